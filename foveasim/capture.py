@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.extras import library, needs
-from foveasim._core.provenance import copied, to_plain_data
+from foveasim._core.extras import import_optional, needs
+from foveasim._core.provenance import copy_plain_data, to_plain_data
 from foveasim._core.rings import same_rings
 from foveasim._core.validation import Floats, Ints, check_choice, check_count, own, read_only, unit_of, unmasked
 from foveasim._io.atomic import atomic_directory
@@ -118,7 +118,7 @@ class Capture:
                 raise ParameterError(name, f"must be <= {limit} everywhere", int(values.max()))
             object.__setattr__(self, name, own(values))
         # Captures of one camera share settings; a copy lets users edit those of one.
-        object.__setattr__(self, "settings", copied(self.settings))
+        object.__setattr__(self, "settings", copy_plain_data(self.settings))
         object.__setattr__(self, "stage_s", dict(self.stage_s))
 
     def __repr__(self) -> str:
@@ -435,7 +435,7 @@ class Capture:
         write_archive(path, about, arrays | layout_to_arrays(self.layout))
 
     def _save_store(self, target: Path) -> None:
-        zarr = library(target, "zarr")
+        zarr = import_optional(target, "zarr")
         variables, coordinates, names = self._variables()
         outlines = {
             "xy_um": _variable("xy_um", ("vertex", "axis"), self.layout.xy_um),

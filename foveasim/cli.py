@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn, TextIO
 import typer
 
 from foveasim import __version__
-from foveasim._io.terminal import PlainConsole, plain_streams, spinner_of, text_of
+from foveasim._io.terminal import PlainConsole, as_plain_text, plain_streams, select_spinner
 from foveasim.errors import FileError, FoveasimError, FoveasimWarning, printable
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 console = PlainConsole()
-console_of_errors = PlainConsole(stderr=True)
+error_console = PlainConsole(stderr=True)
 
 LAYOUT_HELP = "YAML, GDSII, OASIS, GeoJSON, GeoParquet or npz file, or the name of a bundled layout."
 Out = Annotated[Path, typer.Option("--out", "-o", help="Directory for the results; created when missing.")]
@@ -110,7 +110,7 @@ def check(
     file = read_any_layout(layout)
     limits = file.rules if rules is None else read_rules(rules)
     if limits is None:
-        _end(f"error: {layout}: contains no design rules; specify them with --rules", BAD_INPUT)
+        _exit(f"error: {layout}: contains no design rules; specify them with --rules", BAD_INPUT)
     report = file.layout.check(limits)
     console.print(report)
     if report_file is not None:
@@ -182,10 +182,10 @@ def convert(
     from foveasim.layout import write_layout
 
     written = write_layout(read_any_layout(source).layout, target, layer=layer, dbu_um=dbu_um)
-    lost = f"; dropped columns: {', '.join(written.dropped_columns)}" if written.dropped_columns else ""
+    dropped = f"; dropped columns: {', '.join(written.dropped_columns)}" if written.dropped_columns else ""
     _report(
         f"wrote {written.path}: {written.n_sites:,} photosites, vertices moved by at most "
-        f"{written.max_displacement_um:.3g} µm, areas changed by at most {100 * written.worst_area_error:.3g} %{lost}"
+        f"{written.max_displacement_um:.3g} µm, areas changed by at most {100 * written.worst_area_error:.3g} %{dropped}"
     )
 
 
@@ -215,28 +215,28 @@ def view(
     from foveasim.view.web import check_page_path, open_page, serve_page, solid_page, web_page
 
     if out is not None and serve:
-        _end("error: --out and --serve exclude each other; use one of them", BAD_INPUT)
+        _exit("error: --out and --serve exclude each other; use one of them", BAD_INPUT)
     if port and not serve:
-        _end("error: --port requires --serve", BAD_INPUT)
+        _exit("error: --port requires --serve", BAD_INPUT)
     if out is not None:
         check_page_path(out)
     if solid and (rules is not None or layout is not None):
-        _end("error: --solid shows no violations; omit --rules and --layout", BAD_INPUT)
+        _exit("error: --solid shows no violations; omit --rules and --layout", BAD_INPUT)
     with _status("reading"):
-        seen = read_viewable(file, layout=layout, rules=rules)
+        viewable = read_viewable(file, layout=layout, rules=rules)
     with _status("writing the page"):
-        flat = None if solid else web_page(seen.data, report=seen.report, name=seen.name)
-        text = solid_page(seen.data, name=seen.name) if flat is None else flat
+        flat = None if solid else web_page(viewable.data, report=viewable.report, name=viewable.name)
+        text = solid_page(viewable.data, name=viewable.name) if flat is None else flat
     if out is not None:
         with atomic_write(out) as temporary:
             temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
         _report(f"wrote {out}")
         return
     if serve:
-        serve_page(text, port=port, announce=lambda url: _say(f"serving {file} at {url}; press Ctrl-C to stop"))
+        serve_page(text, port=port, announce=lambda url: _print(f"serving {file} at {url}; press Ctrl-C to stop"))
         return
     path, is_opened = open_page(text)
-    _say(f"opened {path}" if is_opened else f"no browser found; open {path} in one")
+    _print(f"opened {path}" if is_opened else f"no browser found; open {path} in one")
 
 
 @app.command()
@@ -260,7 +260,7 @@ def sweep(
     _report(f"wrote {out}: {plan.n_points:,} points ({sizes})")
     failed = [text for text in results["error"].to_numpy().ravel().tolist() if text]
     if failed:
-        _end(f"{len(failed):,} of {plan.n_points:,} points failed; the first: {failed[0]}", FAILED)
+        _exit(f"{len(failed):,} of {plan.n_points:,} points failed; the first: {failed[0]}", FAILED)
 
 
 @app.command()
@@ -291,23 +291,23 @@ def study(
     from foveasim.explore import best_table, finished_trials, read_study, run_study, storage_name
 
     if out is not None and storage is not None:
-        _end("error: --out and --storage exclude each other; use one of them", BAD_INPUT)
+        _exit("error: --out and --storage exclude each other; use one of them", BAD_INPUT)
     if storage is not None and "://" not in storage:
-        _end(f"error: --storage must be a URL, such as sqlite:///study.db, got '{storage}'", BAD_INPUT)
+        _exit(f"error: --storage must be a URL, such as sqlite:///study.db, got '{storage}'", BAD_INPUT)
     plan = read_study(settings, metrics=metrics or (), n_trials=trials)
     base = storage or str(out or "study.db")
-    place = storage_name(base)
-    with _progress(settings.stem, f"finished trials are stored in {place}") as progress:
+    storage_label = storage_name(base)
+    with _progress(settings.stem, f"finished trials are stored in {storage_label}") as progress:
         found = run_study(plan, storage=base, scheduler=scheduler, workers=workers, progress=progress)
-    done = finished_trials(found)
-    failed = [trial.user_attrs["error"] for trial in done if "error" in trial.user_attrs]
+    finished = finished_trials(found)
+    failed = [trial.user_attrs["error"] for trial in finished if "error" in trial.user_attrs]
     if failed:
-        _report_error(f"{len(failed):,} of {len(done):,} trials failed; the first: {failed[0]}")
+        _report_error(f"{len(failed):,} of {len(finished):,} trials failed; the first: {failed[0]}")
     if not found.best_trials:
-        why = "all failed" if len(failed) == len(done) else "all others violate the limits"
-        _end(f"no valid trial in {place}: {why}", FAILED)
+        reason = "all failed" if len(failed) == len(finished) else "all others violate the limits"
+        _exit(f"no valid trial in {storage_label}: {reason}", FAILED)
     console.print(best_table(plan, found))
-    _report(f"wrote {place}: {len(done):,} trials")
+    _report(f"wrote {storage_label}: {len(finished):,} trials")
 
 
 @app.command()
@@ -364,7 +364,7 @@ def video(
     from foveasim.video import count_recorded_frames, partial_path
 
     if frames_per_s is not None and not frames_per_s > 0.0:
-        _end(f"error: --fps must be > 0, got {frames_per_s:g}", BAD_INPUT)
+        _exit(f"error: --fps must be > 0, got {frames_per_s:g}", BAD_INPUT)
     with _status("reading settings"):
         shot = read_shot(settings, changes or [], n_threads=threads)
     frame_s = None if frames_per_s is None else 1.0 / frames_per_s
@@ -375,9 +375,9 @@ def video(
     except KeyboardInterrupt:
         n = count_recorded_frames(out) if is_store and partial_path(out).is_dir() else 0
         stored = f"; {n:,} frames are stored next to {out}, run the same command again to resume" if n else ""
-        _end(f"interrupted{stored}", INTERRUPTED)
-    done = f"{out} was already complete" if was_finished else f"wrote {out}"
-    _report(f"{done}: {n:,} frames")
+        _exit(f"interrupted{stored}", INTERRUPTED)
+    status = f"{out} was already complete" if was_finished else f"wrote {out}"
+    _report(f"{status}: {n:,} frames")
 
 
 @app.command()
@@ -391,21 +391,23 @@ def schema(
 
 
 def _run(settings: Sequence[Path], changes: Sequence[str], out: Path, threads: int | None) -> list[Result]:
-    from foveasim.config import check_folder, read_shot, results_table, run_shot
+    from foveasim.config import check_directory, read_shot, results_table, run_shot
 
-    check_folder(out)
+    check_directory(out)
     results = []
     written = []
     try:
         with _status("reading settings") as status:
             shots = [read_shot(path, changes, n_threads=threads) for path in settings]
             for shot in shots:
-                status.update(text_of(f"{shot.name}: capturing with {shot.camera.sensor.layout.n_sites:,} photosites"))
+                status.update(
+                    as_plain_text(f"{shot.name}: capturing with {shot.camera.sensor.layout.n_sites:,} photosites")
+                )
                 result, paths = run_shot(shot, out)
                 results.append(result)
                 written += paths
     except KeyboardInterrupt:
-        _end("interrupted", INTERRUPTED)
+        _exit("interrupted", INTERRUPTED)
     console.print(results_table(results))
     for path in written:
         _report(f"wrote {path}")
@@ -424,13 +426,13 @@ def _main() -> None:
     try:
         app()
     except FoveasimError as error:
-        _end("; ".join([f"error: {error}", *getattr(error, "__notes__", ())]), BAD_INPUT)
+        _exit("; ".join([f"error: {error}", *getattr(error, "__notes__", ())]), BAD_INPUT)
     except MemoryError:
-        _end("error: not enough memory; use a smaller picture or fewer photosites", BAD_INPUT)
+        _exit("error: not enough memory; use a smaller picture or fewer photosites", BAD_INPUT)
     except OSError as error:
         reason = error.strerror or str(error)
         named = FileError(error.filename, reason) if isinstance(error.filename, str) else reason
-        _end(f"error: {named}", BAD_INPUT)
+        _exit(f"error: {named}", BAD_INPUT)
     finally:
         warnings.showwarning = show_warning
 
@@ -459,7 +461,7 @@ def _progress(name: str, stored: str) -> Iterator[Callable[[int, int], None]]:
     try:
         yield show
     except KeyboardInterrupt:
-        _end(f"interrupted; {stored}, run the same command again to resume", INTERRUPTED)
+        _exit(f"interrupted; {stored}, run the same command again to resume", INTERRUPTED)
     finally:
         if progress.live.is_started:
             progress.stop()
@@ -467,10 +469,10 @@ def _progress(name: str, stored: str) -> Iterator[Callable[[int, int], None]]:
 
 def _status(text: str) -> Status:
     """Show a line with a spinner, on terminals only."""
-    return console.status(text_of(text), spinner=spinner_of(console))
+    return console.status(as_plain_text(text), spinner=select_spinner(console))
 
 
-def _say(text: str) -> None:
+def _print(text: str) -> None:
     # Flushed: a program may read the address from a pipe.
     sys.stdout.write(printable(text) + "\n")
     sys.stdout.flush()
@@ -481,10 +483,10 @@ def _report(text: str) -> None:
 
 
 def _report_error(text: str) -> None:
-    console_of_errors.print(printable(text), soft_wrap=True)
+    error_console.print(printable(text), soft_wrap=True)
 
 
-def _end(text: str, code: int) -> NoReturn:
+def _exit(text: str, code: int) -> NoReturn:
     _report_error(text)
     sys.exit(code)
 
@@ -499,7 +501,7 @@ def _show_warning(
 ) -> None:
     is_ours = issubclass(category, FoveasimWarning)
     text = f"warning: {message}" if is_ours else warnings.formatwarning(message, category, filename, lineno, line)
-    console_of_errors.print(printable(text) if is_ours else text, soft_wrap=True)
+    error_console.print(printable(text) if is_ours else text, soft_wrap=True)
 
 
 if __name__ == "__main__":

@@ -39,8 +39,8 @@ __all__ = [
     "SamplingWarning",
     "SimulationError",
     "disk_problem",
+    "format_value",
     "printable",
-    "shown",
 ]
 
 
@@ -52,13 +52,13 @@ class FoveasimError(Exception):
     """Base class of all errors of the package; pickling preserves instances."""
 
     def __init__(self, message: str = "", *, prefix: str = "") -> None:
-        super().__init__(prefix + _shortened(message))
+        super().__init__(prefix + _shorten(message))
 
     def __reduce__(self) -> tuple[Any, ...]:
         state = dict(self.__dict__)
         if not isinstance(state.get("value"), str | int | float | None):
-            state["value"] = shown(state["value"])  # arbitrary objects may not be picklable
-        return _restored, (type(self), self.args, state)
+            state["value"] = format_value(state["value"])  # arbitrary objects may not be picklable
+        return _restore, (type(self), self.args, state)
 
 
 class ParameterError(FoveasimError, ValueError):
@@ -68,7 +68,7 @@ class ParameterError(FoveasimError, ValueError):
         self.name = name
         self.value = None if value is _NO_VALUE else value
         self.unit = unit
-        got = f", got {shown(value)}{' ' + unit if unit else ''}" if value is not _NO_VALUE else ""
+        got = f", got {format_value(value)}{' ' + unit if unit else ''}" if value is not _NO_VALUE else ""
         #: The message without the name.
         self.detail = f"{rule}{got}{'; ' + hint if hint else ''}"
         super().__init__(f"'{name}' {self.detail}")
@@ -87,7 +87,7 @@ class FileError(FoveasimError, ValueError):
 
     def __init__(self, path: str | Path, message: str) -> None:
         self.path = Path(path)
-        super().__init__(message, prefix=f"{_without_middle(printable(path), LONGEST_PATH)}: ")
+        super().__init__(message, prefix=f"{_elide(printable(path), MAX_PATH_LENGTH)}: ")
 
 
 class ConfigError(FileError):
@@ -114,7 +114,7 @@ class LayoutWarning(FoveasimWarning):
     """A generated layout that covers less of its field than its parameters specify."""
 
 
-def _restored(kind: type[FoveasimError], args: tuple[Any, ...], state: dict[str, Any]) -> FoveasimError:
+def _restore(kind: type[FoveasimError], args: tuple[Any, ...], state: dict[str, Any]) -> FoveasimError:
     """Return an unpickled error; its message is complete and must not be built a second time."""
     error = kind.__new__(kind)
     error.args = args
@@ -123,20 +123,20 @@ def _restored(kind: type[FoveasimError], args: tuple[Any, ...], state: dict[str,
 
 
 #: Most characters of a value in a message, of a word in a message, of a message, and of the file path before it.
-LONGEST_VALUE, LONGEST_WORD, LONGEST_MESSAGE, LONGEST_PATH = 80, 240, 2000, 1000
+MAX_VALUE_LENGTH, MAX_WORD_LENGTH, MAX_MESSAGE_LENGTH, MAX_PATH_LENGTH = 80, 240, 2000, 1000
 #: Depth and number of elements of containers in messages: limits the cost of formatting large values.
-_SHORT = reprlib.Repr()
-_SHORT.maxlevel, _SHORT.maxlong = 3, 2 * LONGEST_VALUE
-_SHORT.maxstring = _SHORT.maxother = LONGEST_VALUE
+_REPR = reprlib.Repr()
+_REPR.maxlevel, _REPR.maxlong = 3, 2 * MAX_VALUE_LENGTH
+_REPR.maxstring = _REPR.maxother = MAX_VALUE_LENGTH
 for _kind in ("tuple", "list", "array", "dict", "set", "frozenset", "deque"):
-    setattr(_SHORT, f"max{_kind}", 8)
+    setattr(_REPR, f"max{_kind}", 8)
 #: System errors that report a failure of the disk, not of the data.
 DISK_ERRNOS = frozenset(
     getattr(errno, name) for name in ("ENOSPC", "EDQUOT", "EFBIG", "EROFS", "EIO") if hasattr(errno, name)
 )
 
 
-def shown(value: Any, *, at_most: int = LONGEST_VALUE) -> str:
+def format_value(value: Any, *, at_most: int = MAX_VALUE_LENGTH) -> str:
     """
     Return a value as one short line for a message.
 
@@ -153,19 +153,19 @@ def shown(value: Any, *, at_most: int = LONGEST_VALUE) -> str:
         Printable characters only; ``...`` replaces the characters above the limit.
     """
     try:
-        text = printable(" ".join(_SHORT.repr(value).split()))
+        text = printable(" ".join(_REPR.repr(value).split()))
     except Exception:  # noqa: BLE001 -- the repr of any object may raise, and Python rejects very long integers
         return f"an object of type {type(value).__name__}"
     return text if len(text) <= at_most else text[: at_most - 3] + "..."
 
 
-def _shortened(message: str) -> str:
+def _shorten(message: str) -> str:
     """Replace the central part of long words and of a long message with ``...``."""
-    words = re.sub(rf"\S{{{LONGEST_WORD + 1},}}", lambda word: _without_middle(word[0], LONGEST_VALUE), message)
-    return _without_middle(words, LONGEST_MESSAGE)
+    words = re.sub(rf"\S{{{MAX_WORD_LENGTH + 1},}}", lambda word: _elide(word[0], MAX_VALUE_LENGTH), message)
+    return _elide(words, MAX_MESSAGE_LENGTH)
 
 
-def _without_middle(text: str, at_most: int) -> str:
+def _elide(text: str, at_most: int) -> str:
     half = (at_most - 3) // 2
     return text if len(text) <= at_most else f"{text[:half]}...{text[-half:]}"
 
@@ -203,14 +203,14 @@ def disk_problem(error: BaseException) -> str:
     Causes are a full disk, an exceeded quota or file size limit, a read-only file system and an input/output error. Libraries
     wrap the system error in their own exceptions, so causes and contexts are also inspected.
     """
-    seen: set[int] = set()
-    found: BaseException | None = error
-    while found is not None and id(found) not in seen:
-        seen.add(id(found))
+    visited: set[int] = set()
+    cause: BaseException | None = error
+    while cause is not None and id(cause) not in visited:
+        visited.add(id(cause))
         # KLayout, Arrow and HDF5 report the error number only in their messages.
-        number = re.search(r"errno ?=? ?(\d+)", str(found))
-        for code in (getattr(found, "errno", None), number and int(number[1])):
+        number = re.search(r"errno ?=? ?(\d+)", str(cause))
+        for code in (getattr(cause, "errno", None), number and int(number[1])):
             if code is not None and code in DISK_ERRNOS:
                 return os.strerror(code)
-        found = found.__cause__ or found.__context__
+        cause = cause.__cause__ or cause.__context__
     return ""

@@ -37,8 +37,8 @@ __all__ = [
     "PowerMap",
     "SceneLike",
     "from_file_rows",
-    "rising",
     "to_file_rows",
+    "with_ascending_axes",
 ]
 
 #: Cell size: one length for square cells, or (along x, along y).
@@ -296,7 +296,9 @@ class PowerMap:
         centred = Grid.centred((n_y, n_x), pitch_um)
         grid = centred if origin_um is None else Grid((n_y, n_x), pitch_um, origin_um)
         return cls(
-            rising(images, is_y_falling=top_row_first), grid, np.atleast_1d(as_numbers("wavelength_nm", wavelength_nm))
+            with_ascending_axes(images, is_y_falling=top_row_first),
+            grid,
+            np.atleast_1d(as_numbers("wavelength_nm", wavelength_nm)),
         )
 
 
@@ -320,12 +322,14 @@ def to_file_rows(picture: ArrayLike) -> NDArray[Any]:
     return picture[::-1] if picture.ndim == 2 else np.moveaxis(picture, 0, -1)[::-1]
 
 
-def rising(images: NDArray[Any], *, is_x_falling: bool = False, is_y_falling: bool = False) -> NDArray[Any]:
+def with_ascending_axes(
+    images: NDArray[Any], *, is_x_falling: bool = False, is_y_falling: bool = False
+) -> NDArray[Any]:
     """
     Return images (..., n_y, n_x) on ascending axes: lowest row and leftmost column first.
 
     The result is contiguous, and read-only if it is a copy.
     """
-    turned = images[..., :: -1 if is_y_falling else 1, :: -1 if is_x_falling else 1]
-    contiguous = np.ascontiguousarray(turned)
-    return contiguous if contiguous is turned else read_only(contiguous)
+    flipped = images[..., :: -1 if is_y_falling else 1, :: -1 if is_x_falling else 1]
+    contiguous = np.ascontiguousarray(flipped)
+    return contiguous if contiguous is flipped else read_only(contiguous)

@@ -17,7 +17,7 @@ import skimage.data
 
 import foveasim as fs
 from foveasim import view
-from foveasim._io.encodings import decoded, encode_srgb_values
+from foveasim._io.encodings import decode, encode_srgb_values
 
 WAVELENGTH_NM = 550.0
 EXPOSURE_S = 0.01
@@ -43,7 +43,7 @@ def photograph(radius_um: float) -> np.ndarray:
     half = int(radius_um / PITCH_UM) + 1
     row, column = GAZE_PX
     padded = np.pad(skimage.data.chelsea(), ((half, half), (half, half), (0, 0)), mode="edge")
-    return decoded(padded[row : row + 2 * half, column : column + 2 * half] / 255.0, "srgb")
+    return decode(padded[row : row + 2 * half, column : column + 2 * half] / 255.0, "srgb")
 
 
 def main(out_dir: Path) -> None:

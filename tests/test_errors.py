@@ -9,7 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foveasim.errors import ConfigError, FileError, GeometryError, ParameterError, SimulationError, printable, shown
+from foveasim.errors import (
+    ConfigError,
+    FileError,
+    GeometryError,
+    ParameterError,
+    SimulationError,
+    format_value,
+    printable,
+)
 
 ERRORS = [
     ParameterError("pitch_um", "must be > 0", -1.0, "µm", "use a larger one"),
@@ -75,7 +83,7 @@ def deep_list():
     ids=["deep", "list", "string", "bytes", "array", "integer", "value", "dict"],
 )
 def test_long_values_are_shortened_in_messages(value):
-    assert len(shown(value)) <= 80
+    assert len(format_value(value)) <= 80
     assert len(str(ParameterError("name", "must be short", value))) < 120
     for error in (FileError, ConfigError):
         try:

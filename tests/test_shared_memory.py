@@ -10,7 +10,7 @@ import pytest
 
 import foveasim as fs
 from foveasim import distortion, modes, optics, video, view
-from foveasim._core.validation import hand_over, own, read_only
+from foveasim._core.validation import freeze, own, read_only
 from foveasim.maps import from_xarray, read_power_map, to_xarray, write_power_map
 from foveasim.metrics.photon_transfer import PhotonTransfer
 from foveasim.reconstruct import Picture
@@ -315,7 +315,7 @@ def test_own_copies_unless_owners_are_read_only(tmp_path):
     np.save(tmp_path / "map.npy", data)
     assert isinstance(own(np.load(tmp_path / "map.npy", mmap_mode="r")), np.memmap)
     assert not isinstance(own(np.load(tmp_path / "map.npy", mmap_mode="r+")).base, np.memmap)
-    window = hand_over(data[2:])
+    window = freeze(data[2:])
     assert own(window) is window
     with pytest.raises(ValueError, match="read-only"):
         data[0] = 1.0

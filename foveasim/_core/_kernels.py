@@ -27,7 +27,7 @@ _M_32 = np.uint64(0xD256D193)
 _LOW, _32, _11 = np.uint64(0xFFFFFFFF), np.uint64(32), np.uint64(11)
 _ONE_IN_2_53, _ONE_IN_2_32, _ONE_IN_2_64, _2_31 = 2.0**-53, 2.0**-32, 2.0**-64, 2.0**31
 #: Pairs of Gaussian numbers per block: the buffers of a block fit in the L1 cache.
-PIECE = 512
+BLOCK_PAIRS = 512
 #: Lowest bit of the exponent of a float64; bit patterns of 1.0 and sqrt(1/2); mask of the mantissa.
 _EXPONENT = 52
 _ONE = np.float64(1.0).view(np.int64)
@@ -46,9 +46,9 @@ _L1, _L3, _L5, _L7, _L9, _L11, _L13, _L15, _L17 = (2.0 / k for k in range(1, 18,
 def _high_word(a, b):
     """Return the upper 64 bits of the product of two 64-bit integers."""
     a_low, a_high, b_low, b_high = a & _LOW, a >> _32, b & _LOW, b >> _32
-    middle = a_high * b_low + ((a_low * b_low) >> _32)
-    low = (middle & _LOW) + a_low * b_high
-    return a_high * b_high + (middle >> _32) + (low >> _32)
+    cross = a_high * b_low + ((a_low * b_low) >> _32)
+    low = (cross & _LOW) + a_low * b_high
+    return a_high * b_high + (cross >> _32) + (low >> _32)
 
 
 @njit()
@@ -113,13 +113,13 @@ def standard_normal(key, out):
     at most pi/4, so sine and cosine need no range reduction. Logarithm, sine and cosine are evaluated by sums and products in a
     fixed order: the compiler vectorises them, and results are bit-identical on every machine.
     """
-    u, angle, signs = np.empty(PIECE), np.empty(PIECE), np.empty(PIECE, np.int32)
-    mantissa, exponent = np.empty(PIECE), np.empty(PIECE)
+    u, angle, signs = np.empty(BLOCK_PAIRS), np.empty(BLOCK_PAIRS), np.empty(BLOCK_PAIRS, np.int32)
+    mantissa, exponent = np.empty(BLOCK_PAIRS), np.empty(BLOCK_PAIRS)
     u_bits, mantissa_bits = u.view(np.int64), mantissa.view(np.int64)
     key_0, key_1, zero = key & _LOW, key >> _32, np.uint64(0)
     n_pairs = (out.size + 1) // 2
-    for first in range(0, n_pairs, PIECE):
-        n = min(PIECE, n_pairs - first)
+    for first in range(0, n_pairs, BLOCK_PAIRS):
+        n = min(BLOCK_PAIRS, n_pairs - first)
         for j in range(n):
             counter = np.uint64(first + j)
             a, b, c, d = philox_4x32(key_0, key_1, counter & _LOW, counter >> _32, zero, zero)
@@ -145,9 +145,9 @@ def standard_normal(key, out):
             u[j] = math.copysign(radius * (cosine + sine), np.float64(signs[j]))
             angle[j] = math.copysign(radius * (cosine - sine), np.float64(np.int32(signs[j] << 1)))
         begin = 2 * first
-        n_whole = min(n, (out.size - begin) // 2)
-        for j in range(n_whole):
+        n_complete = min(n, (out.size - begin) // 2)
+        for j in range(n_complete):
             out[begin + 2 * j] = u[j]
             out[begin + 2 * j + 1] = angle[j]
-        if n_whole < n:
-            out[begin + 2 * n_whole] = u[n_whole]
+        if n_complete < n:
+            out[begin + 2 * n_complete] = u[n_complete]

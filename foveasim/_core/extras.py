@@ -8,7 +8,7 @@ from typing import Any
 
 from foveasim.errors import FileError
 
-__all__ = ["EXTRA_OF", "install_hint", "library", "needs"]
+__all__ = ["EXTRA_OF", "import_optional", "install_hint", "needs"]
 
 #: Smallest extra that installs each optional module.
 EXTRA_OF = {
@@ -45,7 +45,7 @@ def needs(module: str, extra: str | None = None) -> str:
     return f"needs {module}; {install_hint(module, extra)}"
 
 
-def library(path: Path, module: str) -> Any:
+def import_optional(path: Path, module: str) -> Any:
     """
     Import an optional module that a file requires.
 

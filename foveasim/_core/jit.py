@@ -23,7 +23,7 @@ __all__ = ["njit"]
 
 _log = logging.getLogger("foveasim")
 #: Module of numba that reads and writes machine code on disk; its objects have a ``cache_path``.
-CACHING = "numba.core.caching"
+CACHE_MODULE = "numba.core.caching"
 #: Modules whose compilation has been logged.
 _announced: set[str] = set()
 
@@ -50,7 +50,7 @@ def njit(signature: Any = None, **options: Any) -> Callable[[Callable[..., Any]]
     """
     import numba
 
-    def decorated(function: Callable[..., Any]) -> Any:
+    def decorate(function: Callable[..., Any]) -> Any:
         if function.__module__ not in _announced and not _is_cached(function):
             _announced.add(function.__module__)
             package = function.__module__.rpartition(".")[0]
@@ -61,20 +61,20 @@ def njit(signature: Any = None, **options: Any) -> Callable[[Callable[..., Any]]
                 return numba.njit(signature, cache=True, nogil=True, **options)(function)
             except Exception as error:
                 if "no locator available" in str(error):
-                    place = str(Path(tempfile.gettempdir()) / "foveasim-numba")
-                    if place != numba.config.CACHE_DIR:
-                        os.environ["NUMBA_CACHE_DIR"] = numba.config.CACHE_DIR = place
+                    cache_directory = str(Path(tempfile.gettempdir()) / "foveasim-numba")
+                    if cache_directory != numba.config.CACHE_DIR:
+                        os.environ["NUMBA_CACHE_DIR"] = numba.config.CACHE_DIR = cache_directory
                         continue
-                directory = _cache_of(error)
+                directory = _find_cache_directory(error)
                 if directory is None:
                     raise
                 if directory in emptied or isinstance(error, OSError):
-                    raise _unusable(directory, error) from None
-            _empty(directory)
+                    raise _cache_error(directory, error) from None
+            _delete_cache(directory)
             emptied.add(directory)
             _log.warning("compiled kernels in %s were corrupt: compiling them again (a few seconds)", directory)
 
-    return decorated
+    return decorate
 
 
 def _is_cached(function: Callable[..., Any]) -> bool:
@@ -89,27 +89,27 @@ def _is_cached(function: Callable[..., Any]) -> bool:
     return is_elsewhere or any((source.parent / "__pycache__").glob(pattern))
 
 
-def _cache_of(error: BaseException | None) -> Path | None:
+def _find_cache_directory(error: BaseException | None) -> Path | None:
     """Return the cache directory in which an error or its cause was raised, or None."""
     while error is not None:
         for frame, _ in traceback.walk_tb(error.__traceback__):
             path = getattr(frame.f_locals.get("self"), "cache_path", None)
-            if path is not None and frame.f_globals.get("__name__") == CACHING:
+            if path is not None and frame.f_globals.get("__name__") == CACHE_MODULE:
                 return Path(path)
         error = error.__cause__ or error.__context__
     return None
 
 
-def _empty(directory: Path) -> None:
+def _delete_cache(directory: Path) -> None:
     """Delete the machine code in a cache directory; numba creates one per source directory."""
     try:
         for path in directory.glob("*.nb[ic]"):
             path.unlink(missing_ok=True)
     except OSError as error:
-        raise _unusable(directory, error) from None
+        raise _cache_error(directory, error) from None
 
 
-def _unusable(directory: Path, error: Exception) -> FileError:
+def _cache_error(directory: Path, error: Exception) -> FileError:
     reason = " ".join(str(error).split()) or type(error).__name__
     hint = "delete this directory, or set NUMBA_CACHE_DIR to another one"
     return FileError(

@@ -15,10 +15,10 @@ import numpy as np
 from foveasim._core.validation import own
 from foveasim._version import __version__
 
-__all__ = ["copied", "differences", "to_plain_data", "versions"]
+__all__ = ["copy_plain_data", "differences", "to_plain_data", "versions"]
 
 #: Arrays up to this size are stored as lists; larger arrays as shape, dtype and checksum.
-WRITTEN_OUT = 64
+MAX_LISTED_VALUES = 64
 _ATOMS = frozenset({str, int, float, bool, type(None)})
 
 
@@ -33,7 +33,7 @@ def to_plain_data(value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, np.ndarray):
-        if value.size <= WRITTEN_OUT:
+        if value.size <= MAX_LISTED_VALUES:
             return value.tolist()
         digest = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
         return {"shape": list(value.shape), "dtype": str(value.dtype), "sha256": digest}
@@ -49,31 +49,31 @@ def to_plain_data(value: Any) -> Any:
     return repr(value)
 
 
-def copied(value: Any) -> Any:
+def copy_plain_data(value: Any) -> Any:
     """Return a deep copy of plain data; editing the copy does not change the original."""
     # Concrete types first: checks of abstract types take several times as long, and every video frame has such data.
     if type(value) in _ATOMS:
         return value
     if isinstance(value, dict | Mapping):
-        return {key: copied(item) for key, item in value.items()}
+        return {key: copy_plain_data(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [copied(item) for item in value]
+        return [copy_plain_data(item) for item in value]
     if type(value) is tuple:
-        return tuple(copied(item) for item in value)
+        return tuple(copy_plain_data(item) for item in value)
     return own(value) if isinstance(value, np.ndarray) else value
 
 
-def differences(one: Any, other: Any, place: str = "") -> Iterator[str]:
+def differences(one: Any, other: Any, prefix: str = "") -> Iterator[str]:
     """Yield the dotted names of the entries in which plain data differ: ``optics.f_number``."""
     if isinstance(one, dict) and isinstance(other, dict):
         for key in dict.fromkeys([*one, *other]):
-            inside = f"{place}.{key}" if place else str(key)
+            path = f"{prefix}.{key}" if prefix else str(key)
             if key not in one or key not in other:
-                yield inside
+                yield path
             else:
-                yield from differences(one[key], other[key], inside)
+                yield from differences(one[key], other[key], path)
     elif one != other:
-        yield place or "plan"
+        yield prefix or "plan"
 
 
 @cache

@@ -13,7 +13,7 @@ import numpy as np
 
 from foveasim._core.validation import Floats, check_count
 
-__all__ = ["Streams", "derived_seed", "fixed_pattern_key", "standard_normal"]
+__all__ = ["Streams", "derive_seed", "fixed_pattern_key", "standard_normal"]
 
 
 def fixed_pattern_key(seed: int, effect: str) -> tuple[np.uint64, np.uint64]:
@@ -22,7 +22,7 @@ def fixed_pattern_key(seed: int, effect: str) -> tuple[np.uint64, np.uint64]:
     return words[0], words[1]
 
 
-def derived_seed(seed: int, index: int) -> int:
+def derive_seed(seed: int, index: int) -> int:
     """Return a seed below 2**63 that depends only on a common seed and the index of the run."""
     return int(np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(1, np.uint64)[0] >> np.uint64(1))
 

@@ -74,8 +74,8 @@ class Registry(Mapping[str, T], Generic[T]):
         """
         if item is None:
             return lambda decorated: self.register(name, decorated)
-        taken = self._objects.get(name)
-        if taken is not None and (getattr(taken, "__module__", 0), getattr(taken, "__qualname__", 0)) != (
+        existing = self._objects.get(name)
+        if existing is not None and (getattr(existing, "__module__", 0), getattr(existing, "__qualname__", 0)) != (
             getattr(item, "__module__", 1),
             getattr(item, "__qualname__", 1),
         ):

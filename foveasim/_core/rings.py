@@ -21,7 +21,7 @@ __all__ = [
     "next_vertex",
     "positions_in_runs",
     "ring_moments",
-    "ring_spread_um2",
+    "ring_unsigned_area_um2",
     "same_rings",
     "site_area_um2",
     "site_bounds_um",
@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 #: Turning angles (rad) below this may be rounding errors.
-SMALLEST_TURN = 1e-12
+MIN_TURN_RAD = 1e-12
 
 
 def next_vertex(ring_offsets: Ints) -> Ints:
@@ -112,7 +112,7 @@ def ring_moments(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Floats]:
     return area_um2, local_moment + anchor * area_um2[:, np.newaxis]
 
 
-def ring_spread_um2(xy_um: Floats, ring_offsets: Ints) -> Floats:
+def ring_unsigned_area_um2(xy_um: Floats, ring_offsets: Ints) -> Floats:
     """
     Return the sum of the unsigned areas of the triangles with each ring's first vertex.
 
@@ -140,8 +140,8 @@ def are_convex(xy_um: Floats, ring_offsets: Ints) -> Bools:
     turn = dx * dy[after]
     turn -= dy * dx[after]
     length = np.hypot(dx, dy)
-    smallest = SMALLEST_TURN * length * length[after]
-    is_left, is_right = (np.logical_and.reduceat(side, starts) for side in (turn > smallest, turn < -smallest))
+    min_turn = MIN_TURN_RAD * length * length[after]
+    is_left, is_right = (np.logical_and.reduceat(side, starts) for side in (turn > min_turn, turn < -min_turn))
     is_upwards = (dy > 0.0) | ((dy == 0.0) & (dx > 0.0))
     n_rounds = np.add.reduceat((~is_upwards & is_upwards[after]).astype(np.int64), starts)
     return np.asarray((is_left | is_right) & (n_rounds == 1))

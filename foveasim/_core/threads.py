@@ -11,10 +11,10 @@ from typing import TypeVar
 
 from foveasim._core.validation import check_count
 
-__all__ = ["each", "in_order", "thread_count"]
+__all__ = ["in_order", "parallel_map", "thread_count"]
 
 #: Smallest size of the thread pool: users may request more threads than there are cores.
-LEAST_THREADS = 8
+MIN_POOL_THREADS = 8
 #: Upper limit, above the number of cores of any machine.
 MAX_THREADS = 4096
 
@@ -38,7 +38,7 @@ def thread_count(n_threads: int | None = None) -> int:
     return os.cpu_count() or 1
 
 
-def each(work: Callable[[_Item], _Result], items: Iterable[_Item], n_threads: int) -> list[_Result]:
+def parallel_map(work: Callable[[_Item], _Result], items: Iterable[_Item], n_threads: int) -> list[_Result]:
     """
     Return ``[work(item) for item in items]``, computed on several threads.
 
@@ -55,7 +55,7 @@ def each(work: Callable[[_Item], _Result], items: Iterable[_Item], n_threads: in
     results: dict[int, _Result] = {}
     errors: dict[int, BaseException] = {}
 
-    def some() -> None:
+    def process_items() -> None:
         while waiting:
             try:
                 number, item = waiting.popleft()
@@ -67,9 +67,9 @@ def each(work: Callable[[_Item], _Result], items: Iterable[_Item], n_threads: in
                 errors[number] = error
                 waiting.clear()
 
-    helpers = [_pool().submit(some) for _ in range(n_helpers)]
+    helpers = [_pool().submit(process_items) for _ in range(n_helpers)]
     try:
-        some()
+        process_items()
     finally:
         waiting.clear()
         # Helpers that have not started have no items left and are cancelled.
@@ -82,7 +82,7 @@ def each(work: Callable[[_Item], _Result], items: Iterable[_Item], n_threads: in
 @cache
 def _pool() -> ThreadPoolExecutor:
     """Return the thread pool of this process; starting threads takes as long as a small task."""
-    return ThreadPoolExecutor(max(thread_count(), LEAST_THREADS), thread_name_prefix="foveasim")
+    return ThreadPoolExecutor(max(thread_count(), MIN_POOL_THREADS), thread_name_prefix="foveasim")
 
 
 if hasattr(os, "register_at_fork"):
@@ -107,13 +107,13 @@ def in_order(
         yield work(item)
         break
     pool = ThreadPoolExecutor(min(n_threads, n_ahead))
-    going_on: deque[Future[_Result]] = deque()
+    pending: deque[Future[_Result]] = deque()
     try:
         for item in remaining:
-            going_on.append(pool.submit(work, item))
-            if len(going_on) > n_ahead:
-                yield going_on.popleft().result()
-        while going_on:
-            yield going_on.popleft().result()
+            pending.append(pool.submit(work, item))
+            if len(pending) > n_ahead:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
     finally:
         pool.shutdown(cancel_futures=True)

@@ -42,7 +42,7 @@ __all__ = [
     "check_sites",
     "exact_integers",
     "finite_array",
-    "hand_over",
+    "freeze",
     "memory_bytes",
     "own",
     "read_only",
@@ -322,7 +322,7 @@ def unmasked(name: str, value: Any, *, missing_is_nan: bool = False) -> Any:
     if not _has_mask(value):
         return value
     try:
-        data, mask = np.asarray(_parts(value, np.ma.getdata)), np.asarray(_parts(value, np.ma.getmaskarray))
+        data, mask = np.asarray(_map_nested(value, np.ma.getdata)), np.asarray(_map_nested(value, np.ma.getmaskarray))
     except ValueError:
         return value  # ragged: conversion to an array reports the error
     n_masked = int(np.count_nonzero(mask))
@@ -337,9 +337,9 @@ def unmasked(name: str, value: Any, *, missing_is_nan: bool = False) -> Any:
     )
 
 
-def _parts(value: Any, part_of: Callable[[Any], Any]) -> Any:
+def _map_nested(value: Any, function: Callable[[Any], Any]) -> Any:
     """Return the data or the masks of masked arrays in nested lists."""
-    return [_parts(item, part_of) for item in value] if isinstance(value, list | tuple) else part_of(value)
+    return [_map_nested(item, function) for item in value] if isinstance(value, list | tuple) else function(value)
 
 
 def _has_mask(value: object) -> bool:
@@ -392,8 +392,8 @@ def finite_array(
     ):
         if is_bad is not None and np.any(is_bad):
             where = tuple(int(i) for i in np.argwhere(is_bad)[0])
-            place = f" at [{', '.join(map(str, where))}]" if where else ""
-            raise ParameterError(name, f"{rule} everywhere", float(array[where]), (unit_of(name) + place).strip())
+            position = f" at [{', '.join(map(str, where))}]" if where else ""
+            raise ParameterError(name, f"{rule} everywhere", float(array[where]), (unit_of(name) + position).strip())
     return array
 
 
@@ -419,12 +419,12 @@ def wavelengths_nm(name: str, value: ArrayLike) -> Floats:
         When the value is not a list of numbers, is empty, or contains a number outside the range of wavelengths in nm.
     """
     waves_nm = finite_array(name, np.atleast_1d(as_numbers(name, value)), ndim=1, above=0.0)
-    is_odd = (waves_nm < MIN_WAVELENGTH_NM) | (waves_nm > MAX_WAVELENGTH_NM)
-    if waves_nm.size == 0 or is_odd.any():
+    is_outside = (waves_nm < MIN_WAVELENGTH_NM) | (waves_nm > MAX_WAVELENGTH_NM)
+    if waves_nm.size == 0 or is_outside.any():
         raise ParameterError(
             name,
             f"must be from {MIN_WAVELENGTH_NM:g} to {MAX_WAVELENGTH_NM:g}",
-            waves_nm[is_odd].tolist()[:3],
+            waves_nm[is_outside].tolist()[:3],
             "nm",
             "wavelengths are in nm",
         )
@@ -437,7 +437,7 @@ def read_only(array: _Array) -> _Array:
     return array
 
 
-def hand_over(array: _Array) -> _Array:
+def freeze(array: _Array) -> _Array:
     """
     Return the same array, with its base arrays also marked as read-only.
 

@@ -21,7 +21,7 @@ __all__ = ["limit"]
 REJECTIONS = {"FoveasimError", "FormatError"}
 
 
-def limit(kind: str, most: int) -> None:
+def limit(kind: str, maximum: int) -> None:
     """Set a resource limit, such as memory ("RLIMIT_AS") or time ("RLIMIT_CPU"), if supported."""
     try:
         import resource
@@ -29,10 +29,10 @@ def limit(kind: str, most: int) -> None:
         return
     number = getattr(resource, kind)
     hard = resource.getrlimit(number)[1]
-    resource.setrlimit(number, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
+    resource.setrlimit(number, (maximum if hard == resource.RLIM_INFINITY else min(maximum, hard), hard))
 
 
-def _answer(task: dict[str, Any]) -> dict[str, Any]:
+def _run_reader(task: dict[str, Any]) -> dict[str, Any]:
     import numpy as np
 
     try:
@@ -61,14 +61,14 @@ def _answer(task: dict[str, Any]) -> dict[str, Any]:
 
 def _main() -> None:
     task = json.load(sys.stdin)
-    for kind, most in (("RLIMIT_CORE", 0), ("RLIMIT_CPU", task["max_cpu_s"]), ("RLIMIT_AS", task["max_bytes"])):
-        limit(kind, most)
+    for kind, maximum in (("RLIMIT_CORE", 0), ("RLIMIT_CPU", task["max_cpu_s"]), ("RLIMIT_AS", task["max_bytes"])):
+        limit(kind, maximum)
     sys.path[:] = task["sys_path"]
     warnings.simplefilter("ignore")
     # Libraries print problems of a file on standard output.
     with os.fdopen(os.dup(1), "w") as answer, open(task["printed"], "w") as printed:  # noqa: PTH123
         os.dup2(printed.fileno(), 1)
-        answer.write(json.dumps(_answer(task)))
+        answer.write(json.dumps(_run_reader(task)))
 
 
 if __name__ == "__main__":

@@ -68,7 +68,7 @@ def atomic_directory(target: Path, *, is_ours: Callable[[Path], bool]) -> Iterat
         When the target exists and ``is_ours`` is false for it, its parent directory does not exist, or writing fails.
     """
     token = secrets.token_hex(8)
-    new, old = (target.with_name(f".foveasim-{token}-{which}{target.suffix}") for which in ("new", "old"))
+    new, old = (target.with_name(f".foveasim-{token}-{label}{target.suffix}") for label in ("new", "old"))
     try:
         if target.exists() and not is_ours(target):
             raise FileError(target, "cannot be written: the path contains other data; choose another path")
@@ -86,23 +86,23 @@ def atomic_directory(target: Path, *, is_ours: Callable[[Path], bool]) -> Iterat
         _raise_reason(error, target, new)
         raise
     finally:
-        for folder in (new, old):
-            remove_directory(folder)
+        for directory in (new, old):
+            remove_directory(directory)
 
 
-def remove_directory(folder: Path) -> None:
+def remove_directory(directory: Path) -> None:
     """
     Remove a directory and its contents if it exists; ignore errors of the system.
 
     After an error, threads of zarr may continue to write for a short time and create the directory again.
     """
     try:
-        is_there = folder.exists()
+        exists = directory.exists()
     except OSError:  # no permission for the parent directory
-        is_there = False
-    for wait_s in RETRY_S if is_there else ():
+        exists = False
+    for wait_s in RETRY_S if exists else ():
         time.sleep(wait_s)
-        shutil.rmtree(folder, ignore_errors=True)
+        shutil.rmtree(directory, ignore_errors=True)
 
 
 def check_free_space(path: Path, n_bytes: int) -> None:
@@ -146,12 +146,12 @@ def _full(temporary: Path) -> str:
     return ""
 
 
-def _free_bytes(folder: Path) -> int:
+def _free_bytes(directory: Path) -> int:
     """Return the free space of a disk; the superuser may also use the reserved space."""
     if hasattr(os, "statvfs") and os.geteuid() == 0:
-        disk = os.statvfs(folder)
+        disk = os.statvfs(directory)
         return disk.f_bfree * disk.f_frsize
-    return shutil.disk_usage(folder).free
+    return shutil.disk_usage(directory).free
 
 
 def _file_size_limit() -> float:

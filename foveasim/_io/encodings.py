@@ -8,13 +8,13 @@ import numpy as np
 
 from foveasim._core.validation import Floats
 
-__all__ = ["Encoding", "decoded", "encode_srgb_values"]
+__all__ = ["Encoding", "decode", "encode_srgb_values"]
 
 #: sRGB (photographs), the square root of the radiance (the paper), linear radiance.
 Encoding = Literal["srgb", "sqrt", "linear"]
 
 
-def decoded(values: Floats, encoding: Encoding) -> Floats:
+def decode(values: Floats, encoding: Encoding) -> Floats:
     """
     Decode values >= 0 to relative radiance.
 

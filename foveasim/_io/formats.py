@@ -14,18 +14,18 @@ __all__ = [
     "FileFormat",
     "FormatError",
     "as_file_error",
-    "chosen_options",
-    "format_of",
-    "head_of",
+    "detect_format",
     "one_line",
-    "writing_format",
+    "read_head",
+    "select_writer",
+    "validate_options",
 ]
 
 #: Size limit of files that are read.
 MAX_FILE_BYTES = 8 * 2**30
 HEAD_BYTES = 1024
 #: Most characters of a message of this package, and of other packages.
-MAX_MESSAGE, MAX_REASON = 500, 300
+MAX_MESSAGE_LENGTH, MAX_REASON_LENGTH = 500, 300
 #: Messages for files of unsupported types, by their first bytes.
 _HINTS = {
     b"\x1f\x8b": "is compressed with gzip; decompress it first",
@@ -69,7 +69,7 @@ class FileFormat:
     is_sandboxed: bool = False
     is_directory: bool = False
 
-    def is_of(self, path: Path, head: bytes) -> bool:
+    def matches_file(self, path: Path, head: bytes) -> bool:
         """Return whether a file with these first bytes is of the format."""
         if self.matches is not None:
             return self.matches(path, head)
@@ -104,11 +104,11 @@ def as_file_error(path: Path, what: str, *, passes: tuple[type[FoveasimError], .
     except passes:
         raise
     except (FormatError, FoveasimError) as error:
-        raise FileError(path, one_line(str(error).removeprefix(f"{path}: "), MAX_MESSAGE)) from None
+        raise FileError(path, one_line(str(error).removeprefix(f"{path}: "), MAX_MESSAGE_LENGTH)) from None
     except MemoryError:
         raise FileError(path, "needs more memory than is available") from None
     except Exception as error:  # noqa: BLE001 -- readers raise arbitrary exceptions on malformed files
-        reason = one_line(str(error), MAX_REASON) or type(error).__name__
+        reason = one_line(str(error), MAX_REASON_LENGTH) or type(error).__name__
         raise FileError(path, f"is corrupt or not a valid {what} ({reason})") from None
 
 
@@ -118,7 +118,7 @@ def one_line(text: str, max_characters: int) -> str:
     return line if len(line) <= max_characters else line[: max_characters - 3] + "..."
 
 
-def head_of(path: Path) -> bytes:
+def read_head(path: Path) -> bytes:
     """
     Return the first bytes of a file.
 
@@ -144,7 +144,7 @@ def head_of(path: Path) -> bytes:
     return head
 
 
-def format_of(path: Path, formats: Mapping[str, FileFormat], what: str) -> tuple[str, FileFormat]:
+def detect_format(path: Path, formats: Mapping[str, FileFormat], what: str) -> tuple[str, FileFormat]:
     """
     Return the name and the entry of a file's format in a table, detected by content.
 
@@ -153,11 +153,11 @@ def format_of(path: Path, formats: Mapping[str, FileFormat], what: str) -> tuple
     FileError
         When the file cannot be read, or no readable format of the table matches.
     """
-    head = b"" if path.is_dir() else head_of(path)
+    head = b"" if path.is_dir() else read_head(path)
     for name, found in formats.items():
-        if found.read is not None and found.is_of(path, head):
+        if found.read is not None and found.matches_file(path, head):
             return name, found
-    head = head or head_of(path)
+    head = head or read_head(path)
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
     for beginning, hint in _HINTS.items():
         if text.startswith(beginning):
@@ -166,7 +166,7 @@ def format_of(path: Path, formats: Mapping[str, FileFormat], what: str) -> tuple
     raise FileError(path, f"is not a valid {what}: expected {', '.join(titles[:-1])} or {titles[-1]}")
 
 
-def writing_format(path: Path, formats: Mapping[str, FileFormat]) -> FileFormat:
+def select_writer(path: Path, formats: Mapping[str, FileFormat]) -> FileFormat:
     """
     Return the format that has a file's extension.
 
@@ -182,7 +182,7 @@ def writing_format(path: Path, formats: Mapping[str, FileFormat]) -> FileFormat:
         raise FileError(path, f"must end in one of {', '.join(sorted(by_suffix))}") from None
 
 
-def chosen_options(
+def validate_options(
     options: Mapping[str, Any], known: tuple[str, ...], formats: Mapping[str, FileFormat], of: str
 ) -> dict[str, Any]:
     """
@@ -208,8 +208,6 @@ def chosen_options(
     for name, value in given.items():
         if name not in known:
             titles = sorted({found.title for found in formats.values() if name in getattr(found, of)})
-            belongs = (
-                f"is an option of {' and '.join(titles)} files only" if titles else "is not an option of any format"
-            )
-            raise ParameterError(name, belongs, value, hint="omit it")
+            rule = f"is an option of {' and '.join(titles)} files only" if titles else "is not an option of any format"
+            raise ParameterError(name, rule, value, hint="omit it")
     return given

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.extras import library, needs
+from foveasim._core.extras import import_optional, needs
 from foveasim._core.validation import unmasked
 from foveasim._io.atomic import atomic_write
 from foveasim._io.sandbox import read_in_sandbox
@@ -42,11 +42,11 @@ __all__ = [
 #: Larger pictures are rejected: 2**28 pixels are 3 GiB as three float32 channels.
 MAX_PIXELS = 2**28
 #: Limits of decompressed EXR data: for small files, and per byte of larger ones, the maximum ratio of deflate.
-MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE = 2**28, 1032
+MIN_DECOMPRESSED_BYTES, MAX_DECOMPRESSION_RATIO = 2**28, 1032
 #: Formats that are read with Pillow; its other formats are not photographs.
 PILLOW_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "PPM", "JPEG2000", "TGA")
 #: Modes of Pillow that are read unchanged, and conversions of other modes.
-PLAIN_MODES = ("L", "LA", "RGB", "RGBA", "F")
+UNCHANGED_MODES = ("L", "LA", "RGB", "RGBA", "F")
 CONVERTED_MODES = {
     "1": "L",
     "PA": "RGBA",
@@ -63,9 +63,21 @@ PNG_MAGIC, JPEG2000_MAGIC, END_MARKER = b"\x89PNG\r\n\x1a\n", b"\xff\x4f\xff\x51
 START_OF_SCAN, MARKER_BYTES = 0xDA, 2
 #: Orientation tag of TIFF and EXIF.
 ORIENTATION_TAG = 274
-TIFF_ENDINGS = (".tif", ".tiff")
+TIFF_EXTENSIONS = (".tif", ".tiff")
 #: Extensions of picture files in directories.
-PICTURE_EXTENSIONS = (".bmp", ".exr", ".hdr", ".jp2", ".jpeg", ".jpg", ".png", ".ppm", ".tga", *TIFF_ENDINGS, ".webp")
+PICTURE_EXTENSIONS = (
+    ".bmp",
+    ".exr",
+    ".hdr",
+    ".jp2",
+    ".jpeg",
+    ".jpg",
+    ".png",
+    ".ppm",
+    ".tga",
+    *TIFF_EXTENSIONS,
+    ".webp",
+)
 
 
 def picture_names(names: Iterable[str]) -> list[str]:
@@ -123,7 +135,7 @@ def read_picture(path: str | Path) -> NDArray[Any]:
     except OSError as error:
         raise FileError(path, f"cannot be opened: {error.strerror or error}") from None
     try:
-        picture = _reader_of(head)(path)
+        picture = _select_reader(head)(path)
     except FileError:
         raise
     except Exception as error:  # noqa: BLE001 -- readers raise arbitrary exceptions on corrupt files
@@ -135,7 +147,7 @@ def read_picture(path: str | Path) -> NDArray[Any]:
     return picture
 
 
-def _reader_of(head: bytes) -> Any:
+def _select_reader(head: bytes) -> Any:
     """Return the reader for a file that begins with these bytes."""
     if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         return _read_tiff
@@ -164,7 +176,7 @@ def _read_with_pillow(path: Path) -> NDArray[Any]:
                     n_pictures > 1 and image.format != "MPO"
                 ):  # MPO files of phones contain previews after the photograph
                     raise FileError(path, f"contains {n_pictures} pictures; provide a file with one picture")
-                _check_whole(path, str(image.format))
+                _check_complete(path, str(image.format))
                 return pixels_of_image(image)
     except UnidentifiedImageError:
         raise FileError(path, "is not a picture in a supported format") from None
@@ -183,56 +195,56 @@ def pixels_of_image(image: Image.Image) -> NDArray[Any]:
     """
     image.load()  # Pillow applies the orientation of TIFF on load and removes the tag
     orientation = _orientation(image)
-    plain = _plain(image)
-    numbers = np.asarray(plain)
-    if plain.mode == "I":
+    converted = _convert_mode(image)
+    numbers = np.asarray(converted)
+    if converted.mode == "I":
         is_16_bit = numbers.min() >= 0 and numbers.max() <= np.iinfo(np.uint16).max
         numbers = numbers.astype(np.uint16 if is_16_bit else np.float32)
-    return _upright(numbers, orientation)
+    return _apply_orientation(numbers, orientation)
 
 
-def _check_whole(path: Path, kind: str) -> None:
+def _check_complete(path: Path, kind: str) -> None:
     """Reject corrupt files that Pillow accepts: wrong checksums of PNG, missing end markers."""
     if kind not in ("PNG", "JPEG", "MPO", "JPEG2000"):
         return
     content = path.read_bytes()
     if kind == "PNG":
-        is_whole = _has_true_sums(content)
+        is_complete = _has_valid_checksums(content)
     else:
         begin = content.find(JPEG2000_MAGIC) if kind == "JPEG2000" else _first_scan(content)
         # Compressed image data never contain the end marker.
-        is_whole = content.find(END_MARKER, max(begin, 0)) >= 0
-    if not is_whole:
+        is_complete = content.find(END_MARKER, max(begin, 0)) >= 0
+    if not is_complete:
         raise FileError(path, "is corrupt or truncated")
 
 
-def _has_true_sums(content: bytes) -> bool:
+def _has_valid_checksums(content: bytes) -> bool:
     """Return whether the checksums of the image data chunks of a PNG are correct."""
-    place, view = len(PNG_MAGIC), memoryview(content)
-    while place + 12 <= len(content):
-        begin = place + 4
-        end = begin + 4 + int.from_bytes(view[place:begin])
-        told = int.from_bytes(view[end : end + 4])
-        if content.startswith(b"IDAT", begin) and zlib.crc32(view[begin:end]) != told:
+    offset, view = len(PNG_MAGIC), memoryview(content)
+    while offset + 12 <= len(content):
+        begin = offset + 4
+        end = begin + 4 + int.from_bytes(view[offset:begin])
+        checksum = int.from_bytes(view[end : end + 4])
+        if content.startswith(b"IDAT", begin) and zlib.crc32(view[begin:end]) != checksum:
             return False
-        place = end + 4
+        offset = end + 4
     return True
 
 
 def _first_scan(content: bytes) -> int:
     """Return the offset of the image data of a JPEG, after metadata, which may contain a JPEG."""
-    place = MARKER_BYTES
-    while content[place : place + 1] == b"\xff" and content[place + 1] != START_OF_SCAN:
-        is_filler = content[place + 1] == 0xFF
-        place += 1 if is_filler else MARKER_BYTES + int.from_bytes(content[place + 2 : place + 4])
-    return place
+    offset = MARKER_BYTES
+    while content[offset : offset + 1] == b"\xff" and content[offset + 1] != START_OF_SCAN:
+        is_filler = content[offset + 1] == 0xFF
+        offset += 1 if is_filler else MARKER_BYTES + int.from_bytes(content[offset + 2 : offset + 4])
+    return offset
 
 
-def _plain(image: Image.Image) -> Image.Image:
+def _convert_mode(image: Image.Image) -> Image.Image:
     """Return the image in a mode that preserves the values, with transparency as a channel."""
     if "transparency" in image.info and image.mode in ("1", "L", "RGB", "P"):
         return image.convert("LA" if image.mode in ("1", "L") else "RGBA")
-    return image if image.mode in PLAIN_MODES else image.convert(CONVERTED_MODES.get(image.mode, "RGB"))
+    return image if image.mode in UNCHANGED_MODES else image.convert(CONVERTED_MODES.get(image.mode, "RGB"))
 
 
 def _orientation(image: Image.Image) -> Any:
@@ -282,16 +294,16 @@ def _read_tiff(path: Path) -> NDArray[Any]:
             picture = np.moveaxis(np.asarray(page.colormap)[:, picture], 0, -1)
         orientation = page.tags[ORIENTATION_TAG].value if ORIENTATION_TAG in page.tags else 1
         is_inverted = page.photometric == PHOTOMETRIC.MINISWHITE
-        has_dimmed_colours = tifffile.EXTRASAMPLE.ASSOCALPHA in (page.extrasamples or ())
+        has_premultiplied_alpha = tifffile.EXTRASAMPLE.ASSOCALPHA in (page.extrasamples or ())
     if picture.dtype == np.bool_:
         picture = picture.astype(np.uint8) * np.uint8(255)
     if picture.dtype not in (np.uint8, np.uint16) and picture.dtype.kind != "f":
         raise FileError(path, f"must contain 8-bit, 16-bit or floating-point numbers, got {picture.dtype}")
     if is_inverted:
         picture = (1 if picture.dtype.kind == "f" else np.iinfo(picture.dtype).max) - picture
-    if has_dimmed_colours and picture.ndim == 3:
+    if has_premultiplied_alpha and picture.ndim == 3:
         picture = picture[..., :-1]  # premultiplied alpha: the colours are already composed with black
-    return _upright(picture.astype(np.float32) if picture.dtype.kind == "f" else picture, orientation)
+    return _apply_orientation(picture.astype(np.float32) if picture.dtype.kind == "f" else picture, orientation)
 
 
 def pixels_of_page(path: Path, page: Any) -> NDArray[Any]:
@@ -325,14 +337,14 @@ def pixels_of_page(path: Path, page: Any) -> NDArray[Any]:
 
 def _read_deep_png(path: Path) -> NDArray[Any]:
     """Read a 16-bit PNG, which Pillow would reduce to 8 bits in colour."""
-    imagecodecs = library(path, "imagecodecs")
+    imagecodecs = import_optional(path, "imagecodecs")
     content = path.read_bytes()
     check_picture_size(path, *struct.unpack(">II", content[16:24]))
     return np.asarray(imagecodecs.png_decode(content))
 
 
 def _read_radiance(path: Path) -> NDArray[Any]:
-    imagecodecs = library(path, "imagecodecs")
+    imagecodecs = import_optional(path, "imagecodecs")
     content = path.read_bytes()
     size = next((line.split() for line in content[:4096].split(b"\n") if line[:2] in (b"-Y", b"+Y")), [])
     if len(size) != 4:
@@ -343,19 +355,19 @@ def _read_radiance(path: Path) -> NDArray[Any]:
 
 def _read_exr(path: Path) -> NDArray[Any]:
     # OpenEXR prints read errors and may continue without the data.
-    return read_in_sandbox(_openexr, path, kind="EXR", max_decompressed_bytes=_max_decompressed_bytes, is_silent=True)[
-        1
-    ][0]
+    return read_in_sandbox(
+        _read_with_openexr, path, kind="EXR", max_decompressed_bytes=_max_decompressed_bytes, is_silent=True
+    )[1][0]
 
 
 def _max_decompressed_bytes(n_bytes: int) -> int:
-    return min(MIN_UNPACKED_BYTES + UNPACKED_PER_BYTE * n_bytes, 16 * MAX_PIXELS)
+    return min(MIN_DECOMPRESSED_BYTES + MAX_DECOMPRESSION_RATIO * n_bytes, 16 * MAX_PIXELS)
 
 
-def _openexr(name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+def _read_with_openexr(name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
     """Read the picture of an EXR file, in the sandbox process."""
     path = Path(name)
-    OpenEXR = library(path, "OpenEXR")
+    OpenEXR = import_optional(path, "OpenEXR")
     with OpenEXR.File(str(path), header_only=True) as file:
         if len(file.parts) != 1:
             raise FileError(path, f"contains {len(file.parts)} pictures; provide a file with one picture")
@@ -372,7 +384,7 @@ def _openexr(name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
     return {}, [picture]
 
 
-def _upright(picture: NDArray[Any], orientation: object) -> NDArray[Any]:
+def _apply_orientation(picture: NDArray[Any], orientation: object) -> NDArray[Any]:
     """Apply the orientation tag 274 of EXIF and TIFF; values other than 2 to 8 mean upright."""
     match orientation:
         case 2:
@@ -428,19 +440,19 @@ def write_picture(path: str | Path, picture: NDArray[Any]) -> None:
     from PIL import Image
 
     target = Path(path)
-    ending = target.suffix.lower()
-    is_pillow = Image.registered_extensions().get(ending) in PILLOW_FORMATS
-    if not is_pillow and ending not in (*TIFF_ENDINGS, ".exr"):
+    extension = target.suffix.lower()
+    is_pillow = Image.registered_extensions().get(extension) in PILLOW_FORMATS
+    if not is_pillow and extension not in (*TIFF_EXTENSIONS, ".exr"):
         raise FileError(target, "must end in .png, .webp, .jpg, .bmp, .tga, .ppm, .jp2, .tif or .exr; .png is lossless")
     if picture.ndim == 3 and picture.shape[2] == 1:
         picture = picture[..., 0]
-    held = (
+    supported = (
         ("uint8", "uint16", "float32")
-        if ending in TIFF_ENDINGS
-        else {".exr": ("float32",), ".png": ("uint8", "uint16")}.get(ending, ("uint8",))
+        if extension in TIFF_EXTENSIONS
+        else {".exr": ("float32",), ".png": ("uint8", "uint16")}.get(extension, ("uint8",))
     )
     if (
-        picture.dtype.name not in held
+        picture.dtype.name not in supported
         or picture.ndim not in (2, 3)
         or 0 in picture.shape
         or (picture.shape[2:] or (1,))[0] > 4
@@ -448,22 +460,22 @@ def write_picture(path: str | Path, picture: NDArray[Any]) -> None:
         raise FileError(
             target,
             f"cannot store an array of the shape {picture.shape} and type {picture.dtype}, only 1 to 4 channels of "
-            f"{' or '.join(held)}",
+            f"{' or '.join(supported)}",
         )
     picture = np.ascontiguousarray(unmasked("picture", picture))
     with atomic_write(target) as temporary:
         try:
-            if ending in TIFF_ENDINGS:
+            if extension in TIFF_EXTENSIONS:
                 _write_tiff(temporary, picture)
-            elif ending == ".exr":
+            elif extension == ".exr":
                 _write_exr(temporary, picture)
             elif picture.dtype == np.uint16:
-                imagecodecs = library(target, "imagecodecs")
+                imagecodecs = import_optional(target, "imagecodecs")
                 temporary.write_bytes(imagecodecs.png_encode(picture))
             else:
                 # Encode in memory: on a full disk, encoders of Pillow leave a truncated file or never return.
                 encoded = io.BytesIO()
-                Image.fromarray(picture).save(encoded, Image.registered_extensions()[ending])
+                Image.fromarray(picture).save(encoded, Image.registered_extensions()[extension])
                 temporary.write_bytes(encoded.getbuffer())
         except ImportError as error:
             raise FileError(target, needs(error.name or "OpenEXR", "pictures")) from None

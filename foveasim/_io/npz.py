@@ -25,11 +25,11 @@ __all__ = ["open_archive", "read_archive", "read_array", "write_archive", "zip_m
 ABOUT = "about"
 SUFFIX = ".npy"
 #: numpy before 2.2 stores the argument of this name as one more array; readers ignore it.
-STRAY = "allow_pickle"
+IGNORED_ARRAY = "allow_pickle"
 #: Files that would decompress to more than this are rejected.
 MAX_DECOMPRESSED_BYTES = 8 * 2**30
 #: Bytes per read call.
-PIECE_BYTES = 2**20
+CHUNK_BYTES = 2**20
 
 
 def write_archive(
@@ -83,7 +83,7 @@ def read_archive(path: Path, *, max_bytes: int | None = None) -> tuple[Any, dict
         if sum(item.file_size for item in archive.infolist()) > limit:
             raise FileError(path, f"would decompress to more than {limit} bytes")
         for name, item in items.items():
-            if name != STRAY:
+            if name != IGNORED_ARRAY:
                 with archive.open(item) as file:
                     arrays[name] = read_array(file, item.file_size)
     return json.loads(str(arrays.pop(ABOUT))) if ABOUT in arrays else None, arrays
@@ -170,17 +170,17 @@ def read_array(
         check(shape, dtype)
     if dtype.hasobject:
         raise ValueError("an array of Python objects")
-    n, left = math.prod(shape), n_bytes - file.tell()
+    n, n_data_bytes = math.prod(shape), n_bytes - file.tell()
     # The file size does not limit the number of items of zero bytes.
-    if n * dtype.itemsize != left or min(shape, default=0) < 0 or n > max(n_bytes, MAX_SITES):
+    if n * dtype.itemsize != n_data_bytes or min(shape, default=0) < 0 or n > max(n_bytes, MAX_SITES):
         raise ValueError("the size of an array does not match its header")
     if not dtype.itemsize:
         return np.zeros(shape, dtype)
-    data = np.empty(left, np.uint8)
-    done = 0
-    while done < left and (piece := file.read(min(left - done, PIECE_BYTES))):
-        data[done : done + len(piece)] = np.frombuffer(piece, np.uint8)
-        done += len(piece)
-    if done < left:
+    data = np.empty(n_data_bytes, np.uint8)
+    n_read = 0
+    while n_read < n_data_bytes and (chunk := file.read(min(n_data_bytes - n_read, CHUNK_BYTES))):
+        data[n_read : n_read + len(chunk)] = np.frombuffer(chunk, np.uint8)
+        n_read += len(chunk)
+    if n_read < n_data_bytes:
         raise ValueError("truncated")
     return data.view(dtype).reshape(shape, order="F" if is_fortran else "C")

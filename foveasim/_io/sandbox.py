@@ -17,28 +17,28 @@ from numpy.typing import NDArray
 
 from foveasim.errors import FileError
 
-__all__ = ["PATIENCE", "read_in_sandbox", "run_in_sandbox"]
+__all__ = ["WALL_TIME_FACTOR", "read_in_sandbox", "run_in_sandbox"]
 
 #: Memory of the process and its libraries, and number of copies of the data in memory.
-BASE_BYTES, COPIES = 2**31, 3
+BASE_BYTES, DATA_COPIES = 2**31, 3
 MAX_CPU_S, BYTES_PER_S = 10, 2**22
 #: Ratio of the wall time limit to the processor time limit, for busy machines.
-PATIENCE = 5
-CHILD = Path(__file__).with_name("_sandboxed.py")
+WALL_TIME_FACTOR = 5
+SCRIPT = Path(__file__).with_name("_sandboxed.py")
 
 #: Result of a reader: plain data, and arrays.
-Answer = tuple[dict[str, Any], list[NDArray[Any]]]
+ReaderResult = tuple[dict[str, Any], list[NDArray[Any]]]
 
 
 def read_in_sandbox(
-    reader: Callable[..., Answer],
+    reader: Callable[..., ReaderResult],
     path: Path,
     *,
     kind: str,
     max_decompressed_bytes: Callable[[int], int],
     is_silent: bool = False,
     **args: Any,
-) -> Answer:
+) -> ReaderResult:
     """
     Run a reader of the package in the sandbox process, with limits by file size.
 
@@ -69,13 +69,13 @@ def read_in_sandbox(
         args,
         kind=kind,
         max_cpu_s=MAX_CPU_S + n_bytes // BYTES_PER_S,
-        max_bytes=BASE_BYTES + COPIES * max_decompressed_bytes(n_bytes),
+        max_bytes=BASE_BYTES + DATA_COPIES * max_decompressed_bytes(n_bytes),
         is_silent=is_silent,
     )
 
 
 def run_in_sandbox(
-    reader: Callable[..., Answer],
+    reader: Callable[..., ReaderResult],
     path: Path,
     args: Mapping[str, Any],
     *,
@@ -84,7 +84,7 @@ def run_in_sandbox(
     max_bytes: int,
     is_silent: bool = False,
     is_standalone: bool = False,
-) -> Answer:
+) -> ReaderResult:
     """
     Run a reader in the sandbox process, with given limits.
 
@@ -95,7 +95,7 @@ def run_in_sandbox(
     args : mapping
         Keywords of the reader, plain data.
     max_cpu_s : int, s
-        Processor time limit; the wall time limit is ``PATIENCE`` times as long.
+        Processor time limit; the wall time limit is ``WALL_TIME_FACTOR`` times as long.
     max_bytes : int
         Limit of the address space.
     is_standalone : bool
@@ -107,8 +107,8 @@ def run_in_sandbox(
     FileError
         As in :func:`read_in_sandbox`.
     """
-    with tempfile.TemporaryDirectory(prefix="foveasim-") as folder:
-        arrays, printed = Path(folder) / "arrays.npy", Path(folder) / "printed.txt"
+    with tempfile.TemporaryDirectory(prefix="foveasim-") as directory:
+        arrays, printed = Path(directory) / "arrays.npy", Path(directory) / "printed.txt"
         task = {
             "module": reader.__module__,
             "file": sys.modules[reader.__module__].__file__ if is_standalone else None,
@@ -122,24 +122,24 @@ def run_in_sandbox(
             "max_bytes": max_bytes,
         }
         try:
-            done = subprocess.run(  # noqa: S603 -- a script of this package
-                [sys.executable, "-P", str(CHILD)],
+            process = subprocess.run(  # noqa: S603 -- a script of this package
+                [sys.executable, "-P", str(SCRIPT)],
                 input=json.dumps(task).encode(),
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
-                timeout=PATIENCE * max_cpu_s,
+                timeout=WALL_TIME_FACTOR * max_cpu_s,
                 check=False,
                 # Each thread of a library reserves memory.
                 env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "HDF5_PLUGIN_PRELOAD": "::"},
             )
-            is_late = done.returncode == -getattr(signal, "SIGXCPU", 0)
+            is_timed_out = process.returncode == -getattr(signal, "SIGXCPU", 0)
         except subprocess.TimeoutExpired:
-            is_late = True
-        if is_late:
+            is_timed_out = True
+        if is_timed_out:
             raise FileError(path, f"is malformed: reading it took more than {max_cpu_s} s")
-        if done.returncode != 0 or not done.stdout:
+        if process.returncode != 0 or not process.stdout:
             raise FileError(path, f"is malformed: reading it as {kind} crashed")
-        answer = json.loads(done.stdout)
+        answer = json.loads(process.stdout)
         if is_silent and printed.stat().st_size:
             raise FileError(path, "is corrupt or truncated")
         if "rejected" in answer:

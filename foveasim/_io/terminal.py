@@ -19,12 +19,12 @@ from rich.text import Text
 
 from foveasim.errors import printable
 
-__all__ = ["PlainConsole", "plain_streams", "spinner_of", "text_of"]
+__all__ = ["PlainConsole", "as_plain_text", "plain_streams", "select_spinner"]
 
 #: Name of the encoding error handler of streams.
 HANDLER = "foveasim.plain"
 #: ASCII replacements of characters that this package and rich print, of equal length where possible to align tables.
-LOOK_ALIKES = {
+SIMILAR_CHARACTERS = {
     "u": "µμ",
     "x": "×",
     ".": "·",
@@ -50,7 +50,7 @@ LOOK_ALIKES = {
     ">=": "≥",
     "->": "→",
 }
-PLAIN_CHARACTERS = {character: plain for plain, characters in LOOK_ALIKES.items() for character in characters}
+PLAIN_CHARACTERS = {character: plain for plain, characters in SIMILAR_CHARACTERS.items() for character in characters}
 
 
 class PlainConsole(Console):
@@ -68,7 +68,7 @@ class PlainConsole(Console):
         return super().render_str(printable(text, keep="\n"), **options)
 
 
-def text_of(value: object) -> Text:
+def as_plain_text(value: object) -> Text:
     """
     Return an untrusted value as rich text on one line, without interpretation of markup.
 
@@ -77,7 +77,7 @@ def text_of(value: object) -> Text:
     return Text(printable(value))
 
 
-def spinner_of(console: Console) -> str:
+def select_spinner(console: Console) -> str:
     """Return the name of a spinner that the console's stream can encode."""
     return "line" if console.options.ascii_only else "dots"
 
@@ -93,12 +93,14 @@ def plain_streams() -> Iterator[None]:
         yield
 
 
-def _plain(error: UnicodeError) -> tuple[str, int]:
+def _replace_unencodable(error: UnicodeError) -> tuple[str, int]:
     """Replace characters that a stream cannot encode by similar ones or escapes."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
-    bad = error.object[error.start : error.end]
-    return "".join(PLAIN_CHARACTERS.get(c) or c.encode("unicode_escape").decode("ascii") for c in bad), error.end
+    unencodable = error.object[error.start : error.end]
+    return "".join(
+        PLAIN_CHARACTERS.get(c) or c.encode("unicode_escape").decode("ascii") for c in unencodable
+    ), error.end
 
 
-codecs.register_error(HANDLER, _plain)
+codecs.register_error(HANDLER, _replace_unencodable)

@@ -10,13 +10,13 @@ import yaml
 
 from foveasim.errors import ConfigError
 
-__all__ = ["MAX_FILE_BYTES", "parsed", "read_text", "read_yaml"]
+__all__ = ["MAX_FILE_BYTES", "parse_yaml", "read_text", "read_yaml"]
 
 #: Size limit: settings files are written by hand.
 MAX_FILE_BYTES = 1 << 20
 
 
-class _Loader(yaml.SafeLoader):
+class _SafeLoader(yaml.SafeLoader):
     """
     Loader of YAML without tags, anchors and duplicate keys.
 
@@ -30,30 +30,30 @@ class _Loader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        seen = set()
+        keys = set()
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
             line = key_node.start_mark.line + 1
             if not isinstance(key, str) and (not isinstance(key, int) or isinstance(key, bool)):
                 raise yaml.YAMLError(f"the key {key!r} must be a string or an integer (line {line})")
-            if str(key) in seen:
+            if str(key) in keys:
                 raise yaml.YAMLError(f"duplicate key '{key}' (line {line})")
-            seen.add(str(key))
+            keys.add(str(key))
         return {str(key): value for key, value in super().construct_mapping(node, deep).items()}
 
 
-_Loader.yaml_implicit_resolvers = {
+_SafeLoader.yaml_implicit_resolvers = {
     first: [(tag, pattern) for tag, pattern in resolvers if not tag.endswith(("timestamp", "float"))]
     for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
-_Loader.add_implicit_resolver(
+_SafeLoader.add_implicit_resolver(
     "tag:yaml.org,2002:float",
     re.compile(r"^[-+]?(\d+\.\d*|\.\d+|\d+(?=[eE]))([eE][-+]?\d+)?$|^[-+]?\.(inf|Inf|INF)$|^\.(nan|NaN|NAN)$"),
     list("-+0123456789."),
 )
 
 
-def parsed(path: Path, text: str) -> Any:
+def parse_yaml(path: Path, text: str) -> Any:
     """
     Parse a YAML string; errors name the file.
 
@@ -63,7 +63,7 @@ def parsed(path: Path, text: str) -> Any:
         When the string is not YAML, or contains tags, anchors, duplicate keys or deep nesting.
     """
     try:
-        return yaml.load(text, _Loader)  # noqa: S506 -- a SafeLoader
+        return yaml.load(text, _SafeLoader)  # noqa: S506 -- a SafeLoader
     except RecursionError:
         raise ConfigError(path, "is nested too deeply") from None
     except yaml.MarkedYAMLError as error:
@@ -102,7 +102,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         When the file is missing, too large, not UTF-8 text, not YAML, or not a mapping.
     """
     text = read_text(path)
-    data = parsed(path, text)
+    data = parse_yaml(path, text)
     if not isinstance(data, dict):
         raise ConfigError(
             path, f"must contain settings as 'key: value', got {'nothing' if data is None else repr(data)[:60]}"

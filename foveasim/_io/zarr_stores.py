@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.extras import library
-from foveasim.errors import FileError, shown
+from foveasim._core.extras import import_optional
+from foveasim.errors import FileError, format_value
 
 __all__ = [
     "ZARR",
@@ -37,7 +37,7 @@ ZARR = ".zarr"
 #: Size limit of the metadata of a group or an array.
 MAX_METADATA_BYTES = 2**26
 #: Maximum length of an array name: file names are limited to 255 bytes.
-LONGEST_NAME = 60
+MAX_NAME_LENGTH = 60
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def free_name(name: str, taken: Collection[str]) -> str:
     >>> free_name("a/b", {"a_b"})
     'a_b_'
     """
-    safe = re.sub(r"\W", "_", name, flags=re.ASCII)[:LONGEST_NAME]
+    safe = re.sub(r"\W", "_", name, flags=re.ASCII)[:MAX_NAME_LENGTH]
     safe = safe if re.match(r"[A-Za-z]", safe) else f"column_{safe.lstrip('_')}"
     while safe in taken:
         safe += "_"
@@ -125,7 +125,8 @@ def check_codecs(source: Path, allowed: Collection[str], what: str) -> None:
         for codec in metadata.get("codecs", []):
             if codec.get("name") not in allowed:
                 raise FileError(
-                    source, f"has the codec {shown(codec.get('name'), at_most=40)}, which is not valid in a {what}"
+                    source,
+                    f"has the codec {format_value(codec.get('name'), at_most=40)}, which is not valid in a {what}",
                 )
 
 
@@ -157,7 +158,7 @@ def open_store(
     FileError
         When zarr is not installed, or the store is missing, corrupt, incomplete or of another format.
     """
-    zarr = library(path, "zarr")
+    zarr = import_optional(path, "zarr")
     if not path.is_dir():
         raise FileError(path, "is not a zarr store" if path.exists() else "no such zarr store")
     try:
@@ -170,12 +171,14 @@ def open_store(
             if attributes.get("format") != file_format:
                 raise FileError(path, f"is not a {what}")
             if attributes.get("version") != version:
-                raise FileError(path, f"has the format version {shown(attributes.get('version'))}, expected {version}")
+                raise FileError(
+                    path, f"has the format version {format_value(attributes.get('version'))}, expected {version}"
+                )
             arrays: dict[str, Any] = dict(group.arrays())
-            for name, inner in group.groups():
-                arrays |= {f"{name}/{key}": array for key, array in inner.arrays()}
+            for name, subgroup in group.groups():
+                arrays |= {f"{name}/{key}": array for key, array in subgroup.arrays()}
             for name, array in arrays.items():
-                if array.nbytes != _bytes_of_chunks(path / name):
+                if array.nbytes != _chunk_bytes(path / name):
                     raise FileError(path, f"is corrupt: '{name}' is incomplete")
         yield attributes, arrays
     except FileError:
@@ -193,14 +196,14 @@ def _metadata(path: Path) -> Any:
 
 def _check_plain_files(path: Path) -> None:
     """Check that a store contains only regular files and directories, no links."""
-    for folder, folders, files in os.walk(path, followlinks=False):
-        for name in (*folders, *files):
-            found = Path(folder) / name
-            if found.is_symlink() or not (found.is_file() or found.is_dir()):
-                raise FileError(path, f"contains {shown(name)}, which is neither a regular file nor a directory")
+    for directory, directories, files in os.walk(path, followlinks=False):
+        for name in (*directories, *files):
+            entry = Path(directory) / name
+            if entry.is_symlink() or not (entry.is_file() or entry.is_dir()):
+                raise FileError(path, f"contains {format_value(name)}, which is neither a regular file nor a directory")
 
 
-def _bytes_of_chunks(folder: Path) -> int:
-    return sum(file.stat().st_size for file in (folder / "c").rglob("*") if file.is_file()) + (
-        (folder / "c").stat().st_size if (folder / "c").is_file() else 0
+def _chunk_bytes(directory: Path) -> int:
+    return sum(file.stat().st_size for file in (directory / "c").rglob("*") if file.is_file()) + (
+        (directory / "c").stat().st_size if (directory / "c").is_file() else 0
     )

@@ -52,11 +52,11 @@ class _Section(BaseModel):
 def _model(name: str, call: Callable[..., Any], skip: Sequence[str] = (), **types: Any) -> type[_Section]:
     """Return a model with the parameters of a call, with file types for some."""
     hints = get_type_hints(call)
-    summary, sentences = _documentation(call)
+    summary, descriptions = _documentation(call)
     keys: dict[str, Any] = {
         p.name: (
             types.get(p.name, hints.get(p.name)),
-            Field(... if p.default is inspect.Parameter.empty else p.default, description=sentences.get(p.name)),
+            Field(... if p.default is inspect.Parameter.empty else p.default, description=descriptions.get(p.name)),
         )
         for p in inspect.signature(call).parameters.values()
         if p.name not in skip
@@ -74,17 +74,17 @@ def call_of(section: BaseModel) -> Callable[..., Any] | None:
 def _documentation(call: Callable[..., Any]) -> tuple[str, dict[str, str]]:
     """Return the summary of a numpydoc docstring, and the description of each parameter."""
     text = inspect.getdoc(call) or ""
-    sentences: dict[str, str] = {}
+    descriptions: dict[str, str] = {}
     names: list[str] = []
     for line in text.partition("Parameters\n----------\n")[2].split("\n\n")[0].splitlines():
         if line.startswith("    "):
-            sentences.update({name: f"{sentences.get(name, '')} {line.strip()}".strip() for name in names})
+            descriptions.update({name: f"{descriptions.get(name, '')} {line.strip()}".strip() for name in names})
         else:
             names = [name.strip() for name in line.partition(" : ")[0].split(",")]
-    return text.split("\n\n")[0].replace("\n", " "), sentences
+    return text.split("\n\n")[0].replace("\n", " "), descriptions
 
 
-def _one_of(tag: str, models: Mapping[str, type[_Section]]) -> Any:
+def _union_of(tag: str, models: Mapping[str, type[_Section]]) -> Any:
     """Return a union of sections with a discriminating key."""
     tagged = [create_model(f"{name} {tag}", __base__=m, **{tag: (Literal[name], ...)}) for name, m in models.items()]  # type: ignore[call-overload]
     return Annotated[Union[tuple(tagged)], Field(discriminator=tag)]  # noqa: UP007 -- a union of a list
@@ -98,7 +98,7 @@ class PerArea(_Section):
 
 _Outline = Annotated[list[list[float]] | str, Field(description="vertices [x, y] in µm, or WKT")]
 #: Parameters with other types in files than in Python.
-_IN_FILES: dict[str, Any] = {
+_FILE_TYPES: dict[str, Any] = {
     "density": Annotated[str | None, Field(description="a picture, proportional to the density of sites")],
     "importance": Annotated[str, Field(description="a picture, bright where squares are small")],
     "outlines_um": list[_Outline] | None,
@@ -111,7 +111,7 @@ _Numbers: Any = float | list[float] | None
 #: Bands of scenes: one wavelength or several.
 _WAVELENGTHS: dict[str, Any] = {"wavelength_nm": _Numbers, "band_width_nm": _Numbers}
 #: Parameters that files do not contain: a density picture covers the rectangle ``size_um``.
-_NOT_IN_FILES = ("density_grid",)
+_EXCLUDED = ("density_grid",)
 _CROSSTALK: dict[str, Callable[..., Any]] = {"diffusion": Diffusion, "kernel": KernelCrosstalk}
 _PerSite = float | PerArea | list[float]
 
@@ -131,7 +131,7 @@ def models() -> Models:
     return _models(tuple(registry.version for registry in _REGISTRIES))
 
 
-def _registered(
+def _registered_sections(
     registry: Registry[Any], skip: Sequence[str] = (), title: str = "{}", **types: Any
 ) -> dict[str, type[_Section]]:
     """Return sections of registered calls; warn of types that files cannot contain."""
@@ -147,8 +147,8 @@ def _registered(
 
 @lru_cache(maxsize=1)
 def _models(_versions: tuple[int, ...]) -> Models:
-    lens = _one_of("kind", _registered(LENSES))
-    pupil = _one_of("kind", _registered(PUPILS, skip=("wavefront_um",), **_IN_FILES))
+    lens = _union_of("kind", _registered_sections(LENSES))
+    pupil = _union_of("kind", _registered_sections(PUPILS, skip=("wavefront_um",), **_FILE_TYPES))
     optics = _model(
         "optics",
         Optics,
@@ -166,8 +166,8 @@ def _models(_versions: tuple[int, ...]) -> Models:
         routing=_model("routing", Routing) | None,
     )
     layout = _layout(rules)
-    power_map = _model("power_map", read_power_map, **(_IN_FILES | _WAVELENGTHS))
-    scene = _one_of("kind", {**_registered(SCENES, **(_IN_FILES | _WAVELENGTHS)), "power_map": power_map})
+    power_map = _model("power_map", read_power_map, **(_FILE_TYPES | _WAVELENGTHS))
+    scene = _union_of("kind", {**_registered_sections(SCENES, **(_FILE_TYPES | _WAVELENGTHS)), "power_map": power_map})
     fields: dict[str, Any] = {
         "scene": (scene, ...),
         "optics": (optics, ...),
@@ -183,10 +183,10 @@ def _models(_versions: tuple[int, ...]) -> Models:
 
 
 def _sensor() -> type[_Section]:
-    curves = _registered(CURVES, path=str)
-    factor = float | _one_of("kind", curves)
+    curves = _registered_sections(CURVES, path=str)
+    factor = float | _union_of("kind", curves)
     product = _model("product", ProductCurve, curves=list[factor])  # type: ignore[valid-type]
-    curve = _one_of("kind", curves | {"product": product})
+    curve = _union_of("kind", curves | {"product": product})
     filter_set = _model("filter set", FilterSet, curves=list[curve])  # type: ignore[valid-type]
     filter_file = _model("filter file", read_filters, path=str)
     filters: Any = Annotated[
@@ -195,21 +195,21 @@ def _sensor() -> type[_Section]:
             lambda section: "filter file" if isinstance(section, dict) and "path" in section else "filter set"
         ),
     ]
-    effects = _registered(EFFECTS)
+    effects = _registered_sections(EFFECTS)
     return _model(
         "sensor",
         Sensor,
         skip=("layout",) if effects else ("layout", "effects"),
         qe=float | curve | list[float | curve],  # type: ignore[valid-type]
         filters=Literal["rgb"] | filters | None,
-        crosstalk=_one_of("kind", {name: _model(name, way) for name, way in _CROSSTALK.items()}) | None,
+        crosstalk=_union_of("kind", {name: _model(name, model) for name, model in _CROSSTALK.items()}) | None,
         coupling=_model("coupling", InterPixelCapacitance) | None,
         sensitivity=_PerSite,
         dark_e_per_s=_PerSite,
         full_well_e=_PerSite | None,
         read_noise_e=_PerSite,
         capacitance_f=_PerSite,
-        effects=list[_one_of("kind", effects)] if effects else list[Any],  # type: ignore[misc]
+        effects=list[_union_of("kind", effects)] if effects else list[Any],  # type: ignore[misc]
         disabled=list[str],
     )
 
@@ -228,8 +228,8 @@ def _layout(rules: type[_Section]) -> Any:
     base.__doc__ = (
         "A layout: a generator and its parameters, colour filters, edits in the order of the keys, design rules."
     )
-    parameters = _registered(LAYOUTS, _NOT_IN_FILES, "{} parameters", **_IN_FILES)
-    return _one_of(
+    parameters = _registered_sections(LAYOUTS, _EXCLUDED, "{} parameters", **_FILE_TYPES)
+    return _union_of(
         "generator",
         {name: create_model(name, __base__=base, parameters=(part, ...)) for name, part in parameters.items()},
     )

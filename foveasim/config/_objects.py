@@ -14,10 +14,10 @@ from pydantic import BaseModel, TypeAdapter
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import check_number
 from foveasim._io.images import read_picture
-from foveasim._io.yaml_files import parsed, read_yaml
+from foveasim._io.yaml_files import parse_yaml, read_yaml
 from foveasim.camera import Camera
 from foveasim.config._models import PerArea, call_of, models
-from foveasim.config._problems import validated
+from foveasim.config._problems import validate
 from foveasim.errors import ConfigError, FoveasimError, ParameterError
 from foveasim.fields import Grid, PowerMap
 from foveasim.layout import LAYOUTS, PRESETS, DesignRules, Layout, bundled_layouts, inset, mosaic, snap
@@ -33,7 +33,6 @@ __all__ = [
     "Shot",
     "build_shot",
     "check_settings",
-    "files_from",
     "picture_path",
     "put_setting",
     "read_any_layout",
@@ -42,6 +41,7 @@ __all__ = [
     "read_rules",
     "read_settings",
     "read_shot",
+    "resolve_files",
     "schema",
 ]
 
@@ -160,10 +160,10 @@ def check_settings(path: str | Path, settings: Mapping[str, Any]) -> None:
     ConfigError
         When a setting is invalid.
     """
-    validated(Path(path), models().shot, dict(settings))
+    validate(Path(path), models().shot, dict(settings))
 
 
-def _make(_part: str, _settings: Any, make: Callable[[], Any]) -> Any:
+def _make_uncached(_part: str, _settings: Any, make: Callable[[], Any]) -> Any:
     return make()
 
 
@@ -172,7 +172,7 @@ def build_shot(
     data: Mapping[str, Any],
     *,
     n_threads: int | None = None,
-    kept: Callable[[str, Any, Callable[[], Any]], Any] = _make,
+    cache: Callable[[str, Any, Callable[[], Any]], Any] = _make_uncached,
 ) -> Shot:
     """
     Return the shot of settings.
@@ -185,8 +185,8 @@ def build_shot(
         As :func:`read_settings` returns them.
     n_threads : int, optional
         Number of threads of the camera.
-    kept : callable, optional
-        A cache: ``kept(part, settings, make)`` returns ``make()``, or an earlier result for equal settings of the part.
+    cache : callable, optional
+        A cache: ``cache(part, settings, make)`` returns ``make()``, or an earlier result for equal settings of the part.
 
     Raises
     ------
@@ -194,12 +194,12 @@ def build_shot(
         As for :func:`read_shot`.
     """
     path = Path(path)
-    settings = validated(path, models().shot, dict(data))
+    settings = validate(path, models().shot, dict(data))
 
     def layout_file() -> LayoutFile:
         if not isinstance(settings.layout, str):
-            return _built_layout(path, "layout.", settings.layout)
-        read: LayoutFile = _call(path, "layout", read_any_layout, {"path": settings.layout, "folder": path.parent})
+            return _build_layout(path, "layout.", settings.layout)
+        read: LayoutFile = _call(path, "layout", read_any_layout, {"path": settings.layout, "directory": path.parent})
         return read
 
     def sensor_of_layout() -> Sensor:
@@ -207,17 +207,17 @@ def build_shot(
             name: value.per_um2 * layout.area_um2 if isinstance(value, PerArea) else value
             for name, value in _values(path, "sensor.", settings.sensor).items()
         }
-        made: Sensor = _call(path, "sensor", Sensor, {"layout": layout, **values})
-        return made
+        sensor: Sensor = _call(path, "sensor", Sensor, {"layout": layout, **values})
+        return sensor
 
-    file = kept("layout", data["layout"], layout_file)
+    file = cache("layout", data["layout"], layout_file)
     layout = file.layout
-    sensor = kept("sensor", [data["layout"], data.get("sensor")], sensor_of_layout)
-    optics = kept(
+    sensor = cache("sensor", [data["layout"], data.get("sensor")], sensor_of_layout)
+    optics = cache(
         "optics", data["optics"], lambda: _call(path, "optics", Optics, _values(path, "optics.", settings.optics))
     )
-    distortion = kept("distortion", data.get("distortion"), lambda: _built(path, "distortion", settings.distortion))
-    scene = kept("scene", data["scene"], lambda: _built(path, "scene", settings.scene))
+    distortion = cache("distortion", data.get("distortion"), lambda: _build(path, "distortion", settings.distortion))
+    scene = cache("scene", data["scene"], lambda: _build(path, "scene", settings.scene))
     # Errors of a capture are raised here, before it starts, with the path of the key.
     if isinstance(scene, Scene):
         _call(path, "scene", optics.grid, {"scene": scene})
@@ -226,7 +226,7 @@ def build_shot(
     streams = _call(path, "", Streams, {"seed": settings.seed})
     exposure_s = _call(path, "", check_number, {"name": "exposure_s", "value": settings.exposure_s, "at_least": 0.0})
     order = settings.integration_order
-    camera = kept(
+    camera = cache(
         "camera",
         [data["layout"], data.get("distortion"), order],
         lambda: Camera(optics=optics, sensor=sensor, distortion=distortion, order=order, n_threads=n_threads),
@@ -252,7 +252,7 @@ def read_layout_file(path: str | Path) -> LayoutFile:
         When the file is invalid; with the file, the path of the key, and the expected and actual value.
     """
     path = Path(path)
-    return _built_layout(path, "", validated(path, models().layout, read_yaml(path)))
+    return _build_layout(path, "", validate(path, models().layout, read_yaml(path)))
 
 
 def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None = None, **options: Any) -> Layout:
@@ -294,7 +294,7 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
 
 
 def read_any_layout(
-    path: str | Path, *, folder: str | Path = ".", layer: int | None = None, cell: str | None = None, **options: Any
+    path: str | Path, *, directory: str | Path = ".", layer: int | None = None, cell: str | None = None, **options: Any
 ) -> LayoutFile:
     """
     Read a layout with its design rules from a file, or a bundled one by its name.
@@ -303,7 +303,7 @@ def read_any_layout(
     ----------
     path : path or str
         A file takes precedence over a bundled layout of the same name.
-    folder : path
+    directory : path
         Directory of relative paths; the working directory by default.
     layer, cell : optional
         GDSII and OASIS, as for :func:`foveasim.layout.read_layout`.
@@ -315,7 +315,7 @@ def read_any_layout(
     ParameterError
         When the format of the file does not have an option.
     """
-    path = layout_path(path, folder)
+    path = layout_path(path, directory)
     if path.suffix.lower() in YAML_EXTENSIONS:
         check_no_options(layer=layer, cell=cell, **options)
         return read_layout_file(path)
@@ -334,7 +334,7 @@ def read_rules(path: str | Path) -> DesignRules:
     path = Path(path)
     if str(path) in PRESETS and not path.exists():
         return DesignRules(preset=str(path))
-    rules: DesignRules = _built(path, "", validated(path, models().rules, read_yaml(path)))
+    rules: DesignRules = _build(path, "", validate(path, models().rules, read_yaml(path)))
     return rules
 
 
@@ -344,65 +344,65 @@ def schema(section: Any = None, title: str = "foveasim settings") -> dict[str, A
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **model_schema, "title": title}
 
 
-def _built_layout(path: Path, place: str, section: Any) -> LayoutFile:
-    parameters = place + "parameters"
+def _build_layout(path: Path, prefix: str, section: Any) -> LayoutFile:
+    parameters = prefix + "parameters"
     values = _values(path, parameters + ".", section.parameters)
     picture = getattr(LAYOUTS[section.generator], "picture", None)
     if picture is not None and values[picture] is not None:
         values |= _picture_values(path, f"{parameters}.{picture}", values)
     layout = _call(path, parameters, _callable(section.parameters), values)
     if section.mosaic is not None:
-        layout = _call(path, place + "mosaic", mosaic, {"layout": layout, "block": section.mosaic})
+        layout = _call(path, prefix + "mosaic", mosaic, {"layout": layout, "block": section.mosaic})
     if any(section.move_um):
         layout = _call(
-            path, place + "move_um", layout.translate, dict(zip(("dx_um", "dy_um"), section.move_um, strict=True))
+            path, prefix + "move_um", layout.translate, dict(zip(("dx_um", "dy_um"), section.move_um, strict=True))
         )
     if section.inset_um:
-        layout = _call(path, place + "inset_um", inset, {"layout": layout, "margin_um": section.inset_um})
+        layout = _call(path, prefix + "inset_um", inset, {"layout": layout, "margin_um": section.inset_um})
     if section.snap_um is not None:
-        layout = _call(path, place + "snap_um", snap, {"layout": layout, "grid_um": section.snap_um})
-    rules = None if section.rules is None else _built(path, place + "rules", section.rules)
+        layout = _call(path, prefix + "snap_um", snap, {"layout": layout, "grid_um": section.snap_um})
+    rules = None if section.rules is None else _build(path, prefix + "rules", section.rules)
     return LayoutFile(layout=layout, rules=rules, source=section.source)
 
 
-def _picture_values(path: Path, place: str, values: Mapping[str, Any]) -> dict[str, Any]:
+def _picture_values(path: Path, key_path: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Return a picture's grey values, 0 to 1, and for a density their grid."""
-    name = place.rpartition(".")[2]
-    picture = read_picture(picture_path(path, values[name], place))
+    name = key_path.rpartition(".")[2]
+    picture = read_picture(picture_path(path, values[name], key_path))
     scale = np.iinfo(picture.dtype).max if picture.dtype.kind == "u" else 1.0
     n_colours = {2: 1, 4: 3}.get(picture.shape[2], picture.shape[2]) if picture.ndim == 3 else 1
     grey = picture.reshape(*picture.shape[:2], -1)[::-1, :, :n_colours].mean(axis=2, dtype=np.float64) / scale
     if name != "density":
         return {name: grey}
     if values["size_um"] is None:
-        raise ConfigError(path, f"{place}: requires 'size_um', the rectangle that the picture covers")
+        raise ConfigError(path, f"{key_path}: requires 'size_um', the rectangle that the picture covers")
     (width_um, height_um), (n_y, n_x) = values["size_um"], grey.shape
     if abs(width_um * n_y - height_um * n_x) > SHAPE_ROUNDING * abs(width_um * n_y):
         raise ConfigError(
             path,
-            f"{place}: must have the aspect ratio of 'size_um', {width_um:g} x {height_um:g} µm, got {n_x} x {n_y} pixels",
+            f"{key_path}: must have the aspect ratio of 'size_um', {width_um:g} x {height_um:g} µm, got {n_x} x {n_y} pixels",
         )
-    grid = _call(path, place, Grid.centred, {"shape": grey.shape, "pitch_um": width_um / n_x})
+    grid = _call(path, key_path, Grid.centred, {"shape": grey.shape, "pitch_um": width_um / n_x})
     return {name: grey, "density_grid": grid}
 
 
-def _values(path: Path, place: str, section: BaseModel) -> dict[str, Any]:
+def _values(path: Path, prefix: str, section: BaseModel) -> dict[str, Any]:
     """Return a section's values as arguments of its call, with nested sections built."""
     return {
-        name: _built(path, place + name, getattr(section, name))
+        name: _build(path, prefix + name, getattr(section, name))
         for name in type(section).model_fields
         if name not in {"kind", "generator"}
     }
 
 
-def _built(path: Path, place: str, value: Any) -> Any:
+def _build(path: Path, key_path: str, value: Any) -> Any:
     if isinstance(value, list):
-        return [_built(path, f"{place}[{i}]", item) for i, item in enumerate(value)]
-    if isinstance(value, str) and place.rpartition(".")[2] in {"path", "picture"}:
-        return picture_path(path, value, place)
+        return [_build(path, f"{key_path}[{i}]", item) for i, item in enumerate(value)]
+    if isinstance(value, str) and key_path.rpartition(".")[2] in {"path", "picture"}:
+        return picture_path(path, value, key_path)
     if not isinstance(value, BaseModel) or isinstance(value, PerArea):
         return value
-    return _call(path, place, _callable(value), _values(path, place + ".", value))
+    return _call(path, key_path, _callable(value), _values(path, key_path + ".", value))
 
 
 def _callable(section: BaseModel) -> Callable[..., Any]:
@@ -411,18 +411,18 @@ def _callable(section: BaseModel) -> Callable[..., Any]:
     return call
 
 
-def _call(path: Path, place: str, function: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
+def _call(path: Path, key_path: str, function: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
     """Call a function; errors begin with the path of the key."""
     try:
         return function(**arguments)
     except ParameterError as error:
-        where = f"{place}.{error.name}" if place else error.name
-        raise ConfigError(path, f"{where}: {error.detail}") from None
+        full_path = f"{key_path}.{error.name}" if key_path else error.name
+        raise ConfigError(path, f"{full_path}: {error.detail}") from None
     except FoveasimError as error:
-        raise ConfigError(path, f"{place}: {error}") from None
+        raise ConfigError(path, f"{key_path}: {error}") from None
 
 
-def picture_path(path: Path, picture: str, place: str) -> Path:
+def picture_path(path: Path, picture: str, key_path: str) -> Path:
     """
     Return the file of a picture in a settings file.
 
@@ -432,7 +432,7 @@ def picture_path(path: Path, picture: str, place: str) -> Path:
         The settings file.
     picture : str
         A file, or a picture of scikit-image such as ``skimage:astronaut``.
-    place : str
+    key_path : str
         Path of the key in the settings file, for messages.
 
     Raises
@@ -448,7 +448,7 @@ def picture_path(path: Path, picture: str, place: str) -> Path:
     }
     if name not in bundled:
         raise ConfigError(
-            path, f"{place}: scikit-image does not contain '{name}'; its pictures are {', '.join(sorted(bundled))}"
+            path, f"{key_path}: scikit-image does not contain '{name}'; its pictures are {', '.join(sorted(bundled))}"
         )
     return bundled[name]
 
@@ -458,7 +458,7 @@ def _replace(path: Path, data: dict[str, Any], change: str) -> None:
     key, equals, value = change.partition("=")
     if not equals or not all(key.strip().split(".")):
         raise ConfigError(path, f"a change must be 'key=value', such as sensor.bits=10, got '{change}'")
-    put_setting(path, data, key.strip(), files_from(Path(), parsed(path, value), key.strip()))
+    put_setting(path, data, key.strip(), resolve_files(Path(), parse_yaml(path, value), key.strip()))
 
 
 def put_setting(path: str | Path, data: dict[str, Any], key: str, value: Any) -> None:
@@ -473,23 +473,23 @@ def put_setting(path: str | Path, data: dict[str, Any], key: str, value: Any) ->
     names = key.split(".")
     if not all(names):
         raise ConfigError(path, f"'{key}' must be the path of a setting, such as sensor.bits")
-    place: Any = data
+    section: Any = data
     for i, name in enumerate(names[:-1]):
-        place = place.setdefault(name, {})
-        if not isinstance(place, dict):
+        section = section.setdefault(name, {})
+        if not isinstance(section, dict):
             raise ConfigError(
-                path, f"'{key}={value}' cannot be set: {'.'.join(names[: i + 1])} must be a section, got {place!r}"
+                path, f"'{key}={value}' cannot be set: {'.'.join(names[: i + 1])} must be a section, got {section!r}"
             )
-    place[names[-1]] = value
+    section[names[-1]] = value
 
 
-def files_from(folder: Path, value: Any, key: str = "", found: list[Path] | None = None) -> Any:
+def resolve_files(directory: Path, value: Any, key: str = "", found: list[Path] | None = None) -> Any:
     """
     Return settings with absolute paths of files.
 
     Parameters
     ----------
-    folder : Path
+    directory : Path
         Directory of relative paths.
     value : plain data
     key : str
@@ -498,15 +498,15 @@ def files_from(folder: Path, value: Any, key: str = "", found: list[Path] | None
         Output: the files are appended.
     """
     if isinstance(value, dict):
-        return {name: files_from(folder, item, name, found) for name, item in value.items()}
+        return {name: resolve_files(directory, item, name, found) for name, item in value.items()}
     if isinstance(value, list):
-        return [files_from(folder, item, key, found) for item in value]
+        return [resolve_files(directory, item, key, found) for item in value]
     name = key.rpartition(".")[2]
     if name not in FILE_SETTINGS or not isinstance(value, str) or value.startswith(BUNDLED_PICTURE):
         return value
     if name == "layout" and value in bundled_layouts():
         return value
-    file = (folder / value).absolute()
+    file = (directory / value).absolute()
     if found is not None:
         found.append(file)
     return str(file)

@@ -11,13 +11,13 @@ from pydantic import TypeAdapter, ValidationError
 
 from foveasim.errors import ConfigError
 
-__all__ = ["validated"]
+__all__ = ["validate"]
 
 #: Maximum number of problems in one message.
-SHOWN_PROBLEMS = 3
+MAX_PROBLEMS = 3
 
 
-def validated(path: Path, kind: Any, data: dict[str, Any]) -> Any:
+def validate(path: Path, kind: Any, data: dict[str, Any]) -> Any:
     """
     Return settings as an instance of a model.
 
@@ -30,9 +30,9 @@ def validated(path: Path, kind: Any, data: dict[str, Any]) -> Any:
         return TypeAdapter(kind).validate_json(json.dumps(data, default=_reject), strict=True)
     except ValidationError as error:
         problems = _problems(data, error)
-        shown = "; ".join(problems[:SHOWN_PROBLEMS])
-        more = len(problems) - SHOWN_PROBLEMS
-        raise ConfigError(path, shown + (f"; and {more} more" if more > 0 else "")) from None
+        message = "; ".join(problems[:MAX_PROBLEMS])
+        more = len(problems) - MAX_PROBLEMS
+        raise ConfigError(path, message + (f"; and {more} more" if more > 0 else "")) from None
     except (ValueError, RecursionError) as error:
         raise ConfigError(path, f"contains an unreadable value ({error})") from None
 
@@ -43,15 +43,15 @@ def _reject(value: object) -> None:
 
 def _problems(data: dict[str, Any], error: ValidationError) -> list[str]:
     """Return every distinct problem as "key: problem"."""
-    found = [(_place(data, item), item) for item in error.errors(include_url=False)]
+    found = [(_key_path(data, item), item) for item in error.errors(include_url=False)]
     # For a union, pydantic reports a problem for every type: only those of the deepest key matter.
     problems = [
-        f"{'.'.join(place) or 'the file'}{_sentence(item)}"
-        for place, item in found
+        f"{'.'.join(key_path) or 'the file'}{_describe(item)}"
+        for key_path, item in found
         if not (
             item["type"].endswith("_type")
             and any(
-                other[: len(place)] == place and (len(other) > len(place) or not o["type"].endswith("_type"))
+                other[: len(key_path)] == key_path and (len(other) > len(key_path) or not o["type"].endswith("_type"))
                 for other, o in found
             )
         )
@@ -59,9 +59,9 @@ def _problems(data: dict[str, Any], error: ValidationError) -> list[str]:
     return list(dict.fromkeys(problems))
 
 
-def _place(data: Any, error: Any) -> tuple[str, ...]:
+def _key_path(data: Any, error: Any) -> tuple[str, ...]:
     """Return the keys and indices of a problem, without pydantic's tags of union members."""
-    place = []
+    key_path = []
     tags = _tags(data)
     for i, part in enumerate(error["loc"]):
         if part in tags:  # a tag of a union, which may equal the name of a key
@@ -71,10 +71,10 @@ def _place(data: Any, error: Any) -> tuple[str, ...]:
         ):
             data = data[part]
             tags = _tags(data)
-            place.append(str(part))
+            key_path.append(str(part))
         elif i == len(error["loc"]) - 1 and error["type"] == "missing":
-            place.append(str(part))
-    return tuple(place)
+            key_path.append(str(part))
+    return tuple(key_path)
 
 
 def _tags(data: Any) -> tuple[Any, ...]:
@@ -82,7 +82,7 @@ def _tags(data: Any) -> tuple[Any, ...]:
     return (data.get("kind"), data.get("generator")) if isinstance(data, dict) else ()
 
 
-def _sentence(error: Any) -> str:
+def _describe(error: Any) -> str:
     match error["type"]:
         case "extra_forbidden":
             return ": no such setting"

@@ -13,7 +13,7 @@ import numpy as np
 import shapely
 from rich.table import Table
 
-from foveasim._io.terminal import text_of
+from foveasim._io.terminal import as_plain_text
 from foveasim.capture import Capture
 from foveasim.config import Shot
 from foveasim.errors import FileError, printable
@@ -21,7 +21,7 @@ from foveasim.layout import Layout, Report
 from foveasim.view import plot_capture, prisms, render, save_figure
 from foveasim.view.renderer import missing_software
 
-__all__ = ["Result", "check_folder", "demo_settings", "results_table", "run_shot", "write_results"]
+__all__ = ["Result", "check_directory", "demo_settings", "results_table", "run_shot", "write_results"]
 
 #: Shots of the demo, in the order of the table.
 DEMO_SHOTS = ("foveal", "four_zones")
@@ -34,7 +34,7 @@ def demo_settings() -> list[Path]:
     return [Path(str(files("foveasim.config") / f"{name}.yaml")) for name in DEMO_SHOTS]
 
 
-def check_folder(folder: str | Path) -> Path:
+def check_directory(directory: str | Path) -> Path:
     """
     Return the path of a directory for results, after a check of permissions.
 
@@ -43,16 +43,16 @@ def check_folder(folder: str | Path) -> Path:
     FileError
         When a file is in its place, or it cannot be created or written.
     """
-    folder = Path(folder)
-    present = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    if not present.is_dir():
-        raise FileError(folder, f"cannot contain results: {present} is a file; choose a directory")
-    if not os.access(present, os.W_OK | os.X_OK):
-        raise FileError(folder, f"cannot contain results: {present} is not writable")
-    return folder
+    directory = Path(directory)
+    existing = next(path for path in (directory, *directory.absolute().parents) if path.exists())
+    if not existing.is_dir():
+        raise FileError(directory, f"cannot contain results: {existing} is a file; choose a directory")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise FileError(directory, f"cannot contain results: {existing} is not writable")
+    return directory
 
 
-def write_results(shot: Shot, capture: Capture, folder: str | Path) -> tuple[list[Path], float]:
+def write_results(shot: Shot, capture: Capture, directory: str | Path) -> tuple[list[Path], float]:
     """
     Write ``NAME_picture.png``, ``NAME_layout.png`` and ``NAME_capture.npz``.
 
@@ -60,7 +60,7 @@ def write_results(shot: Shot, capture: Capture, folder: str | Path) -> tuple[lis
     ----------
     shot : Shot
     capture : Capture
-    folder : path
+    directory : path
         Created when missing. Each file is written atomically.
 
     Returns
@@ -75,12 +75,14 @@ def write_results(shot: Shot, capture: Capture, folder: str | Path) -> tuple[lis
         When the directory cannot be created or written.
     """
     start_s = time.perf_counter()
-    folder = check_folder(folder)
+    directory = check_directory(directory)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise FileError(folder, f"cannot be created: {error.strerror or error}") from None
-    picture, layout, saved = (folder / f"{shot.name}_{part}" for part in ("picture.png", "layout.png", "capture.npz"))
+        raise FileError(directory, f"cannot be created: {error.strerror or error}") from None
+    picture, layout, saved = (
+        directory / f"{shot.name}_{part}" for part in ("picture.png", "layout.png", "capture.npz")
+    )
     capture.picture(max_pixels=PICTURE_PIXELS).save(picture, capture.white_dn, encode_srgb=True)
     axes = plot_capture(capture)
     axes.set_title(f"{printable(shot.name)}: {capture.layout.n_sites} photosites", parse_math=False)
@@ -99,7 +101,7 @@ class Result:
     writing_s: float
 
 
-def run_shot(shot: Shot, folder: str | Path) -> tuple[Result, list[Path]]:
+def run_shot(shot: Shot, directory: str | Path) -> tuple[Result, list[Path]]:
     """
     Simulate a shot, check its design rules, and write its files.
 
@@ -116,11 +118,11 @@ def run_shot(shot: Shot, folder: str | Path) -> tuple[Result, list[Path]]:
     """
     capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed)
     report = None if shot.rules is None else capture.layout.check(shot.rules)
-    paths, writing_s = write_results(shot, capture, folder)
+    paths, writing_s = write_results(shot, capture, directory)
     return Result(shot, capture, report, writing_s), paths
 
 
-def write_3d_picture(result: Result, folder: str | Path) -> Path | None:
+def write_3d_picture(result: Result, directory: str | Path) -> Path | None:
     """
     Write ``NAME_3d.png``: photosites as prisms with their codes as height, by PyVista.
 
@@ -136,7 +138,7 @@ def write_3d_picture(result: Result, folder: str | Path) -> Path | None:
     """
     if missing_software():
         return None
-    path = check_folder(folder) / f"{result.shot.name}_3d.png"
+    path = check_directory(directory) / f"{result.shot.name}_3d.png"
     render(prisms(result.capture, "code"), path, renderer="pyvista")
     return path
 
@@ -146,7 +148,7 @@ def results_table(results: Sequence[Result]) -> Table:
     table = Table(title="Captures")
     table.add_column("")
     for result in results:
-        table.add_column(text_of(result.shot.name), justify="right")
+        table.add_column(as_plain_text(result.shot.name), justify="right")
     captures = [result.capture for result in results]
     rows = {
         "photosites": [f"{c.layout.n_sites:,}" for c in captures],

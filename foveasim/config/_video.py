@@ -20,9 +20,9 @@ from foveasim.video.frame_source import pictures_in
 __all__ = ["run_video"]
 
 #: Frame period in video files when none is specified.
-USUAL_FRAME_S = 1.0 / 25.0
+DEFAULT_FRAME_S = 1.0 / 25.0
 #: Attributes of the scene that the frames replace.
-OF_FRAMES = ("basis", "source")
+FRAME_ATTRIBUTES = ("basis", "source")
 
 
 def run_video(
@@ -74,30 +74,30 @@ def run_video(
         raise SimulationError(
             f"{shot.name} has a power map; frames require a scene, which specifies the size of their pixels"
         )
-    footage = FrameSource(frames, template=shot.scene, frame_s=frame_s, stop=stop)
-    if line_s and footage.frame_s is None:
+    source = FrameSource(frames, template=shot.scene, frame_s=frame_s, stop=stop)
+    if line_s and source.frame_s is None:
         raise ParameterError(
             "frame_s", "must be given for a rolling shutter: pictures in a directory have no frame rate"
         )
     is_store = Path(out).suffix.lower() == ".zarr"
     n_before = count_recorded_frames(out) if is_store else 0
     captures = shot.camera.video(
-        footage.from_frame(n_before),
+        source.from_frame(n_before),
         exposure_s=shot.exposure_s,
         seed=shot.seed,
         first_frame=n_before,
-        frame_s=footage.frame_s if line_s else None,
+        frame_s=source.frame_s if line_s else None,
         line_s=line_s,
         ahead=thread_count(n_threads),
     )
     return write_video(
         captures,
         out,
-        frame_s=footage.frame_s or USUAL_FRAME_S,
-        n_frames=footage.n_frames,
+        frame_s=source.frame_s or DEFAULT_FRAME_S,
+        n_frames=source.n_frames,
         progress=progress,
         resume=is_store,
-        plan=_plan(shot, shot.scene, Path(frames), footage.frame_s, line_s, stop) if is_store else None,
+        plan=_plan(shot, shot.scene, Path(frames), source.frame_s, line_s, stop) if is_store else None,
     )
 
 
@@ -109,7 +109,9 @@ def _plan(
     assert isinstance(layout, Layout)  # checked by Camera
     files = [[path.name, path.stat().st_size] for path in (pictures_in(frames) if frames.is_dir() else [frames])]
     return {
-        "scene": {f.name: to_plain_data(getattr(scene, f.name)) for f in fields(scene) if f.name not in OF_FRAMES},
+        "scene": {
+            f.name: to_plain_data(getattr(scene, f.name)) for f in fields(scene) if f.name not in FRAME_ATTRIBUTES
+        },
         "optics": to_plain_data(camera.optics),
         "distortion": to_plain_data(camera.distortion),
         "layout": to_plain_data({**layout.provenance, "xy_um": layout.xy_um, "columns": layout.columns}),

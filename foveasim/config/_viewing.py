@@ -56,8 +56,8 @@ def read_viewable(path: str | Path, *, layout: str | Path | None = None, rules: 
             raise ParameterError(
                 "rules", "must be omitted for a report, which contains the results of a check", str(rules)
             )
-        checked = read_any_layout(layout).layout
-        return Viewable(checked, read_lyrdb(path, checked.n_sites), printable(path.stem))
+        layout_of_report = read_any_layout(layout).layout
+        return Viewable(layout_of_report, read_lyrdb(path, layout_of_report.n_sites), printable(path.stem))
     if layout is not None:
         raise ParameterError("layout", f"must be omitted: {path} is not a report (.lyrdb)", str(layout))
     limits = None if rules is None else read_rules(rules)

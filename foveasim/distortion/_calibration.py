@@ -145,7 +145,7 @@ def read_calibration(
     ConfigError
         If the file has none of these formats or lacks a parameter of the lens.
     """
-    from foveasim._io.yaml_files import parsed, read_text
+    from foveasim._io.yaml_files import parse_yaml, read_text
 
     path = Path(path)
     text = read_text(path)
@@ -153,7 +153,7 @@ def read_calibration(
     try:
         if text.lstrip().startswith("#polynomial"):
             return _from_ocamcalib(path, text, pixel_um, focal_um)
-        data = parsed(path, _plain_yaml(text))
+        data = parse_yaml(path, _plain_yaml(text))
         if not isinstance(data, dict):
             raise ConfigError(
                 path, "contains no calibration; provide the keys camera_matrix and distortion_coefficients"

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from foveasim._io.yaml_files import read_yaml
-from foveasim.config import YAML_EXTENSIONS, files_from
+from foveasim.config import YAML_EXTENSIONS, resolve_files
 from foveasim.errors import ConfigError
 
 __all__ = ["digests"]
@@ -43,7 +43,7 @@ def digests(files: Iterable[Path]) -> dict[str, str]:
 def _named_in(file: Path) -> list[Path]:
     named: list[Path] = []
     try:
-        files_from(file.parent, read_yaml(file), found=named)
+        resolve_files(file.parent, read_yaml(file), found=named)
     except ConfigError:  # reported when the settings are built
         return []
     return named

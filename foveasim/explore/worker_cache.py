@@ -157,7 +157,7 @@ class ShotRunner:
     def captured(self, settings: Mapping[str, Any]) -> tuple[Shot, Capture]:
         """Build the shot of the given settings and simulate its capture."""
         cache = self.cache
-        shot = build_shot(self.source, settings, n_threads=self.n_threads, kept=cache.part)
+        shot = build_shot(self.source, settings, n_threads=self.n_threads, cache=cache.part)
         camera, sensor, scene = shot.camera, shot.camera.sensor, shot.scene
         light = _light(shot, settings)
         filters = hashlib.sha256(sensor.filter_of_site.tobytes()).hexdigest()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.rings import positions_in_runs, to_frame
-from foveasim._core.threads import each
+from foveasim._core.threads import parallel_map
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.fields import Grid
 from foveasim.integrate._outlines import Outlines
@@ -86,7 +86,7 @@ class Plan:
             last_row = min(first_row + self.rows_per_band, n_y)
             kernel(read, first_row, last_row, *plan, written)
 
-        each(band, range(0, n_y, self.rows_per_band), 1 if n_y * n_x <= SMALL_MAP else n_threads)
+        parallel_map(band, range(0, n_y, self.rows_per_band), 1 if n_y * n_x <= SMALL_MAP else n_threads)
 
     def gather(self, cells: NDArray[Any], n_threads: int) -> Floats:
         """
@@ -183,7 +183,7 @@ def compile_plan(
     from foveasim.integrate import _kernels
 
     n_y = grid.shape[0]
-    traced = each(
+    traced = parallel_map(
         lambda first: _traced(outlines(first, min(first + SITES_PER_PIECE, n_sites)), first, grid, order),
         range(0, n_sites, SITES_PER_PIECE),
         n_threads,
@@ -213,7 +213,7 @@ def compile_plan(
         _kernels.place_spans(t.spans, t.weights, next_span[i], next_weight[i], *slots, out_spans, out_weights)
         _kernels.place_cuts(t.cuts, t.moments, next_cut[i], *slots, out_cuts, out_moments)
 
-    each(place, range(len(traced)), n_threads)
+    parallel_map(place, range(len(traced)), n_threads)
     return Plan(
         grid=grid,
         n_sites=n_sites,

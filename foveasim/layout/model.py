@@ -13,13 +13,13 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.provenance import copied
+from foveasim._core.provenance import copy_plain_data
 from foveasim._core.rings import (
     are_convex,
     next_vertex,
     positions_in_runs,
     ring_moments,
-    ring_spread_um2,
+    ring_unsigned_area_um2,
     site_bounds_um,
     site_moments,
 )
@@ -130,7 +130,7 @@ class Layout:
         layout = object.__new__(type(self))
         for name in ("xy_um", "ring_offsets", "site_offsets", "columns"):
             object.__setattr__(layout, name, getattr(self, name))
-        object.__setattr__(layout, "provenance", MappingProxyType(copied(dict(provenance))))
+        object.__setattr__(layout, "provenance", MappingProxyType(copy_plain_data(dict(provenance))))
         return layout
 
     def _store(self) -> None:
@@ -157,7 +157,7 @@ class Layout:
         object.__setattr__(self, "ring_offsets", read_only(ring_offsets))
         object.__setattr__(self, "site_offsets", read_only(site_offsets))
         object.__setattr__(self, "columns", MappingProxyType(columns))
-        object.__setattr__(self, "provenance", MappingProxyType(copied(self.provenance)))
+        object.__setattr__(self, "provenance", MappingProxyType(copy_plain_data(self.provenance)))
 
     # -- constructors -----------------------------------------------------------------------------------------------
 
@@ -278,7 +278,7 @@ class Layout:
         box = site_bounds_um(xy_um, ring_offsets, np.arange(ring_offsets.size))
         box_um2 = (box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])
         rounding_um2 = ZERO_AREA_FRACTION * np.maximum(box_um2, np.finfo(np.float64).tiny)
-        is_line = ring_spread_um2(xy_um, ring_offsets) <= rounding_um2
+        is_line = ring_unsigned_area_um2(xy_um, ring_offsets) <= rounding_um2
         _require(np.logical_or.reduceat(is_line, site_offsets[:-1]), "has a ring with zero area")
         _require_valid(Layout._from_checked(xy_um, ring_offsets, site_offsets, {}, {}))
         area_um2, _ = ring_moments(xy_um, ring_offsets)

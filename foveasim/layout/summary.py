@@ -105,11 +105,11 @@ class Summary:
         from rich.console import Group
         from rich.table import Table
 
-        from foveasim._io.terminal import text_of
+        from foveasim._io.terminal import as_plain_text
 
         facts = Table(show_header=False, box=None)
         for name, value in self.rows():
-            facts.add_row(name, text_of(value))
+            facts.add_row(name, as_plain_text(value))
         sizes = Table(title="Pixel sizes", title_justify="left", box=None)
         for heading in ("from µm", "to µm", "sites"):
             sizes.add_column(heading, justify="right")

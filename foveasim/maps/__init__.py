@@ -26,9 +26,9 @@ from pathlib import Path
 from numpy.typing import ArrayLike
 
 from foveasim._core.registry import import_all
-from foveasim._core.validation import hand_over
+from foveasim._core.validation import freeze
 from foveasim._io.atomic import atomic_write
-from foveasim._io.formats import as_file_error, format_of, writing_format
+from foveasim._io.formats import as_file_error, detect_format, select_writer
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Pitch, PowerMap
 from foveasim.maps import _dataset, _exr, _fits, _isetcam, _npy, _tiff  # noqa: F401 -- they register their formats
@@ -111,9 +111,9 @@ def read_power_map(
         top_row_first=top_row_first,
     )
     with as_file_error(path, "power map", passes=(ParameterError,)):
-        kind, _ = format_of(path, MAP_FORMATS, "power map")
+        kind, _ = detect_format(path, MAP_FORMATS, "power map")
         found = read_found(path, kind, name)
-        hand_over(found.data)
+        freeze(found.data)
         return finished(found, given)
 
 
@@ -141,7 +141,7 @@ def write_power_map(power_map: PowerMap, path: str | Path) -> None:
     if not isinstance(power_map, PowerMap):
         raise ParameterError("power_map", f"must be a PowerMap, got a {type(power_map).__name__}")
     path = Path(path)
-    form = writing_format(path, MAP_FORMATS)
+    form = select_writer(path, MAP_FORMATS)
     assert form.write is not None
     if form.is_directory:
         form.write(power_map, path)

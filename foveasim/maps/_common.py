@@ -20,7 +20,7 @@ from foveasim._core.validation import (
 )
 from foveasim._io.formats import FormatError
 from foveasim.errors import ParameterError
-from foveasim.fields import Grid, Pitch, PowerMap, rising
+from foveasim.fields import Grid, Pitch, PowerMap, with_ascending_axes
 from foveasim.maps._units import PER_NM, UNITS, Unit, light_unit, per_band_w_m2
 
 __all__ = [
@@ -169,7 +169,7 @@ def finished(found: Found, given: Given) -> PowerMap:
         given.origin_um if given.origin_um is not None else None if given.pitch_um is not None else found.origin_um
     )
     return PowerMap.from_array(
-        rising(data, is_x_falling=found.is_x_falling, is_y_falling=is_y_falling),
+        with_ascending_axes(data, is_x_falling=found.is_x_falling, is_y_falling=is_y_falling),
         pitch_um=pitch_um,
         wavelength_nm=waves_nm,
         origin_um=origin_um,

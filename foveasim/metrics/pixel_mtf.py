@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.threads import each, thread_count
+from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Floats, finite_array
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
@@ -101,7 +101,7 @@ def polygon_otf(layout: Layout, wave_per_mm: ArrayLike, *, n_threads: int | None
             rad_per_um,
         )
 
-    each(block, range(0, layout.n_sites, BLOCK_SITES), thread_count(n_threads))
+    parallel_map(block, range(0, layout.n_sites, BLOCK_SITES), thread_count(n_threads))
     return otf
 
 

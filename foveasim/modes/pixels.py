@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.random_streams import fixed_pattern_key
-from foveasim._core.threads import each, thread_count
+from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Floats, Ints, check_count, finite_array, read_only
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
@@ -452,7 +452,7 @@ def _collect_events(
             raise _too_many(n_frames)
         return ends, out[0][:n], out[1][:n], out[2][:n]
 
-    pieces = each(piece, range(0, memory.shape[0], PIECE_SITES), n_threads)
+    pieces = parallel_map(piece, range(0, memory.shape[0], PIECE_SITES), n_threads)
     t_s, site, polarity = np.empty(n_found), np.empty(n_found, np.int32), np.empty(n_found, np.int8)
     begins = np.concatenate(([0], sum((ends for ends, *_ in pieces), np.zeros(n_frames, np.int64))))
 
@@ -466,7 +466,7 @@ def _collect_events(
             all_of[where] = of_frame[order]
 
     if pieces:
-        each(frame, range(n_frames), n_threads)
+        parallel_map(frame, range(n_frames), n_threads)
     return Events(read_only(t_s), read_only(site), read_only(polarity), _layout(sensor))
 
 

@@ -20,7 +20,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from foveasim._core.threads import each
+from foveasim._core.threads import parallel_map
 from foveasim._core.validation import Floats, Images, Ints
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.optics.otf import MAX_ALIASES
@@ -164,7 +164,7 @@ class Transform:
         return np.concatenate((far_x, dc_x)), np.concatenate((far_y, dc_y))
 
     def _for_each_row_block(self, work: Callable[[int, int], None], n_rows: int) -> None:
-        each(
+        parallel_map(
             lambda first: work(first, min(first + ROWS_PER_BLOCK, n_rows)),
             range(0, n_rows, ROWS_PER_BLOCK),
             self._n_threads,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from foveasim._core.rings import site_moments
-from foveasim._core.threads import each, thread_count
+from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Floats, Ints, as_numbers, read_only
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PackedRings
@@ -182,7 +182,7 @@ class _Mesh:
             if outside.size:
                 found[outside] = self._on_the_hull(points[outside], edges)
 
-        each(fill, pieces, n_threads)
+        parallel_map(fill, pieces, n_threads)
         return found.T
 
     def _linear(self, points: Floats, transform: Floats, corners: Ints) -> Floats:

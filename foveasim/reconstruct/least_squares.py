@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim._core.threads import each, thread_count
+from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Floats, check_choice, check_count, check_number, finite_array, read_only
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PackedRings
@@ -156,7 +156,7 @@ def least_squares(
             x = problem.solved(problem.natural_strength if isinstance(mu, str) else float(mu))
         return x.reshape(shape)[pad[0] : pad[0] + grid.shape[0], pad[1] : pad[1] + grid.shape[1]]
 
-    data = np.array(each(solved, range(n_channels), thread_count(n_threads)))
+    data = np.array(parallel_map(solved, range(n_channels), thread_count(n_threads)))
     data[:, share == 0.0] = np.nan
     return Picture(read_only(data.astype(np.float32)), read_only(share.astype(np.float32)), grid)
 

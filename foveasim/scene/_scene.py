@@ -17,13 +17,13 @@ from foveasim._core.validation import (
     check_number,
     check_shape,
     finite_array,
-    hand_over,
+    freeze,
     own,
     read_only,
     unmasked,
     wavelengths_nm,
 )
-from foveasim._io.encodings import Encoding, decoded
+from foveasim._io.encodings import Encoding, decode
 from foveasim._io.images import read_picture
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import from_file_rows
@@ -213,7 +213,7 @@ class Scene:
                 "for other wavelengths pass 'spectrum', the spectrum of each channel",
             )
         return cls(
-            hand_over(channels),
+            freeze(channels),
             peak * relative,
             waves_nm,
             band_widths_nm(waves_nm, band_width_nm),
@@ -335,7 +335,7 @@ def _light(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Imag
         pixels = pixels.astype(np.uint8) * np.uint8(255)
     if pixels.dtype in (np.uint8, np.uint16):
         peak = float(np.iinfo(pixels.dtype).max)
-        table = decoded(np.arange(peak + 1) / peak, encoding).astype(np.float32)
+        table = decode(np.arange(peak + 1) / peak, encoding).astype(np.float32)
         values = np.arange(peak + 1, dtype=np.float32) / np.float32(peak)
         colours = pixels[..., :-1] if has_alpha else pixels
         light = np.take(table, np.ascontiguousarray(from_file_rows(colours)))
@@ -352,7 +352,7 @@ def _light(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Imag
             )
         colours = pixels[..., :-1] if has_alpha else pixels
         precise = colours.astype(np.float32) if pixels.dtype == np.float16 else colours
-        light = decoded(np.ascontiguousarray(from_file_rows(precise)), encoding).astype(np.float32)
+        light = decode(np.ascontiguousarray(from_file_rows(precise)), encoding).astype(np.float32)
         alpha = from_file_rows(pixels[..., -1]).astype(np.float32) if has_alpha else None
     else:
         raise ParameterError("picture", f"must have the dtype uint8, uint16 or float, got {pixels.dtype}")

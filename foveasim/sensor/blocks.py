@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from foveasim._core.threads import each, thread_count
+from foveasim._core.threads import parallel_map, thread_count
 
 __all__ = ["BLOCK_SITES", "for_each_block", "pieces"]
 
@@ -18,7 +18,7 @@ PIECE_SITES = 1 << 15
 def for_each_block(n_sites: int, work: Callable[[int, slice], None], n_threads: int | None = None) -> None:
     """Call a function with the number and the slice of each block of sites, in threads."""
     n_blocks = -(-n_sites // BLOCK_SITES)
-    each(
+    parallel_map(
         lambda block: work(block, slice(block * BLOCK_SITES, min((block + 1) * BLOCK_SITES, n_sites))),
         range(n_blocks),
         thread_count(n_threads),

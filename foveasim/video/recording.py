@@ -15,7 +15,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.extras import library
+from foveasim._core.extras import import_optional
 from foveasim._core.provenance import differences, to_plain_data
 from foveasim._core.validation import Floats, check_count
 from foveasim._io.atomic import atomic_directory, lock, remove_directory
@@ -113,7 +113,7 @@ def read_recording(path: str | Path) -> Recording:
         When the store is missing, corrupt, or not a video of captures.
     """
     source = Path(path)
-    library(source, "zarr")
+    import_optional(source, "zarr")
     if not source.is_dir():
         raise FileError(source, "is not a directory" if source.exists() else "no such directory")
     with _trusted(source) as group:
@@ -166,7 +166,7 @@ def count_recorded_frames(path: str | Path) -> int:
     target = Path(path)
     if target.suffix.lower() != ZARR:
         raise FileError(target, "must end in .zarr; other formats cannot be resumed")
-    library(target, "zarr")
+    import_optional(target, "zarr")
     if target.exists():
         with _trusted(target) as group:
             return int(group["code"].shape[0])
@@ -177,7 +177,7 @@ def count_recorded_frames(path: str | Path) -> int:
 @contextmanager
 def _trusted(source: Path, mode: str = "r") -> Iterator[Any]:
     """Open the group of an untrusted recording; exceptions of the block become FileErrors."""
-    zarr = library(source, "zarr")
+    zarr = import_optional(source, "zarr")
     with as_file_error(source, "video of captures", passes=(FileError,)):
         check_codecs(source, CODECS, "video of captures")
         group = zarr.open_group(str(source), mode=mode, use_consolidated=False)  # consolidated metadata are not checked
@@ -194,7 +194,7 @@ def _trusted(source: Path, mode: str = "r") -> Iterator[Any]:
 
 
 def _is_recording(folder: Path) -> bool:
-    zarr = library(folder, "zarr")
+    zarr = import_optional(folder, "zarr")
     try:
         return zarr.open_group(str(folder), mode="r", use_consolidated=False).attrs.get("format") == FORMAT
     except Exception:  # noqa: BLE001 -- other data may raise any exception
@@ -228,7 +228,7 @@ def alike(captures: Iterable[Capture], *, n_before: int = 0) -> Iterator[Capture
 
 def record(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any] | None) -> int:
     """Write captures to a zarr store atomically; return their number."""
-    library(target, "zarr")
+    import_optional(target, "zarr")
     with atomic_directory(target, is_ours=_is_recording) as folder:
         frames = _Frames(folder, plan)
         for capture in alike(captures):
@@ -239,7 +239,7 @@ def record(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any] | 
 
 def resume_recording(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any] | None) -> int:
     """Append captures to a resumable recording; return the total number of frames."""
-    library(target, "zarr")
+    import_optional(target, "zarr")
     if target.exists():
         return _finished(captures, target, plan)
     with _growing(target) as folder:
@@ -466,7 +466,7 @@ class _Frames:
                 shutil.rmtree(path)
             elif path.name != LOCK:
                 path.unlink()
-        group = library(self._folder, "zarr").create_group(
+        group = import_optional(self._folder, "zarr").create_group(
             str(self._folder),
             attributes={
                 "format": FORMAT,

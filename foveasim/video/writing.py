@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.extras import library
+from foveasim._core.extras import import_optional
 from foveasim._core.validation import check_count, check_number
 from foveasim._io.atomic import atomic_directory, atomic_write
 from foveasim._io.images import write_picture
@@ -126,10 +126,10 @@ def write_video(
 def _with_progress(captures: Iterable[Capture], n_frames: int | None, n_before: int) -> Iterator[Capture]:
     from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    from foveasim._io.terminal import PlainConsole, spinner_of
+    from foveasim._io.terminal import PlainConsole, select_spinner
 
     console = PlainConsole()
-    spinner = SpinnerColumn(spinner_of(console))
+    spinner = SpinnerColumn(select_spinner(console))
     columns = (spinner, *Progress.get_default_columns()[:-1], TimeRemainingColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as bar:
         # The remaining time is estimated from new frames only.
@@ -217,7 +217,7 @@ def _write_gif(captures: Iterable[Capture], target: Path, frame_s: float, max_pi
 
 
 def _write_film(captures: Iterable[Capture], target: Path, frame_s: float, max_pixels: int) -> int:
-    av = library(target, "av")
+    av = import_optional(target, "av")
     codec = "libvpx-vp9" if target.suffix.lower() == ".webm" else "libx264"
     n_frames = 0
     with atomic_write(target) as temporary:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.threads import each, thread_count
+from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Floats, check_count, check_shape, finite_array, read_only, unmasked
 from foveasim.errors import ParameterError
 from foveasim.fields import PackedRings
@@ -204,7 +204,7 @@ class SitePixels:
         def blend(rows: slice) -> None:
             _kernels.blended(self.ids, table, n, border is not None, rows.start, picture[rows])
 
-        each(blend, _bands(self.shape[0], n_threads), n_threads)
+        parallel_map(blend, _bands(self.shape[0], n_threads), n_threads)
         return picture if background is None else picture[..., :3]
 
     def site_at(self, x_um: ArrayLike, y_um: ArrayLike) -> NDArray[np.int32]:
@@ -262,6 +262,6 @@ def _sites_at(layout: PackedRings, x_um: Floats, y_um: Floats, n_threads: int) -
             layout.xy_um, layout.ring_offsets, layout.site_offsets, rows, x_um, y_um, band.start, ids[band]
         )
 
-    each(find, range(0, n_sites, CHUNK_SITES), n_threads)
-    each(paint, _bands(y_um.size, n_threads), n_threads)
+    parallel_map(find, range(0, n_sites, CHUNK_SITES), n_threads)
+    parallel_map(paint, _bands(y_um.size, n_threads), n_threads)
     return ids

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.extras import install_hint
 from foveasim._core.provenance import to_plain_data
 from foveasim._core.rings import next_vertex, positions_in_runs
-from foveasim._core.threads import each, thread_count
+from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_length_um, finite_array, unmasked
 from foveasim.capture import Capture
 from foveasim.errors import GeometryError, ParameterError
@@ -141,7 +141,7 @@ def triangulated(layout: Layout) -> Caps:
         return Caps(fans, site, weld)
     keep = is_fan[site]
     others = np.flatnonzero(~is_fan)
-    pieces = each(
+    pieces = parallel_map(
         lambda part: _delaunay(layout, part),
         np.split(others, range(SITES_A_CALL, others.size, SITES_A_CALL)),
         thread_count(),

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, runtime_che
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.threads import each, thread_count
+from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Floats, check_choice, check_count, check_number, check_shape, finite_array
 from foveasim._io.images import write_picture
 from foveasim.errors import FoveasimWarning, GeometryError, ParameterError, SimulationError
@@ -377,7 +377,7 @@ def _nearest(meshes: list[Mesh], eye: _Eye, size_px: tuple[int, int]) -> tuple[N
         def draw_band(k: int, mesh: Mesh = mesh, screen: Floats = screen, first_id: int = first_id) -> None:
             draw(screen, mesh.triangles, first_id, limits[k], limits[k + 1], nearness, ids)
 
-        each(draw_band, range(n_threads), n_threads)
+        parallel_map(draw_band, range(n_threads), n_threads)
         first_id += mesh.triangles.shape[0]
     return ids, nearness
 

@@ -29,7 +29,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.extras import library
+from foveasim._core.extras import import_optional
 from foveasim._core.rings import next_vertex, positions_in_runs
 from foveasim._core.validation import Floats, Ints, check_count, check_length_um, check_number
 from foveasim._io.atomic import atomic_write
@@ -413,7 +413,7 @@ def write_meshes(meshes: Sequence[Mesh], path: str | Path) -> None:
         raise FileError(target, f"must end in {', '.join(FORMATS)}")
     if kind == ".3mf":
         for module in ("lxml", "networkx"):
-            library(target, module)
+            import_optional(target, module)
     bodies = {mesh.name: _body(trimesh, mesh) for mesh in meshes if mesh.triangles.size}
     if not bodies:
         raise GeometryError("the solids have no triangles to write")

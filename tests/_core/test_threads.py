@@ -9,7 +9,7 @@ import warnings
 
 import pytest
 
-from foveasim._core.threads import each, in_order
+from foveasim._core.threads import in_order, parallel_map
 
 
 @pytest.mark.parametrize("n_threads", [1, 2, 3, 50])
@@ -18,23 +18,23 @@ def test_results_are_in_item_order(n_threads):
         time.sleep(0.002 * (5 - k % 6))
         return k * k
 
-    assert each(work, iter(range(24)), n_threads) == [k * k for k in range(24)]
+    assert parallel_map(work, iter(range(24)), n_threads) == [k * k for k in range(24)]
 
 
 def test_no_items_give_no_results():
-    assert each(lambda item: item, [], 4) == []
+    assert parallel_map(lambda item: item, [], 4) == []
 
 
 def test_threads_run_concurrently():
     barrier = threading.Barrier(2, timeout=60.0)
-    each(lambda _: barrier.wait(), range(2), 2)
+    parallel_map(lambda _: barrier.wait(), range(2), 2)
 
 
 def test_nested_calls_do_not_deadlock():
     def row(k: int) -> int:
-        return sum(each(lambda j: j * k, range(20), 4))
+        return sum(parallel_map(lambda j: j * k, range(20), 4))
 
-    assert each(row, range(200), 4) == [190 * k for k in range(200)]
+    assert parallel_map(row, range(200), 4) == [190 * k for k in range(200)]
 
 
 @pytest.mark.parametrize("n_threads", [1, 2, 8])
@@ -52,18 +52,18 @@ def test_first_error_is_raised_after_joining(n_threads):
             running.remove(k)
 
     with pytest.raises(ValueError, match="3"):
-        each(work, range(100), n_threads)
+        parallel_map(work, range(100), n_threads)
     assert not running
 
 
 def _sum_of_squares(n: int) -> int:
-    return sum(each(lambda k: k * k, range(n), 2))
+    return sum(parallel_map(lambda k: k * k, range(n), 2))
 
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="requires fork")
 def test_forked_process_starts_new_threads():
     barrier = threading.Barrier(2, timeout=60.0)
-    each(lambda _: barrier.wait(), range(2), 2)  # starts the threads of the parent
+    parallel_map(lambda _: barrier.wait(), range(2), 2)  # starts the threads of the parent
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # forking with threads is tested here
         with multiprocessing.get_context("fork").Pool(1) as pool:

@@ -205,12 +205,15 @@ def test_ascii_terminals_get_plain_characters(tmp_path, arguments, code, printed
 def test_spinner_is_plain_on_ascii_terminals():
     import io
 
-    from foveasim._io.terminal import PlainConsole, spinner_of
+    from foveasim._io.terminal import PlainConsole, select_spinner
 
     ascii_file = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     utf8_file = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
 
-    assert (spinner_of(PlainConsole(file=ascii_file)), spinner_of(PlainConsole(file=utf8_file))) == ("line", "dots")
+    assert (select_spinner(PlainConsole(file=ascii_file)), select_spinner(PlainConsole(file=utf8_file))) == (
+        "line",
+        "dots",
+    )
 
 
 def test_settings_in_messages_are_short(tmp_path):

@@ -12,7 +12,7 @@ import tifffile
 from PIL import Image
 
 import foveasim as fs
-from foveasim._io.encodings import decoded
+from foveasim._io.encodings import decode
 from foveasim.errors import FileError, ParameterError
 from foveasim.scene import Scene
 
@@ -76,7 +76,7 @@ def flat(**changed):
     ],
 )
 def test_srgb_decoding_matches_standard(value, light):
-    assert abs(decoded(np.array(value), "srgb") - light) < 1e-6
+    assert abs(decode(np.array(value), "srgb") - light) < 1e-6
 
 
 def test_srgb_codes_agree_with_scikit_image():
@@ -94,7 +94,7 @@ def test_linear_and_square_root_encodings_are_powers(encoding, power):
 
 @pytest.mark.parametrize("encoding", ["srgb", "sqrt", "linear"])
 def test_encodings_are_strictly_increasing(encoding):
-    assert np.all(np.diff(decoded(np.linspace(0.0, 2.0, 2001), encoding)) > 0.0)
+    assert np.all(np.diff(decode(np.linspace(0.0, 2.0, 2001), encoding)) > 0.0)
 
 
 @pytest.mark.parametrize("encoding", ["srgb", "sqrt", "linear"])

@@ -145,14 +145,14 @@ def test_packed_numbers_decode_bit_identically(values):
     small = smallest(values)
     about, text = packed(small)
     planes = np.frombuffer(gzip.decompress(base64.b64decode(text)), np.uint8)
-    decoded = (
+    decode = (
         np.ascontiguousarray(planes.reshape(-1, about["size"]).T).view(about["type"]).ravel()
         if about["size"]
         else small
     )
 
-    assert np.array_equal(decoded.astype(np.float64), values.astype(np.float64), equal_nan=True)
-    assert decoded.nbytes <= max(values.nbytes, 1)
+    assert np.array_equal(decode.astype(np.float64), values.astype(np.float64), equal_nan=True)
+    assert decode.nbytes <= max(values.nbytes, 1)
 
 
 def snr_column(capture):

@@ -21,7 +21,7 @@ from foveasim._core.provenance import versions
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import check_choice, check_count
 from foveasim.capture import Capture
-from foveasim.config import Shot, build_shot, check_settings, files_from, put_setting, read_settings
+from foveasim.config import Shot, build_shot, check_settings, put_setting, read_settings, resolve_files
 from foveasim.errors import ConfigError, FileError, FoveasimError, FoveasimWarning, ParameterError, SimulationError
 from foveasim.explore._files import digests
 from foveasim.explore.datasets.distributions import LEAST, MOST, Draw, parse_distribution
@@ -388,7 +388,7 @@ class Dataset:
         def keep(part: str, told: Any, make: Callable[[], Any]) -> Any:
             return self._keep(part, [picture, told], scene) if part == "scene" else self._keep(part, told, make)
 
-        return build_shot(self._file, settings, n_threads=self._n_threads, kept=keep)
+        return build_shot(self._file, settings, n_threads=self._n_threads, cache=keep)
 
     def _captured(self, index: int) -> tuple[Shot, Capture]:
         settings = self._settings_of(index)
@@ -519,14 +519,14 @@ def _base(
     scene = data.get("scene")
     if not isinstance(scene, Mapping) or scene.get("kind") != "picture":
         raise ConfigError(file, "scene.kind: must be 'picture' for a dataset, which supplies the pictures")
-    data = files_from(
+    data = resolve_files(
         file.parent, {**data, "scene": {key: scene[key] for key in scene if key != "picture"}}, found=found
     )
     data["scene"]["picture"] = ""
     if is_fitted:
         data["scene"]["pitch_um"] = 1.0
     for path, value in changes.items():
-        put_setting(file, data, path, files_from(Path(), value, path, found))
+        put_setting(file, data, path, resolve_files(Path(), value, path, found))
     data.pop("seed", None)
     try:
         return file, json.loads(json.dumps(data, default=_plain))
@@ -550,7 +550,9 @@ def _draws(file: Path, vary: Mapping[str, Any], found: list[Path], *, is_fitted:
     check_disjoint(file, draws)
     for path, draw in draws.items():
         if draw.kind == "choice":
-            draws[path] = replace(draw, values=tuple(files_from(Path(), value, path, found) for value in draw.values))
+            draws[path] = replace(
+                draw, values=tuple(resolve_files(Path(), value, path, found) for value in draw.values)
+            )
         if path in ("seed", "scene", "scene.kind", "scene.picture"):
             raise ParameterError(path, "must not vary: the dataset has its own seed and its own pictures")
         if is_fitted and path == "scene.pitch_um":

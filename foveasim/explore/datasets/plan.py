@@ -10,7 +10,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from foveasim._io.yaml_files import read_yaml
-from foveasim.config import files_from, picture_path, validated
+from foveasim.config import picture_path, resolve_files, validate
 from foveasim.explore.datasets.dataset import Dataset
 from foveasim.explore.datasets.label_files import (
     FLOW_ENDINGS,
@@ -122,7 +122,7 @@ def read_dataset(path: str | Path, *, n_threads: int = 1) -> DatasetFile:
         When pictures or labels cannot be read, or do not match.
     """
     path = Path(path)
-    section: DatasetSection = validated(path, DatasetSection, read_yaml(path))
+    section: DatasetSection = validate(path, DatasetSection, read_yaml(path))
     folder = path.parent
     source = _pictures(path, section.pictures)
     options = {name: value for name in SAME if (value := getattr(section, name)) is not None}
@@ -132,7 +132,7 @@ def read_dataset(path: str | Path, *, n_threads: int = 1) -> DatasetFile:
             source,
             folder / section.shot if isinstance(section.shot, str) else section.shot,
             {name: _distribution(folder, name, told) for name, told in section.vary.items()},
-            changes={name: files_from(folder, value, name) for name, value in section.set.items()},
+            changes={name: resolve_files(folder, value, name) for name, value in section.set.items()},
             source=path,
             n_threads=n_threads,
             **options,
@@ -168,4 +168,4 @@ def _labels(folder: Path, section: DatasetSection, pictures: Source) -> Mapping[
 def _distribution(folder: Path, path: str, told: _Distribution) -> dict[str, Any]:
     """Return a distribution as plain data, with file choices relative to the dataset file."""
     given = told.model_dump(exclude_none=True)
-    return {kind: files_from(folder, values, path) if kind == "choice" else values for kind, values in given.items()}
+    return {kind: resolve_files(folder, values, path) if kind == "choice" else values for kind, values in given.items()}

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from foveasim._core.validation import check_count
 from foveasim._io.yaml_files import read_yaml
-from foveasim.config import check_settings, files_from, put_setting, validated
+from foveasim.config import check_settings, put_setting, resolve_files, validate
 from foveasim.errors import ConfigError, ParameterError
 from foveasim.explore._metrics import METRICS, Metric, gives, named_metrics, with_more_metrics
 from foveasim.explore.sweeps.plan import MAX_POINTS, Plan, check_disjoint, plan_sweep, shot_of, with_file_context
@@ -78,7 +78,7 @@ class StudyPlan:
         """Return all settings of a trial; the seed, and so the noise, is equal in all trials."""
         settings = json.loads(json.dumps(dict(self.base.settings))) | {"seed": self.base.seed}
         for path, where in self.search.items():
-            value = files_from(self.folder, _suggested(trial, path, where), path)
+            value = resolve_files(self.folder, _suggested(trial, path, where), path)
             put_setting(self.base.source, settings, path, value)
         return dict(settings)
 
@@ -152,7 +152,7 @@ def read_study(path: str | Path, *, metrics: Sequence[str] = (), n_trials: int |
         When a metric does not exist.
     """
     path = Path(path)
-    section: StudySection = validated(path, StudySection, read_yaml(path))
+    section: StudySection = validate(path, StudySection, read_yaml(path))
     source, shot = shot_of(path, section.shot)
     with with_file_context(path):
         # Names in the file are looked up in METRICS, and never imported.
@@ -171,7 +171,7 @@ def read_study(path: str | Path, *, metrics: Sequence[str] = (), n_trials: int |
             n_trials=section.trials if n_trials is None else n_trials,
             constraints=section.constraints,
             metrics=None if section.metrics is None and not metrics else wanted,
-            changes={name: files_from(path.parent, value, name) for name, value in section.set.items()},
+            changes={name: resolve_files(path.parent, value, name) for name, value in section.set.items()},
             seed=section.seed,
             batch=section.batch,
             name=section.name,

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from foveasim._core.extras import needs
-from foveasim._core.random_streams import derived_seed
+from foveasim._core.random_streams import derive_seed
 from foveasim._core.validation import check_count
 from foveasim._io.atomic import lock
 from foveasim.errors import FileError, FoveasimError, ParameterError, printable
@@ -212,7 +212,7 @@ def best_table(plan: StudyPlan, found: optuna.Study) -> Table:
     from rich.table import Table
     from rich.text import Text
 
-    from foveasim._io.terminal import text_of
+    from foveasim._io.terminal import as_plain_text
 
     limited = [name for name in plan.constraints if name not in plan.objectives]
     table = Table(box=None)
@@ -220,7 +220,7 @@ def best_table(plan: StudyPlan, found: optuna.Study) -> Table:
     for name, way in plan.objectives.items():
         table.add_column(Text(f"{printable(name)}\n{way}d"), justify="right", overflow="fold")
     for heading in (*limited, *_short(plan.search)):
-        table.add_column(text_of(heading), justify="right", overflow="fold")
+        table.add_column(as_plain_text(heading), justify="right", overflow="fold")
     sign = -1.0 if next(iter(plan.objectives.values())) == "maximize" else 1.0
     best = sorted(found.best_trials, key=lambda trial: sign * trial.values[0])
     rows: dict[tuple[str, ...], int] = {}
@@ -230,7 +230,7 @@ def best_table(plan: StudyPlan, found: optuna.Study) -> Table:
         # Trials with equal settings have equal results and share a row.
         rows.setdefault((*(f"{value:.6g}" for value in results), *chosen), trial.number)
     for cells, number in list(rows.items())[:MOST_ROWS]:
-        table.add_row(f"{number}", *map(text_of, cells))
+        table.add_row(f"{number}", *map(as_plain_text, cells))
     if len(rows) > MOST_ROWS:
         table.caption = f"and {len(rows) - MOST_ROWS:,} further best trials"
     return table
@@ -310,7 +310,7 @@ def _opened(optuna: Any, storage: str | Path | None, url: str | None, plan: Stud
 
 def _asked(optuna: Any, found: optuna.Study, plan: StudyPlan, n: int) -> optuna.Trial:
     """Sample the settings of trial n, with a sampler that is seeded for this trial."""
-    found.sampler = optuna.samplers.TPESampler(seed=derived_seed(plan.base.seed, n) % 2**32)
+    found.sampler = optuna.samplers.TPESampler(seed=derive_seed(plan.base.seed, n) % 2**32)
     trial = found.ask()
     plan.settings_of(trial)
     return trial

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from foveasim._core.provenance import versions
-from foveasim._core.random_streams import derived_seed
+from foveasim._core.random_streams import derive_seed
 from foveasim._core.validation import Ints, check_choice, check_count
 from foveasim._io.yaml_files import read_yaml
-from foveasim.config import check_settings, files_from, put_setting, read_settings, validated
+from foveasim.config import check_settings, put_setting, read_settings, resolve_files, validate
 from foveasim.errors import ConfigError, ParameterError
 from foveasim.explore._files import digests
 from foveasim.explore._functions import identity_of
@@ -115,7 +115,7 @@ class Plan:
 
     def seed_of(self, point: int) -> int:
         """Return the noise seed of a point, derived from the sweep seed and the point number."""
-        return derived_seed(self.seed, point)
+        return derive_seed(self.seed, point)
 
     @property
     def is_geometry_varied(self) -> bool:
@@ -250,7 +250,7 @@ def read_sweep(path: str | Path, *, metrics: Sequence[str] = ()) -> Plan:
         When a metric does not exist.
     """
     path = Path(path)
-    section: SweepSection = validated(path, SweepSection, read_yaml(path))
+    section: SweepSection = validate(path, SweepSection, read_yaml(path))
     if (section.vary is None) == (section.points is None):
         raise ConfigError(path, "must have either 'vary' or 'points'")
     vary: Any = section.points
@@ -272,7 +272,7 @@ def read_sweep(path: str | Path, *, metrics: Sequence[str] = ()) -> Plan:
             repeats=section.repeats,
             seed=section.seed,
             metrics=wanted,
-            changes={name: files_from(path.parent, value, name) for name, value in section.set.items()},
+            changes={name: resolve_files(path.parent, value, name) for name, value in section.set.items()},
             source=source,
             folder=path.parent,
         )
@@ -340,14 +340,14 @@ def plan_sweep(
             f"must specify at most {MAX_POINTS:,} points, got {n_points:,}; vary fewer settings together",
         )
     found: list[Path] = []
-    settings = files_from(source.parent, data, found=found)
+    settings = resolve_files(source.parent, data, found=found)
     for path, value in (changes or {}).items():
-        put_setting(source, settings, path, files_from(Path(folder), value, path, found))
+        put_setting(source, settings, path, resolve_files(Path(folder), value, path, found))
     settings.pop("seed", None)
     plan = Plan(
         source=source.absolute(),
         settings=settings,
-        values={path: [files_from(Path(folder), v, path, found) for v in each] for path, each in values.items()},
+        values={path: [resolve_files(Path(folder), v, path, found) for v in each] for path, each in values.items()},
         mode=mode,
         repeats=repeats,
         seed=check_count("seed", seed, at_least=0),

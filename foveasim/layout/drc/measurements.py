@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.registry import Registry
 from foveasim._core.rings import next_vertex, positions_in_runs, ring_moments
-from foveasim._core.threads import each, thread_count
+from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.layout._noding import node_edges
 from foveasim.layout.adjacency import TOUCHING_UM
@@ -136,7 +136,7 @@ class Case:
                 reach_um, LENGTH_ROUNDING_UM, is_shared,
             )  # fmt: skip
 
-        found = each(find_contacts, _task_slices(first.size), thread_count())
+        found = parallel_map(find_contacts, _task_slices(first.size), thread_count())
         distance_um, is_non_overlapping = (np.concatenate(parts) for parts in zip(*found, strict=True))
         return Contacts(first, second, distance_um, is_non_overlapping, is_shared)
 
@@ -467,7 +467,7 @@ def _neighbour_ratios(case: Case) -> Measurement:
     def shared_um(piece: slice) -> Floats:
         return _kernels.shared_lengths(layout.xy_um, case.after, case.first_vertex, a[piece], b[piece], TOUCHING_UM)
 
-    pairs = touching[np.concatenate(each(shared_um, _task_slices(a.size), thread_count())) > 0.0]
+    pairs = touching[np.concatenate(parallel_map(shared_um, _task_slices(a.size), thread_count())) > 0.0]
     size_um = np.sqrt(layout.area_um2)
     ratio = size_um[found.first[pairs]] / size_um[found.second[pairs]]
     return Measurement(

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from foveasim._core.registry import import_all
-from foveasim._io.formats import FileFormat, chosen_options, format_of, writing_format
+from foveasim._io.formats import FileFormat, detect_format, select_writer, validate_options
 from foveasim.errors import FileError
 from foveasim.layout.files._bundled import bundled_layouts, layout_path
 from foveasim.layout.files._common import WrittenLayout
@@ -77,9 +77,9 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
     path = Path(path)
     if str(path) in bundled_layouts() and not path.exists():
         raise FileError(path, "no such file; foveasim.read_layout reads the bundled layout of this name")
-    _, found = format_of(path, FORMATS, "layout file")
+    _, found = detect_format(path, FORMATS, "layout file")
     assert found.read is not None
-    chosen = chosen_options({"layer": layer, "cell": cell, **options}, found.read_options, FORMATS, "read_options")
+    chosen = validate_options({"layer": layer, "cell": cell, **options}, found.read_options, FORMATS, "read_options")
     layout: Layout = found.read(path, **chosen)
     return layout
 
@@ -93,7 +93,7 @@ def check_no_options(**options: object) -> None:
     ParameterError
         When an option is given.
     """
-    chosen_options(options, (), FORMATS, "read_options")
+    validate_options(options, (), FORMATS, "read_options")
 
 
 def write_layout(
@@ -145,10 +145,10 @@ def write_layout(
     0.0
     """
     path = Path(path)
-    found = writing_format(path, FORMATS)
+    found = select_writer(path, FORMATS)
     assert found.write is not None
     given = {"layer": layer, "dbu_um": dbu_um, "colours": colours, **options}
     written: WrittenLayout = found.write(
-        layout, path, **chosen_options(given, found.write_options, FORMATS, "write_options")
+        layout, path, **validate_options(given, found.write_options, FORMATS, "write_options")
     )
     return written

@@ -36,7 +36,7 @@ from foveasim._core.rings import positions_in_runs, ring_moments
 from foveasim._core.validation import MAX_SITES, Floats, Ints, check_count, check_number
 from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import FileFormat, as_file_error
-from foveasim._io.sandbox import PATIENCE, run_in_sandbox
+from foveasim._io.sandbox import WALL_TIME_FACTOR, run_in_sandbox
 from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.layout.files._columns import MAX_COLUMN_BYTES, column_strings, parse_columns, storable_columns
 from foveasim.layout.files._common import (
@@ -392,7 +392,7 @@ def _read_in_sandbox(
         "max_sites": MAX_SITES,
         "max_memory_bytes": max_memory_bytes,
         "max_text_bytes": max(MIN_STRING_BYTES, STRING_BYTES_PER_BYTE * n_bytes),
-        "max_cpu_s": PATIENCE * max_cpu_s,
+        "max_cpu_s": WALL_TIME_FACTOR * max_cpu_s,
     }
     answer, (xy_dbu, counts, tags, lines) = run_in_sandbox(
         _gdstk.read,

@@ -16,7 +16,7 @@ from foveasim._core.validation import (
     check_number,
     check_shape,
     finite_array,
-    hand_over,
+    freeze,
     wavelengths_nm,
 )
 from foveasim.errors import ParameterError, SamplingWarning
@@ -205,7 +205,7 @@ class Canvas:
         The images (n_basis, n_y, n_x) are not copied; the spectra are (n_basis, n_wavelength).
         """
         return Scene(
-            hand_over(basis),
+            freeze(basis),
             spectrum_w_m2_sr_nm,
             np.asarray(self.wavelength_nm),
             np.asarray(self.band_width_nm),

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim._core.threads import each, thread_count
+from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import (
     Floats,
     Ints,
@@ -138,7 +138,7 @@ class CrosstalkOperator:
             rows, matrix = block
             out[rows] = matrix @ columns
 
-        each(multiply, self._row_blocks, thread_count(n_threads))
+        parallel_map(multiply, self._row_blocks, thread_count(n_threads))
         return out
 
     @cached_property
