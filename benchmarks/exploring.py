@@ -19,8 +19,8 @@ from rich.console import Console
 from foveasim import explore
 from foveasim._core.provenance import versions
 from foveasim.explore import executor as executor_module
-from foveasim.explore.cluster import client_of
-from foveasim.explore.executor import _compute, _Dispatch, _pickled, _Results, _Shared, executor
+from foveasim.explore.cluster import open_client
+from foveasim.explore.executor import _compute, _Dispatch, _pickle, _Results, _Shared, executor
 from foveasim.explore.sweeps.sweep import _Points
 from foveasim.explore.worker_cache import ShotRunner
 
@@ -100,9 +100,9 @@ def bench_exploring(report: Report, n_layouts: int) -> None:
     )
     points, changes = (each.tolist() for each in plan.order())
     ours, queue = (_Points(plan, ShotRunner(plan.source, plan.metrics, n_threads=1)) for _ in range(2))
-    with client_of(None, 2) as client, warnings.catch_warnings():
+    with open_client(None, 2) as client, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        shared = client.submit(_Shared, _pickled(queue, "the metrics", ()), versions(), pure=False)
+        shared = client.submit(_Shared, _pickle(queue, "the metrics", ()), versions(), pure=False)
         begin_s = time.perf_counter()
         client.gather(client.map(lambda point, each: _compute(each, [point], 1e9), points, each=shared, pure=False))
         queue_s = time.perf_counter() - begin_s

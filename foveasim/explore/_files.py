@@ -28,25 +28,25 @@ def digests(files: Iterable[Path]) -> dict[str, str]:
     digests : dict of str to str
         By file path. Empty for a missing file; the reader of the file reports it.
     """
-    found: dict[str, str] = {}
-    left = list(files)
-    while left:
-        file = left.pop(0)
-        if str(file) in found:
+    digest_by_path: dict[str, str] = {}
+    pending = list(files)
+    while pending:
+        file = pending.pop(0)
+        if str(file) in digest_by_path:
             continue
-        found[str(file)] = _digest(file)
+        digest_by_path[str(file)] = _digest(file)
         if file.suffix.lower() in YAML_EXTENSIONS and file.is_file():
-            left += _named_in(file)
-    return found
+            pending += _referenced_files(file)
+    return digest_by_path
 
 
-def _named_in(file: Path) -> list[Path]:
-    named: list[Path] = []
+def _referenced_files(file: Path) -> list[Path]:
+    referenced: list[Path] = []
     try:
-        resolve_files(file.parent, read_yaml(file), found=named)
+        resolve_files(file.parent, read_yaml(file), found=referenced)
     except ConfigError:  # reported when the settings are built
         return []
-    return named
+    return referenced
 
 
 def _digest(file: Path) -> str:

@@ -13,12 +13,12 @@ from typing import Any
 from foveasim._core.extras import needs
 from foveasim.errors import ParameterError
 
-__all__ = ["identity_of", "own_module"]
+__all__ = ["find_user_module", "identify_function"]
 
 
-def own_module(thing: Any) -> str | None:
+def find_user_module(value: Any) -> str | None:
     """Return the user module (main program or uninstalled file) of an object, or None."""
-    name = getattr(thing, "__module__", None)
+    name = getattr(value, "__module__", None)
     if not isinstance(name, str) or name.partition(".")[0] == "foveasim":
         return None
     if name == "__main__":
@@ -27,10 +27,10 @@ def own_module(thing: Any) -> str | None:
     if file is None:
         return None
     installed = {sysconfig.get_path(kind) for kind in ("purelib", "platlib", "stdlib")}
-    return None if any(Path(file).is_relative_to(folder) for folder in installed) else name
+    return None if any(Path(file).is_relative_to(directory) for directory in installed) else name
 
 
-def identity_of(function: Callable[..., Any]) -> str:
+def identify_function(function: Callable[..., Any]) -> str:
     """
     Return the module and name of a function, with a content token for user functions.
 
@@ -46,7 +46,7 @@ def identity_of(function: Callable[..., Any]) -> str:
         When dask is not installed.
     """
     name = f"{getattr(function, '__module__', '')}:{getattr(function, '__qualname__', type(function).__qualname__)}"
-    if isinstance(function, FunctionType) and own_module(function) is None and function.__closure__ is None:
+    if isinstance(function, FunctionType) and find_user_module(function) is None and function.__closure__ is None:
         return name
     try:
         from dask.base import tokenize
@@ -55,45 +55,45 @@ def identity_of(function: Callable[..., Any]) -> str:
     return f"{name} {tokenize(_parts_of(function, {}))}"
 
 
-def _parts_of(thing: Any, seen: dict[int, tuple[int, Any]]) -> Any:
+def _parts_of(value: Any, visited: dict[int, tuple[int, Any]]) -> Any:
     """Return nested lists of values, with a number in place of a repeated part."""
-    parts = _parts(thing)
+    parts = _parts(value)
     if parts is None:
-        return thing
+        return value
     # Whether equal constants are one object depends on how the code was loaded. References keep the ids of other parts valid.
-    if not isinstance(thing, tuple | frozenset | CodeType):
-        if id(thing) in seen:
-            return ["part", seen[id(thing)][0]]
-        seen[id(thing)] = len(seen), thing
-    return [type(thing).__qualname__, *(_parts_of(part, seen) for part in parts)]
+    if not isinstance(value, tuple | frozenset | CodeType):
+        if id(value) in visited:
+            return ["part", visited[id(value)][0]]
+        visited[id(value)] = len(visited), value
+    return [type(value).__qualname__, *(_parts_of(part, visited) for part in parts)]
 
 
-def _parts(thing: Any) -> Iterator[Any] | None:
+def _parts(value: Any) -> Iterator[Any] | None:
     """Return the parts of a function, class or container; None for values that dask tokenizes."""
-    if isinstance(thing, list | tuple):
-        return iter(thing)
-    if isinstance(thing, set | frozenset):
-        return iter(sorted(thing, key=repr))  # the iteration order depends on the hash seed
-    if isinstance(thing, dict):
-        return (part for item in thing.items() for part in item)
-    if isinstance(thing, functools.partial):
-        return iter((thing.func, thing.args, sorted(thing.keywords.items())))
-    if isinstance(thing, MethodType):
-        return iter((thing.__func__, thing.__self__))
-    if isinstance(thing, CodeType):
+    if isinstance(value, list | tuple):
+        return iter(value)
+    if isinstance(value, set | frozenset):
+        return iter(sorted(value, key=repr))  # the iteration order depends on the hash seed
+    if isinstance(value, dict):
+        return (part for item in value.items() for part in item)
+    if isinstance(value, functools.partial):
+        return iter((value.func, value.args, sorted(value.keywords.items())))
+    if isinstance(value, MethodType):
+        return iter((value.__func__, value.__self__))
+    if isinstance(value, CodeType):
         # Names of arguments and variables; line numbers do not change the behaviour.
-        return iter((thing.co_code, thing.co_names, thing.co_consts, thing.co_varnames[: thing.co_argcount]))
-    if isinstance(thing, ModuleType):
-        return iter((thing.__name__,))
-    if isinstance(thing, FunctionType):
-        return _parts_of_function(thing)
-    if isinstance(thing, type):
-        own = [] if own_module(thing) is None else [*thing.__bases__, *_members(thing)]
-        return iter((thing.__qualname__, *own))
-    if own_module(type(thing)) is not None:
-        return iter((type(thing), dict(getattr(thing, "__dict__", {}))))
-    if hasattr(thing, "__wrapped__"):
-        return iter((thing.__wrapped__,))
+        return iter((value.co_code, value.co_names, value.co_consts, value.co_varnames[: value.co_argcount]))
+    if isinstance(value, ModuleType):
+        return iter((value.__name__,))
+    if isinstance(value, FunctionType):
+        return _parts_of_function(value)
+    if isinstance(value, type):
+        own = [] if find_user_module(value) is None else [*value.__bases__, *_members(value)]
+        return iter((value.__qualname__, *own))
+    if find_user_module(type(value)) is not None:
+        return iter((type(value), dict(getattr(value, "__dict__", {}))))
+    if hasattr(value, "__wrapped__"):
+        return iter((value.__wrapped__,))
     return None
 
 
@@ -105,7 +105,7 @@ def _parts_of_function(function: FunctionType) -> Iterator[Any]:
         except ValueError:  # a variable without a value
             yield CellType
     # Package versions identify installed functions.
-    if own_module(function) is not None:
+    if find_user_module(function) is not None:
         yield function.__code__
         names = _global_names(function.__code__)
         yield from (function.__globals__[name] for name in names if name in function.__globals__)
@@ -114,13 +114,13 @@ def _parts_of_function(function: FunctionType) -> Iterator[Any]:
 def _members(kind: type) -> Iterator[Any]:
     """Yield the names, functions and constants of a class."""
     for name, member in sorted(vars(kind).items()):
-        inside = getattr(
+        function = getattr(
             member, "__func__", getattr(member, "fget", member)
         )  # of static and class methods, and properties
-        if isinstance(inside, bool | int | float | complex | str | bytes | Path | FunctionType | None) and not (
-            name.startswith("__") and isinstance(inside, str | int | None)
+        if isinstance(function, bool | int | float | complex | str | bytes | Path | FunctionType | None) and not (
+            name.startswith("__") and isinstance(function, str | int | None)
         ):
-            yield from (name, inside)
+            yield from (name, function)
 
 
 def _global_names(code: CodeType) -> Iterator[str]:

@@ -25,10 +25,10 @@ __all__ = [
     "METRICS",
     "REFERENCES",
     "Metric",
-    "gives",
+    "add_metrics",
+    "has_result",
     "import_metric",
-    "named_metrics",
-    "with_more_metrics",
+    "resolve_metrics",
 ]
 
 #: A function of a shot, its camera and its capture that returns a number, a mapping of names to numbers, or a labelled array.
@@ -127,9 +127,9 @@ def import_metric(name: str) -> Metric:
         When the module cannot be imported or has no such function.
     """
     module, _, function = name.partition(":")
-    folder = str(Path.cwd())
-    if folder not in sys.path:
-        sys.path.insert(0, folder)
+    directory = str(Path.cwd())
+    if directory not in sys.path:
+        sys.path.insert(0, directory)
     try:
         found = getattr(importlib.import_module(module), function)
     except Exception as error:  # noqa: BLE001 -- a module may raise anything while it is imported
@@ -140,7 +140,7 @@ def import_metric(name: str) -> Metric:
     return metric
 
 
-def named_metrics(metrics: Iterable[str | Metric] | Mapping[str, Metric] | None) -> dict[str, Metric]:
+def resolve_metrics(metrics: Iterable[str | Metric] | Mapping[str, Metric] | None) -> dict[str, Metric]:
     """
     Return metrics by the names of their results.
 
@@ -183,7 +183,7 @@ def named_metrics(metrics: Iterable[str | Metric] | Mapping[str, Metric] | None)
     return found
 
 
-def with_more_metrics(metrics: Mapping[str, Metric], names: Iterable[str]) -> dict[str, Metric]:
+def add_metrics(metrics: Mapping[str, Metric], names: Iterable[str]) -> dict[str, Metric]:
     """
     Return the metrics of a file and those of the command line.
 
@@ -201,13 +201,13 @@ def with_more_metrics(metrics: Mapping[str, Metric], names: Iterable[str]) -> di
     """
     found = dict(metrics)
     for name in names:
-        for own, metric in named_metrics([import_metric(name) if ":" in name else name]).items():
+        for own, metric in resolve_metrics([import_metric(name) if ":" in name else name]).items():
             if own in found:
                 raise ParameterError("metric", "must have a unique name; another metric has this name", own)
             found[own] = metric
     return found
 
 
-def gives(metric: str, result: str) -> bool:
+def has_result(metric: str, result: str) -> bool:
     """Return whether a result name is that of a metric, or of an item of its mapping."""
     return result == metric or result.startswith(metric + "_")

@@ -21,7 +21,7 @@ from foveasim._core.provenance import differences
 from foveasim._io.atomic import lock
 from foveasim.errors import FileError, ParameterError
 
-__all__ = ["WORKER_LOST", "Journal", "Record", "Value", "check_new", "check_same_plan", "journal_of", "values_of"]
+__all__ = ["WORKER_LOST", "Journal", "Record", "Value", "check_same_plan", "check_unique", "journal_path", "to_values"]
 
 FORMAT, VERSION = "foveasim sweep", 1
 #: Beginning of a journal: a checksum and the format.
@@ -53,7 +53,7 @@ class Record:
     warning: str = ""
 
 
-def values_of(name: str, given: Any) -> dict[str, Scalar | Value]:
+def to_values(name: str, given: Any) -> dict[str, Scalar | Value]:
     """
     Convert the result of a metric to values by variable name.
 
@@ -65,9 +65,9 @@ def values_of(name: str, given: Any) -> dict[str, Scalar | Value]:
     if isinstance(given, Mapping):
         found: dict[str, Scalar | Value] = {}
         for key, item in given.items():
-            more = values_of(_name(f"{name}_{key}"), item)
-            check_new(found, more)
-            found |= more
+            new_values = to_values(_name(f"{name}_{key}"), item)
+            check_unique(found, new_values)
+            found |= new_values
         return found
     if isinstance(given, np.generic | np.ndarray):
         return {name: _value(name, given, tuple(f"{name}_{k}" for k in range(given.ndim)), {})}
@@ -82,7 +82,7 @@ def values_of(name: str, given: Any) -> dict[str, Scalar | Value]:
     )
 
 
-def check_new(found: Collection[str], more: Iterable[str]) -> None:
+def check_unique(found: Collection[str], names: Iterable[str]) -> None:
     """
     Check that the names of new variables are not used yet.
 
@@ -91,9 +91,9 @@ def check_new(found: Collection[str], more: Iterable[str]) -> None:
     ParameterError
         With the repeated name.
     """
-    twice = next((name for name in more if name in found), None)
-    if twice is not None:
-        raise ParameterError(twice, "must be a unique result name, got two results")
+    repeated = next((name for name in names if name in found), None)
+    if repeated is not None:
+        raise ParameterError(repeated, "must be a unique result name, got two results")
 
 
 def _name(name: str) -> str:
@@ -111,19 +111,19 @@ def _name(name: str) -> str:
 
 def _value(name: str, data: Any, dims: tuple[str, ...], labels: Mapping[str, Any]) -> Scalar | Value:
     """Return an array with its labels, or a number or string for a 0-d array."""
-    array = _simple(name, data)
+    array = _as_basic_array(name, data)
     if not dims:
         return _scalar(name, array.item())
     if len(set(dims)) < len(dims):
         raise ParameterError(name, f"must have unique dimension names, got {', '.join(dims)}")
-    simple = {dim: _simple(name, each) for dim, each in labels.items()}
-    for dim, each in simple.items():
+    basic = {dim: _as_basic_array(name, each) for dim, each in labels.items()}
+    for dim, each in basic.items():
         if len(set(each.tolist())) < each.size or (each.dtype.kind == "f" and np.isnan(each).any()):
             raise ParameterError(name, f"must have unique labels along '{dim}', without NaN")
-    return Value(array, dims, simple)
+    return Value(array, dims, basic)
 
 
-def _simple(name: str, array: Any) -> NDArray[Any]:
+def _as_basic_array(name: str, array: Any) -> NDArray[Any]:
     """Convert data to an array of numbers or strings that every store supports."""
     array = np.asarray(array)
     if array.dtype.kind == "T" or (array.dtype.kind == "O" and all(isinstance(item, str) for item in array.flat)):
@@ -152,7 +152,7 @@ def _scalar(name: str, given: Scalar) -> Scalar:
 # -- the journal ------------------------------------------------------------------------------------------------------
 
 
-def journal_of(store: Path) -> Path:
+def journal_path(store: Path) -> Path:
     """
     Return the path of the journal of a store.
 
@@ -171,9 +171,9 @@ class Journal:
     """
 
     def __init__(self, store: Path, plan: Mapping[str, Any]) -> None:
-        self.path = journal_of(store)
+        self.path = journal_path(store)
         self._store = store
-        head = {"format": FORMAT, "version": VERSION, "plan": json.loads(json.dumps(plan))}
+        header = {"format": FORMAT, "version": VERSION, "plan": json.loads(json.dumps(plan))}
         self.records: dict[int, Record] = {}
         self._synced_s = float("-inf")
         try:
@@ -181,7 +181,7 @@ class Journal:
         except OSError as error:
             raise FileError(self.path, f"cannot be written: {error.strerror or error}") from None
         try:
-            lines = self._begin(head)
+            lines = self._open(header)
         except BaseException as error:
             self._file.close()
             if isinstance(error, OSError):
@@ -192,20 +192,20 @@ class Journal:
                 record = _record(line)
                 self.records[record.point] = record
 
-    def _begin(self, head: Mapping[str, Any]) -> list[tuple[Any, int]]:
+    def _open(self, header: Mapping[str, Any]) -> list[tuple[Any, int]]:
         """Return the existing lines of the same plan; write the header to a new journal."""
         if not lock(self._file):
             raise FileError(self._store, "is being written by another program that runs the same sweep")
         self._file.seek(0)
         lines = list(_lines(self._file))
         self._file.seek(0)
-        if lines or not _is_torn_head(self._file.read()):
-            _check_same(self.path, lines[0][0] if lines else None, head)
+        if lines or not _is_truncated_header(self._file.read()):
+            _check_same(self.path, lines[0][0] if lines else None, header)
         self._end = sum(length for _, length in lines)
         self._file.truncate(self._end)
         self._is_new = not lines
         if self._is_new:
-            self._write(head)
+            self._write(header)
         return lines
 
     def __enter__(self) -> Self:
@@ -247,12 +247,12 @@ class Journal:
 
     def _write(self, line: Any) -> None:
         text = json.dumps(line).encode()
-        whole = b"%08x %s\n" % (zlib.crc32(text), text)
+        encoded_line = b"%08x %s\n" % (zlib.crc32(text), text)
         # Unbuffered: the operating system has the line even when this process crashes.
-        left = memoryview(whole)
-        while left:
-            left = left[os.write(self._file.fileno(), left) :]
-        self._end += len(whole)
+        remaining = memoryview(encoded_line)
+        while remaining:
+            remaining = remaining[os.write(self._file.fileno(), remaining) :]
+        self._end += len(encoded_line)
         if time.monotonic() - self._synced_s > SYNC_S:
             self._sync()
 
@@ -269,18 +269,18 @@ def _lines(file: IO[bytes]) -> Iterator[tuple[Any, int]]:
             return
         checksum, _, text = line.rstrip(b"\n").partition(b" ")
         try:
-            said = json.loads(text) if int(checksum, 16) == zlib.crc32(text) else None
+            data = json.loads(text) if int(checksum, 16) == zlib.crc32(text) else None
         except ValueError:
-            said = None
-        yield said, len(line)
+            data = None
+        yield data, len(line)
 
 
-def _is_torn_head(text: bytes) -> bool:
+def _is_truncated_header(text: bytes) -> bool:
     """Return whether a file is empty or contains a truncated journal header."""
     return not text.strip(b"\0") or re.match(TRUNCATED_HEADER, text) is not None
 
 
-def _check_same(path: Path, found: Any, head: Mapping[str, Any]) -> None:
+def _check_same(path: Path, found: Any, header: Mapping[str, Any]) -> None:
     """
     Check that a journal belongs to a plan.
 
@@ -293,10 +293,10 @@ def _check_same(path: Path, found: Any, head: Mapping[str, Any]) -> None:
         raise FileError(path, "is not a sweep journal; move it, or write the results elsewhere")
     if found.get("version") != VERSION:
         raise FileError(path, f"has the format version {found.get('version')}, expected {VERSION}")
-    check_same_plan(path, found.get("plan", {}), head["plan"])
+    check_same_plan(path, found.get("plan", {}), header["plan"])
 
 
-def check_same_plan(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+def check_same_plan(path: Path, found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
     """
     Check that results belong to a plan.
 
@@ -305,8 +305,8 @@ def check_same_plan(path: Path, found: Mapping[str, Any], wanted: Mapping[str, A
     FileError
         When they belong to another plan.
     """
-    wanted = json.loads(json.dumps(wanted))
-    different = next(differences(found, wanted), None)
+    expected = json.loads(json.dumps(expected))
+    different = next(differences(found, expected), None)
     if different is not None:
         raise FileError(
             path,
@@ -319,9 +319,9 @@ def _line(record: Record) -> dict[str, Any]:
         "point": record.point,
         "values": {
             name: {
-                "data": _packed(value.data),
+                "data": _encode_array(value.data),
                 "dims": value.dims,
-                "labels": {dim: _packed(labels) for dim, labels in value.labels.items()},
+                "labels": {dim: _encode_array(labels) for dim, labels in value.labels.items()},
             }
             if isinstance(value, Value)
             else value
@@ -335,9 +335,9 @@ def _line(record: Record) -> dict[str, Any]:
 def _record(line: Mapping[str, Any]) -> Record:
     values = {
         name: Value(
-            _decompressed(value["data"]),
+            _decode_array(value["data"]),
             tuple(value["dims"]),
-            {dim: _decompressed(packed) for dim, packed in value["labels"].items()},
+            {dim: _decode_array(encoded) for dim, encoded in value["labels"].items()},
         )
         if isinstance(value, dict)
         else value
@@ -346,10 +346,10 @@ def _record(line: Mapping[str, Any]) -> Record:
     return Record(line["point"], values, line["error"], line["warning"])
 
 
-def _packed(array: NDArray[Any]) -> list[Any]:
+def _encode_array(array: NDArray[Any]) -> list[Any]:
     return [array.dtype.str, array.shape, base64.b64encode(array.tobytes()).decode("ascii")]
 
 
-def _decompressed(packed: Any) -> NDArray[Any]:
-    dtype, shape, text = packed
+def _decode_array(encoded: Any) -> NDArray[Any]:
+    dtype, shape, text = encoded
     return np.frombuffer(base64.b64decode(text), np.dtype(dtype)).reshape(shape)

@@ -18,7 +18,7 @@ from foveasim.errors import ParameterError, SimulationError
 if TYPE_CHECKING:
     from distributed import Client, Security
 
-__all__ = ["WorkerStates", "client_of", "dask_setup"]
+__all__ = ["WorkerStates", "dask_setup", "open_client"]
 
 #: Timeout of a scheduler, seconds.
 SCHEDULER_S = 10.0
@@ -26,7 +26,7 @@ SCHEDULER_S = 10.0
 PAUSED_S = 10.0
 #: Memory limits of local workers. A worker that dask pauses may wait forever for memory that a metric occupies; a terminated
 #: worker restarts without it.
-MEMORY = {
+MEMORY_SETTINGS = {
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
@@ -37,7 +37,7 @@ NO_HTTP: dict[str, list[str]] = {"distributed.scheduler.http.routes": [], "distr
 
 
 @contextmanager
-def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
+def open_client(scheduler: str | None, n_workers: int) -> Iterator[Client]:
     """
     Connect to a scheduler, or to local workers that end with the context.
 
@@ -74,8 +74,8 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
     except ImportError:
         raise ParameterError("sweep", needs("distributed")) from None
     if scheduler is not None:
-        _check_answer(scheduler, security)
-        with _silent():
+        _check_scheduler(scheduler, security)
+        with _suppress_logs():
             client = Client(scheduler, timeout=SCHEDULER_S, security=security, set_as_default=False)
             try:
                 yield client
@@ -90,13 +90,13 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
     with (
         dask.config.set(
             {"distributed.scheduler.allowed-failures": 0, "distributed.admin.large-graph-warning-threshold": "1 TB"}
-            | MEMORY
+            | MEMORY_SETTINGS
             | NO_HTTP
         ),
-        ExitStack() as opened,
+        ExitStack() as stack,
     ):
         try:
-            cluster = opened.enter_context(
+            cluster = stack.enter_context(
                 LocalCluster(
                     n_workers=n_workers,
                     security=security,
@@ -109,7 +109,7 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
                     silence_logs=logging.CRITICAL,
                 )
             )
-            client = opened.enter_context(Client(cluster, set_as_default=False))
+            client = stack.enter_context(Client(cluster, set_as_default=False))
         except Exception as error:  # noqa: BLE001 -- the start fails in many ways when memory or time is short
             reason = " ".join(str(error).split()) or type(error).__name__
             raise SimulationError(
@@ -120,7 +120,7 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
 
 
 @contextmanager
-def _silent() -> Iterator[None]:
+def _suppress_logs() -> Iterator[None]:
     """Suppress the log messages of dask for lost connections, which are reported as errors."""
     logs = [logging.getLogger(name) for name in ("distributed.client", "distributed.core")]
     levels = [log.level for log in logs]
@@ -133,13 +133,13 @@ def _silent() -> Iterator[None]:
             log.setLevel(level)
 
 
-def _check_answer(scheduler: str, security: Security) -> None:
+def _check_scheduler(scheduler: str, security: Security) -> None:
     """Check that a scheduler answers: a client without one would block for a long time."""
     from distributed import rpc
 
     async def answer() -> Any:
-        async with rpc(scheduler, connection_args=security.get_connection_args("client")) as asked:
-            return await asyncio.wait_for(asked.identity(), SCHEDULER_S)
+        async with rpc(scheduler, connection_args=security.get_connection_args("client")) as connection:
+            return await asyncio.wait_for(connection.identity(), SCHEDULER_S)
 
     reason = "it is not a dask scheduler"
     try:
@@ -200,15 +200,17 @@ class WorkerStates:
             if self._client.cluster is not None:
                 # Dask restarts an ended worker, but not a worker that ends again during its start.
                 self._client.cluster.scale(len(self._client.cluster.worker_spec))
-            found = self._client.scheduler_info(n_workers=-1)["workers"]
+            workers = self._client.scheduler_info(n_workers=-1)["workers"]
         except Exception:  # noqa: BLE001 -- connections fail in many ways
             raise SimulationError("the scheduler no longer answers") from None
         now_s = time.monotonic()
         executing = {
-            address: one["metrics"].get("task_counts", {}).get("executing", 0) for address, one in found.items()
+            address: worker["metrics"].get("task_counts", {}).get("executing", 0) for address, worker in workers.items()
         }
-        self.alive, self.n_executing = set(found), sum(executing.values())
-        self.running = {address for address, one in found.items() if one["status"] == "running"}
-        paused = {address for address, one in found.items() if one["status"] == "paused" and not executing[address]}
+        self.alive, self.n_executing = set(workers), sum(executing.values())
+        self.running = {address for address, worker in workers.items() if worker["status"] == "running"}
+        paused = {
+            address for address, worker in workers.items() if worker["status"] == "paused" and not executing[address]
+        }
         self._paused_since_s = {address: self._paused_since_s.get(address, now_s) for address in paused}
         self.stuck = {address for address, since_s in self._paused_since_s.items() if now_s - since_s > PAUSED_S}

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from foveasim._core.provenance import versions
 from foveasim.errors import FoveasimError, SimulationError
-from foveasim.explore._functions import own_module
-from foveasim.explore.cluster import WorkerStates, client_of
+from foveasim.explore._functions import find_user_module
+from foveasim.explore.cluster import WorkerStates, open_client
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -38,7 +38,7 @@ MAX_ITEMS = 1024
 #: Number of ended workers after which an item is not retried.
 MAX_DEATHS = 3
 #: Longest time without any worker, seconds.
-ABSENT_S = 60.0
+NO_WORKER_TIMEOUT_S = 60.0
 #: Interval between updates of the worker list, seconds.
 POLL_S = 1.0
 
@@ -96,29 +96,29 @@ def executor(
     if scheduler is None and workers is None:
         yield lambda items, _cuts: ((item, function(item)) for item in items)
         return
-    payload = _pickled(function, what, users)
-    with client_of(scheduler, workers or 1) as client:
+    payload = _pickle(function, what, users)
+    with open_client(scheduler, workers or 1) as client:
         shared = client.submit(_Shared, payload, versions(), pure=False)
         yield lambda items, cuts: _Dispatch(client, shared, items, cuts).run()
 
 
-def _pickled(function: Callable[[Any], Any], what: str, users: Iterable[Callable[..., Any]]) -> bytes:
+def _pickle(function: Callable[[Any], Any], what: str, users: Iterable[Callable[..., Any]]) -> bytes:
     import cloudpickle
 
-    names = {own_module(user) for user in users} - {None, "__main__"}
-    own = [sys.modules[name] for name in names if name is not None]
-    for module in own:
+    names = {find_user_module(user) for user in users} - {None, "__main__"}
+    modules = [sys.modules[name] for name in names if name is not None]
+    for module in modules:
         cloudpickle.register_pickle_by_value(module)
     try:
         return bytes(cloudpickle.dumps(function))
     except Exception as error:  # noqa: BLE001 -- objects may raise anything when they are pickled
-        raise SimulationError(f"{what} cannot be sent to other processes ({_line(error)})") from None
+        raise SimulationError(f"{what} cannot be sent to other processes ({_one_line(error)})") from None
     finally:
-        for module in own:
+        for module in modules:
             cloudpickle.unregister_pickle_by_value(module)
 
 
-def _line(error: BaseException) -> str:
+def _one_line(error: BaseException) -> str:
     return f"{' '.join(str(error).split()) or type(error).__name__:.300}"
 
 
@@ -142,9 +142,9 @@ class _Chunk:
 
     positions: range
     worker: str
-    is_alone: bool
+    is_single: bool
     #: Timeout of the transfer of its results, seconds; then the worker list is updated.
-    patience_s: float = POLL_S
+    timeout_s: float = POLL_S
 
 
 class _Dispatch:
@@ -159,7 +159,7 @@ class _Dispatch:
         Ranges without a worker.
     heap : list of (int, int, _Range)
         All ranges of workers, longest first: negative length at insertion, serial number, range.
-    alone : deque of range
+    retries : deque of range
         Items of lost workers, to be sent one by one.
     """
 
@@ -169,7 +169,7 @@ class _Dispatch:
         self.ranges: dict[str, _Range] = {}
         self.heap: list[tuple[int, int, _Range]] = []
         self.numbers = itertools.count()
-        self.alone: deque[range] = deque()
+        self.retries: deque[range] = deque()
         self.deaths: dict[int, int] = {}
         self.sent: dict[Any, _Chunk] = {}
         self.idle: set[str] = set()
@@ -186,18 +186,18 @@ class _Dispatch:
             while self.n_left:
                 if time.monotonic() - self.polled_s > POLL_S:
                     self._poll()
-                    yield from self._yielded(self._cancel_lost())
+                    yield from self._yield_results(self._cancel_lost())
                 self._send()
                 try:
                     future = self.done.get(timeout=POLL_S)
                 except queue.Empty:
                     continue
-                yield from self._yielded(self._received(future))
+                yield from self._yield_results(self._receive(future))
         finally:
             with suppress(Exception):
                 self.client.cancel(list(self.sent))
 
-    def _yielded(self, results: Iterable[tuple[int, Any]]) -> Iterator[tuple[Any, Any]]:
+    def _yield_results(self, results: Iterable[tuple[int, Any]]) -> Iterator[tuple[Any, Any]]:
         for position, result in results:
             self.n_left -= 1
             yield self.items[position], result
@@ -210,16 +210,17 @@ class _Dispatch:
         self.polled_s = time.monotonic()
         self.idle = self.states.running - {chunk.worker for chunk in self.sent.values()}
         for worker in self.ranges.keys() - self.states.running:
-            left = self.ranges.pop(worker)
-            if left:
-                self.free.append(left)
+            remaining = self.ranges.pop(worker)
+            if remaining:
+                self.free.append(remaining)
         if self.states.running or self.states.n_executing:
             self.alive_s = self.polled_s
-        elif self.polled_s - self.alive_s > ABSENT_S:
+        elif self.polled_s - self.alive_s > NO_WORKER_TIMEOUT_S:
             raise SimulationError(
-                f"no worker has computed anything for {ABSENT_S:g} s: all are closing, or paused because of full memory"
+                f"no worker has computed anything for {NO_WORKER_TIMEOUT_S:g} s: all are closing, or paused because of full "
+                "memory"
                 if self.states.alive
-                else f"the scheduler has had no worker for {ABSENT_S:g} s"
+                else f"the scheduler has had no worker for {NO_WORKER_TIMEOUT_S:g} s"
             )
 
     def _cancel_lost(self) -> Iterator[tuple[int, Any]]:
@@ -230,9 +231,9 @@ class _Dispatch:
                 del self.sent[future]
                 self.client.cancel([future])
                 if is_dead:
-                    yield from self._again(chunk)
+                    yield from self._retry(chunk)
                 else:
-                    self._put_back(chunk)
+                    self._requeue(chunk)
 
     def _send(self) -> None:
         """Send a chunk to each idle worker."""
@@ -261,18 +262,18 @@ class _Dispatch:
 
     def _next(self, worker: str) -> _Chunk | None:
         """Return the next chunk of a worker: of its range, a free range, or half of the longest."""
-        if self.alone:
-            return _Chunk(self.alone.popleft(), worker, is_alone=True)
+        if self.retries:
+            return _Chunk(self.retries.popleft(), worker, is_single=True)
         own = self.ranges.get(worker)
         if not own:
-            own = self.free.pop() if self.free else self._half_of_longest()
+            own = self.free.pop() if self.free else self._split_longest()
             if own is None:
                 return None
             self._assign(worker, own)
         n = 1 if self.item_s is None else int(self._chunk_s() / max(self.item_s, 1e-9))
         n = max(1, min(n, MAX_ITEMS, (len(own) + 1) // 2))
         own.start += n
-        return _Chunk(range(own.start - n, own.start), worker, is_alone=False)
+        return _Chunk(range(own.start - n, own.start), worker, is_single=False)
 
     def _assign(self, worker: str, own: _Range) -> None:
         self.ranges[worker] = own
@@ -281,7 +282,7 @@ class _Dispatch:
     def _push(self, own: _Range) -> None:
         heapq.heappush(self.heap, (-len(own), next(self.numbers), own))
 
-    def _half_of_longest(self) -> _Range | None:
+    def _split_longest(self) -> _Range | None:
         """Cut off the second half of the longest range, near a change of shared components."""
         while self.heap:
             length, _, longest = heapq.heappop(self.heap)
@@ -289,11 +290,11 @@ class _Dispatch:
                 if longest:
                     self._push(longest)
                 continue
-            middle = (longest.start + longest.stop) // 2
-            near = bisect_left(self.cuts, middle)
-            cut = min(self.cuts[max(near - 1, 0) : near + 1], key=lambda cut: abs(cut - middle), default=middle)
-            if abs(cut - middle) > len(longest) // 4:
-                cut = middle
+            midpoint = (longest.start + longest.stop) // 2
+            near = bisect_left(self.cuts, midpoint)
+            cut = min(self.cuts[max(near - 1, 0) : near + 1], key=lambda cut: abs(cut - midpoint), default=midpoint)
+            if abs(cut - midpoint) > len(longest) // 4:
+                cut = midpoint
             half = _Range(cut, longest.stop)
             longest.stop = cut
             if longest:
@@ -301,31 +302,31 @@ class _Dispatch:
             return half
         return None
 
-    def _put_back(self, chunk: _Chunk, n_done: int = 0) -> None:
+    def _requeue(self, chunk: _Chunk, n_done: int = 0) -> None:
         """Move the uncomputed items of a chunk back to the unsent ranges."""
-        left = chunk.positions[n_done:]
-        if not left:
+        remaining = chunk.positions[n_done:]
+        if not remaining:
             return
         own = self.ranges.get(chunk.worker)
-        if chunk.is_alone:
-            self.alone.append(left)
-        elif own is not None and own.start == left.stop:
-            own.start = left.start
+        if chunk.is_single:
+            self.retries.append(remaining)
+        elif own is not None and own.start == remaining.stop:
+            own.start = remaining.start
             self._push(own)
         else:
-            self.free.append(_Range(left.start, left.stop))
+            self.free.append(_Range(remaining.start, remaining.stop))
 
-    def _received(self, future: Future[Any]) -> Iterator[tuple[int, Any]]:
+    def _receive(self, future: Future[Any]) -> Iterator[tuple[int, Any]]:
         """Yield the positions and results of a chunk, or retry the items of a lost worker."""
         chunk = self.sent.pop(future, None)
         if chunk is None:  # cancelled before
             return
         try:
-            results = self._result(future, chunk.patience_s)
+            results = self._result(future, chunk.timeout_s)
         except TimeoutError:
             # The results may be lost with their worker; dask then computes them again.
             self.polled_s = float("-inf")
-            chunk.patience_s *= 2.0
+            chunk.timeout_s *= 2.0
             self.sent[future] = chunk
             self.done.put(future)
             return
@@ -333,14 +334,14 @@ class _Dispatch:
             self.idle.add(chunk.worker)
         if results is None:
             self.polled_s = float("-inf")
-            yield from self._again(chunk)
+            yield from self._retry(chunk)
             return
         took_s = results.took_s / max(len(results.values), 1)
         self.item_s = took_s if self.item_s is None else 0.5 * (self.item_s + took_s)
-        self._put_back(chunk, len(results.values))
+        self._requeue(chunk, len(results.values))
         yield from zip(chunk.positions, results.values, strict=False)
 
-    def _result(self, future: Future[Any], patience_s: float) -> _Results | None:
+    def _result(self, future: Future[Any], timeout_s: float) -> _Results | None:
         """Return the results of a chunk, or None when its worker ended."""
         from distributed import KilledWorker
 
@@ -349,7 +350,7 @@ class _Dispatch:
                 future.result()
             # Unlike gather, Future.result() logs an error on a timeout.
             gather = partial(self.client.gather, [future], errors="skip", asynchronous=True)
-            found: list[_Results] = self.client.sync(gather, callback_timeout=patience_s)
+            found: list[_Results] = self.client.sync(gather, callback_timeout=timeout_s)
         except KilledWorker:
             return None
         except TimeoutError:
@@ -359,19 +360,19 @@ class _Dispatch:
         except FoveasimError as error:
             raise error from None  # without the traceback of the worker
         except Exception as error:  # noqa: BLE001 -- workers without the package or a module may raise anything
-            raise SimulationError(f"the workers cannot compute: {_line(error)}") from None
+            raise SimulationError(f"the workers cannot compute: {_one_line(error)}") from None
         if not found:
             raise TimeoutError
         return found[0]
 
-    def _again(self, chunk: _Chunk) -> Iterator[tuple[int, Any]]:
+    def _retry(self, chunk: _Chunk) -> Iterator[tuple[int, Any]]:
         """Retry the items of a lost worker one by one; yield KILLED for the last attempt."""
         for position in chunk.positions:
             self.deaths[position] = self.deaths.get(position, 0) + 1
-            if chunk.is_alone and self.deaths[position] >= MAX_DEATHS:
+            if chunk.is_single and self.deaths[position] >= MAX_DEATHS:
                 yield position, KILLED
             else:
-                self.alone.append(range(position, position + 1))
+                self.retries.append(range(position, position + 1))
 
 
 # -- on a worker ------------------------------------------------------------------------------------------------------
@@ -416,10 +417,10 @@ class _Shared:
         import cloudpickle
 
         if self._function is None:
-            here = versions()
-            differing = [name for name in self._versions if here.get(name) != self._versions[name]]
+            local_versions = versions()
+            differing = [name for name in self._versions if local_versions.get(name) != self._versions[name]]
             if differing:
-                theirs = ", ".join(f"{name} {here.get(name)}" for name in differing)
+                theirs = ", ".join(f"{name} {local_versions.get(name)}" for name in differing)
                 ours = ", ".join(f"{name} {self._versions[name]}" for name in differing)
                 raise RuntimeError(f"a worker has {theirs}, but the client has {ours}")
             self._function = cloudpickle.loads(self._payload)

@@ -20,27 +20,27 @@ from foveasim.capture import Capture
 from foveasim.config import Shot, build_shot
 from foveasim.errors import FoveasimError
 from foveasim.explore._metrics import REFERENCES, Metric
-from foveasim.explore._records import Record, check_new, values_of
+from foveasim.explore._records import Record, check_unique, to_values
 
 __all__ = ["ShotRunner", "WorkerCache"]
 
 #: Limits of a cache: bytes, and number of components. Nested components count in every component that contains them.
 MAX_BYTES, MAX_PARTS = 1 << 30, 1024
 #: A cache uses at most 1/4 of the memory of a worker: captures need most of it.
-FRACTION_OF_MEMORY = 4
+MEMORY_DIVISOR = 4
 #: Kinds of components whose size increases with use.
-GROWING = ("camera", "images")
+GROWING_KINDS = ("camera", "images")
 #: Depth of nested containers whose arrays count towards the size of a component.
-DEPTH = 6
+MAX_DEPTH = 6
 #: Longest stored message, characters.
-LONGEST_MESSAGE = 500
+MAX_MESSAGE_LENGTH = 500
 
 
 @dataclass
 class _Part:
     """Cached component with the warnings of its construction and its size."""
 
-    made: Any
+    value: Any
     warnings: list[str]
     n_bytes: int = 0
 
@@ -63,7 +63,7 @@ class WorkerCache:
         self._parts: OrderedDict[tuple[str, str], _Part] = OrderedDict()
         self._used: set[tuple[str, str]] = set()
         self._warnings: list[str] = []
-        self.n_made: dict[str, int] = {}
+        self.n_built: dict[str, int] = {}
 
     def part(self, kind: str, settings: Any, make: Callable[[], Any]) -> Any:
         """Return the component with the given settings, from the cache or newly built."""
@@ -71,15 +71,15 @@ class WorkerCache:
         if key not in self._parts:
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
-                made = make()
-            self._parts[key] = _Part(made, [str(warning.message) for warning in caught])
-            self.n_made[kind] = self.n_made.get(kind, 0) + 1
+                value = make()
+            self._parts[key] = _Part(value, [str(warning.message) for warning in caught])
+            self.n_built[kind] = self.n_built.get(kind, 0) + 1
         self._parts.move_to_end(key)
         self._used.add(key)
         self._warnings += self._parts[key].warnings
-        return self._parts[key].made
+        return self._parts[key].value
 
-    def end_point(self) -> list[str]:
+    def finish_point(self) -> list[str]:
         """
         Remove the least recently used components, except those of the last point.
 
@@ -90,8 +90,8 @@ class WorkerCache:
         """
         for key in self._used:
             # Measured again for cameras and images, which grow with use.
-            if self._parts[key].n_bytes == 0 or key[0] in GROWING:
-                self._parts[key].n_bytes = _n_bytes(self._parts[key].made, set())
+            if self._parts[key].n_bytes == 0 or key[0] in GROWING_KINDS:
+                self._parts[key].n_bytes = _n_bytes(self._parts[key].value, set())
         total = sum(part.n_bytes for part in self._parts.values())
         for key in list(self._parts):
             if total <= self.max_bytes and len(self._parts) <= MAX_PARTS:
@@ -145,7 +145,7 @@ class ShotRunner:
         if self._cache is None:
             worker = _worker()
             limit = worker.memory_manager.memory_limit if worker is not None else None
-            self._cache = WorkerCache(min(self.max_bytes, limit // FRACTION_OF_MEMORY) if limit else self.max_bytes)
+            self._cache = WorkerCache(min(self.max_bytes, limit // MEMORY_DIVISOR) if limit else self.max_bytes)
             if self.n_threads is None:
                 self.n_threads = thread_count() if worker is None else int(worker.state.nthreads)
         return self._cache
@@ -154,28 +154,28 @@ class ShotRunner:
         """Return the record of a point, given its number and all its settings."""
         return self.record(*point)
 
-    def captured(self, settings: Mapping[str, Any]) -> tuple[Shot, Capture]:
+    def simulate_capture(self, settings: Mapping[str, Any]) -> tuple[Shot, Capture]:
         """Build the shot of the given settings and simulate its capture."""
         cache = self.cache
         shot = build_shot(self.source, settings, n_threads=self.n_threads, cache=cache.part)
         camera, sensor, scene = shot.camera, shot.camera.sensor, shot.scene
-        light = _light(shot, settings)
+        image_settings = _image_settings(shot, settings)
         filters = hashlib.sha256(sensor.filter_of_site.tobytes()).hexdigest()
         sites = [settings["layout"], settings.get("distortion"), settings.get("integration_order"), filters]
-        images = cache.part("images", light, dict) if self.is_geometry_varied else None
+        images = cache.part("images", image_settings, dict) if self.is_geometry_varied else None
         photo_e_per_s = cache.part(
-            "light on sites", [light, sites], lambda: camera.photoelectrons_per_s(scene, images=images)
+            "power on sites", [image_settings, sites], lambda: camera.photoelectrons_per_s(scene, images=images)
         )
         capture = camera.capture(scene, exposure_s=shot.exposure_s, seed=shot.seed, photo_e_per_s=photo_e_per_s)
         return shot, capture
 
-    def _measured(self, metric: Metric, shot: Shot, capture: Capture, settings: Mapping[str, Any]) -> Any:
+    def _measure(self, metric: Metric, shot: Shot, capture: Capture, settings: Mapping[str, Any]) -> Any:
         """Compute a metric, with a cached reference where the metric takes one."""
         compared: Callable[..., Any] = metric
         make = next((make for own, make in REFERENCES.items() if own is metric), None)
         if make is None:
             return metric(shot, shot.camera, capture)
-        key = [_light(shot, settings), settings["layout"], shot.exposure_s]
+        key = [_image_settings(shot, settings), settings["layout"], shot.exposure_s]
         reference = self.cache.part("reference", key, lambda: make(shot, shot.camera))
         return compared(shot, shot.camera, capture, reference)
 
@@ -190,23 +190,23 @@ class ShotRunner:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:
-                shot, capture = self.captured(settings)
+                shot, capture = self.simulate_capture(settings)
             except BaseException as error:  # noqa: BLE001 -- settings may cause any exception of the package or a library
                 _raise_ctrl_c(error)
                 errors.append(_message(error))
             else:
                 for name, metric in self.metrics.items():
                     try:
-                        more = values_of(name, self._measured(metric, shot, capture, settings))
-                        check_new(values, more)
-                        values |= more
+                        new_values = to_values(name, self._measure(metric, shot, capture, settings))
+                        check_unique(values, new_values)
+                        values |= new_values
                     except BaseException as error:  # noqa: BLE001 -- metrics are user code, and may call sys.exit()
                         _raise_ctrl_c(error)
                         text = _message(error)
                         # Messages of this package about a result already start with its name.
                         errors.append(text if text.startswith(f"'{name}") else f"{name}: {text}")
-        texts = dict.fromkeys([*self.cache.end_point(), *(str(warning.message) for warning in caught)])
-        return Record(point, values, "; ".join(errors), "; ".join(_short(text) for text in texts))
+        messages = dict.fromkeys([*self.cache.finish_point(), *(str(warning.message) for warning in caught)])
+        return Record(point, values, "; ".join(errors), "; ".join(_truncate(text) for text in messages))
 
 
 def _worker() -> Any:
@@ -221,7 +221,7 @@ def _worker() -> Any:
         return None
 
 
-def _light(shot: Shot, settings: Mapping[str, Any]) -> list[Any]:
+def _image_settings(shot: Shot, settings: Mapping[str, Any]) -> list[Any]:
     """Return the settings that determine the optical images, with the spectral responsivity."""
     response = shot.camera.sensor.responsivity_e_per_j(shot.scene.wavelength_nm)
     return [settings["scene"], settings["optics"], hashlib.sha256(response.tobytes()).hexdigest()]
@@ -238,35 +238,35 @@ def _raise_ctrl_c(error: BaseException) -> None:
 
 
 def _message(error: BaseException) -> str:
-    return _short(
+    return _truncate(
         str(error) if isinstance(error, FoveasimError) else f"{type(error).__name__}: {error}".removesuffix(": ")
     )
 
 
-def _short(text: str) -> str:
+def _truncate(text: str) -> str:
     text = " ".join(text.split())
-    return text if len(text) <= LONGEST_MESSAGE else text[: LONGEST_MESSAGE - 3] + "..."
+    return text if len(text) <= MAX_MESSAGE_LENGTH else text[: MAX_MESSAGE_LENGTH - 3] + "..."
 
 
-def _n_bytes(thing: Any, seen: set[int], depth: int = DEPTH) -> int:
-    """Return the bytes of the arrays in an object, without those in ``seen``."""
-    if id(thing) in seen or depth == 0:
+def _n_bytes(value: Any, visited: set[int], depth: int = MAX_DEPTH) -> int:
+    """Return the bytes of the arrays in an object, without those in ``visited``."""
+    if id(value) in visited or depth == 0:
         return 0
-    if isinstance(thing, np.ndarray):
-        base = thing if thing.base is None or not isinstance(thing.base, np.ndarray) else thing.base
-        n_bytes = 0 if id(base) in seen else int(base.nbytes)
-        seen |= {id(base), id(thing)}
+    if isinstance(value, np.ndarray):
+        base = value if value.base is None or not isinstance(value.base, np.ndarray) else value.base
+        n_bytes = 0 if id(base) in visited else int(base.nbytes)
+        visited |= {id(base), id(value)}
         return n_bytes
-    if isinstance(thing, str | bytes | int | float | type(None)):
+    if isinstance(value, str | bytes | int | float | type(None)):
         return 0
-    seen.add(id(thing))
-    if isinstance(thing, Mapping):
-        inside: list[Any] = list(thing.values())
-    elif isinstance(thing, list | tuple):
-        inside = list(thing)
-    elif type(thing).__module__.startswith("foveasim"):
-        slots = [name for kind in type(thing).__mro__ for name in getattr(kind, "__slots__", ())]
-        inside = [*getattr(thing, "__dict__", {}).values(), *(getattr(thing, name, None) for name in slots)]
+    visited.add(id(value))
+    if isinstance(value, Mapping):
+        members: list[Any] = list(value.values())
+    elif isinstance(value, list | tuple):
+        members = list(value)
+    elif type(value).__module__.startswith("foveasim"):
+        slots = [name for kind in type(value).__mro__ for name in getattr(kind, "__slots__", ())]
+        members = [*getattr(value, "__dict__", {}).values(), *(getattr(value, name, None) for name in slots)]
     else:
         return 0
-    return sum(_n_bytes(item, seen, depth - 1) for item in inside)
+    return sum(_n_bytes(item, visited, depth - 1) for item in members)

@@ -24,7 +24,7 @@ from foveasim.config import build_shot
 from foveasim.errors import ConfigError, FileError
 from foveasim.explore import _records
 from foveasim.explore._records import Journal, Record
-from foveasim.explore.datasets.label_files import files_of_pictures, read_boxes, read_labels
+from foveasim.explore.datasets.label_files import match_label_files, read_boxes, read_labels
 from foveasim.explore.studies.plan import _suggested
 from foveasim.explore.worker_cache import ShotRunner
 
@@ -695,14 +695,14 @@ def test_each_picture_has_one_label_file(tmp_path):
     (tmp_path / "a.png").touch()
     (tmp_path / "b.jpg").touch()
 
-    assert files_of_pictures(tmp_path, ["a.jpeg"], (".png",)) == [tmp_path / "a.png"]
+    assert match_label_files(tmp_path, ["a.jpeg"], (".png",)) == [tmp_path / "a.png"]
     with pytest.raises(FileError, match="one file per picture, but two pictures have the name 'a'"):
-        files_of_pictures(tmp_path, ["a.jpeg", "a.png"], (".png",))
+        match_label_files(tmp_path, ["a.jpeg", "a.png"], (".png",))
     with pytest.raises(FileError, match=r"first 'b'; it contains 'a' \(\.png\)"):
-        files_of_pictures(tmp_path, ["a.jpeg", "b.jpeg"], (".png",))
+        match_label_files(tmp_path, ["a.jpeg", "b.jpeg"], (".png",))
     (tmp_path / "a.bmp").touch()
     with pytest.raises(FileError, match=r"has two files for the picture 'a': a\.bmp and a\.png"):
-        files_of_pictures(tmp_path, ["a.jpeg"], (".png", ".bmp"))
+        match_label_files(tmp_path, ["a.jpeg"], (".png", ".bmp"))
 
 
 # -- common parts --------------------------------------------------------------------------------------------------
@@ -788,7 +788,7 @@ def test_cached_reference_changes_no_result():
     runner = ShotRunner(plan.source, plan.metrics, is_geometry_varied=False, n_threads=1)
     found = [runner.record(k, plan.settings_of(k)) for k in range(plan.n_points)]
 
-    assert runner.cache.n_made["reference"] == 4
+    assert runner.cache.n_built["reference"] == 4
     for k in (0, 5, 10, 15):
         shot = build_shot("by hand", plan.settings_of(k))
         capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed)

@@ -179,7 +179,7 @@ N_DRAWS = 4000
 )
 def test_continuous_draws_follow_distribution(distribution, cdf):
     draw = explore.parse_distribution("x", distribution)
-    quantiles = np.sort([cdf(draw.at(0, k)[0]) for k in range(N_DRAWS)])
+    quantiles = np.sort([cdf(draw.sample(0, k)[0]) for k in range(N_DRAWS)])
 
     # Kolmogorov-Smirnov statistic: it exceeds 2.3 / sqrt(n) with a probability of 1 / 25,000.
     assert np.abs(quantiles - (np.arange(N_DRAWS) + 0.5) / N_DRAWS).max() < 2.3 / np.sqrt(N_DRAWS)
@@ -195,7 +195,7 @@ def test_continuous_draws_follow_distribution(distribution, cdf):
 )
 def test_discrete_draws_follow_probabilities(distribution, probabilities):
     draw = explore.parse_distribution("x", distribution)
-    found = [draw.at(3, k)[0] for k in range(N_DRAWS)]
+    found = [draw.sample(3, k)[0] for k in range(N_DRAWS)]
 
     assert set(found) == {value for value, p in probabilities.items() if p}
     for value, p in probabilities.items():
@@ -206,7 +206,7 @@ def test_discrete_draws_follow_probabilities(distribution, probabilities):
 def test_normal_draws_are_within_bounds(sigma):
     """A wide truncated distribution is nearly uniform; a narrow one is concentrated at its mean."""
     draw = explore.parse_distribution("x", {"normal": [1.0, sigma, 0.0, 2.0]})
-    found = np.array([draw.at(0, k)[0] for k in range(N_DRAWS)])
+    found = np.array([draw.sample(0, k)[0] for k in range(N_DRAWS)])
     sigma_cut = min(sigma, np.sqrt(1.0 / 3.0))
 
     assert 0.0 <= found.min() <= found.max() <= 2.0
@@ -831,7 +831,7 @@ def test_processes_start_only_for_long_tasks(tmp_path, monkeypatch):
     monkeypatch.setattr(store, "thread_count", lambda: 5)
     data = explore.Dataset(pictures(6), SHOT)
     for name, alone_s, found in (("short", 1e6, []), ("long", 0.0, [(5, 5)])):
-        monkeypatch.setattr(store, "ALONE_S", alone_s)
+        monkeypatch.setattr(store, "SINGLE_PROCESS_S", alone_s)
         stored = explore.write_dataset(data, tmp_path / name, workers=None)
         assert started == found
         assert_same(stored[5], data[5])

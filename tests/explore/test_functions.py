@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from foveasim import explore
-from foveasim.explore._functions import identity_of
+from foveasim.explore._functions import identify_function
 
 OWN = """
 import functools
@@ -67,8 +67,8 @@ METRICS = {
 """
 COMMAND = """
 import json, own
-from foveasim.explore._functions import identity_of
-print(json.dumps({name: identity_of(metric) for name, metric in own.METRICS.items()}))
+from foveasim.explore._functions import identify_function
+print(json.dumps({name: identify_function(metric) for name, metric in own.METRICS.items()}))
 """
 
 
@@ -113,14 +113,14 @@ def test_identity_is_constant_during_use():
     def often(n):
         return sum(n + k for k in range(10)) + table[0]
 
-    before = identity_of(often)
+    before = identify_function(often)
     for k in range(200):
         often(k)
-    assert identity_of(often) == before
+    assert identify_function(often) == before
 
 
 def test_package_metrics_are_identified_by_name():
-    assert identity_of(explore.METRICS["snr"]) == "foveasim.explore._metrics:snr"
+    assert identify_function(explore.METRICS["snr"]) == "foveasim.explore._metrics:snr"
 
 
 @pytest.mark.parametrize(
@@ -133,5 +133,5 @@ def test_package_metrics_are_identified_by_name():
     ],
 )
 def test_identity_depends_on_captured_values(pair):
-    assert identity_of(pair[0]) == identity_of(pair[0])
-    assert identity_of(pair[0]) != identity_of(pair[1])
+    assert identify_function(pair[0]) == identify_function(pair[0])
+    assert identify_function(pair[0]) != identify_function(pair[1])

@@ -22,9 +22,9 @@ import xarray as xr
 from foveasim import explore
 from foveasim.config import build_shot
 from foveasim.errors import ConfigError, FileError, ParameterError, SimulationError
-from foveasim.explore._records import Journal, Record, journal_of, values_of
+from foveasim.explore._records import Journal, Record, journal_path, to_values
 from foveasim.explore.executor import CHUNK_S
-from foveasim.explore.sweeps.results import dataset_of, write_store
+from foveasim.explore.sweeps.results import to_dataset, write_store
 from foveasim.explore.worker_cache import ShotRunner
 
 SHOT = {
@@ -57,7 +57,7 @@ LIMIT_S = 150.0
 def in_process(plan):
     """Compute the results of a plan in this process, with one cache."""
     runner = runner_of(plan)
-    return dataset_of(plan, {k: runner.record(k, plan.settings_of(k)) for k in range(plan.n_points)})
+    return to_dataset(plan, {k: runner.record(k, plan.settings_of(k)) for k in range(plan.n_points)})
 
 
 def runner_of(plan, **options):
@@ -119,9 +119,9 @@ def reference_results():
         capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=plan.seed_of(point))
         values = {}
         for name, metric in plan.metrics.items():
-            values |= values_of(name, metric(shot, shot.camera, capture))
+            values |= to_values(name, metric(shot, shot.camera, capture))
         records[point] = Record(point, values)
-    found = dataset_of(plan, records)
+    found = to_dataset(plan, records)
     assert found["snr_mean"].notnull().all()
     assert (found["mean_code_dn"].sel({"sensor.bits": 14}).std("repeat") > 0.0).all()
     return found
@@ -324,7 +324,7 @@ def test_tasks_of_paused_worker_are_moved(monkeypatch):
 
 def test_pause_of_all_workers_is_reported(monkeypatch):
     monkeypatch.setattr("foveasim.explore.cluster.PAUSED_S", 1.0)
-    monkeypatch.setattr("foveasim.explore.executor.ABSENT_S", 1.0)
+    monkeypatch.setattr("foveasim.explore.executor.NO_WORKER_TIMEOUT_S", 1.0)
     with pytest.raises(
         SimulationError,
         match=r"no worker has computed anything for 1 s: all are closing, or paused.*; \d+ of 12 points are done",
@@ -363,7 +363,7 @@ def test_point_seed_depends_on_seed_and_number():
 
 
 def journal_points(store):
-    lines = journal_of(store).read_text().splitlines() if journal_of(store).exists() else []
+    lines = journal_path(store).read_text().splitlines() if journal_path(store).exists() else []
     return [json.loads(line.partition(" ")[2])["point"] for line in lines[1:]]
 
 
@@ -466,7 +466,7 @@ def test_interrupted_sweep_resumes_without_repetition(directory):
     result = subprocess.run(COMMAND, cwd=directory, capture_output=True, text=True, check=False)
 
     assert result.returncode == 0, result.stderr
-    assert not journal_of(directory / "results.zarr").exists()
+    assert not journal_path(directory / "results.zarr").exists()
     found = explore.open_results(directory / "results.zarr")
     assert (found["error"] == "").all()
     np.testing.assert_array_equal(found["mean_dn"], found["mean_code_dn"])
@@ -508,7 +508,7 @@ def test_failed_points_are_reported_and_retried(tmp_path):
     found = explore.run_sweep(plan, out=tmp_path / "r.zarr", workers=1, retry=True)
 
     np.testing.assert_array_equal(found["unreliable"], [7.0, np.nan, np.nan, 7.0, 7.0])
-    assert journal_of(tmp_path / "r.zarr").exists()
+    assert journal_path(tmp_path / "r.zarr").exists()
 
 
 def test_failed_points_can_be_retried_repeatedly(tmp_path):
@@ -523,14 +523,14 @@ def test_failed_points_can_be_retried_repeatedly(tmp_path):
     plan = explore.plan_sweep(SHOT, {"sensor.bits": [8, 9]}, metrics=[unreliable])
     store = tmp_path / "r.zarr"
     explore.run_sweep(plan, out=store, workers=1)
-    before = journal_of(store).read_bytes()
+    before = journal_path(store).read_bytes()
     with pytest.raises(ParameterError, match="scheduler"):
         explore.run_sweep(plan, out=store, scheduler="tcp://127.0.0.1:1", retry=True)
 
-    assert journal_of(store).read_bytes() == before
+    assert journal_path(store).read_bytes() == before
 
     bad.unlink()
-    journal_of(store).unlink()
+    journal_path(store).unlink()
     found = explore.run_sweep(plan, out=store, workers=1)
 
     assert found["error"].values.tolist() == ["unreliable: RuntimeError: failed"] * 2
@@ -539,7 +539,7 @@ def test_failed_points_can_be_retried_repeatedly(tmp_path):
 
     assert found["error"].values.tolist() == ["", ""]
     assert found["unreliable"].values.tolist() == [7.0, 7.0]
-    assert not journal_of(store).exists()
+    assert not journal_path(store).exists()
 
 
 # -- the journal and the store ----------------------------------------------------------------------------------------
@@ -551,17 +551,17 @@ def test_journal_ignores_truncated_lines_only(tmp_path):
     store = tmp_path / "r.zarr"
     with Journal(store, PLAN.to_dict()) as journal:
         for point in range(3):
-            journal.add(Record(point, {"a": 0.1 + point, "curve": values_of("c", np.arange(3.0))["c"]}, "", "µ"))
-    complete = journal_of(store).read_bytes()
+            journal.add(Record(point, {"a": 0.1 + point, "curve": to_values("c", np.arange(3.0))["c"]}, "", "µ"))
+    complete = journal_path(store).read_bytes()
     for n_cut in (1, 20, 60):
-        journal_of(store).write_bytes(complete[:-n_cut])
+        journal_path(store).write_bytes(complete[:-n_cut])
         with Journal(store, PLAN.to_dict()) as journal:
             assert sorted(journal.records) == [0, 1]
             assert journal.records[1].values["a"] == 1.1
             np.testing.assert_array_equal(journal.records[1].values["curve"].data, np.arange(3.0))
     damaged = bytearray(complete)
     damaged[complete.index(b'"a": 1.1') + 5] ^= 1
-    journal_of(store).write_bytes(damaged)
+    journal_path(store).write_bytes(damaged)
     with Journal(store, PLAN.to_dict()) as journal:
         assert sorted(journal.records) == [0, 2]
 
@@ -569,15 +569,15 @@ def test_journal_ignores_truncated_lines_only(tmp_path):
 def test_journal_with_truncated_header_is_restarted(tmp_path):
     store = tmp_path / "r.zarr"
     with Journal(store, PLAN.to_dict()) as journal:
-        head = journal_of(store).read_bytes()
+        head = journal_path(store).read_bytes()
     for torn in (head[:40], head[:-1], b"\0" * 100, b""):
-        journal_of(store).write_bytes(torn)
+        journal_path(store).write_bytes(torn)
         with Journal(store, PLAN.to_dict()) as journal:
             assert journal.records == {}
             journal.add(Record(0, {"a": 1.0}))
         with Journal(store, PLAN.to_dict()) as journal:
             assert sorted(journal.records) == [0]
-        journal_of(store).unlink()
+        journal_path(store).unlink()
 
 
 def test_full_disk_leaves_valid_journal(tmp_path, monkeypatch):
@@ -606,7 +606,7 @@ def test_sweep_store_is_locked(tmp_path):
 
 def test_store_of_other_sweep_is_unchanged(tmp_path):
     store = tmp_path / "r.zarr"
-    write_store(dataset_of(PLAN, {}), store)
+    write_store(to_dataset(PLAN, {}), store)
     other = explore.plan_sweep(SHOT, {"sensor.bits": [8, 9, 12]})
 
     with pytest.raises(FileError, match=r"belongs to another sweep or study: 'vary\.sensor\.bits' differs"):
@@ -631,11 +631,11 @@ def test_equally_named_metrics_are_distinguished(tmp_path):
 
 @pytest.mark.parametrize("text", ["my notes", "my notes\n", "{}\n{}\n", "cafe", '{"format": "foveasim'])
 def test_invalid_journal_file_is_unchanged(tmp_path, text):
-    journal_of(tmp_path / "r.zarr").write_text(text)
+    journal_path(tmp_path / "r.zarr").write_text(text)
 
     with pytest.raises(FileError, match="is not a sweep journal"):
         explore.run_sweep(PLAN, out=tmp_path / "r.zarr")
-    assert journal_of(tmp_path / "r.zarr").read_text() == text
+    assert journal_path(tmp_path / "r.zarr").read_text() == text
 
 
 # -- contents of results ----------------------------------------------------------------------------------------------
@@ -643,7 +643,7 @@ def test_invalid_journal_file_is_unchanged(tmp_path, text):
 
 def test_xarray_opens_store_without_warning(tmp_path):
     records = {k: Record(k, {"a": 1.0, "path": "ab"[k]}) for k in range(2)}
-    found = dataset_of(explore.plan_sweep(SHOT, {"sensor.bits": [8, 9]}), records)
+    found = to_dataset(explore.plan_sweep(SHOT, {"sensor.bits": [8, 9]}), records)
     write_store(found, tmp_path / "r.zarr")  # warnings are errors here, too
 
     with xr.open_zarr(tmp_path / "r.zarr") as opened:
@@ -655,12 +655,12 @@ def test_arrays_are_aligned_or_padded():
     two = xr.DataArray([3.0, 4.0], dims="colour", coords={"colour": ["green", "blue"]})
     records = {
         k: Record(
-            k, values_of("c", array) | values_of("m", {"n": k, "path": "ab"[k]}) | values_of("v", np.arange(k + 1))
+            k, to_values("c", array) | to_values("m", {"n": k, "path": "ab"[k]}) | to_values("v", np.arange(k + 1))
         )
         for k, array in enumerate((one, two))
     }
 
-    found = dataset_of(explore.plan_sweep(SHOT, {"sensor.bits": [8, 9]}), records)
+    found = to_dataset(explore.plan_sweep(SHOT, {"sensor.bits": [8, 9]}), records)
 
     assert found["colour"].values.tolist() == ["red", "green", "blue"]
     np.testing.assert_array_equal(found["c"], [[1.0, 2.0, np.nan], [np.nan, 3.0, 4.0]])
@@ -697,21 +697,21 @@ UNUSUAL = {
 @pytest.mark.parametrize("kind", UNUSUAL)
 def test_unusual_results_are_stored_and_read(kind, tmp_path):
     plan = explore.plan_sweep(SHOT, {"exposure_s": [0.01, 0.02]}, repeats=2)
-    records = {k: Record(k, values_of("odd", UNUSUAL[kind](k % 2))) for k in range(plan.n_points)}
+    records = {k: Record(k, to_values("odd", UNUSUAL[kind](k % 2))) for k in range(plan.n_points)}
     with Journal(tmp_path / "r.zarr", plan.to_dict()) as journal:
         for record in records.values():
             journal.add(record)
     with Journal(tmp_path / "r.zarr", plan.to_dict()) as journal:
-        found = dataset_of(plan, journal.records)
+        found = to_dataset(plan, journal.records)
     write_store(found, tmp_path / "r.zarr")
 
     assert_identical(explore.open_results(tmp_path / "r.zarr"), found)
-    assert_identical(dataset_of(plan, records), found)
+    assert_identical(to_dataset(plan, records), found)
     assert (found["error"] == "").all()
     names = [name for name in found.data_vars if name.startswith("odd")]
     assert names
     for name in names:
-        given = values_of("odd", UNUSUAL[kind](1))[name]
+        given = to_values("odd", UNUSUAL[kind](1))[name]
         data = np.asarray(getattr(given, "data", given))
         stored = found[name].values[0, 1]
         if data.dtype.kind == "U":
@@ -740,20 +740,20 @@ def test_unusual_results_are_stored_and_read(kind, tmp_path):
 )
 def test_unsupported_results_are_rejected(given, message):
     with pytest.raises(ParameterError, match=message):
-        values_of("m", given)
+        to_values("m", given)
 
 
 def test_results_with_differing_dimensions_are_reported():
     plan = explore.plan_sweep(SHOT, {"sensor.bits": [8, 9, 10, 11]})
     given = [3.0, np.arange(2.0), 4.0, xr.DataArray([1.0], dims="x", coords={"x": [1]})]
-    records = {k: Record(k, values_of("m", one), "failed" if k == 3 else "") for k, one in enumerate(given)}
+    records = {k: Record(k, to_values("m", one), "failed" if k == 3 else "") for k, one in enumerate(given)}
 
-    found = dataset_of(plan, records)
+    found = to_dataset(plan, records)
 
     np.testing.assert_array_equal(found["m"], [3.0, np.nan, 4.0, np.nan])
     message = "m: has other dimensions or labels than in most points, which have none"
     assert found["error"].values.tolist() == ["", message, "", f"failed; {message}"]
-    many = dataset_of(plan, {k: Record(k, values_of("m", given[1] if k else 3.0)) for k in range(4)})
+    many = to_dataset(plan, {k: Record(k, to_values("m", given[1] if k else 3.0)) for k in range(4)})
     assert many["m"].shape == (4, 2)
     assert np.isnan(many["m"][0]).all()
 
@@ -797,12 +797,12 @@ def test_shared_components_are_built_once():
     order, _ = plan.order()
     shared = {int(point): runner.record(point, plan.settings_of(point)) for point in order}
 
-    assert {part: runner.cache.n_made[part] for part in ("scene", "layout", "optics", "images", "light on sites")} == {
+    assert {part: runner.cache.n_built[part] for part in ("scene", "layout", "optics", "images", "power on sites")} == {
         "scene": 1,
         "layout": 2,
         "optics": 2,
         "images": 2,
-        "light on sites": 4,
+        "power on sites": 4,
     }
     small = runner_of(plan, max_bytes=0)
     for point in (0, 199, 57):
@@ -819,7 +819,7 @@ def test_cache_is_limited_in_memory(max_bytes):
         runner.record(point, plan.settings_of(point))
         parts = runner.cache._parts
         new = set(parts) - before
-        assert {part for part, _ in new} >= {"layout", "sensor", "camera", "light on sites"}
+        assert {part for part, _ in new} >= {"layout", "sensor", "camera", "power on sites"}
         sizes.append(sum(part.n_bytes for part in parts.values()))
         least = sum(
             part.n_bytes for key, part in parts.items() if key in new or key[0] in {"scene", "optics", "images"}
@@ -1092,10 +1092,10 @@ def attempt(address, arguments, function):
 def test_only_owner_runs_code_on_local_workers(certificate, tmp_path):
     from distributed import Security
 
-    from foveasim.explore.cluster import client_of
+    from foveasim.explore.cluster import open_client
 
     mark = tmp_path / "mark"
-    with client_of(None, 1) as client:
+    with open_client(None, 1) as client:
         info = client.scheduler_info(n_workers=-1)["workers"]
         addresses = {client.scheduler.address, *info, *(one["nanny"] for one in info.values())}
         assert len(addresses) == 3
@@ -1115,9 +1115,9 @@ def test_only_owner_runs_code_on_local_workers(certificate, tmp_path):
 
 
 def test_local_cluster_answers_nothing_over_http():
-    from foveasim.explore.cluster import client_of
+    from foveasim.explore.cluster import open_client
 
-    with client_of(None, 1) as client:
+    with open_client(None, 1) as client:
         cluster = client.cluster
         ports = [cluster.scheduler.http_server.port] if getattr(cluster.scheduler, "http_server", None) else []
         for worker in client.scheduler_info(n_workers=-1)["workers"].values():

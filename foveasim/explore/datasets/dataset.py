@@ -24,9 +24,9 @@ from foveasim.capture import Capture
 from foveasim.config import Shot, build_shot, check_settings, put_setting, read_settings, resolve_files
 from foveasim.errors import ConfigError, FileError, FoveasimError, FoveasimWarning, ParameterError, SimulationError
 from foveasim.explore._files import digests
-from foveasim.explore.datasets.distributions import LEAST, MOST, Draw, parse_distribution
+from foveasim.explore.datasets.distributions import MAX_INTEGER, MIN_INTEGER, Distribution, parse_distribution
 from foveasim.explore.datasets.labels import (
-    NOTHING,
+    NO_CLASS,
     boxes_on_sites,
     check_per_picture,
     flow_on_sites,
@@ -45,9 +45,9 @@ __all__ = ["FIELDS", "Dataset"]
 #: Quantities per site that samples may contain.
 FIELDS = ("code", "electrons", "expected_e", "expected_dn")
 #: Number of cached components of each kind per process, the most recently used.
-KEPT = 4
+MAX_CACHED = 4
 #: Largest number of values of each setting that are checked before the first sample.
-TRIED_VALUES = 64
+CHECKED_VALUES = 64
 #: Upper limit of cameras and draws, beyond any feasible computation.
 MAX_REPEATS = 10**9
 #: Setting that determines the photosites.
@@ -164,7 +164,7 @@ class Dataset:
         self._n_threads = check_count("n_threads", n_threads)
         self._pictures = source_of(pictures)
         n = len(self._pictures)
-        self._labels, self.class_names = _numbered(self._pictures.labels() if labels is None else labels, n)
+        self._labels, self.class_names = _number_classes(self._pictures.labels() if labels is None else labels, n)
         self._boxes = None
         if boxes is not None:
             each = check_per_picture("boxes", boxes, n)
@@ -175,26 +175,28 @@ class Dataset:
             check_choice("fit", fit, ("cover", "contain"))
         self._fit = fit
         self._files: list[Path] = []
-        self._file, self._settings = _base(shot, Path(source), changes or {}, self._files, is_fitted=fit is not None)
-        self._draws = _draws(self._file, vary or {}, self._files, is_fitted=fit is not None)
-        self._begin()
+        self._file, self._settings = _base_settings(
+            shot, Path(source), changes or {}, self._files, is_fitted=fit is not None
+        )
+        self._distributions = _parse_distributions(self._file, vary or {}, self._files, is_fitted=fit is not None)
+        self._reset()
         self._fit_um = (0.0, 0.0, 1.0)
         self._code_type: Any = np.uint8
-        self._try_ends()
+        self._check_bounds()
 
-    def _begin(self) -> None:
+    def _reset(self) -> None:
         """Initialise the state of a process: caches and warnings."""
-        self._kept: dict[str, OrderedDict[str, tuple[Any, list[Warning]]]] = {}
-        self._told: list[Warning] = []
+        self._cache: dict[str, OrderedDict[str, tuple[Any, list[Warning]]]] = {}
+        self._messages: list[Warning] = []
         self._has_warned = False
 
     def __getstate__(self) -> dict[str, Any]:
-        own = ("_kept", "_told", "_has_warned", "layout")
-        return {name: value for name, value in self.__dict__.items() if name not in own}
+        excluded = ("_cache", "_messages", "_has_warned", "layout")
+        return {name: value for name, value in self.__dict__.items() if name not in excluded}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._begin()
+        self._reset()
 
     def __repr__(self) -> str:
         return (
@@ -221,19 +223,19 @@ class Dataset:
         FileError, SimulationError
             When the picture of the sample cannot be read, or its camera cannot be built.
         """
-        return self._at(index, self._sample)
+        return self._evaluate(index, self._sample)
 
     def capture(self, index: int) -> Capture:
         """Simulate a sample and return its capture."""
-        return self._at(index, lambda index: self._captured(index)[1])
+        return self._evaluate(index, lambda index: self._capture(index)[1])
 
     def shot(self, index: int) -> Shot:
         """Return the camera and scene of a sample; its noise uses ``seed`` and frame ``index``."""
-        return self._at(index, self._shot)
+        return self._evaluate(index, self._shot)
 
     def settings_of(self, index: int) -> dict[str, Any]:
         """Return all settings of a sample in the structure of a settings file."""
-        return self._at(index, self._settings_of)
+        return self._evaluate(index, self._settings_of)
 
     @cached_property
     def layout(self) -> Layout:
@@ -254,7 +256,7 @@ class Dataset:
     @property
     def is_layout_varied(self) -> bool:
         """Whether samples have different layouts."""
-        return any(path == LAYOUT or path.startswith(LAYOUT + ".") for path in self._draws)
+        return any(path == LAYOUT or path.startswith(LAYOUT + ".") for path in self._distributions)
 
     def to_dict(self) -> dict[str, Any]:
         """
@@ -271,7 +273,7 @@ class Dataset:
         return {
             "pictures": self._pictures.to_dict(),
             "settings": self._settings,
-            "vary": {path: draw.to_dict() for path, draw in self._draws.items()},
+            "vary": {path: distribution.to_dict() for path, distribution in self._distributions.items()},
             "cameras": self.cameras,
             "draws": self.draws,
             "seed": self.seed,
@@ -291,11 +293,11 @@ class Dataset:
         contribute.
         """
         numbers = range(self._picture_of(samples[0]), self._picture_of(samples[-1]) + 1)
-        of_pictures = self._pixels_digest if self._pictures.is_lazy else self._pictures.digest
-        found = [of_pictures(k) for k in (_ends(numbers) if self._pictures.is_lazy else numbers)]
+        digest_picture = self._pixels_digest if self._pictures.is_lazy else self._pictures.digest
+        found = [digest_picture(k) for k in (_first_and_last(numbers) if self._pictures.is_lazy else numbers)]
         for each in (self._masks, self._flows):
             if each is not None:
-                found += [digest_of(each[k]) for k in (_ends(numbers) if is_lazy(each) else numbers)]
+                found += [digest_of(each[k]) for k in (_first_and_last(numbers) if is_lazy(each) else numbers)]
         return hashlib.sha256("\n".join(found).encode()).hexdigest()
 
     def _pixels_digest(self, picture: int) -> str:
@@ -306,22 +308,22 @@ class Dataset:
 
     # -- a sample -----------------------------------------------------------------------------------------------------
 
-    def _at(self, index: int, what: Callable[[int], Any]) -> Any:
+    def _evaluate(self, index: int, function: Callable[[int], Any]) -> Any:
         """Evaluate a function of a sample index, with the sample in the messages of errors."""
-        place = operator.index(index)
-        if not -len(self) <= place < len(self):
-            raise IndexError(f"sample index {place} is out of range for {len(self)} samples")
-        place %= len(self)
+        position = operator.index(index)
+        if not -len(self) <= position < len(self):
+            raise IndexError(f"sample index {position} is out of range for {len(self)} samples")
+        position %= len(self)
         try:
-            return what(place)
+            return function(position)
         except FoveasimError as error:
-            raise self._with_sample_name(place, error) from None
+            raise self._with_sample_name(position, error) from None
 
     def _with_sample_name(self, index: int, error: FoveasimError) -> FoveasimError:
-        which = f"sample {index} ({self._name_of(index)})"
+        label = f"sample {index} ({self._name_of(index)})"
         if isinstance(error, ConfigError):
-            return ConfigError(error.path, f"{which}: {str(error).removeprefix(f'{error.path}: ')}")
-        return error if isinstance(error, FileError) else SimulationError(f"{which}: {error}")
+            return ConfigError(error.path, f"{label}: {str(error).removeprefix(f'{error.path}: ')}")
+        return error if isinstance(error, FileError) else SimulationError(f"{label}: {error}")
 
     def _name_of(self, index: int) -> str:
         return self._pictures.name(self._picture_of(index))
@@ -329,16 +331,19 @@ class Dataset:
     def _picture_of(self, index: int) -> int:
         return index // (self.cameras * self.draws)
 
-    def _drawn(self, index: int) -> dict[str, tuple[Any, int | float]]:
+    def _sample_settings(self, index: int) -> dict[str, tuple[Any, int | float]]:
         """Return the random settings of a sample: value and number by path."""
-        return {path: draw.at(self.seed, index // self.draws) for path, draw in self._draws.items()}
+        return {
+            path: distribution.sample(self.seed, index // self.draws)
+            for path, distribution in self._distributions.items()
+        }
 
     def _settings_of(self, index: int) -> dict[str, Any]:
-        return self._with(index, {path: value for path, (value, _) in self._drawn(index).items()})
+        return self._settings_with(index, {path: value for path, (value, _) in self._sample_settings(index).items()})
 
-    def _with(self, index: int, values: Mapping[str, Any]) -> dict[str, Any]:
+    def _settings_with(self, index: int, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the settings with the given values and the picture of a sample."""
-        data = _copied(self._settings)
+        data = _copy(self._settings)
         data["scene"]["picture"] = self._name_of(index)
         if self._fit is not None:
             half_x_um, half_y_um, magnification = self._fit_um
@@ -349,33 +354,33 @@ class Dataset:
             put_setting(self._file, data, path, value)
         return data
 
-    def _keep(self, part: str, settings: Any, make: Callable[[], Any]) -> Any:
+    def _cached(self, part: str, settings: Any, make: Callable[[], Any]) -> Any:
         """
         Return the component with the given settings, from the cache or newly built.
 
         The warnings of its construction are stored with it, so that every sample that uses it reports them.
         """
-        parts = self._kept.setdefault(part, OrderedDict())
+        parts = self._cache.setdefault(part, OrderedDict())
         key = json.dumps(settings, sort_keys=True)
         if key not in parts:
-            with _caught_warnings() as caught:
-                made = make()
-            parts[key] = made, [_warning(each.message) for each in caught]
-            if len(parts) > KEPT:
+            with _record_warnings() as caught:
+                value = make()
+            parts[key] = value, [_as_warning(each.message) for each in caught]
+            if len(parts) > MAX_CACHED:
                 parts.popitem(last=False)
         parts.move_to_end(key)
-        made, told = parts[key]
-        self._told += told
-        return made
+        value, messages = parts[key]
+        self._messages += messages
+        return value
 
     def _pixels(self, picture: int) -> NDArray[Any]:
-        pixels: NDArray[Any] = self._keep("picture", picture, lambda: self._pictures.picture(picture))
+        pixels: NDArray[Any] = self._cached("picture", picture, lambda: self._pictures.picture(picture))
         return pixels
 
     def _shot(self, index: int) -> Shot:
-        return self._built(index, self._settings_of(index))
+        return self._build(index, self._settings_of(index))
 
-    def _built(self, index: int, settings: Mapping[str, Any]) -> Shot:
+    def _build(self, index: int, settings: Mapping[str, Any]) -> Shot:
         picture = self._picture_of(index)
 
         def scene() -> Scene:
@@ -385,42 +390,46 @@ class Dataset:
             except ParameterError as error:
                 raise FileError(self._name_of(index), f"is not a valid picture for these settings: {error}") from None
 
-        def keep(part: str, told: Any, make: Callable[[], Any]) -> Any:
-            return self._keep(part, [picture, told], scene) if part == "scene" else self._keep(part, told, make)
+        def cache(part: str, part_settings: Any, make: Callable[[], Any]) -> Any:
+            return (
+                self._cached(part, [picture, part_settings], scene)
+                if part == "scene"
+                else self._cached(part, part_settings, make)
+            )
 
-        return build_shot(self._file, settings, n_threads=self._n_threads, cache=keep)
+        return build_shot(self._file, settings, n_threads=self._n_threads, cache=cache)
 
-    def _captured(self, index: int) -> tuple[Shot, Capture]:
+    def _capture(self, index: int) -> tuple[Shot, Capture]:
         settings = self._settings_of(index)
-        shot = self._built(index, settings)
+        shot = self._build(index, settings)
         camera, sensor, scene = shot.camera, shot.camera.sensor, shot.scene
         sums = [sensor.responsivity_e_per_j(scene.wavelength_nm), sensor.filter_of_site]
-        light = [
+        power_settings = [
             self._picture_of(index),
             *(settings.get(part) for part in ("scene", "optics", "distortion", "layout", "integration_order")),
             *(hashlib.sha256(each.tobytes()).hexdigest() for each in sums),
         ]
-        photo_e_per_s = self._keep("light", light, lambda: camera.photoelectrons_per_s(scene))
+        photo_e_per_s = self._cached("power", power_settings, lambda: camera.photoelectrons_per_s(scene))
         capture = camera.capture(
             scene, exposure_s=shot.exposure_s, seed=self.seed, frame=index, photo_e_per_s=photo_e_per_s
         )
         return shot, capture
 
     def _sample(self, index: int) -> dict[str, Any]:
-        self._told = []
-        with _caught_warnings() as caught:
-            drawn = self._drawn(index)
-            shot, capture = self._captured(index)
+        self._messages = []
+        with _record_warnings() as caught:
+            sampled = self._sample_settings(index)
+            shot, capture = self._capture(index)
             sample: dict[str, Any] = {"index": index, "picture": self._picture_of(index)}
             sample |= {field: self._field(field, index, shot, capture) for field in self.fields}
             sample |= self._site_labels(index, shot)
-        told = [*self._told, *(_warning(each.message) for each in caught)]
-        if told and not self._has_warned:
+        messages = [*self._messages, *(_as_warning(each.message) for each in caught)]
+        if messages and not self._has_warned:
             self._has_warned = True
-            text = f"sample {index}: {told[0]}; further warnings are in the item 'warning' of each sample"
-            warnings.warn(text, type(told[0]), stacklevel=4)
-        sample["settings"] = {path: number for path, (_, number) in drawn.items()}
-        sample["warning"] = "; ".join(dict.fromkeys(str(each) for each in told))
+            message = f"sample {index}: {messages[0]}; further warnings are in the item 'warning' of each sample"
+            warnings.warn(message, type(messages[0]), stacklevel=4)
+        sample["settings"] = {path: number for path, (_, number) in sampled.items()}
+        sample["warning"] = "; ".join(dict.fromkeys(str(each) for each in messages))
         return sample
 
     def _field(self, field: str, index: int, shot: Shot, capture: Capture) -> NDArray[Any]:
@@ -429,7 +438,7 @@ class Dataset:
         if field == "expected_dn":
             # Equal for all draws of a camera.
             predict = partial(shot.camera.sensor.predict, capture.expected_e, n_threads=self._n_threads)
-            return np.array(self._keep("prediction", index // self.draws, predict)[0])
+            return np.array(self._cached("prediction", index // self.draws, predict)[0])
         return np.array(getattr(capture, field))
 
     def _site_labels(self, index: int, shot: Shot) -> dict[str, Any]:
@@ -447,10 +456,10 @@ class Dataset:
         if self._boxes is not None:
             boxes_px, classes = self._boxes[picture]
             on_sites = boxes_on_sites(boxes_px, integrator, lens)
-            n_most = max(len(each) for each, _ in self._boxes)
-            found["box_um"] = _filled(on_sites.box_um, n_most, 0.0)
-            found["box_label"] = _filled(classes, n_most, NOTHING)
-            found["box_covers"] = _filled(on_sites.covers, n_most, False)
+            max_boxes = max(len(each) for each, _ in self._boxes)
+            found["box_um"] = _pad(on_sites.box_um, max_boxes, 0.0)
+            found["box_label"] = _pad(classes, max_boxes, NO_CLASS)
+            found["box_covers"] = _pad(on_sites.covers, max_boxes, False)
         if self._masks is not None:
             mask = read_mask(self._masks[picture], f"mask {where}", grid.shape)
             found["mask"] = mask_on_sites(mask, integrator)
@@ -461,10 +470,10 @@ class Dataset:
 
     # -- before the first sample --------------------------------------------------------------------------------------
 
-    def _try_ends(self) -> None:
+    def _check_bounds(self) -> None:
         """Build the first shot at the bounds of every setting, to detect errors early."""
         try:
-            base = self._built(0, self._with(0, {}) if self._fit is None else self._unfitted())
+            base = self._build(0, self._settings_with(0, {}) if self._fit is None else self._unscaled_settings())
             layout, scene = base.camera.sensor.layout, base.scene
             if self._fit is not None:
                 assert isinstance(layout, Layout)
@@ -475,28 +484,28 @@ class Dataset:
                 x0, y0, x1, y1 = layout.bounds_um
                 half_um = max(x1 - x_um, x_um - x0), max(y1 - y_um, y_um - y0)
                 self._fit_um = (*half_um, base.camera.optics.magnification(scene.distance_m))
-            first = {path: draw.ends[0] for path, draw in self._draws.items()}
-            most_bits = self._tried(first)
-            for path, draw in self._draws.items():
-                for value in draw.ends[1:TRIED_VALUES]:
-                    most_bits = max(most_bits, self._tried(first | {path: value}))
-            self._code_type = np.uint8 if most_bits <= 8 else np.uint16
+            first = {path: distribution.bounds[0] for path, distribution in self._distributions.items()}
+            max_bits = self._check_values(first)
+            for path, distribution in self._distributions.items():
+                for value in distribution.bounds[1:CHECKED_VALUES]:
+                    max_bits = max(max_bits, self._check_values(first | {path: value}))
+            self._code_type = np.uint8 if max_bits <= 8 else np.uint16
         finally:
-            self._begin()
+            self._reset()
 
-    def _unfitted(self) -> dict[str, Any]:
-        data = _copied(self._settings)
+    def _unscaled_settings(self) -> dict[str, Any]:
+        data = _copy(self._settings)
         data["scene"]["picture"] = self._name_of(0)
         return data
 
-    def _tried(self, values: Mapping[str, Any]) -> int:
+    def _check_values(self, values: Mapping[str, Any]) -> int:
         """Build the shot of the first picture with the given values and return its bit depth."""
-        settings = self._with(0, values)
+        settings = self._settings_with(0, values)
         check_settings(self._file, settings)
-        return self._built(0, settings).camera.sensor.bits
+        return self._build(0, settings).camera.sensor.bits
 
 
-def _base(
+def _base_settings(
     shot: str | Path | Mapping[str, Any],
     source: Path,
     changes: Mapping[str, Any],
@@ -510,7 +519,7 @@ def _base(
     The referenced files are appended to ``found``.
     """
     if isinstance(shot, Mapping):
-        file, data = source, _copied(shot)
+        file, data = source, _copy(shot)
     elif isinstance(shot, str | Path):
         file = Path(shot)
         data = read_settings(file)
@@ -529,12 +538,12 @@ def _base(
         put_setting(file, data, path, resolve_files(Path(), value, path, found))
     data.pop("seed", None)
     try:
-        return file, json.loads(json.dumps(data, default=_plain))
+        return file, json.loads(json.dumps(data, default=_to_plain_data))
     except (TypeError, ValueError, RecursionError) as error:
         raise ConfigError(file, f"must contain only numbers, strings, lists and mappings ({error})") from None
 
 
-def _plain(value: Any) -> Any:
+def _to_plain_data(value: Any) -> Any:
     """Convert numpy and path objects in settings to plain data."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
@@ -543,24 +552,26 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"got a {type(value).__name__}")
 
 
-def _draws(file: Path, vary: Mapping[str, Any], found: list[Path], *, is_fitted: bool) -> dict[str, Draw]:
+def _parse_distributions(
+    file: Path, vary: Mapping[str, Any], found: list[Path], *, is_fitted: bool
+) -> dict[str, Distribution]:
     if not isinstance(vary, Mapping):
         raise ParameterError("vary", "must be a mapping of setting paths to distributions", vary)
-    draws = {str(path): parse_distribution(str(path), told) for path, told in vary.items()}
-    check_disjoint(file, draws)
-    for path, draw in draws.items():
-        if draw.kind == "choice":
-            draws[path] = replace(
-                draw, values=tuple(resolve_files(Path(), value, path, found) for value in draw.values)
+    distributions = {str(path): parse_distribution(str(path), spec) for path, spec in vary.items()}
+    check_disjoint(file, distributions)
+    for path, distribution in distributions.items():
+        if distribution.kind == "choice":
+            distributions[path] = replace(
+                distribution, values=tuple(resolve_files(Path(), value, path, found) for value in distribution.values)
             )
         if path in ("seed", "scene", "scene.kind", "scene.picture"):
             raise ParameterError(path, "must not vary: the dataset has its own seed and its own pictures")
         if is_fitted and path == "scene.pitch_um":
             raise ParameterError(path, "must not vary with 'fit', which sets it")
-    return draws
+    return distributions
 
 
-def _numbered(labels: Any, n: int) -> tuple[list[int] | None, list[str] | None]:
+def _number_classes(labels: Any, n: int) -> tuple[list[int] | None, list[str] | None]:
     """Return the classes of the pictures as numbers, and the names of string classes."""
     if labels is None:
         return None, None
@@ -568,7 +579,7 @@ def _numbered(labels: Any, n: int) -> tuple[list[int] | None, list[str] | None]:
     values = [value.item() if isinstance(value, np.generic) else value for value in (each[k] for k in range(n))]
     if all(isinstance(value, int) for value in values):
         for value in values:
-            check_count("labels", int(value), at_least=LEAST, at_most=MOST)
+            check_count("labels", int(value), at_least=MIN_INTEGER, at_most=MAX_INTEGER)
         return [int(value) for value in values], None
     if all(isinstance(value, str) for value in values):
         names = sorted(set(values))
@@ -577,19 +588,19 @@ def _numbered(labels: Any, n: int) -> tuple[list[int] | None, list[str] | None]:
     raise ParameterError("labels", "must all be integers, or all be strings", values)
 
 
-def _ends(numbers: range) -> list[int]:
+def _first_and_last(numbers: range) -> list[int]:
     """Return the first and the last number."""
     return [*dict.fromkeys((numbers[0], numbers[-1]))]
 
 
-def _filled(array: NDArray[Any], n: int, value: Any) -> NDArray[Any]:
+def _pad(array: NDArray[Any], n: int, value: Any) -> NDArray[Any]:
     """Pad an array with rows of one value to ``n`` rows."""
-    rest = np.full((n - len(array), *array.shape[1:]), value, array.dtype)
-    return np.concatenate((array, rest))
+    padding = np.full((n - len(array), *array.shape[1:]), value, array.dtype)
+    return np.concatenate((array, padding))
 
 
 @contextmanager
-def _caught_warnings() -> Iterator[list[warnings.WarningMessage]]:
+def _record_warnings() -> Iterator[list[warnings.WarningMessage]]:
     """Record all warnings except ResourceWarning, which garbage collection emits at any time."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -597,10 +608,10 @@ def _caught_warnings() -> Iterator[list[warnings.WarningMessage]]:
         yield caught
 
 
-def _warning(message: Warning | str) -> Warning:
+def _as_warning(message: Warning | str) -> Warning:
     return message if isinstance(message, Warning) else FoveasimWarning(message)
 
 
-def _copied(data: Mapping[str, Any]) -> dict[str, Any]:
+def _copy(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return a copy of settings with new mappings; lists are shared."""
-    return {key: _copied(value) if isinstance(value, Mapping) else value for key, value in data.items()}
+    return {key: _copy(value) if isinstance(value, Mapping) else value for key, value in data.items()}

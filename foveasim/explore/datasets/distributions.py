@@ -16,7 +16,7 @@ from foveasim._core.random_streams import Streams
 from foveasim._core.validation import check_count, check_number, finite_array
 from foveasim.errors import ParameterError
 
-__all__ = ["Draw", "parse_distribution"]
+__all__ = ["Distribution", "parse_distribution"]
 
 #: Kinds of distributions and their parameters.
 FORMS = {
@@ -27,13 +27,13 @@ FORMS = {
     "choice": "a list of values",
 }
 #: Largest ratio of the standard deviation to high - low: beyond it, rounding leaves few distinct values.
-WIDEST = 1e6
+MAX_SIGMA_RATIO = 1e6
 #: Range of the integers of a choice: 64 bits, the type of the arrays of samples.
-LEAST, MOST = -(2**63), 2**63 - 1
+MIN_INTEGER, MAX_INTEGER = -(2**63), 2**63 - 1
 
 
 @dataclass(frozen=True)
-class Draw:
+class Distribution:
     """
     Distribution of one setting.
 
@@ -68,33 +68,33 @@ class Draw:
         return int if self.kind == "integers" else float
 
     @property
-    def ends(self) -> tuple[Any, ...]:
+    def bounds(self) -> tuple[Any, ...]:
         """Values that are checked before the first sample: both bounds, or every choice."""
         return self.values if self.kind == "choice" else self.values[-2:]
 
-    def at(self, seed: int, camera: int) -> tuple[Any, int | float]:
+    def sample(self, seed: int, camera: int) -> tuple[Any, int | float]:
         """
         Return the value of the setting for one camera, and the number that samples contain.
 
         Both depend on the seed, the number of the camera and the path only, not on other random settings.
         """
-        share = float(Streams(seed, camera).of(f"setting {self.path}").random())
+        u = float(Streams(seed, camera).of(f"setting {self.path}").random())
         if self.kind == "choice":
-            edges = np.cumsum(np.ones(len(self.values)) if self.weights is None else self.weights)
-            place = int(np.searchsorted(edges, share * edges[-1], side="right"))
-            return self.values[place], self.number_type(self.values[place] if self.is_numeric else place)
+            cumulative = np.cumsum(np.ones(len(self.values)) if self.weights is None else self.weights)
+            index = int(np.searchsorted(cumulative, u * cumulative[-1], side="right"))
+            return self.values[index], self.number_type(self.values[index] if self.is_numeric else index)
         low, high = self.values[-2:]
         if self.kind == "integers":
-            number: int | float = low + int(share * (high - low + 1))
+            number: int | float = low + int(u * (high - low + 1))
         elif self.kind == "uniform":
-            number = low + share * (high - low)
+            number = low + u * (high - low)
         elif self.kind == "log_uniform":
-            number = math.exp(math.log(low) + share * (math.log(high) - math.log(low)))
+            number = math.exp(math.log(low) + u * (math.log(high) - math.log(low)))
         else:
             mean, sigma = self.values[:2]
             with np.errstate(over="ignore"):  # bounds far from the mean
                 below, above = ndtr((np.array([low, high]) - mean) / sigma)
-            number = mean + sigma * float(ndtri(below + share * (above - below)))
+            number = mean + sigma * float(ndtri(below + u * (above - below)))
         number = min(max(number, low), high)  # rounding
         return number, number
 
@@ -103,7 +103,7 @@ class Draw:
         return {self.kind: list(self.values)} | ({} if self.weights is None else {"weights": list(self.weights)})
 
 
-def parse_distribution(path: str, spec: Any) -> Draw:
+def parse_distribution(path: str, spec: Any) -> Distribution:
     """
     Create the distribution of a setting from plain data.
 
@@ -118,7 +118,7 @@ def parse_distribution(path: str, spec: Any) -> Draw:
 
     Returns
     -------
-    Draw
+    Distribution
 
     Raises
     ------
@@ -127,9 +127,9 @@ def parse_distribution(path: str, spec: Any) -> Draw:
 
     Examples
     --------
-    >>> parse_distribution("sensor.bits", {"choice": [8, 10]}).ends
+    >>> parse_distribution("sensor.bits", {"choice": [8, 10]}).bounds
     (8, 10)
-    >>> 1.4 <= parse_distribution("optics.f_number", {"log_uniform": [1.4, 8.0]}).at(seed=0, camera=3)[0] <= 8.0
+    >>> 1.4 <= parse_distribution("optics.f_number", {"log_uniform": [1.4, 8.0]}).sample(seed=0, camera=3)[0] <= 8.0
     True
     """
     known = "; ".join(f"{kind}: {form}" for kind, form in FORMS.items())
@@ -161,26 +161,28 @@ def parse_distribution(path: str, spec: Any) -> Draw:
         # With a mean outside the bounds, rounding would leave few distinct values between them.
         if not (sigma > 0.0 and low <= mean <= high):
             raise ParameterError(path, "must have a standard deviation > 0 and a mean between the bounds", spec)
-        if (high - low) * WIDEST < sigma:
-            raise ParameterError(path, f"must have a standard deviation of at most {WIDEST:g} * (high - low)", spec)
-    return Draw(path, kind, numbers)
+        if (high - low) * MAX_SIGMA_RATIO < sigma:
+            raise ParameterError(
+                path, f"must have a standard deviation of at most {MAX_SIGMA_RATIO:g} * (high - low)", spec
+            )
+    return Distribution(path, kind, numbers)
 
 
-def _choice(path: str, values: Sequence[Any] | NDArray[Any], weights: Any) -> Draw:
+def _choice(path: str, values: Sequence[Any] | NDArray[Any], weights: Any) -> Distribution:
     try:
-        plain = json.loads(json.dumps(list(values), default=lambda value: value.tolist()))
+        choices = json.loads(json.dumps(list(values), default=lambda value: value.tolist()))
     except (TypeError, ValueError, AttributeError, RecursionError):
         raise ParameterError(path, "must have numbers, strings, lists or mappings as choices", values) from None
-    if not plain:
+    if not choices:
         raise ParameterError(path, "must have at least one choice")
-    for value in plain:
+    for value in choices:
         if isinstance(value, int | float) and not isinstance(value, bool):
             check_number(path, value)
-        if isinstance(value, int) and not LEAST <= value <= MOST:
+        if isinstance(value, int) and not MIN_INTEGER <= value <= MAX_INTEGER:
             raise ParameterError(path, "must have signed 64-bit integers as choices", value)
     if weights is not None:
-        shares = finite_array(f"weights of {path}", weights, ndim=1, at_least=0.0)
-        if shares.size != len(plain) or not 0.0 < sum(shares.tolist()) < math.inf:
-            raise ParameterError(path, f"must have {len(plain)} weights with a finite sum > 0", weights)
-        return Draw(path, "choice", tuple(plain), tuple(shares.tolist()))
-    return Draw(path, "choice", tuple(plain))
+        relative_weights = finite_array(f"weights of {path}", weights, ndim=1, at_least=0.0)
+        if relative_weights.size != len(choices) or not 0.0 < sum(relative_weights.tolist()) < math.inf:
+            raise ParameterError(path, f"must have {len(choices)} weights with a finite sum > 0", weights)
+        return Distribution(path, "choice", tuple(choices), tuple(relative_weights.tolist()))
+    return Distribution(path, "choice", tuple(choices))

@@ -16,17 +16,17 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from foveasim._core.validation import Floats
 from foveasim.errors import FileError
 
-__all__ = ["FLOW_ENDINGS", "MASK_ENDINGS", "files_of_pictures", "read_boxes", "read_labels"]
+__all__ = ["FLOW_EXTENSIONS", "MASK_EXTENSIONS", "match_label_files", "read_boxes", "read_labels"]
 
 #: Size limit of a label file, bytes: the boxes of 100,000 photographs take half of this.
 MAX_LABEL_BYTES = 1 << 30
 #: Columns of a CSV file of classes.
 PICTURE, LABEL = "picture", "label"
 #: Extensions of masks (lossless formats only) and of optical flow.
-MASK_ENDINGS, FLOW_ENDINGS = (".png", ".bmp", ".tif", ".tiff"), (".npy",)
+MASK_EXTENSIONS, FLOW_EXTENSIONS = (".png", ".bmp", ".tif", ".tiff"), (".npy",)
 #: Left, top, width, height in pixels.
 _Box = tuple[float, float, float, float]
-WHOLE = re.compile(r"[+-]?\d+")
+INTEGER = re.compile(r"[+-]?\d+")
 
 
 def read_labels(path: Path, pictures: Sequence[str]) -> list[int] | list[str]:
@@ -60,23 +60,23 @@ def read_labels(path: Path, pictures: Sequence[str]) -> list[int] | list[str]:
         lines = list(csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True))
     except (UnicodeDecodeError, csv.Error) as error:
         raise FileError(path, f"is not a valid UTF-8 CSV file ({error})") from None
-    head = [name.strip() for name in lines[0]] if lines else []
-    if PICTURE not in head or LABEL not in head:
-        raise FileError(path, f"must have the columns '{PICTURE}' and '{LABEL}' in its first line, got {head}")
-    at_picture, at_label = head.index(PICTURE), head.index(LABEL)
+    header = [name.strip() for name in lines[0]] if lines else []
+    if PICTURE not in header or LABEL not in header:
+        raise FileError(path, f"must have the columns '{PICTURE}' and '{LABEL}' in its first line, got {header}")
+    picture_column, label_column = header.index(PICTURE), header.index(LABEL)
     found: dict[str, str] = {}
     for number, line in enumerate(lines[1:], 2):
         if not line:
             continue
-        if len(line) != len(head):
-            raise FileError(path, f"has {len(line)} values in line {number}, expected {len(head)}")
-        name = line[at_picture].strip()
+        if len(line) != len(header):
+            raise FileError(path, f"has {len(line)} values in line {number}, expected {len(header)}")
+        name = line[picture_column].strip()
         if name in found:
             raise FileError(path, f"lists the picture '{name}' twice, again in line {number}")
-        found[name] = line[at_label].strip()
-    _check_all(path, pictures, found)
+        found[name] = line[label_column].strip()
+    _check_complete(path, pictures, found)
     labels = [found[name] for name in pictures]
-    return [int(label) for label in labels] if all(WHOLE.fullmatch(label) for label in found.values()) else labels
+    return [int(label) for label in labels] if all(INTEGER.fullmatch(label) for label in found.values()) else labels
 
 
 class _CocoImage(BaseModel):
@@ -127,15 +127,15 @@ def read_boxes(path: Path, pictures: Sequence[str]) -> list[Floats]:
         coco = TypeAdapter(_Coco).validate_json(_content(path))
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
-        place = ".".join(map(str, first["loc"]))
+        location = ".".join(map(str, first["loc"]))
         rule = first["msg"].replace("Input should", "must")
-        raise FileError(path, f"is not a valid COCO file ({place + ': ' if place else ''}{rule})") from None
+        raise FileError(path, f"is not a valid COCO file ({location + ': ' if location else ''}{rule})") from None
     numbers: dict[str, int | str] = {}
     for image in coco.images:
         if image.file_name in numbers:
             raise FileError(path, f"lists the picture '{image.file_name}' twice")
         numbers[image.file_name] = image.id
-    _check_all(path, pictures, numbers)
+    _check_complete(path, pictures, numbers)
     boxes: dict[int | str, list[list[float]]] = {numbers[name]: [] for name in pictures}
     for k, annotation in enumerate(coco.annotations):
         if annotation.image_id not in boxes or annotation.iscrowd:
@@ -147,17 +147,17 @@ def read_boxes(path: Path, pictures: Sequence[str]) -> list[Floats]:
     return [np.array(boxes[numbers[name]], np.float64).reshape(-1, 5) for name in pictures]
 
 
-def files_of_pictures(folder: Path, pictures: Sequence[str], endings: Sequence[str]) -> list[Path]:
+def match_label_files(directory: Path, pictures: Sequence[str], extensions: Sequence[str]) -> list[Path]:
     """
     Return the file for each picture, with the same name and another extension.
 
     Parameters
     ----------
-    folder : Path
+    directory : Path
         Directory with the same subdirectories as that of the pictures.
     pictures : sequence of str
         Names of the pictures.
-    endings : sequence of str
+    extensions : sequence of str
         Allowed extensions.
 
     Raises
@@ -165,24 +165,26 @@ def files_of_pictures(folder: Path, pictures: Sequence[str], endings: Sequence[s
     FileError
         When the directory does not exist, or does not contain exactly one file for each picture.
     """
-    if not folder.is_dir():
-        raise FileError(folder, "no such directory" if not folder.exists() else "is not a directory")
+    if not directory.is_dir():
+        raise FileError(directory, "no such directory" if not directory.exists() else "is not a directory")
     found: dict[str, Path] = {}
-    for file in sorted(folder.rglob("*")):
-        if file.suffix.lower() in endings:
-            name = file.relative_to(folder).with_suffix("").as_posix()
+    for file in sorted(directory.rglob("*")):
+        if file.suffix.lower() in extensions:
+            name = file.relative_to(directory).with_suffix("").as_posix()
             if name in found:
-                raise FileError(folder, f"has two files for the picture '{name}': {found[name].name} and {file.name}")
+                raise FileError(
+                    directory, f"has two files for the picture '{name}': {found[name].name} and {file.name}"
+                )
             found[name] = file
-    wanted = [PurePosixPath(name).with_suffix("").as_posix() for name in pictures]
-    twice = next((name for name, n in Counter(wanted).items() if n > 1), None)
-    if twice is not None:
-        raise FileError(folder, f"must have one file per picture, but two pictures have the name '{twice}'")
-    _check_all(folder, wanted, found, f" ({', '.join(endings)})")
-    return [found[name] for name in wanted]
+    expected = [PurePosixPath(name).with_suffix("").as_posix() for name in pictures]
+    repeated = next((name for name, n in Counter(expected).items() if n > 1), None)
+    if repeated is not None:
+        raise FileError(directory, f"must have one file per picture, but two pictures have the name '{repeated}'")
+    _check_complete(directory, expected, found, f" ({', '.join(extensions)})")
+    return [found[name] for name in expected]
 
 
-def _check_all(path: Path, pictures: Sequence[str], found: Iterable[str], of: str = "") -> None:
+def _check_complete(path: Path, pictures: Sequence[str], found: Iterable[str], of: str = "") -> None:
     names = set(found)
     missing = [name for name in pictures if name not in names]
     if missing:

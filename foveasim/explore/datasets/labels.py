@@ -18,7 +18,7 @@ from foveasim.fields import Grid, from_file_rows
 from foveasim.integrate import Integrator
 
 __all__ = [
-    "NOTHING",
+    "NO_CLASS",
     "Boxes",
     "Flow",
     "boxes_on_sites",
@@ -31,13 +31,13 @@ __all__ = [
 ]
 
 #: Label of a site whose area lies mostly outside the picture, and of padding boxes.
-NOTHING = -1
+NO_CLASS = -1
 #: Largest class of a box: classes are passed as float64, which represents all integers up to 2^53.
-MOST_CLASS = 2**53
+MAX_CLASS = 2**53
 #: Points along each side of a box, whose image may be curved.
-POINTS_A_SIDE = 65
+POINTS_PER_SIDE = 65
 #: Areas that differ by less than this fraction of a site are equal up to rounding; the lower class is then assigned.
-TIE = 1e-9
+AREA_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,25 +100,25 @@ def boxes_on_sites(boxes_px: Floats, integrator: Integrator, lens: Lens | None) 
     n_y, n_x = grid.shape
     box_um = np.empty(boxes_px.shape)
     covers = np.empty((boxes_px.shape[0], integrator.n_sites), bool)
-    seen_um2 = _seen_um2(integrator)
+    collecting_um2 = _collecting_area_um2(integrator)
     for k, (left, top, right, bottom) in enumerate(boxes_px):
-        corners = _on_sensor(np.array([[left, bottom], [right, top]]), grid)
+        corners = _to_sensor_um(np.array([[left, bottom], [right, top]]), grid)
         if lens is None:
             box_um[k] = corners.reshape(-1)
         else:
             (x0, y0), (x1, y1) = corners
-            x, y = np.linspace(x0, x1, POINTS_A_SIDE), np.linspace(y0, y1, POINTS_A_SIDE)
+            x, y = np.linspace(x0, x1, POINTS_PER_SIDE), np.linspace(y0, y1, POINTS_PER_SIDE)
             sides = ((x, y0), (x, y1), (x0, y), (x1, y))
             outline = np.concatenate([np.stack(np.broadcast_arrays(*side), axis=1) for side in sides])
-            real = lens.distort(outline, outside="mask")
-            real = real[~np.isnan(real).any(axis=1)]
-            box_um[k] = [*real.min(axis=0), *real.max(axis=0)] if len(real) else 0.0
+            imaged = lens.distort(outline, outside="mask")
+            imaged = imaged[~np.isnan(imaged).any(axis=1)]
+            box_um[k] = [*imaged.min(axis=0), *imaged.max(axis=0)] if len(imaged) else 0.0
         columns, rows = (
             np.clip(np.minimum(np.arange(n) + 1, high) - np.maximum(np.arange(n), low), 0.0, 1.0)
             for n, low, high in ((n_x, left, right), (n_y, n_y - bottom, n_y - top))
         )
         inside_um2 = integrator(np.outer(rows, columns))
-        covers[k] = (inside_um2 > (0.5 + TIE) * seen_um2) & (seen_um2 > 0.0)
+        covers[k] = (inside_um2 > (0.5 + AREA_TOLERANCE) * collecting_um2) & (collecting_um2 > 0.0)
     return Boxes(box_um, covers)
 
 
@@ -136,7 +136,7 @@ def mask_on_sites(mask: Ints, integrator: Integrator) -> Ints:
     Returns
     -------
     classes : (n_site,) int64
-        :data:`NOTHING` where the area outside the picture is at least that of every class. Among classes with equal area, the
+        :data:`NO_CLASS` where the area outside the picture is at least that of every class. Among classes with equal area, the
         lowest.
 
     Notes
@@ -144,14 +144,14 @@ def mask_on_sites(mask: Ints, integrator: Integrator) -> Ints:
     Areas are those of the undistorted outlines, from which sites collect light.
     """
     rows = from_file_rows(mask)[0]
-    found = np.full(integrator.n_sites, NOTHING, np.int64)
-    rounding_um2 = TIE * _seen_um2(integrator)
-    most_um2 = integrator.uncovered_um2
+    found = np.full(integrator.n_sites, NO_CLASS, np.int64)
+    rounding_um2 = AREA_TOLERANCE * _collecting_area_um2(integrator)
+    max_um2 = integrator.uncovered_um2
     for number in np.unique(rows):
-        own_um2 = integrator((rows == number).astype(np.float32))
-        is_more = own_um2 > most_um2 + rounding_um2
-        found[is_more] = number
-        most_um2 = np.where(is_more, own_um2, most_um2)
+        class_um2 = integrator((rows == number).astype(np.float32))
+        is_larger = class_um2 > max_um2 + rounding_um2
+        found[is_larger] = number
+        max_um2 = np.where(is_larger, class_um2, max_um2)
     return found
 
 
@@ -171,31 +171,34 @@ def flow_on_sites(flow_px: Floats, integrator: Integrator, lens: Lens | None) ->
     Flow
     """
     grid = integrator.grid
-    moves = np.moveaxis(from_file_rows(np.asarray(flow_px, np.float64)), 0, -1) * [grid.pitch_x_um, -grid.pitch_y_um]
-    is_known = np.isfinite(moves).all(axis=-1)
-    moves = np.where(is_known[..., np.newaxis], moves, 0.0)
+    displacement = np.moveaxis(from_file_rows(np.asarray(flow_px, np.float64)), 0, -1) * [
+        grid.pitch_x_um,
+        -grid.pitch_y_um,
+    ]
+    is_known = np.isfinite(displacement).all(axis=-1)
+    displacement = np.where(is_known[..., np.newaxis], displacement, 0.0)
     if lens is not None:
-        middles = np.stack(np.meshgrid(grid.x_um, grid.y_um), axis=-1)
-        moves = lens.distort(middles + moves, outside="mask") - lens.distort(middles, outside="mask")
-        is_known &= np.isfinite(moves).all(axis=-1)
-        moves = np.where(is_known[..., np.newaxis], moves, 0.0)
+        centres = np.stack(np.meshgrid(grid.x_um, grid.y_um), axis=-1)
+        displacement = lens.distort(centres + displacement, outside="mask") - lens.distort(centres, outside="mask")
+        is_known &= np.isfinite(displacement).all(axis=-1)
+        displacement = np.where(is_known[..., np.newaxis], displacement, 0.0)
     known_um2 = integrator(is_known.astype(np.float64))
-    is_told = known_um2 > TIE * np.maximum(_seen_um2(integrator), np.finfo(float).tiny)
-    sums = integrator(np.moveaxis(moves, -1, 0))
-    flow_um = np.where(is_told, sums / np.where(is_told, known_um2, 1.0), 0.0)
-    return Flow(np.ascontiguousarray(np.moveaxis(flow_um, 0, -1)), is_told)
+    is_site_known = known_um2 > AREA_TOLERANCE * np.maximum(_collecting_area_um2(integrator), np.finfo(float).tiny)
+    sums = integrator(np.moveaxis(displacement, -1, 0))
+    flow_um = np.where(is_site_known, sums / np.where(is_site_known, known_um2, 1.0), 0.0)
+    return Flow(np.ascontiguousarray(np.moveaxis(flow_um, 0, -1)), is_site_known)
 
 
-def _seen_um2(integrator: Integrator) -> Floats:
+def _collecting_area_um2(integrator: Integrator) -> Floats:
     """Return the light-collecting area of each site; 0 outside the image circle."""
-    on_um2 = integrator(np.ones(integrator.grid.shape))
-    lost = integrator.sites_outside_image_circle
-    off_um2 = np.array(integrator.uncovered_um2)
-    off_um2[lost] = 0.0
-    return on_um2 + off_um2
+    covered_um2 = integrator(np.ones(integrator.grid.shape))
+    is_outside = integrator.sites_outside_image_circle
+    uncovered_um2 = np.array(integrator.uncovered_um2)
+    uncovered_um2[is_outside] = 0.0
+    return covered_um2 + uncovered_um2
 
 
-def _on_sensor(points_px: Floats, grid: Grid) -> Floats:
+def _to_sensor_um(points_px: Floats, grid: Grid) -> Floats:
     """Convert points (n, 2) from picture coordinates (upper left corner, y down) to sensor µm."""
     x0, _, _, y1 = grid.bounds_um
     return np.array([x0, y1]) + points_px * [grid.pitch_x_um, -grid.pitch_y_um]
@@ -205,7 +208,7 @@ def validate_boxes(name: str, boxes: Any) -> tuple[Floats, Ints]:
     """
     Return the boxes and classes of one picture after validation.
 
-    Classes are :data:`NOTHING` when ``boxes`` has no column of classes.
+    Classes are :data:`NO_CLASS` when ``boxes`` has no column of classes.
 
     Raises
     ------
@@ -221,12 +224,12 @@ def validate_boxes(name: str, boxes: Any) -> tuple[Floats, Ints]:
             f"must have the shape (n, 4) or, with classes, (n, 5), got {numbers.shape}",
             hint="x0, y0, x1, y1, class",
         )
-    is_flat = (numbers[:, 2:4] <= numbers[:, :2]).any(axis=1)
-    if is_flat.any():
-        raise ParameterError(name, "must have x0 < x1 and y0 < y1", numbers[is_flat][0, :4].tolist(), "pixels")
-    classes = numbers[:, 4] if numbers.shape[1] == 5 else np.full(len(numbers), float(NOTHING))
-    if (classes != np.rint(classes)).any() or (np.abs(classes) > MOST_CLASS).any():
-        raise ParameterError(name, f"must have integers up to {MOST_CLASS} as classes", classes.tolist())
+    is_empty = (numbers[:, 2:4] <= numbers[:, :2]).any(axis=1)
+    if is_empty.any():
+        raise ParameterError(name, "must have x0 < x1 and y0 < y1", numbers[is_empty][0, :4].tolist(), "pixels")
+    classes = numbers[:, 4] if numbers.shape[1] == 5 else np.full(len(numbers), float(NO_CLASS))
+    if (classes != np.rint(classes)).any() or (np.abs(classes) > MAX_CLASS).any():
+        raise ParameterError(name, f"must have integers up to {MAX_CLASS} as classes", classes.tolist())
     return numbers[:, :4], classes.astype(np.int64)
 
 
@@ -294,10 +297,12 @@ def read_flow(flow: Any, name: str, shape: tuple[int, int]) -> Floats:
             flow = np.load(flow, allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
             raise FileError(name, f"is not a readable array ({error})") from None
-    moves = np.asarray(flow)
-    if moves.shape != (*shape, 2) or moves.dtype.kind not in "iuf":
-        raise ParameterError(name, f"must be numbers of shape {(*shape, 2)}, got {moves.dtype} of shape {moves.shape}")
-    return moves
+    displacement = np.asarray(flow)
+    if displacement.shape != (*shape, 2) or displacement.dtype.kind not in "iuf":
+        raise ParameterError(
+            name, f"must be numbers of shape {(*shape, 2)}, got {displacement.dtype} of shape {displacement.shape}"
+        )
+    return displacement
 
 
 def check_per_picture(name: str, given: Any, n: int) -> Sequence[Any]:

@@ -70,11 +70,11 @@ def source_of(pictures: Any) -> Source:
         path = Path(pictures).absolute()
         try:
             if path.is_dir():
-                return _Folder(path)
+                return _Directory(path)
             if not path.is_file():
                 raise FileError(path, "no such file or directory")
         except OSError as error:
-            raise _unreadable(error, path) from None
+            raise _read_error(error, path) from None
         if path.suffix.lower() == ".npy":
             return _ArrayFile(path)
         if zipfile.is_zipfile(path):
@@ -110,38 +110,38 @@ def digest_of(item: Any) -> str:
     return digest.hexdigest()
 
 
-class _Folder:
+class _Directory:
     """Pictures of a directory and its subdirectories, in natural order of their names."""
 
     is_lazy = False
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        found = (Path(place) / name for place, _, names in os.walk(folder, onerror=_stop) for name in names)
-        self._names = picture_names(path.relative_to(folder).as_posix() for path in found)
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        found = (Path(root) / name for root, _, names in os.walk(directory, onerror=_raise_error) for name in names)
+        self._names = picture_names(path.relative_to(directory).as_posix() for path in found)
         if not self._names:
-            raise FileError(folder, f"contains no pictures ({', '.join(PICTURE_EXTENSIONS)})")
+            raise FileError(directory, f"contains no pictures ({', '.join(PICTURE_EXTENSIONS)})")
 
     def __len__(self) -> int:
         return len(self._names)
 
     def name(self, k: int) -> str:
-        return str(self._folder / self._names[k])
+        return str(self._directory / self._names[k])
 
     def key(self, k: int) -> str:
         return self._names[k]
 
     def picture(self, k: int) -> NDArray[Any]:
-        return read_picture(self._folder / self._names[k])
+        return read_picture(self._directory / self._names[k])
 
     def labels(self) -> list[Any] | None:
-        return _folder_labels(self._names)
+        return _directory_labels(self._names)
 
     def to_dict(self) -> dict[str, Any]:
         return {"kind": "folder", **_names_digest(self._names)}
 
     def digest(self, k: int) -> str:
-        return digest_of(self._folder / self._names[k])
+        return digest_of(self._directory / self._names[k])
 
 
 class _Zip:
@@ -181,8 +181,8 @@ class _Zip:
             content = archive.read(name)
         except Exception as error:  # noqa: BLE001 -- corrupt members raise many kinds of errors
             raise FileError(self.name(k), f"is corrupt ({' '.join(str(error).split())})") from None
-        with tempfile.TemporaryDirectory(prefix="foveasim-") as folder:
-            file = Path(folder) / f"picture{PurePosixPath(name).suffix}"
+        with tempfile.TemporaryDirectory(prefix="foveasim-") as directory:
+            file = Path(directory) / f"picture{PurePosixPath(name).suffix}"
             file.write_bytes(content)
             try:
                 return read_picture(file)
@@ -190,7 +190,7 @@ class _Zip:
                 raise FileError(self.name(k), str(error).removeprefix(f"{file}: ")) from None
 
     def labels(self) -> list[Any] | None:
-        return _folder_labels(self._names)
+        return _directory_labels(self._names)
 
     def _archive(self) -> zipfile.ZipFile:
         # A forked process shares the file position of its parent.
@@ -296,18 +296,18 @@ class _Items:
         return len(self._items)
 
     def name(self, k: int) -> str:
-        item = self._listed(k)
+        item = self._stored_item(k)
         return str(item) if isinstance(item, str | Path) else f"picture {k}"
 
     def key(self, k: int) -> str:
-        item = self._listed(k)
+        item = self._stored_item(k)
         return Path(item).name if isinstance(item, str | Path) else str(k)
 
     def _item(self, k: int) -> Any:
         item = self._items[k]
         return item[0] if isinstance(item, tuple) else item
 
-    def _listed(self, k: int) -> Any:
+    def _stored_item(self, k: int) -> Any:
         """Return an item of a list, or None if items may be computed on access."""
         return None if self.is_lazy else self._item(k)
 
@@ -364,13 +364,13 @@ def _names_digest(names: Sequence[str]) -> dict[str, Any]:
     return {"n": len(names), "sha256": hashlib.sha256("\n".join(names).encode()).hexdigest()}
 
 
-def _unreadable(error: OSError, path: Path) -> FileError:
+def _read_error(error: OSError, path: Path) -> FileError:
     return FileError(error.filename or path, f"cannot be read: {error.strerror or error}")
 
 
-def _stop(error: OSError) -> None:
+def _raise_error(error: OSError) -> None:
     """Raise errors of ``os.walk``, which would skip unreadable directories silently."""
-    raise _unreadable(error, Path())
+    raise _read_error(error, Path())
 
 
 def _check_stack(name: str, pictures: NDArray[Any]) -> None:
@@ -380,7 +380,7 @@ def _check_stack(name: str, pictures: NDArray[Any]) -> None:
         )
 
 
-def _folder_labels(names: Sequence[str]) -> list[Any] | None:
+def _directory_labels(names: Sequence[str]) -> list[Any] | None:
     """Return the top-level directory of each picture; None if a picture is in none."""
-    folders = [PurePosixPath(name).parts[0] if "/" in name else None for name in names]
-    return folders if all(folder is not None for folder in folders) else None
+    directories = [PurePosixPath(name).parts[0] if "/" in name else None for name in names]
+    return directories if all(directory is not None for directory in directories) else None

@@ -13,9 +13,9 @@ from foveasim._io.yaml_files import read_yaml
 from foveasim.config import picture_path, resolve_files, validate
 from foveasim.explore.datasets.dataset import Dataset
 from foveasim.explore.datasets.label_files import (
-    FLOW_ENDINGS,
-    MASK_ENDINGS,
-    files_of_pictures,
+    FLOW_EXTENSIONS,
+    MASK_EXTENSIONS,
+    match_label_files,
     read_boxes,
     read_labels,
 )
@@ -34,7 +34,7 @@ RECIPES: dict[str | None, Callable[..., Dataset]] = {
 #: Parameters of a distribution, in the unit of its setting.
 _Numbers = list[float]
 #: Keys with the same name in :class:`Dataset`.
-SAME = ("cameras", "draws", "seed", "fields", "fit")
+DATASET_KEYS = ("cameras", "draws", "seed", "fields", "fit")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -123,16 +123,16 @@ def read_dataset(path: str | Path, *, n_threads: int = 1) -> DatasetFile:
     """
     path = Path(path)
     section: DatasetSection = validate(path, DatasetSection, read_yaml(path))
-    folder = path.parent
+    directory = path.parent
     source = _pictures(path, section.pictures)
-    options = {name: value for name in SAME if (value := getattr(section, name)) is not None}
-    labels = _labels(folder, section, source)
+    options = {name: value for name in DATASET_KEYS if (value := getattr(section, name)) is not None}
+    labels = _labels(directory, section, source)
     with with_file_context(path):
         dataset = RECIPES[section.recipe](
             source,
-            folder / section.shot if isinstance(section.shot, str) else section.shot,
-            {name: _distribution(folder, name, told) for name, told in section.vary.items()},
-            changes={name: resolve_files(folder, value, name) for name, value in section.set.items()},
+            directory / section.shot if isinstance(section.shot, str) else section.shot,
+            {name: _distribution(directory, name, distribution) for name, distribution in section.vary.items()},
+            changes={name: resolve_files(directory, value, name) for name, value in section.set.items()},
             source=path,
             n_threads=n_threads,
             **options,
@@ -148,24 +148,26 @@ def _pictures(path: Path, pictures: str | list[str]) -> Source:
         return source_of([picture_path(path, name, f"pictures.{k}").absolute() for k, name in enumerate(pictures)])
 
 
-def _labels(folder: Path, section: DatasetSection, pictures: Source) -> Mapping[str, Any]:
+def _labels(directory: Path, section: DatasetSection, pictures: Source) -> Mapping[str, Any]:
     """Return the label arguments of :class:`Dataset`."""
     names = [pictures.key(k) for k in range(len(pictures))]
     found: dict[str, Any] = {}
     if isinstance(section.labels, str):
-        found["labels"] = read_labels(folder / section.labels, names)
+        found["labels"] = read_labels(directory / section.labels, names)
     elif section.labels is not None:
         found["labels"] = section.labels
     if section.boxes is not None:
-        found["boxes"] = read_boxes(folder / section.boxes, names)
+        found["boxes"] = read_boxes(directory / section.boxes, names)
     if section.masks is not None:
-        found["masks"] = files_of_pictures(folder / section.masks, names, MASK_ENDINGS)
+        found["masks"] = match_label_files(directory / section.masks, names, MASK_EXTENSIONS)
     if section.flows is not None:
-        found["flows"] = files_of_pictures(folder / section.flows, names, FLOW_ENDINGS)
+        found["flows"] = match_label_files(directory / section.flows, names, FLOW_EXTENSIONS)
     return found
 
 
-def _distribution(folder: Path, path: str, told: _Distribution) -> dict[str, Any]:
+def _distribution(directory: Path, path: str, distribution: _Distribution) -> dict[str, Any]:
     """Return a distribution as plain data, with file choices relative to the dataset file."""
-    given = told.model_dump(exclude_none=True)
-    return {kind: resolve_files(folder, values, path) if kind == "choice" else values for kind, values in given.items()}
+    given = distribution.model_dump(exclude_none=True)
+    return {
+        kind: resolve_files(directory, values, path) if kind == "choice" else values for kind, values in given.items()
+    }

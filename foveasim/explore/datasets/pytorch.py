@@ -49,11 +49,11 @@ def torch_dataset(dataset: Samples, transform: Callable[[dict[str, Any]], Any] |
 
         loader = torch.utils.data.DataLoader(torch_dataset(dataset), batch_size=32, shuffle=True, num_workers=4)
     """
-    return _kind()(dataset, transform)
+    return _dataset_class()(dataset, transform)
 
 
 @cache
-def _kind() -> Any:
+def _dataset_class() -> Any:
     """Return the dataset class, which is defined on first use."""
     try:
         import torch  # type: ignore[import-not-found,unused-ignore]
@@ -65,7 +65,7 @@ def _kind() -> Any:
             return value
         return torch.from_numpy(value.astype(np.int32) if value.dtype == np.uint16 else value)
 
-    class TorchDataSet(torch.utils.data.Dataset):  # type: ignore[misc,unused-ignore]
+    class TorchDataset(torch.utils.data.Dataset):  # type: ignore[misc,unused-ignore]
         """Dataset with tensors instead of the arrays of another dataset."""
 
         def __init__(self, dataset: Samples, transform: Callable[[dict[str, Any]], Any] | None) -> None:
@@ -82,4 +82,4 @@ def _kind() -> Any:
             sample = {name: tensor(value) for name, value in self.dataset[index].items()}
             return sample if self.transform is None else self.transform(sample)
 
-    return TorchDataSet
+    return TorchDataset

@@ -17,7 +17,7 @@ __all__ = ["classification", "denoising"]
 #: Range of random device seeds: each device has its own fixed-pattern noise.
 DEVICES = (0, 2**31 - 1)
 #: Lower limit of the f-number of a lens in air.
-FASTEST = 0.5
+MIN_F_NUMBER = 0.5
 
 
 def classification(
@@ -53,9 +53,9 @@ def classification(
     FileError, ParameterError, ConfigError
         As for :class:`Dataset`.
     """
-    f_number, exposure_s = _numbers(shot, options, "optics.f_number", "exposure_s")
-    usual: dict[str, Any] = {
-        "optics.f_number": {"log_uniform": [max(f_number / 1.5, FASTEST), 3.0 * f_number]},
+    f_number, exposure_s = _read_numbers(shot, options, "optics.f_number", "exposure_s")
+    defaults: dict[str, Any] = {
+        "optics.f_number": {"log_uniform": [max(f_number / 1.5, MIN_F_NUMBER), 3.0 * f_number]},
         "exposure_s": {"log_uniform": [exposure_s / 8.0, 4.0 * exposure_s]},
         "sensor.read_noise_e": {"log_uniform": [0.5, 20.0]},
         "sensor.prnu_fraction": {"uniform": [0.0, 0.02]},
@@ -64,7 +64,7 @@ def classification(
         "sensor.device_seed": {"integers": list(DEVICES)},
     }
     return Dataset(
-        pictures, shot, usual | dict(vary or {}), cameras=cameras, seed=seed, **{"fields": ("code",)} | options
+        pictures, shot, defaults | dict(vary or {}), cameras=cameras, seed=seed, **{"fields": ("code",)} | options
     )
 
 
@@ -103,16 +103,16 @@ def denoising(
     FileError, ParameterError, ConfigError
         As for :class:`Dataset`.
     """
-    (exposure_s,) = _numbers(shot, options, "exposure_s")
-    usual: dict[str, Any] = {
+    (exposure_s,) = _read_numbers(shot, options, "exposure_s")
+    defaults: dict[str, Any] = {
         "exposure_s": {"log_uniform": [exposure_s / 32.0, exposure_s]},
         "sensor.read_noise_e": {"log_uniform": [0.5, 20.0]},
     }
     options = {"fields": ("code", "expected_dn")} | options
-    return Dataset(pictures, shot, usual | dict(vary or {}), draws=draws, seed=seed, **options)
+    return Dataset(pictures, shot, defaults | dict(vary or {}), draws=draws, seed=seed, **options)
 
 
-def _numbers(shot: str | Path | Mapping[str, Any], options: Mapping[str, Any], *paths: str) -> list[float]:
+def _read_numbers(shot: str | Path | Mapping[str, Any], options: Mapping[str, Any], *paths: str) -> list[float]:
     """Return numbers of the shot settings, after the ``changes`` of the dataset options."""
     file = Path(options.get("source", "settings")) if isinstance(shot, Mapping) else Path(shot)
     data = deepcopy(dict(shot)) if isinstance(shot, Mapping) else read_settings(file)
@@ -120,10 +120,10 @@ def _numbers(shot: str | Path | Mapping[str, Any], options: Mapping[str, Any], *
         put_setting(file, data, path, value)
     found = []
     for path in paths:
-        place: Any = data
+        setting: Any = data
         for name in path.split("."):
-            place = place.get(name) if isinstance(place, Mapping) else None
-        if place is None:
+            setting = setting.get(name) if isinstance(setting, Mapping) else None
+        if setting is None:
             raise ConfigError(file, f"{path}: is missing")
-        found.append(check_number(path.rpartition(".")[2], place, above=0.0))
+        found.append(check_number(path.rpartition(".")[2], setting, above=0.0))
     return found

@@ -30,19 +30,19 @@ __all__ = ["StoredSamples", "open_dataset", "write_dataset"]
 FORMAT, VERSION = "foveasim dataset", 2
 ZARR, ABOUT = ".zarr", "dataset.json"
 #: Default size of a shard: approximate bytes and largest number of samples. One process has a shard in memory.
-SHARD_BYTES, LARGEST_SHARD = 1 << 26, 512
+SHARD_BYTES, MAX_SHARD_SAMPLES = 1 << 26, 512
 #: Smallest default number of shards: many processes can write, and an interruption loses little.
-FEWEST_SHARDS = 32
+MIN_SHARDS = 32
 #: Number of shards of a zarr store that a reading process caches, the most recently used.
-KEPT_SHARDS = 4
+MAX_CACHED_SHARDS = 4
 #: Names of the array with the digest of each complete shard, and of the group of random settings.
 DONE, SETTINGS = "done", "settings"
 #: First member of a tar file, with the digest of its inputs; WebDataset skips such names.
-MADE_OF = "__made_of__"
+INPUT_DIGEST = "__made_of__"
 #: Bytes of a SHA-256.
 DIGEST_BYTES = 32
 #: Remaining time in one process above which worker processes are started, seconds; their start takes seconds.
-ALONE_S = 10.0
+SINGLE_PROCESS_S = 10.0
 NEEDS_ZARR = needs("zarr", "explore")
 
 #: Function of the number of written samples and the total number.
@@ -107,7 +107,7 @@ def write_dataset(
     workers = None if workers is None else check_count("workers", workers, at_most=1024)
     if per_shard is not None:
         per_shard = check_count("per_shard", per_shard)
-    kind = _kind_of(target)
+    kind = _shards_class(target)
     if kind is _ZarrShards:
         if dataset.is_layout_varied:
             raise ParameterError(
@@ -115,7 +115,7 @@ def write_dataset(
             )
         _zarr(target)
     plan = json.loads(json.dumps(dataset.to_dict()))
-    about = _about_of(target) if os.path.exists(target) else None  # noqa: PTH110 -- False, not an error, without permission
+    about = _read_about(target) if os.path.exists(target) else None  # noqa: PTH110 -- False, not an error, without permission
     if about is None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # reported with the shard of the first sample
@@ -125,12 +125,13 @@ def write_dataset(
             "format": FORMAT,
             "version": VERSION,
             "n_samples": len(dataset),
-            "per_shard": per_shard or max(1, min(SHARD_BYTES // n_bytes, LARGEST_SHARD, len(dataset) // FEWEST_SHARDS)),
+            "per_shard": per_shard
+            or max(1, min(SHARD_BYTES // n_bytes, MAX_SHARD_SAMPLES, len(dataset) // MIN_SHARDS)),
             "has_label": "label" in first,
             "class_names": dataset.class_names,
             "plan": plan,
         }
-        kind.begin(target, about, dataset, first)
+        kind.create(target, about, dataset, first)
     else:
         _check_same(target, about, plan, per_shard)
     _write_shards(dataset, kind(target, about), scheduler, workers, progress)
@@ -151,62 +152,62 @@ def _write_shards(
     dataset: Dataset, shards: _Shards, scheduler: str | None, workers: int | None, progress: Progress | None
 ) -> None:
     """Write missing shards, after a check that the inputs of complete shards are unchanged."""
-    left = []
+    missing = []
     for k in range(shards.n_shards):
-        made_of = shards.made_of(k)
-        if not made_of:
-            left.append(k)
-        elif made_of != dataset.digest(shards.samples(k)):
+        input_digest = shards.input_digest(k)
+        if not input_digest:
+            missing.append(k)
+        elif input_digest != dataset.digest(shards.samples(k)):
             samples = shards.samples(k)
             raise FileError(
-                shards.folder,
+                shards.directory,
                 f"is of other pictures, masks or flows: those of samples {samples[0]} to {samples[-1]} have changed; use "
                 "another path, or remove the existing dataset",
             )
-    n, n_done = shards.n_samples, shards.n_samples - sum(len(shards.samples(k)) for k in left)
-    told: list[str] = []
+    n, n_done = shards.n_samples, shards.n_samples - sum(len(shards.samples(k)) for k in missing)
+    messages: list[str] = []
     if progress is not None:
         progress(n_done, n)
-    with closing(_written(dataset, shards, left, scheduler, workers)) as written:
-        for k, own in written:
-            told += own
+    with closing(_write_each(dataset, shards, missing, scheduler, workers)) as results:
+        for k, shard_messages in results:
+            messages += shard_messages
             n_done += len(shards.samples(k))
             if progress is not None:
                 progress(n_done, n)
-    if told:
+    if messages:
         warnings.warn(
-            f"{len(told):,} of the samples written have warnings, such as: {min(told)}",
+            f"{len(messages):,} of the samples written have warnings, such as: {min(messages)}",
             FoveasimWarning,
             stacklevel=3,
         )
 
 
-def _written(
-    dataset: Dataset, shards: _Shards, left: Sequence[int], scheduler: str | None, workers: int | None
+def _write_each(
+    dataset: Dataset, shards: _Shards, missing: Sequence[int], scheduler: str | None, workers: int | None
 ) -> Generator[tuple[int, list[str]], None, None]:
     """Write shards, and yield each with the warnings of its samples."""
     write = _ShardWriter(dataset, shards)
-    begun_s = time.monotonic()
+    start_s = time.monotonic()
     n_done = 0
     if scheduler is None and workers in (None, 1):
-        for n_done, k in enumerate(left):
-            n_left = len(left) - n_done
-            left_s = n_left * (time.monotonic() - begun_s) / n_done if n_done else 0.0
-            if workers is None and n_left > 1 and left_s > ALONE_S:
+        for n_done, k in enumerate(missing):
+            n_left = len(missing) - n_done
+            left_s = n_left * (time.monotonic() - start_s) / n_done if n_done else 0.0
+            if workers is None and n_left > 1 and left_s > SINGLE_PROCESS_S:
                 break
             yield k, write(k)
         else:
             return
     what = "the pictures or labels"
-    n_workers = min(workers or thread_count(), len(left) - n_done)
+    n_workers = min(workers or thread_count(), len(missing) - n_done)
     with executor(write, what=what, scheduler=scheduler, workers=n_workers) as run:
-        for k, own in run(left[n_done:], ()):
-            if own is KILLED:
+        for k, shard_messages in run(missing[n_done:], ()):
+            if shard_messages is KILLED:
                 raise SimulationError(
                     f"the process that wrote shard {k} ended in every attempt: out of memory, or a crash; complete shards "
                     "remain, and the same call resumes"
                 )
-            yield k, own
+            yield k, shard_messages
 
 
 class _ShardWriter:
@@ -216,15 +217,15 @@ class _ShardWriter:
         self._dataset, self._shards = dataset, shards
 
     def __call__(self, k: int) -> list[str]:
-        made_of = self._dataset.digest(self._shards.samples(k))
+        input_digest = self._dataset.digest(self._shards.samples(k))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # summarised at the end
             samples = [self._dataset[index] for index in self._shards.samples(k)]
         try:
-            self._shards.write(k, samples, made_of)
+            self._shards.write(k, samples, input_digest)
         except OSError as error:
             raise FileError(
-                self._shards.folder,
+                self._shards.directory,
                 f"cannot be written: {error.strerror or error}; complete shards remain, and the same call resumes",
             ) from None
         return [f"sample {sample['index']}: {sample['warning']}" for sample in samples if sample["warning"]]
@@ -248,7 +249,7 @@ class StoredSamples:
 
     def __init__(self, path: Path, about: Mapping[str, Any]) -> None:
         self.path, self.about = path, about
-        self._shards = _kind_of(path)(path, about)
+        self._shards = _shards_class(path)(path, about)
 
     def __repr__(self) -> str:
         return f"StoredSamples({len(self)} in {self.path})"
@@ -272,14 +273,14 @@ class StoredSamples:
         FileError
             When the shard of the sample is corrupt.
         """
-        place = operator.index(index)
-        if not -len(self) <= place < len(self):
-            raise IndexError(f"sample index {place} is out of range for {len(self)} samples")
-        place %= len(self)
+        position = operator.index(index)
+        if not -len(self) <= position < len(self):
+            raise IndexError(f"sample index {position} is out of range for {len(self)} samples")
+        position %= len(self)
         try:
-            return self._shards.read(place)
+            return self._shards.read(position)
         except Exception as error:  # noqa: BLE001 -- corrupt shards raise many kinds of errors
-            raise FileError(self.path, f"has a corrupt sample {place} ({' '.join(str(error).split())})") from None
+            raise FileError(self.path, f"has a corrupt sample {position} ({' '.join(str(error).split())})") from None
 
     @property
     def class_names(self) -> list[str] | None:
@@ -305,15 +306,15 @@ def open_dataset(path: str | Path) -> StoredSamples:
         raise FileError(source, f"cannot be read: {error.strerror or error}") from None
     if source.suffix.lower() == ZARR:
         _zarr(source)
-    stored = StoredSamples(source, _about_of(source))
+    stored = StoredSamples(source, _read_about(source))
     shards = stored._shards  # noqa: SLF001 -- same module
-    n_done = sum(shards.is_done(k) for k in range(shards.n_shards))
+    n_done = sum(shards.is_complete(k) for k in range(shards.n_shards))
     if n_done < shards.n_shards:
         raise FileError(source, f"has {n_done} of {shards.n_shards} shards; write the same dataset again to resume")
     return stored
 
 
-def _about_of(target: Path) -> dict[str, Any]:
+def _read_about(target: Path) -> dict[str, Any]:
     """Read the description of a stored dataset."""
     is_zarr = target.suffix.lower() == ZARR
     file = target / ("zarr.json" if is_zarr else ABOUT)
@@ -330,7 +331,7 @@ def _about_of(target: Path) -> dict[str, Any]:
     return about
 
 
-def _kind_of(target: Path) -> type[_Shards]:
+def _shards_class(target: Path) -> type[_Shards]:
     if target.suffix.lower() == ZARR:
         return _ZarrShards
     if target.suffix:
@@ -352,14 +353,14 @@ def _zarr(path: Path) -> Any:
 class _Shards:
     """Base class of stored shards with a fixed number of samples each."""
 
-    def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
-        self.folder = folder
+    def __init__(self, directory: Path, about: Mapping[str, Any]) -> None:
+        self.directory = directory
         self.n_samples, self.per_shard = int(about["n_samples"]), int(about["per_shard"])
         self.n_shards = -(-self.n_samples // self.per_shard)
         self.has_label = bool(about["has_label"])
 
     @staticmethod
-    def begin(target: Path, about: Mapping[str, Any], dataset: Dataset, first: Mapping[str, Any]) -> None:
+    def create(target: Path, about: Mapping[str, Any], dataset: Dataset, first: Mapping[str, Any]) -> None:
         """Create the store for samples with the items, types and shapes of the first."""
         raise NotImplementedError
 
@@ -367,15 +368,15 @@ class _Shards:
         """Return the indices of the samples of a shard."""
         return range(k * self.per_shard, min((k + 1) * self.per_shard, self.n_samples))
 
-    def is_done(self, k: int) -> bool:
+    def is_complete(self, k: int) -> bool:
         """Return whether a shard is complete."""
-        return self.made_of(k) != ""
+        return self.input_digest(k) != ""
 
-    def made_of(self, k: int) -> str:
+    def input_digest(self, k: int) -> str:
         """Return the digest of the inputs of a shard; empty when it is missing or corrupt."""
         raise NotImplementedError
 
-    def write(self, k: int, samples: Sequence[Mapping[str, Any]], made_of: str) -> None:
+    def write(self, k: int, samples: Sequence[Mapping[str, Any]], input_digest: str) -> None:
         """Write a shard."""
         raise NotImplementedError
 
@@ -387,62 +388,62 @@ class _Shards:
 class _TarShards(_Shards):
     """Shards as tar files, which exist only when complete."""
 
-    def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
-        super().__init__(folder, about)
-        self._places: dict[int, dict[str, tuple[int, int]]] = {}
+    def __init__(self, directory: Path, about: Mapping[str, Any]) -> None:
+        super().__init__(directory, about)
+        self._member_offsets: dict[int, dict[str, tuple[int, int]]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_places": {}}
+        return self.__dict__ | {"_member_offsets": {}}
 
     @staticmethod
-    def begin(target: Path, about: Mapping[str, Any], dataset: Dataset, first: Mapping[str, Any]) -> None:  # noqa: ARG004 -- common signature
+    def create(target: Path, about: Mapping[str, Any], dataset: Dataset, first: Mapping[str, Any]) -> None:  # noqa: ARG004 -- common signature
         with atomic_directory(target, is_ours=lambda _: False) as new:
             (new / ABOUT).write_text(json.dumps(about, indent=1), encoding="utf-8")
             if not dataset.is_layout_varied:
                 dataset.layout.write(new / "layout.npz")
 
     def _file(self, k: int) -> Path:
-        return self.folder / f"shard-{k:06d}.tar"
+        return self.directory / f"shard-{k:06d}.tar"
 
-    def is_done(self, k: int) -> bool:
+    def is_complete(self, k: int) -> bool:
         return self._file(k).is_file()
 
-    def made_of(self, k: int) -> str:
+    def input_digest(self, k: int) -> str:
         try:
             with tarfile.open(self._file(k), "r:") as tar:
                 first = tar.next()
-                told = None if first is None or first.name != MADE_OF else tar.extractfile(first)
-                return "" if told is None else told.read().decode()
+                content = None if first is None or first.name != INPUT_DIGEST else tar.extractfile(first)
+                return "" if content is None else content.read().decode()
         except (OSError, tarfile.TarError, UnicodeDecodeError):
             return ""
 
-    def write(self, k: int, samples: Sequence[Mapping[str, Any]], made_of: str) -> None:
+    def write(self, k: int, samples: Sequence[Mapping[str, Any]], input_digest: str) -> None:
         with (
             atomic_write(self._file(k)) as temporary,
             tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as tar,
         ):
-            _add(tar, MADE_OF, made_of.encode())
+            _add(tar, INPUT_DIGEST, input_digest.encode())
             for sample in samples:
                 arrays: dict[str, Any] = {n: value for n, value in sample.items() if isinstance(value, np.ndarray)}
                 rest = {name: value for name, value in sample.items() if name not in arrays}
-                packed = io.BytesIO()
-                np.savez_compressed(packed, **arrays)
-                parts = {"npz": packed.getvalue(), "json": json.dumps(rest).encode()}
+                compressed = io.BytesIO()
+                np.savez_compressed(compressed, **arrays)
+                parts = {"npz": compressed.getvalue(), "json": json.dumps(rest).encode()}
                 if "label" in sample:
                     parts["cls"] = str(sample["label"]).encode()
-                for ending, content in parts.items():
-                    _add(tar, f"{sample['index']:09d}.{ending}", content)
+                for extension, content in parts.items():
+                    _add(tar, f"{sample['index']:09d}.{extension}", content)
 
     def read(self, index: int) -> dict[str, Any]:
         k = index // self.per_shard
-        if k not in self._places:
+        if k not in self._member_offsets:
             with tarfile.open(self._file(k), "r:") as tar:
-                self._places[k] = {item.name: (item.offset_data, item.size) for item in tar}
-        places = self._places[k]
+                self._member_offsets[k] = {item.name: (item.offset_data, item.size) for item in tar}
+        offsets = self._member_offsets[k]
         with self._file(k).open("rb") as file:
 
-            def content(ending: str) -> bytes:
-                offset, size = places[f"{index:09d}.{ending}"]
+            def content(extension: str) -> bytes:
+                offset, size = offsets[f"{index:09d}.{extension}"]
                 file.seek(offset)
                 return file.read(size)
 
@@ -460,8 +461,8 @@ def _add(tar: tarfile.TarFile, name: str, content: bytes) -> None:
 class _ZarrShards(_Shards):
     """Shards as chunks of zarr arrays, with a digest that is written after all chunks."""
 
-    def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
-        super().__init__(folder, about)
+    def __init__(self, directory: Path, about: Mapping[str, Any]) -> None:
+        super().__init__(directory, about)
         self._opened: tuple[int, dict[str, Any]] | None = None
         self._read: dict[int, dict[str, NDArray[Any]]] = {}
 
@@ -469,14 +470,14 @@ class _ZarrShards(_Shards):
         return self.__dict__ | {"_opened": None, "_read": {}}
 
     @staticmethod
-    def begin(target: Path, about: Mapping[str, Any], dataset: Dataset, first: Mapping[str, Any]) -> None:
+    def create(target: Path, about: Mapping[str, Any], dataset: Dataset, first: Mapping[str, Any]) -> None:
         zarr = _zarr(target)
         n, per_shard = about["n_samples"], about["per_shard"]
         n_shards = -(-n // per_shard)
 
         with atomic_directory(target, is_ours=lambda _: False) as new:
             group = zarr.open_group(str(new), mode="w", zarr_format=3)
-            for name, value in _flat(first).items():
+            for name, value in _flatten(first).items():
                 if isinstance(value, str):
                     group.create_array(name, shape=(n,), chunks=(per_shard,), dtype=str)
                     continue
@@ -502,30 +503,30 @@ class _ZarrShards(_Shards):
 
     def _arrays(self) -> dict[str, Any]:
         if self._opened is None or self._opened[0] != os.getpid():
-            group = _zarr(self.folder).open_group(str(self.folder), mode="r+")
+            group = _zarr(self.directory).open_group(str(self.directory), mode="r+")
             arrays = {name: array for name, array in group.arrays()}  # noqa: C416 -- a generator of pairs
             if SETTINGS in group:
                 arrays |= {f"{SETTINGS}/{name}": array for name, array in group[SETTINGS].arrays()}
             self._opened = os.getpid(), arrays
         return self._opened[1]
 
-    def made_of(self, k: int) -> str:
+    def input_digest(self, k: int) -> str:
         try:
             mark = np.asarray(self._arrays()[DONE][k], np.uint8)
         except Exception:  # noqa: BLE001 -- a truncated digest counts as missing
             return ""
         return mark.tobytes().hex() if mark.any() else ""
 
-    def write(self, k: int, samples: Sequence[Mapping[str, Any]], made_of: str) -> None:
-        arrays, place = self._arrays(), slice(self.samples(k).start, self.samples(k).stop)
-        each = [_flat(sample) for sample in samples]
-        for name in each[0]:
-            values: list[Any] = [sample[name] for sample in each]
+    def write(self, k: int, samples: Sequence[Mapping[str, Any]], input_digest: str) -> None:
+        arrays, position = self._arrays(), slice(self.samples(k).start, self.samples(k).stop)
+        flattened = [_flatten(sample) for sample in samples]
+        for name in flattened[0]:
+            values: list[Any] = [sample[name] for sample in flattened]
             if isinstance(values[0], str):
-                arrays[name][place] = np.array(values, np.dtypes.StringDType())
+                arrays[name][position] = np.array(values, np.dtypes.StringDType())
             else:
-                arrays[name][place] = np.array(values).astype(arrays[name].dtype, casting="safe", copy=False)
-        arrays[DONE][k] = np.frombuffer(bytes.fromhex(made_of), np.uint8)
+                arrays[name][position] = np.array(values).astype(arrays[name].dtype, casting="safe", copy=False)
+        arrays[DONE][k] = np.frombuffer(bytes.fromhex(input_digest), np.uint8)
 
     def read(self, index: int) -> dict[str, Any]:
         rows, row = self._rows(index // self.per_shard), index % self.per_shard
@@ -542,15 +543,15 @@ class _ZarrShards(_Shards):
     def _rows(self, k: int) -> dict[str, NDArray[Any]]:
         """Read all samples of a shard, which are cached: a chunk is decompressed completely."""
         if k not in self._read:
-            place = slice(self.samples(k).start, self.samples(k).stop)
-            rows = {name: np.asarray(array[place]) for name, array in self._arrays().items() if name != DONE}
+            position = slice(self.samples(k).start, self.samples(k).stop)
+            rows = {name: np.asarray(array[position]) for name, array in self._arrays().items() if name != DONE}
             self._read[k] = rows
-            while len(self._read) > KEPT_SHARDS:
+            while len(self._read) > MAX_CACHED_SHARDS:
                 del self._read[next(iter(self._read))]
         return self._read[k]
 
 
-def _flat(sample: Mapping[str, Any]) -> dict[str, NDArray[Any] | int | float | str]:
+def _flatten(sample: Mapping[str, Any]) -> dict[str, NDArray[Any] | int | float | str]:
     """Return a sample with its random settings as separate items."""
     own = {f"{SETTINGS}/{path}": value for path, value in sample[SETTINGS].items()}
     return {name: value for name, value in sample.items() if name != SETTINGS} | own

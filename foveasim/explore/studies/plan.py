@@ -16,8 +16,15 @@ from foveasim._core.validation import check_count
 from foveasim._io.yaml_files import read_yaml
 from foveasim.config import check_settings, put_setting, resolve_files, validate
 from foveasim.errors import ConfigError, ParameterError
-from foveasim.explore._metrics import METRICS, Metric, gives, named_metrics, with_more_metrics
-from foveasim.explore.sweeps.plan import MAX_POINTS, Plan, check_disjoint, plan_sweep, shot_of, with_file_context
+from foveasim.explore._metrics import METRICS, Metric, add_metrics, has_result, resolve_metrics
+from foveasim.explore.sweeps.plan import (
+    MAX_POINTS,
+    Plan,
+    check_disjoint,
+    plan_sweep,
+    read_shot_settings,
+    with_file_context,
+)
 
 if TYPE_CHECKING:
     import optuna
@@ -34,7 +41,7 @@ _Limit = tuple[float | None, float | None]
 #: Keys of a range mapping.
 RANGE_KEYS = {"from", "to", "step", "spacing"}
 #: Items of a sweep plan that do not apply to studies.
-NOT_OF_STUDIES = {"vary", "mode", "repeats"}
+SWEEP_ONLY_KEYS = {"vary", "mode", "repeats"}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,7 +65,7 @@ class StudyPlan:
         Number of trials that are sampled together.
     name : str
         Name of the study in its storage.
-    folder : Path
+    directory : Path
         Directory for relative file paths in choices.
     files : mapping of str to str
         SHA-256 of the files that settings and choices reference.
@@ -71,23 +78,23 @@ class StudyPlan:
     n_trials: int
     batch: int
     name: str
-    folder: Path
+    directory: Path
     files: Mapping[str, str]
 
     def settings_of(self, trial: optuna.Trial) -> dict[str, Any]:
         """Return all settings of a trial; the seed, and so the noise, is equal in all trials."""
         settings = json.loads(json.dumps(dict(self.base.settings))) | {"seed": self.base.seed}
-        for path, where in self.search.items():
-            value = resolve_files(self.folder, _suggested(trial, path, where), path)
+        for path, search_range in self.search.items():
+            value = resolve_files(self.directory, _suggest(trial, path, search_range), path)
             put_setting(self.base.source, settings, path, value)
         return dict(settings)
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything that determines the trials as plain data; resuming requires equality."""
-        base = {key: value for key, value in self.base.to_dict().items() if key not in NOT_OF_STUDIES}
+        base = {key: value for key, value in self.base.to_dict().items() if key not in SWEEP_ONLY_KEYS}
         return base | {
             "files": dict(self.files),
-            "search": {path: _plain(where) for path, where in self.search.items()},
+            "search": {path: _to_plain_data(search_range) for path, search_range in self.search.items()},
             "objectives": dict(self.objectives),
             "constraints": {key: list(limits) for key, limits in self.constraints.items()},
             "batch": self.batch,
@@ -153,30 +160,32 @@ def read_study(path: str | Path, *, metrics: Sequence[str] = (), n_trials: int |
     """
     path = Path(path)
     section: StudySection = validate(path, StudySection, read_yaml(path))
-    source, shot = shot_of(path, section.shot)
+    source, shot = read_shot_settings(path, section.shot)
     with with_file_context(path):
         # Names in the file are looked up in METRICS, and never imported.
-        named = _wanted([*section.objectives, *section.constraints], section.metrics)
-    wanted = with_more_metrics(named, metrics)
+        file_metrics = _select_metrics([*section.objectives, *section.constraints], section.metrics)
+    selected = add_metrics(file_metrics, metrics)
     if n_trials is not None:
         n_trials = check_count("trials", n_trials, at_most=MAX_POINTS)
     with with_file_context(path):
         return plan_study(
             shot,
             {
-                name: where if isinstance(where, list) else where.model_dump(by_alias=True, exclude_none=True)
-                for name, where in section.search.items()
+                name: search_range
+                if isinstance(search_range, list)
+                else search_range.model_dump(by_alias=True, exclude_none=True)
+                for name, search_range in section.search.items()
             },
             section.objectives,
             n_trials=section.trials if n_trials is None else n_trials,
             constraints=section.constraints,
-            metrics=None if section.metrics is None and not metrics else wanted,
+            metrics=None if section.metrics is None and not metrics else selected,
             changes={name: resolve_files(path.parent, value, name) for name, value in section.set.items()},
             seed=section.seed,
             batch=section.batch,
             name=section.name,
             source=source,
-            folder=path.parent,
+            directory=path.parent,
         )
 
 
@@ -193,7 +202,7 @@ def plan_study(
     batch: int = 1,
     name: str = "study",
     source: str | Path = "settings",
-    folder: str | Path = ".",
+    directory: str | Path = ".",
 ) -> StudyPlan:
     """
     Create the plan of a study, with all checks that do not require building a camera.
@@ -204,7 +213,7 @@ def plan_study(
         As for :func:`plan_sweep`.
     search, objectives, n_trials, constraints, metrics, seed, batch, name
         As for :func:`study`.
-    folder : path
+    directory : path
         Directory for relative file paths in choices.
 
     Returns
@@ -224,9 +233,9 @@ def plan_study(
         raise ParameterError("name", "must be a non-empty string", name)
     constraints = dict(constraints or {})
     _check_names(objectives, constraints)
-    wanted = _wanted([*objectives, *constraints], metrics)
-    for place, names in (("objectives", objectives), ("constraints", constraints)):
-        _check_given(place, names, METRICS if metrics is None else wanted)
+    selected = _select_metrics([*objectives, *constraints], metrics)
+    for parameter, names in (("objectives", objectives), ("constraints", constraints)):
+        _check_results(parameter, names, METRICS if metrics is None else selected)
     if not isinstance(search, Mapping) or not search:
         raise ParameterError("search", "must be a non-empty mapping of setting paths to ranges", search)
     if "seed" in search:
@@ -234,42 +243,42 @@ def plan_study(
     plans = [
         plan_sweep(
             shot,
-            {path: _ends(path, where)},
+            {path: _bounds(path, search_range)},
             mode="zip",
-            metrics=wanted,
+            metrics=selected,
             changes=changes,
             seed=seed,
             source=source,
-            folder=folder,
+            directory=directory,
         )
-        for path, where in search.items()
+        for path, search_range in search.items()
     ]
     check_disjoint(plans[0].source, search, "be searched")
     return StudyPlan(
         base=plans[0],
-        search={path: _as_taken(plan, path, search[path]) for path, plan in zip(search, plans, strict=True)},
+        search={path: _typed_range(plan, path, search[path]) for path, plan in zip(search, plans, strict=True)},
         objectives=dict(objectives),
         constraints=constraints,
         n_trials=n_trials,
         batch=batch,
         name=name,
-        folder=Path(folder).absolute(),
+        directory=Path(directory).absolute(),
         files={file: digest for plan in plans for file, digest in plan.files.items()},
     )
 
 
-def _wanted(names: Sequence[str], metrics: Any) -> dict[str, Metric]:
+def _select_metrics(names: Sequence[str], metrics: Any) -> dict[str, Metric]:
     """Return the given metrics, or by default those with the named results."""
     if metrics is not None:
-        return named_metrics(metrics)
-    return {own: METRICS[own] for own in METRICS if any(gives(own, name) for name in names)}
+        return resolve_metrics(metrics)
+    return {own: METRICS[own] for own in METRICS if any(has_result(own, name) for name in names)}
 
 
-def _check_given(place: str, names: Iterable[str], metrics: Iterable[str]) -> None:
+def _check_results(parameter: str, names: Iterable[str], metrics: Iterable[str]) -> None:
     for name in names:
-        if not any(gives(own, name) for own in metrics):
+        if not any(has_result(own, name) for own in metrics):
             raise ParameterError(
-                place,
+                parameter,
                 f"must be results of metrics ({', '.join(metrics)}), or of those in 'metrics'",
                 name,
                 hint="pass other functions in Python, or with --metric module:function",
@@ -279,9 +288,9 @@ def _check_given(place: str, names: Iterable[str], metrics: Iterable[str]) -> No
 def _check_names(objectives: Mapping[str, str], constraints: Limits) -> None:
     if not isinstance(objectives, Mapping) or not objectives:
         raise ParameterError("objectives", 'must map names of results to "maximize" or "minimize"', objectives)
-    for name, way in objectives.items():
-        if way not in ("maximize", "minimize"):
-            raise ParameterError(str(name), 'must be "maximize" or "minimize"', way)
+    for name, direction in objectives.items():
+        if direction not in ("maximize", "minimize"):
+            raise ParameterError(str(name), 'must be "maximize" or "minimize"', direction)
     for name, limits in constraints.items():
         is_pair = isinstance(limits, tuple | list) and len(limits) == 2
         if (
@@ -295,43 +304,55 @@ def _check_names(objectives: Mapping[str, str], constraints: Limits) -> None:
             raise ParameterError(str(name), "must have limits (low, high) with low <= high", limits)
 
 
-def _ends(path: str, where: Search) -> list[Any]:
+def _bounds(path: str, search_range: Search) -> list[Any]:
     """Return the bounds of a range, or all choices."""
-    if isinstance(where, Mapping):
-        if set(where) - RANGE_KEYS or not {"from", "to"} <= set(where) or {"step", "spacing"} <= set(where):
-            raise ParameterError(path, "must have 'from' and 'to', and optionally 'step' or 'spacing'", dict(where))
-        if where.get("spacing", "linear") not in ("linear", "geometric"):
-            raise ParameterError(path, "must have a linear or geometric spacing", where["spacing"])
-        ends = [where["from"], where["to"]]
-    elif isinstance(where, tuple):
-        ends = list(where)
-    elif isinstance(where, list) and where:
-        return where
+    if isinstance(search_range, Mapping):
+        if (
+            set(search_range) - RANGE_KEYS
+            or not {"from", "to"} <= set(search_range)
+            or {"step", "spacing"} <= set(search_range)
+        ):
+            raise ParameterError(
+                path, "must have 'from' and 'to', and optionally 'step' or 'spacing'", dict(search_range)
+            )
+        if search_range.get("spacing", "linear") not in ("linear", "geometric"):
+            raise ParameterError(path, "must have a linear or geometric spacing", search_range["spacing"])
+        bounds = [search_range["from"], search_range["to"]]
+    elif isinstance(search_range, tuple):
+        bounds = list(search_range)
+    elif isinstance(search_range, list) and search_range:
+        return search_range
     else:
-        raise ParameterError(path, "must be searched in (low, high), a range mapping, or a list of choices", where)
-    if len(ends) != 2 or not all(map(_is_number, ends)) or not ends[0] < ends[1]:
-        raise ParameterError(path, "must have two finite bounds in ascending order", where)
-    if isinstance(where, Mapping):
-        if where.get("spacing") == "geometric" and ends[0] <= 0:
-            raise ParameterError(path, "must be > 0 for geometric spacing", where["from"])
-        if "step" in where and not (_is_number(where["step"]) and 0 < where["step"] <= ends[1] - ends[0]):
-            raise ParameterError(path, "must have a step > 0 that is at most the width of the range", where["step"])
-    return ends
+        raise ParameterError(
+            path, "must be searched in (low, high), a range mapping, or a list of choices", search_range
+        )
+    if len(bounds) != 2 or not all(map(_is_number, bounds)) or not bounds[0] < bounds[1]:
+        raise ParameterError(path, "must have two finite bounds in ascending order", search_range)
+    if isinstance(search_range, Mapping):
+        if search_range.get("spacing") == "geometric" and bounds[0] <= 0:
+            raise ParameterError(path, "must be > 0 for geometric spacing", search_range["from"])
+        if "step" in search_range and not (
+            _is_number(search_range["step"]) and 0 < search_range["step"] <= bounds[1] - bounds[0]
+        ):
+            raise ParameterError(
+                path, "must have a step > 0 that is at most the width of the range", search_range["step"]
+            )
+    return bounds
 
 
-def _as_taken(plan: Plan, path: str, where: Search) -> Search:
+def _typed_range(plan: Plan, path: str, search_range: Search) -> Search:
     """Return a range with integer bounds for integer settings, and float bounds for others."""
-    low, *others = _ends(path, where)
-    if isinstance(where, list) or not all(isinstance(end, int) for end in (low, *others)):
-        return where
+    low, *others = _bounds(path, search_range)
+    if isinstance(search_range, list) or not all(isinstance(bound, int) for bound in (low, *others)):
+        return search_range
     settings = json.loads(json.dumps(dict(plan.settings)))
     put_setting(plan.source, settings, path, low + 0.5)
     try:
         check_settings(plan.source, settings)
     except ConfigError:
-        return where
-    if isinstance(where, Mapping):
-        return {key: float(value) if key in {"from", "to"} else value for key, value in where.items()}
+        return search_range
+    if isinstance(search_range, Mapping):
+        return {key: float(value) if key in {"from", "to"} else value for key, value in search_range.items()}
     return float(low), float(others[0])
 
 
@@ -341,24 +362,24 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, float) and math.isfinite(value)
 
 
-def _suggested(trial: optuna.Trial, path: str, where: Search) -> Any:
+def _suggest(trial: optuna.Trial, path: str, search_range: Search) -> Any:
     """Sample the value of a setting for a trial."""
-    if isinstance(where, list):
-        texts = [json.dumps(choice) for choice in where]
-        return json.loads(trial.suggest_categorical(path, texts))
-    low, high = _ends(path, where)
-    step = where.get("step") if isinstance(where, Mapping) else None
-    is_log = isinstance(where, Mapping) and where.get("spacing") == "geometric"
-    is_whole = all(isinstance(number, int) for number in (low, high, step or 1))
+    if isinstance(search_range, list):
+        choices = [json.dumps(choice) for choice in search_range]
+        return json.loads(trial.suggest_categorical(path, choices))
+    low, high = _bounds(path, search_range)
+    step = search_range.get("step") if isinstance(search_range, Mapping) else None
+    is_log = isinstance(search_range, Mapping) and search_range.get("spacing") == "geometric"
+    is_integer = all(isinstance(number, int) for number in (low, high, step or 1))
     if step is not None:
         # Optuna requires a range that is a multiple of the step, in decimal arithmetic.
         first, each = Decimal(str(low)), Decimal(str(step))
         last = first + (Decimal(str(high)) - first) // each * each
-        high = int(last) if is_whole else float(last)
-    if is_whole:
+        high = int(last) if is_integer else float(last)
+    if is_integer:
         return trial.suggest_int(path, low, high, step=step or 1, log=is_log)
     return trial.suggest_float(path, low, high, step=step, log=is_log)
 
 
-def _plain(where: Search) -> Any:
-    return dict(where) if isinstance(where, Mapping) else list(where)
+def _to_plain_data(search_range: Search) -> Any:
+    return dict(search_range) if isinstance(search_range, Mapping) else list(search_range)

@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 __all__ = ["best_table", "finished_trials", "run_study", "storage_name", "study"]
 
 #: Limits of the table of the best trials: rows, and characters of a choice.
-MOST_ROWS, LONGEST_CHOICE = 20, 40
+MAX_ROWS, MAX_CHOICE_LENGTH = 20, 40
 #: Attributes of a study and of its trials.
-PLAN, WRITER, ERROR, IS_CUT = "plan", "writer", "error", "ended with the program"
+PLAN, WRITER, ERROR, INTERRUPTED = "plan", "writer", "error", "ended with the program"
 
 
 def study(
@@ -155,47 +155,47 @@ def run_study(
         workers = min(check_count("workers", workers, at_most=1024), plan.batch)
     optuna = _optuna()
     url = _url(storage)
-    with _alone(storage, url):
+    with _file_lock(storage, url):
         token = secrets.token_hex(8)
-        with _silent(optuna), _using(storage):
-            found = _opened(optuna, storage, url, plan)
-            trials = _begin(optuna, storage, found, plan, token)
+        with _suppress_logs(optuna), _storage_errors(storage):
+            optuna_study = _open_study(optuna, storage, url, plan)
+            trials = _prepare(optuna, storage, optuna_study, plan, token)
         runner = ShotRunner(plan.base.source, plan.base.metrics)
         users = list(plan.base.metrics.values())
         with executor(runner, what="the metrics", users=users, scheduler=scheduler, workers=workers) as run:
-            n_done = len(finished_trials(found))
+            n_done = len(finished_trials(optuna_study))
             while n_done < plan.n_trials:
                 if progress is not None:
                     progress(n_done, plan.n_trials)
-                with _using(storage, n_done):
-                    trials = trials or [_asked(optuna, found, plan, n_done + k) for k in range(plan.batch)]
+                with _storage_errors(storage, n_done):
+                    trials = trials or [_ask(optuna, optuna_study, plan, n_done + k) for k in range(plan.batch)]
                     _check_writer(optuna, storage, trials[-1], token)
                     points = [(trial.number, plan.settings_of(trial)) for trial in trials]
                 records = {
                     number: Record(number, {}, WORKER_LOST) if record is KILLED else record
                     for (number, _), record in run(points, ())
                 }
-                with _using(storage, n_done):
+                with _storage_errors(storage, n_done):
                     for trial in trials:
                         _check_writer(optuna, storage, trial, token)
                         _store_result(
-                            optuna, found, trial, records[trial.number], list(plan.objectives), plan.constraints
+                            optuna, optuna_study, trial, records[trial.number], list(plan.objectives), plan.constraints
                         )
                 n_done += len(trials)
                 trials = []
     if progress is not None:
         progress(plan.n_trials, plan.n_trials)
-    return found
+    return optuna_study
 
 
-def finished_trials(found: optuna.Study) -> list[optuna.trial.FrozenTrial]:
+def finished_trials(optuna_study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
     """
     Return the finished trials of a study, without trials lost in interruptions.
 
     Failed trials contain their message in ``user_attrs["error"]``.
     """
-    trials = found.get_trials(deepcopy=False)
-    return [trial for trial in trials if trial.state.is_finished() and not trial.user_attrs.get(IS_CUT)]
+    trials = optuna_study.get_trials(deepcopy=False)
+    return [trial for trial in trials if trial.state.is_finished() and not trial.user_attrs.get(INTERRUPTED)]
 
 
 def storage_name(storage: str | Path | None) -> str:
@@ -203,7 +203,7 @@ def storage_name(storage: str | Path | None) -> str:
     return re.sub(r"://[^/@]*@", "://", str(storage))
 
 
-def best_table(plan: StudyPlan, found: optuna.Study) -> Table:
+def best_table(plan: StudyPlan, optuna_study: optuna.Study) -> Table:
     """
     Return a table of the best trials, sorted by the first objective.
 
@@ -217,26 +217,26 @@ def best_table(plan: StudyPlan, found: optuna.Study) -> Table:
     limited = [name for name in plan.constraints if name not in plan.objectives]
     table = Table(box=None)
     table.add_column("trial", justify="right")
-    for name, way in plan.objectives.items():
-        table.add_column(Text(f"{printable(name)}\n{way}d"), justify="right", overflow="fold")
-    for heading in (*limited, *_short(plan.search)):
+    for name, direction in plan.objectives.items():
+        table.add_column(Text(f"{printable(name)}\n{direction}d"), justify="right", overflow="fold")
+    for heading in (*limited, *_shortest_suffixes(plan.search)):
         table.add_column(as_plain_text(heading), justify="right", overflow="fold")
     sign = -1.0 if next(iter(plan.objectives.values())) == "maximize" else 1.0
-    best = sorted(found.best_trials, key=lambda trial: sign * trial.values[0])
+    best = sorted(optuna_study.best_trials, key=lambda trial: sign * trial.values[0])
     rows: dict[tuple[str, ...], int] = {}
     for trial in best:
         results = [*trial.values, *(trial.user_attrs[name] for name in limited)]
-        chosen = [_shown(trial.params[path], where) for path, where in plan.search.items()]
+        chosen = [_format_value(trial.params[path], search_range) for path, search_range in plan.search.items()]
         # Trials with equal settings have equal results and share a row.
         rows.setdefault((*(f"{value:.6g}" for value in results), *chosen), trial.number)
-    for cells, number in list(rows.items())[:MOST_ROWS]:
+    for cells, number in list(rows.items())[:MAX_ROWS]:
         table.add_row(f"{number}", *map(as_plain_text, cells))
-    if len(rows) > MOST_ROWS:
-        table.caption = f"and {len(rows) - MOST_ROWS:,} further best trials"
+    if len(rows) > MAX_ROWS:
+        table.caption = f"and {len(rows) - MAX_ROWS:,} further best trials"
     return table
 
 
-def _short(paths: Iterable[str]) -> list[str]:
+def _shortest_suffixes(paths: Iterable[str]) -> list[str]:
     """Return the shortest unique suffixes of setting paths."""
     split = [path.split(".") for path in paths]
     return [
@@ -249,18 +249,18 @@ def _short(paths: Iterable[str]) -> list[str]:
     ]
 
 
-def _shown(value: Any, where: Search) -> str:
+def _format_value(value: Any, search_range: Search) -> str:
     """Format the value of a setting for a table; Optuna stores choices as JSON strings."""
-    chosen = json.loads(value) if isinstance(where, list) else value
+    chosen = json.loads(value) if isinstance(search_range, list) else value
     if isinstance(chosen, float):
         return f"{chosen:.6g}"
     text = chosen if isinstance(chosen, str) else json.dumps(chosen)
-    return text if len(text) <= LONGEST_CHOICE else text[: LONGEST_CHOICE - 3] + "..."
+    return text if len(text) <= MAX_CHOICE_LENGTH else text[: MAX_CHOICE_LENGTH - 3] + "..."
 
 
 def _store_result(
     optuna: Any,
-    found: optuna.Study,
+    optuna_study: optuna.Study,
     trial: optuna.Trial,
     record: Record,
     objectives: Sequence[str],
@@ -282,7 +282,7 @@ def _store_result(
         numbers[name] = float(value)
     if error:
         trial.set_user_attr(ERROR, error)
-        found.tell(trial, state=optuna.trial.TrialState.FAIL)
+        optuna_study.tell(trial, state=optuna.trial.TrialState.FAIL)
         return
     for name, value in record.values.items():
         if isinstance(value, bool | int | float | str):
@@ -292,32 +292,32 @@ def _store_result(
             trial.set_constraint(f"{name} >= {low:g}", low - numbers[name])
         if high is not None:
             trial.set_constraint(f"{name} <= {high:g}", numbers[name] - high)
-    found.tell(trial, [numbers[name] for name in objectives])
+    optuna_study.tell(trial, [numbers[name] for name in objectives])
 
 
-def _opened(optuna: Any, storage: str | Path | None, url: str | None, plan: StudyPlan) -> optuna.Study:
+def _open_study(optuna: Any, storage: str | Path | None, url: str | None, plan: StudyPlan) -> optuna.Study:
     """Load the study from its storage, or create it."""
     directions = list(plan.objectives.values())
     if url is None or plan.name not in optuna.get_all_study_names(storage=url):
         return optuna.create_study(storage=url, study_name=plan.name, directions=directions)
-    found = optuna.load_study(storage=url, study_name=plan.name)
-    if [direction.name.lower() for direction in found.directions] != directions:
+    optuna_study = optuna.load_study(storage=url, study_name=plan.name)
+    if [direction.name.lower() for direction in optuna_study.directions] != directions:
         raise FileError(
             storage_name(storage), f"contains a study '{plan.name}' with other objectives; use another name"
         )
-    return found
+    return optuna_study
 
 
-def _asked(optuna: Any, found: optuna.Study, plan: StudyPlan, n: int) -> optuna.Trial:
+def _ask(optuna: Any, optuna_study: optuna.Study, plan: StudyPlan, n: int) -> optuna.Trial:
     """Sample the settings of trial n, with a sampler that is seeded for this trial."""
-    found.sampler = optuna.samplers.TPESampler(seed=derive_seed(plan.base.seed, n) % 2**32)
-    trial = found.ask()
+    optuna_study.sampler = optuna.samplers.TPESampler(seed=derive_seed(plan.base.seed, n) % 2**32)
+    trial = optuna_study.ask()
     plan.settings_of(trial)
     return trial
 
 
-def _begin(
-    optuna: Any, storage: str | Path | None, found: optuna.Study, plan: StudyPlan, token: str
+def _prepare(
+    optuna: Any, storage: str | Path | None, optuna_study: optuna.Study, plan: StudyPlan, token: str
 ) -> list[optuna.Trial]:
     """
     Check that the stored study has the same plan, and register this program as its writer.
@@ -329,27 +329,27 @@ def _begin(
         already. Trials of a batch without stored results are discarded and sampled again.
     """
     plan_dict = plan.to_dict()
-    before = found.user_attrs.get(PLAN)
-    if before is not None:
-        check_same_plan(Path(storage_name(storage)), before, plan_dict)
-    elif found.get_trials(deepcopy=False):
+    stored_plan = optuna_study.user_attrs.get(PLAN)
+    if stored_plan is not None:
+        check_same_plan(Path(storage_name(storage)), stored_plan, plan_dict)
+    elif optuna_study.get_trials(deepcopy=False):
         raise FileError(
-            storage_name(storage), f"contains a study '{found.study_name}' of another program; use another name"
+            storage_name(storage), f"contains a study '{optuna_study.study_name}' of another program; use another name"
         )
     else:
-        found.set_user_attr(PLAN, json.loads(json.dumps(plan_dict)))
-    found.set_user_attr(WRITER, token)
-    running = found.get_trials(deepcopy=False, states=(optuna.trial.TrialState.RUNNING,))
-    trials = [optuna.trial.Trial(found, trial._trial_id) for trial in running]  # noqa: SLF001 -- Optuna has no public way
-    if len(finished_trials(found)) % plan.batch:
+        optuna_study.set_user_attr(PLAN, json.loads(json.dumps(plan_dict)))
+    optuna_study.set_user_attr(WRITER, token)
+    running = optuna_study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.RUNNING,))
+    trials = [optuna.trial.Trial(optuna_study, trial._trial_id) for trial in running]  # noqa: SLF001 -- Optuna has no public way
+    if len(finished_trials(optuna_study)) % plan.batch:
         return trials
     for trial in trials:
-        _give_up(optuna, trial)
+        _discard(optuna, trial)
     return []
 
 
-def _give_up(optuna: Any, trial: optuna.Trial) -> None:
-    trial.set_user_attr(IS_CUT, True)
+def _discard(optuna: Any, trial: optuna.Trial) -> None:
+    trial.set_user_attr(INTERRUPTED, True)
     trial.study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
 
 
@@ -365,12 +365,12 @@ def _check_writer(optuna: Any, storage: str | Path | None, trial: optuna.Trial, 
     if trial.study.user_attrs.get(WRITER) == token:
         return
     with suppress(Exception):
-        _give_up(optuna, trial)
+        _discard(optuna, trial)
     raise FileError(storage_name(storage), "is being written by another program, which runs the same study")
 
 
 @contextmanager
-def _alone(storage: str | Path | None, url: str | None) -> Iterator[None]:
+def _file_lock(storage: str | Path | None, url: str | None) -> Iterator[None]:
     """
     Lock the SQLite file of a study against other programs on this machine.
 
@@ -381,26 +381,26 @@ def _alone(storage: str | Path | None, url: str | None) -> Iterator[None]:
     FileError
         When another program has locked the file.
     """
-    file = None if url is None else _file_of(url)
+    file = None if url is None else _sqlite_path(url)
     if file is None:
         yield
         return
     # A separate file: closing the database file here would release the locks of SQLite on it.
-    beside = file.with_name(file.name + ".lock")
-    with ExitStack() as opened:
-        is_ours = False
-        while not is_ours:
-            with _using(storage):
-                held = opened.enter_context(beside.open("ab"))
-                if not lock(held):
+    lock_path = file.with_name(file.name + ".lock")
+    with ExitStack() as stack:
+        is_locked = False
+        while not is_locked:
+            with _storage_errors(storage):
+                lock_file = stack.enter_context(lock_path.open("ab"))
+                if not lock(lock_file):
                     raise FileError(storage_name(storage), "is being written by another program that runs a study")
                 # Another program may remove the lock file at its end, after it was opened here.
-                is_ours = beside.exists() and os.path.samestat(beside.stat(), os.fstat(held.fileno()))
-        opened.callback(partial(beside.unlink, missing_ok=True))
+                is_locked = lock_path.exists() and os.path.samestat(lock_path.stat(), os.fstat(lock_file.fileno()))
+        stack.callback(partial(lock_path.unlink, missing_ok=True))
         yield
 
 
-def _file_of(url: str) -> Path | None:
+def _sqlite_path(url: str) -> Path | None:
     """Return the file of an SQLite database; None for other databases."""
     from sqlalchemy.engine import make_url
     from sqlalchemy.exc import ArgumentError
@@ -425,7 +425,7 @@ def _url(storage: str | Path | None) -> str | None:
 
 
 @contextmanager
-def _using(storage: str | Path | None, n_done: int | None = None) -> Iterator[None]:
+def _storage_errors(storage: str | Path | None, n_done: int | None = None) -> Iterator[None]:
     """Raise errors of a storage as FileError, with the number of stored trials."""
     try:
         yield
@@ -436,12 +436,12 @@ def _using(storage: str | Path | None, n_done: int | None = None) -> Iterator[No
         while cause.__cause__ is not None:
             cause = cause.__cause__
         reason = str(cause).partition("\n")[0]
-        kept = "" if n_done is None else f"; {n_done:,} trials are stored, from which the same study resumes"
-        raise FileError(storage_name(storage), f"cannot be used as a study's storage ({reason:.200}){kept}") from None
+        stored = "" if n_done is None else f"; {n_done:,} trials are stored, from which the same study resumes"
+        raise FileError(storage_name(storage), f"cannot be used as a study's storage ({reason:.200}){stored}") from None
 
 
 @contextmanager
-def _silent(optuna: Any) -> Iterator[None]:
+def _suppress_logs(optuna: Any) -> Iterator[None]:
     """Suppress the messages that Optuna logs when it creates a study."""
     verbosity = optuna.logging.get_verbosity()
     optuna.logging.set_verbosity(optuna.logging.WARNING)

@@ -23,8 +23,8 @@ from foveasim._io.yaml_files import read_yaml
 from foveasim.config import check_settings, put_setting, read_settings, resolve_files, validate
 from foveasim.errors import ConfigError, ParameterError
 from foveasim.explore._files import digests
-from foveasim.explore._functions import identity_of
-from foveasim.explore._metrics import Metric, named_metrics, with_more_metrics
+from foveasim.explore._functions import identify_function
+from foveasim.explore._metrics import Metric, add_metrics, resolve_metrics
 
 __all__ = [
     "MAX_POINTS",
@@ -33,8 +33,8 @@ __all__ = [
     "check_disjoint",
     "coordinate",
     "plan_sweep",
+    "read_shot_settings",
     "read_sweep",
-    "shot_of",
     "with_file_context",
 ]
 
@@ -45,8 +45,8 @@ CHECKED_VALUES = 1000
 #: Names of dimensions that are not settings.
 POINT, REPEAT = "point", "repeat"
 #: Settings of the photosites and their integration areas, and settings of the optical image.
-GEOMETRY = ("layout", "distortion", "integration_order")
-LIGHT = ("scene", "optics", "sensor.qe", "sensor.filters")
+GEOMETRY_SETTINGS = ("layout", "distortion", "integration_order")
+IMAGE_SETTINGS = ("scene", "optics", "sensor.qe", "sensor.filters")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -111,7 +111,7 @@ class Plan:
     def settings_of(self, point: int) -> dict[str, Any]:
         """Return all settings of a point, with its seed."""
         chosen = {path: values[k] for (path, values), k in zip(self.values.items(), self.choices[point], strict=True)}
-        return self._changed(chosen) | {"seed": self.seed_of(point)}
+        return self._settings_with(chosen) | {"seed": self.seed_of(point)}
 
     def seed_of(self, point: int) -> int:
         """Return the noise seed of a point, derived from the sweep seed and the point number."""
@@ -120,7 +120,7 @@ class Plan:
     @property
     def is_geometry_varied(self) -> bool:
         """Whether points differ in the photosites or the distortion."""
-        return any(_is_of(path, GEOMETRY) for path in self.values)
+        return any(_overlaps(path, GEOMETRY_SETTINGS) for path in self.values)
 
     def order(self) -> tuple[Ints, Ints]:
         """
@@ -137,13 +137,13 @@ class Plan:
         """
         choices = self.choices if self.mode == "product" else self._first_equal()
         groups = []
-        for parts in (GEOMETRY, LIGHT):
-            own = [k for k, path in enumerate(self.values) if _is_of(path, parts)]
+        for parts in (GEOMETRY_SETTINGS, IMAGE_SETTINGS):
+            own = [k for k, path in enumerate(self.values) if _overlaps(path, parts)]
             groups.append(np.unique(choices[:, own], axis=0, return_inverse=True)[1].reshape(-1))
-        layout, light = groups
-        light_there_and_back = np.where(layout % 2 == 0, light, -light)
-        order = np.lexsort((np.arange(self.n_points), light_there_and_back, layout))
-        is_new = np.diff(layout[order], prepend=-1) | np.diff(light[order], prepend=-1)
+        layout, image = groups
+        alternating_image = np.where(layout % 2 == 0, image, -image)
+        order = np.lexsort((np.arange(self.n_points), alternating_image, layout))
+        is_new = np.diff(layout[order], prepend=-1) | np.diff(image[order], prepend=-1)
         return order, np.flatnonzero(is_new)
 
     def to_dict(self) -> dict[str, Any]:
@@ -154,15 +154,15 @@ class Plan:
             "mode": self.mode,
             "repeats": self.repeats,
             "seed": self.seed,
-            "metrics": dict(self._metrics_described),
+            "metrics": dict(self._metric_identities),
             "files": dict(self.files),
             "versions": versions(),
         }
 
     @cached_property
-    def _metrics_described(self) -> dict[str, str]:
+    def _metric_identities(self) -> dict[str, str]:
         # Computed once: captured values of a function may change while it runs.
-        return {name: identity_of(metric) for name, metric in self.metrics.items()}
+        return {name: identify_function(metric) for name, metric in self.metrics.items()}
 
     def _first_equal(self) -> Ints:
         """Return ``choices`` with equal values replaced by the index of the first of them."""
@@ -173,8 +173,8 @@ class Plan:
             columns.append(np.array(numbers)[chosen])
         return np.stack(columns, axis=1)
 
-    def _changed(self, chosen: Mapping[str, Any]) -> dict[str, Any]:
-        data = _copied(self.settings)
+    def _settings_with(self, chosen: Mapping[str, Any]) -> dict[str, Any]:
+        data = _copy(self.settings)
         for path, value in chosen.items():
             put_setting(self.source, data, path, value)
         return data
@@ -192,12 +192,14 @@ class Plan:
         check_disjoint(self.source, names)
         if self.mode == "zip":
             for k in range(min(len(self.values[names[0]]), CHECKED_VALUES)):
-                check_settings(self.source, self._changed({path: values[k] for path, values in self.values.items()}))
+                check_settings(
+                    self.source, self._settings_with({path: values[k] for path, values in self.values.items()})
+                )
             return
         first = {path: values[0] for path, values in self.values.items()}
         for path, values in self.values.items():
             for value in values[:CHECKED_VALUES]:
-                check_settings(self.source, self._changed(first | {path: value}))
+                check_settings(self.source, self._settings_with(first | {path: value}))
 
 
 class _Range(BaseModel):
@@ -256,14 +258,14 @@ def read_sweep(path: str | Path, *, metrics: Sequence[str] = ()) -> Plan:
     vary: Any = section.points
     if section.vary is not None:
         vary = {
-            name: _numbers(path, name, values) if isinstance(values, _Range) else values
+            name: _expand_range(path, name, values) if isinstance(values, _Range) else values
             for name, values in section.vary.items()
         }
-    source, shot = shot_of(path, section.shot)
+    source, shot = read_shot_settings(path, section.shot)
     with with_file_context(path):
         # Names in the file are looked up in METRICS, and never imported.
-        named = named_metrics(section.metrics)
-    wanted = with_more_metrics(named, metrics)
+        file_metrics = resolve_metrics(section.metrics)
+    all_metrics = add_metrics(file_metrics, metrics)
     with with_file_context(path):
         return plan_sweep(
             shot,
@@ -271,10 +273,10 @@ def read_sweep(path: str | Path, *, metrics: Sequence[str] = ()) -> Plan:
             mode=section.mode,
             repeats=section.repeats,
             seed=section.seed,
-            metrics=wanted,
+            metrics=all_metrics,
             changes={name: resolve_files(path.parent, value, name) for name, value in section.set.items()},
             source=source,
-            folder=path.parent,
+            directory=path.parent,
         )
 
 
@@ -288,7 +290,7 @@ def plan_sweep(
     metrics: Iterable[str | Metric] | Mapping[str, Metric] | None = None,
     changes: Mapping[str, Any] | None = None,
     source: str | Path = "settings",
-    folder: str | Path = ".",
+    directory: str | Path = ".",
 ) -> Plan:
     """
     Create the plan of a sweep, with all checks that do not require building a camera.
@@ -312,7 +314,7 @@ def plan_sweep(
         Settings that are replaced in all points.
     source : path
         Name of a mapping of settings in messages.
-    folder : path
+    directory : path
         Directory for relative file paths in ``vary``.
 
     Returns
@@ -342,16 +344,16 @@ def plan_sweep(
     found: list[Path] = []
     settings = resolve_files(source.parent, data, found=found)
     for path, value in (changes or {}).items():
-        put_setting(source, settings, path, resolve_files(Path(folder), value, path, found))
+        put_setting(source, settings, path, resolve_files(Path(directory), value, path, found))
     settings.pop("seed", None)
     plan = Plan(
         source=source.absolute(),
         settings=settings,
-        values={path: [resolve_files(Path(folder), v, path, found) for v in each] for path, each in values.items()},
+        values={path: [resolve_files(Path(directory), v, path, found) for v in each] for path, each in values.items()},
         mode=mode,
         repeats=repeats,
         seed=check_count("seed", seed, at_least=0),
-        metrics=named_metrics(metrics),
+        metrics=resolve_metrics(metrics),
         files=digests(found),
     )
     clash = next((name for name in plan.metrics if name in plan.values), None)
@@ -361,7 +363,7 @@ def plan_sweep(
     return plan
 
 
-def shot_of(path: Path, shot: str | dict[str, Any]) -> tuple[Path, dict[str, Any]]:
+def read_shot_settings(path: Path, shot: str | dict[str, Any]) -> tuple[Path, dict[str, Any]]:
     """
     Return the settings of the shot of a file, and the file that contains them.
 
@@ -385,8 +387,8 @@ def coordinate(values: Iterable[Any]) -> NDArray[Any]:
                 return np.array(values, dtype)
             except OverflowError:
                 continue
-    texts = [value if isinstance(value, str) else json.dumps(value) for value in values]
-    return np.array(texts, np.dtypes.StringDType())
+    strings = [value if isinstance(value, str) else json.dumps(value) for value in values]
+    return np.array(strings, np.dtypes.StringDType())
 
 
 @contextmanager
@@ -422,9 +424,9 @@ def check_disjoint(source: Path, paths: Iterable[str], verb: str = "vary") -> No
     """
     names = list(paths)
     for path in names:
-        inside = next((other for other in names if other.startswith(path + ".")), None)
-        if inside is not None:
-            raise ConfigError(source, f"'{path}' and '{inside}' cannot both {verb}: the first contains the second")
+        nested = next((other for other in names if other.startswith(path + ".")), None)
+        if nested is not None:
+            raise ConfigError(source, f"'{path}' and '{nested}' cannot both {verb}: the first contains the second")
 
 
 def _by_path(vary: Any, mode: Literal["product", "zip"]) -> tuple[dict[str, list[Any]], Literal["product", "zip"]]:
@@ -444,7 +446,7 @@ def _by_path(vary: Any, mode: Literal["product", "zip"]) -> tuple[dict[str, list
             raise ParameterError(str(path), "must vary over a list of values", each)
         if isinstance(each, Sized) and len(each) > MAX_POINTS:
             raise ParameterError(str(path), f"must have at most {MAX_POINTS:,} values, got {len(each):,}")
-        values[str(path)] = [_plain(str(path), value) for value in each]
+        values[str(path)] = [_to_plain_data(str(path), value) for value in each]
     if not values or not all(values.values()):
         empty = next(iter(values), None)
         raise ParameterError(empty or "vary", "must have at least one value")
@@ -452,19 +454,19 @@ def _by_path(vary: Any, mode: Literal["product", "zip"]) -> tuple[dict[str, list
         raise ParameterError("seed", "must not vary: it is derived from the seed of the sweep; use 'repeats'")
     counts = {path: len(each) for path, each in values.items()}
     if mode == "zip" and len(set(counts.values())) > 1:
-        told = ", ".join(f"{path}: {n}" for path, n in counts.items())
-        raise ParameterError("vary", f"must have equal numbers of values in the mode 'zip' ({told})")
+        listing = ", ".join(f"{path}: {n}" for path, n in counts.items())
+        raise ParameterError("vary", f"must have equal numbers of values in the mode 'zip' ({listing})")
     if mode == "product":
         for path, each in values.items():
-            twice, n = Counter(coordinate(each).tolist()).most_common(1)[0]
+            repeated, n = Counter(coordinate(each).tolist()).most_common(1)[0]
             if n > 1:
                 raise ParameterError(
-                    path, f"must have unique values, got {twice} twice; use 'repeats' for more captures"
+                    path, f"must have unique values, got {repeated} twice; use 'repeats' for more captures"
                 )
     return values, mode
 
 
-def _plain(path: str, value: Any) -> Any:
+def _to_plain_data(path: str, value: Any) -> Any:
     """Convert a value to plain data."""
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
@@ -483,23 +485,23 @@ def _constant(text: str) -> float:
     return float(text)
 
 
-def _numbers(path: Path, name: str, between: _Range) -> list[Any]:
-    if between.spacing == "geometric":
-        if not between.low * between.high > 0.0:
+def _expand_range(path: Path, name: str, value_range: _Range) -> list[Any]:
+    if value_range.spacing == "geometric":
+        if not value_range.low * value_range.high > 0.0:
             raise ConfigError(path, f"vary.{name}: must have non-zero bounds of equal sign for geometric spacing")
-        numbers = np.geomspace(between.low, between.high, between.n)
+        numbers = np.geomspace(value_range.low, value_range.high, value_range.n)
     else:
-        numbers = np.linspace(between.low, between.high, between.n)
+        numbers = np.linspace(value_range.low, value_range.high, value_range.n)
     if not np.isfinite(numbers).all():
         raise ConfigError(path, f"vary.{name}: must have finite bounds")
-    is_whole = bool((numbers == np.rint(numbers)).all())
-    return [int(number) if is_whole else float(number) for number in numbers]
+    is_integer = bool((numbers == np.rint(numbers)).all())
+    return [int(number) if is_integer else float(number) for number in numbers]
 
 
-def _is_of(path: str, parts: tuple[str, ...]) -> bool:
+def _overlaps(path: str, parts: tuple[str, ...]) -> bool:
     return any(path == part or path.startswith(part + ".") or part.startswith(path + ".") for part in parts)
 
 
-def _copied(data: Mapping[str, Any]) -> dict[str, Any]:
+def _copy(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return a copy of settings with new mappings; lists are shared."""
-    return {key: _copied(value) if isinstance(value, dict) else value for key, value in data.items()}
+    return {key: _copy(value) if isinstance(value, dict) else value for key, value in data.items()}

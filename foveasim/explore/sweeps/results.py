@@ -23,7 +23,7 @@ from foveasim.explore.sweeps.plan import POINT, REPEAT, Plan, coordinate
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["check_store", "dataset_of", "open_results", "stored_plan", "write_store"]
+__all__ = ["check_store", "open_results", "stored_plan", "to_dataset", "write_store"]
 
 #: Variables of every sweep.
 SEED, ERROR, WARNING = "seed", "error", "warning"
@@ -31,7 +31,7 @@ SEED, ERROR, WARNING = "seed", "error", "warning"
 PLAN, SETTINGS, VERSIONS = "plan", "settings", "versions"
 
 
-def dataset_of(plan: Plan, records: Mapping[int, Record]) -> xr.Dataset:
+def to_dataset(plan: Plan, records: Mapping[int, Record]) -> xr.Dataset:
     """
     Combine records to an xarray.Dataset, independent of their order.
 
@@ -50,25 +50,27 @@ def dataset_of(plan: Plan, records: Mapping[int, Record]) -> xr.Dataset:
     xr = _xarray()
     shape, dims = plan.shape, plan.dims
     errors = {k: records[k].error if k in records else "not done" for k in range(plan.n_points)}
-    taken = {*plan.values, POINT, REPEAT, SEED, ERROR, WARNING}
-    given = _apart(_alike(_by_name([records[k] for k in sorted(records)]), taken, errors), taken)
-    labels = _labels(given)
+    reserved = {*plan.values, POINT, REPEAT, SEED, ERROR, WARNING}
+    values_by_name = _rename_dimensions(
+        _select_consistent(_by_name([records[k] for k in sorted(records)]), reserved, errors), reserved
+    )
+    labels = _labels(values_by_name)
     variables: dict[str, Any] = {}
-    for name, values in given.items():
-        flat = _stacked(values, plan.n_points, labels)
+    for name, values in values_by_name.items():
+        flat = _stack(values, plan.n_points, labels)
         variables[name] = (
             (*dims, *next(iter(values.values())).dims),
             flat.reshape(*shape, *flat.shape[1:]),
             {"units": unit_of(name)} if unit_of(name) else {},
         )
     seeds = np.array([plan.seed_of(k) for k in range(plan.n_points)], np.int64)
-    texts = {
+    strings = {
         ERROR: list(errors.values()),
         WARNING: [records[k].warning if k in records else "" for k in range(plan.n_points)],
     }
     variables[SEED] = (dims, seeds.reshape(shape))
-    for name, each in texts.items():
-        variables[name] = (dims, _texts(each).reshape(shape))
+    for name, each in strings.items():
+        variables[name] = (dims, _string_array(each).reshape(shape))
     coords: dict[str, Any] = {
         path: (
             (path if plan.mode == "product" else POINT,),
@@ -93,22 +95,22 @@ def dataset_of(plan: Plan, records: Mapping[int, Record]) -> xr.Dataset:
     return xr.Dataset(variables, coords, attributes)
 
 
-def _texts(values: list[str]) -> NDArray[Any]:
+def _string_array(values: list[str]) -> NDArray[Any]:
     return np.array(values, np.dtypes.StringDType())
 
 
 def _by_name(rows: Iterable[Record]) -> dict[str, dict[int, Value]]:
     """Return the values by name and point, with numbers and strings as 0-d arrays."""
-    given: dict[str, dict[int, Value]] = {}
+    values_by_name: dict[str, dict[int, Value]] = {}
     for record in rows:
         for name, value in record.values.items():
             array = value if isinstance(value, Value) else Value(np.asarray(value), (), {})
-            given.setdefault(name, {})[record.point] = array
-    return given
+            values_by_name.setdefault(name, {})[record.point] = array
+    return values_by_name
 
 
-def _alike(
-    given: Mapping[str, dict[int, Value]], taken: set[str], errors: dict[int, str]
+def _select_consistent(
+    values_by_name: Mapping[str, dict[int, Value]], reserved: set[str], errors: dict[int, str]
 ) -> dict[str, dict[int, Value]]:
     """
     Select the values with equal dimensions in all points.
@@ -116,65 +118,68 @@ def _alike(
     Values with other dimensions than most points, or with the name of a varied setting, are excluded and reported in
     ``errors``.
     """
-    kept: dict[str, dict[int, Value]] = {}
-    for name, values in given.items():
+    selected: dict[str, dict[int, Value]] = {}
+    for name, values in values_by_name.items():
         kinds = Counter((value.dims, tuple(value.labels)) for value in values.values())
-        most = kinds.most_common(1)[0][0]
-        alike = {k: value for k, value in values.items() if (value.dims, tuple(value.labels)) == most}
-        why = f"{name}: has other dimensions or labels than in most points, which have {', '.join(most[0]) or 'none'}"
-        if name in taken:
-            alike, why = {}, f"{name}: must not have the name of a setting or a dimension"
-        for k in sorted(values.keys() - alike.keys()):
-            errors[k] = "; ".join(filter(None, (errors[k], why)))
-        if alike:
-            kept[name] = alike
-    return kept
+        most_common = kinds.most_common(1)[0][0]
+        consistent = {k: value for k, value in values.items() if (value.dims, tuple(value.labels)) == most_common}
+        dims = ", ".join(most_common[0]) or "none"
+        problem = f"{name}: has other dimensions or labels than in most points, which have {dims}"
+        if name in reserved:
+            consistent, problem = {}, f"{name}: must not have the name of a setting or a dimension"
+        for k in sorted(values.keys() - consistent.keys()):
+            errors[k] = "; ".join(filter(None, (errors[k], problem)))
+        if consistent:
+            selected[name] = consistent
+    return selected
 
 
-def _apart(given: Mapping[str, Mapping[int, Value]], taken: set[str]) -> dict[str, dict[int, Value]]:
+def _rename_dimensions(
+    values_by_name: Mapping[str, Mapping[int, Value]], reserved: set[str]
+) -> dict[str, dict[int, Value]]:
     """
     Rename dimensions to unique names.
 
     Labelled dimensions are shared by all variables that use their name; unlabelled dimensions belong to one variable.
     """
-    labelled = {dim for values in given.values() for dim in next(iter(values.values())).labels}
-    apart: dict[str, dict[int, Value]] = {}
-    for name, values in given.items():
+    labelled = {dim for values in values_by_name.values() for dim in next(iter(values.values())).labels}
+    renamed: dict[str, dict[int, Value]] = {}
+    for name, values in values_by_name.items():
         first = next(iter(values.values()))
-        own: dict[str, str] = {}
+        new_names: dict[str, str] = {}
         for dim in first.dims:
-            free = dim if dim in first.labels or dim.startswith(name) else f"{name}_{dim}"
-            others = {*taken, *given, *own.values(), *(() if free in first.labels else labelled)}
-            if free in others:
-                free = f"{name}_{dim}"
-            while free in others:
-                free += "_"
-            own[dim] = free
+            new_name = dim if dim in first.labels or dim.startswith(name) else f"{name}_{dim}"
+            others = {*reserved, *values_by_name, *new_names.values(), *(() if new_name in first.labels else labelled)}
+            if new_name in others:
+                new_name = f"{name}_{dim}"
+            while new_name in others:
+                new_name += "_"
+            new_names[dim] = new_name
         for k, value in values.items():
-            labels = {own[dim]: each for dim, each in value.labels.items()}
-            apart.setdefault(name, {})[k] = Value(value.data, tuple(own[dim] for dim in value.dims), labels)
-    return apart
+            labels = {new_names[dim]: each for dim, each in value.labels.items()}
+            renamed.setdefault(name, {})[k] = Value(value.data, tuple(new_names[dim] for dim in value.dims), labels)
+    return renamed
 
 
-def _labels(given: Mapping[str, Mapping[int, Value]]) -> dict[str, tuple[NDArray[Any], dict[Any, int]]]:
+def _labels(values_by_name: Mapping[str, Mapping[int, Value]]) -> dict[str, tuple[NDArray[Any], dict[Any, int]]]:
     """Return the labels of labelled dimensions (sorted numbers, or strings) and their indices."""
     found: dict[str, dict[Any, None]] = {}
-    for values in given.values():
+    for values in values_by_name.values():
         for value in values.values():
             for dim, labels in value.labels.items():
                 found.setdefault(dim, {}).update(dict.fromkeys(labels.tolist()))
-    joined: dict[str, tuple[NDArray[Any], dict[Any, int]]] = {}
+    combined: dict[str, tuple[NDArray[Any], dict[Any, int]]] = {}
     for dim, each in found.items():
         if any(isinstance(label, str) for label in each):
-            places = {text: k for k, text in enumerate(dict.fromkeys(map(str, each)))}
-            joined[dim] = _texts(list(places)), {label: places[str(label)] for label in each}
+            indices = {text: k for k, text in enumerate(dict.fromkeys(map(str, each)))}
+            combined[dim] = _string_array(list(indices)), {label: indices[str(label)] for label in each}
         else:
             numbers = sorted(each)
-            joined[dim] = np.array(numbers), {label: k for k, label in enumerate(numbers)}
-    return joined
+            combined[dim] = np.array(numbers), {label: k for k, label in enumerate(numbers)}
+    return combined
 
 
-def _stacked(
+def _stack(
     values: Mapping[int, Value], n_points: int, labels: Mapping[str, tuple[NDArray[Any], Mapping[Any, int]]]
 ) -> NDArray[Any]:
     """Stack the values of all points, (n_point, ...), with NaN or empty strings where missing."""
@@ -184,24 +189,24 @@ def _stacked(
         for axis, dim in enumerate(first.dims)
     )
     kinds = {value.data.dtype.kind for value in values.values()}
-    is_text = "U" in kinds
-    is_whole = len(values) == n_points and all(value.data.shape == shape for value in values.values())
-    if is_text:
+    is_string = "U" in kinds
+    is_complete = len(values) == n_points and all(value.data.shape == shape for value in values.values())
+    if is_string:
         flat: NDArray[Any] = np.full((n_points, *shape), "", np.dtypes.StringDType())
     else:
         dtype = np.result_type(*(value.data.dtype for value in values.values()))
-        if not is_whole and dtype.kind != "f":
+        if not is_complete and dtype.kind != "f":
             dtype = np.promote_types(dtype, np.float64)
-        flat = np.empty((n_points, *shape), dtype) if is_whole else np.full((n_points, *shape), np.nan, dtype)
+        flat = np.empty((n_points, *shape), dtype) if is_complete else np.full((n_points, *shape), np.nan, dtype)
     for k, value in values.items():
-        at: list[Any] = [
+        axis_indices: list[Any] = [
             np.array([labels[dim][1][label] for label in value.labels[dim].tolist()], np.int64)
             if dim in value.labels
             else np.arange(value.data.shape[axis])
             for axis, dim in enumerate(value.dims)
         ]
-        place: Any = (k, *np.ix_(*at))
-        flat[place] = value.data.astype(flat.dtype) if is_text else value.data
+        index: Any = (k, *np.ix_(*axis_indices))
+        flat[index] = value.data.astype(flat.dtype) if is_string else value.data
     return flat
 
 
@@ -275,7 +280,7 @@ def write_store(dataset: xr.Dataset, path: Path) -> None:
         When the path cannot be written.
     """
     with (
-        atomic_directory(path, is_ours=lambda folder: stored_plan(folder) is not None) as new,
+        atomic_directory(path, is_ours=lambda directory: stored_plan(directory) is not None) as new,
         warnings.catch_warnings(),
     ):
         # For xarray.open_zarr. The warning concerns other zarr implementations, which do not need consolidated metadata.

@@ -13,10 +13,10 @@ from foveasim._core.threads import thread_count
 from foveasim._core.validation import check_count
 from foveasim.errors import SimulationError
 from foveasim.explore._metrics import Metric
-from foveasim.explore._records import WORKER_LOST, Journal, Record, check_same_plan, journal_of
+from foveasim.explore._records import WORKER_LOST, Journal, Record, check_same_plan, journal_path
 from foveasim.explore.executor import KILLED, executor
 from foveasim.explore.sweeps.plan import Plan, plan_sweep
-from foveasim.explore.sweeps.results import check_store, dataset_of, open_results, stored_plan, write_store
+from foveasim.explore.sweeps.results import check_store, open_results, stored_plan, to_dataset, write_store
 from foveasim.explore.worker_cache import ShotRunner
 
 if TYPE_CHECKING:
@@ -132,13 +132,13 @@ def run_sweep(
     if out is None:
         records: dict[int, Record] = {}
         _run(plan, records, lambda record: records.update({record.point: record}), scheduler, workers, progress)
-        return dataset_of(plan, records)
+        return to_dataset(plan, records)
     store = Path(out)
     check_store(store)
-    before = stored_plan(store)
-    if before is not None:
-        check_same_plan(store, before, plan.to_dict())
-        if not journal_of(store).exists():
+    existing_plan = stored_plan(store)
+    if existing_plan is not None:
+        check_same_plan(store, existing_plan, plan.to_dict())
+        if not journal_path(store).exists():
             complete = open_results(store)
             # Records cannot be restored exactly from a store: without the journal, all points are computed.
             if not (retry and (complete["error"] != "").any()):
@@ -148,7 +148,7 @@ def run_sweep(
             for point in [point for point, record in journal.records.items() if record.error]:
                 del journal.records[point]
         _run(plan, journal.records, journal.add, scheduler, workers, progress)
-        dataset = dataset_of(plan, journal.records)
+        dataset = to_dataset(plan, journal.records)
         write_store(dataset, store)
         if not (dataset["error"] != "").any():
             journal.remove()
@@ -164,25 +164,25 @@ def _run(
     progress: Progress | None,
 ) -> None:
     """Compute all points without a record."""
-    n_left = plan.n_points - len(known)
+    n_pending = plan.n_points - len(known)
     n_done = len(known)
-    if n_left == 0:
+    if n_pending == 0:
         return
-    n_workers = min(thread_count() if workers is None else workers, n_left)
+    n_workers = min(thread_count() if workers is None else workers, n_pending)
     # The workers of a scheduler determine their own number of threads.
     n_threads = max(1, thread_count() // n_workers) if scheduler is None else None
     runner = ShotRunner(plan.source, plan.metrics, is_geometry_varied=plan.is_geometry_varied, n_threads=n_threads)
     users = list(plan.metrics.values())
     points, changes = plan.order()
-    is_left = np.array([int(point) not in known for point in points])
-    cuts = (np.cumsum(is_left) - is_left)[changes]
+    is_pending = np.array([int(point) not in known for point in points])
+    cuts = (np.cumsum(is_pending) - is_pending)[changes]
     try:
         with executor(
             _Points(replace(plan), runner), what="the metrics", users=users, scheduler=scheduler, workers=n_workers
         ) as run:
             if progress is not None:
                 progress(n_done, plan.n_points)
-            for point, record in run(points[is_left].tolist(), np.unique(cuts).tolist()):
+            for point, record in run(points[is_pending].tolist(), np.unique(cuts).tolist()):
                 add(Record(point, {}, WORKER_LOST) if record is KILLED else record)
                 n_done += 1
                 if progress is not None:
