@@ -64,9 +64,9 @@ def main(out_dir: Path) -> None:
         method: capture.picture(method, of="light_e", per="um2", grid=grid, sensor=sensor) for method in METHODS
     }
     near_db = {method: psnr_db(picture, light, min_coverage=1.0) for method, picture in pictures.items()}
-    alike = {method: ssim(picture, light, min_coverage=1.0) for method, picture in pictures.items()}
+    check_consistent = {method: ssim(picture, light, min_coverage=1.0) for method, picture in pictures.items()}
     for method in METHODS:
-        print(f"{method:13s}: PSNR {near_db[method]:.2f} dB, SSIM {alike[method]:.3f}")
+        print(f"{method:13s}: PSNR {near_db[method]:.2f} dB, SSIM {check_consistent[method]:.3f}")
 
     # %% The picture: all of it, and its middle.
     white = float(np.nanmax(light.data))
@@ -96,7 +96,7 @@ def main(out_dir: Path) -> None:
     # %% The numbers.
     assert near_db["least_squares"] > near_db["cells"] + 2.0
     assert min(near_db["linear"], near_db["natural"]) > near_db["cells"] + 0.5
-    assert alike["least_squares"] > alike["cells"]
+    assert check_consistent["least_squares"] > check_consistent["cells"]
     for picture in pictures.values():
         assert np.isnan(picture.data[0, N_PIXELS // 2, N_PIXELS // 2])
 

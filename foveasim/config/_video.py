@@ -15,7 +15,7 @@ from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
 from foveasim.scene import Scene
 from foveasim.video import FrameSource, count_recorded_frames, write_video
-from foveasim.video.frame_source import pictures_in
+from foveasim.video.frame_source import list_pictures
 
 __all__ = ["run_video"]
 
@@ -107,7 +107,7 @@ def _plan(
     """Return everything that codes depend on; for frames, names and sizes of their files."""
     camera, layout = shot.camera, shot.camera.sensor.layout
     assert isinstance(layout, Layout)  # checked by Camera
-    files = [[path.name, path.stat().st_size] for path in (pictures_in(frames) if frames.is_dir() else [frames])]
+    files = [[path.name, path.stat().st_size] for path in (list_pictures(frames) if frames.is_dir() else [frames])]
     return {
         "scene": {
             f.name: to_plain_data(getattr(scene, f.name)) for f in fields(scene) if f.name not in FRAME_ATTRIBUTES

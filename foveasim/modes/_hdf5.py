@@ -17,7 +17,7 @@ from foveasim.errors import FileError, ParameterError
 from foveasim.layout import Layout
 from foveasim.layout.packed import layout_from_arrays, layout_to_arrays
 
-__all__ = ["EventFile", "most_bytes", "read_events"]
+__all__ = ["EventFile", "max_file_bytes", "read_events"]
 
 FORMAT, VERSION = "foveasim events", 2
 #: Events, or milliseconds, per chunk.
@@ -27,13 +27,13 @@ METADATA_BYTES = 1 << 16
 #: Size limit of the table of milliseconds: times of more than a day indicate times since an epoch, not since the start.
 MAX_MS = 100_000_000
 #: Limits of decompressed data: per byte of the file, the maximum ratio of deflate, and in total.
-UNPACKED_PER_BYTE, MAX_DECOMPRESSED_BYTES = 1032, 8 * 2**30
+MAX_DECOMPRESSION_RATIO, MAX_DECOMPRESSED_BYTES = 1032, 8 * 2**30
 #: Kinds of numeric columns, and of strings, which are stored as bytes.
-NUMBERS, TEXT = "biuf", "US"
+NUMBERS, STRINGS = "biuf", "US"
 KINDS = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8, "site": np.int32}
 
 
-def most_bytes(layout: Layout, n_before: int, t_us: Ints) -> int:
+def max_file_bytes(layout: Layout, n_before: int, t_us: Ints) -> int:
     """
     Return an upper bound of the file size after adding events: the uncompressed size.
 
@@ -48,9 +48,9 @@ def most_bytes(layout: Layout, n_before: int, t_us: Ints) -> int:
     """
     per_event = sum(np.dtype(kind).itemsize for kind in KINDS.values())
     n_chunks = min(int(t_us[-1]) // 1000 + 1, MAX_MS) // CHUNK + 1 if t_us.size else 1
-    of_layout = sum(values.nbytes for values in layout_to_arrays(layout).values()) + 32 * layout.n_sites
-    about = len(json.dumps(to_plain_data(dict(layout.provenance))))
-    return per_event * (n_before + t_us.size) + 8 * CHUNK * n_chunks + of_layout + about + METADATA_BYTES
+    layout_bytes = sum(values.nbytes for values in layout_to_arrays(layout).values()) + 32 * layout.n_sites
+    provenance_bytes = len(json.dumps(to_plain_data(dict(layout.provenance))))
+    return per_event * (n_before + t_us.size) + 8 * CHUNK * n_chunks + layout_bytes + provenance_bytes + METADATA_BYTES
 
 
 class EventFile:
@@ -81,7 +81,7 @@ class EventFile:
         for name, values in sites.items():
             file[f"sites/{name}"] = values
         for name, values in layout_to_arrays(layout).items():
-            if values.dtype.kind not in NUMBERS + TEXT:
+            if values.dtype.kind not in NUMBERS + STRINGS:
                 raise ParameterError(
                     "batches",
                     f"must have a layout with columns that HDF5 supports, got '{name}' of dtype {values.dtype}",
@@ -119,7 +119,7 @@ class EventFile:
             _append(self._file["ms_to_idx"], self.n_events + np.searchsorted(t_us, begins_us))
         self.n_events, self._n_ms = self.n_events + t_us.size, n_ms
 
-    def end(self) -> None:
+    def finish(self) -> None:
         """Write the entry of the table of milliseconds after the last event."""
         _append(self._file["ms_to_idx"], np.array([self.n_events]))
 
@@ -135,8 +135,8 @@ def read_events(path: Path) -> tuple[Floats, NDArray[np.int32], NDArray[np.int8]
     FileError
         When the file is corrupt, malformed, or contains other data.
     """
-    told, found = read_in_sandbox(_read, path, kind="HDF5", max_decompressed_bytes=_max_decompressed_bytes)
-    arrays = dict(zip(told["names"], found, strict=True))
+    metadata, found = read_in_sandbox(_read, path, kind="HDF5", max_decompressed_bytes=_max_decompressed_bytes)
+    arrays = dict(zip(metadata["names"], found, strict=True))
     outlines = {
         name.removeprefix("layout/"): np.char.decode(values, "utf-8") if values.dtype.kind == "S" else values
         for name, values in arrays.items()
@@ -158,7 +158,7 @@ def _append(dataset: Any, values: NDArray[Any]) -> None:
 
 
 def _max_decompressed_bytes(n_bytes: int) -> int:
-    return min(UNPACKED_PER_BYTE * n_bytes, MAX_DECOMPRESSED_BYTES)
+    return min(MAX_DECOMPRESSION_RATIO * n_bytes, MAX_DECOMPRESSED_BYTES)
 
 
 def _read(file_name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:

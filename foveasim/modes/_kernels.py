@@ -4,7 +4,7 @@ Numba kernels of asynchronous photosites: change events, and spikes of collected
 The kernels use arrays only, release the GIL, and are compiled for explicit types when this module is imported. Each kernel
 processes some sites frame by frame and updates the state of every site. Events are written to arrays in this order, site by
 site in each frame; ``ends`` contains the number of events up to the end of each frame. When the arrays are full, events are
-only counted, so that the caller can repeat the call with longer arrays; counting stops above ``n_most``.
+only counted, so that the caller can repeat the call with longer arrays; counting stops above ``max_events``.
 
 An event whose time would be rounded to another frame is moved to the nearest time in its own frame: change events are in
 ``(begin, end]`` of a frame, spikes in ``[begin, end)``. The order of events therefore does not depend on the batches.
@@ -22,19 +22,19 @@ from numba import types
 from foveasim._core._kernels import philox_4x64, uniform
 from foveasim._core.jit import njit
 
-__all__ = ["DIFFERENCE", "HAZARD", "HELD", "LEVEL", "MISSING", "change_events", "charge_spikes"]
+__all__ = ["DIFFERENCE", "HAZARD", "LEVEL", "MISSING", "REFRACTORY_END", "change_events", "charge_spikes"]
 
 #: State of a change-detecting site: low-pass level, its difference from the level of the last event, end of the refractory
 #: time, and integrated noise rate until the next noise event.
-LEVEL, DIFFERENCE, HELD, HAZARD = range(4)
-#: State of an integrating site: charge until the next spike; and HELD, as above.
+LEVEL, DIFFERENCE, REFRACTORY_END, HAZARD = range(4)
+#: State of an integrating site: charge until the next spike; and REFRACTORY_END, as above.
 MISSING = 0
 #: With a low pass, frames are divided into parts in which the log current changes by at most this: one time constant each.
-PART_CHANGE = 0.25
+MAX_PART_CHANGE = 0.25
 #: For smaller changes of the logarithm, the mean of both ends is the mean current to 1e-9.
-LEAST_CHANGE = 1e-4
+MIN_CHANGE = 1e-4
 #: Maximum steps of the bracketed Newton method, enough to find a crossing to machine precision.
-STEPS = 80
+MAX_STEPS = 80
 
 _bytes, _sites, _counts = types.int8[::1], types.int32[::1], types.int64[::1]
 _row = types.Array(types.float64, 1, "C", readonly=True)
@@ -42,12 +42,12 @@ _rows = types.Array(types.float64, 2, "C", readonly=True)
 
 
 @njit(inline="always")
-def _words(key_0, key_1, site, number):
+def _random_words(key_0, key_1, site, number):
     return philox_4x64(key_0, key_1, np.uint64(site), np.uint64(number), np.uint64(0), np.uint64(0))
 
 
 @njit()
-def _risen(slope, swing, tau, begin, end):
+def _rise(slope, swing, tau, begin, end):
     """Return the rise of ``slope * u + swing * exp(-u / tau)``; without swing if tau is 0."""
     rise = slope * (end - begin)
     if tau > 0.0:
@@ -74,27 +74,27 @@ def _crossing(slope, swing, tau, begin, difference, on, off, end):
             return begin - (off + difference) / slope, -1
         return math.inf, 0
     # The difference has at most one extremum.
-    turn = end
+    extremum = end
     ratio = slope * tau / swing if swing != 0.0 else 0.0
     if ratio > 0.0:
-        turn = min(max(-tau * math.log(ratio), begin), end)
+        extremum = min(max(-tau * math.log(ratio), begin), end)
     for piece in range(2):
-        low = begin if piece == 0 else turn
-        high = turn if piece == 0 else end
-        reached = difference + _risen(slope, swing, tau, begin, high)
+        low = begin if piece == 0 else extremum
+        high = extremum if piece == 0 else end
+        reached = difference + _rise(slope, swing, tau, begin, high)
         if -off < reached < on or high <= low:
             continue
         polarity = 1 if reached >= on else -1
         level = (on if polarity > 0 else -off) - difference
         u = 0.5 * (low + high)
-        for _ in range(STEPS):
-            excess = _risen(slope, swing, tau, begin, u) - level
+        for _ in range(MAX_STEPS):
+            excess = _rise(slope, swing, tau, begin, u) - level
             if excess * polarity >= 0.0:
                 high = u
             else:
                 low = u
-            bend = slope - swing / tau * math.exp(-u / tau)
-            step = u - excess / bend if bend != 0.0 else low
+            derivative = slope - swing / tau * math.exp(-u / tau)
+            step = u - excess / derivative if derivative != 0.0 else low
             last = u
             u = step if low < step < high else 0.5 * (low + high)
             if u == last or high - low <= 1e-16 * end:
@@ -111,58 +111,58 @@ def _crossing(slope, swing, tau, begin, difference, on, off, end):
     ),
 )  # fmt: skip
 def change_events(
-    log_light, current, frame_s, first_frame, on, off, leak_per_s, refractory_s, tau_e, noise_per_s, noise_half,
-    key_0, key_1, first_site, n_most, memory, n_drawn, ends, t_s, site, polarity,
+    log_current, current, frame_s, first_frame, on, off, leak_per_s, refractory_s, tau_e, noise_per_s, noise_half,
+    key_0, key_1, first_site, max_events, memory, n_drawn, ends, t_s, site, polarity,
 ):  # fmt: skip
     """
     Compute the change events of some sites between the first and the last of some frames.
 
-    ``log_light`` and ``current`` are (n_frame, n_site); frame k is at ``(first_frame + k) * frame_s``. The log current is
+    ``log_current`` and ``current`` are (n_frame, n_site); frame k is at ``(first_frame + k) * frame_s``. The log current is
     interpolated linearly between frames. ``tau_e`` divided by the current is the time constant of the low pass; 0 disables it.
     Returns the number of events, including those that did not fit the arrays.
     """
     n = 0
-    for k in range(log_light.shape[0] - 1):
+    for k in range(log_current.shape[0] - 1):
         begin_s, end_s = (first_frame + k) * frame_s, (first_frame + k + 1) * frame_s
         after_s = np.nextafter(begin_s, math.inf)
-        for i in range(log_light.shape[1]):
+        for i in range(log_current.shape[1]):
             up, down = on[i if on.size > 1 else 0], off[i if off.size > 1 else 0]
             leak = leak_per_s[i if leak_per_s.size > 1 else 0] * up
             if n_drawn[i] == 0:
                 n_drawn[i] = 1
-                word_0, word_1, _, _ = _words(key_0, key_1, first_site + i, 0)
+                word_0, word_1, _, _ = _random_words(key_0, key_1, first_site + i, 0)
                 memory[i, HAZARD] = -math.log(uniform(word_0))
                 # The initial phase of the leak is uniformly distributed between two events.
                 memory[i, DIFFERENCE] = uniform(word_1) * up if leak > 0.0 else 0.0
-            change = log_light[k + 1, i] - log_light[k, i]
+            change = log_current[k + 1, i] - log_current[k, i]
             slope = change / frame_s
             total = slope + leak
-            n_parts = max(1, math.ceil(abs(change) / PART_CHANGE)) if tau_e > 0.0 else 1
+            n_parts = max(1, math.ceil(abs(change) / MAX_PART_CHANGE)) if tau_e > 0.0 else 1
             part_s, part_change = frame_s / n_parts, change / n_parts
             end_current = current[k, i]
             for part in range(n_parts):
                 part_begin_s = part * part_s
-                light = log_light[k, i] + part * part_change
+                log_level = log_current[k, i] + part * part_change
                 begin_current, end_current = end_current, current[k + 1, i]
                 if part < n_parts - 1:
                     end_current = current[k, i] * math.exp((part + 1) * part_change)
                 # Mean of a current with linear logarithm; with it the low pass decays correctly.
                 mean = 0.5 * (begin_current + end_current)
-                if abs(part_change) > LEAST_CHANGE:
+                if abs(part_change) > MIN_CHANGE:
                     mean = (end_current - begin_current) / part_change
                 tau = tau_e / mean
-                swing = memory[i, LEVEL] - light + slope * tau if tau > 0.0 else 0.0
+                swing = memory[i, LEVEL] - log_level + slope * tau if tau > 0.0 else 0.0
                 noise = noise_per_s / (1.0 + mean / noise_half)
-                u = min(max(memory[i, HELD] - begin_s - part_begin_s, 0.0), part_s)
+                u = min(max(memory[i, REFRACTORY_END] - begin_s - part_begin_s, 0.0), part_s)
                 while u < part_s:
                     at, sign = _crossing(total, swing, tau, u, memory[i, DIFFERENCE], up, down, part_s)
                     noise_at = u + memory[i, HAZARD] / noise if noise > 0.0 else math.inf
                     if at > part_s and noise_at > part_s:
-                        memory[i, DIFFERENCE] += _risen(total, swing, tau, u, part_s)
+                        memory[i, DIFFERENCE] += _rise(total, swing, tau, u, part_s)
                         memory[i, HAZARD] -= noise * (part_s - u)
                         break
                     if noise_at < at:
-                        word_0, word_1, _, _ = _words(key_0, key_1, first_site + i, n_drawn[i])
+                        word_0, word_1, _, _ = _random_words(key_0, key_1, first_site + i, n_drawn[i])
                         n_drawn[i] += 1
                         memory[i, HAZARD] = -math.log(uniform(word_0))
                         at, sign = noise_at, 1 if word_1 & np.uint64(1) else -1
@@ -172,13 +172,13 @@ def change_events(
                     if n < t_s.size:
                         t_s[n], site[n], polarity[n] = min(max(at_s, after_s), end_s), first_site + i, sign
                     n += 1
-                    if n > n_most:
+                    if n > max_events:
                         return n
                     memory[i, DIFFERENCE] = 0.0
-                    memory[i, HELD] = at_s + refractory_s
+                    memory[i, REFRACTORY_END] = at_s + refractory_s
                     u = at + refractory_s
                 if tau > 0.0:
-                    memory[i, LEVEL] = light + part_change - slope * tau + swing * math.exp(-part_s / tau)
+                    memory[i, LEVEL] = log_level + part_change - slope * tau + swing * math.exp(-part_s / tau)
         ends[k] = n
     return n
 
@@ -193,7 +193,7 @@ def _gamma(shape, key_0, key_1, site, number):
     d = shape - 1.0 / 3.0
     c = 1.0 / math.sqrt(9.0 * d)
     while True:
-        word_0, word_1, word_2, _ = _words(key_0, key_1, site, number)
+        word_0, word_1, word_2, _ = _random_words(key_0, key_1, site, number)
         number += 1
         x = math.sqrt(-2.0 * math.log(uniform(word_0))) * math.cos(2.0 * math.pi * uniform(word_1))
         v = (1.0 + c * x) ** 3
@@ -209,7 +209,7 @@ def _gamma(shape, key_0, key_1, site, number):
 )  # fmt: skip
 def charge_spikes(
     current, frame_s, first_frame, threshold_e, refractory_s, is_noisy, key_0, key_1, first_site,
-    n_most, memory, n_drawn, ends, t_s, site, polarity,
+    max_events, memory, n_drawn, ends, t_s, site, polarity,
 ):  # fmt: skip
     """
     Compute the spikes of some sites during some frames.
@@ -224,7 +224,7 @@ def charge_spikes(
         last_s = np.nextafter((first_frame + k + 1) * frame_s, -math.inf)
         for i in range(current.shape[1]):
             rate, threshold = current[k, i], threshold_e[i if threshold_e.size > 1 else 0]
-            u = min(max(memory[i, HELD] - begin_s, 0.0), frame_s)
+            u = min(max(memory[i, REFRACTORY_END] - begin_s, 0.0), frame_s)
             while u < frame_s:
                 if n_drawn[i] == 0:
                     n_drawn[i] = 1
@@ -239,12 +239,12 @@ def charge_spikes(
                 if n < t_s.size:
                     t_s[n], site[n], polarity[n] = min(begin_s + at, last_s), first_site + i, 1
                 n += 1
-                if n > n_most:
+                if n > max_events:
                     return n
                 memory[i, MISSING] = threshold
                 if is_noisy:
                     memory[i, MISSING], n_drawn[i] = _gamma(threshold, key_0, key_1, first_site + i, n_drawn[i])
-                memory[i, HELD] = begin_s + at + refractory_s
+                memory[i, REFRACTORY_END] = begin_s + at + refractory_s
                 u = at + refractory_s
         ends[k] = n
     return n

@@ -26,7 +26,7 @@ from foveasim.modes import _hdf5
 __all__ = ["Events", "write_events"]
 
 FORMAT, VERSION = "foveasim events", 1
-HDF5_ENDINGS = (".h5", ".hdf5")
+HDF5_EXTENSIONS = (".h5", ".hdf5")
 #: Addresses in files of event tools are unsigned or signed 16-bit integers.
 MAX_ADDRESS, MAX_SIGNED_ADDRESS = 2**16 - 1, 2**15 - 1
 #: Event record of event tools: address, time in µs, and polarity (true for ON).
@@ -94,8 +94,8 @@ class Events:
             if not np.all(np.abs(polarity) == 1):
                 bad = polarity[np.abs(polarity) != 1]
                 raise ParameterError("polarity", "must be 1 or -1", int(bad[0]), hint="convert 0 and 1 with 2 * p - 1")
-        for name, values, kept in zip(ARRAYS, (t_s, site, polarity), (np.float64, np.int32, np.int8), strict=True):
-            object.__setattr__(self, name, own(values.astype(kept, copy=False)))
+        for name, values, dtype in zip(ARRAYS, (t_s, site, polarity), (np.float64, np.int32, np.int8), strict=True):
+            object.__setattr__(self, name, own(values.astype(dtype, copy=False)))
 
     def __repr__(self) -> str:
         return f"Events({self.t_s.size:,} of {self.layout.n_sites:,} sites)"
@@ -106,7 +106,7 @@ class Events:
 
     def counts(self, *, polarity: int | None = None) -> Ints:
         """Return the number of events per site, (n_site,), of one polarity or both."""
-        sites = self.site if polarity is None else self.site[self._is_of(polarity)]
+        sites = self.site if polarity is None else self.site[self._has_polarity(polarity)]
         return np.bincount(sites, minlength=self.layout.n_sites).astype(np.int64)
 
     def histogram(self, edges_s: ArrayLike, *, polarity: int | None = None) -> Ints:
@@ -142,10 +142,10 @@ class Events:
         span = slice(ends[0], ends[-1])
         cell = np.repeat(n_sites * np.arange(n_bins), np.diff(ends)) + self.site[span]
         if polarity is not None:
-            cell = cell[self._is_of(polarity)[span]]
+            cell = cell[self._has_polarity(polarity)[span]]
         return np.bincount(cell, minlength=n_bins * n_sites).astype(np.int64).reshape(n_bins, n_sites)
 
-    def _is_of(self, polarity: int) -> NDArray[np.bool_]:
+    def _has_polarity(self, polarity: int) -> NDArray[np.bool_]:
         if polarity not in POLARITIES:
             raise ParameterError("polarity", "must be 1 or -1", polarity)
         return np.asarray(self.polarity == polarity)
@@ -159,7 +159,7 @@ class Events:
     @classmethod
     def concatenate(cls, parts: Iterable[Events]) -> Events:
         """Concatenate consecutive batches of events."""
-        batches = list(_following("parts", parts))
+        batches = list(_check_consecutive("parts", parts))
         if not batches:
             raise ParameterError("parts", "must contain at least one batch of events")
         t_s, site, polarity = (read_only(np.concatenate([getattr(b, name) for b in batches])) for name in ARRAYS)
@@ -202,22 +202,26 @@ class Events:
         ParameterError
             When an address does not have exactly one site; and as for the class.
         """
-        none = np.zeros(0)
-        site_x, site_y = cls(none, none.astype(np.int32), none.astype(np.int8), layout).addresses(pitch_um)
+        empty = np.zeros(0)
+        site_x, site_y = cls(empty, empty.astype(np.int32), empty.astype(np.int8), layout).addresses(pitch_um)
         code = site_x.astype(np.int64) * (MAX_ADDRESS + 1) + site_y
         order = np.argsort(code, kind="stable")
-        places = [as_numbers(name, values, keep_type=True) for name, values in (("x", x), ("y", y))]
-        for name, values in zip("xy", places, strict=True):
-            if values.ndim != 1 or values.shape != places[0].shape or (values.size and values.dtype.kind not in "iu"):
+        addresses = [as_numbers(name, values, keep_type=True) for name, values in (("x", x), ("y", y))]
+        for name, values in zip("xy", addresses, strict=True):
+            if (
+                values.ndim != 1
+                or values.shape != addresses[0].shape
+                or (values.size and values.dtype.kind not in "iu")
+            ):
                 raise ParameterError(name, f"must be one integer per event, got {values.dtype}{values.shape}")
             if values.size and not 0 <= values.min() <= values.max() <= MAX_ADDRESS:
                 raise ParameterError(name, f"must be from 0 to {MAX_ADDRESS}", (int(values.min()), int(values.max())))
-        wanted = places[0].astype(np.int64) * (MAX_ADDRESS + 1) + places[1].astype(np.int64)
-        first, behind = (np.searchsorted(code[order], wanted, side) for side in ("left", "right"))
-        if np.any(behind - first != 1):
-            bad = int(np.flatnonzero(behind - first != 1)[0])
-            n = int(behind[bad] - first[bad])
-            address = int(places[0][bad]), int(places[1][bad])
+        target_code = addresses[0].astype(np.int64) * (MAX_ADDRESS + 1) + addresses[1].astype(np.int64)
+        first, last = (np.searchsorted(code[order], target_code, side) for side in ("left", "right"))
+        if np.any(last - first != 1):
+            bad = int(np.flatnonzero(last - first != 1)[0])
+            n = int(last[bad] - first[bad])
+            address = int(addresses[0][bad]), int(addresses[1][bad])
             raise ParameterError("layout", f"must have one site at each address (x, y), got {n} at {address}")
         return cls(t_s, order[first].astype(np.int32), polarity, layout)  # type: ignore[arg-type]
 
@@ -241,10 +245,10 @@ class Events:
         FoveasimWarning
             When several sites have the same address.
         """
-        places = _numbered(self.layout) if pitch_um is None else None
-        if places is None:
-            places = _on_raster(self.layout, pitch_um)
-        n_distinct = np.unique(places[0] * (MAX_ADDRESS + 1) + places[1]).size
+        addresses = _addresses_from_columns(self.layout) if pitch_um is None else None
+        if addresses is None:
+            addresses = _addresses_on_raster(self.layout, pitch_um)
+        n_distinct = np.unique(addresses[0] * (MAX_ADDRESS + 1) + addresses[1]).size
         if n_distinct < self.layout.n_sites:
             warnings.warn(
                 f"{self.layout.n_sites:,} sites have only {n_distinct:,} addresses on the raster; use a smaller 'pitch_um', "
@@ -252,9 +256,9 @@ class Events:
                 FoveasimWarning,
                 stacklevel=2,
             )
-        return places[0].astype(np.uint16), places[1].astype(np.uint16)
+        return addresses[0].astype(np.uint16), addresses[1].astype(np.uint16)
 
-    def structured(self, *, pitch_um: float | None = None) -> NDArray[Any]:
+    def to_structured_array(self, *, pitch_um: float | None = None) -> NDArray[Any]:
         """
         Return the events as a structured array for event tools such as Tonic.
 
@@ -283,7 +287,7 @@ class Events:
             )
         events = np.empty(len(self), STRUCTURE)
         events["x"], events["y"] = x[self.site], y[self.site]
-        events["t"], events["p"] = _whole_us(self.t_s), self.polarity > 0
+        events["t"], events["p"] = _to_us(self.t_s), self.polarity > 0
         return events
 
     def save(self, path: str | Path, *, pitch_um: float | None = None) -> None:
@@ -295,7 +299,7 @@ class Events:
         path : path
             The extension selects the format. ``.npz``: arrays and layout, lossless. ``.h5`` or ``.hdf5``: as
             :func:`write_events`. :meth:`load` reads both. Formats for other tools, without the layout: ``.npy``, the array of
-            :meth:`structured`; ``.txt``, a line ``t x y p`` per event, with t in seconds and p 0 or 1.
+            :meth:`to_structured_array`; ``.txt``, a line ``t x y p`` per event, with t in seconds and p 0 or 1.
         pitch_um : float, optional, µm
             Pitch of the raster of :meth:`addresses`, for all formats except ``.npz``.
 
@@ -305,19 +309,19 @@ class Events:
             When the extension is not one of these, h5py is not installed, or the file cannot be written.
         """
         target = Path(path)
-        ending = target.suffix.lower()
-        if ending in HDF5_ENDINGS:
+        extension = target.suffix.lower()
+        if extension in HDF5_EXTENSIONS:
             write_events([self], target, pitch_um=pitch_um)
-        elif ending == ".npy":
-            events = self.structured(pitch_um=pitch_um)
+        elif extension == ".npy":
+            events = self.to_structured_array(pitch_um=pitch_um)
             with atomic_write(target) as temporary, temporary.open("wb") as file:
                 np.save(file, events, allow_pickle=False)
-        elif ending == ".txt":
+        elif extension == ".txt":
             x, y = self.addresses(pitch_um)
             rows = np.stack((self.t_s, x[self.site], y[self.site], self.polarity > 0), axis=1)
             with atomic_write(target) as temporary:
                 np.savetxt(temporary, rows, fmt=("%.9f", "%d", "%d", "%d"))
-        elif ending == ".npz":
+        elif extension == ".npz":
             arrays = {name: np.asarray(getattr(self, name)) for name in ARRAYS}
             about = {"format": FORMAT, "version": VERSION, "provenance": to_plain_data(dict(self.layout.provenance))}
             write_archive(target, about, arrays | layout_to_arrays(self.layout))
@@ -337,7 +341,7 @@ class Events:
             When the file is missing, corrupt, or does not contain events.
         """
         source = Path(path)
-        if source.suffix.lower() in HDF5_ENDINGS:
+        if source.suffix.lower() in HDF5_EXTENSIONS:
             _needs_h5py(source)
             if not source.is_file():
                 raise FileError(source, "is not a file" if source.exists() else "no such file")
@@ -383,36 +387,36 @@ def write_events(batches: Iterable[Events], path: str | Path, *, pitch_um: float
     address; and ``layout``, with which :meth:`Events.load` restores the events.
     """
     target = Path(path)
-    if target.suffix.lower() not in HDF5_ENDINGS:
+    if target.suffix.lower() not in HDF5_EXTENSIONS:
         raise FileError(target, "must end in .h5 or .hdf5")
     _needs_h5py(target)
     import h5py
 
     file: _hdf5.EventFile | None = None
-    with atomic_write(target) as temporary, ExitStack() as opened:
-        for batch in _following("batches", batches):
-            t_us = _whole_us(batch.t_s)
+    with atomic_write(target) as temporary, ExitStack() as stack:
+        for batch in _check_consecutive("batches", batches):
+            t_us = _to_us(batch.t_s)
             # HDF5 crashes on a full disk.
-            n_bytes = _hdf5.most_bytes(batch.layout, 0 if file is None else file.n_events, t_us)
+            n_bytes = _hdf5.max_file_bytes(batch.layout, 0 if file is None else file.n_events, t_us)
             check_free_space(temporary, n_bytes)
             if file is None:
-                hdf5 = opened.enter_context(h5py.File(temporary, "w"))
+                hdf5 = stack.enter_context(h5py.File(temporary, "w"))
                 file = _hdf5.EventFile(hdf5, batch.layout, *batch.addresses(pitch_um))
             file.add(t_us, batch.site, batch.polarity)
         if file is None:
             raise ParameterError("batches", "must contain at least one batch of events")
-        file.end()
+        file.finish()
         return file.n_events
 
 
 # -- parts ------------------------------------------------------------------------------------------------------------
 
 
-def _following(name: str, batches: Iterable[Events]) -> Iterator[Events]:
+def _check_consecutive(name: str, batches: Iterable[Events]) -> Iterator[Events]:
     """Yield batches after checking that they have one layout and are consecutive."""
     if isinstance(batches, Events) or not isinstance(batches, Iterable):
-        cure = "pass a list of batches" if isinstance(batches, Events) else ""
-        raise ParameterError(name, f"must be batches of events, got a {type(batches).__name__}", hint=cure)
+        hint = "pass a list of batches" if isinstance(batches, Events) else ""
+        raise ParameterError(name, f"must be batches of events, got a {type(batches).__name__}", hint=hint)
     layout: Layout | None = None
     last_s = 0.0
     for batch in batches:
@@ -434,33 +438,33 @@ def _following(name: str, batches: Iterable[Events]) -> Iterator[Events]:
         yield batch
 
 
-def _numbered(layout: Layout) -> tuple[Ints, Ints] | None:
+def _addresses_from_columns(layout: Layout) -> tuple[Ints, Ints] | None:
     """
     Return column and row of each site from the columns of the layout.
 
     Returns None if the columns are missing, not aligned with the axes, or not unique.
     """
     centred_um = layout.centroid_um - layout.centroid_um.mean(axis=0) if layout.n_sites else layout.centroid_um
-    places = []
+    addresses = []
     for axis, name in enumerate(("column", "row")):
         numbers = layout.columns.get(name)
         if numbers is None or numbers.dtype.kind not in "iu":
             return None
-        whole = numbers.astype(np.int64)
-        whole -= whole.min(initial=0)
+        integers = numbers.astype(np.int64)
+        integers -= integers.min(initial=0)
         along, across = (
-            float((whole - whole.mean()) @ centred_um[:, a]) if whole.size else 0.0 for a in (axis, 1 - axis)
+            float((integers - integers.mean()) @ centred_um[:, a]) if integers.size else 0.0 for a in (axis, 1 - axis)
         )
-        if abs(along) < abs(across) or whole.max(initial=0) > MAX_ADDRESS:
+        if abs(along) < abs(across) or integers.max(initial=0) > MAX_ADDRESS:
             return None
         # Columns count to the right, rows downwards.
-        is_turned = along < 0.0 if axis == 0 else along >= 0.0
-        places.append(whole.max(initial=0) - whole if is_turned else whole)
-    is_own = np.unique(places[0] * (MAX_ADDRESS + 1) + places[1]).size == layout.n_sites
-    return (places[0], places[1]) if is_own else None
+        is_reversed = along < 0.0 if axis == 0 else along >= 0.0
+        addresses.append(integers.max(initial=0) - integers if is_reversed else integers)
+    is_unique = np.unique(addresses[0] * (MAX_ADDRESS + 1) + addresses[1]).size == layout.n_sites
+    return (addresses[0], addresses[1]) if is_unique else None
 
 
-def _on_raster(layout: Layout, pitch_um: float | None) -> tuple[Ints, Ints]:
+def _addresses_on_raster(layout: Layout, pitch_um: float | None) -> tuple[Ints, Ints]:
     """Return column and row of each centroid on a raster, counted from the top left."""
     from scipy.spatial import cKDTree
 
@@ -487,7 +491,7 @@ def _on_raster(layout: Layout, pitch_um: float | None) -> tuple[Ints, Ints]:
     return column.astype(np.int64), row.astype(np.int64)
 
 
-def _whole_us(t_s: Floats) -> Ints:
+def _to_us(t_s: Floats) -> Ints:
     """Convert times to microseconds, rounded down."""
     if t_s.size and t_s[-1] > MAX_T_S:
         raise ParameterError("t_s", f"must be at most {MAX_T_S:.3g} for microseconds", float(t_s[-1]), "s")

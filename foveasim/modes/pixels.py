@@ -30,16 +30,16 @@ from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
 __all__ = ["EventPixels", "SpikingPixels"]
 
 #: Smallest threshold of a site as a fraction of the mean, for any mismatch.
-LEAST_THRESHOLD = 0.1
+MIN_THRESHOLD_FRACTION = 0.1
 #: Sites per task; fixed, so that results do not depend on the number of threads.
-PIECE_SITES = 2048
+BLOCK_SITES = 2048
 #: More events per batch than this indicate a wrong threshold or a wrong unit of the rates.
 MAX_EVENTS = 1 << 27
 
 #: Kernel call for some sites: slice of sites, maximum number of events, state arrays, output arrays.
-Work = Callable[[slice, int, NDArray[Any], Ints, Ints, Floats, NDArray[np.int32], NDArray[np.int8]], int]
+KernelCall = Callable[[slice, int, NDArray[Any], Ints, Ints, Floats, NDArray[np.int32], NDArray[np.int8]], int]
 #: Events of some sites, frame by frame: number of events up to the end of each frame, times, sites, polarities.
-Piece = tuple[Ints, Floats, NDArray[np.int32], NDArray[np.int8]]
+BlockEvents = tuple[Ints, Floats, NDArray[np.int32], NDArray[np.int8]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,8 +135,10 @@ class EventPixels:
             return read_only(np.full(1, means[0])), read_only(np.full(1, means[1]))
         on, off = (
             mean
-            * np.maximum(1.0 + self.mismatch_fraction * self.sensor.device.normals(f"event {which}"), LEAST_THRESHOLD)
-            for mean, which in zip(means, ("on", "off"), strict=True)
+            * np.maximum(
+                1.0 + self.mismatch_fraction * self.sensor.device.normals(f"event {sign}"), MIN_THRESHOLD_FRACTION
+            )
+            for mean, sign in zip(means, ("on", "off"), strict=True)
         )
         return read_only(on), read_only(off)
 
@@ -192,7 +194,7 @@ class EventPixels:
 
     def events(self, rates: Iterable[ArrayLike], *, frame_s: float, seed: int, n_threads: int | None = None) -> Events:
         """Return all events at once; parameters as for :meth:`stream`."""
-        return _all(self.stream(rates, frame_s=frame_s, seed=seed, n_threads=n_threads), self.sensor)
+        return _concatenate(self.stream(rates, frame_s=frame_s, seed=seed, n_threads=n_threads), self.sensor)
 
     def _stream(
         self, rates: Iterable[ArrayLike], frame_s: float, key: tuple[Any, Any], batch: int, n_threads: int
@@ -204,7 +206,7 @@ class EventPixels:
         memory = np.zeros((self.sensor.layout.n_sites, 4))
         n_drawn = np.zeros(self.sensor.layout.n_sites, np.int64)
         n_before = 0
-        before: Floats | None = None
+        last_current: Floats | None = None
         for dark_current in _batches(self.sensor, rates, batch):
             current = dark_current + self.floor_e_per_s
             if not current.min(initial=np.inf) > 0.0:
@@ -212,18 +214,18 @@ class EventPixels:
                 raise SimulationError(
                     f"the current of site {site} is zero, and its logarithm infinite; set 'floor_e_per_s' or a dark current"
                 )
-            if before is None:
+            if last_current is None:
                 memory[:, _kernels.LEVEL] = np.log(current[0])
-                frames, log_light = current, np.log(current)
+                frames, log_current = current, np.log(current)
             else:
-                frames = np.concatenate((before, current))
-                log_light = np.log(frames)
+                frames = np.concatenate((last_current, current))
+                log_current = np.log(frames)
             first = max(n_before - 1, 0)
 
-            def work(sites: slice, n_most: int, *out: NDArray[Any]) -> int:
+            def run_kernel(sites: slice, max_events: int, *out: NDArray[Any]) -> int:
                 return int(
                     _kernels.change_events(
-                        np.ascontiguousarray(log_light[:, sites]),  # noqa: B023 -- called in this iteration
+                        np.ascontiguousarray(log_current[:, sites]),  # noqa: B023 -- called in this iteration
                         np.ascontiguousarray(frames[:, sites]),  # noqa: B023
                         frame_s,
                         first,  # noqa: B023
@@ -236,14 +238,14 @@ class EventPixels:
                         self.noise_half_e_per_s,
                         *key,
                         sites.start,
-                        n_most,
+                        max_events,
                         *out,
                     )
                 )
 
             n_before += current.shape[0]
-            before = current[-1:].copy()
-            yield _collect_events(work, frames.shape[0] - 1, memory, n_drawn, self.sensor, n_threads)
+            last_current = current[-1:].copy()
+            yield _collect_events(run_kernel, frames.shape[0] - 1, memory, n_drawn, self.sensor, n_threads)
 
 
 @dataclass(frozen=True, eq=False)
@@ -343,7 +345,7 @@ class SpikingPixels:
 
     def events(self, rates: Iterable[ArrayLike], *, frame_s: float, seed: int, n_threads: int | None = None) -> Events:
         """Return all spikes at once; parameters as for :meth:`stream`."""
-        return _all(self.stream(rates, frame_s=frame_s, seed=seed, n_threads=n_threads), self.sensor)
+        return _concatenate(self.stream(rates, frame_s=frame_s, seed=seed, n_threads=n_threads), self.sensor)
 
     def _stream(
         self, rates: Iterable[ArrayLike], frame_s: float, key: tuple[Any, Any], batch: int, n_threads: int
@@ -362,7 +364,7 @@ class SpikingPixels:
                     "higher 'threshold_e' or lower rates"
                 )
 
-            def work(sites: slice, n_most: int, *out: NDArray[Any]) -> int:
+            def run_kernel(sites: slice, max_events: int, *out: NDArray[Any]) -> int:
                 return int(
                     _kernels.charge_spikes(
                         np.ascontiguousarray(current[:, sites]),  # noqa: B023 -- called in this iteration
@@ -373,12 +375,12 @@ class SpikingPixels:
                         self.sensor.shot_noise != "off",
                         *key,
                         sites.start,
-                        n_most,
+                        max_events,
                         *out,
                     )
                 )
 
-            yield _collect_events(work, current.shape[0], memory, n_drawn, self.sensor, n_threads)
+            yield _collect_events(run_kernel, current.shape[0], memory, n_drawn, self.sensor, n_threads)
             first += current.shape[0]
 
 
@@ -425,48 +427,48 @@ def _batches(sensor: Sensor, rates: Iterable[ArrayLike], batch: int) -> Iterator
 
 
 def _collect_events(
-    work: Work, n_frames: int, memory: NDArray[Any], n_drawn: Ints, sensor: Sensor, n_threads: int
+    run_kernel: KernelCall, n_frames: int, memory: NDArray[Any], n_drawn: Ints, sensor: Sensor, n_threads: int
 ) -> Events:
     """Run a kernel on all sites and return the events in temporal order."""
     n_found = 0
-    adding = Lock()
+    counter_lock = Lock()
 
-    def piece(first: int) -> Piece:
+    def compute_block(first: int) -> BlockEvents:
         nonlocal n_found
-        sites = slice(first, min(first + PIECE_SITES, memory.shape[0]))
-        capacity = 4 * PIECE_SITES
+        sites = slice(first, min(first + BLOCK_SITES, memory.shape[0]))
+        capacity = 4 * BLOCK_SITES
         while True:
-            kept, drawn, ends = memory[sites].copy(), n_drawn[sites].copy(), np.zeros(n_frames, np.int64)
+            state, drawn, ends = memory[sites].copy(), n_drawn[sites].copy(), np.zeros(n_frames, np.int64)
             out = np.empty(capacity), np.empty(capacity, np.int32), np.empty(capacity, np.int8)
-            n_most = MAX_EVENTS - n_found
-            n = work(sites, n_most, kept, drawn, ends, *out)
-            if n > n_most:
+            max_events = MAX_EVENTS - n_found
+            n = run_kernel(sites, max_events, state, drawn, ends, *out)
+            if n > max_events:
                 raise _too_many(n_frames)
             if n <= capacity:
                 break
             capacity = n
-        memory[sites], n_drawn[sites] = kept, drawn
-        with adding:
+        memory[sites], n_drawn[sites] = state, drawn
+        with counter_lock:
             n_found += n
         if n_found > MAX_EVENTS:
             raise _too_many(n_frames)
         return ends, out[0][:n], out[1][:n], out[2][:n]
 
-    pieces = parallel_map(piece, range(0, memory.shape[0], PIECE_SITES), n_threads)
+    blocks = parallel_map(compute_block, range(0, memory.shape[0], BLOCK_SITES), n_threads)
     t_s, site, polarity = np.empty(n_found), np.empty(n_found, np.int32), np.empty(n_found, np.int8)
-    begins = np.concatenate(([0], sum((ends for ends, *_ in pieces), np.zeros(n_frames, np.int64))))
+    begins = np.concatenate(([0], sum((ends for ends, *_ in blocks), np.zeros(n_frames, np.int64))))
 
-    def frame(k: int) -> None:
+    def merge_frame(k: int) -> None:
         # Events of a frame are later than those of previous frames, and ordered by site, then by time.
-        parts = [[array[ends[k - 1] if k else 0 : ends[k]] for array in (s, i, p)] for ends, s, i, p in pieces]
+        parts = [[array[ends[k - 1] if k else 0 : ends[k]] for array in (s, i, p)] for ends, s, i, p in blocks]
         found_s, sites, signs = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-        order = _rising(found_s)
-        where = slice(begins[k], begins[k + 1])
-        for all_of, of_frame in ((t_s, found_s), (site, sites), (polarity, signs)):
-            all_of[where] = of_frame[order]
+        order = _stable_argsort(found_s)
+        target = slice(begins[k], begins[k + 1])
+        for merged, frame_values in ((t_s, found_s), (site, sites), (polarity, signs)):
+            merged[target] = frame_values[order]
 
-    if pieces:
-        parallel_map(frame, range(n_frames), n_threads)
+    if blocks:
+        parallel_map(merge_frame, range(n_frames), n_threads)
     return Events(read_only(t_s), read_only(site), read_only(polarity), _layout(sensor))
 
 
@@ -477,21 +479,21 @@ def _too_many(n_frames: int) -> SimulationError:
     )
 
 
-def _rising(values: Floats) -> Ints:
+def _stable_argsort(values: Floats) -> Ints:
     """Return the indices of a stable sort, four times as fast as numpy."""
     order = np.argsort(values)
-    in_order = values[order]
+    ordered = values[order]
     is_tied = np.zeros(values.size, bool)
-    np.equal(in_order[1:], in_order[:-1], out=is_tied[1:])
+    np.equal(ordered[1:], ordered[:-1], out=is_tied[1:])
     is_tied[:-1] |= is_tied[1:]
     tied = order[is_tied]
     order[is_tied] = tied[np.lexsort((tied, values[tied]))]
     return order
 
 
-def _all(batches: Iterator[Events], sensor: Sensor) -> Events:
-    nothing = Events(np.zeros(0), np.zeros(0, np.int32), np.zeros(0, np.int8), _layout(sensor))
-    return Events.concatenate([nothing, *batches])
+def _concatenate(batches: Iterator[Events], sensor: Sensor) -> Events:
+    empty = Events(np.zeros(0), np.zeros(0, np.int32), np.zeros(0, np.int8), _layout(sensor))
+    return Events.concatenate([empty, *batches])
 
 
 def _layout(sensor: Sensor) -> Layout:

@@ -132,23 +132,23 @@ class Exposure:
         exposure_s = check_plausible("exposure_s", exposure_s)
         self._shutter, self.exposure_s = shutter, exposure_s
         self._last = shutter.last_frame(exposure_s)
-        self._n_seen = 0
+        self._n_added = 0
         self._rate_e_per_s: Floats = np.zeros(1)
-        self._share: Floats = np.zeros(1)
+        self._weight: Floats = np.zeros(1)
 
     @property
     def is_complete(self) -> bool:
         """Whether all frames that overlap the exposure have been added."""
-        return self._n_seen > self._last
+        return self._n_added > self._last
 
     def add(self, rate_e_per_s: Floats) -> None:
         """Add the photoelectron rates of the next frame, (n_site,) e-/s."""
-        rate_e_per_s = self._light("rate_e_per_s", rate_e_per_s)
+        rate_e_per_s = self._validate_rate("rate_e_per_s", rate_e_per_s)
         if not self.is_complete:
-            share = self._shutter.overlap_fraction(self._n_seen, self.exposure_s)
-            self._rate_e_per_s = self._rate_e_per_s + share * rate_e_per_s
-            self._share = self._share + share
-        self._n_seen += 1
+            weight = self._shutter.overlap_fraction(self._n_added, self.exposure_s)
+            self._rate_e_per_s = self._rate_e_per_s + weight * rate_e_per_s
+            self._weight = self._weight + weight
+        self._n_added += 1
 
     def mean_e_per_s(self, last_e_per_s: Floats) -> Floats:
         """
@@ -156,16 +156,16 @@ class Exposure:
 
         The rate of the last frame is used for the rest of an incomplete exposure.
         """
-        last_e_per_s = self._light("last_e_per_s", last_e_per_s)
+        last_e_per_s = self._validate_rate("last_e_per_s", last_e_per_s)
         if self.is_complete:
             return self._rate_e_per_s
-        return self._rate_e_per_s + (1.0 - self._share) * last_e_per_s
+        return self._rate_e_per_s + (1.0 - self._weight) * last_e_per_s
 
-    def _light(self, name: str, rate_e_per_s: Floats) -> Floats:
-        light, n_sites = finite_array(name, rate_e_per_s, at_least=0.0), self._shutter.layout.n_sites
-        if light.shape != (n_sites,):
-            raise ParameterError(name, f"must have one number for each of the {n_sites} sites, got {light.shape}")
-        return light
+    def _validate_rate(self, name: str, rate_e_per_s: Floats) -> Floats:
+        rate, n_sites = finite_array(name, rate_e_per_s, at_least=0.0), self._shutter.layout.n_sites
+        if rate.shape != (n_sites,):
+            raise ParameterError(name, f"must have one number for each of the {n_sites} sites, got {rate.shape}")
+        return rate
 
 
 def _hat_integral(x: Floats) -> Floats:

@@ -20,7 +20,7 @@ from foveasim._io.images import PICTURE_EXTENSIONS, check_picture_size, picture_
 from foveasim.errors import FileError, ParameterError, printable
 from foveasim.scene import Scene
 
-__all__ = ["FrameSource", "pictures_in"]
+__all__ = ["FrameSource", "list_pictures"]
 
 #: Placeholder wavelengths, which the spectra of the template replace.
 GREY_NM, COLOUR_NM = (550.0,), (620.0, 550.0, 450.0)
@@ -97,15 +97,15 @@ class FrameSource:
         self._scene = scene
         self._source: Iterable[Any]
         self._n_source: int | None = None
-        told_s: float | None = None
+        period_s: float | None = None
         if isinstance(source, str | Path):
             path = Path(source)
             if path.is_dir():
-                self._source = pictures_in(path)
+                self._source = list_pictures(path)
                 self._n_source = len(self._source)
             elif path.is_file():
                 self._source = _VideoFile(path)
-                self._n_source, told_s = self._source.n_frames, self._source.frame_s
+                self._n_source, period_s = self._source.n_frames, self._source.frame_s
             else:
                 raise FileError(path, "no such file or directory")
         elif isinstance(source, Iterable):
@@ -114,12 +114,12 @@ class FrameSource:
         else:
             raise ParameterError("source", f"must be a path or an iterable of pictures, got a {type(source).__name__}")
         if frame_s is not None:
-            told_s = check_number("frame_s", frame_s, above=0.0)
-        self._frame_s = None if told_s is None else told_s * (self._step if frame_s is None else 1)
+            period_s = check_number("frame_s", frame_s, above=0.0)
+        self._frame_s = None if period_s is None else period_s * (self._step if frame_s is None else 1)
         self._may_be_empty = False
         # The frame count of video files is an estimate.
         if self._n_source is not None and not isinstance(self._source, _VideoFile):
-            self._check_some(self.n_frames)
+            self._check_not_empty(self.n_frames)
 
     def __repr__(self) -> str:
         return f"FrameSource({self.n_frames or 'unknown number of'} frames)"
@@ -156,16 +156,18 @@ class FrameSource:
         ParameterError
             When ``n`` is negative or not an integer.
         """
-        rest = copy.copy(self)
-        rest._start += check_count("n", n, at_least=0, at_most=MAX_FRAMES) * self._step  # noqa: SLF001 -- same class
-        rest._may_be_empty = True  # noqa: SLF001
-        return rest
+        source = copy.copy(self)
+        source._start += check_count("n", n, at_least=0, at_most=MAX_FRAMES) * self._step  # noqa: SLF001 -- same class
+        source._may_be_empty = True  # noqa: SLF001
+        return source
 
-    def _check_some(self, n_frames: int | None) -> None:
+    def _check_not_empty(self, n_frames: int | None) -> None:
         if n_frames == 0 and not self._may_be_empty:
             n_pictures = "an unknown number of" if self._n_source is None else f"{self._n_source:,}"
-            until = "" if self._stop is None else f" and below {self._stop}"
-            raise ParameterError("source", f"must have a frame from {self._start}{until}, got {n_pictures} pictures")
+            upper_limit = "" if self._stop is None else f" and below {self._stop}"
+            raise ParameterError(
+                "source", f"must have a frame from {self._start}{upper_limit}, got {n_pictures} pictures"
+            )
 
     def __iter__(self) -> Iterator[Scene]:
         """Iterate over the scenes."""
@@ -174,7 +176,9 @@ class FrameSource:
         if isinstance(self._source, _VideoFile):  # skipped frames are decoded but not converted to pixels
             pictures = _pixels(self._source.path, pictures)
         for k, picture in enumerate(pictures):
-            scene = Scene.from_picture(picture, **self._scene) if self._template is None else self._made_like(picture)
+            scene = (
+                Scene.from_picture(picture, **self._scene) if self._template is None else self._from_template(picture)
+            )
             if shape is not None and scene.basis.shape != shape:
                 where = picture if isinstance(picture, str | Path) else f"frame {self._start + k * self._step}"
                 raise FileError(
@@ -183,13 +187,13 @@ class FrameSource:
                 )
             shape = scene.basis.shape
             yield scene
-        self._check_some(0 if shape is None else None)
+        self._check_not_empty(0 if shape is None else None)
 
-    def _made_like(self, picture: Any) -> Scene:
+    def _from_template(self, picture: Any) -> Scene:
         template = self._template
         assert template is not None
         n_basis = template.basis.shape[0]
-        read = Scene.from_picture(
+        converted = Scene.from_picture(
             picture,
             pitch_um=template.pitch_um,
             distance_m=template.distance_m,
@@ -199,16 +203,16 @@ class FrameSource:
             band_width_nm=1.0,
             **self._scene,
         )
-        basis = np.broadcast_to(read.basis, (n_basis, *read.basis.shape[1:]))
-        return replace(template, basis=basis, source=read.source)
+        basis = np.broadcast_to(converted.basis, (n_basis, *converted.basis.shape[1:]))
+        return replace(template, basis=basis, source=converted.source)
 
 
-def pictures_in(folder: Path) -> list[Path]:
+def list_pictures(directory: Path) -> list[Path]:
     """Return the paths of the pictures in a directory in natural order."""
-    names = picture_names(path.name for path in folder.iterdir() if path.is_file())
+    names = picture_names(path.name for path in directory.iterdir() if path.is_file())
     if not names:
-        raise FileError(folder, f"contains no pictures ({', '.join(PICTURE_EXTENSIONS)})")
-    return [folder / name for name in names]
+        raise FileError(directory, f"contains no pictures ({', '.join(PICTURE_EXTENSIONS)})")
+    return [directory / name for name in names]
 
 
 def _check_settings(scene: dict[str, Any]) -> None:
@@ -245,21 +249,21 @@ class _VideoFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with _opened(path) as container, _readable(path, "is corrupt"):
+        with _open_video(path) as container, _as_video_error(path, "is corrupt"):
             stream = container.streams.video[0]
             rate = stream.average_rate or stream.base_rate
             self.frame_s = float(1 / rate) if rate and rate > 0 else None
             self.n_frames: int | None = int(stream.frames) if stream.frames > 0 else None
 
     def __iter__(self) -> Iterator[Any]:
-        with _opened(self.path) as container:
+        with _open_video(self.path) as container:
             n_read = 0
-            with _readable(self.path, "is corrupt"):
+            with _as_video_error(self.path, "is corrupt"):
                 stream = container.streams.video[0]
                 stream.thread_type = "AUTO"
                 frames = iter(container.decode(stream))
             while True:
-                with _readable(self.path, f"is corrupt after frame {n_read}"):
+                with _as_video_error(self.path, f"is corrupt after frame {n_read}"):
                     frame = next(frames, None)
                 if frame is None:
                     break
@@ -277,17 +281,17 @@ def _pixels(path: Path, frames: Iterator[Any]) -> Iterator[NDArray[np.uint8]]:
     """
     for frame in frames:
         check_picture_size(path, frame.width, frame.height)
-        with _readable(path, "is corrupt"):
+        with _as_video_error(path, "is corrupt"):
             pixels = frame.to_ndarray(format="rgb24")
         yield pixels
 
 
-def _opened(path: Path) -> Any:
+def _open_video(path: Path) -> Any:
     try:
         import av
     except ImportError:
         raise FileError(path, NEEDS_PYAV) from None
-    with _readable(path, "is not a readable video file"):
+    with _as_video_error(path, "is not a readable video file"):
         # Metadata such as titles are not used and may be corrupt.
         container = av.open(str(path), metadata_errors="replace")
     if not container.streams.video:
@@ -300,7 +304,7 @@ def _opened(path: Path) -> Any:
 
 
 @contextmanager
-def _readable(path: Path, problem: str) -> Iterator[None]:
+def _as_video_error(path: Path, problem: str) -> Iterator[None]:
     """Convert exceptions of the video library, which may be of any type, to FileErrors."""
     try:
         yield

@@ -21,7 +21,7 @@ __all__ = ["GazePath", "pan_camera", "saccades", "shift_sensor"]
 #: Shape of the gamma distribution of fixation durations: the standard deviation is half the mean.
 FIXATION_SHAPE = 4.0
 #: Shortest fixation as a fraction of the mean.
-SHORTEST_FIXATION = 0.2
+MIN_FIXATION = 0.2
 #: Upper limit of points; longer paths indicate wrong units.
 MAX_POINTS = 10**8
 
@@ -125,27 +125,27 @@ def saccades(
     saccade_s = check_number("saccade_s", saccade_s, at_least=0.0)
     drift = check_number("drift_um_per_root_s", drift_um_per_root_s, at_least=0.0)
     streams = Streams(seed)
-    rests, targets, walk = (streams.of(f"gaze {what}") for what in ("rests", "targets", "drift"))
+    fixations, targets, walk = (streams.of(f"gaze {name}") for name in ("rests", "targets", "drift"))
     t_s = frame_s * np.arange(n)
     steps_um = drift * math.sqrt(frame_s) * walk.standard_normal((n, 2))
     xy_um = np.zeros((n, 2))
-    begin_s, place_um = 0.0, np.zeros(2)
+    begin_s, position_um = 0.0, np.zeros(2)
     while begin_s < t_s[-1] or begin_s == 0.0:
-        rest_s = fixation_s * max(rests.gamma(FIXATION_SHAPE) / FIXATION_SHAPE, SHORTEST_FIXATION)
-        leave_s = begin_s + rest_s
-        resting = slice(*np.searchsorted(t_s, (begin_s, leave_s)))
-        walked_um = np.cumsum(steps_um[resting], axis=0) - steps_um[resting][:1]
-        xy_um[resting] = place_um + walked_um
-        left_um = xy_um[resting][-1] if resting.start < resting.stop else place_um
-        place_um = half_um * (2.0 * targets.random(2) - 1.0)
+        rest_duration_s = fixation_s * max(fixations.gamma(FIXATION_SHAPE) / FIXATION_SHAPE, MIN_FIXATION)
+        leave_s = begin_s + rest_duration_s
+        fixation_slice = slice(*np.searchsorted(t_s, (begin_s, leave_s)))
+        drift_um = np.cumsum(steps_um[fixation_slice], axis=0) - steps_um[fixation_slice][:1]
+        xy_um[fixation_slice] = position_um + drift_um
+        left_um = xy_um[fixation_slice][-1] if fixation_slice.start < fixation_slice.stop else position_um
+        position_um = half_um * (2.0 * targets.random(2) - 1.0)
         begin_s = leave_s + saccade_s
-        jumping = slice(*np.searchsorted(t_s, (leave_s, begin_s)))
-        u = ((t_s[jumping] - leave_s) / max(saccade_s, frame_s))[:, np.newaxis]
-        xy_um[jumping] = left_um + (place_um - left_um) * u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
+        saccade_slice = slice(*np.searchsorted(t_s, (leave_s, begin_s)))
+        u = ((t_s[saccade_slice] - leave_s) / max(saccade_s, frame_s))[:, np.newaxis]
+        xy_um[saccade_slice] = left_um + (position_um - left_um) * u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
     return GazePath(np.asarray(t_s), xy_um)
 
 
-def shift_sensor(light: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Scene | PowerMap, tuple[float, float]]]:
+def shift_sensor(source: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Scene | PowerMap, tuple[float, float]]]:
     """
     Yield frames of a static scene for a sensor that moves behind a fixed lens.
 
@@ -154,22 +154,22 @@ def shift_sensor(light: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Scen
 
     Parameters
     ----------
-    light : Scene or PowerMap
+    source : Scene or PowerMap
         Static scene or power map.
     path : GazePath
         Positions of the sensor.
 
     Yields
     ------
-    light, (x_um, y_um)
+    source, (x_um, y_um)
 
     Raises
     ------
     ParameterError
         When an argument is of another class.
     """
-    _check_kinds(("light", light, (Scene, PowerMap)), ("path", path, (GazePath,)))
-    return ((light, (float(x_um), float(y_um))) for x_um, y_um in path.xy_um)
+    _check_types(("source", source, (Scene, PowerMap)), ("path", path, (GazePath,)))
+    return ((source, (float(x_um), float(y_um))) for x_um, y_um in path.xy_um)
 
 
 def pan_camera(
@@ -203,7 +203,7 @@ def pan_camera(
         Immediately when an argument is of another class or the part is larger than the scene; during iteration when the part
         extends beyond the scene.
     """
-    _check_kinds(("scene", scene, (Scene,)), ("path", path, (GazePath,)), ("optics", optics, (Optics,)))
+    _check_types(("scene", scene, (Scene,)), ("path", path, (GazePath,)), ("optics", optics, (Optics,)))
     n_y, n_x = check_shape("shape", shape)
     if n_y > scene.basis.shape[1] or n_x > scene.basis.shape[2]:
         raise ParameterError("shape", f"must not exceed the shape of the scene, {scene.basis.shape[1:]}", (n_y, n_x))
@@ -215,33 +215,34 @@ def _parts(
 ) -> Iterator[tuple[Scene, tuple[float, float]]]:
     """Yield the cropped parts of a scene along a path, and the remaining shifts."""
     free_y, free_x = scene.basis.shape[1] - n_y, scene.basis.shape[2] - n_x
-    before: tuple[int, int] | None = None
+    previous: tuple[int, int] | None = None
     part = scene
-    for t_s, place_um in zip(path.t_s, path.xy_um, strict=True):
+    for t_s, position_um in zip(path.t_s, path.xy_um, strict=True):
         # The centre of the part is off by half a pixel if the number of free pixels is odd.
         left, bottom = (
-            round(float(at_um) / cell_um + 0.5 * free) for at_um, free in zip(place_um, (free_x, free_y), strict=True)
+            round(float(at_um) / cell_um + 0.5 * free)
+            for at_um, free in zip(position_um, (free_x, free_y), strict=True)
         )
         if not (0 <= left <= free_x and 0 <= bottom <= free_y):
             raise ParameterError(
                 "path",
                 f"must stay within the scene, but leaves it at {t_s:g} s: a part of {n_x} x {n_y} pixels can move by at most "
                 f"({0.5 * free_x * cell_um:.4g}, {0.5 * free_y * cell_um:.4g}) µm",
-                tuple(float(at_um) for at_um in place_um),
+                tuple(float(at_um) for at_um in position_um),
                 "µm",
             )
-        if (left, bottom) != before:
+        if (left, bottom) != previous:
             part = replace(scene, basis=scene.basis[:, bottom : bottom + n_y, left : left + n_x])
-            before = left, bottom
-        rest_um = [
+            previous = left, bottom
+        shift_um = [
             float(at_um) - (at - 0.5 * free) * cell_um
-            for at_um, at, free in zip(place_um, (left, bottom), (free_x, free_y), strict=True)
+            for at_um, at, free in zip(position_um, (left, bottom), (free_x, free_y), strict=True)
         ]
-        yield part, (rest_um[0], rest_um[1])
+        yield part, (shift_um[0], shift_um[1])
 
 
-def _check_kinds(*arguments: tuple[str, object, tuple[type, ...]]) -> None:
-    for name, value, kinds in arguments:
-        if not isinstance(value, kinds):
-            class_names = " or ".join(kind.__name__ for kind in kinds)
+def _check_types(*arguments: tuple[str, object, tuple[type, ...]]) -> None:
+    for name, value, types in arguments:
+        if not isinstance(value, types):
+            class_names = " or ".join(type_.__name__ for type_ in types)
             raise ParameterError(name, f"must be a {class_names}, got a {type(value).__name__}")

@@ -28,7 +28,7 @@ from foveasim.layout.packed import layout_to_arrays
 
 __all__ = [
     "Recording",
-    "alike",
+    "check_consistent",
     "count_recorded_frames",
     "partial_path",
     "read_recording",
@@ -45,13 +45,13 @@ WRITE_S = 10.0
 CODECS = ("bytes", "zstd")
 MAX_DECOMPRESSED_BYTES = 8 * 2**30
 #: Arrays of the layout, and arrays that grow frame by frame: frame numbers are written last and mark complete frames.
-GEOMETRY, GROWING = ("xy_um", "ring_offsets", "site_offsets"), ("code", "exposure_s", "frame")
+LAYOUT_ARRAYS, FRAME_ARRAYS = ("xy_um", "ring_offsets", "site_offsets"), ("code", "exposure_s", "frame")
 #: Fill value of frame numbers, for incomplete frames.
 NO_FRAME = -1
 #: Settings that may always differ between captures of one recording.
-OWN_SETTINGS = frozenset({"exposure_s", "frame", "light.source", "place_um"})
+FRAME_SETTINGS = frozenset({"exposure_s", "frame", "light.source", "place_um"})
 #: File that is locked while a recording is written, and extension of incomplete files of zarr.
-LOCK, TORN = "lock", ".partial"
+LOCK, INCOMPLETE = "lock", ".partial"
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -116,7 +116,7 @@ def read_recording(path: str | Path) -> Recording:
     import_optional(source, "zarr")
     if not source.is_dir():
         raise FileError(source, "is not a directory" if source.exists() else "no such directory")
-    with _trusted(source) as group:
+    with _open_checked(source) as group:
         about = group.attrs
         columns = {name: values[:] for name, values in group["columns"].arrays()}
         return Recording(
@@ -168,14 +168,14 @@ def count_recorded_frames(path: str | Path) -> int:
         raise FileError(target, "must end in .zarr; other formats cannot be resumed")
     import_optional(target, "zarr")
     if target.exists():
-        with _trusted(target) as group:
+        with _open_checked(target) as group:
             return int(group["code"].shape[0])
-    folder = partial_path(target)
-    return _count_complete(folder) if folder.exists() else 0
+    directory = partial_path(target)
+    return _count_complete(directory) if directory.exists() else 0
 
 
 @contextmanager
-def _trusted(source: Path, mode: str = "r") -> Iterator[Any]:
+def _open_checked(source: Path, mode: str = "r") -> Iterator[Any]:
     """Open the group of an untrusted recording; exceptions of the block become FileErrors."""
     zarr = import_optional(source, "zarr")
     with as_file_error(source, "video of captures", passes=(FileError,)):
@@ -185,7 +185,7 @@ def _trusted(source: Path, mode: str = "r") -> Iterator[Any]:
             raise FileError(source, "is not a video of captures")
         if group.attrs.get("version") != VERSION:
             raise FileError(source, f"has the format version {group.attrs.get('version')}, expected {VERSION}")
-        names = (*GEOMETRY, "filter_of_site", "exposure_s", "frame")
+        names = (*LAYOUT_ARRAYS, "filter_of_site", "exposure_s", "frame")
         arrays = [group[name] for name in names if name in group]
         arrays += [array for _, array in group["columns"].arrays()] if "columns" in group else []
         if sum(array.nbytes for array in arrays) > MAX_DECOMPRESSED_BYTES:
@@ -193,10 +193,10 @@ def _trusted(source: Path, mode: str = "r") -> Iterator[Any]:
         yield group
 
 
-def _is_recording(folder: Path) -> bool:
-    zarr = import_optional(folder, "zarr")
+def _is_recording(directory: Path) -> bool:
+    zarr = import_optional(directory, "zarr")
     try:
-        return zarr.open_group(str(folder), mode="r", use_consolidated=False).attrs.get("format") == FORMAT
+        return zarr.open_group(str(directory), mode="r", use_consolidated=False).attrs.get("format") == FORMAT
     except Exception:  # noqa: BLE001 -- other data may raise any exception
         return False
 
@@ -204,7 +204,7 @@ def _is_recording(folder: Path) -> bool:
 # -- writing ----------------------------------------------------------------------------------------------------------
 
 
-def alike(captures: Iterable[Capture], *, n_before: int = 0) -> Iterator[Capture]:
+def check_consistent(captures: Iterable[Capture], *, n_before: int = 0) -> Iterator[Capture]:
     """
     Yield the captures after checking that they have the same number of sites and bits.
 
@@ -229,45 +229,47 @@ def alike(captures: Iterable[Capture], *, n_before: int = 0) -> Iterator[Capture
 def record(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any] | None) -> int:
     """Write captures to a zarr store atomically; return their number."""
     import_optional(target, "zarr")
-    with atomic_directory(target, is_ours=_is_recording) as folder:
-        frames = _Frames(folder, plan)
-        for capture in alike(captures):
+    with atomic_directory(target, is_ours=_is_recording) as directory:
+        frames = _Frames(directory, plan)
+        for capture in check_consistent(captures):
             frames.add(capture)
         frames.write()
-    return frames.n_whole
+    return frames.n_complete
 
 
 def resume_recording(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any] | None) -> int:
     """Append captures to a resumable recording; return the total number of frames."""
     import_optional(target, "zarr")
     if target.exists():
-        return _finished(captures, target, plan)
-    with _growing(target) as folder:
-        n_before = _count_complete(folder)
+        return _count_finished(captures, target, plan)
+    with _locked_directory(target) as directory:
+        n_before = _count_complete(directory)
         if n_before:
-            _check_plan(folder, plan)
+            _check_plan(directory, plan)
         with _disk_errors(target):
-            frames = _Frames(folder, plan, n_before)
+            frames = _Frames(directory, plan, n_before)
         try:
-            for capture in _following(alike(captures, n_before=n_before), folder, n_before):
+            for capture in _check_continuation(check_consistent(captures, n_before=n_before), directory, n_before):
                 with _disk_errors(target):
                     frames.add(capture)
                     if time.monotonic() - frames.written_s > WRITE_S:
                         frames.write()
             with _disk_errors(target):
                 frames.write()
-                folder.rename(target)
+                directory.rename(target)
                 (target / LOCK).unlink(missing_ok=True)
         except BaseException as error:
             with suppress(Exception):
                 frames.write()
-            if frames.n_whole:
-                error.add_note(f"{frames.n_whole:,} frames are stored in {folder}; the same call resumes the recording")
+            if frames.n_complete:
+                error.add_note(
+                    f"{frames.n_complete:,} frames are stored in {directory}; the same call resumes the recording"
+                )
             raise
-    return frames.n_whole
+    return frames.n_complete
 
 
-def _finished(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any] | None) -> int:
+def _count_finished(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any] | None) -> int:
     """Return the number of frames of a finished recording; reject further captures."""
     if not _is_recording(target):
         raise FileError(target, "cannot be written: the path contains other data; choose another path")
@@ -284,28 +286,28 @@ def _finished(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any]
 
 
 @contextmanager
-def _growing(target: Path) -> Iterator[Path]:
+def _locked_directory(target: Path) -> Iterator[Path]:
     """Lock the directory of a recording; delete it after the block if it has no frames."""
-    folder = partial_path(target)
+    directory = partial_path(target)
     if not target.parent.is_dir():
         raise FileError(target, f"cannot be written: the directory {target.parent} does not exist")
-    if folder.exists() and not (folder.is_dir() and _is_ours(folder)):
-        raise FileError(folder, "cannot be written: the path contains other data; choose another path")
+    if directory.exists() and not (directory.is_dir() and _is_unfinished_recording(directory)):
+        raise FileError(directory, "cannot be written: the path contains other data; choose another path")
     with _disk_errors(target):
-        folder.mkdir(exist_ok=True)
-        file = (folder / LOCK).open("ab")
+        directory.mkdir(exist_ok=True)
+        file = (directory / LOCK).open("ab")
     with file:
         with _disk_errors(target):
             # Another process may have finished the recording, or replaced the directory, before it was locked.
-            if not lock(file) or not _is_at(file, folder / LOCK):
+            if not lock(file) or not _is_same_file(file, directory / LOCK):
                 raise FileError(target, "is being written by another process")
-            for torn in folder.rglob(f"*{TORN}"):
-                torn.unlink()
+            for incomplete in directory.rglob(f"*{INCOMPLETE}"):
+                incomplete.unlink()
         try:
-            yield folder
+            yield directory
         finally:
-            if folder.exists() and not _count_complete(folder):
-                remove_directory(folder)
+            if directory.exists() and not _count_complete(directory):
+                remove_directory(directory)
 
 
 @contextmanager
@@ -316,32 +318,34 @@ def _disk_errors(target: Path) -> Iterator[None]:
         raise FileError(target, f"cannot be written: {error.strerror or error}") from None
 
 
-def _is_ours(folder: Path) -> bool:
+def _is_unfinished_recording(directory: Path) -> bool:
     """Return whether a directory contains an unfinished recording, possibly without frames."""
-    return all(path.name == LOCK or path.suffix == TORN for path in folder.iterdir()) or _is_recording(folder)
+    return all(path.name == LOCK or path.suffix == INCOMPLETE for path in directory.iterdir()) or _is_recording(
+        directory
+    )
 
 
-def _is_at(file: IO[bytes], path: Path) -> bool:
+def _is_same_file(file: IO[bytes], path: Path) -> bool:
     try:
         return os.path.samestat(os.fstat(file.fileno()), path.stat())
     except OSError:
         return False
 
 
-def _count_complete(folder: Path) -> int:
+def _count_complete(directory: Path) -> int:
     """Return the number of complete frames of an unfinished recording."""
-    if not (folder / "frame" / "zarr.json").exists():
+    if not (directory / "frame" / "zarr.json").exists():
         return 0
-    with _trusted(folder) as group:
+    with _open_checked(directory) as group:
         frame = group["frame"][:]
     return int(np.argmax(frame == NO_FRAME)) if (frame == NO_FRAME).any() else frame.size
 
 
 def _check_plan(path: Path, plan: Mapping[str, Any] | None) -> None:
     """Reject a recording that has another plan."""
-    with _trusted(path) as group:
+    with _open_checked(path) as group:
         found = group.attrs.get("plan")
-    _reject(path, differences(found, _plain(plan)))
+    _reject(path, differences(found, _json_round_trip(plan)))
 
 
 def _reject(path: Path, different: Iterable[str]) -> None:
@@ -352,7 +356,7 @@ def _reject(path: Path, different: Iterable[str]) -> None:
         )
 
 
-def _following(captures: Iterable[Capture], folder: Path, n_before: int) -> Iterator[Capture]:
+def _check_continuation(captures: Iterable[Capture], directory: Path, n_before: int) -> Iterator[Capture]:
     """
     Yield the captures after checking that they continue the frames in the directory.
 
@@ -360,13 +364,13 @@ def _following(captures: Iterable[Capture], folder: Path, n_before: int) -> Iter
     differences mean that it is another recording.
     """
     first: dict[str, Any] | None = None
-    may_differ, next_frame = set(OWN_SETTINGS), None
+    may_differ, next_frame = set(FRAME_SETTINGS), None
     if n_before:
-        with _trusted(folder) as group:
+        with _open_checked(directory) as group:
             first, next_frame = group.attrs["settings"], int(group["frame"][n_before - 1]) + 1
             may_differ |= set(group.attrs["varied"])
     for k, capture in enumerate(captures, n_before):
-        settings = _plain(capture.settings)
+        settings = _json_round_trip(capture.settings)
         frame = check_count("frame", settings.get("frame", k), at_least=0)
         if next_frame is not None and frame != next_frame:
             raise ParameterError(
@@ -378,23 +382,23 @@ def _following(captures: Iterable[Capture], folder: Path, n_before: int) -> Iter
         first = settings if first is None else first
         different = [name for name in differences(first, settings) if name not in may_differ]
         if n_before and k == n_before:
-            _reject(folder, _other_parts(folder, capture))
-            _reject(folder, different)
+            _reject(directory, _property_differences(directory, capture))
+            _reject(directory, different)
         elif different:
             may_differ |= set(different)
-            with _trusted(folder, "r+") as group:
+            with _open_checked(directory, "r+") as group:
                 pass
-            with _disk_errors(folder):
-                group.attrs["varied"] = sorted(may_differ - OWN_SETTINGS)
+            with _disk_errors(directory):
+                group.attrs["varied"] = sorted(may_differ - FRAME_SETTINGS)
         next_frame = frame + 1
         yield capture
 
 
-def _other_parts(folder: Path, capture: Capture) -> Iterator[str]:
+def _property_differences(directory: Path, capture: Capture) -> Iterator[str]:
     """Yield the names of properties (not settings) that differ from those of a recording."""
-    found = read_recording(folder)
-    there, here = layout_to_arrays(found.layout), layout_to_arrays(capture.layout)
-    if there.keys() != here.keys() or any(not np.array_equal(there[name], here[name]) for name in here):
+    found = read_recording(directory)
+    stored, new = layout_to_arrays(found.layout), layout_to_arrays(capture.layout)
+    if stored.keys() != new.keys() or any(not np.array_equal(stored[name], new[name]) for name in new):
         yield "layout"
     if found.bits != capture.bits or found.code.dtype != capture.code.dtype:
         yield "bits"
@@ -403,7 +407,7 @@ def _other_parts(folder: Path, capture: Capture) -> Iterator[str]:
         yield "filters"
 
 
-def _plain(data: Mapping[str, Any] | None) -> Any:
+def _json_round_trip(data: Mapping[str, Any] | None) -> Any:
     """Return data after a JSON round trip, as read from a file."""
     return json.loads(json.dumps(None if data is None else dict(data)))
 
@@ -416,71 +420,71 @@ class _Frames:
     complete are preserved if the process ends at any time.
     """
 
-    def __init__(self, folder: Path, plan: Mapping[str, Any] | None, n_whole: int = 0) -> None:
-        self._folder, self._plan = folder, plan
+    def __init__(self, directory: Path, plan: Mapping[str, Any] | None, n_complete: int = 0) -> None:
+        self._directory, self._plan = directory, plan
         self._arrays: dict[str, Any] = {}
         self._n_chunk = 1
         # Number of frames before the chunk, and its frames: one tuple, so that Ctrl-C cannot leave them inconsistent.
         self._chunk: tuple[int, list[tuple[Any, ...]]] = 0, []
-        self.n_whole, self.written_s = n_whole, time.monotonic()
-        if n_whole:
-            with _trusted(folder, "r+") as group:
-                self._arrays = {name: group[name] for name in GROWING}
+        self.n_complete, self.written_s = n_complete, time.monotonic()
+        if n_complete:
+            with _open_checked(directory, "r+") as group:
+                self._arrays = {name: group[name] for name in FRAME_ARRAYS}
                 code = self._arrays["code"]
                 self._n_chunk = code.chunks[0]
-                n_before = n_whole - n_whole % self._n_chunk
-                if (n_whole - n_before) * code.shape[1] * code.dtype.itemsize > MAX_DECOMPRESSED_BYTES:
-                    raise FileError(folder, f"would decompress to more than {MAX_DECOMPRESSED_BYTES} bytes")
-                values = (array[n_before:n_whole] for array in self._arrays.values())
+                n_before = n_complete - n_complete % self._n_chunk
+                if (n_complete - n_before) * code.shape[1] * code.dtype.itemsize > MAX_DECOMPRESSED_BYTES:
+                    raise FileError(directory, f"would decompress to more than {MAX_DECOMPRESSED_BYTES} bytes")
+                values = (array[n_before:n_complete] for array in self._arrays.values())
                 self._chunk = n_before, list(zip(*values, strict=True))
             for array in self._arrays.values():
-                array.resize((n_whole, *array.shape[1:]))
+                array.resize((n_complete, *array.shape[1:]))
 
     def add(self, capture: Capture) -> None:
         """Add a frame, and write the chunk if it is full."""
         if not self._arrays:
-            self._begin(capture)
+            self._create_arrays(capture)
         n_before, frames = self._chunk
-        told = capture.settings
-        frames.append((capture.code, told.get("exposure_s", np.nan), told.get("frame", n_before + len(frames))))
+        settings = capture.settings
+        frames.append((capture.code, settings.get("exposure_s", np.nan), settings.get("frame", n_before + len(frames))))
         if len(frames) == self._n_chunk:
             self.write()
-            self._chunk = self.n_whole, []
+            self._chunk = self.n_complete, []
 
     def write(self) -> None:
         """Write the frames that are only in memory."""
         n_before, frames = self._chunk
         n = n_before + len(frames)
-        if n > self.n_whole:
+        if n > self.n_complete:
             for array, values in zip(self._arrays.values(), zip(*frames, strict=True), strict=True):
                 array.resize((n, *array.shape[1:]))
                 array[n_before:] = np.asarray(values, array.dtype)
-            self.n_whole = n
+            self.n_complete = n
         self.written_s = time.monotonic()
 
-    def _begin(self, capture: Capture) -> None:
+    def _create_arrays(self, capture: Capture) -> None:
         layout, n_sites = capture.layout, capture.layout.n_sites
         arrays = {}
-        for path in self._folder.iterdir():  # of a recording that was interrupted before its first frame
+        for path in self._directory.iterdir():  # of a recording that was interrupted before its first frame
             if path.is_dir():
                 shutil.rmtree(path)
             elif path.name != LOCK:
                 path.unlink()
-        group = import_optional(self._folder, "zarr").create_group(
-            str(self._folder),
+        group = import_optional(self._directory, "zarr").create_group(
+            str(self._directory),
             attributes={
                 "format": FORMAT,
                 "version": VERSION,
                 "filter_names": list(capture.filter_names),
                 "bits": capture.bits,
                 "white_dn": capture.white_dn.tolist(),
-                "settings": _plain(capture.settings),
+                "settings": _json_round_trip(capture.settings),
                 "varied": [],
                 "provenance": to_plain_data(dict(layout.provenance)),
-                "plan": _plain(self._plan),
+                "plan": _json_round_trip(self._plan),
             },
         )
-        for name in GEOMETRY:
+        for name in LAYOUT_ARRAYS:
             group.create_array(name, data=np.asarray(getattr(layout, name)))
         group.create_array("filter_of_site", data=np.asarray(capture.filter_of_site))
         group.create_group("columns")

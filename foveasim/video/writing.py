@@ -22,13 +22,13 @@ from foveasim.integrate import Integrator
 from foveasim.layout import Layout
 from foveasim.reconstruct import Picture, fill_channels, raster_grid
 from foveasim.reconstruct.picture import coverage_fraction
-from foveasim.video.recording import alike, count_recorded_frames, record, resume_recording
+from foveasim.video.recording import check_consistent, count_recorded_frames, record, resume_recording
 
 __all__ = ["write_video"]
 
-VIDEO_ENDINGS = (".mp4", ".mkv", ".mov", ".webm")
+VIDEO_EXTENSIONS = (".mp4", ".mkv", ".mov", ".webm")
 #: Background grey where there are no photosites, as a fraction of white.
-BEHIND = 0.12
+BACKGROUND_GREY = 0.12
 
 
 def write_video(
@@ -101,24 +101,24 @@ def write_video(
     target = Path(path)
     frame_s = check_number("frame_s", frame_s, above=0.0)
     max_pixels = check_count("max_pixels", max_pixels, at_least=2)
-    ending = target.suffix.lower()
-    if ending != ZARR and (resume or plan is not None):
+    extension = target.suffix.lower()
+    if extension != ZARR and (resume or plan is not None):
         raise ParameterError(
             "resume" if resume else "plan",
             f"is supported for .zarr stores only; {target.name} is written atomically",
         )
     if progress:
         captures = _with_progress(captures, n_frames, count_recorded_frames(target) if resume else 0)
-    if ending == ZARR:
+    if extension == ZARR:
         return (resume_recording if resume else record)(captures, target, plan)
-    if ending == ".gif":
+    if extension == ".gif":
         return _write_gif(captures, target, frame_s, max_pixels)
-    if ending in VIDEO_ENDINGS:
-        return _write_film(captures, target, frame_s, max_pixels)
-    if ending:
+    if extension in VIDEO_EXTENSIONS:
+        return _write_video_file(captures, target, frame_s, max_pixels)
+    if extension:
         raise FileError(
             target,
-            f"must end in .zarr, .gif, {', '.join(VIDEO_ENDINGS)}, or have no extension for a directory of pictures",
+            f"must end in .zarr, .gif, {', '.join(VIDEO_EXTENSIONS)}, or have no extension for a directory of pictures",
         )
     return _write_pictures(captures, target, max_pixels)
 
@@ -145,13 +145,13 @@ def _with_progress(captures: Iterable[Capture], n_frames: int | None, n_before: 
 class _Raster:
     """Renderer of captures of one layout, with the overlaps of sites and pixels computed once."""
 
-    def __init__(self, layout: Layout, max_pixels: int, *, is_even: bool = False) -> None:
+    def __init__(self, layout: Layout, max_pixels: int, *, has_even_size: bool = False) -> None:
         grid = raster_grid(layout, max_pixels)
-        if is_even:  # chroma subsampling of video formats needs even sizes
+        if has_even_size:  # chroma subsampling of video formats needs even sizes
             grid = Grid(tuple(n + n % 2 for n in grid.shape), grid.pitch_um, grid.origin_um)  # type: ignore[arg-type]
         self._layout, self._integrator = layout, Integrator(layout, grid)
-        self._share = coverage_fraction(self._integrator)
-        self._covered_um2 = np.where(self._share > 0.0, self._share, np.nan) * grid.cell_area_um2
+        self._coverage = coverage_fraction(self._integrator)
+        self._covered_um2 = np.where(self._coverage > 0.0, self._coverage, np.nan) * grid.cell_area_um2
 
     def image(self, capture: Capture) -> NDArray[np.uint8]:
         """Return sRGB values and coverage, (n_y, n_x, 2 or 4), top row first."""
@@ -164,27 +164,29 @@ class _Raster:
         white: Any = capture.white_dn
         if n_filters not in (1, 3):
             data, white = data.mean(axis=0, keepdims=True), float(np.mean(white))
-        picture = Picture(data, self._share.astype(np.float32), self._integrator.grid)
+        picture = Picture(data, self._coverage.astype(np.float32), self._integrator.grid)
         return np.asarray(picture.to_image(white, encode_srgb=True), np.uint8)
 
-    def flat(self, capture: Capture) -> NDArray[np.uint8]:
+    def composite(self, capture: Capture) -> NDArray[np.uint8]:
         """Return sRGB values over a dark grey background, (n_y, n_x, 3)."""
         image = self.image(capture).astype(np.float64)
         colours, cover = image[..., :-1], image[..., -1:] / 255.0
-        colours = colours * cover + 255.0 * BEHIND * (1.0 - cover)
+        colours = colours * cover + 255.0 * BACKGROUND_GREY * (1.0 - cover)
         return np.ascontiguousarray(np.broadcast_to(np.rint(colours), (*colours.shape[:2], 3)).astype(np.uint8))
 
 
 def _write_pictures(captures: Iterable[Capture], target: Path, max_pixels: int) -> int:
-    def is_pictures(folder: Path) -> bool:
-        return folder.is_dir() and all(p.name.startswith("frame_") and p.suffix == ".png" for p in folder.iterdir())
+    def is_pictures(directory: Path) -> bool:
+        return directory.is_dir() and all(
+            p.name.startswith("frame_") and p.suffix == ".png" for p in directory.iterdir()
+        )
 
     n_frames = 0
-    with atomic_directory(target, is_ours=is_pictures) as folder:
+    with atomic_directory(target, is_ours=is_pictures) as directory:
         raster: _Raster | None = None
-        for capture in alike(captures):
+        for capture in check_consistent(captures):
             raster = raster or _Raster(capture.layout, max_pixels)
-            write_picture(folder / f"frame_{n_frames:06d}.png", raster.image(capture))
+            write_picture(directory / f"frame_{n_frames:06d}.png", raster.image(capture))
             n_frames += 1
     return n_frames
 
@@ -197,10 +199,10 @@ def _write_gif(captures: Iterable[Capture], target: Path, frame_s: float, max_pi
     def pictures() -> Iterator[Image.Image]:
         nonlocal n_frames
         raster: _Raster | None = None
-        for capture in alike(captures):
+        for capture in check_consistent(captures):
             raster = raster or _Raster(capture.layout, max_pixels)
             n_frames += 1
-            yield Image.fromarray(raster.flat(capture)).quantize(256)
+            yield Image.fromarray(raster.composite(capture)).quantize(256)
 
     with atomic_write(target) as temporary:
         all_pictures = pictures()
@@ -216,7 +218,7 @@ def _write_gif(captures: Iterable[Capture], target: Path, frame_s: float, max_pi
     return n_frames
 
 
-def _write_film(captures: Iterable[Capture], target: Path, frame_s: float, max_pixels: int) -> int:
+def _write_video_file(captures: Iterable[Capture], target: Path, frame_s: float, max_pixels: int) -> int:
     av = import_optional(target, "av")
     codec = "libvpx-vp9" if target.suffix.lower() == ".webm" else "libx264"
     n_frames = 0
@@ -225,9 +227,9 @@ def _write_film(captures: Iterable[Capture], target: Path, frame_s: float, max_p
             with av.open(str(temporary), mode="w") as container:
                 raster: _Raster | None = None
                 stream: Any = None
-                for capture in alike(captures):
-                    raster = raster or _Raster(capture.layout, max_pixels, is_even=True)
-                    pixels = raster.flat(capture)
+                for capture in check_consistent(captures):
+                    raster = raster or _Raster(capture.layout, max_pixels, has_even_size=True)
+                    pixels = raster.composite(capture)
                     if stream is None:
                         stream = container.add_stream(codec, rate=Fraction(1.0 / frame_s).limit_denominator(1001))
                         stream.height, stream.width = pixels.shape[:2]

@@ -301,7 +301,7 @@ def test_events_are_independent_of_threads_and_pieces(monkeypatch):
     pixels = pixels_of(50, **NOISY)
     rates = walk(25, 50)
     expected = pixels.events(rates, frame_s=0.01, seed=4, n_threads=1)
-    monkeypatch.setattr(sys.modules[EventPixels.__module__], "PIECE_SITES", 7)
+    monkeypatch.setattr(sys.modules[EventPixels.__module__], "BLOCK_SITES", 7)
 
     assert same(pixels.events(rates, frame_s=0.01, seed=4, n_threads=2), expected)
 
@@ -407,7 +407,7 @@ def test_too_many_events_stop_early(monkeypatch):
     endless = pixels_of(1, noise_per_s=1e9)
     with pytest.raises(SimulationError, match=r"more than 1,000 events in 1 frames do not fit in memory"):
         endless.events([[1e-3]] * 2, frame_s=1.0, seed=0)
-    monkeypatch.setattr(sys.modules[EventPixels.__module__], "PIECE_SITES", 10)
+    monkeypatch.setattr(sys.modules[EventPixels.__module__], "BLOCK_SITES", 10)
     pixels = pixels_of(50, noise_per_s=30.0)
     assert 100 < len(pixels.events([[1e-3] * 50] * 2, frame_s=0.1, seed=0)) < 1000
     for n_threads in (1, 2):
@@ -664,7 +664,7 @@ def test_mismatched_or_missing_batches_are_rejected(join, tmp_path, monkeypatch)
 def test_structured_array_matches_events(tmp_path):
     events = some_events()
     x, y = events.addresses()
-    found = events.structured()
+    found = events.to_structured_array()
 
     assert found.dtype == np.dtype([("x", np.int16), ("y", np.int16), ("t", np.int64), ("p", bool)])
     assert np.array_equal(found["x"], x[events.site])
@@ -683,14 +683,14 @@ def test_structured_array_matches_events(tmp_path):
 def test_structured_array_out_of_range_is_rejected():
     layout = fs.layout.grid(n_x=40_000, n_y=1, pitch_um=1.0)
     with pytest.raises(ParameterError, match="at most 32768 columns and rows"):
-        Events([1.0], [0], [1], layout).structured()
+        Events([1.0], [0], [1], layout).to_structured_array()
     with pytest.raises(ParameterError, match="'t_s' must be at most"):
-        Events([1e12], [0], [1], fs.layout.grid(n_x=2, n_y=1, pitch_um=1.0)).structured()
+        Events([1e12], [0], [1], fs.layout.grid(n_x=2, n_y=1, pitch_um=1.0)).to_structured_array()
 
 
 def test_events_from_addresses_match_layout():
     events = some_events()
-    found = events.structured()
+    found = events.to_structured_array()
     read = Events.from_addresses(events.t_s, found["x"], found["y"], 2 * found["p"] - 1, events.layout)
 
     assert same(read, events)

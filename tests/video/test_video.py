@@ -31,7 +31,7 @@ from foveasim.video import (
     shift_sensor,
     write_video,
 )
-from foveasim.video.frame_source import pictures_in
+from foveasim.video.frame_source import list_pictures
 
 PITCH_UM, DISTANCE_M = 10.0, 0.5
 LIGHT = {
@@ -440,12 +440,12 @@ def test_invalid_gaze_arguments_are_rejected():
     with pytest.raises(ParameterError, match="duration_s"):
         saccades(duration_s=1e300, frame_s=1e-300, size_um=(1.0, 1.0), seed=0)
     scene, path = scene_of(pictures(1)[0]), GazePath(np.zeros(1), np.zeros((1, 2)))
-    for light, gaze, message in (
-        (None, path, "'light' must be a Scene or PowerMap"),
+    for source, gaze, message in (
+        (None, path, "'source' must be a Scene or PowerMap"),
         (scene, None, "'path' must be a GazePath"),
     ):
         with pytest.raises(ParameterError, match=message):
-            shift_sensor(light, gaze)
+            shift_sensor(source, gaze)
     for change, message in (
         ({"scene": None}, "'scene' must be a Scene"),
         ({"path": 3}, "'path' must be a GazePath"),
@@ -625,7 +625,7 @@ def test_non_ascii_digits_in_names_are_ordered(tmp_path):
     names = ["٣.png", "01.png", "1.png", "2.png", "2²3.png", "10.png"]
     for name in reversed(names):
         write_picture(tmp_path / name, np.zeros((8, 8), np.uint8))
-    assert [path.name for path in pictures_in(tmp_path)] == names
+    assert [path.name for path in list_pictures(tmp_path)] == names
 
 
 def test_iterator_source_is_consumed_once():

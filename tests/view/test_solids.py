@@ -346,8 +346,8 @@ def test_stack_shows_every_layer():
 
     assert opened.check().ok
     # Higher layers have fewer complete sites.
-    n_whole = [np.count_nonzero(v > 0.99 * v.max()) for v in volumes]
-    assert n_whole[0] == n_whole[1] > n_whole[2] > n_whole[3] > 0
+    n_complete = [np.count_nonzero(v > 0.99 * v.max()) for v in volumes]
+    assert n_complete[0] == n_complete[1] > n_complete[2] > n_complete[3] > 0
 
 
 def test_capture_wells_show_code():
