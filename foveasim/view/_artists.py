@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 
 from foveasim.layout import Layout
 from foveasim.view.id_map import SitePixels, site_at
-from foveasim.view.site_colours import BORDER, SiteColours
+from foveasim.view.site_colours import BOUNDARY, SiteColours
 
-__all__ = ["ScaleBar", "SiteImage", "length_text", "nice_length_um"]
+__all__ = ["ScaleBar", "SiteImage", "format_length", "nice_length_um"]
 
 #: Samples along a pixel side, fewer in pictures that would have more than 2^26 samples (256 MB).
-N_SAMPLES, MOST_SAMPLES = 3, 2**26
+N_SAMPLES, MAX_SAMPLES = 3, 2**26
 #: Boundaries are drawn if they take at most this fraction of the samples in every 16th row: sites of 7 pixels.
-MOST_BORDERS, SAMPLED_ROWS = 0.05, 16
+MAX_BOUNDARY_FRACTION, SAMPLED_ROWS = 0.05, 16
 #: Largest length of a scale bar as a fraction of the axes.
-BAR_SHARE = 0.25
+MAX_BAR_FRACTION = 0.25
 
 
 class SiteImage(AxesImage):
@@ -68,11 +68,13 @@ class SiteImage(AxesImage):
         (x0, y0), (x1, y1) = self.axes.transData.inverted().transform((low, high))
         bounds_um = (min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1))
         if self.pixels is None or (self.pixels.bounds_um, self.pixels.shape) != (bounds_um, (n_y, n_x)):
-            n_samples = max(1, min(N_SAMPLES, math.isqrt(MOST_SAMPLES // (n_x * n_y))))
+            n_samples = max(1, min(N_SAMPLES, math.isqrt(MAX_SAMPLES // (n_x * n_y))))
             self.pixels = SitePixels.from_layout(self._layout, (n_y, n_x), bounds_um, n_samples=n_samples)
         changes = self.pixels.ids[::SAMPLED_ROWS, 1:] != self.pixels.ids[::SAMPLED_ROWS, :-1]
-        has_borders = self._colours.has_borders and changes.size > 0 and float(changes.mean()) < MOST_BORDERS
-        picture = self.pixels.picture(self._colours.rgb, background=None, border=BORDER if has_borders else None)
+        has_boundaries = (
+            self._colours.has_boundaries and changes.size > 0 and float(changes.mean()) < MAX_BOUNDARY_FRACTION
+        )
+        picture = self.pixels.picture(self._colours.rgb, background=None, boundary=BOUNDARY if has_boundaries else None)
         alpha = self.get_alpha()
         if alpha is not None:
             picture[..., 3] = np.rint(picture[..., 3] * np.float64(alpha))
@@ -99,10 +101,10 @@ class ScaleBar(Artist):
             return
         window, pt = self.axes.bbox, float(renderer.points_to_pixels(1.0))  # type: ignore[arg-type]
         low_um, high_um = sorted(self.axes.get_xlim())
-        length_um = nice_length_um(BAR_SHARE * (high_um - low_um))
+        length_um = nice_length_um(MAX_BAR_FRACTION * (high_um - low_um))
         length = length_um / (high_um - low_um) * window.width
         x, y, pad = window.x0 + 9 * pt, window.y0 + 9 * pt, 4 * pt
-        text = Text(x + 0.5 * length, y + 5 * pt, length_text(length_um), fontsize=8, ha="center", va="bottom")
+        text = Text(x + 0.5 * length, y + 5 * pt, format_length(length_um), fontsize=8, ha="center", va="bottom")
         text.set_figure(self.axes.figure)
         width = max(length, text.get_window_extent(renderer).width)
         x += 0.5 * (width - length)
@@ -127,13 +129,13 @@ def nice_length_um(limit_um: float) -> float:
     return max(step for step in steps if step <= limit_um * (1.0 + 1e-12))
 
 
-def length_text(length_um: float) -> str:
+def format_length(length_um: float) -> str:
     """
     Format a length in nm, µm or mm.
 
     Examples
     --------
-    >>> length_text(0.5), length_text(20.0), length_text(2000.0)
+    >>> format_length(0.5), format_length(20.0), format_length(2000.0)
     ('500 nm', '20 µm', '2 mm')
     """
     if length_um < 1.0:

@@ -7,7 +7,7 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = ["blended", "paint_sites", "rows_of_sites"]
+__all__ = ["blend", "paint_sites", "rows_of_sites"]
 
 _ints = types.Array(types.int64, 1, "C", readonly=True)
 _floats = types.Array(types.float64, 1, "C", readonly=True)
@@ -17,24 +17,24 @@ _colours = types.Array(types.uint8, 2, "C", readonly=True)
 
 
 #: Samples over a shorter length than this are at one position.
-SMALLEST = 1e-200
+MIN_LENGTH = 1e-200
 
 
 @njit()
-def _per_length(samples):
+def _samples_per_length(samples):
     """Return the number of evenly spaced samples per unit length; 0 for a single sample."""
     length = samples[-1] - samples[0]
-    return (samples.size - 1) / length if length > SMALLEST else 0.0
+    return (samples.size - 1) / length if length > MIN_LENGTH else 0.0
 
 
 @njit()
-def _first_at(samples, per_length, value):
+def _searchsorted_uniform(samples, samples_per_length, value):
     """Return the index of the first of ascending, evenly spaced samples >= a value; exact."""
     if value <= samples[0]:
         return 0
     if value > samples[-1]:
         return samples.size
-    k = int((value - samples[0]) * per_length) + 1
+    k = int((value - samples[0]) * samples_per_length) + 1
     # The estimate has rounding errors; comparison with the samples makes it exact.
     while k == samples.size or samples[k - 1] >= value:
         k -= 1
@@ -51,7 +51,7 @@ def rows_of_sites(xy, starts, x, y, first, rows):
     The range is empty for a site between rows, or outside all columns. Site ``first + i`` has the vertices
     ``starts[first + i] : starts[first + i + 1]``; first row and end of its range are written to ``rows[i]``.
     """
-    per_y = _per_length(y)
+    per_y = _samples_per_length(y)
     for i in range(rows.shape[0]):
         low_x, high_x, low_y, high_y = np.inf, -np.inf, np.inf, -np.inf
         for k in range(starts[first + i], starts[first + i + 1]):
@@ -59,8 +59,8 @@ def rows_of_sites(xy, starts, x, y, first, rows):
             low_y, high_y = min(low_y, xy[k, 1]), max(high_y, xy[k, 1])
         rows[i] = 0
         if low_x <= x[-1] and high_x >= x[0]:
-            rows[i, 0] = _first_at(y, per_y, low_y)
-            rows[i, 1] = _first_at(y, per_y, high_y)
+            rows[i, 0] = _searchsorted_uniform(y, per_y, low_y)
+            rows[i, 1] = _searchsorted_uniform(y, per_y, high_y)
 
 
 @njit(types.void(_points, _ints, _ints, _ids, _floats, _floats, types.int64, types.int32[:, ::1]))
@@ -74,7 +74,7 @@ def paint_sites(xy, ring_offsets, site_offsets, rows, x, y, first_row, ids):
     samples.
     """
     n_rows, n_columns = ids.shape
-    per_x, per_y = _per_length(x), _per_length(y)
+    per_x, per_y = _samples_per_length(x), _samples_per_length(y)
     crossed = np.zeros((n_rows, n_columns + 1), np.bool_)
     left = np.full(n_rows, n_columns + 1)
     right = np.full(n_rows, -1)
@@ -91,10 +91,10 @@ def paint_sites(xy, ring_offsets, site_offsets, rows, x, y, first_row, ids):
                 if low_y == high_y or high_y <= y[first_row + bottom] or low_y > y[first_row + top - 1]:
                     continue
                 run, rise = xy[high, 0] - xy[low, 0], high_y - low_y
-                r = max(_first_at(y, per_y, low_y) - first_row, bottom)
+                r = max(_searchsorted_uniform(y, per_y, low_y) - first_row, bottom)
                 while r < top and y[first_row + r] < high_y:
                     # Multiply before dividing: exact for integer coordinates with an integer crossing.
-                    c = _first_at(x, per_x, xy[low, 0] + (y[first_row + r] - low_y) * run / rise)
+                    c = _searchsorted_uniform(x, per_x, xy[low, 0] + (y[first_row + r] - low_y) * run / rise)
                     crossed[r, c] = not crossed[r, c]
                     left[r], right[r] = min(left[r], c), max(right[r], c)
                     r += 1
@@ -110,30 +110,30 @@ def paint_sites(xy, ring_offsets, site_offsets, rows, x, y, first_row, ids):
 
 
 @njit(types.void(_ids, _colours, types.int64, types.boolean, types.int64, types.uint8[:, :, ::1]))
-def blended(ids, colours, n_samples, has_borders, first_row, band):
+def blend(ids, colours, n_samples, has_boundaries, first_row, band):
     """
     Average the ``n_samples`` x ``n_samples`` samples of each pixel in a band of rows.
 
     ``colours[i + 1]`` (red, green, blue, weight) is the colour of site i, ``colours[0]`` that of the background, and the last
-    one, if ``has_borders``, that of samples whose left or lower neighbour belongs to another site. Weights are 0 or 255; alpha
-    is their mean.
+    one, if ``has_boundaries``, that of samples whose left or lower neighbour belongs to another site. Weights are 0 or 255;
+    alpha is their mean.
     """
-    border = colours.shape[0] - 1
+    boundary = colours.shape[0] - 1
     for row in range(band.shape[0]):
         for column in range(band.shape[1]):
             red, green, blue, n = 0, 0, 0, 0
             for i in range((first_row + row) * n_samples, (first_row + row + 1) * n_samples):
                 for j in range(column * n_samples, (column + 1) * n_samples):
                     k = ids[i, j] + 1
-                    if has_borders and (ids[i, max(j - 1, 0)] != k - 1 or ids[max(i - 1, 0), j] != k - 1):
-                        k = border
+                    if has_boundaries and (ids[i, max(j - 1, 0)] != k - 1 or ids[max(i - 1, 0), j] != k - 1):
+                        k = boundary
                     if colours[k, 3] != 0:
                         red += colours[k, 0]
                         green += colours[k, 1]
                         blue += colours[k, 2]
                         n += 1
-            half, whole = n // 2, max(n, 1)
-            band[row, column, 0] = (red + half) // whole
-            band[row, column, 1] = (green + half) // whole
-            band[row, column, 2] = (blue + half) // whole
+            half, divisor = n // 2, max(n, 1)
+            band[row, column, 0] = (red + half) // divisor
+            band[row, column, 1] = (green + half) // divisor
+            band[row, column, 2] = (blue + half) // divisor
             band[row, column, 3] = (255 * n + n_samples * n_samples // 2) // (n_samples * n_samples)

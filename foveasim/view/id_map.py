@@ -77,7 +77,7 @@ def id_map(
     n_y, n_x = check_shape("shape", shape)
     if n_y * n_x > MAX_SAMPLES:
         raise ParameterError("shape", f"must have at most {MAX_SAMPLES:,} pixels", shape)
-    x_min, y_min, x_max, y_max = _checked(layout, bounds_um)
+    x_min, y_min, x_max, y_max = _validate_bounds(layout, bounds_um)
     columns_um, rows_um = _centres_um(x_min, x_max, n_x), _centres_um(y_min, y_max, n_y)
     return _sites_at(layout, columns_um, rows_um, thread_count(n_threads))
 
@@ -142,7 +142,7 @@ class SitePixels:
         """
         n_y, n_x = check_shape("shape", shape)
         n = check_count("n_samples", n_samples, at_most=16)
-        bounds = _checked(layout, bounds_um)
+        bounds = _validate_bounds(layout, bounds_um)
         ids = id_map(layout, (n * n_y, n * n_x), bounds, n_threads=n_threads)
         return cls(read_only(ids), bounds, n)
 
@@ -157,7 +157,7 @@ class SitePixels:
         rgb: NDArray[np.uint8],
         *,
         background: Rgb | None = BACKGROUND,
-        border: Rgb | None = None,
+        boundary: Rgb | None = None,
         n_threads: int | None = None,
     ) -> NDArray[np.uint8]:
         """
@@ -169,7 +169,7 @@ class SitePixels:
             From :func:`foveasim.view.site_colours`.
         background : (r, g, b) or None
             Colour of areas without sites; None makes them transparent.
-        border : (r, g, b), optional
+        boundary : (r, g, b), optional
             Colour of the boundaries between sites, lines of one sample width.
         n_threads : int, optional
             All cores by default.
@@ -189,20 +189,20 @@ class SitePixels:
         from foveasim.view import _kernels
 
         rgb = np.asarray(unmasked("rgb", rgb))
-        highest = int(self.ids.max(initial=-1))
-        if rgb.dtype != np.uint8 or rgb.ndim != 2 or rgb.shape[1] != 3 or rgb.shape[0] <= highest:
+        max_id = int(self.ids.max(initial=-1))
+        if rgb.dtype != np.uint8 or rgb.ndim != 2 or rgb.shape[1] != 3 or rgb.shape[0] <= max_id:
             raise ParameterError(
-                "rgb", f"must be uint8 of shape (n_site, 3), n_site > {highest}, got {rgb.dtype} of shape {rgb.shape}"
+                "rgb", f"must be uint8 of shape (n_site, 3), n_site > {max_id}, got {rgb.dtype} of shape {rgb.shape}"
             )
         table = np.full((rgb.shape[0] + 2, 4), 255, np.uint8)
         table[0] = (0, 0, 0, 0) if background is None else (*background, 255)
         table[1:-1, :3] = rgb
-        table[-1, :3] = border or 0
+        table[-1, :3] = boundary or 0
         picture = np.empty((*self.shape, 4), np.uint8)
         n, n_threads = self.n_samples, thread_count(n_threads)
 
         def blend(rows: slice) -> None:
-            _kernels.blended(self.ids, table, n, border is not None, rows.start, picture[rows])
+            _kernels.blend(self.ids, table, n, boundary is not None, rows.start, picture[rows])
 
         parallel_map(blend, _bands(self.shape[0], n_threads), n_threads)
         return picture if background is None else picture[..., :3]
@@ -217,12 +217,12 @@ class SitePixels:
         x_min, y_min, x_max, y_max = self.bounds_um
         n_y, n_x = self.ids.shape
         column, row = ((x - x_min) * (n_x / (x_max - x_min)), (y - y_min) * (n_y / (y_max - y_min)))
-        is_in = (column >= 0.0) & (column < n_x) & (row >= 0.0) & (row < n_y)
-        at = self.ids[np.where(is_in, row, 0.0).astype(np.int64), np.where(is_in, column, 0.0).astype(np.int64)]
-        return np.where(is_in, at, np.int32(-1))
+        is_inside = (column >= 0.0) & (column < n_x) & (row >= 0.0) & (row < n_y)
+        at = self.ids[np.where(is_inside, row, 0.0).astype(np.int64), np.where(is_inside, column, 0.0).astype(np.int64)]
+        return np.where(is_inside, at, np.int32(-1))
 
 
-def _checked(layout: PackedRings, bounds_um: Sequence[float] | Floats | None) -> Bounds:
+def _validate_bounds(layout: PackedRings, bounds_um: Sequence[float] | Floats | None) -> Bounds:
     if bounds_um is None:
         if layout.xy_um.size == 0:
             raise ParameterError("layout", "must have sites unless 'bounds_um' is given")

@@ -28,14 +28,14 @@ from foveasim.view.site_colours import colours_of
 if TYPE_CHECKING:
     from pyvista import PolyData
 
-__all__ = ["Caps", "Mesh", "extruded", "polydata", "prisms", "triangulated"]
+__all__ = ["Caps", "Mesh", "extrude", "polydata", "prisms", "triangulate"]
 
 #: Triangles below this fraction of the area of their site's bounding box are degenerate in float64.
-FLAT_SHARE = 1e-12
+DEGENERATE_FRACTION = 1e-12
 #: Default height of the tallest prism as a fraction of the layout's longer side.
-TALLEST_SHARE = 0.15
+MAX_HEIGHT_FRACTION = 0.15
 #: Sites per call of the triangulation.
-SITES_A_CALL = 20_000
+SITES_PER_CALL = 20_000
 #: Measured quantities of a capture in its PolyData.
 MEASURED = ("code", "electrons", "expected_e", "filter_of_site")
 
@@ -110,7 +110,7 @@ class Caps(NamedTuple):
     """(n_vertex,) representative of each vertex: itself, except where a hole touches the outline in a vertex."""
 
 
-def triangulated(layout: Layout) -> Caps:
+def triangulate(layout: Layout) -> Caps:
     """
     Triangulate every photosite exactly, with its own vertices only.
 
@@ -143,11 +143,11 @@ def triangulated(layout: Layout) -> Caps:
     others = np.flatnonzero(~is_fan)
     pieces = parallel_map(
         lambda part: _delaunay(layout, part),
-        np.split(others, range(SITES_A_CALL, others.size, SITES_A_CALL)),
+        np.split(others, range(SITES_PER_CALL, others.size, SITES_PER_CALL)),
         thread_count(),
     )
-    for _, _, vertices, stand_ins in pieces:
-        weld[vertices] = stand_ins
+    for _, _, vertices, representatives in pieces:
+        weld[vertices] = representatives
     return Caps(
         np.concatenate([fans[keep], *(piece[0] for piece in pieces)]),
         np.concatenate([site[keep], *(piece[1] for piece in pieces)]),
@@ -155,7 +155,7 @@ def triangulated(layout: Layout) -> Caps:
     )
 
 
-def extruded(
+def extrude(
     layout: Layout, caps: Caps, low_um: ArrayLike, high_um: ArrayLike, *, has_floor: bool = True
 ) -> tuple[Floats, Indices, Indices]:
     """
@@ -248,13 +248,13 @@ def prisms(
     colours = (shown if by is None else colours_of(data, by)).rgb
     x_min, y_min, x_max, y_max = layout.bounds_um
     max_height_um = (
-        TALLEST_SHARE * max(x_max - x_min, y_max - y_min)
+        MAX_HEIGHT_FRACTION * max(x_max - x_min, y_max - y_min)
         if max_height_um is None
         else check_length_um("max_height_um", max_height_um)
     )
-    most = float(values.max())
-    heights_um = values * (max_height_um / most if most > 0.0 else 0.0)
-    points_um, triangles, photosite = extruded(layout, triangulated(layout), 0.0, heights_um, has_floor=False)
+    max_value = float(values.max())
+    heights_um = values * (max_height_um / max_value if max_value > 0.0 else 0.0)
+    points_um, triangles, photosite = extrude(layout, triangulate(layout), 0.0, heights_um, has_floor=False)
     return Mesh(
         name="columns",
         points_um=points_um,
@@ -320,16 +320,18 @@ def _cells(layout: Layout) -> tuple[Ints, Ints, Ints]:
     Sites that VTK would fill incorrectly are split into triangles.
     """
     counts = np.diff(layout.ring_offsets)
-    is_whole = _is_convex(layout)
-    if is_whole.all():
+    is_convex = _is_convex(layout)
+    if is_convex.all():
         return layout.ring_offsets, np.arange(layout.xy_um.shape[0]), np.arange(layout.n_sites)
-    caps = triangulated(layout)
-    parts = caps.triangles[~is_whole[caps.site]]
-    whole = np.flatnonzero(is_whole)
-    whole_rings = layout.site_offsets[whole]
-    sizes = np.concatenate((counts[whole_rings], np.full(parts.shape[0], 3)))
-    photosite = np.concatenate((whole, caps.site[~is_whole[caps.site]]))
-    vertices = np.repeat(layout.ring_offsets[whole_rings], counts[whole_rings]) + positions_in_runs(counts[whole_rings])
+    caps = triangulate(layout)
+    parts = caps.triangles[~is_convex[caps.site]]
+    convex = np.flatnonzero(is_convex)
+    convex_rings = layout.site_offsets[convex]
+    sizes = np.concatenate((counts[convex_rings], np.full(parts.shape[0], 3)))
+    photosite = np.concatenate((convex, caps.site[~is_convex[caps.site]]))
+    vertices = np.repeat(layout.ring_offsets[convex_rings], counts[convex_rings]) + positions_in_runs(
+        counts[convex_rings]
+    )
     # In site order, so that the cells of a site are contiguous.
     order = np.argsort(photosite, kind="stable")
     starts = np.concatenate(([0], np.cumsum(sizes)))[:-1]
@@ -342,12 +344,12 @@ def _is_convex(layout: Layout) -> Bools:
     """Return whether each site has neither a hole nor a reflex vertex, (n_site,)."""
     if layout.n_sites == 0:
         return np.zeros(0, bool)
-    turn = _turns(layout.xy_um, layout.ring_offsets)
-    least = np.minimum.reduceat(turn, layout.ring_offsets[:-1])[layout.site_offsets[:-1]]
-    return (np.diff(layout.site_offsets) == 1) & (least > -FLAT_SHARE)
+    turn = _turn_sines(layout.xy_um, layout.ring_offsets)
+    min_turn = np.minimum.reduceat(turn, layout.ring_offsets[:-1])[layout.site_offsets[:-1]]
+    return (np.diff(layout.site_offsets) == 1) & (min_turn > -DEGENERATE_FRACTION)
 
 
-def _turns(xy_um: Floats, ring_offsets: Ints) -> Floats:
+def _turn_sines(xy_um: Floats, ring_offsets: Ints) -> Floats:
     """Return the sine of the left turn of the outline at each vertex, (n_vertex,)."""
     after = next_vertex(ring_offsets)
     out = xy_um[after] - xy_um
@@ -367,14 +369,14 @@ def _fans(xy_um: Floats, ring_offsets: Ints) -> tuple[Ints, Bools]:
     if counts.size == 0:
         return np.zeros((0, 3), np.int64), np.zeros(0, bool)
     starts = ring_offsets[:-1]
-    turn = _turns(xy_um, ring_offsets)
+    turn = _turn_sines(xy_um, ring_offsets)
     ring = np.repeat(np.arange(counts.size), counts)
-    is_inward = np.minimum.reduceat(turn, starts) < -FLAT_SHARE
+    has_reflex = np.minimum.reduceat(turn, starts) < -DEGENERATE_FRACTION
     after = next_vertex(ring_offsets)
     before = np.empty_like(after)
     before[after] = np.arange(after.size)
     # From the sharpest reflex vertex; otherwise from a vertex between two true corners, so that no triangle is degenerate.
-    merit = np.where(is_inward[ring], -turn, np.minimum(turn[before], turn[after]))
+    merit = np.where(has_reflex[ring], -turn, np.minimum(turn[before], turn[after]))
     best = np.flatnonzero(merit == np.maximum.reduceat(merit, starts)[ring])
     apex = np.empty(counts.size, np.int64)
     apex[ring[best][::-1]] = best[::-1]  # the first of equal candidates
@@ -388,7 +390,7 @@ def _fans(xy_um: Floats, ring_offsets: Ints) -> tuple[Ints, Bools]:
     double_um2 = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     ends = np.cumsum(n_triangles) - n_triangles
     box = np.maximum.reduceat(xy_um, starts) - np.minimum.reduceat(xy_um, starts)
-    covered = np.minimum.reduceat(double_um2, ends) > FLAT_SHARE * box[:, 0] * box[:, 1]
+    covered = np.minimum.reduceat(double_um2, ends) > DEGENERATE_FRACTION * box[:, 0] * box[:, 1]
     return np.stack((first, second, third), axis=1), covered
 
 
@@ -402,8 +404,8 @@ def _delaunay(layout: Layout, sites: Ints) -> tuple[Ints, Ints, Ints, Ints]:
     triangles, owner = shapely.get_parts(shapely.constrained_delaunay_triangles(part.polygons()), return_index=True)
     corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    is_turned = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] < 0.0
-    corners[is_turned] = corners[is_turned, ::-1]
+    is_clockwise = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] < 0.0
+    corners[is_clockwise] = corners[is_clockwise, ::-1]
     # Corners are matched to the vertices of their site by their coordinates, which are bit-identical.
     first = layout.ring_offsets[layout.site_offsets[sites]]
     counts = layout.ring_offsets[layout.site_offsets[sites + 1]] - first
@@ -415,13 +417,13 @@ def _delaunay(layout: Layout, sites: Ints) -> tuple[Ints, Ints, Ints, Ints]:
     is_new[1:] = (np.diff(site[order]) != 0) | np.any(np.diff(points[order], axis=0) != 0.0, axis=1)
     group = np.empty(order.size, np.int64)
     group[order] = np.cumsum(is_new) - 1
-    stand_in = np.full(int(is_new.sum()), -1)
-    stand_in[group[: vertices.size][::-1]] = vertices[::-1]
-    found = stand_in[group]
-    if found.min(initial=0) < 0:
-        bad = sites[site[np.flatnonzero(found < 0)[0]]]
+    representative = np.full(int(is_new.sum()), -1)
+    representative[group[: vertices.size][::-1]] = vertices[::-1]
+    matched = representative[group]
+    if matched.min(initial=0) < 0:
+        bad = sites[site[np.flatnonzero(matched < 0)[0]]]
         raise GeometryError(f"site {bad} cannot be triangulated; repair its outline", (int(bad),))
-    return found[vertices.size :].reshape(-1, 3), sites[owner], vertices, found[: vertices.size]
+    return matched[vertices.size :].reshape(-1, 3), sites[owner], vertices, matched[: vertices.size]
 
 
 def _polydata(points_um: Floats, offsets: Indices, corners: Indices) -> PolyData:

@@ -17,7 +17,7 @@ from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
 from foveasim.layout import Layout, readout_order
 from foveasim.view.id_map import site_at
-from foveasim.view.site_colours import BACKGROUND, BORDER, CATEGORY_COLOURS, SiteColours, colours_of, shares
+from foveasim.view.site_colours import BACKGROUND, BOUNDARY, CATEGORY_COLOURS, SiteColours, as_fractions, colours_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 __all__ = ["plot_capture", "plot_layout", "plot_noise_budget", "save_drawing", "save_figure"]
 
 #: Layouts of more sites are drawn as an image, which is faster than outlines.
-MOST_OUTLINES = 4000
+MAX_OUTLINES = 4000
 #: Layouts of more sites are not drawn with their adjacency, which would be illegible and slow to compute.
-MOST_ADJACENT = 50_000
+MAX_ADJACENCY_SITES = 50_000
 #: Drawings of more sites open slowly in all viewers.
-MOST_DRAWN = 20_000
+MAX_DRAWING_SITES = 20_000
 #: Smallest ratio of a figure's shorter side to its longer one, which leaves space for axes, labels and colour bars.
-SLIMMEST = 0.4
+MIN_ASPECT_RATIO = 0.4
 #: Brightness of readout lines relative to the category colours of their sites.
 LINE_BRIGHTNESS = 0.55
 
@@ -162,16 +162,21 @@ def plot_noise_budget(
     if labels.shape != (n_sites,):
         raise ParameterError("classes", f"must have one value for each of the {n_sites} sites, got {labels.shape}")
     shown = {name: values for name, values in noise_e.items() if np.any(values > 0.0)}
-    kinds = np.unique(labels)
-    for k, kind in enumerate(kinds):
-        sizes_e = [float(np.sqrt(np.mean(values[labels == kind] ** 2))) for values in shown.values()]
-        places = np.arange(len(shown)) + (k - 0.5 * (kinds.size - 1)) * 0.8 / kinds.size
-        ax.barh(places, sizes_e, height=0.8 / kinds.size, label=None if kinds.size == 1 else f"class {kind}")
+    groups = np.unique(labels)
+    for k, group in enumerate(groups):
+        rms_e = [float(np.sqrt(np.mean(values[labels == group] ** 2))) for values in shown.values()]
+        positions = np.arange(len(shown)) + (k - 0.5 * (groups.size - 1)) * 0.8 / groups.size
+        ax.barh(
+            positions,
+            rms_e,
+            height=0.8 / groups.size,
+            label=None if groups.size == 1 else f"class {group}",
+        )
     ax.set_yticks(range(len(shown)), list(shown))
     ax.invert_yaxis()
     ax.set_xscale("log")
     ax.set_xlabel("noise / e- rms")
-    if kinds.size > 1:
+    if groups.size > 1:
         ax.legend()
     return ax
 
@@ -220,10 +225,10 @@ def save_drawing(data: Layout | Capture, path: str | Path, by: str | ArrayLike |
     rgb = colours_of(data, by).rgb
     if Path(path).suffix.lower() != ".svg":
         raise FileError(path, "must end in .svg")
-    if layout.n_sites > MOST_DRAWN:
+    if layout.n_sites > MAX_DRAWING_SITES:
         raise ParameterError(
             "data",
-            f"must have at most {MOST_DRAWN:,} sites for a drawing, got {layout.n_sites:,}",
+            f"must have at most {MAX_DRAWING_SITES:,} sites for a drawing, got {layout.n_sites:,}",
             hint="save a picture with save_figure, or draw a part of the layout",
         )
     colours, position = np.unique(rgb, axis=0, return_inverse=True)
@@ -235,7 +240,7 @@ def new_axes(figure_inches: float, ratio: float = 1.0) -> Axes:
     """Return axes on a new figure, for content with the given ratio of height to width."""
     from matplotlib.figure import Figure
 
-    width, height = max(SLIMMEST, min(1.0, 1.0 / ratio)), max(SLIMMEST, min(1.0, ratio))
+    width, height = max(MIN_ASPECT_RATIO, min(1.0, 1.0 / ratio)), max(MIN_ASPECT_RATIO, min(1.0, ratio))
     return Figure(figsize=(figure_inches * width, figure_inches * height), layout="constrained").add_subplot()
 
 
@@ -256,7 +261,7 @@ def _plot(
     if ax is None:
         ax = new_axes(figure_inches, (y_max - y_min) / (x_max - x_min))
     find: Callable[[float, float], int] = partial(site_at, layout)
-    if layout.n_sites <= MOST_OUTLINES:
+    if layout.n_sites <= MAX_OUTLINES:
         ax.add_collection(_coloured_outlines(layout, colours))
     else:
         image = SiteImage(ax, layout, colours)
@@ -270,20 +275,20 @@ def _plot(
     ax.set_xlim(x_min, x_max)
     ax.set_ylim(y_min, y_max)
     ax.set_aspect("equal")
-    ax.set_facecolor(shares(BACKGROUND))
+    ax.set_facecolor(as_fractions(BACKGROUND))
     ax.set_xlabel("x / µm")
     ax.set_ylabel("y / µm")
     if legend:
-        _explain(ax, colours)
+        _add_legend(ax, colours)
 
-    def told(x: float, y: float) -> str:  # matplotlib calls with these names
+    def format_coord(x: float, y: float) -> str:  # matplotlib calls with these names
         return _format_site(layout, colours, x, y, find(x, y))
 
-    ax.format_coord = told  # type: ignore[method-assign]
+    ax.format_coord = format_coord  # type: ignore[method-assign]
     return ax
 
 
-def _explain(ax: Axes, colours: SiteColours) -> None:
+def _add_legend(ax: Axes, colours: SiteColours) -> None:
     """Add a colour bar for a scale, or a legend for categories."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import PowerNorm
@@ -294,20 +299,20 @@ def _explain(ax: Axes, colours: SiteColours) -> None:
         shown = ScalarMappable(PowerNorm(scale.gamma, scale.low, scale.high), scale.colour_map)
         ax.figure.colorbar(shown, ax=ax, label=colours.title, shrink=0.8, aspect=30.0, pad=0.02)
     elif colours.legend:
-        patches = [Patch(facecolor=shares(rgb), edgecolor="0.4", label=name) for name, rgb in colours.legend]
+        patches = [Patch(facecolor=as_fractions(rgb), edgecolor="0.4", label=name) for name, rgb in colours.legend]
         ax.legend(handles=patches, title=colours.title or None, loc="upper left", bbox_to_anchor=(1.01, 1.0))
     elif colours.values is not None:
-        n_kinds = np.unique(colours.values).size
-        ax.set_title(f"{colours.title or 'kind'}: {n_kinds} in {len(CATEGORY_COLOURS)} colours", fontsize="medium")
+        n_values = np.unique(colours.values).size
+        ax.set_title(f"{colours.title or 'kind'}: {n_values} in {len(CATEGORY_COLOURS)} colours", fontsize="medium")
 
 
 def _format_site(layout: Layout, colours: SiteColours, x_um: float, y_um: float, site: int) -> str:
     """Return the status bar text for the point under the mouse."""
-    place = f"x = {x_um:.6g} µm, y = {y_um:.6g} µm"
+    position = f"x = {x_um:.6g} µm, y = {y_um:.6g} µm"
     if site < 0:
-        return place
+        return position
     size_um = float(np.sqrt(layout[[site]].area_um2[0]))
-    text = f"{place}: site {site}, size {size_um:.4g} µm"
+    text = f"{position}: site {site}, size {size_um:.4g} µm"
     if colours.values is None or colours.title == "size / µm":
         return text
     value = colours.values[site]
@@ -326,14 +331,14 @@ def _coloured_outlines(layout: Layout, colours: SiteColours) -> Collection:
     from matplotlib.path import Path as Outline
 
     style: dict[str, Any] = {"facecolors": colours.rgb / 255.0, "linewidths": 0.3}
-    style["edgecolors"] = [shares(BORDER)] if colours.has_borders else "face"
+    style["edgecolors"] = [as_fractions(BOUNDARY)] if colours.has_boundaries else "face"
     counts = np.diff(layout.ring_offsets)
     if counts.size == layout.n_sites:
         # One array if all sites have the same number of vertices: matplotlib accepts it, although its types ask for sequences.
-        is_even = counts.size > 0 and bool(np.all(counts == counts[0]))
+        is_uniform = counts.size > 0 and bool(np.all(counts == counts[0]))
         rings: Any = (
             layout.xy_um.reshape(layout.n_sites, -1, 2)
-            if is_even
+            if is_uniform
             else np.split(layout.xy_um, layout.ring_offsets[1:-1])
         )
         return PolyCollection(rings, **style)
@@ -341,11 +346,11 @@ def _coloured_outlines(layout: Layout, colours: SiteColours) -> Collection:
     for site in range(layout.n_sites):  # matplotlib needs one object per site
         ids = range(layout.site_offsets[site], layout.site_offsets[site + 1])
         parts = [layout.xy_um[layout.ring_offsets[r] : layout.ring_offsets[r + 1]] for r in ids]
-        outlines.append(Outline.make_compound_path(*(Outline(part, closed=False) for part in map(_closed, parts))))
+        outlines.append(Outline.make_compound_path(*(Outline(part, closed=False) for part in map(_close_ring, parts))))
     return PathCollection(outlines, **style)
 
 
-def _closed(ring_um: Floats) -> Floats:
+def _close_ring(ring_um: Floats) -> Floats:
     return np.concatenate((ring_um, ring_um[:1]))
 
 
@@ -357,7 +362,7 @@ def _draw_readout_lines(layout: Layout, ax: Axes) -> None:
     ordered = layout if "readout_order" in layout.columns else readout_order(layout)
     order = np.lexsort((ordered.index_column("readout_order"), line))
     starts = np.flatnonzero(np.diff(line[order], prepend=-1))
-    colours = [shares(CATEGORY_COLOURS[k % len(CATEGORY_COLOURS)], LINE_BRIGHTNESS) for k in line[order][starts]]
+    colours = [as_fractions(CATEGORY_COLOURS[k % len(CATEGORY_COLOURS)], LINE_BRIGHTNESS) for k in line[order][starts]]
     through_um = layout.centroid_um[order]
     ax.add_collection(LineCollection(np.split(through_um, starts[1:]), colors=colours, linewidths=1.2))
     ax.scatter(
@@ -369,10 +374,10 @@ def _draw_adjacency(layout: Layout, ax: Axes) -> None:
     """Draw a line between the centres of any two sites that share an edge."""
     from matplotlib.collections import LineCollection
 
-    if layout.n_sites > MOST_ADJACENT:
+    if layout.n_sites > MAX_ADJACENCY_SITES:
         raise ParameterError(
             "overlay",
-            f"must not be 'adjacency' above {MOST_ADJACENT:,} sites, got {layout.n_sites:,}",
+            f"must not be 'adjacency' above {MAX_ADJACENCY_SITES:,} sites, got {layout.n_sites:,}",
             hint="draw a part of the layout",
         )
     pairs = layout.adjacency().tocoo()

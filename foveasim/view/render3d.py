@@ -32,23 +32,23 @@ __all__ = ["SceneOfMeshes", "Viewpoint", "render", "show", "sites_in_view"]
 #: colour is clipped.
 AMBIENT, DIFFUSE = 0.35, 0.65
 #: Direction toward the light source in components to the right, horizontally toward the viewer, and up.
-LIGHT = (-0.38, 0.30, 0.87)
+LIGHT_DIRECTION = (-0.38, 0.30, 0.87)
 #: Background with contrast to both light and dark colours.
 BACKGROUND = (238, 240, 244)
 #: The scene fills this fraction of the picture's narrower direction.
-FILLED_SHARE = 0.94
+FILLED_FRACTION = 0.94
 #: Number of points that determine the viewing distance.
 FRAMING_POINTS = 50_000
 #: Bisections that locate the centre of the scene to a thousandth of a pixel.
 CENTRING_STEPS = 24
 #: Margin that is rendered and cropped: ambient occlusion has a line artefact at the picture boundary.
-SHADE_MARGIN_PX = 16
+OCCLUSION_MARGIN_PX = 16
 #: Radius of ambient occlusion as a fraction of the scene's size.
-SHADE_REACH_SHARE = 0.02
+OCCLUSION_RADIUS_FRACTION = 0.02
 #: Bias of ambient occlusion as a fraction of its radius: a smaller bias shows the steps of the depth buffer as hatching.
-SHADE_BIAS_SHARE = 0.1
+OCCLUSION_BIAS_FRACTION = 0.1
 #: Scenes of more triangles have one sample per pixel by default, which renders them in seconds.
-SMOOTHED_TRIANGLES = 1_000_000
+MAX_OVERSAMPLED_TRIANGLES = 1_000_000
 #: Largest side of a picture, to catch mistakes.
 MAX_SIDE_PX = 32_768
 
@@ -64,7 +64,7 @@ class SceneOfMeshes(Protocol):
         """Parts of the scene."""
 
 
-Shown: TypeAlias = Mesh | Iterable[Mesh] | SceneOfMeshes
+Renderable: TypeAlias = Mesh | Iterable[Mesh] | SceneOfMeshes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,19 +119,19 @@ class _Eye:
     focal_px: float
     view_deg: float
 
-    def on_screen(self, points_um: Floats, size_px: tuple[int, int]) -> Floats:
+    def project(self, points_um: Floats, size_px: tuple[int, int]) -> Floats:
         """Project points to pixels, x to the right and y down, and inverse depth, (n_point, 3)."""
-        seen = (points_um - self.position_um) @ self.axes.T  # to the right, up, toward the viewer
+        visible = (points_um - self.position_um) @ self.axes.T  # to the right, up, toward the viewer
         with np.errstate(divide="ignore"):
-            np.divide(-1.0, seen[:, 2], out=seen[:, 2])
-        seen[:, 0] *= self.focal_px * seen[:, 2]
-        seen[:, 1] *= -self.focal_px * seen[:, 2]
-        seen[:, :2] += 0.5 * np.array(size_px)
-        return np.asarray(seen)
+            np.divide(-1.0, visible[:, 2], out=visible[:, 2])
+        visible[:, 0] *= self.focal_px * visible[:, 2]
+        visible[:, 1] *= -self.focal_px * visible[:, 2]
+        visible[:, :2] += 0.5 * np.array(size_px)
+        return np.asarray(visible)
 
 
 def render(
-    scene: Shown,
+    scene: Renderable,
     path: str | Path | None = None,
     *,
     viewpoint: Viewpoint | None = None,
@@ -181,7 +181,7 @@ def render(
     meshes = _meshes(scene)
     check_choice("renderer", renderer, ("auto", "pyvista", "software"))
     if oversampling is None:
-        oversampling = 2 if sum(mesh.triangles.shape[0] for mesh in meshes) <= SMOOTHED_TRIANGLES else 1
+        oversampling = 2 if sum(mesh.triangles.shape[0] for mesh in meshes) <= MAX_OVERSAMPLED_TRIANGLES else 1
     oversampling = check_count("oversampling", oversampling, at_most=8)
     n_x, n_y = _size(size_px, oversampling)
     if finite_array("background", background).shape != (3,) or not all(0 <= part <= 255 for part in background):
@@ -192,21 +192,21 @@ def render(
     if missing:
         warnings.warn(f"{missing}; the software renderer is used", FoveasimWarning, stacklevel=2)
     # Ambient occlusion has a line artefact at the picture boundary, which is cropped.
-    margin = SHADE_MARGIN_PX * oversampling if ambient_occlusion and not missing and renderer != "software" else 0
+    margin = OCCLUSION_MARGIN_PX * oversampling if ambient_occlusion and not missing and renderer != "software" else 0
     width, height = n_x * oversampling, n_y * oversampling
     eye = _eye(meshes, viewpoint or Viewpoint(), (width, height))
     if renderer == "software" or missing:
-        large = _drawn(meshes, eye, (width, height), background)
+        large = _render_in_software(meshes, eye, (width, height), background)
     else:
-        large = _by_pyvista(meshes, eye, (width, height), background, ambient_occlusion, margin)
-    picture = _mean(large, oversampling)
+        large = _render_with_pyvista(meshes, eye, (width, height), background, ambient_occlusion, margin)
+    picture = _average_samples(large, oversampling)
     if path is not None:
         write_picture(path, picture)
     return picture
 
 
 def sites_in_view(
-    scene: Shown, *, viewpoint: Viewpoint | None = None, size_px: tuple[int, int] = (1600, 1000)
+    scene: Renderable, *, viewpoint: Viewpoint | None = None, size_px: tuple[int, int] = (1600, 1000)
 ) -> NDArray[np.int32]:
     """
     Return the photosite visible in each pixel of the picture by :func:`render`.
@@ -229,7 +229,7 @@ def sites_in_view(
     return np.where(ids < 0, np.int32(-1), first[ids])
 
 
-def show(scene: Shown, *, viewpoint: Viewpoint | None = None, size_px: tuple[int, int] = (1600, 1000)) -> None:
+def show(scene: Renderable, *, viewpoint: Viewpoint | None = None, size_px: tuple[int, int] = (1600, 1000)) -> None:
     """
     Show a scene in an interactive window until the window is closed.
 
@@ -259,7 +259,7 @@ def show(scene: Shown, *, viewpoint: Viewpoint | None = None, size_px: tuple[int
 # -- both renderers ------------------------------------------------------------------------------------------------------
 
 
-def _meshes(scene: Shown) -> list[Mesh]:
+def _meshes(scene: Renderable) -> list[Mesh]:
     if isinstance(scene, Mesh):
         found: list[Any] = [scene]
     elif isinstance(scene, SceneOfMeshes):
@@ -290,28 +290,28 @@ def _eye(meshes: list[Mesh], viewpoint: Viewpoint, size_px: tuple[int, int]) -> 
     toward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     axes = np.stack((right, np.cross(toward, right), toward))
     focal_px = 0.5 * size_px[1] / np.tan(0.5 * np.radians(viewpoint.view_deg))
-    points = np.concatenate([_framing(mesh) for mesh in meshes])
+    points = np.concatenate([_framing_points(mesh) for mesh in meshes])
     low, high = points.min(axis=0), points.max(axis=0)
-    middle_um, size_um = 0.5 * (low + high), float(np.linalg.norm(high - low))
-    reach = FILLED_SHARE * 0.5 * np.array(size_px) / focal_px
-    seen = (points - middle_um) @ axes.T
-    across_um, toward_um = seen[:, :2], seen[:, 2:]
+    centre_um, size_um = 0.5 * (low + high), float(np.linalg.norm(high - low))
+    reach = FILLED_FRACTION * 0.5 * np.array(size_px) / focal_px
+    visible = (points - centre_um) @ axes.T
+    across_um, toward_um = visible[:, :2], visible[:, 2:]
     # A point at s across and z toward the viewer is visible when |s - offset| <= reach (distance - z). Both limits are lines
     # in the offset, whose intersection is the smallest distance that satisfies both.
     from_right, from_left = (np.max(sign * across_um / reach + toward_um, axis=0) for sign in (1.0, -1.0))
     if viewpoint.focus_um is None:
-        distance = _beyond(float(np.max(0.5 * (from_right + from_left))), toward_um, size_um)
-        offset = _centred(across_um, distance - toward_um)
-        focus_um = middle_um + offset @ axes[:2]
+        distance = _limit_distance(float(np.max(0.5 * (from_right + from_left))), toward_um, size_um)
+        offset = _centring_offset(across_um, distance - toward_um)
+        focus_um = centre_um + offset @ axes[:2]
     else:
         focus_um = np.array(viewpoint.focus_um, dtype=np.float64)
-        offset = (focus_um - middle_um) @ axes.T
+        offset = (focus_um - centre_um) @ axes.T
         needed = np.maximum(from_right - offset[:2] / reach, from_left + offset[:2] / reach)
-        distance = _beyond(float(np.max(needed)), toward_um, size_um) - offset[2]
+        distance = _limit_distance(float(np.max(needed)), toward_um, size_um) - offset[2]
     return _Eye(focus_um + distance * toward, focus_um, axes, focal_px * viewpoint.zoom, viewpoint.view_deg)
 
 
-def _beyond(distance_um: float, toward_um: Floats, size_um: float) -> float:
+def _limit_distance(distance_um: float, toward_um: Floats, size_um: float) -> float:
     """
     Limit the distance to at least slightly in front of the nearest point.
 
@@ -320,33 +320,33 @@ def _beyond(distance_um: float, toward_um: Floats, size_um: float) -> float:
     return max(distance_um, float(toward_um.max()) + 1e-3 * size_um)
 
 
-def _centred(across_um: Floats, before_um: Floats) -> Floats:
+def _centring_offset(across_um: Floats, before_um: Floats) -> Floats:
     """Return the offset at which the outermost points are equally far from the centre, (2,)."""
     low, high = across_um.min(axis=0), across_um.max(axis=0)
     for _ in range(CENTRING_STEPS):
-        middle = 0.5 * (low + high)
-        tangent = (across_um - middle) / before_um
+        centre = 0.5 * (low + high)
+        tangent = (across_um - centre) / before_um
         is_left = tangent.max(axis=0) + tangent.min(axis=0) > 0.0
-        low, high = np.where(is_left, middle, low), np.where(is_left, high, middle)
+        low, high = np.where(is_left, centre, low), np.where(is_left, high, centre)
     return np.asarray(0.5 * (low + high))
 
 
-def _framing(mesh: Mesh) -> Floats:
+def _framing_points(mesh: Mesh) -> Floats:
     """Return a subset of the points of a mesh that includes its extreme points."""
     step = max(1, mesh.points_um.shape[0] // FRAMING_POINTS)
     extremes = np.concatenate((mesh.points_um.argmin(axis=0), mesh.points_um.argmax(axis=0)))
     return np.concatenate((mesh.points_um[::step], mesh.points_um[extremes]))
 
 
-def _light(eye: _Eye) -> Floats:
+def _light_direction(eye: _Eye) -> Floats:
     """Return the unit vector toward the light source, which moves with the viewer."""
     right = eye.axes[0]
     ahead = np.array([right[1], -right[0], 0.0])  # horizontal, toward the viewer
-    light = LIGHT[0] * right + LIGHT[1] * ahead + LIGHT[2] * np.array([0.0, 0.0, 1.0])
+    light = LIGHT_DIRECTION[0] * right + LIGHT_DIRECTION[1] * ahead + LIGHT_DIRECTION[2] * np.array([0.0, 0.0, 1.0])
     return np.asarray(light / np.linalg.norm(light))
 
 
-def _mean(large: RgbArray, oversampling: int) -> RgbArray:
+def _average_samples(large: RgbArray, oversampling: int) -> RgbArray:
     """Average each square of samples."""
     if oversampling == 1:
         return large
@@ -372,7 +372,7 @@ def _nearest(meshes: list[Mesh], eye: _Eye, size_px: tuple[int, int]) -> tuple[N
     limits = np.linspace(0, n_y, n_threads + 1).astype(int)
     first_id = 0
     for mesh in meshes:
-        screen = eye.on_screen(mesh.points_um, size_px)
+        screen = eye.project(mesh.points_um, size_px)
 
         def draw_band(k: int, mesh: Mesh = mesh, screen: Floats = screen, first_id: int = first_id) -> None:
             draw(screen, mesh.triangles, first_id, limits[k], limits[k + 1], nearness, ids)
@@ -382,18 +382,20 @@ def _nearest(meshes: list[Mesh], eye: _Eye, size_px: tuple[int, int]) -> tuple[N
     return ids, nearness
 
 
-def _drawn(meshes: list[Mesh], eye: _Eye, size_px: tuple[int, int], background: tuple[int, int, int]) -> RgbArray:
+def _render_in_software(
+    meshes: list[Mesh], eye: _Eye, size_px: tuple[int, int], background: tuple[int, int, int]
+) -> RgbArray:
     """Render with the z-buffer; only visible triangles are shaded."""
     ids, _ = _nearest(meshes, eye, size_px)
     n_x, n_y = size_px
     picture = np.empty((n_y, n_x, 3), np.uint8)
     picture[:] = background
     first_id = 0
-    light = _light(eye)
+    light = _light_direction(eye)
     for mesh in meshes:
         is_here = (ids >= first_id) & (ids < first_id + mesh.triangles.shape[0])
-        seen, which = np.unique(ids[is_here] - first_id, return_inverse=True)
-        corners = mesh.triangles[seen]
+        visible, which = np.unique(ids[is_here] - first_id, return_inverse=True)
+        corners = mesh.triangles[visible]
         a, b, c = (mesh.points_um[corners[:, k]] for k in range(3))
         normal = np.cross(b - a, c - a)
         length = np.maximum(np.linalg.norm(normal, axis=1), np.finfo(np.float64).tiny)
@@ -407,7 +409,7 @@ def _drawn(meshes: list[Mesh], eye: _Eye, size_px: tuple[int, int], background: 
 # -- PyVista ------------------------------------------------------------------------------------------------------------
 
 
-def _by_pyvista(
+def _render_with_pyvista(
     meshes: list[Mesh],
     eye: _Eye,
     size_px: tuple[int, int],
@@ -421,8 +423,8 @@ def _by_pyvista(
     try:
         if ambient_occlusion:
             size_um = float(np.linalg.norm(np.ptp(np.stack([b for m in meshes for b in m.bounds_um]), axis=0)))
-            reach_um = SHADE_REACH_SHARE * size_um
-            plotter.enable_ssao(radius=reach_um, bias=SHADE_BIAS_SHARE * reach_um, kernel_size=64, blur=True)
+            radius_um = OCCLUSION_RADIUS_FRACTION * size_um
+            plotter.enable_ssao(radius=radius_um, bias=OCCLUSION_BIAS_FRACTION * radius_um, kernel_size=64, blur=True)
         large = np.asarray(plotter.screenshot(None, return_img=True))
     finally:
         plotter.close()
@@ -443,7 +445,7 @@ def _plotter(
     plotter.render_window.SetMultiSamples(0 if off_screen else 4)
     plotter.set_background([part / 255.0 for part in background])
     light = pyvista.Light(
-        position=tuple(_light(eye)), focal_point=(0.0, 0.0, 0.0), light_type="scene light", intensity=1.0
+        position=tuple(_light_direction(eye)), focal_point=(0.0, 0.0, 0.0), light_type="scene light", intensity=1.0
     )
     plotter.add_light(light)
     for mesh in meshes:

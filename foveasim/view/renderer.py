@@ -20,7 +20,7 @@ from foveasim._core.extras import install_hint
 __all__ = ["ON_SCREEN", "begin_rendering", "find_renderer", "missing_software"]
 
 #: Environment variable that selects VTK's window class, and names of these classes.
-VTK_CHOICE = "VTK_DEFAULT_OPENGL_WINDOW"
+VTK_VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
 X11, EGL, OSMESA = "vtkXOpenGLRenderWindow", "vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow"
 #: Systems whose native windows VTK always supports.
 NATIVE_WINDOWS = {"darwin": "vtkCocoaRenderWindow", "win32": "vtkWin32OpenGLRenderWindow"}
@@ -66,7 +66,7 @@ def find_renderer() -> str | None:
     """
     if find_spec("vtkmodules") is None:
         return None
-    return next((name for name in dict.fromkeys(_candidates()) if _survives(name)), None)
+    return next((name for name in dict.fromkeys(_candidates()) if _can_render(name)), None)
 
 
 def begin_rendering() -> None:
@@ -77,7 +77,7 @@ def begin_rendering() -> None:
     """
     found = find_renderer()
     if found is not None:
-        os.environ[VTK_CHOICE] = found
+        os.environ[VTK_VARIABLE] = found
 
 
 def missing_software() -> str:
@@ -91,8 +91,8 @@ def missing_software() -> str:
 
 def _candidates() -> Iterator[str]:
     """Yield the window classes whose libraries are available and respond, the best first."""
-    if os.environ.get(VTK_CHOICE):
-        yield os.environ[VTK_CHOICE]
+    if os.environ.get(VTK_VARIABLE):
+        yield os.environ[VTK_VARIABLE]
     if sys.platform in NATIVE_WINDOWS:
         yield NATIVE_WINDOWS[sys.platform]
         return
@@ -100,23 +100,23 @@ def _candidates() -> Iterator[str]:
         yield X11
     if _initialises_egl():
         yield EGL
-    if _library("libOSMesa.so.8") is not None:
+    if _load_library("libOSMesa.so.8") is not None:
         yield OSMESA
 
 
-def _survives(window: str) -> bool:
+def _can_render(window: str) -> bool:
     """Return whether a separate process renders with a window class."""
     command = [sys.executable, "-P", "-c", TRIAL]
     try:
         trial = subprocess.run(  # noqa: S603 -- fixed command
-            command, env={**os.environ, VTK_CHOICE: window}, capture_output=True, timeout=TRIAL_S, check=False
+            command, env={**os.environ, VTK_VARIABLE: window}, capture_output=True, timeout=TRIAL_S, check=False
         )
     except (OSError, subprocess.TimeoutExpired):
         return False
     return trial.returncode == 0
 
 
-def _library(name: str) -> ctypes.CDLL | None:
+def _load_library(name: str) -> ctypes.CDLL | None:
     try:
         return ctypes.CDLL(name)
     except OSError:
@@ -125,7 +125,7 @@ def _library(name: str) -> ctypes.CDLL | None:
 
 def _opens_display() -> bool:
     """Return whether X11 opens a display; the variable DISPLAY alone is not sufficient."""
-    x11 = _library("libX11.so.6")
+    x11 = _load_library("libX11.so.6")
     if x11 is None:
         return False
     x11.XOpenDisplay.restype = ctypes.c_void_p
@@ -145,7 +145,7 @@ def _initialises_egl() -> bool:
     The library without a driver makes VTK crash.
     """
     os.environ.setdefault("EGL_LOG_LEVEL", "fatal")  # otherwise Mesa prints missing paths
-    egl = _library("libEGL.so.1")
+    egl = _load_library("libEGL.so.1")
     if egl is None:
         return False
     egl.eglGetProcAddress.restype = ctypes.c_void_p

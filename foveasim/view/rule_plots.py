@@ -21,13 +21,13 @@ __all__ = ["plot_report"]
 #: Saturated colours, one per rule, distinct from those of bare shapes.
 RULE_COLOURS = ("#d62728", "#1f5fd0", "#c218b8", "#e07b00", "#0a8a5a", "#6a3fb5", "#8a5a2b", "#008ba3")
 #: Number of violations that are drawn per rule, the worst first; and largest total number that is annotated with values.
-MOST_SHOWN, MOST_TEXTS = 2000, 40
+MAX_SHOWN, MAX_ANNOTATIONS = 2000, 40
 #: Circles of the first rule, in points; those of each further rule are wider, so that circles at one position differ.
 CIRCLE_PT, CIRCLE_STEP_PT = 9.0, 4.0
 #: Distance of the legend below the axes, clear of their tick labels and axis label.
 LEGEND_BELOW_PT = 36.0
 #: Margin around the markers if no layout is given, as a fraction of their extent.
-ROOM_SHARE = 0.1
+MARGIN_FRACTION = 0.1
 
 
 def plot_report(
@@ -63,40 +63,40 @@ def plot_report(
 
     if layout is not None and layout.n_sites != report.n_sites:
         raise ParameterError("layout", f"must be the checked layout of {report.n_sites} sites", layout.n_sites, "sites")
-    broken = [result for result in report.results if len(result)]
+    violated = [result for result in report.results if len(result)]
     if layout is not None and layout.n_sites:
         ax = plot_layout(layout, ax=ax, figure_inches=figure_inches)
     else:
         ax = new_axes(figure_inches) if ax is None else ax
         ax.set_aspect("equal")
         ax.set(xlabel="x / µm", ylabel="y / µm")
-    n_violations = sum(map(len, broken))
+    n_violations = sum(map(len, violated))
     corners = []
-    for k, result in enumerate(broken):
-        shown = result.violations[:MOST_SHOWN]
+    for k, result in enumerate(violated):
+        shown = result.violations[:MAX_SHOWN]
         markers = np.array([violation.marker for violation in shown], dtype=object)
         corners.append(shapely.total_bounds(markers))
         _draw_result(ax, result, markers, k)
-        if n_violations <= MOST_TEXTS:
-            for violation, place_um in zip(shown, _centres_um(markers), strict=True):
+        if n_violations <= MAX_ANNOTATIONS:
+            for violation, position_um in zip(shown, _centres_um(markers), strict=True):
                 text = f"{violation.value:.3g} {violation.unit}".strip()
-                _write(ax, text, place_um, k)
+                _annotate(ax, text, position_um, k)
     if layout is None and corners:
         low, high = np.min(corners, axis=0)[:2], np.max(corners, axis=0)[2:]
-        room = ROOM_SHARE * max(float((high - low).max()), 1.0)
-        ax.set_xlim(low[0] - room, high[0] + room)
-        ax.set_ylim(low[1] - room, high[1] + room)
-    n_kept = len(report.results) - len(broken)
+        margin = MARGIN_FRACTION * max(float((high - low).max()), 1.0)
+        ax.set_xlim(low[0] - margin, high[0] + margin)
+        ax.set_ylim(low[1] - margin, high[1] + margin)
+    n_satisfied = len(report.results) - len(violated)
     ax.set_title(
         f"{n_violations:,} violation{'s' * (n_violations != 1)} on {report.n_sites:,} photosites, "
-        f"{n_kept} of {len(report.results)} rules satisfied",
+        f"{n_satisfied} of {len(report.results)} rules satisfied",
         fontsize="medium",
     )
-    if broken:
+    if violated:
         below = ax.transAxes + ScaledTranslation(0.0, -LEGEND_BELOW_PT / 72.0, ax.figure.dpi_scale_trans)
         ax.legend(
             loc="upper left", bbox_to_anchor=(0.0, 0.0), bbox_transform=below, borderaxespad=0.0, fontsize="small",
-            frameon=False, markerscale=CIRCLE_PT / (CIRCLE_PT + CIRCLE_STEP_PT * (len(broken) - 1)),
+            frameon=False, markerscale=CIRCLE_PT / (CIRCLE_PT + CIRCLE_STEP_PT * (len(violated) - 1)),
         )  # fmt: skip
     return ax
 
@@ -127,13 +127,13 @@ def _centres_um(markers: NDArray[Any]) -> NDArray[np.float64]:
     return np.asarray(shapely.get_coordinates(shapely.centroid(markers)))
 
 
-def _write(ax: Axes, text: str, place_um: NDArray[np.float64], k: int) -> None:
+def _annotate(ax: Axes, text: str, position_um: NDArray[np.float64], k: int) -> None:
     """Annotate a position of the k-th violated rule, legible on any background."""
     from matplotlib.patheffects import withStroke
 
-    colour, beside_pt = RULE_COLOURS[k % len(RULE_COLOURS)], 0.4 * (CIRCLE_PT + k * CIRCLE_STEP_PT) + 2.0
+    colour, offset_pt = RULE_COLOURS[k % len(RULE_COLOURS)], 0.4 * (CIRCLE_PT + k * CIRCLE_STEP_PT) + 2.0
     ax.annotate(
-        text, (float(place_um[0]), float(place_um[1])), (beside_pt, beside_pt),
+        text, (float(position_um[0]), float(position_um[1])), (offset_pt, offset_pt),
         textcoords="offset points", color=colour, fontsize=8, path_effects=[withStroke(linewidth=2.5, foreground="white")],
         zorder=6, annotation_clip=True,
     )  # fmt: skip

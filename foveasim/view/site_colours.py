@@ -16,19 +16,19 @@ from foveasim.layout import Layout
 
 __all__ = [
     "BACKGROUND",
-    "BORDER",
+    "BOUNDARY",
     "CATEGORY_COLOURS",
     "FILTER_COLOURS",
     "NO_DATA",
     "ColourScale",
     "SiteColours",
+    "as_fractions",
     "colours_of",
-    "shares",
     "site_colours",
 ]
 
 #: Values within this relative difference are equal up to rounding, and have one colour.
-SAME = 1e-9
+EQUAL_TOLERANCE = 1e-9
 #: Colours as red, green and blue from 0 to 255, sRGB-encoded.
 Rgb: TypeAlias = tuple[int, int, int]
 RgbArray: TypeAlias = NDArray[np.uint8]
@@ -50,15 +50,15 @@ SHADES: tuple[Rgb, ...] = ((222, 226, 232), (202, 209, 218), (232, 228, 219), (2
 #: Areas without photosites: neither black nor white.
 BACKGROUND: Rgb = (185, 196, 214)
 #: Boundaries between sites.
-BORDER: Rgb = (64, 64, 64)
+BOUNDARY: Rgb = (64, 64, 64)
 #: Sites without a value (NaN): in none of the colour maps in use.
 NO_DATA: Rgb = (217, 140, 150)
 #: Colour maps of measured signals, and of other columns: the latter is perceptually uniform and colour-blind safe.
-PHOTOGRAPH, VIRIDIS = "gray", "viridis"
+GREY, VIRIDIS = "gray", "viridis"
 #: Exponent of values before they scale a filter colour on a mosaic, so that dark sites are distinguishable.
 DISPLAY_GAMMA = 1.0 / 2.2
 #: Integers with more distinct values are shown on a scale, and strings without a legend.
-MOST_CATEGORIES = 10
+MAX_CATEGORIES = 10
 #: Measured quantities of a capture, with their titles.
 MEASURED = {"code": "code / DN", "electrons": "electrons / e-", "expected_e": "expected charge / e-"}
 
@@ -101,7 +101,7 @@ class SiteColours:
         Scale of the colour bar of numerical values.
     legend : tuple of (str, (r, g, b))
         Names and colours of categories; empty if there are too many.
-    has_borders : bool
+    has_boundaries : bool
         Whether boundaries between sites are drawn; not for measured signals and given colours.
     """
 
@@ -110,10 +110,10 @@ class SiteColours:
     values: NDArray[Any] | None = None
     scale: ColourScale | None = None
     legend: tuple[tuple[str, Rgb], ...] = ()
-    has_borders: bool = True
+    has_boundaries: bool = True
 
 
-def shares(rgb: Rgb, factor: float = 1.0) -> tuple[float, float, float]:
+def as_fractions(rgb: Rgb, factor: float = 1.0) -> tuple[float, float, float]:
     """Return a colour as fractions from 0 to 1, as in matplotlib, multiplied by a factor."""
     red, green, blue = (factor * c / 255.0 for c in rgb)
     return red, green, blue
@@ -168,16 +168,16 @@ def colours_of(data: Layout | Capture, by: str | ArrayLike | None = None, *, lab
         return SiteColours(np.array(SHADES, np.uint8)[_pseudo_random(layout.n_sites, len(SHADES))])
     by = "code" if by is None else by
     if not isinstance(by, str):
-        return _of_array(by, layout.n_sites, label)
+        return _array_colours(by, layout.n_sites, label)
     if capture is not None and by in MEASURED:
-        return _photograph(capture, np.asarray(getattr(capture, by), np.float64), label or MEASURED[by])
+        return _signal_colours(capture, np.asarray(getattr(capture, by), np.float64), label or MEASURED[by])
     if by == "channel":
         names = _channel_names(layout) if capture is None else capture.filter_names
         return _filters(layout.channel if capture is None else capture.filter_of_site, names, label or "filter")
     values = _column(layout, by, capture is not None)
     title = label or _title(by)
-    is_kind = by == "readout_line" or _is_kind(values)
-    return _kinds(values, title) if is_kind else _sizes(values.astype(np.float64), title, VIRIDIS)
+    is_categorical = by == "readout_line" or _is_categorical(values)
+    return _categories(values, title) if is_categorical else _continuous(values.astype(np.float64), title, VIRIDIS)
 
 
 def _column(layout: Layout, by: str, is_capture: bool) -> NDArray[Any]:
@@ -200,7 +200,7 @@ def _title(name: str) -> str:
     return f"{bare} / {unit}" if bare and unit else bare or unit
 
 
-def _of_array(by: ArrayLike, n_sites: int, label: str) -> SiteColours:
+def _array_colours(by: ArrayLike, n_sites: int, label: str) -> SiteColours:
     """Return the colours of an array of values, or given colours."""
     by = unmasked("by", by, missing_is_nan=True)
     try:
@@ -212,21 +212,21 @@ def _of_array(by: ArrayLike, n_sites: int, label: str) -> SiteColours:
     if array.ndim == 2:
         is_bytes = array.dtype == np.uint8
         given = array / 255.0 if is_bytes else np.clip(finite_array("by", array), 0.0, 1.0)
-        return SiteColours(np.rint(255.0 * given).astype(np.uint8), label, has_borders=False)
-    if array.dtype.kind == "U" or _is_kind(array):
-        return _kinds(array, label)
-    return _sizes(as_numbers("by", array), label, VIRIDIS)
+        return SiteColours(np.rint(255.0 * given).astype(np.uint8), label, has_boundaries=False)
+    if array.dtype.kind == "U" or _is_categorical(array):
+        return _categories(array, label)
+    return _continuous(as_numbers("by", array), label, VIRIDIS)
 
 
-def _photograph(capture: Capture, values: Floats, title: str) -> SiteColours:
+def _signal_colours(capture: Capture, values: Floats, title: str) -> SiteColours:
     """Return measured values in shades of grey, or of the filter of each site."""
     if len(capture.filter_names) == 1:
-        return _sizes(values, title, PHOTOGRAPH)
+        return _continuous(values, title, GREY)
     base = np.array([_filter_colour(k, name) for k, name in enumerate(capture.filter_names)], np.float64)
     high = max(float(values.max(initial=0.0)), 1.0)
     bright = base[capture.filter_of_site] * ((values / high) ** DISPLAY_GAMMA)[:, np.newaxis]
-    scale = ColourScale(0.0, high, PHOTOGRAPH, DISPLAY_GAMMA)
-    return SiteColours(np.rint(bright).astype(np.uint8), title, values, scale, has_borders=False)
+    scale = ColourScale(0.0, high, GREY, DISPLAY_GAMMA)
+    return SiteColours(np.rint(bright).astype(np.uint8), title, values, scale, has_boundaries=False)
 
 
 def _channel_names(layout: Layout) -> tuple[str, ...]:
@@ -242,19 +242,19 @@ def _filter_colour(position: int, name: str) -> Rgb:
 
 def _filters(channel: Ints, names: tuple[str, ...], title: str) -> SiteColours:
     colours = [_filter_colour(k, name) for k, name in enumerate(names)]
-    legend = tuple(zip(names, colours, strict=True)) if len(names) <= MOST_CATEGORIES else ()
+    legend = tuple(zip(names, colours, strict=True)) if len(names) <= MAX_CATEGORIES else ()
     return SiteColours(np.array(colours, np.uint8)[channel], title, np.array(names)[channel], None, legend)
 
 
-def _is_kind(values: NDArray[Any]) -> bool:
+def _is_categorical(values: NDArray[Any]) -> bool:
     if values.dtype.kind not in "iu":
         return values.dtype.kind in "bU"
     # The range is checked first: np.unique is slow for a million different numbers.
     span = int(values.max(initial=0)) - int(values.min(initial=0))
-    return span < 2**16 and np.unique(values).size <= MOST_CATEGORIES
+    return span < 2**16 and np.unique(values).size <= MAX_CATEGORIES
 
 
-def _kinds(values: NDArray[Any], title: str) -> SiteColours:
+def _categories(values: NDArray[Any], title: str) -> SiteColours:
     names, kind = np.unique(values, return_inverse=True)
     # Integers select the colour directly, so that readout lines have the same colours in any part of a layout.
     if names.dtype.kind in "iu":
@@ -262,13 +262,13 @@ def _kinds(values: NDArray[Any], title: str) -> SiteColours:
     kind = kind % len(CATEGORY_COLOURS)
     colours = np.array(CATEGORY_COLOURS, np.uint8)
     legend = []
-    if names.size <= MOST_CATEGORIES:
+    if names.size <= MAX_CATEGORIES:
         first = [int(np.flatnonzero(values == name)[0]) for name in names]
         legend = [(str(name), CATEGORY_COLOURS[kind[i]]) for name, i in zip(names, first, strict=True)]
     return SiteColours(colours[kind], title, values, None, tuple(legend))
 
 
-def _sizes(values: Floats, title: str, colour_map: str) -> SiteColours:
+def _continuous(values: Floats, title: str, colour_map: str) -> SiteColours:
     """
     Return colours of a colour map from the smallest value to the largest.
 
@@ -276,24 +276,24 @@ def _sizes(values: Floats, title: str, colour_map: str) -> SiteColours:
     """
     from matplotlib import colormaps
 
-    is_known = ~np.isnan(values)
+    has_data = ~np.isnan(values)
     if np.isinf(values).any():
         raise ParameterError("by", "must be finite everywhere, or NaN for no data", values)
-    low = float(values.min(where=is_known, initial=np.inf)) if is_known.any() else 0.0
-    high = float(values.max(where=is_known, initial=-np.inf)) if is_known.any() else 0.0
-    if high - low <= SAME * max(abs(low), abs(high)):
+    low = float(values.min(where=has_data, initial=np.inf)) if has_data.any() else 0.0
+    high = float(values.max(where=has_data, initial=-np.inf)) if has_data.any() else 0.0
+    if high - low <= EQUAL_TOLERANCE * max(abs(low), abs(high)):
         low, high = low - 0.5, high + 0.5
     table = np.rint(255.0 * colormaps[colour_map](np.arange(256))[:, :3]).astype(np.uint8)
     table = np.concatenate((table, np.array([NO_DATA], np.uint8)))
     with np.errstate(invalid="ignore"):
-        step = np.where(is_known, np.clip((values - low) * (256.0 / (high - low)), 0.0, 255.0), 256.0)
+        step = np.where(has_data, np.clip((values - low) * (256.0 / (high - low)), 0.0, 255.0), 256.0)
     scale = ColourScale(low, high, colour_map)
-    return SiteColours(table[step.astype(np.int64)], title, values, scale, has_borders=colour_map != PHOTOGRAPH)
+    return SiteColours(table[step.astype(np.int64)], title, values, scale, has_boundaries=colour_map != GREY)
 
 
-def _pseudo_random(n: int, n_kinds: int) -> Ints:
-    """Return reproducible pseudo-random integers below ``n_kinds`` (MurmurHash3 finaliser)."""
+def _pseudo_random(n: int, n_values: int) -> Ints:
+    """Return reproducible pseudo-random integers below ``n_values`` (MurmurHash3 finaliser)."""
     mixed = np.arange(n, dtype=np.uint64)
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35), (16, 1)):
         mixed = ((mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)) & np.uint64(0xFFFFFFFF)
-    return (mixed % np.uint64(n_kinds)).astype(np.int64)
+    return (mixed % np.uint64(n_values)).astype(np.int64)

@@ -37,7 +37,7 @@ from foveasim.capture import Capture
 from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.layout import Layout, inset
 from foveasim.layout._regions import as_region
-from foveasim.view.meshes import FLAT_SHARE, Mesh, extruded, triangulated
+from foveasim.view.meshes import DEGENERATE_FRACTION, Mesh, extrude, triangulate
 from foveasim.view.site_colours import colours_of
 
 __all__ = ["PartReport", "SensorStack", "Solids", "SolidsReport", "solids", "stack", "write_meshes"]
@@ -47,12 +47,12 @@ FORMATS = (".glb", ".stl", ".3mf", ".ply", ".obj")
 #: Colours of parts without a filter: silicon, oxide in the trenches, glass of the lenses.
 SILICON, OXIDE, GLASS = (116, 132, 160), (58, 64, 78), (208, 228, 240)
 #: Fraction of the filter colour in the colour of a lens, through which the filter is visible.
-SEEN_THROUGH = 0.35
+LENS_FILTER_FRACTION = 0.35
 #: Regions that are removed in the cut-away view: from this fraction of the width, up to this fraction of the height.
 QUARTER = (0.5, 0.5)
 TERRACES = (((0.39, 0.61), ("filters", "lenses")), ((0.27, 0.73), ("lenses",)))
 #: Overlaps below this fraction of the smaller part are rounding errors.
-ROUNDING = 1e-9
+OVERLAP_TOLERANCE = 1e-9
 #: Upper limit of the thickness of a layer.
 MAX_THICKNESS_UM = 1000.0
 
@@ -144,7 +144,7 @@ class SolidsReport:
         """Whether every part is closed and no two parts overlap."""
         volumes_um3 = {part.name: part.volume_um3 for part in self.parts}
         return all(part.status == "NoError" for part in self.parts) and all(
-            shared_um3 <= ROUNDING * min(volumes_um3[a], volumes_um3[b])
+            shared_um3 <= OVERLAP_TOLERANCE * min(volumes_um3[a], volumes_um3[b])
             for (a, b), shared_um3 in self.overlap_um3.items()
         )
 
@@ -215,7 +215,7 @@ class Solids:
         -----
         Overlaps between the sites of one part are not checked; the design rule ``max_overlap_um2`` checks them on the layout.
         """
-        made = {name: _manifold(mesh.points_um, mesh.triangles) for name, mesh in self.parts.items()}
+        manifolds = {name: _manifold(mesh.points_um, mesh.triangles) for name, mesh in self.parts.items()}
         return SolidsReport(
             parts=tuple(
                 PartReport(
@@ -225,15 +225,17 @@ class Solids:
                     volume_um3=one.volume(),
                     euler_characteristic=2 - 2 * one.genus(),
                 )
-                for name, one in made.items()
+                for name, one in manifolds.items()
             ),
             overlap_um3={
-                (a, b): (made[a] ^ made[b]).volume() if _overlap_in_height(self.parts[a], self.parts[b]) else 0.0
-                for a, b in combinations(made, 2)
+                (a, b): (manifolds[a] ^ manifolds[b]).volume()
+                if _overlap_in_height(self.parts[a], self.parts[b])
+                else 0.0
+                for a, b in combinations(manifolds, 2)
             },
         )
 
-    def cut(self, region: Any = None, *, of: Sequence[str] | None = None, whole: bool = False) -> Solids:
+    def cut(self, region: Any = None, *, of: Sequence[str] | None = None, complete_sites: bool = False) -> Solids:
         """
         Return the solids without their volume over a region.
 
@@ -244,7 +246,7 @@ class Solids:
             :class:`foveasim.view.Viewpoint`.
         of : sequence of str, optional
             Parts to cut; all by default.
-        whole : bool
+        complete_sites : bool
             Whether to remove complete sites, selected by their centroids, instead of cutting them.
 
         Returns
@@ -262,17 +264,17 @@ class Solids:
         for name in names:
             self._part(name)
         shapely.prepare(region)
-        if whole:
-            is_gone = shapely.contains_xy(region, self.layout.centroid_um)
-            is_crossed = np.zeros_like(is_gone)
+        if complete_sites:
+            is_removed = shapely.contains_xy(region, self.layout.centroid_um)
+            is_cut = np.zeros_like(is_removed)
         else:
             polygons = self.layout.polygons()
-            is_gone = shapely.covers(region, polygons)
-            is_crossed = ~is_gone & shapely.intersects(region, polygons)
+            is_removed = shapely.covers(region, polygons)
+            is_cut = ~is_removed & shapely.intersects(region, polygons)
         parts = dict(self.parts)
         for name in names:
             if parts[name].triangles.size:
-                parts[name] = _without(parts[name], is_gone, is_crossed, region)
+                parts[name] = _remove_region(parts[name], is_removed, is_cut, region)
         return replace(self, parts=MappingProxyType(parts))
 
     def write(self, path: str | Path) -> None:
@@ -314,8 +316,8 @@ def solids(
     Examples
     --------
     >>> from foveasim.layout import grid
-    >>> made = solids(grid(n_x=2, n_y=2, pitch_um=4.0), SensorStack(well_depth_um=3.0, trench_width_um=0.4))
-    >>> round(made.fill_factor, 9)  # (3.6 / 4)²
+    >>> model = solids(grid(n_x=2, n_y=2, pitch_um=4.0), SensorStack(well_depth_um=3.0, trench_width_um=0.4))
+    >>> round(model.fill_factor, 9)  # (3.6 / 4)²
     0.81
     """
     sensor_stack = sensor_stack or SensorStack()
@@ -323,14 +325,14 @@ def solids(
     if layout.n_sites == 0:
         raise GeometryError("the layout has no sites; solids need at least one")
     bare = np.zeros(layout.n_sites)
-    in_silicon = _Colouring(_tinted(layout, SILICON), bare)
+    in_silicon = _Colouring(_uniform_colour(layout, SILICON), bare)
     if by is not None or isinstance(data, Capture):
         shown = colours_of(data, by)
         is_number = shown.values is not None and shown.values.dtype.kind in "biuf"
         in_silicon = _Colouring(shown.rgb, np.asarray(shown.values, np.float64) if is_number else bare)
-    in_oxide = _Colouring(_tinted(layout, OXIDE), in_silicon.values)
+    in_oxide = _Colouring(_uniform_colour(layout, OXIDE), in_silicon.values)
     in_filters = _Colouring(colours_of(data, "channel").rgb, in_silicon.values)
-    in_glass = _Colouring(_mixed(in_filters.rgb, GLASS), in_silicon.values)
+    in_glass = _Colouring(_mix_colours(in_filters.rgb, GLASS), in_silicon.values)
     depth_um, up_um = sensor_stack.well_depth_um, sensor_stack.filter_thickness_um
     has_trench = sensor_stack.trench_width_um > 0.0
     try:
@@ -375,12 +377,14 @@ def stack(
     GeometryError, ParameterError
         As for :func:`solids`.
     """
-    made = solids(data, sensor_stack, by=by)
-    for shares, names in TERRACES:
-        made = made.cut(
-            _near_quarter(made.layout, shares), of=[name for name in names if name in made.parts], whole=True
+    model = solids(data, sensor_stack, by=by)
+    for fractions, names in TERRACES:
+        model = model.cut(
+            _near_quarter(model.layout, fractions),
+            of=[name for name in names if name in model.parts],
+            complete_sites=True,
         )
-    return made.cut(_near_quarter(made.layout, QUARTER))
+    return model.cut(_near_quarter(model.layout, QUARTER))
 
 
 # -- parts ---------------------------------------------------------------------------------------------------------------
@@ -417,13 +421,13 @@ def write_meshes(meshes: Sequence[Mesh], path: str | Path) -> None:
     bodies = {mesh.name: _body(trimesh, mesh) for mesh in meshes if mesh.triangles.size}
     if not bodies:
         raise GeometryError("the solids have no triangles to write")
-    whole = trimesh.Scene(bodies) if kind in (".glb", ".3mf") else trimesh.util.concatenate(list(bodies.values()))
+    scene = trimesh.Scene(bodies) if kind in (".glb", ".3mf") else trimesh.util.concatenate(list(bodies.values()))
     with atomic_write(target) as temporary, temporary.open("wb") as file:
-        content = whole.export(file_type=kind[1:])
+        content = scene.export(file_type=kind[1:])
         file.write(content.encode() if isinstance(content, str) else content)
 
 
-def _near_quarter(layout: Layout, shares: tuple[float, float]) -> Any:
+def _near_quarter(layout: Layout, fractions: tuple[float, float]) -> Any:
     """
     Return a rectangle over the corner of largest x and smallest y.
 
@@ -432,8 +436,8 @@ def _near_quarter(layout: Layout, shares: tuple[float, float]) -> Any:
     x_min, y_min, x_max, y_max = layout.bounds_um
     width, height = x_max - x_min, y_max - y_min
     x, y = layout.centroid_um.T
-    low_x = x[np.abs(x - (x_min + shares[0] * width)).argmin()]
-    high_y = y[np.abs(y - (y_min + shares[1] * height)).argmin()]
+    low_x = x[np.abs(x - (x_min + fractions[0] * width)).argmin()]
+    high_y = y[np.abs(y - (y_min + fractions[1] * height)).argmin()]
     return shapely.box(low_x, y_min - 0.1 * height, x_max + 0.1 * width, high_y)
 
 
@@ -444,12 +448,12 @@ class _Colouring(NamedTuple):
     values: Floats
 
 
-def _tinted(layout: Layout, colour: tuple[int, int, int]) -> NDArray[np.uint8]:
+def _uniform_colour(layout: Layout, colour: tuple[int, int, int]) -> NDArray[np.uint8]:
     return np.tile(np.array(colour, np.uint8), (layout.n_sites, 1))
 
 
-def _mixed(rgb: NDArray[np.uint8], glass: tuple[int, int, int]) -> NDArray[np.uint8]:
-    return np.rint((1.0 - SEEN_THROUGH) * np.array(glass) + SEEN_THROUGH * rgb).astype(np.uint8)
+def _mix_colours(rgb: NDArray[np.uint8], glass: tuple[int, int, int]) -> NDArray[np.uint8]:
+    return np.rint((1.0 - LENS_FILTER_FRACTION) * np.array(glass) + LENS_FILTER_FRACTION * rgb).astype(np.uint8)
 
 
 def _walls(layout: Layout, wells: Layout) -> tuple[Layout, Ints]:
@@ -459,57 +463,59 @@ def _walls(layout: Layout, wells: Layout) -> tuple[Layout, Ints]:
 
 
 def _prisms(
-    name: str, footprint: Layout, z_um: tuple[float, float], look: _Colouring, owner: Ints | None = None
+    name: str, footprint: Layout, z_um: tuple[float, float], colouring: _Colouring, owner: Ints | None = None
 ) -> Mesh:
     """
     Return prisms between two heights, one per polygon of a layout.
 
     ``owner`` is the photosite of each polygon.
     """
-    points_um, triangles, position = extruded(footprint, triangulated(footprint), *z_um)
-    return _coloured(name, points_um, triangles, position if owner is None else owner.astype(np.int32)[position], look)
+    points_um, triangles, position = extrude(footprint, triangulate(footprint), *z_um)
+    return _coloured_mesh(
+        name, points_um, triangles, position if owner is None else owner.astype(np.int32)[position], colouring
+    )
 
 
-def _coloured(
-    name: str, points_um: Floats, triangles: NDArray[np.int32], photosite: NDArray[np.int32], look: _Colouring
+def _coloured_mesh(
+    name: str, points_um: Floats, triangles: NDArray[np.int32], photosite: NDArray[np.int32], colouring: _Colouring
 ) -> Mesh:
     return Mesh(
         name=name,
         points_um=points_um,
         triangles=triangles,
         photosite=photosite,
-        values=look.values[photosite],
-        colours=look.rgb[photosite],
+        values=colouring.values[photosite],
+        colours=colouring.rgb[photosite],
     )
 
 
-def _lenses(layout: Layout, floor_um: float, sensor_stack: SensorStack, look: _Colouring) -> Mesh:
+def _lenses(layout: Layout, floor_um: float, sensor_stack: SensorStack, colouring: _Colouring) -> Mesh:
     """
     Return lenses: spherical caps, stretched to the outlines of the sites.
 
     The outline shrinks toward the apex with increasing height.
     """
     if sensor_stack.n_lens_corners:
-        layout = _with_corners(layout, sensor_stack.n_lens_corners)
-    caps = triangulated(layout)
+        layout = _subdivide_edges(layout, sensor_stack.n_lens_corners)
+    caps = triangulate(layout)
     n, n_sites, n_steps = layout.xy_um.shape[0], layout.n_sites, sensor_stack.n_lens_steps
     site = np.repeat(np.arange(n_sites), np.diff(layout.ring_offsets[layout.site_offsets]))
-    middle_um = _centres(layout, site)
-    arm_um = layout.xy_um - middle_um[site]
+    centre_um = _centres(layout, site)
+    arm_um = layout.xy_um - centre_um[site]
     # Steps of equal angle from the rim (1) to the apex (0), where a fan closes the cap.
-    share = np.cos(0.5 * np.pi * np.arange(n_steps) / n_steps)[:, np.newaxis]
-    drawn_in = np.broadcast_to(share, (n_steps, n))
+    fraction = np.cos(0.5 * np.pi * np.arange(n_steps) / n_steps)[:, np.newaxis]
+    scale = np.broadcast_to(fraction, (n_steps, n))
     if sensor_stack.n_lens_corners:
         # Toward the largest inscribed circle about the apex, so that no step is wider than the one below.
-        round_share = _free_radius_um(layout, arm_um)[site] / np.hypot(*arm_um.T)
-        drawn_in = share * (share**4 + (1.0 - share**4) * round_share)
+        round_fraction = _inscribed_radius_um(layout, arm_um)[site] / np.hypot(*arm_um.T)
+        scale = fraction * (fraction**4 + (1.0 - fraction**4) * round_fraction)
     radius_um = np.sqrt(layout.area_um2 / np.pi)
     points_um = np.empty((n_steps * n + n_sites, 3))
     steps = points_um[: n_steps * n].reshape(n_steps, n, 3)
-    steps[..., :2] = middle_um[site] + drawn_in[..., np.newaxis] * arm_um
-    steps[..., 2] = floor_um + _cap_height_um(radius_um, sensor_stack.lens_height_um, share)[:, site]
+    steps[..., :2] = centre_um[site] + scale[..., np.newaxis] * arm_um
+    steps[..., 2] = floor_um + _cap_height_um(radius_um, sensor_stack.lens_height_um, fraction)[:, site]
     points_um[:n, :2] = layout.xy_um  # bit-identical to the filter below
-    points_um[n_steps * n :, :2] = middle_um
+    points_um[n_steps * n :, :2] = centre_um
     points_um[n_steps * n :, 2] = floor_um + np.minimum(radius_um, sensor_stack.lens_height_um)
     here, after = caps.weld, caps.weld[next_vertex(layout.ring_offsets)]
     low = n * np.arange(n_steps - 1)[:, np.newaxis]
@@ -521,10 +527,10 @@ def _lenses(layout: Layout, floor_um: float, sensor_stack: SensorStack, look: _C
     fan = np.stack((here + top, after + top, n_steps * n + site), axis=1)
     triangles = np.concatenate((caps.triangles[:, ::-1], *(part.reshape(-1, 3) for part in sides), fan))
     photosite = np.concatenate((np.tile(site, n_steps), np.arange(n_sites)))
-    return _coloured("lenses", points_um, triangles.astype(np.int32), photosite.astype(np.int32), look)
+    return _coloured_mesh("lenses", points_um, triangles.astype(np.int32), photosite.astype(np.int32), colouring)
 
 
-def _with_corners(layout: Layout, n_corners: int) -> Layout:
+def _subdivide_edges(layout: Layout, n_corners: int) -> Layout:
     """Divide long edges so that every ring has at least ``n_corners`` vertices."""
     edge_um = layout.xy_um[next_vertex(layout.ring_offsets)] - layout.xy_um
     length_um = np.hypot(*edge_um.T)
@@ -537,7 +543,7 @@ def _with_corners(layout: Layout, n_corners: int) -> Layout:
     return Layout(xy_um, offsets, layout.site_offsets, layout.columns)
 
 
-def _free_radius_um(layout: Layout, arm_um: Floats) -> Floats:
+def _inscribed_radius_um(layout: Layout, arm_um: Floats) -> Floats:
     """
     Return the radius of the largest circle in every site about its apex, (n_site,).
 
@@ -549,7 +555,7 @@ def _free_radius_um(layout: Layout, arm_um: Floats) -> Floats:
     return np.minimum.reduceat(height_um, layout.ring_offsets[layout.site_offsets[:-1]])
 
 
-def _cap_height_um(radius_um: Floats, height_um: float, share: Floats) -> Floats:
+def _cap_height_um(radius_um: Floats, height_um: float, fraction: Floats) -> Floats:
     """
     Return the height of a spherical cap above its rim, at a fraction of its radius.
 
@@ -557,8 +563,8 @@ def _cap_height_um(radius_um: Floats, height_um: float, share: Floats) -> Floats
     """
     sag_um = np.minimum(height_um, radius_um)
     ball_um = (radius_um**2 + sag_um**2) / (2.0 * sag_um)
-    rise_um = np.sqrt(np.maximum(ball_um**2 - (radius_um * share) ** 2, 0.0)) - (ball_um - sag_um)
-    return np.where(share < 1.0, rise_um, 0.0)
+    rise_um = np.sqrt(np.maximum(ball_um**2 - (radius_um * fraction) ** 2, 0.0)) - (ball_um - sag_um)
+    return np.where(fraction < 1.0, rise_um, 0.0)
 
 
 def _centres(layout: Layout, site: Ints) -> Floats:
@@ -568,12 +574,12 @@ def _centres(layout: Layout, site: Ints) -> Floats:
     The point is the centroid, or the centre of the largest inscribed circle.
     """
     has_hole = np.diff(layout.site_offsets) > 1
-    middle_um = layout.centroid_um.copy()
-    hidden = np.flatnonzero(~_sees_all(layout, middle_um, site) & ~has_hole)
-    if hidden.size:
-        circles = shapely.maximum_inscribed_circle(layout[hidden].polygons())
-        middle_um[hidden] = shapely.get_coordinates(circles).reshape(-1, 2, 2)[:, 0]
-    bad = np.flatnonzero(~_sees_all(layout, middle_um, site) | has_hole)
+    centre_um = layout.centroid_um.copy()
+    off_centre = np.flatnonzero(~_is_star_shaped(layout, centre_um, site) & ~has_hole)
+    if off_centre.size:
+        circles = shapely.maximum_inscribed_circle(layout[off_centre].polygons())
+        centre_um[off_centre] = shapely.get_coordinates(circles).reshape(-1, 2, 2)[:, 0]
+    bad = np.flatnonzero(~_is_star_shaped(layout, centre_um, site) | has_hole)
     if bad.size:
         more = f" (and {bad.size - 1} more)" if bad.size > 1 else ""
         raise GeometryError(
@@ -581,16 +587,16 @@ def _centres(layout: Layout, site: Ints) -> Floats:
             "lens_height_um=0, or other sites",
             tuple(int(i) for i in bad),
         )
-    return middle_um
+    return centre_um
 
 
-def _sees_all(layout: Layout, middle_um: Floats, site: Ints) -> NDArray[np.bool_]:
+def _is_star_shaped(layout: Layout, centre_um: Floats, site: Ints) -> NDArray[np.bool_]:
     """Return whether all edges of each site run counter-clockwise about its apex, (n_site,)."""
-    arm_um = layout.xy_um - middle_um[site]
+    arm_um = layout.xy_um - centre_um[site]
     after_um = arm_um[next_vertex(layout.ring_offsets)]
     double_um2 = arm_um[:, 0] * after_um[:, 1] - arm_um[:, 1] * after_um[:, 0]
-    least_um2 = np.minimum.reduceat(double_um2, layout.ring_offsets[layout.site_offsets[:-1]])
-    return np.asarray(least_um2 > FLAT_SHARE * layout.area_um2)
+    min_um2 = np.minimum.reduceat(double_um2, layout.ring_offsets[layout.site_offsets[:-1]])
+    return np.asarray(min_um2 > DEGENERATE_FRACTION * layout.area_um2)
 
 
 # -- manifold3d and trimesh -----------------------------------------------------------------------------------------------
@@ -611,41 +617,41 @@ def _overlap_in_height(one: Mesh, other: Mesh) -> bool:
     return bool(low[2] < other_high[2] and other_low[2] < high[2])
 
 
-def _without(mesh: Mesh, is_gone: NDArray[np.bool_], is_crossed: NDArray[np.bool_], region: Any) -> Mesh:
+def _remove_region(mesh: Mesh, is_removed: NDArray[np.bool_], is_cut: NDArray[np.bool_], region: Any) -> Mesh:
     """Return a part without some sites, and with others cut by a region."""
     site_of = mesh.photosite[mesh.triangles[:, 0]]
-    is_whole = ~is_gone[site_of] & ~is_crossed[site_of]
-    points_um, photosite, triangles = _compact(mesh.points_um, mesh.photosite, mesh.triangles[is_whole])
-    crossed = _compact(mesh.points_um, mesh.photosite, mesh.triangles[is_crossed[site_of]])
+    is_unchanged = ~is_removed[site_of] & ~is_cut[site_of]
+    points_um, photosite, triangles = _compact(mesh.points_um, mesh.photosite, mesh.triangles[is_unchanged])
+    crossed = _compact(mesh.points_um, mesh.photosite, mesh.triangles[is_cut[site_of]])
     if crossed[2].size:
         # Points have the property site + 1. Points created by the cut have 0, and take the site of their connected piece.
         numbered = np.column_stack((crossed[0], crossed[1] + 1.0))
-        left = (_manifold(numbered, crossed[2]) - _over(region, mesh)).to_mesh64()
+        left = (_manifold(numbered, crossed[2]) - _region_prism(region, mesh)).to_mesh64()
         weld = np.arange(left.vert_properties.shape[0])
         weld[left.merge_from_vert] = left.merge_to_vert
         cut = weld[left.tri_verts.astype(np.int64)]
         if cut.size:
             number = np.rint(left.vert_properties[:, 3]).astype(np.int64)
             np.maximum.at(number, weld, number.copy())
-            number = _of_pieces(cut, number) - 1
+            number = _component_maximum(cut, number) - 1
             cut_um, cut_site, cut = _compact(left.vert_properties[:, :3], number.astype(np.int32), cut)
             triangles = np.concatenate((triangles, cut + points_um.shape[0])).astype(np.int32)
             points_um, photosite = np.concatenate((points_um, cut_um)), np.concatenate((photosite, cut_site))
-    look = _Colouring(np.zeros((is_gone.size, 3), np.uint8), np.zeros(is_gone.size))
-    look.rgb[mesh.photosite], look.values[mesh.photosite] = mesh.colours, mesh.values
-    return _coloured(mesh.name, points_um, triangles, photosite, look)
+    colouring = _Colouring(np.zeros((is_removed.size, 3), np.uint8), np.zeros(is_removed.size))
+    colouring.rgb[mesh.photosite], colouring.values[mesh.photosite] = mesh.colours, mesh.values
+    return _coloured_mesh(mesh.name, points_um, triangles, photosite, colouring)
 
 
-def _over(region: Any, mesh: Mesh) -> Any:
+def _region_prism(region: Any, mesh: Mesh) -> Any:
     """Return a prism over a region, from below a mesh to above it."""
     outline = Layout.from_polygons(shapely.get_parts([region]))
     low, high = mesh.bounds_um
     margin_um = high[2] - low[2]
-    points_um, triangles, _ = extruded(outline, triangulated(outline), low[2] - margin_um, high[2] + margin_um)
+    points_um, triangles, _ = extrude(outline, triangulate(outline), low[2] - margin_um, high[2] + margin_um)
     return _manifold(points_um, triangles)
 
 
-def _of_pieces(triangles: Ints, number: Ints) -> Ints:
+def _component_maximum(triangles: Ints, number: Ints) -> Ints:
     """Return for every point the largest number in its connected piece."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

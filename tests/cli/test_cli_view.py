@@ -188,7 +188,7 @@ on_linux = pytest.mark.skipif(sys.platform != "linux", reason="asks the system f
 BIG_BYTES = 20_000_000
 SERVER = f"""
 from foveasim.view.web import _serve
-_serve.PATIENCE_S = {{patience_s}}
+_serve.TIMEOUT_S = {{patience_s}}
 _serve.serve_page("x" * {BIG_BYTES}, announce=lambda address: print(address, flush=True))
 """
 

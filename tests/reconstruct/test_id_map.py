@@ -178,7 +178,7 @@ def test_pixel_is_mean_of_samples():
 
 def test_boundaries_drawn_between_sites():
     pixels = SitePixels.from_layout(L.grid(n_x=2, n_y=2, pitch_um=2.0), (6, 6), (-3, -3, 3, 3), n_samples=1)
-    drawn = np.all(pixels.picture(np.full((4, 3), 200, np.uint8), border=(1, 2, 3)) == (1, 2, 3), axis=-1)
+    drawn = np.all(pixels.picture(np.full((4, 3), 200, np.uint8), boundary=(1, 2, 3)) == (1, 2, 3), axis=-1)
 
     # Sites at pixels 1 to 2 and 3 to 4: boundaries at the first pixel of each, and at the first pixel after them.
     within = np.arange(6) > 0

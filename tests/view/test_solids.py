@@ -323,7 +323,7 @@ def test_partial_cut_leaves_other_parts():
 
 def test_whole_cut_selects_sites_by_centroid():
     layout = fs.layout.grid(n_x=4, n_y=1, pitch_um=2.0)  # centres at -3, -1, 1, 3
-    cut = solids(layout, STACK).cut(shapely.box(0.9, -5, 9, 5), whole=True)
+    cut = solids(layout, STACK).cut(shapely.box(0.9, -5, 9, 5), complete_sites=True)
 
     assert cut.volumes_um3("filters") == pytest.approx([2.4, 2.4, 0.0, 0.0])
 

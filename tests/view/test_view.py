@@ -22,8 +22,8 @@ from foveasim.view import (
     save_figure,
     site_colours,
 )
-from foveasim.view._artists import SiteImage, length_text, nice_length_um
-from foveasim.view.plots import MOST_OUTLINES
+from foveasim.view._artists import SiteImage, format_length, nice_length_um
+from foveasim.view.plots import MAX_OUTLINES
 from foveasim.view.site_colours import BACKGROUND, CATEGORY_COLOURS, FILTER_COLOURS, NO_DATA
 
 FRAME = shapely.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)], [[(2, 2), (2, 6), (6, 6), (6, 2)]])
@@ -75,7 +75,7 @@ def test_outlines_leave_holes_and_gaps_open(tmp_path):
 def test_y_up_and_x_right(tmp_path, n):
     layout = fs.layout.grid(n_x=2 * n, n_y=2 * n, pitch_um=2.0)
     is_high, is_right = (layout.centroid_um[:, i] > 0 for i in (1, 0))
-    assert (layout.n_sites > MOST_OUTLINES) == (n > 1)
+    assert (layout.n_sites > MAX_OUTLINES) == (n > 1)
     axes = layout.plot(np.stack((is_high, is_right, is_high), axis=1) * 1.0, scale_bar=False, ax=bare_axes(4, 4))
     picture = drawn(axes, tmp_path)
 
@@ -87,7 +87,7 @@ def test_y_up_and_x_right(tmp_path, n):
 def test_image_shows_sites_and_uncovered_areas(tmp_path):
     whole = fs.layout.grid(n_x=64, n_y=96, pitch_um=2.0)
     layout = whole[(whole.centroid_um[:, 0] > 0) | (whole.centroid_um[:, 0] < -32.0)]
-    assert layout.n_sites > MOST_OUTLINES
+    assert layout.n_sites > MAX_OUTLINES
     axes = plot_layout(layout, np.zeros((layout.n_sites, 3)), scale_bar=False, ax=bare_axes(4, 6))
     assert tuple(round(255 * c) for c in axes.get_facecolor()[:3]) == BACKGROUND
     picture = drawn(axes, tmp_path)
@@ -102,7 +102,7 @@ def test_image_matches_outlines(tmp_path, monkeypatch):
     colours = np.random.default_rng(0).integers(0, 256, (layout.n_sites, 3), dtype=np.uint8)
     pictures = []
     for most in (0, 10**6):
-        monkeypatch.setattr("foveasim.view.plots.MOST_OUTLINES", most)
+        monkeypatch.setattr("foveasim.view.plots.MAX_OUTLINES", most)
         axes = plot_layout(layout, colours, scale_bar=False, ax=bare_axes(4, 4))
         assert bool(axes.images) == (most == 0)
         pictures.append(drawn(axes, tmp_path).astype(float))
@@ -193,7 +193,7 @@ def test_scale_bar_length_is_round(limit_um, expected_um):
 
 @pytest.mark.parametrize(("length_um", "text"), [(0.2, "200 nm"), (1.0, "1 µm"), (500.0, "500 µm"), (5000.0, "5 mm")])
 def test_scale_bar_unit_matches_length(length_um, text):
-    assert length_text(length_um) == text
+    assert format_length(length_um) == text
 
 
 @pytest.mark.parametrize("zoom", [1.0, 0.1, 0.013])

@@ -15,7 +15,7 @@ import foveasim as fs
 from foveasim._io.images import read_picture
 from foveasim.errors import FileError, FoveasimWarning, GeometryError, ParameterError, SimulationError
 from foveasim.view import Mesh, Viewpoint, prisms, render, render3d, renderer, show, sites_in_view
-from foveasim.view.meshes import triangulated
+from foveasim.view.meshes import triangulate
 
 FRAME = shapely.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)], [[(2, 2), (2, 6), (6, 6), (6, 2)]])
 HOOK = shapely.Polygon([(20, 0), (28, 0), (28, 2), (22, 2), (22, 8), (20, 8)])
@@ -63,7 +63,7 @@ LAYOUTS = {
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_triangles_cover_every_site_once(name):
     layout = LAYOUTS[name]()
-    caps = triangulated(layout)
+    caps = triangulate(layout)
     areas_um2 = area_um2(layout, caps)
 
     assert np.all(areas_um2 > 0.0)
@@ -77,7 +77,7 @@ def test_triangles_cover_every_site_once(name):
 
 
 def test_triangles_lie_inside_their_site():
-    caps = triangulated(ODD_LAYOUT)
+    caps = triangulate(ODD_LAYOUT)
     triangles = shapely.polygons(ODD_LAYOUT.xy_um[caps.triangles])
     outside = shapely.difference(triangles, np.array(ODD)[caps.site])
 
@@ -303,7 +303,7 @@ def test_scene_fits_and_fills_picture(viewpoint):
     margins = np.array([place[:, :2].min(axis=0), size_px - place[:, :2].max(axis=0)]) / size_px
 
     assert np.all(place[:, 2] > 0.0)
-    assert margins.min(axis=0).min() == pytest.approx(0.5 * (1.0 - render3d.FILLED_SHARE), abs=0.002)
+    assert margins.min(axis=0).min() == pytest.approx(0.5 * (1.0 - render3d.FILLED_FRACTION), abs=0.002)
     assert margins[0] == pytest.approx(margins[1], abs=0.002)
     picture = software(columns, viewpoint=viewpoint)
     assert np.all(picture[[0, -1]] == render3d.BACKGROUND)
@@ -498,7 +498,7 @@ def test_failed_trial_gives_no_renderer(outcome, monkeypatch):
 
 def test_first_working_window_is_used(monkeypatch):
     monkeypatch.setattr(renderer, "_candidates", lambda: iter([renderer.X11, renderer.EGL, renderer.OSMESA]))
-    monkeypatch.setattr(renderer, "_survives", lambda window: window == renderer.EGL)
+    monkeypatch.setattr(renderer, "_can_render", lambda window: window == renderer.EGL)
 
     assert renderer.find_renderer.__wrapped__() == renderer.EGL
 

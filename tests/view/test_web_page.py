@@ -564,7 +564,7 @@ def test_violation_list_navigates_by_click_and_enter(visit):
     page.select_option("#rule", label="max_overlap_um2 (1)")
     assert buttons.count() == 1
     assert buttons.first.inner_text().split("\n") == ["sites 7, 8", "6 µm²"]
-    assert "the limit is 0 µm²" in page.inner_text("#sentence")
+    assert "the limit is 0 µm²" in page.inner_text("#rule-description")
 
 
 @pytest.mark.needs("chromium")

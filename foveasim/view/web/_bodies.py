@@ -19,7 +19,7 @@ from foveasim._core.validation import Ints
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout import Layout
 from foveasim.view.meshes import Mesh
-from foveasim.view.web._pack import back_references, smallest
+from foveasim.view.web._pack import back_references, to_smallest_type
 
 __all__ = ["bodies_of"]
 
@@ -75,22 +75,22 @@ def bodies_of(
     lattice_um = _lattice_um(meshes, layout, float((high_um - low_um).max()))
     origin_um = 0.5 * (low_um + high_um)
     points = np.rint((np.concatenate([mesh.points_um for mesh in meshes]) - origin_um) / lattice_um).astype(np.int64)
-    _, place = np.unique((points[:, 0] << 32) + points[:, 1], return_inverse=True)
+    _, position = np.unique((points[:, 0] << 32) + points[:, 1], return_inverse=True)
     tile_of_site = _tiles(layout)
     pieces = []
     start = 0
     for mesh in meshes:
         stop = start + mesh.points_um.shape[0]
-        pieces.append(_runs(mesh, place[start:stop], tile_of_site, start))
+        pieces.append(_runs(mesh, position[start:stop], tile_of_site, start))
         start = stop
     order = np.concatenate([piece.pop("order") for piece in pieces])
-    place, first = _by_first_occurrence(place[order])
+    position, first = _by_first_occurrence(position[order])
     arrays = {key: np.concatenate([piece[key] for piece in pieces]) for key in pieces[0]}
-    corner_places = points[order][first]
+    position_points = points[order][first]
     arrays |= {
-        "place_x": np.diff(corner_places[:, 0], prepend=0),
-        "place_y": np.diff(corner_places[:, 1], prepend=0),
-        "places": back_references(place),
+        "place_x": np.diff(position_points[:, 0], prepend=0),
+        "place_y": np.diff(position_points[:, 1], prepend=0),
+        "places": back_references(position),
         "z": points[order, 2],
     }
     about = {
@@ -108,7 +108,7 @@ def bodies_of(
             for mesh, piece in zip(meshes, pieces, strict=True)
         ],
     }
-    return about, {key: smallest(values) for key, values in arrays.items()}
+    return about, {key: to_smallest_type(values) for key, values in arrays.items()}
 
 
 def _check(mesh: Mesh, n_sites: int) -> None:
@@ -134,12 +134,12 @@ def _tiles(layout: Layout) -> Ints:
     """Return the tile of each photosite, (n_site,), in rows over the layout's bounds."""
     n = max(1, round(np.sqrt(layout.n_sites / SITES_PER_TILE)))
     x_min, y_min, x_max, y_max = layout.bounds_um
-    share = (layout.centroid_um - (x_min, y_min)) / np.maximum((x_max - x_min, y_max - y_min), np.finfo(float).tiny)
-    column, row = np.clip((n * share).astype(np.int64), 0, n - 1).T
+    fraction = (layout.centroid_um - (x_min, y_min)) / np.maximum((x_max - x_min, y_max - y_min), np.finfo(float).tiny)
+    column, row = np.clip((n * fraction).astype(np.int64), 0, n - 1).T
     return row * n + column
 
 
-def _runs(mesh: Mesh, place: Ints, tile_of_site: Ints, offset: int) -> dict[str, NDArray[Any]]:
+def _runs(mesh: Mesh, position: Ints, tile_of_site: Ints, offset: int) -> dict[str, NDArray[Any]]:
     """
     Sort points and triangles of a surface by tile and photosite.
 
@@ -151,7 +151,7 @@ def _runs(mesh: Mesh, place: Ints, tile_of_site: Ints, offset: int) -> dict[str,
     by_tile = np.lexsort((np.arange(tile_of_site.size + 1), np.append(tile_of_site, 0)))
     rank_of_site[by_tile] = np.arange(by_tile.size)
     rank = rank_of_site[site]
-    _, first, same = np.unique(rank * (int(place.max()) + 1) + place, return_index=True, return_inverse=True)
+    _, first, same = np.unique(rank * (int(position.max()) + 1) + position, return_index=True, return_inverse=True)
     order = np.lexsort((first[same], rank))
     starts = np.flatnonzero(np.diff(rank[order], prepend=-1))
     counts = np.diff(starts, append=order.size)
@@ -172,12 +172,12 @@ def _runs(mesh: Mesh, place: Ints, tile_of_site: Ints, offset: int) -> dict[str,
     }
 
 
-def _by_first_occurrence(place: Ints) -> tuple[Ints, Ints]:
+def _by_first_occurrence(position: Ints) -> tuple[Ints, Ints]:
     """Number positions in order of first occurrence, and return where each occurs first."""
-    n = int(place.max()) + 1
+    n = int(position.max()) + 1
     first = np.empty(n, np.int64)
-    first[place[::-1]] = np.arange(place.size)[::-1]  # the last write is the first occurrence
+    first[position[::-1]] = np.arange(position.size)[::-1]  # the last write is the first occurrence
     by_first = np.argsort(first)
     rank = np.empty(n, np.int64)
     rank[by_first] = np.arange(n)
-    return rank[place], first[by_first]
+    return rank[position], first[by_first]

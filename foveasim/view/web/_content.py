@@ -24,10 +24,10 @@ from foveasim.view.site_colours import (
     Rgb,
     site_colours,
 )
-from foveasim.view.web._pack import back_references, smallest
+from foveasim.view.web._pack import back_references, to_smallest_type
 from foveasim.view.web._shapes import shapes_of
 
-__all__ = ["Content", "content_of", "described_sites"]
+__all__ = ["Content", "content_of", "describe_sites"]
 
 #: Longer side of the picture.
 PICTURE_PIXELS = 800
@@ -78,7 +78,7 @@ def content_of(data: Layout | Capture, report: Report | None = None, *, name: st
     GeometryError
         When the layout has no sites.
     """
-    about, arrays, layout = described_sites(data, name=name)
+    about, arrays, layout = describe_sites(data, name=name)
     if report is not None and not isinstance(report, Report):
         raise ParameterError("report", f"must be a Report of a check, got a {type(report).__name__}")
     if report is not None and report.n_sites != layout.n_sites:
@@ -86,14 +86,12 @@ def content_of(data: Layout | Capture, report: Report | None = None, *, name: st
             "report", f"must be a check of this layout of {layout.n_sites:,} sites, got one of {report.n_sites:,}"
         )
     arrays |= _outlines(layout)
-    picture, place = _picture(layout, data if isinstance(data, Capture) else None)
+    picture, position = _picture(layout, data if isinstance(data, Capture) else None)
     rules = [] if report is None else _rules(report, arrays)
-    return Content({**about, "picture": place, "rules": rules}, arrays, picture)
+    return Content({**about, "picture": position, "rules": rules}, arrays, picture)
 
 
-def described_sites(
-    data: Layout | Capture, *, name: str = ""
-) -> tuple[dict[str, Any], dict[str, NDArray[Any]], Layout]:
+def describe_sites(data: Layout | Capture, *, name: str = "") -> tuple[dict[str, Any], dict[str, NDArray[Any]], Layout]:
     """
     Return the data of photosites for all kinds of pages.
 
@@ -144,15 +142,15 @@ def _outlines(layout: Layout) -> dict[str, NDArray[Any]]:
     shapes = shapes_of(layout)
     arrays = {
         "xy_um": shapes.xy_um,
-        "place": smallest(back_references(shapes.place)),
-        "ring_sizes": smallest(np.diff(shapes.ring_offsets)),
+        "place": to_smallest_type(back_references(shapes.position)),
+        "ring_sizes": to_smallest_type(np.diff(shapes.ring_offsets)),
         "cut_sites": shapes.cut_sites.astype(np.uint32),
-        "cut_counts": smallest(np.diff(shapes.cut_offsets)),
+        "cut_counts": to_smallest_type(np.diff(shapes.cut_offsets)),
         "cuts": shapes.cuts.astype(np.uint32).reshape(-1),
     }
     n_rings = np.diff(shapes.site_offsets)
     if n_rings.max() > 1:
-        arrays["site_rings"] = smallest(n_rings)
+        arrays["site_rings"] = to_smallest_type(n_rings)
     return arrays
 
 
@@ -165,11 +163,11 @@ def _columns(layout: Layout, capture: Capture | None, arrays: dict[str, NDArray[
 
     def add(key: str, label: str, unit: str, values: NDArray[Any], kind: str | None = None, **more: Any) -> str:
         name = f"column-{len(arrays)}"
-        told, numbers = _as_numbers(values)
+        metadata, numbers = _as_numbers(values)
         arrays[name] = numbers
         # Numerical columns with few values have a scale too; only strings and columns passed with names are categories.
-        kind = kind or ("kinds" if "names" in told else "even")
-        columns.append({"key": key, "label": label, "unit": unit, "array": name, "kind": kind, **told, **more})
+        kind = kind or ("kinds" if "names" in metadata else "even")
+        columns.append({"key": key, "label": label, "unit": unit, "array": name, "kind": kind, **metadata, **more})
         return name
 
     if capture is not None:
@@ -204,7 +202,7 @@ def _columns(layout: Layout, capture: Capture | None, arrays: dict[str, NDArray[
         if key not in taken:
             label, unit = _label(key)
             values = layout.columns[key]
-            add(key, label, unit, values.astype(str) if _are_few(values) and not unit else values)
+            add(key, label, unit, values.astype(str) if _is_categorical(values) and not unit else values)
     return columns
 
 
@@ -220,7 +218,7 @@ def _is_index(values: NDArray[Any]) -> bool:
     return values.dtype.kind in "iu" and int(values.min(initial=0)) >= 0 and int(values.max(initial=0)) < 256
 
 
-def _are_few(values: NDArray[Any]) -> bool:
+def _is_categorical(values: NDArray[Any]) -> bool:
     """Return whether integers have few distinct values and are categories, such as zones."""
     if values.dtype.kind not in "iu":
         return False
@@ -234,14 +232,14 @@ def _as_numbers(values: NDArray[Any]) -> tuple[dict[str, Any], NDArray[Any]]:
     if values.dtype.kind == "b":
         return {"names": ["no", "yes"], "whole": True}, values.astype(np.uint8)
     if values.dtype.kind in "iu" and (values.max(initial=0) <= MAX_EXACT and values.min(initial=0) >= -MAX_EXACT):
-        return {"whole": True}, smallest(values)
+        return {"whole": True}, to_smallest_type(values)
     if values.dtype.kind == "f":
-        return {}, smallest(values)
+        return {}, to_smallest_type(values)
     if values.dtype.kind == "c":
         values = values.astype(str)
     names, kinds = np.unique(values, return_inverse=True)
-    texts = [name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name) for name in names]
-    return {"names": texts, "whole": True}, smallest(kinds)
+    strings = [name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name) for name in names]
+    return {"names": strings, "whole": True}, to_smallest_type(kinds)
 
 
 def _label(key: str) -> tuple[str, str]:
@@ -270,13 +268,13 @@ def _picture(layout: Layout, capture: Capture | None) -> tuple[bytes, dict[str, 
     from PIL import Image
 
     if capture is not None:
-        seen = capture.picture(max_pixels=PICTURE_PIXELS)
+        picture = capture.picture(max_pixels=PICTURE_PIXELS)
         white = capture.white_dn
-        if seen.data.shape[0] not in (1, 3):
-            seen = replace(seen, data=np.mean(seen.data / white.reshape(-1, 1, 1), axis=0, keepdims=True))
+        if picture.data.shape[0] not in (1, 3):
+            picture = replace(picture, data=np.mean(picture.data / white.reshape(-1, 1, 1), axis=0, keepdims=True))
             white = np.ones(1)
-        pixels = seen.to_image(white, encode_srgb=True)
-        bounds_um = seen.grid.bounds_um
+        pixels = picture.to_image(white, encode_srgb=True)
+        bounds_um = picture.grid.bounds_um
     else:
         x_min, y_min, x_max, y_max = layout.bounds_um
         bounds_um = layout.bounds_um
@@ -311,9 +309,9 @@ def _rules(report: Report, arrays: dict[str, NDArray[Any]]) -> list[dict[str, An
     n_parts = np.bincount(owner[part_of_ring], minlength=len(markers)) if len(markers) else np.zeros(0, np.int64)
     arrays["violation_value"] = np.array(values, dtype=np.float64)
     arrays["violation_sites"] = np.array([site for ids in sites for site in ids], dtype=np.uint32)
-    arrays["violation_site_counts"] = smallest(np.array([len(ids) for ids in sites], dtype=np.int64))
-    arrays["marker_part_counts"] = smallest(n_parts)
-    arrays["marker_sizes"] = smallest(np.bincount(ring_of_point, minlength=len(rings)))
+    arrays["violation_site_counts"] = to_smallest_type(np.array([len(ids) for ids in sites], dtype=np.int64))
+    arrays["marker_part_counts"] = to_smallest_type(n_parts)
+    arrays["marker_sizes"] = to_smallest_type(np.bincount(ring_of_point, minlength=len(rings)))
     arrays["marker_xy_um"] = points_um
     return rules
 

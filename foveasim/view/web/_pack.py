@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from foveasim._core.validation import Ints
 
-__all__ = ["back_references", "packed", "smallest"]
+__all__ = ["back_references", "pack", "to_smallest_type"]
 
 #: Higher levels take several times longer and save a few per cent.
 GZIP_LEVEL = 5
 
 
-def packed(array: NDArray[Any]) -> tuple[dict[str, Any], str]:
+def pack(array: NDArray[Any]) -> tuple[dict[str, Any], str]:
     """
     Encode an array for ``unpack.js``.
 
@@ -31,11 +31,11 @@ def packed(array: NDArray[Any]) -> tuple[dict[str, Any], str]:
     flat = np.ascontiguousarray(array).reshape(-1)
     flat = flat.astype(flat.dtype.newbyteorder("<"), copy=False)
     planes = flat.view(np.uint8).reshape(-1, flat.dtype.itemsize).T if flat.size else flat.view(np.uint8)
-    told = {"type": flat.dtype.name, "size": int(flat.size)}
-    return told, base64.b64encode(gzip.compress(planes.tobytes(), GZIP_LEVEL, mtime=0)).decode()
+    metadata = {"type": flat.dtype.name, "size": int(flat.size)}
+    return metadata, base64.b64encode(gzip.compress(planes.tobytes(), GZIP_LEVEL, mtime=0)).decode()
 
 
-def smallest(values: NDArray[Any]) -> NDArray[Any]:
+def to_smallest_type(values: NDArray[Any]) -> NDArray[Any]:
     """Convert numbers to the smallest JavaScript array type that represents them exactly."""
     if values.dtype.kind == "b":
         return values.astype(np.uint8)
@@ -51,7 +51,7 @@ def smallest(values: NDArray[Any]) -> NDArray[Any]:
     return single if is_same else values.astype(np.float64)
 
 
-def back_references(place: Ints) -> Ints:
+def back_references(position: Ints) -> Ints:
     """
     Encode positions as back references, which compress well.
 
@@ -59,9 +59,9 @@ def back_references(place: Ints) -> Ints:
 
     Parameters
     ----------
-    place : (n_vertex,) int64
+    position : (n_vertex,) int64
         Numbered by their first occurrence.
     """
-    n_seen = np.maximum.accumulate(place) + 1
-    n_before = np.concatenate(([0], n_seen[:-1]))
-    return np.where(place == n_before, 0, n_before - place)
+    n_distinct = np.maximum.accumulate(position) + 1
+    n_before = np.concatenate(([0], n_distinct[:-1]))
+    return np.where(position == n_before, 0, n_before - position)

@@ -19,12 +19,12 @@ from foveasim.capture import Capture
 from foveasim.errors import FileError
 from foveasim.layout import Layout, Report
 from foveasim.view.web._content import content_of
-from foveasim.view.web._pack import packed
+from foveasim.view.web._pack import pack
 
-__all__ = ["bundled", "check_page_path", "joined", "web_page", "write_web_page"]
+__all__ = ["assemble_page", "bundle", "check_page_path", "web_page", "write_web_page"]
 
 #: File extensions of pages.
-ENDINGS = (".html", ".htm")
+EXTENSIONS = (".html", ".htm")
 #: Content security policy: only embedded scripts and style, identified by checksums, and embedded pictures.
 POLICY = (
     "default-src 'none'; script-src '{script}'; style-src '{style}'; img-src data: blob:; base-uri 'none'; "
@@ -69,9 +69,9 @@ def web_page(data: Layout | Capture, *, report: Report | None = None, name: str 
     True
     """
     content = content_of(data, report, name=name)
-    arrays = {key: packed(values) for key, values in content.arrays.items()}
-    about = {**content.about, "arrays": {key: told for key, (told, _) in arrays.items()}}
-    return joined(
+    arrays = {key: pack(values) for key, values in content.arrays.items()}
+    about = {**content.about, "arrays": {key: metadata for key, (metadata, _) in arrays.items()}}
+    return assemble_page(
         "template.html",
         ("page.css",),
         "page.js",
@@ -131,20 +131,20 @@ def check_page_path(path: str | Path) -> Path:
         When the extension is not that of a page, or the directory does not exist.
     """
     target = Path(path)
-    if target.suffix.lower() not in ENDINGS:
+    if target.suffix.lower() not in EXTENSIONS:
         raise FileError(target, "must end in .html")
     if not target.parent.is_dir():
         raise FileError(target, f"cannot be written: the directory {target.parent} does not exist")
     return target
 
 
-def joined(
+def assemble_page(
     template: str,
     styles: tuple[str, ...],
     script: str,
     about: dict[str, Any],
     data: dict[str, str],
-    **texts: str,
+    **strings: str,
 ) -> str:
     """
     Return one HTML document of its parts.
@@ -152,22 +152,22 @@ def joined(
     Parameters
     ----------
     template, styles, script : str
-        Files in this package. The script is the module that imports all others, as :func:`bundled` joins them.
+        Files in this package. The script is the module that imports all others, as :func:`bundle` joins them.
     about : dict
         Plain data, for the element ``about``.
     data : dict of str to base64
         Encoded arrays, for elements ``data-NAME``.
-    **texts : str
-        Texts of the placeholders in the template, which are escaped.
+    **strings : str
+        Strings of the placeholders in the template, which are escaped.
     """
     style = "".join(map(_part, styles))
-    script = bundled(script)
+    script = bundle(script)
     # Angle brackets are escaped: column names in untrusted files must not close the script element.
     plain = json.dumps(about, ensure_ascii=True, allow_nan=False).replace("<", "\\u003c").replace(">", "\\u003e")
     elements = [f'<script type="application/json" id="about">{plain}</script>']
     elements += [f'<script type="text/plain" id="data-{key}">{text}</script>' for key, text in data.items()]
     return Template(_part(template)).substitute(
-        {name: html.escape(text) for name, text in texts.items()},
+        {name: html.escape(text) for name, text in strings.items()},
         policy=html.escape(POLICY.format(script=_checksum(script), style=_checksum(style)), quote=False),
         style=style,
         script=script,
@@ -176,7 +176,7 @@ def joined(
 
 
 @cache
-def bundled(name: str) -> str:
+def bundle(name: str) -> str:
     """
     Return a module and all its imports as one script.
 

@@ -17,9 +17,9 @@ __all__ = ["open_page", "serve_page"]
 #: Loopback address: other computers cannot reach it.
 HOST = "127.0.0.1"
 #: Time limit of a connection for its request, and for each piece of the page.
-PATIENCE_S = 10.0
+TIMEOUT_S = 10.0
 #: Time limit of a connection for closing.
-LINGER_S = 1.0
+CLOSE_TIMEOUT_S = 1.0
 #: Simultaneous connections; further ones receive 503 (service unavailable). A browser opens six.
 MAX_CONNECTIONS = 128
 #: Largest request; those of browsers have a few hundred bytes.
@@ -28,13 +28,13 @@ MAX_REQUEST_BYTES = 16_384
 PIECE_BYTES = 65_536
 
 
-def serve_page(text: str, *, port: int = 0, announce: Callable[[str], None]) -> None:
+def serve_page(page: str, *, port: int = 0, announce: Callable[[str], None]) -> None:
     """
     Serve one page on localhost until the user stops it with Ctrl-C.
 
     Parameters
     ----------
-    text : str
+    page : str
         From :func:`foveasim.view.web_page`.
     port : int
         0 for any free port.
@@ -57,7 +57,7 @@ def serve_page(text: str, *, port: int = 0, announce: Callable[[str], None]) -> 
     except OSError as error:
         raise ParameterError("port", f"must be a free port ({error.strerror or error})", port) from None
     with listener, contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(_serve(listener, text.encode(), announce))
+        asyncio.run(_serve(listener, page.encode(), announce))
 
 
 async def _serve(listener: socket.socket, content: bytes, announce: Callable[[str], None]) -> None:
@@ -65,7 +65,7 @@ async def _serve(listener: socket.socket, content: bytes, announce: Callable[[st
     names = {f"{name}:{port}" for name in (HOST, "localhost")} | ({HOST, "localhost"} if port == 80 else set())
     n_open = 0
 
-    async def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def handle(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         nonlocal n_open
         n_open += 1
         try:
@@ -73,14 +73,14 @@ async def _serve(listener: socket.socket, content: bytes, announce: Callable[[st
                 await _answer(reader, writer, names, content)
             elif n_open <= 2 * MAX_CONNECTIONS:
                 await _send(writer, HTTPStatus.SERVICE_UNAVAILABLE)
-            await _end(reader, writer)
+            await _close(reader, writer)
         except (OSError, asyncio.IncompleteReadError, asyncio.CancelledError):
             # Disconnected, timed out (TimeoutError is an OSError), or the server stops: no response is possible.
             writer.transport.abort()
         finally:
             n_open -= 1
 
-    await asyncio.start_server(connected, sock=listener, limit=MAX_REQUEST_BYTES)
+    await asyncio.start_server(handle, sock=listener, limit=MAX_REQUEST_BYTES)
     announce(f"http://{HOST}:{port}/")
     await asyncio.Event().wait()
 
@@ -88,7 +88,7 @@ async def _serve(listener: socket.socket, content: bytes, announce: Callable[[st
 async def _answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, names: set[str], content: bytes) -> None:
     """Read one request and answer it."""
     try:
-        async with asyncio.timeout(PATIENCE_S):
+        async with asyncio.timeout(TIMEOUT_S):
             head = await reader.readuntil(b"\r\n\r\n")
     except asyncio.LimitOverrunError:
         await _send(writer, HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE)
@@ -131,11 +131,11 @@ async def _send(
     pieces = range(0, len(body), PIECE_BYTES) if with_content else ()
     for start in pieces:
         writer.write(body[start : start + PIECE_BYTES])
-        async with asyncio.timeout(PATIENCE_S):
+        async with asyncio.timeout(TIMEOUT_S):
             await writer.drain()
 
 
-async def _end(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+async def _close(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     """
     Close the connection after the client has read the response.
 
@@ -143,13 +143,13 @@ async def _end(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> No
     """
     writer.write_eof()
     with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(min(LINGER_S, PATIENCE_S)):
+        async with asyncio.timeout(min(CLOSE_TIMEOUT_S, TIMEOUT_S)):
             while await reader.read(PIECE_BYTES):
                 pass
     writer.close()
 
 
-def open_page(text: str) -> tuple[Path, bool]:
+def open_page(page: str) -> tuple[Path, bool]:
     """
     Write a page to a temporary file and open it in the browser.
 
@@ -164,5 +164,5 @@ def open_page(text: str) -> tuple[Path, bool]:
     import webbrowser
 
     path = Path(tempfile.mkdtemp(prefix="foveasim-")) / "view.html"
-    path.write_text(text, encoding="utf-8")
+    path.write_text(page, encoding="utf-8")
     return path, webbrowser.open(path.as_uri())

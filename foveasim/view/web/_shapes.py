@@ -28,7 +28,7 @@ class Shapes:
     ----------
     xy_um : (n_place, 2) float64, µm
         Distinct vertex positions, in the order of their first use by a ring.
-    place : (n_vertex,) int64
+    position : (n_vertex,) int64
         Position of each vertex of each ring. Sites with one ring may begin at another vertex than in the layout.
     ring_offsets, site_offsets : int64
         As in the layout.
@@ -41,7 +41,7 @@ class Shapes:
     """
 
     xy_um: Floats
-    place: Ints
+    position: Ints
     ring_offsets: Ints
     site_offsets: Ints
     cut_sites: Ints
@@ -64,20 +64,20 @@ def shapes_of(layout: Layout) -> Shapes:
     triangles, nor do sites that the fan from their deepest reflex vertex fills.
     """
     order, is_filled = _fans(layout, np.diff(layout.site_offsets) == 1)
-    xy_um, place = _shared(layout.xy_um[order])
+    xy_um, position = _unique_positions(layout.xy_um[order])
     cut_sites = np.flatnonzero(~is_filled)
-    cut_offsets, cuts = _cut(layout, cut_sites, place, xy_um)
-    return Shapes(xy_um, place, layout.ring_offsets, layout.site_offsets, cut_sites, cut_offsets, cuts)
+    cut_offsets, cuts = _triangulate(layout, cut_sites, position, xy_um)
+    return Shapes(xy_um, position, layout.ring_offsets, layout.site_offsets, cut_sites, cut_offsets, cuts)
 
 
-def _shared(xy_um: Floats) -> tuple[Floats, Ints]:
+def _unique_positions(xy_um: Floats) -> tuple[Floats, Ints]:
     """Return distinct positions in order of their first vertex, and each vertex's position."""
     keys = (np.ascontiguousarray(xy_um) + 0.0).view(np.complex128)[:, 0]  # + 0.0 replaces -0 by 0
-    _, first, place = np.unique(keys, return_index=True, return_inverse=True)
+    _, first, position = np.unique(keys, return_index=True, return_inverse=True)
     rank = np.empty(first.size, np.int64)
     by_first = np.argsort(first)
     rank[by_first] = np.arange(first.size)
-    return xy_um[first[by_first]], rank[place]
+    return xy_um[first[by_first]], rank[position]
 
 
 def _fans(layout: Layout, may_fan: Bools) -> tuple[Ints, Bools]:
@@ -124,7 +124,7 @@ def _is_filled(xy_um: Floats, ring_offsets: Ints, order: Ints, rings: Ints, tole
     return np.asarray(np.minimum.reduceat(area_um2, starts) >= -tolerance_um2)
 
 
-def _cut(layout: Layout, sites: Ints, place: Ints, xy_um: Floats) -> tuple[Ints, Ints]:
+def _triangulate(layout: Layout, sites: Ints, position: Ints, xy_um: Floats) -> tuple[Ints, Ints]:
     """Triangulate sites that fans do not fill (constrained Delaunay triangulation)."""
     if sites.size == 0:
         return np.zeros(1, np.int64), np.zeros((0, 3), np.int64)
@@ -141,15 +141,15 @@ def _cut(layout: Layout, sites: Ints, place: Ints, xy_um: Floats) -> tuple[Ints,
     found = np.minimum(np.searchsorted(sorted_keys, corner_keys), sorted_keys.size - 1)
     is_known = sorted_keys[found] == corner_keys
     site_of_vertex = np.repeat(np.arange(layout.n_sites), np.diff(layout.ring_offsets[layout.site_offsets]))
-    pair = site_of_vertex * xy_um.shape[0] + place
+    pair = site_of_vertex * xy_um.shape[0] + position
     by_pair = np.argsort(pair, kind="stable")
-    wanted = np.repeat(owner, 3) * xy_um.shape[0] + by_key[found]
-    at = np.minimum(np.searchsorted(pair[by_pair], wanted), pair.size - 1)
+    target = np.repeat(owner, 3) * xy_um.shape[0] + by_key[found]
+    at = np.minimum(np.searchsorted(pair[by_pair], target), pair.size - 1)
     vertex = by_pair[at]
-    is_known &= pair[vertex] == wanted
-    is_whole = is_known.reshape(-1, 3).all(axis=1)
-    counts = np.bincount(np.searchsorted(sites, owner[is_whole]), minlength=sites.size)
-    return np.concatenate(([0], np.cumsum(counts))), vertex.reshape(-1, 3)[is_whole]
+    is_known &= pair[vertex] == target
+    is_complete = is_known.reshape(-1, 3).all(axis=1)
+    counts = np.bincount(np.searchsorted(sites, owner[is_complete]), minlength=sites.size)
+    return np.concatenate(([0], np.cumsum(counts))), vertex.reshape(-1, 3)[is_complete]
 
 
 def _keys(xy_um: Floats) -> tuple[NDArray[Any], Ints]:

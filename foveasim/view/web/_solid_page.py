@@ -11,9 +11,9 @@ from foveasim.view.meshes import Mesh, prisms
 from foveasim.view.solids import Solids
 from foveasim.view.solids import solids as solids_of
 from foveasim.view.web._bodies import bodies_of
-from foveasim.view.web._content import described_sites
-from foveasim.view.web._pack import packed
-from foveasim.view.web._page import joined, write_page
+from foveasim.view.web._content import describe_sites
+from foveasim.view.web._pack import pack
+from foveasim.view.web._page import assemble_page, write_page
 
 __all__ = ["solid_page", "write_solid_page"]
 
@@ -43,7 +43,7 @@ def solid_page(data: Layout | Capture, *, solids: Solids | None = None, name: st
     GeometryError
         When there is nothing to show.
     """
-    about, arrays, layout = described_sites(data, name=name)
+    about, arrays, layout = describe_sites(data, name=name)
     if solids is None and isinstance(data, Capture):
         meshes: Sequence[Mesh] = (prisms(data),)
         meshes_are_closed = False  # prisms have no bottom faces
@@ -54,13 +54,13 @@ def solid_page(data: Layout | Capture, *, solids: Solids | None = None, name: st
         shown = "z points toward the lens."
     bodies, surfaces = bodies_of(meshes, layout, are_closed=meshes_are_closed)
     arrays |= {**surfaces, "area_um2": layout.area_um2}
-    told = {key: packed(values) for key, values in arrays.items()}
-    return joined(
+    packed = {key: pack(values) for key, values in arrays.items()}
+    return assemble_page(
         "solid.html",
         ("page.css",),
         "solid.js",
-        {**about, "bodies": bodies, "arrays": {key: kind for key, (kind, _) in told.items()}},
-        {key: text for key, (_, text) in told.items()},
+        {**about, "bodies": bodies, "arrays": {key: kind for key, (kind, _) in packed.items()}},
+        {key: text for key, (_, text) in packed.items()},
         title=str(about["name"]),
         shown=shown,
     )

@@ -350,10 +350,10 @@ function listenToPicture() {
     fly(...at, Math.max(state.map.scale, 4 * state.map.fitScale()));
   });
   $("enlarge").addEventListener("click", () => {
-    const main = document.querySelector("main"), isBeside = main.classList.toggle("beside");
-    if (isBeside) main.insertBefore(frame, document.querySelector("aside"));
+    const main = document.querySelector("main"), isSideBySide = main.classList.toggle("side-by-side");
+    if (isSideBySide) main.insertBefore(frame, document.querySelector("aside"));
     else $("picture-heading").closest("section").append(frame);
-    $("enlarge").setAttribute("aria-pressed", isBeside);
+    $("enlarge").setAttribute("aria-pressed", isSideBySide);
     resize();
   });
 }
@@ -384,13 +384,13 @@ function lengthText(value) {
   return value.toFixed(clamp(Math.ceil(Math.log10(state.map.scale)) + 1, 0, 6));
 }
 
-let toldSite = null;
+let announcedSite = null;
 
 function tellSite() {
   const site = state.hovered >= 0 ? state.hovered : state.pinned;
   const key = site + "/" + state.pinned + "/" + state.others + "/" + state.loaded;
-  if (key === toldSite) return;
-  toldSite = key;
+  if (key === announcedSite) return;
+  announcedSite = key;
   $("site").classList.toggle("empty", site < 0);
   $("unpin").hidden = state.pinned < 0;
   $("site-heading").textContent = site < 0 ? "Photosite" : "Photosite " + site.toLocaleString("en-US") + (site === state.pinned ? " (pinned)" : "");
@@ -414,10 +414,10 @@ function tellSite() {
   }
   $("values").replaceChildren(...cells);
   drawHistogram();
-  speak(site < 0 ? null : () => sentence(site));
+  speak(site < 0 ? null : () => describeSite(site));
 }
 
-function sentence(site) {
+function describeSite(site) {
   const parts = about.columns.filter((column) => !column.is_repeat).map((column) => column.label + " " + textOf(column, site, state.sites.area));
   return "Photosite " + site + ": " + parts.join(", ");
 }
@@ -605,9 +605,9 @@ function listViolations() {
   if (rule >= 0) {
     const { description: text, limit, unit, waiver } = about.rules[rule];
     const bound = limit === null ? "" : "; the limit is " + shown(limit) + (unit ? " " + unit : "");
-    $("sentence").textContent = text + bound + "." + (waiver ? " Waived: " + waiver + "." : "") + rest;
-  } else $("sentence").textContent = (count ? "" : "All rules are satisfied.") + rest;
-  if (!$("sentence").textContent) $("sentence").textContent = shown(about.rules.filter((r) => !r.count).length) + " of " + about.rules.length + " rules are satisfied.";
+    $("rule-description").textContent = text + bound + "." + (waiver ? " Waived: " + waiver + "." : "") + rest;
+  } else $("rule-description").textContent = (count ? "" : "All rules are satisfied.") + rest;
+  if (!$("rule-description").textContent) $("rule-description").textContent = shown(about.rules.filter((r) => !r.count).length) + " of " + about.rules.length + " rules are satisfied.";
 }
 
 function violationItem(i) {

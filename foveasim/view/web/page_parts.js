@@ -35,17 +35,17 @@ export function startTheme(onChange) {
 let noticing = 0, speaking = 0;
 
 export function notice(text) {
-  $("told").textContent = text;
-  $("told").hidden = false;
+  $("notice").textContent = text;
+  $("notice").hidden = false;
   clearTimeout(noticing);
-  noticing = setTimeout(() => { $("told").hidden = true; }, 2600);
+  noticing = setTimeout(() => { $("notice").hidden = true; }, 2600);
 }
 
 // Shows a notice until it is null.
 export function stayingNotice(text) {
   clearTimeout(noticing);
-  $("told").hidden = text === null;
-  if (text !== null) $("told").textContent = text;
+  $("notice").hidden = text === null;
+  if (text !== null) $("notice").textContent = text;
 }
 
 // Announces a text to screen readers after a short delay; null for none.

@@ -160,7 +160,7 @@ function listenToTools() {
   $("unpin").addEventListener("click", () => pin(-1, -1));
   $("height").addEventListener("input", () => {
     const factor = 2 ** Number($("height").value);
-    $("height-told").textContent = "× " + Number(factor.toPrecision(2));
+    $("height-scale").textContent = "× " + Number(factor.toPrecision(2));
     state.view.setHeight(factor);
     moved();
   });
