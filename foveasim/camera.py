@@ -37,23 +37,23 @@ from foveasim.sensor import Sensor, noise_budget
 from foveasim.sensor.limits import check_plausible, check_plausible_array
 from foveasim.units import um_from_nm, w_from_w_m2_um2
 
-__all__ = ["Camera", "Light"]
+__all__ = ["Camera", "Frame"]
 
 #: A position in the image plane, (x, y) in µm.
-Place = tuple[float, float]
+Position = tuple[float, float]
 #: One frame: a scene or a power map, or either with the position of the sensor's centre in its image.
-Light = Scene | PowerMap | tuple[Scene | PowerMap, Sequence[float]]
+Frame = Scene | PowerMap | tuple[Scene | PowerMap, Sequence[float]]
 #: Power maps behind each colour filter, on each grid.
-KeptImages = dict[tuple[Grid, int], NDArray[Any]]
+ImageCache = dict[tuple[Grid, int], NDArray[Any]]
 
 #: Fourier transforms in float32 leave negative rates of up to this fraction of the largest one.
 NEGATIVE_ROUNDING = 1e-4
 #: Lower limit of a filter's response, relative to the strongest filter, for white balance.
-DIMMEST_WHITE = 0.01
+MIN_WHITE_FRACTION = 0.01
 #: Exposures that exceed the time between them by this fraction do so by rounding.
 TIME_ROUNDING = 1e-9
 #: Number of compiled layouts in the cache, per grid of one image.
-KEPT_INTEGRATORS = 4
+MAX_CACHED_INTEGRATORS = 4
 #: In cells of at most this width, in units of λN, irradiance is smooth: second-order integration is up to 70 times more
 #: accurate. In cells wider than 0.8 λN it can be less accurate than first order.
 SMOOTH_LAMBDA_N = 0.5
@@ -129,7 +129,7 @@ class Camera:
             self._order = 2 if check_count("order", order, at_most=2) == 2 else 1
         self._layout = sensor.layout
         self._n_threads = thread_count(n_threads)
-        self._integrators: dict[tuple[Grid, int, Place], Integrator] = {}
+        self._integrators: dict[tuple[Grid, int, Position], Integrator] = {}
 
     def __repr__(self) -> str:
         return f"Camera({self._optics!r}, {self._sensor!r})"
@@ -181,7 +181,7 @@ class Camera:
         ParameterError
             When the scene is not a Scene, or its distance is at most the focal length.
         """
-        return self._placed(self._optics.grid(scene))
+        return self._to_sensor_frame(self._optics.grid(scene))
 
     def power_map(self, scene: Scene) -> PowerMap:
         """
@@ -203,9 +203,9 @@ class Camera:
             When the distance of the scene is at most the focal length, or the result is not finite.
         """
         power_map = self._optics.resolve_oversample(scene).power_map(scene, n_threads=self._n_threads)
-        return PowerMap(power_map.data, self._placed(power_map.grid), power_map.wavelength_nm)
+        return PowerMap(power_map.data, self._to_sensor_frame(power_map.grid), power_map.wavelength_nm)
 
-    def _placed(self, grid: Grid) -> Grid:
+    def _to_sensor_frame(self, grid: Grid) -> Grid:
         """Transform a grid from the frame of the optics to the frame of the sensor."""
         if self._distortion is None:
             return grid
@@ -222,7 +222,7 @@ class Camera:
         *,
         order: Literal[1, 2] = 1,
         n_grids: int = 1,
-        place_um: Place = (0.0, 0.0),
+        position_um: Position = (0.0, 0.0),
     ) -> Integrator:
         """
         Return the sensor's layout compiled for a grid.
@@ -234,7 +234,7 @@ class Camera:
             Order of integration.
         n_grids : int
             Number of grids that are used together: the cache has room for them.
-        place_um : (x, y), µm
+        position_um : (x, y), µm
             Position of the layout's origin in the image.
 
         Returns
@@ -242,16 +242,16 @@ class Camera:
         Integrator
             From the cache, when the same one was used recently.
         """
-        key = grid, order, place_um
+        key = grid, order, position_um
         integrator = self._integrators.get(key)
         if integrator is None:
-            layout = self._layout.translate(*place_um) if any(place_um) else self._layout
+            layout = self._layout.translate(*position_um) if any(position_um) else self._layout
             integrator = Integrator(layout, grid, distortion=self._distortion, order=order, n_threads=self._n_threads)
         # The most recent entry is not moved: threads that compute further frames look it up at the same time.
         if next(reversed(self._integrators), None) != key:
             self._integrators.pop(key, None)
             self._integrators[key] = integrator
-        while len(self._integrators) > KEPT_INTEGRATORS * n_grids:
+        while len(self._integrators) > MAX_CACHED_INTEGRATORS * n_grids:
             self._integrators.pop(next(iter(self._integrators)), None)
         return integrator
 
@@ -277,7 +277,7 @@ class Camera:
             other._integrators = self._integrators
         return other
 
-    def photoelectrons_per_s(self, light: Scene | PowerMap, *, images: KeptImages | None = None) -> Floats:
+    def photoelectrons_per_s(self, light: Scene | PowerMap, *, images: ImageCache | None = None) -> Floats:
         """
         Return the expected photoelectrons of every site per second.
 
@@ -300,7 +300,7 @@ class Camera:
         SimulationError
             When the power map is not finite within a site.
         """
-        return self._photoelectrons_per_s(light, _Clock(), kept=images)
+        return self._photoelectrons_per_s(light, _Clock(), cached=images)
 
     def capture(
         self,
@@ -344,9 +344,9 @@ class Camera:
                 raise ParameterError(
                     "photo_e_per_s", f"must be {self._layout.n_sites} numbers, one per site, got {photo_e_per_s.size}"
                 )
-        return self._exposed(light, photo_e_per_s, exposure_s, streams, clock)
+        return self._expose(light, photo_e_per_s, exposure_s, streams, clock)
 
-    def _exposed(
+    def _expose(
         self,
         light: Scene | PowerMap,
         photo_e_per_s: Floats,
@@ -371,8 +371,8 @@ class Camera:
             bits=sensor.bits,
             white_dn=self._white(light),
             settings={
-                "light": _light_described(light),
-                **self._described,
+                "light": _describe_light(light),
+                **self._shared_settings,
                 "oversample": self.oversample(light),
                 "integration_order": self.order(light),
                 "exposure_s": exposure_s,
@@ -385,7 +385,7 @@ class Camera:
         )
 
     @cached_property
-    def _described(self) -> dict[str, Any]:
+    def _shared_settings(self) -> dict[str, Any]:
         """Settings that all captures of the camera share, as plain data."""
         return {
             "optics": to_plain_data(self._optics),
@@ -394,7 +394,7 @@ class Camera:
             "layout": to_plain_data(dict(self._layout.provenance)),
         }
 
-    def rates(self, frames: Iterable[Light], *, ahead: int = 0) -> Iterator[Floats]:
+    def rates(self, frames: Iterable[Frame], *, ahead: int = 0) -> Iterator[Floats]:
         """
         Yield the expected photoelectrons of every site per second, frame by frame.
 
@@ -416,11 +416,11 @@ class Camera:
         """
         _check_frames(frames)
         ahead = check_count("ahead", ahead, at_least=0)
-        return (rate_e_per_s for *_, rate_e_per_s in self._lit(frames, _Clock(), ahead))
+        return (rate_e_per_s for *_, rate_e_per_s in self._frame_rates(frames, _Clock(), ahead))
 
     def video(
         self,
-        frames: Iterable[Light],
+        frames: Iterable[Frame],
         *,
         exposure_s: float | Sequence[float],
         seed: int,
@@ -505,7 +505,7 @@ class Camera:
         streams = Streams(seed, first_frame)
         every, ahead = check_count("every", every), check_count("ahead", ahead, at_least=0)
         if frame_s is None:
-            return self._still(frames, exposures_s, streams, ahead)
+            return self._separate(frames, exposures_s, streams, ahead)
         shutter = Shutter(self._layout, frame_s, line_s, between)
         if exposures_s.max() > (1.0 + TIME_ROUNDING) * every * shutter.frame_s:
             warnings.warn(
@@ -516,34 +516,36 @@ class Camera:
             )
         return self._rolling(frames, exposures_s, streams, shutter, every, ahead)
 
-    def _still(self, frames: Iterable[Light], exposures_s: Floats, streams: Streams, ahead: int) -> Iterator[Capture]:
+    def _separate(
+        self, frames: Iterable[Frame], exposures_s: Floats, streams: Streams, ahead: int
+    ) -> Iterator[Capture]:
         """Yield one capture per frame, each exposed to this frame alone."""
         clock = _Clock()
-        for k, (light, place_um, rate_e_per_s) in enumerate(self._lit(frames, clock, ahead)):
+        for k, (light, position_um, rate_e_per_s) in enumerate(self._frame_rates(frames, clock, ahead)):
             number = Streams(streams.seed, streams.frame + k)
             exposure_s = float(exposures_s[number.frame % exposures_s.size])
-            yield self._exposed(light, rate_e_per_s, exposure_s, number, clock.so_far(), **_place_settings(place_um))
+            yield self._expose(light, rate_e_per_s, exposure_s, number, clock.take(), **_position_settings(position_um))
 
     def _rolling(
-        self, frames: Iterable[Light], exposures_s: Floats, streams: Streams, shutter: Shutter, every: int, ahead: int
+        self, frames: Iterable[Frame], exposures_s: Floats, streams: Streams, shutter: Shutter, every: int, ahead: int
     ) -> Iterator[Capture]:
         """Yield one capture per ``every`` frames, each a sum over its exposure."""
         times = {"frame_s": shutter.frame_s, "line_s": shutter.line_s, "every": every, "between": shutter.between}
-        in_progress: deque[tuple[int, Scene | PowerMap, Place, Exposure]] = deque()
+        in_progress: deque[tuple[int, Scene | PowerMap, Position, Exposure]] = deque()
         clock = _Clock()
 
         def first(last_e_per_s: Floats) -> Capture:
-            k, light, place_um, exposure = in_progress.popleft()
+            k, light, position_um, exposure = in_progress.popleft()
             number = Streams(streams.seed, streams.frame + k)
-            mean_e_per_s, settings = exposure.mean_e_per_s(last_e_per_s), times | _place_settings(place_um)
-            return self._exposed(light, mean_e_per_s, exposure.exposure_s, number, clock.so_far(), **settings)
+            mean_e_per_s, settings = exposure.mean_e_per_s(last_e_per_s), times | _position_settings(position_um)
+            return self._expose(light, mean_e_per_s, exposure.exposure_s, number, clock.take(), **settings)
 
         rate_e_per_s = np.zeros(1)
-        for n, (light, place_um, rate_e_per_s) in enumerate(self._lit(frames, clock, ahead)):
+        for n, (light, position_um, rate_e_per_s) in enumerate(self._frame_rates(frames, clock, ahead)):
             if n % every == 0:
                 k = n // every
                 exposure_s = float(exposures_s[(streams.frame + k) % exposures_s.size])
-                in_progress.append((k, light, place_um, Exposure(shutter, exposure_s)))
+                in_progress.append((k, light, position_um, Exposure(shutter, exposure_s)))
             with clock.stage("shutter"):
                 for *_, exposure in in_progress:
                     exposure.add(rate_e_per_s)
@@ -552,31 +554,31 @@ class Camera:
         while in_progress:
             yield first(rate_e_per_s)
 
-    def _lit(
-        self, frames: Iterable[Light], clock: _Clock, ahead: int
-    ) -> Iterator[tuple[Scene | PowerMap, Place, Floats]]:
+    def _frame_rates(
+        self, frames: Iterable[Frame], clock: _Clock, ahead: int
+    ) -> Iterator[tuple[Scene | PowerMap, Position, Floats]]:
         """Yield source, sensor position and photoelectron rates of each frame."""
-        alone = self
+        single_threaded = self
         if ahead:
-            alone = Camera(
+            single_threaded = Camera(
                 optics=self._optics, sensor=self._sensor, distortion=self._distortion, order=self._order, n_threads=1
             )
-        making = Lock()
+        image_lock = Lock()
 
-        def lit(task: _Task) -> tuple[_Task, Floats | None, _Clock]:
+        def compute(task: _Task) -> tuple[_Task, Floats | None, _Clock]:
             own = _Clock()
             if task.is_repeated:
                 return task, None, own
             # The first frame of a scene computes the images that its next frames share.
-            with making if task.images == {} else nullcontext():
-                return task, alone._photoelectrons_per_s(task.light, own, task.place_um, task.images), own
+            with image_lock if task.images == {} else nullcontext():
+                return task, single_threaded._photoelectrons_per_s(task.light, own, task.position_um, task.images), own
 
         rate_e_per_s = np.zeros(self._layout.n_sites)
-        for task, found, own in in_order(lit, _tasks(frames), self._n_threads, ahead):
+        for task, found, own in in_order(compute, _tasks(frames), self._n_threads, ahead):
             # Repeated frames share the array.
             rate_e_per_s = rate_e_per_s if found is None else read_only(found)
             clock.add(own)
-            yield task.light, task.place_um, rate_e_per_s
+            yield task.light, task.position_um, rate_e_per_s
 
     def predict(self, light: Scene | PowerMap, *, exposure_s: float) -> tuple[Floats, Floats]:
         """
@@ -654,13 +656,13 @@ class Camera:
         self,
         light: Scene | PowerMap,
         clock: _Clock,
-        place_um: Place = (0.0, 0.0),
-        kept: KeptImages | None = None,
+        position_um: Position = (0.0, 0.0),
+        cached: ImageCache | None = None,
     ) -> Floats:
         """
         Return the expected photoelectrons of every site per second.
 
-        ``kept`` is a cache of a scene's images by grid and filter, or None.
+        ``cached`` is a cache of a scene's images by grid and filter, or None.
         """
         if not isinstance(light, Scene | PowerMap):
             raise ParameterError("light", f"must be a Scene or a PowerMap, got a {type(light).__name__}")
@@ -672,10 +674,15 @@ class Camera:
             # Lateral chromatic aberration gives images of several sizes, each with its own grid.
             optics = self._optics.resolve_oversample(light)
             images = optics.image_grids(light)
-            maps, grids = self._images(light, optics, images, clock, kept), [self._placed(grid) for grid, _ in images]
+            maps, grids = (
+                self._images(light, optics, images, clock, cached),
+                [self._to_sensor_frame(grid) for grid, _ in images],
+            )
         with clock.stage("compile layout"):
             order = self.order(light)
-            integrators = [self.integrator(grid, order=order, n_grids=len(grids), place_um=place_um) for grid in grids]
+            integrators = [
+                self.integrator(grid, order=order, n_grids=len(grids), position_um=position_um) for grid in grids
+            ]
         self._warn_of_uncovered(min(integrators, key=lambda integrator: integrator.grid.cell_area_um2))
         rate_e_per_s = np.zeros(self._layout.n_sites)
         for image, cells, weight in maps:
@@ -697,7 +704,7 @@ class Camera:
         optics: Optics,
         images: Sequence[tuple[Grid, Bools]],
         clock: _Clock,
-        kept: KeptImages | None,
+        cached: ImageCache | None,
     ) -> Iterator[_WeightedMap]:
         """
         Yield the photoelectron map of each filter, with weight 1 at its sites and 0 at others.
@@ -708,13 +715,13 @@ class Camera:
         e_per_j = self._sensor.responsivity_e_per_j(scene.wavelength_nm)
         used = np.unique(filter_of_site)
         for k, (grid, is_in_image) in enumerate(images):
-            new = used if kept is None else np.array([c for c in used if (grid, c) not in kept], np.int64)
+            new = used if cached is None else np.array([c for c in used if (grid, c) not in cached], np.int64)
             maps = optics.weighted_maps(scene, e_per_j[new] * is_in_image, grid=grid, n_threads=self._n_threads)
             for c in used:
                 with clock.stage("optics"):
-                    cells = next(maps) if kept is None or (grid, c) not in kept else kept[grid, c]
-                    if kept is not None:
-                        kept[grid, c] = cells
+                    cells = next(maps) if cached is None or (grid, c) not in cached else cached[grid, c]
+                    if cached is not None:
+                        cached[grid, c] = cells
                 weighted = [_WeightedMap(k, cells, (filter_of_site == c).astype(np.float64))]
                 # Without a reference here, one map is in memory at a time.
                 del cells
@@ -750,15 +757,15 @@ class Camera:
 
     def _warn_of_uncovered(self, integrator: Integrator) -> None:
         """Warn of sites outside the image, which are dark whatever the scene is."""
-        n_lost = integrator.sites_outside_image_circle.size
-        if n_lost:
+        n_outside = integrator.sites_outside_image_circle.size
+        if n_outside:
             warnings.warn(
-                f"{n_lost:,} of {self._layout.n_sites:,} photosites lie outside the image circle of the lens and are dark; "
+                f"{n_outside:,} of {self._layout.n_sites:,} photosites lie outside the image circle of the lens and are dark; "
                 "shrink or move the layout, or use a lens model with a larger field",
                 CoverageWarning,
                 stacklevel=4,
             )
-        n_uncovered = int(np.count_nonzero(integrator.uncovered_um2)) - n_lost
+        n_uncovered = int(np.count_nonzero(integrator.uncovered_um2)) - n_outside
         if n_uncovered:
             x_min, y_min, x_max, y_max = integrator.grid.bounds_um
             left, bottom, right, top = self._layout.bounds_um
@@ -775,10 +782,10 @@ class Camera:
         """Return each filter's relative response to an equal-energy spectrum, as a code."""
         width_nm = light.band_width_nm if isinstance(light, Scene) else np.ones(light.wavelength_nm.size)
         response = self._sensor.responsivity_e_per_j(light.wavelength_nm) @ width_nm
-        highest = float(response.max(initial=0.0))
-        if highest == 0.0:
+        max_response = float(response.max(initial=0.0))
+        if max_response == 0.0:
             return np.ones(response.size)
-        return np.maximum(response / highest, DIMMEST_WHITE) * (2**self._sensor.bits - 1)
+        return np.maximum(response / max_response, MIN_WHITE_FRACTION) * (2**self._sensor.bits - 1)
 
 
 class _WeightedMap(NamedTuple):
@@ -806,7 +813,7 @@ class _Clock:
         for name, s in other.stage_s.items():
             self.stage_s[name] = self.stage_s.get(name, 0.0) + s
 
-    def so_far(self) -> _Clock:
+    def take(self) -> _Clock:
         """Return the seconds since the last call, and reset."""
         before = _Clock()
         before.stage_s, self.stage_s = self.stage_s, {}
@@ -817,23 +824,23 @@ class _Task(NamedTuple):
     """One frame of a video, with the cache of its images."""
 
     light: Scene | PowerMap
-    place_um: Place
-    images: KeptImages | None
+    position_um: Position
+    images: ImageCache | None
     is_repeated: bool
 
 
-def _tasks(frames: Iterable[Light]) -> Iterator[_Task]:
+def _tasks(frames: Iterable[Frame]) -> Iterator[_Task]:
     """Yield the frames as tasks; frames of one scene with positions share their images."""
     before: _Task | None = None
     for frame in frames:
-        light, place_um = _parts(frame)
+        light, position_um = _split_frame(frame)
         is_same = before is not None and light is before.light
-        images: KeptImages | None = None
+        images: ImageCache | None = None
         if isinstance(frame, tuple) and isinstance(light, Scene):
-            is_kept = before is not None and is_same and before.images is not None
-            images = before.images if before is not None and is_kept else {}
-        is_repeated = before is not None and is_same and place_um == before.place_um
-        before = _Task(light, place_um, images, is_repeated)
+            is_cached = before is not None and is_same and before.images is not None
+            images = before.images if before is not None and is_cached else {}
+        is_repeated = before is not None and is_same and position_um == before.position_um
+        before = _Task(light, position_um, images, is_repeated)
         yield before
 
 
@@ -845,22 +852,22 @@ def _check_frames(frames: object) -> None:
         )
 
 
-def _place_settings(place_um: Place) -> dict[str, Any]:
+def _position_settings(position_um: Position) -> dict[str, Any]:
     """Return the sensor position as settings of a capture; nothing at the origin."""
-    return {"place_um": list(place_um)} if any(place_um) else {}
+    return {"place_um": list(position_um)} if any(position_um) else {}
 
 
-def _parts(frame: Light) -> tuple[Scene | PowerMap, Place]:
+def _split_frame(frame: Frame) -> tuple[Scene | PowerMap, Position]:
     """Return the source and the position of the sensor's centre in its image."""
     if not isinstance(frame, tuple):
         return frame, (0.0, 0.0)
-    place_um = finite_array("frames", frame[1], ndim=1) if len(frame) == 2 else np.zeros(0)
-    if place_um.size != 2:
+    position_um = finite_array("frames", frame[1], ndim=1) if len(frame) == 2 else np.zeros(0)
+    if position_um.size != 2:
         raise ParameterError("frames", "must be Scenes or PowerMaps, or pairs (light, (x_um, y_um))", frame)
-    return frame[0], (float(place_um[0]), float(place_um[1]))
+    return frame[0], (float(position_um[0]), float(position_um[1]))
 
 
-def _light_described(light: Scene | PowerMap) -> dict[str, object]:
+def _describe_light(light: Scene | PowerMap) -> dict[str, object]:
     if isinstance(light, PowerMap):
         return {"kind": "PowerMap", "grid": to_plain_data(light.grid), "wavelength_nm": light.wavelength_nm.tolist()}
     return {

@@ -99,9 +99,9 @@ class Capture:
 
     def __post_init__(self) -> None:
         n_filters = len(self.filter_names)
-        highest = 2 ** check_count("bits", self.bits, at_least=1, at_most=16) - 1
+        max_code = 2 ** check_count("bits", self.bits, at_least=1, at_most=16) - 1
         for name, shape, kinds, limit in (
-            ("code", (self.layout.n_sites,), "u", highest),
+            ("code", (self.layout.n_sites,), "u", max_code),
             ("electrons", (self.layout.n_sites,), "i", None),
             ("expected_e", (self.layout.n_sites,), "f", None),
             ("filter_of_site", (self.layout.n_sites,), "i", n_filters - 1),
@@ -201,31 +201,31 @@ class Capture:
         self._check_sensor(sensor)
         grid = raster_grid(self.layout, max_pixels) if grid is None else grid
         n_filters = len(self.filter_names)
-        is_own = self.filter_of_site == np.arange(n_filters)[:, np.newaxis]
+        is_in_filter = self.filter_of_site == np.arange(n_filters)[:, np.newaxis]
         is_fitted = method == "least_squares"
-        is_light = is_fitted or of == "light_e"
-        electronics = self._electronics(sensor) if is_light or per == "um2" else None
+        is_estimated = is_fitted or of == "light_e"
+        electronics = self._electronics(sensor) if is_estimated or per == "um2" else None
         values = np.asarray(self.code if of == "light_e" else getattr(self, of), dtype=np.float64)
         response = np.ones(self.layout.n_sites)
         if electronics is not None:
             response = self.layout.area_um2 * electronics.sensitivity
             e_per_dn = electrons_per_code(electronics) if of == "code" else np.ones(values.size)
             response = response * (np.mean(e_per_dn) / e_per_dn)
-            if is_light:
-                readings = self._readings(electronics, of)
-                values = readings.light_e / e_per_dn
+            if is_estimated:
+                estimates = self._estimates(electronics, of)
+                values = estimates.light_e / e_per_dn
                 if is_fitted:
-                    values[readings.is_saturated] = np.nan
-                    options = {"variance": readings.variance_e2 / e_per_dn**2, **options}
+                    values[estimates.is_saturated] = np.nan
+                    options = {"variance": estimates.variance_e2 / e_per_dn**2, **options}
         if is_fitted:
             scale = float(response.mean()) if per == "site" else 1.0
-            is_seen = is_own.any(axis=1)
-            channels = np.where(is_own[is_seen], values, np.nan)
+            is_present = is_in_filter.any(axis=1)
+            channels = np.where(is_in_filter[is_present], values, np.nan)
             found = least_squares(self.layout, channels, grid, response=response / scale, **options)
-            if is_seen.all():
+            if is_present.all():
                 return found
             data = np.zeros((n_filters, *grid.shape), np.float32) * found.data[:1]
-            data[is_seen] = found.data
+            data[is_present] = found.data
             return Picture(read_only(data), found.coverage, grid)
         values = values / (response if per == "um2" else 1.0)
         if method == "cells":
@@ -234,7 +234,7 @@ class Capture:
                 values = np.where(np.isnan(values), 0.0, values)
             return cells(self.layout, values, grid, **options)
         # A filter that no site has is black, as in cells.
-        channels = np.where(is_own, values, np.where(is_own.any(axis=1, keepdims=True), np.nan, 0.0))
+        channels = np.where(is_in_filter, values, np.where(is_in_filter.any(axis=1, keepdims=True), np.nan, 0.0))
         return methods[method](self.layout, channels, grid, **options)
 
     def signal_to_noise(self, *, sensor: Sensor | None = None) -> Floats:
@@ -274,7 +274,7 @@ class Capture:
         """Return the given sensor, or the one in the settings."""
         return Sensor.from_settings(self.layout, self.settings.get("sensor", {})) if sensor is None else sensor
 
-    def _readings(self, electronics: Sensor, of: str) -> SiteEstimates:
+    def _estimates(self, electronics: Sensor, of: str) -> SiteEstimates:
         exposure_s = float(self.settings.get("exposure_s", 0.0))
         if of in ("code", "light_e"):
             return estimate_from_code(self.code, electronics, exposure_s)
@@ -493,7 +493,7 @@ class Capture:
             xy_um, ring_offsets, site_offsets = (
                 arrays[f"{LAYOUT_GROUP}/{name}"][...] for name in ("xy_um", "ring_offsets", "site_offsets")
             )
-            columns = {str(name): arrays[place][...] for name, place in about["columns"].items()}
+            columns = {str(name): arrays[path][...] for name, path in about["columns"].items()}
             return cls(
                 layout=Layout(xy_um, ring_offsets, site_offsets, columns, json.loads(about["provenance"])),
                 **{name: arrays[name][...] for name in (*ARRAYS, "white_dn")},

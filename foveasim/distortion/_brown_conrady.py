@@ -11,7 +11,7 @@ import numpy as np
 
 from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Bools, Floats, check_number
-from foveasim.distortion._lens import Placed
+from foveasim.distortion._lens import LensBase
 from foveasim.distortion._registry import LENSES
 from foveasim.distortion._solve import smallest_roots
 
@@ -20,7 +20,7 @@ __all__ = ["BrownConrady"]
 #: Number of directions in which the fold radius is computed.
 N_DIRECTIONS = 720
 #: Points per work item of a thread.
-POINTS_A_PIECE = 50_000
+POINTS_PER_PIECE = 50_000
 #: Size of the table of start values for the inverse.
 START_POINTS = 4097
 #: Largest radius of the table of start values, in focal lengths: 89.4 degrees from the axis.
@@ -29,7 +29,7 @@ MAX_RADIUS = 100.0
 
 @LENSES.register("brown_conrady")
 @dataclass(frozen=True, kw_only=True)
-class BrownConrady(Placed):
+class BrownConrady(LensBase):
     """
     Radial and tangential distortion with up to eight coefficients.
 
@@ -86,7 +86,7 @@ class BrownConrady(Placed):
     def __post_init__(self) -> None:
         for name in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"):
             object.__setattr__(self, name, check_number(name, getattr(self, name)))
-        self._check_place()
+        self._check_position()
 
     def _radial(self, r2: Floats) -> tuple[Floats, Floats]:
         """Return the radial factor and its derivative with respect to r²."""
@@ -172,16 +172,16 @@ class BrownConrady(Placed):
         if math.isinf(ideal):
             return math.inf, math.inf
         angle_rad = 2.0 * math.pi * np.arange(N_DIRECTIONS) / N_DIRECTIONS
-        border = ideal * np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1)
-        return ideal, float(np.hypot(*self._map(border).T).min())
+        boundary = ideal * np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1)
+        return ideal, float(np.hypot(*self._map(boundary).T).min())
 
     def _is_inside(self, xy: Floats) -> Bools:
         """Return whether points lie within the fold."""
-        turn = np.arctan2(xy[:, 1], xy[:, 0]) / (2.0 * math.pi) * N_DIRECTIONS
-        low = np.floor(turn).astype(np.int64)
+        direction = np.arctan2(xy[:, 1], xy[:, 0]) / (2.0 * math.pi) * N_DIRECTIONS
+        low = np.floor(direction).astype(np.int64)
         # The fold is curved between two directions: compare with the larger radius, and check the determinant's sign.
-        most = np.maximum(self._fold[low % N_DIRECTIONS], self._fold[(low + 1) % N_DIRECTIONS])
-        return np.asarray((np.hypot(xy[:, 0], xy[:, 1]) <= most * (1.0 + 1e-3)) & (self._determinant(xy) > 0.0))
+        max_radius = np.maximum(self._fold[low % N_DIRECTIONS], self._fold[(low + 1) % N_DIRECTIONS])
+        return np.asarray((np.hypot(xy[:, 0], xy[:, 1]) <= max_radius * (1.0 + 1e-3)) & (self._determinant(xy) > 0.0))
 
     def _forward(self, xy: Floats) -> Floats:
         return np.where(self._is_inside(xy)[:, np.newaxis], self._map(xy), np.nan)
@@ -192,10 +192,8 @@ class BrownConrady(Placed):
         points = np.ascontiguousarray(xy)
         k = np.array([self.k1, self.k2, self.k3, self.k4, self.k5, self.k6])
         inverse = _kernels.brown_conrady_inverse
-        pieces = [points[i : i + POINTS_A_PIECE] for i in range(0, max(len(points), 1), POINTS_A_PIECE)]
-        found = parallel_map(
-            lambda p: inverse(p, k, self.p1, self.p2, self._fold, *self._ideal), pieces, thread_count()
-        )
+        pieces = [points[i : i + POINTS_PER_PIECE] for i in range(0, max(len(points), 1), POINTS_PER_PIECE)]
+        found = parallel_map(lambda p: inverse(p, k, self.p1, self.p2, self._fold, *self._ideal), pieces, thread_count())
         return np.concatenate(found) if len(found) > 1 else np.asarray(found[0])
 
     @cached_property

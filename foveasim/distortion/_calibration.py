@@ -78,16 +78,16 @@ def from_opencv(
     if k.size not in allowed:
         raise ParameterError("coefficients", f"must be {', '.join(map(str, allowed))} numbers", k.tolist())
     pixel_um = check_number("pixel_um", pixel_um, above=0.0)
-    place: dict[str, Any] = {
+    position: dict[str, Any] = {
         "focal_um": (matrix[0, 0] * pixel_um, matrix[1, 1] * pixel_um),
         "centre_um": _centre_um((matrix[0, 2], matrix[1, 2]), image_size, pixel_um),
     }
     if fisheye:
-        return PolynomialFisheye(k=k.tolist(), **place)
+        return PolynomialFisheye(k=k.tolist(), **position)
     values: dict[str, Any] = dict(zip(OPENCV_ORDER, k.tolist(), strict=False))
     # The tangential term along y changes its sign because y points up instead of down.
     values["p1"] = -values["p1"]
-    return BrownConrady(**values, **place)
+    return BrownConrady(**values, **position)
 
 
 def to_opencv(
@@ -224,7 +224,7 @@ def _from_matlab_fisheye(path: Path, keys: Mapping[str, Any], pixel_um: float, f
     return Scaramuzza(
         a=a.tolist(),
         pixel_um=pixel_um,
-        focal_um=_given(path, focal_um),
+        focal_um=_require_focal_um(path, focal_um),
         stretch=(matrix * np.array([[1.0, -1.0], [-1.0, 1.0]])).tolist(),
         centre_um=_centre_um((centre[0], centre[1]), (size[1], size[0]), pixel_um),
     )
@@ -250,13 +250,13 @@ def _from_ocamcalib(path: Path, text: str, pixel_um: float, focal_um: float | No
     return Scaramuzza(
         a=[direct[0], direct[2], direct[3], direct[4]],
         pixel_um=pixel_um,
-        focal_um=_given(path, focal_um),
+        focal_um=_require_focal_um(path, focal_um),
         stretch=[[1.0, -e], [-d, c]],
         centre_um=_centre_um((centre[1], centre[0]), (size[1], size[0]), pixel_um),
     )
 
 
-def _given(path: Path, focal_um: float | None) -> float:
+def _require_focal_um(path: Path, focal_um: float | None) -> float:
     if focal_um is None:
         raise ConfigError(path, "contains Scaramuzza's model, which has no focal length; pass 'focal_um'")
     return focal_um

@@ -11,7 +11,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from foveasim._core.validation import Floats, check_choice, check_number, finite_array
-from foveasim.distortion._lens import Placed
+from foveasim.distortion._lens import LensBase
 from foveasim.distortion._registry import LENSES
 from foveasim.distortion._solve import invert_monotonic, smallest_roots
 from foveasim.errors import ParameterError
@@ -20,12 +20,12 @@ __all__ = ["Fisheye", "PolynomialFisheye", "Scaramuzza"]
 
 Projection = Literal["equidistant", "equisolid", "stereographic", "orthographic"]
 #: Points within this normalised radius are scaled linearly, which avoids a division by 0.
-NEAR = 1e-12
+MIN_RADIUS = 1e-12
 #: Margin below 90° in radians, where the pinhole projection diverges.
-GRAZING = 1e-9
+ANGLE_MARGIN_RAD = 1e-9
 
 
-class _ByAngle(Placed):
+class _AngularLens(LensBase):
     """Base of models with an image height that depends only on the angle θ to the axis."""
 
     def _height(self, theta_rad: Floats) -> Floats:
@@ -38,12 +38,12 @@ class _ByAngle(Placed):
         raise NotImplementedError
 
     def _limits(self) -> tuple[float, float]:
-        most_rad = self._max_theta_rad()
-        ideal = math.inf if most_rad >= 0.5 * math.pi - GRAZING else math.tan(most_rad)
-        return ideal, self._highest
+        max_rad = self._max_theta_rad()
+        ideal = math.inf if max_rad >= 0.5 * math.pi - ANGLE_MARGIN_RAD else math.tan(max_rad)
+        return ideal, self._max_image_height
 
     @cached_property
-    def _highest(self) -> float:
+    def _max_image_height(self) -> float:
         """Image height at the largest angle."""
         return float(self._height(np.array([self._max_theta_rad()]))[0])
 
@@ -52,29 +52,29 @@ class _ByAngle(Placed):
         theta_rad = np.arctan(radius)
         is_inside = theta_rad <= self._max_theta_rad()
         height = self._height(np.where(is_inside, theta_rad, 0.0))
-        return _scaled(xy, radius, np.where(is_inside, height, np.nan), float(self._slope()))
+        return _scale_radially(xy, radius, np.where(is_inside, height, np.nan), float(self._slope()))
 
     def _backward(self, xy: Floats) -> Floats:
         radius = np.hypot(xy[:, 0], xy[:, 1])
-        is_inside = radius <= self._highest
+        is_inside = radius <= self._max_image_height
         theta_rad = self._theta_rad(np.where(is_inside, radius, 0.0))
-        return _scaled(xy, radius, np.where(is_inside, np.tan(theta_rad), np.nan), 1.0 / float(self._slope()))
+        return _scale_radially(xy, radius, np.where(is_inside, np.tan(theta_rad), np.nan), 1.0 / float(self._slope()))
 
     def _slope(self) -> float:
         """Return the derivative of the image height with respect to the angle at the axis."""
         return 1.0
 
 
-def _scaled(xy: Floats, radius: Floats, new_radius: Floats, slope: float) -> Floats:
+def _scale_radially(xy: Floats, radius: Floats, new_radius: Floats, slope: float) -> Floats:
     """Move points radially to new radii."""
-    is_near = radius < NEAR
-    scale = np.where(is_near, slope, new_radius / np.where(is_near, 1.0, radius))
+    is_central = radius < MIN_RADIUS
+    scale = np.where(is_central, slope, new_radius / np.where(is_central, 1.0, radius))
     return np.asarray(xy * scale[:, np.newaxis])
 
 
 @LENSES.register("fisheye")
 @dataclass(frozen=True, kw_only=True)
-class Fisheye(_ByAngle):
+class Fisheye(_AngularLens):
     """
     Fisheye lens with one of the classical projections.
 
@@ -109,7 +109,7 @@ class Fisheye(_ByAngle):
 
     def __post_init__(self) -> None:
         check_choice("projection", self.projection, get_args(Projection))
-        self._check_place()
+        self._check_position()
 
     def _height(self, theta_rad: Floats) -> Floats:
         match self.projection:
@@ -134,12 +134,12 @@ class Fisheye(_ByAngle):
                 return np.arcsin(height)
 
     def _max_theta_rad(self) -> float:
-        return 0.5 * math.pi - GRAZING
+        return 0.5 * math.pi - ANGLE_MARGIN_RAD
 
 
 @LENSES.register("polynomial_fisheye")
 @dataclass(frozen=True, kw_only=True)
-class PolynomialFisheye(_ByAngle):
+class PolynomialFisheye(_AngularLens):
     """
     Fisheye lens with an odd polynomial of the angle as image height.
 
@@ -173,7 +173,7 @@ class PolynomialFisheye(_ByAngle):
         if k.shape != (4,):
             raise ParameterError("k", "must be four numbers", self.k)
         object.__setattr__(self, "k", tuple(k.tolist()))
-        self._check_place()
+        self._check_position()
 
     @cached_property
     def _series(self) -> np.polynomial.Polynomial:
@@ -181,22 +181,22 @@ class PolynomialFisheye(_ByAngle):
         return np.polynomial.Polynomial([0, 1, 0, k[0], 0, k[1], 0, k[2], 0, k[3]])
 
     @cached_property
-    def _most_rad(self) -> float:
-        return min(float(smallest_roots(self._series.deriv().coef)[0]), 0.5 * math.pi - GRAZING)
+    def _max_angle_rad(self) -> float:
+        return min(float(smallest_roots(self._series.deriv().coef)[0]), 0.5 * math.pi - ANGLE_MARGIN_RAD)
 
     def _max_theta_rad(self) -> float:
-        return self._most_rad
+        return self._max_angle_rad
 
     def _height(self, theta_rad: Floats) -> Floats:
         return np.asarray(self._series(theta_rad))
 
     def _theta_rad(self, height: Floats) -> Floats:
-        return invert_monotonic(self._series, self._series.deriv(), height, self._most_rad)
+        return invert_monotonic(self._series, self._series.deriv(), height, self._max_angle_rad)
 
 
 @LENSES.register("scaramuzza")
 @dataclass(frozen=True, kw_only=True)
-class Scaramuzza(_ByAngle):
+class Scaramuzza(_AngularLens):
     """
     Scaramuzza's omnidirectional camera model, as fitted by OCamCalib and MATLAB.
 
@@ -247,7 +247,7 @@ class Scaramuzza(_ByAngle):
         object.__setattr__(
             self, "focal_um", check_number("focal_um", self.focal_um, hint="use 'stretch' for unequal axes")
         )
-        self._check_place()
+        self._check_position()
 
     @cached_property
     def _matrix(self) -> Floats:
@@ -276,8 +276,8 @@ class Scaramuzza(_ByAngle):
 
     def _max_theta_rad(self) -> float:
         if math.isinf(self._max_height):
-            return 0.5 * math.pi - GRAZING
-        return min(float(self._angle_rad(np.array([self._max_height]))[0]), 0.5 * math.pi - GRAZING)
+            return 0.5 * math.pi - ANGLE_MARGIN_RAD
+        return min(float(self._angle_rad(np.array([self._max_height]))[0]), 0.5 * math.pi - ANGLE_MARGIN_RAD)
 
     def _angle_rad(self, height: Floats) -> Floats:
         return np.asarray(np.arctan2(height, self._depth(height)))
@@ -293,8 +293,8 @@ class Scaramuzza(_ByAngle):
         upper = self._max_height
         if math.isinf(upper):  # without a limit, double until the height covers the largest angle
             upper = 1.0
-            most_rad = float(np.max(theta_rad, initial=0.0))
-            while float(self._angle_rad(np.array([upper]))[0]) < most_rad and upper < 1e12:
+            max_rad = float(np.max(theta_rad, initial=0.0))
+            while float(self._angle_rad(np.array([upper]))[0]) < max_rad and upper < 1e12:
                 upper *= 2.0
         return invert_monotonic(self._angle_rad, self._angle_slope, theta_rad, upper)
 
@@ -304,6 +304,6 @@ class Scaramuzza(_ByAngle):
     def _backward(self, xy: Floats) -> Floats:
         plain = xy @ np.linalg.inv(self._matrix).T
         radius = np.hypot(plain[:, 0], plain[:, 1])
-        is_inside = radius <= self._highest
+        is_inside = radius <= self._max_image_height
         theta_rad = self._theta_rad(np.where(is_inside, radius, 0.0))
-        return _scaled(plain, radius, np.where(is_inside, np.tan(theta_rad), np.nan), 1.0 / self._slope())
+        return _scale_radially(plain, radius, np.where(is_inside, np.tan(theta_rad), np.nan), 1.0 / self._slope())

@@ -19,9 +19,9 @@ MAX_MOVES = 30
 #: Residuals relative to the distance from the centre: the level of rounding errors, and the tolerance of a solution.
 RESIDUAL, SOLVED = 1e-15, 1e-12
 #: Number of preceding points that are compared, to reuse the result of an equal point.
-LOOK_BACK = 8
+N_COMPARED = 8
 #: Shorter steps cannot reduce a squared residual below this multiple of the squared rounding error.
-NEARLY = 1e4
+ROUNDING_FACTOR = 1e4
 #: Relative size of the last Newton step: convergence is quadratic, so the remaining error is the square of this fraction.
 LAST_STEP = 1e-9
 #: Relative margin of the fold radius between the sampled directions.
@@ -51,8 +51,8 @@ def _is_inside(x, y, determinant, fold, min_fold):
     radius = np.sqrt(x * x + y * y)
     if radius <= min_fold:
         return True
-    turn = np.arctan2(y, x) / (2.0 * np.pi) * fold.size
-    low = int(np.floor(turn))
+    direction = np.arctan2(y, x) / (2.0 * np.pi) * fold.size
+    low = int(np.floor(direction))
     # The fold is curved between two directions: compare with the larger radius; the determinant is positive.
     return radius <= max(fold[low % fold.size], fold[(low + 1) % fold.size]) * (1.0 + FOLD_MARGIN)
 
@@ -76,16 +76,16 @@ def brown_conrady_inverse(xy, k, p1, p2, fold, ideal, per_step):
         u, v = xy[i, 0], xy[i, 1]
         # Adjacent sites of a layout share corners.
         same = -1
-        for j in range(max(i - LOOK_BACK, 0), i):
+        for j in range(max(i - N_COMPARED, 0), i):
             if xy[j, 0] == u and xy[j, 1] == v:
                 same = j
         if same >= 0:
             found[i, 0], found[i, 1] = found[same, 0], found[same, 1]
             continue
         distance = np.sqrt(u * u + v * v)
-        place = distance * per_step
-        at = int(min(place, float(last - 1)))
-        radius = ideal[at] + min(place - at, 1.0) * (ideal[at + 1] - ideal[at])
+        position = distance * per_step
+        at = int(min(position, float(last - 1)))
+        radius = ideal[at] + min(position - at, 1.0) * (ideal[at + 1] - ideal[at])
         scale = radius / distance if distance > 0.0 else 1.0
         # Tangential terms can move a start value near the fold beyond it.
         for _ in range(MAX_MOVES):
@@ -119,7 +119,7 @@ def brown_conrady_inverse(xy, k, p1, p2, fold, ideal, per_step):
                 ):
                     is_better = True
                     break
-                if error <= NEARLY * goal:  # at the level of rounding errors shorter steps do not help
+                if error <= ROUNDING_FACTOR * goal:  # at the level of rounding errors shorter steps do not help
                     break
                 length *= 0.5
             if not is_better:

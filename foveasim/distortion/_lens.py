@@ -11,7 +11,7 @@ from foveasim._core.rings import from_frame, to_frame
 from foveasim._core.validation import Floats, check_choice, check_length_um, finite_array
 from foveasim.errors import GeometryError, ParameterError
 
-__all__ = ["Lens", "Outside", "Placed"]
+__all__ = ["Lens", "LensBase", "Outside"]
 
 #: Treatment of points outside the valid radius of a lens: raise an error, or return NaN.
 Outside: TypeAlias = Literal["error", "mask"]
@@ -36,7 +36,7 @@ class Lens(Protocol):
         """Return ideal positions, (..., 2) µm, of real ones."""
 
 
-class Placed:
+class LensBase:
     """
     Base of lens models that are normalised by the focal length around a centre.
 
@@ -47,7 +47,7 @@ class Placed:
     focal_um: float | tuple[float, float]
     centre_um: tuple[float, float]
 
-    def _check_place(self) -> None:
+    def _check_position(self) -> None:
         focal = np.atleast_1d(finite_array("focal_um", self.focal_um, above=0.0))
         if focal.shape not in ((1,), (2,)):
             raise ParameterError("focal_um", "must be one number, or two (along x and y)", self.focal_um, "µm")
@@ -79,7 +79,7 @@ class Placed:
         GeometryError
             If a point lies outside the radius up to which the model is invertible, and ``outside`` is ``"error"``.
         """
-        return self._mapped(xy_um, self._forward, 0, outside)
+        return self._map_points(xy_um, self._forward, 0, outside)
 
     def undistort(self, xy_um: ArrayLike, *, outside: Outside = "error") -> Floats:
         """
@@ -96,14 +96,14 @@ class Placed:
         -------
         (..., 2) float64, µm
         """
-        return self._mapped(xy_um, self._backward, 1, outside)
+        return self._map_points(xy_um, self._backward, 1, outside)
 
     @property
     def max_radius_um(self) -> tuple[float, float]:
         """Largest valid radii of ``distort`` and ``undistort``, µm; may be infinite."""
         ideal, real = self._limits()
-        least_um = float(np.min(self.focal_um))
-        return ideal * least_um, real * least_um
+        min_um = float(np.min(self.focal_um))
+        return ideal * min_um, real * min_um
 
     def _forward(self, xy: Floats) -> Floats:
         raise NotImplementedError
@@ -114,7 +114,7 @@ class Placed:
     def _limits(self) -> tuple[float, float]:
         raise NotImplementedError
 
-    def _mapped(self, xy_um: ArrayLike, function: object, which: int, outside: Outside) -> Floats:
+    def _map_points(self, xy_um: ArrayLike, function: object, which: int, outside: Outside) -> Floats:
         check_choice("outside", outside, get_args(Outside))
         points = finite_array("xy_um", xy_um)
         if points.ndim == 0 or points.shape[-1] != 2:
@@ -123,12 +123,12 @@ class Placed:
         focal = np.broadcast_to(np.asarray(self.focal_um), (2,))
         normalised = to_frame(points.reshape(-1, 2), centre, focal)
         mapped: Floats = function(normalised)  # type: ignore[operator]
-        is_lost = np.isnan(mapped[:, 0]) if outside == "error" else np.zeros(1, bool)
-        if is_lost.any():
-            at = np.hypot(*(normalised[is_lost] * focal).T).min()
+        is_outside = np.isnan(mapped[:, 0]) if outside == "error" else np.zeros(1, bool)
+        if is_outside.any():
+            at = np.hypot(*(normalised[is_outside] * focal).T).min()
             limit = self.max_radius_um[which]
             raise GeometryError(
-                f"{int(is_lost.sum())} points cannot be {('distorted', 'undistorted')[which]}: the nearest lies {at:.6g} µm "
+                f"{int(is_outside.sum())} points cannot be {('distorted', 'undistorted')[which]}: the nearest lies {at:.6g} µm "
                 f"from the lens centre, and the model is valid up to {limit:.6g} µm; use points within, or outside='mask'"
             )
         return from_frame(mapped, centre, focal).reshape(points.shape)

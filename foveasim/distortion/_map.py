@@ -21,13 +21,13 @@ MAX_ORDER = 5
 #: Memory limit: strong distortion can map the boundary to infinity.
 MAX_CELLS = 2**28
 #: Cells that are interpolated at once, a memory limit.
-CELLS_A_PIECE = 2**20
+CELLS_PER_PIECE = 2**20
 #: Sample points of the boundary: per cell, and minimum per side.
-POINTS_A_CELL, MIN_POINTS = 1, 256
+POINTS_PER_CELL, MIN_POINTS = 1, 256
 #: Tolerance for rounding errors of positions on cell edges, in cells.
-ON_EDGE = 1e-6
+EDGE_TOLERANCE = 1e-6
 #: Step of the finite differences for cells that extend beyond the image circle, in cells.
-STEP = 1e-3
+DIFFERENCE_STEP = 1e-3
 
 
 def distort_map(
@@ -98,7 +98,7 @@ def distort_map(
         raise ParameterError("grid", f"must have at most {MAX_CELLS} cells", grid.shape, hint="reduce its shape")
     coefficients = [_spline(band, order) for band in power_map.data]
     data = np.empty((len(coefficients), *grid.shape), power_map.data.dtype)
-    n_rows = max(CELLS_A_PIECE // grid.shape[1], 1)
+    n_rows = max(CELLS_PER_PIECE // grid.shape[1], 1)
     for first in range(0, grid.shape[0], n_rows):
         rows = slice(first, min(first + n_rows, grid.shape[0]))
         pixel, gain = _source_coordinates(grid, rows, power_map.grid, lens, conserve)
@@ -110,23 +110,23 @@ def distort_map(
 def _bounding_grid(grid: Grid, lens: Any) -> Grid:
     """Return the smallest aligned grid of equal pitch around the distorted map."""
     x0, y0, x1, y1 = grid.bounds_um
-    n_y, n_x = (max(POINTS_A_CELL * n, MIN_POINTS) + 1 for n in grid.shape)
+    n_y, n_x = (max(POINTS_PER_CELL * n, MIN_POINTS) + 1 for n in grid.shape)
     x, y = np.linspace(x0, x1, n_x), np.linspace(y0, y1, n_y)
-    border = np.concatenate(
+    boundary = np.concatenate(
         [np.stack(np.broadcast_arrays(*side), axis=1) for side in ((x, y0), (x, y1), (x0, y), (x1, y))]
     )
-    real = lens.distort(border, outside="mask")
-    is_lost = np.isnan(real).any(axis=1)
-    corners = real[~is_lost]
-    if is_lost.any():
+    real = lens.distort(boundary, outside="mask")
+    is_outside = np.isnan(real).any(axis=1)
+    corners = real[~is_outside]
+    if is_outside.any():
         # Part of the boundary lies beyond the fold: the distorted map fills the image circle.
         radius_um, centre = lens.max_radius_um[1], np.asarray(lens.centre_um)
         corners = np.concatenate((corners, [centre - radius_um, centre + radius_um]))
     low, high = corners.min(axis=0), corners.max(axis=0)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise ParameterError("grid", "must be specified, because the lens maps the map boundary to infinity")
-    first = np.floor((low - (x0, y0)) / grid.pitch_xy_um + ON_EDGE)
-    last = np.ceil((high - (x0, y0)) / grid.pitch_xy_um - ON_EDGE)
+    first = np.floor((low - (x0, y0)) / grid.pitch_xy_um + EDGE_TOLERANCE)
+    last = np.ceil((high - (x0, y0)) / grid.pitch_xy_um - EDGE_TOLERANCE)
     n_x, n_y = (int(n) for n in np.maximum(last - first, 1))
     if n_x * n_y > MAX_CELLS:
         raise ParameterError(
@@ -154,11 +154,11 @@ def _interpolate(image: Images, pixel: Floats, order: int) -> Floats:
     from scipy.ndimage import map_coordinates
 
     n = np.array(image.shape)[:, np.newaxis, np.newaxis]
-    is_on = ((pixel >= -0.5 - ON_EDGE) & (pixel <= n - 0.5 + ON_EDGE)).all(axis=0)
-    inside = np.where(is_on, pixel, 0.0)
-    values = np.empty(is_on.shape)
+    is_on_map = ((pixel >= -0.5 - EDGE_TOLERANCE) & (pixel <= n - 0.5 + EDGE_TOLERANCE)).all(axis=0)
+    inside = np.where(is_on_map, pixel, 0.0)
+    values = np.empty(is_on_map.shape)
     map_coordinates(image, inside, values, order, mode="reflect", prefilter=False)  # type: ignore[call-overload]
-    return np.where(is_on, values, 0.0)
+    return np.where(is_on_map, values, 0.0)
 
 
 def _source_coordinates(
@@ -169,8 +169,8 @@ def _source_coordinates(
 
     Positions are in rows and columns of the source cells.
     """
-    middles = np.stack(np.meshgrid(grid.x_um, grid.y_um[rows]), axis=-1)
-    ideal = lens.undistort(middles, outside="mask")
+    centres = np.stack(np.meshgrid(grid.x_um, grid.y_um[rows]), axis=-1)
+    ideal = lens.undistort(centres, outside="mask")
     cell = (ideal - source.origin_um) / source.pitch_xy_um - 0.5
     pixel = np.stack([cell[..., 1], cell[..., 0]])
     if conserve == "density":
@@ -181,7 +181,7 @@ def _source_coordinates(
     area_um2 = 0.5 * np.abs(rising[..., 0] * falling[..., 1] - rising[..., 1] * falling[..., 0])
     gain = area_um2 / grid.cell_area_um2
     is_rim = np.isnan(gain) & ~np.isnan(ideal).any(axis=-1)
-    gain[is_rim] = _determinant(lens, middles[is_rim], ideal[is_rim], STEP * grid.pitch_xy_um)
+    gain[is_rim] = _determinant(lens, centres[is_rim], ideal[is_rim], DIFFERENCE_STEP * grid.pitch_xy_um)
     return pixel, np.nan_to_num(gain, nan=0.0)
 
 

@@ -13,8 +13,8 @@ __all__ = ["invert_monotonic", "smallest_roots"]
 
 #: Maximum number of bracketed Newton steps; bisection alone needs 60.
 MAX_STEPS = 100
-#: Largest ratio of imaginary and absolute value of a real root; roots above 1 / TINY are ignored.
-REAL, TINY = 1e-9, 1e-12
+#: Largest ratio of imaginary and absolute value of a real root; roots above 1 / MIN_RECIPROCAL are ignored.
+IMAGINARY_TOLERANCE, MIN_RECIPROCAL = 1e-9, 1e-12
 
 
 def invert_monotonic(
@@ -56,6 +56,6 @@ def smallest_roots(coefficients: Any) -> Floats:
     companion[:, np.arange(1, degree), np.arange(degree - 1)] = 1.0
     companion[:, 0, :] = -table[:, 1:] / table[:, :1]
     reciprocal = np.linalg.eigvals(companion)
-    is_real = (np.abs(reciprocal.imag) <= REAL * np.abs(reciprocal)) & (reciprocal.real > TINY)
+    is_real = (np.abs(reciprocal.imag) <= IMAGINARY_TOLERANCE * np.abs(reciprocal)) & (reciprocal.real > MIN_RECIPROCAL)
     largest = np.where(is_real, reciprocal.real, 0.0).max(axis=1)
     return np.divide(1.0, largest, out=roots, where=largest > 0.0)

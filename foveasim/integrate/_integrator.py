@@ -122,15 +122,15 @@ class Integrator:
             outlines = UndistortedOutlines(layout, distortion, min(grid.pitch_x_um, grid.pitch_y_um))
         self._plan: Plan = compile_plan(outlines, layout.site_offsets.size - 1, grid, self.n_threads, self.order)
         # A lens preserves the winding: the undistorted image of a clockwise outline is also clockwise.
-        inside_out = np.flatnonzero(self._plan.area_um2 <= 0.0)
-        if inside_out.size:
+        clockwise = np.flatnonzero(self._plan.area_um2 <= 0.0)
+        if clockwise.size:
             raise GeometryError(
-                f"the outline of site {inside_out[0]} must be counter-clockwise with a positive area; use Layout.from_polygons",
-                tuple(int(i) for i in inside_out),
+                f"the outline of site {clockwise[0]} must be counter-clockwise with a positive area; use Layout.from_polygons",
+                tuple(int(i) for i in clockwise),
             )
         self._gain: Floats | None = None
-        if distortion is not None and (conserve == "density" or self._plan.is_lost.any()):
-            self._gain = np.where(self._plan.is_lost, 0.0, 1.0)
+        if distortion is not None and (conserve == "density" or self._plan.is_outside.any()):
+            self._gain = np.where(self._plan.is_outside, 0.0, 1.0)
             if conserve == "density":
                 self._gain *= (
                     site_area_um2(layout.xy_um, layout.ring_offsets, layout.site_offsets) / self._plan.area_um2
@@ -139,7 +139,7 @@ class Integrator:
     @property
     def sites_outside_image_circle(self) -> Ints:
         """Indices of sites outside the image circle of the lens, which receive no power."""
-        return np.flatnonzero(self._plan.is_lost)
+        return np.flatnonzero(self._plan.is_outside)
 
     def __repr__(self) -> str:
         return f"Integrator({self.n_sites} sites on {self.grid})"
@@ -164,7 +164,7 @@ class Integrator:
         )
         rest_um2 = np.clip(plan.area_um2 - plan.covered_um2, 0.0, plan.area_um2)
         rest_um2 = np.where(beyond_um > rounding_um, rest_um2, 0.0)
-        return read_only(np.where(plan.is_lost, plan.area_um2, rest_um2))
+        return read_only(np.where(plan.is_outside, plan.area_um2, rest_um2))
 
     def __call__(self, power_map: ArrayLike) -> Floats:
         """

@@ -37,9 +37,9 @@ __all__ = [
     "count_pieces",
     "gather",
     "measure_sites",
-    "place_cuts",
-    "place_spans",
     "scatter",
+    "sort_cuts",
+    "sort_spans",
     "trace_sites",
 ]
 
@@ -115,13 +115,13 @@ def _find_cell(head, recent, links, n_cells, row, column):
         here = links[here, 2]
     if links[here, 0] != column:
         before = here if links[here, 0] < column else END
-        behind = links[here, 1] if links[here, 0] < column else here
+        after = links[here, 1] if links[here, 0] < column else here
         here = n_cells
         links[here, 0] = column
-        links[here, 1] = behind
+        links[here, 1] = after
         links[here, 2] = before
-        if behind != END:
-            links[behind, 2] = here
+        if after != END:
+            links[after, 2] = here
         if before != END:
             links[before, 1] = here
         else:
@@ -180,11 +180,11 @@ def _trace_edge(
         left = ua if low == va else min(max(ua + (low - va) * slope, u_low), u_high)
         right = ub if high == vb else min(max(ua + (high - va) * slope, u_low), u_high)
         v_left = low - (row + 0.5)  # relative to the centre of the row
-        upwards = 1.0
+        direction = 1.0
         if left > right:
             left, right = right, left
             v_left = high - (row + 0.5)
-            upwards = -1.0
+            direction = -1.0
         if right > 0.0 or left == 0.0:  # pieces left of the map have no cell on their left
             rise = high - low
             climb[row - bottom, 0] += rise
@@ -214,9 +214,9 @@ def _trace_edge(
                 if column < n_x:
                     cover[cell, 1] += piece * (0.5 * (u + u_next) - column)
                 if moment.shape[0] > 0:
-                    middle = column + 0.5
-                    v, v_next = v_left + upwards * climbed, v_left + upwards * height
-                    _add_moments(moment[cell], u - middle, u_next - middle, v, v_next, piece)
+                    centre = column + 0.5
+                    v, v_next = v_left + direction * climbed, v_left + direction * height
+                    _add_moments(moment[cell], u - centre, u_next - centre, v, v_next, piece)
                 if is_last:
                     break
                 u = u_next
@@ -227,7 +227,7 @@ def _trace_edge(
 
 
 @njit(inline="always")
-def _grown(array, n_used, n_more):
+def _grow(array, n_used, n_more):
     """Return the array, or a longer copy if ``n_more`` further rows do not fit."""
     if n_used + n_more <= array.shape[0]:
         return array
@@ -300,7 +300,7 @@ def _write_row(first_cell, links, cover, climb, n_x, site, row, spans, n_spans, 
 
 
 @njit(inline="always")
-def _gradient_share(index, n):
+def _gradient_scale(index, n):
     """Return the reciprocal distance of the neighbours of the gradient; 0 along a single cell."""
     if n == 1:
         return 0.0
@@ -332,8 +332,8 @@ def _write_cuts(first_cell, links, moment, climb, n_y, n_x, site, row, cuts, mom
                 cuts[n_cuts, SITE] = site
                 cuts[n_cuts, ROW] = row
                 cuts[n_cuts, COLUMN] = c
-                moments[n_cuts, 0] = u_moment * _gradient_share(c, n_x)
-                moments[n_cuts, 1] = v_moment * _gradient_share(row, n_y)
+                moments[n_cuts, 0] = u_moment * _gradient_scale(c, n_x)
+                moments[n_cuts, 1] = v_moment * _gradient_scale(row, n_y)
                 n_cuts += 1
         tilt -= moment[here, 0]
         column = touched + 1
@@ -373,9 +373,9 @@ def measure_sites(xy, ring_offsets, site_offsets):
 @njit(
     types.int64[::1](_points, _ints, _floats, _floats, _points, _count),
 )
-def count_pieces(xy, ring_offsets, first, step, pieces_per_length, most):
+def count_pieces(xy, ring_offsets, first, step, pieces_per_length, max_pieces):
     """
-    Return the number of pieces of the edge after each vertex, (n,), from 1 to ``most``.
+    Return the number of pieces of the edge after each vertex, (n,), from 1 to ``max_pieces``.
 
     The number is the length of the edge times the piece density at its midpoint. The density (n_y, n_x) is sampled at the
     nearest point of a grid that starts at ``first`` with steps of ``step`` (x, y).
@@ -390,7 +390,7 @@ def count_pieces(xy, ring_offsets, first, step, pieces_per_length, most):
             y = int((0.5 * (xy[a, 1] + xy[b, 1]) - first[1]) / step[1] + 0.5)
             density = pieces_per_length[min(max(y, 0), n_y - 1), min(max(x, 0), n_x - 1)]
             length = np.hypot(xy[b, 0] - xy[a, 0], xy[b, 1] - xy[a, 1])
-            out[a] = min(max(np.ceil(length * density), 1.0), float(most))
+            out[a] = min(max(np.ceil(length * density), 1.0), float(max_pieces))
     return out
 
 
@@ -427,11 +427,11 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
     weights = np.empty(16 * n_sites + 64, np.float64)
     has_moments = order == 2
     n_cuts = 0
-    room = 0  # capacity for all cuts except those along horizontal edges
+    capacity = 0  # capacity for all cuts except those along horizontal edges
     if has_moments:
         first_ring, last_ring = site_offsets[0], site_offsets[n_sites]
-        room = n_x + _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x, n_y * n_sites)
-    cuts = np.empty((room, 3), np.int32)
+        capacity = n_x + _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x, n_y * n_sites)
+    cuts = np.empty((capacity, 3), np.int32)
     moments = np.empty((cuts.shape[0], 2), np.float64)
     n_spans = 0
     n_weights = 0
@@ -507,8 +507,8 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
                 )
                 a = b
         # A touched cell adds at most two spans, its own weight, and one weight of a run or the weights of a short run.
-        spans = _grown(spans, n_spans, 2 * n_cells)
-        weights = _grown(weights, n_weights, MIN_RUN * n_cells)
+        spans = _grow(spans, n_spans, 2 * n_cells)
+        weights = _grow(weights, n_weights, MIN_RUN * n_cells)
         for row in range(n_rows):
             n_spans, n_weights, area = _write_row(
                 head[row], links, cover, climb[row], n_x, site, bottom + row, spans, n_spans, weights, n_weights
@@ -517,8 +517,8 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
         if has_moments:
             for row in range(n_rows):
                 if n_cuts + n_x > cuts.shape[0]:
-                    cuts = _grown(cuts, n_cuts, n_x)
-                    moments = _grown(moments, n_cuts, n_x)
+                    cuts = _grow(cuts, n_cuts, n_x)
+                    moments = _grow(moments, n_cuts, n_x)
                 n_cuts = _write_cuts(
                     head[row], links, moment, climb[row], n_y, n_x, site, bottom + row, cuts, moments, n_cuts
                 )
@@ -528,7 +528,7 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
 @njit(
     types.void(_spans, _floats, _int_list, _int_list, _ints, _count, _span_list, _float_list),
 )
-def place_spans(spans, weights, next_span, next_weight, first_slot, rows_per_band, out_spans, out_weights):
+def sort_spans(spans, weights, next_span, next_weight, first_slot, rows_per_band, out_spans, out_weights):
     """
     Copy spans from site order into row order.
 
@@ -557,8 +557,8 @@ def place_spans(spans, weights, next_span, next_weight, first_slot, rows_per_ban
 @njit(
     types.void(_cuts, _points, _int_list, _ints, _count, _cut_list, _moment_list),
 )
-def place_cuts(cuts, moments, next_cut, first_slot, rows_per_band, out_cuts, out_moments):
-    """Copy cuts and their moments into row order, as :func:`place_spans`."""
+def sort_cuts(cuts, moments, next_cut, first_slot, rows_per_band, out_cuts, out_moments):
+    """Copy cuts and their moments into row order, as :func:`sort_spans`."""
     i = 0
     while i < cuts.shape[0]:
         site, row = cuts[i, SITE], cuts[i, ROW]

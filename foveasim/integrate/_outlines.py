@@ -17,7 +17,7 @@ __all__ = ["Outlines", "UndistortedOutlines", "outlines_of"]
 #: longer than a step of the grid below or need more than the maximum number of pieces.
 CHORD_TOLERANCE = 0.002
 #: Number of points along either axis of the layout at which the curvature of undistorted lines is sampled.
-BEND_POINTS = 65
+CURVATURE_POINTS = 65
 #: Maximum number of pieces per edge; edges that need more reach the boundary of the image circle.
 MAX_PIECES = 256
 
@@ -28,7 +28,7 @@ class Outlines(NamedTuple):
     xy_um: Floats
     ring_offsets: Ints
     site_offsets: Ints
-    is_lost: Bools
+    is_outside: Bools
 
 
 def outlines_of(layout: PackedRings, first: int, last: int) -> Outlines:
@@ -64,47 +64,49 @@ class UndistortedOutlines:
 
     def __init__(self, layout: PackedRings, lens: PointMap, pitch_um: float) -> None:
         self._layout, self._lens = layout, lens
-        self._bends = _Bends(layout.xy_um, lens, CHORD_TOLERANCE * pitch_um) if layout.xy_um.size else None
+        self._chord_density = (
+            _ChordDensity(layout.xy_um, lens, CHORD_TOLERANCE * pitch_um) if layout.xy_um.size else None
+        )
 
     def __call__(self, first: int, last: int) -> Outlines:
         """Return the outlines of the sites ``first`` to ``last - 1``."""
         outlines = outlines_of(self._layout, first, last)
-        return outlines if self._bends is None else _carried(outlines, self._lens, self._bends)
+        return outlines if self._chord_density is None else _undistort(outlines, self._lens, self._chord_density)
 
 
-def _carried(outlines: Outlines, lens: PointMap, bends: _Bends) -> Outlines:
+def _undistort(outlines: Outlines, lens: PointMap, chord_density: _ChordDensity) -> Outlines:
     """Return undistorted outlines."""
     xy_um, ring_offsets, site_offsets, _ = outlines
-    n_pieces = bends.n_pieces(xy_um, ring_offsets)
+    n_pieces = chord_density.n_pieces(xy_um, ring_offsets)
     points = xy_um
     if n_pieces.max() > 1:
         end = xy_um[next_vertex(ring_offsets)]
         # Interpolate from the lexicographically smaller vertex, so that adjacent sites split a shared edge identically.
-        is_turned = (end[:, 0] < xy_um[:, 0]) | ((end[:, 0] == xy_um[:, 0]) & (end[:, 1] < xy_um[:, 1]))
-        low, high = np.where(is_turned[:, np.newaxis], end, xy_um), np.where(is_turned[:, np.newaxis], xy_um, end)
+        is_reversed = (end[:, 0] < xy_um[:, 0]) | ((end[:, 0] == xy_um[:, 0]) & (end[:, 1] < xy_um[:, 1]))
+        low, high = np.where(is_reversed[:, np.newaxis], end, xy_um), np.where(is_reversed[:, np.newaxis], xy_um, end)
         edge = np.repeat(np.arange(xy_um.shape[0]), n_pieces)
         step = positions_in_runs(n_pieces)
-        share = np.where(is_turned[edge], n_pieces[edge] - step, step) / n_pieces[edge]
-        points = low[edge] + share[:, np.newaxis] * (high - low)[edge]
+        fraction = np.where(is_reversed[edge], n_pieces[edge] - step, step) / n_pieces[edge]
+        points = low[edge] + fraction[:, np.newaxis] * (high - low)[edge]
         points[step == 0] = xy_um
         ring_offsets = np.concatenate(([0], np.cumsum(n_pieces)))[ring_offsets]
-    carried = lens.undistort(points, outside="mask")
-    is_lost = np.logical_or.reduceat(np.isnan(carried[:, 0]), ring_offsets[site_offsets[:-1]])
-    if is_lost.any():
-        is_of_lost = np.repeat(is_lost, np.diff(ring_offsets[site_offsets]))
-        carried = np.where(is_of_lost[:, np.newaxis], points, carried)
-    return Outlines(carried, ring_offsets, site_offsets, is_lost)
+    undistorted = lens.undistort(points, outside="mask")
+    is_outside = np.logical_or.reduceat(np.isnan(undistorted[:, 0]), ring_offsets[site_offsets[:-1]])
+    if is_outside.any():
+        is_outside_vertex = np.repeat(is_outside, np.diff(ring_offsets[site_offsets]))
+        undistorted = np.where(is_outside_vertex[:, np.newaxis], points, undistorted)
+    return Outlines(undistorted, ring_offsets, site_offsets, is_outside)
 
 
-class _Bends:
+class _ChordDensity:
     """Number of chords per length of edges, sampled on a coarse grid over a layout."""
 
     def __init__(self, xy_um: Floats, lens: PointMap, chord_um: float) -> None:
         self._first_um = np.array([xy_um[:, i].min() for i in (0, 1)])
         size_um = np.array([xy_um[:, i].max() for i in (0, 1)]) - self._first_um
-        self._step_um = np.maximum(size_um, chord_um) / (BEND_POINTS - 1)
+        self._step_um = np.maximum(size_um, chord_um) / (CURVATURE_POINTS - 1)
         # A chord of length L deviates by L² / 8 times the second derivative.
-        self._pieces_per_um = np.sqrt(_bends(self._first_um, self._step_um, lens) / (8.0 * chord_um))
+        self._pieces_per_um = np.sqrt(_max_curvature(self._first_um, self._step_um, lens) / (8.0 * chord_um))
 
     def n_pieces(self, xy_um: Floats, ring_offsets: Ints) -> Ints:
         """Return the number of pieces of every edge, in the order of the first vertices."""
@@ -114,7 +116,7 @@ class _Bends:
         return count(xy_um, ring_offsets, self._first_um, self._step_um, self._pieces_per_um, MAX_PIECES)
 
 
-def _bends(first_um: Floats, step_um: Floats, lens: PointMap) -> Floats:
+def _max_curvature(first_um: Floats, step_um: Floats, lens: PointMap) -> Floats:
     """
     Return the largest second derivative of the undistorted position, 1/µm.
 
@@ -123,14 +125,14 @@ def _bends(first_um: Floats, step_um: Floats, lens: PointMap) -> Floats:
     from scipy.ndimage import maximum_filter
 
     # One additional point on every side for the finite differences.
-    x, y = (first_um[i] + step_um[i] * np.arange(-1, BEND_POINTS + 1) for i in (0, 1))
-    carried = lens.undistort(np.stack(np.meshgrid(x, y), axis=-1), outside="mask")
-    inner = carried[1:-1, 1:-1]
-    xx = (carried[1:-1, 2:] - 2.0 * inner + carried[1:-1, :-2]) / step_um[0] ** 2
-    yy = (carried[2:, 1:-1] - 2.0 * inner + carried[:-2, 1:-1]) / step_um[1] ** 2
-    mixed = carried[2:, 2:] - carried[2:, :-2] - carried[:-2, 2:] + carried[:-2, :-2]
+    x, y = (first_um[i] + step_um[i] * np.arange(-1, CURVATURE_POINTS + 1) for i in (0, 1))
+    undistorted = lens.undistort(np.stack(np.meshgrid(x, y), axis=-1), outside="mask")
+    inner = undistorted[1:-1, 1:-1]
+    xx = (undistorted[1:-1, 2:] - 2.0 * inner + undistorted[1:-1, :-2]) / step_um[0] ** 2
+    yy = (undistorted[2:, 1:-1] - 2.0 * inner + undistorted[:-2, 1:-1]) / step_um[1] ** 2
+    mixed = undistorted[2:, 2:] - undistorted[2:, :-2] - undistorted[:-2, 2:] + undistorted[:-2, :-2]
     xy = mixed / (4.0 * step_um[0] * step_um[1])
     # The second derivative along (c, s) is c² xx + 2 c s xy + s² yy.
     size = np.hypot(xx[..., 0], xx[..., 1]), np.hypot(yy[..., 0], yy[..., 1]), np.hypot(xy[..., 0], xy[..., 1])
-    bend = np.maximum(size[0], size[1]) + size[2]
-    return np.asarray(maximum_filter(np.nan_to_num(bend, nan=0.0), size=3, mode="nearest"))
+    curvature = np.maximum(size[0], size[1]) + size[2]
+    return np.asarray(maximum_filter(np.nan_to_num(curvature, nan=0.0), size=3, mode="nearest"))

@@ -57,7 +57,7 @@ class Plan:
         Area of each outline, and its area on the grid.
     bounds_um : (n_site, 4) float64, µm
         Bounds of each outline: x_min, y_min, x_max, y_max.
-    is_lost : (n_site,) bool
+    is_outside : (n_site,) bool
         Sites with a vertex outside the image circle.
     """
 
@@ -75,7 +75,7 @@ class Plan:
     area_um2: Floats
     covered_um2: Floats
     bounds_um: Floats
-    is_lost: Bools
+    is_outside: Bools
 
     def _pass(self, kernel: Callable[..., None], read: NDArray[Any], written: NDArray[Any], n_threads: int) -> None:
         """Run a kernel over all bands of rows, which write to disjoint elements."""
@@ -155,7 +155,7 @@ class Plan:
         return np.concatenate(weights), np.concatenate(sites), np.concatenate(cells)
 
 
-class _Traced(NamedTuple):
+class _TracedSites(NamedTuple):
     """Traced spans and cuts of sites (see ``_kernels``), and their numbers per row."""
 
     spans: NDArray[np.int32]
@@ -168,7 +168,7 @@ class _Traced(NamedTuple):
     area_um2: Floats
     covered_um2: Floats
     bounds_um: Floats
-    is_lost: Bools
+    is_outside: Bools
 
 
 def compile_plan(
@@ -184,7 +184,7 @@ def compile_plan(
 
     n_y = grid.shape[0]
     traced = parallel_map(
-        lambda first: _traced(outlines(first, min(first + SITES_PER_PIECE, n_sites)), first, grid, order),
+        lambda first: _trace(outlines(first, min(first + SITES_PER_PIECE, n_sites)), first, grid, order),
         range(0, n_sites, SITES_PER_PIECE),
         n_threads,
     )
@@ -208,12 +208,12 @@ def compile_plan(
     out_moments = np.empty((int(row_cuts[-1]), 2))
     slot_of_band_0 = first_slot[:-1] - first_row // rows_per_band
 
-    def place(i: int) -> None:
+    def sort(i: int) -> None:
         t, slots = traced[i], (slot_of_band_0, rows_per_band)
-        _kernels.place_spans(t.spans, t.weights, next_span[i], next_weight[i], *slots, out_spans, out_weights)
-        _kernels.place_cuts(t.cuts, t.moments, next_cut[i], *slots, out_cuts, out_moments)
+        _kernels.sort_spans(t.spans, t.weights, next_span[i], next_weight[i], *slots, out_spans, out_weights)
+        _kernels.sort_cuts(t.cuts, t.moments, next_cut[i], *slots, out_cuts, out_moments)
 
-    parallel_map(place, range(len(traced)), n_threads)
+    parallel_map(sort, range(len(traced)), n_threads)
     return Plan(
         grid=grid,
         n_sites=n_sites,
@@ -229,11 +229,11 @@ def compile_plan(
         area_um2=np.concatenate([np.zeros(0), *(t.area_um2 for t in traced)]),
         covered_um2=np.concatenate([np.zeros(0), *(t.covered_um2 for t in traced)]),
         bounds_um=bounds_um,
-        is_lost=np.concatenate([np.zeros(0, bool), *(t.is_lost for t in traced)]),
+        is_outside=np.concatenate([np.zeros(0, bool), *(t.is_outside for t in traced)]),
     )
 
 
-def _traced(outlines: Outlines, first_site: int, grid: Grid, order: int) -> _Traced:
+def _trace(outlines: Outlines, first_site: int, grid: Grid, order: int) -> _TracedSites:
     """Trace the sites from the index ``first_site`` on."""
     from foveasim.integrate import _kernels
 
@@ -243,7 +243,7 @@ def _traced(outlines: Outlines, first_site: int, grid: Grid, order: int) -> _Tra
     uv = to_frame(outlines.xy_um, grid.origin_um, grid.pitch_xy_um)
     spans, weights, cuts, moments, covered = _kernels.trace_sites(uv, *rings, first_site, n_y, n_x, order)
     n_weights = spans[:, _kernels.N_PARTIAL] + (spans[:, _kernels.N_RUN] > 0)
-    return _Traced(
+    return _TracedSites(
         spans,
         weights,
         cuts,
@@ -254,7 +254,7 @@ def _traced(outlines: Outlines, first_site: int, grid: Grid, order: int) -> _Tra
         area_um2=area_um2,
         covered_um2=covered * grid.cell_area_um2,
         bounds_um=bounds_um,
-        is_lost=outlines.is_lost,
+        is_outside=outlines.is_outside,
     )
 
 

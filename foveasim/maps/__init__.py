@@ -32,7 +32,7 @@ from foveasim._io.formats import as_file_error, detect_format, select_writer
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Pitch, PowerMap
 from foveasim.maps import _dataset, _exr, _fits, _isetcam, _npy, _tiff  # noqa: F401 -- they register their formats
-from foveasim.maps._common import Found, Given, finished
+from foveasim.maps._common import Found, Given, to_power_map
 from foveasim.maps._formats import MAP_FORMATS, read_found
 from foveasim.maps._units import Unit
 from foveasim.maps._xarray import from_xarray, to_xarray
@@ -114,7 +114,7 @@ def read_power_map(
         kind, _ = detect_format(path, MAP_FORMATS, "power map")
         found = read_found(path, kind, name)
         freeze(found.data)
-        return finished(found, given)
+        return to_power_map(found, given)
 
 
 def write_power_map(power_map: PowerMap, path: str | Path) -> None:

@@ -21,7 +21,7 @@ from foveasim._core.validation import (
 from foveasim._io.formats import FormatError
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, Pitch, PowerMap, with_ascending_axes
-from foveasim.maps._units import PER_NM, UNITS, Unit, light_unit, per_band_w_m2
+from foveasim.maps._units import PER_NM, UNITS, Unit, irradiance_unit, per_band_w_m2
 
 __all__ = [
     "Found",
@@ -29,21 +29,21 @@ __all__ = [
     "as_images",
     "check_numbers",
     "check_size",
-    "finished",
     "max_decompressed_bytes",
     "pitch_of_axes",
+    "to_power_map",
 ]
 
 MAX_DECOMPRESSED_BYTES = 8 * 2**30
 #: Limit of the decompressed size: a constant plus a factor of the file size.
-MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE = 2**28, 256
+MIN_DECOMPRESSED_BYTES, DECOMPRESSED_PER_BYTE = 2**28, 256
 MAX_BANDS = 4096
 #: Relative tolerance of uniform steps: coordinates may be float32.
-UNEVEN = 1e-4
+STEP_TOLERANCE = 1e-4
 #: Relative tolerance of square cells: rounding error of a pitch from float32 coordinates.
-SQUARE = 1e-6
+SQUARE_TOLERANCE = 1e-6
 #: Largest negative value relative to the maximum: rounding error of Fourier transforms in float32.
-DARKEST = 1e-5
+NEGATIVE_TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,7 +55,7 @@ class Found:
     ----------
     data : (n_y, n_x) or (n_band, n_y, n_x)
         Values of any numeric dtype, rows and columns in file order.
-    is_y_falling, is_x_falling : bool
+    is_y_descending, is_x_descending : bool
         Whether the first row is the top row, and the first column the rightmost column.
     pitch_um : (along x, along y), µm
     origin_um : (x0, y0), µm
@@ -65,8 +65,8 @@ class Found:
     """
 
     data: NDArray[Any]
-    is_y_falling: bool = False
-    is_x_falling: bool = False
+    is_y_descending: bool = False
+    is_x_descending: bool = False
     pitch_um: tuple[float, float] | None = None
     origin_um: tuple[float, float] | None = None
     wavelength_nm: Sequence[float] | None = None
@@ -100,7 +100,7 @@ class Given:
 
 def max_decompressed_bytes(n_bytes: int) -> int:
     """Return the limit of the decompressed size of a file of ``n_bytes``."""
-    return min(MIN_UNPACKED_BYTES + UNPACKED_PER_BYTE * n_bytes, MAX_DECOMPRESSED_BYTES)
+    return min(MIN_DECOMPRESSED_BYTES + DECOMPRESSED_PER_BYTE * n_bytes, MAX_DECOMPRESSED_BYTES)
 
 
 def check_size(shape: Sequence[int], itemsize: int, n_bytes: int) -> None:
@@ -142,13 +142,13 @@ def pitch_of_axes(x: Floats, y: Floats) -> tuple[float | None, float | None]:
         step = float((along[-1] - along[0]) / (along.size - 1))
         # Coordinates far from 0 that were rounded to float32 also have non-uniform steps.
         rounding = 4.0 * float(np.spacing(np.float32(np.abs(along).max())))
-        if step == 0.0 or np.abs(np.diff(along) - step).max() > UNEVEN * abs(step) + rounding:
+        if step == 0.0 or np.abs(np.diff(along) - step).max() > STEP_TOLERANCE * abs(step) + rounding:
             raise FormatError(f"has non-uniform steps along {name}; resample it to equal cells")
         steps.append(step)
     return steps[0], steps[1]
 
 
-def finished(found: Found, given: Given) -> PowerMap:
+def to_power_map(found: Found, given: Given) -> PowerMap:
     """
     Return the validated map in W/m² per band.
 
@@ -164,12 +164,12 @@ def finished(found: Found, given: Given) -> PowerMap:
     waves_nm = _wavelengths_nm(images, found, given)
     data = _in_w_m2(images, waves_nm, found, given)
     check_numbers(data)
-    is_y_falling = found.is_y_falling if given.top_row_first is None else given.top_row_first
+    is_y_descending = found.is_y_descending if given.top_row_first is None else given.top_row_first
     origin_um = (
         given.origin_um if given.origin_um is not None else None if given.pitch_um is not None else found.origin_um
     )
     return PowerMap.from_array(
-        with_ascending_axes(data, is_x_falling=found.is_x_falling, is_y_falling=is_y_falling),
+        with_ascending_axes(data, is_x_falling=found.is_x_descending, is_y_falling=is_y_descending),
         pitch_um=pitch_um,
         wavelength_nm=waves_nm,
         origin_um=origin_um,
@@ -214,7 +214,7 @@ def _pitch_um(found: Found, given: Given) -> Pitch:
         along_x, along_y = check_pitch_um("pitch_um", found.pitch_um)
     except ParameterError as error:
         raise FormatError(f"has a cell size outside the allowed range ({error})") from None
-    return along_x if abs(along_x - along_y) <= SQUARE * max(along_x, along_y) else (along_x, along_y)
+    return along_x if abs(along_x - along_y) <= SQUARE_TOLERANCE * max(along_x, along_y) else (along_x, along_y)
 
 
 def _wavelengths_nm(images: Images, found: Found, given: Given) -> Floats:
@@ -240,7 +240,7 @@ def _wavelengths_nm(images: Images, found: Found, given: Given) -> Floats:
 
 
 def _in_w_m2(images: Images, waves_nm: Floats, found: Found, given: Given) -> Images:
-    unit, size = (given.unit, 1.0) if given.unit is not None else _parsed_unit(found.unit)
+    unit, size = (given.unit, 1.0) if given.unit is not None else _parse_unit(found.unit)
     width_nm = _band_widths_nm(waves_nm, found, given) if unit in PER_NM else None
     factor = size * per_band_w_m2(unit, waves_nm, width_nm)
     if np.all(factor == 1.0):
@@ -252,11 +252,11 @@ def _in_w_m2(images: Images, waves_nm: Floats, found: Found, given: Given) -> Im
     return read_only(data)
 
 
-def _parsed_unit(text: str | None) -> tuple[Unit, float]:
+def _parse_unit(text: str | None) -> tuple[Unit, float]:
     choices = ", ".join(map(repr, UNITS))
     if text is None:
         raise FormatError(f"does not specify its unit; pass unit=..., one of {choices}")
-    unit = light_unit(text)
+    unit = irradiance_unit(text)
     if unit is None:
         raise FormatError(
             f"has the unit {text!r:.40}, which is not an irradiance; to override it pass unit=..., one of {choices}"
@@ -266,9 +266,9 @@ def _parsed_unit(text: str | None) -> tuple[Unit, float]:
 
 def _band_widths_nm(waves_nm: Floats, found: Found, given: Given) -> Floats:
     """Return the specified widths, or widths that extend halfway to the adjacent wavelengths."""
-    told = given.band_width_nm if given.band_width_nm is not None else found.band_width_nm
-    if told is not None:
-        width_nm = np.asarray(told, dtype=np.float64)
+    specified_nm = given.band_width_nm if given.band_width_nm is not None else found.band_width_nm
+    if specified_nm is not None:
+        width_nm = np.asarray(specified_nm, dtype=np.float64)
         if width_nm.shape not in ((), (1,), waves_nm.shape) or not np.all((width_nm > 0.0) & np.isfinite(width_nm)):
             rule = f"must be one positive number, or one for each of the {waves_nm.size} bands"
             if given.band_width_nm is None:
@@ -300,7 +300,7 @@ def check_numbers(data: Images) -> None:
         raise FormatError(
             f"irradiance must be finite, got {data[where]} at [band, row, column] = {[int(i) for i in where]}; replace it"
         )
-    if lowest < -DARKEST * max(highest, 0.0):
+    if lowest < -NEGATIVE_TOLERANCE * max(highest, 0.0):
         where = np.unravel_index(int(np.argmin(data)), data.shape)
         raise FormatError(
             f"irradiance must be >= 0, got {lowest:.6g} W/m² at [band, row, column] = {[int(i) for i in where]}; clip it"

@@ -65,7 +65,7 @@ NETCDF_BYTES = 2**16
 
 def write_netcdf(power_map: PowerMap, path: Path) -> None:
     """Write an uncompressed netCDF 4 file."""
-    _needs(path, "h5netcdf")
+    _require(path, "h5netcdf")
     # HDF5 crashes if the disk is full.
     check_free_space(path, power_map.data.nbytes + 8 * sum(power_map.data.shape) + NETCDF_BYTES)
     to_xarray(power_map).to_dataset().to_netcdf(path, engine="h5netcdf", encoding={NAME: {"_FillValue": None}})
@@ -80,11 +80,11 @@ def write_zarr(power_map: PowerMap, path: Path) -> None:
     FileError
         If zarr is missing, the path exists and is not a zarr directory, or it cannot be written.
     """
-    _needs(path, "zarr")
-    with atomic_directory(path, is_ours=is_zarr) as folder:
+    _require(path, "zarr")
+    with atomic_directory(path, is_ours=is_zarr) as directory:
         dataset = to_xarray(power_map).to_dataset()
         encoding: dict[str, dict[str, Any]] = {str(name): {"compressors": None} for name in dataset.variables}
-        dataset.to_zarr(folder, mode="w", encoding=encoding, consolidated=False, zarr_format=3)
+        dataset.to_zarr(directory, mode="w", encoding=encoding, consolidated=False, zarr_format=3)
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -102,7 +102,7 @@ def read_netcdf(path: Path, name: str | None) -> Found:
     with xr.open_dataset(
         path, engine="h5netcdf" if is_hdf5 else "scipy", decode_times=False, cache=False, **options
     ) as dataset:
-        return _found(dataset, name, path.stat().st_size)
+        return _read_dataset(dataset, name, path.stat().st_size)
 
 
 def read_zarr(path: Path, name: str | None) -> Found:
@@ -111,7 +111,7 @@ def read_zarr(path: Path, name: str | None) -> Found:
 
     n_bytes = _check_zarr(path)
     with xr.open_zarr(path, consolidated=False, chunks=None, decode_times=False) as dataset:
-        return _found(dataset, name, n_bytes)
+        return _read_dataset(dataset, name, n_bytes)
 
 
 def is_zarr(path: Path) -> bool:
@@ -119,15 +119,15 @@ def is_zarr(path: Path) -> bool:
     return path.is_dir() and any((path / name).is_file() for name in ZARR_FILES[:3])
 
 
-def _found(dataset: xr.Dataset, name: str | None, n_bytes: int) -> Found:
-    variable = dataset[_chosen(dataset, name)]
+def _read_dataset(dataset: xr.Dataset, name: str | None, n_bytes: int) -> Found:
+    variable = dataset[_select_variable(dataset, name)]
     check_size(variable.shape, variable.dtype.itemsize, n_bytes)
     for coordinate in variable.coords.values():
         check_size(coordinate.shape, coordinate.dtype.itemsize, n_bytes)
     return found_in_array(variable)
 
 
-def _chosen(dataset: xr.Dataset, name: str | None) -> str:
+def _select_variable(dataset: xr.Dataset, name: str | None) -> str:
     names = [str(n) for n in dataset.data_vars]
     if name is not None:
         if name not in names:
@@ -157,7 +157,7 @@ def _check_hdf5(path: Path) -> None:
 
     with h5py.File(path, "r") as file:
         groups, n_objects = [file["/"]], 0
-        seen = set()
+        visited = set()
         while groups:
             group = groups.pop()
             for key in group:
@@ -170,9 +170,9 @@ def _check_hdf5(path: Path) -> None:
                     )
                 part = group[key]
                 address = h5py.h5o.get_info(part.id).addr
-                if address in seen:
+                if address in visited:
                     continue
-                seen.add(address)
+                visited.add(address)
                 if isinstance(part, h5py.Group):
                     groups.append(part)
                 elif isinstance(part, h5py.Dataset) and (part.external or part.is_virtual):
@@ -191,20 +191,22 @@ def _check_zarr(path: Path) -> int:
         except (ValueError, RecursionError) as error:
             raise FormatError(f"has an invalid {found.name} ({error})") from None
     return sum(
-        (Path(folder) / file).stat().st_size for folder, _, files in os.walk(path, followlinks=False) for file in files
+        (Path(directory) / file).stat().st_size
+        for directory, _, files in os.walk(path, followlinks=False)
+        for file in files
     )
 
 
 def _metadata_files(path: Path) -> Iterator[Path]:
     """Yield the metadata files of directories that contain some, from the root downwards."""
-    folders = [path]
-    while folders:
-        folder = folders.pop()
-        here = [folder / name for name in ZARR_FILES if (folder / name).exists()]
-        yield from here
-        if here:
+    directories = [path]
+    while directories:
+        directory = directories.pop()
+        existing = [directory / name for name in ZARR_FILES if (directory / name).exists()]
+        yield from existing
+        if existing:
             with contextlib.suppress(OSError):
-                folders += [Path(entry) for entry in os.scandir(folder) if entry.is_dir()]
+                directories += [Path(entry) for entry in os.scandir(directory) if entry.is_dir()]
 
 
 def _check_codecs(metadata: Any) -> None:
@@ -239,7 +241,7 @@ def _check_codecs(metadata: Any) -> None:
                 raise FormatError("contains chunks of invalid size")
 
 
-def _needs(path: Path, engine: str) -> None:
+def _require(path: Path, engine: str) -> None:
     try:
         __import__(engine)
         __import__("xarray")

@@ -22,15 +22,15 @@ from foveasim.errors import FileError, ParameterError
 from foveasim.fields import PowerMap, to_file_rows
 from foveasim.maps._common import MAX_BANDS, Found, check_size
 from foveasim.maps._formats import MAP_FORMATS
-from foveasim.maps._text import about_map, found_in_metadata
+from foveasim.maps._json_metadata import found_in_metadata, map_metadata
 
 __all__ = ["MAGIC", "read", "write"]
 
 MAGIC = b"\x76\x2f\x31\x01"
 ATTRIBUTE = "foveasim"
 #: Channel names of bands; S1 to S3 are polarisation, T is reflectance, and other channels are for display.
-BAND = re.compile(r"(?:S0\.|.*\.)?(?P<number>[0-9]+(?:[.,][0-9]+)?(?:[eE][-+]?[0-9]+)?)nm")
-OTHER = re.compile(r"(?:[RGBAYZ]|S[123]\..*|T\..*)")
+BAND_PATTERN = re.compile(r"(?:S0\.|.*\.)?(?P<number>[0-9]+(?:[.,][0-9]+)?(?:[eE][-+]?[0-9]+)?)nm")
+OTHER_PATTERN = re.compile(r"(?:[RGBAYZ]|S[123]\..*|T\..*)")
 #: Bytes of a 32-bit channel value.
 ITEMSIZE = 4
 
@@ -44,7 +44,7 @@ def write(power_map: PowerMap, path: Path) -> None:
     ParameterError
         If the map is not float32, or two bands have the same wavelength.
     """
-    exr = _openexr(path)
+    exr = _import_openexr(path)
     if power_map.data.dtype != np.float32:
         raise ParameterError(
             "power_map",
@@ -59,7 +59,7 @@ def write(power_map: PowerMap, path: Path) -> None:
         "type": exr.scanlineimage,
         "emissiveUnits": "W.m^-2",
         "spectralLayoutVersion": "1.0",
-        ATTRIBUTE: json.dumps(about_map(power_map)),
+        ATTRIBUTE: json.dumps(map_metadata(power_map)),
     }
     images = [np.ascontiguousarray(to_file_rows(image)) for image in power_map.data]
     with exr.File(header, dict(zip(names, images, strict=True))) as file:
@@ -68,7 +68,7 @@ def write(power_map: PowerMap, path: Path) -> None:
 
 def read(path: Path, name: str | None) -> Found:
     """Read the channels of bands, in written order or by increasing wavelength."""
-    exr = _openexr(path)
+    exr = _import_openexr(path)
     if name is not None:
         raise FormatError("contains one unnamed map; omit name=")
     with exr.File(str(path), header_only=True) as file:
@@ -83,31 +83,33 @@ def read(path: Path, name: str | None) -> Found:
                 f"must have at most {MAX_BANDS} channels of at least 1 x 1, got {len(channels)} of {n_x} x {n_y}"
             )
         check_size((len(channels), n_y, n_x), ITEMSIZE, path.stat().st_size)
-        text, told = (v if isinstance(v := header.get(key), str) else None for key in (ATTRIBUTE, "emissiveUnits"))
+        text, unit = (v if isinstance(v := header.get(key), str) else None for key in (ATTRIBUTE, "emissiveUnits"))
     bands = _bands(list(channels))
     if any(channels[channel] != (1, 1) for channel in bands):
         raise FormatError("has subsampled channels; write all bands at full resolution")
     with exr.File(str(path), separate_channels=True) as file:
         pixels = file.channels()
-        ours = found_in_metadata(text or "", np.empty((1, 1)), is_y_falling=True)
-        if ours.wavelength_nm is not None:
-            order = [_channel_name(wavelength) for wavelength in ours.wavelength_nm]
+        stored = found_in_metadata(text or "", np.empty((1, 1)), is_y_descending=True)
+        if stored.wavelength_nm is not None:
+            order = [_channel_name(wavelength) for wavelength in stored.wavelength_nm]
             if sorted(order) != sorted(bands):
                 raise FormatError("has an attribute 'foveasim' with wavelengths that differ from its channel names")
-            return replace(ours, data=np.stack([pixels[channel].pixels for channel in order]))
+            return replace(stored, data=np.stack([pixels[channel].pixels for channel in order]))
         data = np.stack([pixels[channel].pixels for channel in bands])
     waves = [wavelength for wavelength in bands.values() if wavelength is not None]
     return Found(
         data=data,
-        is_y_falling=True,
+        is_y_descending=True,
         wavelength_nm=waves or None,
-        unit=told,
+        unit=unit,
     )
 
 
 def _bands(names: list[str]) -> dict[str, float | None]:
     """Return the channels of bands by wavelength, or all channels without wavelengths."""
-    waves = {name: match for name in names if not OTHER.fullmatch(name) and (match := BAND.fullmatch(name))}
+    waves = {
+        name: match for name in names if not OTHER_PATTERN.fullmatch(name) and (match := BAND_PATTERN.fullmatch(name))
+    }
     if waves:
         numbers = {name: float(match["number"].replace(",", ".")) for name, match in waves.items()}
         return {name: numbers[name] for name in sorted(numbers, key=numbers.__getitem__)}
@@ -121,7 +123,7 @@ def _channel_name(wavelength_nm: float) -> str:
     return f"S0.{wavelength_nm!r}nm".replace(".", ",").replace("S0,", "S0.")
 
 
-def _openexr(path: Path) -> Any:
+def _import_openexr(path: Path) -> Any:
     try:
         import OpenEXR
     except ImportError:

@@ -21,9 +21,9 @@ from foveasim._core.extras import needs
 from foveasim._io.formats import FileFormat, FormatError
 from foveasim.errors import FileError
 from foveasim.fields import PowerMap
-from foveasim.maps._common import UNEVEN, Found, check_size
+from foveasim.maps._common import STEP_TOLERANCE, Found, check_size
 from foveasim.maps._formats import MAP_FORMATS
-from foveasim.maps._text import about_map, found_in_metadata
+from foveasim.maps._json_metadata import found_in_metadata, map_metadata
 from foveasim.maps._units import length_in_um
 
 __all__ = ["MAGIC", "read", "write"]
@@ -38,7 +38,7 @@ WAVES = ("WAVE", "AWAV", "WAVELENGTH", "LAMBDA")
 
 def write(power_map: PowerMap, path: Path) -> None:
     """Write one image (n_band, n_y, n_x)."""
-    fits = _astropy(path)
+    fits = _import_astropy(path)
     grid, waves_nm = power_map.grid, power_map.wavelength_nm
     hdu = fits.PrimaryHDU(power_map.data.astype(power_map.data.dtype.newbyteorder(">")))
     header = hdu.header
@@ -50,18 +50,18 @@ def write(power_map: PowerMap, path: Path) -> None:
         header[f"CRVAL{axis}"] = start
         header[f"CDELT{axis}"] = step
     step_nm = np.diff(waves_nm)
-    if step_nm.size == 0 or np.ptp(step_nm) <= UNEVEN * abs(step_nm[0]):
+    if step_nm.size == 0 or np.ptp(step_nm) <= STEP_TOLERANCE * abs(step_nm[0]):
         header["CTYPE3"], header["CUNIT3"], header["CRPIX3"] = "WAVE", "nm", 1.0
         header["CRVAL3"], header["CDELT3"] = float(waves_nm[0]), float(step_nm[0]) if step_nm.size else 1.0
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # warns about long strings
-        header[KEYWORD] = json.dumps(about_map(power_map))
+        header[KEYWORD] = json.dumps(map_metadata(power_map))
         hdu.writeto(path, overwrite=True)
 
 
 def read(path: Path, name: str | None) -> Found:
     """Read the image with a name or number, or the first image."""
-    fits = _astropy(path)
+    fits = _import_astropy(path)
     n_bytes = path.stat().st_size
     with (
         warnings.catch_warnings(),
@@ -76,7 +76,7 @@ def read(path: Path, name: str | None) -> Found:
         data = np.asarray(hdu.data)
         n_axes = data.ndim
         text = header.get(KEYWORD)
-        found = found_in_metadata(text if isinstance(text, str) else "", data, is_y_falling=False)
+        found = found_in_metadata(text if isinstance(text, str) else "", data, is_y_descending=False)
         if found.pitch_um is not None:
             return found
         return replace(found, **_header_values(header, data.shape, n_axes))
@@ -102,7 +102,7 @@ def _image(file: Any, name: str | None) -> Any:
 
 def _header_values(header: Any, shape: tuple[int, ...], n_axes: int) -> dict[str, Any]:
     """Return pitch, origin, wavelengths and unit from a header."""
-    told: dict[str, Any] = _plane_values(header, shape)
+    metadata: dict[str, Any] = _plane_values(header, shape)
     if n_axes >= 3 and str(header.get("CTYPE3", "")).strip().upper() in WAVES:
         per = length_in_um(str(header.get("CUNIT3", "m")))
         step, start = _step(header, 3), _number(header, "CRVAL3", 0)
@@ -110,18 +110,18 @@ def _header_values(header: Any, shape: tuple[int, ...], n_axes: int) -> dict[str
             raise FormatError(f"has the wavelength unit {str(header.get('CUNIT3'))!r:.20}, expected a unit of length")
         if step is not None:
             channel = np.arange(shape[-3]) + 1.0 - _number(header, "CRPIX3", 1)
-            told["wavelength_nm"] = ((start + step * channel) * (per * 1e3)).tolist()
+            metadata["wavelength_nm"] = ((start + step * channel) * (per * 1e3)).tolist()
     unit = header.get("BUNIT")
     if isinstance(unit, str) and unit.strip():
-        told["unit"] = unit
-    return told
+        metadata["unit"] = unit
+    return metadata
 
 
 def _plane_values(header: Any, shape: tuple[int, ...]) -> dict[str, Any]:
     steps = [_step(header, axis) for axis in (1, 2)]
     units = [length_in_um(str(header.get(f"CUNIT{axis}", ""))) for axis in (1, 2)]
     if None not in steps and None not in units:
-        told: dict[str, Any] = {"is_x_falling": steps[0] < 0.0, "is_y_falling": steps[1] < 0.0}  # type: ignore[operator]
+        metadata: dict[str, Any] = {"is_x_descending": steps[0] < 0.0, "is_y_descending": steps[1] < 0.0}  # type: ignore[operator]
         pitch, low = [], []
         for axis, (step, per, n) in enumerate(zip(steps, units, shape[::-1][:2], strict=True), start=1):
             assert step is not None
@@ -130,7 +130,7 @@ def _plane_values(header: Any, shape: tuple[int, ...]) -> dict[str, Any]:
             edges = (start + step * (0.5 - at), start + step * (n + 0.5 - at))
             pitch.append(abs(step) * per)
             low.append(min(edges) * per)
-        return {**told, "pitch_um": tuple(pitch), "origin_um": tuple(low)}
+        return {**metadata, "pitch_um": tuple(pitch), "origin_um": tuple(low)}
     sizes = [header.get("XPIXSZ"), header.get("YPIXSZ", header.get("XPIXSZ"))]
     if all(isinstance(size, int | float) and size > 0 for size in sizes):
         return {"pitch_um": tuple(map(float, sizes))}
@@ -157,7 +157,7 @@ def _number(header: Any, keyword: str, default: int) -> float:
     return float(value)
 
 
-def _astropy(path: Path) -> Any:
+def _import_astropy(path: Path) -> Any:
     try:
         from astropy.io import fits
     except ImportError:

@@ -46,7 +46,7 @@ def read_found(path: Path, kind: str, name: str | None) -> Found:
         found: Found = form.read(path, name)
         return found
     # OpenEXR prints read errors and can return incomplete data: any output counts as an error.
-    told, (data,) = sandbox.read_in_sandbox(
+    metadata, (data,) = sandbox.read_in_sandbox(
         _read,
         path,
         kind=form.title,
@@ -55,7 +55,7 @@ def read_found(path: Path, kind: str, name: str | None) -> Found:
         format_name=kind,
         name=name,
     )
-    about: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in told.items()}
+    about: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in metadata.items()}
     return Found(data=data, **about)
 
 
@@ -68,6 +68,6 @@ def _read(path: str, format_name: str, name: str | None) -> tuple[dict[str, Any]
             found: Found = form.read(Path(path), name)
         except ModuleNotFoundError as error:
             raise FormatError(needs(error.name or "a library", "maps")) from None
-        told = asdict(replace(found, data=np.empty(0)))
-        del told["data"]
-        return told, [as_images(found.data)]
+        metadata = asdict(replace(found, data=np.empty(0)))
+        del metadata["data"]
+        return metadata, [as_images(found.data)]

@@ -45,15 +45,15 @@ def read_mat5(path: Path, name: str | None) -> Found:
     """Read a MAT file of version 5 or 7."""
     from scipy.io import loadmat, whosmat
 
-    unpacked: Any = BytesIO(_decompressed(path))
-    names = [str(variable[0]) for variable in whosmat(unpacked)]
-    unpacked.seek(0)
+    decompressed: Any = BytesIO(_decompress(path))
+    names = [str(variable[0]) for variable in whosmat(decompressed)]
+    decompressed.seek(0)
     struct = _struct(names, name)
     variables = list(FIELDS) if struct is None else [struct]
-    tree: Any = loadmat(unpacked, variable_names=variables, struct_as_record=False, squeeze_me=False)
+    tree: Any = loadmat(decompressed, variable_names=variables, struct_as_record=False, squeeze_me=False)
 
-    def field(where: str) -> NDArray[Any] | None:
-        first, *rest = where.split("/") if struct is None else (struct, *where.split("/"))
+    def field(field_path: str) -> NDArray[Any] | None:
+        first, *rest = field_path.split("/") if struct is None else (struct, *field_path.split("/"))
         part: Any = tree.get(first)
         for key in rest:
             if isinstance(part, np.ndarray) and part.dtype == object and part.size == 1:
@@ -61,7 +61,7 @@ def read_mat5(path: Path, name: str | None) -> Found:
             part = getattr(part, key, None) if key in getattr(part, "_fieldnames", ()) else None
         return part if isinstance(part, np.ndarray) and part.dtype.kind in "iufcU" else None
 
-    return _found(field)
+    return _read_fields(field)
 
 
 def read_mat73(path: Path, name: str | None) -> Found:
@@ -72,22 +72,22 @@ def read_mat73(path: Path, name: str | None) -> Found:
     with h5py.File(path, "r") as file:
         struct = _struct(list(file), name)
 
-        def field(where: str) -> NDArray[Any] | None:
+        def field(field_path: str) -> NDArray[Any] | None:
             part: Any = file
-            for key in (where if struct is None else f"{struct}/{where}").split("/"):
+            for key in (field_path if struct is None else f"{struct}/{field_path}").split("/"):
                 if not isinstance(part, h5py.Group) or not isinstance(part.get(key, getlink=True), h5py.HardLink):
                     return None
                 part = part[key]
             if not isinstance(part, h5py.Dataset) or part.dtype.kind not in "iuf" or part.external or part.is_virtual:
                 return None
             check_size(part.shape, part.dtype.itemsize, n_bytes)
-            if where not in PHOTONS and part.size > MAX_VALUES:
+            if field_path not in PHOTONS and part.size > MAX_VALUES:
                 return None
             values = np.asarray(part[()]).transpose()
             is_text = part.attrs.get("MATLAB_class") in (b"char", "char")
             return np.array("".join(map(chr, values.ravel().tolist()))) if is_text else values
 
-        return _found(field)
+        return _read_fields(field)
 
 
 def _struct(names: list[str], name: str | None) -> str | None:
@@ -101,13 +101,13 @@ def _struct(names: list[str], name: str | None) -> str | None:
     raise FormatError(f"contains no optical image {name or 'oi'!r:.40}; available variables: {available or 'none'}")
 
 
-def _found(field: Field) -> Found:
+def _read_fields(field: Field) -> Found:
     photons, waves = (next((v for n in names if (v := field(n)) is not None), None) for names in (PHOTONS, WAVES))
     if photons is None:
         raise FormatError("contains no optical image with data.photons; compute it with oiCompute")
     if photons.ndim not in (2, 3) or 0 in photons.shape:
         raise FormatError(f"contains photons of shape {photons.shape[:5]}, expected (row, column, wave)")
-    images = from_file_rows(_whole(photons, field))
+    images = from_file_rows(_photon_rates(photons, field))
     pitch = _pitch_um(field, photons.shape[1])
     return Found(
         data=images,  # already bottom row first
@@ -118,7 +118,7 @@ def _found(field: Field) -> Found:
     )
 
 
-def _whole(photons: NDArray[Any], field: Field) -> NDArray[Any]:
+def _photon_rates(photons: NDArray[Any], field: Field) -> NDArray[Any]:
     """Return photon rates, scaled from the integers of old versions."""
     if photons.dtype.kind != "u":
         return photons
@@ -150,10 +150,10 @@ def _number(values: NDArray[Any] | None) -> float | None:
 # -- decompression with a limit -----------------------------------------------------------------------------------------
 
 
-def _decompressed(path: Path) -> bytes:
+def _decompress(path: Path) -> bytes:
     """Return the file with decompressed elements, up to the size limit."""
     n_bytes = path.stat().st_size
-    most = max_decompressed_bytes(n_bytes)
+    max_bytes = max_decompressed_bytes(n_bytes)
     with path.open("rb") as file:
         header = file.read(HEADER_BYTES)
         order = "little" if header[126:128] == b"IM" else "big"
@@ -162,26 +162,26 @@ def _decompressed(path: Path) -> bytes:
             kind, length = int.from_bytes(tag[:4], order), int.from_bytes(tag[4:], order)  # type: ignore[arg-type]
             if kind not in (COMPRESSED, MATRIX) or length > n_bytes:
                 raise FormatError("is corrupt: an element is not a variable, or is longer than the file")
-            element = _inflated(file, length, most - size) if kind == COMPRESSED else tag + file.read(length)
+            element = _inflate(file, length, max_bytes - size) if kind == COMPRESSED else tag + file.read(length)
             pieces.append(element)
             size += len(element)
-            if size > most:
-                raise FormatError(f"would decompress to more than {most} bytes; save it uncompressed, with -v6")
+            if size > max_bytes:
+                raise FormatError(f"would decompress to more than {max_bytes} bytes; save it uncompressed, with -v6")
     return b"".join(pieces)
 
 
-def _inflated(file: IO[bytes], length: int, most: int) -> bytes:
-    """Return one decompressed element, limited to little more than ``most`` bytes."""
+def _inflate(file: IO[bytes], length: int, max_bytes: int) -> bytes:
+    """Return one decompressed element, limited to little more than ``max_bytes`` bytes."""
     inflater, parts, size = zlib.decompressobj(), [], 0
-    while length > 0 and size <= most:
-        packed = file.read(min(length, PIECE_BYTES))
-        if not packed:
+    while length > 0 and size <= max_bytes:
+        compressed = file.read(min(length, PIECE_BYTES))
+        if not compressed:
             raise FormatError("is truncated")
-        length -= len(packed)
-        while packed and size <= most:
-            parts.append(inflater.decompress(packed, PIECE_BYTES))
+        length -= len(compressed)
+        while compressed and size <= max_bytes:
+            parts.append(inflater.decompress(compressed, PIECE_BYTES))
             size += len(parts[-1])
-            packed = inflater.unconsumed_tail
+            compressed = inflater.unconsumed_tail
     return b"".join(parts)
 
 

@@ -27,9 +27,9 @@ NPY_MAGIC = b"\x93NUMPY"
 #: Signatures of zip archives: nonempty and empty.
 ZIP_MAGICS = (b"PK\x03\x04", b"PK\x05\x06")
 DATA = "data"
-ABOUT = ("pitch_um", "origin_um", "wavelength_nm", "band_width_nm", "unit")
+METADATA_NAMES = ("pitch_um", "origin_um", "wavelength_nm", "band_width_nm", "unit")
 #: Maximum size of an array of metadata.
-MAX_ABOUT_BYTES = 2**20
+MAX_METADATA_BYTES = 2**20
 
 
 def write_npz(power_map: PowerMap, path: Path) -> None:
@@ -57,18 +57,20 @@ def read_npz(path: Path, name: str | None) -> Found:
     """Read the named array, or ``data``, or the only array, and the metadata."""
     n_bytes = path.stat().st_size
     with zip_members(path) as (archive, items):
-        chosen = _chosen(list(items), name)
-        about = {key: _member(archive, items[key], n_bytes) for key in ABOUT if key in items and key != chosen}
-        data = _member(archive, items[chosen], n_bytes)
-    pitch = about.get("pitch_um")
-    origin = about.get("origin_um")
+        selected = _select_array(list(items), name)
+        metadata = {
+            key: _member(archive, items[key], n_bytes) for key in METADATA_NAMES if key in items and key != selected
+        }
+        data = _member(archive, items[selected], n_bytes)
+    pitch = metadata.get("pitch_um")
+    origin = metadata.get("origin_um")
     return Found(
         data=data,
         pitch_um=None if pitch is None else _pair(np.broadcast_to(pitch, (2,))),
         origin_um=None if origin is None else _pair(origin),
-        wavelength_nm=_list(about.get("wavelength_nm")),
-        band_width_nm=_list(about.get("band_width_nm")),
-        unit=None if "unit" not in about else str(about["unit"]),
+        wavelength_nm=_list(metadata.get("wavelength_nm")),
+        band_width_nm=_list(metadata.get("band_width_nm")),
+        unit=None if "unit" not in metadata else str(metadata["unit"]),
     )
 
 
@@ -77,8 +79,8 @@ def _check_no_name(name: str | None) -> None:
         raise FormatError("contains one unnamed array; omit name=")
 
 
-def _chosen(names: list[str], name: str | None) -> str:
-    others = [n for n in names if n not in ABOUT]
+def _select_array(names: list[str], name: str | None) -> str:
+    others = [n for n in names if n not in METADATA_NAMES]
     if name is not None:
         if name not in names:
             raise FormatError(f"has no array {name!r:.40}; available arrays: {', '.join(map(repr, names[:5]))}")
@@ -100,7 +102,7 @@ def _list(values: NDArray[Any] | None) -> list[float] | None:
 
 
 def _member(archive: zipfile.ZipFile, item: zipfile.ZipInfo, n_bytes: int) -> NDArray[Any]:
-    if item.filename.removesuffix(".npy") in ABOUT and item.file_size > MAX_ABOUT_BYTES:
+    if item.filename.removesuffix(".npy") in METADATA_NAMES and item.file_size > MAX_METADATA_BYTES:
         raise FormatError(f"is corrupt: {item.filename!r:.40} has {item.file_size} bytes")
     check_size((item.file_size,), 1, n_bytes)
     with archive.open(item) as file:

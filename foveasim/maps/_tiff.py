@@ -18,13 +18,13 @@ from foveasim._io.images import pixels_of_page
 from foveasim.fields import PowerMap, to_file_rows
 from foveasim.maps._common import MAX_BANDS, Found, check_size
 from foveasim.maps._formats import MAP_FORMATS
-from foveasim.maps._text import about_map, found_in_metadata
+from foveasim.maps._json_metadata import found_in_metadata, map_metadata
 
 __all__ = ["MAGICS", "read", "write"]
 
 MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 #: TIFF tag of the orientation, and its values for top row first and bottom row first.
-ORIENTATION_TAG, ON_TOP, BELOW = 274, 1, 4
+ORIENTATION_TAG, TOP_FIRST, BOTTOM_FIRST = 274, 1, 4
 #: Maximum data size of a classic TIFF: 4 GiB minus a reserve for metadata.
 CLASSIC_BYTES = 2**32 - 2**24
 
@@ -33,7 +33,7 @@ def write(power_map: PowerMap, path: Path) -> None:
     """Write one uncompressed page per band."""
     import tifffile
 
-    description = json.dumps(about_map(power_map))
+    description = json.dumps(map_metadata(power_map))
     is_big = power_map.data.nbytes > CLASSIC_BYTES
     with tifffile.TiffWriter(path, bigtiff=is_big) as file:
         for band, image in enumerate(power_map.data):
@@ -71,11 +71,11 @@ def read(path: Path, name: str | None) -> Found:
         data = images[0][np.newaxis] if n_pages == 1 else np.stack(images)
         if first.ndim == 3:
             data = _samples_first(data[0], first, tifffile)
-        orientation = first.tags[ORIENTATION_TAG].value if ORIENTATION_TAG in first.tags else ON_TOP
+        orientation = first.tags[ORIENTATION_TAG].value if ORIENTATION_TAG in first.tags else TOP_FIRST
         description = str(first.description)
-    if orientation not in (ON_TOP, BELOW):
+    if orientation not in (TOP_FIRST, BOTTOM_FIRST):
         raise FormatError(f"has the unsupported orientation {orientation!s:.10}; save it with orientation 1 or 4")
-    return found_in_metadata(description, data, is_y_falling=orientation == ON_TOP)
+    return found_in_metadata(description, data, is_y_descending=orientation == TOP_FIRST)
 
 
 def _samples_first(data: NDArray[Any], page: Any, tifffile: Any) -> NDArray[Any]:

@@ -10,7 +10,7 @@ import numpy as np
 from foveasim._core.validation import Floats
 from foveasim.units import photon_energy_j
 
-__all__ = ["PER_NM", "UNITS", "Unit", "length_in_um", "light_unit", "per_band_w_m2"]
+__all__ = ["PER_NM", "UNITS", "Unit", "irradiance_unit", "length_in_um", "per_band_w_m2"]
 
 #: Units of a map: power or photons per second, per square metre, per band or per nanometre.
 Unit: TypeAlias = Literal["w_m2", "w_m2_nm", "photons_s_m2", "photons_s_m2_nm"]
@@ -37,7 +37,7 @@ _BASE: dict[str, _Quantity] = {
     **dict.fromkeys(("photon", "photons", "ph", "quanta"), (1.0, _PHOTON)),
 }
 #: Units of irradiance by their powers of the base units, with their sizes in SI.
-_LIGHT: dict[tuple[int, int, int, int], tuple[Unit, float]] = {
+_IRRADIANCE_UNITS: dict[tuple[int, int, int, int], tuple[Unit, float]] = {
     (1, -2, 0, 0): ("w_m2", 1.0),
     (1, -3, 0, 0): ("w_m2_nm", 1e9),
     (0, -2, -1, 1): ("photons_s_m2", 1.0),
@@ -48,26 +48,26 @@ _TOKEN = re.compile(r"(?P<name>[A-Za-z]+)(?P<power>[-+]?[0-9]{1,2}(?![0-9]))?|(?
 _MAX_CHARS = 64
 
 
-def light_unit(text: str) -> tuple[Unit, float] | None:
+def irradiance_unit(text: str) -> tuple[Unit, float] | None:
     """
     Parse a unit of irradiance; return the supported unit and the factor, or None.
 
     Examples
     --------
-    >>> light_unit("uW/cm2")
+    >>> irradiance_unit("uW/cm2")
     ('w_m2', 0.01)
-    >>> light_unit("W.m^-2.nm^-1")
+    >>> irradiance_unit("W.m^-2.nm^-1")
     ('w_m2_nm', 1.0)
-    >>> light_unit("W m-2 sr-1") is None
+    >>> irradiance_unit("W m-2 sr-1") is None
     True
     """
     if text in UNITS:
         return text, 1.0
     quantity = _quantity(text)
-    if quantity is None or quantity[1] not in _LIGHT:
+    if quantity is None or quantity[1] not in _IRRADIANCE_UNITS:
         return None
-    unit, size = _LIGHT[quantity[1]]
-    return unit, _near(quantity[0] / size)
+    unit, size = _IRRADIANCE_UNITS[quantity[1]]
+    return unit, _round(quantity[0] / size)
 
 
 def length_in_um(text: str) -> float | None:
@@ -80,7 +80,7 @@ def length_in_um(text: str) -> float | None:
     (1000.0, 1.0, None)
     """
     quantity = _quantity(text)
-    return None if quantity is None or quantity[1] != _METRE else _near(quantity[0] * 1e6)
+    return None if quantity is None or quantity[1] != _METRE else _round(quantity[0] * 1e6)
 
 
 def per_band_w_m2(unit: Unit, wavelength_nm: Floats, band_width_nm: Floats | None) -> Floats:
@@ -95,7 +95,7 @@ def per_band_w_m2(unit: Unit, wavelength_nm: Floats, band_width_nm: Floats | Non
     return factor * photon_energy_j(wavelength_nm) if unit.startswith("photons") else factor
 
 
-def _near(factor: float) -> float:
+def _round(factor: float) -> float:
     """Round to 12 digits: 1e-6 / 1e-4 differs from 0.01 in the last bit."""
     return float(f"{factor:.12g}")
 

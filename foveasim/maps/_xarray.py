@@ -12,7 +12,7 @@ from foveasim._core.validation import Floats
 from foveasim._io.formats import FormatError
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, Pitch, PowerMap
-from foveasim.maps._common import Found, Given, finished, pitch_of_axes
+from foveasim.maps._common import Found, Given, pitch_of_axes, to_power_map
 from foveasim.maps._units import Unit, length_in_um
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ X = ("x", "x_um", "col", "cols", "column", "n_x")
 Y = ("y", "y_um", "row", "rows", "n_y")
 BAND = ("wavelength", "wavelength_nm", "wavelengths", "wave", "wl", "lambda", "band", "bands", "channel")
 #: Prefixes of names that libraries generate for unnamed dimensions.
-NAMELESS = ("phony_dim_", "dim_")
+UNNAMED_PREFIXES = ("phony_dim_", "dim_")
 #: Largest difference, in cells, of coordinates from the pitch and origin in attributes: rounding errors.
 ROUNDING = 1e-6
 
@@ -54,7 +54,7 @@ def to_xarray(power_map: PowerMap) -> xr.DataArray:
     """
     if not isinstance(power_map, PowerMap):
         raise ParameterError("power_map", f"must be a PowerMap, got a {type(power_map).__name__}")
-    xr = _xarray()
+    xr = _import_xarray()
     grid = power_map.grid
     return xr.DataArray(
         power_map.data,
@@ -102,16 +102,16 @@ def from_xarray(
     ParameterError
         If the array has other dimensions or invalid values, or metadata are missing.
     """
-    xr = _xarray()
+    xr = _import_xarray()
     if not isinstance(data_array, xr.DataArray):
         raise ParameterError("data_array", f"must be an xarray.DataArray, got a {type(data_array).__name__}")
     given = Given(
         pitch_um=pitch_um, wavelength_nm=wavelength_nm, band_width_nm=band_width_nm, unit=unit, origin_um=origin_um
     )
     try:
-        return finished(found_in_array(data_array), given)
-    except FormatError as rejection:
-        raise ParameterError("data_array", str(rejection)) from None
+        return to_power_map(found_in_array(data_array), given)
+    except FormatError as error:
+        raise ParameterError("data_array", str(error)) from None
 
 
 def found_in_array(array: xr.DataArray) -> Found:
@@ -125,7 +125,7 @@ def found_in_array(array: xr.DataArray) -> Found:
     """
     array = array.squeeze([d for d in array.dims if array.sizes[d] == 1 and d not in (*X, *Y, *BAND)], drop=True)
     names = list(array.dims)
-    if len(names) in (2, 3) and all(str(d).startswith(NAMELESS) for d in names):
+    if len(names) in (2, 3) and all(str(d).startswith(UNNAMED_PREFIXES) for d in names):
         return Found(data=array.to_numpy(), unit=_unit(array))
     if 0 in array.shape:
         raise FormatError(f"contains an empty array of shape {array.shape}")
@@ -137,15 +137,15 @@ def found_in_array(array: xr.DataArray) -> Found:
     array = array.transpose(*rest, y, x)
     along_x, along_y = (_coordinate(array, d) for d in (x, y))
     if along_x is None or along_y is None:
-        falling = (along is not None and bool(along[0] > along[-1]) for along in (along_x, along_y))
-        place: dict[str, Any] = dict(zip(("is_x_falling", "is_y_falling"), falling, strict=True))
+        descending = (along is not None and bool(along[0] > along[-1]) for along in (along_x, along_y))
+        metadata: dict[str, Any] = dict(zip(("is_x_descending", "is_y_descending"), descending, strict=True))
     else:
-        place = _place(array, along_x, along_y, (x, y))
+        metadata = _axis_metadata(array, along_x, along_y, (x, y))
     return Found(
         data=array.to_numpy(),
         wavelength_nm=_wavelengths_nm(array, rest[0] if rest else None),
         unit=_unit(array),
-        **place,
+        **metadata,
     )
 
 
@@ -163,15 +163,15 @@ def _coordinate(array: xr.DataArray, name: Hashable) -> Floats | None:
     return values.astype(np.float64)
 
 
-def _place(array: xr.DataArray, x: Floats, y: Floats, names: tuple[Hashable, Hashable]) -> dict[str, Any]:
+def _axis_metadata(array: xr.DataArray, x: Floats, y: Floats, names: tuple[Hashable, Hashable]) -> dict[str, Any]:
     """Return axis directions, and pitch and origin if the coordinates have units of length."""
     step_x, step_y = pitch_of_axes(x, y)
-    metadata: dict[str, Any] = {"is_x_falling": (step_x or 1.0) < 0.0, "is_y_falling": (step_y or 1.0) < 0.0}
+    metadata: dict[str, Any] = {"is_x_descending": (step_x or 1.0) < 0.0, "is_y_descending": (step_y or 1.0) < 0.0}
     per = [_per_um(array.coords[name], name) for name in names]
     if None in per:
         return metadata
     per_x, per_y = (p for p in per if p is not None)
-    exact = _exact(array, x * per_x, y * per_y)
+    exact = _exact_grid(array, x * per_x, y * per_y)
     if exact is not None:
         return {**metadata, "pitch_um": (exact.pitch_x_um, exact.pitch_y_um), "origin_um": exact.origin_um}
     if step_x is None and step_y is None:
@@ -188,7 +188,7 @@ def _per_um(coordinate: xr.DataArray, name: Hashable) -> float | None:
     return length_in_um(units) if isinstance(units, str) else 1.0 if str(name).endswith("_um") else None
 
 
-def _exact(array: xr.DataArray, x_um: Floats, y_um: Floats) -> Grid | None:
+def _exact_grid(array: xr.DataArray, x_um: Floats, y_um: Floats) -> Grid | None:
     """
     Return the exact grid from the attributes, or None if the coordinates differ from it.
 
@@ -229,7 +229,7 @@ def _unit(array: xr.DataArray) -> str | None:
     return units if isinstance(units, str) and units.strip() else None
 
 
-def _xarray() -> Any:
+def _import_xarray() -> Any:
     try:
         import xarray as xr
     except ImportError:

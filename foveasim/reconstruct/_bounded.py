@@ -17,19 +17,19 @@ import numpy as np
 from foveasim._core.validation import Floats
 from foveasim.errors import SimulationError
 
-__all__ = ["least_nonnegative"]
+__all__ = ["minimise_nonnegative"]
 
 Operator = Callable[[Floats], Floats]
 
 
-def least_nonnegative(
+def minimise_nonnegative(
     matrix: Operator,
     bound: Floats,
     precondition: Operator,
     right: Floats,
     start: Floats,
     *,
-    enough: float,
+    threshold: float,
     max_steps: int,
 ) -> tuple[Floats, int]:
     """
@@ -45,7 +45,7 @@ def least_nonnegative(
         Approximate inverse of A, symmetric and positive definite.
     right, start : (n,) float64
         b, and the starting point.
-    enough : float
+    threshold : float
         Convergence threshold of the root of ``g·M g``, with the projected gradient g and the preconditioner M (the inverse
         of D for unknowns at 0): approximately the distance from the minimum in the norm of A.
     max_steps : int
@@ -70,45 +70,49 @@ def least_nonnegative(
         is_free = x > 0.0
         free = np.where(is_free, gradient, 0.0)
         chopped = np.where(is_free, 0.0, np.minimum(gradient, 0.0))
-        steep = np.where(is_free, precondition(free), 0.0)
-        free2, chopped2 = _dot(free, steep), _dot(chopped, chopped / bound)
-        if math.sqrt(free2 + chopped2) <= enough:
+        preconditioned = np.where(is_free, precondition(free), 0.0)
+        free2, chopped2 = _dot(free, preconditioned), _dot(chopped, chopped / bound)
+        if math.sqrt(free2 + chopped2) <= threshold:
             return x, n_steps
         if n_steps >= max_steps:
             raise SimulationError(
                 f"the picture did not converge in {max_steps} steps; increase 'tolerance', 'mu' or 'max_steps'"
             )
         if chopped2 > _dot(np.minimum(x, free / bound), free):
-            down = chopped / bound
-            image = matrix(down)
+            descent = chopped / bound
+            image = matrix(descent)
             n_steps += 1
-            length = _dot(gradient, down) / _dot(down, image)
-            x = np.maximum(x - length * down, 0.0)  # unknowns at 0 increase; the clip is for rounding
+            length = _dot(gradient, descent) / _dot(descent, image)
+            x = np.maximum(x - length * descent, 0.0)  # unknowns at 0 increase; the clip is for rounding
             gradient -= length * image
             direction = None
             continue
-        direction = steep if direction is None else steep - (_dot(steep, image) / curvature) * direction
+        direction = (
+            preconditioned
+            if direction is None
+            else preconditioned - (_dot(preconditioned, image) / curvature) * direction
+        )
         image = matrix(direction)
         n_steps += 1
         curvature = _dot(direction, image)
         if curvature <= 0.0:  # null space of A: the gradient is rounding error
             return x, n_steps
         length = _dot(gradient, direction) / curvature
-        falls = direction > 0.0
-        room = float(np.min(x[falls] / direction[falls], initial=np.inf))
-        if length <= room:
+        is_decreasing = direction > 0.0
+        max_length = float(np.min(x[is_decreasing] / direction[is_decreasing], initial=np.inf))
+        if length <= max_length:
             x = np.maximum(x - length * direction, 0.0)
             gradient -= length * image
             continue
         # Clip all negative unknowns to 0 if this decreases the objective; otherwise step to the first unknown at 0.
-        tried = np.maximum(x - length * direction, 0.0)
-        tried_gradient = matrix(tried) - right
+        trial = np.maximum(x - length * direction, 0.0)
+        trial_gradient = matrix(trial) - right
         n_steps += 1
-        if _dot(tried, tried_gradient - right) < _dot(x, gradient - right):
-            x, gradient = tried, tried_gradient
+        if _dot(trial, trial_gradient - right) < _dot(x, gradient - right):
+            x, gradient = trial, trial_gradient
         else:
-            x = np.maximum(x - room * direction, 0.0)
-            gradient -= room * image
+            x = np.maximum(x - max_length * direction, 0.0)
+            gradient -= max_length * image
             x = np.where(x > 0.0, np.maximum(x - gradient / bound, 0.0), 0.0)
             gradient = matrix(x) - right
             n_steps += 1

@@ -1,7 +1,7 @@
 """
 Numba kernels of reconstruction: natural neighbours and the roughness gradient.
 
-A **triangulation** is three arrays with one row per triangle: ``corners`` (its sites, counter-clockwise), ``beyond`` (the
+A **triangulation** is three arrays with one row per triangle: ``corners`` (its sites, counter-clockwise), ``neighbours`` (the
 triangle across the edge opposite each corner, -1 where there is none) and ``circles`` (centre and squared radius of the
 circumcircle). The kernels take arrays only, release the interpreter lock, and are compiled for explicit types when this module
 is imported; the machine code is cached on disk.
@@ -20,9 +20,9 @@ __all__ = ["add_roughness", "natural_neighbours"]
 MAX_TRIANGLES = 4096
 #: Values are linear between the ends of a hull edge at points closer to it than this fraction of its length, where
 #: circumcircles become too large.
-THIN = 1e-5
+HULL_FRACTION = 1e-5
 #: A point closer to a corner than this fraction of its triangle's longest edge coincides with the corner.
-AT_CORNER = 1e-10
+CORNER_FRACTION = 1e-10
 
 
 def _input(dtype, ndim):
@@ -51,7 +51,7 @@ def _cross(ax, ay, bx, by):
         types.float64[:, ::1],
     ),
 )
-def natural_neighbours(points, start, xy, values, corners, beyond, circles, out):
+def natural_neighbours(points, start, xy, values, corners, neighbours, circles, out):
     """
     Evaluate Sibson's interpolant at points in known triangles.
 
@@ -74,44 +74,44 @@ def natural_neighbours(points, start, xy, values, corners, beyond, circles, out)
 
     for p in range(points.shape[0]):
         px, py = points[p, 0], points[p, 1]
-        home = start[p]
+        containing = start[p]
 
         # Linear interpolation where the triangle, or the point's distance from the hull, is too small for circumcircles.
         longest2 = 0.0
         for k in range(3):
-            a, b = corners[home, k], corners[home, (k + 1) % 3]
+            a, b = corners[containing, k], corners[containing, (k + 1) % 3]
             longest2 = max(longest2, (xy[a, 0] - xy[b, 0]) ** 2 + (xy[a, 1] - xy[b, 1]) ** 2)
-        whole = 0.0
+        double_area = 0.0
         is_straight = False
-        share = np.empty(3)
+        barycentric = np.empty(3)
         for k in range(3):
-            a, b = corners[home, (k + 1) % 3], corners[home, (k + 2) % 3]
-            share[k] = _cross(xy[a, 0] - px, xy[a, 1] - py, xy[b, 0] - px, xy[b, 1] - py)
-            whole += share[k]
-            if beyond[home, k] < 0 and share[k] < THIN * longest2:
+            a, b = corners[containing, (k + 1) % 3], corners[containing, (k + 2) % 3]
+            barycentric[k] = _cross(xy[a, 0] - px, xy[a, 1] - py, xy[b, 0] - px, xy[b, 1] - py)
+            double_area += barycentric[k]
+            if neighbours[containing, k] < 0 and barycentric[k] < HULL_FRACTION * longest2:
                 is_straight = True
         for k in range(3):
-            a = corners[home, k]
-            if (xy[a, 0] - px) ** 2 + (xy[a, 1] - py) ** 2 <= AT_CORNER**2 * longest2:
+            a = corners[containing, k]
+            if (xy[a, 0] - px) ** 2 + (xy[a, 1] - py) ** 2 <= CORNER_FRACTION**2 * longest2:
                 is_straight = True
-        if whole < 100.0 * THIN * longest2:
+        if double_area < 100.0 * HULL_FRACTION * longest2:
             is_straight = True
 
-        n_triangles, n_edges, has_room = 0, 0, True
+        n_triangles, n_edges, has_capacity = 0, 0, True
         if not is_straight:
-            triangles[0], n_triangles, done = home, 1, 0
-            is_inside[home] = True
-            while done < n_triangles and has_room:
+            triangles[0], n_triangles, done = containing, 1, 0
+            is_inside[containing] = True
+            while done < n_triangles and has_capacity:
                 t = triangles[done]
                 done += 1
                 for k in range(3):
-                    other = beyond[t, k]
+                    other = neighbours[t, k]
                     if other < 0 or is_inside[other]:
                         continue
                     distance2 = (circles[other, 0] - px) ** 2 + (circles[other, 1] - py) ** 2
                     if distance2 < circles[other, 2] * (1.0 - 1e-12):
                         if n_triangles == MAX_TRIANGLES:
-                            has_room = False
+                            has_capacity = False
                             break
                         triangles[n_triangles] = other
                         n_triangles += 1
@@ -122,18 +122,18 @@ def natural_neighbours(points, start, xy, values, corners, beyond, circles, out)
                 cx, cy = circles[t, 0] - px, circles[t, 1] - py
                 for k in range(3):
                     a, b = corners[t, (k + 1) % 3], corners[t, (k + 2) % 3]
-                    other = beyond[t, k]
+                    other = neighbours[t, k]
                     if other >= 0 and is_inside[other]:
                         # Boundary of the old cells of a and b, from the adjacent circumcentre to this one, a on its left.
                         area[a] += _cross(circles[other, 0] - px, circles[other, 1] - py, cx, cy)
                         continue
                     ax, ay, bx, by = xy[a, 0] - px, xy[a, 1] - py, xy[b, 0] - px, xy[b, 1] - py
-                    twice = 2.0 * _cross(ax, ay, bx, by)
+                    edge_cross = 2.0 * _cross(ax, ay, bx, by)
                     a2, b2 = ax * ax + ay * ay, bx * bx + by * by
-                    if twice <= 1e-14 * (a2 + b2):  # the point lies on the edge within rounding error
+                    if edge_cross <= 1e-14 * (a2 + b2):  # the point lies on the edge within rounding error
                         is_straight = True
                         continue
-                    nx, ny = (a2 * by - b2 * ay) / twice, (b2 * ax - a2 * bx) / twice
+                    nx, ny = (a2 * by - b2 * ay) / edge_cross, (b2 * ax - a2 * bx) / edge_cross
                     area[a] += _cross(nx, ny, cx, cy)
                     area[b] += _cross(cx, cy, nx, ny)
                     if n_edges < MAX_TRIANGLES + 2:
@@ -148,10 +148,10 @@ def natural_neighbours(points, start, xy, values, corners, beyond, circles, out)
 
         for c in range(n_channels):
             out[p, c] = 0.0
-        if is_straight or not has_room:
+        if is_straight or not has_capacity:
             for k in range(3):
                 for c in range(n_channels):
-                    out[p, c] += share[k] / whole * values[corners[home, k], c]
+                    out[p, c] += barycentric[k] / double_area * values[corners[containing, k], c]
         else:
             total = 0.0
             for i in range(n_edges):

@@ -37,10 +37,10 @@ def cells(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | N
     """
     integrator = Integrator(layout, grid, n_threads=n_threads)
     channels = np.atleast_2d(finite_array("values", values))
-    share = coverage_fraction(integrator)
-    covered_um2 = np.where(share > 0.0, share, np.nan) * grid.cell_area_um2
+    coverage = coverage_fraction(integrator)
+    covered_um2 = np.where(coverage > 0.0, coverage, np.nan) * grid.cell_area_um2
     data = integrator.spread(channels) / covered_um2
-    return Picture(read_only(data.astype(np.float32)), read_only(share.astype(np.float32)), grid)
+    return Picture(read_only(data.astype(np.float32)), read_only(coverage.astype(np.float32)), grid)
 
 
 def fill_channels(layout: PackedRings, values: Floats, channel: Ints, n_channels: int) -> Floats:

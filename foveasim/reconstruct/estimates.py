@@ -96,14 +96,14 @@ def estimate_from_code(code: ArrayLike, sensor: Sensor, exposure_s: float) -> Si
     see :meth:`foveasim.sensor.Calibration.correct`.
     """
     codes = _per_site("code", code, sensor)
-    share = (linearise(codes, sensor) + 0.5) / 2.0**sensor.bits - sensor.pedestal_v / sensor.v_sat_v
-    bend = sensor.nonlinearity_fraction
+    fraction = (linearise(codes, sensor) + 0.5) / 2.0**sensor.bits - sensor.pedestal_v / sensor.v_sat_v
+    nonlinearity = sensor.nonlinearity_fraction
     slope = np.ones(codes.size)
-    if bend:
-        slope = np.sqrt(np.maximum(1.0 - 4.0 * bend * share, 1e-6))
-        share = (1.0 - slope) / (2.0 * bend)
+    if nonlinearity:
+        slope = np.sqrt(np.maximum(1.0 - 4.0 * nonlinearity * fraction, 1e-6))
+        fraction = (1.0 - slope) / (2.0 * nonlinearity)
     full_e = electrons_per_code(sensor) * 2.0**sensor.bits
-    charge = share * full_e
+    charge = fraction * full_e
     read_e = estimate_from_charge(charge, sensor, exposure_s)
     step_e = sensor.adc.width_of_code_dn(codes) / slope * electrons_per_code(sensor)
     readout = sensor.readout_model(np.maximum(charge, 0.0), is_device_known=False)

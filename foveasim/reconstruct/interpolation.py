@@ -22,11 +22,11 @@ from foveasim.reconstruct.picture import Picture, coverage_fraction
 __all__ = ["linear", "natural", "site_values"]
 
 #: Centroids closer than this fraction of the layout's extent are merged, with the mean of their values.
-SAME_PLACE = 1e-9
+MERGE_FRACTION = 1e-9
 #: Pixels per work item; fixed, so that the result does not depend on the number of threads.
 PIXELS_PER_PIECE = 1 << 14
 #: Distances from points to hull edges that are computed at a time, which limits memory.
-DISTANCES_AT_ONCE = 1 << 22
+MAX_DISTANCES = 1 << 22
 
 
 def linear(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | None = None) -> Picture:
@@ -54,7 +54,7 @@ def linear(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | 
     ParameterError
         When there is not one value per site, a value is infinite, or a channel has no values.
     """
-    return _interpolated(layout, values, grid, n_threads, is_smooth=False)
+    return _interpolate(layout, values, grid, n_threads, is_smooth=False)
 
 
 def natural(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | None = None) -> Picture:
@@ -79,7 +79,7 @@ def natural(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int |
     ParameterError
         As for :func:`linear`.
     """
-    return _interpolated(layout, values, grid, n_threads, is_smooth=True)
+    return _interpolate(layout, values, grid, n_threads, is_smooth=True)
 
 
 def site_values(values: Floats, n_sites: int) -> Floats:
@@ -102,23 +102,21 @@ def site_values(values: Floats, n_sites: int) -> Floats:
     return channels
 
 
-def _interpolated(
-    layout: PackedRings, values: Floats, grid: Grid, n_threads: int | None, *, is_smooth: bool
-) -> Picture:
+def _interpolate(layout: PackedRings, values: Floats, grid: Grid, n_threads: int | None, *, is_smooth: bool) -> Picture:
     integrator = Integrator(layout, grid, n_threads=n_threads)
     channels = site_values(values, integrator.n_sites)
     _, centroid_um = site_moments(layout.xy_um, layout.ring_offsets, layout.site_offsets)
-    share = coverage_fraction(integrator)
-    row, column = np.nonzero(share)
+    fraction = coverage_fraction(integrator)
+    row, column = np.nonzero(fraction)
     points_um = np.stack((grid.x_um[column], grid.y_um[row]), axis=1)
     data = np.full((channels.shape[0], *grid.shape), np.nan)
-    known, kind = np.unique(~np.isnan(channels), axis=0, return_inverse=True)
-    for k, is_known in enumerate(known):
-        of_kind = np.flatnonzero(kind.ravel() == k)
-        mesh = _Mesh.of(centroid_um[is_known], channels[np.ix_(of_kind, np.flatnonzero(is_known))])
-        found = mesh.at(points_um, thread_count(n_threads), is_smooth=is_smooth)
-        data[of_kind[:, np.newaxis], row, column] = found
-    return Picture(read_only(data.astype(np.float32)), read_only(share.astype(np.float32)), grid)
+    patterns, pattern = np.unique(~np.isnan(channels), axis=0, return_inverse=True)
+    for k, is_known in enumerate(patterns):
+        in_pattern = np.flatnonzero(pattern.ravel() == k)
+        mesh = _Mesh.from_centroids(centroid_um[is_known], channels[np.ix_(in_pattern, np.flatnonzero(is_known))])
+        found = mesh.evaluate(points_um, thread_count(n_threads), is_smooth=is_smooth)
+        data[in_pattern[:, np.newaxis], row, column] = found
+    return Picture(read_only(data.astype(np.float32)), read_only(fraction.astype(np.float32)), grid)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,53 +124,60 @@ class _Mesh:
     """
     Distinct points with values, and their Delaunay triangulation.
 
-    Coordinates are relative to ``middle_um``, in units of ``extent_um``.
+    Coordinates are relative to ``centre_um``, in units of ``extent_um``.
     """
 
     xy: Floats
     values: Floats
-    middle_um: Floats
+    centre_um: Floats
     extent_um: float
 
     @classmethod
-    def of(cls, centroid_um: Floats, values: Floats) -> _Mesh:
+    def from_centroids(cls, centroid_um: Floats, values: Floats) -> _Mesh:
         """Create from centroids (n, 2) with values (n_channel, n); equal centroids are merged."""
-        middle_um = 0.5 * (centroid_um.min(axis=0) + centroid_um.max(axis=0))
+        centre_um = 0.5 * (centroid_um.min(axis=0) + centroid_um.max(axis=0))
         extent_um = float(np.ptp(centroid_um, axis=0).max()) or 1.0
-        xy = (centroid_um - middle_um) / extent_um
-        _, first, place = np.unique(np.rint(xy / SAME_PLACE), axis=0, return_index=True, return_inverse=True)
-        place = place.ravel()
-        count = np.bincount(place)
-        sums = np.array([np.bincount(place, weights=channel) for channel in values])
-        return cls(np.ascontiguousarray(xy[first]), np.ascontiguousarray((sums / count).T), middle_um, extent_um)
+        xy = (centroid_um - centre_um) / extent_um
+        _, first, position = np.unique(np.rint(xy / MERGE_FRACTION), axis=0, return_index=True, return_inverse=True)
+        position = position.ravel()
+        count = np.bincount(position)
+        sums = np.array([np.bincount(position, weights=channel) for channel in values])
+        return cls(np.ascontiguousarray(xy[first]), np.ascontiguousarray((sums / count).T), centre_um, extent_um)
 
-    def at(self, points_um: Floats, n_threads: int, *, is_smooth: bool) -> Floats:
+    def evaluate(self, points_um: Floats, n_threads: int, *, is_smooth: bool) -> Floats:
         """Interpolate values at points (n, 2), as (n_channel, n)."""
         from scipy.spatial import Delaunay, QhullError
 
         from foveasim.reconstruct import _kernels
 
-        points = (points_um - self.middle_um) / self.extent_um
+        points = (points_um - self.centre_um) / self.extent_um
         try:
             mesh = Delaunay(self.xy)
         except (QhullError, ValueError):  # fewer than three points, or all collinear
-            return self._along_a_line(points)
+            return self._along_line(points)
         found = np.empty((points.shape[0], self.values.shape[1]))
         pieces = [slice(i, i + PIXELS_PER_PIECE) for i in range(0, points.shape[0], PIXELS_PER_PIECE)]
         triangle = np.asarray(mesh.find_simplex(points), np.int64)
-        corners, beyond = (np.ascontiguousarray(part, np.int64) for part in (mesh.simplices, mesh.neighbors))
-        beyond_hull = np.argwhere(beyond < 0)
-        edges = np.stack([corners[beyond_hull[:, 0], (beyond_hull[:, 1] + k) % 3] for k in (1, 2)], axis=1)
-        circles = _circles(self.xy[corners]) if is_smooth else None
+        corners, neighbours = (np.ascontiguousarray(part, np.int64) for part in (mesh.simplices, mesh.neighbors))
+        hull_edges = np.argwhere(neighbours < 0)
+        edges = np.stack([corners[hull_edges[:, 0], (hull_edges[:, 1] + k) % 3] for k in (1, 2)], axis=1)
+        circles = _circumcircles(self.xy[corners]) if is_smooth else None
 
         def fill(piece: slice) -> None:
             inside = np.flatnonzero(triangle[piece] >= 0) + piece.start
             outside = np.flatnonzero(triangle[piece] < 0) + piece.start
             if is_smooth:
                 out = np.empty((inside.size, self.values.shape[1]))
-                home = triangle[inside]
+                containing = triangle[inside]
                 _kernels.natural_neighbours(
-                    np.ascontiguousarray(points[inside]), home, self.xy, self.values, corners, beyond, circles, out
+                    np.ascontiguousarray(points[inside]),
+                    containing,
+                    self.xy,
+                    self.values,
+                    corners,
+                    neighbours,
+                    circles,
+                    out,
                 )
                 found[inside] = out
             else:
@@ -180,50 +185,52 @@ class _Mesh:
                     points[inside], mesh.transform[triangle[inside]], corners[triangle[inside]]
                 )
             if outside.size:
-                found[outside] = self._on_the_hull(points[outside], edges)
+                found[outside] = self._at_hull(points[outside], edges)
 
         parallel_map(fill, pieces, n_threads)
         return found.T
 
     def _linear(self, points: Floats, transform: Floats, corners: Ints) -> Floats:
         first = np.einsum("nij,nj->ni", transform[:, :2], points - transform[:, 2])
-        shares = np.concatenate((first, 1.0 - first.sum(axis=1, keepdims=True)), axis=1)
-        return np.asarray(np.einsum("nk,nkc->nc", shares, self.values[corners]))
+        weights = np.concatenate((first, 1.0 - first.sum(axis=1, keepdims=True)), axis=1)
+        return np.asarray(np.einsum("nk,nkc->nc", weights, self.values[corners]))
 
-    def _on_the_hull(self, points: Floats, edges: Ints) -> Floats:
+    def _at_hull(self, points: Floats, edges: Ints) -> Floats:
         """Return values at the nearest points of the convex hull."""
         start = self.xy[edges[:, 0]]
         along = self.xy[edges[:, 1]] - start
         length2 = np.einsum("ij,ij->i", along, along)
         found = np.empty((points.shape[0], self.values.shape[1]))
-        step = max(1, DISTANCES_AT_ONCE // edges.shape[0])
+        step = max(1, MAX_DISTANCES // edges.shape[0])
         for i in range(0, points.shape[0], step):
-            apart = points[i : i + step, np.newaxis] - start
-            at = np.clip(np.einsum("pej,ej->pe", apart, along) / length2, 0.0, 1.0)
-            distance2 = ((apart - at[..., np.newaxis] * along) ** 2).sum(axis=-1)
+            offset = points[i : i + step, np.newaxis] - start
+            at = np.clip(np.einsum("pej,ej->pe", offset, along) / length2, 0.0, 1.0)
+            distance2 = ((offset - at[..., np.newaxis] * along) ** 2).sum(axis=-1)
             nearest = distance2.argmin(axis=1)
-            share = np.take_along_axis(at, nearest[:, np.newaxis], axis=1)
+            fraction = np.take_along_axis(at, nearest[:, np.newaxis], axis=1)
             ends = self.values[edges[nearest]]
-            found[i : i + step] = (1.0 - share) * ends[:, 0] + share * ends[:, 1]
+            found[i : i + step] = (1.0 - fraction) * ends[:, 0] + fraction * ends[:, 1]
         return found
 
-    def _along_a_line(self, points: Floats) -> Floats:
+    def _along_line(self, points: Floats) -> Floats:
         """Interpolate along the line of collinear points, clamped at its ends."""
         order = np.lexsort(self.xy.T)
         first, last = self.xy[order[0]], self.xy[order[-1]]
-        place, at = ((xy - first) @ (last - first) for xy in (self.xy, points))
-        order = np.argsort(place)
-        return np.array([np.interp(at, place[order], channel[order]) for channel in self.values.T])
+        position, at = ((xy - first) @ (last - first) for xy in (self.xy, points))
+        order = np.argsort(position)
+        return np.array([np.interp(at, position[order], channel[order]) for channel in self.values.T])
 
 
-def _circles(corners: Floats) -> Floats:
+def _circumcircles(corners: Floats) -> Floats:
     """Return centres and squared radii of triangle circumcircles, (n, 3) from (n, 3, 2)."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    twice = 2.0 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    twice = np.where(twice == 0.0, np.finfo(np.float64).tiny, twice)
+    double_area = 2.0 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    double_area = np.where(double_area == 0.0, np.finfo(np.float64).tiny, double_area)
     a2, b2 = (a**2).sum(axis=1), (b**2).sum(axis=1)
     with np.errstate(over="ignore", invalid="ignore"):
-        centre = np.stack((a2 * b[:, 1] - b2 * a[:, 1], b2 * a[:, 0] - a2 * b[:, 0]), axis=1) / twice[:, np.newaxis]
+        centre = (
+            np.stack((a2 * b[:, 1] - b2 * a[:, 1], b2 * a[:, 0] - a2 * b[:, 0]), axis=1) / double_area[:, np.newaxis]
+        )
         circles = np.concatenate((corners[:, 0] + centre, (centre**2).sum(axis=1, keepdims=True)), axis=1)
     # Collinear corners have no circumcircle: a squared radius of -1 contains no point.
     return np.ascontiguousarray(np.where(np.isfinite(circles).all(axis=1, keepdims=True), circles, (0.0, 0.0, -1.0)))

@@ -21,25 +21,25 @@ from foveasim._core.validation import Floats, check_choice, check_count, check_n
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PackedRings
 from foveasim.integrate import Integrator
-from foveasim.reconstruct._bounded import least_nonnegative
+from foveasim.reconstruct._bounded import minimise_nonnegative
 from foveasim.reconstruct.interpolation import site_values
 from foveasim.reconstruct.picture import Picture, coverage_fraction
 
 __all__ = ["least_squares"]
 
 #: Sites with less than this fraction of their area on the raster are ignored.
-MIN_ON_RASTER = 1e-6
+MIN_RASTER_FRACTION = 1e-6
 #: Relative tolerance of the misfit, compared with the noise, in the discrepancy rule.
 MISFIT_TOLERANCE = 0.02
 #: Largest number of regularisation strengths that are tried, and ratio of the first guess to the smallest strength.
-MAX_STRENGTHS, FURTHEST = 12, 1e8
+MAX_STRENGTHS, MAX_STRENGTH_RATIO = 12, 1e8
 #: Largest strength, as a multiple of the largest curvature of the data term: beyond it the picture is constant.
-STRONGEST = 1e6
+MAX_RELATIVE_STRENGTH = 1e6
 #: Upper bound of a picture's roughness along one axis over its sum of squares; and largest number of pixels across the
 #: coarsest level of the preconditioner.
-ROUGHEST, COARSEST = 4.0, 4
+MAX_ROUGHNESS, MAX_COARSEST_PIXELS = 4.0, 4
 #: Factor by which the tolerance is relaxed during the search for the strength.
-LOOSER = 3.0
+SEARCH_TOLERANCE_FACTOR = 3.0
 
 
 def least_squares(
@@ -121,28 +121,28 @@ def least_squares(
         raise ParameterError("mu", "must be a number without 'variance', as both rules depend on the noise")
     tolerance = check_number("tolerance", tolerance, above=0.0, at_most=0.1)
     max_steps = check_count("max_steps", max_steps)
-    share = coverage_fraction(integrator)
+    coverage = coverage_fraction(integrator)
     kernel_of = _kernels_of(blur, n_channels)
     pad = tuple(n // 2 for n in kernel_of[0].shape) if kernel_of else (0, 0)
-    shape = tuple(_fast(n + 2 * p) if p else n for n, p in zip(grid.shape, pad, strict=True))
-    overlaps = _padded(integrator, pad, shape)
+    shape = tuple(_fast_length(n + 2 * p) if p else n for n, p in zip(grid.shape, pad, strict=True))
+    overlaps = _padded_overlaps(integrator, pad, shape)
     covered_um2 = np.asarray(overlaps.sum(axis=1)).ravel()
-    whole_um2 = covered_um2 + integrator.uncovered_um2
-    gain = whole_um2 if response is None else finite_array("response", response, ndim=1, at_least=0.0)
+    area_um2 = covered_um2 + integrator.uncovered_um2
+    gain = area_um2 if response is None else finite_array("response", response, ndim=1, at_least=0.0)
     if gain.shape != (n_sites,):
         raise ParameterError("response", f"must have the shape ({n_sites},), got {gain.shape}")
-    counts = (covered_um2 > MIN_ON_RASTER * whole_um2) & (gain > 0.0)
+    is_used = (covered_um2 > MIN_RASTER_FRACTION * area_um2) & (gain > 0.0)
     noise = _noise(variance, gain, channels.shape)
 
-    def solved(channel: int) -> Floats:
-        known = np.flatnonzero(counts & ~np.isnan(channels[channel]))
+    def solve(channel: int) -> Floats:
+        known = np.flatnonzero(is_used & ~np.isnan(channels[channel]))
         if known.size == 0:
             raise ParameterError(
                 "values", f"must have a number for a site on the raster, got none in channel {channel}"
             )
         weight = gain[known] / covered_um2[known] / np.sqrt(noise[channel, known])
         problem = _Problem(
-            overlaps=_scaled_rows(overlaps[known], weight),
+            overlaps=_scale_rows(overlaps[known], weight),
             right=channels[channel, known] / np.sqrt(noise[channel, known]),
             shape=shape,
             weights=(grid.pitch_y_um / grid.pitch_x_um, grid.pitch_x_um / grid.pitch_y_um),
@@ -151,14 +151,14 @@ def least_squares(
             max_steps=max_steps,
         )
         if mu == "discrepancy":
-            x = problem.as_smooth_as_noise_allows()
+            x = problem.solve_discrepancy()
         else:
-            x = problem.solved(problem.natural_strength if isinstance(mu, str) else float(mu))
+            x = problem.solve(problem.natural_strength if isinstance(mu, str) else float(mu))
         return x.reshape(shape)[pad[0] : pad[0] + grid.shape[0], pad[1] : pad[1] + grid.shape[1]]
 
-    data = np.array(parallel_map(solved, range(n_channels), thread_count(n_threads)))
-    data[:, share == 0.0] = np.nan
-    return Picture(read_only(data.astype(np.float32)), read_only(share.astype(np.float32)), grid)
+    data = np.array(parallel_map(solve, range(n_channels), thread_count(n_threads)))
+    data[:, coverage == 0.0] = np.nan
+    return Picture(read_only(data.astype(np.float32)), read_only(coverage.astype(np.float32)), grid)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +193,7 @@ class _Problem:
     def _transposed(self) -> Any:
         return self.overlaps.T.tocsr()
 
-    def _blurred(self, x: Floats, transfer: Any) -> Floats:
+    def _blur(self, x: Floats, transfer: Any) -> Floats:
         if transfer is None:
             return x
         from scipy import fft
@@ -203,29 +203,29 @@ class _Problem:
 
     def forward(self, x: Floats) -> Floats:
         """Return the values of a picture, divided by their noise."""
-        return np.asarray(self.overlaps @ self._blurred(x, self.transfer))
+        return np.asarray(self.overlaps @ self._blur(x, self.transfer))
 
     def backward(self, y: Floats) -> Floats:
         """Apply the adjoint of :meth:`forward`."""
-        return self._blurred(np.asarray(self._transposed @ y), None if self.transfer is None else self.transfer.conj())
+        return self._blur(np.asarray(self._transposed @ y), None if self.transfer is None else self.transfer.conj())
 
     @cached_property
-    def _projected(self) -> Floats:
+    def _normal_right(self) -> Floats:
         return self.backward(self.right)
 
     @cached_property
-    def _reach(self) -> Floats:
+    def _row_sums(self) -> Floats:
         """Row sums of the data term of the normal equations, a diagonal that bounds it."""
         return np.maximum(self.backward(self.forward(np.ones(self.overlaps.shape[1]))), 0.0)
 
     def _levels(self, mu: float) -> list[Floats]:
         """Return inverse diagonals of the preconditioner, from the finest level to the coarsest."""
-        level, levels = self._reach.reshape(self.shape), []
+        level, levels = self._row_sums.reshape(self.shape), []
         while True:
-            levels.append(1.0 / (level + ROUGHEST * sum(self.weights) * mu))
-            if min(level.shape) <= COARSEST:
+            levels.append(1.0 / (level + MAX_ROUGHNESS * sum(self.weights) * mu))
+            if min(level.shape) <= MAX_COARSEST_PIXELS:
                 return levels
-            level = _coarser(level)
+            level = _coarsen(level)
 
     @cached_property
     def first_guess(self) -> Floats:
@@ -236,7 +236,7 @@ class _Problem:
         flat = float(np.median(means))
         return np.maximum(np.where(total > 0.0, weighted / np.where(total > 0.0, total, 1.0), flat), 0.0)
 
-    def solved(self, mu: float, start: Floats | None = None, tolerance: float | None = None) -> Floats:
+    def solve(self, mu: float, start: Floats | None = None, tolerance: float | None = None) -> Floats:
         """Return the picture for one regularisation strength."""
         from foveasim.reconstruct import _kernels
 
@@ -252,27 +252,27 @@ class _Problem:
         def precondition(gradient: Floats) -> Floats:
             planes = [gradient.reshape(self.shape)]
             for _ in levels[1:]:
-                planes.append(_coarser(planes[-1]))
+                planes.append(_coarsen(planes[-1]))
             out = planes[-1] * levels[-1]
             for plane, level in zip(planes[-2::-1], levels[-2::-1], strict=True):
-                out = _finer(out, plane.shape) + plane * level
+                out = _refine(out, plane.shape) + plane * level
             return out.ravel()
 
-        x, self.__dict__["n_steps"] = least_nonnegative(
+        x, self.__dict__["n_steps"] = minimise_nonnegative(
             normal,
             1.0 / levels[0].ravel(),
             precondition,
-            self._projected,
+            self._normal_right,
             self.first_guess if start is None else start,
-            enough=(tolerance or self.tolerance) * math.sqrt(self.right @ self.right),
+            threshold=(tolerance or self.tolerance) * math.sqrt(self.right @ self.right),
             max_steps=self.max_steps,
         )
         return x
 
     def misfit(self, x: Floats) -> float:
         """Return the mean squared residual in units of the noise, whose expectation is 1."""
-        apart = self.forward(x) - self.right
-        return float(apart @ apart) / self.right.size
+        residual = self.forward(x) - self.right
+        return float(residual @ residual) / self.right.size
 
     def roughness(self, x: Floats) -> float:
         """Return the weighted sum of the squared differences of neighbouring pixels."""
@@ -288,20 +288,20 @@ class _Problem:
         For uniform pictures the largest strength.
         """
         return self.right.size / max(
-            self.roughness(self.first_guess), self.right.size / (STRONGEST * float(self._reach.max()))
+            self.roughness(self.first_guess), self.right.size / (MAX_RELATIVE_STRENGTH * float(self._row_sums.max()))
         )
 
-    def as_smooth_as_noise_allows(self) -> Floats:
+    def solve_discrepancy(self) -> Floats:
         """
         Return the picture whose misfit equals the noise (discrepancy principle).
 
         The strength is found by a bracketed secant method in the logarithms of strength and misfit.
         """
         x, mu = self.first_guess, self.natural_strength
-        low, high = math.log(mu / FURTHEST), math.log(STRONGEST * float(self._reach.max()))
+        low, high = math.log(mu / MAX_STRENGTH_RATIO), math.log(MAX_RELATIVE_STRENGTH * float(self._row_sums.max()))
         before: tuple[float, float] | None = None
         for _ in range(MAX_STRENGTHS):
-            x = self.solved(mu, x, min(LOOSER * self.tolerance, 0.1))
+            x = self.solve(mu, x, min(SEARCH_TOLERANCE_FACTOR * self.tolerance, 0.1))
             at, value = math.log(mu), math.log(max(self.misfit(x), 1e-300))
             low, high = (at, high) if value < 0.0 else (low, at)
             if abs(value) <= MISFIT_TOLERANCE or high - low < 1e-3:
@@ -311,34 +311,34 @@ class _Problem:
             # The misfit increases with the strength, at most with its square.
             following = at - value / min(max(slope, 0.1), 2.0)
             mu = math.exp(following if low < following < high else 0.5 * (low + high))
-        return self.solved(mu, x)
+        return self.solve(mu, x)
 
 
 # -- levels -----------------------------------------------------------------------------------------------------------
 
 
-def _coarser(plane: Floats) -> Floats:
-    """Apply the adjoint of :func:`_finer`."""
+def _coarsen(plane: Floats) -> Floats:
+    """Apply the adjoint of :func:`_refine`."""
     for axis in (0, 1):
-        plane = np.moveaxis(_halved(np.moveaxis(plane, axis, 0)), 0, axis)
+        plane = np.moveaxis(_downsample(np.moveaxis(plane, axis, 0)), 0, axis)
     return plane
 
 
-def _finer(plane: Floats, shape: tuple[int, ...]) -> Floats:
+def _refine(plane: Floats, shape: tuple[int, ...]) -> Floats:
     """Interpolate linearly between pixel centres to pixels of half the size."""
     for axis in (0, 1):
-        plane = np.moveaxis(_doubled(np.moveaxis(plane, axis, 0), shape[axis]), 0, axis)
+        plane = np.moveaxis(_upsample(np.moveaxis(plane, axis, 0), shape[axis]), 0, axis)
     return plane
 
 
-def _doubled(rows: Floats, n: int) -> Floats:
+def _upsample(rows: Floats, n: int) -> Floats:
     before, after = np.concatenate((rows[:1], rows[:-1])), np.concatenate((rows[1:], rows[-1:]))
     out = np.empty((2 * rows.shape[0], *rows.shape[1:]))
     out[0::2], out[1::2] = 0.75 * rows + 0.25 * before, 0.75 * rows + 0.25 * after
     return out[:n]
 
 
-def _halved(rows: Floats) -> Floats:
+def _downsample(rows: Floats) -> Floats:
     if rows.shape[0] % 2:
         rows = np.concatenate((rows, np.zeros((1, *rows.shape[1:]))))
     even, odd = rows[0::2], rows[1::2]
@@ -367,28 +367,28 @@ def _noise(variance: ArrayLike | None, gain: Floats, shape: tuple[int, int]) -> 
         ) from None
 
 
-def _fast(n: int) -> int:
+def _fast_length(n: int) -> int:
     """Return the next length for which Fourier transforms are fast."""
     from scipy import fft
 
     return int(fft.next_fast_len(n, real=True))
 
 
-def _scaled_rows(matrix: Any, weight: Floats) -> Any:
+def _scale_rows(matrix: Any, weight: Floats) -> Any:
     """Return a sparse matrix with its rows multiplied by weights."""
     scaled = matrix.copy()
     scaled.data *= np.repeat(weight, np.diff(scaled.indptr))
     return scaled
 
 
-def _padded(integrator: Integrator, pad: tuple[int, ...], shape: tuple[int, ...]) -> Any:
+def _padded_overlaps(integrator: Integrator, pad: tuple[int, ...], shape: tuple[int, ...]) -> Any:
     """Return the overlaps as a sparse matrix on a padded raster."""
     from scipy.sparse import csr_array
 
     matrix = integrator.weights()
     row, column = np.divmod(matrix.indices, integrator.grid.shape[1])
-    place = (row + pad[0]) * shape[1] + column + pad[1]
-    return csr_array((matrix.data, place, matrix.indptr), shape=(matrix.shape[0], shape[0] * shape[1]))
+    index = (row + pad[0]) * shape[1] + column + pad[1]
+    return csr_array((matrix.data, index, matrix.indptr), shape=(matrix.shape[0], shape[0] * shape[1]))
 
 
 def _kernels_of(blur: ArrayLike | None, n_channels: int) -> list[Floats]:

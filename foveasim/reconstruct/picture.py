@@ -22,7 +22,7 @@ __all__ = ["Picture", "coverage_fraction", "raster_grid"]
 #: Coverage below this fraction is rounding error.
 NO_COVERAGE = 1e-9
 #: File extensions that store floating-point numbers by default.
-FLOATING = (".tif", ".tiff", ".exr")
+FLOAT_EXTENSIONS = (".tif", ".tiff", ".exr")
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +81,10 @@ class Picture:
             raise ParameterError("bits", "must be 8 or 16", bits)
         if white is None:
             white = float(np.nanmax(self.data, initial=0.0)) or 1.0
-        share = np.clip(np.nan_to_num(self.data) / self._levels(white), 0.0, 1.0)
+        fraction = np.clip(np.nan_to_num(self.data) / self._levels(white), 0.0, 1.0)
         if encode_srgb:
-            share = encode_srgb_values(share)
-        layers = np.concatenate((share, np.clip(self.coverage, 0.0, 1.0)[np.newaxis]))
+            fraction = encode_srgb_values(fraction)
+        layers = np.concatenate((fraction, np.clip(self.coverage, 0.0, 1.0)[np.newaxis]))
         image: NDArray[Any] = np.rint((2**bits - 1) * to_file_rows(layers))
         return np.ascontiguousarray(image.astype(np.uint8 if bits == 8 else np.uint16))
 
@@ -119,7 +119,7 @@ class Picture:
             When ``bits`` is none of these, or as for :meth:`to_image`.
         """
         if bits is None:
-            bits = 32 if Path(path).suffix.lower() in FLOATING else 8
+            bits = 32 if Path(path).suffix.lower() in FLOAT_EXTENSIONS else 8
         if bits not in (8, 16, 32):
             raise ParameterError("bits", "must be 8, 16 or 32", bits)
         if bits != 32:
@@ -149,8 +149,8 @@ def raster_grid(layout: PackedRings, max_pixels: int) -> Grid:
     low, high = layout.xy_um.min(axis=0), layout.xy_um.max(axis=0)
     pitch_um = float((high - low).max()) / max_pixels
     n_x, n_y = (max(1, math.ceil(length / pitch_um - 1e-6)) for length in high - low)
-    middle = 0.5 * (low + high)
-    origin_um = (float(middle[0] - 0.5 * n_x * pitch_um), float(middle[1] - 0.5 * n_y * pitch_um))
+    centre = 0.5 * (low + high)
+    origin_um = (float(centre[0] - 0.5 * n_x * pitch_um), float(centre[1] - 0.5 * n_y * pitch_um))
     return Grid((n_y, n_x), pitch_um, origin_um)
 
 
@@ -160,5 +160,5 @@ def coverage_fraction(integrator: Integrator) -> Floats:
 
     Fractions within rounding error of 0 are 0.
     """
-    share = integrator.spread(np.ones(integrator.n_sites)) / integrator.grid.cell_area_um2
-    return np.where(share > NO_COVERAGE, share, 0.0)
+    fraction = integrator.spread(np.ones(integrator.n_sites)) / integrator.grid.cell_area_um2
+    return np.where(fraction > NO_COVERAGE, fraction, 0.0)

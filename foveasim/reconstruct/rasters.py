@@ -15,22 +15,22 @@ from foveasim.reconstruct.picture import Picture
 __all__ = ["blur_kernel", "reference"]
 
 #: Default encircled energy of a kernel, and its largest radius in pixels.
-HELD_SHARE, MAX_RADIUS = 0.98, 128
+DEFAULT_ENERGY_FRACTION, MAX_RADIUS = 0.98, 128
 #: Largest sample pitch of the PSF in λN: half the Nyquist pitch.
 SAMPLE_LAMBDA_N = 0.25
 #: Largest number of PSF samples along an axis.
 MAX_SAMPLES = 8192
 #: Coverage above which a pixel lies on the map.
-ON_THE_MAP = 1e-9
+MIN_COVERAGE = 1e-9
 
 
-def reference(light: PowerMap, grid: Grid, *, weights: Floats | None = None) -> Picture:
+def reference(power_map: PowerMap, grid: Grid, *, weights: Floats | None = None) -> Picture:
     """
     Resample a power map to the pixels of a picture by exact area-weighted means.
 
     Parameters
     ----------
-    light : PowerMap
+    power_map : PowerMap
     grid : Grid
         Pixels of the picture, of any pitch and position.
     weights : (n_channel, n_band), optional
@@ -46,20 +46,22 @@ def reference(light: PowerMap, grid: Grid, *, weights: Floats | None = None) -> 
     ParameterError
         When the shape of ``weights`` does not match the bands.
     """
-    worth = np.eye(light.wavelength_nm.size) if weights is None else finite_array("weights", weights, ndim=2)
-    if worth.shape[1] != light.wavelength_nm.size:
+    channel_weights = (
+        np.eye(power_map.wavelength_nm.size) if weights is None else finite_array("weights", weights, ndim=2)
+    )
+    if channel_weights.shape[1] != power_map.wavelength_nm.size:
         raise ParameterError(
-            "weights", f"must have the shape (n_channel, {light.wavelength_nm.size}), got {worth.shape}"
+            "weights", f"must have the shape (n_channel, {power_map.wavelength_nm.size}), got {channel_weights.shape}"
         )
-    along_y, along_x = (_overlaps_1d(grid, light.grid, axis) for axis in (0, 1))
+    along_y, along_x = (_overlaps_1d(grid, power_map.grid, axis) for axis in (0, 1))
     on_map = np.outer(along_y.sum(axis=1), along_x.sum(axis=1)) / grid.cell_area_um2
-    is_on = on_map > ON_THE_MAP
-    data = np.full((worth.shape[0], *grid.shape), np.nan)
-    for channel, weight in zip(data, worth, strict=True):
-        plane = np.tensordot(weight, light.data, axes=1)
+    is_covered = on_map > MIN_COVERAGE
+    data = np.full((channel_weights.shape[0], *grid.shape), np.nan)
+    for channel, weight in zip(data, channel_weights, strict=True):
+        plane = np.tensordot(weight, power_map.data, axes=1)
         sums = (along_x @ (along_y @ plane).T).T / grid.cell_area_um2
-        channel[is_on] = sums[is_on] / on_map[is_on]
-    coverage = np.where(is_on, on_map, 0.0).astype(np.float32)
+        channel[is_covered] = sums[is_covered] / on_map[is_covered]
+    coverage = np.where(is_covered, on_map, 0.0).astype(np.float32)
     return Picture(read_only(data.astype(np.float32)), read_only(coverage), grid)
 
 
@@ -105,9 +107,9 @@ def blur_kernel(
         raise ParameterError("optics", f"must be a foveasim.Optics, got a {type(optics).__name__}")
     shorter_um = min(grid.pitch_x_um, grid.pitch_y_um)
     if radius is None:
-        reach = np.arange(1, MAX_RADIUS + 1)
-        held = optics.encircled_energy((reach + 0.5) * shorter_um, wavelength_nm, distance_m=distance_m)
-        radius = int(reach[min(int(np.searchsorted(held, HELD_SHARE)), MAX_RADIUS - 1)])
+        radii = np.arange(1, MAX_RADIUS + 1)
+        energy = optics.encircled_energy((radii + 0.5) * shorter_um, wavelength_nm, distance_m=distance_m)
+        radius = int(radii[min(int(np.searchsorted(energy, DEFAULT_ENERGY_FRACTION)), MAX_RADIUS - 1)])
     radius = check_count("radius", radius, at_least=0, at_most=MAX_RADIUS)
     finest_um = 8.0 * SAMPLE_LAMBDA_N * optics.psf(wavelength_nm, distance_m=distance_m, n_points=1).grid.pitch_x_um
     step_um = shorter_um / (int(np.ceil(shorter_um / finest_um)) | 1)
@@ -118,7 +120,7 @@ def blur_kernel(
             f"must have pixels whose PSF needs at most {MAX_SAMPLES} samples along an axis, got {n_points}",
             hint="use pixels closer to square or a smaller 'radius'",
         )
-    spread = optics.psf(wavelength_nm, distance_m=distance_m, pitch_um=step_um, n_points=n_points)
+    psf = optics.psf(wavelength_nm, distance_m=distance_m, pitch_um=step_um, n_points=n_points)
     # Convolution with the boxes of both pixels, as a product of Fourier transforms that is evaluated at pixel centres only.
     cycles_per_um = np.fft.fftfreq(n_points, step_um)
     centre_um, offset = 0.5 * (n_points - 1) * step_um, np.arange(-radius, radius + 1)
@@ -127,7 +129,7 @@ def blur_kernel(
         * np.sinc(pitch_um * cycles_per_um) ** 2
         for pitch_um in (grid.pitch_y_um, grid.pitch_x_um)
     )
-    means = (along_y @ np.fft.fft2(spread.psf_per_um2) @ along_x.T).real
+    means = (along_y @ np.fft.fft2(psf.psf_per_um2) @ along_x.T).real
     kernel = np.maximum(means, 0.0)
     return np.asarray(kernel / kernel.sum())
 
@@ -144,8 +146,8 @@ def _overlaps_1d(to: Grid, source: Grid, axis: int) -> Any:
         grid.origin_um[1 - axis] + np.arange(grid.shape[axis] + 1) * grid.pitch_xy_um[1 - axis] for grid in (to, source)
     )
     cuts = np.unique(np.concatenate((edges_to, edges_from)))
-    middle, length_um = 0.5 * (cuts[1:] + cuts[:-1]), np.diff(cuts)
-    row, column = (np.searchsorted(edges, middle, side="right") - 1 for edges in (edges_to, edges_from))
-    is_both = (row >= 0) & (row < to.shape[axis]) & (column >= 0) & (column < source.shape[axis])
-    place = (row[is_both], column[is_both])
-    return csr_array((length_um[is_both], place), shape=(to.shape[axis], source.shape[axis]))
+    centre, length_um = 0.5 * (cuts[1:] + cuts[:-1]), np.diff(cuts)
+    row, column = (np.searchsorted(edges, centre, side="right") - 1 for edges in (edges_to, edges_from))
+    is_overlap = (row >= 0) & (row < to.shape[axis]) & (column >= 0) & (column < source.shape[axis])
+    indices = (row[is_overlap], column[is_overlap])
+    return csr_array((length_um[is_overlap], indices), shape=(to.shape[axis], source.shape[axis]))

@@ -40,7 +40,7 @@ MAX_ENCODED = 16.0
 #: Larger values are errors of units: 1e9 m is the distance and width of an astronomical scene.
 MAX_PITCH_UM, MAX_DISTANCE_M = 1e15, 1e9
 #: Weights of red, green and blue in the luminance of a colour (Rec. ITU-R BT.709).
-BRIGHTNESS = np.array([0.2126, 0.7152, 0.0722], np.float32)
+LUMINANCE_WEIGHTS = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +184,7 @@ class Scene:
             pixels.ndim == 3 and pixels.shape[2] in (2, 4) and (spectrum is None or len(spectrum) != pixels.shape[2])
         )
         try:
-            channels = _light(pixels, encoding, has_alpha=has_alpha)
+            channels = _relative_radiance(pixels, encoding, has_alpha=has_alpha)
         except ParameterError as error:
             raise (FileError(str(picture), str(error)) if is_file else error) from None
         n_channels = channels.shape[0]
@@ -203,7 +203,7 @@ class Scene:
         elif n_channels == 1:
             relative = np.ones((1, waves_nm.size))
         elif n_channels == 3 and waves_nm.size == 1:
-            channels, relative = np.tensordot(BRIGHTNESS, channels, axes=1)[np.newaxis], np.ones((1, 1))
+            channels, relative = np.tensordot(LUMINANCE_WEIGHTS, channels, axes=1)[np.newaxis], np.ones((1, 1))
         else:
             raise ParameterError(
                 "wavelength_nm",
@@ -328,7 +328,7 @@ def _picture_array(picture: ArrayLike) -> NDArray[Any]:
         raise ParameterError("picture", "must be a file or an array of numbers", picture) from None
 
 
-def _light(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Images:
+def _relative_radiance(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Images:
     """Return the relative radiance (n_channel, n_y, n_x) float32, multiplied by alpha."""
     pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
     if pixels.dtype == np.bool_:
@@ -338,7 +338,7 @@ def _light(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Imag
         table = decode(np.arange(peak + 1) / peak, encoding).astype(np.float32)
         values = np.arange(peak + 1, dtype=np.float32) / np.float32(peak)
         colours = pixels[..., :-1] if has_alpha else pixels
-        light = np.take(table, np.ascontiguousarray(from_file_rows(colours)))
+        radiance = np.take(table, np.ascontiguousarray(from_file_rows(colours)))
         alpha = values[from_file_rows(pixels[..., -1])] if has_alpha else None
     elif pixels.dtype.kind == "f":
         if not np.isfinite(pixels).all() or pixels.min() < 0:
@@ -352,13 +352,13 @@ def _light(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Imag
             )
         colours = pixels[..., :-1] if has_alpha else pixels
         precise = colours.astype(np.float32) if pixels.dtype == np.float16 else colours
-        light = decode(np.ascontiguousarray(from_file_rows(precise)), encoding).astype(np.float32)
+        radiance = decode(np.ascontiguousarray(from_file_rows(precise)), encoding).astype(np.float32)
         alpha = from_file_rows(pixels[..., -1]).astype(np.float32) if has_alpha else None
     else:
         raise ParameterError("picture", f"must have the dtype uint8, uint16 or float, got {pixels.dtype}")
     if alpha is not None:
-        light *= alpha
-    return light
+        radiance *= alpha
+    return radiance
 
 
 def band_widths_nm(wavelength_nm: Floats, band_width_nm: float | Sequence[float] | Floats | None) -> Floats:

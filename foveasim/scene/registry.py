@@ -15,7 +15,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 #: entry points of the group ``foveasim.scenes``.
 SCENES: Registry[Callable[..., Any]] = Registry("scene", "foveasim.scenes")
 #: Documentation of the common parameters of charts, which replaces ``{picture}`` in their docstrings.
-PICTURE = """shape : (n_y, n_x)
+PICTURE_PARAMETERS = """shape : (n_y, n_x)
         Number of pixels.
     pitch_um : float, µm
         Pixel pitch in the scene.
@@ -33,7 +33,7 @@ def chart(name: str) -> Callable[[F], F]:
     """Register a chart function and insert the common parameters into its docstring."""
 
     def decorate(function: F) -> F:
-        function.__doc__ = (function.__doc__ or "").replace("{picture}", PICTURE)
+        function.__doc__ = (function.__doc__ or "").replace("{picture}", PICTURE_PARAMETERS)
         return SCENES.register(name, function)  # type: ignore[return-value]
 
     return decorate

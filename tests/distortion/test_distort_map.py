@@ -247,7 +247,7 @@ def test_result_is_independent_of_piece_size(monkeypatch):
 
     light = power_map(np.random.default_rng(4).random((60, 70)), fs.Grid.centred((60, 70), 1.0))
     in_one_piece = distort_map(light, BARREL)
-    monkeypatch.setattr(_map, "CELLS_A_PIECE", 300)
+    monkeypatch.setattr(_map, "CELLS_PER_PIECE", 300)
 
     assert np.array_equal(distort_map(light, BARREL).data, in_one_piece.data)
 

@@ -24,7 +24,7 @@ from foveasim._io import sandbox
 from foveasim.errors import FileError, ParameterError
 from foveasim.maps import _dataset, from_xarray, read_power_map, to_xarray, write_power_map
 from foveasim.maps._formats import MAP_FORMATS, read_found
-from foveasim.maps._units import length_in_um, light_unit
+from foveasim.maps._units import irradiance_unit, length_in_um
 
 h5py = pytest.importorskip("h5py")
 xr = pytest.importorskip("xarray")
@@ -797,7 +797,7 @@ def test_default_bands_extend_to_midpoints(tmp_path):
     ],
 )
 def test_irradiance_units_are_parsed(text, unit):
-    assert light_unit(text) == unit
+    assert irradiance_unit(text) == unit
 
 
 @pytest.mark.parametrize(

@@ -180,10 +180,10 @@ def test_letter_f_is_upright_on_sensor():
 
 
 def test_checkerboard_has_specified_arrangement():
-    filled = relative_radiance(chart("checkerboard", square_mm=0.5))
-    assert math.isclose(filled.mean(), 0.5, rel_tol=1e-6)
-    assert filled[30:35, 40:45].max() < 1e-6
-    assert filled[25:30, 40:45].min() > 1.0 - 1e-6
+    fill = relative_radiance(chart("checkerboard", square_mm=0.5))
+    assert math.isclose(fill.mean(), 0.5, rel_tol=1e-6)
+    assert fill[30:35, 40:45].max() < 1e-6
+    assert fill[25:30, 40:45].min() > 1.0 - 1e-6
     board = relative_radiance(chart("checkerboard", square_mm=1.0, n_squares=(3, 5)))
     dark = 1.0 - board
     assert math.isclose(dark.sum() * PITCH_MM**2, 8.0, rel_tol=1e-6)

@@ -101,10 +101,10 @@ def test_image_matches_outlines(tmp_path, monkeypatch):
     layout = fs.layout.log_polar(n_sectors=60, min_size_um=1.0, r_max_um=20.0)
     colours = np.random.default_rng(0).integers(0, 256, (layout.n_sites, 3), dtype=np.uint8)
     pictures = []
-    for most in (0, 10**6):
-        monkeypatch.setattr("foveasim.view.plots.MAX_OUTLINES", most)
+    for max_outlines in (0, 10**6):
+        monkeypatch.setattr("foveasim.view.plots.MAX_OUTLINES", max_outlines)
         axes = plot_layout(layout, colours, scale_bar=False, ax=bare_axes(4, 4))
-        assert bool(axes.images) == (most == 0)
+        assert bool(axes.images) == (max_outlines == 0)
         pictures.append(drawn(axes, tmp_path).astype(float))
 
     difference = np.abs(pictures[0] - pictures[1])

@@ -249,7 +249,7 @@ def test_projected_size_follows_perspective():
 def test_shading_of_tops_and_walls():
     layout = fs.Layout.from_rectangles([[0.0, 0.0]], 10.0)
     mesh = prisms(layout, [1.0], max_height_um=10.0, by=np.array([[200, 100, 40]], np.uint8))
-    light = np.array(render3d.LIGHT) / np.linalg.norm(render3d.LIGHT)
+    light = np.array(render3d.LIGHT_DIRECTION) / np.linalg.norm(render3d.LIGHT_DIRECTION)
     picture = software(mesh, viewpoint=Viewpoint(azimuth_deg=-90.0, elevation_deg=40.0))
     roof = np.array([200, 100, 40]) * (render3d.AMBIENT + render3d.DIFFUSE * light[2])
     front = np.array([200, 100, 40]) * (render3d.AMBIENT + render3d.DIFFUSE * light[1])
@@ -299,7 +299,7 @@ def test_zoom_two_doubles_lengths():
 )
 def test_scene_fits_and_fills_picture(viewpoint):
     columns, size_px = prisms(ODD_LAYOUT, np.arange(5.0)), np.array([400, 300])
-    place = render3d._eye([columns], viewpoint, (400, 300)).on_screen(columns.points_um, (400, 300))
+    place = render3d._eye([columns], viewpoint, (400, 300)).project(columns.points_um, (400, 300))
     margins = np.array([place[:, :2].min(axis=0), size_px - place[:, :2].max(axis=0)]) / size_px
 
     assert np.all(place[:, 2] > 0.0)
@@ -384,7 +384,7 @@ def test_pyvista_picture_matches_sites_in_view():
     columns = prisms(layout, np.random.default_rng(4).random(n), by=colours, max_height_um=0.5)
     site = sites_in_view(columns, viewpoint=STRAIGHT_DOWN, size_px=(500, 400))
     picture = render(columns, viewpoint=STRAIGHT_DOWN, size_px=(500, 400), oversampling=1, renderer="pyvista")
-    light = np.array(render3d.LIGHT) / np.linalg.norm(render3d.LIGHT)
+    light = np.array(render3d.LIGHT_DIRECTION) / np.linalg.norm(render3d.LIGHT_DIRECTION)
     roof = np.rint(colours * (render3d.AMBIENT + render3d.DIFFUSE * light[2]))
     is_roof = (site >= 0) & np.all(np.abs(picture - roof[site]) <= 2, axis=-1)
 
@@ -453,8 +453,8 @@ MACHINES = {
     "no EGL driver": {"__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
     "EGL without OpenGL drivers": {"LIBGL_DRIVERS_PATH": "/nonexistent", "GBM_BACKENDS_PATH": "/nonexistent"},
     "invalid display": {"DISPLAY": ":77", "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
-    "invalid window class": {renderer.VTK_CHOICE: "vtkNoRenderWindow", "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
-    "window class without its library": {renderer.VTK_CHOICE: renderer.OSMESA, "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
+    "invalid window class": {renderer.VTK_VARIABLE: "vtkNoRenderWindow", "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
+    "window class without its library": {renderer.VTK_VARIABLE: renderer.OSMESA, "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
 }  # fmt: skip
 STILL = """
 import warnings
@@ -470,7 +470,7 @@ print(fs.view.find_renderer(), len(np.unique(picture)) > 2, *[w.message for w in
 
 @pytest.mark.parametrize("machine", MACHINES)
 def test_missing_drivers_do_not_crash_interpreter(machine):
-    bare = {k: v for k, v in os.environ.items() if k not in {"DISPLAY", renderer.VTK_CHOICE}}
+    bare = {k: v for k, v in os.environ.items() if k not in {"DISPLAY", renderer.VTK_VARIABLE}}
     run = subprocess.run(
         [sys.executable, "-c", STILL], env={**bare, **MACHINES[machine]}, capture_output=True, text=True, check=False
     )
@@ -504,16 +504,16 @@ def test_first_working_window_is_used(monkeypatch):
 
 
 def test_missing_libraries_give_no_candidates(monkeypatch):
-    for variable in ("DISPLAY", renderer.VTK_CHOICE):
+    for variable in ("DISPLAY", renderer.VTK_VARIABLE):
         monkeypatch.delenv(variable, raising=False)
-    monkeypatch.setattr(renderer, "_library", lambda _: None)
+    monkeypatch.setattr(renderer, "_load_library", lambda _: None)
     monkeypatch.setattr(sys, "platform", "linux")
     assert list(renderer._candidates()) == []
 
     monkeypatch.setenv("DISPLAY", ":0")
     assert list(renderer._candidates()) == []
 
-    monkeypatch.setattr(renderer, "_library", lambda name: object() if name == "libOSMesa.so.8" else None)
+    monkeypatch.setattr(renderer, "_load_library", lambda name: object() if name == "libOSMesa.so.8" else None)
     assert list(renderer._candidates()) == [renderer.OSMESA]
 
 

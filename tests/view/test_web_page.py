@@ -29,7 +29,7 @@ from foveasim.view import SensorStack, prisms, site_at, solid_page, solids, web_
 from foveasim.view.site_colours import FILTER_COLOURS
 from foveasim.view.web._bodies import bodies_of
 from foveasim.view.web._content import content_of
-from foveasim.view.web._pack import back_references, packed, smallest
+from foveasim.view.web._pack import back_references, pack, to_smallest_type
 from foveasim.view.web._shapes import shapes_of
 
 SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
@@ -142,8 +142,8 @@ def test_shared_vertices_stored_once_and_decoded():
     ids=str,
 )  # fmt: skip
 def test_packed_numbers_decode_bit_identically(values):
-    small = smallest(values)
-    about, text = packed(small)
+    small = to_smallest_type(values)
+    about, text = pack(small)
     planes = np.frombuffer(gzip.decompress(base64.b64decode(text)), np.uint8)
     decode = (
         np.ascontiguousarray(planes.reshape(-1, about["size"]).T).view(about["type"]).ravel()

@@ -25,19 +25,19 @@ from foveasim.units import m_from_um
 
 __all__ = [
     "Canvas",
+    "Fractions",
     "OneOrMore",
-    "Shares",
     "add_rectangle",
-    "checked_contrast",
+    "check_contrast",
     "half_plane",
-    "inked",
+    "ink_to_white",
     "interval",
-    "sampled",
+    "sample_means",
 ]
 
 #: A number, or one for each wavelength.
 OneOrMore = float | Sequence[float]
-Shares = NDArray[np.float32]
+Fractions = NDArray[np.float32]
 
 #: Pixels per block: a few float64 arrays of this size fit into the processor cache.
 BLOCK_PIXELS = 2**18
@@ -129,12 +129,12 @@ class Canvas:
         n_rows = max(1, BLOCK_PIXELS // self.shape[1])
         yield from (slice(i, min(i + n_rows, self.shape[0])) for i in range(0, self.shape[0], n_rows))
 
-    def filled(self, function: Callable[[slice], Floats]) -> Shares:
+    def fill(self, function: Callable[[slice], Floats]) -> Fractions:
         """Return a raster (n_y, n_x) float32 of the fractions of white in blocks of rows."""
-        shares = np.empty(self.shape, np.float32)
+        fractions = np.empty(self.shape, np.float32)
         for rows in self.row_blocks():
-            np.clip(function(rows), 0.0, 1.0, out=shares[rows], casting="same_kind")
-        return shares
+            np.clip(function(rows), 0.0, 1.0, out=fractions[rows], casting="same_kind")
+        return fractions
 
     def check_fits(self, name: str, width_mm: float, height_mm: float) -> None:
         """
@@ -180,13 +180,13 @@ class Canvas:
                 stacklevel=3,
             )
 
-    def scene(self, shares: Shares, contrast: float, source: str) -> Scene:
+    def scene(self, fractions: Fractions, contrast: float, source: str) -> Scene:
         """
         Return the scene of a chart in black and white.
 
         Parameters
         ----------
-        shares : (n_y, n_x) float32
+        fractions : (n_y, n_x) float32
             Fraction of white in each pixel; overwritten.
         contrast : float
             Michelson contrast.
@@ -194,11 +194,11 @@ class Canvas:
             Description of the chart.
         """
         black = (1.0 - contrast) / (1.0 + contrast)
-        shares *= np.float32(1.0 - black)
-        shares += np.float32(black)
-        return self.scene_of(shares[np.newaxis], np.asarray(self.radiance_w_m2_sr_nm)[np.newaxis], source)
+        fractions *= np.float32(1.0 - black)
+        fractions += np.float32(black)
+        return self.scene_of(fractions[np.newaxis], np.asarray(self.radiance_w_m2_sr_nm)[np.newaxis], source)
 
-    def scene_of(self, basis: Shares, spectrum_w_m2_sr_nm: Floats, source: str) -> Scene:
+    def scene_of(self, basis: Fractions, spectrum_w_m2_sr_nm: Floats, source: str) -> Scene:
         """
         Return the scene of basis images and their spectra.
 
@@ -215,7 +215,7 @@ class Canvas:
         )
 
 
-def checked_contrast(contrast: float) -> float:
+def check_contrast(contrast: float) -> float:
     """
     Return a Michelson contrast after validation.
 
@@ -227,7 +227,7 @@ def checked_contrast(contrast: float) -> float:
     return check_number("contrast", contrast, at_least=0.0, at_most=1.0)
 
 
-def inked(shares: Shares, ink: str) -> Shares:
+def ink_to_white(fractions: Fractions, ink: str) -> Fractions:
     """
     Convert fractions of ink to fractions of white, in place.
 
@@ -237,8 +237,8 @@ def inked(shares: Shares, ink: str) -> Shares:
         If the ink is neither dark nor bright.
     """
     if check_choice("ink", ink, ("dark", "bright")) == "dark":
-        np.subtract(np.float32(1.0), shares, out=shares)
-    return shares
+        np.subtract(np.float32(1.0), fractions, out=fractions)
+    return fractions
 
 
 def interval(edges_mm: Floats, low_mm: float, high_mm: float) -> Floats:
@@ -248,7 +248,7 @@ def interval(edges_mm: Floats, low_mm: float, high_mm: float) -> Floats:
 
 
 def add_rectangle(
-    picture: Shares, canvas: Canvas, x_mm: tuple[float, float], y_mm: tuple[float, float], value: float = 1.0
+    picture: Fractions, canvas: Canvas, x_mm: tuple[float, float], y_mm: tuple[float, float], value: float = 1.0
 ) -> None:
     """Add the exact pixel means of a rectangle with the bounds ``x_mm`` and ``y_mm``."""
     columns, rows = interval(canvas.x_edges_mm, *x_mm), interval(canvas.y_edges_mm, *y_mm)
@@ -283,13 +283,15 @@ def half_plane(height: Floats, x: Floats | float, y: Floats | float) -> Floats:
     distance = np.minimum(np.abs(height), 0.5 * (wide + narrow))
     beyond = 0.5 * (wide + narrow) - distance
     corner = np.minimum(beyond, narrow)
-    share = np.where(
+    fraction = np.where(
         distance <= 0.5 * (wide - narrow), 0.5 + distance / wide, 1.0 - 0.5 * (corner / narrow) * (corner / wide)
     )
-    return np.where(height < 0.0, 1.0 - share, share)
+    return np.where(height < 0.0, 1.0 - fraction, fraction)
 
 
-def sampled(canvas: Canvas, chosen: Bools, rows: slice, function: Callable[[Floats, Floats], Floats]) -> Floats:
+def sample_means(
+    canvas: Canvas, is_selected: Bools, rows: slice, function: Callable[[Floats, Floats], Floats]
+) -> Floats:
     """
     Return means over selected pixels from 32 x 32 samples each.
 
@@ -298,7 +300,7 @@ def sampled(canvas: Canvas, chosen: Bools, rows: slice, function: Callable[[Floa
     Parameters
     ----------
     canvas : Canvas
-    chosen : (n_row, n_x) bool
+    is_selected : (n_row, n_x) bool
         Selected pixels in the rows of a block.
     rows : slice
         Rows of the block.
@@ -309,7 +311,7 @@ def sampled(canvas: Canvas, chosen: Bools, rows: slice, function: Callable[[Floa
     -------
     means : (n_chosen,) float64
     """
-    i_y, i_x = np.nonzero(chosen)
+    i_y, i_x = np.nonzero(is_selected)
     x_mm, y_mm = canvas.x_mm[i_x], canvas.y_mm[rows][i_y]
     offsets_mm = ((np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5) * canvas.pitch_mm
     means = np.empty(i_x.size)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from foveasim._core.validation import Floats, check_choice, read_only, wavelengths_nm
 from foveasim.errors import ParameterError
 
-__all__ = ["PATCH_NAMES", "Illuminant", "illuminant", "light_of", "nonnegative_factors", "patch_reflectance"]
+__all__ = ["PATCH_NAMES", "Illuminant", "illuminant", "illuminant_spectrum", "nonnegative_factors", "patch_reflectance"]
 
 Illuminant = Literal["A", "D50", "D55", "D65", "D75", "E"]
 
@@ -28,9 +28,9 @@ DAYLIGHTS_K = {"D50": 5003.0, "D55": 5503.0, "D65": 6504.0, "D75": 7504.0}
 #: Normalisation wavelength of relative spectra.
 REFERENCE_NM = 560.0
 #: Planck's second constant and the temperature that define illuminant A (CIE 15).
-PLANCK_NM_K, A_K = 1.435e7, 2848.0
+PLANCK_NM_K, ILLUMINANT_A_K = 1.435e7, 2848.0
 #: Iterations of the factorisation: three times as many reduce its RMS error by 8 %.
-N_ROUNDS = 3000
+N_ITERATIONS = 3000
 
 
 def patch_reflectance(wavelength_nm: ArrayLike) -> Floats:
@@ -62,7 +62,7 @@ def patch_reflectance(wavelength_nm: ArrayLike) -> Floats:
     >>> patch_reflectance([550.0])[18]  # white
     array([0.886])
     """
-    return _between(_table("colour_chart_24"), wavelength_nm)
+    return _interpolate(_table("colour_chart_24"), wavelength_nm)
 
 
 def illuminant(name: Illuminant, wavelength_nm: ArrayLike) -> Floats:
@@ -95,13 +95,15 @@ def illuminant(name: Illuminant, wavelength_nm: ArrayLike) -> Floats:
     if name == "E":
         return np.ones(waves_nm.size)
     if name == "A":
-        planck = np.expm1(PLANCK_NM_K / (A_K * REFERENCE_NM)) / np.expm1(PLANCK_NM_K / (A_K * waves_nm))
+        planck = np.expm1(PLANCK_NM_K / (ILLUMINANT_A_K * REFERENCE_NM)) / np.expm1(
+            PLANCK_NM_K / (ILLUMINANT_A_K * waves_nm)
+        )
         return np.asarray((REFERENCE_NM / waves_nm) ** 5 * planck)
     # S0 is 100 at 560 nm, and the other components are 0.
-    return np.asarray(_daylight_weights(DAYLIGHTS_K[name]) @ _between(_table("cie_daylight"), waves_nm) / 100.0)
+    return np.asarray(_daylight_weights(DAYLIGHTS_K[name]) @ _interpolate(_table("cie_daylight"), waves_nm) / 100.0)
 
 
-def light_of(name: Illuminant, wavelength_nm: ArrayLike) -> Floats:
+def illuminant_spectrum(name: Illuminant, wavelength_nm: ArrayLike) -> Floats:
     """Return :func:`illuminant`; for functions with a parameter of that name."""
     return illuminant(name, wavelength_nm)
 
@@ -146,7 +148,7 @@ def nonnegative_factors(n_factors: int) -> tuple[Floats, Floats]:
         return np.eye(n_factors), reflectance
     spectra = reflectance[_extremes(reflectance, n_factors)]
     weights = np.array([nnls(spectra.T, patch)[0] for patch in reflectance])
-    for _ in range(N_ROUNDS):
+    for _ in range(N_ITERATIONS):
         _improve(weights, reflectance, spectra)
         _improve(spectra.T, reflectance.T, weights.T)
     return read_only(weights), read_only(spectra)
@@ -162,12 +164,12 @@ def _improve(weights: Floats, values: Floats, spectrum: Floats) -> None:
 
 def _extremes(values: Floats, n: int) -> list[int]:
     """Select n rows by the successive projections algorithm."""
-    rest, picked = values.copy(), []
+    rest, selected = values.copy(), []
     for _ in range(n):
-        picked.append(int(np.argmax((rest**2).sum(axis=1))))
-        direction = rest[picked[-1]] / np.linalg.norm(rest[picked[-1]])
+        selected.append(int(np.argmax((rest**2).sum(axis=1))))
+        direction = rest[selected[-1]] / np.linalg.norm(rest[selected[-1]])
         rest -= np.outer(rest @ direction, direction)
-    return picked
+    return selected
 
 
 @cache
@@ -178,7 +180,7 @@ def _table(name: str) -> Floats:
     return read_only(np.loadtxt(lines[1:], delimiter=",").T.copy())
 
 
-def _between(values: Floats, wavelength_nm: ArrayLike) -> Floats:
+def _interpolate(values: Floats, wavelength_nm: ArrayLike) -> Floats:
     """Return the columns (n_column, n) of a table, interpolated at wavelengths."""
     waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
     first, last = values[0, 0], values[0, -1]

@@ -15,9 +15,9 @@ from foveasim.scene.charts._canvas import (
     Canvas,
     OneOrMore,
     add_rectangle,
-    checked_contrast,
+    check_contrast,
     half_plane,
-    inked,
+    ink_to_white,
     interval,
 )
 from foveasim.scene.registry import chart
@@ -109,7 +109,7 @@ def checkerboard(
         If a square is smaller than a pixel.
     """
     canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
-    contrast = checked_contrast(contrast)
+    contrast = check_contrast(contrast)
     square_mm = check_number("square_mm", square_mm, above=0.0)
     edges_mm = canvas.y_edges_mm, canvas.x_edges_mm
     inside: list[Floats] = [np.ones(n) for n in canvas.shape]
@@ -126,10 +126,10 @@ def checkerboard(
         for e, low in zip(edges_mm, first_mm, strict=True)
     )
     # Squares are black if the signs of column and row are equal.
-    shares = canvas.filled(
+    fractions = canvas.fill(
         lambda rows: 1.0 - 0.5 * (np.multiply.outer(inside[0][rows], inside[1]) + np.multiply.outer(y[rows], x))
     )
-    return canvas.scene(shares, contrast, "a checkerboard")
+    return canvas.scene(fractions, contrast, "a checkerboard")
 
 
 @chart("slanted_edge")
@@ -168,13 +168,13 @@ def slanted_edge(
         If a value is out of range.
     """
     canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
-    contrast = checked_contrast(contrast)
+    contrast = check_contrast(contrast)
     angle = np.deg2rad(check_number("angle_deg", angle_deg, at_least=-180.0, at_most=180.0))
     across_x, across_y = float(np.cos(angle)), float(np.sin(angle))
     x = across_x * canvas.x_mm / canvas.pitch_mm
     y = across_y * canvas.y_mm / canvas.pitch_mm
-    shares = canvas.filled(lambda rows: half_plane(np.add.outer(y[rows], x), across_x, across_y))
-    return canvas.scene(shares, contrast, "a slanted edge")
+    fractions = canvas.fill(lambda rows: half_plane(np.add.outer(y[rows], x), across_x, across_y))
+    return canvas.scene(fractions, contrast, "a slanted edge")
 
 
 @chart("bars")
@@ -225,7 +225,7 @@ def bars(
     vertical bars are left of horizontal bars. :func:`bar_elements` returns the positions.
     """
     canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
-    contrast = checked_contrast(contrast)
+    contrast = check_contrast(contrast)
     elements = bar_elements(groups)
     canvas.check_fits(
         "groups",
@@ -233,15 +233,15 @@ def bars(
         2.0 * max(abs(e.y_mm) + 0.5 * e.side_mm for e in elements),
     )
     canvas.warn_if_fine("groups", min(1.0 / e.line_pairs_per_mm for e in elements))
-    shares = np.zeros(canvas.shape, np.float32)
+    fractions = np.zeros(canvas.shape, np.float32)
     for e in elements:
         low, high = -0.5 * e.side_mm, 0.5 * e.side_mm
         for k in range(N_BARS):
             left = low + 2 * k * e.side_mm / BAR_LENGTH
             across, along = (left, left + e.side_mm / BAR_LENGTH), (low, high)
             x, y = (across, along) if e.direction == "vertical" else (along, across)
-            add_rectangle(shares, canvas, (e.x_mm + x[0], e.x_mm + x[1]), (e.y_mm + y[0], e.y_mm + y[1]))
-    return canvas.scene(inked(shares, ink), contrast, "bars")
+            add_rectangle(fractions, canvas, (e.x_mm + x[0], e.x_mm + x[1]), (e.y_mm + y[0], e.y_mm + y[1]))
+    return canvas.scene(ink_to_white(fractions, ink), contrast, "bars")
 
 
 def bar_elements(groups: Sequence[int]) -> tuple[BarElement, ...]:
@@ -275,7 +275,7 @@ def bar_elements(groups: Sequence[int]) -> tuple[BarElement, ...]:
     )
     if len(set(numbers)) != len(numbers):
         raise ParameterError("groups", "must be unique", list(groups))
-    placed = []
+    elements = []
     left_mm = lowest_mm = right_mm = 0.0
     for group in numbers:
         top_mm = 0.0
@@ -285,9 +285,9 @@ def bar_elements(groups: Sequence[int]) -> tuple[BarElement, ...]:
             side_mm = BAR_LENGTH * width_mm
             y_mm = top_mm - 0.5 * side_mm
             x_mm = left_mm + 0.5 * side_mm
-            placed.append((group, element, "vertical", line_pairs_per_mm, x_mm, y_mm, side_mm))
+            elements.append((group, element, "vertical", line_pairs_per_mm, x_mm, y_mm, side_mm))
             x_mm += side_mm + INNER_GAP * width_mm
-            placed.append((group, element, "horizontal", line_pairs_per_mm, x_mm, y_mm, side_mm))
+            elements.append((group, element, "horizontal", line_pairs_per_mm, x_mm, y_mm, side_mm))
             right_mm = max(right_mm, x_mm + 0.5 * side_mm)
             lowest_mm = min(lowest_mm, y_mm - 0.5 * side_mm)
             top_mm -= side_mm + LOWER_GAP * width_mm
@@ -302,7 +302,7 @@ def bar_elements(groups: Sequence[int]) -> tuple[BarElement, ...]:
             y_mm=y_mm - 0.5 * lowest_mm,
             side_mm=side_mm,
         )
-        for group, element, direction, line_pairs_per_mm, x_mm, y_mm, side_mm in placed
+        for group, element, direction, line_pairs_per_mm, x_mm, y_mm, side_mm in elements
     )
 
 
@@ -348,17 +348,17 @@ def letter_f(
         If a stroke is narrower than a pixel.
     """
     canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
-    contrast = checked_contrast(contrast)
+    contrast = check_contrast(contrast)
     height_mm = check_number("height_mm", height_mm, above=0.0)
     unit_mm = height_mm / F_HEIGHT
     canvas.check_fits("height_mm", F_WIDTH * unit_mm, height_mm)
     canvas.warn_if_fine("height_mm", 2.0 * unit_mm)
-    shares = np.zeros(canvas.shape, np.float32)
+    fractions = np.zeros(canvas.shape, np.float32)
     for x0, x1, y0, y1 in F_STROKES:
         x_mm = ((x0 - 0.5 * F_WIDTH) * unit_mm, (x1 - 0.5 * F_WIDTH) * unit_mm)
         y_mm = ((y0 - 0.5 * F_HEIGHT) * unit_mm, (y1 - 0.5 * F_HEIGHT) * unit_mm)
-        add_rectangle(shares, canvas, x_mm, y_mm)
-    return canvas.scene(inked(shares, ink), contrast, "a letter F")
+        add_rectangle(fractions, canvas, x_mm, y_mm)
+    return canvas.scene(ink_to_white(fractions, ink), contrast, "a letter F")
 
 
 def _integral_of_square_wave_mm(x_mm: Floats, half_mm: float) -> Floats:

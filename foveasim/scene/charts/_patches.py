@@ -8,11 +8,11 @@ import numpy as np
 
 from foveasim._core.validation import Floats, check_count, check_number
 from foveasim.scene._scene import GREY_NM, Scene
-from foveasim.scene.charts._canvas import Canvas, OneOrMore, Shares, add_rectangle
+from foveasim.scene.charts._canvas import Canvas, Fractions, OneOrMore, add_rectangle
 from foveasim.scene.charts._colours import (
     PATCH_NAMES,
     Illuminant,
-    light_of,
+    illuminant_spectrum,
     nonnegative_factors,
     patch_reflectance,
 )
@@ -77,12 +77,12 @@ def grey_scale(
     patch_mm = check_number("patch_mm", patch_mm, above=0.0)
     canvas.check_fits("patch_mm", n_steps * patch_mm, patch_mm)
     canvas.warn_if_fine("patch_mm", 2.0 * patch_mm)
-    shares = np.zeros(canvas.shape, np.float32)
+    fractions = np.zeros(canvas.shape, np.float32)
     for k in range(n_steps):
         left_mm = (k - 0.5 * n_steps) * patch_mm
         x_mm, y_mm = (left_mm, left_mm + patch_mm), (-0.5 * patch_mm, 0.5 * patch_mm)
-        add_rectangle(shares, canvas, x_mm, y_mm, float(np.exp(-k * np.log(ratio))))
-    return canvas.scene(shares, 1.0, "a grey scale")
+        add_rectangle(fractions, canvas, x_mm, y_mm, float(np.exp(-k * np.log(ratio))))
+    return canvas.scene(fractions, 1.0, "a grey scale")
 
 
 @SCENES.register("colour_chart")
@@ -160,8 +160,8 @@ def colour_chart(
     canvas.check_fits("patch_mm", N_COLUMNS * step_mm - gap_mm, N_ROWS * step_mm - gap_mm)
     canvas.warn_if_fine("patch_mm", 2.0 * patch_mm)
     weights, spectra = _patch_spectra(np.asarray(canvas.wavelength_nm), n_basis)
-    light = radiance * light_of(illuminant, np.asarray(canvas.wavelength_nm))
-    return canvas.scene_of(_patches(canvas, weights, patch_mm, step_mm), spectra * light, "a colour chart")
+    illumination = radiance * illuminant_spectrum(illuminant, np.asarray(canvas.wavelength_nm))
+    return canvas.scene_of(_patches(canvas, weights, patch_mm, step_mm), spectra * illumination, "a colour chart")
 
 
 def _patch_spectra(wavelength_nm: Floats, n_basis: int) -> tuple[Floats, Floats]:
@@ -175,7 +175,7 @@ def _patch_spectra(wavelength_nm: Floats, n_basis: int) -> tuple[Floats, Floats]
     return weights, np.array([np.interp(wavelength_nm, TABLE_NM, spectrum) for spectrum in spectra])
 
 
-def _patches(canvas: Canvas, weights: Floats, patch_mm: float, step_mm: float) -> Shares:
+def _patches(canvas: Canvas, weights: Floats, patch_mm: float, step_mm: float) -> Fractions:
     """Return basis images (n_basis, n_y, n_x) of patches with weights (24, n_basis)."""
     basis = np.zeros((weights.shape[1], *canvas.shape), np.float32)
     for patch, row_of_weights in enumerate(weights):

@@ -9,7 +9,7 @@ import numpy as np
 
 from foveasim._core.validation import Floats, check_choice, check_count, check_number
 from foveasim.scene._scene import GREY_NM, Scene
-from foveasim.scene.charts._canvas import Canvas, OneOrMore, checked_contrast, half_plane, sampled
+from foveasim.scene.charts._canvas import Canvas, OneOrMore, check_contrast, half_plane, sample_means
 from foveasim.scene.registry import chart
 
 __all__ = ["siemens_star", "sine", "zone_plate"]
@@ -17,11 +17,11 @@ __all__ = ["siemens_star", "sine", "zone_plate"]
 #: Limit of computing time: the sampled centre of a star with more sectors takes minutes.
 MAX_SPOKES = 1000
 #: Sectors wider than this, more than a pixel diagonal, have at most one edge within a pixel.
-CLEAR_WIDTH_PIXELS = 1.5
+MIN_SECTOR_PIXELS = 1.5
 #: Half the pixel diagonal, rounded up.
 HALF_DIAGONAL_PIXELS = 0.7072
 #: Amplitude of the wave that is clipped to a square wave; the value on an edge is 1/2.
-STEEP = 1e9
+SQUARE_WAVE_AMPLITUDE = 1e9
 #: Points and weights of three-point Gauss-Legendre quadrature for means from -1/2 to 1/2.
 GAUSS = ((-0.5 * np.sqrt(0.6), 5.0 / 18.0), (0.0, 8.0 / 18.0), (0.5 * np.sqrt(0.6), 5.0 / 18.0))
 
@@ -71,7 +71,7 @@ def sine(
         If a period is shorter than two pixels.
     """
     canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
-    contrast = checked_contrast(contrast)
+    contrast = check_contrast(contrast)
     per_mm = check_number("line_pairs_per_mm", line_pairs_per_mm, above=0.0)
     angle = np.deg2rad(check_number("angle_deg", angle_deg, at_least=-180.0, at_most=180.0))
     phase = np.deg2rad(check_number("phase_deg", phase_deg, at_least=-360.0, at_most=360.0))
@@ -81,10 +81,10 @@ def sine(
     height = 0.5 * np.sinc(along_x * canvas.pitch_mm) * np.sinc(along_y * canvas.pitch_mm)
     x = np.exp(2j * np.pi * along_x * canvas.x_mm - 1j * phase)
     y = height * np.exp(2j * np.pi * along_y * canvas.y_mm)
-    shares = canvas.filled(
+    fractions = canvas.fill(
         lambda rows: 0.5 + np.multiply.outer(y.real[rows], x.real) - np.multiply.outer(y.imag[rows], x.imag)
     )
-    return canvas.scene(shares, contrast, "a sine wave")
+    return canvas.scene(fractions, contrast, "a sine wave")
 
 
 @chart("zone_plate")
@@ -135,7 +135,7 @@ def zone_plate(
     except in pixels on the rim, which are sampled at 32 x 32 points.
     """
     canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
-    contrast = checked_contrast(contrast)
+    contrast = check_contrast(contrast)
     per_mm = check_number("line_pairs_per_mm", line_pairs_per_mm, above=0.0)
     radius_mm = canvas.radius_mm(radius_mm)
     canvas.warn_if_fine("line_pairs_per_mm", 1.0 / per_mm)
@@ -152,10 +152,10 @@ def zone_plate(
         rings = 0.5 + 0.5 * (np.multiply.outer(cos_y[rows], cos_x) - np.multiply.outer(sin_y[rows], sin_x))
         rings[r > radius_mm] = 0.5
         is_rim = np.abs(r - radius_mm) < HALF_DIAGONAL_PIXELS * canvas.pitch_mm
-        rings[is_rim] = sampled(canvas, is_rim, rows, ideal)
+        rings[is_rim] = sample_means(canvas, is_rim, rows, ideal)
         return rings
 
-    return canvas.scene(canvas.filled(block), contrast, "a zone plate")
+    return canvas.scene(canvas.fill(block), contrast, "a zone plate")
 
 
 @chart("siemens_star")
@@ -210,7 +210,7 @@ def siemens_star(
     on the rim are sampled at 32 x 32 points.
     """
     canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
-    contrast = checked_contrast(contrast)
+    contrast = check_contrast(contrast)
     n_spokes = check_count("n_spokes", n_spokes, at_least=2, at_most=MAX_SPOKES)
     check_choice("profile", profile, ("square", "sine"))
     radius_mm = canvas.radius_mm(radius_mm)
@@ -218,7 +218,7 @@ def siemens_star(
     mean_of_spokes = _mean_of_edges if profile == "square" else _mean_of_waves
 
     def ideal(x: Floats, y: Floats) -> Floats:
-        height = STEEP if profile == "square" else 0.5
+        height = SQUARE_WAVE_AMPLITUDE if profile == "square" else 0.5
         spokes = np.clip(0.5 + height * np.cos(n_spokes * np.arctan2(y, x)), 0.0, 1.0)
         return np.where(x * x + y * y < radius_mm**2, spokes, 0.5)
 
@@ -227,12 +227,12 @@ def siemens_star(
         r, rim = np.hypot(x, y), radius_mm / canvas.pitch_mm
         spokes = mean_of_spokes(x, y, n_spokes)
         spokes[r > rim] = 0.5
-        is_middle = r * np.sin(np.pi / n_spokes) < CLEAR_WIDTH_PIXELS
-        is_cut = (is_middle & (r < rim)) | (np.abs(r - rim) < HALF_DIAGONAL_PIXELS)
-        spokes[is_cut] = sampled(canvas, is_cut, rows, ideal)
+        is_central = r * np.sin(np.pi / n_spokes) < MIN_SECTOR_PIXELS
+        is_sampled = (is_central & (r < rim)) | (np.abs(r - rim) < HALF_DIAGONAL_PIXELS)
+        spokes[is_sampled] = sample_means(canvas, is_sampled, rows, ideal)
         return spokes
 
-    return canvas.scene(canvas.filled(block), contrast, "a Siemens star")
+    return canvas.scene(canvas.fill(block), contrast, "a Siemens star")
 
 
 def _mean_of_edges(x: Floats, y: Floats, n_spokes: int) -> Floats:
@@ -245,9 +245,9 @@ def _mean_of_edges(x: Floats, y: Floats, n_spokes: int) -> Floats:
     number = np.rint(angle * n_spokes / np.pi - 0.5)
     edge = (number + 0.5) * np.pi / n_spokes
     across_x, across_y = -np.sin(edge), np.cos(edge)
-    share = half_plane(across_x * x + across_y * y, across_x, across_y)
+    fraction = half_plane(across_x * x + across_y * y, across_x, across_y)
     # The sector counter-clockwise of the first edge is black, of the next edge white, and so on.
-    return np.where(np.mod(number, 2.0) == 0.0, 1.0 - share, share)
+    return np.where(np.mod(number, 2.0) == 0.0, 1.0 - fraction, fraction)
 
 
 def _mean_of_waves(x: Floats, y: Floats, n_spokes: int) -> Floats:

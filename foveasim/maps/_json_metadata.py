@@ -12,7 +12,7 @@ from foveasim._io.formats import FormatError
 from foveasim.fields import PowerMap
 from foveasim.maps._common import Found
 
-__all__ = ["about_map", "found_in_metadata"]
+__all__ = ["found_in_metadata", "map_metadata"]
 
 FILE_FORMAT = "foveasim power map"
 FILE_VERSION = 1
@@ -20,7 +20,7 @@ FILE_VERSION = 1
 MAX_CHARS = 2**20
 
 
-def about_map(power_map: PowerMap) -> dict[str, Any]:
+def map_metadata(power_map: PowerMap) -> dict[str, Any]:
     """Return the metadata of a map; Python's JSON represents float64 losslessly."""
     return {
         "format": FILE_FORMAT,
@@ -32,7 +32,7 @@ def about_map(power_map: PowerMap) -> dict[str, Any]:
     }
 
 
-def found_in_metadata(text: str, data: NDArray[Any], *, is_y_falling: bool) -> Found:
+def found_in_metadata(text: str, data: NDArray[Any], *, is_y_descending: bool) -> Found:
     """
     Return the map with the metadata of a string that foveasim wrote.
 
@@ -41,9 +41,9 @@ def found_in_metadata(text: str, data: NDArray[Any], *, is_y_falling: bool) -> F
     FormatError
         If the string has the format of foveasim and is invalid.
     """
-    about = _parsed(text)
+    about = _parse(text)
     if not isinstance(about, dict) or about.get("format") != FILE_FORMAT:
-        return Found(data=data, is_y_falling=is_y_falling)
+        return Found(data=data, is_y_descending=is_y_descending)
     if about.get("version") != FILE_VERSION:
         raise FormatError(f"has the format version {about.get('version')!r:.40}, expected {FILE_VERSION}")
     try:
@@ -54,7 +54,7 @@ def found_in_metadata(text: str, data: NDArray[Any], *, is_y_falling: bool) -> F
         raise FormatError("contains an invalid pitch, origin or wavelength") from None
     return Found(
         data=data,
-        is_y_falling=is_y_falling,
+        is_y_descending=is_y_descending,
         pitch_um=(pitch_x_um, pitch_y_um),
         origin_um=(x0, y0),
         wavelength_nm=waves,
@@ -62,7 +62,7 @@ def found_in_metadata(text: str, data: NDArray[Any], *, is_y_falling: bool) -> F
     )
 
 
-def _parsed(text: str) -> Any:
+def _parse(text: str) -> Any:
     if not text.startswith("{") or len(text) > MAX_CHARS:
         return None
     try:
