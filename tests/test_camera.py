@@ -89,19 +89,19 @@ def test_order_depends_on_cells_per_lambda_n(cells_per_lambda_n, order):
     width_um = 401 * lambda_n_um / cells_per_lambda_n
     layout = fs.Layout.from_rectangles([[0.0, 0.0], [0.0, 0.0]], [lambda_n_um, 0.999 * width_um])
     optics = replace(OPTICS, padding="periodic", oversample=1)
-    shares = {}
+    fractions = {}
     for asked in (None, 1, 2):
         camera = fs.Camera(optics=optics, sensor=fs.Sensor(layout), order=asked)
         assert camera.order(scene) == (asked or order)
         assert camera.order(optics.power_map(scene)) == (asked or 1)
-        square, whole = camera.photoelectrons_per_s(scene)
-        shares[asked] = square / whole
+        square, complete = camera.photoelectrons_per_s(scene)
+        fractions[asked] = square / complete
 
-    assert shares[None] == shares[order]
+    assert fractions[None] == fractions[order]
     # A square of side λN at the point, without the boundary of the largest site.
     if cells_per_lambda_n == 8.2:
-        assert shares[2] == pytest.approx(0.528891, abs=4e-4)
-        assert abs(shares[1] - 0.528891) > 1e-3
+        assert fractions[2] == pytest.approx(0.528891, abs=4e-4)
+        assert abs(fractions[1] - 0.528891) > 1e-3
 
 
 def test_each_site_has_own_filter():
@@ -353,12 +353,12 @@ def test_corrupt_capture_files_are_rejected(capture, tmp_path, spoil, message):
 def test_flipped_bits_are_detected(capture, tmp_path):
     path = tmp_path / "c.npz"
     capture.save(path)
-    whole = path.read_bytes()
+    complete = path.read_bytes()
     rng = np.random.default_rng(0)
     sentences = []
     for _ in range(400):
-        spoiled = bytearray(whole)
-        for position in rng.integers(0, len(whole), 3):
+        spoiled = bytearray(complete)
+        for position in rng.integers(0, len(complete), 3):
             spoiled[position] ^= 1 << int(rng.integers(0, 8))
         path.write_bytes(spoiled)
         try:

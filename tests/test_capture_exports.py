@@ -22,7 +22,7 @@ from foveasim.layout.packed import layout_to_arrays
 ODD_NAMES = ("code", "site", "x_um", "a/b", "..", "zarr.json", "__x", "with space", "é", "x" * 300, "area_um2")
 
 
-def taken(**columns):
+def make_capture(**columns):
     layout = fs.layout.mosaic(fs.layout.log_polar(n_sectors=12, r_min_um=4.0, r_max_um=20.0), ("RG", "GB"))
     layout = fs.Layout(
         layout.xy_um,
@@ -44,7 +44,7 @@ def taken(**columns):
 @pytest.fixture(scope="module")
 def capture():
     odd = dict.fromkeys(ODD_NAMES, np.arange)
-    return taken(
+    return make_capture(
         words=lambda n: np.array(["µ", "long word", ""])[np.arange(n) % 3],
         raw=lambda n: np.array([b"a", b"bcd"])[np.arange(n) % 2],
         flag=lambda n: np.arange(n) % 2 == 0,
@@ -172,7 +172,7 @@ def test_xarray_opens_store_as_dataset(capture, tmp_path):
 
 
 def test_store_replaces_captures_only(capture, tmp_path):
-    other = taken()
+    other = make_capture()
     other.save(tmp_path / "x.zarr")
     capture.save(tmp_path / "x.zarr")
     assert_same(fs.Capture.load(tmp_path / "x.zarr"), capture)
@@ -190,7 +190,7 @@ def test_store_replaces_captures_only(capture, tmp_path):
 
 
 def test_failed_save_leaves_the_former_store(capture, tmp_path, monkeypatch):
-    other = taken()
+    other = make_capture()
     other.save(tmp_path / "x.zarr")
     written = []
 
@@ -222,7 +222,7 @@ def edit(path, **changes):
     path.write_text(json.dumps(metadata))
 
 
-SPOILT = {
+CORRUPTIONS = {
     "chunk gone": lambda store: (store / "code" / "c" / "0").unlink(),
     "chunk truncated": lambda store: (store / "code" / "c" / "0").write_bytes(b"\1\0"),
     "array gone": lambda store: shutil.rmtree(store / "electrons"),
@@ -252,11 +252,11 @@ SPOILT = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("how", SPOILT)
+@pytest.mark.parametrize("how", CORRUPTIONS)
 def test_corrupt_store_gives_file_error(capture, tmp_path, how):
     store = tmp_path / "x.zarr"
     capture.save(store)
-    SPOILT[how](store)
+    CORRUPTIONS[how](store)
 
     with pytest.raises(FileError, match=r"x\.zarr: ") as caught:
         fs.Capture.load(store)

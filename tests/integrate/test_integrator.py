@@ -8,7 +8,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.clipping import exact_weights, shapely_weights
-from reference.polygons import ZOO, polygons
+from reference.polygons import POLYGONS, polygons
 
 import foveasim as fs
 from foveasim.errors import GeometryError, ParameterError
@@ -45,17 +45,17 @@ def weights_of(polygon, grid=GRID):
     return fs.Integrator(layout, grid).weights().toarray().reshape(grid.shape)
 
 
-@pytest.mark.parametrize("name", ZOO)
+@pytest.mark.parametrize("name", POLYGONS)
 def test_zoo_weights_equal_rational_clipping(name):
-    expected = exact_weights(ZOO[name], SHAPE)
+    expected = exact_weights(POLYGONS[name], SHAPE)
 
-    assert weights_of(ZOO[name]) == pytest.approx(expected, rel=EXACT, abs=1e-15)
+    assert weights_of(POLYGONS[name]) == pytest.approx(expected, rel=EXACT, abs=1e-15)
 
 
-@pytest.mark.parametrize("name", ZOO)
+@pytest.mark.parametrize("name", POLYGONS)
 def test_zoo_sums_equal_rational_clipping(name):
-    expected = float((exact_weights(ZOO[name], SHAPE) * MAP).sum())
-    layout = fs.Layout.from_polygons([ZOO[name]])
+    expected = float((exact_weights(POLYGONS[name], SHAPE) * MAP).sum())
+    layout = fs.Layout.from_polygons([POLYGONS[name]])
 
     assert fs.Integrator(layout, GRID)(MAP)[0] == pytest.approx(expected, rel=EXACT, abs=0.0)
 
@@ -118,9 +118,9 @@ def test_uniform_map_yields_covered_site_area(name):
     assert integrator.uncovered_um2 == pytest.approx(shapely.area(layout.polygons()) - on_map_um2, abs=1e-12)
 
 
-@pytest.mark.parametrize("name", ZOO)
+@pytest.mark.parametrize("name", POLYGONS)
 def test_matrix_product_equals_integrator_call(name):
-    integrator = fs.Integrator(fs.Layout.from_polygons([ZOO[name]]), GRID)
+    integrator = fs.Integrator(fs.Layout.from_polygons([POLYGONS[name]]), GRID)
 
     assert integrator(MAP) == pytest.approx(integrator.weights() @ MAP.ravel(), rel=1e-14, abs=1e-15)
 
@@ -134,7 +134,7 @@ def test_spread_equals_matrix_transpose():
 
 @pytest.mark.parametrize("name", ["star", "two holes in a row", "off to the left and right", "U shape"])
 def test_weights_ignore_winding_and_start_vertex(name):
-    polygon = ZOO[name]
+    polygon = POLYGONS[name]
     reordered = shapely.Polygon(
         np.roll(polygon.exterior.coords[:-1], 2, axis=0)[::-1],
         [np.roll(h.coords[:-1], 1, axis=0) for h in polygon.interiors],
@@ -145,25 +145,27 @@ def test_weights_ignore_winding_and_start_vertex(name):
 
 @pytest.mark.parametrize("name", ["star", "two holes in a row", "comb with teeth in one row", "ring"])
 def test_integer_cell_shift_shifts_weights(name):
-    shifted = shapely.transform(ZOO[name], lambda xy: xy + np.array([16.0, 8.0]))
+    shifted = shapely.transform(POLYGONS[name], lambda xy: xy + np.array([16.0, 8.0]))
     grid = fs.Grid((15, 25), 1.0)
 
-    assert weights_of(shifted, grid)[8:, 16:] == pytest.approx(weights_of(ZOO[name]), abs=4e-15)
+    assert weights_of(shifted, grid)[8:, 16:] == pytest.approx(weights_of(POLYGONS[name]), abs=4e-15)
 
 
 @pytest.mark.parametrize("name", ["star", "L shape", "hole", "long sliver along a row"])
 def test_quarter_rotation_rotates_weights(name):
-    rotated = shapely.transform(ZOO[name], lambda xy: np.stack((7.0 - xy[:, 1], xy[:, 0]), axis=1))
+    rotated = shapely.transform(POLYGONS[name], lambda xy: np.stack((7.0 - xy[:, 1], xy[:, 0]), axis=1))
 
-    assert weights_of(rotated, fs.Grid((9, 7), 1.0)) == pytest.approx(np.rot90(weights_of(ZOO[name]), -1), abs=1e-14)
+    assert weights_of(rotated, fs.Grid((9, 7), 1.0)) == pytest.approx(
+        np.rot90(weights_of(POLYGONS[name]), -1), abs=1e-14
+    )
 
 
 @pytest.mark.parametrize("name", ["star", "circle", "U shape", "hole"])
 def test_split_site_parts_add_up(name):
     knife = shapely.Polygon([(-20, -20), (30, -20), (30, 4.1), (-20, 2.3)])
-    lower = shapely.get_parts(shapely.intersection(ZOO[name], knife))
-    upper = shapely.get_parts(shapely.difference(ZOO[name], knife))
-    unsplit = fs.Integrator(fs.Layout.from_polygons([ZOO[name]]), GRID)(MAP)[0]
+    lower = shapely.get_parts(shapely.intersection(POLYGONS[name], knife))
+    upper = shapely.get_parts(shapely.difference(POLYGONS[name], knife))
+    unsplit = fs.Integrator(fs.Layout.from_polygons([POLYGONS[name]]), GRID)(MAP)[0]
     parts = fs.Integrator(fs.Layout.from_polygons([*lower, *upper]), GRID)(MAP)
 
     assert parts.sum() == pytest.approx(unsplit, rel=EXACT)
@@ -171,18 +173,21 @@ def test_split_site_parts_add_up(name):
 
 @settings(max_examples=50, deadline=None, derandomize=True)
 @given(
-    pitch_um=st.floats(2.0, 1e3), x0=st.floats(-1e4, 1e4), y0=st.floats(-1e4, 1e4), name=st.sampled_from(sorted(ZOO))
+    pitch_um=st.floats(2.0, 1e3),
+    x0=st.floats(-1e4, 1e4),
+    y0=st.floats(-1e4, 1e4),
+    name=st.sampled_from(sorted(POLYGONS)),
 )
 def test_pitch_and_origin_scale_and_translate(pitch_um, x0, y0, name):
-    moved = shapely.transform(ZOO[name], lambda xy: xy * pitch_um + np.array([x0, y0]))
+    moved = shapely.transform(POLYGONS[name], lambda xy: xy * pitch_um + np.array([x0, y0]))
     layout = fs.Layout.from_polygons([moved])
     # The rounding error of vertices at |x0| is |x0| / pitch x 2**-53 of a cell.
     rounding = 2.0**-50 * (1 + max(abs(x0), abs(y0)) / pitch_um)
-    expected = fs.Integrator(fs.Layout.from_polygons([ZOO[name]]), GRID)(MAP)[0] * pitch_um**2
+    expected = fs.Integrator(fs.Layout.from_polygons([POLYGONS[name]]), GRID)(MAP)[0] * pitch_um**2
 
     got = fs.Integrator(layout, fs.Grid(SHAPE, pitch_um, (x0, y0)))(MAP)[0]
 
-    assert got == pytest.approx(expected, rel=EXACT, abs=rounding * ZOO[name].length * 4 * pitch_um**2 + 1e-300)
+    assert got == pytest.approx(expected, rel=EXACT, abs=rounding * POLYGONS[name].length * 4 * pitch_um**2 + 1e-300)
 
 
 def test_float32_map_agrees_with_float64():
@@ -206,7 +211,7 @@ def test_leading_dimensions_are_integrated_independently():
     "view", [np.asfortranarray, lambda a: a[::-1][::-1], lambda a: np.repeat(a, 2, axis=1)[:, ::2]]
 )
 def test_result_is_independent_of_memory_order(view):
-    integrator = fs.Integrator(fs.Layout.from_polygons(list(ZOO.values())), GRID)
+    integrator = fs.Integrator(fs.Layout.from_polygons(list(POLYGONS.values())), GRID)
 
     assert np.array_equal(integrator(view(MAP)), integrator(MAP))
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import shapely
 from hypothesis import given, settings
-from reference.polygons import ZOO, polygons
+from reference.polygons import POLYGONS, polygons
 
 import foveasim as fs
 from foveasim.distortion import BrownConrady
@@ -111,9 +111,11 @@ def second_order_by_clipping(polygon, cells):
 # -- linear fields -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ZOO)
+@pytest.mark.parametrize("name", POLYGONS)
 def test_linear_fields_are_exact_over_the_zoo(name):
-    assert second(ZOO[name])(linear_means())[0] == pytest.approx(linear_integral(ZOO[name]), rel=EXACT, abs=0.0)
+    assert second(POLYGONS[name])(linear_means())[0] == pytest.approx(
+        linear_integral(POLYGONS[name]), rel=EXACT, abs=0.0
+    )
 
 
 @settings(max_examples=1000, deadline=None, derandomize=True)
@@ -122,9 +124,11 @@ def test_linear_fields_are_exact_over_random_polygons(polygon):
     assert second(polygon)(linear_means())[0] == pytest.approx(linear_integral(polygon), rel=EXACT, abs=0.0)
 
 
-@pytest.mark.parametrize("name", ZOO)
+@pytest.mark.parametrize("name", POLYGONS)
 def test_random_map_equals_clipping_over_zoo(name):
-    assert second(ZOO[name])(MAP)[0] == pytest.approx(second_order_by_clipping(ZOO[name], MAP), rel=EXACT, abs=1e-15)
+    assert second(POLYGONS[name])(MAP)[0] == pytest.approx(
+        second_order_by_clipping(POLYGONS[name], MAP), rel=EXACT, abs=1e-15
+    )
 
 
 @settings(max_examples=150, deadline=None, derandomize=True)
@@ -149,7 +153,7 @@ def test_two_by_two_map_is_exact(polygon):
 )
 def test_single_row_or_column_is_exact(shape, field, name):
     for dx, dy in ((0.0, 0.0), (0.0, -3.2), (-4.4, 0.0), (-4.3, -3.1)):
-        polygon = shapely.transform(ZOO[name], lambda xy, d=(dx, dy): xy + np.array(d))
+        polygon = shapely.transform(POLYGONS[name], lambda xy, d=(dx, dy): xy + np.array(d))
         got = second(polygon, fs.Grid(shape, 1.0))(linear_means(shape, field))[0]
         assert got == pytest.approx(linear_integral(polygon, shape, field), rel=EXACT, abs=1e-15)
 
@@ -206,7 +210,7 @@ def test_tiling_moments_sum_to_zero(name):
 
 @pytest.mark.parametrize("name", [*TILINGS, "zoo"])
 def test_overlaps_are_bit_identical_to_first_order(name):
-    layout = fs.Layout.from_polygons(list(ZOO.values())) if name == "zoo" else TILINGS[name]
+    layout = fs.Layout.from_polygons(list(POLYGONS.values())) if name == "zoo" else TILINGS[name]
     one, two = (fs.Integrator(layout, fs.Grid((40, 40), 0.3, (-6.0, -6.0)), order=order)._plan for order in (1, 2))
 
     assert np.array_equal(one.spans, two.spans)
@@ -216,7 +220,7 @@ def test_overlaps_are_bit_identical_to_first_order(name):
 
 @pytest.mark.parametrize("name", ["star", "two holes in a row", "off to the left and right", "U shape"])
 def test_weights_ignore_winding_and_start_vertex(name):
-    polygon = ZOO[name]
+    polygon = POLYGONS[name]
     reordered = shapely.Polygon(
         np.roll(polygon.exterior.coords[:-1], 2, axis=0)[::-1],
         [np.roll(h.coords[:-1], 1, axis=0) for h in polygon.interiors],
@@ -228,26 +232,30 @@ def test_weights_ignore_winding_and_start_vertex(name):
 @pytest.mark.parametrize("name", ["star", "two holes in a row", "comb with teeth in one row", "ring"])
 def test_integer_cell_shift_shifts_weights(name):
     grid = fs.Grid((25, 35), 1.0)
-    near, far = (shapely.transform(ZOO[name], lambda xy, d=d: xy + np.array(d)) for d in ((2.0, 3.0), (18.0, 11.0)))
+    near, far = (
+        shapely.transform(POLYGONS[name], lambda xy, d=d: xy + np.array(d)) for d in ((2.0, 3.0), (18.0, 11.0))
+    )
 
     assert weights_of(far, grid)[9:, 17:] == pytest.approx(weights_of(near, grid)[1:-8, 1:-16], abs=8e-15)
 
 
 @pytest.mark.parametrize("name", ["star", "L shape", "hole", "long sliver along a row", "off to the left and right"])
 def test_quarter_rotation_rotates_weights(name):
-    rotated = shapely.transform(ZOO[name], lambda xy: np.stack((7.0 - xy[:, 1], xy[:, 0]), axis=1))
+    rotated = shapely.transform(POLYGONS[name], lambda xy: np.stack((7.0 - xy[:, 1], xy[:, 0]), axis=1))
 
-    assert weights_of(rotated, fs.Grid((9, 7), 1.0)) == pytest.approx(np.rot90(weights_of(ZOO[name]), -1), abs=1e-14)
+    assert weights_of(rotated, fs.Grid((9, 7), 1.0)) == pytest.approx(
+        np.rot90(weights_of(POLYGONS[name]), -1), abs=1e-14
+    )
 
 
 @pytest.mark.parametrize("name", ["star", "circle", "U shape", "hole"])
 def test_split_site_parts_add_up(name):
     knife = shapely.Polygon([(-20, -20), (30, -20), (30, 4.1), (-20, 2.3)])
-    lower = shapely.get_parts(shapely.intersection(ZOO[name], knife))
-    upper = shapely.get_parts(shapely.difference(ZOO[name], knife))
+    lower = shapely.get_parts(shapely.intersection(POLYGONS[name], knife))
+    upper = shapely.get_parts(shapely.difference(POLYGONS[name], knife))
     parts = fs.Integrator(fs.Layout.from_polygons([*lower, *upper]), GRID, order=2)(MAP)
 
-    assert parts.sum() == pytest.approx(second(ZOO[name])(MAP)[0], rel=EXACT)
+    assert parts.sum() == pytest.approx(second(POLYGONS[name])(MAP)[0], rel=EXACT)
 
 
 @pytest.mark.parametrize("n_threads", [2, 3, 8])
@@ -280,9 +288,9 @@ def test_operator_adjoint_and_matrix_agree(shape, distortion, conserve):
     np.testing.assert_allclose(spread, values @ matrix.toarray(), rtol=1e-12, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", ZOO)
+@pytest.mark.parametrize("name", POLYGONS)
 def test_matrix_equals_operator_over_zoo(name):
-    integrator = second(ZOO[name])
+    integrator = second(POLYGONS[name])
 
     assert integrator.weights() @ MAP.ravel() == pytest.approx(integrator(MAP), rel=1e-12, abs=1e-15)
 

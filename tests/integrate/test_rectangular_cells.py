@@ -11,7 +11,7 @@ import xarray as xr
 from astropy.io import fits
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference.polygons import ZOO
+from reference.polygons import POLYGONS
 
 import foveasim as fs
 from foveasim._core.provenance import to_plain_data
@@ -31,14 +31,16 @@ LAYOUTS = {
     "hexagons": fs.layout.hexagonal(n_columns=9, n_rows=9, pitch_um=0.8),
     "squares": fs.layout.grid(n_x=7, n_y=9, pitch_um=1.1),
     "off the grid": fs.layout.grid(n_x=9, n_y=9, pitch_um=1.3).translate(3.0, 2.0),
-    "concave and holes": fs.Layout.from_polygons([ZOO[name] for name in ("star", "U shape", "two holes in a row")]),
+    "concave and holes": fs.Layout.from_polygons(
+        [POLYGONS[name] for name in ("star", "U shape", "two holes in a row")]
+    ),
 }
 LAYOUT = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 ORDER = pytest.mark.parametrize("order", [1, 2])
 BARREL = BrownConrady(focal_um=20.0, k1=-0.12, k2=0.02, p1=0.03, p2=-0.02)
 
 
-def scaled(layout, sizes):
+def scale(layout, sizes):
     return fs.Layout(layout.xy_um * sizes, layout.ring_offsets, layout.site_offsets, layout.columns)
 
 
@@ -124,7 +126,7 @@ def test_integration_is_symmetric_under_scaling(layout, order):
     """Cells of p_x by p_y are equivalent to unit cells with the layout divided by p_x along x and by p_y along y."""
     square = fs.Grid(SHAPE, 1.0, tuple(np.array(GRID.origin_um) / PITCH))
     there = fs.Integrator(layout, GRID, order=order)
-    here = fs.Integrator(scaled(layout, 1.0 / np.array(PITCH)), square, order=order)
+    here = fs.Integrator(scale(layout, 1.0 / np.array(PITCH)), square, order=order)
     area = GRID.cell_area_um2
 
     np.testing.assert_allclose(there(MAP), area * here(MAP), rtol=1e-11, atol=1e-13)
@@ -152,7 +154,7 @@ def test_weights_agree_with_shapely_clipping(layout):
     name=st.sampled_from(["star", "U shape", "two holes in a row"]),
 )
 def test_any_pitch_agrees_with_shapely_clipping(order, pitch, origin, name):
-    layout = fs.Layout.from_polygons([ZOO[name]])
+    layout = fs.Layout.from_polygons([POLYGONS[name]])
     shape = tuple(int(n) for n in np.clip(np.ceil(18.0 / np.array(pitch[::-1])), 1, 60))
     grid = fs.Grid(shape, pitch, origin)
     overlaps = clipped_um2(layout, grid)[0]
@@ -224,7 +226,7 @@ def test_distorted_integration_is_symmetric_under_scaling(order):
     grid = fs.Grid.centred((60, 60), tuple(0.2 * sizes))
     values = np.random.default_rng(4).uniform(0.5, 1.5, square.shape)
     here = fs.Integrator(layout, square, distortion=BARREL, order=order)
-    there = fs.Integrator(scaled(layout, sizes), grid, distortion=ScaledLens(BARREL, sizes), order=order)
+    there = fs.Integrator(scale(layout, sizes), grid, distortion=ScaledLens(BARREL, sizes), order=order)
 
     # The chords differ: their error is up to 0.2 % of the shorter side of a cell.
     np.testing.assert_allclose(there(values), here(values) * sizes.prod(), rtol=2e-4)

@@ -75,7 +75,7 @@ def assert_same(read, power_map):
     assert read.wavelength_nm.tolist() == power_map.wavelength_nm.tolist()
 
 
-def saved(tmp_path, array, name="map.npy"):
+def save_array(tmp_path, array, name="map.npy"):
     np.save(tmp_path / name, array)
     return tmp_path / name
 
@@ -323,7 +323,7 @@ def test_written_letter_is_upright_in_other_readers(tmp_path, extension):
 
 
 def test_top_row_first_flips_array_vertically(tmp_path):
-    read = read_power_map(saved(tmp_path, F), **METADATA, top_row_first=True)
+    read = read_power_map(save_array(tmp_path, F), **METADATA, top_row_first=True)
 
     assert np.array_equal(read.data[0], UPRIGHT)
 
@@ -747,7 +747,7 @@ def test_arguments_override_file_metadata(tmp_path):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_values_are_converted_to_watts_per_band(tmp_path, unit, expected, dtype):
     scale = 1.0 if unit.startswith("w") else 1e18
-    path = saved(tmp_path, np.full((2, 3, 4), scale, dtype))
+    path = save_array(tmp_path, np.full((2, 3, 4), scale, dtype))
 
     read = read_power_map(path, pitch_um=1.0, wavelength_nm=[450.0, 550.0], unit=unit)
 
@@ -757,7 +757,7 @@ def test_values_are_converted_to_watts_per_band(tmp_path, unit, expected, dtype)
 
 def test_default_bands_extend_to_midpoints(tmp_path):
     read = read_power_map(
-        saved(tmp_path, np.ones((3, 1, 1))), pitch_um=1.0, wavelength_nm=[600, 400, 450], unit="w_m2_nm"
+        save_array(tmp_path, np.ones((3, 1, 1))), pitch_um=1.0, wavelength_nm=[600, 400, 450], unit="w_m2_nm"
     )
 
     assert read.data.ravel().tolist() == [150.0, 50.0, 100.0]
@@ -810,7 +810,7 @@ def test_length_units_are_parsed(text, size_um):
 
 @pytest.mark.parametrize("dtype", [">f4", ">f8", "<f2", "u1", ">u2", "<i4", ">i8", "u8"])
 def test_all_numeric_dtypes_are_read(tmp_path, dtype):
-    read = read_power_map(saved(tmp_path, np.arange(12).reshape(3, 4).astype(dtype)), **METADATA)
+    read = read_power_map(save_array(tmp_path, np.arange(12).reshape(3, 4).astype(dtype)), **METADATA)
 
     assert np.array_equal(read.data[0], np.arange(12).reshape(3, 4))
     assert read.data.dtype in (np.float32, np.float64)
@@ -821,7 +821,7 @@ def test_fortran_order_yields_same_array(tmp_path):
     array = np.arange(24.0).reshape(2, 3, 4)
 
     read = read_power_map(
-        saved(tmp_path, np.asfortranarray(array)), pitch_um=1.0, wavelength_nm=[450, 550], unit="w_m2"
+        save_array(tmp_path, np.asfortranarray(array)), pitch_um=1.0, wavelength_nm=[450, 550], unit="w_m2"
     )
 
     assert np.array_equal(read.data, array)
@@ -830,7 +830,7 @@ def test_fortran_order_yields_same_array(tmp_path):
 def test_negative_rounding_errors_are_preserved(tmp_path):
     light = np.array([[1.0, -1e-7]])
 
-    assert np.array_equal(read_power_map(saved(tmp_path, light), **METADATA).data[0], light)
+    assert np.array_equal(read_power_map(save_array(tmp_path, light), **METADATA).data[0], light)
 
 
 @pytest.mark.parametrize(
@@ -853,7 +853,7 @@ def test_negative_rounding_errors_are_preserved(tmp_path):
     ],
 )
 def test_read_rejects_invalid_irradiance(tmp_path, array, message):
-    assert_rejected(saved(tmp_path, array), message, **METADATA)
+    assert_rejected(save_array(tmp_path, array), message, **METADATA)
 
 
 @pytest.mark.parametrize(
@@ -887,7 +887,7 @@ def test_read_rejects_invalid_irradiance(tmp_path, array, message):
     ],
 )
 def test_read_rejects_missing_or_invalid_metadata(tmp_path, metadata, message, error):
-    assert_rejected(saved(tmp_path, np.ones((3, 4))), message, error, **{**METADATA, **metadata})
+    assert_rejected(save_array(tmp_path, np.ones((3, 4))), message, error, **{**METADATA, **metadata})
 
 
 def test_read_rejects_files_of_other_formats(tmp_path):
@@ -904,7 +904,7 @@ def test_read_rejects_files_of_other_formats(tmp_path):
 
 # -- malformed files --------------------------------------------------------------------------------------------------
 
-MAX_S, HANGING_S, MAX_BYTES = 20.0, 60.0, 2 * 2**30
+MAX_S, TIMEOUT_S, MAX_BYTES = 20.0, 60.0, 2 * 2**30
 READ = """
 import json, resource, sys
 from foveasim._io import sandbox
@@ -957,7 +957,7 @@ def read_all(paths, *, in_sandbox=True):
             os.fdopen(source) as lines,
         ):
             os.close(sink)
-            timer = threading.Timer(HANGING_S + 4 * len(rest), program.kill)
+            timer = threading.Timer(TIMEOUT_S + 4 * len(rest), program.kill)
             timer.start()
             program.stdin.write("\n".join(map(str, rest)).encode())
             program.stdin.close()

@@ -8,7 +8,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.id_map import id_map as slow_id_map
-from reference.polygons import ZOO
+from reference.polygons import POLYGONS
 
 import foveasim as fs
 from foveasim.errors import ParameterError
@@ -65,10 +65,10 @@ def test_samples_match_exact_rational_arithmetic(layout, steps, n_threads):
 @pytest.mark.parametrize("layout", TILINGS.values(), ids=TILINGS)
 @pytest.mark.parametrize("n", [16, 61])
 def test_tiling_pixels_have_exactly_one_site(layout, n):
-    alone = [id_map(layout[[i]], (n, n), layout.bounds_um) >= 0 for i in range(layout.n_sites)]
+    separate = [id_map(layout[[i]], (n, n), layout.bounds_um) >= 0 for i in range(layout.n_sites)]
     together = id_map(layout, (n, n), layout.bounds_um)
 
-    assert np.sum(alone, axis=0).max() == 1
+    assert np.sum(separate, axis=0).max() == 1
     x_min, y_min, x_max, y_max = layout.bounds_um
     x, y = (low + (np.arange(n) + 0.5) * (high - low) / n for low, high in ((x_min, x_max), (y_min, y_max)))
     inside = shapely.union_all(layout.polygons()).buffer(-1e-9)
@@ -88,13 +88,13 @@ def test_boundary_centres_belong_right_or_above():
             assert ids[iy, ix] == (np.flatnonzero(has)[0] if has.any() else -1)
 
 
-@pytest.mark.parametrize("name", ZOO)
+@pytest.mark.parametrize("name", POLYGONS)
 def test_pixels_cover_area_of_any_shape(name):
-    layout = fs.Layout.from_polygons([ZOO[name]])
+    layout = fs.Layout.from_polygons([POLYGONS[name]])
     x_min, y_min, x_max, y_max = layout.bounds_um
     ids = id_map(layout, (700, 700))
     pixel_um2 = (x_max - x_min) * (y_max - y_min) / 700**2
-    length_um = shapely.length(ZOO[name])
+    length_um = shapely.length(POLYGONS[name])
 
     # The error is less than one pixel per pixel that the outline crosses.
     pitch_um = max(x_max - x_min, y_max - y_min) / 700
@@ -133,10 +133,10 @@ def test_result_independent_of_threads():
 
 def test_window_matches_part_of_full_map():
     layout = L.octagonal(n_x=16, n_y=16, pitch_um=2.0)
-    whole = id_map(layout, (256, 256), (-16, -16, 16, 16))
+    complete = id_map(layout, (256, 256), (-16, -16, 16, 16))
     window = id_map(layout, (64, 128), (-8, -4, 8, 4))
 
-    assert np.array_equal(window, whole[96:160, 64:192])
+    assert np.array_equal(window, complete[96:160, 64:192])
     assert np.all(id_map(layout, (5, 5), (100, 100, 110, 110)) == -1)
 
 
@@ -168,11 +168,11 @@ def test_pixel_is_mean_of_samples():
     # Without a background: the mean of the samples in sites, and their fraction.
     is_site = (three.ids >= 0).reshape(30, 3, 40, 3)
     counts = is_site.sum(axis=(1, 3))
-    alone = (table[three.ids].reshape(30, 3, 40, 3, 3) * is_site[..., None]).sum(axis=(1, 3)) / np.maximum(counts, 1)[
-        ..., None
-    ]
+    separate = (table[three.ids].reshape(30, 3, 40, 3, 3) * is_site[..., None]).sum(axis=(1, 3)) / np.maximum(
+        counts, 1
+    )[..., None]
     clear = three.picture(rgb, background=None)
-    assert np.abs(clear[..., :3] - alone).max() <= 0.5
+    assert np.abs(clear[..., :3] - separate).max() <= 0.5
     assert np.abs(clear[..., 3] - 255 * counts / 9).max() <= 0.5
 
 

@@ -39,15 +39,15 @@ LAYOUTS = {"log-polar": FOVEAL, "hexagons": HEXAGONS, "zones": ZONES, "squares":
 SMOOTH = {"linear": linear, "natural": natural}
 
 
-def fitted(layout, values, grid, **options):
+def fit(layout, values, grid, **options):
     """Least squares with equal responses: values of a uniform scene are equal."""
     return least_squares(layout, values, grid, response=np.ones(layout.n_sites), **{"variance": 1.0, **options})
 
 
-METHODS = {"cells": cells, **SMOOTH, "least squares": fitted}
+METHODS = {"cells": cells, **SMOOTH, "least squares": fit}
 LAYOUT = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 METHOD = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
-BETWEEN = pytest.mark.parametrize("method", SMOOTH.values(), ids=SMOOTH)
+EACH_INTERPOLATION = pytest.mark.parametrize("method", SMOOTH.values(), ids=SMOOTH)
 
 
 def plane(xy_um):
@@ -83,10 +83,10 @@ def test_uncovered_pixels_are_nan(method):
     covered = shapely.union_all(FOVEAL.polygons())
     x, y = np.moveaxis(centres_um(grid), -1, 0)
     half = 0.5 * grid.pitch_um
-    share = shapely.area(shapely.intersection(covered, shapely.box(x - half, y - half, x + half, y + half)))
+    covered_um2 = shapely.area(shapely.intersection(covered, shapely.box(x - half, y - half, x + half, y + half)))
 
-    assert np.array_equal(np.isnan(picture.data[0]), share < 1e-9)
-    assert picture.coverage == pytest.approx(share / grid.cell_area_um2, abs=1e-6)
+    assert np.array_equal(np.isnan(picture.data[0]), covered_um2 < 1e-9)
+    assert picture.coverage == pytest.approx(covered_um2 / grid.cell_area_um2, abs=1e-6)
     assert np.isnan(picture.data[0, 75, 75])
 
 
@@ -96,7 +96,7 @@ def test_result_independent_of_site_order(layout, method):
     values = np.random.default_rng(3).uniform(20.0, 90.0, layout.n_sites)
     order = np.random.default_rng(4).permutation(layout.n_sites)
     grid = raster_grid(layout, 60)
-    options = {"mu": 1e-3, "tolerance": 1e-8} if method is fitted else {}
+    options = {"mu": 1e-3, "tolerance": 1e-8} if method is fit else {}
     one = method(layout, values, grid, **options).data
     other = method(layout[order], values[order], grid, **options).data
 
@@ -104,7 +104,7 @@ def test_result_independent_of_site_order(layout, method):
     if method is linear and layout is ZONES:
         assert np.nanmean(np.abs(one - other) > 1e-3) < 0.4
         return
-    assert np.nanmax(np.abs(one - other)) < (0.02 if method is fitted else 1e-3)
+    assert np.nanmax(np.abs(one - other)) < (0.02 if method is fit else 1e-3)
 
 
 @METHOD
@@ -128,7 +128,7 @@ def test_translated_layout_translates_picture(method):
 # -- interpolation ----------------------------------------------------------------------------------------------------
 
 
-@BETWEEN
+@EACH_INTERPOLATION
 @LAYOUT
 def test_interpolation_exact_at_centroids(layout, method):
     values = np.random.default_rng(1).uniform(1.0, 9.0, layout.n_sites)
@@ -138,7 +138,7 @@ def test_interpolation_exact_at_centroids(layout, method):
         assert picture.data[0, 0, 0] == pytest.approx(values[site], rel=1e-6)
 
 
-@BETWEEN
+@EACH_INTERPOLATION
 @LAYOUT
 def test_linear_field_exact_inside_hull_clamped_outside(layout, method):
     grid = raster_grid(layout, 120)
@@ -195,7 +195,7 @@ def test_natural_neighbours_smoother_than_linear():
     assert bends["natural"] < 0.2 * bends["linear"]
 
 
-@BETWEEN
+@EACH_INTERPOLATION
 def test_missing_sites_interpolated_from_neighbours(method):
     values = plane(HEXAGONS.centroid_um)
     bad = int(np.hypot(*HEXAGONS.centroid_um.T).argmin())
@@ -205,7 +205,7 @@ def test_missing_sites_interpolated_from_neighbours(method):
     assert picture.data[0, 0, 0] == pytest.approx(plane(HEXAGONS.centroid_um[bad]), rel=1e-6)
 
 
-@BETWEEN
+@EACH_INTERPOLATION
 def test_coincident_centroids_are_averaged(method):
     rings = [shapely.Point(0, 0).buffer(r + 1).difference(shapely.Point(0, 0).buffer(r)) for r in (1, 2)]
     others = [shapely.box(x - 1, y - 1, x + 1, y + 1) for x, y in ((9, 0), (-9, 1), (0, 9), (1, -9))]
@@ -215,7 +215,7 @@ def test_coincident_centroids_are_averaged(method):
     assert np.nanmax(np.abs(picture.data - 4.0)) < 1e-5
 
 
-@BETWEEN
+@EACH_INTERPOLATION
 @pytest.mark.parametrize(
     ("centres", "values", "at", "expected"),
     [
@@ -308,12 +308,12 @@ def test_excluded_site_is_filled_smoothly():
     good = plane(HEXAGONS.centroid_um)
     bad = int(np.hypot(*HEXAGONS.centroid_um.T).argmin())
     one, other = (np.where(np.arange(good.size) == bad, wrong, good) for wrong in (np.nan, 1e6))
-    left_out = fitted(HEXAGONS, one, grid, mu=1e-3)
+    left_out = fit(HEXAGONS, one, grid, mu=1e-3)
     x, y = HEXAGONS.centroid_um[bad]
-    place = int((y - grid.origin_um[1]) / grid.pitch_um), int((x - grid.origin_um[0]) / grid.pitch_um)
+    index = int((y - grid.origin_um[1]) / grid.pitch_um), int((x - grid.origin_um[0]) / grid.pitch_um)
 
-    assert left_out.data[0][place] == pytest.approx(good[bad], rel=0.01)
-    assert fitted(HEXAGONS, other, grid, mu=1e-3).data[0][place] > 1e5
+    assert left_out.data[0][index] == pytest.approx(good[bad], rel=0.01)
+    assert fit(HEXAGONS, other, grid, mu=1e-3).data[0][index] > 1e5
 
 
 def test_response_normalises_site_areas():
@@ -330,8 +330,8 @@ def test_blur_is_deconvolved():
     scene[20:44, 28:36] = 60.0
     kernel = np.outer([1, 4, 6, 4, 1], [1, 4, 6, 4, 1]) / 256.0
     padded = np.pad(scene, 2, mode="edge")
-    seen = sum(kernel[i, j] * padded[i : i + 64, j : j + 64] for i in range(5) for j in range(5))
-    values = Integrator(layout, grid)(seen)
+    blurred = sum(kernel[i, j] * padded[i : i + 64, j : j + 64] for i in range(5) for j in range(5))
+    values = Integrator(layout, grid)(blurred)
     sharp = least_squares(layout, values, grid, variance=1e-4, mu=1e-4, blur=kernel, tolerance=1e-6)
     as_seen = least_squares(layout, values, grid, variance=1e-4, mu=1e-4, tolerance=1e-6)
 
@@ -382,7 +382,7 @@ def test_invalid_least_squares_options_raise(options, message):
         least_squares(SQUARES, np.ones(SQUARES.n_sites), raster_grid(SQUARES, 20), **options)
 
 
-@pytest.mark.parametrize("method", [linear, natural, fitted], ids=["linear", "natural", "least squares"])
+@pytest.mark.parametrize("method", [linear, natural, fit], ids=["linear", "natural", "least squares"])
 @pytest.mark.parametrize(
     ("values", "message"),
     [
@@ -401,7 +401,7 @@ def test_nonconvergence_raises_simulation_error():
     values = np.random.default_rng(1).uniform(1.0, 9.0, FOVEAL.n_sites)
 
     with pytest.raises(SimulationError, match="did not converge in 2 steps; increase 'tolerance', 'mu' or 'max_steps'"):
-        fitted(FOVEAL, values, raster_grid(FOVEAL, 60), mu=1e-3, max_steps=2)
+        fit(FOVEAL, values, raster_grid(FOVEAL, 60), mu=1e-3, max_steps=2)
 
 
 @pytest.mark.parametrize("name", ["astronaut", "coffee", "chelsea"])
@@ -475,7 +475,7 @@ def test_blur_kernel_matches_imaged_pixel():
 # -- captures ---------------------------------------------------------------------------------------------------------
 
 
-def captured(layout, **parameters):
+def capture_of(layout, **parameters):
     """Return camera, power map and capture of a uniform scene of 100 electrons per µm²."""
     sensor = fs.Sensor(layout, **{"bits": 12, "capacitance_f": 5e-14, "v_sat_v": 1.0, **parameters})
     camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=4.0), sensor=sensor)
@@ -489,7 +489,7 @@ def captured(layout, **parameters):
 @pytest.mark.parametrize("method", ["cells", "linear", "natural", "least_squares"])
 @pytest.mark.parametrize("of", ["code", "electrons", "expected_e", "light_e"])
 def test_uniform_scene_is_uniform_per_area(method, of):
-    _, _, capture = captured(ZONES)
+    _, _, capture = capture_of(ZONES)
     picture = capture.picture(method, of=of, per="um2", max_pixels=64)
     dn_per_e = 2.0**12 / 312_075.0  # full scale of 50 fF at 1 V
     expected = 100.0 * (dn_per_e if of == "code" else 1.0)
@@ -501,7 +501,7 @@ def test_uniform_scene_is_uniform_per_area(method, of):
 
 def test_area_scaled_capacitances_give_uniform_codes():
     capacitance_f = 1e-15 * ZONES.area_um2
-    camera, _, capture = captured(ZONES, capacitance_f=capacitance_f, shot_noise="off")
+    camera, _, capture = capture_of(ZONES, capacitance_f=capacitance_f, shot_noise="off")
     site, area = (
         capture.picture("least_squares", per=per, max_pixels=64, sensor=camera.sensor).data for per in ("site", "um2")
     )
@@ -513,7 +513,7 @@ def test_area_scaled_capacitances_give_uniform_codes():
 
 def test_dark_signal_and_pedestal_are_subtracted():
     dark = {"dark_e_per_s": 2e6, "pedestal_v": 0.05}
-    camera, _, capture = captured(SQUARES, **dark)
+    camera, _, capture = capture_of(SQUARES, **dark)
     for of in ("light_e", "electrons", "expected_e"):
         found = capture.picture("least_squares", of=of, per="um2", max_pixels=24)
         assert found.data.mean() == pytest.approx(100.0, rel=0.05)
@@ -551,7 +551,7 @@ def test_saturated_sites_are_flagged():
 
 
 def test_least_squares_excludes_saturated_sites():
-    _, _, capture = captured(SQUARES)
+    _, _, capture = capture_of(SQUARES)
     code = capture.code.copy()
     code[54] = 4095
     glaring = fs.Capture(
@@ -579,7 +579,7 @@ def test_least_squares_excludes_saturated_sites():
 @pytest.mark.parametrize("method", ["cells", "linear", "natural", "least_squares"])
 def test_mosaic_has_one_channel_per_filter(method):
     layout = fs.layout.mosaic(fs.layout.grid(n_x=16, n_y=12, pitch_um=2.0), ("RG", "GB"))
-    camera, light, capture = captured(layout, filters="rgb")
+    camera, light, capture = capture_of(layout, filters="rgb")
     grid = raster_grid(layout, 32)
     picture = capture.picture(method, of="expected_e", per="um2", grid=grid)
     expected = camera.reference(light, grid, exposure_s=capture.settings["exposure_s"])
@@ -589,7 +589,7 @@ def test_mosaic_has_one_channel_per_filter(method):
 
 
 def test_loaded_capture_gives_same_picture(tmp_path):
-    _, _, capture = captured(ZONES, read_noise_e=4.0)
+    _, _, capture = capture_of(ZONES, read_noise_e=4.0)
     capture.save(tmp_path / "c.npz")
     one, other = (
         c.picture("least_squares", of="light_e", max_pixels=64).data
@@ -621,7 +621,7 @@ def test_loaded_capture_gives_same_picture(tmp_path):
     ],
 )
 def test_invalid_picture_options_raise(call, message):
-    camera, _, capture = captured(SQUARES, capacitance_f=np.full(SQUARES.n_sites, 5e-14))
+    camera, _, capture = capture_of(SQUARES, capacitance_f=np.full(SQUARES.n_sites, 5e-14))
 
     with pytest.raises(ParameterError, match=message):
         call(capture, camera)

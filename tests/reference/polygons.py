@@ -7,7 +7,7 @@ import shapely
 from hypothesis import strategies as st
 
 #: Polygons by name, for a grid of 7 rows and 9 columns of unit cells.
-ZOO = {
+POLYGONS = {
     "square across boundaries": shapely.box(0.5, 0.5, 2.5, 2.5),
     "square on boundaries": shapely.box(1, 1, 3, 3),
     "one complete cell": shapely.box(4, 3, 5, 4),

@@ -188,7 +188,7 @@ def overlaps(layout, _rules):
     return [(sites, common) for sites, common, smaller in measured if common > AREA_ROUNDING * smaller]
 
 
-def _shares_an_edge(a, b):
+def _has_common_edge(a, b):
     """Return whether a section of an edge of one polygon, not only a crossing, adjoins the other polygon."""
     for edge in (edge for ring in _edges(a) for edge in ring):
         if shapely.LineString(edge).distance(b) > TOUCHING_UM:
@@ -210,7 +210,7 @@ def _shares_an_edge(a, b):
 def neighbour_ratios(layout, _rules):
     measured = []
     for (i, a), (j, b) in combinations(enumerate(layout.polygons()), 2):
-        if a.distance(b) < TOUCHING_UM and (_shares_an_edge(a, b) or _shares_an_edge(b, a)):
+        if a.distance(b) < TOUCHING_UM and (_has_common_edge(a, b) or _has_common_edge(b, a)):
             small, large = sorted([math.sqrt(a.area), math.sqrt(b.area)])
             measured.append(((i, j), large / small))
     return measured
@@ -305,7 +305,7 @@ def _rugged(rng):
     return scale(rotate(max(parts, key=shapely.area), rng.choice([0.0, rng.uniform(0.0, 360.0)])), 0.5, 0.5)
 
 
-def _scattered(shape):
+def _scatter(shape):
     """Return a generator of random shapes of one kind, from overlapping to widely spaced."""
 
     def make(rng, n_sites):
@@ -377,7 +377,7 @@ def _cells(rng, n_sites):
     return list(cells.polygons())
 
 
-def _moved(rng, polygons):
+def _move(rng, polygons):
     """Return polygons with up to three displaced vertices, in one or all sites at a vertex, if all remain valid."""
     for _ in range(int(rng.integers(0, 4))):
         k = int(rng.integers(len(polygons)))
@@ -399,10 +399,10 @@ def _moved(rng, polygons):
 
 #: Families of layouts by name; outlines can cross in those of ``CROSSING``.
 CROSSING = {
-    "stars": _scattered(_star),
-    "hulls": _scattered(_hull),
-    "tilted rectangles": _scattered(_tilted_rectangle),
-    "rugged": _scattered(_rugged),
+    "stars": _scatter(_star),
+    "hulls": _scatter(_hull),
+    "tilted rectangles": _scatter(_tilted_rectangle),
+    "rugged": _scatter(_rugged),
 }
 FAMILIES = {
     **CROSSING,
@@ -422,7 +422,7 @@ def layouts(draw, *, turns=True):
     family = draw(st.sampled_from(sorted(FAMILIES)))
     polygons = FAMILIES[family](rng, int(rng.integers(5, 31)))
     if family not in CROSSING:
-        polygons = _moved(rng, polygons)
+        polygons = _move(rng, polygons)
     layout = fs.Layout.from_polygons(polygons, ring=rng.choice([0, 1, 2, 3, 5, 8], len(polygons)))
     is_rotated = rng.random() < 0.5
     return layout.rotate(rng.uniform(0, 360)).translate(*rng.uniform(-1e4, 1e4, 2)) if turns and is_rotated else layout

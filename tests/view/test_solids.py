@@ -43,18 +43,18 @@ def hull_um2(layout):
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_parts_are_closed_without_overlap(name):
-    made = solids(LAYOUTS[name](), STACK)
-    report = made.check()
+    model = solids(LAYOUTS[name](), STACK)
+    report = model.check()
 
-    assert tuple(made.parts) == PARTS
+    assert tuple(model.parts) == PARTS
     assert report.ok
     assert [part.status for part in report.parts] == ["NoError"] * 4
-    for mesh in made.meshes:
+    for mesh in model.meshes:
         body = as_trimesh(mesh)
         assert body.is_watertight
         assert body.is_winding_consistent
     # One sphere-like or ring-like piece per site.
-    n = made.layout.n_sites
+    n = model.layout.n_sites
     assert [part.euler_characteristic for part in report.parts] == [2 * n, 0, 2 * n, 2 * n]
     assert max(report.overlap_um3.values()) <= 1e-9
 
@@ -62,25 +62,25 @@ def test_parts_are_closed_without_overlap(name):
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_volumes_are_areas_times_thicknesses(name):
     layout = LAYOUTS[name]()
-    made = solids(layout, STACK)
+    model = solids(layout, STACK)
     well_um2 = fs.layout.inset(layout, 0.1).area_um2
 
-    assert made.volumes_um3("wells") == pytest.approx(3.0 * well_um2, rel=1e-9)
-    assert made.volumes_um3("trenches") == pytest.approx(3.0 * (layout.area_um2 - well_um2), rel=1e-9)
-    assert made.volumes_um3("filters") == pytest.approx(0.6 * layout.area_um2, rel=1e-9)
-    for part in made.check().parts:  # sums by manifold3d, also far from the origin
-        assert part.volume_um3 == pytest.approx(made.volumes_um3(part.name).sum(), rel=1e-7)
+    assert model.volumes_um3("wells") == pytest.approx(3.0 * well_um2, rel=1e-9)
+    assert model.volumes_um3("trenches") == pytest.approx(3.0 * (layout.area_um2 - well_um2), rel=1e-9)
+    assert model.volumes_um3("filters") == pytest.approx(0.6 * layout.area_um2, rel=1e-9)
+    for part in model.check().parts:  # sums by manifold3d, also far from the origin
+        assert part.volume_um3 == pytest.approx(model.volumes_um3(part.name).sum(), rel=1e-7)
 
 
 def test_square_trench_volumes_match_hand_calculation():
     # 2 µm squares: wells of 1.8 µm side, trenches of 4 - 3.24 µm².
-    made = solids(fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0), STACK)
+    model = solids(fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0), STACK)
 
-    assert made.volumes_um3("wells") == pytest.approx(np.full(9, 3.0 * 3.24), rel=1e-12)
-    assert made.volumes_um3("trenches") == pytest.approx(np.full(9, 3.0 * 0.76), rel=1e-12)
-    low, high = made.parts["wells"].bounds_um
+    assert model.volumes_um3("wells") == pytest.approx(np.full(9, 3.0 * 3.24), rel=1e-12)
+    assert model.volumes_um3("trenches") == pytest.approx(np.full(9, 3.0 * 0.76), rel=1e-12)
+    low, high = model.parts["wells"].bounds_um
     assert (low[2], high[2]) == (-3.0, 0.0)
-    low, high = made.parts["lenses"].bounds_um
+    low, high = model.parts["lenses"].bounds_um
     assert (low[2], high[2]) == pytest.approx((0.6, 1.3))
 
 
@@ -88,27 +88,27 @@ def test_square_trench_volumes_match_hand_calculation():
 def test_lens_volume_is_sum_of_frustums(n_steps):
     # A frustum between copies of an area A, scaled by s and t, has the volume A h (s² + s t + t²) / 3.
     layout = fs.layout.hexagonal(n_columns=4, n_rows=4, pitch_um=3.0)
-    made = solids(layout, SensorStack(lens_height_um=0.5, n_lens_steps=n_steps))
+    model = solids(layout, SensorStack(lens_height_um=0.5, n_lens_steps=n_steps))
     radius_um = np.sqrt(layout.area_um2[0] / np.pi)
     ball_um = (radius_um**2 + 0.25) / 1.0
-    share = np.append(np.cos(0.5 * np.pi * np.arange(n_steps) / n_steps), 0.0)
-    height_um = np.sqrt(ball_um**2 - (share * radius_um) ** 2) - (ball_um - 0.5)
-    frustums = np.diff(height_um) * (share[1:] ** 2 + share[1:] * share[:-1] + share[:-1] ** 2) / 3.0
+    fraction = np.append(np.cos(0.5 * np.pi * np.arange(n_steps) / n_steps), 0.0)
+    height_um = np.sqrt(ball_um**2 - (fraction * radius_um) ** 2) - (ball_um - 0.5)
+    frustums = np.diff(height_um) * (fraction[1:] ** 2 + fraction[1:] * fraction[:-1] + fraction[:-1] ** 2) / 3.0
 
-    assert made.volumes_um3("lenses") == pytest.approx(layout.area_um2 * frustums.sum(), rel=1e-9)
+    assert model.volumes_um3("lenses") == pytest.approx(layout.area_um2 * frustums.sum(), rel=1e-9)
 
 
 def test_disc_lens_approaches_spherical_cap():
     disc = fs.Layout.from_polygons([shapely.Point(5.0, 5.0).buffer(4.0, quad_segs=64)])
-    made = solids(disc, SensorStack(lens_height_um=1.5, n_lens_steps=48))
+    model = solids(disc, SensorStack(lens_height_um=1.5, n_lens_steps=48))
     cap_um3 = np.pi * 1.5 * (3.0 * 16.0 + 1.5**2) / 6.0
 
-    assert made.volumes_um3("lenses")[0] == pytest.approx(cap_um3, rel=2e-3)
+    assert model.volumes_um3("lenses")[0] == pytest.approx(cap_um3, rel=2e-3)
 
 
 def test_lens_is_at_most_a_hemisphere():
-    made = solids(fs.Layout.from_rectangles([[0, 0], [20, 0]], [1.0, 9.0]), SensorStack(lens_height_um=3.0))
-    mesh = made.parts["lenses"]
+    model = solids(fs.Layout.from_rectangles([[0, 0], [20, 0]], [1.0, 9.0]), SensorStack(lens_height_um=3.0))
+    mesh = model.parts["lenses"]
     top_um = [mesh.points_um[mesh.photosite == k, 2].max() for k in (0, 1)]
 
     assert top_um == pytest.approx([0.6 + 1.0 / np.sqrt(np.pi), 0.6 + 3.0])
@@ -116,29 +116,29 @@ def test_lens_is_at_most_a_hemisphere():
 
 @pytest.mark.parametrize("name", ["squares", "rings with arcs", "gaps"])
 def test_round_lenses_closed_without_overlap(name):
-    made = solids(LAYOUTS[name](), SensorStack(n_lens_corners=20, n_lens_steps=5))
-    lenses = made.parts["lenses"]
-    report = made.check()
+    model = solids(LAYOUTS[name](), SensorStack(n_lens_corners=20, n_lens_steps=5))
+    lenses = model.parts["lenses"]
+    report = model.check()
 
     assert report.ok
     assert as_trimesh(lenses).is_watertight
-    assert report.parts[3].euler_characteristic == 2 * made.layout.n_sites
+    assert report.parts[3].euler_characteristic == 2 * model.layout.n_sites
     # No part of a lens overhangs another one: all faces except the floor face up.
     a, b, c = (lenses.points_um[lenses.triangles[:, k]] for k in range(3))
     upward = np.cross(b - a, c - a)[:, 2]
     assert np.all((upward > 0.0) | (np.maximum(np.maximum(a, b), c)[:, 2] <= 0.6))
     roof_um2 = 0.5 * np.bincount(lenses.photosite[lenses.triangles[:, 0]], weights=np.maximum(upward, 0.0))
-    assert roof_um2 == pytest.approx(made.layout.area_um2, rel=1e-9)
+    assert roof_um2 == pytest.approx(model.layout.area_um2, rel=1e-9)
 
 
 def test_fill_factor_matches_layout():
     for make in LAYOUTS.values():
         layout = make()
-        whole = solids(layout, SensorStack(trench_width_um=0.0))
+        untrenched = solids(layout, SensorStack(trench_width_um=0.0))
         narrowed = solids(layout, STACK)
 
-        assert tuple(whole.parts) == ("wells", "filters", "lenses")
-        assert whole.fill_factor == pytest.approx(layout.describe().fill_factor, rel=1e-9)
+        assert tuple(untrenched.parts) == ("wells", "filters", "lenses")
+        assert untrenched.fill_factor == pytest.approx(layout.describe().fill_factor, rel=1e-9)
         assert narrowed.fill_factor == pytest.approx(
             fs.layout.inset(layout, 0.1).area_um2.sum() / hull_um2(layout), rel=1e-9
         )
@@ -146,29 +146,29 @@ def test_fill_factor_matches_layout():
 
 def test_ten_thousand_sites_closed_without_overlap():
     layout = fs.layout.grid(n_x=100, n_y=100, pitch_um=4.0)
-    made = solids(layout, SensorStack(trench_width_um=0.4))
-    report = made.check()
+    model = solids(layout, SensorStack(trench_width_um=0.4))
+    report = model.check()
 
     assert report.ok
-    assert all(as_trimesh(mesh).is_watertight for mesh in made.meshes)
+    assert all(as_trimesh(mesh).is_watertight for mesh in model.meshes)
     assert max(report.overlap_um3.values()) < 1e-9
-    assert made.fill_factor == pytest.approx(0.81, rel=1e-9)
+    assert model.fill_factor == pytest.approx(0.81, rel=1e-9)
     assert report.parts[0].volume_um3 == pytest.approx(10_000 * 3.6**2 * 3.0, rel=1e-9)
     assert report.parts[1].volume_um3 == pytest.approx(10_000 * (16.0 - 3.6**2) * 3.0, rel=1e-9)
     assert report.parts[2].volume_um3 == pytest.approx(10_000 * 16.0 * 0.6, rel=1e-9)
 
 
 def test_check_detects_overlaps_and_open_surfaces():
-    made = solids(fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0), STACK)
-    wells = made.parts["wells"]
+    model = solids(fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0), STACK)
+    wells = model.parts["wells"]
     moved = type(wells)(**{**fields_of(wells), "points_um": wells.points_um + np.array([0.05, 0.0, 0.0])})
     opened = type(wells)(**{**fields_of(wells), "triangles": wells.triangles[1:]})
 
-    shared = with_wells(made, moved).check()
+    shared = with_wells(model, moved).check()
     # Every well overlaps its own trench by 0.05 µm, over 1.8 µm by 3 µm.
     assert shared.overlap_um3["wells", "trenches"] == pytest.approx(9 * 0.05 * 1.8 * 3.0)
     assert not shared.ok
-    not_closed = with_wells(made, opened).check()
+    not_closed = with_wells(model, opened).check()
     assert not_closed.parts[0].status == "NotManifold"
     assert not not_closed.ok
 
@@ -177,8 +177,8 @@ def fields_of(mesh):
     return {name: getattr(mesh, name) for name in ("name", "points_um", "triangles", "photosite", "values", "colours")}
 
 
-def with_wells(made, wells):
-    return type(made)(layout=made.layout, sensor_stack=made.sensor_stack, parts={**made.parts, "wells": wells})
+def with_wells(model, wells):
+    return type(model)(layout=model.layout, sensor_stack=model.sensor_stack, parts={**model.parts, "wells": wells})
 
 
 # -- sites with holes and reflex vertices --------------------------------------------------------------------------------
@@ -187,14 +187,14 @@ def with_wells(made, wells):
 def test_holes_and_reflex_vertices_are_preserved():
     # The well of the frame is also a frame; its trench follows the outline and the hole.
     layout = fs.Layout.from_polygons([FRAME, HOOK])
-    made = solids(layout, NO_LENSES)
-    report = made.check()
+    model = solids(layout, NO_LENSES)
+    report = model.check()
     well_um2 = [7.8**2 - 4.2**2, 60 - 4 * 7.0]
 
     assert report.ok
-    assert all(as_trimesh(mesh).is_watertight for mesh in made.meshes)
-    assert made.volumes_um3("wells")[0] == pytest.approx(3.0 * well_um2[0], rel=1e-9)
-    assert made.volumes_um3("trenches") == pytest.approx(3.0 * layout.area_um2 - made.volumes_um3("wells"), rel=1e-9)
+    assert all(as_trimesh(mesh).is_watertight for mesh in model.meshes)
+    assert model.volumes_um3("wells")[0] == pytest.approx(3.0 * well_um2[0], rel=1e-9)
+    assert model.volumes_um3("trenches") == pytest.approx(3.0 * layout.area_um2 - model.volumes_um3("wells"), rel=1e-9)
     assert {part.name: part.euler_characteristic for part in report.parts} == {
         "wells": 0 + 2,
         "trenches": 0 + 0 + 0,
@@ -203,11 +203,11 @@ def test_holes_and_reflex_vertices_are_preserved():
 
 
 def test_hole_touching_outline_gives_closed_solid():
-    bitten = shapely.Polygon([(30, 0), (38, 0), (38, 8), (30, 8)], [[(30, 0), (34, 6), (36, 4)]])
-    made = solids(fs.Layout.from_polygons([bitten]), SensorStack(trench_width_um=0.0, lens_height_um=0.0))
+    notched = shapely.Polygon([(30, 0), (38, 0), (38, 8), (30, 8)], [[(30, 0), (34, 6), (36, 4)]])
+    model = solids(fs.Layout.from_polygons([notched]), SensorStack(trench_width_um=0.0, lens_height_um=0.0))
 
-    assert made.check().ok
-    assert made.volumes_um3("wells")[0] == pytest.approx(3.0 * bitten.area, rel=1e-9)
+    assert model.check().ok
+    assert model.volumes_um3("wells")[0] == pytest.approx(3.0 * notched.area, rel=1e-9)
 
 
 def test_lens_on_non_star_shaped_site_raises():
@@ -226,10 +226,10 @@ def test_hook_lens_uses_inscribed_circle():
     # The centroid lies outside; about the centre of the largest inscribed circle the site is star-shaped.
     hook = shapely.Polygon([(0, 0), (8, 0), (8, 3), (3, 3), (3, 8), (0, 8)])
     assert not hook.contains(hook.centroid)
-    made = solids(fs.Layout.from_polygons([hook]), SensorStack())
+    model = solids(fs.Layout.from_polygons([hook]), SensorStack())
 
-    assert made.check().ok
-    assert made.volumes_um3("lenses")[0] > 0.0
+    assert model.check().ok
+    assert model.volumes_um3("lenses")[0] > 0.0
 
 
 def test_trench_wider_than_site_raises():
@@ -290,13 +290,13 @@ def test_cut_solids_closed_with_remaining_volume(name, shape):
 
 
 def test_cut_lens_volume_matches_manifold3d():
-    made = solids(fs.layout.grid(n_x=2, n_y=2, pitch_um=4.0), STACK)
+    model = solids(fs.layout.grid(n_x=2, n_y=2, pitch_um=4.0), STACK)
     region = shapely.box(-1.0, -5.0, 5.0, 1.2)
-    lenses = made.parts["lenses"]
+    lenses = model.parts["lenses"]
     body = manifold3d.Manifold(manifold3d.Mesh64(lenses.points_um, lenses.triangles.astype(np.uint64)))
     box = manifold3d.Manifold.cube((6.0, 6.2, 20.0)).translate((-1.0, -5.0, -10.0))
 
-    assert made.cut(region).volumes_um3("lenses").sum() == pytest.approx((body - box).volume(), rel=1e-12)
+    assert model.cut(region).volumes_um3("lenses").sum() == pytest.approx((body - box).volume(), rel=1e-12)
 
 
 def test_cut_pieces_keep_site_values():
@@ -312,13 +312,13 @@ def test_cut_pieces_keep_site_values():
 
 
 def test_partial_cut_leaves_other_parts():
-    made = solids(LAYOUTS["hexagons"](), STACK)
-    cut = made.cut(of=["lenses", "filters"])
+    model = solids(LAYOUTS["hexagons"](), STACK)
+    cut = model.cut(of=["lenses", "filters"])
 
-    assert cut.parts["wells"] is made.parts["wells"]
-    assert cut.volumes_um3("filters").sum() < made.volumes_um3("filters").sum()
+    assert cut.parts["wells"] is model.parts["wells"]
+    assert cut.volumes_um3("filters").sum() < model.volumes_um3("filters").sum()
     with pytest.raises(ParameterError, match="'part' must be one of 'wells', 'trenches'"):
-        made.cut(of=["glass"])
+        model.cut(of=["glass"])
 
 
 def test_whole_cut_selects_sites_by_centroid():
@@ -329,8 +329,8 @@ def test_whole_cut_selects_sites_by_centroid():
 
 
 def test_cut_of_everything_leaves_empty_solids(tmp_path):
-    made = solids(fs.layout.grid(n_x=2, n_y=2, pitch_um=2.0), STACK)
-    nothing = made.cut(shapely.box(-9, -9, 9, 9))
+    model = solids(fs.layout.grid(n_x=2, n_y=2, pitch_um=2.0), STACK)
+    nothing = model.cut(shapely.box(-9, -9, 9, 9))
 
     assert nothing.volumes_um3("wells").sum() == 0.0
     with pytest.raises(GeometryError, match="the scene is empty"):
@@ -368,16 +368,16 @@ def test_capture_wells_show_code():
 
 
 @pytest.fixture
-def made():
+def model():
     return solids(LAYOUTS["hexagons"](), STACK, by=np.arange(100.0))
 
 
-def test_glb_file_preserves_faces_and_attributes(made, tmp_path):
-    made.write(tmp_path / "sensor.glb")
+def test_glb_file_preserves_faces_and_attributes(model, tmp_path):
+    model.write(tmp_path / "sensor.glb")
     loaded = trimesh.load(tmp_path / "sensor.glb", process=False)
 
     assert set(loaded.geometry) == set(PARTS)
-    for name, mesh in made.parts.items():
+    for name, mesh in model.parts.items():
         body = loaded.geometry[name]
         assert np.array_equal(body.faces, mesh.triangles)
         assert np.allclose(body.vertices, mesh.points_um, rtol=1e-6, atol=1e-5)  # glTF stores float32
@@ -388,26 +388,26 @@ def test_glb_file_preserves_faces_and_attributes(made, tmp_path):
 
 
 @pytest.mark.parametrize("extension", [".stl", ".ply", ".obj", ".3mf"])
-def test_other_files_preserve_faces_and_volume(made, extension, tmp_path):
-    made.write(tmp_path / f"sensor{extension}")
+def test_other_files_preserve_faces_and_volume(model, extension, tmp_path):
+    model.write(tmp_path / f"sensor{extension}")
     loaded = trimesh.load(tmp_path / f"sensor{extension}", process=False)
     bodies = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
     n_faces = sum(len(body.faces) for body in bodies)
-    volume_um3 = sum(made.volumes_um3(part).sum() for part in PARTS)
+    volume_um3 = sum(model.volumes_um3(part).sum() for part in PARTS)
 
-    assert n_faces == sum(mesh.triangles.shape[0] for mesh in made.meshes)
+    assert n_faces == sum(mesh.triangles.shape[0] for mesh in model.meshes)
     assert sum(body.volume for body in bodies) == pytest.approx(volume_um3, rel=1e-5)
 
 
-def test_unknown_extension_raises_without_output(made, tmp_path):
+def test_unknown_extension_raises_without_output(model, tmp_path):
     with pytest.raises(FileError, match=r"must end in \.glb, \.stl"):
-        made.write(tmp_path / "sensor.step")
+        model.write(tmp_path / "sensor.step")
     with pytest.raises(FileError, match=r"the directory .* does not exist"):
-        made.write(tmp_path / "none" / "sensor.glb")
+        model.write(tmp_path / "none" / "sensor.glb")
     assert not list(tmp_path.iterdir())
 
 
-def test_failed_export_keeps_existing_file(made, tmp_path, monkeypatch):
+def test_failed_export_keeps_existing_file(model, tmp_path, monkeypatch):
     (tmp_path / "sensor.glb").write_bytes(b"before")
 
     def fail(*_, **__):
@@ -415,23 +415,23 @@ def test_failed_export_keeps_existing_file(made, tmp_path, monkeypatch):
 
     monkeypatch.setattr(trimesh.Scene, "export", fail)
     with pytest.raises(FileError, match="cannot be written: No space left on device"):
-        made.write(tmp_path / "sensor.glb")
+        model.write(tmp_path / "sensor.glb")
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"before"]
 
 
 @pytest.mark.parametrize("library", ["lxml", "networkx"])
-def test_missing_library_error_names_install_command(made, library, tmp_path, monkeypatch):
+def test_missing_library_error_names_install_command(model, library, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, library, None)
 
     with pytest.raises(FileError, match=rf"needs {library}; install it with: pip install 'foveasim\[view\]'"):
-        made.write(tmp_path / "a.3mf")
+        model.write(tmp_path / "a.3mf")
     assert not list(tmp_path.iterdir())
 
 
-def test_solids_repr_lists_parts(made):
+def test_solids_repr_lists_parts(model):
     assert (
-        repr(made)
+        repr(model)
         == "Solids(2,000 triangles of wells, 4,800 triangles of trenches, 2,000 triangles of filters, 7,000 triangles of lenses)"
     )
     with pytest.raises(ParameterError, match="'part' must be one of"):
-        made.volumes_um3("glass")
+        model.volumes_um3("glass")

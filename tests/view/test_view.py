@@ -33,7 +33,7 @@ MANY = fs.layout.grid(n_x=64, n_y=64, pitch_um=2.0)
 CHEQUERED = np.add.outer(np.arange(64), np.arange(64)).ravel() % 2
 
 
-def drawn(axes, tmp_path, dpi=100):
+def render_pixels(axes, tmp_path, dpi=100):
     """Render the interior of the axes, stretched over the figure, top row first."""
     axes.set_position((0, 0, 1, 1))
     axes.axis("off")
@@ -62,7 +62,7 @@ def mosaic_capture():
 
 def test_outlines_leave_holes_and_gaps_open(tmp_path):
     axes = plot_layout(LAYOUT, np.array([[1.0, 0, 0], [0, 0, 1.0]]), scale_bar=False, ax=bare_axes())
-    picture = drawn(axes, tmp_path)
+    picture = render_pixels(axes, tmp_path)
     red, blue = (np.all(picture == colour, axis=-1).mean() for colour in ([255, 0, 0], [0, 0, 255]))
 
     # Of the plot's 12 x 8 µm the frame covers 64 - 16 µm² and the box 16 µm².
@@ -77,7 +77,7 @@ def test_y_up_and_x_right(tmp_path, n):
     is_high, is_right = (layout.centroid_um[:, i] > 0 for i in (1, 0))
     assert (layout.n_sites > MAX_OUTLINES) == (n > 1)
     axes = layout.plot(np.stack((is_high, is_right, is_high), axis=1) * 1.0, scale_bar=False, ax=bare_axes(4, 4))
-    picture = drawn(axes, tmp_path)
+    picture = render_pixels(axes, tmp_path)
 
     assert np.all(picture[50:150, 50:150] == [255, 0, 255])
     assert np.all(picture[250:350, 250:350] == [0, 255, 0])
@@ -85,12 +85,12 @@ def test_y_up_and_x_right(tmp_path, n):
 
 
 def test_image_shows_sites_and_uncovered_areas(tmp_path):
-    whole = fs.layout.grid(n_x=64, n_y=96, pitch_um=2.0)
-    layout = whole[(whole.centroid_um[:, 0] > 0) | (whole.centroid_um[:, 0] < -32.0)]
+    complete = fs.layout.grid(n_x=64, n_y=96, pitch_um=2.0)
+    layout = complete[(complete.centroid_um[:, 0] > 0) | (complete.centroid_um[:, 0] < -32.0)]
     assert layout.n_sites > MAX_OUTLINES
     axes = plot_layout(layout, np.zeros((layout.n_sites, 3)), scale_bar=False, ax=bare_axes(4, 6))
     assert tuple(round(255 * c) for c in axes.get_facecolor()[:3]) == BACKGROUND
-    picture = drawn(axes, tmp_path)
+    picture = render_pixels(axes, tmp_path)
 
     assert np.all(picture[:, :99] == 0)
     assert np.all(picture[:, 101:199] == 255)
@@ -105,7 +105,7 @@ def test_image_matches_outlines(tmp_path, monkeypatch):
         monkeypatch.setattr("foveasim.view.plots.MAX_OUTLINES", max_outlines)
         axes = plot_layout(layout, colours, scale_bar=False, ax=bare_axes(4, 4))
         assert bool(axes.images) == (max_outlines == 0)
-        pictures.append(drawn(axes, tmp_path).astype(float))
+        pictures.append(render_pixels(axes, tmp_path).astype(float))
 
     difference = np.abs(pictures[0] - pictures[1])
     assert np.median(difference) == 0.0
@@ -117,7 +117,7 @@ def test_image_sharp_at_any_zoom(tmp_path):
     axes.set_xlim(-2.0, 2.0)
     axes.set_ylim(-2.0, 2.0)
     for dpi in (50, 200):
-        picture = drawn(axes, tmp_path, dpi=dpi)
+        picture = render_pixels(axes, tmp_path, dpi=dpi)
         values, counts = np.unique(picture, return_counts=True)
 
         # Four squares of one colour each, except for the pixels on their boundaries.
@@ -127,7 +127,7 @@ def test_image_sharp_at_any_zoom(tmp_path):
 
 def test_subpixel_sites_are_averaged(tmp_path):
     axes = plot_layout(MANY, CHEQUERED[:, None] * np.ones(3), scale_bar=False, ax=bare_axes(0.2, 0.2))
-    picture = drawn(axes, tmp_path)
+    picture = render_pixels(axes, tmp_path)
 
     assert picture.shape[:2] == (20, 20)
     assert picture.mean() == pytest.approx(127.5, abs=3.0)
@@ -137,7 +137,7 @@ def test_inverted_axes_flip_image(tmp_path):
     colours = np.where(MANY.centroid_um[:, :1] > 0, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     axes = plot_layout(MANY, colours, scale_bar=False, ax=bare_axes(4, 4))
     axes.invert_xaxis()
-    picture = drawn(axes, tmp_path)
+    picture = render_pixels(axes, tmp_path)
 
     assert np.all(picture[:, :199] == [255, 0, 0])
     assert np.all(picture[:, 201:] == [0, 0, 255])
@@ -201,7 +201,7 @@ def test_scale_bar_length_matches_label(tmp_path, zoom):
     axes = plot_layout(MANY, np.ones((MANY.n_sites, 3)), ax=bare_axes(6, 6))
     axes.set_xlim(-64.0 * zoom, 64.0 * zoom)
     axes.set_ylim(-64.0 * zoom, 64.0 * zoom)
-    picture = drawn(axes, tmp_path)
+    picture = render_pixels(axes, tmp_path)
     rows = np.all(picture == 0, axis=-1)
     length_px = rows.sum(axis=1).max()
 
@@ -338,13 +338,13 @@ def test_report_plot_shows_every_violation():
     assert list(by_label) == [str(result) for result in report.results if len(result)]
     for result in report.results:
         if len(result):
-            places = [record for record in report.records() if record["rule"] == result.rule]
+            records = [record for record in report.records() if record["rule"] == result.rule]
             offsets = np.asarray(by_label[str(result)].get_offsets())
-            assert np.allclose(offsets, [[p["x_um"], p["y_um"]] for p in places])
+            assert np.allclose(offsets, [[p["x_um"], p["y_um"]] for p in records])
     colours = {tuple(c.get_edgecolor()[0]) for c in by_label.values()}
     assert len(colours) == len(by_label)
-    texts = {text.get_text() for text in axes.texts}
-    assert {"0.5 µm", "1 µm", "1.41 µm"} <= texts
+    labels = {text.get_text() for text in axes.texts}
+    assert {"0.5 µm", "1 µm", "1.41 µm"} <= labels
     assert axes.get_title() == "4 violations on 4 photosites, 0 of 3 rules satisfied"
     waived = next(c for label, c in by_label.items() if "waived" in label)
     assert waived.get_linestyle()[0][1] is not None
@@ -451,14 +451,14 @@ def test_noise_budget_bars_per_source_and_class():
     noise_e = fs.sensor.noise_budget(sensor, np.full(4, 400.0), 1.0)
 
     together = plot_noise_budget(noise_e)
-    apart = plot_noise_budget(noise_e, classes=[0, 0, 1, 1])
+    grouped = plot_noise_budget(noise_e, classes=[0, 0, 1, 1])
 
     names = [text.get_text() for text in together.get_yticklabels()]
     assert names == ["photon_shot", "read", "quantisation", "prnu"]
     widths = [bar.get_width() for bar in together.patches]
     assert widths[0] == pytest.approx(20.0)
     assert widths[1] == pytest.approx(np.sqrt(17.0))
-    assert [bar.get_width() for bar in apart.patches][1::4] == pytest.approx([3.0, 5.0])
+    assert [bar.get_width() for bar in grouped.patches][1::4] == pytest.approx([3.0, 5.0])
     with pytest.raises(ParameterError, match="'classes' must have one value for each of the 4 sites"):
         plot_noise_budget(noise_e, classes=[0, 1])
 

@@ -20,12 +20,12 @@ from foveasim.view.meshes import triangulate
 FRAME = shapely.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)], [[(2, 2), (2, 6), (6, 6), (6, 2)]])
 HOOK = shapely.Polygon([(20, 0), (28, 0), (28, 2), (22, 2), (22, 8), (20, 8)])
 #: The hole touches the outline in a corner.
-BITTEN = shapely.Polygon([(30, 0), (38, 0), (38, 8), (30, 8)], [[(30, 0), (34, 6), (36, 4)]])
+NOTCHED = shapely.Polygon([(30, 0), (38, 0), (38, 8), (30, 8)], [[(30, 0), (34, 6), (36, 4)]])
 #: Edges have collinear vertices, so that every fan from a corner has degenerate triangles.
 NODED = shapely.Polygon(
     [(40 + x, y) for x, y in [(0, 0), (3, 0), (6, 0), (9, 0), (9, 3), (9, 6), (9, 9), (5, 9), (0, 9), (0, 5)]]
 )
-ODD = [FRAME, shapely.box(10, 0, 12, 8), HOOK, BITTEN, NODED]
+ODD = [FRAME, shapely.box(10, 0, 12, 8), HOOK, NOTCHED, NODED]
 ODD_LAYOUT = fs.Layout.from_polygons(ODD, channel=[0, 1, 2, 0, 1], name=["a", "b", "c", "d", "e"])
 STRAIGHT_DOWN = Viewpoint(azimuth_deg=-90.0, elevation_deg=90.0)
 
@@ -203,8 +203,13 @@ def test_top_view_shows_site_under_pixel():
     # Prisms of equal height show the layout, enlarged.
     flat = prisms(ODD_LAYOUT, np.ones(5), max_height_um=0.01)
     site = sites_in_view(flat, viewpoint=STRAIGHT_DOWN, size_px=(980, 200))
-    seen = np.argwhere(site >= 0)
-    left, right, top, bottom = seen[:, 1].min(), seen[:, 1].max() + 1, seen[:, 0].min(), seen[:, 0].max() + 1
+    visible = np.argwhere(site >= 0)
+    left, right, top, bottom = (
+        visible[:, 1].min(),
+        visible[:, 1].max() + 1,
+        visible[:, 0].min(),
+        visible[:, 0].max() + 1,
+    )
     x0, y0, x1, y1 = ODD_LAYOUT.bounds_um
     x_um = x0 + (np.arange(left, right) + 0.5 - left) / (right - left) * (x1 - x0)
     y_um = y1 - (np.arange(top, bottom) + 0.5 - top) / (bottom - top) * (y1 - y0)  # top row first: y up
@@ -261,11 +266,11 @@ def test_shading_of_tops_and_walls():
 
 def test_shading_clips_no_colour():
     picture = software(prisms(ODD_LAYOUT, np.ones(5), by=np.full((5, 3), 255, np.uint8)))
-    seen = picture[np.any(picture != render3d.BACKGROUND, axis=-1)]
+    visible = picture[np.any(picture != render3d.BACKGROUND, axis=-1)]
 
     assert pytest.approx(1.0) == render3d.AMBIENT + render3d.DIFFUSE
-    assert seen.max() < 255
-    assert len(np.unique(seen[:, 0])) >= 3
+    assert visible.max() < 255
+    assert len(np.unique(visible[:, 0])) >= 3
 
 
 def test_oversampling_averages_finer_pixels():
@@ -299,10 +304,10 @@ def test_zoom_two_doubles_lengths():
 )
 def test_scene_fits_and_fills_picture(viewpoint):
     columns, size_px = prisms(ODD_LAYOUT, np.arange(5.0)), np.array([400, 300])
-    place = render3d._eye([columns], viewpoint, (400, 300)).project(columns.points_um, (400, 300))
-    margins = np.array([place[:, :2].min(axis=0), size_px - place[:, :2].max(axis=0)]) / size_px
+    screen = render3d._eye([columns], viewpoint, (400, 300)).project(columns.points_um, (400, 300))
+    margins = np.array([screen[:, :2].min(axis=0), size_px - screen[:, :2].max(axis=0)]) / size_px
 
-    assert np.all(place[:, 2] > 0.0)
+    assert np.all(screen[:, 2] > 0.0)
     assert margins.min(axis=0).min() == pytest.approx(0.5 * (1.0 - render3d.FILLED_FRACTION), abs=0.002)
     assert margins[0] == pytest.approx(margins[1], abs=0.002)
     picture = software(columns, viewpoint=viewpoint)
@@ -456,7 +461,7 @@ MACHINES = {
     "invalid window class": {renderer.VTK_VARIABLE: "vtkNoRenderWindow", "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
     "window class without its library": {renderer.VTK_VARIABLE: renderer.OSMESA, "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
 }  # fmt: skip
-STILL = """
+RENDER_SCRIPT = """
 import warnings
 import numpy as np
 import foveasim as fs
@@ -472,7 +477,11 @@ print(fs.view.find_renderer(), len(np.unique(picture)) > 2, *[w.message for w in
 def test_missing_drivers_do_not_crash_interpreter(machine):
     bare = {k: v for k, v in os.environ.items() if k not in {"DISPLAY", renderer.VTK_VARIABLE}}
     run = subprocess.run(
-        [sys.executable, "-c", STILL], env={**bare, **MACHINES[machine]}, capture_output=True, text=True, check=False
+        [sys.executable, "-c", RENDER_SCRIPT],
+        env={**bare, **MACHINES[machine]},
+        capture_output=True,
+        text=True,
+        check=False,
     )
     found, is_drawn, *messages = run.stdout.strip().split("|")
 

@@ -37,16 +37,16 @@ SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enab
 #: A frame with an island in it, an L, an arrow that no fan from its first vertex fills, a comb that no fan fills,
 #: two boxes with a common boundary, and two that overlap.
 FRAME = shapely.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)], [[(2, 2), (2, 6), (6, 6), (6, 2)]])
-ELL = shapely.Polygon([(10, 0), (16, 0), (16, 2), (12, 2), (12, 8), (10, 8)])
+L_SHAPE = shapely.Polygon([(10, 0), (16, 0), (16, 2), (12, 2), (12, 8), (10, 8)])
 ARROW = shapely.Polygon([(0, 10), (8, 14), (0, 18), (3, 14)])
 COMB = shapely.Polygon([
     (10, 10), (20, 10), (20, 18), (18, 18), (18, 12), (16, 12), (16, 18), (14, 18), (14, 12), (12, 12), (12, 18), (10, 18),
 ])  # fmt: skip
 SHAPES = [
-    FRAME, shapely.box(3, 3, 5, 5), ELL, ARROW, COMB, shapely.box(22, 0, 25, 4), shapely.box(25, 0, 30, 4),
+    FRAME, shapely.box(3, 3, 5, 5), L_SHAPE, ARROW, COMB, shapely.box(22, 0, 25, 4), shapely.box(25, 0, 30, 4),
     shapely.box(22, 10, 27, 15), shapely.box(25, 12, 30, 18), shapely.Point(26, 7).buffer(1.5),
 ]  # fmt: skip
-ZOO = fs.Layout.from_polygons(
+MIXED_LAYOUT = fs.Layout.from_polygons(
     SHAPES,
     readout_line=np.arange(10) // 2,
     gain=np.array([0.1, 1 / 3, 2.5, np.nan, 1e-7, 123456.789, -4.0, 7.0, 8.0, 9.0]),
@@ -100,7 +100,7 @@ def triangles_of(shapes):
 @pytest.mark.parametrize(
     ("layout", "n_cut"),
     [
-        (ZOO, 2),  # the frame, and the comb
+        (MIXED_LAYOUT, 2),  # the frame, and the comb
         (fs.layout.log_polar(n_sectors=24, r_min_um=20.0, r_max_um=60.0, chords_per_arc=3), 0),
         (fs.layout.penrose(side_um=5.0, size_um=60.0), 0),
     ],
@@ -111,7 +111,7 @@ def test_triangles_fill_exactly_their_site(layout, n_cut):
     filled_um2 = np.zeros(layout.n_sites)
     polygons = layout.polygons()
     for site, corners in triangles_of(shapes):
-        triangle = shapely.Polygon(shapes.xy_um[shapes.place[list(corners)]])
+        triangle = shapely.Polygon(shapes.xy_um[shapes.position[list(corners)]])
         filled_um2[site] += triangle.area
         assert triangle.difference(polygons[site]).area < 1e-9
 
@@ -120,13 +120,13 @@ def test_triangles_fill_exactly_their_site(layout, n_cut):
 
 
 def test_shared_vertices_stored_once_and_decoded():
-    for layout in (ZOO, MOSAIC):
+    for layout in (MIXED_LAYOUT, MOSAIC):
         shapes = shapes_of(layout)
-        place, seen = [], 0
-        for back in back_references(shapes.place).tolist():
-            place.append(seen if back == 0 else seen - back)
-            seen += back == 0
-        assert place == shapes.place.tolist()
+        position, n_distinct = [], 0
+        for back in back_references(shapes.position).tolist():
+            position.append(n_distinct if back == 0 else n_distinct - back)
+            n_distinct += back == 0
+        assert position == shapes.position.tolist()
     shapes = shapes_of(fs.layout.grid(n_x=5, n_y=4, pitch_um=1.0))
 
     assert shapes.xy_um.shape == (6 * 5, 2)
@@ -201,15 +201,19 @@ def test_page_loads_no_external_resources():
     ("call", "error", "message"),
     [
         (lambda: web_page(3), ParameterError, "'data' must be a Layout or a Capture, got a int"),
-        (lambda: web_page(ZOO[:0]), GeometryError, "the layout has no sites"),
-        (lambda: web_page(ZOO, report="none"), ParameterError, "'report' must be a Report of a check, got a str"),
+        (lambda: web_page(MIXED_LAYOUT[:0]), GeometryError, "the layout has no sites"),
         (
-            lambda: web_page(ZOO, report=MOSAIC.check(fs.DesignRules(min_size_um=1.0))),
+            lambda: web_page(MIXED_LAYOUT, report="none"),
+            ParameterError,
+            "'report' must be a Report of a check, got a str",
+        ),
+        (
+            lambda: web_page(MIXED_LAYOUT, report=MOSAIC.check(fs.DesignRules(min_size_um=1.0))),
             ParameterError,
             "'report' must be a check of this layout of 10 sites, got one of 120",
         ),
-        (lambda: write_web_page(ZOO, "page.txt"), FileError, r"page.txt: must end in .html"),
-        (lambda: write_web_page(ZOO, "nowhere/page.html"), FileError, "the directory nowhere does not exist"),
+        (lambda: write_web_page(MIXED_LAYOUT, "page.txt"), FileError, r"page.txt: must end in .html"),
+        (lambda: write_web_page(MIXED_LAYOUT, "nowhere/page.html"), FileError, "the directory nowhere does not exist"),
     ],
 )
 def test_invalid_page_arguments_raise(call, error, message):
@@ -221,7 +225,7 @@ def test_page_is_written_atomically(tmp_path, monkeypatch):
     (tmp_path / "page.html").write_text("before")
     monkeypatch.setattr("foveasim.view.web._page.web_page", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        write_web_page(ZOO, tmp_path / "page.html")
+        write_web_page(MIXED_LAYOUT, tmp_path / "page.html")
 
     assert [p.name for p in tmp_path.iterdir()] == ["page.html"]
     assert (tmp_path / "page.html").read_text() == "before"
@@ -294,15 +298,15 @@ def row(page, label):
 
 @pytest.mark.needs("chromium")
 def test_mouse_shows_site_and_values(visit):
-    page = visit(web_page(ZOO))
+    page = visit(web_page(MIXED_LAYOUT))
     inside = {0: (1, 1), 1: (4, 4), 2: (11, 6), 3: (5, 14), 4: (19, 17), 5: (23, 2), 6: (28, 2), 9: (26, 7)}
     for site, point in inside.items():
         hover(page, *point)
         assert page.evaluate("foveasim.hovered") == site
         assert page.inner_text("#site-heading") == f"Photosite {site}"
-        assert row(page, "area") == f"{float(f'{ZOO.area_um2[site]:.6g}'):g} µm²"
+        assert row(page, "area") == f"{float(f'{MIXED_LAYOUT.area_um2[site]:.6g}'):g} µm²"
         assert row(page, "readout line") == str(site // 2)
-        assert row(page, "kind") == ZOO.columns["kind"][site]
+        assert row(page, "kind") == MIXED_LAYOUT.columns["kind"][site]
         assert row(page, "is dark") == ("yes" if site == 3 else "no")
         assert row(page, "wide") == f"{site * 10**15:,}"
     assert row(page, "gain") == "9"
@@ -315,14 +319,14 @@ def test_mouse_shows_site_and_values(visit):
     assert page.evaluate("foveasim.hovered") == 8
     assert row(page, "overlaps") == "7"
     values = page.evaluate("foveasim.nSites && [...Array(10).keys()].map((i) => foveasim.values(i).gain)")
-    assert np.array_equal(np.array(values, dtype=float), ZOO.columns["gain"], equal_nan=True)
+    assert np.array_equal(np.array(values, dtype=float), MIXED_LAYOUT.columns["gain"], equal_nan=True)
 
 
 @pytest.mark.needs("chromium")
 def test_page_picks_match_python(visit):
     pick = "points => points.map(([x, y]) => foveasim.pickAll(x, y))"
     hexagons = fs.layout.hexagonal(n_columns=7, n_rows=6, pitch_um=3.0)
-    for layout, is_straight in ((ZOO, False), (MOSAIC, True), (hexagons, False), (MOSAIC.rotate(30.0), False)):
+    for layout, is_straight in ((MIXED_LAYOUT, False), (MOSAIC, True), (hexagons, False), (MOSAIC.rotate(30.0), False)):
         page = visit(web_page(layout))
         x0, y0, x1, y1 = layout.bounds_um
         anywhere = np.random.default_rng(0).uniform((x0 - 1, y0 - 1), (x1 + 1, y1 + 1), (1500, 2))
@@ -333,7 +337,7 @@ def test_page_picks_match_python(visit):
         found = page.evaluate(pick, points.tolist())
 
         assert [sites[-1] if sites else -1 for sites in found] == [site_at(layout, x, y) for x, y in points]
-        if layout is not ZOO:
+        if layout is not MIXED_LAYOUT:
             rim = shapely.union_all(layout.polygons()).boundary
             inner = on_borders[shapely.distance(rim, shapely.points(on_borders)) > 0.1]
             assert inner.shape[0] > 100
@@ -408,9 +412,9 @@ def test_site_colours_follow_selected_column(visit):
     def drawn():
         return page.evaluate("([x, y]) => foveasim.pixel(x, y)", [x, y])[:3]
 
-    share = CAPTURE.code[site] / CAPTURE.code.max()
+    fraction = CAPTURE.code[site] / CAPTURE.code.max()
     assert page.evaluate("foveasim.column") == "picture"
-    assert drawn() == pytest.approx(np.array(FILTER_COLOURS["G"]) * share ** (1 / 2.2), abs=2)
+    assert drawn() == pytest.approx(np.array(FILTER_COLOURS["G"]) * fraction ** (1 / 2.2), abs=2)
     page.select_option("#colouring", "channel")
     until(page, "foveasim.column === 'channel'")
     assert drawn() == list(FILTER_COLOURS["G"])
@@ -421,7 +425,7 @@ def test_site_colours_follow_selected_column(visit):
     assert drawn() == pytest.approx(np.array(expected) * 255, abs=4)
     page.select_option("#colouring", "code")
     until(page, "foveasim.column === 'code'")
-    assert drawn() == pytest.approx([255 * share ** (1 / 2.2)] * 3, abs=2)
+    assert drawn() == pytest.approx([255 * fraction ** (1 / 2.2)] * 3, abs=2)
     hover(page, x, y)
     assert row(page, "code") == f"{CAPTURE.code[site]:,} DN"
     assert row(page, "electrons") == f"{CAPTURE.electrons[site]:,} e⁻"
@@ -432,7 +436,7 @@ def test_site_colours_follow_selected_column(visit):
 
 @pytest.mark.needs("chromium")
 def test_holes_and_notches_show_background(visit):
-    page = visit(web_page(ZOO), color_scheme="light")
+    page = visit(web_page(MIXED_LAYOUT), color_scheme="light")
     points = [(2.5, 4.0), (1.0, 14.0), (17.0, 15.0), (13.0, 5.0), (1.0, 1.0), (4.0, 4.0), (7.0, 14.0), (19.0, 17.0)]
     is_ground = [page.evaluate("([x, y]) => foveasim.pixel(x, y)", list(p))[:3] == [185, 196, 214] for p in points]
 
@@ -543,8 +547,8 @@ def test_site_search_finds_number_or_reports(visit):
 @pytest.mark.needs("chromium")
 def test_violation_list_navigates_by_click_and_enter(visit):
     rules = fs.DesignRules(max_overlap_um2=0.0, min_size_um=2.5, min_space_um=2.5, max_sites=50)
-    report = ZOO.check(rules)
-    page = visit(web_page(ZOO, report=report))
+    report = MIXED_LAYOUT.check(rules)
+    page = visit(web_page(MIXED_LAYOUT, report=report))
     buttons = page.locator("#violations button")
 
     assert buttons.count() == len(report.violations) > 3
@@ -633,14 +637,14 @@ MALICIOUS = (
 
 @pytest.mark.needs("chromium")
 def test_untrusted_names_are_escaped(visit, tmp_path):
-    layout = ZOO.with_columns(**{
-        text: np.array([MALICIOUS[(i + k) % len(MALICIOUS)] for i in range(ZOO.n_sites)])
+    layout = MIXED_LAYOUT.with_columns(**{
+        text: np.array([MALICIOUS[(i + k) % len(MALICIOUS)] for i in range(MIXED_LAYOUT.n_sites)])
         for k, text in enumerate(MALICIOUS)
     })  # fmt: skip
     layout = fs.Layout(
         layout.xy_um, layout.ring_offsets, layout.site_offsets, layout.columns, {"generator": MALICIOUS[0]}
     )
-    ZOO.check(fs.DesignRules(min_size_um=2.5)).write(tmp_path / "report.lyrdb")
+    MIXED_LAYOUT.check(fs.DesignRules(min_size_um=2.5)).write(tmp_path / "report.lyrdb")
     text = (tmp_path / "report.lyrdb").read_text()
     text = text.replace("min_size_um", MALICIOUS[1].replace("<", "&lt;")).replace("photosite", "place")
     (tmp_path / "malformed.lyrdb").write_text(text)
@@ -677,8 +681,8 @@ def test_missing_webgl2_shows_message_and_picture(visit):
 
 
 def luminance(colour):
-    shares = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
-    linear = [s / 12.92 if s <= 0.04045 else ((s + 0.055) / 1.055) ** 2.4 for s in shares]
+    fractions = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    linear = [s / 12.92 if s <= 0.04045 else ((s + 0.055) / 1.055) ** 2.4 for s in fractions]
     return np.dot(linear, (0.2126, 0.7152, 0.0722))
 
 
@@ -754,7 +758,7 @@ def test_outlines_sharp_at_extreme_zoom(visit):
 
 
 def test_about_json_names_every_array():
-    text = web_page(ZOO, report=ZOO.check(fs.DesignRules(min_size_um=2.5)))
+    text = web_page(MIXED_LAYOUT, report=MIXED_LAYOUT.check(fs.DesignRules(min_size_um=2.5)))
     about = json.loads(re.search(r'<script type="application/json" id="about">(.*?)</script>', text)[1])
     ids = {attrs["id"] for tag, attrs in Elements(text).found if tag == "script" and attrs.get("type") == "text/plain"}
 
@@ -799,9 +803,9 @@ def test_hidden_parts_expose_parts_below(visit):
     page = visit(solid_page(layout, solids=stack))
     assert page.evaluate("foveasim.parts") == list(stack.parts) == ["wells", "trenches", "filters", "lenses"]
     page.evaluate("foveasim.lookDown()")
-    place = [*layout.centroid_um[14], 0.0]
+    position = [*layout.centroid_um[14], 0.0]
     for part in ("lenses", "filters", "wells"):
-        found = page.evaluate("(p) => foveasim.pick(...foveasim.toWindow(...p))", place)
+        found = page.evaluate("(p) => foveasim.pick(...foveasim.toWindow(...p))", position)
         assert found == {"site": 14, "part": part}
         page.get_by_label(part).uncheck()
     found = page.evaluate(
@@ -857,12 +861,14 @@ def test_solid_page_is_self_contained(tmp_path):
 
 def surfaces_of(about, arrays):
     """Yield decoded surfaces, in plain loops: name, corners (n, 3, 3) in µm, sites and colours of triangles."""
-    x, y = np.cumsum(arrays["place_x"], dtype=np.int64), np.cumsum(arrays["place_y"], dtype=np.int64)
-    place, seen = [], 0
-    for back in arrays["places"].tolist():
-        place.append(seen if back == 0 else seen - back)
-        seen += back == 0
-    points_um = np.array(about["origin_um"]) + about["lattice_um"] * np.column_stack((x[place], y[place], arrays["z"]))
+    x, y = np.cumsum(arrays["position_x"], dtype=np.int64), np.cumsum(arrays["position_y"], dtype=np.int64)
+    position, n_distinct = [], 0
+    for back in arrays["positions"].tolist():
+        position.append(n_distinct if back == 0 else n_distinct - back)
+        n_distinct += back == 0
+    points_um = np.array(about["origin_um"]) + about["lattice_um"] * np.column_stack(
+        (x[position], y[position], arrays["z"])
+    )
     runs = list(zip(*(arrays[f"run_{key}"].tolist() for key in ("sites", "points", "triangles")), strict=True))
     colours = arrays["run_colours"].reshape(-1, 3)
     tiles = arrays["tile_runs"].tolist()
@@ -896,7 +902,7 @@ BIG = fs.layout.mosaic(fs.layout.grid(n_x=90, n_y=70, pitch_um=2.0), ("RG", "GB"
 @pytest.mark.parametrize(
     ("layout", "meshes", "n_tiles"),
     [
-        (ZOO, (prisms(ZOO, np.arange(10.0)),), 1),
+        (MIXED_LAYOUT, (prisms(MIXED_LAYOUT, np.arange(10.0)),), 1),
         (MOSAIC, solids(MOSAIC, SensorStack(trench_width_um=0.3)).meshes, 1),
         (MOSAIC, solids(MOSAIC, SensorStack(trench_width_um=0.3, n_lens_corners=12)).cut().meshes, 1),
         (BIG, (prisms(BIG, np.arange(6300.0)),), 4),
@@ -1030,12 +1036,12 @@ VIEWS = {
 
 @pytest.mark.needs("chromium")
 @pytest.mark.parametrize(
-    "made",
-    [lambda: columns_of(ZOO), lambda: columns_of(ODD), lambda: columns_of(RINGS), stack_prisms],
+    "build",
+    [lambda: columns_of(MIXED_LAYOUT), lambda: columns_of(ODD), lambda: columns_of(RINGS), stack_prisms],
     ids=["notches and holes", "hexagons", "log-polar", "stack"],
 )
-def test_picks_match_ray_casting(visit, made):
-    text, parts, has_floor = made()
+def test_picks_match_ray_casting(visit, build):
+    text, parts, has_floor = build()
     page = visit(text)
     box = page.locator("#solid").bounding_box()
     rng = np.random.default_rng(5)
@@ -1046,8 +1052,8 @@ def test_picks_match_ray_casting(visit, made):
         go(page)
         camera = page.evaluate("foveasim.camera")
         pixels = np.floor(rng.uniform((0, 0), (int(box["width"]), int(box["height"])), (250, 2))) + 0.5
-        places = pixels + np.array([box["x"], box["y"]])
-        found = page.evaluate("points => points.map(([x, y]) => foveasim.pick(x, y))", places.tolist())
+        positions = pixels + np.array([box["x"], box["y"]])
+        found = page.evaluate("points => points.map(([x, y]) => foveasim.pick(x, y))", positions.tolist())
         # Compare pixels within one site without another site at the same depth; at boundaries rounding decides.
         around = [pixels + offset for offset in ((0, 0), (0.6, 0.6), (-0.6, 0.6), (0.6, -0.6), (-0.6, -0.6))]
         rays = rays_of(camera, box["width"], box["height"], np.concatenate(around))
@@ -1140,8 +1146,8 @@ def test_solid_page_touch_gestures(visit):
     page = visit(solid_page(CAPTURE), has_touch=True)
     fingers = page.context.new_cdp_session(page)
 
-    def touch(kind, *places):
-        points = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(places)]
+    def touch(kind, *positions):
+        points = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(positions)]
         fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
 
     before = page.evaluate("foveasim.camera")
@@ -1205,16 +1211,16 @@ def test_wheel_approaches_surface_under_mouse(visit):
     site = int(CAPTURE.code.argmax())
     x0, y0, x1, y1 = MOSAIC.bounds_um
     top = [*MOSAIC.centroid_um[site], 0.15 * max(x1 - x0, y1 - y0)]
-    place = page.evaluate("(p) => foveasim.toWindow(...p)", top)
-    page.mouse.move(*place)
+    position = page.evaluate("(p) => foveasim.toWindow(...p)", top)
+    page.mouse.move(*position)
     until(page, "site => foveasim.hovered === site", site)
     before = page.evaluate("foveasim.camera.distance")
     for _ in range(6):
         page.mouse.wheel(0, -200)
     until(page, "before => foveasim.camera.distance < 0.12 * before", before)
 
-    assert page.evaluate("(p) => foveasim.toWindow(...p)", top) == pytest.approx(place, abs=1.0)
-    assert page.evaluate("(p) => foveasim.pick(...p)", place)["site"] == site
+    assert page.evaluate("(p) => foveasim.toWindow(...p)", top) == pytest.approx(position, abs=1.0)
+    assert page.evaluate("(p) => foveasim.pick(...p)", position)["site"] == site
 
 
 @pytest.mark.needs("chromium")
@@ -1397,7 +1403,7 @@ def test_solids_show_colours_on_background(visit, tmp_path, theme, ground):
 
 
 #: Emulates a graphics card, for which edges are anti-aliased.
-AS_IF_FAST = (
+EMULATE_GRAPHICS_CARD = (
     "const ask = WebGL2RenderingContext.prototype.getParameter;"
     "WebGL2RenderingContext.prototype.getParameter = function (name) { return name === 0x9246 ? 'card' : ask.call(this, name); };"
 )
@@ -1408,7 +1414,7 @@ def test_fast_graphics_antialias_solid_edges(visit, tmp_path):
     layout = fs.Layout.from_polygons([shapely.Polygon([(0, 0), (30, 2), (28, 20), (1, 18)])])
     flat = SensorStack(trench_width_um=0.0, filter_thickness_um=0.0, lens_height_um=0.0)
     n_colours, sites = {}, {}
-    for name, script in (("slow", None), ("fast", AS_IF_FAST)):
+    for name, script in (("slow", None), ("fast", EMULATE_GRAPHICS_CARD)):
         page = visit(solid_page(layout, solids=solids(layout, flat)), script=script)
         press(page, "t")
         rest(page)
@@ -1433,8 +1439,8 @@ def test_large_solid_page_sites_are_pickable(visit, n_x, n_y):
     page = visit(solid_page(layout, solids=wells))
     page.evaluate("foveasim.lookDown()")
     sites = np.random.default_rng(1).integers(0, layout.n_sites, 100)
-    places = np.column_stack((layout.centroid_um[sites], np.zeros(sites.size))).tolist()
-    found = page.evaluate("places => places.map((p) => foveasim.pick(...foveasim.toWindow(...p)).site)", places)
+    positions = np.column_stack((layout.centroid_um[sites], np.zeros(sites.size))).tolist()
+    found = page.evaluate("places => places.map((p) => foveasim.pick(...foveasim.toWindow(...p)).site)", positions)
 
     if n_x == 100:
         assert found == sites.tolist()

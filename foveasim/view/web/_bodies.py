@@ -52,10 +52,10 @@ def bodies_of(
     about : dict
         ``lattice_um``, ``origin_um``, the bounding box ``low_um`` and ``high_um``, and the ``list`` of surfaces.
     arrays : dict of str to array
-        ``place_x``, ``place_y``: lattice steps from one position to the next; ``places``: position of each point, as back
-        references; ``z``: height of each point on the lattice; ``run_sites``: site + 1 of each run of points, with
-        ``run_points``, ``run_triangles``, ``run_colours`` of each run; ``corners``: triangles, as indices relative to the first
-        point of their run; ``tile_runs``: number of runs of each tile.
+        ``position_x``, ``position_y``: lattice steps from one position to the next; ``positions``: position of each point, as
+        back references; ``z``: height of each point on the lattice; ``run_sites``: site + 1 of each run of points, with
+        ``run_points``, ``run_triangles``, ``run_colours`` of each run; ``corners``: triangles, as indices relative to the
+        first point of their run; ``tile_runs``: number of runs of each tile.
 
     Raises
     ------
@@ -88,9 +88,9 @@ def bodies_of(
     arrays = {key: np.concatenate([piece[key] for piece in pieces]) for key in pieces[0]}
     position_points = points[order][first]
     arrays |= {
-        "place_x": np.diff(position_points[:, 0], prepend=0),
-        "place_y": np.diff(position_points[:, 1], prepend=0),
-        "places": back_references(position),
+        "position_x": np.diff(position_points[:, 0], prepend=0),
+        "position_y": np.diff(position_points[:, 1], prepend=0),
+        "positions": back_references(position),
         "z": points[order, 2],
     }
     about = {

@@ -142,7 +142,7 @@ def _outlines(layout: Layout) -> dict[str, NDArray[Any]]:
     shapes = shapes_of(layout)
     arrays = {
         "xy_um": shapes.xy_um,
-        "place": to_smallest_type(back_references(shapes.position)),
+        "position": to_smallest_type(back_references(shapes.position)),
         "ring_sizes": to_smallest_type(np.diff(shapes.ring_offsets)),
         "cut_sites": shapes.cut_sites.astype(np.uint32),
         "cut_counts": to_smallest_type(np.diff(shapes.cut_offsets)),
@@ -166,7 +166,7 @@ def _columns(layout: Layout, capture: Capture | None, arrays: dict[str, NDArray[
         metadata, numbers = _as_numbers(values)
         arrays[name] = numbers
         # Numerical columns with few values have a scale too; only strings and columns passed with names are categories.
-        kind = kind or ("kinds" if "names" in metadata else "even")
+        kind = kind or ("kinds" if "names" in metadata else "linear")
         columns.append({"key": key, "label": label, "unit": unit, "array": name, "kind": kind, **metadata, **more})
         return name
 
@@ -195,8 +195,8 @@ def _columns(layout: Layout, capture: Capture | None, arrays: dict[str, NDArray[
         letters = list(CHANNEL_NAMES[:n_channels]) if n_channels in (3, 4) else [str(k) for k in range(n_channels)]
         colours = [_filter_colour(k, name) for k, name in enumerate(letters)]
         add("channel", "channel", "", layout.channel, "kinds", names=letters, colours=colours)
-    columns.append({"key": "size_um", "label": "pixel size", "unit": "µm", "kind": "even", "of": "size"})
-    columns.append({"key": "area_um2", "label": "area", "unit": "µm²", "kind": "even", "of": "area"})
+    columns.append({"key": "size_um", "label": "pixel size", "unit": "µm", "kind": "linear", "of": "size"})
+    columns.append({"key": "area_um2", "label": "area", "unit": "µm²", "kind": "linear", "of": "area"})
     taken = {column["key"] for column in columns}
     for key in sorted(layout.columns, key=lambda name: name != "readout_line"):
         if key not in taken:
@@ -230,16 +230,16 @@ def _is_categorical(values: NDArray[Any]) -> bool:
 def _as_numbers(values: NDArray[Any]) -> tuple[dict[str, Any], NDArray[Any]]:
     """Return metadata of a column, and its values as numbers that are exact in JavaScript."""
     if values.dtype.kind == "b":
-        return {"names": ["no", "yes"], "whole": True}, values.astype(np.uint8)
+        return {"names": ["no", "yes"], "is_integer": True}, values.astype(np.uint8)
     if values.dtype.kind in "iu" and (values.max(initial=0) <= MAX_EXACT and values.min(initial=0) >= -MAX_EXACT):
-        return {"whole": True}, to_smallest_type(values)
+        return {"is_integer": True}, to_smallest_type(values)
     if values.dtype.kind == "f":
         return {}, to_smallest_type(values)
     if values.dtype.kind == "c":
         values = values.astype(str)
     names, kinds = np.unique(values, return_inverse=True)
     strings = [name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name) for name in names]
-    return {"names": strings, "whole": True}, to_smallest_type(kinds)
+    return {"names": strings, "is_integer": True}, to_smallest_type(kinds)
 
 
 def _label(key: str) -> tuple[str, str]:

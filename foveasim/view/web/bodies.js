@@ -1,6 +1,6 @@
 // Decodes surfaces of a page: from data per photosite to vertices and triangles for the graphics card.
 
-import { offsetsOf, placesOf } from "./unpack.js";
+import { offsetsOf, positionsOf } from "./unpack.js";
 
 export class Bodies {
   // about: { lattice_um, origin_um, low_um, high_um, list: [{ name, n_runs, n_tiles, is_closed }] }; arrays by their names in the page.
@@ -10,11 +10,11 @@ export class Bodies {
     this.low = about.low_um;
     this.high = about.high_um;
     this.arrays = arrays;
-    this.x = runningSum(arrays.place_x);
-    this.y = runningSum(arrays.place_y);
+    this.x = runningSum(arrays.position_x);
+    this.y = runningSum(arrays.position_y);
     this.firstPoint = offsetsOf(arrays.run_points);
     this.firstTriangle = offsetsOf(arrays.run_triangles);
-    this.place = placesOf(arrays.places);
+    this.position = positionsOf(arrays.positions);
     let run = 0, tile = 0;
     this.list = about.list.map(({ name, n_runs, n_tiles, is_closed }) => {
       const body = { name, isClosed: is_closed, runs: [run, run + n_runs], tiles: [tile, tile + n_tiles] };
@@ -27,9 +27,9 @@ export class Bodies {
 
   // Vertices on the lattice, site + 1 of each vertex, corners, and tiles with their boxes on the lattice.
   build(body) {
-    const { x, y, place, firstPoint, firstTriangle } = this, { z, corners, run_sites: runSites, tile_runs: tileRuns } = this.arrays;
+    const { x, y, position, firstPoint, firstTriangle } = this, { z, corners, run_sites: runSites, tile_runs: tileRuns } = this.arrays;
     const [fromRun, toRun] = body.runs, base = firstPoint[fromRun], n = firstPoint[toRun] - base;
-    const places = new Int32Array(3 * n), sites = new Uint32Array(n);
+    const positions = new Int32Array(3 * n), sites = new Uint32Array(n);
     const indices = new Uint32Array(3 * body.nTriangles), tiles = [];
     let run = fromRun, at = 0;
     for (let t = body.tiles[0]; t < body.tiles[1]; t++) {
@@ -37,10 +37,10 @@ export class Bodies {
       for (const end = run + tileRuns[t]; run < end; run++) {
         const first = firstPoint[run] - base;
         for (let p = first; p < firstPoint[run + 1] - base; p++) {
-          const u = x[place[base + p]], v = y[place[base + p]], w = z[base + p];
-          places[3 * p] = u;
-          places[3 * p + 1] = v;
-          places[3 * p + 2] = w;
+          const u = x[position[base + p]], v = y[position[base + p]], w = z[base + p];
+          positions[3 * p] = u;
+          positions[3 * p + 1] = v;
+          positions[3 * p + 2] = w;
           if (u < box[0]) box[0] = u;
           if (v < box[1]) box[1] = v;
           if (w < box[2]) box[2] = w;
@@ -53,7 +53,7 @@ export class Bodies {
       }
       if (at > from) tiles.push({ box, from, to: at });
     }
-    return { places, sites, indices, tiles };
+    return { positions, sites, indices, tiles };
   }
 
   // Colours of the sites of a body as bytes r, g, b, a, at index site + 1.

@@ -27,19 +27,19 @@ export function bytesOfHex(hex) {
   return [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16));
 }
 
-function viridis(share) {
-  const at = 6 * Math.round(255 * share);
+function viridis(fraction) {
+  const at = 6 * Math.round(255 * fraction);
   return [0, 2, 4].map((i) => parseInt(VIRIDIS.slice(at + i, at + i + 2), 16));
 }
 
 // Displayed colour of a signal: a fraction of white through a filter, with gamma so that dark sites are distinguishable.
-function lit(share, colour, palette) {
-  const level = share ** palette.gamma;
+function lit(fraction, colour, palette) {
+  const level = fraction ** palette.gamma;
   return colour.map((c) => Math.round(c * level));
 }
 
 // Mapping of a column's values to colours. Kinds of columns:
-//   even   numbers, on a perceptually uniform scale
+//   linear numbers, on a perceptually uniform scale
 //   grey   numbers as grey levels
 //   lit    numbers as brightness of the colour of each site's filter
 //   kinds  integers of categories
@@ -59,25 +59,25 @@ export class Scale {
     if (column.kind === "grey" || column.kind === "lit") low = 0;
     // Values that differ by rounding only are one value, in the centre of the scale.
     const isOne = high - low <= 1e-9 * Math.max(Math.abs(low), Math.abs(high));
-    this.from = isOne && !column.whole && low !== 0 ? low - 0.5 : low;
+    this.from = isOne && !column.is_integer && low !== 0 ? low - 0.5 : low;
     this.to = isOne ? this.from + 1 : high;
-    this.canLog = column.kind === "even" && low > 0 && high / low > 4;
+    this.canLog = column.kind === "linear" && low > 0 && high / low > 4;
     // Values of a large range have a logarithmic scale.
     this.isLog = this.canLog && (wantsLog ?? (Boolean(column.of) && high / low > 40));
     // Colours of categories repeat; a column may name more categories than there are colours.
     this.nKinds = column.colours ? column.colours.length : palette.kinds.length;
-    if (column.kind === "even") this.tables = [table(viridis)];
-    else if (column.kind === "grey") this.tables = [table((share) => lit(share, [255, 255, 255], palette))];
-    else if (column.kind === "lit") this.tables = column.colours.map((c) => table((share) => lit(share, bytesOfHex(c), palette)));
+    if (column.kind === "linear") this.tables = [table(viridis)];
+    else if (column.kind === "grey") this.tables = [table((fraction) => lit(fraction, [255, 255, 255], palette))];
+    else if (column.kind === "lit") this.tables = column.colours.map((c) => table((fraction) => lit(fraction, bytesOfHex(c), palette)));
   }
 
-  share(value) {
+  fraction(value) {
     if (this.isLog) return Math.log(value / this.from) / Math.log(this.to / this.from);
     return (value - this.from) / (this.to - this.from);
   }
 
-  value(share) {
-    return this.isLog ? this.from * (this.to / this.from) ** share : this.from + share * (this.to - this.from);
+  value(fraction) {
+    return this.isLog ? this.from * (this.to / this.from) ** fraction : this.from + fraction * (this.to - this.from);
   }
 
   colour(site) {
@@ -85,7 +85,7 @@ export class Scale {
     if (this.column.kind === "kinds") return this.kindColour(value);
     if (!Number.isFinite(value)) return bytesOfHex(this.palette.no_data);
     const shades = this.tables[this.tables.length > 1 ? this.filterOf[site] : 0];
-    return shades[Math.round(255 * clamp(this.share(value), 0, 1))];
+    return shades[Math.round(255 * clamp(this.fraction(value), 0, 1))];
   }
 
   kindColour(kind) {
@@ -105,7 +105,7 @@ export class Scale {
       const value = values[site], side = value >= from && value <= to ? 0 : 1;
       if (kinds) out[site] = kinds[side][value % kinds[0].length];
       else if (!Number.isFinite(value)) out[site] = nothing[range ? 1 : 0][0];
-      else out[site] = tables[tables.length > 1 ? filterOf[site] : 0][side][Math.round(255 * clamp(this.share(value), 0, 1))];
+      else out[site] = tables[tables.length > 1 ? filterOf[site] : 0][side][Math.round(255 * clamp(this.fraction(value), 0, 1))];
     }
   }
 
@@ -121,7 +121,7 @@ export class Scale {
       }
       return ticks.length > 1 ? ticks : [this.from, this.to];
     }
-    const step = roundStep((this.to - this.from) / count, this.column.whole), ticks = [];
+    const step = roundStep((this.to - this.from) / count, this.column.is_integer), ticks = [];
     for (let k = Math.ceil(this.from / step - 1e-9); k * step <= this.to + 1e-9 * step; k++) {
       ticks.push(Number((k * step).toPrecision(12)));
     }
@@ -131,11 +131,11 @@ export class Scale {
   // Number of sites in each of n steps along the scale.
   histogram(most) {
     const { values } = this, span = this.to - this.from;
-    const isCounted = this.column.whole && !this.isLog && span < most;
+    const isCounted = this.column.is_integer && !this.isLog && span < most;
     const n = isCounted ? span + 1 : most, counts = new Uint32Array(n);
     for (let i = 0; i < values.length; i++) {
       if (!Number.isFinite(values[i])) continue;
-      const bin = isCounted ? values[i] - this.from : Math.floor(this.share(values[i]) * n);
+      const bin = isCounted ? values[i] - this.from : Math.floor(this.fraction(values[i]) * n);
       counts[clamp(bin, 0, n - 1)]++;
     }
     return counts;

@@ -4,7 +4,7 @@ import { clamp } from "./colours.js";
 import { TEXTURE_WIDTH, bindIntegers, buildProgram, createLookup, fitCanvas, sendLookup, textureSize } from "./gl.js";
 
 const VERTEX_SHADER = `#version 300 es
-in ivec2 place;
+in ivec2 position;
 in uint site;
 uniform ivec2 centre;
 uniform vec2 rest;
@@ -14,7 +14,7 @@ flat out vec4 colour;
 void main() {
   colour = texelFetch(colours, ivec2(int(site) % ${TEXTURE_WIDTH}, int(site) / ${TEXTURE_WIDTH}), 0);
   // Integers subtract exactly, so that outlines are sharp at any zoom.
-  gl_Position = vec4((vec2(place - centre) - rest) * zoom, 0.0, 1.0);
+  gl_Position = vec4((vec2(position - centre) - rest) * zoom, 0.0, 1.0);
 }`;
 const FRAGMENT_SHADER = `#version 300 es
 precision mediump float;
@@ -45,19 +45,19 @@ export class SensorMap {
 
   _load() {
     const { gl, sites } = this;
-    const { program, at } = buildProgram(gl, VERTEX_SHADER, FRAGMENT_SHADER, ["place", "site"]);
+    const { program, at } = buildProgram(gl, VERTEX_SHADER, FRAGMENT_SHADER, ["position", "site"]);
     gl.useProgram(program);
     this.at = at;
 
-    const n = sites.place.length, places = new Int32Array(2 * n), owners = new Uint32Array(n);
+    const n = sites.position.length, positions = new Int32Array(2 * n), owners = new Uint32Array(n);
     for (let v = 0; v < n; v++) {
-      const p = 2 * sites.place[v];
-      places[2 * v] = Math.round((sites.xy[p] - this.middle[0]) * this.perUm);
-      places[2 * v + 1] = Math.round((sites.xy[p + 1] - this.middle[1]) * this.perUm);
+      const p = 2 * sites.position[v];
+      positions[2 * v] = Math.round((sites.xy[p] - this.middle[0]) * this.perUm);
+      positions[2 * v + 1] = Math.round((sites.xy[p + 1] - this.middle[1]) * this.perUm);
     }
     for (let site = 0; site < sites.n; site++) owners.fill(site, sites.firstVertex(site), sites.firstVertex(site + 1));
     gl.bindVertexArray(gl.createVertexArray());
-    bindIntegers(gl, 0, places, 2, gl.INT);
+    bindIntegers(gl, 0, positions, 2, gl.INT);
     bindIntegers(gl, 1, owners, 1, gl.UNSIGNED_INT);
     const { corners, tiles } = sites.triangles();
     this.tiles = tiles;

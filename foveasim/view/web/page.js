@@ -108,10 +108,10 @@ function drawLegend() {
   });
   const ticks = scale.ticks(4);
   $("ticks").replaceChildren(...ticks.map((tick) => {
-    const label = make("span", brief(tick)), share = scale.share(tick);
-    label.style.left = 100 * clamp(share, 0, 1) + "%";
-    if (share < 0.04) label.style.transform = "none";
-    if (share > 0.96) label.style.transform = "translateX(-100%)";
+    const label = make("span", brief(tick)), fraction = scale.fraction(tick);
+    label.style.left = 100 * clamp(fraction, 0, 1) + "%";
+    if (fraction < 0.04) label.style.transform = "none";
+    if (fraction > 0.96) label.style.transform = "translateX(-100%)";
     return label;
   }));
   let sum = 0, count = 0;
@@ -128,7 +128,7 @@ function drawHistogram() {
   if (!histogram || column.kind === "kinds") return;
   const { context, width, height } = fitted($("histogram"));
   const most = Math.max(...histogram), step = width / histogram.length;
-  const [from, to] = state.range ? state.range.map((v) => scale.share(v) * width) : [-1, width + 1];
+  const [from, to] = state.range ? state.range.map((v) => scale.fraction(v) * width) : [-1, width + 1];
   const inside = inkOf("--accent"), outside = inkOf("--line");
   context.clearRect(0, 0, width, height);
   histogram.forEach((count, i) => {
@@ -139,7 +139,7 @@ function drawHistogram() {
   });
   const site = state.pinned >= 0 ? state.pinned : state.hovered;
   if (site >= 0 && Number.isFinite(column.values[site])) {
-    const x = clamp(scale.share(column.values[site]), 0, 1) * width;
+    const x = clamp(scale.fraction(column.values[site]), 0, 1) * width;
     context.fillStyle = inkOf("--text");
     context.fillRect(clamp(x - 1, 0, width - 2), 0, 2, height);
   }
@@ -168,7 +168,7 @@ function listenToHistogram() {
   const valueAt = (event) => {
     const box = canvas.getBoundingClientRect();
     const value = state.scale.value(clamp((event.clientX - box.left) / box.width, 0, 1));
-    return state.column.whole && !state.scale.isLog ? Math.round(value) : value;
+    return state.column.is_integer && !state.scale.isLog ? Math.round(value) : value;
   };
   canvas.addEventListener("pointerdown", (event) => { start = valueAt(event); canvas.setPointerCapture(event.pointerId); });
   canvas.addEventListener("pointermove", (event) => { if (start !== null && event.buttons) setRange(start, valueAt(event)); });
@@ -337,15 +337,15 @@ function drawPictureMarks() {
 
 function listenToPicture() {
   const frame = $("picture-frame");
-  const place = (event) => {
+  const position = (event) => {
     const area = frame.getBoundingClientRect(), box = pictureBox();
     return [box.fromX(event.clientX - area.left), box.fromY(event.clientY - area.top)];
   };
   const isIn = ([x, y]) => { const [a, b, c, d] = about.picture.bounds_um; return x >= a && x <= c && y >= b && y <= d; };
-  frame.addEventListener("pointermove", (event) => { const at = place(event); isIn(at) ? hover(...at, "picture") : leave(); });
+  frame.addEventListener("pointermove", (event) => { const at = position(event); isIn(at) ? hover(...at, "picture") : leave(); });
   frame.addEventListener("pointerleave", leave);
   frame.addEventListener("click", (event) => {
-    const at = place(event);
+    const at = position(event);
     if (!isIn(at)) return;
     fly(...at, Math.max(state.map.scale, 4 * state.map.fitScale()));
   });
@@ -780,7 +780,7 @@ async function open() {
     return;
   }
   state.isSlow = renderer.isSlow;
-  const names = ["xy_um", "place", "ring_sizes", "cut_sites", "cut_counts", "cuts", ...(about.arrays.site_rings ? ["site_rings"] : [])];
+  const names = ["xy_um", "position", "ring_sizes", "cut_sites", "cut_counts", "cuts", ...(about.arrays.site_rings ? ["site_rings"] : [])];
   const arrays = Object.fromEntries(await Promise.all(names.map(async (name) => [name, await array(name)])));
   state.sites = new Sites(arrays, about);
   state.map = new SensorMap($("cells"), state.sites, renderer);

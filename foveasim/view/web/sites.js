@@ -1,6 +1,6 @@
 // Photosites: exact outlines, sites under a point, and triangles to draw.
 
-import { offsetsOf, placesOf } from "./unpack.js";
+import { offsetsOf, positionsOf } from "./unpack.js";
 
 export class Sites {
   constructor(arrays, about) {
@@ -9,7 +9,7 @@ export class Sites {
     this.xy = arrays.xy_um;
     this.ringOffsets = offsetsOf(arrays.ring_sizes);
     this.siteOffsets = arrays.site_rings ? offsetsOf(arrays.site_rings) : null;
-    this.place = placesOf(arrays.place);
+    this.position = positionsOf(arrays.position);
     this.cuts = { sites: arrays.cut_sites, counts: arrays.cut_counts, corners: arrays.cuts };
     this._measure();
     this._sortIntoBins();
@@ -20,17 +20,17 @@ export class Sites {
 
   // Boxes and areas of all sites; holes have the opposite winding, so that their areas subtract.
   _measure() {
-    const { n, xy, place, ringOffsets } = this;
+    const { n, xy, position, ringOffsets } = this;
     this.box = new Float64Array(4 * n);
     this.area = new Float64Array(n);
     for (let site = 0; site < n; site++) {
       let x0 = Infinity, y0 = Infinity, x1 = -Infinity, y1 = -Infinity, twice = 0;
-      const ax = xy[2 * place[this.firstVertex(site)]], ay = xy[2 * place[this.firstVertex(site)] + 1];
+      const ax = xy[2 * position[this.firstVertex(site)]], ay = xy[2 * position[this.firstVertex(site)] + 1];
       for (let ring = this.firstRing(site); ring < this.firstRing(site + 1); ring++) {
         const from = ringOffsets[ring], to = ringOffsets[ring + 1];
-        let px = xy[2 * place[to - 1]] - ax, py = xy[2 * place[to - 1] + 1] - ay;
+        let px = xy[2 * position[to - 1]] - ax, py = xy[2 * position[to - 1] + 1] - ay;
         for (let v = from; v < to; v++) {
-          const x = xy[2 * place[v]], y = xy[2 * place[v] + 1];
+          const x = xy[2 * position[v]], y = xy[2 * position[v] + 1];
           if (x < x0) x0 = x;
           if (x > x1) x1 = x;
           if (y < y0) y0 = y;
@@ -96,19 +96,19 @@ export class Sites {
   }
 
   holds(site, x, y) {
-    const { box, xy, place, ringOffsets } = this, at = 4 * site;
+    const { box, xy, position, ringOffsets } = this, at = 4 * site;
     if (x < box[at] || y < box[at + 1] || x > box[at + 2] || y > box[at + 3]) return false;
     let inside = false;
     for (let ring = this.firstRing(site); ring < this.firstRing(site + 1); ring++) {
       const to = ringOffsets[ring + 1];
-      let p = 2 * place[to - 1];
+      let p = 2 * position[to - 1];
       for (let v = ringOffsets[ring]; v < to; v++) {
-        const q = 2 * place[v], py = xy[p + 1], qy = xy[q + 1];
+        const q = 2 * position[v], py = xy[p + 1], qy = xy[q + 1];
         if (py > y !== qy > y) {
           // From the lower end in both directions, so that both sites of the edge agree bit-identically.
           const low = py < qy ? p : q, high = py < qy ? q : p;
-          const share = (y - xy[low + 1]) / (xy[high + 1] - xy[low + 1]);
-          if (x < xy[low] + share * (xy[high] - xy[low])) inside = !inside;
+          const fraction = (y - xy[low + 1]) / (xy[high + 1] - xy[low + 1]);
+          if (x < xy[low] + fraction * (xy[high] - xy[low])) inside = !inside;
         }
         p = q;
       }
@@ -134,14 +134,14 @@ export class Sites {
   }
 
   centre(site) {
-    const { xy, place, ringOffsets } = this;
-    const a = 2 * place[this.firstVertex(site)], ax = xy[a], ay = xy[a + 1];
+    const { xy, position, ringOffsets } = this;
+    const a = 2 * position[this.firstVertex(site)], ax = xy[a], ay = xy[a + 1];
     let twice = 0, mx = 0, my = 0;
     for (let ring = this.firstRing(site); ring < this.firstRing(site + 1); ring++) {
       const to = ringOffsets[ring + 1];
-      let px = xy[2 * place[to - 1]] - ax, py = xy[2 * place[to - 1] + 1] - ay;
+      let px = xy[2 * position[to - 1]] - ax, py = xy[2 * position[to - 1] + 1] - ay;
       for (let v = ringOffsets[ring]; v < to; v++) {
-        const qx = xy[2 * place[v]] - ax, qy = xy[2 * place[v] + 1] - ay, cross = px * qy - py * qx;
+        const qx = xy[2 * position[v]] - ax, qy = xy[2 * position[v] + 1] - ay, cross = px * qy - py * qx;
         twice += cross;
         mx += (px + qx) * cross;
         my += (py + qy) * cross;
@@ -200,10 +200,10 @@ export class Sites {
 
   // Traces the rings of a site on a canvas, through a function from µm to pixels.
   trace(context, site, view) {
-    const { xy, place, ringOffsets } = this;
+    const { xy, position, ringOffsets } = this;
     for (let ring = this.firstRing(site); ring < this.firstRing(site + 1); ring++) {
       for (let v = ringOffsets[ring]; v < ringOffsets[ring + 1]; v++) {
-        const p = 2 * place[v], x = view.toX(xy[p]), y = view.toY(xy[p + 1]);
+        const p = 2 * position[v], x = view.toX(xy[p]), y = view.toY(xy[p + 1]);
         if (v === ringOffsets[ring]) context.moveTo(x, y);
         else context.lineTo(x, y);
       }

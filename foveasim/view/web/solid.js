@@ -10,7 +10,7 @@ import { SolidView } from "./solid_view.js";
 import { unpack } from "./unpack.js";
 
 const about = JSON.parse($("about").textContent);
-const ARRAYS = ["place_x", "place_y", "places", "z", "corners", "run_sites", "run_points", "run_triangles", "run_colours", "tile_runs"];
+const ARRAYS = ["position_x", "position_y", "positions", "z", "corners", "run_sites", "run_points", "run_triangles", "run_colours", "tile_runs"];
 const state = { view: null, area: null, pinned: -1, part: -1, pinnedPart: -1, pointer: null, anchor: null, isAsked: false };
 const ASIDE = [Math.atan2(-0.9, 0.35), Math.atan2(0.75, Math.hypot(0.35, 0.9))], ABOVE = [-0.5 * Math.PI, 0.5 * Math.PI];
 
@@ -109,9 +109,9 @@ function listenToCanvas() {
   const canvas = $("solid"), { orbit } = state.view, point = new Float64Array(3);
   // Point of the pointer on a surface, cached since it arrived there; else in front of the target.
   const under = (px, py) => state.anchor || orbit.pointAt(px, py, 1, point);
-  const depthOf = (place) => {
+  const depthOf = (position) => {
     let depth = 1;
-    for (let i = 0; i < 3; i++) depth -= (orbit.toEye[i] * (place[i] - orbit.target[i])) / orbit.distance;
+    for (let i = 0; i < 3; i++) depth -= (orbit.toEye[i] * (position[i] - orbit.target[i])) / orbit.distance;
     return Math.max(depth, 0.05);
   };
   let held = 1;

@@ -2,10 +2,10 @@
 
 import { TEXTURE_WIDTH, bindIntegers, buildProgram, createLookup, fitCanvas, sendLookup, textureSize } from "./gl.js";
 
-const ATTRIBUTES = ["place", "site"];
+const ATTRIBUTES = ["position", "site"];
 const VERTEX_SHADER = `#version 300 es
 precision highp float;
-in ivec3 place;
+in ivec3 position;
 in uint site;
 uniform ivec3 centre;
 uniform vec3 rest;
@@ -17,7 +17,7 @@ flat out vec3 colour;
 flat out uint owner;
 void main() {
   // Integers subtract exactly, so that surfaces are sharp at any zoom.
-  at = (vec3(place - centre) - rest) * unit;
+  at = (vec3(position - centre) - rest) * unit;
   gl_Position = toClip * vec4(at, 1.0);
   colour = texelFetch(colours, ivec2(int(site) % ${TEXTURE_WIDTH}, int(site) / ${TEXTURE_WIDTH}), 0).rgb;
   owner = site;
@@ -66,9 +66,9 @@ out vec4 pixel;
 const vec3 MARK = vec3(1.0, 0.69, 0.03);
 ${SRGB}
 void main() {
-  ivec2 place = ivec2(gl_FragCoord.xy);
-  vec4 seen = texelFetch(image, place, 0);
-  if (hovered != 0u && texelFetch(ids, place, 0).r == hovered) seen.rgb = toScreen(mix(toLinear(seen.rgb), MARK * seen.a, 0.7));
+  ivec2 position = ivec2(gl_FragCoord.xy);
+  vec4 seen = texelFetch(image, position, 0);
+  if (hovered != 0u && texelFetch(ids, position, 0).r == hovered) seen.rgb = toScreen(mix(toLinear(seen.rgb), MARK * seen.a, 0.7));
   pixel = vec4(seen.rgb, 1.0);
 }`;
 // Samples per pixel on fast graphics cards.
@@ -107,11 +107,11 @@ export class SolidView {
     this.screen = buildProgram(gl, SCREEN_SHADER, COMPOSE_SHADER);
     gl.activeTexture(gl.TEXTURE0);
     for (const part of this.parts) {
-      const { places, sites, indices, tiles } = bodies.build(part.body);
+      const { positions, sites, indices, tiles } = bodies.build(part.body);
       part.tiles = tiles;
       part.vertices = gl.createVertexArray();
       gl.bindVertexArray(part.vertices);
-      bindIntegers(gl, 0, places, 3, gl.INT);
+      bindIntegers(gl, 0, positions, 3, gl.INT);
       bindIntegers(gl, 1, sites, 1, gl.UNSIGNED_INT);
       gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
       gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);

@@ -37,8 +37,8 @@ export function offsetsOf(counts) {
 }
 
 // Decodes positions from back references: 0 is the next new position, n the n-th last of the distinct ones so far.
-export function placesOf(references) {
-  const place = new Uint32Array(references.length);
-  for (let v = 0, seen = 0; v < place.length; v++) place[v] = references[v] === 0 ? seen++ : seen - references[v];
-  return place;
+export function positionsOf(references) {
+  const position = new Uint32Array(references.length);
+  for (let v = 0, seen = 0; v < position.length; v++) position[v] = references[v] === 0 ? seen++ : seen - references[v];
+  return position;
 }
