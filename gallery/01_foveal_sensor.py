@@ -1,10 +1,10 @@
 """
-What does a foveal colour sensor capture of a photograph, compared with a square grid of as many photosites?
+How does a foveal colour sensor capture a photograph, compared with a square grid of as many photosites?
 
 New here: ``layout.log_polar``, ``layout.mosaic``, ``Scene.from_picture``, ``Optics``, ``Sensor``, ``Camera``, ``Capture``.
 
-Expect: a blind spot of 60.12 µm radius (within 0.01 µm), the inner edge of the first ring whose pixels reach 2 µm;
-photosites of 11.4 µm on the square grid, which covers the same field.
+Expect: a blind spot with a radius of 60.12 µm (within 0.01 µm), the inner radius of the first ring with pixels of at least
+2 µm; photosites of 11.4 µm on the square grid, which covers the same field.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ EXPOSURE_S = 1 / 30
 
 
 def camera_of(layout: fs.Layout) -> fs.Camera:
-    """Return the camera with these photosites, of the same capacitance per area."""
+    """Return a camera with these photosites and a fixed capacitance per area."""
     sensor = fs.Sensor(
         layout,
         qe=fs.SiliconQE(depth_um=3.0),
@@ -37,8 +37,8 @@ def camera_of(layout: fs.Layout) -> fs.Camera:
 
 
 def main(out_dir: Path) -> None:
-    """Write the picture and the layout to a folder."""
-    # %% The scene: a photograph, half a millimetre a pixel, one metre away.
+    """Write the pictures and the layout to a directory."""
+    # %% Scene: a photograph with pixels of 0.5 mm at a distance of 1 m.
     scene = fs.Scene.from_picture(
         astronaut(),
         pitch_um=PITCH_UM,
@@ -47,31 +47,33 @@ def main(out_dir: Path) -> None:
         wavelength_nm=(620, 550, 450),
     )
 
-    # %% The sensor: rings of 192 sites, none smaller than 2 µm, looking at the face.
+    # %% Sensor: rings of 192 sites of at least 2 µm, centred on the face.
     layout = fs.layout.log_polar(n_sectors=192, min_size_um=2.0, r_max_um=690.0, stagger=True, chords_per_arc=2)
     layout = fs.layout.mosaic(layout, ("RG", "GB")).translate(-140.0, 320.0)
     camera = camera_of(layout)
 
-    # %% The capture.
+    # %% Capture.
     capture = camera.capture(scene, exposure_s=EXPOSURE_S, seed=1)
     capture.picture(max_pixels=800).save(out_dir / "01_foveal_picture.png", capture.white_dn, encode_srgb=True)
     axes = plot_capture(capture)
     save_figure(axes.figure, out_dir / "01_foveal_layout.png", dpi=100)
 
-    # %% The same field on a square grid of as many photosites.
+    # %% The same field on a square grid with as many photosites.
     x_min, y_min, x_max, y_max = layout.bounds_um
     n = math.isqrt(layout.n_sites)
     pitch_um = (x_max - x_min) / n
     square = fs.layout.mosaic(fs.layout.grid(n_x=n, n_y=n, pitch_um=pitch_um), ("RG", "GB"))
     square = square.translate(0.5 * (x_min + x_max), 0.5 * (y_min + y_max))
-    even = camera_of(square).capture(scene, exposure_s=EXPOSURE_S, seed=1)
-    even.picture(max_pixels=800).save(out_dir / "01_square_picture.png", even.white_dn, encode_srgb=True)
+    square_capture = camera_of(square).capture(scene, exposure_s=EXPOSURE_S, seed=1)
+    square_capture.picture(max_pixels=800).save(
+        out_dir / "01_square_picture.png", square_capture.white_dn, encode_srgb=True
+    )
 
-    # %% The numbers.
+    # %% Checks.
     print(f"{square.n_sites} square photosites of {pitch_um:.1f} µm")
     assert abs(pitch_um - 11.4) < 0.05
     blind_radius_um = layout.provenance["blind_radius_um"]
-    print(f"blind spot of {blind_radius_um:.2f} µm radius, {layout.n_sites} photosites")
+    print(f"{layout.n_sites} foveal photosites, blind spot with a radius of {blind_radius_um:.2f} µm")
     assert abs(blind_radius_um - 60.12) < 0.01
 
 

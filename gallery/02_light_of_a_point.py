@@ -1,9 +1,10 @@
 """
-How much of a point's light falls into a square pixel?
+Which fraction of the energy of a point source falls on a square pixel?
 
 New here: ``Scene.point_sources``, ``Optics.power_map``, ``Integrator``, ``Layout.from_rectangles``.
 
-Expect: 52.889 % in a square of side wavelength x f-number (within 0.001 %), the textbook value of the Airy pattern.
+Expect: an ensquared energy of 52.889 % (within 0.001 %) in a square of side wavelength x f-number, the textbook value of the
+Airy pattern.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ SHAPE = (1025, 1025)
 
 
 def main(out_dir: Path) -> None:
-    """Write the curve of ensquared energy to a folder."""
-    # %% One point on the axis; nine cells of the map to wavelength x f-number.
+    """Write the curve of ensquared energy to a directory."""
+    # %% One point on the axis; nine cells of the power map per wavelength x f-number.
     optics = fs.Optics(focal_length_mm=22.0, f_number=4.0, padding="periodic", precision="double")
     lambda_n_um = 1e-3 * WAVELENGTH_NM * optics.working_f_number(DISTANCE_M)
     scene = fs.Scene.point_sources(
@@ -40,23 +41,23 @@ def main(out_dir: Path) -> None:
     )
     power_map = optics.power_map(scene)
 
-    # %% Squares around it, their edges on cell borders, where the integral is exact.
+    # %% Squares centred on the point, with edges on cell boundaries, where the integral is exact.
     squares = fs.Layout.from_rectangles(np.zeros((SIDES.size, 2)), SIDES * lambda_n_um)
     power = fs.Integrator(squares, power_map.grid)(power_map.data)[0]
-    share = power / (power_map.data.sum() * power_map.grid.cell_area_um2)
+    ensquared = power / (power_map.data.sum() * power_map.grid.cell_area_um2)
 
     axes = Figure(figsize=(6.4, 4.0), layout="constrained").add_subplot()
-    axes.plot(SIDES, 100 * share, "o-", markersize=3)
-    axes.set_xlabel("side of the pixel / (wavelength × f-number)")
-    axes.set_ylabel("fraction of a point's light / %")
+    axes.plot(SIDES, 100 * ensquared, "o-", markersize=3)
+    axes.set_xlabel("pixel side / (wavelength × f-number)")
+    axes.set_ylabel("ensquared energy / %")
     axes.set_ylim(0, 100)
     axes.grid(visible=True, alpha=0.3)
     save_figure(axes.figure, out_dir / "02_light_of_a_point.png", dpi=120)
 
-    # %% The number.
-    at_one = float(share[CELLS // 2])
-    print(f"{100 * at_one:.3f} % of the light in a square of side wavelength x f-number")
-    assert abs(at_one - 0.52889) < 1e-5
+    # %% Check.
+    at_lambda_n = float(ensquared[CELLS // 2])
+    print(f"{100 * at_lambda_n:.3f} % of the energy in a square of side wavelength x f-number")
+    assert abs(at_lambda_n - 0.52889) < 1e-5
 
 
 if __name__ == "__main__":

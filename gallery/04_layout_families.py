@@ -1,10 +1,10 @@
 """
-Which layouts can be made, and what does the middle of a foveal one look like?
+Which layout generators exist, and how can the centre of a foveal layout be filled?
 
-New here: every family of ``layout.LAYOUTS``, the fillings of a fovea, ``colouring``, ``plot_layout``.
+New here: all generators in ``layout.LAYOUTS``, ``log_polar(fovea=)``, ``graph_colouring``, ``plot_layout``.
 
-Expect: fifteen layouts, none with two sites over each other; four foveas that differ in the middle alone: 1,740 sites around a
-blind spot, and 169, 144 and 235 sites in it, none below the minimum size of 2 µm.
+Expect: fifteen layouts without overlapping sites; four foveal layouts that differ only in the centre: 1,740 sites around a
+blind spot, which is empty or contains 169, 144 or 235 sites, none below the minimum size of 2 µm.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ FOVEA = {"n_sectors": 60, "min_size_um": MIN_SIZE_UM, "r_max_um": 380.0, "stagge
 
 
 def families() -> dict[str, fs.Layout]:
-    """The example of each registered family, and what may be made of two of them."""
+    """Return the example layout of each registered generator, and variants of two of them."""
     make = fs.layout
     return {
         **{name.replace("_", " "): generator(**generator.example) for name, generator in make.LAYOUTS.items()},
@@ -33,8 +33,8 @@ def families() -> dict[str, fs.Layout]:
 
 
 def main(out_dir: Path) -> None:
-    """Write the sheet of families and the foveas to a folder."""
-    # %% One of each, coloured so that neighbours differ.
+    """Write the overview of generators and the foveas to a directory."""
+    # %% One layout per generator, with different colours for neighbours.
     layouts = families()
     figure = Figure(figsize=(18, 11), layout="constrained")
     colours = np.array([(0.55, 0.7, 0.86), (0.98, 0.85, 0.55), (0.75, 0.85, 0.65), (0.9, 0.65, 0.6)])
@@ -44,7 +44,7 @@ def main(out_dir: Path) -> None:
         axes.set_title(f"{name}: {layout.n_sites} sites")
     save_figure(figure, out_dir / "04_families.png", dpi=80)
 
-    # %% What may be done with the blind spot.
+    # %% Options for the blind spot.
     foveas = {
         filling: fs.layout.log_polar(**FOVEA, fovea=filling) for filling in ("none", "rings", "linear", "hexagons")
     }
@@ -57,14 +57,14 @@ def main(out_dir: Path) -> None:
         axes.set_title(f"fovea={name!r}: {layout.n_sites} sites")
     save_figure(figure, out_dir / "04_foveas.png", dpi=80)
 
-    # %% The numbers.
+    # %% Checks.
     no_overlap = fs.DesignRules(max_overlap_um2=0.0)
     for name, layout in (layouts | foveas).items():
         assert layout.check(no_overlap).ok, name
     n_around = foveas["none"].n_sites
     for name, layout in foveas.items():
         size_um = np.sqrt(layout.area_um2[: layout.n_sites - n_around])
-        print(f"{name:>9}: {size_um.size:4d} sites in the middle, {n_around:,} around it")
+        print(f"{name:>9}: {size_um.size:4d} sites in the centre, {n_around:,} around it")
         assert np.all(size_um >= MIN_SIZE_UM)
     assert [layout.n_sites - n_around for layout in foveas.values()] == [0, 169, 144, 235]
 

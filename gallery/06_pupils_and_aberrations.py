@@ -1,12 +1,12 @@
 """
-What do the shape of the pupil and the faults of a lens make of a point, and of a letter?
+How do the pupil shape and the aberrations of a lens affect the images of a point and of a letter?
 
 New here: ``Optics(pupil=, zernike=, seidel=, focus_distance_m=)``, ``Optics.psf``, ``.mtf``, ``.strehl``,
 ``.isoplanatic_error``.
 
-Expect: rays at right angles to edges and vanes; a flare of coma that points up, where its wavefront grows; Strehl ratios of
-0.814 to 0.817 for a fourteenth of a wave rms, whatever its form; a field on which points flare away from the axis, made of
-7 x 7 patterns, which put a third of a point's light into wrong places at worst, fringes counted one by one.
+Expect: diffraction spikes perpendicular to edges and vanes; a coma flare in +y, where its wavefront error increases; Strehl
+ratios of 0.814 to 0.817 for 1/14 wave rms of any aberration; a field of points with flares away from the axis, computed with
+7 x 7 isoplanatic patches, which displace up to a third of the PSF energy when each fringe counts.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ WAVELENGTH_NM = 550.0
 DISTANCE_M = 0.5
 LENS = {"focal_length_mm": 10.0, "f_number": 4.0}
 LIGHT = {"distance_m": DISTANCE_M, "wavelength_nm": [WAVELENGTH_NM], "band_width_nm": 10.0}
-#: Waves rms for a Strehl ratio of about 0.8 (Marechal).
-FOURTEENTH = 1.0 / 14.0
+#: Wavefront error for a Strehl ratio of about 0.8 (Marechal criterion), waves rms.
+MARECHAL_WAVES = 1.0 / 14.0
 
 
-def half_moon(x: np.ndarray, y: np.ndarray, wavelength_nm: float) -> np.ndarray:  # noqa: ARG001 -- as every pupil
-    """A pupil of one's own: the upper half, fading to the right."""
+def half_moon(x: np.ndarray, y: np.ndarray, wavelength_nm: float) -> np.ndarray:  # noqa: ARG001 -- signature of pupil functions
+    """Return the transmission of a user-defined pupil: the upper half, decreasing in x."""
     return (y > 0.0) * (1.0 - 0.4 * (1.0 + x))
 
 
 def lenses() -> dict[str, fs.Optics]:
-    """Lenses that differ in one thing."""
+    """Return lenses that differ in the pupil or in one aberration."""
     waves = {"unit": "waves", "wavelength_nm": WAVELENGTH_NM}
     return {
         "clear circle": fs.Optics(**LENS),
@@ -45,8 +45,8 @@ def lenses() -> dict[str, fs.Optics]:
         "three vanes": fs.Optics(pupil=(parts.Annulus(0.3), parts.Spider(3, 0.03, angle_deg=90.0)), **LENS),
         "five blades": fs.Optics(pupil=parts.Blades(5, angle_deg=90.0), **LENS),
         "slit": fs.Optics(pupil=parts.Slit(0.25), **LENS),
-        "a function": fs.Optics(pupil=half_moon, **LENS),
-        "out of focus": fs.Optics(focus_distance_m=0.65, **LENS),
+        "user function": fs.Optics(pupil=half_moon, **LENS),
+        "defocus": fs.Optics(focus_distance_m=0.65, **LENS),
         "coma in y": fs.Optics(zernike=parts.Zernike(coefficients={7: 0.3}, **waves), **LENS),
         "astigmatism": fs.Optics(zernike=parts.Zernike(coefficients={6: 0.25}, **waves), **LENS),
         "spherical": fs.Optics(zernike=parts.Zernike(coefficients={11: 0.25}, **waves), **LENS),
@@ -54,8 +54,8 @@ def lenses() -> dict[str, fs.Optics]:
 
 
 def main(out_dir: Path) -> None:
-    """Write points, letters and a field of points to a folder."""
-    # %% One point and one letter through each lens.
+    """Write PSFs, letters and a field of points to a directory."""
+    # %% PSF, image of a letter and MTF of each lens.
     all_lenses = lenses()
     letter = charts.letter_f(
         height_mm=3.0, shape=(160, 160), pitch_um=32.0, radiance_w_m2_sr_nm=0.1, contrast=1.0, **LIGHT
@@ -88,7 +88,7 @@ def main(out_dir: Path) -> None:
     axes[2, 0].set_ylabel("MTF")
     save_figure(figure, out_dir / "06_pupils.png", dpi=80)
 
-    # %% A field of points behind a lens with coma and astigmatism that grow from the axis.
+    # %% Field of points through a lens with coma and astigmatism that increase with field height.
     points = charts.point_grid(shape=(360, 480), pitch_um=60.0, spacing_mm=3.6, intensity_w_sr_nm=1e-6, **LIGHT)
     field = fs.Optics(
         **LENS, seidel=parts.Seidel(coma_um=1.2, astigmatism_um=0.6, field_radius_um=300.0), field_patches=7
@@ -112,16 +112,16 @@ def main(out_dir: Path) -> None:
         axes.set_ylabel("y / µm")
     save_figure(figure, out_dir / "06_field.png", dpi=110)
 
-    # %% The numbers.
+    # %% Checks.
     waves = {"unit": "waves", "wavelength_nm": WAVELENGTH_NM}
     for j, name in {4: "defocus", 6: "astigmatism", 7: "coma", 11: "spherical"}.items():
-        faulty = fs.Optics(zernike=parts.Zernike(coefficients={j: FOURTEENTH}, **waves), **LENS)
-        strehl = faulty.strehl(WAVELENGTH_NM)
-        print(f"{name:>12}: Strehl {strehl:.4f} for a fourteenth of a wave")
-        assert abs(strehl - np.exp(-((2.0 * np.pi * FOURTEENTH) ** 2))) < 4e-3
-    astray = field.isoplanatic_error(points)
-    print(f"7 x 7 patterns put {astray:.1%} of a point's light into wrong places, at worst")
-    assert abs(astray - 0.335) < 0.02
+        aberrated = fs.Optics(zernike=parts.Zernike(coefficients={j: MARECHAL_WAVES}, **waves), **LENS)
+        strehl = aberrated.strehl(WAVELENGTH_NM)
+        print(f"{name:>12}: Strehl {strehl:.4f} for 1/14 wave rms")
+        assert abs(strehl - np.exp(-((2.0 * np.pi * MARECHAL_WAVES) ** 2))) < 4e-3
+    displaced = field.isoplanatic_error(points)
+    print(f"7 x 7 isoplanatic patches displace up to {displaced:.1%} of the PSF energy")
+    assert abs(displaced - 0.335) < 0.02
     coma = all_lenses["coma in y"].psf(WAVELENGTH_NM)
     weight = coma.psf_per_um2 / coma.psf_per_um2.sum()
     assert float((weight * coma.grid.y_um[:, np.newaxis]).sum()) > 1.0

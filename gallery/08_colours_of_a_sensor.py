@@ -1,12 +1,12 @@
 """
-How do quantum efficiency and colour filters mix, and what does a colour mosaic make of one grey picture?
+How do quantum efficiency and colour filters combine, and how does a colour mosaic record a grey picture?
 
 New here: ``sensor.ccd_qe``, ``PolynomialCurve``, ``camera_filters``, ``PassBand``, products of curves, ``layout.mosaic``.
 
-Expect: a polynomial of degree 5 within 0.012 of a measured quantum efficiency from 400 to 1000 nm (the paper's Fig. 5);
-filters, quantum efficiency and infrared cut in one curve that give the electrons of all three (Fig. 6); and a grey picture at
-three wavelengths in one mosaic (Fig. 7): the sum of three pictures within 1e-6 of the brightest site, and each colour's
-electrons per photon as the curves say within 1e-5.
+Expect: a polynomial of degree 5 within 0.012 of a measured quantum efficiency from 400 to 1000 nm (Fig. 5 of the paper);
+one curve for filters, quantum efficiency and infrared cut, with the same electrons as the three curves (Fig. 6); a grey picture
+at three wavelengths in one mosaic (Fig. 7): the sum of three monochromatic pictures within 1e-6 of the brightest site, and
+electrons per photon of each colour that agree with the curves within 1e-5.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from foveasim.view import plot_capture, save_figure
 
 FROM_NM, TO_NM = 400.0, 1000.0
 DEGREES = (2, 3, 5, 9)
-#: The wavelengths of the paper's Fig. 7, for red, green and blue.
+#: Wavelengths of red, green and blue in Fig. 7 of the paper.
 RGB_NM = (620.0, 550.0, 450.0)
 BAND_NM = 10.0
 PITCH_UM = 10.0
@@ -36,7 +36,7 @@ EXPOSURE_S = 1 / 30
 
 
 def fits() -> dict[int, PolynomialCurve]:
-    """Polynomials of several degrees through the table from 400 to 1000 nm."""
+    """Fit polynomials of several degrees to the table from 400 to 1000 nm."""
     table = ccd_qe()
     inside = [(w, v) for w, v in zip(table.wavelength_nm, table.value, strict=True) if FROM_NM <= w <= TO_NM]
     waves_nm, values = zip(*inside, strict=True)
@@ -44,7 +44,7 @@ def fits() -> dict[int, PolynomialCurve]:
 
 
 def draw_filters(axes: Axes, filters: fs.FilterSet, waves_nm: np.ndarray, title: str) -> None:
-    """Curves of a filter set in their colours."""
+    """Plot the curves of a filter set in their colours."""
     for name, values in zip(filters.names, filters.transmission(waves_nm), strict=True):
         axes.plot(waves_nm, values, color=COLOURS[name], label=name)
     axes.set_title(title)
@@ -53,7 +53,7 @@ def draw_filters(axes: Axes, filters: fs.FilterSet, waves_nm: np.ndarray, title:
 
 
 def sensors(qe: Curve) -> dict[str, fs.Sensor]:
-    """The same electronics behind squares, hexagons and rings, all with red, green and blue filters."""
+    """Return sensors of squares, hexagons and rings with equal electronics and RGB filters."""
     make = fs.layout
     layouts = {
         "squares": make.mosaic(make.grid(n_x=120, n_y=120, pitch_um=PITCH_UM), ("RG", "GB")),
@@ -69,13 +69,13 @@ def sensors(qe: Curve) -> dict[str, fs.Sensor]:
 
 
 def electrons(sensor: fs.Sensor, scene: fs.Scene) -> np.ndarray:
-    """Expected charge of every site."""
+    """Return the expected charge of every site."""
     return fs.Camera(optics=OPTICS, sensor=sensor).capture(scene, exposure_s=EXPOSURE_S, seed=1).expected_e
 
 
 def main(out_dir: Path) -> None:
-    """Write the curves and the mosaics to a folder."""
-    # %% Fig. 5: a table of quantum efficiencies, and polynomials through it.
+    """Write the curves and the mosaics to a directory."""
+    # %% Fig. 5: a table of quantum efficiencies, and polynomial fits.
     table, polynomials = ccd_qe(), fits()
     waves_nm = np.arange(FROM_NM, TO_NM + 1.0)
     worst = {degree: float(np.abs(curve(waves_nm) - table(waves_nm)).max()) for degree, curve in polynomials.items()}
@@ -83,7 +83,7 @@ def main(out_dir: Path) -> None:
     axes = figure.add_subplot()
     axes.plot(table.wavelength_nm, table.value, "ko", markersize=4, label="measured (ESO, CCD44-82)")
     for degree, curve in polynomials.items():
-        axes.plot(waves_nm, curve(waves_nm), label=f"degree {degree}, off by {worst[degree]:.3f} at most")
+        axes.plot(waves_nm, curve(waves_nm), label=f"degree {degree}, largest error {worst[degree]:.3f}")
     steps = StepCurve(edge_nm=[400, 600, 800, 1000], value=table([500.0, 700.0, 900.0]))
     axes.plot(waves_nm, steps(waves_nm), ":", color="gray", label="piecewise constant")
     axes.set_xlabel("wavelength / nm")
@@ -92,21 +92,21 @@ def main(out_dir: Path) -> None:
     axes.legend()
     save_figure(figure, out_dir / "08_quantum_efficiency.png", dpi=100)
 
-    # %% Fig. 6: filters, and what is left of them behind an infrared cut and in front of silicon.
+    # %% Fig. 6: filters, and their product with an infrared cut and the quantum efficiency of silicon.
     visible_nm = np.arange(FROM_NM, 751.0)
     qe, cut = polynomials[5], PassBand(to_nm=660.0, edge_nm=25.0)
-    mixed = fs.rgb_filters() * qe * cut
+    combined = fs.rgb_filters() * qe * cut
     figure = Figure(figsize=(14, 4.2), layout="constrained")
     first, second, third = figure.subplots(1, 3, sharey=True)
     draw_filters(first, fs.rgb_filters(), visible_nm, "filters")
-    draw_filters(second, mixed, visible_nm, "filters × quantum efficiency × infrared cut")
+    draw_filters(second, combined, visible_nm, "filters × quantum efficiency × infrared cut")
     second.plot(visible_nm, qe(visible_nm), "k--", linewidth=1, label="quantum efficiency")
     second.plot(visible_nm, cut(visible_nm), "k:", linewidth=1, label="infrared cut")
-    draw_filters(third, camera_filters(), visible_nm, "measured, all in one (Nikon D5100)")
+    draw_filters(third, camera_filters(), visible_nm, "measured product (Nikon D5100)")
     figure.legend(handles=second.get_lines(), loc="outside right upper")
     save_figure(figure, out_dir / "08_filters.png", dpi=90)
 
-    # %% Fig. 7: one grey picture as the radiance at three wavelengths, through the filters into one mosaic.
+    # %% Fig. 7: one grey picture as the radiance at three wavelengths, recorded by one mosaic.
     peak = {"peak_radiance_w_m2_sr_nm": 0.2, **LIGHT}
     together = fs.Scene.from_picture(photographer(), wavelength_nm=RGB_NM, **peak)
     figure = Figure(figsize=(15, 9.5), layout="constrained")
@@ -120,10 +120,10 @@ def main(out_dir: Path) -> None:
         axes = figure.add_subplot(2, 3, 3 + position)
         axes.imshow(capture.picture(max_pixels=600).to_image(encode_srgb=True))
         axes.set_axis_off()
-        axes.set_title("red, green and blue from the nearest sites")
+        axes.set_title("colours of the nearest sites")
     save_figure(figure, out_dir / "08_mosaics.png", dpi=90)
 
-    # %% The numbers: curves mix to one curve, light adds up, and channels differ as the curves say.
+    # %% Checks: curves combine to one, bands are additive, and channels agree with the curves.
     print(", ".join(f"degree {degree}: {error:.3f}" for degree, error in worst.items()))
     assert worst[5] < 0.012
     assert list(worst.values()) == sorted(worst.values(), reverse=True)
@@ -131,18 +131,22 @@ def main(out_dir: Path) -> None:
     per_photon = (fs.rgb_filters().transmission(rays_nm) * qe(rays_nm) * cut(rays_nm)) @ rays_nm / rays_nm.sum()
     flat = fs.Scene.flat(shape=(400, 400), radiance_w_m2_sr_nm=0.1, wavelength_nm=RGB_NM, **LIGHT)
     for name, sensor in mosaics.items():
-        shares = electrons(sensor, flat) / electrons(fs.Sensor(sensor.layout), flat)
-        seen = [float(shares[sensor.layout.channel == k].mean()) for k in range(3)]
-        print(f"{name}: {seen[0]:.4f}, {seen[1]:.4f} and {seen[2]:.4f} electrons a photon in red, green and blue")
-        assert np.allclose(shares, per_photon[sensor.layout.channel], rtol=1e-5)
+        efficiency = electrons(sensor, flat) / electrons(fs.Sensor(sensor.layout), flat)
+        by_channel = [float(efficiency[sensor.layout.channel == k].mean()) for k in range(3)]
+        print(
+            f"{name}: {by_channel[0]:.4f}, {by_channel[1]:.4f} and {by_channel[2]:.4f} e- per photon in red, green and blue"
+        )
+        assert np.allclose(efficiency, per_photon[sensor.layout.channel], rtol=1e-5)
 
-        all_e, in_one = electrons(sensor, together), fs.Sensor(sensor.layout, filters=mixed)
-        assert np.allclose(electrons(in_one, together), all_e, rtol=1e-12)
-        apart = [
-            fs.Scene.from_picture(photographer(), wavelength_nm=[ray_nm], **peak)  # one picture a wavelength
+        all_e, one_curve = electrons(sensor, together), fs.Sensor(sensor.layout, filters=combined)
+        assert np.allclose(electrons(one_curve, together), all_e, rtol=1e-12)
+        monochromatic = [
+            fs.Scene.from_picture(photographer(), wavelength_nm=[ray_nm], **peak)  # one picture per wavelength
             for ray_nm in RGB_NM
         ]
-        assert np.allclose(sum(electrons(sensor, scene) for scene in apart), all_e, rtol=0, atol=1e-6 * all_e.max())
+        assert np.allclose(
+            sum(electrons(sensor, scene) for scene in monochromatic), all_e, rtol=0, atol=1e-6 * all_e.max()
+        )
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """
-What do the noises of the electronic chain look like, one after the other?
+How does each noise source of the electronic chain appear in a picture?
 
 New here: ``PowerMap.from_array``, ``Sensor(read_noise_e=, line_fpn_fraction=, dnl_dn=)``, ``Camera.predict``.
 
-Expect: the paper's read noises of 0, 50 and 200 e- on at most 6000 photons: spreads of the brightest sites of 77, 92 and
-214 e-, drawn and predicted; stripes of 2 % of the range that stay from frame to frame; codes of 4 bits of which the converter's
-own steps move 28 %, in every column in another way.
+Expect: temporal noise of 77, 92 and 214 e- rms in the brightest sites, simulated and predicted, for the read noises of
+the paper, 0, 50 and 200 e-, and at most 6000 photons; column FPN of 2 % of the range, the same in all frames; a 4-bit ADC whose
+DNL, different for each column, changes 28 % of the codes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from foveasim.view import save_figure
 
 WAVELENGTH_NM = 550.0
 EXPOSURE_S = 0.01
-MOST_PHOTONS = 6000.0
+MAX_PHOTONS = 6000.0
 FULL_WELL_E = 7000.0
 N_SIDE = 256
 PITCH_UM = 2.0
@@ -31,64 +31,66 @@ V_SAT_V = 3.0
 N_FRAMES = 24
 
 
-def light() -> fs.PowerMap:
-    """A photograph as light: its brightest cell sends so many photons to a site in an exposure."""
+def photograph() -> fs.PowerMap:
+    """Return a photograph as a power map with at most ``MAX_PHOTONS`` per site and exposure."""
     picture = resize(skimage.data.camera(), (N_SIDE, N_SIDE), anti_aliasing=True) ** 2.2
-    joules = MOST_PHOTONS * fs.units.photon_energy_j(WAVELENGTH_NM) * picture / picture.max()
+    joules = MAX_PHOTONS * fs.units.photon_energy_j(WAVELENGTH_NM) * picture / picture.max()
     irradiance_w_m2 = joules / EXPOSURE_S / (PITCH_UM * 1e-6) ** 2
     return fs.PowerMap.from_array(irradiance_w_m2, pitch_um=PITCH_UM, wavelength_nm=WAVELENGTH_NM, top_row_first=True)
 
 
 def camera(**parameters: object) -> fs.Camera:
-    """A camera of square sites whose highest code is the full well."""
+    """Return a camera of square sites with the highest code at the full well capacity."""
     layout = fs.layout.grid(n_x=N_SIDE, n_y=N_SIDE, pitch_um=PITCH_UM)
     capacitance_f = FULL_WELL_E * fs.units.ELEMENTARY_CHARGE_C / V_SAT_V
     values = {"bits": 10, "capacitance_f": capacitance_f, "full_well_e": FULL_WELL_E, "v_sat_v": V_SAT_V, **parameters}
     return fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=fs.Sensor(layout, **values))
 
 
-def codes(one: fs.Camera, scene: fs.PowerMap, frame: int = 0) -> np.ndarray:
-    """Codes as a picture, the lowest row first."""
-    return one.capture(scene, exposure_s=EXPOSURE_S, seed=1, frame=frame).code.reshape(N_SIDE, N_SIDE)
+def codes(tested: fs.Camera, scene: fs.PowerMap, frame: int = 0) -> np.ndarray:
+    """Return the codes of a capture as a picture, bottom row first."""
+    return tested.capture(scene, exposure_s=EXPOSURE_S, seed=1, frame=frame).code.reshape(N_SIDE, N_SIDE)
 
 
 def main(out_dir: Path) -> None:
-    """Write the noises' pictures to a folder."""
-    scene = light()
-    # %% Read noise: the paper's three.
+    """Write pictures with each noise source to a directory."""
+    scene = photograph()
+    # %% The three read noises of the paper.
     noises_e = (0.0, 50.0, 200.0)
     cameras = [camera(read_noise_e=noise_e) for noise_e in noises_e]
     figure = Figure(figsize=(15, 5.7), layout="constrained")
-    for axes, one, noise_e in zip(figure.subplots(1, 3), cameras, noises_e, strict=True):
-        axes.imshow(codes(one, scene), origin="lower", cmap="gray", vmin=0, vmax=1023 * MOST_PHOTONS / FULL_WELL_E)
+    for axes, tested, noise_e in zip(figure.subplots(1, 3), cameras, noises_e, strict=True):
+        axes.imshow(codes(tested, scene), origin="lower", cmap="gray", vmin=0, vmax=1023 * MAX_PHOTONS / FULL_WELL_E)
         axes.set_title(f"read noise {noise_e:g} e-")
         axes.set_axis_off()
     save_figure(figure, out_dir / "09_read_noise.png", dpi=70)
 
-    # %% Fixed patterns: of lines, and of pixels.
-    striped, grainy = camera(line_fpn_fraction=0.02), camera(pixel_fpn_fraction=0.02)
+    # %% Fixed-pattern noise of columns and of pixels.
+    with_column_fpn, with_pixel_fpn = camera(line_fpn_fraction=0.02), camera(pixel_fpn_fraction=0.02)
     figure = Figure(figsize=(10, 5.7), layout="constrained")
-    for axes, (name, one) in zip(
-        figure.subplots(1, 2), {"lines, 2 %": striped, "pixels, 2 %": grainy}.items(), strict=True
+    for axes, (name, tested) in zip(
+        figure.subplots(1, 2),
+        {"column FPN, 2 %": with_column_fpn, "pixel FPN, 2 %": with_pixel_fpn}.items(),
+        strict=True,
     ):
-        axes.imshow(codes(one, scene), origin="lower", cmap="gray")
+        axes.imshow(codes(tested, scene), origin="lower", cmap="gray")
         axes.set_title(name)
         axes.set_axis_off()
     save_figure(figure, out_dir / "09_fixed_patterns.png", dpi=70)
 
-    # %% A converter of 4 bits whose steps are wrong, by half a step rms, in every column in another way.
-    even, uneven = camera(bits=4, shot_noise="off"), camera(bits=4, shot_noise="off", dnl_dn=0.5)
-    pictures = [codes(one, scene).astype(int) for one in (even, uneven)]
+    # %% A 4-bit ADC with a DNL of 0.5 DN rms, different for each column.
+    ideal_adc, adc_with_dnl = camera(bits=4, shot_noise="off"), camera(bits=4, shot_noise="off", dnl_dn=0.5)
+    pictures = [codes(tested, scene).astype(int) for tested in (ideal_adc, adc_with_dnl)]
     column = N_SIDE // 2
-    expected_e = even.photoelectrons_per_s(scene).reshape(N_SIDE, N_SIDE) * EXPOSURE_S
+    expected_e = ideal_adc.photoelectrons_per_s(scene).reshape(N_SIDE, N_SIDE) * EXPOSURE_S
     figure = Figure(figsize=(16, 5.7), layout="constrained")
     axes = figure.subplots(1, 3, width_ratios=[1, 1, 1.3])
-    for place, picture, name in zip(axes, pictures, ("4 bits", "4 bits, DNL of 0.5"), strict=False):
-        place.imshow(picture, origin="lower", cmap="gray", vmin=0, vmax=15)
-        place.axvline(column, color="tab:red", linewidth=0.8)
-        place.set_title(name)
-        place.set_axis_off()
-    axes[2].plot(expected_e[:, column] / FULL_WELL_E * 16, color="tab:red", linewidth=1, label="before the converter")
+    for panel, picture, name in zip(axes, pictures, ("4 bits", "4 bits, DNL of 0.5 DN"), strict=False):
+        panel.imshow(picture, origin="lower", cmap="gray", vmin=0, vmax=15)
+        panel.axvline(column, color="tab:red", linewidth=0.8)
+        panel.set_title(name)
+        panel.set_axis_off()
+    axes[2].plot(expected_e[:, column] / FULL_WELL_E * 16, color="tab:red", linewidth=1, label="ADC input")
     axes[2].step(np.arange(N_SIDE), pictures[0][:, column], color="tab:green", where="mid", label="4 bits")
     axes[2].step(np.arange(N_SIDE), pictures[1][:, column], color="tab:blue", where="mid", label="with DNL")
     axes[2].set_xlabel("row")
@@ -96,29 +98,31 @@ def main(out_dir: Path) -> None:
     axes[2].legend()
     save_figure(figure, out_dir / "09_converter.png", dpi=70)
 
-    # %% The numbers.
+    # %% Checks.
     e_per_dn = FULL_WELL_E / 1024
-    for one, noise_e, spread_e in zip(cameras, noises_e, (77.0, 92.0, 214.0), strict=True):
-        mean_dn, variance_dn2 = one.predict(scene, exposure_s=EXPOSURE_S)
-        frames = np.stack([codes(one, scene, frame).ravel() for frame in range(N_FRAMES)])
+    for tested, noise_e, noise_rms_e in zip(cameras, noises_e, (77.0, 92.0, 214.0), strict=True):
+        mean_dn, variance_dn2 = tested.predict(scene, exposure_s=EXPOSURE_S)
+        frames = np.stack([codes(tested, scene, frame).ravel() for frame in range(N_FRAMES)])
         brightest = mean_dn > 0.97 * mean_dn.max()
-        drawn_e = float(np.sqrt(frames[:, brightest].var(axis=0, ddof=1).mean())) * e_per_dn
-        told_e = float(np.sqrt(variance_dn2[brightest].mean())) * e_per_dn
-        apart = np.abs(frames.mean(axis=0) - mean_dn) / np.sqrt(variance_dn2 / N_FRAMES + 1e-3)
-        print(f"read noise {noise_e:3g} e-: the brightest sites spread by {drawn_e:.0f} e-, {told_e:.0f} predicted")
-        assert abs(told_e - spread_e) < 2.0
-        assert abs(drawn_e - told_e) < 0.03 * told_e
-        assert apart.max() < 6.0
-    plain, frames = codes(camera(), scene).astype(float), [codes(striped, scene, k) for k in (0, 1)]
-    stripes = np.where((plain > 100) & (plain < 900), frames[0] - plain, np.nan)
-    line_dn = np.nanmean(stripes, axis=0)
+        simulated_e = float(np.sqrt(frames[:, brightest].var(axis=0, ddof=1).mean())) * e_per_dn
+        predicted_e = float(np.sqrt(variance_dn2[brightest].mean())) * e_per_dn
+        deviation_sigma = np.abs(frames.mean(axis=0) - mean_dn) / np.sqrt(variance_dn2 / N_FRAMES + 1e-3)
+        print(
+            f"read noise {noise_e:3g} e-: {simulated_e:.0f} e- rms in the brightest sites, {predicted_e:.0f} e- predicted"
+        )
+        assert abs(predicted_e - noise_rms_e) < 2.0
+        assert abs(simulated_e - predicted_e) < 0.03 * predicted_e
+        assert deviation_sigma.max() < 6.0
+    plain, frames = codes(camera(), scene).astype(float), [codes(with_column_fpn, scene, k) for k in (0, 1)]
+    fpn_dn = np.where((plain > 100) & (plain < 900), frames[0] - plain, np.nan)
+    line_dn = np.nanmean(fpn_dn, axis=0)
     assert abs(line_dn.std() / 1024 - 0.02) < 0.003
-    assert np.nanmax(np.abs(stripes - line_dn)) <= 1.0
-    assert np.corrcoef(np.nanmean(np.where(np.isnan(stripes), np.nan, frames[1] - plain), axis=0), line_dn)[0, 1] > 0.95
-    moved = pictures[1] - pictures[0]
-    print(f"wrong steps move {np.mean(moved != 0):.0%} of the codes, by up to {np.abs(moved).max()}")
-    assert 0.22 < np.mean(moved != 0) < 0.34
-    assert np.abs(moved.mean()) < 0.2
+    assert np.nanmax(np.abs(fpn_dn - line_dn)) <= 1.0
+    assert np.corrcoef(np.nanmean(np.where(np.isnan(fpn_dn), np.nan, frames[1] - plain), axis=0), line_dn)[0, 1] > 0.95
+    change_dn = pictures[1] - pictures[0]
+    print(f"DNL changes {np.mean(change_dn != 0):.0%} of the codes, by up to {np.abs(change_dn).max()} DN")
+    assert 0.22 < np.mean(change_dn != 0) < 0.34
+    assert np.abs(change_dn.mean()) < 0.2
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """
-How much of a photograph is in the codes of a foveal sensor, and which picture shows it?
+Which reconstruction method recovers a photograph best from the codes of a foveal sensor?
 
 New here: ``Capture.picture(method=)``: "cells", "linear", "natural", "least_squares"; ``Camera.reference``;
 ``foveasim.metrics.psnr_db`` and ``ssim``.
 
-Expect: the picture of least squares at least 2 dB nearer to the light on the sensor than that of cells, about 27 dB against 24;
-pictures between the centres about 1 dB nearer; the blind spot open in all of them.
+Expect: a PSNR of about 27 dB for "least_squares", relative to the charge density on the sensor, at least 2 dB more than the
+24 dB of "cells"; about 1 dB more than "cells" for the two interpolations between centroids; no data in the blind spot.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ WAVELENGTH_NM, BAND_WIDTH_NM = 550.0, 50.0
 DISTANCE_M, EXPOSURE_S = 0.5, 0.01
 RADIANCE_W_M2_SR_NM = 0.01
 FIELD_UM, N_PIXELS = 1024.0, 512
-#: Capacitance of a square micrometre: the brightest light fills two thirds of the codes of small and large sites alike.
+#: The maximum irradiance gives two thirds of the highest code for all site sizes.
 CAPACITANCE_F_PER_UM2 = 6e-17
 METHODS = ("cells", "linear", "natural", "least_squares")
 
 
 def main(out_dir: Path) -> None:
-    """Write the pictures side by side to a folder."""
-    # %% A photograph on a log-polar sensor whose capacitances grow with the sites' areas.
+    """Write the pictures side by side to a directory."""
+    # %% A photograph on a log-polar sensor with capacitances proportional to the areas of the sites.
     layout = fs.layout.log_polar(n_sectors=200, min_size_um=2.0, r_max_um=510.0, stagger=True)
     optics = fs.Optics(focal_length_mm=8.0, f_number=4.0)
     sensor = fs.Sensor(
@@ -57,46 +57,46 @@ def main(out_dir: Path) -> None:
     capture = camera.capture(scene, exposure_s=EXPOSURE_S, seed=1)
     print(f"{capture}: {np.median(capture.electrons):,.0f} electrons in the median site")
 
-    # %% Four pictures of the same codes, in electrons per µm², and the light that they are of.
+    # %% Four pictures of the same codes, in electrons per µm², and their reference.
     grid = fs.Grid.centred((N_PIXELS, N_PIXELS), FIELD_UM / N_PIXELS)
-    light = camera.reference(scene, grid, exposure_s=EXPOSURE_S)
+    reference = camera.reference(scene, grid, exposure_s=EXPOSURE_S)
     pictures = {
         method: capture.picture(method, of="light_e", per="um2", grid=grid, sensor=sensor) for method in METHODS
     }
-    near_db = {method: psnr_db(picture, light, min_coverage=1.0) for method, picture in pictures.items()}
-    check_consistent = {method: ssim(picture, light, min_coverage=1.0) for method, picture in pictures.items()}
+    quality_db = {method: psnr_db(picture, reference, min_coverage=1.0) for method, picture in pictures.items()}
+    similarity = {method: ssim(picture, reference, min_coverage=1.0) for method, picture in pictures.items()}
     for method in METHODS:
-        print(f"{method:13s}: PSNR {near_db[method]:.2f} dB, SSIM {check_consistent[method]:.3f}")
+        print(f"{method:13s}: PSNR {quality_db[method]:.2f} dB, SSIM {similarity[method]:.3f}")
 
-    # %% The picture: all of it, and its middle.
-    white = float(np.nanmax(light.data))
+    # %% Figure: complete pictures, and their centres.
+    white = float(np.nanmax(reference.data))
     figure = Figure(figsize=(20, 8.6), layout="constrained")
     axes = figure.subplots(2, 5)
-    panels = {"light on the sensor": light, **pictures}
+    panels = {"reference": reference, **pictures}
     left, bottom, right, top = grid.bounds_um
     for column, (name, picture) in enumerate(panels.items()):
         shown = encode_srgb_values(np.clip(picture.data[0] / white, 0.0, 1.0))
-        for place in axes[:, column]:
-            place.set_facecolor("tab:blue")  # no data
-            place.imshow(
+        for panel in axes[:, column]:
+            panel.set_facecolor("tab:blue")  # no data
+            panel.imshow(
                 shown, origin="lower", cmap="gray", vmin=0.0, vmax=1.0, extent=(left, right, bottom, top), zorder=1
             )
-            place.set_xticks([])
-            place.set_yticks([])
+            panel.set_xticks([])
+            panel.set_yticks([])
         axes[1, column].set(xlim=(-150.0, 150.0), ylim=(-150.0, 150.0))
-        axes[0, column].set_title(name if name not in near_db else f"{name}: {near_db[name]:.1f} dB")
-    axes[0, 0].set_ylabel("whole")
-    axes[1, 0].set_ylabel("the middle 300 µm")
+        axes[0, column].set_title(name if name not in quality_db else f"{name}: {quality_db[name]:.1f} dB")
+    axes[0, 0].set_ylabel("complete")
+    axes[1, 0].set_ylabel("central 300 µm")
     save_figure(figure, out_dir / "11_reconstruction.png", dpi=70)
 
-    # %% The same for other programs: 16 bits to look at, and the values themselves.
+    # %% Files for other programs: a PNG file of 16 bits for display, and a TIFF file of the values.
     pictures["least_squares"].save(out_dir / "11_least_squares.png", white, encode_srgb=True, bits=16)
     pictures["least_squares"].save(out_dir / "11_least_squares.tif")
 
-    # %% The numbers.
-    assert near_db["least_squares"] > near_db["cells"] + 2.0
-    assert min(near_db["linear"], near_db["natural"]) > near_db["cells"] + 0.5
-    assert check_consistent["least_squares"] > check_consistent["cells"]
+    # %% Checks.
+    assert quality_db["least_squares"] > quality_db["cells"] + 2.0
+    assert min(quality_db["linear"], quality_db["natural"]) > quality_db["cells"] + 0.5
+    assert similarity["least_squares"] > similarity["cells"]
     for picture in pictures.values():
         assert np.isnan(picture.data[0, N_PIXELS // 2, N_PIXELS // 2])
 

@@ -1,11 +1,11 @@
 """
-What can be drawn of a layout, and how many photosites does a picture bear?
+Which plots show a layout, and how many photosites can one figure contain?
 
-New here: ``Layout.plot`` by columns, with readout lines and neighbours over it; ``view.id_map``, the site under each pixel.
+New here: ``Layout.plot`` of columns, with overlaid readout lines and adjacency; ``view.id_map``, the site at each pixel.
 
-Expect: a foveal layout by size, by filter, by readout line and with its neighbours; and a million hexagons in one picture, each
-where it is: of 2000 x 2000 pixels each shows one of them, and the areas that pixels count agree with the photosites' own within
-1 % in every hundredth of the field.
+Expect: a foveal layout by size, by filter, by readout line and with its adjacency; a million hexagons in one figure, at their
+correct positions: each of 2000 x 2000 pixels shows one of them, and areas counted in pixels agree with the areas of the
+photosites within 1 % in each of 10 x 10 parts of the field.
 """
 
 from __future__ import annotations
@@ -23,47 +23,49 @@ N_PIXELS, N_PARTS = 2000, 10
 
 
 def main(out_dir: Path) -> None:
-    """Write the drawings to a folder."""
-    # %% One layout in four ways.
+    """Write the plots to a directory."""
+    # %% Four plots of one layout.
     layout = fs.layout.log_polar(n_sectors=36, min_size_um=4.0, r_max_um=102.0, fovea="hexagons", stagger=True)
     mosaic = fs.layout.graph_colouring(layout, 3)
     rings_alone = fs.layout.log_polar(n_sectors=36, min_size_um=4.0, r_max_um=102.0)
-    lines = fs.layout.readout_by(rings_alone, "sector")
+    readout = fs.layout.readout_by(rings_alone, "sector")
     figure = Figure(figsize=(14.0, 11.0), layout="constrained")
     axes = figure.subplots(2, 2)
     layout.plot("size_um", ax=axes[0, 0])
     axes[0, 0].set_title("by size")
     mosaic.plot("channel", ax=axes[0, 1])
-    axes[0, 1].set_title("three filters, never two of a kind side by side")
-    lines.plot("readout_line", overlay="readout_lines", legend=False, ax=axes[1, 0])
-    axes[1, 0].set_title("by readout line, one a sector")
+    axes[0, 1].set_title("three filters, different for neighbours")
+    readout.plot("readout_line", overlay="readout_lines", legend=False, ax=axes[1, 0])
+    axes[1, 0].set_title("by readout line, one per sector")
     layout.plot(overlay="adjacency", ax=axes[1, 1])
-    axes[1, 1].set_title("photosites and their neighbours")
+    axes[1, 1].set_title("adjacency of the photosites")
     for ax in axes.flat:
         ax.set(xlim=(-80.0, 80.0), ylim=(-80.0, 80.0))
     save_figure(figure, out_dir / "13_ways_to_draw.png", dpi=80)
 
-    # %% A million hexagons, each with the value of a zone plate in its middle, and a closer look.
-    many = fs.layout.hexagonal(n_columns=1000, n_rows=1000, pitch_um=1.0)
-    radius_um = np.hypot(*many.centroid_um.T)
+    # %% A million hexagons with the values of a zone plate at their centroids, and an enlarged part.
+    hexagons = fs.layout.hexagonal(n_columns=1000, n_rows=1000, pitch_um=1.0)
+    radius_um = np.hypot(*hexagons.centroid_um.T)
     rings = np.cos(np.pi * radius_um**2 / 900.0)
     figure = Figure(figsize=(14.0, 6.4), layout="constrained")
     for ax, half_um in zip(figure.subplots(1, 2), (None, 22.0), strict=True):
-        many.plot(rings, label="cos(π r² / 900 µm²)", ax=ax, legend=half_um is not None)
+        hexagons.plot(rings, label="cos(π r² / 900 µm²)", ax=ax, legend=half_um is not None)
         if half_um is not None:
             ax.set(xlim=(410.0 - half_um, 410.0 + half_um), ylim=(-half_um, half_um))
     save_figure(figure, out_dir / "13_a_million.png", dpi=80)
 
-    # %% The photosite under each pixel, and what it counts.
+    # %% Photosite at each pixel, and areas counted in pixels.
     half_um = 300.0
-    ids = id_map(many, (N_PIXELS, N_PIXELS), (-half_um, -half_um, half_um, half_um))
-    x, y = (np.clip(((c + half_um) * N_PARTS / (2 * half_um)).astype(int), 0, N_PARTS - 1) for c in many.centroid_um.T)
+    ids = id_map(hexagons, (N_PIXELS, N_PIXELS), (-half_um, -half_um, half_um, half_um))
+    x, y = (
+        np.clip(((c + half_um) * N_PARTS / (2 * half_um)).astype(int), 0, N_PARTS - 1) for c in hexagons.centroid_um.T
+    )
     part = y * N_PARTS + x
-    is_seen = np.all(np.abs(many.centroid_um) < half_um, axis=1)
+    is_inside = np.all(np.abs(hexagons.centroid_um) < half_um, axis=1)
     counted_um2 = np.bincount(part[ids].ravel(), minlength=N_PARTS**2) * (2 * half_um / N_PIXELS) ** 2
-    own_um2 = np.bincount(part[is_seen], many.area_um2[is_seen], minlength=N_PARTS**2)
-    error = float(np.max(np.abs(counted_um2 / own_um2 - 1.0)))
-    print(f"{many.n_sites:,} photosites, {np.unique(ids).size:,} in the picture; areas by pixels within {error:.2%}")
+    expected_um2 = np.bincount(part[is_inside], hexagons.area_um2[is_inside], minlength=N_PARTS**2)
+    error = float(np.max(np.abs(counted_um2 / expected_um2 - 1.0)))
+    print(f"{hexagons.n_sites:,} photosites, {np.unique(ids).size:,} in the id map; areas in pixels within {error:.2%}")
     assert ids.min() >= 0
     assert error < 0.01
 

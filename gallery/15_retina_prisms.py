@@ -1,10 +1,10 @@
 """
-What does a retina see that looks a cat in the eye?
+How does a retina-like sensor record the eye of a cat?
 
-New here: ``view.prisms`` of a capture, in colours of one's own, ``view.Viewpoint``, ``Integrator`` on other pictures.
+New here: ``view.prisms`` of a capture in user-defined colours, ``view.Viewpoint``, ``Integrator`` for other pictures.
 
-Expect: 9,411 sites, 28 % of them in a fovea of 5.1 % of the area; columns whose height is the code, of which the brightest
-stands 60 µm tall and the others in proportion within 1e-12.
+Expect: 9,411 sites, 28 % of them in a fovea with 5.1 % of the area; columns with heights proportional to the codes within
+1e-12, and a height of 60 µm for the highest code.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from foveasim._io.encodings import decode, encode_srgb_values
 
 WAVELENGTH_NM = 550.0
 EXPOSURE_S = 0.01
-#: Of white, on a square micrometre in an exposure.
-MOST_PHOTONS_PER_UM2 = 1500.0
+#: Photons per exposure at white.
+MAX_PHOTONS_PER_UM2 = 1500.0
 CAPACITANCE_F_PER_UM2 = 0.7e-16
-#: Row and column of the cat's eye, which comes to the axis.
+#: Row and column of the cat's eye, which is imaged on the optical axis.
 GAZE_PX = (113, 172)
 PITCH_UM = 2.3
 N_FOVEA = 30
-TALLEST_UM = 60.0
-#: Of the colours, since walls in the shade are darker than the photograph.
-BRIGHTENING = 1.5
+MAX_HEIGHT_UM = 60.0
+#: Factor on the colours, since shaded walls are darker than the photograph.
+COLOUR_GAIN = 1.5
 
 
 def retina() -> fs.Layout:
-    """Rings of unit height in the middle, then rings that grow: the Giotto rule."""
+    """Return a Giotto layout: rings of unit height in the fovea, growing rings around it."""
     return fs.layout.giotto(n_rho=64, n_theta=200, n_fovea=N_FOVEA, n_across=260, unit_um=2.0)
 
 
 def photograph(radius_um: float) -> np.ndarray:
-    """Relative radiance of red, green and blue around the cat's eye, as far as the retina reaches."""
+    """Return the relative RGB radiance around the cat's eye within a radius."""
     half = int(radius_um / PITCH_UM) + 1
     row, column = GAZE_PX
     padded = np.pad(skimage.data.chelsea(), ((half, half), (half, half), (0, 0)), mode="edge")
@@ -47,26 +47,26 @@ def photograph(radius_um: float) -> np.ndarray:
 
 
 def main(out_dir: Path) -> None:
-    """Write the pictures to a folder."""
+    """Write the pictures to a directory."""
     layout = retina()
     rgb = photograph(layout.bounds_um[2])
-    joules_um2 = MOST_PHOTONS_PER_UM2 * fs.units.photon_energy_j(WAVELENGTH_NM) * rgb @ np.array([0.3, 0.6, 0.1])
-    light = fs.PowerMap.from_array(
+    joules_um2 = MAX_PHOTONS_PER_UM2 * fs.units.photon_energy_j(WAVELENGTH_NM) * rgb @ np.array([0.3, 0.6, 0.1])
+    power_map = fs.PowerMap.from_array(
         joules_um2 / EXPOSURE_S / 1e-12, pitch_um=PITCH_UM, wavelength_nm=WAVELENGTH_NM, top_row_first=True
     )
 
-    # %% Large sites hold more charge, so that a code is light per area whatever the site's size.
+    # %% With capacitances proportional to areas, codes are proportional to irradiance for all site sizes.
     sensor = fs.Sensor(layout, capacitance_f=CAPACITANCE_F_PER_UM2 * layout.area_um2, bits=10)
     camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
-    capture = camera.capture(light, exposure_s=EXPOSURE_S, seed=1)
+    capture = camera.capture(power_map, exposure_s=EXPOSURE_S, seed=1)
     print(capture)
 
-    # %% Each column in the mean colour of what its site looks at.
-    of_sites = fs.Integrator(layout, light.grid)(np.moveaxis(rgb[::-1], -1, 0)) / layout.area_um2
-    colours = encode_srgb_values(BRIGHTENING * of_sites).T
-    columns = view.prisms(capture, by=colours, max_height_um=TALLEST_UM)
+    # %% Each column has the mean colour of the photograph over its site.
+    site_rgb = fs.Integrator(layout, power_map.grid)(np.moveaxis(rgb[::-1], -1, 0)) / layout.area_um2
+    colours = encode_srgb_values(COLOUR_GAIN * site_rgb).T
+    columns = view.prisms(capture, by=colours, max_height_um=MAX_HEIGHT_UM)
 
-    # %% The whole retina, and its fovea; without OpenGL without the shade of corners.
+    # %% Complete retina, and its fovea; the software renderer, used without OpenGL, has no ambient occlusion.
     renderer = "pyvista" if view.find_renderer() else "software"
     for name, viewpoint in {
         "whole": view.Viewpoint(azimuth_deg=-80.0, elevation_deg=52.0),
@@ -81,17 +81,17 @@ def main(out_dir: Path) -> None:
             renderer=renderer,
         )
 
-    # %% The numbers.
+    # %% Checks.
     is_fovea = layout.columns["ring"] < N_FOVEA
-    share, of_area = is_fovea.mean(), layout.area_um2[is_fovea].sum() / layout.area_um2.sum()
-    print(f"the brightest colour is {colours.max():.2f} of white")
-    print(f"{layout.n_sites:,} sites, {share:.0%} of them in a fovea of {of_area:.1%} of the area")
+    site_fraction, area_fraction = is_fovea.mean(), layout.area_um2[is_fovea].sum() / layout.area_um2.sum()
+    print(f"highest colour value: {colours.max():.2f} of white")
+    print(f"{layout.n_sites:,} sites, {site_fraction:.0%} of them in a fovea with {area_fraction:.1%} of the area")
     top_um = np.zeros(layout.n_sites)
     np.maximum.at(top_um, columns.photosite, columns.points_um[:, 2])
     assert layout.n_sites == 9411
-    assert abs(share - 0.28) < 0.005
-    assert abs(of_area - 0.051) < 0.0005
-    assert np.allclose(top_um, TALLEST_UM * capture.code / capture.code.max(), rtol=1e-12, atol=0.0)
+    assert abs(site_fraction - 0.28) < 0.005
+    assert abs(area_fraction - 0.051) < 0.0005
+    assert np.allclose(top_um, MAX_HEIGHT_UM * capture.code / capture.code.max(), rtol=1e-12, atol=0.0)
     assert capture.saturated_fraction == 0.0
     assert colours.max() < 1.0
 

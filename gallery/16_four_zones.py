@@ -1,11 +1,11 @@
 """
-What does a sensor of four zones see, each with pixels twice as large as the one inside?
+How does a sensor of four zones, whose pixel pitch doubles outwards, record a photograph?
 
-New here: a layout that comes with the package (``layouts/four_zones.yaml``), a picture of a part, light that adds up.
+New here: a bundled layout (``layouts/four_zones.yaml``), a picture of a region, additivity of charge.
 
-Expect: the paper's Fig. 14 on another photograph: 13,312 photosites where the smallest pixels everywhere would be 262,144. The
-light in a pixel of 8, 16 or 32 µm is the sum of that in the 4, 16 or 64 small pixels under it, within 1e-12; in the middle
-zone all is equal.
+Expect: Fig. 14 of the paper with another photograph: 13,312 photosites, compared with 262,144 of a uniform grid of the smallest
+pixels. The expected charge of a pixel of 8, 16 or 32 µm is the sum over the 4, 16 or 64 small pixels in the same area, within
+1e-12 of the total charge; in the central zone both sensors are equal.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ EXPOSURE_S = 1 / 30
 
 
 def main(out_dir: Path) -> None:
-    """Write both sensors' pictures to a folder."""
-    # %% The scene, and two sensors of the same size: four zones, and the smallest pixels everywhere.
-    # More sky above him, so that he stands where the sensor is sharpest.
+    """Write the pictures of both sensors to a directory."""
+    # %% Scene, and two sensors of the same size: four zones, and a uniform grid of the smallest pixels.
+    # Additional sky at the top shifts the photographer to the finest zone.
     photograph = np.pad(photographer(), ((126, 0), (25, 0)), mode="edge")[:512, :512]
     scene = fs.Scene.from_picture(
         photograph,
@@ -49,17 +49,17 @@ def main(out_dir: Path) -> None:
         )
         return fs.Camera(optics=optics, sensor=sensor).capture(scene, exposure_s=EXPOSURE_S, seed=1)
 
-    seen, everywhere = capture(zones), capture(fine)
+    zone_capture, fine_capture = capture(zones), capture(fine)
 
-    # %% Both pictures, and the middle of the first.
+    # %% Both pictures, and the central zone.
     figure = Figure(figsize=(13.0, 4.6), layout="constrained")
-    middle = fs.Grid((512, 512), 0.5, (-128.0, -128.0))
+    centre = fs.Grid((512, 512), 0.5, (-128.0, -128.0))
     for ax, (title, shot, grid) in zip(
         figure.subplots(1, 3),
         (
-            (f"{fine.n_sites:,} pixels of 4 µm", everywhere, None),
-            (f"{zones.n_sites:,} pixels of 4, 8, 16 and 32 µm", seen, None),
-            ("its middle: 4,096 pixels of 4 µm", seen, middle),
+            (f"{fine.n_sites:,} pixels of 4 µm", fine_capture, None),
+            (f"{zones.n_sites:,} pixels of 4, 8, 16 and 32 µm", zone_capture, None),
+            ("central zone: 4,096 pixels of 4 µm", zone_capture, centre),
         ),
         strict=True,
     ):
@@ -71,20 +71,22 @@ def main(out_dir: Path) -> None:
         ax.set_xlabel("x / µm")
     save_figure(figure, out_dir / "16_four_zones.png", dpi=110)
 
-    # %% Light adds up: every pixel has the sum of the small ones under it.
+    # %% Additivity: the charge of every pixel is the sum over the small pixels in the same area.
     column, row = (np.floor(fine.centroid_um / SMALLEST_UM).astype(int) + n_side // 2).T
-    light = np.zeros((n_side, n_side))
-    light[row, column] = everywhere.expected_e
-    sums = np.pad(light.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    charge_e = np.zeros((n_side, n_side))
+    charge_e[row, column] = fine_capture.expected_e
+    sums = np.pad(charge_e.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
     low, high = np.rint(zones.site_bounds_um / SMALLEST_UM + n_side // 2).astype(int).reshape(-1, 2, 2).swapaxes(0, 1)
-    under = (
+    summed_e = (
         sums[high[:, 1], high[:, 0]]
         - sums[low[:, 1], high[:, 0]]
         - sums[high[:, 1], low[:, 0]]
         + sums[low[:, 1], low[:, 0]]
     )
-    error = float(np.max(np.abs(seen.expected_e - under)) / sums[-1, -1])
-    print(f"{zones.n_sites} sites against {fine.n_sites}; largest error of the sums {error:.1e} of all the light")
+    error = float(np.max(np.abs(zone_capture.expected_e - summed_e)) / sums[-1, -1])
+    print(
+        f"{zones.n_sites} sites, uniform grid {fine.n_sites}; largest error of the sums {error:.1e} of the total charge"
+    )
     assert (zones.n_sites, fine.n_sites) == (13_312, 262_144)
     assert error < 1e-12
 

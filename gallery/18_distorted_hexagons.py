@@ -1,11 +1,10 @@
 """
-What does a hexagonal sensor see through a lens that bends lines, and where does its light come from?
+How does a distorting lens change the picture and the irradiance on a hexagonal sensor?
 
-New here: ``Integrator(distortion=)`` next to ``Camera(distortion=)``, and a lens model used by hand.
+New here: ``Integrator(distortion=)`` in addition to ``Camera(distortion=)``, and direct use of a lens model.
 
-Expect: a checkerboard like a barrel on 27,170 hexagons, whose outlines, carried back into the picture of an ideal lens, grow
-towards the corners. There a hexagon gets the light of 1.777 times the area of one in the middle: the lens model's own stretch,
-within 1e-4.
+Expect: a checkerboard with barrel distortion on 27,170 hexagons, whose undistorted outlines grow towards the corners. There a
+hexagon receives 1.777 times the power of one at the centre: the Jacobian determinant of the lens model, within 1e-4.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ LENS = fs.distortion.BrownConrady(focal_um=4000.0, k1=-1.4, k2=1.6)
 
 
 def main(out_dir: Path) -> None:
-    """Write what both lenses give, and the outlines, to a folder."""
-    # %% A checkerboard of 20 mm squares, half a metre away, and a sensor of hexagons.
+    """Write the captures of both lenses and the outlines to a directory."""
+    # %% Checkerboard of 20 mm squares at a distance of 0.5 m, and a sensor of hexagons.
     scene = charts.checkerboard(
         square_mm=20.0,
         shape=(900, 1300),
@@ -42,38 +41,42 @@ def main(out_dir: Path) -> None:
     )
     sensor = fs.Sensor(layout, qe=0.6, capacitance_f=3e-15, read_noise_e=3.0, bits=10)
     optics = fs.Optics(focal_length_mm=4.0, f_number=2.8)
-    straight = fs.Camera(optics=optics, sensor=sensor).capture(scene, exposure_s=0.02, seed=0)
-    bent = fs.Camera(optics=optics, sensor=sensor, distortion=LENS).capture(scene, exposure_s=0.02, seed=0)
+    ideal = fs.Camera(optics=optics, sensor=sensor).capture(scene, exposure_s=0.02, seed=0)
+    distorted = fs.Camera(optics=optics, sensor=sensor, distortion=LENS).capture(scene, exposure_s=0.02, seed=0)
 
-    # %% What both see, and where the light of some hexagons comes from.
+    # %% Captures of both lenses, and undistorted outlines of larger hexagons.
     figure = Figure(figsize=(15.0, 3.4), layout="constrained")
     axes = figure.subplots(1, 3)
-    straight.plot(ax=axes[0])
-    axes[0].set_title("an ideal lens")
-    bent.plot(ax=axes[1])
-    axes[1].set_title("a lens that bends lines")
-    some = fs.layout.hexagonal(n_columns=19, n_rows=14, pitch_um=100.0)
-    origins = fs.Layout(LENS.undistort(some.xy_um), some.ring_offsets, some.site_offsets)
-    origins.plot(origins.area_um2 / some.area_um2, label="area carried back / area", ax=axes[2])
-    axes[2].set_title("hexagons of 100 µm, carried back")
+    ideal.plot(ax=axes[0])
+    axes[0].set_title("ideal lens")
+    distorted.plot(ax=axes[1])
+    axes[1].set_title("distorting lens")
+    large_hexagons = fs.layout.hexagonal(n_columns=19, n_rows=14, pitch_um=100.0)
+    undistorted = fs.Layout(
+        LENS.undistort(large_hexagons.xy_um), large_hexagons.ring_offsets, large_hexagons.site_offsets
+    )
+    undistorted.plot(undistorted.area_um2 / large_hexagons.area_um2, label="undistorted area / area", ax=axes[2])
+    axes[2].set_title("undistorted outlines of 100 µm hexagons")
     save_figure(figure, out_dir / "18_distorted_hexagons.png", dpi=110)
 
-    # %% Even light: what a hexagon gets is the area that the lens draws together there.
+    # %% Uniform irradiance: the power of a hexagon is proportional to its undistorted area.
     grid = fs.Grid((1000, 1500), 2.0, (-1500.0, -1000.0))
     power = fs.Integrator(layout, grid, distortion=LENS)(np.ones(grid.shape)) / layout.area_um2
     corner = int(np.argmax(np.hypot(*layout.centroid_um.T)))
-    middle = int(np.argmin(np.hypot(*layout.centroid_um.T)))
+    centre = int(np.argmin(np.hypot(*layout.centroid_um.T)))
     step_um = 0.01
     x_um, y_um = layout.centroid_um[corner]
     right, left, up, down = LENS.undistort(
         [[x_um + step_um, y_um], [x_um - step_um, y_um], [x_um, y_um + step_um], [x_um, y_um - step_um]]
     )
     along_x, along_y = (right - left) / (2.0 * step_um), (up - down) / (2.0 * step_um)
-    stretch = float(along_x[0] * along_y[1] - along_x[1] * along_y[0])
-    gained = float(power[corner] / power[middle])
-    print(f"{layout.n_sites} hexagons; light in the corner {gained:.5f}, stretch of the lens {stretch:.5f}")
-    assert abs(gained / stretch - 1.0) < 1e-4
-    assert abs(gained - 1.777) < 1e-3
+    jacobian = float(along_x[0] * along_y[1] - along_x[1] * along_y[0])
+    power_ratio = float(power[corner] / power[centre])
+    print(
+        f"{layout.n_sites} hexagons; relative power in the corner {power_ratio:.5f}, Jacobian determinant {jacobian:.5f}"
+    )
+    assert abs(power_ratio / jacobian - 1.0) < 1e-4
+    assert abs(power_ratio - 1.777) < 1e-3
 
 
 if __name__ == "__main__":

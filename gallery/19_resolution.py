@@ -1,12 +1,12 @@
 """
-How fine a detail do photosites of different shapes, places and sizes tell, and what becomes of finer ones?
+Which frequencies do photosites of different shapes and layouts resolve, and how do higher ones alias?
 
 New here: ``slanted_edge_mtf``, ``polygon_mtf``, ``nyquist_vs_eccentricity``, ``sampling_spectrum``, ``aliasing_spectrum``.
 
-Expect: the MTF of a lens with squares and with hexagons, by a slanted edge, within 2 % of its closed form up to the Nyquist
-frequency; the Nyquist frequencies of the layouts that come with the package, constant or falling as the inverse of the
-distance; spectra of their sampling points: peaks of lattices, which turn a sine that is too fine into a coarse one of the same
-contrast, and rings where sites are without order, which turn it into noise.
+Expect: the slanted-edge MTF of a lens with squares and with hexagons, within 2 % of its closed form up to the Nyquist
+frequency; the Nyquist frequencies of the bundled layouts, constant or inversely proportional to eccentricity; spectra of their
+sampling points: peaks for lattices, which alias a sine above Nyquist to a lower frequency with the same contrast, and rings for
+irregular sites, which convert it to noise.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ from foveasim.view import save_figure
 
 OPTICS = fs.Optics(focal_length_mm=10.0, f_number=4.0)
 DISTANCE_M, WAVELENGTH_NM = 0.5, 550.0
-#: Pixels of the chart, as wide on the sensor.
+#: Size of a chart pixel in the image.
 CELL_UM = 0.5
 PITCH_UM, ANGLE_DEG = 4.0, 5.0
-#: Spectra are those of a disc of so many sites across, or less where sites grow with the distance from the middle.
+#: Maximum diameter of the discs for spectra, in sites; smaller where site sizes grow with eccentricity.
 SITES_ACROSS = 28
-#: A sine this much finer than the sites tell.
-TOO_FINE = 1.4
-#: Direction of it: halfway between the rows and the diagonals of squares.
-TOO_FINE_DEG = 22.5
+#: Frequency of the aliased sine over the Nyquist frequency.
+SINE_OVER_NYQUIST = 1.4
+#: Direction of the sine: midway between the rows and the diagonals of squares.
+SINE_DEG = 22.5
 
 
 def edge_and_closed_form(layout: fs.Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Frequencies, MTF by the edge, the closed form of lens, chart and pixel, and that of the pixel."""
+    """Return frequencies and MTFs: slanted edge; lens, chart and pixel; pixel only."""
     chart = charts.slanted_edge(
         angle_deg=ANGLE_DEG,
         shape=(600, 600),
@@ -60,36 +60,36 @@ def edge_and_closed_form(layout: fs.Layout) -> tuple[np.ndarray, np.ndarray, np.
     )
     sensor = fs.Sensor(layout, capacitance_f=1e-15 * layout.area_um2)
     capture = fs.Camera(optics=OPTICS, sensor=sensor).capture(chart, exposure_s=0.1, seed=1)
-    found = slanted_edge_mtf(layout, capture.expected_e)
-    print(f"{found!r}")
-    per_mm = found.frequency_per_mm
+    measured_mtf = slanted_edge_mtf(layout, capture.expected_e)
+    print(f"{measured_mtf!r}")
+    per_mm = measured_mtf.frequency_per_mm
     lens = circular_otf(per_mm * 1e-6 * WAVELENGTH_NM * OPTICS.working_f_number(DISTANCE_M))
-    # The chart's mean over its pixel, and the map's over a cell.
-    cells = np.prod(np.sinc(1e-3 * CELL_UM * wave_vectors_per_mm(per_mm, found.angle_deg)), axis=1) ** 2
-    pixel = polygon_mtf(layout[[0]], per_mm, angle_deg=found.angle_deg)[0]
-    return per_mm, found.mtf, lens * cells * pixel, pixel
+    # Mean of the chart over its pixel, and of the power map over a cell.
+    cells = np.prod(np.sinc(1e-3 * CELL_UM * wave_vectors_per_mm(per_mm, measured_mtf.angle_deg)), axis=1) ** 2
+    pixel = polygon_mtf(layout[[0]], per_mm, angle_deg=measured_mtf.angle_deg)[0]
+    return per_mm, measured_mtf.mtf, lens * cells * pixel, pixel
 
 
 def spectra(layout: fs.Layout, *, is_foveal: bool) -> tuple[SamplingSpectrum, AliasingSpectrum]:
-    """Spectrum of the sampling points in a disc, and what becomes of a sine that is too fine for them."""
+    """Return spectra of the sampling points in a disc and of a sine above Nyquist."""
     if np.unique(layout.channel).size > 1:
         layout = layout[layout.channel == 1]
     low, high = np.reshape(layout.bounds_um, (2, 2))
-    # In the middle, but of a foveal layout far out to the right, where sites do not differ much.
-    out_um = 0.375 * (high - low)[0] if is_foveal else 0.0
-    site = np.hypot(*(layout.centroid_um - 0.5 * (low + high) - [out_um, 0.0]).T).argmin()
-    near_um = np.sort(np.hypot(*(layout.centroid_um - layout.centroid_um[site]).T))
-    radius_um = near_um[min(near_um.size - 1, int(np.pi / 4 * SITES_ACROSS**2))]
-    most_um = out_um / 3.0 if is_foveal else 0.5 * (high - low).min()
-    region = {"centre_um": tuple(layout.centroid_um[site]), "radius_um": float(min(radius_um, most_um))}
+    # At the centre; in foveal layouts at a large eccentricity, where adjacent sites have similar sizes.
+    eccentricity_um = 0.375 * (high - low)[0] if is_foveal else 0.0
+    site = np.hypot(*(layout.centroid_um - 0.5 * (low + high) - [eccentricity_um, 0.0]).T).argmin()
+    distance_um = np.sort(np.hypot(*(layout.centroid_um - layout.centroid_um[site]).T))
+    radius_um = distance_um[min(distance_um.size - 1, int(np.pi / 4 * SITES_ACROSS**2))]
+    max_radius_um = eccentricity_um / 3.0 if is_foveal else 0.5 * (high - low).min()
+    region = {"centre_um": tuple(layout.centroid_um[site]), "radius_um": float(min(radius_um, max_radius_um))}
     points = sampling_spectrum(layout, **region)
-    wave = wave_vectors_per_mm(TOO_FINE * points.nyquist_per_mm, TOO_FINE_DEG)[0]
+    wave = wave_vectors_per_mm(SINE_OVER_NYQUIST * points.nyquist_per_mm, SINE_DEG)[0]
     return points, aliasing_spectrum(layout, tuple(wave), **region)
 
 
 def main(out_dir: Path) -> None:
-    """Write the curves and the spectra to a folder."""
-    # %% The MTF of lens and pixels, by an edge and in closed form.
+    """Write the curves and the spectra to a directory."""
+    # %% MTF of lens and pixels, by a slanted edge and in closed form.
     sensors = {
         "squares": fs.layout.grid(n_x=56, n_y=56, pitch_um=PITCH_UM),
         "hexagons": fs.layout.hexagonal(n_columns=56, n_rows=64, pitch_um=PITCH_UM),
@@ -101,50 +101,48 @@ def main(out_dir: Path) -> None:
         per_mm, measured, expected, pixel = edge_and_closed_form(layout)
         nyquist = float(nyquist_per_mm(layout)[0])
         worst[name] = float(np.abs(measured / expected - 1.0)[per_mm <= nyquist].max())
-        axes[0].plot(per_mm, pixel, ":", color=colour, label=f"{name}, the pixel alone")
+        axes[0].plot(per_mm, pixel, ":", color=colour, label=f"{name}, pixel only")
         axes[0].plot(per_mm, expected, "-", color=colour, label=f"{name}, lens × pixel")
-        axes[0].plot(per_mm[::4], measured[::4], ".", color=colour, label=f"{name}, by the edge")
+        axes[0].plot(per_mm[::4], measured[::4], ".", color=colour, label=f"{name}, slanted edge")
         axes[0].axvline(nyquist, color=colour, linewidth=0.6)
-        print(f"{name}: off by {100.0 * worst[name]:.2f} % at most up to the Nyquist frequency, {nyquist:.1f} per mm")
+        print(f"{name}: largest error {100.0 * worst[name]:.2f} % up to the Nyquist frequency, {nyquist:.1f} per mm")
     axes[0].set(xlabel="line pairs per mm", ylabel="MTF", xlim=(0, 1e3 / PITCH_UM), ylim=(0, 1.02))
-    axes[0].set_title(f"pitch {PITCH_UM:g} µm; upright lines: Nyquist")
+    axes[0].set_title(f"pitch {PITCH_UM:g} µm; vertical lines: Nyquist frequencies")
     axes[0].legend(fontsize=8)
 
-    # %% How finely the layouts that come with the package sample, from their middle outwards.
+    # %% Nyquist frequencies of the bundled layouts against eccentricity.
     layouts = {name: read_any_layout(path).layout for name, path in bundled_layouts().items()}
     is_foveal = {}
     for name, layout in layouts.items():
         table = nyquist_vs_eccentricity(layout, n_bins=40, per_channel=True)
-        middle_um = 0.5 * (table.edges_um[1:] + table.edges_um[:-1])
-        is_known = np.isfinite(table.nyquist_per_mm)
+        bin_centre_um = 0.5 * (table.edges_um[1:] + table.edges_um[:-1])
+        is_finite = np.isfinite(table.nyquist_per_mm)
         is_foveal[name] = table.growth_fraction != 0.0
         part = axes[1 if is_foveal[name] else 2]
-        (line,) = part.plot(middle_um[is_known], table.nyquist_per_mm[is_known], label=name)
+        (line,) = part.plot(bin_centre_um[is_finite], table.nyquist_per_mm[is_finite], label=name)
         if is_foveal[name]:
-            low, high = table.nyquist_min_per_mm[is_known], table.nyquist_max_per_mm[is_known]
-            part.fill_between(middle_um[is_known], low, high, color=line.get_color(), alpha=0.2, linewidth=0.0)
-            print(f"{name}: size {table.size_at_centre_um:.3g} µm + {table.growth_fraction:.4f} times the distance")
+            low, high = table.nyquist_min_per_mm[is_finite], table.nyquist_max_per_mm[is_finite]
+            part.fill_between(bin_centre_um[is_finite], low, high, color=line.get_color(), alpha=0.2, linewidth=0.0)
+            print(f"{name}: size {table.size_at_centre_um:.3g} µm + {table.growth_fraction:.4f} times the eccentricity")
     for part, title in zip(
-        axes[1:], ("foveal: median and range of sites and filters", "even: median of filters"), strict=True
+        axes[1:], ("foveal: median and range of sites and filters", "uniform: median of filters"), strict=True
     ):
-        part.set(
-            xlabel="distance from the middle (µm)", ylabel="Nyquist (line pairs per mm)", xscale="log", yscale="log"
-        )
+        part.set(xlabel="eccentricity (µm)", ylabel="Nyquist frequency (line pairs per mm)", xscale="log", yscale="log")
         part.set_title(title)
         part.legend(fontsize=8)
     save_figure(figure, out_dir / "19_mtf_and_nyquist.png", dpi=90)
 
-    # %% What becomes of a sine that is too fine.
+    # %% Aliasing of a sine above the Nyquist frequency.
     shown = layouts | {
         "hexagons": sensors["hexagons"],
         "sunflower": fs.layout.sunflower(n_sites=2500, spacing_um=PITCH_UM),
-        "Voronoi, even density": fs.layout.voronoi(n_sites=2500, size_um=(200.0, 200.0), seed=1),
+        "Voronoi, uniform density": fs.layout.voronoi(n_sites=2500, size_um=(200.0, 200.0), seed=1),
     }
     figure = Figure(figsize=(16, 10.2), layout="constrained")
-    false = {}
+    alias_ratio = {}
     for axes, (name, layout) in zip(figure.subplots(3, 5).ravel(), shown.items(), strict=True):
         points, alias = spectra(layout, is_foveal=is_foveal.get(name, False))
-        false[name] = alias.alias_fraction / alias.baseband_fraction
+        alias_ratio[name] = alias.alias_fraction / alias.baseband_fraction
         reach = points.frequency_per_mm[-1] / points.nyquist_per_mm
         axes.imshow(
             np.log10(points.power + 1e-9),
@@ -154,23 +152,25 @@ def main(out_dir: Path) -> None:
             vmin=-2.5,
             vmax=2.5,
         )
-        turn = np.linspace(0.0, 2.0 * np.pi, 100)
-        axes.plot(np.cos(turn), np.sin(turn), "-", color="w", linewidth=0.6)
+        angle = np.linspace(0.0, 2.0 * np.pi, 100)
+        axes.plot(np.cos(angle), np.sin(angle), "-", color="w", linewidth=0.6)
         axes.plot(*(alias.wave_per_mm / points.nyquist_per_mm), "+", color="c")
         axes.plot(*(alias.alias_per_mm / points.nyquist_per_mm), "x", color="lime")
-        axes.set_title(f"{name}\nalias {100.0 * false[name]:.0f} % of the sine", fontsize=10)
+        axes.set_title(f"{name}\nalias {100.0 * alias_ratio[name]:.0f} % of the sine", fontsize=10)
         axes.set(xticks=(-2, 0, 2), yticks=(-2, 0, 2))
     figure.suptitle(
-        "power of sampling points over frequencies in units of Nyquist's (circle): a sine (+) and its strongest alias (×)"
+        "power spectra of sampling points, frequencies in units of Nyquist (circle): a sine (+) and its strongest alias (×)"
     )
     save_figure(figure, out_dir / "19_sampling_spectra.png", dpi=70)
 
-    # %% The numbers.
-    for name in ("bayer_grid", "sunflower", "Voronoi, even density"):
-        print(f"{name}: {100.0 * false[name]:.1f} % of a sine at {TOO_FINE} Nyquist come back as one false sine")
+    # %% Checks.
+    for name in ("bayer_grid", "sunflower", "Voronoi, uniform density"):
+        print(
+            f"{name}: strongest alias {100.0 * alias_ratio[name]:.1f} % of a sine at {SINE_OVER_NYQUIST} times Nyquist"
+        )
     assert max(worst.values()) < 0.02
-    assert abs(false["pixirad_1"] - 1.0) < 0.01
-    assert false["Voronoi, even density"] < 0.4
+    assert abs(alias_ratio["pixirad_1"] - 1.0) < 0.01
+    assert alias_ratio["Voronoi, uniform density"] < 0.4
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
 """
-What do a rolling shutter, event pixels and spiking pixels make of a fan that turns?
+How do a rolling shutter, event pixels and spiking pixels record a rotating fan?
 
 New here: ``Camera.video`` and ``Camera.rates``, ``foveasim.video.FrameSource``, ``foveasim.modes``: ``EventPixels`` and
 ``SpikingPixels``.
 
-Expect: blades bent by a shutter whose lines begin 0.25 ms after each other, and a bar of 1.92 µm/ms that leans by 0.48 µm a
-line; events of brightening before every blade and of darkening behind it, on photosites of 0.7 to 6 µm, which tell the fan's
-5 turns a second to 1 %.
+Expect: blades distorted by a rolling shutter with a line time of 0.25 ms, and a bar at 1.92 µm/ms that is skewed by 0.48 µm per
+line; ON events at the leading edge of every blade and OFF events at its trailing edge, on photosites of 0.7 to 6 µm, which give
+the rotation rate of 5 turns per second within 1 %.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from foveasim.modes import EventPixels, SpikingPixels
 from foveasim.video import FrameSource
 from foveasim.view import save_figure
 
-#: The scene: pictures of 1 ms, which the lens makes 2.5 times smaller than their pixels of 2.4 µm.
+#: Scene: frames of 1 ms, with pixels of 2.4 µm that the lens demagnifies 2.5 times.
 N_SIDE, SCENE_PITCH_UM, DISTANCE_M, FOCAL_LENGTH_MM = 240, 2.4, 0.07, 20.0
 FRAME_S, N_FRAMES = 1e-3, 60
-TURNS_PER_S, N_BLADES, DARK = 5.0, 3, 0.1
+TURNS_PER_S, N_BLADES, BACKGROUND = 5.0, 3, 0.1
 BAR_PX_PER_FRAME, BAR_PX = 2.0, 16
 #: The sensors.
 N_LINES, PITCH_UM, LINE_S, EXPOSURE_S = 96, 2.0, 0.25e-3, 0.5e-3
@@ -38,27 +38,27 @@ SPIKE_E = 20_000.0
 
 
 def fan() -> Iterator[np.ndarray]:
-    """Pictures of bright blades, smooth over a pixel, that turn counter-clockwise."""
+    """Yield pictures of bright antialiased blades that rotate counter-clockwise."""
     x, y = np.meshgrid(*[np.arange(N_SIDE) - 0.5 * (N_SIDE - 1)] * 2)
-    radius, angle = np.hypot(x, y), np.arctan2(-y, x)  # the first row is on top
+    radius, angle = np.hypot(x, y), np.arctan2(-y, x)  # top row first
     for k in range(N_FRAMES):
-        turned = N_BLADES * (angle - 2.0 * np.pi * TURNS_PER_S * FRAME_S * k)
-        to_edge = radius * np.arcsin(np.sin(turned)) / N_BLADES
+        phase = N_BLADES * (angle - 2.0 * np.pi * TURNS_PER_S * FRAME_S * k)
+        to_edge = radius * np.arcsin(np.sin(phase)) / N_BLADES
         disc = np.clip(0.48 * N_SIDE - radius, 0.0, 1.0) * np.clip(radius - 6.0, 0.0, 1.0)
-        yield DARK + (1.0 - DARK) * np.clip(to_edge + 0.5, 0.0, 1.0) * disc
+        yield BACKGROUND + (1.0 - BACKGROUND) * np.clip(to_edge + 0.5, 0.0, 1.0) * disc
 
 
 def bar() -> Iterator[np.ndarray]:
-    """Pictures of an upright bar that goes to the right."""
+    """Yield pictures of a vertical bar that moves to the right."""
     for k in range(N_FRAMES):
-        picture = np.full((N_SIDE, N_SIDE), DARK)
+        picture = np.full((N_SIDE, N_SIDE), BACKGROUND)
         left = 40 + round(BAR_PX_PER_FRAME * k)
         picture[:, left : left + BAR_PX] = 1.0
         yield picture
 
 
-def footage(pictures: Iterator[np.ndarray]) -> FrameSource:
-    """The pictures as light."""
+def frame_source(pictures: Iterator[np.ndarray]) -> FrameSource:
+    """Return a frame source of the pictures."""
     return FrameSource(
         pictures,
         pitch_um=SCENE_PITCH_UM,
@@ -69,8 +69,8 @@ def footage(pictures: Iterator[np.ndarray]) -> FrameSource:
     )
 
 
-def sites(axes: Axes, layout: fs.Layout, values: np.ndarray, colours: str, limit: float, title: str) -> None:
-    """Draw every site in the colour of its value, from 0 or from the negative limit on."""
+def plot_sites(axes: Axes, layout: fs.Layout, values: np.ndarray, colours: str, limit: float, title: str) -> None:
+    """Plot values of sites on a scale from 0, or from the negative limit, to the limit."""
     low = -limit if values.min() < 0 else 0.0
     rings = np.split(layout.xy_um, layout.ring_offsets[1:-1])
     shapes = PolyCollection(rings, array=values, cmap=colours, edgecolors="face", linewidths=0.2)
@@ -81,29 +81,29 @@ def sites(axes: Axes, layout: fs.Layout, values: np.ndarray, colours: str, limit
 
 
 def main(out_dir: Path) -> None:
-    """Write the pictures to a folder."""
+    """Write the pictures to a directory."""
     optics = fs.Optics(focal_length_mm=FOCAL_LENGTH_MM, f_number=2.8)
 
-    # %% A sensor whose lines are read from the lowest up, and one exposure of it, through either shutter.
+    # %% A sensor read line by line, bottom line first, and one exposure with each shutter.
     grid = readout_by(fs.layout.grid(n_x=N_LINES, n_y=N_LINES, pitch_um=PITCH_UM), "column")
     camera = fs.Camera(optics=optics, sensor=fs.Sensor(grid, bits=12, capacitance_f=5e-15, read_noise_e=3.0))
     times = {"exposure_s": EXPOSURE_S, "seed": 1, "frame_s": FRAME_S, "every": N_FRAMES}
-    still = next(camera.video(footage(fan()), **times))
-    bent = next(camera.video(footage(fan()), **times, line_s=LINE_S, between="linear"))
-    leaning = next(camera.video(footage(bar()), **times, line_s=LINE_S))
+    global_shutter = next(camera.video(frame_source(fan()), **times))
+    rolling_shutter = next(camera.video(frame_source(fan()), **times, line_s=LINE_S, between="linear"))
+    skewed = next(camera.video(frame_source(bar()), **times, line_s=LINE_S))
 
-    # %% How far the bar leans from line to line.
-    light = np.maximum(leaning.expected_e.reshape(N_LINES, N_LINES) - 1.5 * np.median(leaning.expected_e), 0.0)
-    middle_um = light @ grid.centroid_um[:N_LINES, 0] / light.sum(axis=1)
-    lean_um = np.polyfit(np.arange(N_LINES), middle_um, 1)[0]
+    # %% Skew of the bar per line.
+    signal_e = np.maximum(skewed.expected_e.reshape(N_LINES, N_LINES) - 1.5 * np.median(skewed.expected_e), 0.0)
+    centroid_um = signal_e @ grid.centroid_um[:N_LINES, 0] / signal_e.sum(axis=1)
+    skew_um = np.polyfit(np.arange(N_LINES), centroid_um, 1)[0]
     cell_um = optics.magnification(DISTANCE_M) * SCENE_PITCH_UM
     expected_um = BAR_PX_PER_FRAME * cell_um / FRAME_S * LINE_S
-    print(f"the bar leans by {lean_um:.4f} µm a line, its speed times the time of a line is {expected_um:.4f} µm")
+    print(f"skew of the bar: {skew_um:.4f} µm per line; speed times line time: {expected_um:.4f} µm")
 
-    # %% The same fan on photosites that speak for themselves, on rings.
+    # %% The same fan on rings of event pixels and of spiking pixels.
     rings = fs.layout.log_polar(n_sectors=96, n_rings=36, r_min_um=10.0, r_max_um=100.0)
     foveal = fs.Camera(optics=optics, sensor=fs.Sensor(rings, dark_e_per_s=100.0))
-    rates = list(foveal.rates(footage(fan())))
+    rates = list(foveal.rates(frame_source(fan())))
     pixels = EventPixels(
         foveal.sensor,
         contrast_on=CONTRAST,
@@ -116,37 +116,46 @@ def main(out_dir: Path) -> None:
     events = pixels.events(rates, frame_s=FRAME_S, seed=2)
     spikes = SpikingPixels(foveal.sensor, threshold_e=SPIKE_E).events(rates, frame_s=FRAME_S, seed=3)
 
-    # %% The speed: that at which the events of brightening keep their angle to a blade best.
+    # %% Rotation rate with the highest phase coherence of ON events relative to the blades.
     angle = np.arctan2(rings.centroid_um[:, 1], rings.centroid_um[:, 0])
-    ups = events.polarity > 0
-    up_s, up_angle = events.t_s[ups], angle[events.site[ups]]
-    guesses = np.linspace(3.0, 7.0, 4001)
-    kept = [abs(np.exp(1j * N_BLADES * (up_angle - 2.0 * np.pi * guess * up_s)).sum()) for guess in guesses]
-    turns_per_s = guesses[int(np.argmax(kept))]
-    print(f"{len(events):,} events tell {turns_per_s:.3f} turns a second; {len(spikes):,} spikes")
+    is_on = events.polarity > 0
+    on_s, on_angle = events.t_s[is_on], angle[events.site[is_on]]
+    candidates = np.linspace(3.0, 7.0, 4001)
+    coherence = [
+        abs(np.exp(1j * N_BLADES * (on_angle - 2.0 * np.pi * candidate * on_s)).sum()) for candidate in candidates
+    ]
+    turns_per_s = candidates[int(np.argmax(coherence))]
+    print(f"{len(events):,} events: {turns_per_s:.3f} turns per second; {len(spikes):,} spikes")
 
-    # %% The picture.
+    # %% Figure.
     figure = Figure(figsize=(15, 9.4), layout="constrained")
     axes = figure.subplots(2, 3)
-    top = float(np.quantile(still.code, 0.999))
-    sites(axes[0, 0], grid, still.code, "gray", top, "global shutter")
-    sites(axes[0, 1], grid, bent.code, "gray", top, f"rolling shutter, {1e3 * LINE_S:g} ms a line, from below")
-    sites(axes[0, 2], grid, leaning.code, "gray", top, f"a bar that leans by {lean_um:.3f} µm a line")
+    max_dn = float(np.quantile(global_shutter.code, 0.999))
+    plot_sites(axes[0, 0], grid, global_shutter.code, "gray", max_dn, "global shutter")
+    plot_sites(
+        axes[0, 1],
+        grid,
+        rolling_shutter.code,
+        "gray",
+        max_dn,
+        f"rolling shutter, {1e3 * LINE_S:g} ms per line, bottom first",
+    )
+    plot_sites(axes[0, 2], grid, skewed.code, "gray", max_dn, f"moving bar, skew {skew_um:.3f} µm per line")
     last = events.between(FRAME_S * (N_FRAMES - 1) - 4e-3, FRAME_S * N_FRAMES)
     balance = (last.counts(polarity=1) - last.counts(polarity=-1)).astype(np.float64)
-    sites(axes[1, 0], rings, balance, "RdBu", 4.0, "events of the last 4 ms: brighter blue, darker red")
+    plot_sites(axes[1, 0], rings, balance, "RdBu", 4.0, "events of the last 4 ms: ON blue, OFF red")
     for polarity, colour in ((1, "tab:blue"), (-1, "tab:red")):
-        own = events.polarity == polarity
-        axes[1, 1].plot(1e3 * events.t_s[own], np.degrees(angle[events.site[own]]), ",", color=colour)
+        is_shown = events.polarity == polarity
+        axes[1, 1].plot(1e3 * events.t_s[is_shown], np.degrees(angle[events.site[is_shown]]), ",", color=colour)
     axes[1, 1].set(xlabel="time (ms)", ylabel="angle of the site (degrees)", ylim=(-180, 180))
-    axes[1, 1].set_title(f"{len(events):,} events: {turns_per_s:.3f} turns a second")
+    axes[1, 1].set_title(f"{len(events):,} events: {turns_per_s:.3f} turns per second")
     early = spikes.between(0.0, 4e-3)
     per_s = early.counts() / 4e-3
-    sites(axes[1, 2], rings, per_s, "gray", float(np.quantile(per_s, 0.99)), "spikes a second, of the first 4 ms")
+    plot_sites(axes[1, 2], rings, per_s, "gray", float(np.quantile(per_s, 0.99)), "spikes per second in the first 4 ms")
     save_figure(figure, out_dir / "20_events_and_rolling_shutter.png", dpi=80)
 
-    # %% The numbers.
-    assert np.isclose(lean_um, expected_um, rtol=0.01)
+    # %% Checks.
+    assert np.isclose(skew_um, expected_um, rtol=0.01)
     assert np.isclose(turns_per_s, TURNS_PER_S, rtol=0.01)
 
 

@@ -1,10 +1,10 @@
 """
-Which foveal sensor shows a photograph best for its number of photosites?
+Which foveal sensors give the best picture for their number of photosites?
 
-New here: ``foveasim.explore.study``: a search with two objectives and a constraint, which gives a Pareto front.
+New here: ``foveasim.explore.study``: a search with two objectives and a constraint, with a Pareto front.
 
-Expect: of 40 sensors about ten that no other beats in both; the blind spot of each of them leaves at least 92 % of the field to
-photosites, and the front rises: who has more photosites shows more.
+Expect: about ten of 40 sensors on the Pareto front, all with photosites on at least 92 % of the field; along the front, PSNR
+increases with the number of photosites.
 """
 
 from __future__ import annotations
@@ -41,70 +41,70 @@ SHOT = {
     "exposure_s": 0.01,
 }
 N_TRIALS = 40
-LEAST_SEEING_FRACTION = 0.92
+MIN_COVERED_FRACTION = 0.92
 
 
-def seeing_fraction(_shot: Shot, _camera: fs.Camera, capture: fs.Capture) -> float:
-    """Fraction of the round field that is photosites."""
+def covered_fraction(_shot: Shot, _camera: fs.Camera, capture: fs.Capture) -> float:
+    """Return the fraction of the circular field that photosites cover."""
     return float(capture.layout.area_um2.sum()) / (np.pi * FIELD_RADIUS_UM**2)
 
 
 def main(out_dir: Path) -> None:
-    """Write the study and its picture to a folder."""
-    # %% Sectors and the smallest pixel: the blind spot grows with both.
-    found = study(
+    """Write the study and its figure to a directory."""
+    # %% Search over sectors and minimum pixel size; the blind spot grows with both.
+    result = study(
         SHOT,
         {
             "layout.parameters.n_sectors": {"from": 32, "to": 192, "step": 4},
             "layout.parameters.min_size_um": {"from": 0.5, "to": 4.0, "spacing": "geometric"},
         },
         {"psnr_db": "maximize", "n_sites": "minimize"},
-        constraints={"seeing_fraction": (LEAST_SEEING_FRACTION, None)},
-        metrics={**{name: METRICS[name] for name in ("psnr_db", "n_sites")}, "seeing_fraction": seeing_fraction},
+        constraints={"covered_fraction": (MIN_COVERED_FRACTION, None)},
+        metrics={**{name: METRICS[name] for name in ("psnr_db", "n_sites")}, "covered_fraction": covered_fraction},
         n_trials=N_TRIALS,
         seed=1,
         storage=out_dir / "22_study.db",
     )
-    trials = [trial for trial in found.trials if trial.values]
-    front = sorted(found.best_trials, key=lambda trial: trial.values[1])
+    trials = [trial for trial in result.trials if trial.values]
+    front = sorted(result.best_trials, key=lambda trial: trial.values[1])
 
-    # %% All of them, and the front.
+    # %% All trials, and the Pareto front.
     figure = Figure(figsize=(7.6, 5.0), layout="constrained")
     ax = figure.subplots()
-    is_allowed = np.array([trial.user_attrs["seeing_fraction"] >= LEAST_SEEING_FRACTION for trial in trials])
+    is_feasible = np.array([trial.user_attrs["covered_fraction"] >= MIN_COVERED_FRACTION for trial in trials])
     psnr_db, n_sites = np.array([trial.values for trial in trials]).T
     size_um = np.array([trial.params["layout.parameters.min_size_um"] for trial in trials])
-    ax.plot(n_sites[~is_allowed], psnr_db[~is_allowed], "x", color="0.6", label="blind spot too large")
+    ax.plot(n_sites[~is_feasible], psnr_db[~is_feasible], "x", color="0.6", label="blind spot too large")
     ax.plot(
         [trial.values[1] for trial in front],
         [trial.values[0] for trial in front],
         color="black",
         linewidth=1,
-        label="front",
+        label="Pareto front",
     )
-    dots = ax.scatter(
-        n_sites[is_allowed],
-        psnr_db[is_allowed],
-        c=size_um[is_allowed],
+    points = ax.scatter(
+        n_sites[is_feasible],
+        psnr_db[is_feasible],
+        c=size_um[is_feasible],
         norm=mpl.colors.LogNorm(0.5, 4.0),
         zorder=3,
-        label="allowed",
+        label="feasible",
     )
-    bar = figure.colorbar(dots, ax=ax, label="smallest pixel / µm")
-    bar.ax.set_yticks([0.5, 1, 2, 4], ["0.5", "1", "2", "4"])
-    bar.ax.set_yticks([], minor=True)
-    ax.set(xscale="log", xlabel="photosites", ylabel="PSNR against the light behind the lens / dB")
+    colour_bar = figure.colorbar(points, ax=ax, label="smallest pixel / µm")
+    colour_bar.ax.set_yticks([0.5, 1, 2, 4], ["0.5", "1", "2", "4"])
+    colour_bar.ax.set_yticks([], minor=True)
+    ax.set(xscale="log", xlabel="photosites", ylabel="PSNR relative to the optical image / dB")
     ax.grid(color="0.9")
     ax.legend(frameon=False)
     save_figure(figure, out_dir / "22_study.png", dpi=110)
 
-    # %% The numbers.
+    # %% Checks.
     for trial in front:
         settings = ", ".join(f"{path.rpartition('.')[2]} {value:.3g}" for path, value in trial.params.items())
         print(f"{trial.values[1]:7,.0f} photosites, {trial.values[0]:.1f} dB: {settings}")
     assert len(trials) == N_TRIALS
     assert 7 <= len(front) <= 14
-    assert all(trial.user_attrs["seeing_fraction"] >= LEAST_SEEING_FRACTION for trial in front)
+    assert all(trial.user_attrs["covered_fraction"] >= MIN_COVERED_FRACTION for trial in front)
     assert all(np.diff([trial.values[0] for trial in front]) > 0.0)
 
 

@@ -1,11 +1,11 @@
 """
-What do networks learn from that are to mind neither the camera nor its noise?
+How are datasets for networks generated that are robust to the camera or to its noise?
 
 New here: ``foveasim.explore.classification`` and ``denoising``, ``Dataset``, ``write_dataset``.
 
-Expect: one photograph as 8 cameras drawn at random take it, each sample with its class and the sites of its box; noisy captures
-at three exposures beside the mean code that they are noisy about, whose mean squared distance is the variance that the sensor
-predicts, within 3 %.
+Expect: one photograph through 8 random cameras, each sample with its class and the sites in its bounding box; noisy captures at
+three exposures with their expected codes, and a mean squared error that agrees with the variance predicted by the sensor within
+3 %.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SHOT = {
     "sensor": {"qe": 0.6, "filters": "rgb", "capacitance_f": {"per_um2": 1e-16}, "v_sat_v": 1.0, "bits": 10},
     "exposure_s": 0.02,
 }
-#: Layouts that samples may have: any that come with the package, or that settings describe.
+#: Layouts of the samples: names of bundled layouts, or settings.
 LAYOUTS = [
     "foveal_blind_spot",
     {
@@ -45,34 +45,34 @@ LAYOUTS = [
     },
     {"generator": "grid", "parameters": {"n_x": 100, "n_y": 100, "pitch_um": 12.5}, "mosaic": ["RG", "GB"]},
 ]
-#: Fewer of them for the other dataset: means of few electrons take longer to compute than captures.
+#: Fewer sites for denoising: expected codes of few electrons take longer to compute than captures.
 HEXAGONS = {
     "generator": "hexagonal",
     "parameters": {"n_columns": 76, "n_rows": 88, "pitch_um": 17.3},
     "mosaic": ["RG", "GB"],
 }
-#: For a denoiser: hundreds of electrons fill the codes.
+#: Settings for denoising: hundreds of electrons give the highest code.
 DIM = {"exposure_s": 2e-4, "sensor.capacitance_f": {"per_um2": 1e-18}, "layout": HEXAGONS}
-#: The face in the photograph, in its pixels from the upper left corner, and its class.
+#: Bounding box of the face, in pixels from the upper left corner, and its class.
 FACE_PX, FACE = [170, 50, 280, 200], 1
 N_CAMERAS, N_DRAWS = 8, 4
-#: Of the pictures: their side, and what is where no photosite is.
+#: Side of the pictures in pixels, and the grey level of regions without photosites.
 PICTURE_PIXELS, GREY = 300, 60.0
 
 
-def shown(capture: Capture, white_dn: float | None = None) -> NDArray[np.uint8]:
-    """A capture's picture over grey, its codes or up to a highest one."""
-    share = 1.0 if white_dn is None else white_dn / capture.white_dn.max()
-    image = capture.picture(max_pixels=PICTURE_PIXELS).to_image(share * capture.white_dn, encode_srgb=True)
+def picture_on_grey(capture: Capture, white_dn: float | None = None) -> NDArray[np.uint8]:
+    """Return the picture of a capture over grey, optionally with a white level."""
+    scale = 1.0 if white_dn is None else white_dn / capture.white_dn.max()
+    image = capture.picture(max_pixels=PICTURE_PIXELS).to_image(scale * capture.white_dn, encode_srgb=True)
     cover = image[..., -1:] / 255.0
     return np.rint(image[..., :-1] * cover + GREY * (1.0 - cover)).astype(np.uint8)
 
 
 def main(out_dir: Path) -> None:
-    """Write samples of both datasets to a folder."""
+    """Write samples of both datasets to a directory."""
     photograph = skimage.data.astronaut()
 
-    # %% For a classifier: the same class, whatever the layout, the lens, the exposure and the electronics.
+    # %% Classification: the same class for all layouts, lenses, exposures and electronics.
     data = explore.classification(
         [photograph],
         SHOT,
@@ -87,20 +87,20 @@ def main(out_dir: Path) -> None:
     for k, axes in enumerate(figure.subplots(2, N_CAMERAS // 2).ravel()):
         sample, capture = data[k], data.capture(k)
         x0, y0, x1, y1 = capture.layout.bounds_um
-        axes.imshow(shown(capture), extent=(x0, x1, y0, y1))
+        axes.imshow(picture_on_grey(capture), extent=(x0, x1, y0, y1))
         left, low, right, high = sample["box_um"][0]
         axes.plot([left, right, right, left, left], [low, low, high, high, low], color="yellow", linewidth=0.8)
         drawn = sample["settings"]
         axes.set_title(
             f"f/{drawn['optics.f_number']:.1f}, {1e3 * drawn['exposure_s']:.0f} ms, "
             f"{drawn['sensor.read_noise_e']:.1f} e- read noise, {drawn['sensor.bits']} bits\n"
-            f"{capture.layout.n_sites:,} sites, {sample['box_covers'][0].sum():,} of the face",
+            f"{capture.layout.n_sites:,} sites, {sample['box_covers'][0].sum():,} on the face",
             fontsize=9,
         )
         axes.set_axis_off()
     save_figure(figure, out_dir / "23_random_cameras.png", dpi=75)
 
-    # %% For a denoiser: draws of the noise, and the mean of all draws, computed.
+    # %% Denoising: noise realisations, and their mean, computed analytically.
     noisy = explore.denoising([photograph], SHOT, cameras=3, draws=N_DRAWS, fit="cover", changes=DIM)
     figure = Figure(figsize=(11, 7.6), layout="constrained")
     ratios = []
@@ -111,23 +111,23 @@ def main(out_dir: Path) -> None:
         errors_dn = [sample["code"] - sample["expected_dn"] for sample in samples]
         ratios.append(float(np.mean(np.square(errors_dn)) / variance_dn2.mean()))
         drawn = samples[0]["settings"]
-        print(f"{1e6 * drawn['exposure_s']:.0f} µs: mean squared distance over the variance {ratios[-1]:.4f}")
+        print(f"{1e6 * drawn['exposure_s']:.0f} µs: mean squared error / predicted variance {ratios[-1]:.4f}")
         titles = (
             f"code: {1e6 * drawn['exposure_s']:.0f} µs, {drawn['sensor.read_noise_e']:.1f} e- read noise",
-            f"its expectation, {np.sqrt(np.mean(np.square(errors_dn))):.1f} DN away",
+            f"expected code, rms error {np.sqrt(np.mean(np.square(errors_dn))):.1f} DN",
         )
         mean_dn = samples[0]["expected_dn"]
         target = replace(capture, code=np.rint(mean_dn).astype(capture.code.dtype))
-        for part, one, title in zip(axes, (capture, target), titles, strict=True):
-            part.imshow(shown(one, float(np.percentile(mean_dn, 99.0))))
+        for part, plotted, title in zip(axes, (capture, target), titles, strict=True):
+            part.imshow(picture_on_grey(plotted, float(np.percentile(mean_dn, 99.0))))
             part.set_title(title, fontsize=9)
             part.set_axis_off()
     save_figure(figure, out_dir / "23_denoising.png", dpi=75)
 
-    # %% Written shard by shard, and read back.
-    with tempfile.TemporaryDirectory() as folder:
-        stored = explore.write_dataset(noisy, Path(folder) / "noisy")
-        print(stored, "of seed", stored.about["plan"]["seed"])
+    # %% Write the dataset in shards, and read it back.
+    with tempfile.TemporaryDirectory() as directory:
+        stored = explore.write_dataset(noisy, Path(directory) / "noisy")
+        print(stored, "with seed", stored.about["plan"]["seed"])
         assert np.array_equal(stored[7]["code"], noisy[7]["code"])
     assert max(abs(ratio - 1.0) for ratio in ratios) < 0.03
 

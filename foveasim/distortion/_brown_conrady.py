@@ -193,7 +193,9 @@ class BrownConrady(LensBase):
         k = np.array([self.k1, self.k2, self.k3, self.k4, self.k5, self.k6])
         inverse = _kernels.brown_conrady_inverse
         pieces = [points[i : i + POINTS_PER_PIECE] for i in range(0, max(len(points), 1), POINTS_PER_PIECE)]
-        found = parallel_map(lambda p: inverse(p, k, self.p1, self.p2, self._fold, *self._ideal), pieces, thread_count())
+        found = parallel_map(
+            lambda p: inverse(p, k, self.p1, self.p2, self._fold, *self._ideal), pieces, thread_count()
+        )
         return np.concatenate(found) if len(found) > 1 else np.asarray(found[0])
 
     @cached_property

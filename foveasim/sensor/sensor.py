@@ -526,7 +526,9 @@ class Sensor:
 
     @cached_property
     def _before_exposure(self) -> tuple[Step, ...]:
-        return merge_steps((Factor(self.sensitivity), *self._effects_at("photo"), Offset(self.dark_rate_e_per_s)), self.sites)
+        return merge_steps(
+            (Factor(self.sensitivity), *self._effects_at("photo"), Offset(self.dark_rate_e_per_s)), self.sites
+        )
 
     @cached_property
     def _after_collection(self) -> tuple[Step, ...]:
