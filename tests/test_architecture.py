@@ -46,8 +46,8 @@ DIMENSIONLESS = {
 }  # fmt: skip
 #: Names in private functions, in cells, pitches or steps as their docstrings specify.
 INTERNAL = {
-    "axes", "bend", "beside", "blur_cells", "blur_lambda_n", "bound", "columns", "corners", "curve", "cycles", "diagonal", "edge", "enough", "extent", "fade", "fraction", "fractions", "from_step", "function", "gradient", "height", "inl", "mean", "measure",
-    "n_across", "moments", "new_radius", "per_step", "pixel", "plane", "points", "quantiles", "r2", "radius", "right", "rows", "s_x", "s_y", "scale", "screen", "share", "side", "shares", "slope", "spread", "start", "tables_at",
+    "axes", "blur_cells", "blur_lambda_n", "bound", "columns", "corners", "curve", "cycles", "diagonal", "edge", "extent", "fraction", "fractions", "from_step", "function", "gradient", "height", "inl", "mean", "measure",
+    "n_across", "moments", "new_radius", "off_diagonal", "per_step", "pixel", "plane", "points", "quantiles", "r2", "radius", "right", "rows", "s_x", "s_y", "scale", "screen", "side", "slope", "spread", "start", "tables_at",
     "tangent2_x", "tangent2_y", "threshold", "to_step", "transform", "upper", "x", "x2", "xy", "y", "y2",
 }  # fmt: skip
 FLOATING = re.compile(r"\b(float|Floats|PerSite)\b")

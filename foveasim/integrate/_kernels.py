@@ -375,7 +375,7 @@ def measure_sites(xy, ring_offsets, site_offsets):
 )
 def count_pieces(xy, ring_offsets, first, step, pieces_per_length, max_pieces):
     """
-    Return the number of pieces of the edge after each vertex, (n,), from 1 to ``max_pieces``.
+    Return the number of pieces of the edge after each vertex, 1 to ``max_pieces``, (n,).
 
     The number is the length of the edge times the piece density at its midpoint. The density (n_y, n_x) is sampled at the
     nearest point of a grid that starts at ``first`` with steps of ``step`` (x, y).

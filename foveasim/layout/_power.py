@@ -26,7 +26,7 @@ MIN_MOVE_FRACTION = 0.01
 
 
 def auxiliary_points_um(low_um: Floats, high_um: Floats) -> Floats:
-    """Return auxiliary points (N_AUXILIARY, 2) on a circle around a box, relative to its centre."""
+    """Return auxiliary points (N_AUXILIARY, 2) on a circle around a box."""
     angle_rad = 2.0 * math.pi * (np.arange(N_AUXILIARY) + 0.5) / N_AUXILIARY
     return (
         AUXILIARY_RADII

@@ -196,10 +196,11 @@ def emva1288(
     mean_dn, variance_dn2 = above_dark(transfer, dark_transfer)
     level_ph = _photons(photons, groups, len(frames))
     i_saturation, i_class = transfer.saturation_level, np.arange(transfer.classes.size)
-    if np.any(i_saturation == len(frames) - 1):
+    n_at_end = np.count_nonzero(i_saturation == len(frames) - 1)
+    if n_at_end:
         warnings.warn(
-            f"the variance is highest at the last level for {np.count_nonzero(i_saturation == len(frames) - 1)} of {i_saturation.size} classes: "
-            "saturation is not reached and is underestimated; add levels of higher irradiance",
+            f"the variance is highest at the last level for {n_at_end} of {i_saturation.size} classes: saturation is not "
+            "reached and is underestimated; add levels of higher irradiance",
             FoveasimWarning,
             stacklevel=2,
         )

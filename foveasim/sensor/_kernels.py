@@ -169,7 +169,7 @@ def _apply_nonlinearity(v, nonlinearity, v_sat_v):
 
 @njit(types.void(types.float64[::1], types.float64, types.float64), error_model="numpy")
 def apply_nonlinearity(voltage_v, nonlinearity, v_sat_v):
-    """Apply the nonlinearity in place; ``nonlinearity`` is the relative signal loss at full range."""
+    """Apply the nonlinearity, the relative signal loss at full range, in place."""
     for i in range(voltage_v.size):
         voltage_v[i] = _apply_nonlinearity(voltage_v[i], nonlinearity, v_sat_v)
 
@@ -190,7 +190,7 @@ def _add_inl(value, n_codes, inl):
 
 @njit(inline="always")
 def _unquantised_code(charge, site, adc):
-    """Return the unquantised code; ``site`` is (v_per_e, sense_v, scale, output_v, nonlinearity)."""
+    """Return the code of a charge before quantisation; ``site``: transfer parameters."""
     per_e, sense_v, scale, output_v, nonlinearity = site
     v = _apply_nonlinearity(charge * per_e + sense_v, nonlinearity, adc.v_sat_v) * scale + output_v
     value = _compand(_relative_voltage(v, adc.v_sat_v), adc) * adc.n_codes
