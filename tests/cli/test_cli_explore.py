@@ -25,7 +25,7 @@ from foveasim.errors import ConfigError, FileError
 from foveasim.explore import _records
 from foveasim.explore._records import Journal, Record
 from foveasim.explore.datasets.label_files import match_label_files, read_boxes, read_labels
-from foveasim.explore.studies.plan import _suggested
+from foveasim.explore.studies.plan import _suggest
 from foveasim.explore.worker_cache import ShotRunner
 
 GALLERY = Path(__file__).parents[2] / "gallery" / "sweeps"
@@ -295,7 +295,7 @@ def test_study_file_equals_call(folder):
 )
 def test_range_suggests_its_steps_only(where, possible):
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
-    found = [_suggested(study.ask(), "x", where) for _ in range(60)]
+    found = [_suggest(study.ask(), "x", where) for _ in range(60)]
 
     if isinstance(where, list):
         assert {json.dumps(value) for value in found} == possible

@@ -34,7 +34,7 @@ from foveasim.errors import ConfigError, CoverageWarning, FileError, FoveasimWar
 from foveasim.explore.datasets import store
 from foveasim.explore.datasets.labels import boxes_on_sites, flow_on_sites, mask_on_sites
 from foveasim.explore.datasets.pictures import source_of
-from foveasim.explore.datasets.pytorch import _kind
+from foveasim.explore.datasets.pytorch import _dataset_class
 
 SHOT = {
     "scene": {
@@ -1248,7 +1248,7 @@ def test_classification_draws_cameras_around_shot():
 
 def test_missing_torch_gives_install_hint(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
-    _kind.cache_clear()
+    _dataset_class.cache_clear()
     with pytest.raises(ParameterError, match=r"needs torch; install it with: pip install 'foveasim\[learn\]'"):
         explore.torch_dataset(labelled(1))
 
