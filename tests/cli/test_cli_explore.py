@@ -246,11 +246,11 @@ def test_study_without_valid_trial_exits_with_1(foveasim, folder):
     assert code == 1
     assert "3 of 3 trials failed; the first: " in wrong
     assert "exposure_s: must be >= 0, got -" in wrong
-    assert wrong.splitlines()[-1] == "no trial in a.db is good: all failed"
+    assert wrong.splitlines()[-1] == "no valid trial in a.db: all failed"
 
     code, _, wrong = foveasim("study", "beyond.yaml", "-o", "b.db")
 
-    assert (code, wrong) == (1, "no trial in b.db is good: those that did not fail are beyond the limits\n")
+    assert (code, wrong) == (1, "no valid trial in b.db: all others violate the limits\n")
 
 
 def test_failed_trials_are_reported(foveasim, folder):
@@ -355,7 +355,7 @@ BAD_STUDIES = [
     ({"search": {"sensor.bitz": [8]}}, "bad.yaml: with shot.yaml: sensor.bitz: no such setting"),
     ({"search": {}}, "bad.yaml: 'search' must be a non-empty mapping of setting paths to ranges"),
     ({"search": {"sensor.bits": []}}, "bad.yaml: 'sensor.bits' must be searched in"),
-    ({"search": {"sensor.bits": {"from": 8}}}, "bad.yaml: search.sensor.bits.to: is missing"),
+    ({"search": {"sensor.bits": {"from": 8}}}, "bad.yaml: search.sensor.bits.to: missing"),
     (
         {"search": {"sensor.bits": {"from": 12, "to": 8}}},
         "'sensor.bits' must have two finite bounds in ascending order",

@@ -428,7 +428,7 @@ def test_site_density_follows_picture(tmp_path, picture_file):
         ),
         (
             "{n_sites: 9, density: where.png, size_um: [9.0, 9.0]}",
-            "density: has 64 x 32 pixels, which do not fit 'size_um'",
+            "density: must have the aspect ratio of 'size_um', 9 x 9 µm, got 64 x 32 pixels",
         ),
         ("{n_sites: 9, density: gone.png, size_um: [9.0, 9.0]}", "gone.png: no such file"),
         (
