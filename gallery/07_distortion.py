@@ -5,8 +5,8 @@ New here: ``Camera(distortion=)``, a shot from a settings file (``mobius_distort
 ``conserve="density"``, ``fs.distortion.distort_map``.
 
 Expect: a checkerboard with barrel distortion, and with brighter corners, since the lens demagnifies them; point images,
-displaced by up to 90 pixels, within an eighth of a pixel of their positions in the lens model (limited by undersampling); an
-upright F; undistorted outlines and a warped map that agree within 1.5 % of the brightest site; a power deficit of 41 % in the
+displaced by up to 90 pixels, within 0.15 pixels of their positions in the lens model (limited by undersampling); an upright
+F; undistorted outlines and a warped map that agree within 1.5 % of the brightest site; a power deficit of 41 % in the
 corners of a picture that is warped without regard to areas.
 """
 
