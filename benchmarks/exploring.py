@@ -1,5 +1,5 @@
 """
-What the executor of sweeps adds to the work itself: its time per task with many workers, and dask's own queue beside it.
+Overhead of the executor of sweeps per task with many workers, compared with dask's own queue.
 
     python benchmarks/exploring.py             3,000 tasks; 40 layouts of 4 bit depths on 2 workers
     python benchmarks/exploring.py --quick     10 layouts
@@ -43,7 +43,7 @@ console = Console(width=130)
 
 
 class _InstantClient:
-    """A dask client of n workers whose tasks take no time: what remains is the executor's own work."""
+    """A dask client of n workers whose tasks take no time, to measure the executor alone."""
 
     cluster = None
 
@@ -87,7 +87,7 @@ def _dispatch(n_workers: int) -> Callable[[], object]:
 
 
 def bench_exploring(report: Report, n_layouts: int) -> None:
-    """Measure the executor against itself with fewer workers, and against dask's own queue."""
+    """Compare the executor with fewer workers, and with dask's own queue."""
     largest, executor_module.MAX_ITEMS = executor_module.MAX_ITEMS, 1
     try:
         times = best_s({"10": _dispatch(10), "1000": _dispatch(1000)}, N_REPEATS)

@@ -1,4 +1,4 @@
-"""What layouts cost: making, neighbours, rules and files, in seconds for a million sites and as ratios to peers."""
+"""Layouts: generation, adjacency, design rules and files, in seconds for 10^6 sites and as ratios to other libraries."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from report import Report, best_s
 
 from foveasim.layout import DesignRules, Layout, Readout, Routing, hexagonal, log_polar, read_layout
 
-#: Sites that the peers are given: the slowest takes a millisecond for each.
+#: Sites for other libraries: the slowest takes 1 ms per site.
 PEER_SITES, SLOW_PEER_SITES = 100_000, 5_000
 DBU_UM = 1e-3
 
 
 def bench_layouts(report: Report, n_sites: int) -> None:
-    """Time the layout room on hexagons and rings of so many sites."""
+    """Measure ``foveasim.layout`` on hexagons and log-polar rings of ``n_sites``."""
     side = round(n_sites**0.5)
     hexagons = hexagonal(n_columns=side, n_rows=side, pitch_um=3.0)
     rings = log_polar(n_sectors=side, n_rings=side, r_min_um=1000.0, r_max_um=6500.0)
@@ -30,7 +30,7 @@ def bench_layouts(report: Report, n_sites: int) -> None:
 
 
 def every_rule(layout: Layout, **changes: Any) -> DesignRules:
-    """Limits for every rule, all but the gaps kept by hexagons and rings of these sizes."""
+    """Return limits for every rule; the layouts satisfy all but those of gaps."""
     x0, y0, x1, y1 = layout.bounds_um
     limits: dict[str, Any] = {
         "min_size_um": 0.1, "max_size_um": 1e3, "min_area_um2": 0.1, "min_hole_um2": 0.1, "min_width_um": 0.1,
@@ -48,7 +48,7 @@ def every_rule(layout: Layout, **changes: Any) -> DesignRules:
 
 def _seconds(report: Report, side: int, hexagons: Layout, rings: Layout) -> None:
     n = f"{side * side:,}"
-    # Kernels compile at their first use.
+    # The first call compiles kernels.
     small = hexagons[:100]
     small.adjacency()
     small.check(every_rule(small))
@@ -74,7 +74,7 @@ def _seconds(report: Report, side: int, hexagons: Layout, rings: Layout) -> None
 
 
 def _fresh(layout: Layout) -> Layout:
-    """The layout without what it has computed already."""
+    """Return a copy of the layout without cached properties."""
     return Layout(layout.xy_um, layout.ring_offsets, layout.site_offsets, layout.columns)
 
 
@@ -92,12 +92,12 @@ def _against_klayout(report: Report, layout: Layout) -> None:
         },
         3,
     )
-    report.faster_than(f"rule of width, {n}", times["width"], "klayout width_check", times["k width"], 1)
-    report.faster_than(f"rule of space, {n}", times["space"], "klayout space_check", times["k space"], 1)
+    report.faster_than(f"minimum width, {n}", times["width"], "klayout width_check", times["k width"], 1)
+    report.faster_than(f"minimum space, {n}", times["space"], "klayout space_check", times["k space"], 1)
 
 
 def _against_loops(report: Report, apart: Layout, abutting: Layout) -> None:
-    """Compare with what one writes first: a loop over shapely polygons."""
+    """Compare with loops over shapely polygons."""
 
     def adjacency_by_loop() -> float:
         polygons = abutting.polygons()
@@ -139,4 +139,4 @@ def _against_loops(report: Report, apart: Layout, abutting: Layout) -> None:
         f"hexagonal, {side * side:,} sites", times["make"], "loop of shapely.Polygon", times["make loop"], 10
     )
     report.faster_than(f"adjacency, {n}", times["adjacency"], "loop over shapely", times["adjacency loop"], 10)
-    report.faster_than(f"rule of space, {n}", times["space"], "loop over shapely", times["space loop"], 10)
+    report.faster_than(f"minimum space, {n}", times["space"], "loop over shapely", times["space loop"], 10)

@@ -1,5 +1,5 @@
 """
-What samples for learning cost: cameras simulated on the fly, beside a loader that only reads and resizes the same pictures.
+Samples for learning: cameras simulated on demand, compared with a loader that reads and resizes the same pictures.
 
     python benchmarks/learning.py             1,000 samples of 50 photographs, with 0 and 2 workers where torch is installed
     python benchmarks/learning.py --quick     100 samples
@@ -45,7 +45,7 @@ console = Console(width=130)
 
 
 class PlainPictures:
-    """What a loader of pictures does: read, turn into RGB, resize, and tell the class."""
+    """A loader of pictures: read, convert to RGB, resize, return the class."""
 
     def __init__(self, paths: Sequence[Path], n: int) -> None:
         self.paths, self.n = paths, n
@@ -62,7 +62,7 @@ class PlainPictures:
 
 
 def bench_learning(report: Report, n_samples: int) -> None:
-    """Take all samples with 0 and 2 workers, see that they are the same, and time them beside plain pictures."""
+    """Compute all samples with 0 and 2 workers, check that they are equal, and compare with plain pictures."""
     with tempfile.TemporaryDirectory() as folder:
         paths = _photographs(Path(folder))
         data = explore.classification(
@@ -70,12 +70,14 @@ def bench_learning(report: Report, n_samples: int) -> None:
         )
         data[0]  # compiles the kernels
         has_torch = importlib.util.find_spec("torch") is not None
-        told: dict[str, set[str]] = {}
+        digests_of: dict[str, set[str]] = {}
         for n_workers in (0, 2) if has_torch else (0,):
             took = {}
             for name, samples in (("cameras", data), ("pictures", PlainPictures(paths, len(data)))):
                 begin = time.perf_counter()
-                told.setdefault(name, set()).add(_digest(_loaded(samples, n_workers) if has_torch else iter(samples)))
+                digests_of.setdefault(name, set()).add(
+                    _digest(_loaded(samples, n_workers) if has_torch else iter(samples))
+                )
                 took[name] = (time.perf_counter() - begin) / len(data)
             console.print(
                 f"{len(data):,} samples, {n_workers} workers: {1 / took['cameras']:.0f} a second through cameras drawn at "
@@ -87,11 +89,11 @@ def bench_learning(report: Report, n_samples: int) -> None:
                 "a plain picture",
                 took["pictures"],
             )
-        assert all(len(digests) == 1 for digests in told.values()), "samples differ with the number of workers"
+        assert all(len(digests) == 1 for digests in digests_of.values()), "samples differ with the number of workers"
 
 
 def _photographs(folder: Path) -> list[Path]:
-    """Crops of photographs as JPEG files."""
+    """Write crops of photographs as JPEG files."""
     rng = np.random.default_rng(0)
     sources = [skimage.data.astronaut(), skimage.data.coffee(), skimage.data.chelsea()]
     paths = []
@@ -110,7 +112,7 @@ def _loaded(samples: Any, n_workers: int) -> Iterator[Any]:
 
 
 def _digest(batches: Iterator[Any]) -> str:
-    """Of all codes, in their order."""
+    """Return the digest of all codes, in order."""
     digest = hashlib.sha256()
     for batch in batches:
         digest.update(np.ascontiguousarray(batch["code"]).tobytes())
@@ -119,7 +121,7 @@ def _digest(batches: Iterator[Any]) -> str:
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description="Datasets: samples a second beside plain pictures.")
+    parser = argparse.ArgumentParser(description="Datasets: samples per second, compared with plain pictures.")
     parser.add_argument("--quick", action="store_true", help="100 samples")
     options = parser.parse_args()
     report = Report(is_judged=False)

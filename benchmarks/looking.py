@@ -1,4 +1,4 @@
-"""What looking costs: pictures of many photosites beside matplotlib's collections and PyVista as it comes."""
+"""Views: pictures of many photosites, compared with matplotlib's collections and PyVista's defaults."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from report import Report, best_s
 import foveasim as fs
 from foveasim import view
 
-#: Largest times for a first picture, kernels compiled: 200,000 sites, a million, columns of 200,000.
+#: Bounds for a first picture with compiled kernels: 200,000 sites, 10^6 sites, prisms of 200,000 sites.
 PICTURE_S, LARGE_PICTURE_S, COLUMNS_S = 0.5, 1.5, 3.0
 
 
 def sunflower_of(n_sites: int) -> tuple[fs.Layout, np.ndarray]:
-    """A Voronoi layout, six sides to a site on average, and a value for each site."""
+    """Return a Voronoi layout with six edges per site on average, and a value for each site."""
     layout = fs.layout.sunflower(n_sites=n_sites, spacing_um=1.0)
     return layout, np.random.default_rng(0).random(layout.n_sites)
 
 
 def bench_looking(report: Report, n_sites: int) -> None:
-    """Draw a layout in two and in three dimensions, to a file, and the same with the libraries' own means."""
+    """Draw a layout in 2D and 3D to a file, and compare with the libraries' defaults."""
     with TemporaryDirectory() as folder:
         _bench_flat(report, n_sites, Path(folder) / "picture.png")
         _bench_columns(report, n_sites // 5, Path(folder) / "picture.png")
@@ -72,6 +72,6 @@ def _bench_columns(report: Report, n_sites: int, path: Path) -> None:
     times = best_s(calls, 2)
     if renderer:
         what = f"a picture of {n_sites:,} columns"
-        report.faster_than(what, times["ours"], "PyVista as it comes, of equal height", times["defaults"])
+        report.faster_than(what, times["ours"], "PyVista's default, equal heights", times["defaults"])
         report.add("the same", f"{times['ours']:.3g} s", "seconds", "", times["ours"], COLUMNS_S)
         report.slower_than("the same without OpenGL", times["software"], "with it", times["ours"])

@@ -34,7 +34,7 @@ LAYOUTS = {
 
 
 def captured(layout: fs.Layout, scene: fs.Scene) -> tuple[fs.Camera, fs.Capture]:
-    """A capture whose brightest site is at 90 % of the range."""
+    """Return a capture with the brightest site at 90 % of the range."""
     optics = fs.Optics(focal_length_mm=8.0, f_number=4.0)
     plain = fs.Sensor(layout, qe=0.6)
     trial = fs.Camera(optics=optics, sensor=plain).capture(scene, exposure_s=EXPOSURE_S, seed=0)
@@ -47,7 +47,7 @@ def captured(layout: fs.Layout, scene: fs.Scene) -> tuple[fs.Camera, fs.Capture]
 
 def main() -> None:
     """Print the table."""
-    table = Table(title="PSNR in dB, SSIM, seconds, against the light on the sensor")
+    table = Table(title="PSNR in dB, SSIM, seconds; reference: irradiance on the sensor")
     for heading in ("layout", "photograph", *METHODS):
         table.add_column(heading)
     for kind, layout in LAYOUTS.items():

@@ -1,4 +1,4 @@
-"""Times taken in turns, and the table of their ratios."""
+"""Interleaved timing, and the table of ratios."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rich.table import Table
 
 
 def best_s(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
-    """Least seconds of each call, called in turns, so that a slow spell of the machine hits all of them."""
+    """Return the minimum time of each call; calls are interleaved, so that slow phases of the machine affect all."""
     seconds = dict.fromkeys(calls, float("inf"))
     for _ in range(repeats):
         for name, call in calls.items():
@@ -20,7 +20,7 @@ def best_s(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, fl
 
 
 class Report:
-    """The table of ratios, and how many of them miss their bounds."""
+    """Table of ratios, and the number of missed bounds."""
 
     def __init__(self, *, is_judged: bool) -> None:
         self.table = Table(title="Ratios, each within one run")
@@ -30,11 +30,11 @@ class Report:
         self.missed = 0
 
     def slower_than(self, what: str, s: float, against: str, s_against: float, at_most: float | None = None) -> None:
-        """Add how many times as long as a limit something takes."""
+        """Add a ratio to the time of a limit, with an upper bound."""
         self.add(what, f"{s:.4g} s", against, f"{s_against:.4g} s", s / s_against, at_most)
 
     def faster_than(self, what: str, s: float, against: str, s_against: float, at_least: float | None = None) -> None:
-        """Add how many times as fast as a peer something is."""
+        """Add a speed-up over another library, with a lower bound."""
         self.add(what, f"{s:.4g} s", against, f"{s_against:.4g} s", s_against / s, at_least, is_lower_bound=True)
 
     def add(
@@ -48,7 +48,7 @@ class Report:
         *,
         is_lower_bound: bool = False,
     ) -> None:
-        """Add a figure, and whether it keeps its bound."""
+        """Add a figure, and whether it satisfies its bound."""
         sign = "≥" if is_lower_bound else "≤"
         verdict = ""
         if bound is not None and self.is_judged:

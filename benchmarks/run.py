@@ -1,11 +1,11 @@
 """
-What the hot paths cost, as ratios to a limit of the machine or to a peer, all measured in one run.
+Times of the critical paths, as ratios to a limit of the machine or to another library, measured in one run.
 
-Single times on shared machines mean little; each figure is the best of several runs, taken in turns with what it is
-compared with. A ratio that misses its bound is marked; the program then ends with exit code 1.
+Each figure is the best of several runs, interleaved with those of its reference, since single times on shared machines vary.
+A ratio that misses its bound is marked; the program then exits with 1.
 
     python benchmarks/run.py            everything, about five minutes
-    python benchmarks/run.py --quick    the same on a picture of a sixteenth of the pixels (bounds are not judged)
+    python benchmarks/run.py --quick    the same for a sixteenth of the pixels, without bounds
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ console = Console(width=130)
 
 
 def paper_scene(shape: tuple[int, int], spectrum: np.ndarray, wavelength_nm: np.ndarray) -> fs.Scene:
-    """A picture of noise, as large as the paper's largest, with its pitch and distance."""
+    """Return a noise picture with the size, pitch and distance of the paper's largest."""
     rng = np.random.default_rng(0)
     basis = rng.random((spectrum.shape[0], *shape), dtype=np.float32)
     widths_nm = np.full(wavelength_nm.size, 300.0 / wavelength_nm.size)
@@ -50,13 +50,13 @@ def paper_scene(shape: tuple[int, int], spectrum: np.ndarray, wavelength_nm: np.
 
 
 def paper_layout(grid: fs.Grid) -> fs.Layout:
-    """30,240 log-polar sites that fill the picture's height."""
+    """Return 30,240 log-polar sites over the height of the image."""
     r_max_um = 0.495 * grid.shape[0] * grid.pitch_um
     return fs.layout.log_polar(n_sectors=N_SECTORS, n_rings=N_RINGS, r_min_um=0.026 * r_max_um, r_max_um=r_max_um)
 
 
 def bench_integrator(report: Report, shape: tuple[int, int]) -> None:
-    """Compare the integrator with exactextract, with reading the map, and with clipping polygons."""
+    """Compare the integrator with exactextract, with one pass over the map, and with polygon clipping."""
     from exactextract import exact_extract
     from exactextract.feature import JSONFeatureSource
     from exactextract.raster import NumPyRasterSource
@@ -113,7 +113,7 @@ def bench_integrator(report: Report, shape: tuple[int, int]) -> None:
 
 
 def bench_optics(report: Report, shape: tuple[int, int]) -> None:
-    """Compare optics and whole captures with the two Fourier transforms that they cannot do without."""
+    """Compare optics and complete captures with two Fourier transforms."""
     n_threads = thread_count()
     optics = fs.Optics(focal_length_mm=22.0, f_number=4.0)
     mono = paper_scene(shape, np.ones((1, 1)), np.array([550.0]))
@@ -121,9 +121,9 @@ def bench_optics(report: Report, shape: tuple[int, int]) -> None:
     layout = paper_layout(grid)
     sensor = fs.Sensor(layout, qe=0.6, dark_e_per_s=20.0, full_well_e=1e6, read_noise_e=1.0, bits=12)
     camera = fs.Camera(optics=optics, sensor=sensor)
-    # With the same padding.
+    # Reference with the same padding.
     aberrated = replace(optics, pupil=fs.optics.Blades(6), zernike=fs.optics.Zernike(coefficients={7: 0.02}))
-    # The padded size: 99 % of a point's light lies within 20.3 λN.
+    # Padded size: the encircled energy within 20.3 λN is 99 %.
     pad = int(np.ceil(20.3 * 0.55 * optics.working_f_number(0.56) / grid.pitch_um))
     padded = tuple(int(scipy.fft.next_fast_len(n + 2 * pad, real=True)) for n in shape)
     picture = np.random.default_rng(0).random(padded, dtype=np.float32)
@@ -151,7 +151,7 @@ def bench_optics(report: Report, shape: tuple[int, int]) -> None:
 
 
 def bench_wavelengths(report: Report, shape: tuple[int, int]) -> None:
-    """Compare a colour capture at many wavelengths with one at three."""
+    """Compare a colour capture with 31 wavelengths and with three."""
     rng = np.random.default_rng(3)
     optics = fs.Optics(focal_length_mm=22.0, f_number=4.0)
     few = paper_scene(shape, rng.random((3, 3)), np.array([450.0, 550.0, 620.0]))
@@ -169,7 +169,7 @@ def bench_wavelengths(report: Report, shape: tuple[int, int]) -> None:
 
 
 def bench_distortion(report: Report, shape: tuple[int, int]) -> None:
-    """Compare a distorted capture with an undistorted one, and carried outlines with a warped map."""
+    """Compare captures with and without distortion, and undistorted outlines with a warped map."""
     import cv2
 
     scene = paper_scene(shape, np.ones((1, 1)), np.array([550.0]))
@@ -183,11 +183,11 @@ def bench_distortion(report: Report, shape: tuple[int, int]) -> None:
     cells = np.random.default_rng(0).random(grid.shape, dtype=np.float32)
     straight, carried = plain.integrator(grid), bent.integrator(grid)
     squares = fs.layout.grid(n_x=8 * shape[1] // 50, n_y=8 * shape[0] // 50, pitch_um=5.0 * grid.pitch_um)
-    # Where each cell of the warped map comes from, in cells.
+    # Source position of each cell of the warped map, in cells.
     x, y = np.meshgrid(grid.x_um, grid.y_um)
     source = lens.undistort(np.stack((x, y), axis=-1), outside="mask")
     index = ((source - np.array([grid.x_um[0], grid.y_um[0]])) / grid.pitch_um).astype(np.float32)
-    # What is compared is taken in turns, and nothing between that leaves the machine other memory.
+    # Compared calls alternate, without other allocations in between.
     compiling = best_s(
         {
             "bent": lambda: fs.Integrator(layout, grid, distortion=lens),
@@ -209,13 +209,13 @@ def bench_distortion(report: Report, shape: tuple[int, int]) -> None:
     report.slower_than("distorted mono capture", times["bent"], "the same undistorted", times["plain"], 1.1)
     report.faster_than("distorted frame", times["frame"], "cv2.remap + undistorted frame", times["remap"], 3)
     report.slower_than("compiling a distorted layout", compiling["bent"], "undistorted", compiling["plain"], 2)
-    # Squares on the cells' borders are as simple as outlines can be, and bent ones are not: the hardest case.
+    # Worst case: squares on cell boundaries are the simplest outlines, distorted ones are not.
     what = f"compiling {squares.n_sites:,} distorted squares"
     report.slower_than(what, compiling["squares bent"], "undistorted", compiling["squares"], 2)
 
 
 def bench_sensor(report: Report, n_side: int) -> None:
-    """Measure the whole electronic chain, every noise on, against its bound a site and the random numbers that it draws."""
+    """Compare the electronic chain with all noise on with its bound per site and with numpy's Gaussian numbers."""
     layout = fs.layout.hexagonal(n_columns=n_side, n_rows=n_side, pitch_um=2.0)
     layout = layout.with_columns(readout_line=np.arange(layout.n_sites) % n_side)
     sensor = fs.Sensor(
@@ -259,13 +259,13 @@ def bench_sensor(report: Report, n_side: int) -> None:
 
     times = best_s({"chain": chain, "numbers": numbers}, 8)
     ns = 1e9 * times["chain"] / layout.n_sites
-    report.add(f"sensor, every noise, {layout.n_sites:,} sites", f"{ns:.3g} ns", "a site", "", ns, 30)
+    report.add(f"sensor, every noise, {layout.n_sites:,} sites", f"{ns:.3g} ns", "per site", "", ns, 30)
     report.slower_than("the same", times["chain"], "numpy's Gaussian numbers for it", times["numbers"], 2)
     tracemalloc.start()
     chain()
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    report.add("memory of the same", "", "arrays of float64 a site", "", peak / (8 * layout.n_sites), 4)
+    report.add("memory of the same", "", "float64 arrays (n_site,)", "", peak / (8 * layout.n_sites), 4)
 
 
 MEMORY_PROBE = """
@@ -291,7 +291,7 @@ print((status("VmHWM") - before) / (4 * shape[0] * shape[1]))
 
 
 def bench_memory(report: Report, shape: tuple[int, int]) -> None:
-    """Measure the most memory that a capture holds, in a process of its own (Linux)."""
+    """Measure the peak memory of a capture, in a separate process (Linux)."""
     if not Path("/proc/self/clear_refs").exists():
         return
     arguments = [sys.executable, "-c", MEMORY_PROBE, str(Path(__file__).parent), *map(str, shape)]
@@ -300,17 +300,17 @@ def bench_memory(report: Report, shape: tuple[int, int]) -> None:
 
 
 def bench_import(report: Report) -> None:
-    """Measure what importing the package adds to Python's own start."""
+    """Measure the import time, in addition to the start of Python."""
 
     def start(code: str) -> Callable[[], object]:
         return lambda: subprocess.run([sys.executable, "-c", code], check=True)
 
     times = best_s({"bare": start("pass"), "ours": start("import foveasim")}, 5)
-    report.add("import foveasim", "", "seconds beyond Python's own start", "", times["ours"] - times["bare"], 0.5)
+    report.add("import foveasim", "", "seconds after the start of Python", "", times["ours"] - times["bare"], 0.5)
 
 
 def main() -> int:
-    """Run the benchmarks; the exit code tells whether every bound is kept."""
+    """Run the benchmarks; exit with 1 when a bound is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true")
     is_quick = parser.parse_args().quick

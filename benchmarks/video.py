@@ -120,11 +120,11 @@ def _bench_camera(report: Report, camera: fs.Camera) -> None:
         report.slower_than(title, times[name], against, times["limit"], bound)
     for name, title in (("still", "frame of a video"), ("pictures", "the same from sRGB pictures")):
         report.slower_than(f"{title}, oversample={k}: processor time", cpu[name], against, cpu["limit"], 1.0 / 0.6)
-    _shares(camera, pictures)
+    _print_stage_times(camera, pictures)
 
 
 def _best(calls: dict[str, tuple[Callable[[], None], int]], repeats: int) -> tuple[dict[str, float], dict[str, float]]:
-    """Least seconds of wall and of processor time a frame, the calls taken in turns."""
+    """Return the minimum wall and processor time per frame, with interleaved calls."""
     wall, cpu = dict.fromkeys(calls, float("inf")), dict.fromkeys(calls, float("inf"))
     for _ in range(repeats):
         for name, (call, n_frames) in calls.items():
@@ -166,8 +166,8 @@ def _footage(pictures: object) -> fs.video.FrameSource:
     )
 
 
-def _shares(camera: fs.Camera, pictures: list[np.ndarray]) -> None:
-    """Print what the stages of a frame take."""
+def _print_stage_times(camera: fs.Camera, pictures: list[np.ndarray]) -> None:
+    """Print the times of the stages of a frame."""
     total: dict[str, float] = {}
     start, cpu = time.perf_counter(), time.process_time()
     for capture in camera.video(_footage(pictures * 4), exposure_s=EXPOSURE_S, seed=0):
@@ -185,11 +185,11 @@ def _shares(camera: fs.Camera, pictures: list[np.ndarray]) -> None:
 
 
 def _memory(report: Report, n_frames: int) -> None:
-    """Stream in a program of its own, which tells its peak of memory."""
-    told = subprocess.run(
+    """Stream in a separate process, which reports its peak memory."""
+    result = subprocess.run(
         [sys.executable, __file__, "--stream", str(n_frames)], capture_output=True, text=True, check=True
     )
-    found = json.loads(told.stdout)
+    found = json.loads(result.stdout)
     console.print(
         f"{n_frames:,} frames from pictures to a zarr folder: {n_frames / found['wall_s']:.1f} frames/s of wall, "
         f"{n_frames / found['cpu_s']:.1f} frames per second of processor time, {found['folder_mb']:.0f} MB written"
@@ -200,7 +200,7 @@ def _memory(report: Report, n_frames: int) -> None:
 
 
 def _stream(n_frames: int) -> None:
-    """Write a long video, and tell time and memory."""
+    """Write a long video, and report time and memory."""
     camera, pictures = _camera(), _pictures()
 
     def frames() -> Iterator[np.ndarray]:
@@ -215,7 +215,7 @@ def _stream(n_frames: int) -> None:
         )
         wall_s, cpu_s = time.perf_counter() - start, time.process_time() - cpu
         n_bytes = sum(p.stat().st_size for p in path.rglob("*") if p.is_file())
-    # Of this program alone: what getrusage tells begins with what the one that started it had in memory.
+    # Peak of this process alone: getrusage includes the memory of its parent.
     status = Path("/proc/self/status").read_text()
     peak_gb = next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) * 1024 / 1e9
     print(json.dumps({"wall_s": wall_s, "cpu_s": cpu_s, "peak_gb": peak_gb, "folder_mb": n_bytes / 1e6}))
@@ -223,7 +223,7 @@ def _stream(n_frames: int) -> None:
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description="Videos: frames per second, shares and memory.")
+    parser = argparse.ArgumentParser(description="Videos: frames per second, times of stages, memory.")
     parser.add_argument("--quick", action="store_true", help="100 frames")
     parser.add_argument("--stream", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
