@@ -141,9 +141,8 @@ def test_separated_part_is_assigned_to_neighbour():
 
 
 @given(st.sampled_from([NOTCH, STAR]), st.integers(8, 80), seeds)
-@settings(
-    relaxed, max_examples=60, suppress_health_check=[HealthCheck.filter_too_much]
-)  # one layout in about six qualifies
+# About one in six of these layouts has exactly one separated part.
+@settings(relaxed, max_examples=60, suppress_health_check=[HealthCheck.filter_too_much])
 def test_separated_part_joins_longest_shared_boundary(region, n, seed):
     """The reference cells are those of shapely, for layouts with one separated part."""
     centres = points_in(region, n, seed)
