@@ -90,7 +90,7 @@ def test_run_prints_names_as_they_are(marked, environment):
     ("arguments", "code", "printed"),
     [
         (("check", "{}.npz", "--rules", "sky130_met1", "--report", "{}.lyrdb"), (0, 1), "wrote {}.lyrdb"),
-        (("check", "{}.npz"), (2,), "error: {}.npz: holds no rules"),
+        (("check", "{}.npz"), (2,), "error: {}.npz: contains no design rules"),
         (("check", "{}.npz", "--rules", "{}"), (2,), "error: {}: "),
         (("convert", "{}.npz", "{}.svg"), (0,), "wrote {}.svg"),
         (("convert", "{}.npz", "{}.svg"), (0,), "dropped columns: {}, "),  # the column that is lost

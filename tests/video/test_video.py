@@ -1251,9 +1251,9 @@ def test_stopped_command_resumes(directory, capsys):
         n_recorded = count_recorded_frames(out)
         if n_recorded:
             break
-        assert message == "stopped\n"
+        assert message == "interrupted\n"
 
-    assert message.startswith("stopped; ")
+    assert message.startswith("interrupted; ")
     assert f"{n_recorded} frames" in message
     assert 0 < n_recorded < 400
     assert not out.exists()
@@ -1288,7 +1288,7 @@ def test_command_leaves_finished_recordings_unchanged(directory, capsys):
     capsys.readouterr()
 
     assert command(*arguments) == 0
-    assert "v.zarr was finished before: 3 frames" in capsys.readouterr().out
+    assert "v.zarr was already complete: 3 frames" in capsys.readouterr().out
     for changes, name in (
         (("--set", "optics.f_number=4"), "optics.f_number"),
         (("--stop", "2"), "stop"),
