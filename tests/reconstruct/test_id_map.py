@@ -193,7 +193,7 @@ def test_boundaries_drawn_between_sites():
     ("call", "message"),
     [
         (lambda g: id_map(g, (0, 4)), r"'shape\[0\]' must be >= 1"),
-        (lambda g: id_map(g, (2**16, 2**16)), "'shape' must (have at most|give 3 arrays)"),
+        (lambda g: id_map(g, (2**16, 2**16)), "'shape' must (have at most|fit in memory: 3 arrays)"),
         (lambda g: id_map(g, (4, 4), (0, 0, 0, 1)), "'bounds_um' must be"),
         (lambda g: id_map(g, (4, 4), (0, 0, np.nan, 1)), "'bounds_um' must be finite"),
         (lambda g: id_map(g[:0], (4, 4)), "'layout' must have sites unless"),
