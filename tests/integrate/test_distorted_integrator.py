@@ -165,7 +165,7 @@ def test_camera_warns_of_sites_outside_image_circle():
     camera = fs.Camera(
         optics=optics, sensor=fs.Sensor(layout), distortion=Fisheye(projection="orthographic", focal_um=40.0)
     )
-    with pytest.warns(CoverageWarning, match=r"\d+ of 144 photosites lie outside the lens's image circle"):
+    with pytest.warns(CoverageWarning, match=r"\d+ of 144 photosites lie outside the image circle of the lens"):
         camera.capture(scene, exposure_s=0.01, seed=1)
 
 
