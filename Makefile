@@ -1,18 +1,18 @@
-# Every target makes its environment and installs what it needs; nothing but Python 3.11 or later and make is expected.
+# Every target creates its environment and installs its requirements, with Python 3.11 or later and make.
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out
-# Arguments of pytest in all test targets: make test PYTEST_ARGS="tests/cli"
+# Arguments for pytest in all test targets: make test PYTEST_ARGS="tests/cli"
 PYTEST_ARGS ?=
 PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadgroup
 
-# The oldest versions that pyproject.toml admits, on the oldest Python: .venv-lowest/uv chooses them, .venv-lowest/env has them.
+# Lower bounds of pyproject.toml on the oldest Python: .venv-lowest/uv resolves them, .venv-lowest/env contains them.
 LOWEST := .venv-lowest
 LOWEST_PYTHON ?= 3.11
 UV := $(LOWEST)/uv/bin/uv
-# PyTorch has an environment of its own, as its wheel may bring gigabytes of CUDA libraries.
+# PyTorch has a separate environment, since its wheel may install gigabytes of CUDA libraries.
 TORCH_VENV ?= .venv-torch
 
 .PHONY: demo test test-lowest test-torch soak lint bench docs clean
@@ -24,7 +24,7 @@ demo: $(VENV)/.installed
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest $(PARALLEL) $(PYTEST_ARGS)
 
-# Deprecations that old versions find in new ones of what they use are theirs.
+# Deprecation warnings between old versions of dependencies are ignored.
 test-lowest: $(LOWEST)/.installed
 	NUMBA_CACHE_DIR="$(CURDIR)/$(LOWEST)/numba" $(LOWEST)/env/bin/python -m pytest $(PARALLEL) \
 		-W default::DeprecationWarning -W default::PendingDeprecationWarning -W error::pytest.PytestWarning $(PYTEST_ARGS)
@@ -32,7 +32,7 @@ test-lowest: $(LOWEST)/.installed
 test-torch: $(TORCH_VENV)/.installed
 	FOVEASIM_TESTS_NEED=torch $(TORCH_VENV)/bin/python -m pytest tests/explore/test_dataset_torch.py $(PYTEST_ARGS)
 
-# Kills workers at random for some minutes: every item must be computed, and none more than twice.
+# Kills workers at random for some minutes: every item must be computed, at most twice.
 soak: $(VENV)/.installed-dev
 	FOVEASIM_SOAK_ROUNDS=20 $(BIN)/python -m pytest tests/explore/test_executor.py -k lost --verbose $(PYTEST_ARGS)
 
@@ -46,21 +46,21 @@ bench: $(VENV)/.installed-dev
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet --builder html docs docs/_build/html
-	@echo "the site begins at docs/_build/html/index.html"
+	@echo "open docs/_build/html/index.html"
 
 clean:
 	rm -rf $(VENV) $(LOWEST) $(TORCH_VENV) out docs/_build docs/gallery docs/reference .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find foveasim tests -name __pycache__ -type d -exec rm -rf {} +
 
 $(VENV)/.made $(LOWEST)/uv/.made $(TORCH_VENV)/.made:
-	@command -v $(PYTHON) >/dev/null || { echo "there is no $(PYTHON); name a Python with: make PYTHON=..."; exit 1; }
+	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) not found; specify one with: make PYTHON=..."; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-		{ echo "foveasim needs Python 3.11 or later; name one with: make PYTHON=python3.12"; exit 1; }
+		{ echo "foveasim requires Python 3.11 or later; specify one with: make PYTHON=python3.12"; exit 1; }
 	$(PYTHON) -m venv $(@D) || { rm -rf $(@D); exit 1; }
 	touch $@
 
 $(VENV)/.installed: $(VENV)/.made pyproject.toml
-	@echo "installing foveasim and what it needs into $(VENV) (a minute or so)"
+	@echo "installing foveasim into $(VENV) (a minute or so)"
 	$(BIN)/python -m pip install --quiet --editable '.[view]'
 	touch $@
 
@@ -70,13 +70,13 @@ $(VENV)/.installed-dev: $(VENV)/.made pyproject.toml
 	touch $@ $(VENV)/.installed
 
 $(VENV)/.installed-docs: $(VENV)/.made pyproject.toml
-	@echo "installing foveasim and what its documentation is made with into $(VENV) (a minute or so)"
+	@echo "installing foveasim and its documentation tools into $(VENV) (a minute or so)"
 	$(BIN)/python -m pip install --quiet --editable '.[docs]'
 	touch $@ $(VENV)/.installed-dev $(VENV)/.installed
 
-# The oldest build backend too, which uv chooses of its own accord the newest.
+# Pins the oldest build backend, too, since uv selects the newest.
 $(LOWEST)/.installed: $(LOWEST)/uv/.made pyproject.toml
-	@echo "installing the oldest versions that foveasim admits into $(LOWEST) (a minute or so)"
+	@echo "installing the lower bounds of the dependencies into $(LOWEST) (a minute or so)"
 	$(LOWEST)/uv/bin/python -m pip install --quiet uv
 	$(UV) venv --quiet --clear --python $(LOWEST_PYTHON) $(LOWEST)/env
 	$(LOWEST)/uv/bin/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"], sep="\n")' | \
@@ -86,6 +86,6 @@ $(LOWEST)/.installed: $(LOWEST)/uv/.made pyproject.toml
 	touch $@
 
 $(TORCH_VENV)/.installed: $(TORCH_VENV)/.made pyproject.toml
-	@echo "installing foveasim and PyTorch into $(TORCH_VENV) (minutes, where PyTorch brings CUDA)"
+	@echo "installing foveasim and PyTorch into $(TORCH_VENV) (minutes with CUDA)"
 	$(TORCH_VENV)/bin/python -m pip install --quiet --editable '.[explore,learn]' pytest
 	touch $@
