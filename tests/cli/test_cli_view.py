@@ -139,8 +139,8 @@ def test_page_is_served_on_localhost(view, folder):
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
         try:
             line = server.stdout.readline()
-            assert re.fullmatch(r"layout.npz is at http://127.0.0.1:\d+/ until you press Ctrl-C\n", line)
-            address = line.split(" ")[3]
+            assert re.fullmatch(r"serving layout.npz at http://127.0.0.1:\d+/; press Ctrl-C to stop\n", line)
+            address = line.split(" ")[3].rstrip(";")
             port = int(address.rsplit(":", 1)[1].strip("/"))
             with urllib.request.urlopen(address) as answer:
                 assert answer.headers["Content-Type"] == "text/html; charset=utf-8"
