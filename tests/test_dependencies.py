@@ -41,7 +41,7 @@ INDIRECT = {
     "networkx": "trimesh writes 3MF with it",
 }
 #: Functions that take the name of a module.
-IMPORTING = {"__import__", "_imported", "find_spec", "import_module", "importorskip", "library"}
+IMPORTING = {"__import__", "_imported", "find_spec", "import_module", "import_optional", "importorskip"}
 
 
 def normalised(name):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import os
 import re
@@ -297,6 +298,8 @@ def _store_result(
 
 def _open_study(optuna: Any, storage: str | Path | None, url: str | None, plan: StudyPlan) -> optuna.Study:
     """Load the study from its storage, or create it."""
+    # An interrupt during a query makes SQLAlchemy log a cursor that it cannot close; the interrupt itself is raised.
+    logging.getLogger("sqlalchemy.pool").addHandler(logging.NullHandler())
     directions = list(plan.objectives.values())
     if url is None or plan.name not in optuna.get_all_study_names(storage=url):
         return optuna.create_study(storage=url, study_name=plan.name, directions=directions)
