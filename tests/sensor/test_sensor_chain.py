@@ -158,7 +158,7 @@ def test_ring_device_is_invariant_to_vertex_order():
     )
 
 
-def test_equal_polygons_share_one_device():
+def test_equal_polygons_have_equal_patterns():
     duplicates = fs.Layout.from_polygons([concentric_rings().polygons()[2]] * 2)
 
     assert np.ptp(Device(seed=3, layout=duplicates).normals("prnu")) == 0.0

@@ -1051,7 +1051,7 @@ def test_recording_with_different_filters_is_rejected(tmp_path):
             write_video(interrupted(captures, 2), tmp_path / "v.zarr", resume=True)
 
 
-def test_settings_that_varied_may_vary_after_resuming(tmp_path):
+def test_varied_settings_may_vary_after_resuming(tmp_path):
     """The distance differs between frames."""
     path = tmp_path / "v.zarr"
     scenes = [fs.Scene.from_picture(p, **(LIGHT | {"distance_m": 0.5 - 0.02 * k})) for k, p in enumerate(pictures(4))]
