@@ -666,16 +666,17 @@ class Camera:
         """
         if not isinstance(light, Scene | PowerMap):
             raise ParameterError("light", f"must be a Scene or a PowerMap, got a {type(light).__name__}")
+        e_per_j = self._sensor.responsivity_e_per_j(light.wavelength_nm)
         with clock.stage("load kernels"):
             _load_kernels(light)
         if isinstance(light, PowerMap):
-            maps, grids = self._bands(light), [light.grid]
+            maps, grids = self._bands(light, e_per_j), [light.grid]
         else:
             # Lateral chromatic aberration gives images of several sizes, each with its own grid.
             optics = self._optics.resolve_oversample(light)
             images = optics.image_grids(light)
             maps, grids = (
-                self._images(light, optics, images, clock, cached),
+                self._images(light, optics, images, e_per_j, clock, cached),
                 [self._to_sensor_frame(grid) for grid, _ in images],
             )
         with clock.stage("compile layout"):
@@ -692,9 +693,8 @@ class Camera:
         self._check_rates(light, rate_e_per_s)
         return np.maximum(rate_e_per_s, 0.0)
 
-    def _bands(self, power_map: PowerMap) -> Iterator[_WeightedMap]:
+    def _bands(self, power_map: PowerMap, e_per_j: Floats) -> Iterator[_WeightedMap]:
         """Yield each band of a power map, with every site's photoelectrons per joule in it."""
-        e_per_j = self._sensor.responsivity_e_per_j(power_map.wavelength_nm)
         for band, cells in enumerate(power_map.data):
             yield _WeightedMap(0, cells, e_per_j[self._sensor.filter_of_site, band])
 
@@ -703,6 +703,7 @@ class Camera:
         scene: Scene,
         optics: Optics,
         images: Sequence[tuple[Grid, Bools]],
+        e_per_j: Floats,
         clock: _Clock,
         cached: ImageCache | None,
     ) -> Iterator[_WeightedMap]:
@@ -712,20 +713,22 @@ class Camera:
         One inverse transform per filter and image, for any number of wavelengths.
         """
         filter_of_site = self._sensor.filter_of_site
-        e_per_j = self._sensor.responsivity_e_per_j(scene.wavelength_nm)
         used = np.unique(filter_of_site)
+
+        # As a function, without a reference in this generator: one map is in memory at a time.
+        def image(grid: Grid, c: int, maps: Iterator[NDArray[Any]]) -> NDArray[Any]:
+            with clock.stage("optics"):
+                if cached is None:
+                    return next(maps)
+                if (grid, c) not in cached:
+                    cached[grid, c] = next(maps)
+                return cached[grid, c]
+
         for k, (grid, is_in_image) in enumerate(images):
             new = used if cached is None else np.array([c for c in used if (grid, c) not in cached], np.int64)
             maps = optics.weighted_maps(scene, e_per_j[new] * is_in_image, grid=grid, n_threads=self._n_threads)
             for c in used:
-                with clock.stage("optics"):
-                    cells = next(maps) if cached is None or (grid, c) not in cached else cached[grid, c]
-                    if cached is not None:
-                        cached[grid, c] = cells
-                weighted = [_WeightedMap(k, cells, (filter_of_site == c).astype(np.float64))]
-                # Without a reference here, one map is in memory at a time.
-                del cells
-                yield weighted.pop()
+                yield _WeightedMap(k, image(grid, c, maps), (filter_of_site == c).astype(np.float64))
 
     def _check_rates(self, light: Scene | PowerMap, rate_e_per_s: Floats) -> None:
         """Raise or warn when rates are not finite, or negative beyond rounding."""
