@@ -56,8 +56,10 @@ def pytest_configure(config):
             import_module(name)
 
 
-def pytest_collection_modifyitems(items):
+def pytest_collection_modifyitems(config, items):
     """Run the tests of a file in one process, except for those of ``INDEPENDENT``."""
+    if not config.pluginmanager.hasplugin("xdist"):
+        return
     for item in items:
         if item.path.name not in INDEPENDENT:
             item.add_marker(pytest.mark.xdist_group(str(item.path)))
