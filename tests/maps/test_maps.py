@@ -1252,7 +1252,7 @@ def test_read_rejects_truncated_exr(valid_files, tmp_path):
 @pytest.mark.parametrize(
     ("limit", "value", "message"),
     [
-        ("BASE_BYTES", 2**26 - 3 * 2**28, "reading it as MAT crashed|asks for more memory|failed to map|is corrupt"),
+        ("BASE_BYTES", 96 * 2**20 - 3 * 2**28, "crashed|more memory|failed to map|is corrupt|took more than"),
         ("MAX_CPU_S", 0, "reading it took more than 0 s"),
     ],
 )
