@@ -36,7 +36,6 @@ KERNELS = re.compile(r"^from foveasim\._core\.jit import njit$", re.MULTILINE)
 INDEPENDENT = {
     "test_gallery.py",
     "test_docs.py",
-    "test_layout_files_malformed.py",
     "test_cli_explore.py",
     "test_principal_point.py",
 }

@@ -1,4 +1,4 @@
-"""The command line in a separate process: output, exit codes and files."""
+"""Commands: output, exit codes and files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ exposure_s: 0.01
 """
 
 
-def foveasim(*arguments, cwd):
+def run_program(*arguments, cwd):
+    """Run the program as users do, in a process of its own."""
     command = [sys.executable, "-m", "foveasim.cli", *arguments]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
 
@@ -50,7 +51,7 @@ def folder(tmp_path):
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")
-    return folder / "out", foveasim("demo", "-o", "out", cwd=folder)
+    return folder / "out", run_program("demo", "-o", "out", cwd=folder)
 
 
 def test_demo_writes_its_files(demo):
@@ -90,7 +91,7 @@ def test_demo_picture_is_upright_with_blind_spot(demo):
 
 
 def test_run_writes_capture_of_settings(folder):
-    result = foveasim("run", "shot.yaml", "--set", "sensor.bits=12", "--set", "seed=4", "-o", "out", cwd=folder)
+    result = run_program("run", "shot.yaml", "--set", "sensor.bits=12", "--set", "seed=4", "-o", "out", cwd=folder)
     capture = fs.Capture.load(folder / "out" / "shot_capture.npz")
 
     assert result.returncode == 0, result.stderr
@@ -102,7 +103,7 @@ def test_run_writes_capture_of_settings(folder):
     ]
 
 
-def test_schema_is_json(tmp_path):
+def test_schema_is_json(foveasim, tmp_path):
     assert json.loads(foveasim("schema", cwd=tmp_path).stdout)["title"]
 
 
@@ -118,7 +119,7 @@ def test_schema_is_json(tmp_path):
         ("layout={generator: none}", "shot.yaml: layout.generator: must be one of"),
     ],
 )
-def test_invalid_settings_print_one_line(folder, change, words):
+def test_invalid_settings_print_one_line(foveasim, folder, change, words):
     result = foveasim("run", "shot.yaml", "--set", change, "-o", "out", cwd=folder)
 
     assert result.returncode == 2
@@ -139,7 +140,7 @@ def test_invalid_settings_print_one_line(folder, change, words):
         (lambda p: p.write_bytes(huge_png(p.read_bytes())), "has 65536 x 65536 pixels, more than the limit|has more than"),
     ],
 )  # fmt: skip
-def test_invalid_picture_prints_one_line(folder, spoil, words):
+def test_invalid_picture_prints_one_line(foveasim, folder, spoil, words):
     spoil(folder / "photo.png")
     result = foveasim("run", "shot.yaml", "-o", "out", cwd=folder)
 
@@ -150,7 +151,7 @@ def test_invalid_picture_prints_one_line(folder, spoil, words):
     assert not (folder / "out").exists()
 
 
-def test_file_as_output_directory_is_rejected(folder):
+def test_file_as_output_directory_is_rejected(foveasim, folder):
     (folder / "out").write_text("I am a file")
     result = foveasim("run", "shot.yaml", "-o", "out", cwd=folder)
 
@@ -170,8 +171,8 @@ source: made for this test
 def test_exit_code_reports_rule_violations(tmp_path):
     (tmp_path / "rings.yaml").write_text(LAYOUT)
     (tmp_path / "loose.yaml").write_text("min_size_um: 0.1\n")
-    broken = foveasim("check", "rings.yaml", "--report", "rings.lyrdb", cwd=tmp_path)
-    kept = foveasim("check", "rings.yaml", "--rules", "loose.yaml", cwd=tmp_path)
+    broken = run_program("check", "rings.yaml", "--report", "rings.lyrdb", cwd=tmp_path)
+    kept = run_program("check", "rings.yaml", "--rules", "loose.yaml", cwd=tmp_path)
 
     assert broken.returncode == 1
     assert "fail" in broken.stdout
@@ -180,7 +181,7 @@ def test_exit_code_reports_rule_violations(tmp_path):
     assert "pass" in kept.stdout
 
 
-def test_converted_gds_file_is_checked(tmp_path):
+def test_converted_gds_file_is_checked(foveasim, tmp_path):
     (tmp_path / "rings.yaml").write_text(LAYOUT)
     (tmp_path / "rules.yaml").write_text("min_size_um: 1.0\n")
     converted = foveasim("convert", "rings.yaml", "rings.gds", "--dbu-um", "0.001", cwd=tmp_path)
@@ -203,7 +204,7 @@ def test_converted_gds_file_is_checked(tmp_path):
         (("convert", "wrong.gds", "rings.npz"), "wrong.gds: is not a valid layout file"),
     ],
 )
-def test_invalid_layout_files_print_one_line(tmp_path, arguments, words):
+def test_invalid_layout_files_print_one_line(foveasim, tmp_path, arguments, words):
     (tmp_path / "rings.yaml").write_text(LAYOUT)
     (tmp_path / "bare.yaml").write_text("generator: grid\nparameters: {n_x: 3, n_y: 3, pitch_um: 2.0}\n")
     (tmp_path / "wrong.yaml").write_text("min_sise_um: 1.0\n")
@@ -227,7 +228,7 @@ def test_invalid_layout_files_print_one_line(tmp_path, arguments, words):
         ("{generator: grid, parameters: {n_x: 9, n_y: 9, pitch_um: 5}}", "none"),
     ],
 )
-def test_blind_spot_is_central_hole_only(tmp_path, layout, radius):
+def test_blind_spot_is_central_hole_only(foveasim, tmp_path, layout, radius):
     scene = (
         "{kind: flat, shape: [400, 400], pitch_um: 100, distance_m: 1.0, radiance_w_m2_sr_nm: 0.1, band_width_nm: 10}"
     )
@@ -239,7 +240,7 @@ def test_blind_spot_is_central_hole_only(tmp_path, layout, radius):
     assert line.split("│")[2].strip() == radius
 
 
-def test_layouts_lists_bundled_layouts(tmp_path):
+def test_layouts_lists_bundled_layouts(foveasim, tmp_path):
     result = foveasim("layouts", cwd=tmp_path)
 
     assert result.returncode == 0, result.stderr
@@ -247,7 +248,7 @@ def test_layouts_lists_bundled_layouts(tmp_path):
     assert "243,712" in result.stdout
 
 
-def test_describe_prints_counts_and_data_rate(tmp_path):
+def test_describe_prints_counts_and_data_rate(foveasim, tmp_path):
     fs.layout.zones(side_um=(64, 128), pitch_um=(1, 2)).write(tmp_path / "two.npz")
     by_file = foveasim("describe", "two.npz", cwd=tmp_path)
     by_name = foveasim("describe", "four_zones", "--fps", "30", "--bits", "10", "--blanking", "0.2", cwd=tmp_path)
@@ -257,7 +258,7 @@ def test_describe_prints_counts_and_data_rate(tmp_path):
     assert all(text in by_name.stdout for text in ("13,312", "100 % of the convex hull", "4.792 Mbit/s", "4 to 32 µm"))
 
 
-def test_describe_rejects_invalid_options(tmp_path):
+def test_describe_rejects_invalid_options(foveasim, tmp_path):
     gone = foveasim("describe", "gone.gds", cwd=tmp_path)
     bad = foveasim("describe", "four_zones", "--fps", "-1", cwd=tmp_path)
 
@@ -266,7 +267,7 @@ def test_describe_rejects_invalid_options(tmp_path):
     assert bad.stderr.startswith("error: 'frames_per_s' must be > 0, got -1.0")
 
 
-def test_bundled_layouts_are_found_by_name(tmp_path):
+def test_bundled_layouts_are_found_by_name(foveasim, tmp_path):
     checked = foveasim("check", "prima_100", cwd=tmp_path)
     converted = foveasim("convert", "prima_100", "prima.gds", cwd=tmp_path)
 
@@ -275,14 +276,14 @@ def test_bundled_layouts_are_found_by_name(tmp_path):
     assert fs.layout.read_layout(tmp_path / "prima.gds").n_sites == 378
 
 
-def test_convert_reports_dropped_columns(tmp_path):
+def test_convert_reports_dropped_columns(foveasim, tmp_path):
     result = foveasim("convert", "prima_75", "prima.svg", cwd=tmp_path)
 
     assert result.returncode == 0, result.stderr
     assert "dropped columns: column, readout_line, row" in result.stdout
 
 
-def test_short_option_prints_help(tmp_path):
+def test_short_option_prints_help(foveasim, tmp_path):
     short, long = (foveasim("run", option, cwd=tmp_path) for option in ("-h", "--help"))
     assert short.returncode == 0
     assert short.stdout == long.stdout != ""

@@ -38,15 +38,15 @@ SHOT = {
 ASCII = {"LC_ALL": "C", "PYTHONIOENCODING": "ascii:strict", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 
 
-def foveasim(*arguments, cwd, **environment):
-    """Standard output and error as bytes, of a terminal wide enough for any name."""
+def run_program(*arguments, cwd, **environment):
+    """Return exit code, standard output and standard error as bytes, as of a wide terminal."""
     command = [sys.executable, "-m", "foveasim.cli", *arguments]
     env = {**os.environ, "COLUMNS": "200", **environment}
     return subprocess.run(command, cwd=cwd, env=env, capture_output=True, check=False)
 
 
 def is_clean(result):
-    return result.returncode >= 0 and b"Traceback" not in result.stderr + result.stdout
+    return result.returncode >= 0 and "Traceback" not in str(result.stderr + result.stdout)
 
 
 @pytest.fixture(params=MARKUP, ids=["end", "style"])
@@ -67,23 +67,23 @@ def marked(request, tmp_path):
     return parent, name
 
 
-def test_describe_prints_provenance_as_it_is(marked):
+def test_describe_prints_provenance_as_it_is(foveasim, marked):
     folder, name = marked
     result = foveasim("describe", f"{name}.npz", cwd=folder)
 
     assert result.returncode == 0, result.stderr
-    assert re.search(rf"origin\s+{re.escape(name)}\s", result.stdout.decode())
+    assert re.search(rf"origin\s+{re.escape(name)}\s", result.stdout)
 
 
 @pytest.mark.parametrize("environment", [{}, {"FORCE_COLOR": "1", "TERM": "xterm"}], ids=["pipe", "terminal"])
-def test_run_prints_names_as_they_are(marked, environment):
+def test_run_prints_names_as_they_are(foveasim, marked, environment):
     folder, name = marked
     result = foveasim("run", f"{name}.yaml", "-o", f"out{name}", cwd=folder, **environment)
 
     assert result.returncode == 0, result.stderr
     stem = name.rsplit("/", 1)[-1]
-    assert f"wrote out{name}/{stem}_capture.npz" in result.stdout.decode()
-    assert re.search(rf" {re.escape(stem)}( |:|\x1b)", result.stdout.decode())
+    assert f"wrote out{name}/{stem}_capture.npz" in result.stdout
+    assert re.search(rf" {re.escape(stem)}( |:|\x1b)", result.stdout)
 
 
 @pytest.mark.parametrize(
@@ -111,13 +111,13 @@ def test_run_prints_names_as_they_are(marked, environment):
     ],
     ids=lambda value: " ".join(value)[:40] if isinstance(value, tuple) and isinstance(value[0], str) else None,
 )
-def test_commands_print_names_as_they_are(marked, arguments, code, printed):
+def test_commands_print_names_as_they_are(foveasim, marked, arguments, code, printed):
     folder, name = marked
     result = foveasim(*(argument.replace("{}", name) for argument in arguments), cwd=folder)
 
     assert is_clean(result)
     assert result.returncode in code
-    assert printed.replace("{}", name) in (result.stdout + result.stderr).decode()
+    assert printed.replace("{}", name) in (result.stdout + result.stderr)
 
 
 def test_report_and_summary_print_markup_literally():
@@ -135,24 +135,24 @@ def test_report_and_summary_print_markup_literally():
     assert "[red]" not in text
 
 
-def test_control_characters_are_escaped(tmp_path):
+def test_control_characters_are_escaped(foveasim, tmp_path):
     name = "a\x1b[31m\n\u202eb.yaml"
     (tmp_path / name).write_text("{}")
     for command in ("run", "check", "describe", "sweep", "study", "dataset", "view"):
         result = foveasim(command, name, cwd=tmp_path)
 
         assert result.returncode == 2, command
-        assert result.stderr.startswith(rb"error: a\x1b[31m\n\u202eb.yaml: "), command
-        assert result.stderr.count(b"\n") == 1
+        assert result.stderr.startswith(r"error: a\x1b[31m\n\u202eb.yaml: "), command
+        assert result.stderr.count("\n") == 1
 
 
 def test_names_outside_utf8_are_escaped(tmp_path):
     name = os.fsdecode(b"$caf\xe9$^.yaml")
     (tmp_path / name).write_text(yaml.safe_dump(SHOT))
-    ran = foveasim("run", name, "-o", "out", cwd=tmp_path)
-    failed = foveasim("describe", name + "x", cwd=tmp_path)
+    ran = run_program("run", name, "-o", "out", cwd=tmp_path)
+    failed = run_program("describe", name + "x", cwd=tmp_path)
     capture = os.fsdecode(b"out/$caf\xe9$^_capture.npz")
-    viewed = foveasim("view", capture, "--out", "page.html", cwd=tmp_path)
+    viewed = run_program("view", capture, "--out", "page.html", cwd=tmp_path)
 
     assert ran.returncode == 0, ran.stderr
     assert rb"wrote out/$caf\udce9$^_capture.npz" in ran.stdout
@@ -194,7 +194,7 @@ def test_ascii_terminals_get_plain_characters(tmp_path, arguments, code, printed
     (tmp_path / "frames").mkdir()
     for k in range(2):
         Image.new("RGB", (60, 60), (90 * k, 9, 9)).save(tmp_path / "frames" / f"{k}.png")
-    result = foveasim(*arguments, cwd=tmp_path, **ASCII)
+    result = run_program(*arguments, cwd=tmp_path, **ASCII)
 
     assert is_clean(result), result.stderr
     assert result.returncode == code, result.stderr
@@ -216,7 +216,7 @@ def test_spinner_is_plain_on_ascii_terminals():
     )
 
 
-def test_settings_in_messages_are_short(tmp_path):
+def test_settings_in_messages_are_short(foveasim, tmp_path):
     shot = json.loads(json.dumps(SHOT))
     shot["sensor"] = {"bits": "x" * 100_000, "y" * 100_000: 1}
     (tmp_path / "shot.yaml").write_text(yaml.safe_dump(shot))
@@ -229,15 +229,15 @@ def test_settings_in_messages_are_short(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "printed"),
     [
-        (("run", "shot.yaml", "--threads", "9" * 30), b"error: 'n_threads' must be <= 4096"),
-        (("video", "picture.yaml", "--frames", "frames", "--stop", "9" * 30), b"error: 'stop' must be <= "),
-        (("dataset", "dataset.yaml"), b"error: dataset.yaml: 'cameras' must be <= 1000000000"),
-        (("study", "study.yaml"), b"error: study.yaml: "),
-        (("check", "x" * 5000), b"File name too long"),
+        (("run", "shot.yaml", "--threads", "9" * 30), "error: 'n_threads' must be <= 4096"),
+        (("video", "picture.yaml", "--frames", "frames", "--stop", "9" * 30), "error: 'stop' must be <= "),
+        (("dataset", "dataset.yaml"), "error: dataset.yaml: 'cameras' must be <= 1000000000"),
+        (("study", "study.yaml"), "error: study.yaml: "),
+        (("check", "x" * 5000), "File name too long"),
     ],
     ids=lambda value: " ".join(value)[:30] if isinstance(value, tuple) else None,
 )
-def test_absurd_numbers_end_in_one_line(tmp_path, arguments, printed):
+def test_absurd_numbers_end_in_one_line(foveasim, tmp_path, arguments, printed):
     scene = {"kind": "picture", "pitch_um": 300.0, "distance_m": 1.0, "peak_radiance_w_m2_sr_nm": 0.1}
     scene["wavelength_nm"] = [620, 550, 450]
     taken = {**SHOT, "scene": {**scene, "picture": "frames/0.png"}}
@@ -253,5 +253,5 @@ def test_absurd_numbers_end_in_one_line(tmp_path, arguments, printed):
 
     assert result.returncode == 2
     assert printed in result.stderr
-    assert result.stderr.count(b"\n") == 1
+    assert result.stderr.count("\n") == 1
     assert len(result.stderr) < 1500

@@ -66,41 +66,57 @@ METRICS = {
 }
 """
 COMMAND = """
-import json, own
+import importlib, json, sys
 from foveasim.explore._functions import identify_function
-print(json.dumps({name: identify_function(metric) for name, metric in own.METRICS.items()}))
+found = []
+for directory in sys.argv[1:]:
+    sys.path.insert(0, directory)
+    sys.modules.pop("own", None)
+    own = importlib.import_module("own")
+    found.append({name: identify_function(metric) for name, metric in own.METRICS.items()})
+print(json.dumps(found))
 """
 
 
-def identities(directory, source, hash_seed):
-    (directory / "own.py").write_text(source)
+def identities(directory, sources, hash_seed):
+    """Return the identities in each version of a module, from a process of its own."""
+    directories = [directory / f"{hash_seed}_{k}" for k in range(len(sources))]
+    for one, source in zip(directories, sources, strict=True):
+        one.mkdir()
+        (one / "own.py").write_text(source)
     environment = os.environ | {"PYTHONHASHSEED": str(hash_seed), "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, "-c", COMMAND]
-    found = subprocess.run(command, cwd=directory, env=environment, capture_output=True, text=True, check=False)
+    command = [sys.executable, "-c", COMMAND, *map(str, directories)]
+    found = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert found.returncode == 0, found.stderr
     return json.loads(found.stdout)
 
 
+#: Changes of the module, and the metrics whose behaviour they change.
+CHANGES = (
+    ("make(10)", "make(60)", {"closure"}),
+    ("of=4", "of=5", {"partial"}),
+    ("Counter(3)", "Counter(4)", {"object"}),
+    ("scale = 2", "scale = 3", {"object"}),
+    ("self.scale * self.level", "self.scale + self.level", {"object"}),
+    ("LEVEL = 10", "LEVEL = 11", {"plain", "partial", "lambda"}),
+    ("code > LEVEL", "code >= LEVEL", {"plain", "partial"}),
+    ("np.arange(5.0)", "np.arange(6.0)", {"closure"}),
+    ('"two", "three"}', '"two", "four"}', {"closure"}),
+    ("ping(n) + 2", "ping(n) + 3", {"both"}),
+    ("n - 1", "n - 2", {"recursive"}),
+)
+
+
 def test_identity_depends_on_behaviour_only(tmp_path):
-    before = identities(tmp_path, OWN, 1)
+    (before,) = identities(tmp_path, [OWN], 1)
+    unchanged, *changed = identities(
+        tmp_path, ["# a comment\n\n" + OWN, *(OWN.replace(old, new) for old, new, _ in CHANGES)], 2
+    )
 
     assert len(set(before.values())) == len(before)
-    assert identities(tmp_path, "# a comment\n\n" + OWN, 2) == before
-    for old, new, changed in (
-        ("make(10)", "make(60)", {"closure"}),
-        ("of=4", "of=5", {"partial"}),
-        ("Counter(3)", "Counter(4)", {"object"}),
-        ("scale = 2", "scale = 3", {"object"}),
-        ("self.scale * self.level", "self.scale + self.level", {"object"}),
-        ("LEVEL = 10", "LEVEL = 11", {"plain", "partial", "lambda"}),
-        ("code > LEVEL", "code >= LEVEL", {"plain", "partial"}),
-        ("np.arange(5.0)", "np.arange(6.0)", {"closure"}),
-        ('"two", "three"}', '"two", "four"}', {"closure"}),
-        ("ping(n) + 2", "ping(n) + 3", {"both"}),
-        ("n - 1", "n - 2", {"recursive"}),
-    ):
-        after = identities(tmp_path, OWN.replace(old, new), 3)
-        assert {name for name in before if before[name] != after[name]} == changed, old
+    assert unchanged == before
+    for (old, _, expected), after in zip(CHANGES, changed, strict=True):
+        assert {name for name in before if before[name] != after[name]} == expected, old
 
 
 def fraction_above(level, unit=1.0):

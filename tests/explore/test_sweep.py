@@ -201,10 +201,12 @@ def programs(n_workers):
                 wait_for(lambda: answers(port))
         yield address, running[0]
     finally:
-        for program in reversed(running):
-            program.terminate()
-        for program in running:
-            program.wait(timeout=LIMIT_S)
+        # Workers first: they sign off at the scheduler.
+        for group in (running[1:], running[:1]):
+            for program in group:
+                program.terminate()
+            for program in group:
+                program.wait(timeout=LIMIT_S)
 
 
 @pytest.fixture(scope="module")
@@ -511,7 +513,8 @@ def test_failed_points_are_reported_and_retried(tmp_path):
     assert journal_path(tmp_path / "r.zarr").exists()
 
 
-def test_failed_points_can_be_retried_repeatedly(tmp_path):
+def test_failed_points_can_be_retried_repeatedly(tmp_path, monkeypatch):
+    monkeypatch.setattr("foveasim.explore.cluster.SCHEDULER_S", 0.5)
     bad = tmp_path / "bad"
     bad.touch()
 
