@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 OUT ?= out
 # Arguments for pytest in all test targets: make test PYTEST_ARGS="tests/cli"
 PYTEST_ARGS ?=
-PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadgroup
+PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 
 # Lower bounds of pyproject.toml on the oldest Python: .venv-lowest/uv resolves them, .venv-lowest/env contains them.
 LOWEST := .venv-lowest
