@@ -27,7 +27,7 @@ from foveasim.capture import Capture
 from foveasim.distortion import Lens
 from foveasim.errors import CoverageWarning, FoveasimWarning, ParameterError, SamplingWarning, SimulationError
 from foveasim.fields import Grid, PowerMap
-from foveasim.integrate import Integrator
+from foveasim.integrate import Integrator, outline_bounds_um
 from foveasim.layout import Layout
 from foveasim.modes import Between, Exposure, Shutter
 from foveasim.optics import Optics
@@ -46,6 +46,10 @@ Frame = Scene | PowerMap | tuple[Scene | PowerMap, Sequence[float]]
 #: Power maps behind each colour filter, on each grid.
 ImageCache = dict[tuple[Grid, int], NDArray[Any]]
 
+#: Cameras warn when the layout measures less than this fraction of the width of a photograph.
+MIN_PICTURE_FRACTION = 0.25
+#: Margin of a picture that covers undistorted outlines: their edges are curves of limited accuracy.
+COVER_MARGIN = 1e-5
 #: Fourier transforms in float32 leave negative rates of up to this fraction of the largest one.
 NEGATIVE_ROUNDING = 1e-4
 #: Lower limit of a filter's response, relative to the strongest filter, for white balance.
@@ -86,7 +90,8 @@ class Camera:
     Warns
     -----
     CoverageWarning
-        On a capture, when photosites extend beyond the image or the image circle.
+        On a capture, when photosites extend beyond the image or the image circle, or when the layout measures less than a
+        quarter of the width of a photograph. Scenes with ``fit`` are framed on the layout, without these warnings.
     SamplingWarning
         On a capture, when second-order integration of a sharp image on coarse cells gives negative photoelectrons.
 
@@ -130,6 +135,7 @@ class Camera:
         self._layout = sensor.layout
         self._n_threads = thread_count(n_threads)
         self._integrators: dict[tuple[Grid, int, Position], Integrator] = {}
+        self._bounds_um: list[tuple[float, float, float, float]] = []
 
     def __repr__(self) -> str:
         return f"Camera({self._optics!r}, {self._sensor!r})"
@@ -151,10 +157,12 @@ class Camera:
 
     def oversample(self, light: Scene | PowerMap) -> int:
         """Return the number of map cells along a source pixel; 1 for power maps."""
+        light = self._with_pitch(light)
         return 1 if isinstance(light, PowerMap) else int(self._optics.resolve_oversample(light).oversample)
 
     def order(self, light: Scene | PowerMap) -> Literal[1, 2]:
         """Return the order of integration for a scene or power map."""
+        light = self._with_pitch(light)
         if self._order is not None:
             return self._order
         if isinstance(light, PowerMap):
@@ -162,6 +170,72 @@ class Camera:
         narrowest_um = float(um_from_nm(light.wavelength_nm.min())) * self._optics.working_f_number(light.distance_m)
         cell_um = self._optics.grid(light).pitch_x_um / self.oversample(light)
         return 2 if cell_um <= SMOOTH_LAMBDA_N * narrowest_um else 1
+
+    def frame(self, scene: Scene) -> Scene:
+        """
+        Return a scene with the pixel pitch that its ``fit`` requires with this camera.
+
+        Captures and all other results of the camera frame their scenes; this method shows the pitch, or prepares a scene for
+        functions without a camera, such as :meth:`Optics.power_map`.
+
+        Parameters
+        ----------
+        scene : Scene
+            With ``fit="cover"`` the image of the picture covers all photosites, with ``"contain"`` it lies within the bounding
+            box of the layout, with ``"width"`` it has the width of this box. The centre of the picture is on the optical axis,
+            so that a layout that is not centred on the axis requires a larger picture to be covered, and contains a smaller
+            one. Outlines are undistorted first; sites outside the image circle do not count. With lateral chromatic
+            aberration, the condition holds for all wavelengths.
+
+        Returns
+        -------
+        Scene
+            With ``pitch_um`` and without ``fit``; the scene itself if it has a pitch.
+
+        Raises
+        ------
+        ParameterError
+            When the layout has no photosites in the image circle, or for ``"contain"`` the optical axis is outside its
+            bounding box; when the distance of the scene is at most the focal length.
+        """
+        if not isinstance(scene, Scene):
+            raise ParameterError("scene", f"must be a Scene, got a {type(scene).__name__}")
+        return scene if scene.pitch_um is not None else self._fit(scene, scene.fit)
+
+    def _fit(self, scene: Scene, fit: str | None) -> Scene:
+        """Return a scene with the pitch of a framing."""
+        if not self._bounds_um:
+            self._bounds_um.append(outline_bounds_um(self._layout, self._distortion))
+        bounds_um = np.array(self._bounds_um[0])
+        if np.isnan(bounds_um).any():
+            required = "photosites in the image circle" if self._layout.n_sites else "photosites"
+            raise ParameterError("fit", f"must be used with a layout that has {required}", fit)
+        axis_um = np.zeros(2) if self._distortion is None else np.array(self._distortion.centre_um)
+        below_um, above_um = axis_um - bounds_um[:2], bounds_um[2:] - axis_um
+        # The image scales with the pitch. At this one its pixels are of about 1 µm.
+        unit_um = 1.0 / self._optics.magnification(scene.distance_m)
+        one = scene.with_pitch(unit_um)
+        images = [self._optics.grid(one)] if fit == "width" else [grid for grid, _ in self._optics.image_grids(one)]
+        half_um = 0.5 * np.array([_size_um(self._to_sensor_frame(grid).bounds_um) for grid in images])
+        if fit == "width":
+            scale = 0.5 * (below_um + above_um)[0] / half_um[0, 0]
+        elif fit == "cover":
+            margin = 0.0 if self._distortion is None else COVER_MARGIN
+            scale = (1.0 + margin) * (np.maximum(below_um, above_um) / half_um.min(axis=0)).max()
+        else:
+            scale = (np.minimum(below_um, above_um) / half_um.max(axis=0)).min()
+            if not scale > 0.0:
+                raise ParameterError(
+                    "fit",
+                    f"must not be 'contain' with the optical axis, at {_format_point(axis_um)} µm, outside the layout, which "
+                    f"extends from {_format_point(bounds_um[:2])} to {_format_point(bounds_um[2:])} µm; use 'cover' or "
+                    "'width', or move the layout",
+                )
+        return scene.with_pitch(float(scale) * unit_um)
+
+    def _with_pitch(self, light: Scene | PowerMap) -> Scene | PowerMap:
+        """Return a scene with its pitch, or a power map."""
+        return self.frame(light) if isinstance(light, Scene) else light
 
     def image_grid(self, scene: Scene) -> Grid:
         """
@@ -181,7 +255,7 @@ class Camera:
         ParameterError
             When the scene is not a Scene, or its distance is at most the focal length.
         """
-        return self._to_sensor_frame(self._optics.grid(scene))
+        return self._to_sensor_frame(self._optics.grid(self.frame(scene)))
 
     def power_map(self, scene: Scene) -> PowerMap:
         """
@@ -202,6 +276,7 @@ class Camera:
         ParameterError, SimulationError
             When the distance of the scene is at most the focal length, or the result is not finite.
         """
+        scene = self.frame(scene)
         power_map = self._optics.resolve_oversample(scene).power_map(scene, n_threads=self._n_threads)
         return PowerMap(power_map.data, self._to_sensor_frame(power_map.grid), power_map.wavelength_nm)
 
@@ -274,7 +349,7 @@ class Camera:
             n_threads=self._n_threads,
         )
         if other._layout is self._layout:
-            other._integrators = self._integrators
+            other._integrators, other._bounds_um = self._integrators, self._bounds_um
         return other
 
     def photoelectrons_per_s(self, light: Scene | PowerMap, *, images: ImageCache | None = None) -> Floats:
@@ -371,7 +446,7 @@ class Camera:
             bits=sensor.bits,
             white_dn=self._white(light),
             settings={
-                "light": _describe_light(light),
+                "light": self._describe_light(light),
                 **self._shared_settings,
                 "oversample": self.oversample(light),
                 "integration_order": self.order(light),
@@ -383,6 +458,26 @@ class Camera:
             },
             stage_s=clock.stage_s,
         )
+
+    def _describe_light(self, light: Scene | PowerMap) -> dict[str, object]:
+        if isinstance(light, PowerMap):
+            return {
+                "kind": "PowerMap",
+                "grid": to_plain_data(light.grid),
+                "wavelength_nm": light.wavelength_nm.tolist(),
+            }
+        return {
+            "kind": "Scene",
+            "source": light.source,
+            "shape": list(light.basis.shape),
+            "pitch_um": self.frame(light).pitch_um,
+            "fit": light.fit,
+            "field_of_view_deg": light.field_of_view_deg,
+            "distance_m": light.distance_m,
+            "wavelength_nm": light.wavelength_nm.tolist(),
+            "band_width_nm": light.band_width_nm.tolist(),
+            "spectrum_w_m2_sr_nm": to_plain_data(light.spectrum_w_m2_sr_nm),
+        }
 
     @cached_property
     def _shared_settings(self) -> dict[str, Any]:
@@ -563,6 +658,7 @@ class Camera:
             single_threaded = Camera(
                 optics=self._optics, sensor=self._sensor, distortion=self._distortion, order=self._order, n_threads=1
             )
+            single_threaded._bounds_um = self._bounds_um
         image_lock = Lock()
 
         def compute(task: _Task) -> tuple[_Task, Floats | None, _Clock]:
@@ -571,7 +667,8 @@ class Camera:
                 return task, None, own
             # The first frame of a scene computes the images that its next frames share.
             with image_lock if task.images == {} else nullcontext():
-                return task, single_threaded._photoelectrons_per_s(task.light, own, task.position_um, task.images), own
+                position_um = task.position_um if task.is_moving else None
+                return task, single_threaded._photoelectrons_per_s(task.light, own, position_um, task.images), own
 
         rate_e_per_s = np.zeros(self._layout.n_sites)
         for task, found, own in in_order(compute, _tasks(frames), self._n_threads, ahead):
@@ -656,16 +753,18 @@ class Camera:
         self,
         light: Scene | PowerMap,
         clock: _Clock,
-        position_um: Position = (0.0, 0.0),
+        position_um: Position | None = None,
         cached: ImageCache | None = None,
     ) -> Floats:
         """
         Return the expected photoelectrons of every site per second.
 
-        ``cached`` is a cache of a scene's images by grid and filter, or None.
+        ``position_um`` is the position of a moving sensor, or None; ``cached`` is a cache of a scene's images by grid and
+        filter, or None.
         """
         if not isinstance(light, Scene | PowerMap):
             raise ParameterError("light", f"must be a Scene or a PowerMap, got a {type(light).__name__}")
+        source, light = light, self._with_pitch(light)
         e_per_j = self._sensor.responsivity_e_per_j(light.wavelength_nm)
         with clock.stage("load kernels"):
             _load_kernels(light)
@@ -682,9 +781,11 @@ class Camera:
         with clock.stage("compile layout"):
             order = self.order(light)
             integrators = [
-                self.integrator(grid, order=order, n_grids=len(grids), position_um=position_um) for grid in grids
+                self.integrator(grid, order=order, n_grids=len(grids), position_um=position_um or (0.0, 0.0))
+                for grid in grids
             ]
-        self._warn_of_uncovered(min(integrators, key=lambda integrator: integrator.grid.cell_area_um2))
+        smallest = min(integrators, key=lambda integrator: integrator.grid.cell_area_um2)
+        self._warn_of_coverage(source, smallest, is_moving=position_um is not None)
         rate_e_per_s = np.zeros(self._layout.n_sites)
         for image, cells, weight in maps:
             with clock.stage("integration"):
@@ -758,8 +859,8 @@ class Camera:
             stacklevel=5,
         )
 
-    def _warn_of_uncovered(self, integrator: Integrator) -> None:
-        """Warn of sites outside the image, which are dark whatever the scene is."""
+    def _warn_of_coverage(self, source: Scene | PowerMap, integrator: Integrator, *, is_moving: bool) -> None:
+        """Warn of sites outside the image, which are dark whatever the scene is, and of a layout that measures little of it."""
         n_outside = integrator.sites_outside_image_circle.size
         if n_outside:
             warnings.warn(
@@ -768,18 +869,35 @@ class Camera:
                 CoverageWarning,
                 stacklevel=4,
             )
+        is_photograph = isinstance(source, Scene) and source.is_picture
+        fit = source.fit if isinstance(source, Scene) else None
+        if fit in ("contain", "width"):
+            return
+        image_um, layout_um = integrator.grid.bounds_um, integrator.bounds_um
         n_uncovered = int(np.count_nonzero(integrator.uncovered_um2)) - n_outside
         if n_uncovered:
-            x_min, y_min, x_max, y_max = integrator.grid.bounds_um
-            left, bottom, right, top = self._layout.bounds_um
+            remedy = (
+                "use fit='cover', or a larger pitch_um or field_of_view_deg"
+                if is_photograph
+                else "enlarge the scene (pitch_um)"
+            )
             warnings.warn(
                 f"{n_uncovered:,} of {self._layout.n_sites:,} photosites lie partly or completely outside the image, where "
-                f"irradiance is 0: the image extends from ({x_min:.4g}, {y_min:.4g}) to ({x_max:.4g}, {y_max:.4g}) µm, the "
-                f"layout from ({left:.4g}, {bottom:.4g}) to ({right:.4g}, {top:.4g}) µm; enlarge the scene (pitch_um), or "
-                "shrink or move the layout",
+                f"irradiance is 0: the image measures {_format_extent(image_um)}, the layout {_format_extent(layout_um)}; "
+                f"{remedy}, or shrink or move the layout",
                 CoverageWarning,
                 stacklevel=4,
             )
+        elif is_photograph and fit is None and not is_moving:
+            fraction = _size_um(layout_um)[0] / _size_um(image_um)[0]
+            if fraction < MIN_PICTURE_FRACTION:
+                warnings.warn(
+                    f"the layout measures only {100.0 * fraction:.2g} % of the width of the picture: the image measures "
+                    f"{_format_extent(image_um)}, the layout {_format_extent(layout_um)}; use fit='cover', or a smaller "
+                    "pitch_um or field_of_view_deg",
+                    CoverageWarning,
+                    stacklevel=4,
+                )
 
     def _white(self, light: Scene | PowerMap) -> Floats:
         """Return each filter's relative response to an equal-energy spectrum, as a code."""
@@ -830,6 +948,7 @@ class _Task(NamedTuple):
     position_um: Position
     images: ImageCache | None
     is_repeated: bool
+    is_moving: bool
 
 
 def _tasks(frames: Iterable[Frame]) -> Iterator[_Task]:
@@ -843,7 +962,7 @@ def _tasks(frames: Iterable[Frame]) -> Iterator[_Task]:
             is_cached = before is not None and is_same and before.images is not None
             images = before.images if before is not None and is_cached else {}
         is_repeated = before is not None and is_same and position_um == before.position_um
-        before = _Task(light, position_um, images, is_repeated)
+        before = _Task(light, position_um, images, is_repeated, isinstance(frame, tuple))
         yield before
 
 
@@ -870,19 +989,22 @@ def _split_frame(frame: Frame) -> tuple[Scene | PowerMap, Position]:
     return frame[0], (float(position_um[0]), float(position_um[1]))
 
 
-def _describe_light(light: Scene | PowerMap) -> dict[str, object]:
-    if isinstance(light, PowerMap):
-        return {"kind": "PowerMap", "grid": to_plain_data(light.grid), "wavelength_nm": light.wavelength_nm.tolist()}
-    return {
-        "kind": "Scene",
-        "source": light.source,
-        "shape": list(light.basis.shape),
-        "pitch_um": light.pitch_um,
-        "distance_m": light.distance_m,
-        "wavelength_nm": light.wavelength_nm.tolist(),
-        "band_width_nm": light.band_width_nm.tolist(),
-        "spectrum_w_m2_sr_nm": to_plain_data(light.spectrum_w_m2_sr_nm),
-    }
+def _size_um(bounds_um: Sequence[float]) -> tuple[float, float]:
+    """Return width and height of a bounding box."""
+    x0_um, y0_um, x1_um, y1_um = bounds_um
+    return x1_um - x0_um, y1_um - y0_um
+
+
+def _format_point(xy_um: Sequence[float] | Floats) -> str:
+    return f"({xy_um[0]:.4g}, {xy_um[1]:.4g})"
+
+
+def _format_extent(bounds_um: Sequence[float]) -> str:
+    """Return size and position of a bounding box, for messages."""
+    width_um, height_um = _size_um(bounds_um)
+    return (
+        f"{width_um:.5g} x {height_um:.5g} µm, from {_format_point(bounds_um[:2])} to {_format_point(bounds_um[2:])} µm"
+    )
 
 
 def _load_kernels(light: Scene | PowerMap) -> None:

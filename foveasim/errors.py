@@ -12,7 +12,7 @@ Errors and warnings of foveasim.
 
     FoveasimWarning (UserWarning)
     ├── SamplingWarning                  the sampling is too coarse for the physics
-    ├── CoverageWarning                  photosites lie outside the power map
+    ├── CoverageWarning                  image and layout differ in size: photosites outside, or a small part
     └── LayoutWarning                    a layout covers less of its field than its parameters specify
 
 Each message gives the name of the parameter or the path of the file, the rule, the value and a hint.
@@ -107,7 +107,7 @@ class SamplingWarning(FoveasimWarning):
 
 
 class CoverageWarning(FoveasimWarning):
-    """Photosites that are partly or completely outside the power map."""
+    """Photosites outside the image, or a layout that measures only a small part of a photograph."""
 
 
 class LayoutWarning(FoveasimWarning):

@@ -101,8 +101,8 @@ class SceneLike(Protocol):
         """Widths of the wavelength bands (n_wavelength,)."""
 
     @property
-    def pitch_um(self) -> float:
-        """Pixel pitch in the scene plane."""
+    def pitch_um(self) -> float | None:
+        """Pixel pitch in the scene plane; None if the framing on a layout determines it."""
 
     @property
     def distance_m(self) -> float:

@@ -84,6 +84,7 @@ class Shot:
     name : str
         File name without extension.
     scene : Scene or PowerMap
+        A scene with ``fit`` has no pitch: ``camera.frame(scene)`` has.
     camera : Camera
     rules : DesignRules or None
         Rules that the layout is designed for.
@@ -219,9 +220,6 @@ def build_shot(
     distortion = cache("distortion", data.get("distortion"), lambda: _build(path, "distortion", settings.distortion))
     scene = cache("scene", data["scene"], lambda: _build(path, "scene", settings.scene))
     # Errors of a capture are raised here, before it starts, with the path of the key.
-    if isinstance(scene, Scene):
-        _call(path, "scene", optics.grid, {"scene": scene})
-        _call(path, "optics", optics.check, {"scene": scene})
     _call(path, "scene", sensor.responsivity_e_per_j, {"wavelength_nm": scene.wavelength_nm})
     streams = _call(path, "", Streams, {"seed": settings.seed})
     exposure_s = _call(path, "", check_number, {"name": "exposure_s", "value": settings.exposure_s, "at_least": 0.0})
@@ -231,11 +229,16 @@ def build_shot(
         [data["layout"], data.get("distortion"), order],
         lambda: Camera(optics=optics, sensor=sensor, distortion=distortion, order=order, n_threads=n_threads),
     )
+    # Other optics and electronics share the compiled layout.
+    camera = camera.replace(optics=optics, sensor=sensor)
+    if isinstance(scene, Scene):
+        framed = _call(path, "scene", camera.frame, {"scene": scene})
+        _call(path, "scene", optics.grid, {"scene": framed})
+        _call(path, "optics", optics.check, {"scene": framed})
     return Shot(
         name=path.stem,
         scene=scene,
-        # Other optics and electronics share the compiled layout.
-        camera=camera.replace(optics=optics, sensor=sensor),
+        camera=camera,
         rules=file.rules,
         exposure_s=exposure_s,
         seed=streams.seed,
@@ -338,9 +341,10 @@ def read_rules(path: str | Path) -> DesignRules:
     return rules
 
 
-def schema(section: Any = None, title: str = "foveasim settings") -> dict[str, Any]:
-    """Return the JSON schema of shots, or of a model."""
-    model_schema = TypeAdapter(models().shot if section is None else section).json_schema()
+def schema(section: Any = "shot", title: str = "foveasim settings") -> dict[str, Any]:
+    """Return the JSON schema of a ``"shot"``, a ``"layout"`` or ``"rules"``, or of a model."""
+    model = getattr(models(), section) if isinstance(section, str) else section
+    model_schema = TypeAdapter(model).json_schema()
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **model_schema, "title": title}
 
 

@@ -42,7 +42,7 @@ def run_video(
     Parameters
     ----------
     shot : Shot
-        Pitch, distance and spectra of its scene apply to the frames.
+        Pitch or framing, distance and spectra of its scene apply to the frames.
     frames : path
         A directory of pictures, or a video file.
     out : path

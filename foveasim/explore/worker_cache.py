@@ -21,6 +21,7 @@ from foveasim.config import Shot, build_shot
 from foveasim.errors import FoveasimError
 from foveasim.explore._metrics import REFERENCES, Metric
 from foveasim.explore._records import Record, check_unique, to_values
+from foveasim.scene import Scene
 
 __all__ = ["ShotRunner", "WorkerCache"]
 
@@ -222,9 +223,12 @@ def _worker() -> Any:
 
 
 def _image_settings(shot: Shot, settings: Mapping[str, Any]) -> list[Any]:
-    """Return the settings that determine the optical images, with the spectral responsivity."""
-    response = shot.camera.sensor.responsivity_e_per_j(shot.scene.wavelength_nm)
-    return [settings["scene"], settings["optics"], hashlib.sha256(response.tobytes()).hexdigest()]
+    """Return the settings that determine the optical images, with the spectral responsivity and the pitch."""
+    scene = shot.scene
+    response = shot.camera.sensor.responsivity_e_per_j(scene.wavelength_nm)
+    # With 'fit' the pitch depends on layout and distortion.
+    pitch_um = shot.camera.frame(scene).pitch_um if isinstance(scene, Scene) else None
+    return [settings["scene"], settings["optics"], pitch_um, hashlib.sha256(response.tobytes()).hexdigest()]
 
 
 def _raise_ctrl_c(error: BaseException) -> None:

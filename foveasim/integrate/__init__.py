@@ -9,5 +9,6 @@ exactly ``sum over cells of map[cell] * area(site ∩ cell)``; at second order e
 from __future__ import annotations
 
 from foveasim.integrate._integrator import Integrator
+from foveasim.integrate._outlines import outline_bounds_um
 
-__all__ = ["Integrator"]
+__all__ = ["Integrator", "outline_bounds_um"]

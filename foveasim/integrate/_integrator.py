@@ -150,6 +150,20 @@ class Integrator:
         return self._plan.n_sites
 
     @cached_property
+    def bounds_um(self) -> tuple[float, float, float, float]:
+        """
+        Bounding box (x_min, y_min, x_max, y_max) of the outlines in the plane of the map, µm.
+
+        Sites outside the image circle do not count; NaN without others.
+        """
+        bounds_um = self._plan.bounds_um[~self._plan.is_outside]
+        if not bounds_um.size:
+            return np.nan, np.nan, np.nan, np.nan
+        x0, y0 = bounds_um[:, :2].min(axis=0).tolist()
+        x1, y1 = bounds_um[:, 2:].max(axis=0).tolist()
+        return x0, y0, x1, y1
+
+    @cached_property
     def uncovered_um2(self) -> Floats:
         """
         Area of each site outside the grid or the image circle, (n_site,) µm².

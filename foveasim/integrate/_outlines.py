@@ -11,13 +11,17 @@ from foveasim._core.rings import next_vertex, positions_in_runs
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.fields import PackedRings, PointMap
 
-__all__ = ["Outlines", "UndistortedOutlines", "outlines_of"]
+__all__ = ["Outlines", "UndistortedOutlines", "outline_bounds_um", "outlines_of"]
 
 #: Maximum deviation of an undistorted edge from its chords, as a fraction of a cell; exceeded a few times by edges that are
 #: longer than a step of the grid below or need more than the maximum number of pieces.
 CHORD_TOLERANCE = 0.002
 #: Number of points along either axis of the layout at which the curvature of undistorted lines is sampled.
 CURVATURE_POINTS = 65
+#: Accuracy of the bounds of undistorted outlines, as a fraction of the larger side of the layout.
+BOUNDS_TOLERANCE = 1e-6
+#: Sites that are undistorted at once, a memory limit.
+SITES_PER_BLOCK = 2**16
 #: Maximum number of pieces per edge; edges that need more reach the boundary of the image circle.
 MAX_PIECES = 256
 
@@ -96,6 +100,41 @@ def _undistort(outlines: Outlines, lens: PointMap, chord_density: _ChordDensity)
         is_outside_vertex = np.repeat(is_outside, np.diff(ring_offsets[site_offsets]))
         undistorted = np.where(is_outside_vertex[:, np.newaxis], points, undistorted)
     return Outlines(undistorted, ring_offsets, site_offsets, is_outside)
+
+
+def outline_bounds_um(layout: PackedRings, distortion: PointMap | None = None) -> tuple[float, float, float, float]:
+    """
+    Return the bounding box of all outlines, undistorted if a lens is given.
+
+    Parameters
+    ----------
+    layout : packed rings
+        Outlines in the sensor plane.
+    distortion : object with ``undistort(xy_um, outside="mask")``, optional
+        A lens of :mod:`foveasim.distortion`; sites outside its image circle do not count.
+
+    Returns
+    -------
+    x_min, y_min, x_max, y_max : float, µm
+        NaN if there are no sites. With a lens, curved edges are within 1e-6 of the larger side of the layout.
+    """
+    xy_um, n_sites = layout.xy_um, layout.site_offsets.size - 1
+    if not xy_um.size:
+        return np.nan, np.nan, np.nan, np.nan
+    low_um, high_um = xy_um.min(axis=0), xy_um.max(axis=0)
+    if distortion is not None:
+        tolerance_um = BOUNDS_TOLERANCE * float((high_um - low_um).max())
+        outlines_between = UndistortedOutlines(layout, distortion, tolerance_um / CHORD_TOLERANCE)
+        low_um, high_um = np.full(2, np.inf), np.full(2, -np.inf)
+        for first in range(0, n_sites, SITES_PER_BLOCK):
+            outlines = outlines_between(first, min(first + SITES_PER_BLOCK, n_sites))
+            n_vertices = np.diff(outlines.ring_offsets[outlines.site_offsets])
+            points_um = outlines.xy_um[~np.repeat(outlines.is_outside, n_vertices)]
+            low_um = np.minimum(low_um, points_um.min(axis=0, initial=np.inf))
+            high_um = np.maximum(high_um, points_um.max(axis=0, initial=-np.inf))
+        if not (low_um <= high_um).all():
+            return np.nan, np.nan, np.nan, np.nan
+    return float(low_um[0]), float(low_um[1]), float(high_um[0]), float(high_um[1])
 
 
 class _ChordDensity:

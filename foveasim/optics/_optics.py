@@ -55,6 +55,16 @@ MAX_AUTO_CELLS = 1 << 27
 PADDINGS = ("reflect", "edge", "zero", "periodic")
 
 
+def _pitch_um(scene: SceneLike) -> float:
+    """Return the pixel pitch of a scene, which a scene with ``fit`` does not have."""
+    if scene.pitch_um is None:
+        raise ParameterError(
+            "scene",
+            "must have a pixel pitch, which with 'fit' depends on the layout; pass camera.frame(scene), or set 'pitch_um'",
+        )
+    return scene.pitch_um
+
+
 def _is_pupil(pupil: object) -> bool:
     """Return whether an object is callable with x, y and a wavelength."""
     if not callable(pupil) or isinstance(pupil, type):
@@ -286,7 +296,7 @@ class Optics(PointImages):
         if not hasattr(scene, "spectrum_w_m2_sr_nm"):
             raise ParameterError("scene", f"must be a Scene, got a {type(scene).__name__}")
         shape = scene.basis.shape
-        return Grid.centred((shape[1], shape[2]), scene.pitch_um * self.magnification(scene.distance_m))
+        return Grid.centred((shape[1], shape[2]), _pitch_um(scene) * self.magnification(scene.distance_m))
 
     def image_grids(self, scene: SceneLike) -> list[tuple[Grid, Bools]]:
         """
@@ -485,7 +495,7 @@ class Optics(PointImages):
         imaging = Imaging(
             basis=scene.basis,
             irradiance_w_m2=irradiance_w_m2
-            * (scene.pitch_um * self.magnification(scene.distance_m) / pixels.pitch_x_um) ** 2,
+            * (_pitch_um(scene) * self.magnification(scene.distance_m) / pixels.pitch_x_um) ** 2,
             weights=weights,
             tangent2_x=tangent2_x,
             tangent2_y=tangent2_y,
@@ -641,5 +651,5 @@ class Optics(PointImages):
     def _squared_tangents(self, scene: SceneLike) -> tuple[Floats, Floats]:
         """Return (x0/H)² of the scene columns and (y0/H)² of the scene rows."""
         _, n_y, n_x = scene.basis.shape
-        step = float(m_from_um(scene.pitch_um)) / scene.distance_m
+        step = float(m_from_um(_pitch_um(scene))) / scene.distance_m
         return ((np.arange(n_x) - 0.5 * (n_x - 1)) * step) ** 2, ((np.arange(n_y) - 0.5 * (n_y - 1)) * step) ** 2

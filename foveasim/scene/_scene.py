@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,9 +30,12 @@ from foveasim._io.images import read_picture
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import from_file_rows
 from foveasim.scene.registry import SCENES
-from foveasim.units import m_from_um
+from foveasim.units import m_from_um, um_from_m
 
-__all__ = ["Scene"]
+__all__ = ["Fit", "Scene"]
+
+#: Framing of a picture on a layout.
+Fit: TypeAlias = Literal["cover", "contain", "width"]
 
 #: Default wavelengths of the channels of colour pictures (red, green, blue) and of grey pictures.
 RGB_NM = (620.0, 550.0, 450.0)
@@ -39,6 +44,8 @@ GREY_NM = (550.0,)
 MAX_ENCODED = 16.0
 #: Larger values are errors of units: 1e9 m is the distance and width of an astronomical scene.
 MAX_PITCH_UM, MAX_DISTANCE_M = 1e15, 1e9
+#: Tolerance of a pitch that is given together with the field of view: rounding errors.
+PITCH_ROUNDING = 1e-9
 #: Weights of red, green and blue in the luminance of a colour (Rec. ITU-R BT.709).
 LUMINANCE_WEIGHTS = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
@@ -61,15 +68,24 @@ class Scene:
         Wavelengths of the bands.
     band_width_nm : (n_wavelength,) float64, nm
         Widths of the bands.
-    pitch_um : float, µm
-        Pixel pitch in the scene.
+    pitch_um : float or None, µm
+        Pixel pitch in the scene; None for a scene with ``fit``, and derived from ``field_of_view_deg`` if that is given.
     distance_m : float, m
         Distance of the scene from the pupil of the lens.
+    source : str
+        Origin of the basis images, for provenance.
+    fit : {"cover", "contain", "width"}, optional
+        Framing on the layout of a camera, which derives the pitch: :meth:`foveasim.Camera.frame`.
+    field_of_view_deg : float, optional, degrees
+        Horizontal angle of the scene as seen from the lens.
+    is_picture : bool
+        Whether the scene is a photograph: cameras warn if their layout measures only a small part of it.
 
     Raises
     ------
     ParameterError
-        If the arrays have inconsistent shapes, or contain values that are not finite or negative.
+        If the arrays have inconsistent shapes, or contain values that are not finite or negative, or if not exactly one of
+        pitch, fit and field of view is given.
 
     Notes
     -----
@@ -80,9 +96,12 @@ class Scene:
     spectrum_w_m2_sr_nm: Floats
     wavelength_nm: Floats
     band_width_nm: Floats
-    pitch_um: float
+    pitch_um: float | None
     distance_m: float
     source: str = field(default="arrays", kw_only=True)
+    fit: Fit | None = field(default=None, kw_only=True)
+    field_of_view_deg: float | None = field(default=None, kw_only=True)
+    is_picture: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
         basis = np.asarray(unmasked("basis", self.basis))
@@ -111,14 +130,66 @@ class Scene:
         object.__setattr__(self, "spectrum_w_m2_sr_nm", read_only(spectrum.copy()))
         object.__setattr__(self, "wavelength_nm", wavelength_nm)
         object.__setattr__(self, "band_width_nm", read_only(width_nm.copy()))
-        object.__setattr__(self, "pitch_um", check_number("pitch_um", self.pitch_um, above=0.0, at_most=MAX_PITCH_UM))
         distance_m = check_number("distance_m", self.distance_m, above=0.0, at_most=MAX_DISTANCE_M)
         object.__setattr__(self, "distance_m", distance_m)
+        object.__setattr__(self, "pitch_um", self._checked_pitch_um())
+
+    def _checked_pitch_um(self) -> float | None:
+        """Return the pitch that is given or follows from the field of view; None for a scene with ``fit``."""
+        if self.fit is not None:
+            check_choice("fit", self.fit, get_args(Fit))
+            for name in ("pitch_um", "field_of_view_deg"):
+                if getattr(self, name) is not None:
+                    raise _framing_conflict("fit", self.fit, name)
+            return None
+        given_um = None
+        if self.pitch_um is not None:
+            given_um = check_number("pitch_um", self.pitch_um, above=0.0, at_most=MAX_PITCH_UM)
+        if self.field_of_view_deg is None:
+            if given_um is None:
+                raise ParameterError("pitch_um", "must be given, or 'fit' or 'field_of_view_deg' instead")
+            return given_um
+        angle_deg = check_number("field_of_view_deg", self.field_of_view_deg, above=0.0)
+        if not angle_deg < 180.0:
+            raise ParameterError("field_of_view_deg", "must be < 180", angle_deg, "degrees", "a scene is a plane")
+        object.__setattr__(self, "field_of_view_deg", angle_deg)
+        width_um = 2.0 * float(um_from_m(self.distance_m)) * math.tan(math.radians(0.5 * angle_deg))
+        pitch_um = check_number("pitch_um", width_um / self.basis.shape[2], above=0.0, at_most=MAX_PITCH_UM)
+        if given_um is not None and not math.isclose(given_um, pitch_um, rel_tol=PITCH_ROUNDING):
+            raise _framing_conflict("field_of_view_deg", angle_deg, "pitch_um")
+        return pitch_um
+
+    def with_pitch(self, pitch_um: float) -> Scene:
+        """
+        Return the scene with another pixel pitch instead of its pitch, fit or field of view.
+
+        Parameters
+        ----------
+        pitch_um : float, µm
+            Pixel pitch in the scene.
+
+        Returns
+        -------
+        Scene
+            Shares the arrays of this scene.
+
+        Raises
+        ------
+        ParameterError
+            When the pitch is out of range.
+        """
+        # Not dataclasses.replace, which would check all pixels again.
+        scene = copy.copy(self)
+        pitch_um = check_number("pitch_um", pitch_um, above=0.0, at_most=MAX_PITCH_UM)
+        for name, value in {"pitch_um": pitch_um, "fit": None, "field_of_view_deg": None}.items():
+            object.__setattr__(scene, name, value)
+        return scene
 
     def __repr__(self) -> str:
         n_basis, n_y, n_x = self.basis.shape
+        size = f", fit='{self.fit}'," if self.pitch_um is None else f" of {self.pitch_um:g} µm"
         return (
-            f"Scene({n_x} x {n_y} pixels of {self.pitch_um:g} µm at {self.distance_m:g} m, {n_basis} basis images, "
+            f"Scene({n_x} x {n_y} pixels{size} at {self.distance_m:g} m, {n_basis} basis images, "
             f"{self.wavelength_nm.size} wavelengths, from {self.source})"
         )
 
@@ -127,7 +198,9 @@ class Scene:
         cls,
         picture: str | Path | ArrayLike,
         *,
-        pitch_um: float,
+        pitch_um: float | None = None,
+        fit: Fit | None = None,
+        field_of_view_deg: float | None = None,
         distance_m: float,
         peak_radiance_w_m2_sr_nm: float,
         wavelength_nm: Sequence[float] | None = None,
@@ -144,8 +217,13 @@ class Scene:
             File, or array in the convention of image libraries, top row first: grey or colour, with or without alpha. 8-bit
             and 16-bit values range from 0 to the maximum of the dtype; floating-point values have the peak 1 and may exceed
             it. The radiance is multiplied by alpha.
-        pitch_um : float, µm
-            Pixel pitch in the scene.
+        pitch_um : float, optional, µm
+            Pixel pitch in the scene, instead of ``fit``.
+        fit : {"cover", "contain", "width"}, optional
+            Framing, from which each camera derives the pitch: the image of the picture covers the layout completely, lies
+            within its bounding box, or has its width. The optical axis is at the centre of the picture. Default: ``"cover"``.
+        field_of_view_deg : float, optional, degrees
+            Horizontal angle of the picture as seen from the lens, instead of ``pitch_um`` and ``fit``.
         distance_m : float, m
             Distance of the scene from the lens.
         peak_radiance_w_m2_sr_nm : float, W/(m² sr nm)
@@ -166,8 +244,13 @@ class Scene:
         FileError
             If the file cannot be read.
         ParameterError
-            If channels, wavelengths and spectra are inconsistent, or a value is out of range.
+            If channels, wavelengths and spectra are inconsistent, a value is out of range, or more than one of ``pitch_um``,
+            ``fit`` and ``field_of_view_deg`` is given.
         """
+        if pitch_um is not None and field_of_view_deg is not None:
+            raise _framing_conflict("field_of_view_deg", field_of_view_deg, "pitch_um")
+        if pitch_um is None and field_of_view_deg is None and fit is None:
+            fit = "cover"
         check_choice("encoding", encoding, get_args(Encoding))
         peak = check_number("peak_radiance_w_m2_sr_nm", peak_radiance_w_m2_sr_nm, at_least=0.0)
         is_file = isinstance(picture, str | Path)
@@ -220,6 +303,9 @@ class Scene:
             pitch_um,
             distance_m,
             source=str(picture) if is_file else "a picture array",
+            fit=fit,
+            field_of_view_deg=field_of_view_deg,
+            is_picture=True,
         )
 
     @classmethod
@@ -248,14 +334,16 @@ class Scene:
         ParameterError
             If a value is out of range.
         """
-        return cls.from_picture(
-            np.ones(check_shape("shape", shape), np.float32),
-            pitch_um=pitch_um,
-            distance_m=distance_m,
-            peak_radiance_w_m2_sr_nm=radiance_w_m2_sr_nm,
-            wavelength_nm=wavelength_nm,
-            band_width_nm=band_width_nm,
-            encoding="linear",
+        radiance = check_number("radiance_w_m2_sr_nm", radiance_w_m2_sr_nm, at_least=0.0)
+        waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
+        return cls(
+            freeze(np.ones((1, *check_shape("shape", shape)), np.float32)),
+            np.full((1, waves_nm.size), radiance),
+            waves_nm,
+            band_widths_nm(waves_nm, band_width_nm),
+            pitch_um,
+            distance_m,
+            source="a uniform field",
         )
 
     @classmethod
@@ -318,6 +406,15 @@ class Scene:
             distance_m,
             source="point sources",
         )
+
+
+def _framing_conflict(name: str, value: object, other: str) -> ParameterError:
+    return ParameterError(
+        name,
+        f"must not be given together with '{other}'",
+        value,
+        hint="choose one of 'pitch_um', 'fit' and 'field_of_view_deg', and omit the others or set them to null",
+    )
 
 
 def _picture_array(picture: ArrayLike) -> NDArray[Any]:

@@ -44,11 +44,11 @@ class FrameSource:
     frame_s : float, optional, s
         Frame period; by default that of the video file.
     template : Scene, optional
-        Scene that specifies pitch, distance and spectra of the frames; the pictures replace its basis images. Colours are
-        converted to grey for a template with one basis image, and grey to colour for a template with three.
+        Scene that specifies pitch or framing, distance and spectra of the frames; the pictures replace its basis images.
+        Colours are converted to grey for a template with one basis image, and grey to colour for a template with three.
     **scene
-        Parameters of :meth:`foveasim.Scene.from_picture`: ``pitch_um``, ``distance_m``, ``peak_radiance_w_m2_sr_nm``, and
-        others; with ``template`` only ``encoding``.
+        Parameters of :meth:`foveasim.Scene.from_picture`: ``fit`` or ``pitch_um``, ``distance_m``,
+        ``peak_radiance_w_m2_sr_nm``, and others; with ``template`` only ``encoding``.
 
     Raises
     ------
@@ -195,7 +195,6 @@ class FrameSource:
         n_basis = template.basis.shape[0]
         converted = Scene.from_picture(
             picture,
-            pitch_um=template.pitch_um,
             distance_m=template.distance_m,
             peak_radiance_w_m2_sr_nm=1.0,
             # A single wavelength converts colours to grey. The template specifies the spectra.
@@ -204,7 +203,9 @@ class FrameSource:
             **self._scene,
         )
         basis = np.broadcast_to(converted.basis, (n_basis, *converted.basis.shape[1:]))
-        return replace(template, basis=basis, source=converted.source)
+        # The field of view is that of each frame, whatever its number of pixels.
+        pitch_um = template.pitch_um if template.field_of_view_deg is None else None
+        return replace(template, basis=basis, source=converted.source, pitch_um=pitch_um)
 
 
 def list_pictures(directory: Path) -> list[Path]:

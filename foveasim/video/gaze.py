@@ -185,7 +185,7 @@ def pan_camera(
     Parameters
     ----------
     scene : Scene
-        The complete scene.
+        The complete scene, with a pixel pitch; frame a scene with ``fit`` by :meth:`foveasim.Camera.frame`.
     path : GazePath
         Gaze positions in the sensor plane, in the image of the complete scene.
     optics : Optics
@@ -232,7 +232,9 @@ def _parts(
                 "µm",
             )
         if (left, bottom) != previous:
-            part = replace(scene, basis=scene.basis[:, bottom : bottom + n_y, left : left + n_x])
+            part = replace(
+                scene, basis=scene.basis[:, bottom : bottom + n_y, left : left + n_x], field_of_view_deg=None
+            )
             previous = left, bottom
         shift_um = [
             float(at_um) - (at - 0.5 * free) * cell_um

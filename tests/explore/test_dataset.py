@@ -438,18 +438,38 @@ def test_samples_are_finite_outside_picture():
 
 @pytest.mark.parametrize(("fit", "is_covered"), [("cover", True), ("contain", False)])
 def test_fit_scales_pictures_to_layout(fit, is_covered):
-    wide, high = np.full((20, 90, 3), 200, np.uint8), np.full((90, 20, 3), 200, np.uint8)
-    data = explore.Dataset([wide, high], SHOT, masks=[wide[..., 0] // 200, high[..., 0] // 200], fit=fit)
+    wide, high = np.full((24, 90, 3), 200, np.uint8), np.full((90, 24, 3), 200, np.uint8)
+    shot = SHOT | {"optics": {"focal_length_mm": 8.0, "f_number": 1.0}}
+    data = explore.Dataset([wide, high], shot, masks=[wide[..., 0] // 200, high[..., 0] // 200], fit=fit)
     if is_covered:
         assert all((sample["mask"] == 1).all() for sample in data)
         return
-    with pytest.warns(CoverageWarning):
-        assert all((sample["mask"] == -1).any() for sample in data)
-    for k, n in ((0, 90), (1, 90)):
-        grid = data.shot(k).camera.optics.grid(data.shot(k).scene)
-        x0, y0, x1, y1 = np.abs(data.layout.bounds_um)
-        half_um = (max(x0, x1), max(y0, y1))[k]
-        assert n * grid.pitch_um / 2 == pytest.approx(half_um)
+    assert all((sample["mask"] == -1).any() for sample in data)
+    x0, y0, x1, y1 = data.layout.bounds_um
+    for k, half_um in enumerate((min(-x0, x1), min(-y0, y1))):
+        grid = data.shot(k).camera.image_grid(data.shot(k).scene)
+        assert 90 * grid.pitch_um / 2 == pytest.approx(half_um)
+
+
+def test_fit_follows_random_lens():
+    vary = {"optics.focal_length_mm": {"uniform": [4.0, 16.0]}}
+    data = explore.Dataset(pictures(1), SHOT, vary, cameras=3, fit="width")
+    x0, _, x1, _ = data.layout.bounds_um
+
+    pitches_um = [data.shot(k).camera.frame(data.shot(k).scene).pitch_um for k in range(3)]
+    assert len(set(pitches_um)) == 3
+    for k in range(3):
+        assert data.shot(k).camera.image_grid(data.shot(k).scene).pitch_um * N_X == pytest.approx(x1 - x0)
+
+
+def test_fit_of_shot_is_that_of_dataset():
+    scene = {key: value for key, value in SHOT["scene"].items() if key != "pitch_um"}
+    shots = [SHOT | {"scene": scene | {"fit": "contain"}}, SHOT]
+    by_shot, by_dataset = (
+        explore.Dataset(pictures(1), shot, fit=fit)[0] for shot, fit in zip(shots, (None, "contain"), strict=True)
+    )
+
+    np.testing.assert_array_equal(by_shot["code"], by_dataset["code"])
 
 
 # -- picture sources --------------------------------------------------------------------------------------------------
@@ -655,7 +675,7 @@ def test_zarr_store_contains_layout_and_settings(tmp_path):
 
 def test_only_tar_shards_support_varied_layouts(tmp_path):
     vary = {"layout.parameters.pitch_um": {"uniform": [5.0, 7.0]}, "layout.parameters.n_rows": {"integers": [6, 9]}}
-    data = explore.Dataset(pictures(5), SHOT, vary)
+    data = explore.Dataset(pictures(5), SHOT | {"scene": SHOT["scene"] | {"pitch_um": 200.0}}, vary)
 
     stored = explore.write_dataset(data, tmp_path / "data", per_shard=2)
 

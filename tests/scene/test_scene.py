@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -343,6 +344,24 @@ def test_from_picture_rejects_invalid_arrays(picture, message):
         (COLOUR, {"band_width_nm": [10.0, 0.0, 10.0]}, "'band_width_nm' must be > 0"),
         (WHITE, {"encoding": "gamma"}, "'encoding' must be one of 'srgb', 'sqrt', 'linear', got 'gamma'"),
         (WHITE, {"pitch_um": 0.0}, "'pitch_um' must be > 0"),
+        (
+            WHITE,
+            {"fit": "cover"},
+            "'fit' must not be given together with 'pitch_um', got 'cover'; choose one of 'pitch_um', 'fit' and",
+        ),
+        (
+            WHITE,
+            {"field_of_view_deg": 30.0},
+            "'field_of_view_deg' must not be given together with 'pitch_um', got 30.0",
+        ),
+        (
+            WHITE,
+            {"pitch_um": None, "fit": "width", "field_of_view_deg": 30.0},
+            "'fit' must not be given together with 'field_of_view_deg', got 'width'",
+        ),
+        (WHITE, {"pitch_um": None, "fit": "crop"}, "'fit' must be one of 'cover', 'contain', 'width', got 'crop'"),
+        (WHITE, {"pitch_um": None, "field_of_view_deg": 0.0}, "'field_of_view_deg' must be > 0"),
+        (WHITE, {"pitch_um": None, "field_of_view_deg": 180.0}, "'field_of_view_deg' must be < 180, got 180.0 degrees"),
         (WHITE, {"pitch_um": "10"}, "'pitch_um' must be one number"),
         (WHITE, {"distance_m": -1.0}, "'distance_m' must be > 0"),
         (WHITE, {"distance_m": math.inf}, "'distance_m' must be finite"),
@@ -415,6 +434,9 @@ def test_flat_scene_rejects_invalid_shape(shape):
         ({"wavelength_nm": [-550.0]}, "wavelength_nm"),
         ({"band_width_nm": [10.0, 10.0]}, "band_width_nm"),
         ({"pitch_um": math.nan}, "pitch_um"),
+        ({"pitch_um": None}, "pitch_um"),
+        ({"fit": "cover"}, "fit"),
+        ({"field_of_view_deg": 30.0}, "field_of_view_deg"),
         ({"distance_m": 0.0}, "distance_m"),
     ],
 )
@@ -458,3 +480,23 @@ def test_scene_rejects_sizes_of_other_units(name):
 
     with pytest.raises(ParameterError, match=rf"'{name}' must be <= 1e\+"):
         fs.Scene.flat(shape=(4, 4), radiance_w_m2_sr_nm=1.0, band_width_nm=1.0, **values)
+
+
+def test_pitch_replaces_framing_and_shares_pixels():
+    scene = scene_of(F, pitch_um=None, fit="contain")
+    framed = scene.with_pitch(3.0)
+
+    assert (framed.pitch_um, framed.fit, framed.field_of_view_deg) == (3.0, None, None)
+    assert np.shares_memory(framed.basis, scene.basis)
+    assert scene.pitch_um is None
+    with pytest.raises(ParameterError, match=r"'pitch_um' must be > 0, got -1\.0 µm"):
+        scene.with_pitch(-1.0)
+
+
+def test_field_of_view_follows_replaced_distance():
+    scene = scene_of(F, pitch_um=None, field_of_view_deg=60.0)
+    farther = replace(scene, distance_m=2.0 * scene.distance_m, pitch_um=None)
+
+    assert farther.pitch_um == pytest.approx(2.0 * scene.pitch_um)
+    with pytest.raises(ParameterError, match="'field_of_view_deg' must not be given together with 'pitch_um'"):
+        replace(scene, distance_m=2.0)

@@ -654,8 +654,11 @@ def test_empty_frame_source_is_rejected():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"pich_um": 3.0}, "'pich_um' is not a parameter of Scene.from_picture; available: pitch_um, distance_m"),
-        ({"pitch_um": None}, "'pitch_um' is missing"),
+        (
+            {"pich_um": 3.0},
+            "'pich_um' is not a parameter of Scene.from_picture; available: pitch_um, fit, field_of_view_deg",
+        ),
+        ({"distance_m": None}, "'distance_m' is missing"),
     ],
 )
 def test_scene_parameters_are_checked_before_reading(changes, message):

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,7 @@ from foveasim.explore.datasets.pictures import digest_of, is_lazy, source_of
 from foveasim.explore.sweeps.plan import check_disjoint
 from foveasim.layout import Layout
 from foveasim.scene import Scene
+from foveasim.scene._scene import Fit
 
 __all__ = ["FIELDS", "Dataset"]
 
@@ -50,6 +51,8 @@ MAX_CACHED = 4
 CHECKED_VALUES = 64
 #: Upper limit of cameras and draws, beyond any feasible computation.
 MAX_REPEATS = 10**9
+#: Settings that ``fit`` replaces.
+FRAMING = ("scene.pitch_um", "scene.fit", "scene.field_of_view_deg")
 #: Setting that determines the photosites.
 LAYOUT = "layout"
 
@@ -90,9 +93,9 @@ class Dataset:
         Classes of the pixels of each picture.
     flows : sequence of (n_y, n_x, 2), or of ``.npy`` files, optional, pixels
         Displacement of each pixel, x to the right and y down; NaN where it is unknown.
-    fit : {"cover", "contain"}, optional
-        Scaling of each picture with the lens of the shot: the scene pitch is chosen so that the image just covers the layout,
-        or just fits on it. By default the pitch is that of the shot.
+    fit : {"cover", "contain", "width"}, optional
+        Framing of each picture, as the setting ``scene.fit``, which it replaces (:meth:`foveasim.Scene.from_picture`). The
+        pitch follows from the layout and lens of each sample. By default the framing or pitch is that of the shot.
     changes : mapping of str to value, optional
         Settings that are replaced in all samples.
     source : path
@@ -150,7 +153,7 @@ class Dataset:
         boxes: Sequence[Any] | None = None,
         masks: Sequence[Any] | None = None,
         flows: Sequence[Any] | None = None,
-        fit: Literal["cover", "contain"] | None = None,
+        fit: Literal["cover", "contain", "width"] | None = None,
         changes: Mapping[str, Any] | None = None,
         source: str | Path = "settings",
         n_threads: int = 1,
@@ -172,15 +175,12 @@ class Dataset:
         self._masks = None if masks is None else check_per_picture("masks", masks, n)
         self._flows = None if flows is None else check_per_picture("flows", flows, n)
         if fit is not None:
-            check_choice("fit", fit, ("cover", "contain"))
+            check_choice("fit", fit, get_args(Fit))
         self._fit = fit
         self._files: list[Path] = []
-        self._file, self._settings = _base_settings(
-            shot, Path(source), changes or {}, self._files, is_fitted=fit is not None
-        )
+        self._file, self._settings = _base_settings(shot, Path(source), changes or {}, self._files, fit)
         self._distributions = _parse_distributions(self._file, vary or {}, self._files, is_fitted=fit is not None)
         self._reset()
-        self._fit_um = (0.0, 0.0, 1.0)
         self._code_type: Any = np.uint8
         self._check_bounds()
 
@@ -345,11 +345,6 @@ class Dataset:
         """Return the settings with the given values and the picture of a sample."""
         data = _copy(self._settings)
         data["scene"]["picture"] = self._name_of(index)
-        if self._fit is not None:
-            half_x_um, half_y_um, magnification = self._fit_um
-            n_y, n_x = self._pixels(self._picture_of(index)).shape[:2]
-            choose = max if self._fit == "cover" else min
-            data["scene"]["pitch_um"] = choose(2.0 * half_x_um / n_x, 2.0 * half_y_um / n_y) / magnification
         for path, value in values.items():
             put_setting(self._file, data, path, value)
         return data
@@ -446,8 +441,9 @@ class Dataset:
         found: dict[str, Any] = {} if self._labels is None else {"label": self._labels[picture]}
         if self._boxes is None and self._masks is None and self._flows is None:
             return found
-        camera, scene = shot.camera, shot.scene
-        assert isinstance(scene, Scene)
+        camera = shot.camera
+        assert isinstance(shot.scene, Scene)
+        scene = camera.frame(shot.scene)
         grid = camera.image_grid(scene)
         lens = camera.distortion
         n_grids = len(camera.optics.image_grids(scene))
@@ -473,17 +469,7 @@ class Dataset:
     def _check_bounds(self) -> None:
         """Build the first shot at the bounds of every setting, to detect errors early."""
         try:
-            base = self._build(0, self._settings_with(0, {}) if self._fit is None else self._unscaled_settings())
-            layout, scene = base.camera.sensor.layout, base.scene
-            if self._fit is not None:
-                assert isinstance(layout, Layout)
-                assert isinstance(scene, Scene)
-                if layout.n_sites == 0:
-                    raise ParameterError("fit", "must be used with a layout that has photosites")
-                x_um, y_um = (0.0, 0.0) if base.camera.distortion is None else base.camera.distortion.centre_um
-                x0, y0, x1, y1 = layout.bounds_um
-                half_um = max(x1 - x_um, x_um - x0), max(y1 - y_um, y_um - y0)
-                self._fit_um = (*half_um, base.camera.optics.magnification(scene.distance_m))
+            self._build(0, self._settings_with(0, {}))
             first = {path: distribution.bounds[0] for path, distribution in self._distributions.items()}
             max_bits = self._check_values(first)
             for path, distribution in self._distributions.items():
@@ -492,11 +478,6 @@ class Dataset:
             self._code_type = np.uint8 if max_bits <= 8 else np.uint16
         finally:
             self._reset()
-
-    def _unscaled_settings(self) -> dict[str, Any]:
-        data = _copy(self._settings)
-        data["scene"]["picture"] = self._name_of(0)
-        return data
 
     def _check_values(self, values: Mapping[str, Any]) -> int:
         """Build the shot of the first picture with the given values and return its bit depth."""
@@ -510,8 +491,7 @@ def _base_settings(
     source: Path,
     changes: Mapping[str, Any],
     found: list[Path],
-    *,
-    is_fitted: bool,
+    fit: str | None,
 ) -> tuple[Path, Any]:
     """
     Return the file of the settings, for messages, and the settings with absolute paths.
@@ -532,8 +512,8 @@ def _base_settings(
         file.parent, {**data, "scene": {key: scene[key] for key in scene if key != "picture"}}, found=found
     )
     data["scene"]["picture"] = ""
-    if is_fitted:
-        data["scene"]["pitch_um"] = 1.0
+    if fit is not None:
+        data["scene"] |= {"fit": fit, "pitch_um": None, "field_of_view_deg": None}
     for path, value in changes.items():
         put_setting(file, data, path, resolve_files(Path(), value, path, found))
     data.pop("seed", None)
@@ -566,8 +546,8 @@ def _parse_distributions(
             )
         if path in ("seed", "scene", "scene.kind", "scene.picture"):
             raise ParameterError(path, "must not vary: the dataset has its own seed and its own pictures")
-        if is_fitted and path == "scene.pitch_um":
-            raise ParameterError(path, "must not vary with 'fit', which sets it")
+        if is_fitted and path in FRAMING:
+            raise ParameterError(path, "must not vary with 'fit', which replaces it")
     return distributions
 
 

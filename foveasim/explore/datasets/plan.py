@@ -82,7 +82,9 @@ class DatasetSection(BaseModel):
     fields: list[Literal["code", "electrons", "expected_e", "expected_dn"]] | None = Field(
         None, description="quantities per site; by default code and electrons, or those of the recipe"
     )
-    fit: Literal["cover", "contain"] | None = Field(None, description="scaling of the pictures to the layout")
+    fit: Literal["cover", "contain", "width"] | None = Field(
+        None, description="framing of the pictures on the layout, instead of that of the scene"
+    )
     labels: str | list[int | str] | None = Field(
         None, description="a .csv file with the columns picture and label, an array (.npy), or a list"
     )
