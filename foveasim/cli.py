@@ -38,6 +38,7 @@ app = typer.Typer(
 console = PlainConsole()
 error_console = PlainConsole(stderr=True)
 
+KINDS = "shot, layout, rules, sweep, study or dataset"
 LAYOUT_HELP = "YAML, GDSII, OASIS, GeoJSON, GeoParquet or npz file, or the name of a bundled layout."
 Out = Annotated[Path, typer.Option("--out", "-o", help="Directory for the results; created when missing.")]
 Changes = Annotated[
@@ -382,12 +383,27 @@ def video(
 
 @app.command()
 def schema(
-    kind: Annotated[str, typer.Argument(help="Kind of settings file: shot, sweep, study or dataset.")] = "shot",
+    kind: Annotated[str, typer.Argument(help=f"Kind of file: {KINDS}.")] = "shot",
 ) -> None:
     """Print the JSON schema of a kind of settings file."""
     from foveasim.explore import schema_of
 
     sys.stdout.write(json.dumps(schema_of(kind), indent=2) + "\n")
+
+
+@app.command()
+def new(
+    kind: Annotated[str, typer.Argument(help=f"Kind of file: {KINDS}.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="File to write, by default KIND.yaml in this directory.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+) -> None:
+    """Write a commented settings file to start from."""
+    from foveasim.config import starting_command, write_starting_file
+
+    path = write_starting_file(kind, out, force=force)
+    _report(f"wrote {path}; next: {starting_command(kind, path)}")
 
 
 def _run(settings: Sequence[Path], changes: Sequence[str], out: Path, threads: int | None) -> list[Result]:

@@ -33,11 +33,13 @@ from foveasim.config._shots import (
     write_3d_picture,
     write_results,
 )
+from foveasim.config._starting_files import STARTING_FILES, starting_command, starting_file, write_starting_file
 from foveasim.config._video import run_video
 from foveasim.config._viewing import Viewable, read_viewable
 from foveasim.layout import bundled_layouts
 
 __all__ = [
+    "STARTING_FILES",
     "YAML_EXTENSIONS",
     "LayoutFile",
     "Result",
@@ -62,7 +64,10 @@ __all__ = [
     "run_shot",
     "run_video",
     "schema",
+    "starting_command",
+    "starting_file",
     "validate",
     "write_3d_picture",
     "write_results",
+    "write_starting_file",
 ]

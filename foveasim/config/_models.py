@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, create_mo
 
 from foveasim._core.registry import Registry
 from foveasim.distortion import LENSES
-from foveasim.layout import LAYOUTS, DesignRules, Readout, Routing
+from foveasim.layout import LAYOUTS, PRESETS, RULES, DesignRules, Readout, Routing
 from foveasim.maps import read_power_map
 from foveasim.optics import PUPILS, LateralColour, Optics, Seidel, Zernike
 from foveasim.scene import SCENES
@@ -38,7 +38,7 @@ __all__ = ["Models", "PerArea", "call_of", "models"]
 #: The function or class of each section.
 _CALLS: dict[type[BaseModel], Callable[..., Any]] = {}
 #: Registries whose members are sections: the models are rebuilt when one of these changes.
-_REGISTRIES: tuple[Registry[Any], ...] = (LAYOUTS, SCENES, LENSES, PUPILS, CURVES, EFFECTS)
+_REGISTRIES: tuple[Registry[Any], ...] = (LAYOUTS, RULES, SCENES, LENSES, PUPILS, CURVES, EFFECTS)
 
 _log = logging.getLogger("foveasim")
 
@@ -158,28 +158,43 @@ def _models(_versions: tuple[int, ...]) -> Models:
         lateral_colour=_model("lateral colour", LateralColour) | None,
     )
     sensor = _sensor()
-    rules = _model(
-        "design rules",
-        DesignRules,
-        preset=str | None,
-        readout=_model("readout", Readout) | None,
-        routing=_model("routing", Routing) | None,
-    )
+    rules = _rules()
     layout = _layout(rules)
     power_map = _model("power_map", read_power_map, **(_FILE_TYPES | _WAVELENGTHS))
     scene = _union_of("kind", {**_registered_sections(SCENES, **(_FILE_TYPES | _WAVELENGTHS)), "power_map": power_map})
     fields: dict[str, Any] = {
-        "scene": (scene, ...),
-        "optics": (optics, ...),
-        "distortion": (lens | None, None),
-        "layout": (str | layout, ...),
-        "sensor": (sensor, Field(default_factory=sensor)),
-        "exposure_s": (float, ...),
-        "seed": (int, 0),
-        "integration_order": (Literal[1, 2] | None, None),
+        "scene": (scene, Field(description="a photograph, a test chart, or a power map of another program")),
+        "optics": (optics, Field(description="parameters of the lens")),
+        "distortion": (lens | None, Field(None, description="distortion model of the lens")),
+        "layout": (str | layout, Field(description="a layout file, the name of a bundled layout, or a generator")),
+        "sensor": (sensor, Field(default_factory=sensor, description="parameters of the photosites and their readout")),
+        "exposure_s": (float, Field(description="exposure time, s")),
+        "seed": (int, Field(0, description="seed of the noise")),
+        "integration_order": (
+            Literal[1, 2] | None,
+            Field(None, description="cells of constant irradiance, or with a gradient; chosen by default"),
+        ),
     }
     summary = "A shot: scene or power map, optics, distortion, layout, sensor, exposure."
     return Models(create_model("ShotSection", __base__=_Section, __doc__=summary, **fields), layout, rules)
+
+
+def _rules() -> type[_Section]:
+    """Return the model of design rules; the schema lists the names of presets and registered rules."""
+    own = set(inspect.signature(DesignRules).parameters)
+
+    def names(rules: Sequence[str]) -> Any:
+        return Field(json_schema_extra={"propertyNames": {"enum": list(rules)} if rules else False})
+
+    return _model(
+        "design rules",
+        DesignRules,
+        preset=Annotated[str | None, Field(json_schema_extra={"enum": [*PRESETS, None]})],
+        readout=_model("readout", Readout) | None,
+        routing=_model("routing", Routing) | None,
+        waivers=Annotated[Mapping[str, str] | None, names([*RULES])],
+        custom=Annotated[Mapping[str, float] | None, names([name for name in RULES if name not in own])],
+    )
 
 
 def _sensor() -> type[_Section]:
@@ -217,12 +232,15 @@ def _sensor() -> type[_Section]:
 def _layout(rules: type[_Section]) -> Any:
     """Return the union of the sections of all layout generators."""
     fields: dict[str, Any] = {
-        "mosaic": (str | list[str] | None, None),
-        "move_um": (tuple[float, float], (0.0, 0.0)),
-        "inset_um": (float, 0.0),
-        "snap_um": (float | None, None),
-        "rules": (rules | None, None),
-        "source": (str, ""),
+        "mosaic": (
+            str | list[str] | None,
+            Field(None, description="repeating block of colour filters: a name, or rows of letters, the lowest first"),
+        ),
+        "move_um": (tuple[float, float], Field((0.0, 0.0), description="displacement along x and y, µm")),
+        "inset_um": (float, Field(0.0, description="margin that is removed from each photosite, µm")),
+        "snap_um": (float | None, Field(None, description="manufacturing grid of the vertices, µm")),
+        "rules": (rules | None, Field(None, description="design rules of the layout")),
+        "source": (str, Field("", description="source of the parameters")),
     }
     base = create_model("_LayoutSection", __base__=_Section, **fields)
     base.__doc__ = (

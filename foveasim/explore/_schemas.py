@@ -12,8 +12,15 @@ from foveasim.explore.sweeps.plan import SweepSection
 
 __all__ = ["schema_of"]
 
-#: Models of the file kinds.
-FILES: dict[str, Any] = {"sweep": SweepSection, "study": StudySection, "dataset": DatasetSection}
+#: Models of the file kinds; the first three depend on registered extensions.
+FILES: dict[str, Any] = {
+    "shot": "shot",
+    "layout": "layout",
+    "rules": "rules",
+    "sweep": SweepSection,
+    "study": StudySection,
+    "dataset": DatasetSection,
+}
 
 
 def schema_of(kind: str) -> dict[str, Any]:
@@ -22,12 +29,12 @@ def schema_of(kind: str) -> dict[str, Any]:
 
     Parameters
     ----------
-    kind : {"shot", "sweep", "study", "dataset"}
+    kind : {"shot", "layout", "rules", "sweep", "study", "dataset"}
 
     Raises
     ------
     ParameterError
         When ``kind`` is none of these.
     """
-    check_choice("kind", kind, ("shot", *FILES))
-    return schema(FILES[kind], f"foveasim {kind}") if kind in FILES else schema()
+    check_choice("kind", kind, FILES)
+    return schema(FILES[kind], f"foveasim {kind}")

@@ -733,7 +733,7 @@ def test_default_schema_is_of_shots(foveasim):
     assert foveasim("schema", "film") == (
         2,
         "",
-        "error: 'kind' must be one of 'shot', 'sweep', 'study', 'dataset', got 'film'\n",
+        "error: 'kind' must be one of 'shot', 'layout', 'rules', 'sweep', 'study', 'dataset', got 'film'\n",
     )
 
 

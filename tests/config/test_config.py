@@ -11,6 +11,7 @@ import yaml
 
 import foveasim as fs
 from foveasim._io.images import read_picture, write_picture
+from foveasim._io.yaml_files import read_yaml
 from foveasim.config import bundled_layouts, demo_settings, read_any_layout, read_layout_file, read_shot, schema
 from foveasim.errors import ConfigError, FileError
 from foveasim.view import plot_layout, save_figure
@@ -180,7 +181,10 @@ def test_invalid_setting_is_reported_with_key(shot_file, change, message):
         ("scene.encoding=gamma", r"scene\.encoding: must be 'srgb', 'sqrt' or 'linear', got \"gamma\""),
         ("scene.band_width_nm=[1.0, x]", r'scene\.band_width_nm\.1: must be a valid number, got "x"'),
         ("scene.picture=3", r"scene\.picture: must be a valid string, got 3"),
-        ("scene={kind: picture, picture: a.png}", r"scene\.pitch_um: missing; scene\.distance_m: missing"),
+        (
+            "scene={kind: picture, picture: a.png}",
+            r"scene\.distance_m: missing; scene\.peak_radiance_w_m2_sr_nm: missing",
+        ),
         (
             "scene={kind: point_sources, shape: [4, 5], pixels: [[1, 2, 3]]}",
             r"scene\.pixels\.0: must have at most 2 items, not 3",
@@ -303,6 +307,91 @@ def test_pictures_resolve_to_files_and_bundled(shot_file):
     with pytest.raises(ConfigError, match="scikit-image does not contain 'mona_lisa'; its pictures are astronaut, "):
         read_shot(shot_file, ["scene.picture='skimage:mona_lisa'"])
     assert read_shot(shot_file, ["scene.picture='skimage:camera'"]).scene.basis.shape == (1, 512, 512)
+
+
+PICTURE = """
+scene: {kind: picture, picture: 'skimage:camera', fit: cover, distance_m: 1.0, peak_radiance_w_m2_sr_nm: 0.1, band_width_nm: 100}
+"""
+
+
+def test_framing_follows_settings(shot_file):
+    shot_file.write_text(PICTURE + SHOT.split("\n", 2)[2])
+    for changes in ([], ["optics.focal_length_mm=16"], ["layout.parameters.pitch_um=16"]):
+        shot = read_shot(shot_file, changes)
+        layout = shot.camera.sensor.layout
+        half_um = max(np.abs(layout.bounds_um))
+        assert shot.scene.pitch_um is None
+        assert shot.camera.image_grid(shot.scene).bounds_um == pytest.approx([-half_um, -half_um, half_um, half_um])
+    view = read_shot(shot_file, ["scene.fit=null", "scene.field_of_view_deg=30"])
+    assert view.scene.pitch_um == pytest.approx(2e6 * np.tan(np.deg2rad(15.0)) / 512)
+    assert read_shot(shot_file, ["scene.fit=null", "scene.pitch_um=70"]).scene.pitch_um == 70.0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("scene.fit=crop", r"shot\.yaml: scene\.fit: must be 'cover', 'contain' or 'width', got \"crop\"$"),
+        (
+            "scene.pitch_um=70",
+            r"shot\.yaml: scene\.fit: must not be given together with 'pitch_um', got 'cover'; choose one of .* to null$",
+        ),
+        (
+            "layout.move_um=[900, 0]; scene.fit=contain",
+            r"scene\.fit: must not be 'contain' with the optical axis, at \(0, 0\)",
+        ),
+        ("scene.field_of_view_deg=200; scene.fit=null", r"scene\.field_of_view_deg: must be < 180, got 200\.0 degrees"),
+    ],
+)
+def test_invalid_framing_names_its_key(shot_file, change, message):
+    shot_file.write_text(PICTURE + SHOT.split("\n", 2)[2])
+    with pytest.raises(ConfigError, match=message):
+        read_shot(shot_file, change.split("; "))
+
+
+def errors_of(kind, data):
+    """Return the errors of plain data by the JSON schema of a kind of file."""
+    jsonschema = pytest.importorskip("jsonschema")
+    validator = jsonschema.Draft202012Validator(schema(kind))
+    return [error.message for error in validator.iter_errors(data)]
+
+
+@pytest.mark.parametrize("name", sorted(bundled_layouts()))
+def test_bundled_layout_satisfies_schema(name):
+    data = read_yaml(bundled_layouts()[name])
+
+    assert errors_of("layout", data) == []
+    assert errors_of("rules", data.get("rules", {})) == []
+    assert errors_of("layout", data | {"mosiac": "bayer"}) != []
+    assert errors_of("layout", data | {"parameters": data["parameters"] | {"sectors": 3}}) != []
+    assert errors_of("layout", data | {"rules": {"min_sise_um": 1.0}}) != []
+
+
+@pytest.mark.parametrize(
+    ("data", "is_valid"),
+    [
+        ({"preset": "sky130_met1"}, True),
+        ({"preset": "sky130"}, False),
+        ({"min_size_um": 2, "waivers": {"min_size_um": "prototype"}}, True),
+        ({"waivers": {"min_sise_um": "prototype"}}, False),
+        ({"readout": {"frames_per_s": 30.0, "bits": 10}, "max_data_rate_gbit_per_s": 1.0}, True),
+        ({"readout": {"frames_per_second": 30.0}}, False),
+        ({"min_size_um": "2 µm"}, False),
+        ({"custom": {"min_round": 0.5}}, False),
+    ],
+)
+def test_schema_of_rules_knows_names(data, is_valid):
+    assert (errors_of("rules", data) == []) == is_valid
+
+
+def test_registered_rule_is_in_schema():
+    before = dict(fs.layout.RULES)
+    fs.layout.RULES.register("min_round", fs.layout.Rule("minimum roundness", "", lambda case: case.layout.area_um2))
+    try:
+        assert errors_of("rules", {"custom": {"min_round": 0.5}}) == []
+    finally:
+        fs.layout.RULES._objects = before
+        fs.layout.RULES.version += 1
+    assert errors_of("rules", {"custom": {"min_round": 0.5}}) != []
 
 
 def test_schema_contains_parameters_of_calls():

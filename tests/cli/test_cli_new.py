@@ -1,0 +1,165 @@
+"""Starting files: each is read by its reader and simulated; existing files are not replaced."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+import foveasim as fs
+from foveasim.config import STARTING_FILES, read_any_layout, read_rules, read_shot, starting_file
+from foveasim.explore import read_dataset, read_study, read_sweep
+from foveasim.explore.worker_cache import ShotRunner
+
+#: A smaller layout, for the time of the tests.
+SMALL = ["layout.parameters.r_max_um=150"]
+
+
+@pytest.fixture
+def new_file(foveasim, tmp_path):
+    """Write a file of a kind with the program and return its path."""
+
+    def write(kind):
+        result = foveasim("new", kind, cwd=tmp_path)
+        assert (result.returncode, result.stderr) == (0, "")
+        assert result.stdout.startswith(f"wrote {kind}.yaml; next: foveasim ")
+        return tmp_path / f"{kind}.yaml"
+
+    return write
+
+
+def small(plan_settings):
+    return plan_settings | {
+        "layout": plan_settings["layout"]
+        | {"parameters": plan_settings["layout"]["parameters"] | {"r_max_um": 150.0, "n_sectors": 48}}
+    }
+
+
+def metrics_of(plan, plan_settings):
+    record = ShotRunner(plan.source, plan.metrics, n_threads=1)((0, small(plan_settings)))
+    assert (record.error, record.warning) == ("", "")
+    return record.values
+
+
+def test_starting_shot_is_simulated(new_file):
+    path = new_file("shot")
+    shot = read_shot(path, SMALL)
+    capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed)
+
+    assert capture.settings["light"]["fit"] == "cover"
+    assert 100 < np.median(capture.code) < 2**shot.camera.sensor.bits - 1
+    assert capture.saturated_fraction < 0.05
+    assert shot.camera.sensor.layout.check(shot.rules).ok
+
+
+def test_starting_shot_runs(foveasim, new_file):
+    path = new_file("shot")
+    result = foveasim("run", path.name, "--set", *SMALL, "--out", "out", cwd=path.parent)
+
+    assert (result.returncode, result.stderr) == (0, "")
+    assert fs.Capture.load(path.parent / "out" / "shot_capture.npz").bits == 10
+
+
+def test_starting_layout_satisfies_its_rules(foveasim, new_file):
+    path = new_file("layout")
+    file = read_any_layout(path)
+
+    assert file.layout.check(file.rules).ok
+    assert foveasim("check", path.name, cwd=path.parent).returncode == 0
+
+
+def test_starting_rules_are_those_of_layout(foveasim, new_file):
+    path = new_file("rules")
+
+    assert read_rules(path) == read_any_layout(new_file("layout")).rules
+    assert foveasim("check", "four_zones", "--rules", path.name, cwd=path.parent).returncode == 0
+
+
+def test_starting_sweep_point_has_metrics(new_file):
+    plan = read_sweep(new_file("sweep"))
+    values = metrics_of(plan, plan.settings_of(0))
+
+    assert plan.shape == (3, 3)
+    assert {"n_sites", "snr_mean", "psnr_db", "saturated_fraction"} <= set(values)
+
+
+def test_starting_study_has_results_of_objectives(new_file):
+    plan = read_study(new_file("study"))
+    values = metrics_of(plan.base, dict(plan.base.settings) | {"seed": 1})
+
+    assert {*plan.objectives, *plan.constraints} <= set(values)
+    assert values["psnr_db"] > 10.0
+
+
+def test_starting_dataset_has_labelled_samples(new_file):
+    path = new_file("dataset")
+    data = yaml.safe_load(path.read_text())
+    path.write_text(yaml.safe_dump(data | {"shot": small(data["shot"])}))
+    dataset = read_dataset(path).dataset
+
+    assert len(dataset) == 12
+    assert dataset[11]["label"] == 1
+    assert dataset[11]["warning"] == ""
+    assert dataset.class_names == ["cat", "cup", "person"]
+
+
+@pytest.mark.parametrize("kind", STARTING_FILES)
+def test_starting_file_has_comments_and_schema(foveasim, tmp_path, kind):
+    jsonschema = pytest.importorskip("jsonschema")
+    text = starting_file(kind)
+    schema = json.loads(foveasim("schema", kind, cwd=tmp_path).stdout)
+
+    assert jsonschema.Draft202012Validator(schema).is_valid(yaml.safe_load(text))
+    assert "{" + kind not in text
+    assert max(map(len, text.splitlines())) <= 128
+    header = text.partition("\n\n")[0]
+    assert "Change first: " in header
+    assert re.search(r"^# +foveasim \w+ .*FILE", header, re.MULTILINE)
+    keys = [line for line in text.splitlines() if re.match(r" *\w+: *[^ #{]", line)]
+    assert sum("#" in line for line in keys) >= 0.6 * len(keys)
+
+
+def test_existing_file_is_not_replaced(foveasim, tmp_path):
+    (tmp_path / "shot.yaml").write_text("mine")
+    result = foveasim("new", "shot", cwd=tmp_path)
+
+    assert (result.returncode, result.stdout) == (2, "")
+    assert (
+        result.stderr
+        == "error: shot.yaml: exists already; choose another file with --out, or replace it with --force\n"
+    )
+    assert (tmp_path / "shot.yaml").read_text() == "mine"
+    assert foveasim("new", "shot", "--force", cwd=tmp_path).returncode == 0
+    assert (tmp_path / "shot.yaml").read_text() == starting_file("shot")
+    assert [path.name for path in tmp_path.iterdir()] == ["shot.yaml"]
+
+
+def test_next_command_contains_quoted_path(foveasim, tmp_path):
+    result = foveasim("new", "rules", "--out", "my rules.yaml", cwd=tmp_path)
+
+    assert result.stdout == "wrote my rules.yaml; next: foveasim check four_zones --rules 'my rules.yaml'\n"
+    assert (tmp_path / "my rules.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (
+            ("film",),
+            "error: 'kind' must be one of 'shot', 'layout', 'rules', 'sweep', 'study', 'dataset', got 'film'\n",
+        ),
+        (
+            ("shot", "--out", "nowhere/shot.yaml"),
+            f"error: {Path('nowhere/shot.yaml')}: cannot be written: the directory nowhere does not exist\n",
+        ),
+    ],
+)
+def test_starting_file_errors_are_one_line(foveasim, tmp_path, arguments, line):
+    result = foveasim("new", *arguments, cwd=tmp_path)
+
+    assert (result.returncode, result.stdout, result.stderr) == (2, "", line)
+    assert list(tmp_path.iterdir()) == []
