@@ -860,7 +860,11 @@ class Camera:
         )
 
     def _warn_of_coverage(self, source: Scene | PowerMap, integrator: Integrator, *, is_moving: bool) -> None:
-        """Warn of sites outside the image, which are dark whatever the scene is, and of a layout that measures little of it."""
+        """
+        Warn of sites outside the image, and of a layout that measures a small part of it.
+
+        Sites outside are dark whatever the scene is.
+        """
         n_outside = integrator.sites_outside_image_circle.size
         if n_outside:
             warnings.warn(

@@ -107,7 +107,7 @@ class SamplingWarning(FoveasimWarning):
 
 
 class CoverageWarning(FoveasimWarning):
-    """Photosites outside the image, or a layout that measures only a small part of a photograph."""
+    """Photosites outside the image, or a layout that measures a small part of a photograph."""
 
 
 class LayoutWarning(FoveasimWarning):

@@ -180,7 +180,7 @@ def _models(_versions: tuple[int, ...]) -> Models:
 
 
 def _rules() -> type[_Section]:
-    """Return the model of design rules; the schema lists the names of presets and registered rules."""
+    """Return the model of design rules; its schema lists presets and registered rules."""
     own = set(inspect.signature(DesignRules).parameters)
 
     def names(rules: Sequence[str]) -> Any:

@@ -1,4 +1,8 @@
-"""Commented files to start from, one per kind; files contain each other, so that each value has one source."""
+"""
+Commented files to start from, one per kind.
+
+Files include each other, so that each value has one source.
+"""
 
 from __future__ import annotations
 

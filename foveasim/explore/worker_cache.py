@@ -223,7 +223,7 @@ def _worker() -> Any:
 
 
 def _image_settings(shot: Shot, settings: Mapping[str, Any]) -> list[Any]:
-    """Return the settings that determine the optical images, with the spectral responsivity and the pitch."""
+    """Return the settings that determine the images, with spectral responsivity and pitch."""
     scene = shot.scene
     response = shot.camera.sensor.responsivity_e_per_j(scene.wavelength_nm)
     # With 'fit' the pitch depends on layout and distortion.

@@ -135,7 +135,7 @@ class Scene:
         object.__setattr__(self, "pitch_um", self._checked_pitch_um())
 
     def _checked_pitch_um(self) -> float | None:
-        """Return the pitch that is given or follows from the field of view; None for a scene with ``fit``."""
+        """Return the given pitch or that of the field of view; None with ``fit``."""
         if self.fit is not None:
             check_choice("fit", self.fit, get_args(Fit))
             for name in ("pitch_um", "field_of_view_deg"):
