@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.extras import import_optional, needs
+from foveasim._core.names import possible_names
 from foveasim._core.provenance import copy_plain_data, to_plain_data
 from foveasim._core.rings import same_rings
 from foveasim._core.validation import Floats, Ints, check_choice, check_count, own, read_only, unit_of, unmasked
@@ -197,7 +198,8 @@ class Capture:
         )
         if set(options) - known:
             name = min(set(options) - known)
-            raise ParameterError(name, f"must be an option of {method!r}: {', '.join(sorted(known))}")
+            hint = possible_names(name, sorted(known))
+            raise ParameterError(name, f"must be an option of the method {method!r}", hint=hint)
         self._check_sensor(sensor)
         grid = raster_grid(self.layout, max_pixels) if grid is None else grid
         n_filters = len(self.filter_names)

@@ -85,13 +85,19 @@ class GeometryError(FoveasimError, ValueError):
 class FileError(FoveasimError, ValueError):
     """A file that is missing, corrupt, of another format, or too large."""
 
-    def __init__(self, path: str | Path, message: str) -> None:
-        self.path = Path(path)
-        super().__init__(message, prefix=f"{_elide(printable(path), MAX_PATH_LENGTH)}: ")
+    def __init__(self, path: str | Path | None, message: str, *, position: tuple[int, int] | None = None) -> None:
+        self.path = None if path is None else Path(path)
+        #: Line and column of the problem in a text file, from 1.
+        self.position = position
+        #: The message without the path.
+        self.detail = message
+        where = "" if position is None else ":{}:{}".format(*position)
+        prefix = "" if path is None else f"{_elide(printable(path), MAX_PATH_LENGTH)}{where}: "
+        super().__init__(message, prefix=prefix)
 
 
 class ConfigError(FileError):
-    """A settings file with an unknown key, a wrong type, or an invalid value."""
+    """Settings with an unknown key, a wrong type, or an invalid value; ``path`` is None for settings from Python."""
 
 
 class SimulationError(FoveasimError, RuntimeError):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import entry_points
 from pkgutil import iter_modules
 from typing import Any, Generic, TypeVar, overload
 
+from foveasim._core.names import did_you_mean, possible_names
 from foveasim.errors import ParameterError
 
 __all__ = ["Registry", "import_all"]
@@ -119,7 +119,8 @@ class Registry(Mapping[str, T], Generic[T]):
         def attribute(name: str) -> T:
             if not name.startswith("_") and name in self:
                 return self[name]
-            raise AttributeError(f"module '{module}' has no attribute '{name}'")
+            hint = did_you_mean(name, self)
+            raise AttributeError(f"module '{module}' has no attribute '{name}'{'; ' if hint else ''}{hint}")
 
         return attribute
 
@@ -130,11 +131,11 @@ class Registry(Mapping[str, T], Generic[T]):
         Raises
         ------
         ParameterError
-            When no object has this name; the message suggests the closest name.
+            When no object has this name; the message contains the closest name and all names.
         """
         objects = self._all()
         if isinstance(name, str) and name in objects:
             return objects[name]
-        closest = get_close_matches(str(name), objects, n=1)
-        hint = f"did you mean '{closest[0]}'?" if closest else f"available: {', '.join(self) or 'none'}"
-        raise ParameterError(parameter, f"must be the name of a {self.kind}", name, hint=hint)
+        raise ParameterError(
+            parameter, f"must be the name of a {self.kind}", name, hint=possible_names(name, list(objects))
+        )

@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.names import did_you_mean, list_names
 from foveasim.errors import ParameterError
 
 __all__ = [
@@ -294,10 +295,11 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> str:
     Raises
     ------
     ParameterError
-        When the value is not one of the choices; the message lists them.
+        When the value is not one of the choices; the message lists them, with the closest one.
     """
     if not isinstance(value, str) or value not in choices:
-        raise ParameterError(name, f"must be one of {', '.join(repr(c) for c in choices)}", value)
+        rule = f"must be one of {list_names(choices, value)}"
+        raise ParameterError(name, rule, value, hint=did_you_mean(value, choices) if isinstance(value, str) else "")
     return value
 
 
@@ -371,7 +373,13 @@ def as_numbers(name: str, value: ArrayLike, *, keep_type: bool = False, missing_
 
 
 def finite_array(
-    name: str, value: ArrayLike, *, ndim: int | None = None, at_least: float | None = None, above: float | None = None
+    name: str,
+    value: ArrayLike,
+    *,
+    ndim: int | None = None,
+    at_least: float | None = None,
+    above: float | None = None,
+    at_most: float | None = None,
 ) -> Floats:
     """
     Return the value as a float64 array of finite numbers.
@@ -389,6 +397,7 @@ def finite_array(
         (~np.isfinite(array), "must be finite"),
         (array < at_least if at_least is not None else None, f"must be >= {at_least}"),
         (array <= above if above is not None else None, f"must be > {above}"),
+        (array > at_most if at_most is not None else None, f"must be <= {at_most:g}" if at_most is not None else ""),
     ):
         if is_bad is not None and np.any(is_bad):
             where = tuple(int(i) for i in np.argwhere(is_bad)[0])

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from foveasim._core.names import did_you_mean, missing_path, possible_names
 from foveasim.errors import FileError, FoveasimError, ParameterError
 
 __all__ = [
@@ -104,7 +105,9 @@ def as_file_error(path: Path, what: str, *, passes: tuple[type[FoveasimError], .
     except passes:
         raise
     except (FormatError, FoveasimError) as error:
-        raise FileError(path, one_line(str(error).removeprefix(f"{path}: "), MAX_MESSAGE_LENGTH)) from None
+        is_own = isinstance(error, FileError) and error.path == path
+        detail, position = (error.detail, error.position) if is_own else (str(error), None)
+        raise FileError(path, one_line(detail, MAX_MESSAGE_LENGTH), position=position) from None
     except MemoryError:
         raise FileError(path, "needs more memory than is available") from None
     except Exception as error:  # noqa: BLE001 -- readers raise arbitrary exceptions on malformed files
@@ -129,7 +132,7 @@ def read_head(path: Path) -> bytes:
     """
     try:
         if not path.is_file():
-            raise FileError(path, "is not a file" if path.exists() else "no such file")
+            raise FileError(path, missing_path(path))
         n_bytes = path.stat().st_size
         if n_bytes > MAX_FILE_BYTES:
             raise FileError(path, f"has {n_bytes} bytes, more than the limit of {MAX_FILE_BYTES}")
@@ -179,7 +182,8 @@ def select_writer(path: Path, formats: Mapping[str, FileFormat]) -> FileFormat:
     try:
         return by_suffix[path.suffix.lower()]
     except KeyError:
-        raise FileError(path, f"must end in one of {', '.join(sorted(by_suffix))}") from None
+        hint = did_you_mean(path.suffix, by_suffix) if path.suffix else ""
+        raise FileError(path, f"must end in one of {', '.join(sorted(by_suffix))}{'; ' * bool(hint)}{hint}") from None
 
 
 def validate_options(
@@ -209,5 +213,6 @@ def validate_options(
         if name not in known:
             titles = sorted({found.title for found in formats.values() if name in getattr(found, of)})
             rule = f"is an option of {' and '.join(titles)} files only" if titles else "is not an option of any format"
-            raise ParameterError(name, rule, value, hint="omit it")
+            hint = f"omit it; {possible_names(name, known)}" if known and not titles else "omit it"
+            raise ParameterError(name, rule, value, hint=hint)
     return given

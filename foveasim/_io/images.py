@@ -14,6 +14,8 @@ import warnings
 import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
@@ -21,8 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.extras import import_optional, needs
+from foveasim._core.names import missing_path
 from foveasim._core.validation import unmasked
 from foveasim._io.atomic import atomic_write
+from foveasim._io.formats import FileFormat, select_writer
 from foveasim._io.sandbox import read_in_sandbox
 from foveasim.errors import FileError, disk_problem
 
@@ -31,7 +35,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "PICTURE_EXTENSIONS",
+    "PICTURE_FORMATS",
+    "PictureFormat",
     "check_picture_size",
+    "picture_format",
     "picture_names",
     "pixels_of_image",
     "pixels_of_page",
@@ -129,7 +136,7 @@ def read_picture(path: str | Path) -> NDArray[Any]:
     path = Path(path)
     try:
         if not path.is_file():
-            raise FileError(path, "is not a file" if path.exists() else "no such file")
+            raise FileError(path, missing_path(path))
         with path.open("rb") as file:
             head = file.read(32)
     except OSError as error:
@@ -420,69 +427,57 @@ def check_picture_size(path: Path, width: int, height: int) -> None:
 # -- writing ---------------------------------------------------------------------------------------------------------
 
 
-def write_picture(path: str | Path, picture: NDArray[Any]) -> None:
+@dataclass(frozen=True, kw_only=True)
+class PictureFormat(FileFormat):
     """
-    Write a picture file atomically.
+    A format of written pictures; entry of :data:`PICTURE_FORMATS`.
 
     Parameters
     ----------
-    path : path
-        The extension selects the format: ``.png`` and ``.tif`` store uint8 and uint16 losslessly; ``.tif`` and, with the extra
-        ``pictures``, ``.exr`` store float32 losslessly, including NaN; other formats store uint8, some with lossy compression.
-    picture : (n_y, n_x) or (n_y, n_x, n_channel) uint8, uint16 or float32
-        Top row first; grey, grey and alpha, colour, or colour and alpha.
-
-    Raises
-    ------
-    FileError
-        When the extension is unknown, the format does not support the array, or the file cannot be written.
+    types : tuple of str
+        Types of the numbers that the format stores; the first is the default.
+    has_alpha : bool
+        Whether the format stores the coverage of pixels.
     """
+
+    types: tuple[str, ...] = ("uint8",)
+    has_alpha: bool = False
+
+    def check(self, path: Path, picture: NDArray[Any]) -> None:
+        """
+        Check that the format can store an array.
+
+        Raises
+        ------
+        FileError
+            When it cannot.
+        """
+        n_channels = (picture.shape[2:] or (1,))[0]
+        if picture.dtype.name not in self.types or picture.ndim not in (2, 3) or 0 in picture.shape or n_channels > 4:
+            raise FileError(
+                path,
+                f"cannot store an array of the shape {picture.shape} and type {picture.dtype}, only 1 to 4 channels of "
+                f"{' or '.join(sorted(self.types, key=lambda name: (name[0] != 'u', name[-1] != '8')))}",
+            )
+        if n_channels in (2, 4) and not self.has_alpha:
+            raise FileError(path, f"cannot store alpha: {self.title} has none; use .png, or a background colour")
+
+
+def _write_with_pillow(path: Path, picture: NDArray[Any], **options: Any) -> None:
     from PIL import Image
 
-    target = Path(path)
-    extension = target.suffix.lower()
-    is_pillow = Image.registered_extensions().get(extension) in PILLOW_FORMATS
-    if not is_pillow and extension not in (*TIFF_EXTENSIONS, ".exr"):
-        raise FileError(target, "must end in .png, .webp, .jpg, .bmp, .tga, .ppm, .jp2, .tif or .exr; .png is lossless")
-    if picture.ndim == 3 and picture.shape[2] == 1:
-        picture = picture[..., 0]
-    supported = (
-        ("uint8", "uint16", "float32")
-        if extension in TIFF_EXTENSIONS
-        else {".exr": ("float32",), ".png": ("uint8", "uint16")}.get(extension, ("uint8",))
-    )
-    if (
-        picture.dtype.name not in supported
-        or picture.ndim not in (2, 3)
-        or 0 in picture.shape
-        or (picture.shape[2:] or (1,))[0] > 4
-    ):
-        raise FileError(
-            target,
-            f"cannot store an array of the shape {picture.shape} and type {picture.dtype}, only 1 to 4 channels of "
-            f"{' or '.join(supported)}",
-        )
-    picture = np.ascontiguousarray(unmasked("picture", picture))
-    with atomic_write(target) as temporary:
-        try:
-            if extension in TIFF_EXTENSIONS:
-                _write_tiff(temporary, picture)
-            elif extension == ".exr":
-                _write_exr(temporary, picture)
-            elif picture.dtype == np.uint16:
-                imagecodecs = import_optional(target, "imagecodecs")
-                temporary.write_bytes(imagecodecs.png_encode(picture))
-            else:
-                # Encode in memory: on a full disk, encoders of Pillow leave a truncated file or never return.
-                encoded = io.BytesIO()
-                Image.fromarray(picture).save(encoded, Image.registered_extensions()[extension])
-                temporary.write_bytes(encoded.getbuffer())
-        except ImportError as error:
-            raise FileError(target, needs(error.name or "OpenEXR", "pictures")) from None
-        except (OSError, ValueError, RuntimeError) as error:
-            if disk_problem(error):
-                raise
-            raise FileError(target, f"cannot be written in this format ({error}); use .png") from None
+    # Encode in memory: on a full disk, encoders of Pillow leave a truncated file or never return.
+    encoded = io.BytesIO()
+    Image.fromarray(picture).save(encoded, Image.registered_extensions()[path.suffix.lower()], **options)
+    path.write_bytes(encoded.getbuffer())
+
+
+def _write_png(path: Path, picture: NDArray[Any]) -> None:
+    if picture.dtype == np.uint8:
+        _write_with_pillow(path, picture)
+        return
+    imagecodecs = import_optional(path, "imagecodecs")
+    path.write_bytes(imagecodecs.png_encode(picture))
 
 
 def _write_tiff(path: Path, picture: NDArray[Any]) -> None:
@@ -509,3 +504,79 @@ def _write_exr(path: Path, picture: NDArray[Any]) -> None:
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, channels) as file:
         file.write(str(path))
+
+
+#: Formats of written pictures by name. JPEG and GIF are lossy: JPEG of high quality without chroma subsampling, GIF with a
+#: palette of 256 colours.
+PICTURE_FORMATS: dict[str, PictureFormat] = {
+    "png": PictureFormat(title="PNG", suffixes=(".png",), write=_write_png, types=("uint8", "uint16"), has_alpha=True),
+    "tiff": PictureFormat(
+        title="TIFF", suffixes=TIFF_EXTENSIONS, write=_write_tiff, types=("float32", "uint8", "uint16"), has_alpha=True
+    ),
+    "exr": PictureFormat(title="EXR", suffixes=(".exr",), write=_write_exr, types=("float32",), has_alpha=True),
+    "jpeg": PictureFormat(
+        title="JPEG", suffixes=(".jpg", ".jpeg"), write=partial(_write_with_pillow, quality=95, subsampling=0)
+    ),
+    "webp": PictureFormat(
+        title="WebP",
+        suffixes=(".webp",),
+        write=partial(_write_with_pillow, lossless=True, exact=True),
+        has_alpha=True,
+    ),
+    "jpeg2000": PictureFormat(title="JPEG 2000", suffixes=(".jp2",), write=_write_with_pillow, has_alpha=True),
+    "tga": PictureFormat(title="TGA", suffixes=(".tga",), write=_write_with_pillow, has_alpha=True),
+    "bmp": PictureFormat(title="BMP", suffixes=(".bmp",), write=_write_with_pillow),
+    "ppm": PictureFormat(title="PPM", suffixes=(".ppm",), write=_write_with_pillow),
+    "gif": PictureFormat(title="GIF", suffixes=(".gif",), write=_write_with_pillow),
+}
+
+
+def picture_format(path: str | Path) -> PictureFormat:
+    """
+    Return the format that has the extension of a file.
+
+    Raises
+    ------
+    FileError
+        When no format has it; the message lists the extensions.
+    """
+    found = select_writer(Path(path), PICTURE_FORMATS)
+    assert isinstance(found, PictureFormat)
+    return found
+
+
+def write_picture(path: str | Path, picture: NDArray[Any]) -> None:
+    """
+    Write a picture file atomically.
+
+    Parameters
+    ----------
+    path : path
+        The extension selects one of :data:`PICTURE_FORMATS`. ``.png`` and ``.tif`` store uint8 and uint16 losslessly; ``.tif``
+        and, with the extra ``pictures``, ``.exr`` store float32 losslessly, including NaN; other formats store uint8.
+    picture : (n_y, n_x) or (n_y, n_x, n_channel) uint8, uint16 or float32
+        Top row first; grey, grey and alpha, colour, or colour and alpha.
+
+    Raises
+    ------
+    FileError
+        When the extension is unknown, the format does not support the array, or the file cannot be written.
+    """
+    target = Path(path)
+    chosen = picture_format(target)
+    if picture.ndim == 3 and picture.shape[2] == 1:
+        picture = picture[..., 0]
+    chosen.check(target, picture)
+    picture = np.ascontiguousarray(unmasked("picture", picture))
+    assert chosen.write is not None
+    with atomic_write(target) as temporary:
+        try:
+            chosen.write(temporary, picture)
+        except FileError as error:
+            raise FileError(target, error.detail) from None
+        except ImportError as error:
+            raise FileError(target, needs(error.name or "OpenEXR", "pictures")) from None
+        except (OSError, ValueError, RuntimeError) as error:
+            if disk_problem(error):
+                raise
+            raise FileError(target, f"cannot be written in this format ({error}); use .png") from None

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from foveasim._core.names import missing_path
 from foveasim._core.validation import MAX_SITES
 from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import as_file_error
@@ -112,7 +113,7 @@ def open_archive(
     """
     source = Path(path)
     if not source.is_file():
-        raise FileError(source, "is not a file" if source.exists() else "no such file")
+        raise FileError(source, missing_path(source))
     with as_file_error(source, what, passes=(FileError,)):
         about, arrays = read_archive(source)
         if not isinstance(about, dict) or about.get("format") != file_format:

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from foveasim._core.names import missing_path
 from foveasim.errors import ConfigError
 
-__all__ = ["MAX_FILE_BYTES", "parse_yaml", "read_text", "read_yaml"]
+__all__ = ["MAX_FILE_BYTES", "parse_yaml", "position_of", "read_text", "read_yaml"]
 
 #: Size limit: settings files are written by hand.
 MAX_FILE_BYTES = 1 << 20
+
+
+class _NotAllowedError(yaml.MarkedYAMLError):
+    """Valid YAML that settings may not contain."""
+
+
+def _not_allowed(problem: str, node: Any) -> _NotAllowedError:
+    return _NotAllowedError(problem=problem, problem_mark=node.start_mark)
 
 
 class _SafeLoader(yaml.SafeLoader):
@@ -26,18 +36,17 @@ class _SafeLoader(yaml.SafeLoader):
     def compose_node(self, parent: Any, index: Any) -> Any:
         event = self.peek_event()  # type: ignore[no-untyped-call]
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
-            raise yaml.YAMLError(f"anchors and aliases are not allowed (line {event.start_mark.line + 1})")
+            raise _not_allowed("anchors and aliases are not allowed; repeat the values", event)
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         keys = set()
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
-            line = key_node.start_mark.line + 1
             if not isinstance(key, str) and (not isinstance(key, int) or isinstance(key, bool)):
-                raise yaml.YAMLError(f"the key {key!r} must be a string or an integer (line {line})")
+                raise _not_allowed(f"the key {key!r} must be a string or an integer", key_node)
             if str(key) in keys:
-                raise yaml.YAMLError(f"duplicate key '{key}' (line {line})")
+                raise _not_allowed(f"duplicate key '{key}'", key_node)
             keys.add(str(key))
         return {str(key): value for key, value in super().construct_mapping(node, deep).items()}
 
@@ -67,10 +76,50 @@ def parse_yaml(path: Path, text: str) -> Any:
     except RecursionError:
         raise ConfigError(path, "is nested too deeply") from None
     except yaml.MarkedYAMLError as error:
-        line = "" if error.problem_mark is None else f", line {error.problem_mark.line + 1}"
-        raise ConfigError(path, f"is not YAML{line}: {error.problem}") from None
+        position = None if error.problem_mark is None else _position(error.problem_mark)
+        kind = "is not valid YAML for settings" if isinstance(error, _NotAllowedError) else "is not YAML"
+        raise ConfigError(path, f"{kind}: {error.problem}", position=position) from None
     except (yaml.YAMLError, ValueError) as error:
         raise ConfigError(path, f"is not valid YAML for settings: {' '.join(str(error).split())}") from None
+
+
+def _position(mark: Any) -> tuple[int, int]:
+    return mark.line + 1, mark.column + 1
+
+
+def position_of(path: Path, keys: Sequence[str], *, is_exact: bool = False) -> tuple[int, int] | None:
+    """
+    Return the line and column of a key in a YAML file, from 1.
+
+    Parameters
+    ----------
+    path : Path
+    keys : sequence of str
+        Keys, and indices of lists.
+    is_exact : bool
+        Whether the file must contain the key; by default the position is that of the innermost section with it.
+
+    Returns
+    -------
+    position : (line, column) or None
+        None when the file cannot be read, or does not contain the key.
+    """
+    try:
+        node = yaml.compose(read_text(path), _SafeLoader)
+    except (ConfigError, yaml.YAMLError, RecursionError, ValueError, OSError):
+        return None
+    mark = None
+    for key in keys:
+        if isinstance(node, yaml.MappingNode):
+            found = next(((k.start_mark, v) for k, v in node.value if k.value == key), None)
+        elif isinstance(node, yaml.SequenceNode) and key.isdecimal() and int(key) < len(node.value):
+            found = node.value[int(key)].start_mark, node.value[int(key)]
+        else:
+            found = None
+        if found is None:
+            return None if is_exact or mark is None else _position(mark)
+        mark, node = found
+    return None if mark is None else _position(mark)
 
 
 def read_text(path: Path) -> str:
@@ -83,7 +132,7 @@ def read_text(path: Path) -> str:
         When the file is missing, too large, or not UTF-8 text.
     """
     if not path.is_file():
-        raise ConfigError(path, "no such file" if not path.exists() else "is not a file")
+        raise ConfigError(path, missing_path(path))
     if path.stat().st_size > MAX_FILE_BYTES:
         raise ConfigError(path, f"is larger than {MAX_FILE_BYTES} bytes, the limit of settings files")
     try:

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.extras import import_optional
+from foveasim._core.names import missing_path
 from foveasim.errors import FileError, format_value
 
 __all__ = [
@@ -160,7 +161,7 @@ def open_store(
     """
     zarr = import_optional(path, "zarr")
     if not path.is_dir():
-        raise FileError(path, "is not a zarr store" if path.exists() else "no such zarr store")
+        raise FileError(path, missing_path(path, "zarr store"))
     try:
         _check_plain_files(path)
         check_codecs(path, ("bytes",), what)

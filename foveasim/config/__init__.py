@@ -33,6 +33,7 @@ from foveasim.config._shots import (
     write_3d_picture,
     write_results,
 )
+from foveasim.config._sources import Source
 from foveasim.config._starting_files import STARTING_FILES, starting_command, starting_file, write_starting_file
 from foveasim.config._video import run_video
 from foveasim.config._viewing import Viewable, read_viewable
@@ -44,6 +45,7 @@ __all__ = [
     "LayoutFile",
     "Result",
     "Shot",
+    "Source",
     "Viewable",
     "build_shot",
     "bundled_layouts",

@@ -66,9 +66,10 @@ def _model(name: str, call: Callable[..., Any], skip: Sequence[str] = (), **type
     return model
 
 
-def call_of(section: BaseModel) -> Callable[..., Any] | None:
-    """Return the call of a section; None for a section that only contains values."""
-    return next((_CALLS[kind] for kind in type(section).__mro__ if kind in _CALLS), None)
+def call_of(section: BaseModel | type[BaseModel]) -> Callable[..., Any] | None:
+    """Return the call of a section or of its model; None for a section that only contains values."""
+    model = section if isinstance(section, type) else type(section)
+    return next((_CALLS[kind] for kind in model.__mro__ if kind in _CALLS), None)
 
 
 def _documentation(call: Callable[..., Any]) -> tuple[str, dict[str, str]]:

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, TypeAdapter
 
+from foveasim._core.names import possible_names
 from foveasim._core.random_streams import Streams
-from foveasim._core.validation import check_number
 from foveasim._io.images import read_picture
 from foveasim._io.yaml_files import parse_yaml, read_yaml
 from foveasim.camera import Camera
 from foveasim.config._models import PerArea, call_of, models
 from foveasim.config._problems import validate
+from foveasim.config._sources import Source
 from foveasim.errors import ConfigError, FoveasimError, ParameterError
 from foveasim.fields import Grid, PowerMap
 from foveasim.layout import LAYOUTS, PRESETS, DesignRules, Layout, bundled_layouts, inset, mosaic, snap
@@ -26,6 +27,7 @@ from foveasim.layout.files import read_layout as read_sites
 from foveasim.optics import Optics
 from foveasim.scene import Scene
 from foveasim.sensor import Sensor
+from foveasim.sensor.limits import check_plausible
 
 __all__ = [
     "YAML_EXTENSIONS",
@@ -51,6 +53,8 @@ BUNDLED_PICTURE = "skimage:"
 YAML_EXTENSIONS = (".yaml", ".yml")
 #: Settings whose value may be a file.
 FILE_SETTINGS = ("density", "importance", "layout", "path", "picture")
+#: Option of the command line that replaces settings.
+CHANGE = "--set"
 #: Tolerance of the aspect ratio of a picture and the rectangle that it covers.
 SHAPE_ROUNDING = 1e-6
 
@@ -121,7 +125,8 @@ def read_shot(path: str | Path, changes: Sequence[str] = (), *, n_threads: int |
     FileError
         When a picture of the file cannot be read.
     """
-    return build_shot(path, read_settings(path, changes), n_threads=n_threads)
+    source = Source(file=Path(path), replaced={change.partition("=")[0].strip(): CHANGE for change in changes})
+    return build_shot(source, read_settings(path, changes), n_threads=n_threads)
 
 
 def read_settings(path: str | Path, changes: Sequence[str] = ()) -> dict[str, Any]:
@@ -145,14 +150,14 @@ def read_settings(path: str | Path, changes: Sequence[str] = ()) -> dict[str, An
     return data
 
 
-def check_settings(path: str | Path, settings: Mapping[str, Any]) -> None:
+def check_settings(source: Source | str | Path | None, settings: Mapping[str, Any]) -> None:
     """
     Check names and types of a shot's settings.
 
     Parameters
     ----------
-    path : path
-        File of the settings, for messages.
+    source : Source, path or None
+        Origin of the settings, for messages; None for settings from Python.
     settings : mapping
         As :func:`read_settings` returns them.
 
@@ -161,7 +166,7 @@ def check_settings(path: str | Path, settings: Mapping[str, Any]) -> None:
     ConfigError
         When a setting is invalid.
     """
-    validate(Path(path), models().shot, dict(settings))
+    validate(source, models().shot, dict(settings))
 
 
 def _make_uncached(_part: str, _settings: Any, make: Callable[[], Any]) -> Any:
@@ -169,7 +174,7 @@ def _make_uncached(_part: str, _settings: Any, make: Callable[[], Any]) -> Any:
 
 
 def build_shot(
-    path: str | Path,
+    source: Source | str | Path | None,
     data: Mapping[str, Any],
     *,
     n_threads: int | None = None,
@@ -180,8 +185,9 @@ def build_shot(
 
     Parameters
     ----------
-    path : path
-        File of the settings; paths in them are relative to its directory.
+    source : Source, path or None
+        File of the settings; paths in them are relative to its directory. None for settings from Python, whose paths are
+        relative to the working directory.
     data : mapping
         As :func:`read_settings` returns them.
     n_threads : int, optional
@@ -194,35 +200,37 @@ def build_shot(
     ConfigError, FileError
         As for :func:`read_shot`.
     """
-    path = Path(path)
-    settings = validate(path, models().shot, dict(data))
+    source = Source.of(source)
+    settings = validate(source, models().shot, dict(data))
 
     def layout_file() -> LayoutFile:
         if not isinstance(settings.layout, str):
-            return _build_layout(path, "layout.", settings.layout)
-        read: LayoutFile = _call(path, "layout", read_any_layout, {"path": settings.layout, "directory": path.parent})
+            return _build_layout(source, "layout.", settings.layout)
+        read: LayoutFile = _call(
+            source, "layout", read_any_layout, {"path": settings.layout, "directory": source.directory}
+        )
         return read
 
     def sensor_of_layout() -> Sensor:
         values = {
             name: value.per_um2 * layout.area_um2 if isinstance(value, PerArea) else value
-            for name, value in _values(path, "sensor.", settings.sensor).items()
+            for name, value in _values(source, "sensor.", settings.sensor).items()
         }
-        sensor: Sensor = _call(path, "sensor", Sensor, {"layout": layout, **values})
+        sensor: Sensor = _call(source, "sensor", Sensor, {"layout": layout, **values})
         return sensor
 
     file = cache("layout", data["layout"], layout_file)
     layout = file.layout
     sensor = cache("sensor", [data["layout"], data.get("sensor")], sensor_of_layout)
     optics = cache(
-        "optics", data["optics"], lambda: _call(path, "optics", Optics, _values(path, "optics.", settings.optics))
+        "optics", data["optics"], lambda: _call(source, "optics", Optics, _values(source, "optics.", settings.optics))
     )
-    distortion = cache("distortion", data.get("distortion"), lambda: _build(path, "distortion", settings.distortion))
-    scene = cache("scene", data["scene"], lambda: _build(path, "scene", settings.scene))
+    distortion = cache("distortion", data.get("distortion"), lambda: _build(source, "distortion", settings.distortion))
+    scene = cache("scene", data["scene"], lambda: _build(source, "scene", settings.scene))
     # Errors of a capture are raised here, before it starts, with the path of the key.
-    _call(path, "scene", sensor.responsivity_e_per_j, {"wavelength_nm": scene.wavelength_nm})
-    streams = _call(path, "", Streams, {"seed": settings.seed})
-    exposure_s = _call(path, "", check_number, {"name": "exposure_s", "value": settings.exposure_s, "at_least": 0.0})
+    _call(source, "scene", sensor.responsivity_e_per_j, {"wavelength_nm": scene.wavelength_nm})
+    streams = _call(source, "", Streams, {"seed": settings.seed})
+    exposure_s = _call(source, "", check_plausible, {"name": "exposure_s", "value": settings.exposure_s})
     order = settings.integration_order
     camera = cache(
         "camera",
@@ -232,11 +240,11 @@ def build_shot(
     # Other optics and electronics share the compiled layout.
     camera = camera.replace(optics=optics, sensor=sensor)
     if isinstance(scene, Scene):
-        framed = _call(path, "scene", camera.frame, {"scene": scene})
-        _call(path, "scene", optics.grid, {"scene": framed})
-        _call(path, "optics", optics.check, {"scene": framed})
+        framed = _call(source, "scene", camera.frame, {"scene": scene})
+        _call(source, "scene", optics.grid, {"scene": framed})
+        _call(source, "optics", optics.check, {"scene": framed})
     return Shot(
-        name=path.stem,
+        name=source.name,
         scene=scene,
         camera=camera,
         rules=file.rules,
@@ -254,8 +262,8 @@ def read_layout_file(path: str | Path) -> LayoutFile:
     ConfigError
         When the file is invalid; with the file, the path of the key, and the expected and actual value.
     """
-    path = Path(path)
-    return _build_layout(path, "", validate(path, models().layout, read_yaml(path)))
+    source = Source.of(path)
+    return _build_layout(source, "", validate(source, models().layout, read_yaml(Path(path))))
 
 
 def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None = None, **options: Any) -> Layout:
@@ -335,9 +343,13 @@ def read_rules(path: str | Path) -> DesignRules:
         When the file is invalid; with the file, the path of the key, and the expected and actual value.
     """
     path = Path(path)
-    if str(path) in PRESETS and not path.exists():
-        return DesignRules(preset=str(path))
-    rules: DesignRules = _build(path, "", validate(path, models().rules, read_yaml(path)))
+    if not path.exists() and not path.suffix and path.name == str(path):
+        if str(path) in PRESETS:
+            return DesignRules(preset=str(path))
+        hint = possible_names(path, list(PRESETS))
+        raise ConfigError(path, f"no such file, and not the name of a preset; {hint}")
+    source = Source.of(path)
+    rules: DesignRules = _build(source, "", validate(source, models().rules, read_yaml(path)))
     return rules
 
 
@@ -348,65 +360,65 @@ def schema(section: Any = "shot", title: str = "foveasim settings") -> dict[str,
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **model_schema, "title": title}
 
 
-def _build_layout(path: Path, prefix: str, section: Any) -> LayoutFile:
+def _build_layout(source: Source, prefix: str, section: Any) -> LayoutFile:
     parameters = prefix + "parameters"
-    values = _values(path, parameters + ".", section.parameters)
+    values = _values(source, parameters + ".", section.parameters)
     picture = getattr(LAYOUTS[section.generator], "picture", None)
     if picture is not None and values[picture] is not None:
-        values |= _picture_values(path, f"{parameters}.{picture}", values)
-    layout = _call(path, parameters, _callable(section.parameters), values)
+        values |= _picture_values(source, f"{parameters}.{picture}", values)
+    layout = _call(source, parameters, _callable(section.parameters), values)
     if section.mosaic is not None:
-        layout = _call(path, prefix + "mosaic", mosaic, {"layout": layout, "block": section.mosaic})
+        layout = _call(source, prefix + "mosaic", mosaic, {"layout": layout, "block": section.mosaic})
     if any(section.move_um):
         layout = _call(
-            path, prefix + "move_um", layout.translate, dict(zip(("dx_um", "dy_um"), section.move_um, strict=True))
+            source, prefix + "move_um", layout.translate, dict(zip(("dx_um", "dy_um"), section.move_um, strict=True))
         )
     if section.inset_um:
-        layout = _call(path, prefix + "inset_um", inset, {"layout": layout, "margin_um": section.inset_um})
+        layout = _call(source, prefix + "inset_um", inset, {"layout": layout, "margin_um": section.inset_um})
     if section.snap_um is not None:
-        layout = _call(path, prefix + "snap_um", snap, {"layout": layout, "grid_um": section.snap_um})
-    rules = None if section.rules is None else _build(path, prefix + "rules", section.rules)
+        layout = _call(source, prefix + "snap_um", snap, {"layout": layout, "grid_um": section.snap_um})
+    rules = None if section.rules is None else _build(source, prefix + "rules", section.rules)
     return LayoutFile(layout=layout, rules=rules, source=section.source)
 
 
-def _picture_values(path: Path, key_path: str, values: Mapping[str, Any]) -> dict[str, Any]:
+def _picture_values(source: Source, key_path: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Return a picture's grey values, 0 to 1, and for a density their grid."""
     name = key_path.rpartition(".")[2]
-    picture = read_picture(picture_path(path, values[name], key_path))
+    picture = read_picture(picture_path(source, values[name], key_path))
     scale = np.iinfo(picture.dtype).max if picture.dtype.kind == "u" else 1.0
     n_colours = {2: 1, 4: 3}.get(picture.shape[2], picture.shape[2]) if picture.ndim == 3 else 1
     grey = picture.reshape(*picture.shape[:2], -1)[::-1, :, :n_colours].mean(axis=2, dtype=np.float64) / scale
     if name != "density":
         return {name: grey}
     if values["size_um"] is None:
-        raise ConfigError(path, f"{key_path}: requires 'size_um', the rectangle that the picture covers")
+        raise source.error(key_path, "requires 'size_um', the rectangle that the picture covers")
     (width_um, height_um), (n_y, n_x) = values["size_um"], grey.shape
     if abs(width_um * n_y - height_um * n_x) > SHAPE_ROUNDING * abs(width_um * n_y):
-        raise ConfigError(
-            path,
-            f"{key_path}: must have the aspect ratio of 'size_um', {width_um:g} x {height_um:g} µm, got {n_x} x {n_y} pixels",
+        raise source.error(
+            key_path,
+            f"must have the aspect ratio of 'size_um', {width_um:g} x {height_um:g} µm, got {n_x} x {n_y} pixels",
         )
-    grid = _call(path, key_path, Grid.centred, {"shape": grey.shape, "pitch_um": width_um / n_x})
+    grid = _call(source, key_path, Grid.centred, {"shape": grey.shape, "pitch_um": width_um / n_x})
     return {name: grey, "density_grid": grid}
 
 
-def _values(path: Path, prefix: str, section: BaseModel) -> dict[str, Any]:
+def _values(source: Source, prefix: str, section: BaseModel) -> dict[str, Any]:
     """Return a section's values as arguments of its call, with nested sections built."""
     return {
-        name: _build(path, prefix + name, getattr(section, name))
+        name: _build(source, prefix + name, getattr(section, name))
         for name in type(section).model_fields
         if name not in {"kind", "generator"}
     }
 
 
-def _build(path: Path, key_path: str, value: Any) -> Any:
+def _build(source: Source, key_path: str, value: Any) -> Any:
     if isinstance(value, list):
-        return [_build(path, f"{key_path}[{i}]", item) for i, item in enumerate(value)]
+        return [_build(source, f"{key_path}[{i}]", item) for i, item in enumerate(value)]
     if isinstance(value, str) and key_path.rpartition(".")[2] in {"path", "picture"}:
-        return picture_path(path, value, key_path)
+        return picture_path(source, value, key_path)
     if not isinstance(value, BaseModel) or isinstance(value, PerArea):
         return value
-    return _call(path, key_path, _callable(value), _values(path, key_path + ".", value))
+    return _call(source, key_path, _callable(value), _values(source, key_path + ".", value))
 
 
 def _callable(section: BaseModel) -> Callable[..., Any]:
@@ -415,25 +427,25 @@ def _callable(section: BaseModel) -> Callable[..., Any]:
     return call
 
 
-def _call(path: Path, key_path: str, function: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
+def _call(source: Source, key_path: str, function: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
     """Call a function; errors begin with the path of the key."""
     try:
         return function(**arguments)
     except ParameterError as error:
         full_path = f"{key_path}.{error.name}" if key_path else error.name
-        raise ConfigError(path, f"{full_path}: {error.detail}") from None
+        raise source.error(full_path, error.detail) from None
     except FoveasimError as error:
-        raise ConfigError(path, f"{key_path}: {error}") from None
+        raise source.error(key_path, str(error)) from None
 
 
-def picture_path(path: Path, picture: str, key_path: str) -> Path:
+def picture_path(source: Source, picture: str, key_path: str) -> Path:
     """
     Return the file of a picture in a settings file.
 
     Parameters
     ----------
-    path : Path
-        The settings file.
+    source : Source
+        Origin of the setting.
     picture : str
         A file, or a picture of scikit-image such as ``skimage:astronaut``.
     key_path : str
@@ -445,15 +457,13 @@ def picture_path(path: Path, picture: str, key_path: str) -> Path:
         When scikit-image does not contain the picture.
     """
     if not picture.startswith(BUNDLED_PICTURE):
-        return path.parent / picture
+        return source.directory / picture
     name = picture.removeprefix(BUNDLED_PICTURE)
     bundled = {
         Path(str(f)).stem: Path(str(f)) for f in files("skimage.data").iterdir() if f.name.endswith((".png", ".jpg"))
     }
     if name not in bundled:
-        raise ConfigError(
-            path, f"{key_path}: scikit-image does not contain '{name}'; its pictures are {', '.join(sorted(bundled))}"
-        )
+        raise source.error(key_path, f"scikit-image does not contain '{name}'; {possible_names(name, sorted(bundled))}")
     return bundled[name]
 
 
@@ -462,10 +472,14 @@ def _replace(path: Path, data: dict[str, Any], change: str) -> None:
     key, equals, value = change.partition("=")
     if not equals or not all(key.strip().split(".")):
         raise ConfigError(path, f"a change must be 'key=value', such as sensor.bits=10, got '{change}'")
-    put_setting(path, data, key.strip(), resolve_files(Path(), parse_yaml(path, value), key.strip()))
+    try:
+        parsed = parse_yaml(path, value)
+    except ConfigError as error:
+        raise ConfigError(path, f"{CHANGE} {key.strip()}: {error.detail}") from None
+    put_setting(path, data, key.strip(), resolve_files(Path(), parsed, key.strip()))
 
 
-def put_setting(path: str | Path, data: dict[str, Any], key: str, value: Any) -> None:
+def put_setting(source: Source | str | Path | None, data: dict[str, Any], key: str, value: Any) -> None:
     """
     Set a value by its path, such as ``"sensor.bits"``, in place.
 
@@ -476,13 +490,14 @@ def put_setting(path: str | Path, data: dict[str, Any], key: str, value: Any) ->
     """
     names = key.split(".")
     if not all(names):
-        raise ConfigError(path, f"'{key}' must be the path of a setting, such as sensor.bits")
+        raise ConfigError(Source.of(source).file, f"'{key}' must be the path of a setting, such as sensor.bits")
     section: Any = data
     for i, name in enumerate(names[:-1]):
         section = section.setdefault(name, {})
         if not isinstance(section, dict):
             raise ConfigError(
-                path, f"'{key}={value}' cannot be set: {'.'.join(names[: i + 1])} must be a section, got {section!r}"
+                Source.of(source).file,
+                f"'{key}={value}' cannot be set: {'.'.join(names[: i + 1])} must be a section, got {section!r}",
             )
     section[names[-1]] = value
 

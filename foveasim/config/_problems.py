@@ -1,14 +1,19 @@
-"""Validation of settings: each problem in one line, with the path of its key."""
+"""Validation of settings: each problem in one line, with the path and position of its key."""
 
 from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from foveasim._core.names import closest_name, did_you_mean, list_names, possible_names
+from foveasim.config._models import call_of
+from foveasim.config._sources import Source
 from foveasim.errors import ConfigError
 
 __all__ = ["validate"]
@@ -17,45 +22,52 @@ __all__ = ["validate"]
 MAX_PROBLEMS = 3
 
 
-def validate(path: Path, kind: Any, data: dict[str, Any]) -> Any:
+def validate(source: Source | str | Path | None, kind: Any, data: dict[str, Any]) -> Any:
     """
     Return settings as an instance of a model.
 
     Raises
     ------
     ConfigError
-        With the file, the path of the key, and the expected and actual value.
+        With the file, its line and column, the path of the key, and the expected and actual value.
     """
+    source = Source.of(source)
     try:
         return TypeAdapter(kind).validate_json(json.dumps(data, default=_reject), strict=True)
     except ValidationError as error:
-        problems = _problems(data, error)
-        message = "; ".join(problems[:MAX_PROBLEMS])
-        more = len(problems) - MAX_PROBLEMS
-        raise ConfigError(path, message + (f"; and {more} more" if more > 0 else "")) from None
+        (key_path, first), *others = _problems(kind, data, error)
+        more = len(others) + 1 - MAX_PROBLEMS
+        others_listed = [
+            f"{'.'.join(key)}: {problem}" if key else problem for key, problem in others[: MAX_PROBLEMS - 1]
+        ]
+        message = "; ".join([first, *others_listed, *([f"and {more} more"] if more > 0 else [])])
+        raise source.error(key_path, message) from None
     except (ValueError, RecursionError) as error:
-        raise ConfigError(path, f"contains an unreadable value ({error})") from None
+        raise ConfigError(source.file, f"contains an unreadable value ({error})") from None
 
 
 def _reject(value: object) -> None:
     raise ValueError(f"a {type(value).__name__} is not a number, string, list or section")
 
 
-def _problems(data: dict[str, Any], error: ValidationError) -> list[str]:
-    """Return every distinct problem as "key: problem"."""
+def _problems(kind: Any, data: dict[str, Any], error: ValidationError) -> list[tuple[tuple[str, ...], str]]:
+    """Return the path and the description of every distinct problem."""
     found = [(_key_path(data, item), item) for item in error.errors(include_url=False)]
     # For a union, pydantic reports a problem for every type: only those of the deepest key matter.
-    problems = [
-        f"{'.'.join(key_path) or 'the file'}{_describe(item)}"
-        for key_path, item in found
-        if not (
-            item["type"].endswith("_type")
-            and any(
-                other[: len(key_path)] == key_path and (len(other) > len(key_path) or not o["type"].endswith("_type"))
-                for other, o in found
-            )
+    problems = []
+    # Unknown keys first: a misspelt key is also missing.
+    for key_path, item in sorted(found, key=lambda each: each[1]["type"] != "extra_forbidden"):
+        is_type = item["type"].endswith("_type") or (
+            item["type"] == "literal_error" and isinstance(item["input"], dict | list)
         )
-    ]
+        is_shadowed = is_type and any(
+            other[: len(key_path)] == key_path and (len(other) > len(key_path) or not o["type"].endswith("_type"))
+            for other, o in found
+        )
+        if not is_shadowed:
+            # The value of the key that selects the kind of a section.
+            tag = [item["ctx"]["discriminator"].strip("'")] if item["type"] == "union_tag_invalid" else []
+            problems.append(((*key_path, *tag), _describe(kind, item, is_first=not problems)))
     return list(dict.fromkeys(problems))
 
 
@@ -82,18 +94,86 @@ def _tags(data: Any) -> tuple[Any, ...]:
     return (data.get("kind"), data.get("generator")) if isinstance(data, dict) else ()
 
 
-def _describe(error: Any) -> str:
+def _describe(kind: Any, error: Any, *, is_first: bool) -> str:
+    """Return the rule and the value of a problem; for unknown names the closest one, and the list if it is the first."""
     match error["type"]:
         case "extra_forbidden":
-            return ": no such setting"
+            name = error["loc"][-1]
+            section = _section_at(kind, error["loc"][:-1])
+            if section is None:
+                return "unknown key"
+            call = call_of(section)
+            what = "unknown key" if call is None else f"unknown parameter of {call.__name__}"
+            keys = [field.alias or key for key, field in section.model_fields.items()]
+            hint = possible_names(name, keys) if is_first else did_you_mean(name, keys)
+            return f"{what}; {hint}" if hint else what
         case "missing":
-            return ": missing"
+            return "missing"
         case "union_tag_not_found":
-            return f": requires the key {error['ctx']['discriminator']}"
-        case "union_tag_invalid":
             key = error["ctx"]["discriminator"].strip("'")
-            return f".{key}: must be one of {error['ctx']['expected_tags']}, got '{error['ctx']['tag']}'"
+            given = closest_name(key, error["input"]) if isinstance(error["input"], dict) else None
+            return f"requires the key '{key}'" + ("" if given is None else f", got '{given}'")
+        case "union_tag_invalid":
+            known, tag = _quoted(error["ctx"]["expected_tags"]), error["ctx"]["tag"]
+            return _not_one_of(known, tag, f"'{tag}'")
+        case "literal_error":
+            value = error["input"]
+            return _not_one_of(_quoted(error["ctx"]["expected"]), value, json.dumps(value))
         case _:
             got = "" if isinstance(error["input"], dict | list) else f", got {json.dumps(error['input'])}"
             rule = re.sub(r"^\w+ should", "must", error["msg"]).replace(" after validation", "")
-            return f": {rule}{got}"
+            return f"{rule}{got}"
+
+
+def _quoted(names: str) -> list[str]:
+    """Return the names in a list of pydantic such as ``'a', 'b' or 'c'``."""
+    return re.findall(r"'([^']*)'", names) or re.findall(r"[^\s,]+(?<!\bor)", names)
+
+
+def _not_one_of(known: list[str], value: Any, shown: str) -> str:
+    hint = did_you_mean(value, known) if isinstance(value, str) else ""
+    return f"must be one of {list_names(known, value)}, got {shown}{'; ' if hint else ''}{hint}"
+
+
+def _section_at(kind: Any, loc: tuple[Any, ...]) -> type[BaseModel] | None:
+    """Return the model of a section, by its location in the notation of pydantic."""
+    candidates = list(_alternatives(kind))
+    for part in loc:
+        tagged = [each for each in candidates if part in _literals(each)]
+        candidates = tagged or [
+            below for each in candidates for inner in _below(each, part) for below in _alternatives(inner)
+        ] or candidates  # fmt: skip
+    return next((each for each in candidates if isinstance(each, type) and issubclass(each, BaseModel)), None)
+
+
+def _alternatives(kind: Any) -> Iterator[Any]:
+    """Yield the types of a union, without annotations."""
+    if get_origin(kind) is Annotated:
+        yield from _alternatives(get_args(kind)[0])
+    elif get_origin(kind) in (Union, UnionType):
+        for each in get_args(kind):
+            yield from _alternatives(each)
+    else:
+        yield kind
+
+
+def _literals(kind: Any) -> tuple[Any, ...]:
+    """Return the values of the key that selects a section in a union."""
+    if not (isinstance(kind, type) and issubclass(kind, BaseModel)):
+        return ()
+    fields = (kind.model_fields.get(key) for key in ("kind", "generator"))
+    return tuple(
+        value
+        for field in fields
+        if field is not None and get_origin(field.annotation) is Literal
+        for value in get_args(field.annotation)
+    )
+
+
+def _below(kind: Any, part: Any) -> list[Any]:
+    """Return the type of a key of a section, or of an item of a container."""
+    if isinstance(kind, type) and issubclass(kind, BaseModel):
+        return [field.annotation for key, field in kind.model_fields.items() if part in (key, field.alias)]
+    if get_origin(kind) in (list, tuple) and isinstance(part, int):
+        return list(get_args(kind)[:1])
+    return list(get_args(kind)[1:2]) if get_origin(kind) is dict else []

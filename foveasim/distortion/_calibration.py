@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from foveasim._core.names import possible_names
 from foveasim._core.validation import Floats, check_count, check_number, finite_array
 from foveasim.distortion._brown_conrady import BrownConrady
 from foveasim.distortion._fisheye import PolynomialFisheye, Scaramuzza
@@ -181,7 +182,8 @@ def _from_keys(path: Path, keys: Mapping[str, Any], pixel_um: float, image_size:
     model = str(next((keys[key] for key in MODEL_KEYS if key in keys), PINHOLE_MODELS[0])).lower()
     model = re.sub("kannalabrandt", "kannala_brandt", re.sub("[- ]", "_", model))
     if model not in FISHEYE_MODELS + PINHOLE_MODELS:
-        raise ConfigError(path, f"the distortion model must be one of {FISHEYE_MODELS + PINHOLE_MODELS}, got '{model}'")
+        known = FISHEYE_MODELS + PINHOLE_MODELS
+        raise ConfigError(path, f"has the unknown distortion model '{model}'; {possible_names(model, known)}")
     size: list[Any] = [next((keys[key] for key in names if key in keys), None) for names in (WIDTH_KEYS, HEIGHT_KEYS)]
     if None in size:
         if image_size is None:

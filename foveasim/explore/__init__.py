@@ -12,7 +12,8 @@ from foveasim.explore.datasets.pytorch import torch_dataset
 from foveasim.explore.datasets.recipes import classification, denoising
 from foveasim.explore.datasets.store import StoredSamples, open_dataset, write_dataset
 from foveasim.explore.studies.plan import StudyPlan, plan_study, read_study
-from foveasim.explore.studies.study import best_table, finished_trials, run_study, storage_name, study
+from foveasim.explore.studies.study import best_table, run_study, storage_name, study
+from foveasim.explore.studies.trials import finished_trials, trials_table
 from foveasim.explore.sweeps.plan import Plan, plan_sweep, read_sweep
 from foveasim.explore.sweeps.results import open_results
 from foveasim.explore.sweeps.sweep import run_sweep, sweep
@@ -45,6 +46,7 @@ __all__ = [
     "study",
     "sweep",
     "torch_dataset",
+    "trials_table",
     "write_dataset",
 ]
 

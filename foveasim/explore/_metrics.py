@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from foveasim._core.names import possible_names
 from foveasim._core.registry import Registry
 from foveasim.camera import Camera
 from foveasim.capture import Capture
@@ -40,6 +41,8 @@ METRICS: Registry[Metric] = Registry("metric", "foveasim.metrics")
 PSNR_PIXELS = 256
 #: Variables and dimensions of results that are not metrics.
 RESERVED = ("seed", "error", "warning", "point", "repeat")
+#: Hint for functions that are not registered.
+OTHER_METRICS = "pass other functions in Python, or with --metric module:function"
 #: Default metrics of a sweep.
 DEFAULT_METRICS = ("mean_code_dn", "saturated_fraction", "snr", "n_sites")
 
@@ -165,9 +168,9 @@ def resolve_metrics(metrics: Iterable[str | Metric] | Mapping[str, Metric] | Non
         if metric is None:
             raise ParameterError(
                 "metrics",
-                f"must be one of {', '.join(sorted(METRICS))}",
+                "must be names of metrics",
                 name,
-                hint="pass other functions in Python, or with --metric module:function",
+                hint=f"{possible_names(name, sorted(METRICS))}; {OTHER_METRICS}",
             )
         if not callable(metric):
             raise ParameterError("metrics", "must be names of metrics or functions", metric)

@@ -17,7 +17,7 @@ import numpy as np
 
 from foveasim._core.threads import thread_count
 from foveasim.capture import Capture
-from foveasim.config import Shot, build_shot
+from foveasim.config import Shot, Source, build_shot
 from foveasim.errors import FoveasimError
 from foveasim.explore._metrics import REFERENCES, Metric
 from foveasim.explore._records import Record, check_unique, to_values
@@ -109,8 +109,8 @@ class ShotRunner:
 
     Parameters
     ----------
-    source : Path
-        File of the settings, for messages.
+    source : Source, path or None
+        Origin of the settings, for messages.
     metrics : mapping of str to function
     is_geometry_varied : bool
         Whether points differ in photosites or distortion; optical images are then cached.
@@ -126,7 +126,7 @@ class ShotRunner:
 
     def __init__(
         self,
-        source: Path,
+        source: Source | Path | None,
         metrics: Mapping[str, Metric],
         *,
         is_geometry_varied: bool = True,

@@ -13,6 +13,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.names import possible_names
 from foveasim._core.provenance import copy_plain_data
 from foveasim._core.rings import (
     are_convex,
@@ -338,7 +339,8 @@ class Layout:
             When the layout has no such column, or its values are not valid indices.
         """
         if name not in self.columns:
-            raise ParameterError(name, f"must be a column of the layout, which has {sorted(self.columns)}")
+            hint = possible_names(name, sorted(self.columns))
+            raise ParameterError(name, "must be a column of the layout", hint=hint)
         column = self.columns[name]
         if column.dtype.kind not in "iu":
             raise ParameterError(name, f"must contain integers from 0 to {MAX_SITES}", column)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from foveasim._core.extras import needs
+from foveasim._core.names import possible_names
 from foveasim._io.atomic import atomic_directory, check_free_space
 from foveasim._io.formats import FileFormat, FormatError
 from foveasim.errors import FileError
@@ -131,9 +132,7 @@ def _select_variable(dataset: xr.Dataset, name: str | None) -> str:
     names = [str(n) for n in dataset.data_vars]
     if name is not None:
         if name not in names:
-            raise FormatError(
-                f"has no variable {name!r:.40}; available variables: {', '.join(n[:40] for n in names[:5])}"
-            )
+            raise FormatError(f"has no variable {name!r:.40}; {possible_names(name, names)}")
         return name
     if NAME in names:
         return NAME

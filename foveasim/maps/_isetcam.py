@@ -19,6 +19,7 @@ from typing import IO, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.names import possible_names
 from foveasim._io.formats import FileFormat, FormatError
 from foveasim.fields import from_file_rows
 from foveasim.maps._common import Found, check_size, max_decompressed_bytes
@@ -97,8 +98,7 @@ def _struct(names: list[str], name: str | None) -> str | None:
             return one
     if name is None and {"data", "photons"} & set(names):
         return None
-    available = ", ".join(n[:40] for n in names[:5])
-    raise FormatError(f"contains no optical image {name or 'oi'!r:.40}; available variables: {available or 'none'}")
+    raise FormatError(f"contains no optical image {name or 'oi'!r:.40}; {possible_names(name or 'oi', names)}")
 
 
 def _read_fields(field: Field) -> Found:

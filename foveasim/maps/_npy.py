@@ -15,6 +15,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.names import possible_names
 from foveasim._io.formats import FileFormat, FormatError
 from foveasim._io.npz import read_array, zip_members
 from foveasim.fields import PowerMap
@@ -83,7 +84,7 @@ def _select_array(names: list[str], name: str | None) -> str:
     others = [n for n in names if n not in METADATA_NAMES]
     if name is not None:
         if name not in names:
-            raise FormatError(f"has no array {name!r:.40}; available arrays: {', '.join(map(repr, names[:5]))}")
+            raise FormatError(f"has no array {name!r:.40}; {possible_names(name, names)}")
         return name
     if DATA in others:
         return DATA

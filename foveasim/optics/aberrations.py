@@ -33,6 +33,8 @@ __all__ = ["LateralColour", "Seidel", "Zernike", "noll_to_nm", "osa_to_nm", "zer
 
 #: Highest index, of radial order 100; polynomials up to this order are accurate to 1e-12.
 MAX_INDEX = 5151
+#: Largest wavefront error, µm or waves: 10 cm is beyond any lens.
+MAX_PATH = 1e5
 
 
 def noll_to_nm(j: int) -> tuple[int, int]:
@@ -166,7 +168,7 @@ class Zernike:
         clean: dict[int, float | tuple[float, ...]] = {}
         for j, value in self.coefficients.items():
             self._orders(j)
-            numbers = finite_array(f"coefficients[{j}]", value)
+            numbers = finite_array(f"coefficients[{j}]", value, at_least=-MAX_PATH, at_most=MAX_PATH)
             if numbers.ndim > 1 or (numbers.ndim == 1 and numbers.size != n_waves):
                 raise ParameterError(
                     f"coefficients[{j}]", f"must be one number, or one for each of the {n_waves} wavelengths", value
@@ -249,7 +251,8 @@ class Seidel:
 
     def __post_init__(self) -> None:
         for name in ("spherical_um", "coma_um", "astigmatism_um", "field_curvature_um"):
-            object.__setattr__(self, name, check_number(name, getattr(self, name)))
+            path_um = check_number(name, getattr(self, name), at_least=-MAX_PATH, at_most=MAX_PATH)
+            object.__setattr__(self, name, path_um)
         radius_um = check_number("field_radius_um", self.field_radius_um, above=0.0, at_most=1e7)
         object.__setattr__(self, "field_radius_um", radius_um)
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.validation import Floats, Images, check_count, finite_array, own, unmasked
-from foveasim._io.encodings import encode_srgb_values
-from foveasim._io.images import write_picture
+from foveasim._io.encodings import decode, encode_srgb_values
+from foveasim._io.images import picture_format, write_picture
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid, PackedRings, to_file_rows
 from foveasim.integrate import Integrator
@@ -21,8 +22,10 @@ __all__ = ["Picture", "coverage_fraction", "raster_grid"]
 
 #: Coverage below this fraction is rounding error.
 NO_COVERAGE = 1e-9
-#: File extensions that store floating-point numbers by default.
-FLOAT_EXTENSIONS = (".tif", ".tiff", ".exr")
+#: Colour of pixels without photosites in formats without alpha.
+NO_DATA_COLOUR = "white"
+#: A name or code of HTML, such as "white" or "#204060", or red, green and blue from 0 to 255.
+Colour: TypeAlias = str | Sequence[int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +55,12 @@ class Picture:
             object.__setattr__(self, name, own(np.asarray(values)))
 
     def to_image(
-        self, white: float | Floats | None = None, *, encode_srgb: bool = False, bits: int = 8
+        self,
+        white: float | Floats | None = None,
+        *,
+        encode_srgb: bool = False,
+        bits: int = 8,
+        background: Colour | None = None,
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
         """
         Return the picture as integers for a file or a screen, top row first.
@@ -64,16 +72,21 @@ class Picture:
         encode_srgb : bool
             Whether to encode linear values with the sRGB transfer function.
         bits : {8, 16}
+        background : str or (r, g, b), optional
+            Colour of pixels without photosites, such as ``"white"``, ``"#204060"`` or ``(32, 64, 96)``; pixels that photosites
+            cover partly are mixed with it, as viewers mix transparent pixels. By default such pixels are transparent.
 
         Returns
         -------
-        image : (n_y, n_x, n_channel + 1) uint8 or uint16
-            Grey or RGB, with the coverage as alpha: pixels without photosites are transparent.
+        image : (n_y, n_x, n_channel + 1) or, with a background, (n_y, n_x, 1 or 3), uint8 or uint16
+            Grey or RGB, with the coverage as alpha. With a background there is no alpha; a grey picture on a background of
+            another colour becomes RGB.
 
         Raises
         ------
         ParameterError
-            When the picture has neither 1 nor 3 channels, ``white`` is not positive, or ``bits`` is neither 8 nor 16.
+            When the picture has neither 1 nor 3 channels, ``white`` is not positive, ``bits`` is neither 8 nor 16, or
+            ``background`` is not a colour.
         """
         if self.data.shape[0] not in (1, 3):
             raise ParameterError("data", f"must have 1 or 3 channels to be shown, got {self.data.shape[0]}")
@@ -84,7 +97,11 @@ class Picture:
         fraction = np.clip(np.nan_to_num(self.data) / self._levels(white), 0.0, 1.0)
         if encode_srgb:
             fraction = encode_srgb_values(fraction)
-        layers = np.concatenate((fraction, np.clip(self.coverage, 0.0, 1.0)[np.newaxis]))
+        coverage = np.clip(self.coverage, 0.0, 1.0)[np.newaxis]
+        if background is None:
+            layers = np.concatenate((fraction, coverage))
+        else:
+            layers = coverage * fraction + (1.0 - coverage) * _channels(background, fraction.shape[0])
         image: NDArray[Any] = np.rint((2**bits - 1) * to_file_rows(layers))
         return np.ascontiguousarray(image.astype(np.uint8 if bits == 8 else np.uint16))
 
@@ -95,6 +112,7 @@ class Picture:
         *,
         encode_srgb: bool = False,
         bits: int | None = None,
+        background: Colour | None = None,
     ) -> None:
         """
         Write the picture to a file atomically.
@@ -102,34 +120,48 @@ class Picture:
         Parameters
         ----------
         path : path
-            ``.png`` and other integer formats, ``.tif`` with integers or floating-point numbers, or, with the extra
-            ``pictures``, ``.exr``.
+            ``.png``, ``.webp``, ``.jp2``, ``.tga`` (with alpha), ``.jpg``, ``.bmp``, ``.ppm``, ``.gif`` (without alpha),
+            ``.tif`` with integers or floating-point numbers, or, with the extra ``pictures``, ``.exr``. 16 bits per channel
+            are available in ``.png`` (in colour with the extra ``pictures``) and ``.tif``.
         white, encode_srgb
             For integers, as for :meth:`to_image`. Floating-point files contain linear values, divided by ``white`` if it is
             given, and cannot be encoded.
         bits : {8, 16, 32}, optional
             32 writes floating-point numbers, with NaN where no photosite lies and without alpha. By default 32 for TIFF and
             EXR, and 8 for other formats.
+        background : str or (r, g, b), optional
+            As for :meth:`to_image`; white by default in formats without alpha. In floating-point files its linear value, where
+            1 is ``white``, replaces NaN and is mixed with partly covered pixels.
 
         Raises
         ------
         FileError
             When the extension is unknown, the format does not support ``bits``, or the file cannot be written.
         ParameterError
-            When ``bits`` is none of these, or as for :meth:`to_image`.
+            When ``bits`` is none of these, a floating-point file has a background and no ``white``, or as for
+            :meth:`to_image`.
         """
+        chosen = picture_format(path)
         if bits is None:
-            bits = 32 if Path(path).suffix.lower() in FLOAT_EXTENSIONS else 8
+            bits = np.dtype(chosen.types[0]).itemsize * 8
         if bits not in (8, 16, 32):
             raise ParameterError("bits", "must be 8, 16 or 32", bits)
         if bits != 32:
-            write_picture(path, self.to_image(white, encode_srgb=encode_srgb, bits=bits))
+            if background is None and not chosen.has_alpha:
+                background = NO_DATA_COLOUR
+            write_picture(path, self.to_image(white, encode_srgb=encode_srgb, bits=bits, background=background))
             return
         if encode_srgb:
             raise ParameterError("encode_srgb", "must be False for floating-point files, which store linear values")
         if self.data.shape[0] not in (1, 3):
             raise ParameterError("data", f"must have 1 or 3 channels to be saved, got {self.data.shape[0]}")
-        values = self.data if white is None else self.data / self._levels(white)
+        values = np.asarray(self.data if white is None else self.data / self._levels(white))
+        if background is not None:
+            if white is None:
+                raise ParameterError("white", "must be given with 'background' in floating-point files, as its unit")
+            colour = decode(_channels(background, self.data.shape[0]), "srgb")
+            coverage = np.clip(self.coverage, 0.0, 1.0)
+            values = coverage * np.nan_to_num(values) + (1.0 - coverage) * colour
         write_picture(path, np.ascontiguousarray(to_file_rows(np.asarray(values, np.float32))))
 
     def _levels(self, white: float | Floats) -> Floats:
@@ -139,6 +171,25 @@ class Picture:
                 "white", f"must be one number, or one for each of the {self.data.shape[0]} channels", white
             )
         return levels.reshape(-1, 1, 1)
+
+
+def _channels(colour: Colour, n_channels: int) -> Floats:
+    """Return a colour as sRGB values from 0 to 1, (1 or 3, 1, 1): three if the picture or the colour is not grey."""
+    from PIL import ImageColor
+
+    try:
+        if isinstance(colour, str):
+            rgb = tuple(ImageColor.getrgb(colour)[:3])
+        else:
+            rgb = tuple(check_count("background", part, at_least=0, at_most=255) for part in colour)
+        if len(rgb) != 3:
+            raise ValueError
+    except (TypeError, ValueError):
+        raise ParameterError(
+            "background", "must be a colour such as 'white', '#204060' or (32, 64, 96)", colour
+        ) from None
+    is_grey = n_channels == 1 and len(set(rgb)) == 1
+    return np.array(rgb[:1] if is_grey else rgb, np.float64).reshape(-1, 1, 1) / 255.0
 
 
 def raster_grid(layout: PackedRings, max_pixels: int) -> Grid:

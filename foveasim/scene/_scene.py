@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.validation import (
+    MAX_WAVELENGTH_NM,
     Floats,
     Images,
     check_choice,
@@ -46,6 +47,8 @@ MAX_ENCODED = 16.0
 MAX_PITCH_UM, MAX_DISTANCE_M = 1e15, 1e9
 #: Tolerance of a pitch that is given together with the field of view: rounding errors.
 PITCH_ROUNDING = 1e-9
+#: Spectral radiance above that of any source, W/(m² sr nm); that of the sun is about 2e4.
+MAX_RADIANCE = 1e24
 #: Weights of red, green and blue in the luminance of a colour (Rec. ITU-R BT.709).
 LUMINANCE_WEIGHTS = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
@@ -115,8 +118,17 @@ class Scene:
         if lowest < 0.0:
             raise ParameterError("basis", "must be >= 0", lowest)
         wavelength_nm = wavelengths_nm("wavelength_nm", self.wavelength_nm)
-        width_nm = finite_array("band_width_nm", np.atleast_1d(self.band_width_nm), ndim=1, above=0.0)
-        spectrum = finite_array("spectrum_w_m2_sr_nm", self.spectrum_w_m2_sr_nm, ndim=2, at_least=0.0)
+        width_nm = finite_array(
+            "band_width_nm", np.atleast_1d(self.band_width_nm), ndim=1, above=0.0, at_most=MAX_WAVELENGTH_NM
+        )
+        spectrum = finite_array(
+            "spectrum_w_m2_sr_nm", self.spectrum_w_m2_sr_nm, ndim=2, at_least=0.0, at_most=MAX_RADIANCE
+        )
+        brightest = highest * float(spectrum.max(initial=0.0))
+        if not brightest <= MAX_RADIANCE:
+            raise ParameterError(
+                "basis", f"must have a spectral radiance of at most {MAX_RADIANCE:g}", brightest, "W/(m² sr nm)"
+            )
         if width_nm.shape != wavelength_nm.shape:
             raise ParameterError(
                 "band_width_nm", f"must have one value for each of the {wavelength_nm.size} wavelengths", width_nm
@@ -252,7 +264,7 @@ class Scene:
         if pitch_um is None and field_of_view_deg is None and fit is None:
             fit = "cover"
         check_choice("encoding", encoding, get_args(Encoding))
-        peak = check_number("peak_radiance_w_m2_sr_nm", peak_radiance_w_m2_sr_nm, at_least=0.0)
+        peak = check_number("peak_radiance_w_m2_sr_nm", peak_radiance_w_m2_sr_nm, at_least=0.0, at_most=MAX_RADIANCE)
         is_file = isinstance(picture, str | Path)
         pixels = read_picture(picture) if is_file else _picture_array(picture)  # type: ignore[arg-type]
         if (
@@ -334,7 +346,7 @@ class Scene:
         ParameterError
             If a value is out of range.
         """
-        radiance = check_number("radiance_w_m2_sr_nm", radiance_w_m2_sr_nm, at_least=0.0)
+        radiance = check_number("radiance_w_m2_sr_nm", radiance_w_m2_sr_nm, at_least=0.0, at_most=MAX_RADIANCE)
         waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
         return cls(
             freeze(np.ones((1, *check_shape("shape", shape)), np.float32)),
@@ -461,7 +473,7 @@ def _relative_radiance(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: b
 def band_widths_nm(wavelength_nm: Floats, band_width_nm: float | Sequence[float] | Floats | None) -> Floats:
     """Return the specified widths, or widths that extend halfway to the adjacent wavelengths."""
     if band_width_nm is not None:
-        widths = finite_array("band_width_nm", band_width_nm, above=0.0)
+        widths = finite_array("band_width_nm", band_width_nm, above=0.0, at_most=MAX_WAVELENGTH_NM)
         if widths.ndim > 1 or (widths.ndim == 1 and widths.size != wavelength_nm.size):
             raise ParameterError(
                 "band_width_nm", f"must be one number, or one for each of the {wavelength_nm.size} wavelengths"

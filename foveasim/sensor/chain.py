@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from difflib import get_close_matches
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.names import possible_names
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Floats
 from foveasim.errors import ParameterError, SimulationError
@@ -165,7 +165,7 @@ def check_names(names: Any, effects: Iterable[Effect]) -> tuple[str, ...]:
     Raises
     ------
     ParameterError
-        If a name is not that of an effect; the message suggests the closest name.
+        If a name is not that of an effect; the message contains the closest name and all names.
     """
     if isinstance(names, str):
         names = (names,)
@@ -176,8 +176,7 @@ def check_names(names: Any, effects: Iterable[Effect]) -> tuple[str, ...]:
         raise ParameterError("disabled", "must contain names of effects", names) from None
     for name in names:
         if name not in known:
-            closest = get_close_matches(str(name), known, n=1)
-            hint = f"did you mean '{closest[0]}'?" if closest else f"the effects are {', '.join(known)}"
+            hint = possible_names(name, known)
             raise ParameterError("disabled", "must contain names of effects", name, hint=hint)
     return names
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.names import possible_names
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Floats, Ints, check_choice, check_count, check_number, read_only, unmasked
 from foveasim.errors import ParameterError, SimulationError
@@ -471,8 +472,8 @@ class Sensor:
             elif (half_step := effect.half_step(self.sites)) is not None:
                 patterns[effect.name] = half_step
         if name not in patterns:
-            names = ", ".join(patterns) or "none"
-            raise ParameterError("name", f"must be one of the sensor's fixed patterns ({names})", name)
+            hint = possible_names(name, list(patterns))
+            raise ParameterError("name", "must be one of the sensor's fixed patterns", name, hint=hint)
         return patterns[name]
 
     @cached_property

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.extras import needs
+from foveasim._core.names import missing_path, possible_names
 from foveasim._core.validation import check_count, check_number
 from foveasim._io.images import PICTURE_EXTENSIONS, check_picture_size, picture_names
 from foveasim.errors import FileError, ParameterError, printable
@@ -107,7 +108,7 @@ class FrameSource:
                 self._source = _VideoFile(path)
                 self._n_source, period_s = self._source.n_frames, self._source.frame_s
             else:
-                raise FileError(path, "no such file or directory")
+                raise FileError(path, missing_path(path, "file or directory"))
         elif isinstance(source, Iterable):
             self._source = _SinglePass(source) if isinstance(source, Iterator) else source
             self._n_source = len(source) if isinstance(source, Sized) else None
@@ -222,7 +223,7 @@ def _check_settings(scene: dict[str, Any]) -> None:
     names = [p.name for p in parameters]
     for name in scene:
         if name not in names:
-            raise ParameterError(name, f"is not a parameter of Scene.from_picture; available: {', '.join(names)}")
+            raise ParameterError(name, "must be a parameter of Scene.from_picture", hint=possible_names(name, names))
     for parameter in parameters:
         if parameter.default is parameter.empty and parameter.name not in scene:
             raise ParameterError(

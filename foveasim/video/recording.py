@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.extras import import_optional
+from foveasim._core.names import missing_path
 from foveasim._core.provenance import differences, to_plain_data
 from foveasim._core.validation import Floats, check_count
 from foveasim._io.atomic import atomic_directory, lock, remove_directory
@@ -115,7 +116,7 @@ def read_recording(path: str | Path) -> Recording:
     source = Path(path)
     import_optional(source, "zarr")
     if not source.is_dir():
-        raise FileError(source, "is not a directory" if source.exists() else "no such directory")
+        raise FileError(source, missing_path(source, "directory"))
     with _open_checked(source) as group:
         about = group.attrs
         columns = {name: values[:] for name, values in group["columns"].arrays()}

@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.names import possible_names
 from foveasim._core.validation import UNIT_SUFFIXES, Floats, Ints, as_numbers, finite_array, own, unmasked
 from foveasim.capture import Capture
 from foveasim.errors import ParameterError
@@ -190,7 +191,7 @@ def _column(layout: Layout, by: str, is_capture: bool) -> NDArray[Any]:
     if by == "readout_line":
         return layout.readout_line
     known = [*(MEASURED if is_capture else ()), "channel", "area_um2", "size_um", "readout_line", *layout.columns]
-    raise ParameterError("by", f"must be one of {', '.join(sorted(set(known)))}, or an array", by)
+    raise ParameterError("by", "must be a column or an array", by, hint=possible_names(by, sorted(set(known))))
 
 
 def _title(name: str) -> str:

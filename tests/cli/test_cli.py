@@ -110,13 +110,13 @@ def test_schema_is_json(foveasim, tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ("sensor.bitz=3", "shot.yaml: sensor.bitz: no such setting"),
-        ("sensor.bits=ten", "shot.yaml: sensor.bits: must be a valid integer"),
-        ("optics.f_number=0", "shot.yaml: optics.f_number: must be > 0, got 0"),
-        ("layout.parameters.n_x=0", "shot.yaml: layout.parameters.n_x: must be >= 1"),
-        ("scene.distance_m=0.002", "shot.yaml: scene.distance_m: must be larger than the focal length"),
-        ("exposure_s=[1]", "shot.yaml: exposure_s: must be a valid number"),
-        ("layout={generator: none}", "shot.yaml: layout.generator: must be one of"),
+        ("sensor.bitz=3", "shot.yaml: --set sensor.bitz: unknown parameter of Sensor; did you mean 'bits'?"),
+        ("sensor.bits=ten", "shot.yaml: --set sensor.bits: must be a valid integer"),
+        ("optics.f_number=0", "shot.yaml: --set optics.f_number: must be > 0, got 0"),
+        ("layout.parameters.n_x=0", "shot.yaml: --set layout.parameters.n_x: must be >= 1"),
+        ("scene.distance_m=0.002", "shot.yaml: --set scene.distance_m: must be larger than the focal length"),
+        ("exposure_s=[1]", "shot.yaml: --set exposure_s: must be a valid number"),
+        ("layout={generator: none}", "shot.yaml: --set layout.generator: must be one of"),
     ],
 )
 def test_invalid_settings_print_one_line(foveasim, folder, change, words):
@@ -145,7 +145,7 @@ def test_invalid_picture_prints_one_line(foveasim, folder, spoil, words):
     result = foveasim("run", "shot.yaml", "-o", "out", cwd=folder)
 
     assert result.returncode == 2
-    assert result.stderr.startswith("error: shot.yaml: scene: photo.png: ")
+    assert result.stderr.startswith("error: shot.yaml:2:1: scene: photo.png: ")
     assert any(word in result.stderr for word in words.split("|"))
     assert result.stderr.count("\n") == 1
     assert not (folder / "out").exists()
@@ -199,7 +199,10 @@ def test_converted_gds_file_is_checked(foveasim, tmp_path):
         (("check", "rings.gds"), "rings.gds: no such file"),
         (("check", "bare.yaml"), "bare.yaml: contains no design rules"),
         (("check", "rings.yaml", "--rules", "none.yaml"), "none.yaml: no such file"),
-        (("check", "rings.yaml", "--rules", "wrong.yaml"), "wrong.yaml: min_sise_um: no such setting"),
+        (
+            ("check", "rings.yaml", "--rules", "wrong.yaml"),
+            "wrong.yaml:1:1: min_sise_um: unknown parameter of DesignRules; did you mean 'min_size_um'?",
+        ),
         (("convert", "rings.yaml", "rings.docx"), "rings.docx: "),
         (("convert", "wrong.gds", "rings.npz"), "wrong.gds: is not a valid layout file"),
     ],

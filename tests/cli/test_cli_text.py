@@ -99,11 +99,11 @@ def test_run_prints_names_as_they_are(foveasim, marked, environment):
         (("view", "{}"), (2,), "error: {}: no such"),
         (("describe", "{}"), (2,), "error: {}: no such"),
         (("run", "{}.yaml", "--set", "{}.=1"), (2,), "{}"),
-        (("run", "key.yaml"), (2,), "{}: no such setting"),
+        (("run", "key.yaml"), (2,), "{}: unknown key"),
         (("run", "{}.yaml", "--set", "layout.generator={}"), (2,), "{}"),
-        (("sweep", "{}.yaml"), (2,), "error: {}.yaml: "),
-        (("study", "{}.yaml"), (2,), "error: {}.yaml: "),
-        (("dataset", "{}.yaml"), (2,), "error: {}.yaml: "),
+        (("sweep", "{}.yaml"), (2,), "error: {}.yaml:1:1: "),
+        (("study", "{}.yaml"), (2,), "error: {}.yaml:1:1: "),
+        (("dataset", "{}.yaml"), (2,), "error: {}.yaml:1:1: "),
         (("video", "{}.yaml", "--frames", "{}"), (2,), "error: {}: no such"),
         (("schema", "{}"), (2,), "'{}'"),
         (("sweep", "{}.yaml", "--workers", "{}"), (2,), "Invalid"),
@@ -158,7 +158,7 @@ def test_names_outside_utf8_are_escaped(tmp_path):
     assert rb"wrote out/$caf\udce9$^_capture.npz" in ran.stdout
     assert (tmp_path / "out" / os.fsdecode(b"$caf\xe9$^_capture.npz")).is_file()
     assert viewed.returncode == 0, viewed.stderr
-    assert failed.stderr == rb"error: $caf\udce9$^.yamlx: no such file" + b"\n"
+    assert failed.stderr == rb"error: $caf\udce9$^.yamlx: no such file; did you mean '$caf\udce9$^.yaml'?" + b"\n"
 
 
 @pytest.mark.parametrize(
@@ -231,8 +231,8 @@ def test_settings_in_messages_are_short(foveasim, tmp_path):
     [
         (("run", "shot.yaml", "--threads", "9" * 30), "error: 'n_threads' must be <= 4096"),
         (("video", "picture.yaml", "--frames", "frames", "--stop", "9" * 30), "error: 'stop' must be <= "),
-        (("dataset", "dataset.yaml"), "error: dataset.yaml: 'cameras' must be <= 1000000000"),
-        (("study", "study.yaml"), "error: study.yaml: "),
+        (("dataset", "dataset.yaml"), "error: dataset.yaml:1:1: 'cameras' must be <= 1000000000"),
+        (("study", "study.yaml"), "error: study.yaml:4:3: "),
         (("check", "x" * 5000), "File name too long"),
     ],
     ids=lambda value: " ".join(value)[:30] if isinstance(value, tuple) else None,

@@ -95,9 +95,9 @@ def test_read_layout_suggests_bundled_names(tmp_path, monkeypatch):
     [
         (
             "giotto_3",
-            "giotto_3: no such file, and not the name of a bundled layout; did you mean 'giotto_2'? the names",
+            "giotto_3: no such file, and not the name of a bundled layout; did you mean 'giotto_2'? possible: ",
         ),
-        ("zzzz", "zzzz: no such file, and not the name of a bundled layout; the names are bayer_grid, four_zones, "),
+        ("zzzz", "zzzz: no such file, and not the name of a bundled layout; possible: 'bayer_grid', 'four_zones', "),
         ("giotto_2.yaml", "giotto_2.yaml: no such file; 'giotto_2' is a bundled layout"),
         ("sub/giotto_2", "sub/giotto_2: no such file"),
         ("nowhere.gds", "nowhere.gds: no such file"),

@@ -1062,7 +1062,7 @@ def test_sample_warnings_are_summarised_and_stored(tmp_path):
 @pytest.mark.parametrize(
     ("vary", "error", "message"),
     [
-        ({"optics.speed": {"uniform": [1, 2]}}, ConfigError, "settings: optics.speed: no such setting"),
+        ({"optics.speed": {"uniform": [1, 2]}}, ConfigError, "^vary.optics.speed: unknown parameter of Optics"),
         ({"exposure_s": [1, 2]}, ParameterError, "'exposure_s' must have exactly one distribution"),
         ({"exposure_s": {"gamma": [1, 2]}}, ParameterError, "must have exactly one distribution"),
         ({"exposure_s": {"uniform": [2, 1]}}, ParameterError, "must have 'uniform' bounds in ascending order"),
@@ -1100,7 +1100,7 @@ def test_sample_warnings_are_summarised_and_stored(tmp_path):
         (
             {"optics.f_number": {"uniform": [0.1, 2]}},
             ConfigError,
-            "settings: optics.f_number: must be >= 0.5, got 0.1",
+            "^vary.optics.f_number: must be >= 0.5, got 0.1",
         ),
         ({"seed": {"integers": [0, 9]}}, ParameterError, "'seed' must not vary"),
         ({"scene.picture": {"choice": ["a.png"]}}, ParameterError, "'scene.picture' must not vary"),
@@ -1137,13 +1137,13 @@ def test_invalid_distribution_is_rejected_before_sampling(vary, error, message):
         ({"cameras": 0}, ParameterError, "'cameras' must be >= 1"),
         ({"draws": 1.5}, ParameterError, "'draws' must be an integer"),
         ({"seed": -1}, ParameterError, "'seed' must be >= 0"),
-        ({"changes": {"optics.speed": 1}}, ConfigError, "optics.speed: no such setting"),
+        ({"changes": {"optics.speed": 1}}, ConfigError, "optics.speed: unknown (key|parameter)"),
         ({"fit": "cover", "vary": {"scene.pitch_um": {"uniform": [1, 2]}}}, ParameterError, "must not vary with 'fit'"),
         ({"shot": SHOT | {"scene": FLAT}}, ConfigError, "scene.kind: must be 'picture'"),
         (
             {"shot": SHOT | {"exposure_s": object()}},
             ConfigError,
-            "settings: must contain only numbers, strings, lists and mappings",
+            "^shot: must contain only numbers, strings, lists and mappings",
         ),
         ({"shot": 5}, ParameterError, "'shot' must be a settings file or a mapping of settings, got a int"),
         ({"shot": "missing.yaml"}, ConfigError, "missing.yaml: no such file"),

@@ -602,10 +602,13 @@ def test_loaded_capture_gives_same_picture(tmp_path):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda c, _: c.picture("natural", mu=1.0), "'mu' must be an option of 'natural': n_threads"),
+        (
+            lambda c, _: c.picture("natural", mu=1.0),
+            "'mu' must be an option of the method 'natural'; possible: 'n_threads'",
+        ),
         (
             lambda c, _: c.picture("least_squares", magic=1.0),
-            "'magic' must be an option of 'least_squares': blur, max_steps",
+            "'magic' must be an option of the method 'least_squares'; possible: 'blur', 'max_steps'",
         ),
         (lambda c, _: c.picture(of="magic"), "'of' must be one of"),
         (lambda c, _: c.picture(per="magic"), "'per' must be one of"),

@@ -699,8 +699,8 @@ def test_settings_file_accepts_pairs_and_lists(shot_of):
     ("kind", "changed", "message"),
     [
         ("siemens_star", {"radius_mm": 99.0}, r"scene\.radius_mm: must yield a chart within the picture"),
-        ("siemens_star", {"profile": "saw"}, r"scene\.profile: must be 'square' or 'sine', got \"saw\""),
-        ("slanted_edge", {"angle": 3}, r"scene\.angle: no such setting"),
+        ("siemens_star", {"profile": "saw"}, r"scene\.profile: must be one of 'square', 'sine', got \"saw\""),
+        ("slanted_edge", {"angle": 3}, r"scene\.angle: unknown (key|parameter)"),
         ("bars", {"groups": [1, 1]}, r"scene\.groups: must be unique"),
     ],
 )

@@ -21,7 +21,7 @@ from foveasim._core.provenance import versions
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import check_choice, check_count
 from foveasim.capture import Capture
-from foveasim.config import Shot, build_shot, check_settings, put_setting, read_settings, resolve_files
+from foveasim.config import Shot, Source, build_shot, check_settings, put_setting, resolve_files
 from foveasim.errors import ConfigError, FileError, FoveasimError, FoveasimWarning, ParameterError, SimulationError
 from foveasim.explore._files import digests
 from foveasim.explore.datasets.distributions import MAX_INTEGER, MIN_INTEGER, Distribution, parse_distribution
@@ -36,7 +36,7 @@ from foveasim.explore.datasets.labels import (
     validate_boxes,
 )
 from foveasim.explore.datasets.pictures import digest_of, is_lazy, source_of
-from foveasim.explore.sweeps.plan import check_disjoint
+from foveasim.explore.sweeps.plan import VARY, check_disjoint, locate_shot, with_changes
 from foveasim.layout import Layout
 from foveasim.scene import Scene
 from foveasim.scene._scene import Fit
@@ -98,8 +98,9 @@ class Dataset:
         pitch follows from the layout and lens of each sample. By default the framing or pitch is that of the shot.
     changes : mapping of str to value, optional
         Settings that are replaced in all samples.
-    source : path
-        Name of a mapping of settings in messages.
+    source : path, optional
+        File of the dataset, for messages; relative paths in ``changes`` and in a mapping of settings are relative to its
+        directory, by default the working directory.
     n_threads : int
         Number of threads per sample.
 
@@ -155,7 +156,7 @@ class Dataset:
         flows: Sequence[Any] | None = None,
         fit: Literal["cover", "contain", "width"] | None = None,
         changes: Mapping[str, Any] | None = None,
-        source: str | Path = "settings",
+        source: Source | str | Path | None = None,
         n_threads: int = 1,
     ) -> None:
         self.cameras = check_count("cameras", cameras, at_most=MAX_REPEATS)
@@ -178,8 +179,11 @@ class Dataset:
             check_choice("fit", fit, get_args(Fit))
         self._fit = fit
         self._files: list[Path] = []
-        self._file, self._settings = _base_settings(shot, Path(source), changes or {}, self._files, fit)
-        self._distributions = _parse_distributions(self._file, vary or {}, self._files, is_fitted=fit is not None)
+        own = Source.of(source)
+        base_source, self._settings = _base_settings(shot, own, changes or {}, self._files, fit)
+        self._distributions = _parse_distributions(own, vary or {}, self._files, is_fitted=fit is not None)
+        written = own.absolute().at(VARY)
+        self._source = base_source.absolute().with_replaced({path: written.at(path) for path in self._distributions})
         self._reset()
         self._code_type: Any = np.uint8
         self._check_bounds()
@@ -322,7 +326,7 @@ class Dataset:
     def _with_sample_name(self, index: int, error: FoveasimError) -> FoveasimError:
         label = f"sample {index} ({self._name_of(index)})"
         if isinstance(error, ConfigError):
-            return ConfigError(error.path, f"{label}: {str(error).removeprefix(f'{error.path}: ')}")
+            return ConfigError(error.path, f"{label}: {error.detail}", position=error.position)
         return error if isinstance(error, FileError) else SimulationError(f"{label}: {error}")
 
     def _name_of(self, index: int) -> str:
@@ -346,7 +350,7 @@ class Dataset:
         data = _copy(self._settings)
         data["scene"]["picture"] = self._name_of(index)
         for path, value in values.items():
-            put_setting(self._file, data, path, value)
+            put_setting(self._source, data, path, value)
         return data
 
     def _cached(self, part: str, settings: Any, make: Callable[[], Any]) -> Any:
@@ -392,7 +396,7 @@ class Dataset:
                 else self._cached(part, part_settings, make)
             )
 
-        return build_shot(self._file, settings, n_threads=self._n_threads, cache=cache)
+        return build_shot(self._source, settings, n_threads=self._n_threads, cache=cache)
 
     def _capture(self, index: int) -> tuple[Shot, Capture]:
         settings = self._settings_of(index)
@@ -482,45 +486,43 @@ class Dataset:
     def _check_values(self, values: Mapping[str, Any]) -> int:
         """Build the shot of the first picture with the given values and return its bit depth."""
         settings = self._settings_with(0, values)
-        check_settings(self._file, settings)
+        check_settings(self._source, settings)
         return self._build(0, settings).camera.sensor.bits
 
 
 def _base_settings(
     shot: str | Path | Mapping[str, Any],
-    source: Path,
+    own: Source,
     changes: Mapping[str, Any],
     found: list[Path],
     fit: str | None,
-) -> tuple[Path, Any]:
+) -> tuple[Source, Any]:
     """
-    Return the file of the settings, for messages, and the settings with absolute paths.
+    Return the origin of the settings, for messages, and the settings with absolute paths.
 
     The referenced files are appended to ``found``.
     """
-    if isinstance(shot, Mapping):
-        file, data = source, _copy(shot)
-    elif isinstance(shot, str | Path):
-        file = Path(shot)
-        data = read_settings(file)
-    else:
+    if not isinstance(shot, str | Path | Mapping):
         raise ParameterError("shot", f"must be a settings file or a mapping of settings, got a {type(shot).__name__}")
+    source, data = locate_shot(own, shot)
+    data = _copy(data)
     scene = data.get("scene")
     if not isinstance(scene, Mapping) or scene.get("kind") != "picture":
-        raise ConfigError(file, "scene.kind: must be 'picture' for a dataset, which supplies the pictures")
+        raise source.error("scene.kind", "must be 'picture' for a dataset, which supplies the pictures")
     data = resolve_files(
-        file.parent, {**data, "scene": {key: scene[key] for key in scene if key != "picture"}}, found=found
+        source.directory, {**data, "scene": {key: scene[key] for key in scene if key != "picture"}}, found=found
     )
     data["scene"]["picture"] = ""
     if fit is not None:
         data["scene"] |= {"fit": fit, "pitch_um": None, "field_of_view_deg": None}
+    source = with_changes(own, source, changes)
     for path, value in changes.items():
-        put_setting(file, data, path, resolve_files(Path(), value, path, found))
+        put_setting(source, data, path, resolve_files(own.directory, value, path, found))
     data.pop("seed", None)
     try:
-        return file, json.loads(json.dumps(data, default=_to_plain_data))
+        return source, json.loads(json.dumps(data, default=_to_plain_data))
     except (TypeError, ValueError, RecursionError) as error:
-        raise ConfigError(file, f"must contain only numbers, strings, lists and mappings ({error})") from None
+        raise source.error("", f"must contain only numbers, strings, lists and mappings ({error})") from None
 
 
 def _to_plain_data(value: Any) -> Any:
@@ -533,12 +535,12 @@ def _to_plain_data(value: Any) -> Any:
 
 
 def _parse_distributions(
-    file: Path, vary: Mapping[str, Any], found: list[Path], *, is_fitted: bool
+    own: Source, vary: Mapping[str, Any], found: list[Path], *, is_fitted: bool
 ) -> dict[str, Distribution]:
     if not isinstance(vary, Mapping):
         raise ParameterError("vary", "must be a mapping of setting paths to distributions", vary)
     distributions = {str(path): parse_distribution(str(path), spec) for path, spec in vary.items()}
-    check_disjoint(file, distributions)
+    check_disjoint(own, distributions)
     for path, distribution in distributions.items():
         if distribution.kind == "choice":
             distributions[path] = replace(

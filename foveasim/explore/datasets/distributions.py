@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from foveasim._core.names import did_you_mean
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import check_count, check_number, finite_array
 from foveasim.errors import ParameterError
@@ -135,7 +136,9 @@ def parse_distribution(path: str, spec: Any) -> Distribution:
     known = "; ".join(f"{kind}: {form}" for kind, form in FORMS.items())
     kinds = set(spec) - {"weights"} if isinstance(spec, Mapping) else set()
     if not isinstance(spec, Mapping) or len(kinds) != 1 or not kinds <= set(FORMS):
-        raise ParameterError(path, f"must have exactly one distribution ({known})", spec)
+        unknown = sorted(kinds - set(FORMS))
+        hint = did_you_mean(unknown[0], FORMS) if unknown else ""
+        raise ParameterError(path, f"must have exactly one distribution ({known})", spec, hint=hint)
     (kind,) = kinds
     values = spec[kind]
     if not isinstance(values, Sequence | np.ndarray) or isinstance(values, str | bytes):

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
+from foveasim._core.names import missing_path
 from foveasim._core.validation import Floats
 from foveasim.errors import FileError
 
@@ -166,7 +167,7 @@ def match_label_files(directory: Path, pictures: Sequence[str], extensions: Sequ
         When the directory does not exist, or does not contain exactly one file for each picture.
     """
     if not directory.is_dir():
-        raise FileError(directory, "no such directory" if not directory.exists() else "is not a directory")
+        raise FileError(directory, missing_path(directory, "directory"))
     found: dict[str, Path] = {}
     for file in sorted(directory.rglob("*")):
         if file.suffix.lower() in extensions:
@@ -196,7 +197,7 @@ def _check_complete(path: Path, pictures: Sequence[str], found: Iterable[str], o
 
 def _content(path: Path) -> bytes:
     if not path.is_file():
-        raise FileError(path, "no such file" if not path.exists() else "is not a file")
+        raise FileError(path, missing_path(path))
     if path.stat().st_size > MAX_LABEL_BYTES:
         raise FileError(path, f"is larger than {MAX_LABEL_BYTES} bytes, the limit of label files")
     try:

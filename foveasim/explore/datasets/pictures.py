@@ -14,6 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.names import missing_path
 from foveasim._io.images import PICTURE_EXTENSIONS, picture_names, pixels_of_image, read_picture
 from foveasim.errors import FileError, ParameterError
 from foveasim.explore._files import digests
@@ -72,7 +73,7 @@ def source_of(pictures: Any) -> Source:
             if path.is_dir():
                 return _Directory(path)
             if not path.is_file():
-                raise FileError(path, "no such file or directory")
+                raise FileError(path, missing_path(path, "file or directory"))
         except OSError as error:
             raise _read_error(error, path) from None
         if path.suffix.lower() == ".npy":

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from foveasim._io.yaml_files import read_yaml
-from foveasim.config import picture_path, resolve_files, validate
+from foveasim.config import Source, picture_path, resolve_files, validate
 from foveasim.explore.datasets.dataset import Dataset
 from foveasim.explore.datasets.label_files import (
     FLOW_EXTENSIONS,
@@ -19,7 +19,8 @@ from foveasim.explore.datasets.label_files import (
     read_boxes,
     read_labels,
 )
-from foveasim.explore.datasets.pictures import Source, source_of
+from foveasim.explore.datasets.pictures import Source as PictureSource
+from foveasim.explore.datasets.pictures import source_of
 from foveasim.explore.datasets.recipes import classification, denoising
 from foveasim.explore.sweeps.plan import with_file_context
 
@@ -134,7 +135,7 @@ def read_dataset(path: str | Path, *, n_threads: int = 1) -> DatasetFile:
             source,
             directory / section.shot if isinstance(section.shot, str) else section.shot,
             {name: _distribution(directory, name, distribution) for name, distribution in section.vary.items()},
-            changes={name: resolve_files(directory, value, name) for name, value in section.set.items()},
+            changes=section.set,
             source=path,
             n_threads=n_threads,
             **options,
@@ -143,14 +144,17 @@ def read_dataset(path: str | Path, *, n_threads: int = 1) -> DatasetFile:
     return DatasetFile(dataset=dataset, per_shard=section.per_shard)
 
 
-def _pictures(path: Path, pictures: str | list[str]) -> Source:
+def _pictures(path: Path, pictures: str | list[str]) -> PictureSource:
     with with_file_context(path):
+        if not pictures:
+            raise Source.of(path).error("pictures", "must name a directory, a zip file, an array (.npy) or pictures")
         if isinstance(pictures, str):
             return source_of(path.parent / pictures)
-        return source_of([picture_path(path, name, f"pictures.{k}").absolute() for k, name in enumerate(pictures)])
+        own = Source.of(path)
+        return source_of([picture_path(own, name, f"pictures.{k}").absolute() for k, name in enumerate(pictures)])
 
 
-def _labels(directory: Path, section: DatasetSection, pictures: Source) -> Mapping[str, Any]:
+def _labels(directory: Path, section: DatasetSection, pictures: PictureSource) -> Mapping[str, Any]:
     """Return the label arguments of :class:`Dataset`."""
     names = [pictures.key(k) for k in range(len(pictures))]
     found: dict[str, Any] = {}

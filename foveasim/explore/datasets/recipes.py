@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from foveasim._core.validation import check_number
-from foveasim.config import put_setting, read_settings
-from foveasim.errors import ConfigError
+from foveasim.config import Source, put_setting
 from foveasim.explore.datasets.dataset import Dataset
+from foveasim.explore.sweeps.plan import locate_shot, with_changes
 
 __all__ = ["classification", "denoising"]
 
@@ -114,16 +114,18 @@ def denoising(
 
 def _read_numbers(shot: str | Path | Mapping[str, Any], options: Mapping[str, Any], *paths: str) -> list[float]:
     """Return numbers of the shot settings, after the ``changes`` of the dataset options."""
-    file = Path(options.get("source", "settings")) if isinstance(shot, Mapping) else Path(shot)
-    data = deepcopy(dict(shot)) if isinstance(shot, Mapping) else read_settings(file)
+    own = Source.of(options.get("source"))
+    source, data = locate_shot(own, shot)
+    data = deepcopy(data)
+    source = with_changes(own, source, options.get("changes"))
     for path, value in (options.get("changes") or {}).items():
-        put_setting(file, data, path, value)
+        put_setting(source, data, path, value)
     found = []
     for path in paths:
         setting: Any = data
         for name in path.split("."):
             setting = setting.get(name) if isinstance(setting, Mapping) else None
         if setting is None:
-            raise ConfigError(file, f"{path}: is missing")
+            raise source.error(path, "missing")
         found.append(check_number(path.rpartition(".")[2], setting, above=0.0))
     return found

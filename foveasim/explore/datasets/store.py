@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.extras import needs
+from foveasim._core.names import missing_path
 from foveasim._core.threads import thread_count
 from foveasim._core.validation import check_count
 from foveasim._io.atomic import atomic_directory, atomic_write
@@ -33,6 +34,8 @@ ZARR, ABOUT = ".zarr", "dataset.json"
 SHARD_BYTES, MAX_SHARD_SAMPLES = 1 << 26, 512
 #: Smallest default number of shards: many processes can write, and an interruption loses little.
 MIN_SHARDS = 32
+#: Smallest default number of samples of a shard, which precedes the number of shards: few files for small datasets.
+MIN_SHARD_SAMPLES = 8
 #: Number of shards of a zarr store that a reading process caches, the most recently used.
 MAX_CACHED_SHARDS = 4
 #: Names of the array with the digest of each complete shard, and of the group of random settings.
@@ -70,7 +73,7 @@ def write_dataset(
         and, with labels, the class (``.cls``) of each sample. Zarr is faster for arrays of all samples; tar files are faster
         for random access to single samples, which are read individually.
     per_shard : int, optional
-        Number of samples per shard; by default about 64 MiB, at most 512 samples and at most 1/32 of the dataset.
+        Number of samples per shard; by default 1/32 of the dataset, from 8 to 512 samples, and at most about 64 MiB.
     workers : int, optional
         Number of processes. They import the main file of the calling program: call this function under
         ``if __name__ == "__main__":``. None: one process per core, as soon as the estimated remaining time in this process
@@ -125,8 +128,7 @@ def write_dataset(
             "format": FORMAT,
             "version": VERSION,
             "n_samples": len(dataset),
-            "per_shard": per_shard
-            or max(1, min(SHARD_BYTES // n_bytes, MAX_SHARD_SAMPLES, len(dataset) // MIN_SHARDS)),
+            "per_shard": per_shard or _default_per_shard(len(dataset), n_bytes),
             "has_label": "label" in first,
             "class_names": dataset.class_names,
             "plan": plan,
@@ -136,6 +138,12 @@ def write_dataset(
         _check_same(target, about, plan, per_shard)
     _write_shards(dataset, kind(target, about), scheduler, workers, progress)
     return open_dataset(target)
+
+
+def _default_per_shard(n_samples: int, n_bytes: int) -> int:
+    """Return the default number of samples of a shard, for samples of a given size."""
+    n = min(max(n_samples // MIN_SHARDS, MIN_SHARD_SAMPLES), MAX_SHARD_SAMPLES)
+    return max(1, min(n, SHARD_BYTES // n_bytes, n_samples))
 
 
 def _check_same(target: Path, about: Mapping[str, Any], plan: Mapping[str, Any], per_shard: int | None) -> None:
@@ -301,7 +309,7 @@ def open_dataset(path: str | Path) -> StoredSamples:
     source = Path(path).absolute()
     try:
         if not source.is_dir():
-            raise FileError(source, "is not a directory" if source.exists() else "no such directory")
+            raise FileError(source, missing_path(source, "directory"))
     except OSError as error:
         raise FileError(source, f"cannot be read: {error.strerror or error}") from None
     if source.suffix.lower() == ZARR:

@@ -12,24 +12,24 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from foveasim._core.names import did_you_mean, possible_names
 from foveasim._core.validation import check_count
 from foveasim._io.yaml_files import read_yaml
-from foveasim.config import check_settings, put_setting, resolve_files, validate
+from foveasim.config import Source, check_settings, put_setting, resolve_files, validate
 from foveasim.errors import ConfigError, ParameterError
-from foveasim.explore._metrics import METRICS, Metric, add_metrics, has_result, resolve_metrics
+from foveasim.explore._metrics import METRICS, OTHER_METRICS, Metric, add_metrics, has_result, resolve_metrics
 from foveasim.explore.sweeps.plan import (
     MAX_POINTS,
     Plan,
     check_disjoint,
     plan_sweep,
-    read_shot_settings,
     with_file_context,
 )
 
 if TYPE_CHECKING:
     import optuna
 
-__all__ = ["Limits", "Search", "StudyPlan", "StudySection", "plan_study", "read_study"]
+__all__ = ["Limits", "Search", "StudyPlan", "StudySection", "plan_study", "read_study", "typed_choice"]
 
 #: Search range of a setting: (low, high), a mapping with step or spacing, or a list of choices.
 Search = tuple[float, float] | Mapping[str, Any] | Sequence[Any]
@@ -38,6 +38,8 @@ Limits = Mapping[str, tuple[float | None, float | None]]
 #: Value of a setting or result, in its unit; and limits in a file.
 _Number = int | float
 _Limit = tuple[float | None, float | None]
+#: Key of the search ranges in a file.
+SEARCH = "search"
 #: Keys of a range mapping.
 RANGE_KEYS = {"from", "to", "step", "spacing"}
 #: Items of a sweep plan that do not apply to studies.
@@ -80,6 +82,11 @@ class StudyPlan:
     name: str
     directory: Path
     files: Mapping[str, str]
+
+    @property
+    def source(self) -> Source:
+        """Origin of the settings of all trials."""
+        return self.base.source.with_replaced({path: self.base.written.at(path) for path in self.search})
 
     def settings_of(self, trial: optuna.Trial) -> dict[str, Any]:
         """Return all settings of a trial; the seed, and so the noise, is equal in all trials."""
@@ -160,7 +167,6 @@ def read_study(path: str | Path, *, metrics: Sequence[str] = (), n_trials: int |
     """
     path = Path(path)
     section: StudySection = validate(path, StudySection, read_yaml(path))
-    source, shot = read_shot_settings(path, section.shot)
     with with_file_context(path):
         # Names in the file are looked up in METRICS, and never imported.
         file_metrics = _select_metrics([*section.objectives, *section.constraints], section.metrics)
@@ -169,7 +175,7 @@ def read_study(path: str | Path, *, metrics: Sequence[str] = (), n_trials: int |
         n_trials = check_count("trials", n_trials, at_most=MAX_POINTS)
     with with_file_context(path):
         return plan_study(
-            shot,
+            path.parent / section.shot if isinstance(section.shot, str) else section.shot,
             {
                 name: search_range
                 if isinstance(search_range, list)
@@ -180,12 +186,11 @@ def read_study(path: str | Path, *, metrics: Sequence[str] = (), n_trials: int |
             n_trials=section.trials if n_trials is None else n_trials,
             constraints=section.constraints,
             metrics=None if section.metrics is None and not metrics else selected,
-            changes={name: resolve_files(path.parent, value, name) for name, value in section.set.items()},
+            changes=section.set,
             seed=section.seed,
             batch=section.batch,
             name=section.name,
-            source=source,
-            directory=path.parent,
+            source=path,
         )
 
 
@@ -201,8 +206,7 @@ def plan_study(
     seed: int = 0,
     batch: int = 1,
     name: str = "study",
-    source: str | Path = "settings",
-    directory: str | Path = ".",
+    source: Source | str | Path | None = None,
 ) -> StudyPlan:
     """
     Create the plan of a study, with all checks that do not require building a camera.
@@ -210,11 +214,9 @@ def plan_study(
     Parameters
     ----------
     shot, changes, source
-        As for :func:`plan_sweep`.
+        As for :func:`plan_sweep`, with relative paths in choices.
     search, objectives, n_trials, constraints, metrics, seed, batch, name
         As for :func:`study`.
-    directory : path
-        Directory for relative file paths in choices.
 
     Returns
     -------
@@ -249,11 +251,11 @@ def plan_study(
             changes=changes,
             seed=seed,
             source=source,
-            directory=directory,
+            written_as=SEARCH,
         )
         for path, search_range in search.items()
     ]
-    check_disjoint(plans[0].source, search, "be searched")
+    check_disjoint(plans[0].written, search, "be searched")
     return StudyPlan(
         base=plans[0],
         search={path: _typed_range(plan, path, search[path]) for path, plan in zip(search, plans, strict=True)},
@@ -262,7 +264,7 @@ def plan_study(
         n_trials=n_trials,
         batch=batch,
         name=name,
-        directory=Path(directory).absolute(),
+        directory=Source.of(source).directory.absolute(),
         files={file: digest for plan in plans for file, digest in plan.files.items()},
     )
 
@@ -279,9 +281,9 @@ def _check_results(parameter: str, names: Iterable[str], metrics: Iterable[str])
         if not any(has_result(own, name) for own in metrics):
             raise ParameterError(
                 parameter,
-                f"must be results of metrics ({', '.join(metrics)}), or of those in 'metrics'",
+                "must be results of metrics, or of those in 'metrics'",
                 name,
-                hint="pass other functions in Python, or with --metric module:function",
+                hint=f"{possible_names(name, list(metrics))}; {OTHER_METRICS}",
             )
 
 
@@ -290,7 +292,8 @@ def _check_names(objectives: Mapping[str, str], constraints: Limits) -> None:
         raise ParameterError("objectives", 'must map names of results to "maximize" or "minimize"', objectives)
     for name, direction in objectives.items():
         if direction not in ("maximize", "minimize"):
-            raise ParameterError(str(name), 'must be "maximize" or "minimize"', direction)
+            hint = did_you_mean(direction, ("maximize", "minimize"))
+            raise ParameterError(str(name), 'must be "maximize" or "minimize"', direction, hint=hint)
     for name, limits in constraints.items():
         is_pair = isinstance(limits, tuple | list) and len(limits) == 2
         if (
@@ -313,7 +316,10 @@ def _bounds(path: str, search_range: Search) -> list[Any]:
             or {"step", "spacing"} <= set(search_range)
         ):
             raise ParameterError(
-                path, "must have 'from' and 'to', and optionally 'step' or 'spacing'", dict(search_range)
+                path,
+                "must have 'from' and 'to', and optionally 'step' or 'spacing'",
+                dict(search_range),
+                hint=next((did_you_mean(key, RANGE_KEYS) for key in search_range if key not in RANGE_KEYS), ""),
             )
         if search_range.get("spacing", "linear") not in ("linear", "geometric"):
             raise ParameterError(path, "must have a linear or geometric spacing", search_range["spacing"])
@@ -365,8 +371,9 @@ def _is_number(value: Any) -> bool:
 def _suggest(trial: optuna.Trial, path: str, search_range: Search) -> Any:
     """Sample the value of a setting for a trial."""
     if isinstance(search_range, list):
-        choices = [json.dumps(choice) for choice in search_range]
-        return json.loads(trial.suggest_categorical(path, choices))
+        is_native = _is_stored_natively(search_range)
+        choices = search_range if is_native else [json.dumps(choice) for choice in search_range]
+        return typed_choice(trial.suggest_categorical(path, choices), search_range)
     low, high = _bounds(path, search_range)
     step = search_range.get("step") if isinstance(search_range, Mapping) else None
     is_log = isinstance(search_range, Mapping) and search_range.get("spacing") == "geometric"
@@ -379,6 +386,20 @@ def _suggest(trial: optuna.Trial, path: str, search_range: Search) -> Any:
     if is_integer:
         return trial.suggest_int(path, low, high, step=step or 1, log=is_log)
     return trial.suggest_float(path, low, high, step=step, log=is_log)
+
+
+def _is_stored_natively(choices: Sequence[Any]) -> bool:
+    """Return whether Optuna stores choices as they are: unique numbers, strings and None, without lists and mappings."""
+    return (
+        all(isinstance(choice, bool | int | float | str | None) for choice in choices)
+        and all(math.isfinite(choice) for choice in choices if isinstance(choice, float))
+        and len(set(choices)) == len(choices)  # 1, 1.0 and true are equal
+    )
+
+
+def typed_choice(stored: Any, choices: Sequence[Any]) -> Any:
+    """Return the value of a setting from its value in Optuna, which is JSON if the choices contain lists or mappings."""
+    return stored if _is_stored_natively(choices) else json.loads(stored)
 
 
 def _to_plain_data(search_range: Search) -> Any:

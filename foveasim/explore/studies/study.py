@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from foveasim._core.extras import needs
+from foveasim._core.names import possible_names
 from foveasim._core.random_streams import derive_seed
 from foveasim._core.validation import check_count
 from foveasim._io.atomic import lock
@@ -23,18 +24,19 @@ from foveasim.explore._metrics import Metric
 from foveasim.explore._records import WORKER_LOST, Record, Value, check_same_plan
 from foveasim.explore.executor import KILLED, executor
 from foveasim.explore.studies.plan import Limits, Search, StudyPlan, plan_study
+from foveasim.explore.studies.trials import ERROR, INTERRUPTED, PLAN, completed_trials, with_typed_params
 from foveasim.explore.worker_cache import ShotRunner
 
 if TYPE_CHECKING:
     import optuna
     from rich.table import Table
 
-__all__ = ["best_table", "finished_trials", "run_study", "storage_name", "study"]
+__all__ = ["best_table", "run_study", "storage_name", "study"]
 
 #: Limits of the table of the best trials: rows, and characters of a choice.
 MAX_ROWS, MAX_CHOICE_LENGTH = 20, 40
-#: Attributes of a study and of its trials.
-PLAN, WRITER, ERROR, INTERRUPTED = "plan", "writer", "error", "ended with the program"
+#: Attribute of a study with the program that writes it.
+WRITER = "writer"
 
 
 def study(
@@ -91,7 +93,8 @@ def study(
     -------
     optuna.Study
         ``best_trials`` is the Pareto front. ``user_attrs`` of a trial contains the results of all metrics, or the message of a
-        failed trial under ``"error"``.
+        failed trial under ``"error"``; its ``params`` are the settings, in which choices of lists or mappings are JSON.
+        :func:`trials_table` returns settings and results as a table, and :func:`finished_trials` trials with lists as lists.
 
     Raises
     ------
@@ -161,10 +164,10 @@ def run_study(
         with _suppress_logs(optuna), _storage_errors(storage):
             optuna_study = _open_study(optuna, storage, url, plan)
             trials = _prepare(optuna, storage, optuna_study, plan, token)
-        runner = ShotRunner(plan.base.source, plan.base.metrics)
+        runner = ShotRunner(plan.source, plan.base.metrics)
         users = list(plan.base.metrics.values())
         with executor(runner, what="the metrics", users=users, scheduler=scheduler, workers=workers) as run:
-            n_done = len(finished_trials(optuna_study))
+            n_done = len(completed_trials(optuna_study))
             while n_done < plan.n_trials:
                 if progress is not None:
                     progress(n_done, plan.n_trials)
@@ -187,16 +190,6 @@ def run_study(
     if progress is not None:
         progress(plan.n_trials, plan.n_trials)
     return optuna_study
-
-
-def finished_trials(optuna_study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
-    """
-    Return the finished trials of a study, without trials lost in interruptions.
-
-    Failed trials contain their message in ``user_attrs["error"]``.
-    """
-    trials = optuna_study.get_trials(deepcopy=False)
-    return [trial for trial in trials if trial.state.is_finished() and not trial.user_attrs.get(INTERRUPTED)]
 
 
 def storage_name(storage: str | Path | None) -> str:
@@ -223,11 +216,14 @@ def best_table(plan: StudyPlan, optuna_study: optuna.Study) -> Table:
     for heading in (*limited, *_shortest_suffixes(plan.search)):
         table.add_column(as_plain_text(heading), justify="right", overflow="fold")
     sign = -1.0 if next(iter(plan.objectives.values())) == "maximize" else 1.0
-    best = sorted(optuna_study.best_trials, key=lambda trial: sign * trial.values[0])
+    best = sorted(
+        (with_typed_params(optuna_study, trial) for trial in optuna_study.best_trials),
+        key=lambda trial: sign * trial.values[0],
+    )
     rows: dict[tuple[str, ...], int] = {}
     for trial in best:
         results = [*trial.values, *(trial.user_attrs[name] for name in limited)]
-        chosen = [_format_value(trial.params[path], search_range) for path, search_range in plan.search.items()]
+        chosen = [_format_value(trial.params[path]) for path in plan.search]
         # Trials with equal settings have equal results and share a row.
         rows.setdefault((*(f"{value:.6g}" for value in results), *chosen), trial.number)
     for cells, number in list(rows.items())[:MAX_ROWS]:
@@ -250,12 +246,11 @@ def _shortest_suffixes(paths: Iterable[str]) -> list[str]:
     ]
 
 
-def _format_value(value: Any, search_range: Search) -> str:
-    """Format the value of a setting for a table; Optuna stores choices as JSON strings."""
-    chosen = json.loads(value) if isinstance(search_range, list) else value
-    if isinstance(chosen, float):
-        return f"{chosen:.6g}"
-    text = chosen if isinstance(chosen, str) else json.dumps(chosen)
+def _format_value(value: Any) -> str:
+    """Format the value of a setting for a table."""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    text = value if isinstance(value, str) else json.dumps(value)
     return text if len(text) <= MAX_CHOICE_LENGTH else text[: MAX_CHOICE_LENGTH - 3] + "..."
 
 
@@ -273,11 +268,10 @@ def _store_result(
     for name in (*objectives, *constraints):
         value = record.values.get(name)
         if not isinstance(value, int | float) or not math.isfinite(value):
-            given = ", ".join(record.values) or "nothing"
             error = error or (
                 f"'{name}' must be a finite number, got {'an array' if isinstance(value, Value) else repr(value):.40}"
                 if name in record.values
-                else f"'{name}' must be one of the results ({given})"
+                else f"'{name}' must be one of the results; {possible_names(name, list(record.values))}"
             )
             break
         numbers[name] = float(value)
@@ -344,7 +338,7 @@ def _prepare(
     optuna_study.set_user_attr(WRITER, token)
     running = optuna_study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.RUNNING,))
     trials = [optuna.trial.Trial(optuna_study, trial._trial_id) for trial in running]  # noqa: SLF001 -- Optuna has no public way
-    if len(finished_trials(optuna_study)) % plan.batch:
+    if len(completed_trials(optuna_study)) % plan.batch:
         return trials
     for trial in trials:
         _discard(optuna, trial)

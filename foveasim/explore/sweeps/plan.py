@@ -7,7 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -19,8 +19,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from foveasim._core.provenance import versions
 from foveasim._core.random_streams import derive_seed
 from foveasim._core.validation import Ints, check_choice, check_count
-from foveasim._io.yaml_files import read_yaml
-from foveasim.config import check_settings, put_setting, read_settings, resolve_files, validate
+from foveasim._io.yaml_files import position_of, read_yaml
+from foveasim.config import Source, check_settings, put_setting, read_settings, resolve_files, validate
 from foveasim.errors import ConfigError, ParameterError
 from foveasim.explore._files import digests
 from foveasim.explore._functions import identify_function
@@ -32,9 +32,10 @@ __all__ = [
     "SweepSection",
     "check_disjoint",
     "coordinate",
+    "locate_shot",
     "plan_sweep",
-    "read_shot_settings",
     "read_sweep",
+    "with_changes",
     "with_file_context",
 ]
 
@@ -44,6 +45,8 @@ MAX_POINTS = 1_000_000
 CHECKED_VALUES = 1000
 #: Names of dimensions that are not settings.
 POINT, REPEAT = "point", "repeat"
+#: Keys of files with the values of settings: by path, and by point.
+VARY, POINTS = "vary", "points"
 #: Settings of the photosites and their integration areas, and settings of the optical image.
 GEOMETRY_SETTINGS = ("layout", "distortion", "integration_order")
 IMAGE_SETTINGS = ("scene", "optics", "sensor.qe", "sensor.filters")
@@ -56,8 +59,10 @@ class Plan:
 
     Attributes
     ----------
-    source : Path
-        File of the settings, for messages.
+    source : Source
+        Origin of the settings of the shot, for messages.
+    written : Source
+        Origin of the values.
     settings : mapping
         Settings of the shot as plain data, with absolute file paths.
     values : mapping of str to list
@@ -73,7 +78,8 @@ class Plan:
         SHA-256 of the files that the settings reference directly or indirectly.
     """
 
-    source: Path
+    source: Source
+    written: Source
     settings: Mapping[str, Any]
     values: Mapping[str, Sequence[Any]]
     mode: Literal["product", "zip"]
@@ -189,17 +195,31 @@ class Plan:
             When a setting is invalid; with its path, the expected and the actual value.
         """
         names = list(self.values)
-        check_disjoint(self.source, names)
+        check_disjoint(self.written, names)
+        first = dict.fromkeys(names, 0)
         if self.mode == "zip":
-            for k in range(min(len(self.values[names[0]]), CHECKED_VALUES)):
-                check_settings(
-                    self.source, self._settings_with({path: values[k] for path, values in self.values.items()})
-                )
-            return
-        first = {path: values[0] for path, values in self.values.items()}
-        for path, values in self.values.items():
-            for value in values[:CHECKED_VALUES]:
-                check_settings(self.source, self._settings_with(first | {path: value}))
+            points = [dict.fromkeys(names, k) for k in range(min(len(self.values[names[0]]), CHECKED_VALUES))]
+        else:
+            points = [
+                first | {path: k}
+                for path, values in self.values.items()
+                for k in range(min(len(values), CHECKED_VALUES))
+            ]
+        for point in points:
+            chosen = {path: self.values[path][k] for path, k in point.items()}
+            check_settings(self.source_with(point), self._settings_with(chosen))
+
+    def source_with(self, choices: Mapping[str, int] | None = None) -> Source:
+        """Return the origin of all settings of a point, given the indices of its values, or of all points."""
+        is_list = self.written.keys[-1:] == (POINTS,)
+        replaced: dict[str, Source | str] = {}
+        for path in self.values:
+            index = "" if choices is None else str(choices[path])
+            if is_list:
+                replaced[path] = self.written.at(*([index] if index else []), path)
+            else:
+                replaced[path] = replace(self.written.at(path), index=index)
+        return self.source.with_replaced(replaced)
 
 
 class _Range(BaseModel):
@@ -261,22 +281,20 @@ def read_sweep(path: str | Path, *, metrics: Sequence[str] = ()) -> Plan:
             name: _expand_range(path, name, values) if isinstance(values, _Range) else values
             for name, values in section.vary.items()
         }
-    source, shot = read_shot_settings(path, section.shot)
     with with_file_context(path):
         # Names in the file are looked up in METRICS, and never imported.
         file_metrics = resolve_metrics(section.metrics)
     all_metrics = add_metrics(file_metrics, metrics)
     with with_file_context(path):
         return plan_sweep(
-            shot,
+            path.parent / section.shot if isinstance(section.shot, str) else section.shot,
             vary,
             mode=section.mode,
             repeats=section.repeats,
             seed=section.seed,
             metrics=all_metrics,
-            changes={name: resolve_files(path.parent, value, name) for name, value in section.set.items()},
-            source=source,
-            directory=path.parent,
+            changes=section.set,
+            source=path,
         )
 
 
@@ -289,8 +307,8 @@ def plan_sweep(
     seed: int = 0,
     metrics: Iterable[str | Metric] | Mapping[str, Metric] | None = None,
     changes: Mapping[str, Any] | None = None,
-    source: str | Path = "settings",
-    directory: str | Path = ".",
+    source: Source | str | Path | None = None,
+    written_as: str = VARY,
 ) -> Plan:
     """
     Create the plan of a sweep, with all checks that do not require building a camera.
@@ -312,10 +330,11 @@ def plan_sweep(
         numbers or strings, a numpy array, or an xarray.DataArray.
     changes : mapping of str to value, optional
         Settings that are replaced in all points.
-    source : path
-        Name of a mapping of settings in messages.
-    directory : path
-        Directory for relative file paths in ``vary``.
+    source : Source or path, optional
+        File of the sweep, for messages. Relative paths in ``changes``, ``vary`` and a mapping of settings are relative to its
+        directory, by default the working directory.
+    written_as : str
+        Key of the values in this file.
 
     Returns
     -------
@@ -327,11 +346,10 @@ def plan_sweep(
         When nothing varies, a path or a value is invalid, or there are too many points.
     """
     check_choice("mode", mode, ("product", "zip"))
-    if isinstance(shot, Mapping):
-        source, data = Path(source), dict(shot)
-    else:
-        source = Path(shot)
-        data = read_settings(source)
+    own = Source.of(source)
+    shot_source, data = locate_shot(own, shot)
+    if own.file is not None and not isinstance(vary, Mapping):
+        written_as = POINTS
     values, mode = _by_path(vary, mode)
     repeats = check_count("repeats", repeats, at_most=MAX_POINTS)
     counts = [len(each) for each in values.values()]
@@ -342,14 +360,16 @@ def plan_sweep(
             f"must specify at most {MAX_POINTS:,} points, got {n_points:,}; vary fewer settings together",
         )
     found: list[Path] = []
-    settings = resolve_files(source.parent, data, found=found)
+    settings = resolve_files(shot_source.directory, data, found=found)
+    shot_source = with_changes(own, shot_source, changes)
     for path, value in (changes or {}).items():
-        put_setting(source, settings, path, resolve_files(Path(directory), value, path, found))
+        put_setting(shot_source, settings, path, resolve_files(own.directory, value, path, found))
     settings.pop("seed", None)
     plan = Plan(
-        source=source.absolute(),
+        source=shot_source.absolute(),
+        written=own.absolute().at(written_as),
         settings=settings,
-        values={path: [resolve_files(Path(directory), v, path, found) for v in each] for path, each in values.items()},
+        values={path: [resolve_files(own.directory, v, path, found) for v in each] for path, each in values.items()},
         mode=mode,
         repeats=repeats,
         seed=check_count("seed", seed, at_least=0),
@@ -363,19 +383,30 @@ def plan_sweep(
     return plan
 
 
-def read_shot_settings(path: Path, shot: str | dict[str, Any]) -> tuple[Path, dict[str, Any]]:
+def locate_shot(own: Source, shot: str | Path | Mapping[str, Any]) -> tuple[Source, dict[str, Any]]:
     """
-    Return the settings of the shot of a file, and the file that contains them.
+    Return the settings of a shot, and their origin.
+
+    Parameters
+    ----------
+    own : Source
+        Origin of the sweep, study or dataset; that of a mapping of settings is its key ``shot``.
+    shot : path or mapping
 
     Raises
     ------
     ConfigError
         When the file does not exist, or is not valid YAML.
     """
-    if not isinstance(shot, str):
-        return path, shot
-    source = path.parent / shot
-    return source, read_settings(source)
+    if isinstance(shot, Mapping):
+        return own.at("shot"), dict(shot)
+    return Source.of(shot), read_settings(shot)
+
+
+def with_changes(own: Source, shot_source: Source, changes: Mapping[str, Any] | None) -> Source:
+    """Return the origin of settings of which a sweep, study or dataset replaces some."""
+    key = "changes" if own.file is None else "set"
+    return shot_source.with_replaced({path: own.absolute().at(key, path) for path in changes or {}})
 
 
 def coordinate(values: Iterable[Any]) -> NDArray[Any]:
@@ -406,14 +437,17 @@ def with_file_context(path: Path) -> Iterator[None]:
     try:
         yield
     except ParameterError as error:
-        raise ConfigError(path, str(error)) from None
+        sections = ([VARY], ["search"], ["set"], ["objectives"], ["constraints"], [])
+        positions = (position_of(path, [*section, error.name], is_exact=True) for section in sections)
+        raise ConfigError(path, str(error), position=next(filter(None, positions), None)) from None
     except ConfigError as error:
-        if error.path.absolute() == path.absolute():
-            raise
-        raise ConfigError(path, f"with {error.path.name}: {str(error).removeprefix(f'{error.path}: ')}") from None
+        if error.path is None or error.path.absolute() == path.absolute():
+            raise ConfigError(path, error.detail, position=error.position) from None
+        name = ":".join(map(str, (error.path.name, *(error.position or ()))))
+        raise ConfigError(path, f"with {name}: {error.detail}", position=position_of(path, ["shot"])) from None
 
 
-def check_disjoint(source: Path, paths: Iterable[str], verb: str = "vary") -> None:
+def check_disjoint(source: Source, paths: Iterable[str], verb: str = "vary") -> None:
     """
     Check that no setting contains another.
 
@@ -426,7 +460,7 @@ def check_disjoint(source: Path, paths: Iterable[str], verb: str = "vary") -> No
     for path in names:
         nested = next((other for other in names if other.startswith(path + ".")), None)
         if nested is not None:
-            raise ConfigError(source, f"'{path}' and '{nested}' cannot both {verb}: the first contains the second")
+            raise ConfigError(source.file, f"'{path}' and '{nested}' cannot both {verb}: the first contains the second")
 
 
 def _by_path(vary: Any, mode: Literal["product", "zip"]) -> tuple[dict[str, list[Any]], Literal["product", "zip"]]:

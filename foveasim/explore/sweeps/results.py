@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.extras import needs
+from foveasim._core.names import missing_path
 from foveasim._core.validation import unit_of
 from foveasim._io.atomic import atomic_directory
 from foveasim.errors import FileError, ParameterError
@@ -261,7 +262,7 @@ def open_results(path: str | Path) -> xr.Dataset:
     """
     path = Path(path)
     if stored_plan(path) is None:
-        raise FileError(path, "no such store")
+        raise FileError(path, missing_path(path, "store"))
     try:
         with _xarray().open_zarr(path, consolidated=False, chunks=None) as dataset:
             loaded: xr.Dataset = dataset.load()

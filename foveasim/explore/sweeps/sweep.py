@@ -171,7 +171,9 @@ def _run(
     n_workers = min(thread_count() if workers is None else workers, n_pending)
     # The workers of a scheduler determine their own number of threads.
     n_threads = max(1, thread_count() // n_workers) if scheduler is None else None
-    runner = ShotRunner(plan.source, plan.metrics, is_geometry_varied=plan.is_geometry_varied, n_threads=n_threads)
+    runner = ShotRunner(
+        plan.source_with(), plan.metrics, is_geometry_varied=plan.is_geometry_varied, n_threads=n_threads
+    )
     users = list(plan.metrics.values())
     points, changes = plan.order()
     is_pending = np.array([int(point) not in known for point in points])

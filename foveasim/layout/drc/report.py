@@ -11,6 +11,7 @@ import numpy as np
 import shapely
 
 from foveasim._core.extras import needs
+from foveasim._core.names import missing_path
 from foveasim._io.atomic import atomic_write
 from foveasim.errors import FileError
 
@@ -130,7 +131,7 @@ def read_lyrdb(path: str | Path, n_sites: int) -> Report:
 
     source = Path(path)
     if not source.is_file():
-        raise FileError(source, "is not a file" if source.exists() else "no such file")
+        raise FileError(source, missing_path(source))
     if source.stat().st_size > MAX_BYTES:
         raise FileError(source, f"is larger than {MAX_BYTES} bytes")
     content = source.read_bytes()

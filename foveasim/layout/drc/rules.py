@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from foveasim._core.names import possible_names
 from foveasim._core.validation import Floats, check_choice, check_number, finite_array
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout.drc.measurements import RULES, Case, Measurement, Rule, min_width_um
@@ -180,7 +181,8 @@ class DesignRules:
         waivers = dict(self.waivers or {})
         for name, reason in waivers.items():
             if name not in RULES:
-                raise ParameterError("waivers", f"must have names of rules as keys ({', '.join(RULES)})", name)
+                hint = possible_names(name, list(RULES))
+                raise ParameterError("waivers", "must have names of rules as keys", name, hint=hint)
             if not isinstance(reason, str) or not reason.strip():
                 raise ParameterError("waivers", f"must give a reason for '{name}'", reason)
         object.__setattr__(self, "waivers", waivers)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from difflib import get_close_matches
 from pathlib import Path
 
+from foveasim._core.names import closest_name, missing_path, possible_names
 from foveasim.errors import FileError
 
 __all__ = ["bundled_layouts", "layout_path"]
@@ -40,12 +40,13 @@ def layout_path(name: str | Path, directory: str | Path = ".") -> Path:
         return file
     if str(name) in bundled:
         return bundled[str(name)]
-    closest = get_close_matches(Path(name).stem, bundled, n=1)
-    if Path(name).suffix or file.exists():
-        if closest and not file.exists():
-            raise FileError(file, f"no such file; '{closest[0]}' is a bundled layout")
+    if file.exists():
         return file
-    suggestion = f"did you mean '{closest[0]}'? " if closest else ""
-    raise FileError(
-        file, f"no such file, and not the name of a bundled layout; {suggestion}the names are {', '.join(bundled)}"
-    )
+    if Path(name).suffix:
+        problem = missing_path(file)
+        closest = closest_name(Path(name).stem, bundled)
+        if closest is not None and "did you mean" not in problem:
+            problem += f"; '{closest}' is a bundled layout"
+        raise FileError(file, problem)
+    hint = possible_names(name, list(bundled))
+    raise FileError(file, f"no such file, and not the name of a bundled layout; {hint}")

@@ -10,6 +10,7 @@ import math
 import re
 import warnings
 from collections.abc import Callable, Iterator
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -149,7 +150,9 @@ def _top_cell(cells: dict[str, Any], wanted: str | None) -> str:
     """Return the name of the cell to read."""
     if wanted is not None:
         if wanted not in cells:
-            raise FormatError(f"has no cell {wanted!r}; its cells are {_format_names(cells)}")
+            closest = get_close_matches(wanted, cells, n=1)
+            hint = f"did you mean {closest[0]!r}? " if closest else ""
+            raise FormatError(f"has no cell {wanted!r}; {hint}possible: {_format_names(cells)}")
         return wanted
     below = {reference.cell_name for cell in cells.values() for reference in cell.references}
     tops = [n for n, c in cells.items() if n not in below and not n.startswith(KLAYOUT_METADATA)]

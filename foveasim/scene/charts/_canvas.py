@@ -20,7 +20,7 @@ from foveasim._core.validation import (
     wavelengths_nm,
 )
 from foveasim.errors import ParameterError, SamplingWarning
-from foveasim.scene._scene import MAX_DISTANCE_M, MAX_PITCH_UM, Scene, band_widths_nm
+from foveasim.scene._scene import MAX_DISTANCE_M, MAX_PITCH_UM, MAX_RADIANCE, Scene, band_widths_nm
 from foveasim.units import m_from_um
 
 __all__ = [
@@ -79,7 +79,7 @@ class Canvas:
 
     def __post_init__(self) -> None:
         waves_nm = wavelengths_nm("wavelength_nm", self.wavelength_nm)
-        radiance = finite_array("radiance_w_m2_sr_nm", self.radiance_w_m2_sr_nm, at_least=0.0)
+        radiance = finite_array("radiance_w_m2_sr_nm", self.radiance_w_m2_sr_nm, at_least=0.0, at_most=MAX_RADIANCE)
         if radiance.ndim > 1 or radiance.size not in (1, waves_nm.size):
             raise ParameterError(
                 "radiance_w_m2_sr_nm", f"must be one number, or one for each of the {waves_nm.size} wavelengths"

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from foveasim._core.validation import Floats, check_count, check_number
-from foveasim.scene._scene import GREY_NM, Scene
+from foveasim.scene._scene import GREY_NM, MAX_RADIANCE, Scene
 from foveasim.scene.charts._canvas import Canvas, Fractions, OneOrMore, add_rectangle
 from foveasim.scene.charts._colours import (
     PATCH_NAMES,
@@ -152,7 +152,7 @@ def colour_chart(
     0.3 and 1.3 for 10, 0.8 and 2.5 for 8.
     """
     canvas = Canvas(shape, pitch_um, distance_m, 1.0, wavelength_nm, band_width_nm)
-    radiance = check_number("radiance_w_m2_sr_nm", radiance_w_m2_sr_nm, at_least=0.0)
+    radiance = check_number("radiance_w_m2_sr_nm", radiance_w_m2_sr_nm, at_least=0.0, at_most=MAX_RADIANCE)
     patch_mm = check_number("patch_mm", patch_mm, above=0.0)
     gap_mm = check_number("gap_mm", gap_mm, at_least=0.0)
     n_basis = check_count("n_basis", n_basis, at_most=len(PATCH_NAMES))

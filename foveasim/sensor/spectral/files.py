@@ -17,6 +17,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from foveasim._core.names import missing_path, possible_names
 from foveasim._core.validation import MAX_WAVELENGTH_NM, MIN_WAVELENGTH_NM, Floats, check_choice
 from foveasim.errors import FileError
 from foveasim.sensor.spectral.curves import CURVES
@@ -157,7 +158,7 @@ def _position(path: Path, table: _Table, column: str | int) -> int:
     if isinstance(column, int) and not isinstance(column, bool) and 1 <= column <= len(table.names):
         return column - 1
     raise FileError(
-        path, f"has no column {column!r}; the columns are {', '.join(table.names)}, or 1 to {len(table.names)}"
+        path, f"has no column {column!r}; {possible_names(column, table.names)}, or 1 to {len(table.names)}"
     )
 
 
@@ -192,7 +193,7 @@ def _read(path: Path, wavelength_unit: WavelengthUnit | None, value_unit: ValueU
 def _read_string(path: Path) -> str:
     try:
         if not path.is_file():
-            raise FileError(path, "is not a file" if path.exists() else "no such file")
+            raise FileError(path, missing_path(path))
         if path.stat().st_size > MAX_FILE_BYTES:
             raise FileError(path, f"must be a table of curves with at most {MAX_FILE_BYTES} bytes")
         return path.read_text(encoding="utf-8-sig")

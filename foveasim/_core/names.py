@@ -1,0 +1,158 @@
+"""Messages about unknown names: the closest name, the equivalent of another program's term, and the possible names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterable
+from difflib import SequenceMatcher
+from itertools import islice
+from pathlib import Path
+
+from foveasim.errors import printable
+
+__all__ = ["closest_name", "did_you_mean", "list_names", "missing_path", "possible_names"]
+
+#: Longest complete list of names in a message; of longer lists, it contains the closest names and the total number.
+MAX_LISTED = 16
+#: Similarity of names, 0 to 1, from which one is suggested for the other, as in :func:`difflib.get_close_matches`.
+MIN_SIMILARITY = 0.6
+#: Longest name that is compared, and largest number of files of a directory.
+MAX_COMPARED, MAX_FILES = 80, 10_000
+#: Terms of ISETCam, Pyxel, KLayout and data sheets, and the beginnings of the names of these quantities here.
+OTHER_TERMS: dict[str, tuple[str, ...]] = {
+    "aperture": ("f_number",),
+    "bit_depth": ("bits",),
+    "conversion_gain": ("capacitance",),
+    "dark_current": ("dark_e_per_s",),
+    "dead_time": ("refractory",),
+    "exposure_time": ("exposure",),
+    "fnumber": ("f_number",),
+    "integration_time": ("exposure",),
+    "min_pixel": ("min_size",),
+    "pixel_pitch": ("pitch",),
+    "pixel_size": ("pitch", "min_size"),
+    "quantum_efficiency": ("qe",),
+    "resolution": ("bits", "pitch"),
+    "shutter": ("exposure",),
+    "spacing": ("pitch", "min_space"),
+    "trench": ("gap", "min_space"),
+    "voltage_swing": ("v_sat",),
+    "well_capacity": ("full_well",),
+}
+
+
+def closest_name(name: object, names: Iterable[str]) -> str | None:
+    """
+    Return the name that is most similar to an unknown one, or None.
+
+    Case, hyphens and spaces are ignored. Without a similar name, terms of other programs are looked up in ``OTHER_TERMS``.
+    """
+    known = list(names)
+    similar = _most_similar(name, known)
+    if similar is not None:
+        return similar
+    words = _normalise(name)
+    beginnings = [each for term, found in OTHER_TERMS.items() if words.startswith(term) for each in found]
+    return next((each for begin in beginnings for each in known if _normalise(each).startswith(begin)), None)
+
+
+def did_you_mean(name: object, names: Iterable[str]) -> str:
+    """Return the question ``did you mean 'gap_um'?``, or an empty string if no name is similar."""
+    closest = closest_name(name, names)
+    return "" if closest is None else f"did you mean {_quote(closest)}?"
+
+
+def list_names(names: Collection[str], name: object = "") -> str:
+    """
+    Return a list of names for a message.
+
+    Parameters
+    ----------
+    names : collection of str
+        More than ``MAX_LISTED`` names are reduced to the closest ones, in the given order.
+    name : object
+        The unknown name.
+
+    Examples
+    --------
+    >>> list_names(["grid", "giotto"])
+    "'grid', 'giotto'"
+    >>> list_names([f"name_{k}" for k in range(40)], "name_7").endswith("(16 closest of 40)")
+    True
+    """
+    if len(names) <= MAX_LISTED:
+        return ", ".join(map(_quote, names)) or "none"
+    closest = set(sorted(names, key=lambda each: -_similarity(name, each))[:MAX_LISTED])
+    return f"{', '.join(_quote(each) for each in names if each in closest)} ({MAX_LISTED} closest of {len(names)})"
+
+
+def possible_names(name: object, names: Collection[str]) -> str:
+    """
+    Return the hint of a message about an unknown name.
+
+    Examples
+    --------
+    >>> possible_names("gapum", ["gap_um", "pitch_um"])
+    "did you mean 'gap_um'? possible: 'gap_um', 'pitch_um'"
+    >>> possible_names("zzz", ["gap_um"])
+    "possible: 'gap_um'"
+    """
+    return f"{did_you_mean(name, names)} possible: {list_names(names, name)}".strip()
+
+
+def missing_path(path: Path, kind: str = "file") -> str:
+    """
+    Return the problem of a path that is not an existing file or directory.
+
+    Parameters
+    ----------
+    path : Path
+    kind : str
+        Expected kind of the path: ``"file"``, ``"directory"``, ``"file or directory"``.
+
+    Returns
+    -------
+    problem : str
+        Such as ``no such file; did you mean 'photo.jpg'?``, with the closest name in the same directory.
+    """
+    try:
+        if path.exists():
+            return f"is not a {kind}"
+        directory = next(each for each in path.parents if each.exists())
+        # The first part of the path that does not exist.
+        wanted = path.relative_to(directory).parts[0]
+        is_last = directory == path.parent
+        visible = (each for each in islice(directory.iterdir(), MAX_FILES) if not each.name.startswith("."))
+        found = sorted(each.name for each in visible if is_last or each.is_dir())
+        # Files with the same extension are compared without it.
+        stems = {Path(name).stem: name for name in found if Path(name).suffix == Path(wanted).suffix}
+        closest = stems.get(_most_similar(Path(wanted).stem, stems) or "") or _most_similar(
+            wanted, [name for name in found if Path(name).suffix != Path(wanted).suffix]
+        )
+        hint = "" if closest is None else f"did you mean {_quote(closest)}?"
+    except (OSError, ValueError, StopIteration):  # no permission, or not a valid path
+        return f"no such {kind}"
+    if not is_last:
+        hint = f"there is no directory {_quote(wanted)}{'; ' * bool(hint)}{hint}"
+    return f"no such {kind}; {hint}" if hint else f"no such {kind}"
+
+
+def _quote(name: object) -> str:
+    return f"'{printable(name)}'"
+
+
+def _normalise(name: object) -> str:
+    return re.sub(r"[\s-]+", "_", str(name)[:MAX_COMPARED].casefold())
+
+
+def _most_similar(name: object, names: Iterable[str]) -> str | None:
+    """Return the most similar name if it is similar enough to be suggested; of equals the last in the alphabet."""
+    similarity = {each: _similarity(name, each) for each in names}
+    best = max(similarity, key=lambda each: (similarity[each], each), default=None)
+    return best if best is not None and similarity[best] >= MIN_SIMILARITY else None
+
+
+def _similarity(name: object, other: str) -> float:
+    """Return the similarity of two names, from 0 to 1."""
+    first, second = _normalise(name), _normalise(other)
+    return SequenceMatcher(None, second, first, autojunk=False).ratio()

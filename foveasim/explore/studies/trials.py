@@ -1,0 +1,97 @@
+"""Trials of a study: settings as numbers and lists, and tables of trials."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import copy
+from typing import TYPE_CHECKING, Any
+
+from foveasim._core.extras import needs
+from foveasim.errors import ParameterError
+from foveasim.explore.studies.plan import typed_choice
+
+if TYPE_CHECKING:
+    import optuna
+    import pandas as pd
+
+__all__ = ["ERROR", "INTERRUPTED", "PLAN", "completed_trials", "finished_trials", "trials_table", "with_typed_params"]
+
+#: Attributes of a study and of its trials.
+PLAN, ERROR, INTERRUPTED = "plan", "error", "ended with the program"
+
+
+def finished_trials(optuna_study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
+    """
+    Return the finished trials of a study, without trials lost in interruptions.
+
+    Returns
+    -------
+    trials : list of optuna.trial.FrozenTrial
+        ``params`` contains numbers, strings, lists, mappings and None as in the search. Failed trials contain their message in
+        ``user_attrs["error"]``.
+    """
+    return [with_typed_params(optuna_study, trial) for trial in completed_trials(optuna_study)]
+
+
+def completed_trials(optuna_study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
+    """Return the finished trials of a study as Optuna stores them."""
+    trials = optuna_study.get_trials(deepcopy=False)
+    return [trial for trial in trials if trial.state.is_finished() and not trial.user_attrs.get(INTERRUPTED)]
+
+
+def with_typed_params(optuna_study: optuna.Study, trial: optuna.trial.FrozenTrial) -> optuna.trial.FrozenTrial:
+    """Return a copy of a trial with choices as in the search."""
+    search = optuna_study.user_attrs.get(PLAN, {}).get("search", {})
+    typed = copy(trial)
+    typed.params = {
+        path: typed_choice(value, search[path]) if _is_choice(trial, path, search) else value
+        for path, value in trial.params.items()
+    }
+    return typed
+
+
+def _is_choice(trial: optuna.trial.FrozenTrial, path: str, search: Mapping[str, Any]) -> bool:
+    return path in search and hasattr(trial.distributions[path], "choices")
+
+
+def trials_table(optuna_study: optuna.Study) -> pd.DataFrame:
+    """
+    Return the finished trials of a study as a table.
+
+    Parameters
+    ----------
+    optuna_study : optuna.Study
+        Study of :func:`study`, or of :func:`optuna.load_study` with its storage.
+
+    Returns
+    -------
+    table : pandas.DataFrame
+        One row per trial, with its number as index. Columns are the settings by path, with numbers as numbers and lists as
+        lists; the results of the metrics by name, NaN for failed trials; ``is_best``, whether the trial is on the Pareto front;
+        and ``error``, the message of a failed trial or an empty string.
+
+    Raises
+    ------
+    ParameterError
+        When pandas is not installed.
+
+    Examples
+    --------
+    ::
+
+        table = explore.trials_table(found)
+        table[table.is_best].sort_values("snr_mean")
+    """
+    try:
+        import pandas as pd
+    except ImportError:
+        raise ParameterError("trials_table", needs("pandas")) from None
+    best = {trial.number for trial in optuna_study.best_trials}
+    rows = []
+    for trial in finished_trials(optuna_study):
+        results = {name: value for name, value in trial.user_attrs.items() if name != ERROR}
+        marks = {"is_best": trial.number in best, ERROR: trial.user_attrs.get(ERROR, "")}
+        rows.append({**trial.params, **results, **marks})
+    names = list(dict.fromkeys(name for row in rows for name in row if name not in ("is_best", ERROR)))
+    index = pd.Index([trial.number for trial in completed_trials(optuna_study)], name="trial")
+    return pd.DataFrame(rows, index=index, columns=[*names, "is_best", ERROR])
