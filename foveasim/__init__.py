@@ -30,6 +30,7 @@ from foveasim import (
     video,
     view,
 )
+from foveasim._core.calls import check_public_calls
 from foveasim._version import __version__
 from foveasim.camera import Camera
 from foveasim.capture import Capture
@@ -85,6 +86,13 @@ __all__ = [
     "write_power_map",
 ]
 
+
+for _module in (
+    "distortion", "layout", "maps", "metrics", "modes", "optics", "reconstruct", "scene", "scene.charts", "sensor",
+    "sensor.effects", "units", "video", "view",
+):  # fmt: skip
+    check_public_calls(f"{__name__}.{_module}")
+check_public_calls(__name__)
 
 #: Names that are imported when they are used, and the modules that have them: both load the models of settings.
 _LAZY = {"explore": "foveasim.explore", "read_layout": "foveasim.config"}

@@ -5,6 +5,7 @@ Errors and warnings of foveasim.
 
     FoveasimError
     ├── ParameterError   (ValueError)    an invalid value: .name .value .unit
+    │   └── ArgumentError  (TypeError)   a call with a misspelt, missing or surplus argument
     ├── GeometryError    (ValueError)    outlines that are not valid photosites: .site_ids
     ├── FileError        (ValueError)    a file that cannot be read or written: .path
     │   └── ConfigError                  a settings file with an invalid key or value
@@ -28,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 __all__ = [
+    "ArgumentError",
     "ConfigError",
     "CoverageWarning",
     "FileError",
@@ -72,6 +74,10 @@ class ParameterError(FoveasimError, ValueError):
         #: The message without the name.
         self.detail = f"{rule}{got}{'; ' + hint if hint else ''}"
         super().__init__(f"'{name}' {self.detail}")
+
+
+class ArgumentError(ParameterError, TypeError):
+    """A call with a misspelt, missing or surplus argument; the message contains the signature."""
 
 
 class GeometryError(FoveasimError, ValueError):

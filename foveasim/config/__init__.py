@@ -6,6 +6,7 @@ Each section names a call of the package and its parameters: file and Python hav
 
 from __future__ import annotations
 
+from foveasim._core.calls import check_public_calls
 from foveasim.config._objects import (
     YAML_EXTENSIONS,
     LayoutFile,
@@ -73,3 +74,5 @@ __all__ = [
     "write_results",
     "write_starting_file",
 ]
+
+check_public_calls(__name__)

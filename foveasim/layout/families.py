@@ -10,6 +10,7 @@ from typing import Any, ParamSpec
 import numpy as np
 import shapely
 
+from foveasim._core.calls import check_arguments
 from foveasim._core.provenance import to_plain_data
 from foveasim._core.registry import Registry
 from foveasim.errors import SimulationError
@@ -54,10 +55,11 @@ def layout_family(
     def decorate(generator: Callable[P, Layout]) -> Callable[P, Layout]:
         signature = inspect.signature(generator)
         name = generator.__name__
+        checked = check_arguments(generator)
 
-        @functools.wraps(generator)
+        @functools.wraps(checked)
         def family(*args: P.args, **kwargs: P.kwargs) -> Layout:
-            layout = generator(*args, **kwargs)
+            layout = checked(*args, **kwargs)
             if not isinstance(layout, Layout):
                 raise SimulationError(f"the layout family '{name}' must return a Layout, got a {type(layout).__name__}")
             given = signature.bind(*args, **kwargs)

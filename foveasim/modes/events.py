@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.extras import needs
 from foveasim._core.provenance import to_plain_data
+from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Floats, Ints, as_numbers, check_number, finite_array, own, read_only
 from foveasim._io.atomic import atomic_write, check_free_space
 from foveasim._io.formats import as_file_error
@@ -250,11 +250,10 @@ class Events:
             addresses = _addresses_on_raster(self.layout, pitch_um)
         n_distinct = np.unique(addresses[0] * (MAX_ADDRESS + 1) + addresses[1]).size
         if n_distinct < self.layout.n_sites:
-            warnings.warn(
+            warn(
                 f"{self.layout.n_sites:,} sites have only {n_distinct:,} addresses on the raster; use a smaller 'pitch_um', "
                 "or identify sites by their indices",
                 FoveasimWarning,
-                stacklevel=2,
             )
         return addresses[0].astype(np.uint16), addresses[1].astype(np.uint16)
 

@@ -7,7 +7,6 @@ needs OpenGL, and adds windows and ambient occlusion; the software renderer has 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.threads import parallel_map, thread_count
+from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Floats, check_choice, check_count, check_number, check_shape, finite_array
 from foveasim._io.images import write_picture
 from foveasim.errors import FoveasimWarning, GeometryError, ParameterError, SimulationError
@@ -190,7 +190,7 @@ def render(
     if missing and renderer == "pyvista":
         raise SimulationError(missing)
     if missing:
-        warnings.warn(f"{missing}; the software renderer is used", FoveasimWarning, stacklevel=2)
+        warn(f"{missing}; the software renderer is used", FoveasimWarning)
     # Ambient occlusion has a line artefact at the picture boundary, which is cropped.
     margin = OCCLUSION_MARGIN_PX * oversampling if ambient_occlusion and not missing and renderer != "software" else 0
     width, height = n_x * oversampling, n_y * oversampling

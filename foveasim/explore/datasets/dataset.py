@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.provenance import versions
 from foveasim._core.random_streams import Streams
+from foveasim._core.user_warnings import warn
 from foveasim._core.validation import check_choice, check_count
 from foveasim.capture import Capture
 from foveasim.config import Shot, Source, build_shot, check_settings, put_setting, resolve_files
@@ -426,7 +427,7 @@ class Dataset:
         if messages and not self._has_warned:
             self._has_warned = True
             message = f"sample {index}: {messages[0]}; further warnings are in the item 'warning' of each sample"
-            warnings.warn(message, type(messages[0]), stacklevel=4)
+            warn(message, type(messages[0]))
         sample["settings"] = {path: number for path, (_, number) in sampled.items()}
         sample["warning"] = "; ".join(dict.fromkeys(str(each) for each in messages))
         return sample

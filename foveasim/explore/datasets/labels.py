@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats, Ints, finite_array
 from foveasim._io.images import read_picture
 from foveasim.distortion import Lens
@@ -57,6 +58,8 @@ class Boxes:
     box_um: Floats
     covers: Bools
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False)
 class Flow:
@@ -73,6 +76,8 @@ class Flow:
 
     flow_um: Floats
     is_known: Bools
+
+    __repr__ = short_repr
 
 
 def boxes_on_sites(boxes_px: Floats, integrator: Integrator, lens: Lens | None) -> Boxes:

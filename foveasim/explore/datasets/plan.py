@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from foveasim._core.short_repr import short_repr
 from foveasim._io.yaml_files import read_yaml
 from foveasim.config import Source, picture_path, resolve_files, validate
 from foveasim.explore.datasets.dataset import Dataset
@@ -52,6 +53,8 @@ class DatasetFile:
 
     dataset: Dataset
     per_shard: int | None
+
+    __repr__ = short_repr
 
 
 class _Distribution(BaseModel):

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from foveasim._core.extras import needs
 from foveasim._core.names import missing_path
 from foveasim._core.threads import thread_count
+from foveasim._core.user_warnings import warn
 from foveasim._core.validation import check_count
 from foveasim._io.atomic import atomic_directory, atomic_write
 from foveasim.errors import FileError, FoveasimWarning, ParameterError, SimulationError
@@ -183,10 +184,9 @@ def _write_shards(
             if progress is not None:
                 progress(n_done, n)
     if messages:
-        warnings.warn(
+        warn(
             f"{len(messages):,} of the samples written have warnings, such as: {min(messages)}",
             FoveasimWarning,
-            stacklevel=3,
         )
 
 

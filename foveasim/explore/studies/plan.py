@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from foveasim._core.names import did_you_mean, possible_names
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import check_count
 from foveasim._io.yaml_files import read_yaml
 from foveasim.config import Source, check_settings, put_setting, resolve_files, validate
@@ -82,6 +83,8 @@ class StudyPlan:
     name: str
     directory: Path
     files: Mapping[str, str]
+
+    __repr__ = short_repr
 
     @property
     def source(self) -> Source:

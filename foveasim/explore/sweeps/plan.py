@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from foveasim._core.provenance import versions
 from foveasim._core.random_streams import derive_seed
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Ints, check_choice, check_count
 from foveasim._io.yaml_files import position_of, read_yaml
 from foveasim.config import Source, check_settings, put_setting, read_settings, resolve_files, validate
@@ -87,6 +88,8 @@ class Plan:
     seed: int
     metrics: Mapping[str, Metric]
     files: Mapping[str, str]
+
+    __repr__ = short_repr
 
     @cached_property
     def shape(self) -> tuple[int, ...]:

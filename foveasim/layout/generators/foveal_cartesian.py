@@ -30,7 +30,7 @@ CORNER_ROUNDING = 1e-12
 
 
 @layout_family(example={"n_rings": 12, "pitch_um": 1.0, "n_fovea": 4, "ring_ratio": 1.2})
-def foveal_cartesian(*, n_rings: int, ring_ratio: float, pitch_um: float, n_fovea: int = 1) -> Layout:
+def foveal_cartesian(n_rings: int, *, ring_ratio: float, pitch_um: float, n_fovea: int = 1) -> Layout:
     """
     Generate square rings of rectangles that grow geometrically around the optical axis.
 

@@ -23,7 +23,7 @@ CHORDS_PER_SITE = 4
 
 
 @layout_family(example={"fov_um": 36.0, "a_um": 3.0, "n_rings": 12})
-def fovi(*, fov_um: float, a_um: float, n_rings: int, n_chords: int | None = None) -> Layout:
+def fovi(fov_um: float, *, a_um: float, n_rings: int, n_chords: int | None = None) -> Layout:
     """
     Generate isotropic rings around a central site, with a spacing that grows outwards.
 

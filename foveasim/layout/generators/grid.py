@@ -17,10 +17,10 @@ __all__ = ["grid"]
 
 @layout_family(example={"n_x": 14, "n_y": 14, "pitch_um": 2.0, "trench_um": 0.3, "stagger": True})
 def grid(
-    *,
     n_x: int,
     n_y: int,
     pitch_um: float,
+    *,
     pitch_y_um: float | None = None,
     width_um: float | None = None,
     trench_um: float | None = None,

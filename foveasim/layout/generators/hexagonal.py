@@ -17,10 +17,10 @@ __all__ = ["hexagonal"]
 
 @layout_family(example={"n_columns": 14, "n_rows": 16, "pitch_um": 2.0})
 def hexagonal(
-    *,
     n_columns: int,
     n_rows: int,
     pitch_um: float,
+    *,
     width_um: float | None = None,
     trench_um: float | None = None,
     fill_factor: float | None = None,

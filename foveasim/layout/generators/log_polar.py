@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import warnings
 from typing import Any, Literal, get_args
 
 import numpy as np
 
 from foveasim._core.rings import ring_moments
+from foveasim._core.user_warnings import warn
 from foveasim._core.validation import (
     MAX_SITES,
     Floats,
@@ -52,9 +52,9 @@ def square_ring_ratio(n_sectors: int) -> float:
 
 @layout_family(example={"n_sectors": 36, "min_size_um": 1.0, "r_max_um": 18.0, "fovea": "hexagons"})
 def log_polar(
-    *,
     n_sectors: int,
     r_max_um: float,
+    *,
     min_size_um: float | None = None,
     r_min_um: float | None = None,
     n_rings: int | None = None,
@@ -269,11 +269,10 @@ def _ring_radii_um(
         )
     if radii_um[-1] < MIN_REACH * r_max_um:
         last_um, next_um = float(radii_um[-1]), float(radii_um[-1]) * ratio
-        warnings.warn(
+        warn(
             f"'r_max_um' is {r_max_um:g} µm, but the outermost ring ends at {last_um:.6g} µm: the next one, {ratio:.6g} times "
             f"as large, would extend to {next_um:.6g} µm; take 'r_max_um' = {next_um * (1.0 + 1e-5):.6g} µm, or 'n_rings' with "
             f"'r_min_um' = {radii_um[0]:.6g} µm for rings that end at 'r_max_um'",
             LayoutWarning,
-            stacklevel=3,
         )
     return radii_um

@@ -24,10 +24,10 @@ TOUCHING_ROUNDING = 1e-9
 
 @layout_family(example={"n_x": 12, "n_y": 12, "pitch_um": 2.0})
 def octagonal(
-    *,
     n_x: int,
     n_y: int,
     pitch_um: float,
+    *,
     diamond_um: float | None = None,
     border: Literal["whole", "cut"] = "whole",
 ) -> Layout:

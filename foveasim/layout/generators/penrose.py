@@ -32,7 +32,7 @@ DECAGON_INRADIUS_RATIO = math.cos(math.pi / 10.0)
 
 
 @layout_family(example={"side_um": 2.0, "size_um": 30.0})
-def penrose(*, side_um: float, size_um: float, shape: Literal["disc", "square"] = "disc") -> Layout:
+def penrose(side_um: float, size_um: float, *, shape: Literal["disc", "square"] = "disc") -> Layout:
     """
     Generate thick and thin rhombs with fivefold symmetry around the optical axis.
 

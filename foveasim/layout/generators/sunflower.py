@@ -23,7 +23,7 @@ MIN_CHORDS = 64
 
 
 @layout_family(example={"n_sites": 300, "spacing_um": 1.6})
-def sunflower(*, n_sites: int, spacing_um: float, n_chords: int | None = None) -> Layout:
+def sunflower(n_sites: int, spacing_um: float, *, n_chords: int | None = None) -> Layout:
     """
     Generate Voronoi cells of approximately equal area on a golden spiral.
 

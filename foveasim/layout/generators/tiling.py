@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import warnings
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 import shapely
 
+from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Floats, check_choice, check_length_um, check_sites, finite_array
 from foveasim.errors import GeometryError, LayoutWarning, ParameterError
 from foveasim.layout._regions import as_region, parse_region, region_as_plain_data
@@ -35,8 +35,8 @@ AREA_ROUNDING = 1e-9
 
 @layout_family(example={"pitch_um": 2.0, "radius_um": 14.0})
 def tiling(
-    *,
     pitch_um: float,
+    *,
     cells: Cells = "hexagons",
     size_um: tuple[float, float] | None = None,
     radius_um: float | None = None,
@@ -135,11 +135,10 @@ def tiling(
         layout = _merge_small_pieces(layout, smallest_um)
         open_um2 = pieces_um2 - float(layout.area_um2.sum())
         if layout.n_sites and open_um2 > AREA_ROUNDING * pieces_um2:
-            warnings.warn(
+            warn(
                 f"{open_um2:.6g} µm² of the region remain uncovered, in parts smaller than a site of {smallest_um:.6g} µm; "
                 "exclude them from the region, or take a smaller 'min_size_um'",
                 LayoutWarning,
-                stacklevel=2,
             )
     if layout.n_sites == 0:
         raise GeometryError("the region is too small for a single site; enlarge it, or take a smaller pitch")

@@ -73,8 +73,8 @@ REGULARISATION_FACTOR, N_REGULARISATIONS = 0.25, 16
 
 @layout_family(example={"n_sites": 200, "size_um": (32.0, 32.0), "n_iterations": 20}, picture="density")
 def voronoi(
-    *,
     n_sites: int,
+    *,
     density: Density | None = None,
     density_grid: Grid | None = None,
     size_um: tuple[float, float] | None = None,

@@ -28,9 +28,9 @@ INTEGER_ROUNDING = 1e-9
 
 @layout_family(example={"side_um": (8.0, 16.0, 32.0), "pitch_um": (1.0, 2.0, 4.0)})
 def zones(
-    *,
     pitch_um: Sequence[float],
     side_um: Sequence[float] | None = None,
+    *,
     outlines_um: Sequence[Any] | None = None,
     cells: Cells | Sequence[Cells] = "squares",
 ) -> Layout:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.user_warnings import warn
 from foveasim._core.validation import (
     Bools,
     Floats,
@@ -170,14 +170,13 @@ class Canvas:
         return radius_mm
 
     def warn_if_fine(self, name: str, period_mm: float) -> None:
-        """Warn of fewer than two pixels per period; to be called directly by chart functions."""
+        """Warn of fewer than two pixels per period."""
         n_pixels = period_mm / self.pitch_mm
         if n_pixels < MIN_PIXELS_PER_PERIOD * (1 - ROUNDING):
-            warnings.warn(
+            warn(
                 f"'{name}' yields {n_pixels:.3g} pixels per period in the finest part of the pattern, which averages to grey "
                 f"below 2; use a coarser pattern, or a pixel pitch of at most {500.0 * period_mm:.4g} µm",
                 SamplingWarning,
-                stacklevel=3,
             )
 
     def scene(self, fractions: Fractions, contrast: float, source: str) -> Scene:

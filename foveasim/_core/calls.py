@@ -1,0 +1,170 @@
+"""
+Messages for calls with wrong arguments.
+
+Python reports a misspelt, missing or surplus argument as a TypeError. Public functions, constructors and methods raise an
+:class:`~foveasim.errors.ArgumentError` instead, with the signature of the call and the closest name. Signatures, types and
+docstrings are those of the original function.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import sys
+from collections.abc import Callable, Mapping
+from difflib import get_close_matches
+from types import FunctionType
+from typing import Any, ParamSpec, TypeVar
+
+from foveasim.errors import ArgumentError
+
+__all__ = ["check_arguments", "check_public_calls"]
+
+P = ParamSpec("P")
+R = TypeVar("R")
+#: Characters of a signature in a message; optional parameters beyond are replaced by "...".
+MAX_SIGNATURE = 150
+#: Characters of a default in a signature.
+MAX_DEFAULT = 12
+#: Similarity of a name to the closest parameter.
+MIN_SIMILARITY = 0.5
+#: Parameters that Python passes.
+BOUND = ("self", "cls")
+#: Attribute of checked functions.
+CHECKED = "_arguments_are_checked"
+
+
+def check_arguments(call: Callable[P, R]) -> Callable[P, R]:
+    """
+    Return a function that raises an ArgumentError for arguments outside its signature.
+
+    Parameters
+    ----------
+    call : function
+
+    Notes
+    -----
+    The only cost of a valid call is that of a Python call.
+    """
+    if not isinstance(call, FunctionType) or hasattr(call, CHECKED):
+        return call
+    find_problem = _find_problem
+
+    @functools.wraps(call)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return call(*args, **kwargs)
+        except TypeError as error:
+            # Without a deeper frame, the call itself failed; other errors are those of its code.
+            if error.__traceback__ is None or error.__traceback__.tb_next is not None:
+                raise
+            problem = find_problem(call, args, kwargs)
+            if problem is None:
+                raise
+            raise problem from None
+
+    # With the globals of the function, so that doctest finds its examples.
+    found = FunctionType(checked.__code__, call.__globals__, checked.__name__, None, checked.__closure__)
+    functools.update_wrapper(found, call)
+    setattr(found, CHECKED, True)
+    return found
+
+
+def check_public_calls(module_name: str) -> None:
+    """
+    Check the arguments of all public functions, constructors and methods of a module.
+
+    Public names are those in its ``__all__``; see :func:`check_arguments`.
+    """
+    module = sys.modules[module_name]
+    for name in module.__all__:
+        item = vars(module).get(name)  # None for names that are imported on use
+        package = str(getattr(item, "__module__", "")).partition(".")[0]
+        if package != __name__.partition(".")[0]:
+            continue
+        if isinstance(item, FunctionType):
+            checked = check_arguments(item)
+            # In the module that defines it, too, where pickle looks it up.
+            for home in (module, sys.modules[item.__module__]):
+                if vars(home).get(name) is item:
+                    setattr(home, name, checked)
+        elif (
+            isinstance(item, type) and not issubclass(item, BaseException) and not getattr(item, "_is_protocol", False)
+        ):
+            for kind in item.__mro__:
+                if kind.__module__.partition(".")[0] == package:
+                    _check_methods(kind)
+
+
+def _check_methods(kind: type) -> None:
+    for name, member in list(vars(kind).items()):
+        if name.startswith("_") and name not in ("__init__", "__call__"):
+            continue
+        if isinstance(member, classmethod | staticmethod):
+            setattr(kind, name, type(member)(check_arguments(member.__func__)))
+        elif isinstance(member, FunctionType):
+            setattr(kind, name, check_arguments(member))
+
+
+def _find_problem(call: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> ArgumentError | None:
+    """Return the error of arguments that do not match a signature, None if they do."""
+    every = list(inspect.signature(call).parameters.values())
+    is_bound = bool(every) and every[0].name in BOUND and "." in call.__qualname__
+    parameters = every[1:] if is_bound else every
+    args = args[1:] if is_bound else args
+    name = _name_of(call)
+    shown = _format_signature(name, parameters)
+    by_position = [p.name for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    by_name = [p.name for p in parameters if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    kinds = {p.kind for p in parameters}
+    given = {*by_position[: len(args)], *kwargs}
+    unknown = [] if inspect.Parameter.VAR_KEYWORD in kinds else [key for key in kwargs if key not in by_name]
+    if unknown:
+        free = [key for key in by_name if key not in given]
+        closest = get_close_matches(unknown[0], free, n=1, cutoff=MIN_SIMILARITY)
+        hint = f"did you mean '{closest[0]}'?" if closest else ""
+        return ArgumentError(unknown[0], f"must be an argument of {shown}", hint=hint)
+    twice = [key for key in by_position[: len(args)] if key in kwargs]
+    if twice:
+        return ArgumentError(twice[0], f"must be given once, by position or by name: {shown}")
+    if len(args) > len(by_position) and inspect.Parameter.VAR_POSITIONAL not in kinds:
+        n = len(by_position)
+        limit = f"at most {n} positional argument{'s' * (n != 1)}" if n else "named arguments only"
+        return ArgumentError(name, f"must have {limit}, got {len(args)} by position: {shown}")
+    missing = [p.name for p in parameters if p.name not in given and _is_required(p)]
+    if missing:
+        others = "".join(f"and '{key}' " for key in missing[1:])
+        return ArgumentError(missing[0], f"{others}must be given: {shown}")
+    return None
+
+
+def _is_required(parameter: inspect.Parameter) -> bool:
+    is_variadic = parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
+    return parameter.default is parameter.empty and not is_variadic
+
+
+def _name_of(call: Callable[..., Any]) -> str:
+    """Return the name as in a call: the class for a constructor, ``Class.method`` for a method."""
+    return call.__qualname__.rpartition("<locals>.")[2].removesuffix(".__init__")
+
+
+def _format_signature(name: str, parameters: list[inspect.Parameter]) -> str:
+    """Return a signature: all required parameters, and as many optional ones as fit."""
+    parts: list[str] = []
+    is_shortened = False
+    for k, parameter in enumerate(parameters):
+        if parameter.kind is parameter.KEYWORD_ONLY and not any(
+            p.kind in (p.KEYWORD_ONLY, p.VAR_POSITIONAL) for p in parameters[:k]
+        ):
+            parts.append("*")
+        if _is_required(parameter):
+            parts.append(parameter.name)
+        elif is_shortened or len(", ".join(parts)) > MAX_SIGNATURE:
+            is_shortened = True
+        elif parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
+            parts.append(("*" if parameter.kind is parameter.VAR_POSITIONAL else "**") + parameter.name)
+        else:
+            default = repr(parameter.default)
+            is_short = len(default) <= MAX_DEFAULT and not default.startswith("<")
+            parts.append(f"{parameter.name}={default if is_short else '...'}")
+    return f"{name}({', '.join(parts)}{', ...' * is_shortened})"
