@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import time
-import warnings
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 from foveasim._core.provenance import to_plain_data, versions
 from foveasim._core.random_streams import Streams
 from foveasim._core.threads import in_order, thread_count
+from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, check_count, finite_array, read_only
 from foveasim.capture import Capture
 from foveasim.distortion import Lens
@@ -33,7 +33,7 @@ from foveasim.modes import Between, Exposure, Shutter
 from foveasim.optics import Optics
 from foveasim.reconstruct import Picture, reference
 from foveasim.scene import Scene
-from foveasim.sensor import Sensor, noise_budget
+from foveasim.sensor import NoiseBudget, Sensor, noise_budget
 from foveasim.sensor.limits import check_plausible, check_plausible_array
 from foveasim.units import um_from_nm, w_from_w_m2_um2
 
@@ -139,6 +139,11 @@ class Camera:
 
     def __repr__(self) -> str:
         return f"Camera({self._optics!r}, {self._sensor!r})"
+
+    def _repr_html_(self) -> str:
+        from foveasim.view import to_html
+
+        return to_html(self)
 
     @property
     def optics(self) -> Optics:
@@ -603,11 +608,10 @@ class Camera:
             return self._separate(frames, exposures_s, streams, ahead)
         shutter = Shutter(self._layout, frame_s, line_s, between)
         if exposures_s.max() > (1.0 + TIME_ROUNDING) * every * shutter.frame_s:
-            warnings.warn(
+            warn(
                 f"the exposure of {exposures_s.max():g} s is longer than the {every * shutter.frame_s:g} s between the starts "
                 "of exposures, and no photosite can be exposed twice at a time; reduce 'exposure_s' or increase 'every'",
                 FoveasimWarning,
-                stacklevel=2,
             )
         return self._rolling(frames, exposures_s, streams, shutter, every, ahead)
 
@@ -728,7 +732,7 @@ class Camera:
         weights = self._sensor.responsivity_e_per_j(light.wavelength_nm) * joules_per_w_m2
         return reference(power_map, grid, weights=weights)
 
-    def noise_budget(self, light: Scene | PowerMap, *, exposure_s: float) -> dict[str, Floats]:
+    def noise_budget(self, light: Scene | PowerMap, *, exposure_s: float) -> NoiseBudget:
         """
         Return the noise of every site by source: :func:`foveasim.sensor.noise_budget`.
 
@@ -739,8 +743,8 @@ class Camera:
 
         Returns
         -------
-        dict of str to (n_site,) float64, e-
-            Standard deviation by source.
+        NoiseBudget
+            Standard deviation by source, a dict of str to (n_site,) float64, e-.
 
         Raises
         ------
@@ -851,12 +855,11 @@ class Camera:
     def _warn_of_negative(self, rate_e_per_s: Floats, is_negative: Bools) -> None:
         """Warn when gradients of coarse cells give negative photoelectrons."""
         fraction = -float(rate_e_per_s[is_negative].sum()) / float(np.abs(rate_e_per_s).sum())
-        warnings.warn(
+        warn(
             f"second-order integration makes the photoelectrons of {int(is_negative.sum()):,} of {rate_e_per_s.size:,} "
             f"photosites negative, {100.0 * fraction:.3g} % of all, and they are set to 0: the image is too sharp for cells of "
             "this size; use order=1, or smaller cells (Optics(oversample=...))",
             SamplingWarning,
-            stacklevel=5,
         )
 
     def _warn_of_coverage(self, source: Scene | PowerMap, integrator: Integrator, *, is_moving: bool) -> None:
@@ -867,11 +870,10 @@ class Camera:
         """
         n_outside = integrator.sites_outside_image_circle.size
         if n_outside:
-            warnings.warn(
+            warn(
                 f"{n_outside:,} of {self._layout.n_sites:,} photosites lie outside the image circle of the lens and are dark; "
                 "shrink or move the layout, or use a lens model with a larger field",
                 CoverageWarning,
-                stacklevel=4,
             )
         is_photograph = isinstance(source, Scene) and source.is_picture
         fit = source.fit if isinstance(source, Scene) else None
@@ -885,22 +887,20 @@ class Camera:
                 if is_photograph
                 else "enlarge the scene (pitch_um)"
             )
-            warnings.warn(
+            warn(
                 f"{n_uncovered:,} of {self._layout.n_sites:,} photosites lie partly or completely outside the image, where "
                 f"irradiance is 0: the image measures {_format_extent(image_um)}, the layout {_format_extent(layout_um)}; "
                 f"{remedy}, or shrink or move the layout",
                 CoverageWarning,
-                stacklevel=4,
             )
         elif is_photograph and fit is None and not is_moving:
             fraction = _size_um(layout_um)[0] / _size_um(image_um)[0]
             if fraction < MIN_PICTURE_FRACTION:
-                warnings.warn(
+                warn(
                     f"the layout measures only {100.0 * fraction:.2g} % of the width of the picture: the image measures "
                     f"{_format_extent(image_um)}, the layout {_format_extent(layout_um)}; use fit='cover', or a smaller "
                     "pitch_um or field_of_view_deg",
                     CoverageWarning,
-                    stacklevel=4,
                 )
 
     def _white(self, light: Scene | PowerMap) -> Floats:

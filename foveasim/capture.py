@@ -294,6 +294,11 @@ class Capture:
 
         return plot_capture(self, by, **options)
 
+    def _repr_html_(self) -> str:
+        from foveasim.view import to_html
+
+        return to_html(self)
+
     def to_xarray(self) -> xr.Dataset:
         """
         Return the capture as a labelled dataset that netCDF and zarr files can store.

@@ -9,7 +9,7 @@ two orders.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,6 +28,9 @@ from foveasim._core.validation import (
     wavelengths_nm,
 )
 from foveasim.errors import ParameterError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = [
     "Grid",
@@ -242,6 +245,23 @@ class PowerMap:
             )
         object.__setattr__(self, "data", own(data))
         object.__setattr__(self, "wavelength_nm", wavelength_nm)
+
+    def __repr__(self) -> str:
+        n_bands, n_y, n_x = self.data.shape
+        low_nm, high_nm = self.wavelength_nm.min(), self.wavelength_nm.max()
+        bands = f"1 band at {low_nm:g} nm" if n_bands == 1 else f"{n_bands} bands from {low_nm:g} to {high_nm:g} nm"
+        return f"PowerMap({n_x} x {n_y} cells of {self.grid.pitch_x_um:.4g} x {self.grid.pitch_y_um:.4g} µm, {bands})"
+
+    def plot(self, band: int | None = None, **options: Any) -> Axes:
+        """Draw the irradiance on matplotlib axes; see :func:`foveasim.view.plot_power_map`."""
+        from foveasim.view import plot_power_map
+
+        return plot_power_map(self, band, **options)
+
+    def _repr_html_(self) -> str:
+        from foveasim.view import to_html
+
+        return to_html(self)
 
     @classmethod
     def from_array(

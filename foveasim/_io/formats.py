@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from foveasim._core.names import did_you_mean, missing_path, possible_names
+from foveasim._core.short_repr import short_repr
 from foveasim.errors import FileError, FoveasimError, ParameterError
 
 __all__ = [
@@ -69,6 +70,8 @@ class FileFormat:
     write_options: tuple[str, ...] = ()
     is_sandboxed: bool = False
     is_directory: bool = False
+
+    __repr__ = short_repr
 
     def matches_file(self, path: Path, head: bytes) -> bool:
         """Return whether a file with these first bytes is of the format."""

@@ -13,6 +13,7 @@ from pydantic import BaseModel, TypeAdapter
 
 from foveasim._core.names import possible_names
 from foveasim._core.random_streams import Streams
+from foveasim._core.short_repr import short_repr
 from foveasim._io.images import read_picture
 from foveasim._io.yaml_files import parse_yaml, read_yaml
 from foveasim.camera import Camera
@@ -77,6 +78,8 @@ class LayoutFile:
     rules: DesignRules | None
     source: str
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, kw_only=True)
 class Shot:
@@ -102,6 +105,8 @@ class Shot:
     rules: DesignRules | None
     exposure_s: float
     seed: int
+
+    __repr__ = short_repr
 
 
 def read_shot(path: str | Path, changes: Sequence[str] = (), *, n_threads: int | None = None) -> Shot:

@@ -13,12 +13,13 @@ import numpy as np
 import shapely
 from rich.table import Table
 
+from foveasim._core.short_repr import short_repr
 from foveasim._io.terminal import as_plain_text
 from foveasim.capture import Capture
 from foveasim.config import Shot
 from foveasim.errors import FileError, printable
 from foveasim.layout import Layout, Report
-from foveasim.view import plot_capture, prisms, render, save_figure
+from foveasim.view import hidden_figures, plot_capture, prisms, render, save_figure
 from foveasim.view.renderer import missing_software
 
 __all__ = ["Result", "check_directory", "demo_settings", "results_table", "run_shot", "write_results"]
@@ -84,7 +85,8 @@ def write_results(shot: Shot, capture: Capture, directory: str | Path) -> tuple[
         directory / f"{shot.name}_{part}" for part in ("picture.png", "layout.png", "capture.npz")
     )
     capture.picture(max_pixels=PICTURE_PIXELS).save(picture, capture.white_dn, encode_srgb=True)
-    axes = plot_capture(capture)
+    with hidden_figures():
+        axes = plot_capture(capture)
     axes.set_title(f"{printable(shot.name)}: {capture.layout.n_sites} photosites", parse_math=False)
     save_figure(axes.figure, layout)  # type: ignore[arg-type]
     capture.save(saved)
@@ -99,6 +101,8 @@ class Result:
     capture: Capture
     report: Report | None
     writing_s: float
+
+    __repr__ = short_repr
 
 
 def run_shot(shot: Shot, directory: str | Path) -> tuple[Result, list[Path]]:

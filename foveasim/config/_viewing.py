@@ -6,6 +6,7 @@ import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from foveasim._core.short_repr import short_repr
 from foveasim._io.zarr_stores import store_format
 from foveasim.capture import Capture
 from foveasim.config import read_any_layout, read_rules
@@ -26,6 +27,8 @@ class Viewable:
     data: Layout | Capture
     report: Report | None
     name: str
+
+    __repr__ = short_repr
 
 
 def read_viewable(path: str | Path, *, layout: str | Path | None = None, rules: str | Path | None = None) -> Viewable:

@@ -518,6 +518,11 @@ class Layout:
 
         return plot_layout(self, by, **options)
 
+    def _repr_html_(self) -> str:
+        from foveasim.view import to_html
+
+        return to_html(self)
+
     # -- neighbours ----------------------------------------------------------------------------------------------
 
     def adjacency(self, *, max_gap_um: float | None = None) -> csr_array[Any]:

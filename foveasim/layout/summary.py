@@ -66,6 +66,13 @@ class Summary:
     readout: Readout | None
     origin: str
 
+    def __repr__(self) -> str:
+        x0, y0, x1, y1 = self.bounds_um
+        return (
+            f"Summary({self.n_sites:,} photosites of {self.size_um[0]:.4g} to {self.size_um[-1]:.4g} µm on "
+            f"{x1 - x0:.6g} x {y1 - y0:.6g} µm, from {self.origin})"
+        )
+
     def rows(self) -> list[tuple[str, str]]:
         """Return names and values as strings, in the order of the table."""
         x0, y0, x1, y1 = self.bounds_um
@@ -100,6 +107,11 @@ class Summary:
 
     def __str__(self) -> str:
         return "\n".join(f"{name}: {value}" for name, value in self.rows())
+
+    def _repr_html_(self) -> str:
+        from foveasim.view import to_html
+
+        return to_html(self)
 
     def __rich__(self) -> RenderableType:
         from rich.console import Group

@@ -10,11 +10,12 @@ blue-noise points leave low frequencies free of it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import (
     Floats,
     check_choice,
@@ -29,6 +30,9 @@ from foveasim.layout import Layout
 from foveasim.metrics.pixel_mtf import polygon_otf
 from foveasim.metrics.sampling import nyquist_per_mm, require_layout
 from foveasim.units import per_mm_from_per_um, per_um_from_per_mm
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["AliasingSpectrum", "SamplingSpectrum", "aliasing_spectrum", "sampling_spectrum"]
 
@@ -85,6 +89,16 @@ class SamplingSpectrum:
     nyquist_per_mm: float
     peak_per_mm: float
     n_sites: int
+
+    __repr__ = short_repr
+
+    def plot(self, *, ax: Axes | None = None) -> Axes:
+        """Draw the radial mean of the power (:meth:`radial`) on matplotlib axes."""
+        from foveasim.view import plot_curves
+
+        frequency_per_mm, power, _ = self.radial()
+        labels = "frequency / (line pairs per mm)", "mean power"
+        return plot_curves({"": (frequency_per_mm, power)}, *labels, logarithmic="y", ax=ax)
 
     def radial(self, n_bins: int = 64) -> tuple[Floats, Floats, Floats]:
         """
@@ -156,6 +170,8 @@ class AliasingSpectrum:
     alias_fraction: float
     alias_per_mm: Floats
     noise_fraction: float
+
+    __repr__ = short_repr
 
 
 def sampling_spectrum(

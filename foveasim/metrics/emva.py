@@ -9,14 +9,14 @@ is omitted, as are the plots and histograms of the standard.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, finite_array, read_only
 from foveasim.errors import FoveasimWarning, ParameterError
 from foveasim.metrics.photon_transfer import (
@@ -111,6 +111,21 @@ class Emva1288:
     def __repr__(self) -> str:
         return f"Emva1288({self.transfer.n_frames.size} levels, {self.classes.size} classes)"
 
+    def records(self) -> list[dict[str, Any]]:
+        """Return one dict per class, with all parameters of the class."""
+        names = [f.name for f in fields(self) if f.name not in ("classes", "transfer", "dark")]
+        derived = ("saturation_e", "threshold_e", "snr_max", "snr_max_db", "dynamic_range", "dynamic_range_db")
+        columns = {name: np.asarray(getattr(self, name)).tolist() for name in (*names, *derived)}
+        return [
+            {"class": label, **{name: values[k] for name, values in columns.items()}}
+            for k, label in enumerate(self.classes.tolist())
+        ]
+
+    def _repr_html_(self) -> str:
+        from foveasim.view import to_html
+
+        return to_html(self)
+
     @property
     def saturation_e(self) -> Floats:
         """Saturation capacity, (n_class,) e-: ``qe * saturation_ph``."""
@@ -198,11 +213,10 @@ def emva1288(
     i_saturation, i_class = transfer.saturation_level, np.arange(transfer.classes.size)
     n_at_end = np.count_nonzero(i_saturation == len(frames) - 1)
     if n_at_end:
-        warnings.warn(
+        warn(
             f"the variance is highest at the last level for {n_at_end} of {i_saturation.size} classes: saturation is not "
             "reached and is underestimated; add levels of higher irradiance",
             FoveasimWarning,
-            stacklevel=2,
         )
     saturation_dn = mean_dn[i_saturation, i_class]
 
@@ -320,10 +334,9 @@ def _underflow_fraction(dark: Any, groups: SiteClasses) -> Floats:
     """Return the fraction of codes that are 0; warn if it is too large."""
     fraction = groups.mean((codes_of("dark[0]", dark) == 0).mean(axis=0))
     if fraction.max() > MAX_UNDERFLOW_FRACTION:
-        warnings.warn(
+        warn(
             f"{100 * fraction.max():.1f} % of the dark codes are 0, which clips the noise: dark noise and DSNU are "
             "underestimated; raise the dark level above 0, for example by a pedestal",
             FoveasimWarning,
-            stacklevel=3,
         )
     return fraction

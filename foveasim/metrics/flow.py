@@ -7,12 +7,13 @@ integral of the image gradient over the site.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.short_repr import short_repr
+from foveasim._core.user_warnings import warn
 from foveasim._core.validation import (
     Bools,
     Floats,
@@ -56,6 +57,8 @@ class FlowBound:
     n_sites: Ints
     information_per_um2: Floats
 
+    __repr__ = short_repr
+
     @property
     def covariance_um2(self) -> Floats:
         """
@@ -96,6 +99,8 @@ class FlowEstimate:
     bound: FlowBound
     misfit: Floats
 
+    __repr__ = short_repr
+
 
 def site_gradients_e_per_um(
     layout: Layout, map_e_per_um2: ArrayLike, grid: Grid, *, n_threads: int | None = None
@@ -134,11 +139,10 @@ def site_gradients_e_per_um(
     integrator = Integrator(layout, grid, order=2, n_threads=n_threads)
     is_on = _is_on_map(integrator, layout)
     if not is_on.all():
-        warnings.warn(
+        warn(
             f"{np.count_nonzero(~is_on):,} of {layout.n_sites:,} photosites lie partly or entirely off the map and have a "
             "gradient of 0; use a larger map or fewer sites",
             CoverageWarning,
-            stacklevel=2,
         )
     gradient = np.moveaxis(integrator(_gradients(cells, grid)), 0, -1)
     return np.where(is_on[:, np.newaxis], gradient, 0.0)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,6 +32,9 @@ from foveasim._core.validation import (
 from foveasim.errors import ParameterError
 from foveasim.sensor import Sensor
 from foveasim.sensor.adc import QUANTISATION_DN2
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = [
     "PhotonTransfer",
@@ -91,6 +94,37 @@ class PhotonTransfer:
 
     def __repr__(self) -> str:
         return f"PhotonTransfer({self.n_frames.size} levels, {self.classes.size} classes of {self.n_sites.sum()} sites)"
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return one dict per level and class."""
+        return [
+            {
+                "level": level,
+                "class": label,
+                "n_frames": int(self.n_frames[level]),
+                "mean_dn": float(self.mean_dn[level, k]),
+                "temporal_variance_dn2": float(self.temporal_variance_dn2[level, k]),
+                "spatial_variance_dn2": float(self.spatial_variance_dn2[level, k]),
+            }
+            for level in range(self.n_frames.size)
+            for k, label in enumerate(self.classes.tolist())
+        ]
+
+    def plot(self, *, ax: Axes | None = None) -> Axes:
+        """Draw the temporal variance of each class against its mean on matplotlib axes."""
+        from foveasim.view import plot_curves
+
+        curves: dict[str, tuple[Floats, Floats]] = {
+            f"class {label}" if self.classes.size > 1 else "": (self.mean_dn[:, k], self.temporal_variance_dn2[:, k])
+            for k, label in enumerate(self.classes.tolist())
+        }
+        labels = "mean code / DN", "temporal variance / DN²"
+        return plot_curves(curves, *labels, logarithmic="xy", marker=".", ax=ax)
+
+    def _repr_html_(self) -> str:
+        from foveasim.view import to_html
+
+        return to_html(self)
 
     @property
     def saturation_level(self) -> Ints:

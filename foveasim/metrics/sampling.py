@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,9 @@ from foveasim._core.validation import Floats, Ints, check_choice, check_count, f
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
 from foveasim.units import per_mm_from_per_um
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = [
     "EccentricityTable",
@@ -168,6 +171,12 @@ class EccentricityTable:
     size_at_centre_um: float
     growth_fraction: float
 
+    def __repr__(self) -> str:
+        return (
+            f"EccentricityTable({self.n_sites.size} rings from {self.edges_um[0]:.4g} to {self.edges_um[-1]:.4g} µm, "
+            f"{int(self.n_sites.sum()):,} photosites)"
+        )
+
     @property
     def e2_um(self) -> float:
         """Eccentricity at which the site size has doubled, µm; infinite for sites of equal size."""
@@ -187,6 +196,24 @@ class EccentricityTable:
             }
             for k in range(self.n_sites.size)
         ]
+
+    def plot(self, *, ax: Axes | None = None) -> Axes:
+        """Draw the Nyquist frequencies against the eccentricity on matplotlib axes."""
+        from foveasim.view import plot_curves
+
+        centre_um = 0.5 * (self.edges_um[1:] + self.edges_um[:-1])
+        curves: dict[str, tuple[Floats, Floats]] = {
+            "highest": (centre_um, self.nyquist_max_per_mm),
+            "median": (centre_um, self.nyquist_per_mm),
+            "lowest": (centre_um, self.nyquist_min_per_mm),
+        }
+        labels = "eccentricity / µm", "Nyquist frequency / (line pairs per mm)"
+        return plot_curves(curves, *labels, logarithmic="y", ax=ax)
+
+    def _repr_html_(self) -> str:
+        from foveasim.view import to_html
+
+        return to_html(self)
 
     def __str__(self) -> str:
         lines = ["     from       to / µm    sites  size / µm   Nyquist / mm: lowest   median  highest"]

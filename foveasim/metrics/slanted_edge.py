@@ -8,7 +8,7 @@ spread function (ESF). The method does not require a grid: every site is a sampl
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,6 +29,9 @@ from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
 from foveasim.metrics.sampling import require_layout
 from foveasim.units import per_mm_from_per_um, per_um_from_per_mm
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["EdgeMtf", "slanted_edge_mtf"]
 
@@ -108,6 +111,12 @@ class EdgeMtf:
             f"EdgeMtf(MTF50 at {self.mtf50_per_mm:.4g} per mm, edge at {self.angle_deg:.4g} degrees, "
             f"{self.n_sites:,} sites in bins of {self.bin_um:.4g} µm)"
         )
+
+    def plot(self, *, ax: Axes | None = None) -> Axes:
+        """Draw the MTF against the frequency on matplotlib axes."""
+        from foveasim.view import plot_curves
+
+        return plot_curves({"": (self.frequency_per_mm, self.mtf)}, "frequency / (line pairs per mm)", "MTF", ax=ax)
 
     @property
     def mtf50_per_mm(self) -> float:

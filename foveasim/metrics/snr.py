@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +26,9 @@ from foveasim.sensor import Sensor, SiteSignals, signal_to_noise
 from foveasim.sensor.adc import ADC, QUANTISATION_DN2
 from foveasim.sensor.limits import check_plausible
 from foveasim.sensor.signal_to_noise import CLIPPING_SIGMAS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["SnrTable", "measured_snr_by_class", "relative_exposure_at_snr_fraction", "size_classes_um", "snr_by_class"]
 
@@ -69,6 +72,9 @@ class SnrTable:
     noise_dn: Floats
     saturated_fraction: Floats
 
+    def __repr__(self) -> str:
+        return f"SnrTable({self.classes.size} classes of {int(self.n_sites.sum()):,} photosites)"
+
     @property
     def snr(self) -> Floats:
         """
@@ -98,6 +104,19 @@ class SnrTable:
         }
         rows = zip(*(values.tolist() for values in columns.values()), strict=True)
         return [dict(zip(columns, row, strict=True)) for row in rows]
+
+    def plot(self, *, ax: Axes | None = None) -> Axes:
+        """Draw the SNR of each class against its mean pixel size on matplotlib axes."""
+        from foveasim.view import plot_curves
+
+        return plot_curves(
+            {"": (self.size_um, self.snr)}, "pixel size / µm", "SNR", logarithmic="xy", marker="o", ax=ax
+        )
+
+    def _repr_html_(self) -> str:
+        from foveasim.view import to_html
+
+        return to_html(self)
 
     def __str__(self) -> str:
         heads = ("class", "sites", "size / µm", "signal / DN", "noise / DN", "SNR", "SNR / dB", "saturated")

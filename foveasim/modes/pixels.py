@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.random_streams import fixed_pattern_key
+from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Floats, Ints, check_count, finite_array, read_only
 from foveasim.errors import ParameterError, SimulationError
@@ -116,6 +117,8 @@ class EventPixels:
     noise_per_s: float = 0.0
     noise_half_e_per_s: float = 1e4
     floor_e_per_s: float = 1.0
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         _check_sensor(self.sensor)
@@ -287,6 +290,8 @@ class SpikingPixels:
     _: KW_ONLY
     threshold_e: float | Floats = 1000.0
     refractory_s: float = 0.0
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         _check_sensor(self.sensor)

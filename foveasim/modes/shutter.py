@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, check_choice, check_count, finite_array
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
@@ -63,6 +64,8 @@ class Shutter:
     frame_s: float
     line_s: float = 0.0
     between: Between = "hold"
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         if not isinstance(self.layout, Layout):

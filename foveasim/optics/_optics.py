@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import math
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -12,7 +11,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import thread_count
+from foveasim._core.user_warnings import warn
 from foveasim._core.validation import (
     Bools,
     Floats,
@@ -175,6 +176,13 @@ class Optics(PointImages):
     padding_cells: int | None = None
     precision: Literal["single", "double"] = "single"
     _cache: TableCache = field(default_factory=TableCache, init=False, repr=False, compare=False)
+
+    __repr__ = short_repr
+
+    def _repr_html_(self) -> str:
+        from foveasim.view import to_html
+
+        return to_html(self)
 
     def __post_init__(self) -> None:
         numbers = {
@@ -639,13 +647,12 @@ class Optics(PointImages):
         ratio = 0.5 * min(grid.shape) * grid.pitch_x_um / widest_um
         if ratio < MIN_RADIUS_RATIO:
             height, width = (n * grid.pitch_x_um for n in grid.shape)
-            warnings.warn(
+            warn(
                 f"the image of the scene is only {width:.4g} x {height:.4g} µm, and the Airy disc has a diameter of "
                 f"{2.44 * widest_um:.3g} µm: Eq. 5 of the paper requires an aperture radius much larger than "
                 f"H λ / (p0 min(M, N)), got {ratio:.3g} times this value; use a larger picture or a smaller "
                 "f-number, and check the units of pitch_um, distance_m and focal_length_mm",
                 SamplingWarning,
-                stacklevel=4,
             )
 
     def _squared_tangents(self, scene: SceneLike) -> tuple[Floats, Floats]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, check_count, check_number, finite_array
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid
@@ -49,6 +50,8 @@ class PointSpread:
     psf_per_um2: Floats
     grid: Grid
     wavelength_nm: float
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.registry import Registry
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import (
     Bools,
     Floats,
@@ -205,6 +206,8 @@ class PupilImage:
     picture: str | Path | ArrayLike = field(repr=False)
     values: Literal["amplitude", "power"] = "amplitude"
     wavefront_um: ArrayLike | None = field(default=None, repr=False)
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         check_choice("values", self.values, ("amplitude", "power"))

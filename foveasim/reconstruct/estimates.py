@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats, finite_array
 from foveasim.errors import ParameterError
 from foveasim.sensor import Sensor, linearise
@@ -38,6 +39,8 @@ class SiteEstimates:
     light_e: Floats
     variance_e2: Floats
     is_saturated: Bools
+
+    __repr__ = short_repr
 
 
 def electrons_per_code(sensor: Sensor) -> Floats:

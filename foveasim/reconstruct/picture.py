@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ from foveasim._io.images import picture_format, write_picture
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid, PackedRings, to_file_rows
 from foveasim.integrate import Integrator
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["Picture", "coverage_fraction", "raster_grid"]
 
@@ -53,6 +56,29 @@ class Picture:
         for name, missing_is_nan in (("data", True), ("coverage", False)):
             values = unmasked(name, getattr(self, name), missing_is_nan=missing_is_nan)
             object.__setattr__(self, name, own(np.asarray(values)))
+
+    def __repr__(self) -> str:
+        n_channels, n_y, n_x = self.data.shape
+        values = self.data[np.isfinite(self.data)]
+        extent = f"values from {values.min():.4g} to {values.max():.4g}" if values.size else "no values"
+        pixels = f"{n_x} x {n_y} pixels of {self.grid.pitch_x_um:.4g} x {self.grid.pitch_y_um:.4g} µm"
+        return f"Picture({pixels}, {n_channels} channel{'s' * (n_channels != 1)}, {extent})"
+
+    def plot(self, **options: Any) -> Axes:
+        """Draw on matplotlib axes; see :func:`foveasim.view.plot_picture`."""
+        from foveasim.view import plot_picture
+
+        return plot_picture(self, **options)
+
+    def _repr_html_(self) -> str:
+        from foveasim.view import to_html
+
+        return to_html(self)
+
+    def _repr_png_(self) -> bytes | None:
+        from foveasim.view import to_png
+
+        return to_png(self)
 
     def to_image(
         self,

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,6 +32,9 @@ from foveasim.errors import FileError, ParameterError
 from foveasim.fields import from_file_rows
 from foveasim.scene.registry import SCENES
 from foveasim.units import m_from_um, um_from_m
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["Fit", "Scene"]
 
@@ -204,6 +207,17 @@ class Scene:
             f"Scene({n_x} x {n_y} pixels{size} at {self.distance_m:g} m, {n_basis} basis images, "
             f"{self.wavelength_nm.size} wavelengths, from {self.source})"
         )
+
+    def plot(self, **options: Any) -> Axes:
+        """Draw approximate colours on matplotlib axes; see :func:`foveasim.view.plot_scene`."""
+        from foveasim.view import plot_scene
+
+        return plot_scene(self, **options)
+
+    def _repr_html_(self) -> str:
+        from foveasim.view import to_html
+
+        return to_html(self)
 
     @classmethod
     def from_picture(

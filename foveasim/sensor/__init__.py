@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from foveasim.sensor.budget import FIXED, TEMPORAL, noise_budget
+from foveasim.sensor.budget import FIXED, TEMPORAL, NoiseBudget, noise_budget
 from foveasim.sensor.calibration import Calibration, calibrate, linearise
 from foveasim.sensor.effects.crosstalk import CrosstalkOperator, Diffusion, InterPixelCapacitance, KernelCrosstalk
 from foveasim.sensor.effects.shot import draw_shot_noise
@@ -47,6 +47,7 @@ __all__ = [
     "InterPixelCapacitance",
     "KernelCrosstalk",
     "Limits",
+    "NoiseBudget",
     "PassBand",
     "PolynomialCurve",
     "ProductCurve",

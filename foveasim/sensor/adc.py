@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, check_choice, check_count, finite_array, read_only
 from foveasim.errors import ParameterError
 from foveasim.sensor.limits import check_plausible, check_plausible_array
@@ -73,6 +74,8 @@ class ADC:
     companding_table: Sequence[float] | None = None
     inl_dn: Sequence[float] = ()
     dnl_dn: float = 0.0
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "bits", check_count("bits", self.bits, at_least=1, at_most=16))

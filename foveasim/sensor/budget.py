@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,7 +16,10 @@ from foveasim.sensor.prediction import MIN_SLOPE
 from foveasim.sensor.sensor import Sensor
 from foveasim.sensor.signal_to_noise import local_step_e
 
-__all__ = ["FIXED", "TEMPORAL", "noise_budget"]
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["FIXED", "TEMPORAL", "NoiseBudget", "noise_budget"]
 
 #: Standard entries of the budget: temporal noise and fixed patterns.
 TEMPORAL = (
@@ -26,7 +31,69 @@ TEMPORAL = (
 FIXED = tuple(effect.name for effect in STANDARD if not effect.is_temporal)
 
 
-def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> dict[str, Floats]:
+class NoiseBudget(dict[str, Floats]):
+    """
+    Standard deviation of each site's charge by effect, a dict of (n_site,) arrays in e-.
+
+    Attributes
+    ----------
+    temporal : tuple of str
+        Names of the temporal effects; the others are fixed patterns.
+    """
+
+    def __init__(self, noise_e: Mapping[str, Floats], temporal: Sequence[str]) -> None:
+        super().__init__(noise_e)
+        self.temporal = tuple(temporal)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return NoiseBudget, (dict(self), self.temporal)
+
+    def __repr__(self) -> str:
+        total_e = {row["effect"]: row["rms_e"] for row in self.records()}
+        n_sites = next((values.size for values in self.values()), 0)
+        return (
+            f"NoiseBudget({n_sites:,} sites, temporal noise {total_e['all temporal']:.4g} e-, "
+            f"fixed patterns {total_e['all fixed']:.4g} e-)"
+        )
+
+    def __str__(self) -> str:
+        return "\n".join(f"{row['effect']:>16}: {row['rms_e']:.4g} e-" for row in self.records())
+
+    def records(self) -> list[dict[str, Any]]:
+        """
+        Return one dict per effect that contributes, and for the sums.
+
+        The keys are effect, kind, and rms_e, min_e and max_e over the sites.
+        """
+        parts = [(name, name in self.temporal, values) for name, values in self.items() if np.any(values > 0.0)]
+        sums = []
+        for kind, is_temporal in (("temporal", True), ("fixed", False)):
+            variances = [values**2 for _, temporal, values in parts if temporal is is_temporal]
+            sums.append((f"all {kind}", is_temporal, np.sqrt(np.sum(variances, axis=0)) if variances else np.zeros(1)))
+        return [
+            {
+                "effect": name,
+                "kind": "temporal" if is_temporal else "fixed",
+                "rms_e": float(np.sqrt(np.mean(values**2))) if values.size else 0.0,
+                "min_e": float(values.min(initial=np.inf)) if values.size else 0.0,
+                "max_e": float(values.max(initial=0.0)),
+            }
+            for name, is_temporal, values in (*parts, *sums)
+        ]
+
+    def plot(self, **options: Any) -> Axes:
+        """Draw as bars on matplotlib axes; see :func:`foveasim.view.plot_noise_budget`."""
+        from foveasim.view import plot_noise_budget
+
+        return plot_noise_budget(self, **options)
+
+    def _repr_html_(self) -> str:
+        from foveasim.view import to_html
+
+        return to_html(self)
+
+
+def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> NoiseBudget:
     """
     Compute the standard deviation of a site's charge due to each effect alone.
 
@@ -39,12 +106,12 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> di
 
     Returns
     -------
-    noise_e : dict of (n_site,) float64, e-
-        Entries by name: :data:`TEMPORAL`, further temporal effects of the sensor, :data:`FIXED`, further fixed effects; 0 for
-        effects that the sensor does not have. Effects on voltages are referred to the charge by the slope of the complete
-        chain at the site's mean, as is conversion noise: the step divided by ``sqrt(12)``, and differential nonlinearity.
-        Without clipping, the squares of temporal entries add up to the temporal variance of a site, and the squares of fixed
-        entries to the variance between identical sites.
+    NoiseBudget
+        A dict of (n_site,) float64, e-. Entries by name: :data:`TEMPORAL`, further temporal effects of the sensor,
+        :data:`FIXED`, further fixed effects; 0 for effects that the sensor does not have. Effects on voltages are referred to
+        the charge by the slope of the complete chain at the site's mean, as is conversion noise: the step divided by
+        ``sqrt(12)``, and differential nonlinearity. Without clipping, the squares of temporal entries add up to the temporal
+        variance of a site, and the squares of fixed entries to the variance between identical sites.
 
     Raises
     ------
@@ -96,4 +163,5 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> di
             mean, variance = effect.validate_moments(values, np.zeros(1), sites)
             entries = temporal if effect.is_temporal else fixed
             entries[effect.name] = np.sqrt(variance + (mean - values) ** 2) * e_per_unit
-    return {name: np.broadcast_to(entry, n_sites).copy() for name, entry in (temporal | fixed).items()}
+    noise_e = {name: np.broadcast_to(entry, n_sites).copy() for name, entry in (temporal | fixed).items()}
+    return NoiseBudget(noise_e, tuple(temporal))

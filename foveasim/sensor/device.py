@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.random_streams import fixed_pattern_key
 from foveasim._core.rings import positions_in_runs, site_moments
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, Ints, read_only
 from foveasim.errors import ParameterError
 from foveasim.fields import PackedRings
@@ -61,6 +62,8 @@ class Device:
 
     seed: int
     layout: PackedRings
+
+    __repr__ = short_repr
 
     @cached_property
     def _sites(self) -> tuple[Words, Words]:

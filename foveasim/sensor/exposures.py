@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.random_streams import Streams
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, Ints, as_numbers, own, unmasked
 from foveasim.errors import ParameterError
 from foveasim.sensor.calibration import Calibration, linearise, nominal_e_per_dn
@@ -51,6 +52,8 @@ class Rates:
     sigma_e_per_s: Floats
     n_used: Ints
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
         _make_read_only(self)
 
@@ -72,6 +75,8 @@ class Ramp:
     times_s: Floats
     electrons: Ints
     code: NDArray[Any]
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         _make_read_only(self)

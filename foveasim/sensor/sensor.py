@@ -301,6 +301,11 @@ class Sensor:
     def __repr__(self) -> str:
         return f"Sensor({self.layout!r}, filters {', '.join(self.filter_names)}, {self.bits} bits)"
 
+    def _repr_html_(self) -> str:
+        from foveasim.view import to_html
+
+        return to_html(self)
+
     def _per_site(self, name: str, value: PerSite) -> PerSite:
         if np.ndim(value) == 0:
             return check_plausible(name, value)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats
 from foveasim.sensor.prediction import MIN_SLOPE, ReadoutModel
 from foveasim.sensor.sensor import Sensor
@@ -44,6 +45,8 @@ class SiteSignals:
     noise_e: Floats
     gain_dn_per_e: Floats
     is_saturated: Bools
+
+    __repr__ = short_repr
 
     @property
     def ratio(self) -> Floats:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.random_streams import Streams
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, check_number, check_shape, finite_array, read_only
 from foveasim.errors import ParameterError
 from foveasim.fields import PowerMap
@@ -46,6 +47,8 @@ class GazePath:
 
     t_s: Floats
     xy_um: Floats
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         t_s, xy_um = finite_array("t_s", self.t_s, ndim=1), finite_array("xy_um", self.xy_um, ndim=2)

@@ -6,9 +6,12 @@ matplotlib is imported when something is drawn.
 
 from __future__ import annotations
 
+from foveasim.view.figures import hidden_figures
 from foveasim.view.id_map import SitePixels, id_map, site_at
 from foveasim.view.meshes import Mesh, polydata, prisms
-from foveasim.view.plots import plot_capture, plot_layout, plot_noise_budget, save_drawing, save_figure
+from foveasim.view.notebook import to_html, to_png
+from foveasim.view.plots import plot_capture, plot_curves, plot_layout, plot_noise_budget, save_drawing, save_figure
+from foveasim.view.raster_plots import plot_picture, plot_power_map, plot_scene
 from foveasim.view.render3d import Viewpoint, render, show, sites_in_view
 from foveasim.view.renderer import find_renderer
 from foveasim.view.rule_plots import plot_report
@@ -27,11 +30,16 @@ __all__ = [
     "Viewpoint",
     "colours_of",
     "find_renderer",
+    "hidden_figures",
     "id_map",
     "plot_capture",
+    "plot_curves",
     "plot_layout",
     "plot_noise_budget",
+    "plot_picture",
+    "plot_power_map",
     "plot_report",
+    "plot_scene",
     "polydata",
     "prisms",
     "render",
@@ -44,6 +52,8 @@ __all__ = [
     "solid_page",
     "solids",
     "stack",
+    "to_html",
+    "to_png",
     "web_page",
     "write_meshes",
     "write_solid_page",

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Floats, check_count, check_shape, finite_array, read_only, unmasked
 from foveasim.errors import ParameterError
@@ -109,6 +110,8 @@ class SitePixels:
     ids: NDArray[np.int32]
     bounds_um: Bounds
     n_samples: int = 1
+
+    __repr__ = short_repr
 
     @classmethod
     def from_layout(

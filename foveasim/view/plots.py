@@ -6,7 +6,7 @@ import io
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +16,7 @@ from foveasim._io.atomic import atomic_write
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
 from foveasim.layout import Layout, readout_order
+from foveasim.view.figures import new_axes
 from foveasim.view.id_map import site_at
 from foveasim.view.site_colours import BACKGROUND, BOUNDARY, CATEGORY_COLOURS, SiteColours, as_fractions, colours_of
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.collections import Collection
     from matplotlib.figure import Figure
 
-__all__ = ["plot_capture", "plot_layout", "plot_noise_budget", "save_drawing", "save_figure"]
+__all__ = ["plot_capture", "plot_curves", "plot_layout", "plot_noise_budget", "save_drawing", "save_figure"]
 
 #: Layouts of more sites are drawn as an image, which is faster than outlines.
 MAX_OUTLINES = 4000
@@ -32,8 +33,6 @@ MAX_OUTLINES = 4000
 MAX_ADJACENCY_SITES = 50_000
 #: Drawings of more sites open slowly in all viewers.
 MAX_DRAWING_SITES = 20_000
-#: Smallest ratio of a figure's shorter side to its longer one, which leaves space for axes, labels and colour bars.
-MIN_ASPECT_RATIO = 0.4
 #: Brightness of readout lines relative to the category colours of their sites.
 LINE_BRIGHTNESS = 0.55
 
@@ -153,10 +152,7 @@ def plot_noise_budget(
     ParameterError
         When there is not one class per site.
     """
-    from matplotlib.figure import Figure
-
-    if ax is None:
-        ax = Figure(figsize=(7.0, 4.5), layout="constrained").add_subplot()
+    ax = new_axes(7.0, 0.64) if ax is None else ax
     n_sites = next(iter(noise_e.values())).size
     labels = np.zeros(n_sites, np.int64) if classes is None else np.asarray(unmasked("classes", classes))
     if labels.shape != (n_sites,):
@@ -177,6 +173,55 @@ def plot_noise_budget(
     ax.set_xscale("log")
     ax.set_xlabel("noise / e- rms")
     if groups.size > 1:
+        ax.legend()
+    return ax
+
+
+def plot_curves(
+    curves: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    x_label: str,
+    y_label: str,
+    *,
+    logarithmic: Literal["", "x", "y", "xy"] = "",
+    marker: str = "",
+    ax: Axes | None = None,
+) -> Axes:
+    """
+    Draw curves with labelled axes, such as results of :mod:`foveasim.metrics`.
+
+    Parameters
+    ----------
+    curves : mapping of str to (x, y)
+        Points of each curve by its name in the legend; an empty name for a single curve.
+    x_label, y_label : str
+        Quantity and unit.
+    logarithmic : {"", "x", "y", "xy"}
+        Axes with logarithmic scales, on which values <= 0 are not drawn.
+    marker : str
+        Marker of matplotlib at each point.
+    ax : matplotlib axes, optional
+        New axes by default.
+
+    Returns
+    -------
+    matplotlib axes
+
+    Raises
+    ------
+    ParameterError
+        When ``logarithmic`` is none of these.
+    """
+    check_choice("logarithmic", logarithmic, ("", "x", "y", "xy"))
+    ax = new_axes(7.0, 0.64) if ax is None else ax
+    for name, (x, y) in curves.items():
+        ax.plot(x, y, marker=marker, label=name)
+    if "x" in logarithmic:
+        ax.set_xscale("log")
+    if "y" in logarithmic:
+        ax.set_yscale("log")
+    ax.set(xlabel=x_label, ylabel=y_label)
+    ax.grid(visible=True, alpha=0.3)
+    if any(curves):
         ax.legend()
     return ax
 
@@ -234,14 +279,6 @@ def save_drawing(data: Layout | Capture, path: str | Path, by: str | ArrayLike |
     colours, position = np.unique(rgb, axis=0, return_inverse=True)
     names = {k: "#{:02x}{:02x}{:02x}".format(*colour) for k, colour in enumerate(colours.tolist())}
     layout.with_columns(channel=position.ravel()).write(path, colours=names)
-
-
-def new_axes(figure_inches: float, ratio: float = 1.0) -> Axes:
-    """Return axes on a new figure, for content with the given ratio of height to width."""
-    from matplotlib.figure import Figure
-
-    width, height = max(MIN_ASPECT_RATIO, min(1.0, 1.0 / ratio)), max(MIN_ASPECT_RATIO, min(1.0, ratio))
-    return Figure(figsize=(figure_inches * width, figure_inches * height), layout="constrained").add_subplot()
 
 
 def _plot(

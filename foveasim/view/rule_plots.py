@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
 from foveasim.layout.drc.rules import Report, RuleResult
-from foveasim.view.plots import new_axes, plot_layout
+from foveasim.view.figures import new_axes
+from foveasim.view.plots import plot_layout
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,7 +42,7 @@ def plot_report(
     report : Report
         From :meth:`foveasim.Layout.check`.
     layout : Layout, optional
-        The checked layout, drawn below the violations.
+        The checked layout, drawn below the violations; by default that of the report, if it has one.
     ax : matplotlib axes, optional
         New axes by default.
     figure_inches : float
@@ -61,6 +62,7 @@ def plot_report(
     """
     from matplotlib.transforms import ScaledTranslation
 
+    layout = report.layout if layout is None else layout
     if layout is not None and layout.n_sites != report.n_sites:
         raise ParameterError("layout", f"must be the checked layout of {report.n_sites} sites", layout.n_sites, "sites")
     violated = [result for result in report.results if len(result)]
@@ -73,7 +75,7 @@ def plot_report(
     n_violations = sum(map(len, violated))
     corners = []
     for k, result in enumerate(violated):
-        shown = result.violations[:MAX_SHOWN]
+        shown = result.worst_violations(MAX_SHOWN)
         markers = np.array([violation.marker for violation in shown], dtype=object)
         corners.append(shapely.total_bounds(markers))
         _draw_result(ax, result, markers, k)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.names import possible_names
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import UNIT_SUFFIXES, Floats, Ints, as_numbers, finite_array, own, unmasked
 from foveasim.capture import Capture
 from foveasim.errors import ParameterError
@@ -26,6 +27,7 @@ __all__ = [
     "as_fractions",
     "colours_of",
     "site_colours",
+    "title_of",
 ]
 
 #: Values within this relative difference are equal up to rounding, and have one colour.
@@ -113,6 +115,8 @@ class SiteColours:
     legend: tuple[tuple[str, Rgb], ...] = ()
     has_boundaries: bool = True
 
+    __repr__ = short_repr
+
 
 def as_fractions(rgb: Rgb, factor: float = 1.0) -> tuple[float, float, float]:
     """Return a colour as fractions from 0 to 1, as in matplotlib, multiplied by a factor."""
@@ -176,7 +180,7 @@ def colours_of(data: Layout | Capture, by: str | ArrayLike | None = None, *, lab
         names = _channel_names(layout) if capture is None else capture.filter_names
         return _filters(layout.channel if capture is None else capture.filter_of_site, names, label or "filter")
     values = _column(layout, by, capture is not None)
-    title = label or _title(by)
+    title = label or title_of(by)
     is_categorical = by == "readout_line" or _is_categorical(values)
     return _categories(values, title) if is_categorical else _continuous(values.astype(np.float64), title, VIRIDIS)
 
@@ -194,8 +198,8 @@ def _column(layout: Layout, by: str, is_capture: bool) -> NDArray[Any]:
     raise ParameterError("by", "must be a column or an array", by, hint=possible_names(by, sorted(set(known))))
 
 
-def _title(name: str) -> str:
-    """Return the title of a column: its name in words and its unit."""
+def title_of(name: str) -> str:
+    """Return the title of a column: its name in words and its unit, ``"area / µm²"``."""
     suffix = next((suffix for suffix in UNIT_SUFFIXES if name.lower().endswith(suffix)), "")
     bare, unit = name[: len(name) - len(suffix)].replace("_", " "), UNIT_SUFFIXES.get(suffix, "")
     return f"{bare} / {unit}" if bare and unit else bare or unit

@@ -31,6 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.extras import import_optional
 from foveasim._core.rings import next_vertex, positions_in_runs
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, Ints, check_count, check_length_um, check_number
 from foveasim._io.atomic import atomic_write
 from foveasim.capture import Capture
@@ -138,6 +139,8 @@ class SolidsReport:
 
     parts: tuple[PartReport, ...]
     overlap_um3: Mapping[tuple[str, str], float]
+
+    __repr__ = short_repr
 
     @property
     def ok(self) -> bool:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.registry import Registry
 from foveasim._core.rings import next_vertex, positions_in_runs, ring_moments
+from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.layout._noding import node_edges
@@ -59,6 +60,8 @@ class Contacts:
     is_non_overlapping: Bools
     is_shared: Bools
 
+    __repr__ = short_repr
+
     def sites_of(self, pairs: Any) -> Ints:
         """Return the sites of the given pairs, (n, 2)."""
         return np.stack((self.first[pairs], self.second[pairs]), axis=1)
@@ -70,6 +73,8 @@ class Case:
 
     layout: Layout
     rules: DesignRules
+
+    __repr__ = short_repr
 
     @cached_property
     def polygons(self) -> NDArray[Any]:
@@ -197,6 +202,8 @@ class Measurement:
     sites: Callable[[Ints], Any] | None = None
     markers: Callable[[Ints], Any] | None = None
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, slots=True)
 class Rule:
@@ -229,6 +236,8 @@ class Rule:
     is_deviation: bool = False
     rounding: float = LENGTH_ROUNDING_UM
     repair: Literal["drop", "merge"] | None = "drop"
+
+    __repr__ = short_repr
 
     def excess(self, values: Floats, limit: float) -> Floats:
         """

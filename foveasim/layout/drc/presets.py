@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from foveasim._core.short_repr import short_repr
+
 __all__ = ["PRESETS", "Preset"]
 
 
@@ -18,6 +20,8 @@ class Preset(NamedTuple):
 
     limits: Mapping[str, Any]
     source: str
+
+    __repr__ = short_repr
 
 
 _SKY130 = "SkyWater SKY130 PDK (github.com/google/skywater-pdk), docs/rules/periphery: "

@@ -167,8 +167,8 @@ def _result(name: str, about: _RuleInfo, items: list[_Item]) -> Any:
 
     description, limit, unit = about
     values = np.array([value for _, value, _ in items], dtype=np.float64)
-    locations = ([sites for sites, _, _ in items], [marker for _, _, marker in items])
-    return RuleResult(name, description, limit, unit, values, None, lambda: locations)
+    sites, markers = [sites for sites, _, _ in items], [marker for _, _, marker in items]
+    return RuleResult(name, description, limit, unit, values, None, lambda part: (sites[part], markers[part]))
 
 
 def _categories(root: Any, parent: str = "") -> list[tuple[str, Any]]:

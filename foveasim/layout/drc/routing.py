@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, Ints, as_numbers, check_choice, check_count, check_length_um, check_number
 from foveasim.layout.model import Layout
 
@@ -127,6 +128,8 @@ class TrackDemand(NamedTuple):
     n_tracks: Ints
     first_sites: Ints
     strip: Ints
+
+    __repr__ = short_repr
 
 
 def track_demand(layout: Layout, routing: Routing) -> TrackDemand:

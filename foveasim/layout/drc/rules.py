@@ -7,8 +7,8 @@ and values beyond the limit are violations. :func:`check` does not raise on viol
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import InitVar, dataclass, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import InitVar, dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from foveasim._core.names import possible_names
-from foveasim._core.validation import Floats, check_choice, check_number, finite_array
+from foveasim._core.short_repr import short_repr
+from foveasim._core.validation import Floats, check_choice, check_count, check_number, finite_array
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout.drc.measurements import RULES, Case, Measurement, Rule, min_width_um
 from foveasim.layout.drc.presets import PRESETS
@@ -143,6 +144,8 @@ class DesignRules:
     custom: Mapping[str, float] | None = None
     preset: InitVar[str | None] = None
 
+    __repr__ = short_repr
+
     def __post_init__(self, preset: str | None) -> None:
         if preset is not None:
             for name, limit in PRESETS[check_choice("preset", preset, tuple(PRESETS))].limits.items():
@@ -228,6 +231,8 @@ class Violation:
     unit: str
     marker: Any
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False)
 class RuleResult:
@@ -253,17 +258,28 @@ class RuleResult:
     unit: str
     values: Floats
     waiver: str | None
-    _locate: Callable[[], tuple[Any, Any]]
+    _locate: Callable[[slice], tuple[Any, Any]]
+
+    __repr__ = short_repr
 
     @cached_property
     def violations(self) -> tuple[Violation, ...]:
         """Violations of the rule, the worst first; computed on first access."""
-        if self.values.size == 0:
+        return self._violations(slice(None))
+
+    def worst_violations(self, n: int) -> tuple[Violation, ...]:
+        """Return at most n violations, the worst first, without computing the others."""
+        n = check_count("n", n)
+        return self._violations(slice(n)) if n < self.values.size else self.violations
+
+    def _violations(self, part: slice) -> tuple[Violation, ...]:
+        values = self.values[part].tolist()
+        if not values:
             return ()
-        sites, markers = self._locate()
+        sites, markers = self._locate(part)
         return tuple(
             Violation(self.rule, tuple(int(site) for site in ids), value, self.limit, self.unit, marker)
-            for ids, value, marker in zip(sites, self.values.tolist(), markers, strict=True)
+            for ids, value, marker in zip(sites, values, markers, strict=True)
         )
 
     def __len__(self) -> int:
@@ -274,7 +290,7 @@ class RuleResult:
         found = self.violations
         locations = ([v.site_ids for v in found], [v.marker for v in found])
         return RuleResult, (
-            self.rule, self.description, self.limit, self.unit, self.values, self.waiver, partial(tuple, locations)
+            self.rule, self.description, self.limit, self.unit, self.values, self.waiver, partial(_select, *locations)
         )  # fmt: skip
 
     @property
@@ -307,10 +323,21 @@ class Report:
         Number of sites of the layout.
     results : tuple of RuleResult
         One result per rule with a limit.
+    layout : Layout, optional
+        The checked layout, for drawings; None for reports of files.
     """
 
     n_sites: int
     results: tuple[RuleResult, ...]
+    layout: Layout | None = field(default=None, compare=False, repr=False)
+
+    def __repr__(self) -> str:
+        n_satisfied, n_violations = sum(len(r) == 0 for r in self.results), sum(map(len, self.results))
+        waived = f", {n_waived} waived" if (n_waived := sum(r.waiver is not None for r in self.results)) else ""
+        return (
+            f"Report({n_satisfied} of {len(self.results)} rules satisfied{waived}, {n_violations:,} violations, "
+            f"{self.n_sites:,} photosites)"
+        )
 
     @property
     def ok(self) -> bool:
@@ -362,6 +389,11 @@ class Report:
 
         return plot_report(self, layout, **options)
 
+    def _repr_html_(self) -> str:
+        from foveasim.view import to_html
+
+        return to_html(self)
+
     def write(self, path: str | Path) -> None:
         """
         Write a KLayout report database (``.lyrdb``).
@@ -395,6 +427,11 @@ class Report:
         return table
 
 
+def _select(sites: Sequence[Any], markers: Sequence[Any], part: slice) -> tuple[Any, Any]:
+    """Return sites and markers of a part of the violations."""
+    return sites[part], markers[part]
+
+
 def check(layout: Layout, rules: DesignRules) -> Report:
     """
     Check a layout against design rules.
@@ -419,7 +456,7 @@ def check(layout: Layout, rules: DesignRules) -> Report:
         values, locate = _violations(rule, _measure(name, rule, case), bound, case)
         waiver = (rules.waivers or {}).get(name)
         results.append(RuleResult(name, rule.description, bound, rule.unit, values, waiver, locate))
-    return Report(layout.n_sites, tuple(results))
+    return Report(layout.n_sites, tuple(results), layout)
 
 
 def _measure(name: str, rule: Rule, case: Case) -> Measurement:
@@ -438,16 +475,17 @@ def _measure(name: str, rule: Rule, case: Case) -> Measurement:
 
 def _violations(
     rule: Rule, found: Measurement, limit: float, case: Case
-) -> tuple[Floats, Callable[[], tuple[Any, Any]]]:
+) -> tuple[Floats, Callable[[slice], tuple[Any, Any]]]:
     """Return the values beyond the limit, worst first, and a getter of sites and markers."""
     beyond = rule.excess(found.values, limit)
     bad = np.flatnonzero(beyond > rule.rounding)
     bad = bad[np.argsort(-beyond[bad], kind="stable")]
 
-    def locate() -> tuple[Any, Any]:
+    def locate(part: slice) -> tuple[Any, Any]:
+        chosen = bad[part]
         return (
-            bad[:, np.newaxis] if found.sites is None else found.sites(bad),
-            case.shapes(bad) if found.markers is None else found.markers(bad),
+            chosen[:, np.newaxis] if found.sites is None else found.sites(chosen),
+            case.shapes(chosen) if found.markers is None else found.markers(chosen),
         )
 
     return found.values[bad], locate

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.random_streams import standard_normal
 from foveasim._core.registry import Registry
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, Ints, read_only
 from foveasim.errors import SimulationError
 from foveasim.fields import PackedRings
@@ -100,6 +101,8 @@ class Sites:
     n_threads: int | None = None
     _cache: dict[Any, Any] = field(default_factory=dict, repr=False)
     _lock: Any = field(default_factory=RLock, repr=False)
+
+    __repr__ = short_repr
 
     @property
     def n_sites(self) -> int:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import (
     Floats,
@@ -403,6 +404,8 @@ class KernelCrosstalk(_Crosstalk):
     kernel: Sequence[Sequence[float]]
     border: Literal["kept", "lost"] = "kept"
     pitch_um: float | tuple[float, float] | None = None
+
+    __repr__ = short_repr
 
     def compile_for(self, sites: Sites) -> CrosstalkOperator:
         """Return the operator for all sites of the layout."""

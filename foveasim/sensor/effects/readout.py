@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats
 from foveasim.sensor.effects.contract import AdditiveNoise, Effect, Sites, Stage
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
@@ -55,6 +56,8 @@ class ReadNoise(AdditiveNoise):
     stage: ClassVar[Stage] = "charge"
 
     read_noise_e: float | Floats
+
+    __repr__ = short_repr
 
     @classmethod
     def from_sensor(cls, sensor: Any) -> Self | None:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.registry import Registry
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, as_numbers, check_count, check_number
 from foveasim.errors import FoveasimError, ParameterError
 
@@ -267,6 +268,8 @@ class ProductCurve(CurveBase):
 
     curves: Sequence[Factor]
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
         given = tuple(self.curves) if isinstance(self.curves, list | tuple) else ()
         if not given:
@@ -313,6 +316,8 @@ class BandMean(CurveBase):
     curve: Curve
     band_width_nm: float
     n_points: int = 64
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         if not callable(self.curve):

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats
 from foveasim.errors import ParameterError
 from foveasim.sensor.spectral.curves import (
@@ -46,6 +47,8 @@ class FilterSet:
 
     curves: Sequence[Curve]
     names: Sequence[str] | None = None
+
+    __repr__ = short_repr
 
     #: Makes numpy scalars and arrays defer multiplication to the set.
     __array_ufunc__ = None

@@ -10,6 +10,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, as_numbers, check_choice, check_count, finite_array, wavelengths_nm
 from foveasim.errors import ParameterError
 from foveasim.sensor.spectral.curves import CURVES, CurveBase, check_within
@@ -47,6 +48,8 @@ class PolynomialCurve(CurveBase):
     wavelength_nm: Sequence[float]
     value: Sequence[float]
     degree: int = 5
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         _set_table(self)
@@ -88,6 +91,8 @@ class TableCurve(CurveBase):
     beyond: Beyond = "raise"
     source: str = field(default="", compare=False)
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
         _set_table(self)
         check_choice("beyond", self.beyond, get_args(Beyond))
@@ -128,6 +133,8 @@ class SplineCurve(CurveBase):
     value: Sequence[float]
     beyond: Beyond = "raise"
     source: str = field(default="", compare=False)
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         _set_table(self)
@@ -173,6 +180,8 @@ class StepCurve(CurveBase):
     value: Sequence[float]
     beyond: Beyond = "raise"
     source: str = field(default="", compare=False)
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         values = _check_fractions(self.value)

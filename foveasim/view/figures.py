@@ -1,0 +1,87 @@
+"""
+New figures: shown in notebooks and windows, plain objects in scripts.
+
+Figures of pyplot are shown at the end of a notebook cell or in a window, and remain in memory until they are closed. Other
+figures are not shown, and are freed with their last reference. All plot functions create their figures here.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["hidden_figures", "new_axes"]
+
+#: Smallest ratio of a figure's shorter side to its longer one, which leaves space for axes, labels and colour bars.
+MIN_ASPECT_RATIO = 0.4
+
+_is_hidden: ContextVar[bool] = ContextVar("_is_hidden", default=False)
+
+
+def new_axes(figure_inches: float, ratio: float = 1.0) -> Axes:
+    """
+    Return axes on a new figure.
+
+    Parameters
+    ----------
+    figure_inches : float
+        Longer side of the figure.
+    ratio : float
+        Height over width of the content.
+
+    Notes
+    -----
+    The figure is made by pyplot if a notebook or a window shows it: the backend is that of a notebook (inline, ipympl), or the
+    user has imported pyplot and its backend is interactive. Otherwise pyplot is not imported, and the figure is in none of its
+    lists.
+    """
+    width, height = max(MIN_ASPECT_RATIO, min(1.0, 1.0 / ratio)), max(MIN_ASPECT_RATIO, min(1.0, ratio))
+    size_inches = figure_inches * width, figure_inches * height
+    if _is_shown():
+        from matplotlib import pyplot as plt
+
+        return plt.figure(figsize=size_inches, layout="constrained").add_subplot()
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=size_inches, layout="constrained").add_subplot()
+
+
+@contextmanager
+def hidden_figures() -> Iterator[None]:
+    """Make plain figures inside the block, such as those of files, also in notebooks."""
+    token = _is_hidden.set(True)
+    try:
+        yield
+    finally:
+        _is_hidden.reset(token)
+
+
+def _is_shown() -> bool:
+    """Return whether figures of pyplot are shown; selects a backend only for pyplot users."""
+    if _is_hidden.get():
+        return False
+    import matplotlib as mpl
+    from matplotlib.backends import BackendFilter, backend_registry
+
+    has_pyplot = "matplotlib.pyplot" in sys.modules
+    backend = mpl.get_backend(auto_select=has_pyplot)
+    if backend is None or backend.lower() in backend_registry.list_builtin(BackendFilter.NON_INTERACTIVE):
+        return False
+    if backend.lower() in backend_registry.list_builtin(BackendFilter.INTERACTIVE):
+        # Importing pyplot would load a GUI toolkit, and toolkits work in the main thread only.
+        return has_pyplot and threading.current_thread() is threading.main_thread()
+    return has_pyplot or _is_ipython()
+
+
+def _is_ipython() -> bool:
+    """Return whether the code runs in IPython."""
+    # Programs started from a notebook inherit its backend, but show no figures.
+    ipython = sys.modules.get("IPython")
+    return ipython is not None and ipython.get_ipython() is not None

@@ -1,0 +1,237 @@
+"""Plots and approximate colours of scenes, power maps and pictures."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim._core.validation import Floats, check_count
+from foveasim._io.encodings import encode_srgb_values
+from foveasim.errors import ParameterError
+from foveasim.fields import PowerMap, to_file_rows
+from foveasim.reconstruct import Picture
+from foveasim.scene import Scene
+from foveasim.sensor import rgb_filters
+from foveasim.view.figures import new_axes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["picture_pixels", "plot_picture", "plot_power_map", "plot_scene", "power_map_pixels", "scene_pixels"]
+
+#: Pixels along the longer side of a plot; larger rasters are averaged.
+PLOT_PIXELS = 1600
+#: Filter transmission below which bands have no colour, such as those of infrared.
+MIN_TRANSMISSION = 1e-3
+#: Units of the axes of scenes: the smallest in which the longer side is below a thousand.
+LENGTH_UNITS = (("µm", 1.0), ("mm", 1e3), ("m", 1e6), ("km", 1e9))
+
+
+def plot_scene(scene: Scene, *, ax: Axes | None = None, figure_inches: float = 8.0) -> Axes:
+    """
+    Draw a scene in approximate colours.
+
+    Parameters
+    ----------
+    scene : Scene
+    ax : matplotlib axes, optional
+        New axes by default.
+    figure_inches : float
+        Longer side of a new figure.
+
+    Returns
+    -------
+    matplotlib axes
+        In the plane of the scene, centred on the optical axis. The colours are those of a camera with generic RGB filters
+        (:func:`foveasim.rgb_filters`), balanced for equal radiance in all bands, sRGB-encoded; grey outside the visible range.
+    """
+    n_y, n_x = scene.basis.shape[1:]
+    width_um, height_um = n_x * scene.pitch_um, n_y * scene.pitch_um
+    unit, um = next((u for u in LENGTH_UNITS if max(width_um, height_um) < 1e3 * u[1]), LENGTH_UNITS[-1])
+    half_x, half_y = 0.5 * width_um / um, 0.5 * height_um / um
+    ax = new_axes(figure_inches, height_um / width_um) if ax is None else ax
+    ax.imshow(scene_pixels(scene, PLOT_PIXELS), extent=(-half_x, half_x, -half_y, half_y))
+    ax.set(xlabel=f"x / {unit}", ylabel=f"y / {unit}")
+    return ax
+
+
+def plot_power_map(
+    power_map: PowerMap, band: int | None = None, *, ax: Axes | None = None, figure_inches: float = 8.0
+) -> Axes:
+    """
+    Draw the irradiance of a power map.
+
+    Parameters
+    ----------
+    power_map : PowerMap
+    band : int, optional
+        Index of a wavelength band; by default the sum of all bands.
+    ax : matplotlib axes, optional
+        New axes by default.
+    figure_inches : float
+        Longer side of a new figure.
+
+    Returns
+    -------
+    matplotlib axes
+        In µm, with a colour bar in W/m².
+
+    Raises
+    ------
+    ParameterError
+        When there is no such band.
+    """
+    n_bands = power_map.data.shape[0]
+    if band is not None:
+        band = check_count("band", band, at_least=0, at_most=n_bands - 1)
+    shown = power_map.data if band is None else power_map.data[band : band + 1]
+    irradiance_w_m2 = block_means(shown, PLOT_PIXELS).sum(axis=0)
+    label = "irradiance / (W/m²)" if band is None else f"irradiance at {power_map.wavelength_nm[band]:g} nm / (W/m²)"
+    return _draw_values(to_file_rows(irradiance_w_m2), power_map.grid.bounds_um, label, "viridis", ax, figure_inches)
+
+
+def plot_picture(
+    picture: Picture,
+    white: float | Floats | None = None,
+    *,
+    encode_srgb: bool = False,
+    channel: int | None = None,
+    ax: Axes | None = None,
+    figure_inches: float = 8.0,
+) -> Axes:
+    """
+    Draw a picture.
+
+    Parameters
+    ----------
+    picture : Picture
+    white, encode_srgb
+        Of colour pictures, as for :meth:`foveasim.Picture.to_image`.
+    channel : int, optional
+        Draws the values of one channel, with a colour bar, as for pictures of one channel. Required for pictures of neither
+        1 nor 3 channels.
+    ax : matplotlib axes, optional
+        New axes by default.
+    figure_inches : float
+        Longer side of a new figure.
+
+    Returns
+    -------
+    matplotlib axes
+        In µm; transparent where no photosite lies.
+
+    Raises
+    ------
+    ParameterError
+        When there is no such channel, or as for :meth:`foveasim.Picture.to_image`.
+    """
+    n_channels = picture.data.shape[0]
+    if n_channels == 3 and channel is None:
+        x0, y0, x1, y1 = picture.grid.bounds_um
+        ax = new_axes(figure_inches, (y1 - y0) / (x1 - x0)) if ax is None else ax
+        ax.imshow(picture.to_image(white, encode_srgb=encode_srgb), extent=(x0, x1, y0, y1))
+        ax.set(xlabel="x / µm", ylabel="y / µm")
+        return ax
+    if n_channels > 1 and channel is None:
+        raise ParameterError("channel", f"must be given for a picture of {n_channels} channels")
+    channel = check_count("channel", 0 if channel is None else channel, at_least=0, at_most=n_channels - 1)
+    values = to_file_rows(picture.data[channel])
+    return _draw_values(values, picture.grid.bounds_um, "value", "gray", ax, figure_inches)
+
+
+def _draw_values(
+    values: NDArray[Any],
+    bounds_um: tuple[float, float, float, float],
+    label: str,
+    colour_map: str,
+    ax: Axes | None,
+    figure_inches: float,
+) -> Axes:
+    """Draw values, top row first, with a colour bar."""
+    x0, y0, x1, y1 = bounds_um
+    ax = new_axes(figure_inches, (y1 - y0) / (x1 - x0)) if ax is None else ax
+    image = ax.imshow(values, cmap=colour_map, extent=(x0, x1, y0, y1))
+    ax.figure.colorbar(image, ax=ax, label=label, shrink=0.8, aspect=30.0, pad=0.02)
+    ax.set(xlabel="x / µm", ylabel="y / µm")
+    return ax
+
+
+# -- pixels of thumbnails and plots ---------------------------------------------------------------------------------------
+
+
+def scene_pixels(scene: Scene, max_pixels: int) -> NDArray[np.uint8]:
+    """
+    Return approximate colours of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    max_pixels : int
+        Pixels along the longer side, at most; larger scenes are averaged.
+
+    Returns
+    -------
+    pixels : (n_y, n_x, 3) uint8
+        sRGB-encoded, top row first; white is the brightest value.
+    """
+    weights = scene.spectrum_w_m2_sr_nm @ _colour_weights(scene.wavelength_nm)
+    return _encode(np.tensordot(weights, block_means(scene.basis, max_pixels), (0, 0)))
+
+
+def power_map_pixels(power_map: PowerMap, max_pixels: int) -> NDArray[np.uint8]:
+    """Return approximate colours of a power map, as :func:`scene_pixels`."""
+    weights = _colour_weights(power_map.wavelength_nm)
+    return _encode(np.tensordot(weights, block_means(power_map.data, max_pixels), (0, 0)))
+
+
+def picture_pixels(picture: Picture, max_pixels: int) -> NDArray[np.uint8]:
+    """
+    Return a picture as :meth:`foveasim.Picture.to_image`, averaged to a smaller size.
+
+    Pictures of neither 1 nor 3 channels are shown as the mean of their channels. The result is (n_y, n_x, 2 or 4) uint8, with
+    alpha.
+    """
+    data, coverage = block_means(picture.data, max_pixels), block_means(picture.coverage[np.newaxis], max_pixels)[0]
+    if data.shape[0] not in (1, 3):
+        data = data.mean(axis=0, keepdims=True)
+    return np.asarray(Picture(data, coverage, picture.grid).to_image(), np.uint8)
+
+
+def block_means(images: NDArray[Any], max_pixels: int) -> NDArray[Any]:
+    """
+    Return images (n, n_y, n_x) averaged over square blocks.
+
+    The longer side of the result has at most ``max_pixels``. NaN means missing data. The remainder at the end of rows and
+    columns, less than a block, is omitted.
+    """
+    n_images, n_y, n_x = images.shape
+    side = -(-max(n_y, n_x) // max_pixels)
+    if side == 1:
+        return images
+    side_y, side_x = min(side, n_y), min(side, n_x)
+    n_y, n_x = n_y // side_y, n_x // side_x
+    blocks = images[:, : n_y * side_y, : n_x * side_x].reshape(n_images, n_y, side_y, n_x, side_x)
+    means = blocks.mean(axis=(2, 4))
+    if np.isnan(means).any():
+        has_data = ~np.isnan(blocks)
+        count = has_data.sum(axis=(2, 4))
+        with np.errstate(invalid="ignore"):
+            means = np.where(has_data, blocks, 0.0).sum(axis=(2, 4)) / np.where(count, count, np.nan)
+    return np.asarray(means, images.dtype)
+
+
+def _colour_weights(wavelength_nm: Floats) -> Floats:
+    """Return weights of the bands in red, green and blue, (n_wavelength, 3)."""
+    transmission = rgb_filters().transmission(wavelength_nm)
+    total = transmission.sum(axis=1, keepdims=True)
+    if wavelength_nm.size == 1 or total.min() < MIN_TRANSMISSION:
+        return np.full((wavelength_nm.size, 3), 1.0 / wavelength_nm.size)
+    return np.asarray((transmission / total).T)
+
+
+def _encode(rgb: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return linear channels (3, n_y, n_x) as sRGB pixels, top row first."""
+    fraction = np.clip(rgb / (float(rgb.max(initial=0.0)) or 1.0), 0.0, 1.0)
+    return np.ascontiguousarray(np.rint(255.0 * to_file_rows(encode_srgb_values(fraction))).astype(np.uint8))
