@@ -52,6 +52,7 @@ def check_arguments(call: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(call)
     def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        __tracebackhide__ = True  # in the tracebacks of IPython and pytest
         try:
             return call(*args, **kwargs)
         except TypeError as error:
@@ -149,7 +150,7 @@ def _name_of(call: Callable[..., Any]) -> str:
 
 
 def _format_signature(name: str, parameters: list[inspect.Parameter]) -> str:
-    """Return a signature: all required parameters, and as many optional ones as fit."""
+    """Return a signature: required parameters, and as many optional ones as fit."""
     parts: list[str] = []
     is_shortened = False
     for k, parameter in enumerate(parameters):

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Bools, Floats, check_number
 from foveasim.distortion._lens import LensBase
@@ -82,6 +83,8 @@ class BrownConrady(LensBase):
     p1: float = 0.0
     p2: float = 0.0
     centre_um: tuple[float, float] = (0.0, 0.0)
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         for name in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"):

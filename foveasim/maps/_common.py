@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import (
     Floats,
     Images,
@@ -72,6 +73,8 @@ class Found:
     wavelength_nm: Sequence[float] | None = None
     band_width_nm: Sequence[float] | None = None
     unit: str | None = None
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

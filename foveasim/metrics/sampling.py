@@ -172,10 +172,8 @@ class EccentricityTable:
     growth_fraction: float
 
     def __repr__(self) -> str:
-        return (
-            f"EccentricityTable({self.n_sites.size} rings from {self.edges_um[0]:.4g} to {self.edges_um[-1]:.4g} µm, "
-            f"{int(self.n_sites.sum()):,} photosites)"
-        )
+        n_rings, n_sites = self.n_sites.size, int(self.n_sites.sum())
+        return f"EccentricityTable({n_rings} rings up to {self.edges_um[-1]:.4g} µm, {n_sites:,} photosites)"
 
     @property
     def e2_um(self) -> float:

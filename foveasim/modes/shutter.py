@@ -139,6 +139,9 @@ class Exposure:
         self._rate_e_per_s: Floats = np.zeros(1)
         self._weight: Floats = np.zeros(1)
 
+    def __repr__(self) -> str:
+        return f"Exposure({self.exposure_s:.6g} s, {self._n_added} of {self._last + 1} frames added)"
+
     @property
     def is_complete(self) -> bool:
         """Whether all frames that overlap the exposure have been added."""

@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import (
     Floats,
     as_numbers,
@@ -153,6 +154,8 @@ class Zernike:
     index: Literal["noll", "osa"] = "noll"
     unit: Literal["um", "waves"] = "um"
     wavelength_nm: float | Sequence[float] | None = None
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         check_choice("index", self.index, ("noll", "osa"))
@@ -293,6 +296,8 @@ class LateralColour:
 
     wavelength_nm: Sequence[float]
     magnification: Sequence[float]
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         waves_nm = wavelengths_nm("wavelength_nm", self.wavelength_nm)

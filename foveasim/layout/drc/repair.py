@@ -9,6 +9,7 @@ from typing import Literal, TypeAlias, get_args
 import numpy as np
 import shapely
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Ints, check_choice
 from foveasim.errors import GeometryError
 from foveasim.layout.drc.rules import RULES, DesignRules, Report, RuleResult
@@ -41,6 +42,8 @@ class Change:
     rule: str
     action: Literal["dropped", "merged", "replaced"]
     site_ids: tuple[int, ...]
+
+    __repr__ = short_repr
 
 
 def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> tuple[Layout, tuple[Change, ...]]:

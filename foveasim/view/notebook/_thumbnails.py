@@ -27,8 +27,9 @@ MIN_PIXELS = 8
 MIN_SITE_PIXELS = 6.0
 #: Relative difference of areas below which sites have equal sizes.
 SIZE_ROUNDING = 1e-3
-#: Radius and width of the circle around a violation, in pixels; pictures are drawn larger by a factor and then reduced.
-CIRCLE_PIXELS, LINE_PIXELS, DRAWING_SCALE = 5, 1.5, 3
+#: Radius of the circle around a violation by the number of violations, and width of its line, in pixels. Pictures are drawn
+#: larger by a factor and then reduced.
+CIRCLE_PIXELS, LINE_PIXELS, DRAWING_SCALE = ((50, 5), (500, 3), (math.inf, 1)), 1.5, 3
 
 
 def encode_png(pixels: NDArray[np.uint8], max_bytes: int = MAX_BYTES) -> tuple[bytes, tuple[int, int]]:
@@ -119,8 +120,9 @@ def report_thumbnail(report: Report, alt: str) -> Html:
     image = Image.fromarray(_site_pixels(layout, colours_of(layout), DRAWING_SCALE))
     draw = ImageDraw.Draw(image)
     x0, y0, x1, y1 = layout.bounds_um
-    radius = CIRCLE_PIXELS * DRAWING_SCALE
     violated = [result for result in report.results if len(result)]
+    n_violations = sum(map(len, violated))
+    radius = DRAWING_SCALE * next(pixels for limit, pixels in CIRCLE_PIXELS if n_violations <= limit)
     for k, result in enumerate(violated):
         markers = np.array([violation.marker for violation in result.worst_violations(MAX_SHOWN)], dtype=object)
         centre_um = shapely.get_coordinates(shapely.centroid(markers))
