@@ -14,7 +14,7 @@ Errors and warnings of foveasim.
     FoveasimWarning (UserWarning)
     ├── SamplingWarning                  the sampling is too coarse for the physics
     ├── CoverageWarning                  image and layout differ in size: photosites outside, or a small part
-    └── LayoutWarning                    a layout covers less of its field than its parameters specify
+    └── LayoutWarning                    a layout that differs from its parameters, or its file from the layout
 
 Each message gives the name of the parameter or the path of the file, the rule, the value and a hint.
 """
@@ -123,7 +123,7 @@ class CoverageWarning(FoveasimWarning):
 
 
 class LayoutWarning(FoveasimWarning):
-    """A generated layout that covers less of its field than its parameters specify."""
+    """A layout that covers less of its field than specified, or a file with rounded outlines."""
 
 
 def _restore(kind: type[FoveasimError], args: tuple[Any, ...], state: dict[str, Any]) -> FoveasimError:

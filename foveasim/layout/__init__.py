@@ -13,7 +13,16 @@ from foveasim.layout.drc.routing import Readout, Routing, track_demand
 from foveasim.layout.drc.rules import DesignRules, Report, RuleResult, Violation, min_width_um
 from foveasim.layout.edits import clip, cut_out, inset, merge, merge_small, node, snap, split, union
 from foveasim.layout.families import LAYOUTS, layout_family
-from foveasim.layout.files import FORMATS, FileFormat, WrittenLayout, bundled_layouts, read_layout, write_layout
+from foveasim.layout.files import (
+    DERIVED_LAYERS,
+    FORMATS,
+    FileFormat,
+    WrittenLayout,
+    bundled_layouts,
+    read_layer_map,
+    read_layout,
+    write_layout,
+)
 from foveasim.layout.generators.foveal_cartesian import foveal_cartesian
 from foveasim.layout.generators.fovi import fovi
 from foveasim.layout.generators.giotto import giotto, giotto_ratio
@@ -32,6 +41,7 @@ from foveasim.layout.readout import nearest_bus, readout_by, readout_order
 from foveasim.layout.summary import Summary, describe
 
 __all__ = [
+    "DERIVED_LAYERS",
     "FORMATS",
     "LAYOUTS",
     "MOSAICS",
@@ -77,6 +87,7 @@ __all__ = [
     "penrose",
     "quadtree",
     "random_channels",
+    "read_layer_map",
     "read_layout",
     "readout_by",
     "readout_order",

@@ -7,8 +7,8 @@ extension      format              preserved by a round trip
 .npz           numpy arrays        everything, bit for bit
 .parquet       GeoParquet          everything, bit for bit; small files
 .geojson       GeoJSON             everything; columns of numbers and strings only
-.gds, .oas     GDSII, OASIS        outlines on the database grid, order of the sites, ``channel``; columns of numbers,
-                                   exactly and as 64-bit types, of booleans and of short strings
+.gds, .oas     GDSII, OASIS        outlines on the database grid, order of the sites; columns of numbers, exactly and as
+                                   64-bit types, of booleans and of short strings
 .svg           SVG                 nothing: a drawing, write-only
 =============  ==================  =================================================================================
 
@@ -18,9 +18,9 @@ its content, not from its extension. A corrupt, truncated or malformed file rais
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from foveasim._core.registry import import_all
 from foveasim._io.formats import FileFormat, detect_format, select_writer, validate_options
@@ -28,23 +28,38 @@ from foveasim.errors import FileError
 from foveasim.layout.files._bundled import bundled_layouts, layout_path
 from foveasim.layout.files._common import WrittenLayout
 from foveasim.layout.files._formats import FORMATS
+from foveasim.layout.files._layers import DERIVED_LAYERS, read_layer_map
 from foveasim.layout.model import Layout
 
 __all__ = [
+    "DERIVED_LAYERS",
     "FORMATS",
     "FileFormat",
     "WrittenLayout",
     "bundled_layouts",
     "check_no_options",
     "layout_path",
+    "read_layer_map",
     "read_layout",
     "write_layout",
 ]
 
 import_all(__name__, __path__)
 
+#: Layers of photosites: a number, with datatype, or several.
+LayerChoice: TypeAlias = int | str | tuple[int, int] | Sequence[int | str | tuple[int, int]]
 
-def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None = None, **options: Any) -> Layout:
+
+def read_layout(
+    path: str | Path,
+    *,
+    layer: LayerChoice | None = None,
+    cell: str | None = None,
+    layers: Mapping[str, Any] | str | Path | None = None,
+    channels: Mapping[Any, int | str] | None = None,
+    filter_names: Sequence[str] | None = None,
+    **options: Any,
+) -> Layout:
     """
     Read the photosites of a layout file.
 
@@ -54,23 +69,32 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
     ----------
     path : path
         GDSII, OASIS, npz, GeoJSON or GeoParquet, detected by content. Coordinates of GeoJSON and GeoParquet are in µm.
-    layer : int, optional
-        GDSII and OASIS: layer of the photosites; required where several layers contain shapes.
+    layer : int, (int, int), str or list of these, optional
+        GDSII and OASIS: layer of the photosites, ``77``, with datatype ``(77, 3)`` or ``"77/3"``, or several. By default the
+        layer of the photosites of a file that foveasim wrote; required for other files with shapes on several layers.
     cell : str, optional
         GDSII and OASIS: cell to read, with its complete cell hierarchy; required where there are several top cells.
+    layers : mapping or path, optional
+        GDSII and OASIS: layer map as for :func:`write_layout`. Its filter layers give the channels.
+    channels : mapping, optional
+        GDSII and OASIS: channels of filter layers, as numbers or names: ``{(10, 0): "R", "11/0": 1}``. The shape that covers a
+        photosite gives its channel.
+    filter_names : sequence of str, optional
+        GDSII and OASIS: names of the channels 0, 1, ..., such as ``filters.names``; by default R, G, B, W.
     **options
         Options of other formats in :data:`foveasim.layout.files.FORMATS`.
 
     Returns
     -------
     Layout
-        Layout with the sites in the order in which they were written. For GDSII and OASIS, the column ``channel`` is the
-        datatype, and the other columns are those with a value for every site.
+        Layout with the sites in the order in which they were written. For GDSII and OASIS, the columns are those with a value
+        for every site, and ``channel`` follows from filter layers, from the file, or from several datatypes.
 
     Raises
     ------
     FileError
-        When the file is missing, corrupt, truncated, too large, or not a layout.
+        When the file is missing, corrupt, truncated, too large, or not a layout, or a photosite has no filter although
+        channels of filter layers are given.
     ParameterError
         When an option does not belong to the file's format.
     """
@@ -79,7 +103,8 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
         raise FileError(path, "no such file; foveasim.read_layout reads the bundled layout of this name")
     _, found = detect_format(path, FORMATS, "layout file")
     assert found.read is not None
-    chosen = validate_options({"layer": layer, "cell": cell, **options}, found.read_options, FORMATS, "read_options")
+    given = {"layer": layer, "cell": cell, "layers": layers, "channels": channels, "filter_names": filter_names}
+    chosen = validate_options(given | options, found.read_options, FORMATS, "read_options")
     layout: Layout = found.read(path, **chosen)
     return layout
 
@@ -100,8 +125,11 @@ def write_layout(
     layout: Layout,
     path: str | Path,
     *,
-    layer: int | None = None,
+    layer: LayerChoice | None = None,
+    layers: Mapping[str, Any] | str | Path | None = None,
+    filter_names: Sequence[str] | None = None,
     dbu_um: float | None = None,
+    hierarchy: bool | None = None,
     colours: Mapping[int, str] | None = None,
     **options: Any,
 ) -> WrittenLayout:
@@ -113,11 +141,21 @@ def write_layout(
     layout : Layout
     path : path
         The extension selects the format: ``.gds``, ``.oas``, ``.npz``, ``.geojson``, ``.parquet`` or ``.svg``.
-    layer : int, optional
-        GDSII and OASIS: layer of the photosites, by default 1.
+    layer : int, (int, int) or str, optional
+        GDSII and OASIS: layer of the photosites, by default 1, with the channel as datatype. ``(77, 3)`` or ``"77/3"`` sets the
+        datatype; the channel is then a column.
+    layers : mapping or path, optional
+        GDSII and OASIS: layer map, or its YAML file: the layer of the outlines, ``"photosite": (77, 3)``, of colour filters,
+        ``"filter_R": (10, 0)`` or ``"filter_0": (10, 0)``, and of shapes derived from the outlines by the functions
+        :data:`foveasim.layout.DERIVED_LAYERS`, ``"well": {"layer": (20, 0), "inset_um": 0.2}``.
+    filter_names : sequence of str, optional
+        GDSII and OASIS: names of the channels 0, 1, ..., such as ``filters.names``; by default R, G, B, W.
     dbu_um : float, optional
-        GDSII and OASIS: database unit in µm; vertices are rounded to its multiples. The default 1e-4, a tenth of a
-        nanometre, allows coordinates up to 214 mm.
+        GDSII and OASIS: database unit in µm; vertices are rounded to its multiples. The default 1e-3, one nanometre, moves
+        them by at most 0.71 nm.
+    hierarchy : bool, optional
+        GDSII and OASIS: whether congruent sites are references to a cell, and regular ones arrays, by default True. Otherwise
+        each site is a polygon in the top cell.
     colours : mapping of int to str, optional
         SVG: colour of each channel, such as ``{0: "#c23b22", 1: "green"}``; other channels are grey.
     **options
@@ -135,7 +173,12 @@ def write_layout(
     ParameterError
         When an option does not belong to the format, or the format does not support a column or a channel.
     GeometryError
-        When sites collapse or self-intersect on the database grid.
+        When sites, or shapes derived from them, vanish, collapse or self-intersect on the database grid.
+
+    Warns
+    -----
+    LayoutWarning
+        When rounding moves a vertex by more than 1 nm.
 
     Examples
     --------
@@ -147,7 +190,15 @@ def write_layout(
     path = Path(path)
     found = select_writer(path, FORMATS)
     assert found.write is not None
-    given = {"layer": layer, "dbu_um": dbu_um, "colours": colours, **options}
+    given = {
+        "layer": layer,
+        "layers": layers,
+        "filter_names": filter_names,
+        "dbu_um": dbu_um,
+        "hierarchy": hierarchy,
+        "colours": colours,
+        **options,
+    }
     written: WrittenLayout = found.write(
         layout, path, **validate_options(given, found.write_options, FORMATS, "write_options")
     )

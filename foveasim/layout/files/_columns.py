@@ -6,22 +6,24 @@ They are used by formats with shape properties but without tables.
 A string consists of words such as ``ring=3 gain=0.25 is_dead=true name="a"``: a key, and a value. A value is a number with
 the digits required for an exact round trip, a boolean, or a string quoted as in JSON, with blanks as \u0020. A key is a
 plain name, or any other name quoted in the same way. Strings that are read are parsed and never evaluated.
+
+An array of sites has one string. In it, ``row=2+1j`` and ``column=0+1i`` are integers that change by 1 from row to row (index
+j) and from column to column (index i); other values are those of all sites of the array.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.validation import Bools, exact_integers
-from foveasim.layout.model import Layout
+from foveasim._core.validation import Bools, Ints, exact_integers
 
-__all__ = ["CHANNEL", "MAX_COLUMN_BYTES", "column_strings", "parse_columns", "storable_columns"]
+__all__ = ["CHANNEL", "MAX_COLUMN_BYTES", "column_strings", "linear_text", "parse_columns", "storable_columns"]
 
 #: Column that GDSII and OASIS store as the datatype.
 CHANNEL = "channel"
@@ -38,6 +40,7 @@ PLAIN_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.:-]*")
 #: Escapes of blanks and equal signs in quoted strings.
 ESCAPES = str.maketrans({" ": "\\u0020", "=": "\\u003d"})
 BOOLEANS = {b"true": True, b"false": False}
+LINEAR = re.compile(rb"(-?[0-9]+)(?:([+-][0-9]+)i)?(?:([+-][0-9]+)j)?")
 QUOTED = re.compile(rb'"(?:[^"\\]|\\.)*"')
 _VALUE = re.compile(rb"=\S*")
 
@@ -46,15 +49,23 @@ _VALUE = re.compile(rb"=\S*")
 
 
 def storable_columns(
-    layout: Layout, max_chars: int, max_strings: int = MAX_STRINGS
+    columns: Mapping[str, NDArray[Any]],
+    first: Ints,
+    steps: Mapping[str, Ints],
+    max_chars: int | Ints,
+    max_strings: int = MAX_STRINGS,
 ) -> tuple[dict[str, list[Any]], tuple[str, ...]]:
     """
-    Return the columns that fit into one string per site, except the channel.
+    Return the columns that fit into one string per site or array of sites.
 
     Parameters
     ----------
-    layout : Layout
-    max_chars : int
+    columns : mapping of str to (n_site,) arrays
+    first : (n,) int64
+        The site, or the first site of the array, of each string.
+    steps : mapping of str to (n, 2) int64
+        Differences of the values of successive columns and rows of an array.
+    max_chars : int or (n,) int64
         Maximum length of a string.
     max_strings : int
         Maximum number of distinct string values of a column.
@@ -68,19 +79,24 @@ def storable_columns(
     """
     stored: dict[str, list[Any]] = {}
     dropped = []
-    n_chars = np.full(layout.n_sites, -1)
-    for name, column in layout.columns.items():
-        if name == CHANNEL:
-            continue
-        values = _values(column) if layout.n_sites and len(stored) < MAX_COLUMNS else None
+    n_chars = np.full(first.size, -1)
+    for name, column in columns.items():
+        values = _values(column[first]) if first.size and len(stored) < MAX_COLUMNS else None
         if values is not None:
+            for k in np.flatnonzero(steps[name].any(axis=1)).tolist():
+                values[k] = linear_text(values[k], *steps[name][k].tolist())
             key = name if PLAIN_NAME.fullmatch(name) else _quote(name)
             longer = n_chars + len(key) + 2 + np.fromiter(map(len, map(str, values)), np.int64, len(values))
-            if longer.max() <= max_chars and len({v for v in values if isinstance(v, str)}) <= max_strings:
+            if (longer <= max_chars).all() and len({v for v in values if isinstance(v, str)}) <= max_strings:
                 stored[key], n_chars = values, longer
                 continue
         dropped.append(name)
     return stored, tuple(sorted(dropped))
+
+
+def linear_text(start: int, step_i: int, step_j: int) -> str:
+    """Return an integer that changes from column to column and from row to row of an array."""
+    return f"{start}" + (f"{step_i:+d}i" if step_i else "") + (f"{step_j:+d}j" if step_j else "")
 
 
 def column_strings(stored: dict[str, list[Any]]) -> list[str]:
@@ -127,7 +143,7 @@ def _quote(text: str) -> str:
 # -- reading ----------------------------------------------------------------------------------------------------------
 
 
-def parse_columns(lines: bytes) -> dict[str, NDArray[Any]]:
+def parse_columns(lines: bytes) -> dict[str, tuple[NDArray[Any], Ints | None]]:
     """
     Return the columns that every string contains.
 
@@ -135,12 +151,19 @@ def parse_columns(lines: bytes) -> dict[str, NDArray[Any]]:
     ----------
     lines : bytes
         One string per line, in printable ASCII; untrusted.
+
+    Returns
+    -------
+    columns : dict of str to (values, steps)
+        One value per line, and for integers that change within arrays their steps, (n_line, 2) int64.
     """
-    columns: dict[str, NDArray[Any]] = {}
+    columns: dict[str, tuple[NDArray[Any], Ints | None]] = {}
     for key, values in (_parse_uniform_lines(lines) or _parse_mixed_lines(lines)).items():
-        name, column = _name(key), _column(values)
-        if name is not None and column is not None and name != CHANNEL:
-            columns[name] = column
+        name, column, steps = _name(key), _column(values), None
+        if column is None:
+            column, steps = _linear_integers(values)
+        if name is not None and column is not None:
+            columns[name] = (column, steps)
     return columns
 
 
@@ -207,6 +230,18 @@ def _numbers(values: Sequence[bytes]) -> NDArray[Any] | None:
         return exact_integers(list(map(int, values)))
     except ValueError:
         return np.array(list(map(float, values)))
+
+
+def _linear_integers(values: Sequence[bytes]) -> tuple[NDArray[Any] | None, Ints | None]:
+    """Return integers and their steps within arrays, or None for other values."""
+    matches = list(map(LINEAR.fullmatch, values))
+    if not all(matches):
+        return None, None
+    try:
+        table = np.array([[int(number or 0) for number in match.groups()] for match in matches if match], np.int64)
+    except (OverflowError, ValueError):
+        return None, None
+    return table[:, 0], table[:, 1:]
 
 
 def _strings(values: Sequence[bytes]) -> NDArray[Any] | None:

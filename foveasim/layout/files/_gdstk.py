@@ -24,12 +24,16 @@ KLAYOUT_METADATA = "$$$CONTEXT_INFO$$$"
 #: Number of names in a message.
 MAX_LISTED = 5
 #: Memory in bytes per vertex and per polygon while cells are flattened: source, copies and concatenation.
-VERTEX_BYTES, POLYGON_BYTES = 48, 192
+VERTEX_BYTES, POLYGON_BYTES = 48, 208
 #: Limit of the polygons copied between cells, as a multiple of the maximum number of sites.
 MAX_COPY_RATIO = 2
 #: Attributes of the GDSII properties for the number of a photosite and for its columns.
 NUMBER_PROPERTY, COLUMNS_PROPERTY = 1, 2
 NUMBER = re.compile(r"photosite ([0-9]{1,9})(?: part ([0-9]{1,9}) of ([0-9]{1,9}))?\0*")
+#: Numbers of the sites of an array: that of its first site, steps from column to column and row to row, columns and rows.
+NUMBERS = re.compile(
+    r"photosites ([0-9]{1,9})(?:([+-][0-9]{1,9})i)?(?:([+-][0-9]{1,9})j)? of ([0-9]{1,9})x([0-9]{1,9})\0*"
+)
 MAX_SITE = 10**9
 #: Maximum number of names and values of a shape's columns, and maximum length of their string.
 MAX_WORDS = 128
@@ -49,9 +53,9 @@ class Shapes:
     xy : (n_vertex, 2) float64, in database units
     counts : (n,) int64
         Vertices of each polygon.
-    tags : (n, 7) int64
+    tags : (n, 8) int64
         Layer, datatype, photosite (-1: unknown), part and number of parts (0: undivided), placement of the cell, line of
-        its columns in the text of all columns (-1: none).
+        its columns in the text of all columns (-1: none), index in its array (column + 2^32 row).
     n_placements : int
         Number of placements of the cell.
     """
@@ -73,13 +77,41 @@ class Shapes:
         tags[:, 5] += np.repeat(np.arange(k) * self.n_placements, len(self.tags))
         return Shapes(xy, np.tile(self.counts, k), tags, k * self.n_placements)
 
+    def place_sites(
+        self, matrix: NDArray[np.float64], offsets: NDArray[np.float64], identity: NDArray[np.int64]
+    ) -> Shapes:
+        """Return copies that are different sites: photosite, line and index in the array per copy, (n, 3)."""
+        import numpy as np
+
+        copies = self.place(matrix, offsets)
+        copies.tags[:, 5] = 0
+        own = np.repeat(identity, len(self.tags), axis=0)
+        copies.tags[:, 2] = np.where(copies.tags[:, 2] < 0, -1, own[:, 0])
+        copies.tags[:, 6:] = own[:, 1:]
+        return Shapes(copies.xy, copies.counts, copies.tags, 0)
+
+    def is_site(self) -> bool:
+        """Return whether the shapes are those of one site, so that copies are numbered."""
+        return self.n_placements == 1 and self.tags.size > 0 and bool((self.tags[:, 2] <= 0).all())
+
+    def select(self, chosen: NDArray[np.bool_]) -> Shapes:
+        """Return the chosen shapes."""
+        import numpy as np
+
+        if chosen.all():
+            return self
+        return Shapes(
+            self.xy[np.repeat(chosen, self.counts)], self.counts[chosen], self.tags[chosen], self.n_placements
+        )
+
 
 def read(
     path: str,
     *,
     limit: Callable[[str, int], None],
     is_oasis: bool,
-    layer: int | None,
+    layers: list[tuple[int, int | None]] | None,
+    filters: list[tuple[int, int | None]],
     cell: str | None,
     max_sites: int,
     max_memory_bytes: int,
@@ -95,17 +127,22 @@ def read(
     limit : callable
         Function that sets limits of memory and processor time. Tighter limits apply while gdstk reads the file.
     is_oasis : bool
-    layer, cell : optional
-        Layer and cell selected by the user.
+    layers : list of (layer, datatype), optional
+        Layers of the photosites; a datatype of None stands for all.
+    filters : list of (layer, datatype)
+        Layers of the colour filters.
+    cell : str, optional
+        Cell selected by the user.
     max_sites, max_memory_bytes, max_text_bytes, max_cpu_s : int
         Limits of the flattened content.
 
     Returns
     -------
     about : dict
-        Database unit ``dbu_um`` and name ``cell``.
+        Database unit ``dbu_um``, name ``cell``, and ``layers`` of the photosites.
     arrays : list
-        ``xy`` in database units, ``counts``, ``tags`` (see :class:`Shapes`), and the text of all columns.
+        ``xy`` in database units, ``counts``, ``tags`` (see :class:`Shapes`) of the photosites, the text of their columns, and
+        the same three arrays of the filters.
 
     Raises
     ------
@@ -126,7 +163,9 @@ def read(
     cells = {cell.name: cell for cell in library.cells}
     top = _top_cell(cells, cell)
     order = _post_order(cells, top)
-    _check_numbers(cells, order, max_sites, max_memory_bytes)
+    layers = _layers_of_sites(cells, order, layers)
+    is_read = _Selection([*layers, *filters])
+    _check_numbers(cells, order, is_read, max_sites, max_memory_bytes)
     # Memory and time of the following steps are bounded.
     limit("RLIMIT_AS", max_memory_bytes)
     limit("RLIMIT_CPU", max_cpu_s)
@@ -134,13 +173,79 @@ def read(
     lines: list[str] = []
     last_use = {child: name for name in order for child in _children(cells, name)}
     for name in order:
-        flat[name] = _flatten(cells[name], flat, lines, library.unit * 1e6, dbu_um)
+        flat[name] = _flatten(cells[name], flat, lines, is_read, library.unit * 1e6, dbu_um)
         for child in _children(cells, name):
             if last_use[child] == name:
                 del flat[child]
-    shapes = _select_layer(flat[top], layer)
-    text = _column_lines(shapes, lines, max_text_bytes)
-    return {"dbu_um": dbu_um, "cell": top}, [shapes.xy, shapes.counts, shapes.tags, text]
+    sites, covers = (flat[top].select(_Selection(chosen).mask(flat[top].tags)) for chosen in (layers, filters))
+    text = _column_lines(sites, lines, max_text_bytes)
+    about = {"dbu_um": dbu_um, "cell": top, "layers": layers}
+    return about, [sites.xy, sites.counts, sites.tags, text, covers.xy, covers.counts, covers.tags]
+
+
+# -- layers -----------------------------------------------------------------------------------------------------------
+
+
+class _Selection:
+    """Set of layers; a datatype of None stands for all."""
+
+    def __init__(self, layers: list[tuple[int, int | None]]) -> None:
+        self.layers = [(number, kind) for number, kind in layers]
+        self.is_known: dict[tuple[int, int], bool] = {}
+
+    def __call__(self, layer: int, datatype: int) -> bool:
+        """Return whether a layer is in the set."""
+        key = (layer, datatype)
+        if key not in self.is_known:
+            self.is_known[key] = any(layer == n and kind in (None, datatype) for n, kind in self.layers)
+        return self.is_known[key]
+
+    def mask(self, tags: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which shapes are on the layers."""
+        import numpy as np
+
+        is_chosen = np.zeros(len(tags), bool)
+        for number, kind in self.layers:
+            is_chosen |= (tags[:, 0] == number) & ((tags[:, 1] == kind) if kind is not None else True)
+        return is_chosen
+
+
+def _layers_of_sites(
+    cells: dict[str, Any], order: list[str], wanted: list[tuple[int, int | None]] | None
+) -> list[tuple[int, int | None]]:
+    """
+    Return the layers of the photosites.
+
+    By default these are the layers of the shapes with numbers of photosites, or the only layer with shapes.
+    """
+    found: dict[tuple[int, int], bool] = {}
+    for name in order:
+        in_cell: dict[tuple[int, int], Any] = {}
+        for polygon in cells[name].polygons:
+            in_cell.setdefault((polygon.layer, polygon.datatype), polygon)
+        for path in cells[name].paths:
+            in_cell.update(dict.fromkeys(zip(path.layers, path.datatypes, strict=False)))
+        for key, polygon in in_cell.items():
+            found[key] = found.get(key, False) or (polygon is not None and _site(polygon)[0] >= 0)
+    if wanted is not None:
+        for number, kind in wanted:
+            if not any(number == n and kind in (None, d) for n, d in found):
+                text = f"{number}" if kind is None else f"{number}/{kind}"
+                raise FormatError(f"has no shape on layer {text}; its layers with shapes are {_format_layers(found)}")
+        return wanted
+    numbered = [key for key, is_numbered in found.items() if is_numbered]
+    layers = {number for number, _ in numbered} or {number for number, _ in found}
+    if len(layers) > 1:
+        raise FormatError(f"has shapes on several layers, {_format_layers(found)}; select one with layer=")
+    if numbered and any(number in layers and not is_numbered for (number, _), is_numbered in found.items()):
+        return [(number, kind) for number, kind in numbered]
+    return [(number, None) for number in layers]
+
+
+def _format_layers(found: Any) -> str:
+    shown = sorted(found)
+    texts = [f"{number}/{kind}" for number, kind in shown[:MAX_LISTED]]
+    return ", ".join(texts) + (", ..." if len(shown) > MAX_LISTED else "") if shown else "none"
 
 
 # -- cells ------------------------------------------------------------------------------------------------------------
@@ -192,7 +297,9 @@ def _children(cells: dict[str, Any], name: str) -> Iterator[str]:
         yield child
 
 
-def _check_numbers(cells: dict[str, Any], order: list[str], max_sites: int, max_memory_bytes: int) -> None:
+def _check_numbers(
+    cells: dict[str, Any], order: list[str], is_read: _Selection, max_sites: int, max_memory_bytes: int
+) -> None:
     """Reject a hierarchy that would flatten to too many sites or too much memory or time."""
     n_polygons: dict[str, int] = {}
     n_vertices: dict[str, int] = {}
@@ -201,24 +308,29 @@ def _check_numbers(cells: dict[str, Any], order: list[str], max_sites: int, max_
     for name in order:
         cell = cells[name]
         references = [(r.cell_name, _n_copies(r)) for r in cell.references]
-        own = sum(map(_n_copies, cell.polygons)) + sum(map(_n_copies, cell.paths))
+        own = sum(map(_n_copies, _polygons(cell, is_read))) + sum(map(_n_copies, cell.paths))
         n_polygons[name] = own + sum(k * n_polygons[c] for c, k in references)
         n_copied += n_polygons[name]
         # References to empty cells require time, too.
         if max(n_polygons[name], sum(k for _, k in references)) > max_sites or n_copied > MAX_COPY_RATIO * max_sites:
             raise FormatError(f"has more than the maximum of {max_sites} sites")
-        n_vertices[name] = _count_vertices(cell, max_vertices) + sum(k * n_vertices[c] for c, k in references)
+        n_vertices[name] = _count_vertices(cell, is_read, max_vertices) + sum(k * n_vertices[c] for c, k in references)
         if VERTEX_BYTES * n_vertices[name] + POLYGON_BYTES * n_polygons[name] > max_memory_bytes:
             raise FormatError("would flatten to more sites and vertices than the maximum for a file of its size")
 
 
-def _count_vertices(cell: Any, max_vertices: int) -> int:
+def _polygons(cell: Any, is_read: _Selection) -> list[Any]:
+    """Return the polygons of a cell on the layers that are read."""
+    return [polygon for polygon in cell.polygons if is_read(polygon.layer, polygon.datatype)]
+
+
+def _count_vertices(cell: Any, is_read: _Selection, max_vertices: int) -> int:
     """
     Count the vertices of a cell's polygons and paths.
 
     Counting stops when the number exceeds ``max_vertices``, as paths may have very many vertices.
     """
-    n = sum(p.size * _n_copies(p) for p in cell.polygons)
+    n = sum(p.size * _n_copies(p) for p in _polygons(cell, is_read))
     for path in cell.paths:
         if n > max_vertices:
             break
@@ -249,28 +361,41 @@ def _has_shapes(cell: Any) -> bool:
     return bool(cell.polygons or cell.paths)
 
 
-def _flatten(cell: Any, flat: dict[str, Shapes], lines: list[str], unit_um: float, dbu_um: float) -> Shapes:
+def _flatten(
+    cell: Any, flat: dict[str, Shapes], lines: list[str], is_read: _Selection, unit_um: float, dbu_um: float
+) -> Shapes:
     """
     Return the polygons of a cell and its hierarchy, in database units.
 
-    The column strings of the polygons are appended to ``lines``.
+    The column strings of the polygons and of numbered references are appended to ``lines``.
     """
     import numpy as np
 
-    parts = [_own_shapes(cell, lines, unit_um, dbu_um)]
+    parts = [_own_shapes(cell, lines, is_read, unit_um, dbu_um)]
     n_placements = 1
     groups: dict[tuple[Any, ...], list[NDArray[np.float64]]] = {}
+    numbered: dict[tuple[Any, ...], tuple[list[NDArray[np.float64]], list[NDArray[np.int64]]]] = {}
     for r in cell.references:
         offsets = np.asarray(r.repetition.get_offsets(), dtype=np.float64).reshape(-1, 2)
         offsets = offsets if len(offsets) else np.zeros((1, 2))
         key = (r.cell_name, r.rotation or 0.0, r.magnification or 1.0, bool(r.x_reflection))
-        groups.setdefault(key, []).append(np.asarray(r.origin) + offsets)
-    for (name, angle_rad, magnification, is_mirrored), origins in groups.items():
-        matrix = _rotation(angle_rad) @ np.diag([magnification, -magnification if is_mirrored else magnification])
-        copies = flat[name].place(matrix, np.rint(np.concatenate(origins) * (unit_um / dbu_um)))
+        positions = np.asarray(r.origin) + offsets
+        identity = _site_numbers(r, offsets, len(lines)) if flat[r.cell_name].is_site() else None
+        if identity is None:
+            groups.setdefault(key, []).append(positions)
+        else:
+            lines.append(_columns(r))
+            places, identities = numbered.setdefault(key, ([], []))
+            places.append(positions)
+            identities.append(identity)
+    for (name, *transformation), origins in groups.items():
+        copies = flat[name].place(_matrix(*transformation), np.rint(np.concatenate(origins) * (unit_um / dbu_um)))
         copies.tags[:, 5] += n_placements
         n_placements += copies.n_placements
         parts.append(copies)
+    for (name, *transformation), (origins, identities) in numbered.items():
+        offsets = np.rint(np.concatenate(origins) * (unit_um / dbu_um))
+        parts.append(flat[name].place_sites(_matrix(*transformation), offsets, np.concatenate(identities)))
     parts = [p for p in parts if p.counts.size] or parts[:1]
     if len(parts) == 1:
         return Shapes(parts[0].xy, parts[0].counts, parts[0].tags, n_placements)
@@ -280,6 +405,52 @@ def _flatten(cell: Any, flat: dict[str, Shapes], lines: list[str], unit_um: floa
         np.concatenate([p.tags for p in parts]),
         n_placements,
     )
+
+
+def _matrix(angle_rad: float, magnification: float, is_mirrored: bool) -> NDArray[np.float64]:
+    """Return the matrix of a reference: mirrored at the x axis, magnified, rotated."""
+    import numpy as np
+
+    return _rotation(angle_rad) @ np.diag([magnification, -magnification if is_mirrored else magnification])
+
+
+def _site_numbers(reference: Any, offsets: NDArray[np.float64], line: int) -> NDArray[np.int64] | None:
+    """
+    Return photosite, line of the columns and index in the array for each copy, (n, 3), or None without numbers.
+
+    Columns and rows follow from the offsets, as programs store arrays in different orders. An array that another program
+    changed has no numbers.
+    """
+    import numpy as np
+
+    number = _array_number(reference)
+    if number is None:
+        return None
+    first, step_i, step_j, n_x, n_y = number
+    (x, i), (y, j) = (np.unique(np.rint(offsets[:, axis] * 1e6), return_inverse=True) for axis in (0, 1))
+    sites = first + step_i * i + step_j * j
+    is_valid = sites.min() >= 0 and sites.max() < MAX_SITE
+    if (x.size, y.size) != (n_x, n_y) or len(offsets) != n_x * n_y or not is_valid:
+        return None
+    return np.stack((sites, np.full(len(offsets), line), i + (j << 32)), axis=1)
+
+
+def _array_number(reference: Any) -> tuple[int, int, int, int, int] | None:
+    """Return the number of the first site, the steps, and the columns and rows, from the properties of a reference."""
+    text = reference.get_gds_property(NUMBER_PROPERTY)
+    if isinstance(text, str):
+        match = NUMBERS.fullmatch(text) or NUMBER.fullmatch(text)
+        if match is None or (match.re is NUMBER and match[2]):
+            return None
+        first, step_i, step_j, n_x, n_y = (int(n or 0) for n in (*match.groups(), *("0", "0"))[:5])
+        return (first, step_i, step_j, n_x, n_y) if match.re is NUMBERS else (first, 0, 0, 1, 1)
+    numbers = reference.get_property("photosites")
+    if numbers and len(numbers) == 5 and all(isinstance(n, int) and abs(n) < MAX_SITE for n in numbers):
+        return numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
+    numbers = reference.get_property("photosite")
+    if numbers and len(numbers) == 1 and isinstance(numbers[0], int) and 0 <= numbers[0] < MAX_SITE:
+        return numbers[0], 0, 0, 1, 1
+    return None
 
 
 def _rotation(angle_rad: float) -> NDArray[np.float64]:
@@ -293,24 +464,25 @@ def _rotation(angle_rad: float) -> NDArray[np.float64]:
     return np.array([[c, -s], [s, c]])
 
 
-def _own_shapes(cell: Any, lines: list[str], unit_um: float, dbu_um: float) -> Shapes:
+def _own_shapes(cell: Any, lines: list[str], is_read: _Selection, unit_um: float, dbu_um: float) -> Shapes:
     """Return the polygons of one cell, with paths as polygons and repetitions expanded."""
     import numpy as np
 
-    polygons = list(cell.polygons)
-    for p in cell.polygons:
+    polygons = _polygons(cell, is_read)
+    for p in list(polygons):
         if p.repetition.size:
             # Copies are separate photosites, although they have the same number.
             polygons += p.apply_repetition()
     for path in cell.paths:
-        polygons += [q for p in (path, *path.apply_repetition()) for q in p.to_polygons()]
+        outlines = [q for p in (path, *path.apply_repetition()) for q in p.to_polygons()]
+        polygons += [q for q in outlines if is_read(q.layer, q.datatype)]
     points = [p.points for p in polygons]
     counts = np.fromiter(map(len, points), np.int64, len(points))
     xy = np.concatenate(points) if points else np.zeros((0, 2))
     del points
     xy *= unit_um / dbu_um
     np.rint(xy, out=xy)
-    tags = np.array([(p.layer, p.datatype, *_site(p), 0, -1) for p in polygons], np.int64).reshape(-1, 7)
+    tags = np.array([(p.layer, p.datatype, *_site(p), 0, -1, 0) for p in polygons], np.int64).reshape(-1, 8)
     strings = [_columns(p) for p in polygons]
     tags[:, 6] = np.where(list(map(bool, strings)), len(lines) + np.arange(len(strings)), -1)
     lines += strings
@@ -329,11 +501,11 @@ def _site(polygon: Any) -> tuple[int, int, int]:
     return (numbers[0], numbers[1], numbers[2]) if len(numbers) == 3 else (numbers[0], 0, 0)
 
 
-def _columns(polygon: Any) -> str:
-    """Return a polygon's column string of words ``name=value``, empty where it has none."""
-    text = polygon.get_gds_property(COLUMNS_PROPERTY)
+def _columns(element: Any) -> str:
+    """Return the column string of words ``name=value`` of a polygon or reference, empty where it has none."""
+    text = element.get_gds_property(COLUMNS_PROPERTY)
     if text is None:
-        values = polygon.get_property("columns")
+        values = element.get_property("columns")
         if not values or len(values) % 2 or len(values) > MAX_WORDS:
             return ""
         words = [v.decode("ascii", "replace") if isinstance(v, bytes) else str(v) for v in values]
@@ -359,21 +531,3 @@ def _column_lines(shapes: Shapes, lines: list[str], max_bytes: int) -> NDArray[n
     used_lines = lines if used.size == len(lines) else [lines[i] for i in used.tolist()]
     n_bytes = sum(map(len, used_lines)) + len(used_lines)
     return np.frombuffer("\n".join(used_lines).encode(), np.uint8) if n_bytes <= max_bytes else np.zeros(0, np.uint8)
-
-
-def _select_layer(shapes: Shapes, wanted: int | None) -> Shapes:
-    """Return the polygons on the layer of the photosites."""
-    import numpy as np
-
-    layers = np.unique(shapes.tags[:, 0])
-    if wanted is None and layers.size > 1:
-        raise FormatError(f"has shapes on several layers, {_format_names(layers.tolist())}; select one with layer=")
-    if wanted is None or layers.tolist() == [wanted]:
-        return shapes
-    if wanted not in layers:
-        raise FormatError(
-            f"has no shape on layer {wanted}; its layers with shapes are {_format_names(layers.tolist())}"
-        )
-    is_wanted = shapes.tags[:, 0] == wanted
-    is_selected_vertex = np.repeat(is_wanted, shapes.counts)
-    return Shapes(shapes.xy[is_selected_vertex], shapes.counts[is_wanted], shapes.tags[is_wanted], shapes.n_placements)

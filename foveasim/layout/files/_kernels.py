@@ -1,4 +1,4 @@
-"""Numba kernel that follows the records of a GDSII file."""
+"""Numba kernels of GDSII and OASIS files: records of a file, and regular arrays."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = ["walk_records"]
+__all__ = ["progressions", "walk_records"]
 
 _bytes = types.Array(types.uint8, 1, "C", readonly=True)
 _flags = types.Array(types.boolean, 1, "C", readonly=True)
@@ -33,3 +33,45 @@ def walk_records(data, is_known, last):
             return at, -1
         at += length
     return at, record
+
+
+_table = types.Array(types.int64, 2, "C", readonly=True)
+_keys = types.Array(types.int64, 1, "C", readonly=True)
+
+
+@njit(types.Array(types.boolean, 1, "C")(_table, _keys, types.int64))
+def progressions(rows, group, at_most):
+    """
+    Divide rows into arithmetic progressions: successive rows of a group with a constant difference.
+
+    Parameters
+    ----------
+    rows : (n, k) int64
+    group : (n,) int64
+        Rows of different groups are in different progressions.
+    at_most : int
+        Maximum length of a progression.
+
+    Returns
+    -------
+    is_first : (n,) bool
+        Whether a row is the first of its progression.
+    """
+    n, k = rows.shape
+    is_first = np.zeros(n, np.bool_)
+    start = 0
+    while start < n:
+        is_first[start] = True
+        stop = start + 1
+        while stop < n and stop - start < at_most and group[stop] == group[start]:
+            if stop > start + 1:
+                is_regular = True
+                for c in range(k):
+                    if rows[stop, c] - rows[stop - 1, c] != rows[start + 1, c] - rows[start, c]:
+                        is_regular = False
+                        break
+                if not is_regular:
+                    break
+            stop += 1
+        start = stop
+    return is_first

@@ -1,9 +1,10 @@
 """
 GDSII and OASIS files, through gdstk.
 
-A photosite is a polygon on one layer. Its channel is the datatype, and its number is a property, which preserves the order
-in programs that sort shapes: attribute 1 with the string ``photosite 17`` in GDSII, the property ``photosite`` in OASIS.
-Coordinates are integer multiples of the database unit. Neither format has holes, and a GDSII polygon has at most 8,190
+A photosite is a polygon on one layer. By default its channel is the datatype; a layer map specifies the layers of outlines,
+colour filters and derived shapes, and the channel is then a column. The number of a photosite is a property, which preserves
+the order in programs that sort shapes: attribute 1 with the string ``photosite 17`` in GDSII, the property ``photosite`` in
+OASIS. Coordinates are integer multiples of the database unit. Neither format has holes, and a GDSII polygon has at most 8,190
 vertices including the closing one. Sites with holes or more vertices are written as several polygons (``photosite 17 part
 1 of 3``) that share edges and add no vertex; reading merges them exactly.
 
@@ -13,19 +14,24 @@ other numbers as float64, bit for bit. A column with values that do not fit for 
 reported: the properties of a GDSII polygon contain at most 128 bytes, and gdstk is very slow for a large number of distinct
 strings in OASIS. A column without a value for every photosite of a file is not read.
 
+Regular arrays of congruent sites are references to a cell, with the numbers of their sites as a property: ``photosites
+0+1i+640j of 640x480`` in GDSII, the list (0, 1, 640, 640, 480) in OASIS. Their columns are functions of the column i and the
+row j of a site in the array, such as ``row=0+1j``. An array that another program has changed to another number of columns or
+rows is read without numbers and columns.
+
 References: Calma, GDSII Stream Format Manual 6.0 (1987); SEMI P39, OASIS.
 """
 
 from __future__ import annotations
 
+import warnings
 import zlib
-from bisect import bisect_left, bisect_right
-from collections import Counter
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
-from itertools import chain, pairwise, repeat
+from itertools import chain, repeat
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import shapely
@@ -33,12 +39,19 @@ from numpy.typing import NDArray
 
 from foveasim._core.extras import needs
 from foveasim._core.rings import positions_in_runs, ring_moments
-from foveasim._core.validation import MAX_SITES, Floats, Ints, check_count, check_number
+from foveasim._core.validation import MAX_SITES, Floats, Ints, check_number
 from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import FileFormat, as_file_error
 from foveasim._io.sandbox import WALL_TIME_FACTOR, run_in_sandbox
-from foveasim.errors import FileError, GeometryError, ParameterError
-from foveasim.layout.files._columns import MAX_COLUMN_BYTES, column_strings, parse_columns, storable_columns
+from foveasim.errors import FileError, GeometryError, LayoutWarning, ParameterError
+from foveasim.layout.files._columns import (
+    CHANNEL,
+    MAX_COLUMN_BYTES,
+    column_strings,
+    linear_text,
+    parse_columns,
+    storable_columns,
+)
 from foveasim.layout.files._common import (
     WrittenLayout,
     check_site_count,
@@ -47,18 +60,29 @@ from foveasim.layout.files._common import (
     rounding_report,
 )
 from foveasim.layout.files._formats import FORMATS
+from foveasim.layout.files._hierarchy import Arrays, concatenate, congruence_classes, find_arrays, single_sites
+from foveasim.layout.files._holes import hole_free_rings, without_keyholes
+from foveasim.layout.files._layers import (
+    MAX_LAYER,
+    PHOTOSITE,
+    DrawnLayer,
+    LayerNumber,
+    parse_channels,
+    parse_layer,
+    parse_layer_map,
+    parse_selection,
+)
 from foveasim.layout.model import Layout, valid_sites
 
 __all__ = ["GDS_MAGIC", "OASIS_MAGIC", "read", "write"]
 
-Point: TypeAlias = tuple[float, float]
-
 GDS_MAGIC = b"\x00\x06\x00\x02"
 OASIS_MAGIC = b"%SEMI-OASIS\r\n"
 
-DEFAULT_DBU_UM = 1e-4
-#: Maximum layer and datatype: some programs read them as signed 16-bit integers.
-MAX_LAYER = 32767
+#: Database unit of most processes, and default of layout programs.
+DEFAULT_DBU_UM = 1e-3
+#: A larger displacement of a vertex by rounding causes a warning; the default database unit displaces by at most 0.71 nm.
+ROUNDING_TOLERANCE_NM = 1.0
 #: Maximum vertices of a GDSII polygon, without the closing one: gdstk warns of incompatibility above 8,190 in total.
 MAX_GDS_VERTICES = 8189
 #: Maximum bytes of a GDSII property, and of all properties of a polygon, that all programs read.
@@ -72,6 +96,10 @@ MAX_DBU = 2**31 - 1
 #: Constant timestamp, for reproducible files.
 TIMESTAMP = datetime(2000, 1, 1)  # noqa: DTZ001 -- GDSII has no time zones
 CELL_NAME = "SENSOR"
+#: Cells of congruent sites are named PIXEL_0, PIXEL_1, ...
+SITE_CELL = "PIXEL"
+#: An array with more vertices, in all of its sites and layers, is written as a reference: it needs fewer bytes.
+MAX_FLAT_VERTICES = 16
 
 #: Limits of the sandbox process: memory while gdstk reads, and in total; column strings; time; larger for large files.
 MIN_READING_BYTES, READING_PER_BYTE = 2**30, 256
@@ -88,8 +116,6 @@ RECORDS_OF_TYPE = {
     6: b"\x02\x06\x12\x19\x1f\x20\x23\x24\x2c\x37\x3a",
 }
 END_OF_LIBRARY = 0x0400
-#: Maximum number of vertices after noding an outline with slits, as a multiple of its own.
-MAX_NODING_RATIO = 16
 #: OASIS: size and type of the END record, which ends the file, and number of the validation scheme CRC-32.
 OASIS_END_BYTES = 256
 OASIS_END = 2
@@ -99,34 +125,58 @@ CRC32_SCHEME = 1
 # -- writing ----------------------------------------------------------------------------------------------------------
 
 
-def write(layout: Layout, path: Path, *, layer: int = 1, dbu_um: float = DEFAULT_DBU_UM) -> WrittenLayout:
+def write(
+    layout: Layout,
+    path: Path,
+    *,
+    layer: Any = None,
+    layers: Mapping[str, Any] | str | Path | None = None,
+    filter_names: Sequence[str] | None = None,
+    dbu_um: float = DEFAULT_DBU_UM,
+    hierarchy: bool = True,
+) -> WrittenLayout:
     """
     Write GDSII or OASIS, depending on the extension.
 
     Raises
     ------
     GeometryError
-        When sites collapse or self-intersect on the database grid.
+        When sites or derived shapes vanish, collapse or self-intersect on the database grid.
     ParameterError
-        When the layer, a channel or a coordinate exceeds the range of the format.
+        When the layer map is invalid, or a layer, a channel or a coordinate exceeds the range of the format.
     FileError
         When gdstk is not installed, or the file cannot be written.
     """
     gdstk = _gdstk(path)
-    layer = check_count("layer", layer, at_least=0, at_most=MAX_LAYER)
+    drawn = _drawn_layers(layout, layer, layers, filter_names)
     dbu_um = check_number("dbu_um", dbu_um, at_least=1e-9, at_most=1e3)
-    channel = layout.channel
-    if channel.size and channel.max() > MAX_LAYER:
-        raise ParameterError("channel", f"must be <= {MAX_LAYER} in GDSII and OASIS", int(channel.max()))
+    if not isinstance(hierarchy, bool):
+        raise ParameterError("hierarchy", "must be True or False", hierarchy)
     is_oasis = path.suffix.lower() in (".oas", ".oasis")
-    snapped = _snap_to_grid(layout, dbu_um)
+    xy_dbu, snapped = _snap_to_grid(layout, dbu_um)
     report = rounding_report(layout, snapped.xy_um, path)
-    site, part, n_parts, rings_um = _hole_free_rings(snapped, None if is_oasis else MAX_GDS_VERTICES)
-    polygons = [gdstk.Polygon(r, layer, c) for r, c in zip(rings_um, channel[site].tolist(), strict=True)]
+    _warn_of_rounding(layout, snapped, dbu_um)
+    stack_of, origin = congruence_classes(xy_dbu, snapped.ring_offsets, snapped.site_offsets)
+    if any(d.datatype is None or d.channel is not None for d in drawn):
+        stack_of = stack_of * (MAX_LAYER + 1) + layout.channel
+    _, first, stack_of = np.unique(stack_of, return_index=True, return_inverse=True)
+    drawing = _draw(layout, snapped, first, origin, drawn, dbu_um, None if is_oasis else MAX_GDS_VERTICES)
+    columns = _stored_columns(layout, drawn)
+    references, flat = _divide(drawing, stack_of, origin, columns, hierarchy=hierarchy)
+
+    cells, elements, numbers = _references(gdstk, drawing, references, stack_of, origin, dbu_um, is_oasis=is_oasis)
+    ring, owner = drawing.rings_of(stack_of[flat.first])
+    polygons = drawing.polygons(gdstk, ring, origin[flat.first[owner]], dbu_um)
+    is_site = drawing.is_site[ring]
+    elements += [polygon for polygon, is_one in zip(polygons, is_site.tolist(), strict=True) if is_one]
+    numbers += drawing.numbers(ring[is_site], flat.first[owner[is_site]])
+    array = np.concatenate((np.arange(references.first.size), references.first.size + owner[is_site]))
     set_properties = _set_oasis_properties if is_oasis else _set_gds_properties
-    dropped = set_properties(polygons, layout, site.tolist(), part.tolist(), n_parts.tolist())
+    dropped = set_properties(elements, numbers, array, concatenate(references, flat), columns)
+
     library = gdstk.Library("FOVEASIM", unit=1e-6, precision=dbu_um * 1e-6)
-    library.new_cell(CELL_NAME).add(*polygons)
+    shapes = [polygon for polygon, is_one in zip(polygons, is_site.tolist(), strict=True) if not is_one]
+    library.add(library.new_cell(CELL_NAME).add(*elements, *shapes), *cells)
     with atomic_write(path) as temporary:
         if is_oasis:
             library.write_oas(temporary, validation="crc32")
@@ -136,40 +186,267 @@ def write(layout: Layout, path: Path, *, layer: int = 1, dbu_um: float = DEFAULT
     return replace(report, dropped_columns=dropped)
 
 
+def _drawn_layers(layout: Layout, layer: Any, layers: Any, filter_names: Sequence[str] | None) -> list[DrawnLayer]:
+    """Return the layers of the file, by default that of the photosites with the channel as datatype."""
+    if layers is not None and layer is not None:
+        raise ParameterError("layer", "must not be given with 'layers'", layer, hint="set layers={'photosite': ...}")
+    if layers is None:
+        number, datatype = parse_layer("layer", 1 if layer is None else layer, at_most=MAX_LAYER)
+        if datatype is None and layout.channel.max(initial=0) > MAX_LAYER:
+            raise ParameterError("channel", f"must be <= {MAX_LAYER} in GDSII and OASIS", int(layout.channel.max()))
+        return [DrawnLayer(name=PHOTOSITE, layer=number, datatype=datatype)]
+    drawn = parse_layer_map(layers, filter_names)
+    filters = [d.channel for d in drawn if d.channel is not None]
+    missing = np.setdiff1d(layout.channel, filters) if filters else np.zeros(0)
+    if missing.size:
+        site = int(np.flatnonzero(layout.channel == missing[0])[0])
+        raise ParameterError(
+            "layers",
+            f"must have a filter layer for channel {missing[0]} of site {site}",
+            hint=f"add 'filter_{missing[0]}', or omit all filter layers",
+        )
+    return drawn
+
+
+def _stored_columns(layout: Layout, drawn: list[DrawnLayer]) -> dict[str, NDArray[Any]]:
+    """Return the columns to store; the channel first, unless it is represented by several datatypes."""
+    others = {name: column for name, column in layout.columns.items() if name != CHANNEL}
+    is_datatype = any(d.datatype is None for d in drawn) and bool((layout.channel != layout.channel[:1]).any())
+    return others if is_datatype or CHANNEL not in layout.columns else {CHANNEL: layout.columns[CHANNEL], **others}
+
+
+def _divide(
+    drawing: _Drawing, stack_of: Ints, origin: Ints, columns: Mapping[str, NDArray[Any]], *, hierarchy: bool
+) -> tuple[Arrays, Arrays]:
+    """Return the arrays that are written as references, and the other sites as arrays of 1 x 1."""
+    if not hierarchy or stack_of.size == 0:
+        nowhere = np.zeros(0, np.int64)
+        return single_sites(nowhere, columns), single_sites(np.arange(stack_of.size), columns)
+    arrays = find_arrays(stack_of, origin, columns, MAX_DBU)
+    stack = stack_of[arrays.first]
+    is_shorter = arrays.n_x * arrays.n_y * drawing.n_vertices[stack] > MAX_FLAT_VERTICES
+    is_shorter &= np.bincount(stack_of)[stack] > 1
+    return arrays.select(is_shorter), single_sites(np.sort(arrays.select(~is_shorter).sites()), columns)
+
+
+# -- shapes -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Drawing:
+    """
+    Shapes of congruent sites on all layers, as packed rings without holes, relative to the origins of the sites.
+
+    A stack consists of the shapes of a site. ``number`` and ``part`` have the shape (n_ring, 2): layer and datatype; number of
+    the part and number of parts of a divided photosite, or 0 and 0.
+    """
+
+    xy_dbu: Ints
+    ring_offsets: Ints
+    stack_offsets: Ints
+    number: Ints
+    part: Ints
+    is_site: NDArray[np.bool_]
+
+    @property
+    def n_vertices(self) -> Ints:
+        """Vertices of each stack."""
+        return np.diff(self.ring_offsets[self.stack_offsets])
+
+    def rings_of(self, stack: Ints) -> tuple[Ints, Ints]:
+        """Return the rings of several stacks, and the positions of their stacks in ``stack``."""
+        n_rings = np.diff(self.stack_offsets)[stack]
+        owner = np.repeat(np.arange(stack.size), n_rings)
+        return self.stack_offsets[stack][owner] + positions_in_runs(n_rings), owner
+
+    def polygons(self, gdstk: Any, ring: Ints, origin: Ints, dbu_um: float) -> list[Any]:
+        """Return polygons of gdstk for rings at the given origins, (n, 2)."""
+        n_vertices = np.diff(self.ring_offsets)[ring]
+        vertex = np.repeat(self.ring_offsets[:-1][ring], n_vertices) + positions_in_runs(n_vertices)
+        xy_um = _to_um(self.xy_dbu[vertex] + np.repeat(origin, n_vertices, axis=0), dbu_um)
+        stops = np.cumsum(n_vertices)
+        return [
+            gdstk.Polygon(xy_um[a:b], layer, datatype)
+            for a, b, (layer, datatype) in zip(
+                (stops - n_vertices).tolist(), stops.tolist(), self.number[ring].tolist(), strict=True
+            )
+        ]
+
+    def numbers(self, ring: Ints, site: Ints) -> list[tuple[int, ...]]:
+        """Return the numbers of the given sites, with the parts of divided ones."""
+        rows = zip(site.tolist(), self.part[ring].tolist(), strict=True)
+        return [(s, part, n) if n else (s,) for s, (part, n) in rows]
+
+
+def _draw(
+    layout: Layout,
+    snapped: Layout,
+    first: Ints,
+    origin: Ints,
+    drawn: list[DrawnLayer],
+    dbu_um: float,
+    max_vertices: int | None,
+) -> _Drawing:
+    """Draw one site of each stack; ``first`` are their indices."""
+    models = snapped[first]
+    owner = np.repeat(np.arange(first.size), np.diff(models.ring_offsets[models.site_offsets]))
+    xy_um = models.xy_um - _to_um(origin[first], dbu_um)[owner]
+    models = Layout._from_checked(  # noqa: SLF001 -- of the same subpackage
+        _to_um(np.rint(xy_um / dbu_um), dbu_um), models.ring_offsets, models.site_offsets, {}, {}
+    )
+    channel = layout.channel[first] if any(d.datatype is None or d.channel is not None for d in drawn) else None
+    outlines = hole_free_rings(models, max_vertices)
+    tables, rings_um = [], []
+    for level, d in enumerate(drawn):
+        stack, part, n_parts, rings = (
+            _derived_rings(d, models, first, dbu_um, max_vertices) if d.is_derived else outlines
+        )
+        chosen = np.arange(stack.size)
+        if d.channel is not None:
+            assert channel is not None
+            chosen = np.flatnonzero(channel[stack] == d.channel)
+        datatype = np.full(stack.size, d.datatype) if d.datatype is not None else channel[stack]  # type: ignore[index]
+        is_site = np.full(stack.size, d.name == PHOTOSITE)
+        parts = (part * is_site, n_parts * is_site)
+        table = np.stack(
+            (stack, np.full(stack.size, level), np.full(stack.size, d.layer), datatype, *parts, is_site), 1
+        )
+        tables.append(table[chosen])
+        rings_um += [rings[k] for k in chosen.tolist()] if chosen.size < len(rings) else rings
+    table = np.concatenate(tables)
+    order = np.lexsort((table[:, 1], table[:, 0]))
+    table = table[order]
+    rings_um = [rings_um[k] for k in order.tolist()]
+    xy_um = np.concatenate(rings_um) if rings_um else np.zeros((0, 2))
+    return _Drawing(
+        np.rint(xy_um / dbu_um).astype(np.int64),
+        np.concatenate(([0], np.cumsum(list(map(len, rings_um)), dtype=np.int64))),
+        np.searchsorted(table[:, 0], np.arange(first.size + 1)),
+        table[:, 2:4],
+        table[:, 4:6],
+        table[:, 6].astype(bool),
+    )
+
+
+def _derived_rings(
+    drawn: DrawnLayer, models: Layout, first: Ints, dbu_um: float, max_vertices: int | None
+) -> tuple[Ints, Ints, Ints, list[Floats]]:
+    """Return the rings of a derived layer as :func:`hole_free_rings` does; the first index is that of the stack."""
+    polygons = drawn.shapes(models)
+    parts, stack = shapely.get_parts(polygons, return_index=True)
+    is_area = shapely.area(parts) > 0.0
+    parts, stack = parts[is_area], stack[is_area]
+    vanished = np.setdiff1d(np.arange(first.size), stack)
+    site = int(first[vanished].min(initial=MAX_SITES))
+    try:
+        if vanished.size == 0:
+            derived = Layout.from_polygons(parts)
+            piece, part, n_parts, rings = hole_free_rings(_snap_to_grid(derived, dbu_um)[1], max_vertices)
+            return stack[piece], part, n_parts, rings
+    except GeometryError as error:
+        site = int(first[stack[error.site_ids[0]]]) if error.site_ids else int(first[0])
+    raise GeometryError(
+        f"layer '{drawn.name}': the shape of site {site} vanishes on the database grid of {dbu_um:g} µm; change its parameters",
+        (site,),
+    )
+
+
+def _references(
+    gdstk: Any, drawing: _Drawing, arrays: Arrays, stack_of: Ints, origin: Ints, dbu_um: float, *, is_oasis: bool
+) -> tuple[list[Any], list[Any], list[tuple[int, ...]]]:
+    """Return cells of sites, references to them for all arrays, and the numbers of the sites of the references."""
+    stack = stack_of[arrays.first]
+    used, first_use = np.unique(stack, return_index=True)
+    cells = {}
+    for k, s in enumerate(used[np.argsort(first_use)].tolist()):
+        ring, _ = drawing.rings_of(np.array([s]))
+        polygons = drawing.polygons(gdstk, ring, np.zeros((ring.size, 2), np.int64), dbu_um)
+        sites = ring[drawing.is_site[ring]]
+        for polygon, number in zip(polygons, drawing.numbers(sites, np.zeros_like(sites)), strict=False):
+            _set_number(polygon, number, is_oasis=is_oasis)
+        cells[s] = gdstk.Cell(f"{SITE_CELL}_{k}").add(*polygons)
+    references, numbers = [], []
+    rows = zip(
+        stack.tolist(),
+        arrays.first.tolist(),
+        arrays.n_x.tolist(),
+        arrays.n_y.tolist(),
+        _to_um(origin[arrays.first], dbu_um).tolist(),
+        _to_um(arrays.pitch, dbu_um).tolist(),
+        arrays.number_steps.tolist(),
+        strict=True,
+    )
+    for s, site, n_x, n_y, at_um, (dx_um, dy_um), steps in rows:
+        if n_x * n_y == 1:
+            references.append(gdstk.Reference(cells[s], at_um))
+            numbers.append((site,))
+            continue
+        # An array of one column or row has the pitch of the other direction, as some programs reject a pitch of 0.
+        spacing = (dx_um or dy_um, dy_um or dx_um)
+        references.append(gdstk.Reference(cells[s], at_um, columns=n_x, rows=n_y, spacing=spacing))
+        numbers.append((site, *steps, n_x, n_y))
+    return list(cells.values()), references, numbers
+
+
+# -- properties -------------------------------------------------------------------------------------------------------
+
+
 def _set_gds_properties(
-    polygons: list[Any], layout: Layout, site: list[int], part: list[int], n_parts: list[int]
+    elements: list[Any],
+    numbers: list[tuple[int, ...]],
+    array: Ints,
+    arrays: Arrays,
+    columns: Mapping[str, NDArray[Any]],
 ) -> tuple[str, ...]:
-    """Set the number and columns of each polygon's site; return the dropped columns."""
-    numbers = [
-        f"photosite {s}" if n == 0 else f"photosite {s} part {k} of {n}"
-        for s, k, n in zip(site, part, n_parts, strict=True)
-    ]
-    longest = max(map(len, numbers), default=0)
-    columns, dropped = storable_columns(layout, min(MAX_GDS_STRING, MAX_GDS_PROPERTIES - longest - longest % 2))
-    strings = column_strings(columns)
+    """Set the numbers and columns of sites and arrays; return the dropped columns."""
+    texts = list(map(_number_text, numbers))
+    n_chars = np.fromiter(map(len, texts), np.int64, len(texts))
+    longest = np.zeros(arrays.first.size, np.int64)
+    np.maximum.at(longest, array, n_chars + n_chars % 2)
+    room = np.minimum(MAX_GDS_STRING, MAX_GDS_PROPERTIES - longest)
+    stored, dropped = storable_columns(columns, arrays.first, arrays.column_steps, room)
+    strings = column_strings(stored)
     if strings:
         # gdstk writes properties in reverse order of setting.
-        for polygon, s in zip(polygons, site, strict=True):
-            polygon.set_gds_property(2, strings[s])
-    for polygon, number in zip(polygons, numbers, strict=True):
-        polygon.set_gds_property(1, number)
+        for element, k in zip(elements, array.tolist(), strict=True):
+            element.set_gds_property(2, strings[k])
+    for element, number in zip(elements, numbers, strict=True):
+        _set_number(element, number, is_oasis=False)
     return dropped
 
 
 def _set_oasis_properties(
-    polygons: list[Any], layout: Layout, site: list[int], part: list[int], n_parts: list[int]
+    elements: list[Any],
+    numbers: list[tuple[int, ...]],
+    array: Ints,
+    arrays: Arrays,
+    columns: Mapping[str, NDArray[Any]],
 ) -> tuple[str, ...]:
-    """Set the number and columns of each polygon's site; return the dropped columns."""
-    columns, dropped = storable_columns(
-        layout, MAX_OASIS_STRING, int(OASIS_STRING_COMPARISONS // max(len(polygons), 1))
-    )
-    rows = list(zip(*chain.from_iterable((repeat(key), values) for key, values in columns.items()), strict=False))
+    """Set the numbers and columns of sites and arrays; return the dropped columns."""
+    max_strings = int(OASIS_STRING_COMPARISONS // max(len(elements), 1))
+    stored, dropped = storable_columns(columns, arrays.first, arrays.column_steps, MAX_OASIS_STRING, max_strings)
+    rows = list(zip(*chain.from_iterable((repeat(key), values) for key, values in stored.items()), strict=False))
     if rows:
-        for polygon, s in zip(polygons, site, strict=True):
-            polygon.set_property("columns", rows[s])
-    for polygon, s, k, n in zip(polygons, site, part, n_parts, strict=True):
-        polygon.set_property("photosite", [s] if n == 0 else [s, k, n])
+        for element, k in zip(elements, array.tolist(), strict=True):
+            element.set_property("columns", rows[k])
+    for element, number in zip(elements, numbers, strict=True):
+        _set_number(element, number, is_oasis=True)
     return dropped
+
+
+def _set_number(element: Any, number: tuple[int, ...], *, is_oasis: bool) -> None:
+    """Set the number of a site, of a part (with part and number of parts), or of an array (with steps and size)."""
+    if is_oasis:
+        element.set_property("photosites" if len(number) == 5 else "photosite", list(number))
+    else:
+        element.set_gds_property(1, _number_text(number))
+
+
+def _number_text(number: tuple[int, ...]) -> str:
+    if len(number) == 5:
+        first, step_i, step_j, n_x, n_y = number
+        return f"photosites {linear_text(first, step_i, step_j)} of {n_x}x{n_y}"
+    return f"photosite {number[0]}" + (f" part {number[1]} of {number[2]}" if len(number) == 3 else "")
 
 
 def _gdstk(path: Path) -> Any:
@@ -187,8 +464,24 @@ def _to_um(xy_dbu: NDArray[Any], dbu_um: float) -> Floats:
     return np.asarray(xy_dbu / per_um if is_integer else xy_dbu * dbu_um, dtype=np.float64)
 
 
-def _snap_to_grid(layout: Layout, dbu_um: float) -> Layout:
-    """Round the vertices of a layout to the database grid, and check the photosites."""
+def _warn_of_rounding(layout: Layout, snapped: Layout, dbu_um: float) -> None:
+    """Warn where rounding displaces a vertex by more than the tolerance."""
+    if layout.n_sites == 0:
+        return
+    displacement_nm = 1e3 * np.hypot(*(snapped.xy_um - layout.xy_um).T)
+    vertex = int(np.argmax(displacement_nm))
+    if displacement_nm[vertex] > ROUNDING_TOLERANCE_NM:
+        site = int(np.searchsorted(layout.ring_offsets[layout.site_offsets], vertex, side="right")) - 1
+        warnings.warn(
+            f"rounding to the database unit of {1e3 * dbu_um:g} nm moves a vertex of site {site} by "
+            f"{displacement_nm[vertex]:.3g} nm, more than {ROUNDING_TOLERANCE_NM:g} nm; use dbu_um={DEFAULT_DBU_UM:g}",
+            LayoutWarning,
+            stacklevel=5,
+        )
+
+
+def _snap_to_grid(layout: Layout, dbu_um: float) -> tuple[Ints, Layout]:
+    """Round the vertices of a layout to the database grid, and check the photosites; return integers and µm."""
     xy_dbu = np.rint(layout.xy_um / dbu_um)
     if xy_dbu.size and np.abs(xy_dbu).max() > MAX_DBU:
         raise ParameterError(
@@ -209,7 +502,7 @@ def _snap_to_grid(layout: Layout, dbu_um: float) -> Layout:
                 f"the database grid of {dbu_um:g} µm; use a smaller dbu_um",
                 tuple(int(i) for i in bad),
             )
-    return snapped
+    return xy_dbu.astype(np.int64), snapped
 
 
 def _check_complete(path: Path, is_oasis: bool) -> None:
@@ -220,97 +513,18 @@ def _check_complete(path: Path, is_oasis: bool) -> None:
         raise OSError("the written file is incomplete")
 
 
-# -- sites as polygons without holes ----------------------------------------------------------------------------------
-
-
-def _hole_free_rings(layout: Layout, max_vertices: int | None) -> tuple[Ints, Ints, Ints, list[Floats]]:
-    """
-    Return hole-free rings of all sites, in their order.
-
-    Returns
-    -------
-    site, part, n_parts : (n_ring,) int64
-        Index of the site, number of the part from 1, and number of parts; 0 and 0 for an undivided site.
-    rings_um : list of (n, 2), µm
-    """
-    rings_of_site = np.diff(layout.site_offsets)
-    outline = layout.site_offsets[:-1]
-    starts, stops = layout.ring_offsets[outline], layout.ring_offsets[outline + 1]
-    rings_um = [layout.xy_um[a:b] for a, b in zip(starts.tolist(), stops.tolist(), strict=True)]
-    is_cut = rings_of_site > 1
-    if max_vertices is not None:
-        is_cut |= stops - starts > max_vertices
-    n_parts = np.zeros(layout.n_sites, np.int64)
-    if not is_cut.any():
-        return np.arange(layout.n_sites), n_parts, n_parts, rings_um
-    cut = np.flatnonzero(is_cut)
-    parts_of = {
-        int(s): _hole_free_parts(polygon, max_vertices) for s, polygon in zip(cut, layout[cut].polygons(), strict=True)
-    }
-    n_parts[cut] = [len(parts) for parts in parts_of.values()]
-    n_rings = np.maximum(n_parts, 1)
-    site = np.repeat(np.arange(layout.n_sites), n_rings)
-    part = positions_in_runs(n_rings) + 1
-    pieces = [ring for s, undivided in enumerate(rings_um) for ring in parts_of.get(s, [undivided])]
-    return site, np.where(n_parts[site] > 0, part, 0), n_parts[site], pieces
-
-
-def _hole_free_parts(polygon: Any, max_vertices: int | None) -> list[Floats]:
-    """
-    Divide a polygon into rings without holes and without additional vertices.
-
-    Notes
-    -----
-    Triangles of a constrained Delaunay triangulation are merged as long as each adds a new vertex. Such a part has no
-    repeated vertex, and is therefore simple and without holes.
-    """
-    triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
-    corners = shapely.get_coordinates(shapely.normalize(triangles)).reshape(-1, 4, 2)[:, :3]
-    points, ids = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
-    corner_ids = ids.reshape(-1, 3).tolist()
-    neighbours: dict[tuple[int, int], list[int]] = {}
-    for t, (a, b, c) in enumerate(corner_ids):
-        for u, v in ((a, b), (b, c), (c, a)):
-            neighbours.setdefault((min(u, v), max(u, v)), []).append(t)
-    is_free = [True] * len(corner_ids)
-    parts = []
-    for first in range(len(corner_ids)):
-        if is_free[first]:
-            is_free[first] = False
-            parts.append(points[_grow_part(first, corner_ids, neighbours, is_free, max_vertices)])
-    return parts
-
-
-def _grow_part(
-    first: int,
-    corner_ids: list[list[int]],
-    neighbours: dict[tuple[int, int], list[int]],
-    is_free: list[bool],
-    max_vertices: int | None,
-) -> list[int]:
-    """Return the vertices, in order, of a part grown from one triangle; mark its triangles."""
-    after = dict(zip(corner_ids[first], [*corner_ids[first][1:], corner_ids[first][0]], strict=True))
-    edges = list(after.items())
-    while edges and (max_vertices is None or len(after) < max_vertices):
-        u, v = edges.pop()
-        for t in neighbours[min(u, v), max(u, v)]:
-            apex = next(w for w in corner_ids[t] if w not in (u, v))
-            if is_free[t] and apex not in after:
-                is_free[t] = False
-                after[u], after[apex] = apex, v
-                edges += [(u, apex), (apex, v)]
-                break
-    start = next(iter(after))
-    ring = [start]
-    while after[ring[-1]] != start:
-        ring.append(after[ring[-1]])
-    return ring
-
-
 # -- reading ----------------------------------------------------------------------------------------------------------
 
 
-def read(path: Path, *, layer: int | None = None, cell: str | None = None) -> Layout:
+def read(
+    path: Path,
+    *,
+    layer: Any = None,
+    cell: str | None = None,
+    layers: Mapping[str, Any] | str | Path | None = None,
+    channels: Mapping[Any, Any] | None = None,
+    filter_names: Sequence[str] | None = None,
+) -> Layout:
     """
     Read GDSII or OASIS, detected by content.
 
@@ -319,23 +533,27 @@ def read(path: Path, *, layer: int | None = None, cell: str | None = None) -> La
     Raises
     ------
     FileError
-        When gdstk is not installed, or the file is corrupt, truncated, malformed, or contains invalid photosites.
+        When gdstk is not installed, or the file is corrupt, truncated, malformed, contains invalid photosites, or photosites
+        without a filter although the channels of filter layers are given.
+    ParameterError
+        When a layer or a channel is invalid.
     """
     _gdstk(path)
     kind = "GDSII or OASIS"
-    if layer is not None:
-        layer = check_count("layer", layer, at_least=0, at_most=2**31 - 1)
+    wanted, filters = _selection(layer, layers, channels, filter_names)
     with as_file_error(path, f"{kind} layout"):
         data = path.read_bytes()
         is_oasis = data.startswith(OASIS_MAGIC)
         (_check_oasis if is_oasis else _check_records)(path, data)
         n_bytes = len(data)
         del data
-        answer, xy_dbu, counts, tags, lines = _read_in_sandbox(path, is_oasis, layer, cell, n_bytes)
+        answer, shapes, covers = _read_in_sandbox(path, is_oasis, wanted, list(filters), cell, n_bytes)
+        counts, tags = shapes.counts, shapes.tags
         check_site_count(path, counts.size)
-        xy_um = _to_um(xy_dbu, answer["dbu_um"])
+        xy_um = _to_um(shapes.xy_dbu, answer["dbu_um"])
         pieces, piece, first = _group_by_site(path, xy_um, counts, tags)
-        columns = {"channel": tags[piece[first], 1], **_columns(lines, tags[piece, 6], first)}
+        columns = _columns(shapes.lines, tags[piece], first)
+        columns = _with_channel(columns, tags[piece[first], 1:3], wanted)
         about = {
             "made_by": "read_layout",
             "file": path.name,
@@ -347,9 +565,84 @@ def read(path: Path, *, layer: int | None = None, cell: str | None = None) -> La
         is_undivided = first.size == piece.size
         packed = (pieces.xy_um, pieces.ring_offsets, pieces.site_offsets)
         try:
-            return layout_from_untrusted(packed if is_undivided else _merge_parts(pieces, first), columns, about)
+            layout = layout_from_untrusted(packed if is_undivided else _merge_parts(pieces, first), columns, about)
         except GeometryError:
-            return layout_from_untrusted(_without_keyholes(_merge_parts(pieces, first)), columns, about)
+            layout = layout_from_untrusted(without_keyholes(_merge_parts(pieces, first)), columns, about)
+        if filters:
+            channel = _covering_channels(path, layout, _to_um(covers.xy_dbu, answer["dbu_um"]), covers, filters)
+            layout = layout.with_columns(channel=channel).with_provenance(about)
+        return layout
+
+
+def _selection(
+    layer: Any, layers: Any, channels: Any, filter_names: Sequence[str] | None
+) -> tuple[list[LayerNumber] | None, dict[LayerNumber, int]]:
+    """Return the layers of the photosites, or None for the default, and the channels of filter layers."""
+    wanted = None if layer is None else parse_selection(layer)
+    filters = {} if channels is None else parse_channels(channels, filter_names)
+    if layers is not None:
+        drawn = parse_layer_map(layers, filter_names)
+        if wanted is None:
+            wanted = [d.number for d in drawn if d.name == PHOTOSITE]
+        filters = {d.number: d.channel for d in drawn if d.channel is not None} | filters
+    return wanted, filters
+
+
+def _with_channel(
+    columns: dict[str, NDArray[Any]], tags: Ints, wanted: list[LayerNumber] | None
+) -> dict[str, NDArray[Any]]:
+    """
+    Return the columns with the channel, if the file contains it.
+
+    A column of this name precedes the datatype. The datatype is a channel where it differs between sites, and in files of other
+    programs also where it is not 0 and only a layer number was selected. ``tags`` are datatype and number of each site.
+    """
+    channel = columns.pop(CHANNEL, None)
+    if channel is not None and channel.dtype.kind in "iu" and channel.size:
+        is_index = int(channel.min()) >= 0 and int(channel.max()) <= MAX_SITES
+        columns |= {CHANNEL: channel} if is_index else {}
+    if CHANNEL in columns:
+        return columns
+    datatype, number = tags.T
+    is_other = bool((number < 0).any()) and (wanted is None or any(kind is None for _, kind in wanted))
+    is_channel = bool((datatype != datatype[:1]).any()) or (is_other and bool(datatype.any()))
+    return {CHANNEL: datatype, **columns} if is_channel else columns
+
+
+def _covering_channels(
+    path: Path, layout: Layout, xy_um: Floats, covers: _Shapes, channels: Mapping[LayerNumber, int]
+) -> Ints:
+    """
+    Return the channel of the filter that covers each site.
+
+    A filter covers a site if it contains a point in the interior of the site.
+    """
+    layer_channel = np.full(covers.counts.size, -1)
+    for (layer, datatype), channel in channels.items():
+        is_own = (covers.tags[:, 0] == layer) & ((covers.tags[:, 1] == datatype) if datatype is not None else True)
+        layer_channel[is_own] = channel
+    ring_offsets = np.concatenate(([0], np.cumsum(covers.counts)))
+    filters = Layout(xy_um, ring_offsets, np.arange(ring_offsets.size)).polygons()
+    points = shapely.point_on_surface(layout.polygons())
+    site, cover = shapely.STRtree(filters).query(points, predicate="within")
+    found = np.full(layout.n_sites, -1)
+    found[site] = layer_channel[cover]
+    bare = np.flatnonzero(found < 0)
+    if bare.size:
+        x, y = layout.centroid_um[bare[0]]
+        raise FileError(
+            path,
+            f"has {bare.size} of {layout.n_sites} photosites without a filter, first site {bare[0]} at ({x:.6g}, {y:.6g}) µm; "
+            "add the layer of its filter to channels= or layers=",
+        )
+    different = np.flatnonzero(found[site] != layer_channel[cover])
+    if different.size:
+        s = int(site[different].min())
+        x, y = layout.centroid_um[s]
+        raise FileError(
+            path, f"has filters of several channels over site {s} at ({x:.6g}, {y:.6g}) µm; select one layer"
+        )
+    return found
 
 
 def _check_records(path: Path, data: bytes) -> None:
@@ -377,9 +670,24 @@ def _check_oasis(path: Path, data: bytes) -> None:
         raise FileError(path, "is corrupt: its CRC-32 does not match its content")
 
 
+@dataclass(frozen=True)
+class _Shapes:
+    """Shapes from the sandbox process: see :class:`foveasim.layout.files._gdstk.Shapes`."""
+
+    xy_dbu: Floats
+    counts: Ints
+    tags: Ints
+    lines: bytes
+
+
 def _read_in_sandbox(
-    path: Path, is_oasis: bool, layer: int | None, cell: str | None, n_bytes: int
-) -> tuple[dict[str, Any], Floats, Ints, Ints, bytes]:
+    path: Path,
+    is_oasis: bool,
+    layers: list[LayerNumber] | None,
+    filters: list[LayerNumber],
+    cell: str | None,
+    n_bytes: int,
+) -> tuple[dict[str, Any], _Shapes, _Shapes]:
     """Read the file with gdstk in the sandbox process, which a malformed file may crash."""
     from foveasim.layout.files import _gdstk
 
@@ -387,14 +695,15 @@ def _read_in_sandbox(
     max_memory_bytes = min(MIN_MEMORY_BYTES + MEMORY_PER_BYTE * n_bytes, MAX_MEMORY_BYTES)
     args = {
         "is_oasis": is_oasis,
-        "layer": layer,
+        "layers": layers,
+        "filters": filters,
         "cell": cell,
         "max_sites": MAX_SITES,
         "max_memory_bytes": max_memory_bytes,
         "max_text_bytes": max(MIN_STRING_BYTES, STRING_BYTES_PER_BYTE * n_bytes),
         "max_cpu_s": WALL_TIME_FACTOR * max_cpu_s,
     }
-    answer, (xy_dbu, counts, tags, lines) = run_in_sandbox(
+    answer, (xy_dbu, counts, tags, lines, *covers) = run_in_sandbox(
         _gdstk.read,
         path,
         args,
@@ -403,7 +712,7 @@ def _read_in_sandbox(
         max_bytes=min(MIN_READING_BYTES + READING_PER_BYTE * n_bytes, max_memory_bytes),
         is_standalone=True,
     )
-    return answer, xy_dbu, counts, tags, lines.tobytes()
+    return answer, _Shapes(xy_dbu, counts, tags, lines.tobytes()), _Shapes(*covers, b"")
 
 
 def _group_by_site(path: Path, xy_um: Floats, counts: Ints, tags: Ints) -> tuple[Layout, Ints, Ints]:
@@ -452,99 +761,25 @@ def _merge_parts(pieces: Layout, first: Ints) -> NDArray[Any]:
     return merged
 
 
-def _columns(lines: bytes, line: Ints, first: Ints) -> dict[str, NDArray[Any]]:
+def _columns(lines: bytes, tags: Ints, first: Ints) -> dict[str, NDArray[Any]]:
     """
     Return the columns with a value for all pieces, equal for all pieces of a site.
 
-    ``line`` is the line of each piece in ``lines``.
+    ``tags`` are those of the pieces, with the line of each piece in ``lines`` and its index in an array.
     """
     columns = {}
+    line, row, column = tags[:, 6], tags[:, 7] >> 32, tags[:, 7] & 0xFFFFFFFF
     size = np.diff(np.append(first, line.size))
-    for name, values in parse_columns(lines).items() if lines else ():
+    for name, (values, steps) in parse_columns(lines).items() if lines else ():
         if values.itemsize * line.size > MAX_COLUMN_BYTES:
             continue
         pieces = values[line]
-        column = pieces[first]
-        if np.array_equal(np.repeat(column, size), pieces, equal_nan=values.dtype.kind == "f"):
-            columns[name] = column
+        if steps is not None:
+            pieces = pieces + steps[line, 0] * column + steps[line, 1] * row
+        of_site = pieces[first]
+        if np.array_equal(np.repeat(of_site, size), pieces, equal_nan=values.dtype.kind == "f"):
+            columns[name] = of_site
     return columns
-
-
-def _without_keyholes(polygons: NDArray[Any]) -> NDArray[Any]:
-    """
-    Convert outlines with keyholes to polygons with holes; other polygons are unchanged.
-
-    Other programs write holes as keyholes: the outline reaches the hole through a slit of zero width.
-    """
-    invalid = np.flatnonzero(~shapely.is_valid(polygons) & (shapely.get_num_interior_rings(polygons) == 0))
-    repaired = np.full(len(polygons), None)
-    for i in invalid:
-        repaired[i] = _polygon_from_rings(
-            _split_into_rings(_node_path(list(map(tuple, shapely.get_coordinates(polygons[i]).tolist()))))
-        )
-    check_sizes(np.maximum(shapely.get_num_interior_rings(repaired), 0) + 1, shapely.get_num_coordinates(repaired))
-    return np.where(shapely.is_valid(repaired), repaired, polygons)
-
-
-def _node_path(path: list[Point]) -> list[Point]:
-    """Node a closed path: insert its vertices that lie on its horizontal and vertical edges."""
-    nodes: tuple[dict[float, list[float]], ...] = ({}, {})
-    for axis, of_line in enumerate(nodes):
-        for vertex in set(path):
-            of_line.setdefault(vertex[axis], []).append(vertex[1 - axis])
-        for values in of_line.values():
-            values.sort()
-    noded = path[:1]
-    for a, b in pairwise(path):
-        axis = 0 if a[0] == b[0] else 1
-        # A path with too many nodes is not a valid outline.
-        if a[axis] == b[axis] and len(noded) < MAX_NODING_RATIO * len(path):
-            values, (low, high) = nodes[axis][a[axis]], sorted((a[1 - axis], b[1 - axis]))
-            passed = values[bisect_right(values, low) : bisect_left(values, high)]
-            on_line = [(a[0], v) if axis == 0 else (v, a[1]) for v in passed]
-            noded += on_line if a < b else on_line[::-1]
-        noded.append(b)
-    return noded
-
-
-def _split_into_rings(closed_path: list[Point]) -> list[list[Point]]:
-    """Return the rings of a closed path without the edges traversed in both directions."""
-    n_times = Counter(pairwise(closed_path))
-    successors: dict[Point, list[Point]] = {}
-    for (a, b), n in n_times.items():
-        if a != b:
-            successors.setdefault(a, []).extend([b] * (n - n_times[b, a]))
-    rings = []
-    for start in successors:
-        path, index_of = [start], {start: 0}
-        while successors[path[-1]]:
-            vertex = successors[path[-1]].pop()
-            at = index_of.setdefault(vertex, len(path))
-            if at == len(path):
-                path.append(vertex)
-                continue
-            rings.append(path[at:])
-            for passed in path[at + 1 :]:
-                del index_of[passed]
-            del path[at + 1 :]
-    return rings
-
-
-def _polygon_from_rings(rings: list[list[Point]]) -> Any:
-    """
-    Return the polygon of the largest ring, with the others as holes.
-
-    The result is None if another ring has the same winding order as the largest.
-    """
-    if not rings:
-        return None
-    offsets = np.cumsum([0, *map(len, rings)])
-    area_um2 = ring_moments(np.array([vertex for ring in rings for vertex in ring]), offsets)[0]
-    outline = int(np.argmax(np.abs(area_um2)))
-    is_hole = area_um2 * area_um2[outline] < 0.0
-    if np.count_nonzero(is_hole) != len(rings) - 1:
-        return None
-    return shapely.Polygon(rings[outline], [ring for ring, is_in in zip(rings, is_hole, strict=True) if is_in])
 
 
 for _name, _title, _suffixes, _magic in (
@@ -559,7 +794,7 @@ for _name, _title, _suffixes, _magic in (
             signatures=(_magic,),
             read=read,
             write=write,
-            read_options=("layer", "cell"),
-            write_options=("layer", "dbu_um"),
+            read_options=("layer", "cell", "layers", "channels", "filter_names"),
+            write_options=("layer", "layers", "filter_names", "dbu_um", "hierarchy"),
         ),
     )

@@ -1,0 +1,237 @@
+"""
+Congruent sites, and the regular arrays that they form.
+
+Sites on the database grid are congruent if their vertices are equal after a translation, as integers and in the same order. An
+array consists of congruent sites in columns and rows of constant pitch, whose numbers and integer columns are linear functions
+of the indices in the array, and whose other columns are constant: a few numbers specify all of its sites exactly. Rotated
+copies are not congruent: on the database grid, their vertices are rounded differently.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim._core.rings import positions_in_runs
+from foveasim._core.validation import Ints
+
+__all__ = ["Arrays", "concatenate", "congruence_classes", "find_arrays", "single_sites"]
+
+#: Maximum number of columns and of rows of an array in GDSII.
+MAX_ARRAY_SIDE = 32767
+#: Integers below this limit are exact as steps of an array; columns with larger ones count as constant.
+MAX_STEP = 2**53
+#: Integer columns with at most so few values, such as channels, are constant in an array: they may be periodic.
+MAX_CONSTANTS = 4
+#: Odd multipliers of the hash of vertices (splitmix64 and the golden ratio).
+_MIX = tuple(np.uint64(c) for c in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB, 0xD6E8FEB86659FD93))
+
+
+@dataclass(frozen=True)
+class Arrays:
+    """
+    Arrays of congruent sites; single sites are arrays of 1 x 1.
+
+    Attributes
+    ----------
+    first : (n,) int64
+        Index of the site in column 0, row 0.
+    n_x, n_y : (n,) int64
+        Numbers of columns and rows.
+    pitch : (n, 2) int64
+        Pitch of the columns in x and of the rows in y, in database units.
+    number_steps : (n, 2) int64
+        Steps of the site index from column to column, and from row to row.
+    column_steps : mapping of str to (n, 2) int64
+        The same for integer columns.
+    """
+
+    first: Ints
+    n_x: Ints
+    n_y: Ints
+    pitch: Ints
+    number_steps: Ints
+    column_steps: Mapping[str, Ints]
+
+    def select(self, chosen: Any) -> Arrays:
+        """Return some of the arrays."""
+        return Arrays(
+            self.first[chosen],
+            self.n_x[chosen],
+            self.n_y[chosen],
+            self.pitch[chosen],
+            self.number_steps[chosen],
+            {name: steps[chosen] for name, steps in self.column_steps.items()},
+        )
+
+    def sites(self) -> Ints:
+        """Return the sites of all arrays, array after array."""
+        size = self.n_x * self.n_y
+        array = np.repeat(np.arange(size.size), size)
+        j, i = np.divmod(positions_in_runs(size), self.n_x[array])
+        return np.asarray(self.first[array] + i * self.number_steps[array, 0] + j * self.number_steps[array, 1])
+
+
+def single_sites(sites: Ints, columns: Mapping[str, NDArray[Any]]) -> Arrays:
+    """Return the given sites as arrays of 1 x 1."""
+    one, zero = np.ones(sites.size, np.int64), np.zeros((sites.size, 2), np.int64)
+    return Arrays(sites, one, one, zero, zero, dict.fromkeys(columns, zero))
+
+
+def congruence_classes(xy_dbu: Ints, ring_offsets: Ints, site_offsets: Ints) -> tuple[Ints, Ints]:
+    """
+    Return the congruence class of each site, and the position of each site.
+
+    Parameters
+    ----------
+    xy_dbu : (n_vertex, 2) int64
+    ring_offsets, site_offsets : int64
+        Packed rings, as of a layout.
+
+    Returns
+    -------
+    class_of : (n_site,) int64
+        Classes 0, 1, ... in no particular order.
+    origin_dbu : (n_site, 2) int64
+        Lower left corner of the bounding box; vertices of congruent sites are equal relative to it.
+    """
+    start = ring_offsets[site_offsets[:-1]]
+    n_vertices = np.diff(ring_offsets[site_offsets])
+    if start.size == 0:
+        return np.zeros(0, np.int64), np.zeros((0, 2), np.int64)
+    origin = np.stack([np.minimum.reduceat(xy_dbu[:, axis], start) for axis in (0, 1)], axis=1)
+    site = np.repeat(np.arange(start.size), n_vertices)
+    position = positions_in_runs(n_vertices)
+    ring = np.repeat(positions_in_runs(np.diff(site_offsets)), np.diff(ring_offsets))
+    vertex = np.column_stack((xy_dbu - origin[site], ring))
+    found, first, class_of = np.unique(
+        np.add.reduceat(_vertex_hash(vertex, position), start), return_index=True, return_inverse=True
+    )
+    # Sites with equal hashes are compared with the first one of their class; different ones would be a class of their own.
+    model = first[class_of]
+    has_size = n_vertices == n_vertices[model]
+    twin = np.where(has_size[site], start[model][site] + position, 0)
+    is_equal = np.logical_and.reduceat((vertex == vertex[twin]).all(axis=1), start) & has_size
+    collided = np.flatnonzero(~is_equal)
+    class_of[collided] = found.size + np.arange(collided.size)
+    return class_of, origin
+
+
+def _vertex_hash(vertex: Ints, position: Ints) -> NDArray[np.uint64]:
+    """Return a hash of each vertex and its position in the site; the hash of a site is their sum modulo 2^64."""
+    mixed = (position + 1).astype(np.uint64) * _MIX[0]
+    for axis in range(vertex.shape[1]):
+        mixed = (mixed ^ vertex[:, axis].astype(np.uint64)) * _MIX[axis + 1]
+        mixed ^= mixed >> np.uint64(29)
+    return mixed
+
+
+def find_arrays(class_of: Ints, origin_dbu: Ints, columns: Mapping[str, NDArray[Any]], max_dbu: int) -> Arrays:
+    """
+    Divide the sites into arrays.
+
+    Parameters
+    ----------
+    class_of : (n_site,) int64
+        Sites of different classes are in different arrays.
+    origin_dbu : (n_site, 2) int64
+    columns : mapping of str to (n_site,) arrays
+        Columns that the arrays reproduce.
+    max_dbu : int
+        Maximum coordinate, also of the position behind the last column and row.
+
+    Notes
+    -----
+    Sites in the order of class, y and x are divided into runs of constant pitch, and runs of equal length, pitch and x into
+    arrays. Each step is one sort and one pass.
+    """
+    kind, numbers = class_of, [np.arange(class_of.size)]
+    index_of: dict[str, int] = {}
+    for name, column in columns.items():
+        if _is_linear(column) and np.unique(column).size > MAX_CONSTANTS:
+            index_of[name] = 2 + len(numbers)
+            numbers.append(column.astype(np.int64))
+        else:
+            kind = _combine(kind, _codes(column))
+    is_repeated = np.bincount(kind)[kind] > 1 if kind.size else np.zeros(0, bool)
+    rows = np.column_stack((origin_dbu, *numbers))[is_repeated]
+    kind = kind[is_repeated]
+
+    order = np.lexsort((rows[:, 0], rows[:, 1], kind))
+    rows, kind = rows[order], kind[order]
+    start, n_x, step_x = _progressions(rows, np.column_stack((kind, rows[:, 1])))
+    rows, keys = rows[start], np.column_stack((kind[start], n_x, rows[start, 0], step_x))
+    order = np.lexsort((rows[:, 1], *keys.T[::-1]))
+    rows, n_x, step_x = rows[order], n_x[order], step_x[order]
+    start, n_y, step_y = _progressions(rows, keys[order])
+    rows, n_x, steps = rows[start], n_x[start], np.stack((step_x[start], step_y), axis=2)
+
+    none = np.zeros_like(steps[:, 0])
+    arrays = Arrays(
+        rows[:, 2],
+        n_x,
+        n_y,
+        np.stack((steps[:, 0, 0], steps[:, 1, 1]), axis=1),
+        steps[:, 2],
+        {name: steps[:, index_of[name]] if name in index_of else none for name in columns},
+    )
+    end = rows[:, :2] + arrays.pitch * np.stack((n_x, n_y), axis=1)
+    is_within = (np.abs(end) <= max_dbu).all(axis=1)
+    others = np.concatenate((np.flatnonzero(~is_repeated), arrays.select(~is_within).sites()))
+    joined = concatenate(arrays.select(is_within), single_sites(others, columns))
+    return joined.select(np.argsort(joined.first))
+
+
+def _progressions(rows: Ints, keys: Ints) -> tuple[Ints, Ints, Ints]:
+    """
+    Divide sorted rows into arithmetic progressions of rows with equal keys.
+
+    Returns
+    -------
+    start, size : (n,) int64
+        Index of the first row, and number of rows.
+    step : (n, k) int64
+        Difference of successive rows; 0 for a single one.
+    """
+    from foveasim.layout.files import _kernels
+
+    is_new = np.ones(len(keys), bool)
+    is_new[1:] = (keys[1:] != keys[:-1]).any(axis=1)
+    start = np.flatnonzero(_kernels.progressions(np.ascontiguousarray(rows), np.cumsum(is_new), MAX_ARRAY_SIDE))
+    size = np.diff(np.append(start, len(rows)))
+    second = np.minimum(start + 1, len(rows) - 1)
+    return start, size, np.where((size > 1)[:, np.newaxis], rows[second] - rows[start], 0)
+
+
+def concatenate(*parts: Arrays) -> Arrays:
+    """Return the arrays of all parts."""
+    return Arrays(
+        *(
+            np.concatenate([getattr(p, name) for p in parts])
+            for name in ("first", "n_x", "n_y", "pitch", "number_steps")
+        ),
+        {name: np.concatenate([p.column_steps[name] for p in parts]) for name in parts[0].column_steps},
+    )
+
+
+def _is_linear(column: NDArray[Any]) -> bool:
+    """Return whether the values are integers whose differences are exact."""
+    if column.dtype.kind not in "iu" or column.size == 0:
+        return False
+    return int(column.min()) > -MAX_STEP and int(column.max()) < MAX_STEP
+
+
+def _codes(column: NDArray[Any]) -> Ints:
+    """Return an integer per distinct value; numbers are distinct if their bits are."""
+    if column.dtype.kind == "f":
+        column = column.astype(np.float64).view(np.int64)
+    return np.asarray(np.unique(column, return_inverse=True)[1], np.int64)
+
+
+def _combine(a: Ints, b: Ints) -> Ints:
+    """Return an integer per distinct pair."""
+    return np.asarray(np.unique(a * (int(b.max(initial=0)) + 1) + b, return_inverse=True)[1], np.int64)

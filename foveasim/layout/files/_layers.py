@@ -1,0 +1,357 @@
+"""
+Layer maps of GDSII and OASIS files: layer and datatype of each kind of shape, and the table of derived layers.
+
+A layer map is a mapping from names to layers:
+
+==================  ================================================================================================
+name                shapes
+==================  ================================================================================================
+``photosite``       outlines of all sites
+``filter_R``        outlines of the sites with this filter; ``filter_0`` for the channel 0
+a derived layer     polygons computed from the outlines: see :data:`DERIVED_LAYERS`
+==================  ================================================================================================
+
+A layer is a pair ``(layer, datatype)``, a string ``"77/3"``, an integer (datatype 0), or a mapping of ``layer`` and of the
+parameters of a derived layer: ``{"layer": (20, 0), "inset_um": 0.2}``.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from foveasim._core.registry import Registry
+from foveasim._core.validation import check_count, check_number
+from foveasim._io.yaml_files import read_yaml
+from foveasim.errors import ConfigError, ParameterError
+from foveasim.layout.model import Layout
+
+__all__ = [
+    "DERIVED_LAYERS",
+    "FILTER_NAMES",
+    "DrawnLayer",
+    "LayerNumber",
+    "parse_channels",
+    "parse_layer",
+    "parse_layer_map",
+    "parse_selection",
+    "read_layer_map",
+]
+
+#: Layer and datatype; None for any datatype.
+LayerNumber: TypeAlias = tuple[int, int | None]
+#: Function of a layout that returns one polygon per site.
+DerivedLayer: TypeAlias = Callable[..., NDArray[Any]]
+
+#: Maximum layer and datatype: some programs read them as signed 16-bit integers.
+MAX_LAYER = 32767
+#: Maximum layer and datatype that are read.
+MAX_READ_LAYER = 2**31 - 1
+PHOTOSITE = "photosite"
+FILTER = "filter_"
+#: Names of the channels in the order of ``mosaic`` and of the RGB filters of a sensor.
+FILTER_NAMES = ("R", "G", "B", "W")
+#: Corners are extended by at most this multiple of the offset.
+MITRE_LIMIT = 100.0
+EXAMPLE = "such as (77, 3) or '77/3'"
+_NUMBERS = re.compile(r"([0-9]{1,9})(?:/([0-9]{1,9}))?")
+
+
+# -- derived layers ---------------------------------------------------------------------------------------------------
+
+#: Derived layers by name: functions of a layout, with keywords, that return one polygon per site, (n_site,), in µm. A polygon
+#: depends on the outline of its own site only, because congruent sites are drawn once. Installed packages add derived layers as
+#: entry points of the group ``foveasim.derived_layers``.
+DERIVED_LAYERS: Registry[DerivedLayer] = Registry("derived layer", "foveasim.derived_layers")
+
+
+@DERIVED_LAYERS.register("well")
+def _well(layout: Layout, *, inset_um: float = 0.1) -> NDArray[Any]:
+    """Return the wells of the photodiodes: outlines with an inward offset, half a trench."""
+    return _offset(layout.polygons(), -check_number("inset_um", inset_um, at_least=0.0))
+
+
+@DERIVED_LAYERS.register("microlens")
+def _microlens(layout: Layout, *, inset_um: float = 0.0, corner_radius_um: float = 0.0) -> NDArray[Any]:
+    """Return the bases of the microlenses: outlines without holes, inset, with round corners."""
+    inset_um = check_number("inset_um", inset_um, at_least=0.0)
+    radius_um = check_number("corner_radius_um", corner_radius_um, at_least=0.0)
+    outlines = shapely.polygons(shapely.get_exterior_ring(layout.polygons()))
+    return np.asarray(shapely.buffer(_offset(outlines, -inset_um - radius_um), radius_um, quad_segs=8))
+
+
+@DERIVED_LAYERS.register("metal_keep_out")
+def _metal_keep_out(layout: Layout, *, outset_um: float = 0.0) -> NDArray[Any]:
+    """Return the areas without metal: outlines with an outward offset, inward if negative."""
+    return _offset(layout.polygons(), check_number("outset_um", outset_um))
+
+
+def _offset(polygons: NDArray[Any], distance_um: float) -> NDArray[Any]:
+    if distance_um == 0.0:
+        return polygons
+    return np.asarray(shapely.buffer(polygons, distance_um, join_style="mitre", mitre_limit=MITRE_LIMIT))
+
+
+# -- layer maps -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DrawnLayer:
+    """
+    A layer of a file, and its shapes.
+
+    Attributes
+    ----------
+    name : str
+        Name in the layer map.
+    layer, datatype : int
+        A datatype of None stands for the channel of each site.
+    channel : int, optional
+        Channel of the sites of a filter layer.
+    parameters : dict
+        Keywords of the function of a derived layer.
+    """
+
+    name: str
+    layer: int
+    datatype: int | None
+    channel: int | None = None
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def number(self) -> LayerNumber:
+        """Layer and datatype."""
+        return self.layer, self.datatype
+
+    @property
+    def is_derived(self) -> bool:
+        """Whether the shapes are derived from the outlines."""
+        return self.name != PHOTOSITE and self.channel is None
+
+    def shapes(self, layout: Layout) -> NDArray[Any]:
+        """
+        Return the polygons of a derived layer, one per site.
+
+        Raises
+        ------
+        ParameterError
+            When a parameter is invalid, or the function does not return one geometry per site.
+        """
+        try:
+            polygons = np.asarray(DERIVED_LAYERS[self.name](layout, **self.parameters))
+        except ParameterError as error:
+            raise ParameterError(f"layers[{self.name}].{error.name}", error.detail) from None
+        if polygons.shape != (layout.n_sites,) or not shapely.is_geometry(polygons).all():
+            raise ParameterError(
+                "layers", f"derived layer '{self.name}' must return one polygon for each of the {layout.n_sites} sites"
+            )
+        return polygons
+
+
+def read_layer_map(path: str | Path) -> dict[str, Any]:
+    """
+    Read a layer map from a YAML file.
+
+    Parameters
+    ----------
+    path : path
+        Lines such as ``photosite: 77/3`` and ``well: {layer: 20/0, inset_um: 0.2}``.
+
+    Returns
+    -------
+    layers : dict
+        Value of ``layers=`` of :func:`write_layout` and :func:`read_layout`.
+
+    Raises
+    ------
+    ConfigError
+        When the file is missing, or not a mapping in YAML.
+    """
+    layers: dict[str, Any] = read_yaml(Path(path))
+    return layers
+
+
+def parse_layer_map(
+    layers: Mapping[str, Any] | str | Path, filter_names: Sequence[str] | None = None
+) -> list[DrawnLayer]:
+    """
+    Return the layers of a layer map, or of its YAML file.
+
+    Parameters
+    ----------
+    layers : mapping or path
+    filter_names : sequence of str, optional
+        Names of the channels 0, 1, ...
+
+    Raises
+    ------
+    ConfigError
+        When the file is missing or invalid.
+    ParameterError
+        When a name is unknown, a layer is invalid, or two names have the same layer.
+    """
+    if isinstance(layers, str | Path):
+        path = Path(layers)
+        try:
+            return parse_layer_map(read_layer_map(path), filter_names)
+        except ParameterError as error:
+            raise ConfigError(path, str(error)) from None
+    if not isinstance(layers, Mapping) or not layers:
+        raise ParameterError("layers", f"must be a mapping of names to layers, {EXAMPLE}, or a YAML file", layers)
+    names = check_filter_names(filter_names)
+    drawn = [_drawn_layer(name, value, names) for name, value in layers.items()]
+    owner: dict[LayerNumber, str] = {}
+    for layer in drawn:
+        other = owner.setdefault(layer.number, layer.name)
+        if other != layer.name:
+            raise ParameterError(
+                "layers", f"must be different layers, but '{other}' and '{layer.name}' are both {_text(layer.number)}"
+            )
+    channels = [layer.channel for layer in drawn if layer.channel is not None]
+    if len(channels) != len(set(channels)):
+        raise ParameterError("layers", "must have one layer per channel", list(layers))
+    if PHOTOSITE not in layers:
+        raise ParameterError("layers", "must contain the layer 'photosite'", list(layers))
+    return drawn
+
+
+def _drawn_layer(name: str, value: Any, filter_names: Sequence[str]) -> DrawnLayer:
+    if not isinstance(name, str):
+        raise ParameterError("layers", "must have strings as keys", name)
+    key = f"layers[{name}]"
+    channel = None
+    parameters: dict[str, Any] = {}
+    if name.startswith(FILTER):
+        channel = parse_channel("layers", name.removeprefix(FILTER), filter_names)
+    elif name != PHOTOSITE and name not in DERIVED_LAYERS:
+        known = [PHOTOSITE, *(FILTER + n for n in filter_names), *DERIVED_LAYERS]
+        closest = get_close_matches(name.replace(" ", "_").replace("-", "_"), known, n=1)
+        hint = f"did you mean '{closest[0]}'?" if closest else f"available: {', '.join(known)}"
+        raise ParameterError("layers", "must have names of layers as keys", name, hint=hint)
+    if isinstance(value, Mapping):
+        parameters = dict(value)
+        value = parameters.pop("layer", None)
+        allowed = [] if name not in DERIVED_LAYERS else list(inspect.signature(DERIVED_LAYERS[name]).parameters)[1:]
+        for parameter in parameters:
+            if parameter not in allowed:
+                raise ParameterError(key, f"must have the keys {', '.join(['layer', *allowed])} only", parameter)
+    layer, datatype = parse_layer(key, value, at_most=MAX_LAYER)
+    return DrawnLayer(
+        name=name, layer=layer, datatype=0 if datatype is None else datatype, channel=channel, parameters=parameters
+    )
+
+
+def parse_layer(name: str, value: Any, *, at_most: int = MAX_READ_LAYER) -> LayerNumber:
+    """
+    Return layer and datatype of ``77``, ``(77, 3)``, ``"77"`` or ``"77/3"``.
+
+    Raises
+    ------
+    ParameterError
+        When the value is none of these, or out of range.
+    """
+    parts: Sequence[Any]
+    if isinstance(value, str):
+        match = _NUMBERS.fullmatch(value.strip())
+        parts = () if match is None else [int(n) for n in match.groups() if n is not None]
+    elif isinstance(value, Sequence):
+        parts = value
+    else:
+        parts = (value,)
+    is_integer = [isinstance(n, int | np.integer) and not isinstance(n, bool) for n in parts]
+    if len(parts) not in (1, 2) or not all(is_integer):
+        raise ParameterError(name, f"must be a layer, {EXAMPLE}", value)
+    numbers = [check_count(name, n, at_least=0, at_most=at_most) for n in parts]
+    return numbers[0], numbers[1] if len(numbers) == 2 else None
+
+
+def parse_selection(value: Any) -> list[LayerNumber]:
+    """
+    Return the layers to read: one layer, or a list of layers.
+
+    Raises
+    ------
+    ParameterError
+        When a layer is invalid, or there is none.
+    """
+    is_pair = isinstance(value, tuple) and len(value) == 2 and all(isinstance(n, int) for n in value)
+    if isinstance(value, str) or not isinstance(value, Sequence) or is_pair:
+        return [parse_layer("layer", value)]
+    if not value:
+        raise ParameterError("layer", f"must be one or more layers, {EXAMPLE}", value)
+    return [parse_layer("layer", item) for item in value]
+
+
+def parse_channels(channels: Any, filter_names: Sequence[str] | None = None) -> dict[LayerNumber, int]:
+    """
+    Return the channel of each filter layer.
+
+    Parameters
+    ----------
+    channels : mapping
+        From layers to names or numbers of channels: ``{(10, 0): "R", "11/0": 1}``.
+    filter_names : sequence of str, optional
+        Names of the channels 0, 1, ...
+
+    Raises
+    ------
+    ParameterError
+        When a layer or a channel is invalid.
+    """
+    if not isinstance(channels, Mapping) or not channels:
+        raise ParameterError("channels", "must be a mapping of layers to channels, such as {(10, 0): 'R'}", channels)
+    names = check_filter_names(filter_names)
+    return {parse_layer("channels", key): parse_channel("channels", value, names) for key, value in channels.items()}
+
+
+def parse_channel(name: str, value: Any, filter_names: Sequence[str]) -> int:
+    """
+    Return a channel from its number, or from its name.
+
+    Raises
+    ------
+    ParameterError
+        When no channel has this name; the message lists the names.
+    """
+    if isinstance(value, str):
+        if value in filter_names:
+            return list(filter_names).index(value)
+        if not (value.isascii() and value.isdecimal() and len(value) <= len(str(MAX_LAYER))):
+            raise ParameterError(
+                name,
+                "must have channels as numbers, or as names of filter_names",
+                value,
+                hint=f"the names are {', '.join(filter_names)}; others with filter_names=(...)",
+            )
+        value = int(value)
+    return check_count(name, value, at_least=0, at_most=MAX_LAYER)
+
+
+def check_filter_names(filter_names: Sequence[str] | None) -> Sequence[str]:
+    """
+    Return the names of the channels, by default R, G, B, W.
+
+    Raises
+    ------
+    ParameterError
+        When they are not different strings.
+    """
+    if filter_names is None:
+        return FILTER_NAMES
+    names = list(filter_names) if isinstance(filter_names, Sequence) else []
+    if not names or not all(isinstance(n, str) and n for n in names) or len(set(names)) != len(names):
+        raise ParameterError("filter_names", "must be different strings, one per channel", filter_names)
+    return names
+
+
+def _text(number: LayerNumber) -> str:
+    return "/".join(str(n) for n in number if n is not None)
