@@ -173,7 +173,22 @@ def convert(
     target: Annotated[
         Path, typer.Argument(help="File to write; the format by extension: .gds .oas .geojson .parquet .npz .svg.")
     ],
-    layer: Annotated[int | None, typer.Option("--layer", help="GDSII or OASIS layer of the photosites.")] = None,
+    layer: Annotated[
+        list[str] | None,
+        typer.Option("--layer", help="Layer of the photosites, 77/3, or of other shapes, filter_R=10/0; repeatable."),
+    ] = None,
+    layers: Annotated[
+        Path | None, typer.Option("--layers", help="Layer map: YAML file of lines such as well: 20/0.")
+    ] = None,
+    source_layer: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--source-layer", help="Layer of the photosites in SOURCE, or with a name as for --layer; repeatable."
+        ),
+    ] = None,
+    source_cell: Annotated[
+        str | None, typer.Option("--source-cell", help="Cell of SOURCE, a GDSII or OASIS file.")
+    ] = None,
     dbu_um: Annotated[
         float | None, typer.Option("--dbu-um", help="Database unit of a GDSII or OASIS file in µm.")
     ] = None,
@@ -181,8 +196,10 @@ def convert(
     """Convert a layout to another file format, and report rounding and dropped columns."""
     from foveasim.config import read_any_layout
     from foveasim.layout import write_layout
+    from foveasim.layout.files import layer_options
 
-    written = write_layout(read_any_layout(source).layout, target, layer=layer, dbu_um=dbu_um)
+    layout = read_any_layout(source, cell=source_cell, **layer_options(source_layer or [])).layout
+    written = write_layout(layout, target, dbu_um=dbu_um, **layer_options(layer or [], layers))
     dropped = f"; dropped columns: {', '.join(written.dropped_columns)}" if written.dropped_columns else ""
     _report(
         f"wrote {written.path}: {written.n_sites:,} photosites, vertices moved by at most "

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, create_mo
 
 from foveasim._core.registry import Registry
 from foveasim.distortion import LENSES
-from foveasim.layout import LAYOUTS, PRESETS, RULES, DesignRules, Readout, Routing
+from foveasim.layout import LAYOUTS, PRESETS, RULES, DesignRules, Readout, Routing, read_layout
 from foveasim.maps import read_power_map
 from foveasim.optics import PUPILS, LateralColour, Optics, Seidel, Zernike
 from foveasim.scene import SCENES
@@ -33,7 +33,7 @@ from foveasim.sensor import (
 from foveasim.sensor.effects import EFFECTS
 from foveasim.sensor.spectral import CURVES
 
-__all__ = ["Models", "PerArea", "call_of", "models"]
+__all__ = ["FILE_OPTIONS", "Models", "PerArea", "call_of", "models"]
 
 #: The function or class of each section.
 _CALLS: dict[type[BaseModel], Callable[..., Any]] = {}
@@ -111,6 +111,15 @@ _FILE_TYPES: dict[str, Any] = {
 _Numbers: Any = float | list[float] | None
 #: Bands of scenes: one wavelength or several.
 _WAVELENGTHS: dict[str, Any] = {"wavelength_nm": _Numbers, "band_width_nm": _Numbers}
+#: Options of layout files in settings, with their types: a layer is ``77`` or ``77/3``.
+_Layer: Any = int | str
+FILE_OPTIONS: dict[str, Any] = {
+    "layer": _Layer | list[_Layer] | None,
+    "cell": str | None,
+    "layers": str | dict[str, _Layer | dict[str, _Layer | float]] | None,
+    "channels": dict[str, int | str] | None,
+    "filter_names": list[str] | None,
+}
 #: Parameters that files do not contain: a density picture covers the rectangle ``size_um``.
 _EXCLUDED = ("density_grid",)
 _CROSSTALK: dict[str, Callable[..., Any]] = {"diffusion": Diffusion, "kernel": KernelCrosstalk}
@@ -247,8 +256,22 @@ def _layout(rules: type[_Section]) -> Any:
     base.__doc__ = (
         "A layout: a generator and its parameters, colour filters, edits in the order of the keys, design rules."
     )
+    descriptions = _documentation(read_layout)[1]
+    options: dict[str, Any] = {
+        name: (kind, Field(None, description=descriptions[name])) for name, kind in FILE_OPTIONS.items()
+    }
+    file = create_model("layout file", __base__=base, file=(str, ...), **options)
+    file.__doc__ = (
+        "A layout: a file and options of its format, colour filters, edits in the order of the keys, design rules."
+    )
     parameters = _registered_sections(LAYOUTS, _EXCLUDED, "{} parameters", **_FILE_TYPES)
-    return _union_of(
+    generated = _union_of(
         "generator",
         {name: create_model(name, __base__=base, parameters=(part, ...)) for name, part in parameters.items()},
     )
+    return Annotated[
+        Annotated[file, Tag("layout file")] | Annotated[generated, Tag("layout generator")],
+        Discriminator(
+            lambda section: "layout file" if isinstance(section, dict) and "file" in section else "layout generator"
+        ),
+    ]

@@ -17,7 +17,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._io.images import read_picture
 from foveasim._io.yaml_files import parse_yaml, read_yaml
 from foveasim.camera import Camera
-from foveasim.config._models import PerArea, call_of, models
+from foveasim.config._models import FILE_OPTIONS, PerArea, call_of, models
 from foveasim.config._problems import validate
 from foveasim.config._sources import Source
 from foveasim.errors import ConfigError, FoveasimError, ParameterError
@@ -53,7 +53,7 @@ BUNDLED_PICTURE = "skimage:"
 #: Extensions of settings files; the format of other layout files follows from their content.
 YAML_EXTENSIONS = (".yaml", ".yml")
 #: Settings whose value may be a file.
-FILE_SETTINGS = ("density", "importance", "layout", "path", "picture")
+FILE_SETTINGS = ("density", "file", "importance", "layers", "layout", "path", "picture")
 #: Option of the command line that replaces settings.
 CHANGE = "--set"
 #: Tolerance of the aspect ratio of a picture and the rectangle that it covers.
@@ -271,7 +271,7 @@ def read_layout_file(path: str | Path) -> LayoutFile:
     return _build_layout(source, "", validate(source, models().layout, read_yaml(Path(path))))
 
 
-def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None = None, **options: Any) -> Layout:
+def read_layout(path: str | Path, **options: Any) -> Layout:
     """
     Read a layout from a file of any format, or a bundled layout by its name.
 
@@ -281,12 +281,9 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
         A GDSII, OASIS, GeoJSON, GeoParquet or npz file, recognised by its content; a YAML file of a generator and its
         parameters; or a name, such as ``"giotto_2"``. A file of that name in the working directory comes first, as on
         the command line.
-    layer : int, optional
-        GDSII and OASIS: the layer of the photosites; required when several layers contain shapes.
-    cell : str, optional
-        GDSII and OASIS: the top cell to read; required when there are several.
     **options
-        Options of other formats in :data:`foveasim.layout.FORMATS`.
+        Options of the format, as for :func:`foveasim.layout.read_layout`: for GDSII and OASIS ``layer=`` of the photosites,
+        ``cell=``, and ``channels=`` or ``layers=`` for the colour filters.
 
     Returns
     -------
@@ -306,12 +303,10 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
     >>> fs.read_layout("prima_100").n_sites
     378
     """
-    return read_any_layout(path, layer=layer, cell=cell, **options).layout
+    return read_any_layout(path, **options).layout
 
 
-def read_any_layout(
-    path: str | Path, *, directory: str | Path = ".", layer: int | None = None, cell: str | None = None, **options: Any
-) -> LayoutFile:
+def read_any_layout(path: str | Path, *, directory: str | Path = ".", **options: Any) -> LayoutFile:
     """
     Read a layout with its design rules from a file, or a bundled one by its name.
 
@@ -321,8 +316,8 @@ def read_any_layout(
         A file takes precedence over a bundled layout of the same name.
     directory : path
         Directory of relative paths; the working directory by default.
-    layer, cell : optional
-        GDSII and OASIS, as for :func:`foveasim.layout.read_layout`.
+    **options
+        Options of the format, as for :func:`foveasim.layout.read_layout`.
 
     Raises
     ------
@@ -333,9 +328,9 @@ def read_any_layout(
     """
     path = layout_path(path, directory)
     if path.suffix.lower() in YAML_EXTENSIONS:
-        check_no_options(layer=layer, cell=cell, **options)
+        check_no_options(**options)
         return read_layout_file(path)
-    return LayoutFile(layout=read_sites(path, layer=layer, cell=cell, **options), rules=None, source=str(path))
+    return LayoutFile(layout=read_sites(path, **options), rules=None, source=str(path))
 
 
 def read_rules(path: str | Path) -> DesignRules:
@@ -365,13 +360,33 @@ def schema(section: Any = "shot", title: str = "foveasim settings") -> dict[str,
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **model_schema, "title": title}
 
 
-def _build_layout(source: Source, prefix: str, section: Any) -> LayoutFile:
+def _generate(source: Source, prefix: str, section: Any) -> Layout:
+    """Return the layout of a generator and its parameters."""
     parameters = prefix + "parameters"
     values = _values(source, parameters + ".", section.parameters)
     picture = getattr(LAYOUTS[section.generator], "picture", None)
     if picture is not None and values[picture] is not None:
         values |= _picture_values(source, f"{parameters}.{picture}", values)
-    layout = _call(source, parameters, _callable(section.parameters), values)
+    layout: Layout = _call(source, parameters, _callable(section.parameters), values)
+    return layout
+
+
+def _read_sites(source: Source, prefix: str, section: Any) -> Layout:
+    """Return the layout of a file, with options of its format."""
+    file = source.directory / section.file
+    if file.suffix.lower() in YAML_EXTENSIONS:
+        raise source.error(
+            prefix + "file", f"must not be a YAML file, got '{section.file}'; specify it as layout: {section.file}"
+        )
+    options = {name: getattr(section, name) for name in FILE_OPTIONS}
+    if isinstance(options["layers"], str):
+        options["layers"] = source.directory / options["layers"]
+    layout: Layout = _call(source, prefix.rstrip("."), read_sites, {"path": file, **options})
+    return layout
+
+
+def _build_layout(source: Source, prefix: str, section: Any) -> LayoutFile:
+    layout = (_generate if hasattr(section, "generator") else _read_sites)(source, prefix, section)
     if section.mosaic is not None:
         layout = _call(source, prefix + "mosaic", mosaic, {"layout": layout, "block": section.mosaic})
     if any(section.move_um):

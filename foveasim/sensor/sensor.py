@@ -252,7 +252,8 @@ class Sensor:
         if self.n_filters > 1 and "channel" not in self.layout.columns:
             raise SimulationError(
                 f"the sensor has {self.n_filters} filters, but the layout has no column 'channel'; add it, for example with "
-                "foveasim.layout.mosaic(layout, ('RG', 'GB'))"
+                "foveasim.layout.mosaic(layout, ('RG', 'GB')), or read it from the filter layers of a GDSII or OASIS file with "
+                "channels={'10/0': 'R', ...}"
             )
         highest = int(self.layout.channel.max(initial=0))
         if highest >= self.n_filters:

@@ -192,7 +192,7 @@ def _near_pairs(box_um: Floats, reach_um: float) -> tuple[Ints, Ints]:
 @dataclass(frozen=True, slots=True)
 class Measurement:
     """
-    Measured values, with functions that return their sites and markers.
+    Measured values, with functions that return their sites and markers, and a note for the report.
 
     ``sites(positions)`` returns the sites of the values at some positions (site i by default), ``markers(positions)`` the
     marker geometries (those sites by default). Both are called for values that violate the rule only.
@@ -201,6 +201,7 @@ class Measurement:
     values: Floats
     sites: Callable[[Ints], Any] | None = None
     markers: Callable[[Ints], Any] | None = None
+    note: str = ""
 
     __repr__ = short_repr
 
@@ -278,11 +279,13 @@ def _spaces(case: Case) -> Measurement:
     found = case.contacts
     # Abutting sites share their boundary; with a manufacturing grid, to within one grid step.
     is_spaced = found.distance_um > max(LENGTH_ROUNDING_UM, case.rules.grid_um or 0.0)
+    n_abutting = int(np.count_nonzero(~is_spaced))
     near = np.flatnonzero(is_spaced & (found.distance_um <= float(case.rules.min_space_um or 0.0)))
     return Measurement(
         found.distance_um[near],
         lambda k: found.sites_of(near[k]),
         lambda k: shapely.shortest_line(case.shapes(found.first[near[k]]), case.shapes(found.second[near[k]])),
+        f"{n_abutting} pairs of sites touch and have no space; check inset outlines" if n_abutting else "",
     )
 
 

@@ -27,13 +27,15 @@ MAX_BYTES = 2**29
 #: Number of first bytes that are searched for the root element.
 HEAD_BYTES = 512
 #: Patterns of the category descriptions and item texts of write_lyrdb.
-DESCRIPTION = re.compile(r"^(?P<description>.*) \(limit (?P<limit>\S+) ?(?P<unit>[^)]*)\)$", re.DOTALL)
+DESCRIPTION = re.compile(
+    r"^(?P<description>.*) \(limit (?P<limit>\S+) ?(?P<unit>[^)]*)\)(?:; (?P<note>.*))?$", re.DOTALL
+)
 VIOLATION = re.compile(r"photosite (?P<sites>\d+(?:, \d+)*): (?P<value>\S+) ?(?P<unit>[^']*)")
 #: Points of one ring, edge or box of a marker.
 POINTS = re.compile(r"\(([^()]*)\)")
 
-#: Description, limit and unit of a rule; sites, value and marker of a violation.
-_RuleInfo: TypeAlias = tuple[str, float, str]
+#: Description, limit, unit and note of a rule; sites, value and marker of a violation.
+_RuleInfo: TypeAlias = tuple[str, float, str, str]
 _Item: TypeAlias = tuple[tuple[int, ...], float, Any]
 
 
@@ -66,7 +68,8 @@ def write_lyrdb(report: Report, path: str | Path) -> None:
     cell = database.create_cell(CELL_NAME).rdb_id()
     for result in report.results:
         category = database.create_category(result.rule)
-        category.description = f"{result.description} (limit {result.limit:g} {result.unit})"
+        note = f"; {result.note}" if result.note else ""
+        category.description = f"{result.description} (limit {result.limit:g} {result.unit}){note}"
         for violation in result.violations:
             item = database.create_item(cell, category.rdb_id())
             sites = ", ".join(map(str, violation.site_ids))
@@ -147,7 +150,11 @@ def read_lyrdb(path: str | Path, n_sites: int) -> Report:
     about: dict[str, _RuleInfo] = {}
     for name, category in _categories(root):
         match = DESCRIPTION.match(category.findtext("description") or "")
-        about[name] = (match["description"], _number(match["limit"]), match["unit"]) if match else (name, np.nan, "")
+        about[name] = (
+            (match["description"], _number(match["limit"]), match["unit"], match["note"] or "")
+            if match
+            else (name, np.nan, "", "")
+        )
         found[name] = []
     for item in root.iterfind("items/item"):
         name = (item.findtext("category") or "").strip().strip("'")
@@ -158,17 +165,17 @@ def read_lyrdb(path: str | Path, n_sites: int) -> Report:
             )
         found.setdefault(name, []).append((sites, value, marker))
     return Report(
-        n_sites, tuple(_result(name, about.get(name, (name, np.nan, "")), items) for name, items in found.items())
+        n_sites, tuple(_result(name, about.get(name, (name, np.nan, "", "")), items) for name, items in found.items())
     )
 
 
 def _result(name: str, about: _RuleInfo, items: list[_Item]) -> Any:
     from foveasim.layout.drc.rules import RuleResult
 
-    description, limit, unit = about
+    description, limit, unit, note = about
     values = np.array([value for _, value, _ in items], dtype=np.float64)
     sites, markers = [sites for sites, _, _ in items], [marker for _, _, marker in items]
-    return RuleResult(name, description, limit, unit, values, None, lambda part: (sites[part], markers[part]))
+    return RuleResult(name, description, limit, unit, values, None, lambda part: (sites[part], markers[part]), note)
 
 
 def _categories(root: Any, parent: str = "") -> list[tuple[str, Any]]:

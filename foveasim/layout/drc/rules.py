@@ -250,6 +250,8 @@ class RuleResult:
         Measured values of the violations, the worst first.
     waiver : str or None
         Reason why the rule may be violated.
+    note : str
+        What the rule did not check, such as the space between sites that touch.
     """
 
     rule: str
@@ -259,6 +261,7 @@ class RuleResult:
     values: Floats
     waiver: str | None
     _locate: Callable[[slice], tuple[Any, Any]]
+    note: str = ""
 
     __repr__ = short_repr
 
@@ -290,7 +293,8 @@ class RuleResult:
         found = self.violations
         locations = ([v.site_ids for v in found], [v.marker for v in found])
         return RuleResult, (
-            self.rule, self.description, self.limit, self.unit, self.values, self.waiver, partial(_select, *locations)
+            self.rule, self.description, self.limit, self.unit, self.values, self.waiver, partial(_select, *locations),
+            self.note,
         )  # fmt: skip
 
     @property
@@ -299,12 +303,13 @@ class RuleResult:
         return self.values.size == 0 or self.waiver is not None
 
     def __str__(self) -> str:
+        note = f" ({self.note})" if self.note else ""
         if self.worst is None:
-            return f"{self.rule}: satisfied"
+            return f"{self.rule}: satisfied{note}"
         count = f"{self.values.size} violation{'s' * (self.values.size != 1)}"
         waived = "" if self.waiver is None else f" (waived: {self.waiver})"
         unit = f" {self.unit}" if self.unit else ""
-        return f"{self.rule}: {count}, worst {self.worst:.6g}{unit}, limit {self.limit:g}{unit}{waived}"
+        return f"{self.rule}: {count}, worst {self.worst:.6g}{unit}, limit {self.limit:g}{unit}{waived}{note}"
 
     @property
     def worst(self) -> float | None:
@@ -424,6 +429,8 @@ class Report:
                 else Text("waived", "yellow")
             )
             table.add_row(r.rule, verdict, f"{r.values.size}", worst, f"{r.limit:g}", r.unit)
+        notes = [f"{r.rule}: {r.note}" for r in self.results if r.note]
+        table.caption = "\n".join(notes) or None
         return table
 
 
@@ -453,9 +460,10 @@ def check(layout: Layout, rules: DesignRules) -> Report:
     for name, limit in rules.limits().items():
         rule = RULES[name]
         bound = 0.0 if rule.is_deviation else float(limit)
-        values, locate = _violations(rule, _measure(name, rule, case), bound, case)
+        found = _measure(name, rule, case)
+        values, locate = _violations(rule, found, bound, case)
         waiver = (rules.waivers or {}).get(name)
-        results.append(RuleResult(name, rule.description, bound, rule.unit, values, waiver, locate))
+        results.append(RuleResult(name, rule.description, bound, rule.unit, values, waiver, locate, found.note))
     return Report(layout.n_sites, tuple(results), layout)
 
 

@@ -28,7 +28,7 @@ from foveasim.errors import FileError
 from foveasim.layout.files._bundled import bundled_layouts, layout_path
 from foveasim.layout.files._common import WrittenLayout
 from foveasim.layout.files._formats import FORMATS
-from foveasim.layout.files._layers import DERIVED_LAYERS, read_layer_map
+from foveasim.layout.files._layers import DERIVED_LAYERS, layer_options, read_layer_map
 from foveasim.layout.model import Layout
 
 __all__ = [
@@ -38,6 +38,7 @@ __all__ = [
     "WrittenLayout",
     "bundled_layouts",
     "check_no_options",
+    "layer_options",
     "layout_path",
     "read_layer_map",
     "read_layout",

@@ -40,6 +40,7 @@ __all__ = [
     "FILTER_NAMES",
     "DrawnLayer",
     "LayerNumber",
+    "layer_options",
     "parse_channels",
     "parse_layer",
     "parse_layer_map",
@@ -155,6 +156,33 @@ class DrawnLayer:
                 "layers", f"derived layer '{self.name}' must return one polygon for each of the {layout.n_sites} sites"
             )
         return polygons
+
+
+def layer_options(words: Sequence[str], map_file: Path | None = None) -> dict[str, Any]:
+    """
+    Return options of writers and readers from the words of a command line.
+
+    Parameters
+    ----------
+    words : sequence of str
+        Layers of the photosites, ``77/3``, or entries of a layer map, ``filter_R=10/0``.
+    map_file : path, optional
+        YAML file of a layer map; words replace its entries.
+
+    Raises
+    ------
+    ConfigError
+        When the file is invalid.
+    ParameterError
+        When a layer without a name is given with a layer map.
+    """
+    entries = {name: value for name, equals, value in (word.partition("=") for word in words) if equals}
+    numbers = [word for word in words if "=" not in word]
+    if map_file is None and not entries:
+        return {"layer": numbers[0] if len(numbers) == 1 else numbers} if numbers else {}
+    if numbers:
+        raise ParameterError("layer", "must have a name in a layer map", numbers[0], hint=f"photosite={numbers[0]}")
+    return {"layers": {**(read_layer_map(map_file) if map_file is not None else {}), **entries}}
 
 
 def read_layer_map(path: str | Path) -> dict[str, Any]:

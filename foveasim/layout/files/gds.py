@@ -176,7 +176,8 @@ def write(
 
     library = gdstk.Library("FOVEASIM", unit=1e-6, precision=dbu_um * 1e-6)
     shapes = [polygon for polygon, is_one in zip(polygons, is_site.tolist(), strict=True) if not is_one]
-    library.add(library.new_cell(CELL_NAME).add(*elements, *shapes), *cells)
+    library.new_cell(CELL_NAME).add(*elements, *shapes)
+    library.add(*cells)
     with atomic_write(path) as temporary:
         if is_oasis:
             library.write_oas(temporary, validation="crc32")
@@ -197,6 +198,12 @@ def _drawn_layers(layout: Layout, layer: Any, layers: Any, filter_names: Sequenc
         return [DrawnLayer(name=PHOTOSITE, layer=number, datatype=datatype)]
     drawn = parse_layer_map(layers, filter_names)
     filters = [d.channel for d in drawn if d.channel is not None]
+    if filters and CHANNEL not in layout.columns:
+        raise ParameterError(
+            "layers",
+            "must not contain filter layers for a layout without the column 'channel'",
+            hint="add it, for example with foveasim.layout.mosaic(layout, ('RG', 'GB'))",
+        )
     missing = np.setdiff1d(layout.channel, filters) if filters else np.zeros(0)
     if missing.size:
         site = int(np.flatnonzero(layout.channel == missing[0])[0])
@@ -346,7 +353,8 @@ def _derived_rings(
     except GeometryError as error:
         site = int(first[stack[error.site_ids[0]]]) if error.site_ids else int(first[0])
     raise GeometryError(
-        f"layer '{drawn.name}': the shape of site {site} vanishes on the database grid of {dbu_um:g} µm; change its parameters",
+        f"layer '{drawn.name}': the shape of site {site} would vanish or collapse on the database grid of {dbu_um:g} µm; "
+        "change the parameters of the layer",
         (site,),
     )
 
