@@ -27,6 +27,8 @@ MAX_ARRAY_SIDE = 32767
 MAX_STEP = 2**53
 #: Integer columns with at most so few values, such as channels, are constant in an array: they may be periodic.
 MAX_CONSTANTS = 4
+#: Periods of mosaics, in sites of the same filter in a row.
+STRIDES = (1, 2, 3, 4, 6, 8)
 #: Odd multipliers of the hash of vertices (splitmix64 and the golden ratio).
 _MIX = tuple(np.uint64(c) for c in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB, 0xD6E8FEB86659FD93))
 
@@ -147,7 +149,7 @@ def find_arrays(class_of: Ints, origin_dbu: Ints, columns: Mapping[str, NDArray[
     Notes
     -----
     Sites in the order of class, y and x are divided into runs of constant pitch, and runs of equal length, pitch and x into
-    arrays. Each step is one sort and one pass.
+    arrays. Each step is a sort and a pass, repeated for several periods where a class is not regular.
     """
     kind, numbers = class_of, [np.arange(class_of.size)]
     index_of: dict[str, int] = {}
@@ -163,12 +165,16 @@ def find_arrays(class_of: Ints, origin_dbu: Ints, columns: Mapping[str, NDArray[
 
     order = np.lexsort((rows[:, 0], rows[:, 1], kind))
     rows, kind = rows[order], kind[order]
-    start, n_x, step_x = _progressions(rows, np.column_stack((kind, rows[:, 1])))
+    order, start, n_x = _progressions(rows, np.column_stack((kind, rows[:, 1])))
+    rows, kind = rows[order], kind[order]
+    step_x = _steps(rows, start, n_x)
     rows, keys = rows[start], np.column_stack((kind[start], n_x, rows[start, 0], step_x))
     order = np.lexsort((rows[:, 1], *keys.T[::-1]))
-    rows, n_x, step_x = rows[order], n_x[order], step_x[order]
-    start, n_y, step_y = _progressions(rows, keys[order])
-    rows, n_x, steps = rows[start], n_x[start], np.stack((step_x[start], step_y), axis=2)
+    rows, n_x, step_x, keys = rows[order], n_x[order], step_x[order], keys[order]
+    order, start, n_y = _progressions(rows, keys)
+    rows, n_x, step_x = rows[order], n_x[order][start], step_x[order][start]
+    steps = np.stack((step_x, _steps(rows, start, n_y)), axis=2)
+    rows = rows[start]
 
     none = np.zeros_like(steps[:, 0])
     arrays = Arrays(
@@ -190,21 +196,58 @@ def _progressions(rows: Ints, keys: Ints) -> tuple[Ints, Ints, Ints]:
     """
     Divide sorted rows into arithmetic progressions of rows with equal keys.
 
+    Parameters
+    ----------
+    rows : (n, k) int64
+        Sorted by keys.
+    keys : (n, m) int64
+        The first key is the kind. Every n-th row of equal keys is in the same progressions, with the n of :data:`STRIDES` that
+        leads to the fewest progressions for the kind: in a quad Bayer mosaic, the pitch of every second red site is constant.
+
     Returns
     -------
-    start, size : (n,) int64
-        Index of the first row, and number of rows.
-    step : (n, k) int64
-        Difference of successive rows; 0 for a single one.
+    order : (n,) int64
+        Rows in the order of their progressions.
+    start, size : int64
+        First row of each progression in this order, and number of rows.
     """
     from foveasim.layout.files import _kernels
 
     is_new = np.ones(len(keys), bool)
     is_new[1:] = (keys[1:] != keys[:-1]).any(axis=1)
-    start = np.flatnonzero(_kernels.progressions(np.ascontiguousarray(rows), np.cumsum(is_new), MAX_ARRAY_SIDE))
-    size = np.diff(np.append(start, len(rows)))
+    group = np.cumsum(is_new) - 1
+    position = np.arange(len(keys)) - np.flatnonzero(is_new)[group]
+    kind = np.unique(keys[:, 0], return_inverse=True)[1]
+    n_kinds = int(kind.max(initial=-1)) + 1
+
+    def divide(chosen: Ints, stride: Any) -> tuple[Ints, Ints]:
+        """Return the chosen rows in order of progressions, and the positions of their first rows."""
+        residue = position[chosen] % stride
+        order = chosen[np.lexsort((residue, group[chosen]))] if np.any(stride != 1) else chosen
+        line = group[order] * max(STRIDES) + (
+            position[order] % (stride if np.isscalar(stride) else strides[kind[order]])
+        )
+        return order, np.flatnonzero(_kernels.progressions(np.ascontiguousarray(rows[order]), line, MAX_ARRAY_SIDE))
+
+    strides = np.ones(n_kinds, np.int64)
+    order, start = divide(np.arange(len(keys)), 1)
+    fewest = np.bincount(kind[start], minlength=n_kinds)
+    is_irregular = (fewest > np.bincount(kind[is_new], minlength=n_kinds))[kind]
+    if is_irregular.any():
+        irregular = np.flatnonzero(is_irregular)
+        for stride in STRIDES[1:]:
+            order, start = divide(irregular, stride)
+            n = np.bincount(kind[order[start]], minlength=n_kinds)
+            is_better = (n > 0) & (n < fewest)
+            strides[is_better], fewest[is_better] = stride, n[is_better]
+        order, start = divide(np.arange(len(keys)), strides[kind])
+    return order, start, np.diff(np.append(start, len(rows)))
+
+
+def _steps(rows: Ints, start: Ints, size: Ints) -> Ints:
+    """Return the difference of successive rows of each progression; 0 for a single row."""
     second = np.minimum(start + 1, len(rows) - 1)
-    return start, size, np.where((size > 1)[:, np.newaxis], rows[second] - rows[start], 0)
+    return np.where((size > 1)[:, np.newaxis], rows[second] - rows[start], 0)
 
 
 def concatenate(*parts: Arrays) -> Arrays:

@@ -180,7 +180,8 @@ def write(
     library.add(*cells)
     with atomic_write(path) as temporary:
         if is_oasis:
-            library.write_oas(temporary, validation="crc32")
+            # Rectangles of OASIS do not preserve the first vertex.
+            library.write_oas(temporary, detect_rectangles=False, detect_trapezoids=False, validation="crc32")
         else:
             library.write_gds(temporary, max_points=0, timestamp=TIMESTAMP)
         _check_complete(temporary, is_oasis)
