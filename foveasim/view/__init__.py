@@ -16,6 +16,7 @@ from foveasim.view.render3d import Viewpoint, render, show, sites_in_view
 from foveasim.view.renderer import find_renderer
 from foveasim.view.rule_plots import plot_report
 from foveasim.view.site_colours import SiteColours, colours_of, site_colours
+from foveasim.view.site_pictures import site_picture
 from foveasim.view.solids import PartReport, SensorStack, Solids, SolidsReport, solids, stack, write_meshes
 from foveasim.view.web import solid_page, web_page, write_solid_page, write_web_page
 
@@ -48,6 +49,7 @@ __all__ = [
     "show",
     "site_at",
     "site_colours",
+    "site_picture",
     "sites_in_view",
     "solid_page",
     "solids",

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from foveasim.layout import Layout
 from foveasim.view.id_map import SitePixels, site_at
 from foveasim.view.site_colours import BOUNDARY, SiteColours
+from foveasim.view.site_pictures import SiteMeans, cover
 
 __all__ = ["ScaleBar", "SiteImage", "format_length", "nice_length_um"]
 
@@ -31,7 +32,9 @@ MAX_BAR_FRACTION = 0.25
 
 class SiteImage(AxesImage):
     """
-    Image of coloured photosites, sampled for each view and each file resolution.
+    Image of coloured photosites, computed for each view and each file resolution.
+
+    Pixels are exact area-weighted means, as in :func:`foveasim.view.site_picture`.
 
     Parameters
     ----------
@@ -47,6 +50,7 @@ class SiteImage(AxesImage):
         self.set_data(np.zeros((1, 1, 4), np.uint8))  # placeholder until the first draw
         self._layout, self._colours = layout, colours
         self.pixels: SitePixels | None = None
+        self._means: SiteMeans | None = None
 
     def recolour(self, colours: SiteColours) -> None:
         """Change the colours of the sites without sampling the layout again."""
@@ -70,11 +74,14 @@ class SiteImage(AxesImage):
         if self.pixels is None or (self.pixels.bounds_um, self.pixels.shape) != (bounds_um, (n_y, n_x)):
             n_samples = max(1, min(N_SAMPLES, math.isqrt(MAX_SAMPLES // (n_x * n_y))))
             self.pixels = SitePixels.from_layout(self._layout, (n_y, n_x), bounds_um, n_samples=n_samples)
+            self._means = SiteMeans(self._layout, (n_y, n_x), bounds_um)
+        assert self._means is not None  # created together with the pixels
+        picture = self._means.picture(self._colours)
         changes = self.pixels.ids[::SAMPLED_ROWS, 1:] != self.pixels.ids[::SAMPLED_ROWS, :-1]
-        has_boundaries = (
-            self._colours.has_boundaries and changes.size > 0 and float(changes.mean()) < MAX_BOUNDARY_FRACTION
-        )
-        picture = self.pixels.picture(self._colours.rgb, background=None, boundary=BOUNDARY if has_boundaries else None)
+        if self._colours.has_boundaries and changes.size > 0 and float(changes.mean()) < MAX_BOUNDARY_FRACTION:
+            lines = self.pixels.boundary_fraction()
+            picture[..., :3] = cover(picture[..., :3], np.full((n_y, n_x, 3), BOUNDARY, np.uint8), lines)
+            picture[..., 3] = np.maximum(picture[..., 3], np.rint(255.0 * lines))
         alpha = self.get_alpha()
         if alpha is not None:
             picture[..., 3] = np.rint(picture[..., 3] * np.float64(alpha))

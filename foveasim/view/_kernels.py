@@ -13,7 +13,8 @@ _ints = types.Array(types.int64, 1, "C", readonly=True)
 _floats = types.Array(types.float64, 1, "C", readonly=True)
 _points = types.Array(types.float64, 2, "C", readonly=True)
 _ids = types.Array(types.int32, 2, "C", readonly=True)
-_colours = types.Array(types.uint8, 2, "C", readonly=True)
+_colours = types.Array(types.float32, 2, "C", readonly=True)
+_encoded = types.Array(types.uint8, 1, "C", readonly=True)
 
 
 #: Samples over a shorter length than this are at one position.
@@ -109,31 +110,32 @@ def paint_sites(xy, ring_offsets, site_offsets, rows, x, y, first_row, ids):
             left[r], right[r] = n_columns + 1, -1
 
 
-@njit(types.void(_ids, _colours, types.int64, types.boolean, types.int64, types.uint8[:, :, ::1]))
-def blend(ids, colours, n_samples, has_boundaries, first_row, band):
+@njit(types.void(_ids, _colours, _encoded, types.int64, types.boolean, types.int64, types.uint8[:, :, ::1]))
+def blend(ids, colours, encoded, n_samples, has_boundaries, first_row, band):
     """
-    Average the ``n_samples`` x ``n_samples`` samples of each pixel in a band of rows.
+    Average the ``n_samples`` x ``n_samples`` samples of each pixel in a band of rows, in linear light.
 
-    ``colours[i + 1]`` (red, green, blue, weight) is the colour of site i, ``colours[0]`` that of the background, and the last
-    one, if ``has_boundaries``, that of samples whose left or lower neighbour belongs to another site. Weights are 0 or 255;
-    alpha is their mean.
+    ``colours[i + 1]`` (red, green, blue, weight) is the colour of site i from 0 to 1, ``colours[0]`` that of the background,
+    and the last one, if ``has_boundaries``, that of samples whose left or lower neighbour belongs to another site. Weights are
+    0 or 1; alpha is their mean. ``encoded`` is the byte of each of evenly spaced levels from 0 to 1.
     """
     boundary = colours.shape[0] - 1
+    levels = encoded.size - 1
     for row in range(band.shape[0]):
         for column in range(band.shape[1]):
-            red, green, blue, n = 0, 0, 0, 0
+            red, green, blue, n = 0.0, 0.0, 0.0, 0
             for i in range((first_row + row) * n_samples, (first_row + row + 1) * n_samples):
                 for j in range(column * n_samples, (column + 1) * n_samples):
                     k = ids[i, j] + 1
                     if has_boundaries and (ids[i, max(j - 1, 0)] != k - 1 or ids[max(i - 1, 0), j] != k - 1):
                         k = boundary
-                    if colours[k, 3] != 0:
+                    if colours[k, 3] != 0.0:
                         red += colours[k, 0]
                         green += colours[k, 1]
                         blue += colours[k, 2]
                         n += 1
-            half, divisor = n // 2, max(n, 1)
-            band[row, column, 0] = (red + half) // divisor
-            band[row, column, 1] = (green + half) // divisor
-            band[row, column, 2] = (blue + half) // divisor
+            scale = levels / max(n, 1)
+            band[row, column, 0] = encoded[int(red * scale + 0.5)]
+            band[row, column, 1] = encoded[int(green * scale + 0.5)]
+            band[row, column, 2] = encoded[int(blue * scale + 0.5)]
             band[row, column, 3] = (255 * n + n_samples * n_samples // 2) // (n_samples * n_samples)

@@ -17,14 +17,16 @@ from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Floats, check_count, check_shape, finite_array, read_only, unmasked
 from foveasim.errors import ParameterError
 from foveasim.fields import PackedRings
-from foveasim.view.site_colours import BACKGROUND, Rgb
+from foveasim.view.site_colours import BACKGROUND, Rgb, decode_light, encode_light
 
-__all__ = ["SitePixels", "id_map", "site_at"]
+__all__ = ["SitePixels", "id_map", "site_at", "validate_bounds"]
 
 #: Largest number of samples in a picture: 4 GB of indices.
 MAX_SAMPLES = 2**30
 #: Bands of rows per thread: two balance the load of clustered sites; each band visits all sites, so that more are slower.
 BANDS_PER_THREAD = 2
+#: Levels of linear light that are encoded: steps far below that of the darkest sRGB byte.
+N_LEVELS = 2**16
 #: Sites per work item in the search for their rows.
 CHUNK_SITES = 65_536
 
@@ -78,7 +80,7 @@ def id_map(
     n_y, n_x = check_shape("shape", shape)
     if n_y * n_x > MAX_SAMPLES:
         raise ParameterError("shape", f"must have at most {MAX_SAMPLES:,} pixels", shape)
-    x_min, y_min, x_max, y_max = _validate_bounds(layout, bounds_um)
+    x_min, y_min, x_max, y_max = validate_bounds(layout, bounds_um)
     columns_um, rows_um = _centres_um(x_min, x_max, n_x), _centres_um(y_min, y_max, n_y)
     return _sites_at(layout, columns_um, rows_um, thread_count(n_threads))
 
@@ -145,7 +147,7 @@ class SitePixels:
         """
         n_y, n_x = check_shape("shape", shape)
         n = check_count("n_samples", n_samples, at_most=16)
-        bounds = _validate_bounds(layout, bounds_um)
+        bounds = validate_bounds(layout, bounds_um)
         ids = id_map(layout, (n * n_y, n * n_x), bounds, n_threads=n_threads)
         return cls(read_only(ids), bounds, n)
 
@@ -181,8 +183,8 @@ class SitePixels:
         -------
         picture : (n_y, n_x, 3) uint8, or (n_y, n_x, 4) without a background
             Red, green, blue, and the fraction covered by sites as alpha; row 0 is the lowest y. A pixel is the mean of its
-            encoded sample colours. On a grey scale this is the mean of the values, on other colour maps approximately. Outline
-            plots are anti-aliased in the same way.
+            sample colours in linear light. :func:`foveasim.view.site_picture` averages exactly, and values before their
+            colours.
 
         Raises
         ------
@@ -197,18 +199,27 @@ class SitePixels:
             raise ParameterError(
                 "rgb", f"must be uint8 of shape (n_site, 3), n_site > {max_id}, got {rgb.dtype} of shape {rgb.shape}"
             )
-        table = np.full((rgb.shape[0] + 2, 4), 255, np.uint8)
-        table[0] = (0, 0, 0, 0) if background is None else (*background, 255)
-        table[1:-1, :3] = rgb
-        table[-1, :3] = boundary or 0
+        table = np.ones((rgb.shape[0] + 2, 4), np.float32)
+        table[0] = 0.0 if background is None else (*decode_light(np.array(background)), 1.0)
+        table[1:-1, :3] = decode_light(rgb)
+        table[-1, :3] = decode_light(np.array(boundary or (0, 0, 0)))
         picture = np.empty((*self.shape, 4), np.uint8)
         n, n_threads = self.n_samples, thread_count(n_threads)
+        encoded = encode_light(np.linspace(0.0, 1.0, N_LEVELS))
 
         def blend(rows: slice) -> None:
-            _kernels.blend(self.ids, table, n, boundary is not None, rows.start, picture[rows])
+            _kernels.blend(self.ids, table, encoded, n, boundary is not None, rows.start, picture[rows])
 
         parallel_map(blend, _bands(self.shape[0], n_threads), n_threads)
         return picture if background is None else picture[..., :3]
+
+    def boundary_fraction(self) -> Floats:
+        """Return the fraction of each pixel that lines of one sample width between sites cover, (n_y, n_x)."""
+        is_boundary = np.zeros(self.ids.shape, bool)
+        is_boundary[:, 1:] = self.ids[:, 1:] != self.ids[:, :-1]
+        is_boundary[1:] |= self.ids[1:] != self.ids[:-1]
+        (n_y, n_x), n = self.shape, self.n_samples
+        return np.asarray(is_boundary.reshape(n_y, n, n_x, n).mean(axis=(1, 3)))
 
     def site_at(self, x_um: ArrayLike, y_um: ArrayLike) -> NDArray[np.int32]:
         """
@@ -225,7 +236,8 @@ class SitePixels:
         return np.where(is_inside, at, np.int32(-1))
 
 
-def _validate_bounds(layout: PackedRings, bounds_um: Sequence[float] | Floats | None) -> Bounds:
+def validate_bounds(layout: PackedRings, bounds_um: Sequence[float] | Floats | None) -> Bounds:
+    """Return checked bounds of a picture; by default those of the layout."""
     if bounds_um is None:
         if layout.xy_um.size == 0:
             raise ParameterError("layout", "must have sites unless 'bounds_um' is given")

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.names import possible_names
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import UNIT_SUFFIXES, Floats, Ints, as_numbers, finite_array, own, unmasked
+from foveasim._io.encodings import decode, encode_srgb_values
 from foveasim.capture import Capture
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
@@ -26,6 +27,8 @@ __all__ = [
     "SiteColours",
     "as_fractions",
     "colours_of",
+    "decode_light",
+    "encode_light",
     "site_colours",
     "title_of",
 ]
@@ -86,6 +89,27 @@ class ColourScale:
     colour_map: str
     gamma: float = 1.0
 
+    def colours(self, values: Floats) -> RgbArray:
+        """
+        Return the colours of values on the scale.
+
+        Parameters
+        ----------
+        values : (...) float64
+            Values outside the scale have the colour of its end, NaN that of no data.
+
+        Returns
+        -------
+        rgb : (..., 3) uint8
+        """
+        from matplotlib import colormaps
+
+        table = np.rint(255.0 * colormaps[self.colour_map](np.arange(256))[:, :3]).astype(np.uint8)
+        table = np.concatenate((table, np.array([NO_DATA], np.uint8)))
+        fraction = np.clip((values - self.low) / (self.high - self.low), 0.0, 1.0) ** self.gamma
+        step = np.where(np.isnan(fraction), 256.0, np.minimum(256.0 * fraction, 255.0))
+        return table[step.astype(np.int64)]
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SiteColours:
@@ -106,6 +130,8 @@ class SiteColours:
         Names and colours of categories; empty if there are too many.
     has_boundaries : bool
         Whether boundaries between sites are drawn; not for measured signals and given colours.
+    is_on_scale : bool
+        Whether the colours are those of the scale; on a mosaic they are filter colours scaled by the values.
     """
 
     rgb: RgbArray
@@ -114,6 +140,7 @@ class SiteColours:
     scale: ColourScale | None = None
     legend: tuple[tuple[str, Rgb], ...] = ()
     has_boundaries: bool = True
+    is_on_scale: bool = False
 
     __repr__ = short_repr
 
@@ -122,6 +149,16 @@ def as_fractions(rgb: Rgb, factor: float = 1.0) -> tuple[float, float, float]:
     """Return a colour as fractions from 0 to 1, as in matplotlib, multiplied by a factor."""
     red, green, blue = (factor * c / 255.0 for c in rgb)
     return red, green, blue
+
+
+def decode_light(rgb: NDArray[Any]) -> Floats:
+    """Return sRGB bytes as linear light from 0 to 1."""
+    return np.asarray(decode(np.arange(256) / 255.0, "srgb")[rgb])
+
+
+def encode_light(linear: Floats) -> RgbArray:
+    """Return linear light from 0 to 1 as sRGB bytes."""
+    return np.rint(255.0 * encode_srgb_values(np.clip(linear, 0.0, 1.0))).astype(np.uint8)
 
 
 def site_colours(data: Layout | Capture, by: str | ArrayLike | None = None) -> RgbArray:
@@ -279,8 +316,6 @@ def _continuous(values: Floats, title: str, colour_map: str) -> SiteColours:
 
     Equal values have the colour at the centre of the map.
     """
-    from matplotlib import colormaps
-
     has_data = ~np.isnan(values)
     if np.isinf(values).any():
         raise ParameterError("by", "must be finite everywhere, or NaN for no data", values)
@@ -288,12 +323,9 @@ def _continuous(values: Floats, title: str, colour_map: str) -> SiteColours:
     high = float(values.max(where=has_data, initial=-np.inf)) if has_data.any() else 0.0
     if high - low <= EQUAL_TOLERANCE * max(abs(low), abs(high)):
         low, high = low - 0.5, high + 0.5
-    table = np.rint(255.0 * colormaps[colour_map](np.arange(256))[:, :3]).astype(np.uint8)
-    table = np.concatenate((table, np.array([NO_DATA], np.uint8)))
-    with np.errstate(invalid="ignore"):
-        step = np.where(has_data, np.clip((values - low) * (256.0 / (high - low)), 0.0, 255.0), 256.0)
     scale = ColourScale(low, high, colour_map)
-    return SiteColours(table[step.astype(np.int64)], title, values, scale, has_boundaries=colour_map != GREY)
+    has_boundaries = colour_map != GREY
+    return SiteColours(scale.colours(values), title, values, scale, has_boundaries=has_boundaries, is_on_scale=True)
 
 
 def _pseudo_random(n: int, n_values: int) -> Ints:

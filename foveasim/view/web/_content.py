@@ -15,15 +15,15 @@ from foveasim._core.validation import UNIT_SUFFIXES, Floats
 from foveasim.capture import Capture
 from foveasim.errors import GeometryError, ParameterError, SimulationError
 from foveasim.layout import Layout, Report
-from foveasim.view.id_map import SitePixels
 from foveasim.view.site_colours import (
     CATEGORY_COLOURS,
     DISPLAY_GAMMA,
     FILTER_COLOURS,
     NO_DATA,
     Rgb,
-    site_colours,
+    colours_of,
 )
+from foveasim.view.site_pictures import site_picture
 from foveasim.view.web._pack import back_references, to_smallest_type
 from foveasim.view.web._shapes import shapes_of
 
@@ -281,7 +281,7 @@ def _picture(layout: Layout, capture: Capture | None) -> tuple[bytes, dict[str, 
         pixel_um = max(x_max - x_min, y_max - y_min) / PICTURE_PIXELS
         shape = (max(1, round((y_max - y_min) / pixel_um)), max(1, round((x_max - x_min) / pixel_um)))
         by = "channel" if "channel" in layout.columns and _is_index(layout.columns["channel"]) else "size_um"
-        pixels = SitePixels.from_layout(layout, shape, n_samples=2).picture(site_colours(layout, by))[::-1]
+        pixels = site_picture(layout, colours_of(layout, by), shape)[::-1]
     file = BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(file, "PNG")
     height, width = pixels.shape[:2]

@@ -1,0 +1,222 @@
+"""
+Pictures of photosites with area-correct pixels.
+
+A pixel shows the mean over its area: of the values on a colour scale, which are mapped to a colour afterwards, and otherwise of
+the colours in linear light. Sites far smaller than a pixel therefore neither alias nor introduce colours that the colour map
+does not have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim._core.rings import site_area_um2, site_bounds_um
+from foveasim._core.validation import Bools, Floats, check_shape
+from foveasim.errors import ParameterError
+from foveasim.fields import Grid, PackedRings
+from foveasim.integrate import Integrator
+from foveasim.reconstruct.picture import coverage_fraction
+from foveasim.view.id_map import validate_bounds
+from foveasim.view.site_colours import BACKGROUND, NO_DATA, Rgb, SiteColours, decode_light, encode_light
+
+__all__ = ["SiteMeans", "cover", "site_picture"]
+
+#: Pixels that are drawn together: 32 MB per channel.
+PIXELS_PER_BAND = 2**22
+#: Fractions of a pixel up to this are rounding errors.
+ROUNDING = 1e-9
+
+
+class SiteMeans:
+    """
+    Exact area-weighted means of photosite values over the pixels of a picture.
+
+    Parameters
+    ----------
+    layout : Layout
+        Sites without a positive area are left out.
+    shape : (n_y, n_x)
+        Numbers of pixels.
+    bounds_um : (x_min, y_min, x_max, y_max), optional, µm
+        Extent of the pixels; the bounds of the layout by default.
+    n_threads : int, optional
+        All cores by default; the result does not depend on it.
+
+    Raises
+    ------
+    ParameterError
+        When the shape or the bounds are invalid, or the layout has no sites and no bounds are given.
+    """
+
+    def __init__(
+        self,
+        layout: PackedRings,
+        shape: tuple[int, int],
+        bounds_um: Sequence[float] | Floats | None = None,
+        *,
+        n_threads: int | None = None,
+    ) -> None:
+        n_y, n_x = self.shape = check_shape("shape", shape)
+        x_min, y_min, x_max, y_max = self.bounds_um = validate_bounds(layout, bounds_um)
+        self.n_sites = layout.site_offsets.size - 1
+        pitch_um = ((x_max - x_min) / n_x, (y_max - y_min) / n_y)
+        rings = (layout.xy_um, layout.ring_offsets, layout.site_offsets)
+        reach_um, has_area = site_bounds_um(*rings), site_area_um2(*rings) > 0.0
+        self._bands = []
+        for first in range(0, n_y, max(1, PIXELS_PER_BAND // n_x)):
+            n_rows = min(max(1, PIXELS_PER_BAND // n_x), n_y - first)
+            grid = Grid((n_rows, n_x), pitch_um, (x_min, y_min + first * pitch_um[1]))
+            low_um, high_um = grid.bounds_um[1], grid.bounds_um[3]
+            is_near = has_area & (reach_um[:, 0] < x_max) & (reach_um[:, 2] > x_min)
+            is_near &= (reach_um[:, 1] < high_um) & (reach_um[:, 3] > low_um)
+            self._bands.append(_Band(layout, is_near, grid, first, n_threads))
+
+    def picture(self, colours: SiteColours) -> NDArray[np.uint8]:
+        """
+        Return a picture of coloured sites.
+
+        Parameters
+        ----------
+        colours : SiteColours
+            From :func:`foveasim.view.colours_of`.
+
+        Returns
+        -------
+        picture : (n_y, n_x, 4) uint8
+            Red, green, blue, and the covered fraction as alpha; row 0 is the lowest y. Values on a colour scale are averaged
+            and then mapped to a colour; other colours are averaged in linear light.
+
+        Raises
+        ------
+        ParameterError
+            When there is not one colour per site.
+        """
+        if colours.rgb.shape != (self.n_sites, 3):
+            raise ParameterError(
+                "colours", f"must have one colour for each of the {self.n_sites} sites, got {colours.rgb.shape[0]}"
+            )
+        picture = np.empty((*self.shape, 4), np.uint8)
+        for band in self._bands:
+            band.draw(colours, picture[band.rows])
+        return picture
+
+
+class _Band:
+    """Sites on a band of rows of a picture."""
+
+    def __init__(self, layout: PackedRings, is_near: Bools, grid: Grid, first_row: int, n_threads: int | None) -> None:
+        part, self.sites = _select(layout, is_near)
+        self.rows = slice(first_row, first_row + grid.shape[0])
+        self.integrator = Integrator(part, grid, n_threads=n_threads)
+        coverage = coverage_fraction(self.integrator)
+        self.alpha = np.rint(255.0 * np.minimum(coverage, 1.0)).astype(np.uint8)
+        self.covered_um2 = np.where(coverage > 0.0, coverage, np.inf) * grid.cell_area_um2
+
+    def means(self, values: Floats) -> Floats:
+        """Return means (..., n_y, n_x) of values (..., n_site) over the covered part of each pixel; 0 without sites."""
+        return self.integrator.spread(values[..., self.sites]) / self.covered_um2
+
+    def draw(self, colours: SiteColours, picture: NDArray[np.uint8]) -> None:
+        """Write the band of a picture (n_y, n_x, 4)."""
+        picture[..., 3] = self.alpha
+        if not colours.is_on_scale or colours.scale is None or colours.values is None:
+            picture[..., :3] = encode_light(np.moveaxis(self.means(decode_light(colours.rgb).T), 0, -1))
+            return
+        has_data = ~np.isnan(colours.values)
+        if has_data.all():
+            picture[..., :3] = colours.scale.colours(self.means(colours.values))
+            return
+        # Pixels with and without data: the colour of the mean of the data, and that of no data, by their areas.
+        with_data, values = self.means(np.stack((has_data, np.where(has_data, colours.values, 0.0))))
+        shown = colours.scale.colours(values / np.where(with_data > 0.0, with_data, np.inf))
+        fraction = with_data[..., np.newaxis]
+        mixed = fraction * decode_light(shown) + (1.0 - fraction) * decode_light(np.array(NO_DATA))
+        picture[..., :3] = np.where(fraction >= 1.0 - ROUNDING, shown, encode_light(mixed))
+
+
+def site_picture(
+    layout: PackedRings,
+    colours: SiteColours,
+    shape: tuple[int, int],
+    bounds_um: Sequence[float] | Floats | None = None,
+    *,
+    background: Rgb = BACKGROUND,
+) -> NDArray[np.uint8]:
+    """
+    Return a picture of coloured sites on a background.
+
+    Parameters
+    ----------
+    layout : Layout
+    colours : SiteColours
+        From :func:`foveasim.view.colours_of`.
+    shape : (n_y, n_x)
+        Numbers of pixels.
+    bounds_um : (x_min, y_min, x_max, y_max), optional, µm
+        Extent of the pixels; the bounds of the layout by default.
+    background : (r, g, b)
+        Colour of areas without sites.
+
+    Returns
+    -------
+    picture : (n_y, n_x, 3) uint8
+        Row 0 is the lowest y. A pixel shows the colour of the mean value of its sites, weighted by area; filters, categories
+        and given colours are averaged in linear light.
+
+    Raises
+    ------
+    ParameterError
+        When the shape or the bounds are invalid, or there is not one colour per site.
+
+    Examples
+    --------
+    >>> from foveasim.layout import grid
+    >>> from foveasim.view import colours_of
+    >>> pair = grid(n_x=2, n_y=1, pitch_um=3.0)
+    >>> site_picture(pair, colours_of(pair, [0.0, 1.0]), (1, 1)).tolist()  # viridis at 0.5
+    [[[33, 145, 140]]]
+    """
+    clear = SiteMeans(layout, shape, bounds_um).picture(colours)
+    return cover(np.full((*clear.shape[:2], 3), background, np.uint8), clear[..., :3], clear[..., 3] / 255.0)
+
+
+def cover(under: NDArray[np.uint8], over: NDArray[np.uint8], opacity: Floats) -> NDArray[np.uint8]:
+    """
+    Return a picture covered by another one in linear light.
+
+    Parameters
+    ----------
+    under, over : (n_y, n_x, 3) uint8
+    opacity : (n_y, n_x)
+        From 0 to 1.
+
+    Returns
+    -------
+    picture : (n_y, n_x, 3) uint8
+        Exactly one of the pictures where the opacity is 0 or 1.
+    """
+    alpha = opacity[..., np.newaxis]
+    mixed = encode_light(alpha * decode_light(over) + (1.0 - alpha) * decode_light(under))
+    return np.where(alpha == 0.0, under, np.where(alpha == 1.0, over, mixed))
+
+
+def _select(layout: PackedRings, is_selected: Bools) -> tuple[PackedRings, NDArray[np.int64]]:
+    """Return the packed rings of some sites, and their indices."""
+    sites = np.flatnonzero(is_selected)
+    if sites.size == is_selected.size:
+        return layout, sites
+    n_rings = np.diff(layout.site_offsets)
+    keeps_ring = np.repeat(is_selected, n_rings)
+    n_vertices = np.diff(layout.ring_offsets)
+    return (
+        SimpleNamespace(
+            xy_um=np.ascontiguousarray(layout.xy_um[np.repeat(keeps_ring, n_vertices)]),
+            ring_offsets=np.concatenate(([0], np.cumsum(n_vertices[keeps_ring]))),
+            site_offsets=np.concatenate(([0], np.cumsum(n_rings[is_selected]))),
+        ),
+        sites,
+    )
