@@ -294,6 +294,12 @@ class Capture:
 
         return plot_capture(self, by, **options)
 
+    def plot3d(self, height: str | ArrayLike | None = None, **options: Any) -> None:
+        """Show the photosites as columns in a window: :func:`foveasim.view.show_columns`."""
+        from foveasim.view import show_columns
+
+        show_columns(self, height, **options)
+
     def _repr_html_(self) -> str:
         from foveasim.view import to_html
 

@@ -68,7 +68,7 @@ def test_package_lists_public_names_only():
 
 
 #: Methods that draw their object: only these may import from a higher layer, foveasim.view.
-SHOWN_BY = {"_repr_html_", "_repr_png_", "plot", "to_pyvista"}
+SHOWN_BY = {"_repr_html_", "_repr_png_", "plot", "plot3d", "to_pyvista"}
 
 
 def imported_subpackages(path):

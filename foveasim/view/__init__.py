@@ -12,11 +12,11 @@ from foveasim.view.meshes import Mesh, polydata, prisms
 from foveasim.view.notebook import to_html, to_png
 from foveasim.view.plots import plot_capture, plot_curves, plot_layout, plot_noise_budget, save_drawing, save_figure
 from foveasim.view.raster_plots import plot_picture, plot_power_map, plot_scene
-from foveasim.view.render3d import Viewpoint, render, show, sites_in_view
+from foveasim.view.render3d import Viewpoint, plotter, render, show, show_columns, sites_in_view
 from foveasim.view.renderer import find_renderer
 from foveasim.view.rule_plots import plot_report
 from foveasim.view.site_colours import SiteColours, colours_of, site_colours
-from foveasim.view.site_pictures import site_picture
+from foveasim.view.site_pictures import picture_colours, site_picture
 from foveasim.view.solids import PartReport, SensorStack, Solids, SolidsReport, solids, stack, write_meshes
 from foveasim.view.web import solid_page, web_page, write_solid_page, write_web_page
 
@@ -33,6 +33,7 @@ __all__ = [
     "find_renderer",
     "hidden_figures",
     "id_map",
+    "picture_colours",
     "plot_capture",
     "plot_curves",
     "plot_layout",
@@ -41,12 +42,14 @@ __all__ = [
     "plot_power_map",
     "plot_report",
     "plot_scene",
+    "plotter",
     "polydata",
     "prisms",
     "render",
     "save_drawing",
     "save_figure",
     "show",
+    "show_columns",
     "site_at",
     "site_colours",
     "site_picture",

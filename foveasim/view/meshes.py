@@ -7,7 +7,6 @@ Coordinates are those of the sensor: x to the right, y up, z toward the lens. Tr
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,11 +18,20 @@ from foveasim._core.extras import install_hint
 from foveasim._core.provenance import to_plain_data
 from foveasim._core.rings import next_vertex, positions_in_runs
 from foveasim._core.threads import parallel_map, thread_count
-from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_length_um, finite_array, unmasked
+from foveasim._core.validation import (
+    Bools,
+    Floats,
+    Ints,
+    as_numbers,
+    check_length_um,
+    finite_array,
+    unit_of,
+    unmasked,
+)
 from foveasim.capture import Capture
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout import Layout
-from foveasim.view.site_colours import colours_of
+from foveasim.view.site_colours import SiteColours, colours_of
 
 if TYPE_CHECKING:
     from pyvista import PolyData
@@ -36,8 +44,10 @@ DEGENERATE_FRACTION = 1e-12
 MAX_HEIGHT_FRACTION = 0.15
 #: Sites per call of the triangulation.
 SITES_PER_CALL = 20_000
-#: Measured quantities of a capture in its PolyData.
+#: Measured quantities of a capture in its PolyData; the first is active.
 MEASURED = ("code", "electrons", "expected_e", "filter_of_site")
+#: Units of quantities without a suffix.
+UNITS = {"code": "DN", "electrons": "e-"}
 
 Indices = NDArray[np.int32]
 RgbArray = NDArray[np.uint8]
@@ -61,6 +71,12 @@ class Mesh:
         Value of the photosite, in its unit.
     colours : (n_point, 3) uint8
         Red, green, blue, sRGB-encoded.
+    title : str
+        Quantity and unit of the values, such as ``"code / DN"``.
+    shown : SiteColours or None
+        Colours of the photosites with their scale or legend.
+    is_smooth : bool
+        Whether the triangles that face up approximate a smooth surface, which is shaded without edges.
     """
 
     name: str
@@ -69,6 +85,9 @@ class Mesh:
     photosite: Indices
     values: Floats
     colours: RgbArray
+    title: str = ""
+    shown: SiteColours | None = None
+    is_smooth: bool = False
 
     def __repr__(self) -> str:
         return f"Mesh({self.name!r}, {self.triangles.shape[0]:,} triangles)"
@@ -82,7 +101,13 @@ class Mesh:
 
     def to_pyvista(self) -> PolyData:
         """
-        Return the mesh as PolyData with the cell data ``photosite``, ``value`` and ``rgb``.
+        Return the mesh as PolyData.
+
+        Returns
+        -------
+        pyvista.PolyData
+            Cell data: the values (the active scalars) by their title, such as ``code / DN``, or as ``value``; ``site``, the
+            photosite of each triangle; ``rgb``, the colours.
 
         Raises
         ------
@@ -93,9 +118,11 @@ class Mesh:
         mesh = _polydata(
             self.points_um, np.arange(self.triangles.shape[0] + 1, dtype=np.int32) * 3, self.triangles.ravel()
         )
-        mesh.cell_data["photosite"] = self.photosite[first]
-        mesh.cell_data["value"] = self.values[first]
+        name = self.title or "value"
+        mesh.cell_data[name] = self.values[first]
+        mesh.cell_data["site"] = self.photosite[first]
         mesh.cell_data["rgb"] = self.colours[first]
+        mesh.set_active_scalars(name, preference="cell")
         return mesh
 
 
@@ -245,7 +272,7 @@ def prisms(
     except ParameterError as error:
         raise ParameterError("height", error.detail) from None
     values = finite_array("height", shown.values if shown.values is not None else height, ndim=1, at_least=0.0)
-    colours = (shown if by is None else colours_of(data, by)).rgb
+    coloured = shown if by is None else colours_of(data, by)
     x_min, y_min, x_max, y_max = layout.bounds_um
     max_height_um = (
         MAX_HEIGHT_FRACTION * max(x_max - x_min, y_max - y_min)
@@ -261,7 +288,9 @@ def prisms(
         triangles=triangles,
         photosite=photosite,
         values=values[photosite],
-        colours=colours[photosite],
+        colours=coloured.rgb[photosite],
+        title=shown.title,
+        shown=coloured,
     )
 
 
@@ -276,68 +305,85 @@ def polydata(data: Layout | Capture) -> PolyData:
     Returns
     -------
     pyvista.PolyData
-        One polygon per site, in site order; sites with a hole or a reflex vertex are several triangles. Cell data:
-        ``photosite``, ``area_um2``, ``channel``, ``readout_line``, every column, and for a capture ``code``, ``electrons``,
-        ``expected_e``, ``filter_of_site``. Field data: ``provenance``, and for a capture ``settings``, as JSON.
+        One polygon per site in site order, so that arrays over sites are cell data; only a site with a hole is several
+        triangles. Cell data: for a capture ``code`` (the active scalars), ``electrons``, ``expected_e``, ``filter_of_site``;
+        ``site``, the index of the photosite of each cell; ``area_um2`` (the active scalars of a layout), ``channel``,
+        ``readout_line``, and every column. Field data, as JSON: ``units`` by array name, ``provenance``, and for a capture
+        ``settings``.
 
     Raises
     ------
     ParameterError
         When PyVista is not installed.
+
+    Notes
+    -----
+    VTK measures cells with reflex vertices incorrectly; use ``area_um2``, or ``triangulate()`` the mesh first.
     """
     layout = data.layout if isinstance(data, Capture) else data
-    columns: dict[str, NDArray[Any]] = {
+    columns: dict[str, NDArray[Any]] = {}
+    notes: dict[str, Any] = {"provenance": to_plain_data(dict(layout.provenance))}
+    if isinstance(data, Capture):
+        columns = {name: getattr(data, name) for name in MEASURED}
+        notes["settings"] = data.settings
+    active = next(iter(columns), "area_um2")
+    columns |= {
+        "site": np.arange(layout.n_sites, dtype=np.int32),
         "area_um2": layout.area_um2,
         "channel": layout.channel,
         "readout_line": layout.readout_line,
         **layout.columns,
     }
-    notes: dict[str, Mapping[str, Any]] = {"provenance": to_plain_data(dict(layout.provenance))}
-    if isinstance(data, Capture):
-        columns |= {name: getattr(data, name) for name in MEASURED}
-        notes["settings"] = data.settings
-    offsets, corners, photosite = _cells(layout)
+    notes["units"] = {name: unit for name in columns if (unit := UNITS.get(name) or unit_of(name))}
+    xy_um, offsets, corners, site = _cells(layout)
     mesh = _polydata(
-        np.column_stack((layout.xy_um, np.zeros(layout.xy_um.shape[0]))),
-        offsets.astype(np.int32),
-        corners.astype(np.int32),
+        np.column_stack((xy_um, np.zeros(xy_um.shape[0]))), offsets.astype(np.int32), corners.astype(np.int32)
     )
-    mesh.cell_data["photosite"] = photosite
     for name, column in columns.items():
-        mesh.cell_data[name] = (column.astype(np.float32) if column.dtype == np.float16 else column)[photosite]
+        mesh.cell_data[name] = (column.astype(np.float32) if column.dtype == np.float16 else column)[site]
     for name, note in notes.items():
         mesh.field_data[name] = [json.dumps(note)]
+    if mesh.n_cells:
+        mesh.set_active_scalars(active, preference="cell")
     return mesh
 
 
 # -- parts ---------------------------------------------------------------------------------------------------------------
 
 
-def _cells(layout: Layout) -> tuple[Ints, Ints, Ints]:
+def _cells(layout: Layout) -> tuple[Floats, Ints, Ints, Ints]:
     """
-    Return polygons of all sites: offsets, vertices and sites.
+    Return polygons of all sites: points (n_point, 2), offsets, corners and sites.
 
-    Sites that VTK would fill incorrectly are split into triangles.
+    Sites with holes, which VTK polygons cannot have, are split into triangles. VTK draws quadrilaterals with a reflex vertex
+    incorrectly, but not polygons with more vertices: these have the centre of an edge as an additional point.
     """
-    counts = np.diff(layout.ring_offsets)
-    is_convex = _is_convex(layout)
-    if is_convex.all():
-        return layout.ring_offsets, np.arange(layout.xy_um.shape[0]), np.arange(layout.n_sites)
+    counts, has_hole = np.diff(layout.ring_offsets), np.diff(layout.site_offsets) > 1
+    first_ring = layout.site_offsets[:-1]
+    is_quad = ~has_hole & ~_is_convex(layout) & (counts[first_ring] == 4)
+    if not (has_hole.any() or is_quad.any()):
+        return layout.xy_um, layout.ring_offsets, np.arange(layout.xy_um.shape[0]), np.arange(layout.n_sites)
     caps = triangulate(layout)
-    parts = caps.triangles[~is_convex[caps.site]]
-    convex = np.flatnonzero(is_convex)
-    convex_rings = layout.site_offsets[convex]
-    sizes = np.concatenate((counts[convex_rings], np.full(parts.shape[0], 3)))
-    photosite = np.concatenate((convex, caps.site[~is_convex[caps.site]]))
-    vertices = np.repeat(layout.ring_offsets[convex_rings], counts[convex_rings]) + positions_in_runs(
-        counts[convex_rings]
-    )
+    is_part = has_hole[caps.site]
+    simple = np.flatnonzero(~has_hole)
+    sizes = np.concatenate((counts[first_ring[simple]], np.full(np.count_nonzero(is_part), 3)))
+    site = np.concatenate((simple, caps.site[is_part]))
+    starts = layout.ring_offsets[first_ring[simple]]
+    vertices = np.repeat(starts, counts[first_ring[simple]]) + positions_in_runs(counts[first_ring[simple]])
+    flat = np.concatenate((vertices, caps.triangles[is_part].ravel()))
+    # Additional points after the last corner of their site.
+    quads = np.flatnonzero(is_quad)
+    start = layout.ring_offsets[first_ring[quads]]
+    middle_um = 0.5 * (layout.xy_um[start] + layout.xy_um[start + 3])
+    last = np.cumsum(sizes)[np.searchsorted(simple, quads)]
+    flat = np.insert(flat, last, layout.xy_um.shape[0] + np.arange(quads.size))
+    sizes[np.searchsorted(simple, quads)] += 1
     # In site order, so that the cells of a site are contiguous.
-    order = np.argsort(photosite, kind="stable")
-    starts = np.concatenate(([0], np.cumsum(sizes)))[:-1]
-    flat = np.concatenate((vertices, parts.ravel()))
-    corners = flat[np.repeat(starts[order], sizes[order]) + positions_in_runs(sizes[order])]
-    return np.concatenate(([0], np.cumsum(sizes[order]))), corners, photosite[order]
+    order = np.argsort(site, kind="stable")
+    begin = np.concatenate(([0], np.cumsum(sizes)))[:-1]
+    corners = flat[np.repeat(begin[order], sizes[order]) + positions_in_runs(sizes[order])]
+    offsets = np.concatenate(([0], np.cumsum(sizes[order])))
+    return np.concatenate((layout.xy_um, middle_um)), offsets, corners, site[order]
 
 
 def _is_convex(layout: Layout) -> Bools:

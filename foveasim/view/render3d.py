@@ -7,26 +7,30 @@ needs OpenGL, and adds windows and ambient occlusion; the software renderer has 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import warnings
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Floats, check_choice, check_count, check_number, check_shape, finite_array
 from foveasim._io.images import write_picture
+from foveasim.capture import Capture
 from foveasim.errors import FoveasimWarning, GeometryError, ParameterError, SimulationError
-from foveasim.view.meshes import Mesh, import_pyvista
+from foveasim.layout import Layout
+from foveasim.view._annotations import Label, add_strip, strip_width_px
+from foveasim.view.meshes import Mesh, import_pyvista, prisms
 from foveasim.view.renderer import ON_SCREEN, begin_rendering, find_renderer, missing_software
 
 if TYPE_CHECKING:
-    from pyvista import Plotter
+    from pyvista import Plotter, PolyData
 
-__all__ = ["SceneOfMeshes", "Viewpoint", "render", "show", "sites_in_view"]
+__all__ = ["SceneOfMeshes", "Viewpoint", "plotter", "render", "show", "show_columns", "sites_in_view"]
 
 #: Ambient reflection of every face, and additional reflection of a face toward the light source. Their sum is 1, so that no
 #: colour is clipped.
@@ -49,6 +53,12 @@ OCCLUSION_RADIUS_FRACTION = 0.02
 OCCLUSION_BIAS_FRACTION = 0.1
 #: Scenes of more triangles have one sample per pixel by default, which renders them in seconds.
 MAX_OVERSAMPLED_TRIANGLES = 1_000_000
+#: Smallest fraction of a picture's width that remains for the scene.
+MIN_SCENE_FRACTION = 0.3
+#: Distance of the end of a label's line from the outline of its part.
+LABEL_INSET_PX = 3
+#: Right part of a plotter's window for the scalar bar.
+BAR_FRACTION = 0.14
 #: Largest side of a picture, to catch mistakes.
 MAX_SIDE_PX = 32_768
 
@@ -64,7 +74,7 @@ class SceneOfMeshes(Protocol):
         """Parts of the scene."""
 
 
-Renderable: TypeAlias = Mesh | Iterable[Mesh] | SceneOfMeshes
+Renderable: TypeAlias = Mesh | Iterable[Mesh] | SceneOfMeshes | Layout | Capture
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,13 +150,16 @@ def render(
     ambient_occlusion: bool = False,
     background: tuple[int, int, int] = BACKGROUND,
     renderer: Literal["auto", "pyvista", "software"] = "auto",
+    legend: bool | None = None,
+    labels: bool = False,
 ) -> RgbArray:
     """
     Render a scene to a picture, off screen.
 
     Parameters
     ----------
-    scene : Mesh, sequence of Mesh, or Solids
+    scene : Mesh, sequence of Mesh, Solids, Layout or Capture
+        A layout or a capture is shown as columns; see :func:`foveasim.view.prisms`.
     path : path, optional
         File to which the picture is also written; its extension selects the format.
     viewpoint : Viewpoint, optional
@@ -161,6 +174,11 @@ def render(
         Colour behind the scene.
     renderer : {"auto", "pyvista", "software"}
         By default PyVista if it can render, otherwise the software renderer, with a warning that names the missing software.
+    legend : bool, optional
+        Whether to show the colour bar or the legend of the first mesh that has one, on the right side; by default for a
+        layout or a capture.
+    labels : bool
+        Whether to show names and thicknesses of the parts, on the right side.
 
     Returns
     -------
@@ -179,11 +197,21 @@ def render(
         When ``renderer="pyvista"`` and PyVista cannot render on this machine.
     """
     meshes = _meshes(scene)
+    legend = isinstance(scene, Layout | Capture) if legend is None else legend
     check_choice("renderer", renderer, ("auto", "pyvista", "software"))
     if oversampling is None:
         oversampling = 2 if sum(mesh.triangles.shape[0] for mesh in meshes) <= MAX_OVERSAMPLED_TRIANGLES else 1
     oversampling = check_count("oversampling", oversampling, at_most=8)
-    n_x, n_y = _size(size_px, oversampling)
+    total_x, n_y = _size(size_px, oversampling)
+    shown = next((mesh.shown for mesh in meshes if mesh.shown is not None), None) if legend else None
+    texts = [_part_text(mesh) for mesh in meshes] if labels else []
+    n_x = total_x - sum(strip_width_px(shown, texts, n_y))
+    if n_x < MIN_SCENE_FRACTION * total_x:
+        raise ParameterError(
+            "size_px",
+            f"must leave space for the scene, got {size_px}",
+            hint="use a larger picture, or legend=False and labels=False",
+        )
     if finite_array("background", background).shape != (3,) or not all(0 <= part <= 255 for part in background):
         raise ParameterError("background", "must be three numbers from 0 to 255", background)
     missing = "" if renderer == "software" else missing_software()
@@ -200,6 +228,9 @@ def render(
     else:
         large = _render_with_pyvista(meshes, eye, (width, height), background, ambient_occlusion, margin)
     picture = _average_samples(large, oversampling)
+    if n_x < total_x:
+        marks = _labels(meshes, texts, eye, (width, height), oversampling) if labels else []
+        picture = add_strip(picture, shown, marks, background)
     if path is not None:
         write_picture(path, picture)
     return picture
@@ -229,6 +260,49 @@ def sites_in_view(
     return np.where(ids < 0, np.int32(-1), first[ids])
 
 
+def plotter(
+    scene: Renderable,
+    *,
+    viewpoint: Viewpoint | None = None,
+    size_px: tuple[int, int] = (1600, 1000),
+    off_screen: bool = False,
+) -> Plotter:
+    """
+    Return a PyVista plotter of a scene, for further changes before its ``show()`` or ``screenshot()``.
+
+    Parameters
+    ----------
+    scene, viewpoint, size_px
+        As for :func:`render`.
+    off_screen : bool
+        Whether to render without a window.
+
+    Returns
+    -------
+    pyvista.Plotter
+        With one actor per mesh, by its name; a scalar bar with quantity and unit; and, in a window, the photosite and its
+        value at a right click.
+
+    Raises
+    ------
+    GeometryError
+        When the scene is empty.
+    SimulationError
+        When this machine has no OpenGL or no PyVista.
+    """
+    meshes = _meshes(scene)
+    size = _size(size_px, 1)
+    missing = missing_software()
+    if missing:
+        raise SimulationError(missing)
+    eye = _eye(meshes, viewpoint or Viewpoint(), size)
+    plot = _plotter(meshes, eye, size, BACKGROUND, off_screen=off_screen)
+    _add_scalar_bar(plot, meshes)
+    if not off_screen:
+        plot.enable_element_picking(callback=picking_reporter(plot, meshes), mode="cell", show_message=False)
+    return plot
+
+
 def show(scene: Renderable, *, viewpoint: Viewpoint | None = None, size_px: tuple[int, int] = (1600, 1000)) -> None:
     """
     Show a scene in an interactive window until the window is closed.
@@ -236,7 +310,7 @@ def show(scene: Renderable, *, viewpoint: Viewpoint | None = None, size_px: tupl
     Parameters
     ----------
     scene, viewpoint, size_px
-        As for :func:`render`.
+        As for :func:`plotter`.
 
     Raises
     ------
@@ -244,7 +318,6 @@ def show(scene: Renderable, *, viewpoint: Viewpoint | None = None, size_px: tupl
         When this machine has no screen, no OpenGL or no PyVista; the message names a remedy.
     """
     meshes = _meshes(scene)
-    size = _size(size_px, 1)
     missing = missing_software()
     if missing:
         raise SimulationError(missing)
@@ -252,24 +325,53 @@ def show(scene: Renderable, *, viewpoint: Viewpoint | None = None, size_px: tupl
         raise SimulationError(
             "this machine has no screen to open a window on; write a picture with foveasim.view.render(scene, 'picture.png')"
         )
-    plotter = _plotter(meshes, _eye(meshes, viewpoint or Viewpoint(), size), size, BACKGROUND, off_screen=False)
-    plotter.show()
+    plotter(meshes, viewpoint=viewpoint, size_px=size_px).show()
+
+
+def show_columns(
+    data: Layout | Capture,
+    height: str | ArrayLike | None = None,
+    *,
+    by: str | ArrayLike | None = None,
+    max_height_um: float | None = None,
+    viewpoint: Viewpoint | None = None,
+    size_px: tuple[int, int] = (1600, 1000),
+) -> None:
+    """
+    Show photosites as columns in an interactive window, with a scalar bar.
+
+    Parameters
+    ----------
+    data : Layout or Capture
+    height, by, max_height_um
+        As for :func:`foveasim.view.prisms`.
+    viewpoint, size_px
+        As for :func:`render`.
+
+    Raises
+    ------
+    ParameterError, GeometryError
+        As for :func:`foveasim.view.prisms`.
+    SimulationError
+        As for :func:`show`.
+    """
+    show(prisms(data, height, by=by, max_height_um=max_height_um), viewpoint=viewpoint, size_px=size_px)
 
 
 # -- both renderers ------------------------------------------------------------------------------------------------------
 
 
 def _meshes(scene: Renderable) -> list[Mesh]:
-    if isinstance(scene, Mesh):
-        found: list[Any] = [scene]
+    if isinstance(scene, Layout | Capture):
+        found: list[Any] = [prisms(scene)]
+    elif isinstance(scene, Mesh):
+        found = [scene]
     elif isinstance(scene, SceneOfMeshes):
         found = list(scene.meshes)
     else:
         found = list(scene) if isinstance(scene, Iterable) else [scene]
     if not all(isinstance(mesh, Mesh) for mesh in found):
-        raise ParameterError(
-            "scene", "must be a Mesh, a sequence of them, or Solids; create one with view.prisms", scene
-        )
+        raise ParameterError("scene", "must be a Layout, a Capture, a Mesh, a sequence of meshes, or Solids", scene)
     found = [mesh for mesh in found if mesh.triangles.size]
     if not found:
         raise GeometryError("the scene is empty; it must have at least one triangle")
@@ -396,6 +498,13 @@ def _render_in_software(
         is_here = (ids >= first_id) & (ids < first_id + mesh.triangles.shape[0])
         visible, which = np.unique(ids[is_here] - first_id, return_inverse=True)
         corners = mesh.triangles[visible]
+        if mesh.is_smooth:
+            normal = _smooth_normals(mesh, corners, which, np.argwhere(is_here), eye, size_px)
+            bright = AMBIENT + DIFFUSE * np.clip(normal @ light, 0.0, 1.0)
+            colours = mesh.colours[corners[:, 0]][which]
+            picture[is_here] = np.rint(colours * bright[:, np.newaxis]).astype(np.uint8)
+            first_id += mesh.triangles.shape[0]
+            continue
         a, b, c = (mesh.points_um[corners[:, k]] for k in range(3))
         normal = np.cross(b - a, c - a)
         length = np.maximum(np.linalg.norm(normal, axis=1), np.finfo(np.float64).tiny)
@@ -404,6 +513,77 @@ def _render_in_software(
         picture[is_here] = lit[which]
         first_id += mesh.triangles.shape[0]
     return picture
+
+
+def _face_normals(points_um: Floats, triangles: NDArray[np.int32]) -> Floats:
+    """Return normals whose lengths are twice the areas, (n_triangle, 3)."""
+    a, b, c = (points_um[triangles[:, k]] for k in range(3))
+    return np.cross(b - a, c - a)
+
+
+def point_normals(mesh: Mesh) -> Floats:
+    """Return the mean normal of the triangles facing up at each point of a smooth mesh, (n_point, 3)."""
+    faces = _face_normals(mesh.points_um, mesh.triangles)
+    faces[faces[:, 2] <= 0.0] = 0.0
+    normal = np.stack(
+        [np.bincount(mesh.triangles.ravel(), np.repeat(faces[:, k], 3), mesh.points_um.shape[0]) for k in range(3)],
+        axis=1,
+    )
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+
+
+def _smooth_normals(
+    mesh: Mesh,
+    corners: NDArray[np.int32],
+    which: NDArray[np.int64],
+    pixels: NDArray[np.int64],
+    eye: _Eye,
+    size_px: tuple[int, int],
+) -> Floats:
+    """Interpolate point normals at pixels (row, column), whose triangles are ``corners[which]``; other faces are flat."""
+    screen = eye.project(mesh.points_um, size_px)
+    a, b, c = (screen[corners[:, k]][which] for k in range(3))
+    y, x = pixels[:, 0] + 0.5, pixels[:, 1] + 0.5
+    area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
+    area = np.where(area == 0.0, 1.0, area)
+    second = ((x - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (y - a[:, 1])) / area
+    third = ((b[:, 0] - a[:, 0]) * (y - a[:, 1]) - (x - a[:, 0]) * (b[:, 1] - a[:, 1])) / area
+    # Perspective: weights on the surface are those on the screen times the inverse depth.
+    weight = np.clip(np.stack((1.0 - second - third, second, third), axis=1), 0.0, 1.0)
+    weight *= np.stack((a[:, 2], b[:, 2], c[:, 2]), axis=1)
+    mean = np.einsum("ij,ijk->ik", weight, point_normals(mesh)[corners][which])
+    flat = _face_normals(mesh.points_um, corners)[which]
+    normal = np.where(flat[:, 2:] > 0.0, mean, flat)
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+
+
+# -- labels --------------------------------------------------------------------------------------------------------------
+
+
+def _part_text(mesh: Mesh) -> str:
+    """Return the name and the thickness of a part."""
+    low, high = mesh.bounds_um
+    return f"{mesh.name} {high[2] - low[2]:.3g} µm"
+
+
+def _labels(
+    meshes: list[Mesh], texts: list[str], eye: _Eye, size_px: tuple[int, int], oversampling: int
+) -> list[Label]:
+    """Return labels of the visible parts, at the right end of their visible area."""
+    from scipy.ndimage import binary_erosion
+
+    ids, _ = _nearest(meshes, eye, size_px)
+    labels, first_id = [], 0
+    for mesh, text in zip(meshes, texts, strict=True):
+        is_here = (ids >= first_id) & (ids < first_id + mesh.triangles.shape[0])
+        first_id += mesh.triangles.shape[0]
+        # Well inside, if the part is large enough.
+        inner = binary_erosion(is_here, iterations=LABEL_INSET_PX * oversampling)
+        rows, columns = np.nonzero(inner if inner.any() else is_here)
+        if rows.size:
+            last = columns.argmax()
+            labels.append(Label(text, columns[last] / oversampling, rows[last] / oversampling))
+    return labels
 
 
 # -- PyVista ------------------------------------------------------------------------------------------------------------
@@ -450,6 +630,8 @@ def _plotter(
     plotter.add_light(light)
     for mesh in meshes:
         surface = mesh.to_pyvista()
+        if mesh.is_smooth:
+            _split_at_rims(surface, mesh)
         surface.points = surface.points.astype(
             np.float32
         )  # native type of graphics cards; VTK would convert element by element
@@ -461,9 +643,10 @@ def _plotter(
             ambient=AMBIENT,
             diffuse=DIFFUSE,
             specular=0.0,
-            smooth_shading=False,
+            smooth_shading=mesh.is_smooth,
             show_scalar_bar=False,
             copy_mesh=False,
+            name=mesh.name,
         )
     camera = plotter.camera
     camera.position = tuple(eye.position_um)
@@ -473,3 +656,69 @@ def _plotter(
     camera.view_angle = float(np.degrees(2.0 * np.arctan(0.5 * size_px[1] / eye.focal_px)))
     plotter.reset_camera_clipping_range()
     return plotter
+
+
+def _split_at_rims(surface: PolyData, mesh: Mesh) -> None:
+    """Set normals of a smooth mesh: those of points on triangles facing up, and flat ones on separate points elsewhere."""
+    is_up = _face_normals(mesh.points_um, mesh.triangles)[:, 2] > 0.0
+    flat = mesh.triangles[~is_up]
+    n = mesh.points_um.shape[0]
+    triangles = mesh.triangles.astype(np.int64)
+    triangles[~is_up] = n + np.arange(flat.size).reshape(-1, 3)
+    normals = np.concatenate((point_normals(mesh), np.repeat(_face_normals(mesh.points_um, flat), 3, axis=0)))
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    surface.points = np.concatenate((mesh.points_um, mesh.points_um[flat.ravel()]))
+    surface.faces = np.column_stack((np.full(triangles.shape[0], 3), triangles)).ravel()
+    surface.point_data.active_normals = normals
+
+
+def _add_scalar_bar(plot: Plotter, meshes: list[Mesh]) -> None:
+    """Add the colour bar or the legend of the first mesh that has one, on the right of the scene."""
+    from matplotlib.colors import ListedColormap
+
+    pyvista = import_pyvista()
+    shown = next((mesh.shown for mesh in meshes if mesh.shown is not None), None)
+    if shown is None or (shown.scale is None and not shown.legend):
+        return
+    plot.camera.SetWindowCenter(BAR_FRACTION, 0.0)
+    plot.camera.zoom(1.0 - BAR_FRACTION)
+    if shown.scale is not None:
+        steps = np.linspace(0.0, 1.0, 256)
+        colours = shown.scale.colours(shown.scale.low + (shown.scale.high - shown.scale.low) * steps)
+        table = pyvista.LookupTable(ListedColormap(colours / 255.0), n_values=256)
+        table.scalar_range = (shown.scale.low, shown.scale.high)
+        mapper = pyvista.DataSetMapper()
+        mapper.lookup_table = table
+        mapper.scalar_range = table.scalar_range
+        plot.add_scalar_bar(
+            title=f"{shown.title}\n",
+            mapper=mapper,
+            color="black",
+            vertical=True,
+            fmt="%.4g",
+            position_x=0.89,
+            position_y=0.2,
+            width=0.05,
+            height=0.6,
+            title_font_size=16,
+            label_font_size=14,
+        )
+    else:
+        labels = [[name, [part / 255.0 for part in rgb]] for name, rgb in shown.legend]
+        plot.add_legend(
+            labels, bcolor=None, face="rectangle", size=(0.1, 0.05 * len(labels)), loc="center right", border=False
+        )
+
+
+def picking_reporter(plot: Plotter, meshes: list[Mesh]) -> Callable[[Any], None]:
+    """Return a function that shows the photosite and the value of a picked cell."""
+    titles = [mesh.title or "value" for mesh in meshes]
+
+    def report(cell: Any) -> None:
+        if cell is None or cell.n_cells == 0 or "site" not in cell.cell_data:
+            return
+        values = [f"{title} {float(cell.cell_data[title][0]):g}" for title in titles if title in cell.cell_data]
+        text = ", ".join([f"site {int(cell.cell_data['site'][0])}", *dict.fromkeys(values)])
+        plot.add_text(text, position="lower_left", font_size=12, color="black", name="picked site")
+
+    return report

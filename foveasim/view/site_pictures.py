@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.rings import site_area_um2, site_bounds_um
-from foveasim._core.validation import Bools, Floats, check_shape
+from foveasim._core.validation import Bools, Floats, check_shape, unmasked
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PackedRings
 from foveasim.integrate import Integrator
@@ -23,7 +23,7 @@ from foveasim.reconstruct.picture import coverage_fraction
 from foveasim.view.id_map import validate_bounds
 from foveasim.view.site_colours import BACKGROUND, NO_DATA, Rgb, SiteColours, decode_light, encode_light
 
-__all__ = ["SiteMeans", "cover", "site_picture"]
+__all__ = ["SiteMeans", "cover", "picture_colours", "site_picture"]
 
 #: Pixels that are drawn together: 32 MB per channel.
 PIXELS_PER_BAND = 2**22
@@ -182,6 +182,56 @@ def site_picture(
     """
     clear = SiteMeans(layout, shape, bounds_um).picture(colours)
     return cover(np.full((*clear.shape[:2], 3), background, np.uint8), clear[..., :3], clear[..., 3] / 255.0)
+
+
+def picture_colours(
+    layout: PackedRings, picture: ArrayLike, bounds_um: Sequence[float] | Floats | None = None
+) -> NDArray[np.uint8]:
+    """
+    Return the mean colours of a photograph over the photosites.
+
+    Parameters
+    ----------
+    layout : Layout
+    picture : (n_y, n_x, 3) or (n_y, n_x) uint8
+        sRGB or grey levels, top row first, such as ``np.asarray(PIL.Image.open(path).convert("RGB"))``.
+    bounds_um : (x_min, y_min, x_max, y_max), optional, µm
+        Extent of the picture; by default it covers the layout, centred and without distortion.
+
+    Returns
+    -------
+    rgb : (n_site, 3) uint8
+        Exact means in linear light, for ``by=`` of plots and columns; black for sites outside the picture.
+
+    Raises
+    ------
+    ParameterError
+        When the picture is not uint8 of this shape, or the bounds are invalid.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from foveasim.layout import grid
+    >>> picture_colours(grid(n_x=2, n_y=1, pitch_um=1.0), np.array([[[9, 8, 7], [255, 0, 0]]], np.uint8)).tolist()
+    [[9, 8, 7], [255, 0, 0]]
+    """
+    pixels = np.asarray(unmasked("picture", picture))
+    if pixels.dtype != np.uint8 or pixels.size == 0 or (pixels.ndim != 2 and pixels.shape[2:] != (3,)):
+        raise ParameterError(
+            "picture", f"must be uint8 of shape (n_y, n_x, 3) or (n_y, n_x), got {pixels.dtype} of shape {pixels.shape}"
+        )
+    pixels = np.broadcast_to(pixels.reshape(*pixels.shape[:2], -1), (*pixels.shape[:2], 3))
+    n_y, n_x = pixels.shape[:2]
+    x_min, y_min, x_max, y_max = validate_bounds(layout, bounds_um)
+    pitch_um = ((x_max - x_min) / n_x, (y_max - y_min) / n_y)
+    if bounds_um is None:
+        pitch_um = (max(pitch_um), max(pitch_um))
+    centre_um = (0.5 * (x_min + x_max), 0.5 * (y_min + y_max))
+    origin_um = (centre_um[0] - 0.5 * n_x * pitch_um[0], centre_um[1] - 0.5 * n_y * pitch_um[1])
+    integrator = Integrator(layout, Grid((n_y, n_x), pitch_um, origin_um))
+    light = integrator(np.moveaxis(decode_light(pixels[::-1]), -1, 0))
+    covered_um2 = integrator(np.ones((n_y, n_x)))
+    return encode_light((light / np.where(covered_um2 > 0.0, covered_um2, np.inf)).T)
 
 
 def cover(under: NDArray[np.uint8], over: NDArray[np.uint8], opacity: Floats) -> NDArray[np.uint8]:

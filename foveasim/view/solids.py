@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -38,8 +38,11 @@ from foveasim.capture import Capture
 from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.layout import Layout, inset
 from foveasim.layout._regions import as_region
-from foveasim.view.meshes import DEGENERATE_FRACTION, Mesh, extrude, triangulate
+from foveasim.view.meshes import DEGENERATE_FRACTION, Mesh, extrude, import_pyvista, triangulate
 from foveasim.view.site_colours import colours_of
+
+if TYPE_CHECKING:
+    from pyvista import MultiBlock
 
 __all__ = ["PartReport", "SensorStack", "Solids", "SolidsReport", "solids", "stack", "write_meshes"]
 
@@ -280,6 +283,24 @@ class Solids:
                 parts[name] = _remove_region(parts[name], is_removed, is_cut, region)
         return replace(self, parts=MappingProxyType(parts))
 
+    def to_pyvista(self) -> MultiBlock:
+        """
+        Return the parts as a PyVista MultiBlock with one named block per part.
+
+        Returns
+        -------
+        pyvista.MultiBlock
+            Blocks as in :meth:`Mesh.to_pyvista`; parts that a cut has removed completely are missing.
+
+        Raises
+        ------
+        ParameterError
+            When PyVista is not installed.
+        """
+        return import_pyvista().MultiBlock(
+            {name: mesh.to_pyvista() for name, mesh in self.parts.items() if mesh.triangles.size}
+        )
+
     def write(self, path: str | Path) -> None:
         """Write the solids to a file; see :func:`foveasim.view.write_meshes`."""
         write_meshes(self.meshes, path)
@@ -329,6 +350,7 @@ def solids(
         raise GeometryError("the layout has no sites; solids need at least one")
     bare = np.zeros(layout.n_sites)
     in_silicon = _Colouring(_uniform_colour(layout, SILICON), bare)
+    shown = None
     if by is not None or isinstance(data, Capture):
         shown = colours_of(data, by)
         is_number = shown.values is not None and shown.values.dtype.kind in "biuf"
@@ -346,7 +368,8 @@ def solids(
             f"{at} is too narrow for a trench of {sensor_stack.trench_width_um:g} µm; use a smaller trench_width_um",
             error.site_ids,
         ) from None
-    parts = {"wells": _prisms("wells", footprint, (-depth_um, 0.0), in_silicon)}
+    wells = _prisms("wells", footprint, (-depth_um, 0.0), in_silicon)
+    parts = {"wells": wells if shown is None else replace(wells, title=shown.title, shown=shown)}
     if has_trench:
         walls, owner = _walls(layout, footprint)
         parts["trenches"] = _prisms("trenches", walls, (-depth_um, 0.0), in_oxide, owner)
@@ -530,7 +553,8 @@ def _lenses(layout: Layout, floor_um: float, sensor_stack: SensorStack, colourin
     fan = np.stack((here + top, after + top, n_steps * n + site), axis=1)
     triangles = np.concatenate((caps.triangles[:, ::-1], *(part.reshape(-1, 3) for part in sides), fan))
     photosite = np.concatenate((np.tile(site, n_steps), np.arange(n_sites)))
-    return _coloured_mesh("lenses", points_um, triangles.astype(np.int32), photosite.astype(np.int32), colouring)
+    mesh = _coloured_mesh("lenses", points_um, triangles.astype(np.int32), photosite.astype(np.int32), colouring)
+    return replace(mesh, is_smooth=True)
 
 
 def _subdivide_edges(layout: Layout, n_corners: int) -> Layout:
@@ -642,7 +666,8 @@ def _remove_region(mesh: Mesh, is_removed: NDArray[np.bool_], is_cut: NDArray[np
             points_um, photosite = np.concatenate((points_um, cut_um)), np.concatenate((photosite, cut_site))
     colouring = _Colouring(np.zeros((is_removed.size, 3), np.uint8), np.zeros(is_removed.size))
     colouring.rgb[mesh.photosite], colouring.values[mesh.photosite] = mesh.colours, mesh.values
-    return _coloured_mesh(mesh.name, points_um, triangles, photosite, colouring)
+    left_over = _coloured_mesh(mesh.name, points_um, triangles, photosite, colouring)
+    return replace(left_over, title=mesh.title, shown=mesh.shown, is_smooth=mesh.is_smooth)
 
 
 def _region_prism(region: Any, mesh: Mesh) -> Any:

@@ -10,12 +10,29 @@ import sys
 import numpy as np
 import pytest
 import shapely
+import shapely.affinity
 
 import foveasim as fs
 from foveasim._io.images import read_picture
 from foveasim.errors import FileError, FoveasimWarning, GeometryError, ParameterError, SimulationError
-from foveasim.view import Mesh, Viewpoint, prisms, render, render3d, renderer, show, sites_in_view
+from foveasim.view import (
+    Mesh,
+    SensorStack,
+    Viewpoint,
+    picture_colours,
+    plotter,
+    prisms,
+    render,
+    render3d,
+    renderer,
+    show,
+    sites_in_view,
+    solids,
+    stack,
+)
+from foveasim.view._annotations import strip_width_px
 from foveasim.view.meshes import triangulate
+from foveasim.view.site_colours import FILTER_COLOURS
 
 FRAME = shapely.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)], [[(2, 2), (2, 6), (6, 6), (6, 2)]])
 HOOK = shapely.Polygon([(20, 0), (28, 0), (28, 2), (22, 2), (22, 8), (20, 8)])
@@ -92,7 +109,8 @@ def test_polydata_cells_have_all_columns():
     mesh = layout.to_pyvista()
 
     assert mesh.n_cells == 12
-    assert np.array_equal(mesh.cell_data["photosite"], np.arange(12))
+    assert np.array_equal(mesh.cell_data["site"], np.arange(12))
+    assert mesh.active_scalars_name == "area_um2"
     assert np.array_equal(mesh.cell_data["zone"], np.arange(12) // 5)
     assert mesh.cell_data["area_um2"] == pytest.approx(layout.area_um2)
     assert mesh.compute_cell_sizes()["Area"] == pytest.approx(layout.area_um2)
@@ -100,15 +118,46 @@ def test_polydata_cells_have_all_columns():
     assert json.loads(mesh.field_data["provenance"][0])["generator"] == "hexagonal"
 
 
-def test_concave_sites_keep_area_and_index():
-    mesh = ODD_LAYOUT.to_pyvista()
-    photosite = np.asarray(mesh.cell_data["photosite"])
-    sizes = np.asarray(mesh.compute_cell_sizes()["Area"])
+def test_concave_sites_are_single_cells():
+    # The hook, an arrow of four vertices, and a site with collinear vertices; beside them two with holes, which are triangles.
+    arrow = shapely.Polygon([(60, 0), (68, 4), (60, 8), (63, 4)])
+    layout = fs.Layout.from_polygons([*ODD, arrow], name=list("abcdef"))
+    mesh = layout.to_pyvista()
+    site = np.asarray(mesh.cell_data["site"])
+    parts = mesh.triangulate()
+    sizes = np.asarray(parts.compute_cell_sizes()["Area"])
 
-    assert np.bincount(photosite, weights=sizes) == pytest.approx(ODD_LAYOUT.area_um2)
-    assert np.array_equal(photosite, np.sort(photosite))
-    assert np.count_nonzero(photosite == 1) == 1
-    assert [str(name) for name in mesh.cell_data["name"]] == [list("abcde")[site] for site in photosite]
+    assert np.bincount(np.asarray(parts.cell_data["site"]), weights=sizes) == pytest.approx(layout.area_um2)
+    assert np.array_equal(site, np.sort(site))
+    assert [np.count_nonzero(site == k) for k in (1, 2, 4, 5)] == [1, 1, 1, 1]
+    assert [str(name) for name in mesh.cell_data["name"]] == [list("abcdef")[k] for k in site]
+    assert layout[[1, 2, 4, 5]].to_pyvista().n_cells == 4
+
+
+@pytest.mark.needs("renderer")
+def test_pyvista_fills_concave_cells_exactly():
+    renderer.begin_rendering()
+    import pyvista
+
+    arrows = [[(0, 0), (8, 4), (0, 8), (3, 4)], [(8, 4), (0, 8), (3, 4), (0, 0)], [(0, 8), (3, 4), (0, 0), (8, 4)]]
+    shapes = [shapely.affinity.translate(shapely.Polygon(ring), 10 * k) for k, ring in enumerate(arrows)]
+    mesh = fs.Layout.from_polygons([*shapes, shapely.affinity.translate(HOOK, 12)]).to_pyvista()
+    assert mesh.n_cells == 4
+    plot = pyvista.Plotter(off_screen=True, window_size=(420, 100), lighting=None)
+    plot.render_window.SetMultiSamples(0)
+    plot.set_background("white")
+    plot.add_mesh(mesh, color="black", lighting=False)
+    plot.camera.parallel_projection = True
+    plot.camera.position, plot.camera.focal_point, plot.camera.up = (20.5, 4, 50), (20.5, 4, 0), (0, 1, 0)
+    plot.camera.parallel_scale = 5.0
+    drawn = np.asarray(plot.screenshot(None, return_img=True))[..., 0] < 128
+    plot.close()
+    x_um, y_um = np.meshgrid(20.5 + (np.arange(420) - 209.5) / 10.0, 4.0 - (np.arange(100) - 49.5) / 10.0)
+    inside = np.any(
+        [shapely.contains_xy(s, x_um, y_um) for s in [*shapes, shapely.affinity.translate(HOOK, 12)]], axis=0
+    )
+
+    assert np.mean(drawn != inside) < 0.01
 
 
 def test_polydata_contains_capture_values_and_settings():
@@ -117,6 +166,10 @@ def test_polydata_contains_capture_values_and_settings():
 
     for name in ("code", "electrons", "expected_e", "filter_of_site"):
         assert np.array_equal(mesh.cell_data[name], getattr(taken, name))
+    assert mesh.active_scalars_name == "code"
+    assert json.loads(mesh.field_data["units"][0]) == {
+        "code": "DN", "electrons": "e-", "expected_e": "e-", "area_um2": "µm²"
+    }  # fmt: skip
     assert json.loads(mesh.field_data["settings"][0]) == json.loads(json.dumps(taken.settings))
 
 
@@ -346,10 +399,127 @@ def test_invalid_viewpoints_raise_by_name(parameters, message):
 
 
 def test_invalid_scene_raises():
-    with pytest.raises(ParameterError, match="'scene' must be a Mesh"):
-        render(ODD_LAYOUT)
+    with pytest.raises(ParameterError, match="'scene' must be a Layout, a Capture, a Mesh"):
+        render(3)
+    with pytest.raises(ParameterError, match="'scene' must be a Layout, a Capture, a Mesh"):
+        render([ODD_LAYOUT])
     with pytest.raises(GeometryError, match="the scene is empty"):
         render([])
+
+
+def test_capture_renders_with_titled_colour_bar():
+    taken = capture()
+    picture = software(taken, size_px=(300, 200))
+    bare = software(taken, size_px=(300, 200), legend=False)
+    width = sum(strip_width_px(prisms(taken).shown, [], 200))
+    assert picture.shape == bare.shape == (200, 300, 3)
+    assert np.array_equal(picture[:, :-width], software(taken, size_px=(300 - width, 200), legend=False))
+
+    # The bar is grey from black to white; text is dark.
+    strip = picture[:, -width:].astype(int)
+    column = strip[
+        :, np.argmax(np.ptp(strip[..., 0], axis=0) + np.count_nonzero(np.diff(strip[..., 0], axis=0), axis=0))
+    ]
+    assert len(np.unique(column[:, 0])) > 60
+    assert prisms(taken).title == "code / DN"
+    assert np.array_equal(bare, software(prisms(taken), size_px=(300, 200)))
+
+
+def test_filter_legend_has_every_colour():
+    layout = fs.layout.mosaic(fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0), ("RG", "GB"))
+    picture = software(prisms(layout, by="channel"), size_px=(400, 200), legend=True)
+    strip = picture[:, -70:].reshape(-1, 3)
+
+    assert all(np.any(np.all(strip == colour, axis=1)) for colour in (FILTER_COLOURS[name] for name in "RGB"))
+    with pytest.raises(ParameterError, match="'size_px' must leave space for the scene"):
+        software(prisms(layout, by="channel"), size_px=(60, 200), legend=True)
+
+
+def test_labels_end_on_their_parts():
+    stack_of = SensorStack(well_depth_um=3.0, trench_width_um=0.3, lens_height_um=0.8)
+    model = stack(fs.layout.grid(n_x=8, n_y=8, pitch_um=3.0), stack_of)
+    meshes, size_px = list(model.meshes), (500, 400)
+    eye = render3d._eye(meshes, Viewpoint(), size_px)
+    ids, _ = render3d._nearest(meshes, eye, size_px)
+    ends = np.cumsum([mesh.triangles.shape[0] for mesh in meshes])
+    labels = render3d._labels(meshes, [mesh.name for mesh in meshes], eye, size_px, 1)
+
+    assert [label.text for label in labels] == ["wells", "trenches", "filters", "lenses"]
+    for label in labels:
+        part = np.searchsorted(ends, ids[int(label.y_px), int(label.x_px)], side="right")
+        assert meshes[part].name == label.text
+    assert software(model, size_px=(700, 400), labels=True).shape == (400, 700, 3)
+
+
+def test_smooth_lens_normals_follow_sphere():
+    # A dense dome over a regular 48-gon: the normal of a sphere points away from its centre.
+    disc = fs.Layout.from_polygons([shapely.Point(0, 0).buffer(2.0, quad_segs=12)])
+    model = solids(disc, SensorStack(lens_height_um=0.8, n_lens_steps=24, trench_width_um=0.0, filter_thickness_um=0.0))
+    dome = model.parts["lenses"]
+    radius_um = np.sqrt(disc.area_um2[0] / np.pi)
+    ball_um = (radius_um**2 + 0.8**2) / 1.6
+    is_inner = (np.hypot(*dome.points_um[:, :2].T) < 1.7) & (dome.points_um[:, 2] > 0.0)
+    expected = dome.points_um[is_inner] - (0.0, 0.0, 0.8 - ball_um)
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+
+    assert dome.is_smooth
+    assert np.sum(is_inner) > 200
+    assert np.einsum("ij,ij->i", render3d.point_normals(dome)[is_inner], expected).min() > np.cos(np.radians(2.0))
+
+
+def test_solids_become_named_blocks():
+    model = solids(fs.layout.grid(n_x=2, n_y=2, pitch_um=3.0))
+    blocks = model.to_pyvista()
+
+    assert list(blocks.keys()) == ["wells", "trenches", "filters", "lenses"]
+    assert blocks["wells"].n_cells == model.parts["wells"].triangles.shape[0]
+    assert set(np.unique(blocks["lenses"].cell_data["site"])) == {0, 1, 2, 3}
+
+
+def test_mesh_values_are_active_and_titled():
+    mesh = prisms(capture(), "electrons").to_pyvista()
+
+    assert mesh.active_scalars_name == "electrons / e-"
+    assert set(mesh.cell_data.keys()) == {"electrons / e-", "site", "rgb"}
+
+
+@pytest.mark.needs("renderer")
+def test_plotter_names_actors_and_picked_sites():
+    taken = capture()
+    plot = plotter(taken, size_px=(300, 200), off_screen=True)
+    assert "columns" in plot.actors
+    assert [title.strip() for title in list(plot.scalar_bars.keys())] == ["code / DN"]
+    report = render3d.picking_reporter(plot, [prisms(taken)])
+    mesh = plot.actors["columns"].mapper.dataset
+    last = mesh.n_cells - 1
+    report(mesh.extract_cells([last]))
+    site = int(mesh.cell_data["site"][last])
+    assert plot.actors["picked site"].GetText(0) == f"site {site}, code / DN {taken.code[site]}"
+    plot.close()
+
+
+@pytest.mark.needs("renderer")
+def test_both_renderers_shade_lenses_alike():
+    model = solids(fs.layout.grid(n_x=5, n_y=5, pitch_um=3.0), SensorStack(n_lens_corners=16))
+    ours, theirs = (
+        render(model, size_px=(400, 260), oversampling=2, renderer=name).astype(int) for name in ("software", "pyvista")
+    )
+
+    assert np.mean(np.abs(ours - theirs).max(axis=-1) > 6) < 0.02
+
+
+def test_photograph_colours_are_exact_means():
+    layout = fs.Layout.from_rectangles([[1.0, 0.5], [2.5, 1.5]], [[2.0, 1.0], [1.0, 1.0]])
+    picture = np.array([[[0, 0, 0], [0, 0, 0], [10, 20, 30]], [[255, 255, 255], [0, 0, 0], [0, 0, 0]]], np.uint8)
+    # The first site covers a white and a black pixel of the bottom row: half of the light, sRGB 188.
+    assert picture_colours(layout, picture, (0, 0, 3, 2)).tolist() == [[188, 188, 188], [10, 20, 30]]
+    assert picture_colours(layout, picture[..., 1], (0, 0, 3, 2))[1].tolist() == [20, 20, 20]
+    # A wide picture over a square layout is centred, and its sides are cropped.
+    square = fs.layout.grid(n_x=2, n_y=2, pitch_um=1.0)
+    wide = np.repeat(np.arange(8, dtype=np.uint8)[np.newaxis] // 2, 4, axis=0)
+    assert picture_colours(square, wide).tolist() == [[v] * 3 for v in (1, 2, 1, 2)]
+    with pytest.raises(ParameterError, match="'picture' must be uint8 of shape"):
+        picture_colours(square, wide / 8.0)
 
 
 def test_written_picture_equals_returned_one(tmp_path):
