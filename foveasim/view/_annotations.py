@@ -16,7 +16,7 @@ __all__ = ["Label", "add_strip", "strip_width_px"]
 TEXT_FRACTION, MIN_TEXT_PX = 0.022, 12.0
 #: Widths of a colour bar with its numbers, and of a character, in heights of text.
 BAR_WIDTH, CHARACTER_WIDTH = 7.5, 0.62
-#: Distance of two labels, in heights of text.
+#: Smallest distance between labels, in heights of text.
 LABEL_STEP = 1.7
 
 

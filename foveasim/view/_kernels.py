@@ -113,9 +113,9 @@ def paint_sites(xy, ring_offsets, site_offsets, rows, x, y, first_row, ids):
 @njit(types.void(_ids, _colours, _encoded, types.int64, types.boolean, types.int64, types.uint8[:, :, ::1]))
 def blend(ids, colours, encoded, n_samples, has_boundaries, first_row, band):
     """
-    Average the ``n_samples`` x ``n_samples`` samples of each pixel in a band of rows, in linear light.
+    Average the samples of each pixel in a band of rows, in linear light.
 
-    ``colours[i + 1]`` (red, green, blue, weight) is the colour of site i from 0 to 1, ``colours[0]`` that of the background,
+    A pixel has ``n_samples`` x ``n_samples`` samples. ``colours[i + 1]`` (red, green, blue, weight) is the colour of site i from 0 to 1, ``colours[0]`` that of the background,
     and the last one, if ``has_boundaries``, that of samples whose left or lower neighbour belongs to another site. Weights are
     0 or 1; alpha is their mean. ``encoded`` is the byte of each of evenly spaced levels from 0 to 1.
     """

@@ -214,7 +214,11 @@ class SitePixels:
         return picture if background is None else picture[..., :3]
 
     def boundary_fraction(self) -> Floats:
-        """Return the fraction of each pixel that lines of one sample width between sites cover, (n_y, n_x)."""
+        """
+        Return the fraction of each pixel that boundaries between sites cover, (n_y, n_x).
+
+        Boundaries have the width of one sample.
+        """
         is_boundary = np.zeros(self.ids.shape, bool)
         is_boundary[:, 1:] = self.ids[:, 1:] != self.ids[:, :-1]
         is_boundary[1:] |= self.ids[1:] != self.ids[:-1]

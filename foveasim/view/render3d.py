@@ -268,7 +268,7 @@ def plotter(
     off_screen: bool = False,
 ) -> Plotter:
     """
-    Return a PyVista plotter of a scene, for further changes before its ``show()`` or ``screenshot()``.
+    Return a PyVista plotter of a scene, for changes before ``show`` or ``screenshot``.
 
     Parameters
     ----------
@@ -522,7 +522,7 @@ def _face_normals(points_um: Floats, triangles: NDArray[np.int32]) -> Floats:
 
 
 def point_normals(mesh: Mesh) -> Floats:
-    """Return the mean normal of the triangles facing up at each point of a smooth mesh, (n_point, 3)."""
+    """Return the mean normal of the triangles facing up at each point, (n_point, 3)."""
     faces = _face_normals(mesh.points_um, mesh.triangles)
     faces[faces[:, 2] <= 0.0] = 0.0
     normal = np.stack(
@@ -540,7 +540,11 @@ def _smooth_normals(
     eye: _Eye,
     size_px: tuple[int, int],
 ) -> Floats:
-    """Interpolate point normals at pixels (row, column), whose triangles are ``corners[which]``; other faces are flat."""
+    """
+    Interpolate point normals at pixels (row, column), whose triangles are ``corners[which]``.
+
+    Faces that do not face up have their own normals.
+    """
     screen = eye.project(mesh.points_um, size_px)
     a, b, c = (screen[corners[:, k]][which] for k in range(3))
     y, x = pixels[:, 0] + 0.5, pixels[:, 1] + 0.5
@@ -659,7 +663,11 @@ def _plotter(
 
 
 def _split_at_rims(surface: PolyData, mesh: Mesh) -> None:
-    """Set normals of a smooth mesh: those of points on triangles facing up, and flat ones on separate points elsewhere."""
+    """
+    Set the normals of a smooth mesh.
+
+    Triangles facing up have the normals of their points; all others have separate points with their own normals.
+    """
     is_up = _face_normals(mesh.points_um, mesh.triangles)[:, 2] > 0.0
     flat = mesh.triangles[~is_up]
     n = mesh.points_um.shape[0]
@@ -673,7 +681,7 @@ def _split_at_rims(surface: PolyData, mesh: Mesh) -> None:
 
 
 def _add_scalar_bar(plot: Plotter, meshes: list[Mesh]) -> None:
-    """Add the colour bar or the legend of the first mesh that has one, on the right of the scene."""
+    """Add the colour bar or legend of the first mesh that has one, right of the scene."""
     from matplotlib.colors import ListedColormap
 
     pyvista = import_pyvista()

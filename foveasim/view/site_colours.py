@@ -156,9 +156,9 @@ def decode_light(rgb: NDArray[Any]) -> Floats:
     return np.asarray(decode(np.arange(256) / 255.0, "srgb")[rgb])
 
 
-def encode_light(linear: Floats) -> RgbArray:
+def encode_light(fraction: Floats) -> RgbArray:
     """Return linear light from 0 to 1 as sRGB bytes."""
-    return np.rint(255.0 * encode_srgb_values(np.clip(linear, 0.0, 1.0))).astype(np.uint8)
+    return np.rint(255.0 * encode_srgb_values(np.clip(fraction, 0.0, 1.0))).astype(np.uint8)
 
 
 def site_colours(data: Layout | Capture, by: str | ArrayLike | None = None) -> RgbArray:

@@ -117,7 +117,7 @@ class _Band:
         self.covered_um2 = np.where(coverage > 0.0, coverage, np.inf) * grid.cell_area_um2
 
     def means(self, values: Floats) -> Floats:
-        """Return means (..., n_y, n_x) of values (..., n_site) over the covered part of each pixel; 0 without sites."""
+        """Return means (..., n_y, n_x) over the covered part of each pixel; 0 without sites."""
         return self.integrator.spread(values[..., self.sites]) / self.covered_um2
 
     def draw(self, colours: SiteColours, picture: NDArray[np.uint8]) -> None:
@@ -234,22 +234,22 @@ def picture_colours(
     return encode_light((light / np.where(covered_um2 > 0.0, covered_um2, np.inf)).T)
 
 
-def cover(under: NDArray[np.uint8], over: NDArray[np.uint8], opacity: Floats) -> NDArray[np.uint8]:
+def cover(under: NDArray[np.uint8], over: NDArray[np.uint8], weight: Floats) -> NDArray[np.uint8]:
     """
     Return a picture covered by another one in linear light.
 
     Parameters
     ----------
     under, over : (n_y, n_x, 3) uint8
-    opacity : (n_y, n_x)
+    weight : (n_y, n_x)
         From 0 to 1.
 
     Returns
     -------
     picture : (n_y, n_x, 3) uint8
-        Exactly one of the pictures where the opacity is 0 or 1.
+        Exactly one of the pictures where the weight is 0 or 1.
     """
-    alpha = opacity[..., np.newaxis]
+    alpha = weight[..., np.newaxis]
     mixed = encode_light(alpha * decode_light(over) + (1.0 - alpha) * decode_light(under))
     return np.where(alpha == 0.0, under, np.where(alpha == 1.0, over, mixed))
 

@@ -119,7 +119,7 @@ def test_polydata_cells_have_all_columns():
 
 
 def test_concave_sites_are_single_cells():
-    # The hook, an arrow of four vertices, and a site with collinear vertices; beside them two with holes, which are triangles.
+    # The hook, an arrow of four vertices, and a site with collinear vertices; and two with holes, which are triangles.
     arrow = shapely.Polygon([(60, 0), (68, 4), (60, 8), (63, 4)])
     layout = fs.Layout.from_polygons([*ODD, arrow], name=list("abcdef"))
     mesh = layout.to_pyvista()

@@ -1,35 +1,13 @@
 // Values to colours: scales, their ticks, and formatted numbers.
 
-// matplotlib's viridis, which is perceptually uniform: 256 colours of three bytes.
-const VIRIDIS = [
-  "44015444025645045745055946075a46085c460a5d460b5e470d60470e61471063471164471365481467481668481769",
-  "48186a481a6c481b6d481c6e481d6f481f70482071482173482374482475482576482677482878482979472a7a472c7a",
-  "472d7b472e7c472f7d46307e46327e46337f463480453581453781453882443983443a83443b84433d84433e85423f85",
-  "4240864241864142874144874045884046883f47883f48893e49893e4a893e4c8a3d4d8a3d4e8a3c4f8a3c508b3b518b",
-  "3b528b3a538b3a548c39558c39568c38588c38598c375a8c375b8d365c8d365d8d355e8d355f8d34608d34618d33628d",
-  "33638d32648e32658e31668e31678e31688e30698e306a8e2f6b8e2f6c8e2e6d8e2e6e8e2e6f8e2d708e2d718e2c718e",
-  "2c728e2c738e2b748e2b758e2a768e2a778e2a788e29798e297a8e297b8e287c8e287d8e277e8e277f8e27808e26818e",
-  "26828e26828e25838e25848e25858e24868e24878e23888e23898e238a8d228b8d228c8d228d8d218e8d218f8d21908d",
-  "21918c20928c20928c20938c1f948c1f958b1f968b1f978b1f988b1f998a1f9a8a1e9b8a1e9c891e9d891f9e891f9f88",
-  "1fa0881fa1881fa1871fa28720a38620a48621a58521a68522a78522a88423a98324aa8325ab8225ac8226ad8127ad81",
-  "28ae8029af7f2ab07f2cb17e2db27d2eb37c2fb47c31b57b32b67a34b67935b77937b87838b9773aba763bbb753dbc74",
-  "3fbc7340bd7242be7144bf7046c06f48c16e4ac16d4cc26c4ec36b50c46a52c56954c56856c66758c7655ac8645cc863",
-  "5ec96260ca6063cb5f65cb5e67cc5c69cd5b6ccd5a6ece5870cf5773d05675d05477d1537ad1517cd2507fd34e81d34d",
-  "84d44b86d54989d5488bd6468ed64590d74393d74195d84098d83e9bd93c9dd93ba0da39a2da37a5db36a8db34aadc32",
-  "addc30b0dd2fb2dd2db5de2bb8de29bade28bddf26c0df25c2df23c5e021c8e020cae11fcde11dd0e11cd2e21bd5e21a",
-  "d8e219dae319dde318dfe318e2e418e5e419e7e419eae51aece51befe51cf1e51df4e61ef6e620f8e621fbe723fde725",
-].join("");
+import { COLOUR_MAPS, mapColour } from "./colour_maps.js";
+
 export const clamp = (x, low, high) => Math.min(high, Math.max(low, x));
 const packedColour = ([r, g, b]) => (255 << 24 | b << 16 | g << 8 | r) >>> 0;
 const table = (colourOf) => Array.from({ length: 256 }, (_, i) => colourOf(i / 255));
 
 export function bytesOfHex(hex) {
   return [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16));
-}
-
-function viridis(fraction) {
-  const at = 6 * Math.round(255 * fraction);
-  return [0, 2, 4].map((i) => parseInt(VIRIDIS.slice(at + i, at + i + 2), 16));
 }
 
 // Displayed colour of a signal: a fraction of white through a filter, with gamma so that dark sites are distinguishable.
@@ -44,7 +22,7 @@ function lit(fraction, colour, palette) {
 //   lit    numbers as brightness of the colour of each site's filter
 //   kinds  integers of categories
 export class Scale {
-  constructor(column, values, filterOf, palette, wantsLog) {
+  constructor(column, values, filterOf, palette, wantsLog, wantedMap) {
     Object.assign(this, { column, values, filterOf, palette });
     let low = Infinity, high = -Infinity;
     for (let i = 0; i < values.length; i++) {
@@ -66,8 +44,11 @@ export class Scale {
     this.isLog = this.canLog && (wantsLog ?? (Boolean(column.of) && high / low > 40));
     // Colours of categories repeat; a column may name more categories than there are colours.
     this.nKinds = column.colours ? column.colours.length : palette.kinds.length;
-    if (column.kind === "linear") this.tables = [table(viridis)];
-    else if (column.kind === "grey") this.tables = [table((fraction) => lit(fraction, [255, 255, 255], palette))];
+    // Signals are grey levels unless another colour map is chosen.
+    this.canMap = column.kind === "linear" || column.kind === "grey";
+    this.map = COLOUR_MAPS.includes(wantedMap) ? wantedMap : column.kind === "grey" ? "grey" : COLOUR_MAPS[0];
+    if (column.kind === "grey" && this.map === "grey") this.tables = [table((fraction) => lit(fraction, [255, 255, 255], palette))];
+    else if (this.canMap) this.tables = [table((fraction) => mapColour(this.map, fraction))];
     else if (column.kind === "lit") this.tables = column.colours.map((c) => table((fraction) => lit(fraction, bytesOfHex(c), palette)));
   }
 
@@ -84,9 +65,11 @@ export class Scale {
     const value = this.values[site];
     if (this.column.kind === "kinds") return this.kindColour(value);
     if (!Number.isFinite(value)) return bytesOfHex(this.palette.no_data);
-    const shades = this.tables[this.tables.length > 1 ? this.filterOf[site] : 0];
-    return shades[Math.round(255 * clamp(this.fraction(value), 0, 1))];
+    return this.shade(value, this.tables.length > 1 ? this.filterOf[site] : 0);
   }
+
+  // Colour of a number, on a mosaic that of a filter.
+  shade(value, filter = 0) { return this.tables[filter][Math.round(255 * clamp(this.fraction(value), 0, 1))]; }
 
   kindColour(kind) {
     const own = this.column.colours && this.column.colours[kind];
@@ -148,6 +131,11 @@ export function roundStep(length, isWhole) {
   const power = 10 ** Math.floor(Math.log10(length)), lead = length / power;
   const step = power * (lead <= 1 ? 1 : lead <= 2 ? 2 : lead <= 5 ? 5 : 10);
   return isWhole ? Math.max(1, step) : step;
+}
+
+// Formats a length in nm, µm or mm.
+export function formatLength(length) {
+  return length >= 1000 ? length / 1000 + " mm" : length >= 0.1 ? Number(length.toPrecision(3)) + " µm" : Number((1000 * length).toPrecision(3)) + " nm";
 }
 
 // Formats integers exactly, other numbers with six significant digits.

@@ -5,7 +5,7 @@ import { clamp } from "./colours.js";
 // A pointer that moves less than this between down and up is a click.
 const CLICK_PIXELS = 4;
 
-// Calls the callbacks that are given: press(), drag(dx, dy, { px, py, isSecond, isMiddle }), pinch(factor, px, py),
+// Calls the callbacks that are given: press(px, py), drag(dx, dy, { px, py, isSecond, isMiddle }), pinch(factor, px, py),
 // wheel(factor, px, py), click(px, py), move(px, py, isHeld), leave(). Factors above 1 zoom in. isSecond: with
 // two fingers, the right button, or Shift, Ctrl or Meta.
 export function listenToPointers(canvas, on) {
@@ -22,7 +22,7 @@ export function listenToPointers(canvas, on) {
     on.wheel(Math.exp(-clamp(event.deltaY * lines, -400, 400) * (event.ctrlKey ? 0.01 : 0.002)), ...at(event));
   }, { passive: false });
   canvas.addEventListener("pointerdown", (event) => {
-    on.press?.();
+    on.press?.(...at(event));
     canvas.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, at(event));
     travelled = 0;

@@ -96,6 +96,9 @@ export class Orbit {
     return distance;
   }
 
+  // Pixels per µm at the target.
+  pixelsPerUm() { return (0.5 * FOCAL * this.tall) / this.distance; }
+
   eye(out) {
     for (let i = 0; i < 3; i++) out[i] = this.target[i] + this.distance * this.toEye[i];
     return out;

@@ -1,9 +1,13 @@
 // The page: controls, the photosite under the mouse, colours, design rules, picture, links.
 
-import { Scale, brief, bytesOfHex, clamp, roundStep, shown, textOf } from "./colours.js";
+import { Scale, brief, bytesOfHex, clamp, formatLength, roundStep, shown, textOf } from "./colours.js";
+import { COLOUR_MAPS } from "./colour_maps.js";
 import { listenToPointers } from "./gestures.js";
 import { findRenderer, fitCanvas, pixelRatio, watchSize } from "./gl.js";
+import { drawRamp, kindItems, summaryOf, tickLabels, titleOf } from "./legend.js";
 import { SensorMap } from "./map.js";
+import { downloadTable, lengthText, sitesIn, statisticsRows, tableOf } from "./measure.js";
+import { Overview } from "./overview.js";
 import { $, downloadPicture, inkOf, isForPage, listenToHelp, make, notice, speak, startTheme, stayingNotice } from "./page_parts.js";
 import { Sites } from "./sites.js";
 import { offsetsOf, unpack } from "./unpack.js";
@@ -18,6 +22,7 @@ const STEPS = 72;
 const state = {
   sites: null, map: null, columns: [], scale: null, column: null, range: null, wantsLog: undefined,
   hovered: -1, others: [], pinned: -1, cursor: null, chosen: null, shownViolations: 0, drawn: 0, drawMs: 0, loaded: false, isSlow: false,
+  wantedMap: null, tool: null, start: null, ruler: null, selection: null, selected: [],
 };
 const loading = new Map();
 const asks = { map: false, marks: false };
@@ -38,8 +43,6 @@ async function valuesOf(column) {
   return column.values;
 }
 
-const titleOf = (column) => (column.unit ? column.label + " / " + column.unit : column.label);
-
 async function colourBy(key, range = null) {
   const column = about.columns.find((c) => c.key === key) || about.columns[0];
   const values = await valuesOf(column);
@@ -47,7 +50,7 @@ async function colourBy(key, range = null) {
   if (state.column !== column) state.wantsLog = undefined;
   state.column = column;
   state.range = range;
-  state.scale = new Scale(column, values, state.filterOf, about.palette, state.wantsLog);
+  state.scale = new Scale(column, values, state.filterOf, about.palette, state.wantsLog, state.wantedMap);
   $("colouring").value = column.key;
   repaint();
   drawLegend();
@@ -82,44 +85,20 @@ function drawLegend() {
   $("kinds").hidden = !isKinds;
   $("log-label").hidden = !scale.canLog;
   $("log").checked = scale.isLog;
-  const { values } = column;
+  $("map-label").hidden = !scale.canMap;
+  $("colour-map").value = scale.map;
   if (isKinds) {
-    const counts = new Map();
-    for (let i = 0; i < values.length; i++) counts.set(values[i], (counts.get(values[i]) || 0) + 1);
-    const kinds = [...counts.keys()].sort((a, b) => a - b), most = 40;
-    $("kinds").replaceChildren(...kinds.slice(0, most).map((kind) => {
-      const item = make("li"), swatch = make("i");
-      swatch.style.background = "rgb(" + scale.kindColour(kind) + ")";
-      item.append(swatch, make("span", (column.names ? column.names[kind] : shown(kind)) + " · " + shown(counts.get(kind))));
-      return item;
-    }));
-    $("summary").textContent = kinds.length > most ? "and " + shown(kinds.length - most) + " more; colours repeat" : "";
+    const { items, rest } = kindItems(scale);
+    $("kinds").replaceChildren(...items);
+    $("summary").textContent = rest;
     return;
   }
-  const histogram = scale.histogram(STEPS);
-  state.histogram = histogram;
+  state.histogram = scale.histogram(STEPS);
   drawHistogram();
-  const ramp = fitted($("ramp")), rows = scale.tables.length;
-  scale.tables.forEach((shades, row) => {
-    for (let px = 0; px < ramp.width; px++) {
-      ramp.context.fillStyle = "rgb(" + shades[Math.round((255 * px) / Math.max(1, ramp.width - 1))] + ")";
-      ramp.context.fillRect(px, (row * ramp.height) / rows, 1.5, ramp.height / rows);
-    }
-  });
-  const ticks = scale.ticks(4);
-  $("ticks").replaceChildren(...ticks.map((tick) => {
-    const label = make("span", brief(tick)), fraction = scale.fraction(tick);
-    label.style.left = 100 * clamp(fraction, 0, 1) + "%";
-    if (fraction < 0.04) label.style.transform = "none";
-    if (fraction > 0.96) label.style.transform = "translateX(-100%)";
-    return label;
-  }));
-  let sum = 0, count = 0;
-  for (let i = 0; i < values.length; i++) if (Number.isFinite(values[i])) { sum += values[i]; count++; }
-  const unit = column.unit ? " " + column.unit : "";
-  $("summary").textContent = count === 0 ? "no values" :
-    shown(scale.lowest) + " to " + shown(scale.highest) + unit + ", mean " + shown(Number((sum / count).toPrecision(5))) + unit +
-    (column.note ? " (" + column.note + ")" : "");
+  const ramp = fitted($("ramp"));
+  drawRamp(ramp.context, scale, ramp.width, ramp.height);
+  $("ticks").replaceChildren(...tickLabels(scale));
+  $("summary").textContent = summaryOf(scale);
 }
 
 // Heights are square roots of counts, so that a few sites among many are visible.
@@ -184,6 +163,11 @@ function listenToHistogram() {
     });
   }
   $("range-all").addEventListener("click", () => setRange(null));
+  $("colour-map").append(...COLOUR_MAPS.map((name) => make("option", name)));
+  $("colour-map").addEventListener("change", () => {
+    state.wantedMap = $("colour-map").value;
+    colourBy(state.column.key, state.range);
+  });
   $("log").addEventListener("change", () => {
     state.wantsLog = $("log").checked;
     colourBy(state.column.key, state.range);
@@ -208,6 +192,7 @@ function drawAsked() {
 function drawMap() {
   const start = performance.now();
   state.map.draw(groundColour());
+  state.overview.update(state.map, state.scale, state.range);
   drawLines();
   drawScaleBar();
   state.drawn++;
@@ -296,12 +281,13 @@ function drawMarks() {
     const cross = () => { for (const [u, v] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) { context.moveTo(x + 4 * u, y + 4 * v); context.lineTo(x + 13 * u, y + 13 * v); } };
     outline(context, cross, [4, 2], ["#ffffff", "#10151f"]);
   }
+  drawTools(context);
   drawPictureMarks();
 }
 
 function drawScaleBar() {
   const { map } = state, length = roundStep(90 / map.scale / 2), bar = $("scale-bar");
-  bar.querySelector("span").textContent = length >= 1000 ? length / 1000 + " mm" : length >= 0.1 ? Number(length.toPrecision(3)) + " µm" : Number((1000 * length).toPrecision(3)) + " nm";
+  bar.querySelector("span").textContent = formatLength(length);
   bar.querySelector("i").style.width = length * map.scale + "px";
   state.scaleBar = { length, width: length * map.scale };
 }
@@ -365,7 +351,7 @@ function hover(x, y, from) {
   state.cursor = { x, y, from };
   state.hovered = all.length ? all[all.length - 1] : -1;
   state.others = all.slice(0, -1);
-  $("cursor").textContent = "x " + lengthText(x) + "  y " + lengthText(y) + " µm";
+  $("cursor").textContent = "x " + positionText(x) + "  y " + positionText(y) + " µm";
   tellSite();
   ask("marks");
 }
@@ -380,7 +366,7 @@ function leave() {
 }
 
 // Formats a position with the digits that the view resolves.
-function lengthText(value) {
+function positionText(value) {
   return value.toFixed(clamp(Math.ceil(Math.log10(state.map.scale)) + 1, 0, 6));
 }
 
@@ -483,9 +469,14 @@ function resize() {
 
 function listenToMap() {
   const canvas = $("marks"), { map } = state;
+  let held = null;
   listenToPointers(canvas, {
-    press: () => cancelAnimationFrame(flight),
-    drag: (dx, dy) => { map.set(map.x - dx / map.scale, map.y + dy / map.scale, map.scale); moved(); },
+    press: (px, py) => { cancelAnimationFrame(flight); held = [map.fromX(px), map.fromY(py)]; },
+    drag: (dx, dy, { px, py, isSecond }) => {
+      if (state.tool && !isSecond) { extend(held, [map.fromX(px), map.fromY(py)]); return; }
+      map.set(map.x - dx / map.scale, map.y + dy / map.scale, map.scale);
+      moved();
+    },
     pinch: (factor, px, py) => { map.zoom(factor, px, py); moved(); },
     wheel: (factor, px, py) => {
       cancelAnimationFrame(flight);
@@ -493,7 +484,7 @@ function listenToMap() {
       hover(map.fromX(px), map.fromY(py), "mouse");
       moved();
     },
-    click: () => pin(state.hovered),
+    click: () => { if (!state.tool) pin(state.hovered); },
     move: (px, py) => hover(map.fromX(px), map.fromY(py), "mouse"),
     leave,
   });
@@ -503,10 +494,11 @@ function listenToMap() {
     const moves = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     if (moves[event.key]) map.set(map.x + step * moves[event.key][0], map.y + step * moves[event.key][1], map.scale);
-    else if (event.key === "Enter" || event.key === " ") { hover(map.x, map.y, "keys"); pin(state.hovered); } else return;
+    else if (event.key === "Enter" || event.key === " ") { hover(map.x, map.y, "keys"); if (state.tool) setPoint(); else pin(state.hovered); } else return;
     event.preventDefault();
     cancelAnimationFrame(flight);
     hover(map.x, map.y, "keys");
+    if (moves[event.key] && state.tool && state.start) extend(state.start, [map.x, map.y]);
     moved();
   });
   document.addEventListener("keydown", (event) => {
@@ -516,7 +508,9 @@ function listenToMap() {
     else if (event.key === "-" || event.key === "_") nearer(1 / 1.4);
     else if (event.key === "0") fit();
     else if (event.key === "/") { $("find-site").focus(); event.preventDefault(); }
-    else if (event.key === "Escape") { state.pinned = -1; choose(null); setRange(null); tellSite(); moved(); }
+    else if (event.key === "r" || event.key === "R") useTool("ruler");
+    else if (event.key === "s" || event.key === "S") useTool("select");
+    else if (event.key === "Escape") { clearTools(); state.pinned = -1; choose(null); setRange(null); tellSite(); moved(); }
     if (document.activeElement === canvas) hover(map.x, map.y, "keys");
   });
   $("nearer").addEventListener("click", () => fly(map.x, map.y, 2 * map.scale));
@@ -524,6 +518,95 @@ function listenToMap() {
   $("fit").addEventListener("click", fit);
   $("unpin").addEventListener("click", () => { state.pinned = -1; tellSite(); moved(); });
   watchSize($("map"), resize);
+}
+
+// -- ruler and selection ------------------------------------------------------------------------------------------------------------------
+
+// Chooses the ruler or the selection of a rectangle; the same again, or null, for panning.
+function useTool(name) {
+  state.tool = state.tool === name ? null : name;
+  state.start = null;
+  for (const id of ["ruler", "select"]) $(id).setAttribute("aria-pressed", state.tool === id);
+  $("marks").classList.toggle("measuring", Boolean(state.tool));
+  if (state.tool) notice(state.tool === "ruler" ? "Drag to measure a length" : "Drag to select photosites");
+}
+
+function clearTools() {
+  if (state.tool) useTool(state.tool);
+  state.ruler = null;
+  select(null);
+}
+
+// Sets the ends of the ruler, or opposite corners of the rectangle.
+function extend(from, to) {
+  if (state.tool === "ruler") { state.ruler = [from, to]; announceRuler(); } else select([from, to]);
+  ask("marks");
+}
+
+// With the keyboard: the first point at the centre of the view; the arrows move the second one, Enter ends.
+function setPoint() {
+  const at = [state.map.x, state.map.y];
+  if (state.start) extend(state.start, at);
+  else notice("First point set; the arrows move the second one, Enter ends");
+  state.start = state.start ? null : at;
+}
+
+function announceRuler() {
+  const { text, detail } = lengthText(...state.ruler);
+  $("cursor").textContent = text + "  " + detail;
+  speak(() => "Length " + text + ", " + detail);
+}
+
+function select(rectangle) {
+  state.selection = rectangle;
+  state.selected = rectangle ? sitesIn(state.sites, rectangle) : [];
+  $("selection").hidden = !rectangle;
+  if (rectangle) showSelection();
+  ask("marks");
+}
+
+function showSelection() {
+  const { selection: [[x0, y0], [x1, y1]], selected } = state, size = (v) => String(Number(Math.abs(v).toPrecision(4)));
+  $("selection-heading").textContent = "Selection: " + shown(selected.length) + (selected.length === 1 ? " photosite" : " photosites");
+  $("selection-note").textContent = "Centres in " + size(x1 - x0) + " × " + size(y1 - y0) + " µm; std is the sample standard deviation.";
+  $("statistics").replaceChildren(...statisticsRows(about.columns, selected));
+  $("export").disabled = !selected.length || !state.loaded;
+  rememberView();
+}
+
+function drawTools(context) {
+  const { map, ruler, selection } = state;
+  if (selection) {
+    const [[x0, y0], [x1, y1]] = selection;
+    const box = [map.toX(Math.min(x0, x1)), map.toY(Math.max(y0, y1)), Math.abs(x1 - x0) * map.scale, Math.abs(y1 - y0) * map.scale];
+    context.fillStyle = "rgb(31 95 191 / 14%)";
+    context.fillRect(...box);
+    outline(context, () => context.rect(...box), [4, 2], ["#ffffff", "#1f5fbf"]);
+  }
+  if (ruler) {
+    const [[x0, y0], [x1, y1]] = ruler.map(([x, y]) => [map.toX(x), map.toY(y)]), length = Math.hypot(x1 - x0, y1 - y0) || 1;
+    const [u, v] = [(-6 * (y1 - y0)) / length, (6 * (x1 - x0)) / length];
+    const line = () => {
+      context.moveTo(x0, y0);
+      context.lineTo(x1, y1);
+      for (const [x, y] of [[x0, y0], [x1, y1]]) { context.moveTo(x - u, y - v); context.lineTo(x + u, y + v); }
+    };
+    outline(context, line, [5, 2], ["#ffffff", "#10151f"]);
+    const { text } = lengthText(...ruler);
+    context.font = "600 13px system-ui, sans-serif";
+    const width = context.measureText(text).width + 12;
+    const x = clamp(0.5 * (x0 + x1) - 0.5 * width, 4, Math.max(4, map.width - width - 4)), y = clamp(0.5 * (y0 + y1) - 30, 4, map.height - 26);
+    context.fillStyle = inkOf("--raised");
+    context.fillRect(x, y, width, 21);
+    context.fillStyle = inkOf("--text");
+    context.fillText(text, x + 6, y + 15);
+  }
+}
+
+function listenToMeasurements() {
+  for (const id of ["ruler", "select"]) $(id).addEventListener("click", () => useTool(id));
+  $("clear-selection").addEventListener("click", () => { select(null); rememberView(); });
+  $("export").addEventListener("click", () => downloadTable(state.sites, about.columns, state.selected, about.name));
 }
 
 // -- design rules -----------------------------------------------------------------------------------------------------------------------
@@ -572,6 +655,7 @@ class Violations {
 }
 
 async function loadRules() {
+  for (const element of document.querySelectorAll(".for-rules")) element.hidden = !about.rules.length;
   if (!about.rules.length) return;
   const names = ["violation_value", "violation_sites", "violation_site_counts", "marker_part_counts", "marker_sizes", "marker_xy_um"];
   const arrays = Object.fromEntries(await Promise.all(names.map(async (name) => [name, await array(name)])));
@@ -613,12 +697,13 @@ function listViolations() {
 function violationItem(i) {
   const { violations } = state, rule = about.rules[violations.rule[i]], ids = [...violations.sitesOf(i)];
   const sites = ids.length ? (ids.length > 1 ? "sites " : "site ") + ids.slice(0, 4).join(", ") + (ids.length > 4 ? ", …" : "") : "position";
-  const value = Number.isNaN(violations.value[i]) ? "" : shown(violations.value[i]) + (rule.unit ? " " + rule.unit : "");
+  const unit = rule.unit ? " " + rule.unit : "", limit = rule.limit === null ? "" : ", limit " + shown(rule.limit) + unit;
+  const value = Number.isNaN(violations.value[i]) ? "" : shown(Number(violations.value[i].toPrecision(4))) + unit + limit;
   const item = make("li"), button = make("button");
   button.type = "button";
   button.dataset.violation = i;
   button.append(make("span", Number($("rule").value) < 0 ? rule.name + ": " + sites : sites), make("span", value));
-  button.title = rule.name + ": " + sites;
+  button.title = rule.name + ": " + sites + (value ? ", " + value : "");
   button.addEventListener("click", () => flyToViolation(i));
   item.append(button);
   return item;
@@ -662,6 +747,8 @@ function viewHash() {
   words.set("width", Number((map.width / map.scale).toPrecision(5)));
   words.set("by", column.key);
   if (range) words.set("range", range.map((v) => Number(v.toPrecision(7))).join(" "));
+  if (state.wantedMap) words.set("map", state.wantedMap);
+  if (state.selection) words.set("select", state.selection.flat().map((v) => Number(v.toPrecision(9))).join(" "));
   if (pinned >= 0) words.set("site", pinned);
   return "#" + words;
 }
@@ -673,7 +760,9 @@ function readHash() {
   if (Number.isFinite(x) && Number.isFinite(y) && width > 0) map.set(x, y, map.width / width);
   const site = words.has("site") ? Number(words.get("site")) : -1;
   if (Number.isInteger(site) && site >= 0 && site < sites.n) state.pinned = site;
-  const range = (words.get("range") || "").split(" ").map(Number);
+  const range = (words.get("range") || "").split(" ").map(Number), box = (words.get("select") || "").split(" ").map(Number);
+  state.wantedMap = COLOUR_MAPS.includes(words.get("map")) ? words.get("map") : null;
+  if (box.length === 4 && box.every(Number.isFinite)) select([box.slice(0, 2), box.slice(2)]);
   return [words.get("by"), range.length === 2 && range.every(Number.isFinite) ? range : null];
 }
 
@@ -698,7 +787,8 @@ function viewAsPicture() {
   context.fillRect(0, 0, picture.width, picture.height);
   map.draw(groundColour());
   context.drawImage(cells, 0, 0);
-  for (const id of ["lines", "marks"]) context.drawImage($(id), 0, 0, cells.width, cells.height);
+  state.overview.update(map, scale, state.range);
+  for (const id of ["overview", "lines", "marks"].filter((name) => !$(name).hidden)) context.drawImage($(id), 0, 0, cells.width, cells.height);
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   context.translate(14, map.height);
   context.fillStyle = context.strokeStyle = inkOf("--text");
@@ -709,12 +799,9 @@ function viewAsPicture() {
   context.fillText(titleOf(column), 0, 18);
   if (column.kind !== "kinds") {
     const width = 220;
-    scale.tables.forEach((shades, row) => {
-      for (let px = 0; px < width; px++) {
-        context.fillStyle = "rgb(" + shades[Math.round((255 * px) / (width - 1))] + ")";
-        context.fillRect(px, 26 + (row * 10) / scale.tables.length, 1.5, 10 / scale.tables.length);
-      }
-    });
+    context.translate(0, 26);
+    drawRamp(context, scale, width, 10);
+    context.translate(0, -26);
     context.fillStyle = inkOf("--text");
     const ends = brief(scale.from) + " to " + brief(scale.to) + (scale.isLog ? ", log" : "");
     context.fillText(ends, width + 10, 36);
@@ -784,6 +871,7 @@ async function open() {
   const arrays = Object.fromEntries(await Promise.all(names.map(async (name) => [name, await array(name)])));
   state.sites = new Sites(arrays, about);
   state.map = new SensorMap($("cells"), state.sites, renderer);
+  state.overview = new Overview($("overview"), state.sites);
   if (!state.map.gl) throw new Error("WebGL2 was lost");
   listenToLosses();
   $("colouring").append(...about.columns.map((column) => {
@@ -803,6 +891,7 @@ async function open() {
   listenToHistogram();
   listenToPicture();
   listenToTools();
+  listenToMeasurements();
   tellSite();
   drawAsked();
   $("opening").hidden = true;
@@ -813,6 +902,7 @@ async function openRest() {
   for (const column of about.columns) await valuesOf(column);
   state.loaded = true;
   tellSite();
+  if (state.selection) showSelection();
 }
 
 const handle = {
@@ -835,6 +925,18 @@ const handle = {
   // CSS pixels of the window, for mouse events.
   toWindow: (x, y) => { const box = $("marks").getBoundingClientRect(); return [box.left + state.map.toX(x), box.top + state.map.toY(y)]; },
   fromWindow: (px, py) => { const box = $("marks").getBoundingClientRect(); return [state.map.fromX(px - box.left), state.map.fromY(py - box.top)]; },
+  get selected() { return [...state.selected]; },
+  get ruler() { return state.ruler && lengthText(...state.ruler).length; },
+  get tool() { return state.tool; },
+  get table() { return tableOf(state.sites, about.columns, state.selected); },
+  get colourMap() { return state.scale.map; },
+  get hasOverview() { return !$("overview").hidden; },
+  // Colours of the overview as drawn, (r, g, b, a) of all pixels, top row first.
+  overview: () => {
+    const canvas = $("overview");
+    state.overview.draw(state.map, state.scale, state.range);
+    return { width: canvas.width, height: canvas.height, data: [...canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data] };
+  },
   // Colours of the drawn pixels of the map, (r, g, b, a) at a position on the sensor.
   pixel: (x, y) => {
     const { map } = state, { gl } = map, ratio = map.canvas.width / map.width, bytes = new Uint8Array(4);

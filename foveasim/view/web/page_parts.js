@@ -56,15 +56,17 @@ export function speak(textOrNull) {
 
 // -- files ------------------------------------------------------------------------------------------------------------------
 
-export function downloadPicture(canvas, name) {
-  canvas.toBlob((blob) => {
-    const link = document.createElement("a");
-    link.href = URL.createObjectURL(blob);
-    link.download = name.replace(/[^\p{L}\p{N}_-]+/gu, "_").slice(0, 60) + ".png";
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 5000);
-  });
+function download(blob, name, extension) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name.replace(/[^\p{L}\p{N}_-]+/gu, "_").slice(0, 60) + "." + extension;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 5000);
 }
+
+export function downloadPicture(canvas, name) { canvas.toBlob((blob) => download(blob, name, "png")); }
+
+export function downloadText(text, name, extension, type) { download(new Blob([text], { type: type + ";charset=utf-8" }), name, extension); }
 
 // -- keys -------------------------------------------------------------------------------------------------------------------
 

@@ -1,9 +1,11 @@
 // The page of solids: parts in three dimensions, and the photosite under the mouse.
 
 import { Bodies } from "./bodies.js";
-import { bytesOfHex, shown, textOf } from "./colours.js";
+import { COLOUR_MAPS } from "./colour_maps.js";
+import { Scale, bytesOfHex, clamp, formatLength, roundStep, shown, textOf } from "./colours.js";
 import { listenToPointers } from "./gestures.js";
-import { findRenderer, watchSize } from "./gl.js";
+import { findRenderer, fitCanvas, pixelRatio, textureSize, watchSize } from "./gl.js";
+import { drawRamp, kindItems, summaryOf, tickLabels, titleOf } from "./legend.js";
 import { Orbit } from "./orbit.js";
 import { $, downloadPicture, inkOf, isForPage, listenToHelp, make, notice, speak, startTheme, stayingNotice } from "./page_parts.js";
 import { SolidView } from "./solid_view.js";
@@ -11,7 +13,9 @@ import { unpack } from "./unpack.js";
 
 const about = JSON.parse($("about").textContent);
 const ARRAYS = ["position_x", "position_y", "positions", "z", "corners", "run_sites", "run_points", "run_triangles", "run_colours", "tile_runs"];
-const state = { view: null, area: null, pinned: -1, part: -1, pinnedPart: -1, pointer: null, anchor: null, isAsked: false };
+const state = { view: null, area: null, pinned: -1, part: -1, pinnedPart: -1, pointer: null, anchor: null, isAsked: false, scale: null };
+// Steps of the position of the cut.
+const CUT_STEPS = 200;
 const ASIDE = [Math.atan2(-0.9, 0.35), Math.atan2(0.75, Math.hypot(0.35, 0.9))], ABOVE = [-0.5 * Math.PI, 0.5 * Math.PI];
 
 // -- the photosite --------------------------------------------------------------------------------------------------------
@@ -63,7 +67,76 @@ function drawFrame() {
   if (view.gl.isContextLost()) return;
   if (!wasMoving) hover();
   view.draw();
+  drawScaleBar();
   if (wasMoving) ask();
+}
+
+// Lengths at the centre of the view; nearer parts appear larger.
+function drawScaleBar() {
+  const perUm = state.view.orbit.pixelsPerUm(), length = roundStep(45 / perUm), bar = $("scale-bar");
+  bar.querySelector("span").textContent = formatLength(length);
+  bar.querySelector("i").style.width = length * perUm + "px";
+}
+
+// -- colours and cut ------------------------------------------------------------------------------------------------------
+
+// Colours all parts by a column, or by their own colours for an empty key.
+async function colourBy(key) {
+  const { view } = state, column = about.columns.find((one) => one.key === key);
+  $("colouring").value = column ? key : "";
+  $("legend").hidden = !column;
+  state.scale = null;
+  if (column) {
+    const filterOf = about.filter && column.kind === "lit" ? await unpack(about.filter, about.arrays[about.filter]) : null;
+    state.scale = new Scale(column, await valuesOf(column), filterOf, about.palette, undefined, $("colour-map").value);
+    drawLegend();
+  }
+  for (const part of view.parts) view.setColours(part, state.scale && siteBytes(state.scale));
+  ask();
+}
+
+async function valuesOf(column) {
+  if (column.of) return column.of === "area" ? state.area : Float64Array.from(state.area, Math.sqrt);
+  column.values = column.values || (await unpack(column.array, about.arrays[column.array]));
+  return column.values;
+}
+
+function siteBytes(scale) {
+  const words = new Uint32Array(textureSize(about.n_sites + 1));
+  scale.paint(words.subarray(1), null, [0, 0, 0]);
+  return new Uint8Array(words.buffer);
+}
+
+function drawLegend() {
+  const { scale } = state, isKinds = scale.column.kind === "kinds";
+  $("bar").hidden = isKinds;
+  $("kinds").hidden = !isKinds;
+  $("map-label").hidden = !scale.canMap;
+  $("colour-map").value = scale.map || COLOUR_MAPS[0];
+  if (isKinds) {
+    const { items, rest } = kindItems(scale);
+    $("kinds").replaceChildren(...items);
+    $("summary").textContent = rest;
+    return;
+  }
+  const ramp = $("ramp"), ratio = pixelRatio();
+  fitCanvas(ramp, ramp.clientWidth, ramp.clientHeight);
+  const context = ramp.getContext("2d");
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  drawRamp(context, scale, ramp.clientWidth, ramp.clientHeight);
+  $("ticks").replaceChildren(...tickLabels(scale));
+  $("summary").textContent = titleOf(scale.column) + ": " + summaryOf(scale);
+}
+
+// The direction of the cut and its position, from 0 at the low end of the sensor to 1 at the high end.
+function cutAt() {
+  const words = { x: [0, 1], "-x": [0, -1], y: [1, 1], "-y": [1, -1], z: [2, 1] }[$("cut").value], { low, high } = state.view.bodies;
+  $("cut-position").hidden = $("cut-text").hidden = !words;
+  if (!words) { state.view.setCut(null); moved(); return; }
+  const [axis, sign] = words, position = low[axis] + ((high[axis] - low[axis]) * Number($("cut-position").value)) / CUT_STEPS;
+  $("cut-text").textContent = "xyz"[axis] + (sign > 0 ? " above " : " below ") + Number(position.toPrecision(4)) + " µm is removed";
+  state.view.setCut({ axis, sign, position });
+  moved();
 }
 
 // The view has changed, by more than a zoom about the pointer.
@@ -148,11 +221,36 @@ function listenToCanvas() {
     else if (event.key === "-" || event.key === "_") approach(1 / 1.3);
     else if (event.key === "0") look(ASIDE);
     else if (event.key === "t" || event.key === "T") look(ABOVE);
+    else if (event.key === "c" || event.key === "C") nextCut();
+    else if (event.key === "[" || event.key === "]") moveCut(event.key === "]" ? 5 : -5);
     else if (event.key === "Escape") pin(-1, -1);
   });
 }
 
+function nextCut() {
+  const { options } = $("cut");
+  $("cut").selectedIndex = ($("cut").selectedIndex + 1) % options.length;
+  cutAt();
+  notice($("cut").value ? "Cut along " + $("cut").selectedOptions[0].textContent : "No cut");
+}
+
+function moveCut(steps) {
+  if (!$("cut").value) return;
+  $("cut-position").value = clamp(Number($("cut-position").value) + steps, 0, CUT_STEPS);
+  cutAt();
+}
+
 function listenToTools() {
+  $("colouring").append(...[["", "of the parts"], ...about.columns.map((column) => [column.key, titleOf(column)])].map(([key, text]) => {
+    const option = make("option", text);
+    option.value = key;
+    return option;
+  }));
+  $("colour-map").append(...COLOUR_MAPS.map((name) => make("option", name)));
+  $("colouring").addEventListener("change", () => { $("colour-map").value = COLOUR_MAPS[0]; colourBy($("colouring").value); });
+  $("colour-map").addEventListener("change", () => colourBy($("colouring").value));
+  $("cut").addEventListener("change", cutAt);
+  $("cut-position").addEventListener("input", cutAt);
   $("nearer").addEventListener("click", () => approach(1.5));
   $("farther").addEventListener("click", () => approach(1 / 1.5));
   $("fit").addEventListener("click", () => look(ASIDE));
@@ -220,12 +318,13 @@ async function open() {
   watchSize($("map"), resize);
   showSite();
   state.view.draw();
+  drawScaleBar();
   $("opening").hidden = true;
 }
 
 async function openRest() {
   for (const column of about.columns) {
-    if (column.array && !column.is_repeat) column.values = await unpack(column.array, about.arrays[column.array]);
+    if (column.array && !column.is_repeat && !column.values) column.values = await unpack(column.array, about.arrays[column.array]);
   }
   showSite();
 }
@@ -245,6 +344,10 @@ window.foveasim = {
   get hovered() { return state.view.hovered; },
   get pinned() { return state.pinned; },
   get parts() { return state.view.parts.map((part) => part.name); },
+  get cut() { return state.view.cut; },
+  get scaleBarUm() { return $("scale-bar").querySelector("i").getBoundingClientRect().width / state.view.orbit.pixelsPerUm(); },
+  // Colours of a site on the scale in use, (r, g, b).
+  colour: (site) => state.scale && state.scale.colour(site),
   get counts() { return { ...state.view.counts }; },
   // The eye, the target, and the visible length of a vertical line at the target, in µm with heights scaled.
   get camera() {

@@ -32,6 +32,7 @@ in vec3 at;
 flat in vec3 colour;
 flat in uint owner;
 uniform uint pinned;
+uniform vec4 cut;
 out vec4 pixel;
 const vec3 SUN = vec3(-0.331, -0.397, 0.856);
 const vec3 FLOOR = vec3(0.32, 0.37, 0.46);
@@ -40,6 +41,9 @@ ${SRGB}
 void main() {
   // The plane of a triangle from its neighbours on the screen: it faces the eye, independent of its winding.
   vec3 normal = normalize(cross(dFdx(at), dFdy(at)));
+  if (dot(cut.xyz, at) > cut.w) discard;
+  // Back faces are visible through a cut only: lit as the plane of the cut, they look like its surface.
+  if (!gl_FrontFacing && cut.xyz != vec3(0.0)) normal = cut.xyz;
   vec3 light = 0.42 * mix(FLOOR, vec3(1.0), 0.5 * normal.z + 0.5) + 0.60 * max(dot(normal, SUN), 0.0);
   vec3 own = toLinear(colour);
   if (pinned != 0u && owner == pinned) own = mix(own, MARK, 0.7);
@@ -49,10 +53,15 @@ void main() {
 const ID_SHADER = `#version 300 es
 precision highp float;
 precision highp int;
+in vec3 at;
 flat in uint owner;
 uniform uint part;
+uniform vec4 cut;
 out uvec2 id;
-void main() { id = uvec2(owner, part | (uint(gl_FragCoord.z * 16777215.0) << 8)); }`;
+void main() {
+  if (dot(cut.xyz, at) > cut.w) discard;
+  id = uvec2(owner, part | (uint(gl_FragCoord.z * 16777215.0) << 8));
+}`;
 const SCREEN_SHADER = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID == 1, gl_VertexID == 2) * 4.0 - 1.0, 0.0, 1.0); }`;
 // The image, with the hovered site highlighted according to the ids.
@@ -84,10 +93,12 @@ export class SolidView {
     this.orbit = orbit;
     this.nSites = nSites;
     this.wantedSamples = renderer.isSlow ? 0 : SAMPLES;
-    this.parts = bodies.list.map((body) => ({ name: body.name, nTriangles: body.nTriangles, isClosed: body.isClosed, isVisible: true, body }));
+    this.parts = bodies.list.map((body) => ({ name: body.name, nTriangles: body.nTriangles, isClosed: body.isClosed, isVisible: true, painted: null, body }));
     this.ground = [0, 0, 0];
     this.hovered = -1;
     this.pinned = -1;
+    // Cut plane: the side of larger coordinates along an axis, or of smaller ones with the sign -1, is not drawn.
+    this.cut = null;
     // Number of times that each was drawn.
     this.counts = { image: 0, ids: 0, screen: 0 };
     this.found = { site: -1, part: -1, depth: 1 };
@@ -100,7 +111,7 @@ export class SolidView {
 
   // Creates all GPU resources; again after the context was lost.
   load() {
-    const { gl, bodies, nSites } = this;
+    const { gl, bodies } = this;
     // The same attribute numbers, so that one vertex array serves both programs.
     this.image = buildProgram(gl, VERTEX_SHADER, IMAGE_SHADER, ATTRIBUTES);
     this.id = buildProgram(gl, VERTEX_SHADER, ID_SHADER, ATTRIBUTES);
@@ -116,9 +127,7 @@ export class SolidView {
       gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
       gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
       part.colours = createLookup(gl);
-      const bytes = new Uint8Array(4 * textureSize(nSites + 1));
-      bodies.paint(part.body, bytes);
-      sendLookup(gl, bytes);
+      sendLookup(gl, part.painted || this._ownColours(part));
     }
     this.nothing = gl.createVertexArray();
     gl.bindVertexArray(null);
@@ -186,6 +195,25 @@ export class SolidView {
   setGround(ground) { this.ground = ground; this.changeColours(); }
   setPinned(site) { this.pinned = site; this.changeColours(); }
   setVisible(part, isVisible) { part.isVisible = isVisible; this.change(); }
+  // Cuts at a position in µm along an axis; null for no cut.
+  setCut(cut) { this.cut = cut; this.change(); }
+
+  // Changes the colours of a part: bytes r, g, b, a, at index site + 1; null for its own colours.
+  setColours(part, bytes) {
+    const { gl } = this;
+    part.painted = bytes;
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, part.colours);
+    sendLookup(gl, bytes || this._ownColours(part));
+    this.changeColours();
+  }
+
+  _ownColours(part) {
+    const bytes = new Uint8Array(4 * textureSize(this.nSites + 1));
+    this.bodies.paint(part.body, bytes);
+    return bytes;
+  }
+
   setHeight(factor) { this.orbit.setHeight(factor); this.change(); }
 
   // Draws outdated buffers, and the screen.
@@ -251,6 +279,7 @@ export class SolidView {
     gl.uniform3f(at.rest, cx - wx, cy - wy, cz - wz);
     gl.uniform3f(at.unit, unit, unit, unit * orbit.height);
     gl.uniformMatrix4fv(at.toClip, false, orbit.toClip);
+    gl.uniform4f(at.cut, ...this._cutPlane());
     this._findPlanes(cx, cy, cz, unit);
     // Open parts show their inside to an eye below, and only there.
     const isAbove = target[2] + distance * orbit.toEye[2] >= orbit.low(2);
@@ -258,7 +287,7 @@ export class SolidView {
     for (let k = 0; k < this.parts.length; k++) {
       const part = this.parts[k], { tiles } = part;
       if (!part.isVisible) continue;
-      if (part.isClosed || isAbove) gl.enable(gl.CULL_FACE);
+      if (!this.cut && (part.isClosed || isAbove)) gl.enable(gl.CULL_FACE);
       else gl.disable(gl.CULL_FACE);
       if (at.part !== undefined) gl.uniform1ui(at.part, k + 1);
       gl.bindTexture(gl.TEXTURE_2D, part.colours);
@@ -276,6 +305,16 @@ export class SolidView {
       if (to > from) gl.drawElements(gl.TRIANGLES, to - from, gl.UNSIGNED_INT, 4 * from);
     }
     gl.bindVertexArray(null);
+  }
+
+  // The cut relative to the target in units of its distance: a normal and a distance; a zero normal cuts nothing.
+  _cutPlane() {
+    const { cut, orbit: { target, distance, height } } = this, plane = [0, 0, 0, 1];
+    if (cut) {
+      plane[cut.axis] = cut.sign;
+      plane[3] = (cut.sign * (cut.position * (cut.axis === 2 ? height : 1) - target[cut.axis])) / distance;
+    }
+    return plane;
   }
 
   // The six planes of the view, for boxes on the lattice: a x + b y + c z + d is at least 0 inside each.
