@@ -115,9 +115,10 @@ def blend(ids, colours, encoded, n_samples, has_boundaries, first_row, band):
     """
     Average the samples of each pixel in a band of rows, in linear light.
 
-    A pixel has ``n_samples`` x ``n_samples`` samples. ``colours[i + 1]`` (red, green, blue, weight) is the colour of site i from 0 to 1, ``colours[0]`` that of the background,
-    and the last one, if ``has_boundaries``, that of samples whose left or lower neighbour belongs to another site. Weights are
-    0 or 1; alpha is their mean. ``encoded`` is the byte of each of evenly spaced levels from 0 to 1.
+    A pixel has ``n_samples`` x ``n_samples`` samples. ``colours[i + 1]`` (red, green, blue, weight) is the colour of site i
+    from 0 to 1, ``colours[0]`` that of the background, and the last one, if ``has_boundaries``, that of samples whose left or
+    lower neighbour belongs to another site. Weights are 0 or 1; alpha is their mean. ``encoded`` is the byte of each of evenly
+    spaced levels from 0 to 1.
     """
     boundary = colours.shape[0] - 1
     levels = encoded.size - 1

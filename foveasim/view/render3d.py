@@ -541,7 +541,7 @@ def _smooth_normals(
     size_px: tuple[int, int],
 ) -> Floats:
     """
-    Interpolate point normals at pixels (row, column), whose triangles are ``corners[which]``.
+    Interpolate point normals at pixels (row, column) of ``corners[which]``.
 
     Faces that do not face up have their own normals.
     """

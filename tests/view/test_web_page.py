@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import base64
+import csv
 import gzip
+import io
 import itertools
 import json
 import re
@@ -26,7 +28,8 @@ from foveasim._io.images import read_picture
 from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.layout.drc.report import read_lyrdb
 from foveasim.view import SensorStack, prisms, site_at, solid_page, solids, web_page, write_solid_page, write_web_page
-from foveasim.view.site_colours import FILTER_COLOURS
+from foveasim.view.site_colours import FILTER_COLOURS, colours_of
+from foveasim.view.site_pictures import SiteMeans
 from foveasim.view.web._bodies import bodies_of
 from foveasim.view.web._content import content_of
 from foveasim.view.web._pack import back_references, pack, to_smallest_type
@@ -567,7 +570,7 @@ def test_violation_list_navigates_by_click_and_enter(visit):
         assert str(violation.site_ids[0]) in buttons.nth(i).inner_text()
     page.select_option("#rule", label="max_overlap_um2 (1)")
     assert buttons.count() == 1
-    assert buttons.first.inner_text().split("\n") == ["sites 7, 8", "6 µm²"]
+    assert buttons.first.inner_text().split("\n") == ["sites 7, 8", "6 µm², limit 0 µm²"]
     assert "the limit is 0 µm²" in page.inner_text("#rule-description")
 
 
@@ -1419,8 +1422,8 @@ def test_fast_graphics_antialias_solid_edges(visit, tmp_path):
         press(page, "t")
         rest(page)
         page.evaluate("document.activeElement.blur()")
-        # Clipped to exclude the buttons over the view.
-        (tmp_path / "edge.png").write_bytes(page.screenshot(clip={"x": 4, "y": 70, "width": 800, "height": 700}))
+        # Clipped to exclude the buttons and the scale bar over the view.
+        (tmp_path / "edge.png").write_bytes(page.screenshot(clip={"x": 4, "y": 70, "width": 800, "height": 670}))
         picture = read_picture(tmp_path / "edge.png")[..., :3]
         n_colours[name] = len(np.unique(picture.reshape(-1, 3), axis=0))
         sites[name] = page.evaluate("(p) => foveasim.pick(...foveasim.toWindow(...p))", [15, 10, 0])["site"]
@@ -1484,3 +1487,239 @@ def test_scripts_import_as_modules(browser):
     assert all(exports.values())
     assert {"Orbit"} == set(exports["orbit"])
     assert "SolidView" in exports["solid_view"]
+
+
+# -- measurements, colour maps, overview ------------------------------------------------------------------------------------
+
+
+SMALL = {"viewport": {"width": 460, "height": 620}}
+
+
+def drag_tool(page, key, start_um, end_um):
+    """Choose a tool by its key, and drag between two points of the sensor."""
+    page.keyboard.press(key)
+    for k, point in enumerate((start_um, np.mean([start_um, end_um], axis=0).tolist(), end_um)):
+        page.mouse.move(*page.evaluate("([x, y]) => foveasim.toWindow(x, y)", list(point)))
+        if k == 0:
+            page.mouse.down()
+    page.mouse.up()
+    page.evaluate("() => new Promise(requestAnimationFrame)")
+
+
+@pytest.mark.needs("chromium")
+def test_selection_statistics_match_numpy(visit, tmp_path):
+    page = visit(web_page(CAPTURE, name="one"), **SMALL)
+    drag_tool(page, "s", [-9.0, -6.0], [4.5, 8.0])
+    x_um, y_um = MOSAIC.centroid_um.T
+    chosen = np.flatnonzero((x_um > -9.0) & (x_um < 4.5) & (y_um > -6.0) & (y_um < 8.0))
+    assert page.evaluate("foveasim.selected") == chosen.tolist()
+    assert page.inner_text("#selection-heading") == f"Selection: {chosen.size} photosites"
+
+    rows = page.locator("#statistics tr").all_inner_texts()
+    assert rows[0].split() == ["n", "mean", "std", "min", "max"]
+    for title, values in (("code / DN", CAPTURE.code), ("electrons / e⁻", CAPTURE.electrons), ("expected electrons / e⁻", CAPTURE.expected_e)):  # fmt: skip
+        shown = [float(part.replace(",", "")) for part in rows[rows.index(title) + 1].split()]
+        part = values[chosen].astype(float)
+        assert shown[0] == chosen.size
+        assert shown[1:] == pytest.approx([part.mean(), part.std(ddof=1), part.min(), part.max()], rel=6e-4)
+    counts = np.bincount(CAPTURE.filter_of_site[chosen])
+    assert sorted(rows[rows.index("filter") + 1].split(", ")) == sorted(f"{n} {k}" for n, k in zip("RGB", counts, strict=True))  # fmt: skip
+
+    with page.expect_download() as download:
+        page.click("#export")
+    download.value.save_as(tmp_path / "sites.csv")
+    assert download.value.suggested_filename == "one_sites.csv"
+    table = np.genfromtxt(tmp_path / "sites.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
+    assert np.array_equal(table["site"], chosen)
+    assert table["x_um"] == pytest.approx(x_um[chosen], abs=1e-9)
+    assert np.array_equal(table["code"], CAPTURE.code[chosen])
+    assert np.array_equal(table["expected_e"], CAPTURE.expected_e[chosen])
+    assert "".join(table["channel"]) == "".join("RGB"[k] for k in CAPTURE.filter_of_site[chosen])
+
+    until(page, "location.hash.includes('select=')")
+    again = visit(web_page(CAPTURE), hash_text=page.evaluate("location.hash"), **SMALL)
+    assert again.evaluate("foveasim.selected") == chosen.tolist()
+    page.click("#clear-selection")
+    assert page.locator("#selection").is_hidden()
+
+
+@pytest.mark.needs("chromium")
+def test_csv_quotes_strings_and_formulas(visit):
+    names = np.array(["a,b", 'say "x"', "=1+1", "-2", "two\nlines", "plain", "@x", "+y", "µ", ""])
+    page = visit(web_page(MIXED_LAYOUT.with_columns(kind=names)), **SMALL)
+    drag_tool(page, "s", [-1.0, -1.0], [31.0, 19.0])
+    rows = list(csv.DictReader(io.StringIO(page.evaluate("foveasim.table"), newline="")))
+
+    assert [int(row["site"]) for row in rows] == list(range(10))
+    assert [row["kind"] for row in rows] == [
+        ("'" if name[:1] in "=-@+" and name else "") + name for name in names.tolist()
+    ]
+    gain = [float(row["gain"]) if row["gain"] else np.nan for row in rows]
+    assert np.array_equal(gain, MIXED_LAYOUT.columns["gain"], equal_nan=True)
+
+
+@pytest.mark.needs("chromium")
+def test_ruler_measures_by_mouse_and_keys(visit):
+    page = visit(web_page(CAPTURE), **SMALL)
+    before = page.evaluate("foveasim.view")
+    drag_tool(page, "r", [-6.0, -4.0], [6.0, 5.0])
+    assert page.evaluate("foveasim.ruler") == pytest.approx(15.0, rel=1e-3)
+    assert page.evaluate("foveasim.view") == before
+    assert page.evaluate("foveasim.pinned") == -1
+    assert page.inner_text("#cursor").startswith("15 µm Δx 12, Δy 9 µm, 36.87°")
+
+    # With the keyboard, the arrow moves the second point by 60 pixels; Escape ends and removes the ruler.
+    page.focus("#marks")
+    page.keyboard.press("Enter")
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("Enter")
+    assert page.evaluate("foveasim.ruler") == pytest.approx(60.0 / before["scale"], rel=1e-6)
+    page.keyboard.press("Escape")
+    assert page.evaluate("[foveasim.ruler, foveasim.tool]") == [None, None]
+    # Without a tool, a drag pans.
+    x_um = page.evaluate("foveasim.view.x")
+    page.mouse.move(*page.evaluate("foveasim.toWindow(0, 0)"))
+    page.mouse.down()
+    page.mouse.move(*page.evaluate("foveasim.toWindow(3, 0)"), steps=2)
+    page.mouse.up()
+    assert page.evaluate("foveasim.view.x") == pytest.approx(x_um - 3.0, abs=0.1)
+
+
+@pytest.mark.needs("chromium")
+@pytest.mark.parametrize("name", ["viridis", "cividis", "grey"])
+def test_colour_maps_match_matplotlib(visit, name):
+    page = visit(web_page(CAPTURE), hash_text="#by=electrons", **SMALL)
+    page.select_option("#colour-map", name)
+    until(page, "name => foveasim.colourMap === name", name)
+    table = np.rint(255.0 * colormaps["gray" if name == "grey" else name](np.arange(256))[:, :3])
+    span = np.ptp(CAPTURE.electrons)
+    for site in (0, 17, int(CAPTURE.electrons.argmax()), int(CAPTURE.electrons.argmin())):
+        step = round(255 * (CAPTURE.electrons[site] - CAPTURE.electrons.min()) / span)
+        assert page.evaluate("site => foveasim.colour(site)", site) == table[step].tolist()
+    until(page, "name => location.hash.includes('map=' + name)", name)
+
+
+def overview_of(page):
+    """Return the overview of a page, lowest row first, and the bounds of the view."""
+    shown = page.evaluate("foveasim.overview()")
+    view = page.evaluate("foveasim.view")
+    picture = np.array(shown["data"], np.uint8).reshape(shown["height"], shown["width"], 4)[::-1]
+    half = np.array([view["width"], view["height"]]) / (2 * view["scale"])
+    return picture, (view["x"] - half[0], view["y"] - half[1], view["x"] + half[0], view["y"] + half[1])
+
+
+@pytest.mark.needs("chromium")
+@pytest.mark.parametrize("by", ["size_um", "channel"])
+def test_overview_shows_exact_area_means(visit, by):
+    layout = fs.layout.voronoi(n_sites=900, size_um=(30.0, 20.0), seed=2)
+    layout = fs.layout.random_channels(layout, (0.5, 0.3, 0.2), seed=1)
+    page = visit(web_page(layout), hash_text=f"#by={by}", viewport={"width": 400, "height": 420})
+    picture, bounds_um = overview_of(page)
+    expected = SiteMeans(layout, picture.shape[:2], bounds_um).picture(colours_of(layout, by)).astype(int)
+
+    assert np.abs(picture[..., 3] - expected[..., 3]).max() <= 2
+    is_inside = expected[..., 3] == 255
+    assert is_inside.mean() > 0.2
+    # The page and matplotlib round values to colours differently, by at most one of 256 steps.
+    assert np.abs(picture.astype(int) - expected)[is_inside].max() <= 4
+
+
+@pytest.mark.needs("chromium")
+def test_overview_of_chequerboard_has_no_moire(visit):
+    layout = fs.layout.grid(n_x=500, n_y=400, pitch_um=1.0)
+    value = (np.add.outer(np.arange(400), np.arange(500)).ravel() % 2).astype(float)
+    page = visit(web_page(layout.with_columns(value=value)), hash_text="#by=value&map=cividis", viewport={"width": 220, "height": 300})  # fmt: skip
+    picture, _ = overview_of(page)
+    table = np.rint(255.0 * colormaps["cividis"](np.arange(256))[:, :3])
+    drawn = picture[picture[..., 3] == 255][:, :3]
+    step = np.abs(drawn[:, np.newaxis] - table).sum(axis=2)
+
+    assert drawn.shape[0] > 3000
+    assert np.all(step.min(axis=1) == 0)
+    side = page.evaluate("1 / foveasim.view.scale")
+    assert np.abs(step.argmin(axis=1) - 127.5).max() <= 128 / side**2 + 2
+
+
+@pytest.mark.needs("chromium")
+def test_overview_appears_for_small_sites_only(visit):
+    layout = fs.layout.grid(n_x=120, n_y=100, pitch_um=1.0)
+    page = visit(web_page(layout.with_columns(value=np.arange(12000.0))), viewport={"width": 300, "height": 360})
+    until(page, "foveasim.hasOverview")
+    page.evaluate("location.hash = '#x=0&y=0&width=12&by=value'")
+    until(page, "foveasim.view.scale > 10 && !foveasim.hasOverview")
+
+
+@pytest.mark.needs("chromium")
+def test_solid_page_colours_have_legend(visit):
+    page = visit(solid_page(CAPTURE), **SMALL)
+    assert page.locator("#legend").is_hidden()
+    page.select_option("#colouring", "expected_e")
+    until(page, "foveasim.colour(3) !== null")
+    span = np.ptp(CAPTURE.expected_e)
+    step = round(255 * (CAPTURE.expected_e[3] - CAPTURE.expected_e.min()) / span)
+    assert page.evaluate("foveasim.colour(3)") == np.rint(255 * np.array(colormaps["viridis"](step))[:3]).tolist()
+    assert page.inner_text("#summary").startswith("expected electrons / e⁻: ")
+    assert len(page.locator("#ticks span").all_inner_texts()) >= 3
+
+    page.select_option("#colouring", "channel")
+    until(page, "!document.getElementById('kinds').hidden")
+    counts = np.bincount(CAPTURE.filter_of_site)
+    assert page.locator("#kinds li").all_inner_texts() == [f"{n} · {k}" for n, k in zip("RGB", counts, strict=True)]
+    page.select_option("#colouring", "")
+    until(page, "foveasim.colour(3) === null")
+
+
+@pytest.mark.needs("chromium")
+def test_solid_page_scale_bar_length(visit):
+    page = visit(solid_page(CAPTURE), **SMALL)
+    page.evaluate("foveasim.lookDown()")
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    text = page.inner_text("#scale-bar")
+    length_um = page.evaluate("foveasim.scaleBarUm")
+    camera = page.evaluate("foveasim.camera")
+    # At the height of the target, two points at this distance are as far apart as the bar is long.
+    z_um = camera["target"][2] / camera["height"]
+    ends = [page.evaluate("(p) => foveasim.toWindow(...p)", [x, camera["target"][1], z_um]) for x in (0.0, length_um)]
+
+    assert text.strip() == f"{length_um:.3g} µm"
+    box = page.locator("#scale-bar i").bounding_box()
+    assert ends[1][0] - ends[0][0] == pytest.approx(box["width"], abs=0.5)
+
+
+@pytest.mark.needs("chromium")
+def test_cut_removes_sites_beyond_plane(visit):
+    page = visit(solid_page(CAPTURE), **SMALL)
+    page.evaluate("foveasim.lookDown()")
+
+    def picked(site):
+        return page.evaluate("(p) => foveasim.pick(...foveasim.toWindow(...p)).site", [*MOSAIC.centroid_um[site], 0.1])
+
+    left, right = 4 * N_X + 2, 4 * N_X + 9
+    assert (picked(left), picked(right)) == (left, right)
+    page.keyboard.press("c")
+    assert page.evaluate("foveasim.cut") == {"axis": 0, "sign": 1, "position": pytest.approx(0.0, abs=0.5)}
+    assert (picked(left), picked(right)) == (left, -1)
+    assert "is removed" in page.inner_text("#cut-text")
+    for _ in range(30):
+        page.keyboard.press("]")
+    assert picked(right) == right
+    page.keyboard.press("c")
+    page.evaluate("document.getElementById('cut-position').value = 100")
+    page.dispatch_event("#cut-position", "input")
+    assert (picked(left), picked(right)) == (-1, right)
+    page.select_option("#cut", "")
+    assert (picked(left), picked(right)) == (left, right)
+    assert page.evaluate("foveasim.cut") is None
+
+
+@pytest.mark.needs("chromium")
+@pytest.mark.parametrize("make", [web_page, solid_page])
+def test_listed_letter_keys_have_functions(visit, make):
+    page = visit(make(CAPTURE), **SMALL)
+    listed = page.evaluate("[...document.querySelectorAll('#keys kbd')].map((one) => one.textContent)")
+    letters = {key.lower() for key in listed if len(key) == 1 and key.isalpha()}
+    script = page.evaluate("document.querySelector('body > script:not([type])').textContent")
+
+    assert letters == {key.lower() for key in re.findall(r'event\.key === "([a-z])"', script)}
+    is_shown = page.evaluate("[...document.querySelectorAll('.for-rules')].some((one) => !one.hidden)")
+    assert not is_shown

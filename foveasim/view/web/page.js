@@ -351,7 +351,7 @@ function hover(x, y, from) {
   state.cursor = { x, y, from };
   state.hovered = all.length ? all[all.length - 1] : -1;
   state.others = all.slice(0, -1);
-  $("cursor").textContent = "x " + positionText(x) + "  y " + positionText(y) + " µm";
+  $("cursor").textContent = rulerText() || "x " + positionText(x) + "  y " + positionText(y) + " µm";
   tellSite();
   ask("marks");
 }
@@ -539,7 +539,11 @@ function clearTools() {
 
 // Sets the ends of the ruler, or opposite corners of the rectangle.
 function extend(from, to) {
-  if (state.tool === "ruler") { state.ruler = [from, to]; announceRuler(); } else select([from, to]);
+  if (state.tool === "ruler") {
+    state.ruler = [from, to];
+    $("cursor").textContent = rulerText();
+    speak(() => "Length " + rulerText());
+  } else select([from, to]);
   ask("marks");
 }
 
@@ -551,10 +555,10 @@ function setPoint() {
   state.start = state.start ? null : at;
 }
 
-function announceRuler() {
+function rulerText() {
+  if (state.tool !== "ruler" || !state.ruler) return "";
   const { text, detail } = lengthText(...state.ruler);
-  $("cursor").textContent = text + "  " + detail;
-  speak(() => "Length " + text + ", " + detail);
+  return text + "  " + detail;
 }
 
 function select(rectangle) {
@@ -787,7 +791,7 @@ function viewAsPicture() {
   context.fillRect(0, 0, picture.width, picture.height);
   map.draw(groundColour());
   context.drawImage(cells, 0, 0);
-  state.overview.update(map, scale, state.range);
+  if (state.overview.isNeeded(map)) state.overview.draw(map, scale, state.range);
   for (const id of ["overview", "lines", "marks"].filter((name) => !$(name).hidden)) context.drawImage($(id), 0, 0, cells.width, cells.height);
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   context.translate(14, map.height);

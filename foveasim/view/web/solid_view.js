@@ -83,6 +83,8 @@ void main() {
 // Samples per pixel on fast graphics cards.
 const SAMPLES = 4;
 const MAX_PARTS = 254;
+// Distance of the plane of a cut from its position, as a fraction of the extent along its axis.
+const CUT_INSET = 1e-4;
 
 export class SolidView {
   // Takes the canvas, Bodies, an Orbit around them, the number of sites, and findRenderer().
@@ -312,7 +314,9 @@ export class SolidView {
     const { cut, orbit: { target, distance, height } } = this, plane = [0, 0, 0, 1];
     if (cut) {
       plane[cut.axis] = cut.sign;
-      plane[3] = (cut.sign * (cut.position * (cut.axis === 2 ? height : 1) - target[cut.axis])) / distance;
+      // Slightly inside, so that walls exactly at the position are removed.
+      const inset = CUT_INSET * (this.bodies.high[cut.axis] - this.bodies.low[cut.axis]) * (cut.axis === 2 ? height : 1);
+      plane[3] = (cut.sign * (cut.position * (cut.axis === 2 ? height : 1) - target[cut.axis]) - inset) / distance;
     }
     return plane;
   }
