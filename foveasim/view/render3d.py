@@ -7,7 +7,6 @@ needs OpenGL, and adds windows and ambient occlusion; the software renderer has 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path

@@ -220,7 +220,9 @@ def test_vanishing_derived_shape_names_site(tmp_path):
 def test_derived_layer_requires_polygon_per_site(bayer, tmp_path, monkeypatch):
     monkeypatch.setattr(DERIVED_LAYERS, "_objects", dict(DERIVED_LAYERS))
     DERIVED_LAYERS.register("frame", lambda layout: layout.polygons()[:-1])
-    with pytest.raises(ParameterError, match=r"derived layer 'frame' must return one polygon for each of the \d+ sites"):
+    with pytest.raises(
+        ParameterError, match=r"derived layer 'frame' must return one polygon for each of the \d+ sites"
+    ):
         bayer.write(tmp_path / "a.gds", layers={"photosite": 1, "frame": 2})
 
 
