@@ -309,3 +309,13 @@ def test_bounds_of_many_sites_are_exact():
 
     x0, _, x1, _ = fs.Integrator(layout, grid, distortion=lens).bounds_um
     assert grid.bounds_um[2] - grid.bounds_um[0] == pytest.approx(x1 - x0, rel=1e-5)
+
+
+def test_scene_with_fit_is_drawn_in_pixels():
+    scene = fs.Scene.from_picture(
+        np.zeros((30, 40), np.uint8), distance_m=1.0, peak_radiance_w_m2_sr_nm=0.1, band_width_nm=10.0
+    )
+    ax = scene.plot()
+
+    assert (ax.get_xlabel(), ax.get_xlim(), ax.get_ylim()) == ("x / pixels", (-20.0, 20.0), (-15.0, 15.0))
+    assert "fit='cover'" in scene._repr_html_().replace("&#x27;", "'")

@@ -13,6 +13,7 @@ __all__ = ["EXTRA_OF", "import_optional", "install_hint", "needs"]
 #: Smallest extra that installs each optional module.
 EXTRA_OF = {
     "OpenEXR": "pictures",
+    "anywidget": "notebook",
     "astropy": "maps",
     "av": "video",
     "cryptography": "explore",

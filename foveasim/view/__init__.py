@@ -19,6 +19,7 @@ from foveasim.view.site_colours import SiteColours, colours_of, site_colours
 from foveasim.view.site_pictures import picture_colours, site_picture
 from foveasim.view.solids import PartReport, SensorStack, Solids, SolidsReport, solids, stack, write_meshes
 from foveasim.view.web import solid_page, web_page, write_solid_page, write_web_page
+from foveasim.view.widgets import widget
 
 __all__ = [
     "Mesh",
@@ -60,6 +61,7 @@ __all__ = [
     "to_html",
     "to_png",
     "web_page",
+    "widget",
     "write_meshes",
     "write_solid_page",
     "write_web_page",

@@ -44,14 +44,18 @@ def plot_scene(scene: Scene, *, ax: Axes | None = None, figure_inches: float = 8
     Returns
     -------
     matplotlib axes
-        In the plane of the scene, centred on the optical axis. The colours are those of a camera with generic RGB filters
+        In the plane of the scene, centred on the optical axis; in pixels for a scene with ``fit``, whose size depends on the
+        camera. The colours are those of a camera with generic RGB filters
         (:func:`foveasim.rgb_filters`), balanced for equal radiance in all bands, sRGB-encoded; grey outside the visible range.
     """
     n_y, n_x = scene.basis.shape[1:]
-    width_um, height_um = n_x * scene.pitch_um, n_y * scene.pitch_um
-    unit, um = next((u for u in LENGTH_UNITS if max(width_um, height_um) < 1e3 * u[1]), LENGTH_UNITS[-1])
-    half_x, half_y = 0.5 * width_um / um, 0.5 * height_um / um
-    ax = new_axes(figure_inches, height_um / width_um) if ax is None else ax
+    unit, per_pixel = "pixels", 1.0
+    if scene.pitch_um is not None:
+        size_um = max(n_x, n_y) * scene.pitch_um
+        unit, um = next((u for u in LENGTH_UNITS if size_um < 1e3 * u[1]), LENGTH_UNITS[-1])
+        per_pixel = scene.pitch_um / um
+    half_x, half_y = 0.5 * n_x * per_pixel, 0.5 * n_y * per_pixel
+    ax = new_axes(figure_inches, n_y / n_x) if ax is None else ax
     ax.imshow(scene_pixels(scene, PLOT_PIXELS), extent=(-half_x, half_x, -half_y, half_y))
     ax.set(xlabel=f"x / {unit}", ylabel=f"y / {unit}")
     return ax

@@ -35,7 +35,6 @@ from foveasim.view.web._content import content_of
 from foveasim.view.web._pack import back_references, pack, to_smallest_type
 from foveasim.view.web._shapes import shapes_of
 
-SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 #: A frame with an island in it, an L, an arrow that no fan from its first vertex fills, a comb that no fan fills,
 #: two boxes with a common boundary, and two that overlap.
@@ -235,16 +234,6 @@ def test_page_is_written_atomically(tmp_path, monkeypatch):
 
 
 # -- in a browser --------------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def browser():
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=list(SOFTWARE))
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture

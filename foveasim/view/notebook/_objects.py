@@ -218,9 +218,15 @@ def _scene(scene: Scene) -> str:
     n_basis, n_y, n_x = scene.basis.shape
     title = f"Scene of {n_x:,} x {n_y:,} pixels"
     waves_nm = scene.wavelength_nm
-    rows = {
-        "size": f"{1e-3 * n_x * scene.pitch_um:.6g} x {1e-3 * n_y * scene.pitch_um:.6g} mm at {scene.distance_m:g} m",
-        "pixel pitch": f"{scene.pitch_um:g} µm",
+    if scene.pitch_um is None:
+        size = {"framing": f"fit='{scene.fit}', on the layout of a camera", "distance": f"{scene.distance_m:g} m"}
+    else:
+        width_mm, height_mm = 1e-3 * n_x * scene.pitch_um, 1e-3 * n_y * scene.pitch_um
+        size = {
+            "size": f"{width_mm:.6g} x {height_mm:.6g} mm at {scene.distance_m:g} m",
+            "pixel pitch": f"{scene.pitch_um:g} µm",
+        }
+    rows = size | {
         "wavelengths": ", ".join(f"{nm:g}" for nm in waves_nm) + " nm"
         if waves_nm.size <= 4
         else f"{waves_nm.size} from {waves_nm.min():g} to {waves_nm.max():g} nm",

@@ -18,10 +18,10 @@ from foveasim._io.atomic import atomic_write
 from foveasim.capture import Capture
 from foveasim.errors import FileError
 from foveasim.layout import Layout, Report
-from foveasim.view.web._content import content_of
+from foveasim.view.web._content import Content, content_of
 from foveasim.view.web._pack import pack
 
-__all__ = ["assemble_page", "bundle", "check_page_path", "web_page", "write_web_page"]
+__all__ = ["assemble_page", "bundle", "check_page_path", "page_of", "part", "web_page", "write_web_page"]
 
 #: File extensions of pages.
 EXTENSIONS = (".html", ".htm")
@@ -68,7 +68,11 @@ def web_page(data: Layout | Capture, *, report: Report | None = None, name: str 
     >>> "<title>a small grid</title>" in page
     True
     """
-    content = content_of(data, report, name=name)
+    return page_of(content_of(data, report, name=name))
+
+
+def page_of(content: Content) -> str:
+    """Return the page of a layout's or a capture's content."""
     arrays = {key: pack(values) for key, values in content.arrays.items()}
     about = {**content.about, "arrays": {key: metadata for key, (metadata, _) in arrays.items()}}
     return assemble_page(
@@ -78,7 +82,7 @@ def web_page(data: Layout | Capture, *, report: Report | None = None, name: str 
         about,
         {key: text for key, (_, text) in arrays.items()},
         title=str(content.about["name"]),
-        alt="Picture of the capture" if isinstance(data, Capture) else "Photosites of the layout",
+        alt="Picture of the capture" if content.about["kind"] == "capture" else "Photosites of the layout",
         picture="data:image/png;base64," + base64.b64encode(content.picture_png).decode(),
     )
 
@@ -160,13 +164,13 @@ def assemble_page(
     **strings : str
         Strings of the placeholders in the template, which are escaped.
     """
-    style = "".join(map(_part, styles))
+    style = "".join(map(part, styles))
     script = bundle(script)
     # Angle brackets are escaped: column names in untrusted files must not close the script element.
     plain = json.dumps(about, ensure_ascii=True, allow_nan=False).replace("<", "\\u003c").replace(">", "\\u003e")
     elements = [f'<script type="application/json" id="about">{plain}</script>']
     elements += [f'<script type="text/plain" id="data-{key}">{text}</script>' for key, text in data.items()]
-    return Template(_part(template)).substitute(
+    return Template(part(template)).substitute(
         {name: html.escape(text) for name, text in strings.items()},
         policy=html.escape(POLICY.format(script=_checksum(script), style=_checksum(style)), quote=False),
         style=style,
@@ -197,7 +201,7 @@ def bundle(name: str) -> str:
 
     def add(module: str) -> None:
         if module not in modules:
-            text = _part(module)
+            text = part(module)
             for imported in IMPORT.findall(text):
                 add(imported)
             modules[module] = EXPORT.sub("", IMPORT.sub("", text))
@@ -207,7 +211,8 @@ def bundle(name: str) -> str:
 
 
 @cache
-def _part(name: str) -> str:
+def part(name: str) -> str:
+    """Return a file of this package."""
     return files("foveasim.view.web").joinpath(name).read_text(encoding="utf-8")
 
 

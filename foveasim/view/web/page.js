@@ -1,5 +1,6 @@
 // The page: controls, the photosite under the mouse, colours, design rules, picture, links.
 
+import { connect, hasAddress, report } from "./bridge.js";
 import { Scale, brief, bytesOfHex, clamp, formatLength, roundStep, shown, textOf } from "./colours.js";
 import { COLOUR_MAPS } from "./colour_maps.js";
 import { listenToPointers } from "./gestures.js";
@@ -8,7 +9,7 @@ import { drawRamp, kindItems, summaryOf, tickLabels, titleOf } from "./legend.js
 import { SensorMap } from "./map.js";
 import { downloadTable, lengthText, sitesIn, statisticsRows, tableOf } from "./measure.js";
 import { Overview } from "./overview.js";
-import { $, downloadPicture, inkOf, isForPage, listenToHelp, make, notice, speak, startTheme, stayingNotice } from "./page_parts.js";
+import { $, downloadPicture, inkOf, isForPage, listenToHelp, make, notice, speak, startTheme, stayingNotice, useTheme } from "./page_parts.js";
 import { Sites } from "./sites.js";
 import { offsetsOf, unpack } from "./unpack.js";
 
@@ -56,6 +57,7 @@ async function colourBy(key, range = null) {
   drawLegend();
   fillRange();
   rememberView();
+  report("by", column.key);
 }
 
 function repaint() {
@@ -377,6 +379,8 @@ function tellSite() {
   const key = site + "/" + state.pinned + "/" + state.others + "/" + state.loaded;
   if (key === announcedSite) return;
   announcedSite = key;
+  report("hovered", state.hovered);
+  report("pinned", state.pinned);
   $("site").classList.toggle("empty", site < 0);
   $("unpin").hidden = state.pinned < 0;
   $("site-heading").textContent = site < 0 ? "Photosite" : "Photosite " + site.toLocaleString("en-US") + (site === state.pinned ? " (pinned)" : "");
@@ -561,18 +565,21 @@ function rulerText() {
   return text + "  " + detail;
 }
 
-function select(rectangle) {
+// Selects the sites in a rectangle, or given ones; null and no sites for none.
+function select(rectangle, sites = rectangle ? sitesIn(state.sites, rectangle) : []) {
   state.selection = rectangle;
-  state.selected = rectangle ? sitesIn(state.sites, rectangle) : [];
-  $("selection").hidden = !rectangle;
-  if (rectangle) showSelection();
+  state.selected = sites;
+  $("selection").hidden = !rectangle && !sites.length;
+  if (!$("selection").hidden) showSelection();
+  report("selected", sites);
   ask("marks");
 }
 
 function showSelection() {
-  const { selection: [[x0, y0], [x1, y1]], selected } = state, size = (v) => String(Number(Math.abs(v).toPrecision(4)));
+  const { selection, selected } = state, size = (v) => String(Number(Math.abs(v).toPrecision(4)));
   $("selection-heading").textContent = "Selection: " + shown(selected.length) + (selected.length === 1 ? " photosite" : " photosites");
-  $("selection-note").textContent = "Centres in " + size(x1 - x0) + " × " + size(y1 - y0) + " µm; std is the sample standard deviation.";
+  const where = selection ? "Centres in " + size(selection[1][0] - selection[0][0]) + " × " + size(selection[1][1] - selection[0][1]) + " µm; " : "";
+  $("selection-note").textContent = where + "std is the sample standard deviation.";
   $("statistics").replaceChildren(...statisticsRows(about.columns, selected));
   $("export").disabled = !selected.length || !state.loaded;
   rememberView();
@@ -586,6 +593,9 @@ function drawTools(context) {
     context.fillStyle = "rgb(31 95 191 / 14%)";
     context.fillRect(...box);
     outline(context, () => context.rect(...box), [4, 2], ["#ffffff", "#1f5fbf"]);
+  } else if (state.selected.length) {
+    const { sites } = state, shownSites = state.selected.slice(0, MOST_OUTLINES);
+    outline(context, () => { for (const site of shownSites) sites.trace(context, site, map); }, [3.5, 1.75], ["#ffffff", "#1f5fbf"]);
   }
   if (ruler) {
     const [[x0, y0], [x1, y1]] = ruler.map(([x, y]) => [map.toX(x), map.toY(y)]), length = Math.hypot(x1 - x0, y1 - y0) || 1;
@@ -740,7 +750,7 @@ let remembering = 0;
 
 function rememberView() {
   clearTimeout(remembering);
-  remembering = setTimeout(() => history.replaceState(null, "", viewHash()), 150);
+  if (hasAddress) remembering = setTimeout(() => history.replaceState(null, "", viewHash()), 150);
 }
 
 function viewHash() {
@@ -814,6 +824,7 @@ function viewAsPicture() {
 }
 
 function listenToTools() {
+  $("link").hidden = !hasAddress;
   $("link").addEventListener("click", copyLink);
   $("save").addEventListener("click", () => downloadPicture(viewAsPicture(), about.name));
   $("find").addEventListener("submit", (event) => {
@@ -906,8 +917,21 @@ async function openRest() {
   for (const column of about.columns) await valuesOf(column);
   state.loaded = true;
   tellSite();
-  if (state.selection) showSelection();
+  if (state.selected.length) showSelection();
+  connected();
 }
+
+// The view as a notebook reads and sets it.
+const connected = connect(
+  {
+    by: (key) => colourBy(key),
+    pinned: (site) => { state.pinned = site < state.sites.n ? site : -1; tellSite(); drawHistogram(); ask("marks"); },
+    // The same sites again keep their rectangle.
+    selected: (sites) => { if (sites.join() !== state.selected.join()) select(null, sites.filter((site) => site < state.sites.n)); },
+    theme: useTheme,
+  },
+  () => ({ by: state.column.key, hovered: state.hovered, pinned: state.pinned, selected: state.selected }),
+);
 
 const handle = {
   nSites: about.n_sites,

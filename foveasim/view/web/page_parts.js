@@ -13,18 +13,27 @@ export const inkOf = (name) => getComputedStyle(document.documentElement).getPro
 
 // -- themes ---------------------------------------------------------------------------------------------------------------
 
+let chosenTheme = null, themeChanged = () => {};
+
+// Shows a theme, "dark" or "light", unless the user has chosen one.
+export function useTheme(theme) {
+  if (chosenTheme || document.documentElement.dataset.theme === theme) return;
+  document.documentElement.dataset.theme = theme;
+  themeChanged();
+}
+
 // Uses the theme chosen on an earlier page, else that of the system; onChange is called when the theme changes.
 export function startTheme(onChange) {
   const root = document.documentElement, system = matchMedia("(prefers-color-scheme: dark)");
-  let chosen = null;
-  try { chosen = localStorage.getItem("foveasim-theme"); } catch { /* not kept */ }
-  if (chosen !== "dark" && chosen !== "light") chosen = null;
-  const show = () => { root.dataset.theme = chosen || (system.matches ? "dark" : "light"); };
+  themeChanged = onChange;
+  try { chosenTheme = localStorage.getItem("foveasim-theme"); } catch { /* not kept */ }
+  if (chosenTheme !== "dark" && chosenTheme !== "light") chosenTheme = null;
+  const show = () => { root.dataset.theme = chosenTheme || (system.matches ? "dark" : "light"); };
   show();
-  system.addEventListener("change", () => { if (!chosen) { show(); onChange(); } });
+  system.addEventListener("change", () => { if (!chosenTheme) { show(); onChange(); } });
   $("theme").addEventListener("click", () => {
-    chosen = root.dataset.theme === "dark" ? "light" : "dark";
-    try { localStorage.setItem("foveasim-theme", chosen); } catch { /* kept for this page alone */ }
+    chosenTheme = root.dataset.theme === "dark" ? "light" : "dark";
+    try { localStorage.setItem("foveasim-theme", chosenTheme); } catch { /* kept for this page alone */ }
     show();
     onChange();
   });

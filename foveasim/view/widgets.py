@@ -1,0 +1,67 @@
+"""Interactive view of photosites in notebooks."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from foveasim._core.extras import needs
+from foveasim.capture import Capture
+from foveasim.errors import ParameterError
+from foveasim.layout import Layout, Report
+
+if TYPE_CHECKING:
+    from foveasim.view.web._widget import SitesWidget
+
+__all__ = ["widget"]
+
+
+def widget(
+    data: Layout | Capture, *, report: Report | None = None, name: str = "", height_px: int = 600
+) -> SitesWidget:
+    """
+    Return a widget to explore a layout or a capture in a notebook.
+
+    It is the page of :func:`foveasim.view.web_page`, connected with Python: the colours, the pinned site and the selection can
+    be read, observed and set.
+
+    Parameters
+    ----------
+    data : Layout or Capture
+    report : Report, optional
+        Check of this layout, whose violations are listed and marked.
+    name : str
+        Heading; by default the generator of the layout.
+    height_px : int
+        Height in pixels of the screen.
+
+    Returns
+    -------
+    SitesWidget
+        With the traits ``by`` (quantity shown by the colours), ``pinned`` (index of a site, or -1), ``selected`` (indices) and
+        ``hovered`` (read-only). Works where anywidget does: JupyterLab, VS Code, Colab, marimo.
+
+    Raises
+    ------
+    ParameterError
+        When anywidget is missing, the data is neither a layout nor a capture, or the report is of another layout.
+    GeometryError
+        When the layout has no sites.
+
+    Examples
+    --------
+    Select sites in the widget by a rectangle, or in Python, and read their values::
+
+        view = fs.view.widget(capture)
+        view                                   # last line of a cell
+        view.by = "electrons"
+        capture.electrons[view.selected].mean()
+    """
+    try:
+        from foveasim.view.web._widget import SitesWidget
+    except ModuleNotFoundError as error:
+        if error.name not in ("anywidget", "traitlets"):
+            raise
+        raise ParameterError("widget", needs("anywidget")) from None
+    from foveasim.view.web._content import content_of
+
+    return SitesWidget(content_of(data, report, name=name), height_px)
