@@ -9,7 +9,6 @@ import io
 import itertools
 import json
 import re
-import shutil
 import sys
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -34,7 +33,6 @@ from foveasim.view.web._bodies import bodies_of
 from foveasim.view.web._content import content_of
 from foveasim.view.web._pack import back_references, pack, to_smallest_type
 from foveasim.view.web._shapes import shapes_of
-
 
 #: A frame with an island in it, an L, an arrow that no fan from its first vertex fills, a comb that no fan fills,
 #: two boxes with a common boundary, and two that overlap.
