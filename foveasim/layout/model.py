@@ -37,7 +37,7 @@ from foveasim._core.validation import (
     read_only,
     unmasked,
 )
-from foveasim.errors import GeometryError, ParameterError
+from foveasim.errors import GeometryError, ParameterError, printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -65,6 +65,8 @@ HOLE_REASONS = {
     "Hole lies outside shell": "has a hole outside its outline",
     "Holes are nested": "has a hole inside another hole",
 }
+#: Characters of the origin, and columns, in the representation of a layout.
+MAX_SHOWN_ORIGIN, MAX_SHOWN_COLUMNS = 60, 8
 #: Number of invalid sites that a message lists.
 MAX_LISTED = 5
 
@@ -314,7 +316,9 @@ class Layout:
 
     def __repr__(self) -> str:
         origin = self.provenance.get("generator", self.provenance.get("made_by", "packed rings"))
-        return f"Layout({self.n_sites} sites from {origin}, columns {sorted(self.columns)})"
+        columns = sorted(self.columns)
+        shown = columns if len(columns) <= MAX_SHOWN_COLUMNS else [*columns[:MAX_SHOWN_COLUMNS], "..."]
+        return f"Layout({self.n_sites} sites from {printable(str(origin))[:MAX_SHOWN_ORIGIN]}, columns {shown})"
 
     @property
     def channel(self) -> Ints:

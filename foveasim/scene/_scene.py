@@ -28,7 +28,7 @@ from foveasim._core.validation import (
 )
 from foveasim._io.encodings import Encoding, decode
 from foveasim._io.images import read_picture
-from foveasim.errors import FileError, ParameterError
+from foveasim.errors import FileError, ParameterError, printable
 from foveasim.fields import from_file_rows
 from foveasim.scene.registry import SCENES
 from foveasim.units import m_from_um, um_from_m
@@ -52,6 +52,8 @@ MAX_PITCH_UM, MAX_DISTANCE_M = 1e15, 1e9
 PITCH_ROUNDING = 1e-9
 #: Spectral radiance above that of any source, W/(m² sr nm); that of the sun is about 2e4.
 MAX_RADIANCE = 1e24
+#: Characters of the source in the representation.
+MAX_SOURCE = 100
 #: Weights of red, green and blue in the luminance of a colour (Rec. ITU-R BT.709).
 LUMINANCE_WEIGHTS = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
@@ -205,7 +207,7 @@ class Scene:
         size = f", fit='{self.fit}'," if self.pitch_um is None else f" of {self.pitch_um:g} µm"
         return (
             f"Scene({n_x} x {n_y} pixels{size} at {self.distance_m:g} m, {n_basis} basis images, "
-            f"{self.wavelength_nm.size} wavelengths, from {self.source})"
+            f"{self.wavelength_nm.size} wavelengths, from {printable(self.source)[:MAX_SOURCE]})"
         )
 
     def plot(self, **options: Any) -> Axes:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 import scipy.constants
@@ -111,3 +113,27 @@ def test_presets_match_published_parameters(name, published):
 
     assert {key: getattr(sensor, key) for key in published} == published
     assert set(PRESETS[name]) == set(published)
+
+
+def test_budget_lists_sums_and_draws_bars():
+    layout = grid(4, 1, 3.0)
+    sensor = Sensor(layout, read_noise_e=3.0, dark_e_per_s=100.0, prnu_fraction=0.02, capacitance_f=1e-15, bits=14)
+    budget = noise_budget(sensor, np.array([1600.0, 1600.0, 0.0, 0.0]), 1.0)
+    rows = {row["effect"]: row for row in budget.records()}
+    bars = budget.plot()
+
+    # Shot noise of 1600 e- is 40 e-; its RMS over the four sites is 40 / sqrt(2).
+    assert rows["photon_shot"] == {
+        "effect": "photon_shot", "kind": "temporal", "rms_e": pytest.approx(40.0 / np.sqrt(2.0)), "min_e": 0.0, "max_e": pytest.approx(40.0)
+    }  # fmt: skip
+    step_e = 3.0 * 1e-15 / scipy.constants.e / 2**14
+    assert rows["all temporal"]["max_e"] == pytest.approx(np.sqrt(1600.0 + 100.0 + 9.0 + step_e**2 / 12.0))
+    assert rows["all fixed"]["max_e"] == pytest.approx(0.02 * 1600.0)
+    assert "reset" not in rows
+    assert set(budget) == {*TEMPORAL, *FIXED}
+    assert [label.get_text() for label in bars.get_yticklabels()] == [
+        name for name in rows if not name.startswith("all")
+    ]
+    copy = pickle.loads(pickle.dumps(budget))
+    assert str(copy) == str(budget)
+    assert repr(copy).startswith("NoiseBudget(4 sites, temporal noise ")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -354,7 +355,8 @@ def test_report_plot_shows_every_violation():
 
 
 def test_report_plot_without_layout():
-    report = LAYOUT.check(fs.DesignRules(min_width_um=3.0))
+    checked = LAYOUT.check(fs.DesignRules(min_width_um=3.0))
+    report = replace(checked, layout=None)  # as from a file
     axes = plot_report(report)
 
     assert len(report.violations) == 2
@@ -363,6 +365,8 @@ def test_report_plot_without_layout():
     assert axes.get_ylim()[0] < y.min() <= y.max() < axes.get_ylim()[1]
     with pytest.raises(ParameterError, match="'layout' must be the checked layout of 2 sites"):
         report.plot(MANY)
+    assert len(axes.collections) < len(checked.plot().collections)
+    assert checked.plot().get_xlim() == (0.0, 12.0)
 
 
 def test_report_plot_without_violations(tmp_path):

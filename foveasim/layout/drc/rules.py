@@ -338,7 +338,8 @@ class Report:
 
     def __repr__(self) -> str:
         n_satisfied, n_violations = sum(len(r) == 0 for r in self.results), sum(map(len, self.results))
-        waived = f", {n_waived} waived" if (n_waived := sum(r.waiver is not None for r in self.results)) else ""
+        n_waived = sum(len(r) > 0 and r.waiver is not None for r in self.results)
+        waived = f", {n_waived} waived" if n_waived else ""
         return (
             f"Report({n_satisfied} of {len(self.results)} rules satisfied{waived}, {n_violations:,} violations, "
             f"{self.n_sites:,} photosites)"

@@ -556,3 +556,19 @@ def test_invalid_limits_are_rejected(name, limit, message):
 def test_invalid_dies_are_rejected(die_um, message):
     with pytest.raises(ParameterError, match=message):
         DesignRules(die_um=die_um)
+
+
+def test_worst_violations_are_the_first_ones():
+    sites = Layout.from_rectangles(np.arange(40.0).reshape(20, 2) * 10.0, np.linspace(1.0, 3.0, 20))
+    (result,) = sites.check(DesignRules(min_size_um=2.9)).results
+    located = []
+    locate = result._locate
+    counted = replace(result, _locate=lambda part: located.append(part) or locate(part))
+    worst = counted.worst_violations(3)
+
+    assert [violation.site_ids for violation in worst] == [(0,), (1,), (2,)]
+    assert located == [slice(3)]
+    assert worst == result.violations[:3]
+    assert counted.worst_violations(100) == result.violations
+    with pytest.raises(ParameterError, match="'n' must be an integer"):
+        counted.worst_violations(0)
