@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Mapping
 from difflib import get_close_matches
 from types import FunctionType
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar, cast
 
 from foveasim.errors import ArgumentError
 
@@ -48,9 +48,8 @@ def check_arguments(call: Callable[P, R]) -> Callable[P, R]:
     """
     if not isinstance(call, FunctionType) or hasattr(call, CHECKED):
         return call
-    find_problem = _find_problem
+    find_problem = _find_problem  # not a global of the function below
 
-    @functools.wraps(call)
     def checked(*args: P.args, **kwargs: P.kwargs) -> R:
         __tracebackhide__ = True  # in the tracebacks of IPython and pytest
         try:
@@ -65,10 +64,10 @@ def check_arguments(call: Callable[P, R]) -> Callable[P, R]:
             raise problem from None
 
     # With the globals of the function, so that doctest finds its examples.
-    found = FunctionType(checked.__code__, call.__globals__, checked.__name__, None, checked.__closure__)
+    found = FunctionType(checked.__code__, call.__globals__, call.__name__, None, checked.__closure__)
     functools.update_wrapper(found, call)
     setattr(found, CHECKED, True)
-    return found
+    return cast("Callable[P, R]", found)
 
 
 def check_public_calls(module_name: str) -> None:
@@ -145,12 +144,12 @@ def _is_required(parameter: inspect.Parameter) -> bool:
 
 
 def _name_of(call: Callable[..., Any]) -> str:
-    """Return the name as in a call: the class for a constructor, ``Class.method`` for a method."""
+    """Return the name as in a call: ``function``, ``Class``, ``Class.method``."""
     return call.__qualname__.rpartition("<locals>.")[2].removesuffix(".__init__")
 
 
 def _format_signature(name: str, parameters: list[inspect.Parameter]) -> str:
-    """Return a signature: required parameters, and as many optional ones as fit."""
+    """Return a signature with all required, and as many optional parameters as fit."""
     parts: list[str] = []
     is_shortened = False
     for k, parameter in enumerate(parameters):

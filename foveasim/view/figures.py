@@ -68,13 +68,15 @@ def _is_shown() -> bool:
     if _is_hidden.get():
         return False
     import matplotlib as mpl
-    from matplotlib.backends import BackendFilter, backend_registry
+    from matplotlib.backends.registry import BackendFilter, backend_registry
 
     has_pyplot = "matplotlib.pyplot" in sys.modules
-    backend = mpl.get_backend(auto_select=has_pyplot)
-    if backend is None or backend.lower() in backend_registry.list_builtin(BackendFilter.NON_INTERACTIVE):
+    backend = mpl.get_backend() if has_pyplot else mpl.get_backend(auto_select=False)
+    without_window: list[str] = backend_registry.list_builtin(BackendFilter.NON_INTERACTIVE)  # type: ignore[no-untyped-call]
+    with_window: list[str] = backend_registry.list_builtin(BackendFilter.INTERACTIVE)  # type: ignore[no-untyped-call]
+    if backend is None or backend.lower() in without_window:
         return False
-    if backend.lower() in backend_registry.list_builtin(BackendFilter.INTERACTIVE):
+    if backend.lower() in with_window:
         # Importing pyplot would load a GUI toolkit, and toolkits work in the main thread only.
         return has_pyplot and threading.current_thread() is threading.main_thread()
     return has_pyplot or _is_ipython()

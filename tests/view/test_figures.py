@@ -127,7 +127,7 @@ def test_windows_are_opened_in_main_thread_only(monkeypatch):
 
 def test_backend_is_not_selected_without_pyplot(monkeypatch):
     selected = []
-    monkeypatch.setattr(mpl, "get_backend", lambda *, auto_select: selected.append(auto_select))
+    monkeypatch.setattr(mpl, "get_backend", lambda auto_select=True: selected.append(auto_select))
     monkeypatch.delitem(sys.modules, "matplotlib.pyplot")
 
     assert type(SITES.plot().figure) is Figure

@@ -21,7 +21,8 @@ class Preset(NamedTuple):
     limits: Mapping[str, Any]
     source: str
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 _SKY130 = "SkyWater SKY130 PDK (github.com/google/skywater-pdk), docs/rules/periphery: "

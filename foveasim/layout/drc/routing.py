@@ -129,7 +129,8 @@ class TrackDemand(NamedTuple):
     first_sites: Ints
     strip: Ints
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def track_demand(layout: Layout, routing: Routing) -> TrackDemand:

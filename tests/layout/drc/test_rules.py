@@ -570,5 +570,5 @@ def test_worst_violations_are_the_first_ones():
     assert located == [slice(3)]
     assert worst == result.violations[:3]
     assert counted.worst_violations(100) == result.violations
-    with pytest.raises(ParameterError, match="'n' must be an integer"):
+    with pytest.raises(ParameterError, match="'n' must be >= 1, got 0"):
         counted.worst_violations(0)
