@@ -64,6 +64,7 @@ PHOTOGRAPHED = SHOT | {
         "peak_radiance_w_m2_sr_nm": 0.05,
         "wavelength_nm": [620, 550, 450],
     },
+    "layout": {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 4.0}},
     "exposure_s": 0.01,
 }
 VARY = {
@@ -804,7 +805,7 @@ def test_journal_is_synced_every_second(tmp_path, monkeypatch):
 
 def test_cached_reference_changes_no_result():
     vary = {"optics.f_number": [2.0, 4.0], "sensor.bits": [8, 12], "exposure_s": [1e-4, 2e-4]}
-    scene = PHOTOGRAPHED["scene"] | {"picture": "skimage:astronaut", "pitch_um": 30.0}
+    scene = PHOTOGRAPHED["scene"] | {"picture": "skimage:astronaut", "pitch_um": 20.0}
     plan = explore.plan_sweep(SHOT | {"scene": scene}, vary, repeats=2, metrics=["psnr_db"])
     runner = ShotRunner(plan.source, plan.metrics, is_geometry_varied=False, n_threads=1)
     found = [runner.record(k, plan.settings_of(k)) for k in range(plan.n_points)]

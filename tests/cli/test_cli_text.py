@@ -186,7 +186,7 @@ def test_ascii_terminals_get_plain_characters(tmp_path, arguments, code, printed
     scene = {
         "kind": "picture",
         "picture": "frames/0.png",
-        "pitch_um": 300.0,
+        "pitch_um": 100.0,
         "distance_m": 1.0,
         "peak_radiance_w_m2_sr_nm": 0.1,
     }

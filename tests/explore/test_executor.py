@@ -28,7 +28,7 @@ SHOT = {
     "scene": {
         "kind": "picture",
         "picture": "",
-        "pitch_um": 500.0,
+        "pitch_um": 300.0,
         "distance_m": 1.0,
         "peak_radiance_w_m2_sr_nm": 0.1,
         "wavelength_nm": 550,

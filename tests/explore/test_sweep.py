@@ -870,6 +870,47 @@ def test_camera_reuses_images_and_compiled_layout():
         camera.capture(shot.scene, exposure_s=0.01, seed=1, photo_e_per_s=known[:3])
 
 
+def test_framing_follows_lens_and_layout():
+    scene = {"kind": "picture", "picture": "skimage:camera", "fit": "width", "distance_m": 1.0, "wavelength_nm": 550}
+    scene |= {"band_width_nm": 100.0, "peak_radiance_w_m2_sr_nm": 0.1}
+    vary = {"optics.focal_length_mm": [4.0, 8.0], "layout.parameters.n_x": [16, 24], "scene.fit": ["width", "cover"]}
+
+    def image_um(shot, camera, _):
+        x0, _, x1, _ = camera.image_grid(shot.scene).bounds_um
+        return x1 - x0
+
+    layout = {"generator": "grid", "parameters": {"n_x": 16, "n_y": 20, "pitch_um": 3.0}}
+    plan = explore.plan_sweep(
+        SHOT | {"scene": scene, "layout": layout},
+        vary,
+        metrics={"image_um": image_um, "psnr": explore.METRICS["psnr_db"]},
+    )
+    runner = runner_of(plan)
+    for k in range(plan.n_points):
+        settings = plan.settings_of(k)
+        shared, alone = runner.record(k, settings), runner_of(plan).record(k, settings)
+        width_um = 3.0 * settings["layout"]["parameters"]["n_x"]
+        expected_um = width_um if settings["scene"]["fit"] == "width" else max(width_um, 60.0)  # a square picture
+        assert (shared.error, shared.warning) == ("", "")
+        assert shared.values["image_um"] == pytest.approx(expected_um, rel=1e-12)
+        assert shared.values == alone.values
+
+
+def test_framed_reference_depends_on_distortion():
+    scene = {"kind": "picture", "picture": "skimage:camera", "fit": "width", "distance_m": 1.0, "wavelength_nm": 550}
+    shot = SHOT | {
+        "scene": scene | {"band_width_nm": 100.0, "peak_radiance_w_m2_sr_nm": 0.1},
+        "layout": {"generator": "grid", "parameters": {"n_x": 16, "n_y": 12, "pitch_um": 3.0}},
+        "distortion": {"kind": "brown_conrady", "focal_um": 100.0},
+    }
+    plan = explore.plan_sweep(shot, {"distortion.k1": [-0.3, 0.3]}, metrics=["psnr_db"])
+    runner = runner_of(plan)
+    shared = [runner.record(k, plan.settings_of(k)).values for k in range(2)]
+
+    assert shared == [runner_of(plan).record(k, plan.settings_of(k)).values for k in range(2)]
+    assert runner.cache.n_built["reference"] == 2
+
+
 # -- invalid sweeps ---------------------------------------------------------------------------------------------------
 
 
