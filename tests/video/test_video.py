@@ -1223,6 +1223,20 @@ def test_command_records_directory_with_shot_camera(directory, capsys):
     assert np.array_equal(recording.code[2], single.code)
 
 
+@pytest.mark.parametrize("framing", ["fit: cover", "field_of_view_deg: 1.0"])
+def test_command_frames_each_picture(directory, framing):
+    """The pictures of the video have other numbers of pixels than that of the shot."""
+    from foveasim.config import read_shot
+
+    (directory / "shot.yaml").write_text(SHOT.replace("pitch_um: 100", framing))
+    write_picture(directory / "photo.png", np.zeros((30, 90, 3), np.uint8))
+    assert command("shot.yaml", "--frames", "frames", "--out", "v.zarr") == 0
+
+    shot = read_shot("shot.yaml", ["scene.picture=frames/1.png"])
+    single = shot.camera.capture(shot.scene, exposure_s=0.01, seed=0, frame=1)
+    assert np.array_equal(read_recording(directory / "v.zarr").code[1], single.code)
+
+
 def test_command_stops_after_given_frames(directory):
     assert command("shot.yaml", "--frames", "frames", "--out", "pictures", "--stop", "2") == 0
 
