@@ -102,7 +102,10 @@ if not TYPE_CHECKING:  # type checkers would take any name for an attribute
     def __getattr__(name: str) -> Any:
         """Import the names of ``_LAZY``."""
         if name not in _LAZY:
-            raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+            from foveasim._core.names import did_you_mean
+
+            hint = did_you_mean(name, __all__)
+            raise AttributeError(f"module '{__name__}' has no attribute '{name}'{'; ' if hint else ''}{hint}")
         from importlib import import_module
 
         module = import_module(_LAZY[name])

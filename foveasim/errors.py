@@ -103,7 +103,11 @@ class FileError(FoveasimError, ValueError):
 
 
 class ConfigError(FileError):
-    """Settings with an unknown key, a wrong type, or an invalid value; ``path`` is None for settings from Python."""
+    """
+    Settings with an unknown key, a wrong type, or an invalid value.
+
+    ``path`` is None for settings from Python, ``position`` the line and column in a file, from 1, if it is known.
+    """
 
 
 class SimulationError(FoveasimError, RuntimeError):

@@ -1,4 +1,4 @@
-"""Messages about unknown names: the closest name, the equivalent of another program's term, and the possible names."""
+"""Messages about unknown names: the closest name, and the possible names."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ __all__ = ["closest_name", "did_you_mean", "list_names", "missing_path", "possib
 MAX_LISTED = 16
 #: Similarity of names, 0 to 1, from which one is suggested for the other, as in :func:`difflib.get_close_matches`.
 MIN_SIMILARITY = 0.6
+#: Similarity from which a name precedes the equivalent of another program's term.
+HIGH_SIMILARITY = 0.8
 #: Longest name that is compared, and largest number of files of a directory.
 MAX_COMPARED, MAX_FILES = 80, 10_000
 #: Terms of ISETCam, Pyxel, KLayout and data sheets, and the beginnings of the names of these quantities here.
@@ -36,6 +38,7 @@ OTHER_TERMS: dict[str, tuple[str, ...]] = {
     "shutter": ("exposure",),
     "spacing": ("pitch", "min_space"),
     "trench": ("gap", "min_space"),
+    "gap": ("trench", "min_space"),
     "voltage_swing": ("v_sat",),
     "well_capacity": ("full_well",),
 }
@@ -45,19 +48,19 @@ def closest_name(name: object, names: Iterable[str]) -> str | None:
     """
     Return the name that is most similar to an unknown one, or None.
 
-    Case, hyphens and spaces are ignored. Without a similar name, terms of other programs are looked up in ``OTHER_TERMS``.
+    Case, hyphens and spaces are ignored, and equal units at the end. Terms of other programs are looked up in ``OTHER_TERMS``.
     """
     known = list(names)
     similar = _most_similar(name, known)
-    if similar is not None:
+    if similar is not None and _similarity(name, similar) >= HIGH_SIMILARITY:
         return similar
     words = _normalise(name)
     beginnings = [each for term, found in OTHER_TERMS.items() if words.startswith(term) for each in found]
-    return next((each for begin in beginnings for each in known if _normalise(each).startswith(begin)), None)
+    return next((each for begin in beginnings for each in known if _normalise(each).startswith(begin)), similar)
 
 
 def did_you_mean(name: object, names: Iterable[str]) -> str:
-    """Return the question ``did you mean 'gap_um'?``, or an empty string if no name is similar."""
+    """Return the question ``did you mean 'gap_um'?``, or an empty string."""
     closest = closest_name(name, names)
     return "" if closest is None else f"did you mean {_quote(closest)}?"
 
@@ -123,7 +126,7 @@ def missing_path(path: Path, kind: str = "file") -> str:
         wanted = path.relative_to(directory).parts[0]
         is_last = directory == path.parent
         visible = (each for each in islice(directory.iterdir(), MAX_FILES) if not each.name.startswith("."))
-        found = sorted(each.name for each in visible if is_last or each.is_dir())
+        found = sorted(each.name for each in visible if (is_last and kind != "directory") or each.is_dir())
         # Files with the same extension are compared without it.
         stems = {Path(name).stem: name for name in found if Path(name).suffix == Path(wanted).suffix}
         closest = stems.get(_most_similar(Path(wanted).stem, stems) or "") or _most_similar(
@@ -146,7 +149,7 @@ def _normalise(name: object) -> str:
 
 
 def _most_similar(name: object, names: Iterable[str]) -> str | None:
-    """Return the most similar name if it is similar enough to be suggested; of equals the last in the alphabet."""
+    """Return the most similar name, of equals the last; None if none is similar enough."""
     similarity = {each: _similarity(name, each) for each in names}
     best = max(similarity, key=lambda each: (similarity[each], each), default=None)
     return best if best is not None and similarity[best] >= MIN_SIMILARITY else None
@@ -155,4 +158,7 @@ def _most_similar(name: object, names: Iterable[str]) -> str | None:
 def _similarity(name: object, other: str) -> float:
     """Return the similarity of two names, from 0 to 1."""
     first, second = _normalise(name), _normalise(other)
+    (begin, _, unit), (other_begin, _, other_unit) = first.rpartition("_"), second.rpartition("_")
+    if unit == other_unit and begin and other_begin and first != second:
+        first, second = begin, other_begin
     return SequenceMatcher(None, second, first, autojunk=False).ratio()

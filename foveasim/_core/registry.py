@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -119,7 +120,7 @@ class Registry(Mapping[str, T], Generic[T]):
         def attribute(name: str) -> T:
             if not name.startswith("_") and name in self:
                 return self[name]
-            hint = did_you_mean(name, self)
+            hint = did_you_mean(name, {*self, *(own for own in vars(sys.modules[module]) if not own.startswith("_"))})
             raise AttributeError(f"module '{module}' has no attribute '{name}'{'; ' if hint else ''}{hint}")
 
         return attribute

@@ -216,6 +216,7 @@ def validate_options(
         if name not in known:
             titles = sorted({found.title for found in formats.values() if name in getattr(found, of)})
             rule = f"is an option of {' and '.join(titles)} files only" if titles else "is not an option of any format"
-            hint = f"omit it; {possible_names(name, known)}" if known and not titles else "omit it"
+            every = sorted({option for found in formats.values() for option in getattr(found, of)})
+            hint = "omit it" if titles else possible_names(name, every)
             raise ParameterError(name, rule, value, hint=hint)
     return given

@@ -67,7 +67,7 @@ def _model(name: str, call: Callable[..., Any], skip: Sequence[str] = (), **type
 
 
 def call_of(section: BaseModel | type[BaseModel]) -> Callable[..., Any] | None:
-    """Return the call of a section or of its model; None for a section that only contains values."""
+    """Return the call of a section or of its model; None if it only contains values."""
     model = section if isinstance(section, type) else type(section)
     return next((_CALLS[kind] for kind in model.__mro__ if kind in _CALLS), None)
 

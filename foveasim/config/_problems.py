@@ -95,7 +95,7 @@ def _tags(data: Any) -> tuple[Any, ...]:
 
 
 def _describe(kind: Any, error: Any, *, is_first: bool) -> str:
-    """Return the rule and the value of a problem; for unknown names the closest one, and the list if it is the first."""
+    """Return the rule and the value of a problem; for the first unknown name the list."""
     match error["type"]:
         case "extra_forbidden":
             name = error["loc"][-1]

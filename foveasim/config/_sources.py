@@ -1,4 +1,4 @@
-"""Origin of settings, for messages: file, line and column, key, or change on the command line."""
+"""Origin of settings for messages: file and position, key, or command line."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Source:
         return replace(self, replaced={**self.replaced, **replaced})
 
     def error(self, key_path: str | tuple[str, ...], problem: str) -> ConfigError:
-        """Return an error about a setting, such as ``"sensor.bits"`` or its keys, with its position in the file."""
+        """Return an error about a setting, such as ``"sensor.bits"``, with its position."""
         parts = key_path if isinstance(key_path, tuple) else tuple(re.findall(r"[^.\[\]]+", key_path))
         name = ".".join(key_path) if isinstance(key_path, tuple) else key_path
         for n in range(len(parts), 0, -1):

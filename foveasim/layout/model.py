@@ -435,9 +435,8 @@ class Layout:
         values = []
         for key in keys:
             if isinstance(key, str) and key not in self.columns:
-                raise ParameterError(
-                    "keys", f"must be values or columns of the layout, which has {sorted(self.columns)}", key
-                )
+                hint = possible_names(key, sorted(self.columns))
+                raise ParameterError("keys", "must be values or columns of the layout", key, hint=hint)
             value = self.columns[key] if isinstance(key, str) else np.asarray(unmasked("keys", key))
             if value.shape != (self.n_sites,):
                 raise ParameterError(

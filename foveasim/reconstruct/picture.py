@@ -200,7 +200,7 @@ class Picture:
 
 
 def _channels(colour: Colour, n_channels: int) -> Floats:
-    """Return a colour as sRGB values from 0 to 1, (1 or 3, 1, 1): three if the picture or the colour is not grey."""
+    """Return a colour as sRGB values from 0 to 1, (1 or 3, 1, 1); one if all is grey."""
     from PIL import ImageColor
 
     try:

@@ -662,6 +662,37 @@ def test_tar_shards_do_not_depend_on_workers(tmp_path):
     assert fs.read_layout(tmp_path / "data1" / "layout.npz").n_sites == labelled().layout.n_sites
 
 
+@pytest.mark.parametrize(("n", "n_shards"), [(1, 1), (5, 1), (20, 3)])
+@pytest.mark.parametrize("name", ["data", "data.zarr"])
+def test_small_datasets_have_few_shards(tmp_path, name, n, n_shards):
+    data = explore.Dataset(list(pictures(1)), SHOT, draws=n)
+    explore.write_dataset(data, tmp_path / name)
+    stored = explore.open_dataset(tmp_path / name)
+
+    assert len(stored) == n
+    assert stored.about["per_shard"] == min(n, 8)
+    if name == "data":
+        assert len(list((tmp_path / name).glob("*.tar"))) == n_shards
+    assert all((stored[k]["code"] == data[k]["code"]).all() for k in (0, n - 1))
+
+
+@pytest.mark.parametrize(
+    ("n_samples", "n_bytes", "per_shard"),
+    [
+        (3, 1000, 3),
+        (100, 1000, 8),
+        (256, 1000, 8),
+        (3200, 1000, 100),
+        (10**6, 1000, 512),
+        (10**6, 2**20, 64),
+        (100, 2**25, 2),
+        (100, 2**30, 1),
+    ],
+)
+def test_default_shards_follow_sizes(n_samples, n_bytes, per_shard):
+    assert store._default_per_shard(n_samples, n_bytes) == per_shard
+
+
 def test_zarr_store_contains_layout_and_settings(tmp_path):
     zarr = pytest.importorskip("zarr")
     data = explore.Dataset(pictures(2), SHOT, VARY)
@@ -1259,7 +1290,7 @@ def test_classification_draws_cameras_around_shot():
     assert {each["sensor.bits"] for each in drawn} == {6, 8}
     data = explore.denoising(pictures(1), SHOT, draws=1, cameras=40, changes={"exposure_s": 3.2})
     assert all(0.1 <= sample["settings"]["exposure_s"] <= 3.2 for sample in data)
-    with pytest.raises(ConfigError, match="exposure_s: is missing"):
+    with pytest.raises(ConfigError, match="exposure_s: missing"):
         explore.classification(pictures(1), {key: value for key, value in SHOT.items() if key != "exposure_s"})
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import shapely
 import skimage.data
+from PIL import Image, features
 from reference.neighbours import sibson_weights
 from skimage.color import rgb2gray
 from skimage.transform import resize
@@ -685,6 +686,7 @@ def test_float_file_is_relative_to_white(tmp_path):
         (1, "p.tif", {"encode_srgb": True}, ParameterError, "'encode_srgb' must be False for floating-point files"),
         (2, "p.tif", {}, ParameterError, "'data' must have 1 or 3 channels to be saved, got 2"),
         (2, "p.png", {}, ParameterError, "'data' must have 1 or 3 channels to be shown, got 2"),
+        (1, "p.tif", {"background": "white"}, ParameterError, "'white' must be given with 'background'"),
         (1, "nowhere/p.exr", {}, fs.errors.FileError, "the directory .*nowhere does not exist"),
     ],
 )
@@ -692,6 +694,132 @@ def test_unsupported_files_raise_without_output(tmp_path, n_channels, name, opti
     with pytest.raises(error, match=message):
         asymmetric(n_channels).save(tmp_path / name, **options)
 
+    assert list(tmp_path.iterdir()) == []
+
+
+def partly_covered(n_channels):
+    """Picture with covered, partly covered and uncovered pixels."""
+    picture = asymmetric(n_channels)
+    coverage = np.array(picture.coverage)
+    coverage[2, 1], coverage[3, 3] = 0.25, 0.5
+    return Picture(picture.data, coverage, picture.grid)
+
+
+def composed_by_pillow(picture, colour, **options):
+    """Picture over a colour, composed by another program from the transparent PNG file."""
+    image = picture.to_image(2.0, **options)
+    rgba = image if image.shape[2] == 4 else np.dstack([image[..., :1]] * 3 + [image[..., 1:]])
+    over = Image.new("RGBA", rgba.shape[1::-1], colour)
+    return np.asarray(Image.alpha_composite(over, Image.fromarray(rgba)).convert("RGB")).astype(int)
+
+
+@pytest.mark.parametrize("n_channels", [1, 3])
+@pytest.mark.parametrize("encode_srgb", [False, True])
+@pytest.mark.parametrize(
+    ("background", "rgb"), [("white", (255, 255, 255)), ("#204060", (32, 64, 96)), ((9, 200, 0), (9, 200, 0))]
+)
+def test_background_equals_composition_by_pillow(n_channels, encode_srgb, background, rgb):
+    picture = partly_covered(n_channels)
+    image = picture.to_image(2.0, encode_srgb=encode_srgb, background=background)
+    expected = composed_by_pillow(picture, rgb, encode_srgb=encode_srgb)
+
+    assert image.shape[2] == (1 if n_channels == 1 and background == "white" else 3)
+    assert np.abs(np.broadcast_to(image, expected.shape) - expected).max() <= 1
+    assert tuple(np.broadcast_to(image, expected.shape)[-2, 2]) == rgb
+
+
+@pytest.mark.parametrize("n_channels", [1, 3])
+@pytest.mark.parametrize(
+    ("name", "tolerance"), [("p.bmp", 0), ("p.ppm", 0), ("p.jpg", 20), ("p.jpeg", 20), ("p.gif", 0)]
+)
+def test_formats_without_alpha_are_white_outside(tmp_path, n_channels, name, tolerance):
+    picture = asymmetric(n_channels)
+    smooth = np.linspace(0.4, 1.6, picture.data.size).reshape(picture.data.shape).astype(np.float32)
+    picture = Picture(np.where(np.isnan(picture.data), np.nan, smooth), picture.coverage, picture.grid)
+    picture.save(tmp_path / name, 2.0)
+    read = np.atleast_3d(read_picture(tmp_path / name)).astype(int)
+    expected = composed_by_pillow(picture, "white")[..., : read.shape[2]]
+
+    assert np.abs(np.broadcast_to(read, expected.shape) - expected)[:2].max() <= tolerance
+    if tolerance == 0:
+        assert (read[-2, 2] == 255).all()
+
+
+@pytest.mark.parametrize("name", ["p.png", "p.webp", "p.jp2", "p.tga"])
+def test_formats_with_alpha_preserve_coverage(tmp_path, name):
+    if name == "p.webp" and not features.check("webp"):
+        pytest.skip("Pillow without WebP")
+    picture = partly_covered(3)
+    picture.save(tmp_path / name, 2.0)
+    read = read_picture(tmp_path / name)
+
+    np.testing.assert_array_equal(read[..., 3], np.rint(255 * picture.coverage[::-1]))
+    np.testing.assert_array_equal(read, picture.to_image(2.0))
+
+
+@pytest.mark.parametrize("name", ["p.png", "p.webp", "p.tif", "p.jp2", "p.tga"])
+@pytest.mark.parametrize("n_channels", [1, 3])
+def test_background_removes_alpha(tmp_path, n_channels, name):
+    picture = partly_covered(n_channels)
+    picture.save(tmp_path / name, 2.0, bits=8, background="black")
+    read = np.atleast_3d(read_picture(tmp_path / name)).astype(int)
+    expected = composed_by_pillow(picture, "black")[..., : read.shape[2]]
+
+    assert read.shape[2] in (n_channels, 3)
+    assert np.abs(read - expected).max() <= 1
+
+
+@pytest.mark.parametrize("name", ["p.png", "p.tif"])
+def test_deep_background_has_16_bits(tmp_path, name):
+    picture = partly_covered(3)
+    picture.save(tmp_path / name, 2.0, bits=16, background=(255, 128, 1))
+    read = read_picture(tmp_path / name)
+
+    assert read.dtype == np.uint16
+    assert read[-2, 2].tolist() == [65535, 128 * 257, 257]
+    assert read[0, 0, 0] == round(float(picture.data[0, -1, 0]) / 2.0 * 65535)
+
+
+@pytest.mark.parametrize("name", ["p.tif", "p.exr"])
+def test_float_background_is_linear(tmp_path, name):
+    picture = partly_covered(3)
+    picture.save(tmp_path / name, 2.0, background=(188, 188, 188))
+    read = read_picture(tmp_path / name)[::-1]
+
+    assert read[1, 2] == pytest.approx(0.5029, abs=1e-4)  # the sRGB value 188 is half of white
+    assert read[2, 1] == pytest.approx(0.25 * picture.data[:, 2, 1] / 2.0 + 0.75 * 0.5029, abs=1e-4)
+    np.testing.assert_array_equal(read[0, 0], picture.data[:, 0, 0] / np.float32(2.0))
+
+
+def test_srgb_file_decodes_to_linear_values(tmp_path):
+    picture = asymmetric(3)
+    picture.save(tmp_path / "p.png", 2.0, encode_srgb=True, bits=16)
+    stored = read_picture(tmp_path / "p.png")[::-1, :, :3] / 65535
+    linear = np.where(stored <= 0.04045, stored / 12.92, ((stored + 0.055) / 1.055) ** 2.4)
+
+    assert np.moveaxis(linear, -1, 0) == pytest.approx(np.nan_to_num(picture.data) / 2.0, abs=4e-5)
+
+
+@pytest.mark.parametrize("background", ["whit", "#12345", (1, 2), (0, 0, 300), (0.5, 0.5, 0.5), 3, "rgb(1,2)"])
+def test_invalid_background_is_rejected(tmp_path, background):
+    with pytest.raises(ParameterError, match="'background' must be"):
+        asymmetric(1).save(tmp_path / "p.png", background=background)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (
+            "p.jpgg",
+            r"p\.jpgg: must end in one of \.bmp, \.exr, \.gif, \.jp2, \.jpeg, \.jpg, .*; did you mean '\.jpg'\?$",
+        ),
+        ("p", r"must end in one of .*, \.webp$"),
+    ],
+)
+def test_unknown_picture_format_lists_formats(tmp_path, name, message):
+    with pytest.raises(fs.errors.FileError, match=message):
+        asymmetric(1).save(tmp_path / name)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -392,7 +392,7 @@ def _suggest(trial: optuna.Trial, path: str, search_range: Search) -> Any:
 
 
 def _is_stored_natively(choices: Sequence[Any]) -> bool:
-    """Return whether Optuna stores choices as they are: unique numbers, strings and None, without lists and mappings."""
+    """Return whether Optuna stores choices as they are: unique numbers, strings, None."""
     return (
         all(isinstance(choice, bool | int | float | str | None) for choice in choices)
         and all(math.isfinite(choice) for choice in choices if isinstance(choice, float))
@@ -401,7 +401,7 @@ def _is_stored_natively(choices: Sequence[Any]) -> bool:
 
 
 def typed_choice(stored: Any, choices: Sequence[Any]) -> Any:
-    """Return the value of a setting from its value in Optuna, which is JSON if the choices contain lists or mappings."""
+    """Return the value of a choice from its value in Optuna, which may be JSON."""
     return stored if _is_stored_natively(choices) else json.loads(stored)
 
 

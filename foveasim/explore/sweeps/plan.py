@@ -213,7 +213,7 @@ class Plan:
             check_settings(self.source_with(point), self._settings_with(chosen))
 
     def source_with(self, choices: Mapping[str, int] | None = None) -> Source:
-        """Return the origin of all settings of a point, given the indices of its values, or of all points."""
+        """Return the origin of the settings of a point, given the indices of its values."""
         is_list = self.written.keys[-1:] == (POINTS,)
         replaced: dict[str, Source | str] = {}
         for path in self.values:
