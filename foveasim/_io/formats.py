@@ -108,9 +108,9 @@ def as_file_error(path: Path, what: str, *, passes: tuple[type[FoveasimError], .
     except passes:
         raise
     except (FormatError, FoveasimError) as error:
-        is_own = isinstance(error, FileError) and error.path == path
-        detail, position = (error.detail, error.position) if is_own else (str(error), None)
-        raise FileError(path, one_line(detail, MAX_MESSAGE_LENGTH), position=position) from None
+        if isinstance(error, FileError) and error.path == path:
+            raise FileError(path, one_line(error.detail, MAX_MESSAGE_LENGTH), position=error.position) from None
+        raise FileError(path, one_line(str(error), MAX_MESSAGE_LENGTH)) from None
     except MemoryError:
         raise FileError(path, "needs more memory than is available") from None
     except Exception as error:  # noqa: BLE001 -- readers raise arbitrary exceptions on malformed files

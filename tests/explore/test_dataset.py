@@ -883,7 +883,7 @@ def test_processes_start_only_for_long_tasks(tmp_path, monkeypatch):
     data = explore.Dataset(pictures(6), SHOT)
     for name, alone_s, found in (("short", 1e6, []), ("long", 0.0, [(5, 5)])):
         monkeypatch.setattr(store, "SINGLE_PROCESS_S", alone_s)
-        stored = explore.write_dataset(data, tmp_path / name, workers=None)
+        stored = explore.write_dataset(data, tmp_path / name, per_shard=1, workers=None)
         assert started == found
         assert_same(stored[5], data[5])
 
