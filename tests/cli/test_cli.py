@@ -279,6 +279,38 @@ def test_bundled_layouts_are_found_by_name(foveasim, tmp_path):
     assert fs.layout.read_layout(tmp_path / "prima.gds").n_sites == 378
 
 
+def test_convert_writes_layer_map(foveasim, tmp_path):
+    (tmp_path / "map.yaml").write_text("photosite: 77/3\nwell: {layer: 20/0, inset_um: 2.0}\n")
+    named = foveasim("convert", "prima_100", "a.gds", "--layers", "map.yaml", "--layer", "microlens=30/1", cwd=tmp_path)
+    again = foveasim("convert", "a.gds", "b.npz", "--source-layer", "20/0", "--source-cell", "SENSOR", cwd=tmp_path)
+    plain = foveasim("convert", "prima_100", "c.gds", "--layer", "77/3", cwd=tmp_path)
+
+    for result in (named, again, plain):
+        assert result.returncode == 0, result.stderr
+    outline, well = fs.read_layout(tmp_path / "c.gds", layer=(77, 3)), fs.read_layout(tmp_path / "b.npz")
+    assert outline.n_sites == well.n_sites == fs.read_layout(tmp_path / "a.gds", layer="30/1").n_sites == 378
+    assert (well.area_um2 < outline.area_um2).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--layer", "wel=2", "--layer", "photosite=1"), "got 'wel'; did you mean 'well'?"),
+        (("--layer", "2", "--layer", "well=1"), "'layer' must have a name in a layer map, got '2'; photosite=2"),
+        (("--layer", "one"), "'layer' must be a layer, such as (77, 3) or '77/3', got 'one'"),
+        (("--layers", "none.yaml"), "none.yaml: no such file"),
+        (("--source-layer", "3"), "'layer' is an option of GDSII and OASIS files only"),
+    ],
+)
+def test_convert_rejects_invalid_layers(foveasim, tmp_path, arguments, words):
+    result = foveasim("convert", "prima_100", "a.gds", *arguments, cwd=tmp_path)
+
+    assert result.returncode == 2
+    assert words in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
 def test_convert_reports_dropped_columns(foveasim, tmp_path):
     result = foveasim("convert", "prima_75", "prima.svg", cwd=tmp_path)
 

@@ -10,7 +10,7 @@ import pytest
 
 import foveasim as fs
 from foveasim.config import read_any_layout, read_shot
-from foveasim.errors import FileError, ParameterError
+from foveasim.errors import ConfigError, FileError, ParameterError
 from foveasim.layout import bundled_layouts
 
 SHOT = """
@@ -111,3 +111,85 @@ def test_unknown_names_are_rejected_with_the_closest(name, words, tmp_path, monk
 
     assert str(caught.value).startswith(words)
     assert (found.returncode, found.stderr.strip()) == (2, f"error: {caught.value}")
+
+
+# -- chip files -------------------------------------------------------------------------------------------------------
+
+CHIP_SHOT = """
+scene: {{kind: flat, shape: [40, 40], pitch_um: 100, distance_m: 1.0, radiance_w_m2_sr_nm: 0.1, band_width_nm: 10}}
+optics: {{focal_length_mm: 8, f_number: 2.8}}
+layout: {layout}
+sensor: {{filters: rgb}}
+exposure_s: 0.01
+"""
+
+
+@pytest.fixture
+def chip(tmp_path):
+    """A directory with a chip file without properties, as from another program; returns the layout."""
+    gdstk = pytest.importorskip("gdstk")
+    layout = fs.layout.mosaic(fs.layout.grid(n_x=6, n_y=4, pitch_um=2.0), ("RG", "GB"))
+    layers = {"photosite": (77, 3), "filter_R": (10, 0), "filter_G": (11, 0), "filter_B": (12, 0)}
+    layout.write(tmp_path / "chip.gds", layers=layers, hierarchy=False)
+    library = gdstk.read_gds(tmp_path / "chip.gds")
+    for polygon in library.cells[0].polygons:
+        polygon.properties = []
+    library.write_gds(tmp_path / "chip.gds")
+    (tmp_path / "map.yaml").write_text("photosite: 77/3\nfilter_R: 10\nfilter_G: 11\nfilter_B: 12/0\n")
+    return layout
+
+
+@pytest.mark.parametrize(
+    "section",
+    [
+        "{file: chip.gds, layer: 77/3, channels: {10/0: R, 11: 1, 12/0: B}}",
+        "{file: chip.gds, cell: SENSOR, layers: {photosite: 77/3, filter_R: 10, filter_G: 11/0, filter_2: {layer: 12}}}",
+        "{file: chip.gds, layers: map.yaml, inset_um: 0.1}",
+        "{file: chip.gds, layer: 77, channels: {10: C, 11: M, 12: Y}, filter_names: [C, M, Y]}",
+    ],
+)
+def test_settings_read_channels_of_chip(chip, tmp_path, section):
+    (tmp_path / "shot.yaml").write_text(CHIP_SHOT.format(layout=section))
+    read = read_shot(tmp_path / "shot.yaml").camera.sensor.layout
+    place = np.lexsort(read.centroid_um.round(3).T)
+
+    np.testing.assert_array_equal(read.channel[place], chip.channel)
+
+
+def test_layout_file_names_chip_with_rules(chip, tmp_path):
+    (tmp_path / "layout.yaml").write_text(
+        "file: chip.gds\nlayers: map.yaml\nrules: {min_size_um: 1.0}\nsource: a foundry\n"
+    )
+    found = read_any_layout(tmp_path / "layout.yaml")
+
+    assert found.layout.n_sites == chip.n_sites
+    assert (found.rules.min_size_um, found.source) == (1.0, "a foundry")
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        (
+            "{file: chip.gds, layer: 77/3}",
+            "sensor: the sensor has 3 filters, but the layout has no column 'channel'; add it",
+        ),
+        ("{file: chip.gds}", "layout: .*several layers, 10/0, 11/0, 12/0, 77/3; select one with layer="),
+        ("{file: chip.gds, layer: 78}", "layout: .*has no shape on layer 78"),
+        (
+            "{file: chip.gds, layer: 77, channels: {10: X}}",
+            "layout.channels: must have channels as numbers, or as names",
+        ),
+        ("{file: chip.gds, layers: {photosit: 77/3}}", "layout.layers: .*did you mean 'photosite'"),
+        ("{file: chip.gds, layers: other.yaml}", "layout: .*other.yaml: no such file"),
+        ("{file: chip.gds, layr: 77}", "layout.layr: no such setting"),
+        ("{file: chip.gds, generator: grid}", "layout.generator: no such setting"),
+        ("{file: shot.yaml}", "layout.file: must not be a YAML file, got 'shot.yaml'"),
+        ("{file: none.gds}", "layout: .*none.gds: no such file"),
+    ],
+)
+@pytest.mark.usefixtures("chip")
+def test_invalid_chip_settings_give_one_line(tmp_path, section, message):
+    (tmp_path / "shot.yaml").write_text(CHIP_SHOT.format(layout=section))
+    with pytest.raises(ConfigError, match=message) as caught:
+        read_shot(tmp_path / "shot.yaml")
+    assert "\n" not in str(caught.value)

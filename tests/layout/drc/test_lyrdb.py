@@ -121,3 +121,21 @@ def test_invalid_report_is_rejected(tmp_path, content, n_sites, message):
         path.write_text(strings.get(content, content))
     with pytest.raises(FileError, match=message):
         read_lyrdb(path, n_sites)
+
+
+NOTE = "6 pairs of sites touch and have no space; check inset outlines"
+
+
+def test_note_of_touching_sites_round_trips(tmp_path):
+    report = fs.layout.grid(n_x=2, n_y=2, pitch_um=2.0).check(fs.DesignRules(min_space_um=0.2, min_size_um=3.0))
+    report.write(tmp_path / "a.lyrdb")
+    database = rdb.ReportDatabase("a")
+    database.load(str(tmp_path / "a.lyrdb"))
+    (category,) = [c for c in database.each_category() if c.name() == "min_space_um"]
+    again = read_lyrdb(tmp_path / "a.lyrdb", 4)
+
+    assert category.description.endswith(f"(limit 0.2 µm); {NOTE}")
+    assert [(r.rule, r.note, r.limit, r.unit) for r in again.results] == [
+        ("min_size_um", "", 3.0, "µm"),
+        ("min_space_um", NOTE, 0.2, "µm"),
+    ]

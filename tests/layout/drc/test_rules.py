@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import pickle
 from dataclasses import replace
 from itertools import combinations
 
@@ -572,3 +573,20 @@ def test_worst_violations_are_the_first_ones():
     assert counted.worst_violations(100) == result.violations
     with pytest.raises(ParameterError, match="'n' must be >= 1, got 0"):
         counted.worst_violations(0)
+
+
+@pytest.mark.parametrize(
+    ("trench_um", "text"),
+    [
+        # Sites also touch at corners: 2 x 2 squares have 4 edges and 2 diagonals in contact, or 0.1 and 0.14 µm apart.
+        (0.0, "min_space_um: satisfied (6 pairs of sites touch and have no space; check inset outlines)"),
+        (0.3, "min_space_um: satisfied"),
+        (0.1, "min_space_um: 6 violations, worst 0.1 µm, limit 0.2 µm"),
+    ],
+)
+def test_minimum_space_notes_touching_sites(trench_um, text):
+    layout = Layout.from_rectangles([[0, 0], [2, 0], [0, 2], [2, 2]], 2.0 - trench_um)
+    (result,) = layout.check(DesignRules(min_space_um=0.2)).results
+
+    assert str(result) == text
+    assert str(pickle.loads(pickle.dumps(result))) == text

@@ -130,7 +130,7 @@ def gds_shape(*xy, properties=()):
 SQUARE = gds_shape(0, 0, 10000, 0, 10000, 10000, 0, 10000, 0, 0)
 
 
-def gds_reference(name, n_columns=None, n_rows=None, *, magnification=None, angle=None, step=20000, x=0):
+def gds_reference(name, n_columns=None, n_rows=None, *, magnification=None, angle=None, step=20000, x=0, properties=()):
     """Return a reference to a cell, or an array of references."""
     is_array = n_columns is not None
     element = record(0x0B if is_array else 0x0A, 0) + text_record(0x12, name)
@@ -143,7 +143,17 @@ def gds_reference(name, n_columns=None, n_rows=None, *, magnification=None, angl
         element += record(0x13, 2, struct.pack(">hh", n_columns, n_rows))
         limit = 2**31 - 1
         xy = (x, 0, min(step * abs(n_columns), limit), 0, 0, min(step * abs(n_rows), limit))
-    return element + record(0x10, 3, struct.pack(f">{len(xy)}i", *xy)) + record(0x11, 0)
+    element += record(0x10, 3, struct.pack(f">{len(xy)}i", *xy))
+    for attribute, text in properties:
+        element += record(0x2B, 2, struct.pack(">h", attribute)) + text_record(0x2C, text)
+    return element + record(0x11, 0)
+
+
+def numbered_array(text, columns=b"a=0+1i", n_columns=30, n_rows=20):
+    """Return a file with an array of numbered photosites."""
+    site = gds_shape(0, 0, 10000, 0, 10000, 10000, 0, 10000, 0, 0, properties=[(1, b"photosite 0")])
+    properties = [(1, text), (2, columns)]
+    return gds((b"C", site), (b"TOP", gds_reference(b"C", n_columns, n_rows, properties=properties)))
 
 
 def gds_path(width, end, n=2):
@@ -167,6 +177,28 @@ def columns(text):
 
 
 GDS_BOMBS = {
+    "numbered array of 32767 x 32767": lambda: numbered_array(
+        b"photosites 0+1i+32767j of 32767x32767", n_columns=32767, n_rows=32767
+    ),
+    "numbers beyond 64 bits": lambda: numbered_array(b"photosites 999999999+999999999i+999999999j of 30x20"),
+    "array of equal numbers": lambda: numbered_array(b"photosites 7 of 30x20"),
+    "array of negative numbers": lambda: numbered_array(b"photosites 0-1i of 30x20"),
+    "array of another size": lambda: numbered_array(b"photosites 0+1i+30j of 30x999999999"),
+    "array columns beyond 64 bits": lambda: numbered_array(
+        b"photosites 0+1i+30j of 30x20", b"a=0+9223372036854775807i+9j"
+    ),
+    "array columns of 800 digits": lambda: numbered_array(b"photosites 0+1i+30j of 30x20", b"a=0+" + b"9" * 800 + b"i"),
+    "array with a channel beyond 64 bits": lambda: numbered_array(
+        b"photosites 0+1i+30j of 30x20", b"channel=0+9223372036854775807i"
+    ),
+    "arrays of a site in two parts": lambda: gds(
+        (b"C", gds_shape(0, 0, 9, 0, 9, 9, 0, 0, properties=[(1, b"photosite 0 part 1 of 2")]) * 2),
+        (b"TOP", gds_reference(b"C", 3, 3, properties=[(1, b"photosites 0+1i+3j of 3x3")])),
+    ),
+    "20000 references with the same number": lambda: gds(
+        (b"C", gds_shape(0, 0, 10000, 0, 10000, 10000, 0, 10000, 0, 0, properties=[(1, b"photosite 0")])),
+        (b"TOP", gds_reference(b"C", properties=[(1, b"photosite 5"), (2, b"a=1")]) * 20_000),
+    ),
     "array of 32767 x 32767": lambda: gds((b"C", SQUARE), (b"TOP", gds_reference(b"C", 32767, 32767))),
     "10 levels of 10": lambda: nested(10, 10),
     "60 levels of 2": lambda: nested(60, 2),
@@ -312,6 +344,13 @@ def spike(i):
     return number(abs(x) << 2 | (x < 0) << 1 | 1) + number(abs(y) << 1 | (y < 0))
 
 
+def oasis_numbered(numbers, repetition):
+    """Return a cell with a numbered array of squares."""
+    words = [b"\x08" + number(n) for n in numbers]
+    placement = bytes([17, 0b10111000]) + string(b"D") + b"\x00\x00" + repetition
+    return placement + oasis_property(words, b"photosites") + b"\x0e" + string(b"D") + oasis_rectangle()
+
+
 def oasis_property(values, name=b"columns"):
     """Return a property with its name and values."""
     head = bytes([28, 0b00000100 | (min(len(values), 15) << 4)]) + string(name)
@@ -319,6 +358,11 @@ def oasis_property(values, name=b"columns"):
 
 
 OASIS_BOMBS = {
+    "numbered array beyond 64 bits": lambda: oasis(oasis_numbered([2**63 - 1, 2**63 - 1, 0, 2, 2], repeated(10, 10))),
+    "numbered array of a string": lambda: oasis(oasis_numbered([0, 1, 10], repeated(10, 10))),
+    "numbered array of a million times a million": lambda: oasis(
+        oasis_numbered([0, 1, 10**6, 10**6, 10**6], repeated(10**6, 10**6))
+    ),
     "a million times a million": lambda: oasis(oasis_rectangle(repeated(10**6, 10**6))),
     "2^32 x 2^32, beyond 64 bits": lambda: oasis(oasis_rectangle(repeated(2**32, 2**32))),
     "2^63 x 4, beyond 64 bits": lambda: oasis(oasis_rectangle(repeated(2**63 + 2, 4))),
@@ -673,6 +717,14 @@ def answers(tmp_path_factory):
 HARMLESS = {
     "gds": {
         "array of 0 x -1",
+        "numbers beyond 64 bits",
+        "array of equal numbers",
+        "array of negative numbers",
+        "array of another size",
+        "array columns beyond 64 bits",
+        "array columns of 800 digits",
+        "array with a channel beyond 64 bits",
+        "20000 references with the same number",
         "chain of 1000 cells with 20000 squares",
         "5000 cells in a chain",
         "rotated by a huge angle",
@@ -685,6 +737,8 @@ HARMLESS = {
         "columns with Python code",
     },
     "oas": {
+        "numbered array beyond 64 bits",
+        "numbered array of a string",
         "block of a hundred million empty records",
         "a million properties of a square",
         "columns of long words on 20000 squares",
