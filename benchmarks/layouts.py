@@ -6,16 +6,19 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import gdstk
 import klayout.db as kdb
 import numpy as np
 import shapely
 from report import Report, best_s
 
-from foveasim.layout import DesignRules, Layout, Readout, Routing, hexagonal, log_polar, read_layout
+from foveasim.layout import DesignRules, Layout, Readout, Routing, grid, hexagonal, log_polar, read_layout
 
 #: Sites for other libraries: the slowest takes 1 ms per site.
 PEER_SITES, SLOW_PEER_SITES = 100_000, 5_000
 DBU_UM = 1e-3
+#: Log-polar sites in files, for a million sites elsewhere, and sectors of each ring.
+RING_SITES, RING_SECTORS = 30_000, 240
 
 
 def bench_layouts(report: Report, n_sites: int) -> None:
@@ -27,6 +30,10 @@ def bench_layouts(report: Report, n_sites: int) -> None:
     few = hexagonal(n_columns=250, n_rows=PEER_SITES // 250, pitch_um=3.0, trench_um=0.3)
     _against_klayout(report, few)
     _against_loops(report, few[:SLOW_PEER_SITES], hexagons[:SLOW_PEER_SITES])
+    _against_gdstk(report, "squares", grid(n_x=side, n_y=side, pitch_um=2.2), (2.0, 0.5))
+    n_rings = round(n_sites * RING_SITES / 1e6 / RING_SECTORS)
+    rings = log_polar(n_sectors=RING_SECTORS, n_rings=n_rings, r_min_um=100.0, r_max_um=3000.0)
+    _against_gdstk(report, "log-polar sites", rings, (0.05, 0.05))
 
 
 def every_rule(layout: Layout, **changes: Any) -> DesignRules:
@@ -94,6 +101,37 @@ def _against_klayout(report: Report, layout: Layout) -> None:
     )
     report.faster_than(f"minimum width, {n}", times["width"], "klayout width_check", times["k width"], 1)
     report.faster_than(f"minimum space, {n}", times["space"], "klayout space_check", times["k space"], 1)
+
+
+def _against_gdstk(report: Report, what: str, layout: Layout, at_least: tuple[float, float]) -> None:
+    """Compare sizes and times of GDSII files with gdstk's own writer and reader, with a polygon per site without properties."""
+    with tempfile.TemporaryDirectory() as folder:
+        ours, peer = Path(folder) / "ours.gds", Path(folder) / "peer.gds"
+
+        def write_with_gdstk() -> None:
+            library = gdstk.Library(unit=1e-6, precision=DBU_UM * 1e-6)
+            rings = np.split(layout.xy_um, layout.ring_offsets[1:-1])
+            library.new_cell("SENSOR").add(*(gdstk.Polygon(ring, 1) for ring in rings))
+            library.write_gds(peer)
+
+        def read_with_gdstk() -> list[Any]:
+            return [polygon.points for polygon in gdstk.read_gds(peer).top_level()[0].polygons]
+
+        times = best_s(
+            {
+                "write": lambda: layout.write(ours),
+                "write peer": write_with_gdstk,
+                "read": lambda: read_layout(ours),
+                "read peer": read_with_gdstk,
+            },
+            2,
+        )
+        n_bytes, n_peer_bytes = ours.stat().st_size, peer.stat().st_size
+    n = f"{layout.n_sites:,} {what}"
+    report.faster_than(f"GDSII write, {n}", times["write"], "gdstk, polygons", times["write peer"], at_least[0])
+    report.faster_than(f"GDSII read and check, {n}", times["read"], "gdstk.read_gds", times["read peer"], at_least[1])
+    sizes = (f"{n_bytes / 1e3:,.4g} kB", "gdstk, polygons", f"{n_peer_bytes / 1e3:,.4g} kB")
+    report.add(f"GDSII file, {n}", *sizes, n_bytes / n_peer_bytes, None)
 
 
 def _against_loops(report: Report, apart: Layout, abutting: Layout) -> None:

@@ -253,11 +253,12 @@ def _steps(rows: Ints, start: Ints, size: Ints) -> Ints:
 def concatenate(*parts: Arrays) -> Arrays:
     """Return the arrays of all parts."""
     return Arrays(
-        *(
-            np.concatenate([getattr(p, name) for p in parts])
-            for name in ("first", "n_x", "n_y", "pitch", "number_steps")
-        ),
-        {name: np.concatenate([p.column_steps[name] for p in parts]) for name in parts[0].column_steps},
+        np.concatenate([part.first for part in parts]),
+        np.concatenate([part.n_x for part in parts]),
+        np.concatenate([part.n_y for part in parts]),
+        np.concatenate([part.pitch for part in parts]),
+        np.concatenate([part.number_steps for part in parts]),
+        {name: np.concatenate([part.column_steps[name] for part in parts]) for name in parts[0].column_steps},
     )
 
 

@@ -374,7 +374,8 @@ def _references(
         for polygon, number in zip(polygons, drawing.numbers(sites, np.zeros_like(sites)), strict=False):
             _set_number(polygon, number, is_oasis=is_oasis)
         cells[s] = gdstk.Cell(f"{SITE_CELL}_{k}").add(*polygons)
-    references, numbers = [], []
+    references: list[Any] = []
+    numbers: list[tuple[int, ...]] = []
     rows = zip(
         stack.tolist(),
         arrays.first.tolist(),
@@ -721,7 +722,7 @@ def _read_in_sandbox(
         max_bytes=min(MIN_READING_BYTES + READING_PER_BYTE * n_bytes, max_memory_bytes),
         is_standalone=True,
     )
-    return answer, _Shapes(xy_dbu, counts, tags, lines.tobytes()), _Shapes(*covers, b"")
+    return answer, _Shapes(xy_dbu, counts, tags, lines.tobytes()), _Shapes(covers[0], covers[1], covers[2], b"")
 
 
 def _group_by_site(path: Path, xy_um: Floats, counts: Ints, tags: Ints) -> tuple[Layout, Ints, Ints]:
