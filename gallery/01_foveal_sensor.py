@@ -56,7 +56,7 @@ def main(out_dir: Path) -> None:
     capture = camera.capture(scene, exposure_s=EXPOSURE_S, seed=1)
     capture.picture(max_pixels=800).save(out_dir / "01_foveal_picture.png", capture.white_dn, encode_srgb=True)
     axes = plot_capture(capture)
-    save_figure(axes.figure, out_dir / "01_foveal_layout.png", dpi=100)
+    save_figure(axes.figure, out_dir / "01_foveal_layout.png", dpi=140)
 
     # %% The same field on a square grid with as many photosites.
     x_min, y_min, x_max, y_max = layout.bounds_um

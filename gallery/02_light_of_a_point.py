@@ -52,7 +52,7 @@ def main(out_dir: Path) -> None:
     axes.set_ylabel("ensquared energy / %")
     axes.set_ylim(0, 100)
     axes.grid(visible=True, alpha=0.3)
-    save_figure(axes.figure, out_dir / "02_light_of_a_point.png", dpi=120)
+    save_figure(axes.figure, out_dir / "02_light_of_a_point.png", dpi=140)
 
     # %% Check.
     at_lambda_n = float(ensquared[CELLS // 2])

@@ -110,7 +110,7 @@ def main(out_dir: Path) -> None:
     print("relative time   " + "".join(f"{ratio:<10.1f}" for ratio in cost_s / cost_s[0]))
     print("relative memory " + "".join(f"{k * k:<10}" for k in OVERSAMPLE))
 
-    figure = Figure(figsize=(10.4, 4.0), layout="constrained")
+    figure = Figure(figsize=(8.0, 4.2), layout="constrained")
     axes, oversampled = figure.subplots(1, 2)
     for cells, row in zip(PIXELS_PER_LAMBDA_N, errors_oversampled, strict=True):
         oversampled.semilogy(OVERSAMPLE, row, "o-", label=f"{cells:g} pixels per λN")
@@ -125,7 +125,7 @@ def main(out_dir: Path) -> None:
     axes.set_xlabel("cells per wavelength × f-number")
     axes.set_ylabel("error of the energy fraction of a pixel")
     axes.legend()
-    save_figure(figure, out_dir / "03_edges_and_cells.png", dpi=120)
+    save_figure(figure, out_dir / "03_edges_and_cells.png", dpi=140)
 
     # %% Checks.
     slope = float(np.polyfit(np.log(CELLS), np.log(np.abs(errors)), 1)[0])

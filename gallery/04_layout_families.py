@@ -36,26 +36,26 @@ def main(out_dir: Path) -> None:
     """Write the overview of generators and the foveas to a directory."""
     # %% One layout per generator, with different colours for neighbours.
     layouts = families()
-    figure = Figure(figsize=(18, 11), layout="constrained")
+    figure = Figure(figsize=(8.0, 13.5), layout="constrained")
     colours = np.array([(0.55, 0.7, 0.86), (0.98, 0.85, 0.55), (0.75, 0.85, 0.65), (0.9, 0.65, 0.6)])
     for position, (name, layout) in enumerate(layouts.items(), start=1):
-        axes = figure.add_subplot(3, 5, position)
+        axes = figure.add_subplot(5, 3, position)
         plot_layout(layout, colours[fs.layout.graph_colouring(layout, 4).channel], ax=axes)
-        axes.set_title(f"{name}: {layout.n_sites} sites")
-    save_figure(figure, out_dir / "04_families.png", dpi=80)
+        axes.set_title(f"{name}: {layout.n_sites} sites", fontsize=10)
+    save_figure(figure, out_dir / "04_families.png", dpi=140)
 
     # %% Options for the blind spot.
     foveas = {
         filling: fs.layout.log_polar(**FOVEA, fovea=filling) for filling in ("none", "rings", "linear", "hexagons")
     }
-    figure = Figure(figsize=(16, 4.4), layout="constrained")
+    figure = Figure(figsize=(8.0, 7.8), layout="constrained")
     for position, (name, layout) in enumerate(foveas.items(), start=1):
-        axes = figure.add_subplot(1, 4, position)
+        axes = figure.add_subplot(2, 2, position)
         plot_layout(layout, ax=axes)
         axes.set_xlim(-45, 45)
         axes.set_ylim(-45, 45)
         axes.set_title(f"fovea={name!r}: {layout.n_sites} sites")
-    save_figure(figure, out_dir / "04_foveas.png", dpi=80)
+    save_figure(figure, out_dir / "04_foveas.png", dpi=140)
 
     # %% Checks.
     no_overlap = fs.DesignRules(max_overlap_um2=0.0)

@@ -77,17 +77,17 @@ def closed_form(layout: fs.Layout, angle: float) -> np.ndarray:
 def main(out_dir: Path) -> None:
     """Write the charts, the edge and the star to a directory."""
     # %% All charts.
-    figure = Figure(figsize=(15, 9.5), layout="constrained")
+    figure = Figure(figsize=(8.0, 6.4), layout="constrained")
     for position, (name, scene) in enumerate(grey_charts().items(), start=1):
         axes = figure.add_subplot(3, 4, position)
         axes.imshow(scene.basis[0], origin="lower", cmap="gray", vmin=0.0)
-        axes.set_title(name)
+        axes.set_title(name, fontsize=10)
     axes = figure.add_subplot(3, 4, 11)
     axes.imshow(colour_chart_rgb(), origin="lower")
-    axes.set_title("colour_chart")
+    axes.set_title("colour_chart", fontsize=10)
     for axes in figure.axes:
         axes.set_axis_off()
-    save_figure(figure, out_dir / "05_charts.png", dpi=90)
+    save_figure(figure, out_dir / "05_charts.png", dpi=140)
 
     # %% Slanted edge on hexagons: each site samples the edge profile at its own distance.
     scene_pitch_um = CELL_UM / OPTICS.magnification(DISTANCE_M)
@@ -100,28 +100,28 @@ def main(out_dir: Path) -> None:
     measured, expected = found.mtf, closed_form(layout, angle)
     distance_um = layout.centroid_um @ [np.cos(angle), np.sin(angle)]
 
-    figure = Figure(figsize=(14, 4.6), layout="constrained")
-    plot_capture(capture, ax=figure.add_subplot(1, 3, 1))
-    axes = figure.add_subplot(1, 3, 2)
+    figure = Figure(figsize=(8.0, 7.4), layout="constrained")
+    plot_capture(capture, ax=figure.add_subplot(2, 2, 1))
+    axes = figure.add_subplot(2, 2, 2)
     axes.plot(distance_um, capture.expected_e, ".", markersize=2)
     axes.set_xlim(-15, 15)
     axes.set_xlabel("distance of the site from the edge / µm")
     axes.set_ylabel("expected charge / e-")
-    axes = figure.add_subplot(1, 3, 3)
+    axes = figure.add_subplot(2, 1, 2)
     axes.plot(PER_MM, measured, "o", markersize=3, label="slanted edge")
     axes.plot(PER_MM, expected, label="closed form, lens × hexagon")
     axes.set_xlabel("line pairs per mm on the sensor")
     axes.set_ylabel("MTF")
     axes.set_ylim(0, 1)
     axes.legend()
-    save_figure(figure, out_dir / "05_edge_on_hexagons.png", dpi=100)
+    save_figure(figure, out_dir / "05_edge_on_hexagons.png", dpi=140)
 
     # %% Siemens star on rings: a log-polar sensor resolves the same number of spokes near its centre and at its edge.
     rings = fs.layout.log_polar(n_sectors=180, min_size_um=2.0, r_max_um=300.0, stagger=True)
     camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(rings, capacitance_f=1e-15 * rings.area_um2))
     star = charts.siemens_star(n_spokes=36, shape=(640, 640), pitch_um=2.0 * scene_pitch_um, **LIGHT)
     axes = plot_capture(camera.capture(star, exposure_s=0.1, seed=1))
-    save_figure(axes.figure, out_dir / "05_star_on_rings.png", dpi=90)
+    save_figure(axes.figure, out_dir / "05_star_on_rings.png", dpi=140)
 
     # %% Checks.
     at_100 = float(measured[np.searchsorted(PER_MM, 100.0)])

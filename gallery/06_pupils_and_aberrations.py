@@ -61,9 +61,10 @@ def main(out_dir: Path) -> None:
         height_mm=3.0, shape=(160, 160), pitch_um=32.0, radiance_w_m2_sr_nm=0.1, contrast=1.0, **LIGHT
     )
     per_mm = np.linspace(0.0, 460.0, 200)
-    figure = Figure(figsize=(20, 7), layout="constrained")
-    axes = figure.subplots(3, 10)
-    for column, (name, lens) in zip(axes.T, all_lenses.items(), strict=True):
+    figure = Figure(figsize=(8.0, 9.6), layout="constrained")
+    axes = figure.subplots(6, 5)
+    columns = np.hstack((axes[:3], axes[3:])).T  # five lenses above, five below
+    for column, (name, lens) in zip(columns, all_lenses.items(), strict=True):
         psf = lens.psf(WAVELENGTH_NM, distance_m=DISTANCE_M)
         left, bottom, right, top = psf.grid.bounds_um
         highest = psf.psf_per_um2.max()
@@ -74,7 +75,7 @@ def main(out_dir: Path) -> None:
             norm=LogNorm(1e-4 * highest, highest),
             cmap="magma",
         )
-        column[0].set_title(f"{name}\nStrehl {lens.strehl(WAVELENGTH_NM, distance_m=DISTANCE_M):.2f}")
+        column[0].set_title(f"{name}\nStrehl {lens.strehl(WAVELENGTH_NM, distance_m=DISTANCE_M):.2f}", fontsize=10)
         column[1].imshow(lens.power_map(letter).data[0], origin="lower", cmap="gray", vmin=0.0)
         column[1].set_axis_off()
         for angle_deg, label in ((0.0, "along x"), (90.0, "along y")):
@@ -82,18 +83,19 @@ def main(out_dir: Path) -> None:
                 per_mm, lens.mtf(per_mm, WAVELENGTH_NM, angle_deg=angle_deg, distance_m=DISTANCE_M), label=label
             )
         column[2].set_ylim(0.0, 1.0)
-        column[2].set_xlabel("line pairs per mm")
-    axes[2, 0].legend()
-    axes[0, 0].set_ylabel("y / µm")
-    axes[2, 0].set_ylabel("MTF")
-    save_figure(figure, out_dir / "06_pupils.png", dpi=80)
+        column[2].set_xlabel("per mm")
+    for row in (0, 3):
+        axes[row, 0].set_ylabel("y / µm")
+        axes[row + 2, 0].set_ylabel("MTF")
+    figure.legend(*axes[2, 0].get_legend_handles_labels(), ncols=2, frameon=False, loc="outside lower center")
+    save_figure(figure, out_dir / "06_pupils.png", dpi=140)
 
     # %% Field of points through a lens with coma and astigmatism that increase with field height.
     points = charts.point_grid(shape=(360, 480), pitch_um=60.0, spacing_mm=3.6, intensity_w_sr_nm=1e-6, **LIGHT)
     field = fs.Optics(
         **LENS, seidel=parts.Seidel(coma_um=1.2, astigmatism_um=0.6, field_radius_um=300.0), field_patches=7
     )
-    figure = Figure(figsize=(12, 4.8), layout="constrained")
+    figure = Figure(figsize=(8.0, 3.4), layout="constrained")
     for position, (name, lens) in enumerate(
         {"no aberrations": fs.Optics(**LENS), "coma, astigmatism": field}.items(), start=1
     ):
@@ -110,7 +112,7 @@ def main(out_dir: Path) -> None:
         axes.set_title(name)
         axes.set_xlabel("x / µm")
         axes.set_ylabel("y / µm")
-    save_figure(figure, out_dir / "06_field.png", dpi=110)
+    save_figure(figure, out_dir / "06_field.png", dpi=140)
 
     # %% Checks.
     waves = {"unit": "waves", "wavelength_nm": WAVELENGTH_NM}

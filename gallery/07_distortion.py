@@ -16,9 +16,11 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import skimage.data
 from matplotlib.figure import Figure
 
 import foveasim as fs
+from foveasim._io.encodings import encode_srgb_values
 from foveasim.config import read_shot
 from foveasim.scene import charts
 from foveasim.view import save_figure
@@ -75,6 +77,30 @@ def main(out_dir: Path) -> None:
     distorted = fs.Camera(optics=optics, sensor=coarse, distortion=lens)
     upright = distorted.capture(letter, exposure_s=shot.exposure_s, seed=1)
 
+    # %% A photograph through the ideal lens and through this one, as in Fig. 4 of the paper.
+    medium = fs.layout.grid(n_x=shape[1] // 2, n_y=shape[0] // 2, pitch_um=2.0 * size["pitch_um"])
+    half = fs.Sensor(medium, qe=fine.qe, capacitance_f=4.0 * fine.capacitance_f, v_sat_v=fine.v_sat_v, bits=fine.bits)
+    photograph = fs.Scene.from_picture(
+        skimage.data.coffee(),
+        pitch_um=template["shape"][1] * template["pitch_um"] / skimage.data.coffee().shape[1],
+        distance_m=template["distance_m"],
+        peak_radiance_w_m2_sr_nm=3.0,
+        wavelength_nm=(550.0,),
+        band_width_nm=100.0,
+    )
+    figure = Figure(figsize=(8.0, 2.9), layout="constrained")
+    for axes, (title, distortion) in zip(
+        figure.subplots(1, 2), {"ideal lens": None, "Mobius ActionCam": lens}.items(), strict=True
+    ):
+        shown = fs.Camera(optics=optics, sensor=half, distortion=distortion).capture(
+            photograph, exposure_s=shot.exposure_s, seed=1
+        )
+        codes = encode_srgb_values(shown.code.reshape(shape[0] // 2, -1) / 255.0)
+        axes.imshow(codes, origin="lower", extent=(left, right, bottom, top), cmap="gray", vmin=0.0, vmax=1.0)
+        axes.set_title(f"photograph, {title}", fontsize=10)
+        axes.set(xlabel="x / µm", ylabel="y / µm")
+    save_figure(figure, out_dir / "07_photograph.png", dpi=140)
+
     cells = optics.grid(points)
     lit = np.argwhere(points.basis[0] > 0.0)
     ideal_um = np.column_stack((cells.x_um[lit[:, 1]], cells.y_um[lit[:, 0]]))
@@ -96,31 +122,31 @@ def main(out_dir: Path) -> None:
         for mode in ("density", "flux")
     )
 
-    figure = Figure(figsize=(18, 7.4), layout="constrained")
+    figure = Figure(figsize=(8.0, 8.2), layout="constrained")
     pictures = {
         "ideal lens: code / DN": (undistorted.code, "gray"),
         "run of the paper: code / DN": (checkers.code, "gray"),
         "letter F: code / DN": (upright.code, "gray"),
-        "power of a warped picture / power through the lens": (by_density / by_flux, "viridis"),
+        "power of a warped picture /\npower through the lens": (by_density / by_flux, "viridis"),
     }
     for position, (name, (values, colours)) in enumerate(pictures.items(), start=1):
-        axes = figure.add_subplot(2, 3, position)
+        axes = figure.add_subplot(3, 2, position)
         n_rows = round((values.size * shape[0] / shape[1]) ** 0.5)
         image = axes.imshow(values.reshape(n_rows, -1), origin="lower", extent=(left, right, bottom, top), cmap=colours)
-        axes.set_title(name)
+        axes.set_title(name, fontsize=10)
         axes.set_xlabel("x / µm")
         axes.set_ylabel("y / µm")
         if colours == "viridis":
             figure.colorbar(image, ax=axes)
-    axes = figure.add_subplot(2, 3, 5)
+    axes = figure.add_subplot(3, 2, 5)
     axes.plot(*ideal_um[is_inside].T, "o", markerfacecolor="none", label="without distortion")
     axes.plot(*found_um.T, "x", label="centroids of the capture")
-    axes.set_title("point sources")
+    axes.set_title("point sources", fontsize=10)
     axes.set_aspect("equal")
     axes.set_xlabel("x / µm")
     axes.set_ylabel("y / µm")
-    axes.legend(loc="center")
-    save_figure(figure, out_dir / "07_distortion.png", dpi=80)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), frameon=False)
+    save_figure(figure, out_dir / "07_distortion.png", dpi=140)
 
     # %% Checks.
     error_px = np.hypot(*(found_um - expected_um[is_inside]).T).max() / lens.pixel_um

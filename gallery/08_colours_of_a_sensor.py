@@ -90,38 +90,39 @@ def main(out_dir: Path) -> None:
     axes.set_ylabel("quantum efficiency")
     axes.set_ylim(0.0, 1.0)
     axes.legend()
-    save_figure(figure, out_dir / "08_quantum_efficiency.png", dpi=100)
+    save_figure(figure, out_dir / "08_quantum_efficiency.png", dpi=140)
 
     # %% Fig. 6: filters, and their product with an infrared cut and the quantum efficiency of silicon.
     visible_nm = np.arange(FROM_NM, 751.0)
     qe, cut = polynomials[5], PassBand(to_nm=660.0, edge_nm=25.0)
     combined = fs.rgb_filters() * qe * cut
-    figure = Figure(figsize=(14, 4.2), layout="constrained")
-    first, second, third = figure.subplots(1, 3, sharey=True)
+    figure = Figure(figsize=(8.0, 6.6), layout="constrained")
+    (first, second), (third, rest) = figure.subplots(2, 2, sharey=True)
+    rest.set_axis_off()
     draw_filters(first, fs.rgb_filters(), visible_nm, "filters")
-    draw_filters(second, combined, visible_nm, "filters × quantum efficiency × infrared cut")
+    draw_filters(second, combined, visible_nm, "filters × QE × infrared cut")
     second.plot(visible_nm, qe(visible_nm), "k--", linewidth=1, label="quantum efficiency")
     second.plot(visible_nm, cut(visible_nm), "k:", linewidth=1, label="infrared cut")
     draw_filters(third, camera_filters(), visible_nm, "measured product (Nikon D5100)")
-    figure.legend(handles=second.get_lines(), loc="outside right upper")
-    save_figure(figure, out_dir / "08_filters.png", dpi=90)
+    rest.legend(handles=second.get_lines(), loc="center", frameon=False)
+    save_figure(figure, out_dir / "08_filters.png", dpi=140)
 
     # %% Fig. 7: one grey picture as the radiance at three wavelengths, recorded by one mosaic.
     peak = {"peak_radiance_w_m2_sr_nm": 0.2, **LIGHT}
     together = fs.Scene.from_picture(photographer(), wavelength_nm=RGB_NM, **peak)
-    figure = Figure(figsize=(15, 9.5), layout="constrained")
+    figure = Figure(figsize=(8.0, 5.8), layout="constrained")
     mosaics = sensors(qe * cut)
     for position, (name, sensor) in enumerate(mosaics.items(), start=1):
         capture = fs.Camera(optics=OPTICS, sensor=sensor).capture(together, exposure_s=EXPOSURE_S, seed=1)
         axes = plot_capture(capture, legend=False, ax=figure.add_subplot(2, 3, position))
         axes.set_xlim(60, 260)
         axes.set_ylim(200, 400)
-        axes.set_title(f"{name}: {sensor.layout.n_sites:,} sites")
+        axes.set_title(f"{name}: {sensor.layout.n_sites:,} sites", fontsize=10)
         axes = figure.add_subplot(2, 3, 3 + position)
         axes.imshow(capture.picture(max_pixels=600).to_image(encode_srgb=True))
         axes.set_axis_off()
-        axes.set_title("colours of the nearest sites")
-    save_figure(figure, out_dir / "08_mosaics.png", dpi=90)
+        axes.set_title("colours of the nearest sites", fontsize=10)
+    save_figure(figure, out_dir / "08_mosaics.png", dpi=140)
 
     # %% Checks: curves combine to one, bands are additive, and channels agree with the curves.
     print(", ".join(f"degree {degree}: {error:.3f}" for degree, error in worst.items()))

@@ -1,7 +1,8 @@
 """
 How does each noise source of the electronic chain appear in a picture?
 
-New here: ``PowerMap.from_array``, ``Sensor(read_noise_e=, line_fpn_fraction=, dnl_dn=)``, ``Camera.predict``.
+New here: ``PowerMap.from_array``, ``Sensor(read_noise_e=, line_fpn_fraction=, dnl_dn=)``, ``Camera.predict``; ``Sensor.chain``,
+drawn with the noise budget (Fig. 8 of the paper).
 
 Expect: temporal noise of 77, 92 and 214 e- rms in the brightest sites, simulated and predicted, for the read noises of
 the paper, 0, 50 and 200 e-, and at most 6000 photons; column FPN of 2 % of the range, the same in all frames; a 4-bit ADC whose
@@ -15,7 +16,9 @@ from pathlib import Path
 
 import numpy as np
 import skimage.data
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import FancyBboxPatch
 from skimage.transform import resize
 
 import foveasim as fs
@@ -29,6 +32,16 @@ N_SIDE = 256
 PITCH_UM = 2.0
 V_SAT_V = 3.0
 N_FRAMES = 24
+#: Stages of the chain, with the quantity that passes each.
+STAGES = {
+    "photo": "photocurrent",
+    "dark": "dark current",
+    "collection": "charge, drawn\nat collection",
+    "charge": "charge at readout",
+    "sense_node": "voltage",
+    "output": "output voltage",
+    "ADC": "code",
+}
 
 
 def photograph() -> fs.PowerMap:
@@ -52,22 +65,81 @@ def codes(tested: fs.Camera, scene: fs.PowerMap, frame: int = 0) -> np.ndarray:
     return tested.capture(scene, exposure_s=EXPOSURE_S, seed=1, frame=frame).code.reshape(N_SIDE, N_SIDE)
 
 
+def draw_chain(axes: Axes, sensor: fs.Sensor, photo_e_per_s: float) -> None:
+    """Draw the stages of a sensor from top to bottom, with the noise of every source at a photocurrent."""
+    rms_e = fs.sensor.noise_budget(sensor, np.full(sensor.layout.n_sites, photo_e_per_s), EXPOSURE_S)
+    sources = {effect.name: (effect.stage, effect.is_temporal) for effect in sensor.chain if effect.name != "shot"}
+    sources |= dict.fromkeys(("photon_shot", "dark_shot"), ("collection", True)) | {"quantisation": ("ADC", True)}
+    names = sorted(sources, key=lambda name: list(STAGES).index(sources[name][0]))
+    noise_e = [float(np.sqrt(np.mean(rms_e[name] ** 2))) for name in names]
+    colours = ["tab:blue" if sources[name][1] else "tab:orange" for name in names]
+    axes.barh(range(len(names)), noise_e, color=colours, height=0.6)
+    for row, value in enumerate(noise_e):
+        axes.text(1.1 * value, row, f"{value:.2g}", va="center")
+    axes.set(
+        xscale="log",
+        xlim=(0.1, 3.0 * max(noise_e)),
+        xlabel="noise / e- rms",
+        yticks=range(len(names)),
+        yticklabels=names,
+    )
+    axes.invert_yaxis()
+    axes.spines[["top", "right"]].set_visible(False)
+    # Stages on the left: boxes over the rows of their sources, and arrows from each to the next.
+    stage_of_row = [sources[name][0] for name in names]
+    place = axes.get_yaxis_transform()
+    for stage, text in STAGES.items():
+        rows = [row for row, of in enumerate(stage_of_row) if of == stage]
+        low, high = rows[0] - 0.38, rows[-1] + 0.38
+        box = FancyBboxPatch(
+            (-0.78, low), 0.46, high - low, boxstyle="round,pad=0.0,rounding_size=0.02", transform=place
+        )
+        box.set(facecolor="#e8eef8", edgecolor="#3b6ab0", clip_on=False, mutation_aspect=12.0)
+        axes.add_patch(box)
+        axes.text(-0.55, 0.5 * (low + high), text, transform=place, ha="center", va="center")
+        if rows[-1] + 1 < len(names):
+            arrow = {"arrowstyle": "-|>", "color": "0.3", "shrinkA": 0.0, "shrinkB": 0.0}
+            axes.annotate("", (-0.55, high + 0.24), (-0.55, high), xycoords=place, textcoords=place, arrowprops=arrow)
+    for colour, text in (("tab:blue", "drawn in every frame"), ("tab:orange", "fixed pattern of the device")):
+        axes.barh(0, np.nan, color=colour, label=text)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.1, 1.0), ncols=2, frameon=False)
+
+
 def main(out_dir: Path) -> None:
-    """Write pictures with each noise source to a directory."""
+    """Write the chain and pictures with each noise source to a directory."""
+    # %% The chain of a sensor with all sources, at half of the full well capacity.
+    complete = camera(
+        prnu_fraction=0.01,
+        dark_e_per_s=500.0,
+        dsnu_fraction=0.05,
+        hot_fraction=0.01,
+        hot_e_per_s=1e4,
+        ktc_noise=True,
+        read_noise_e=20.0,
+        rts_fraction=0.1,
+        rts_e=30.0,
+        gain_fpn_fraction=0.01,
+        pixel_fpn_fraction=0.005,
+        line_fpn_fraction=0.005,
+    ).sensor
+    figure = Figure(figsize=(8.0, 6.0))
+    draw_chain(figure.add_axes((0.45, 0.1, 0.52, 0.81)), complete, 0.5 * FULL_WELL_E / EXPOSURE_S)
+    save_figure(figure, out_dir / "09_chain.png", dpi=140)
+
     scene = photograph()
     # %% The three read noises of the paper.
     noises_e = (0.0, 50.0, 200.0)
     cameras = [camera(read_noise_e=noise_e) for noise_e in noises_e]
-    figure = Figure(figsize=(15, 5.7), layout="constrained")
+    figure = Figure(figsize=(8.0, 3.1), layout="constrained")
     for axes, tested, noise_e in zip(figure.subplots(1, 3), cameras, noises_e, strict=True):
         axes.imshow(codes(tested, scene), origin="lower", cmap="gray", vmin=0, vmax=1023 * MAX_PHOTONS / FULL_WELL_E)
         axes.set_title(f"read noise {noise_e:g} e-")
         axes.set_axis_off()
-    save_figure(figure, out_dir / "09_read_noise.png", dpi=70)
+    save_figure(figure, out_dir / "09_read_noise.png", dpi=140)
 
     # %% Fixed-pattern noise of columns and of pixels.
     with_column_fpn, with_pixel_fpn = camera(line_fpn_fraction=0.02), camera(pixel_fpn_fraction=0.02)
-    figure = Figure(figsize=(10, 5.7), layout="constrained")
+    figure = Figure(figsize=(8.0, 4.4), layout="constrained")
     for axes, (name, tested) in zip(
         figure.subplots(1, 2),
         {"column FPN, 2 %": with_column_fpn, "pixel FPN, 2 %": with_pixel_fpn}.items(),
@@ -76,15 +148,15 @@ def main(out_dir: Path) -> None:
         axes.imshow(codes(tested, scene), origin="lower", cmap="gray")
         axes.set_title(name)
         axes.set_axis_off()
-    save_figure(figure, out_dir / "09_fixed_patterns.png", dpi=70)
+    save_figure(figure, out_dir / "09_fixed_patterns.png", dpi=140)
 
     # %% A 4-bit ADC with a DNL of 0.5 DN rms, different for each column.
     ideal_adc, adc_with_dnl = camera(bits=4, shot_noise="off"), camera(bits=4, shot_noise="off", dnl_dn=0.5)
     pictures = [codes(tested, scene).astype(int) for tested in (ideal_adc, adc_with_dnl)]
     column = N_SIDE // 2
     expected_e = ideal_adc.photoelectrons_per_s(scene).reshape(N_SIDE, N_SIDE) * EXPOSURE_S
-    figure = Figure(figsize=(16, 5.7), layout="constrained")
-    axes = figure.subplots(1, 3, width_ratios=[1, 1, 1.3])
+    figure = Figure(figsize=(8.0, 7.2), layout="constrained")
+    axes = list(figure.subplot_mosaic("AB;CC", height_ratios=(1.0, 0.8)).values())
     for panel, picture, name in zip(axes, pictures, ("4 bits", "4 bits, DNL of 0.5 DN"), strict=False):
         panel.imshow(picture, origin="lower", cmap="gray", vmin=0, vmax=15)
         panel.axvline(column, color="tab:red", linewidth=0.8)
@@ -95,8 +167,9 @@ def main(out_dir: Path) -> None:
     axes[2].step(np.arange(N_SIDE), pictures[1][:, column], color="tab:blue", where="mid", label="with DNL")
     axes[2].set_xlabel("row")
     axes[2].set_ylabel("code / DN")
-    axes[2].legend()
-    save_figure(figure, out_dir / "09_converter.png", dpi=70)
+    axes[2].set_ylim(0, 18)
+    axes[2].legend(ncols=3, loc="upper center", frameon=False)
+    save_figure(figure, out_dir / "09_converter.png", dpi=140)
 
     # %% Checks.
     e_per_dn = FULL_WELL_E / 1024

@@ -103,8 +103,8 @@ def main(out_dir: Path) -> None:
     simulated, dark = photon_transfer(frames, classes=size_um), result.dark
 
     # %% Figure.
-    figure = Figure(figsize=(13, 5.4), layout="constrained")
-    curves, variances = figure.subplots(1, 2)
+    figure = Figure(figsize=(8.0, 8.6), layout="constrained")
+    curves, variances = figure.subplots(2, 1)
     for c, (size, colour) in enumerate(zip(PITCH_UM, ("tab:blue", "tab:orange"), strict=True)):
         for axes, transform in ((curves, np.sqrt), (variances, np.array)):
             axes.plot(
@@ -112,7 +112,7 @@ def main(out_dir: Path) -> None:
                 transform(simulated.temporal_variance_dn2[:, c]),
                 ".",
                 color=colour,
-                label=f"{size:.0f} µm, two frames per level",
+                label=f"{size:.0f} µm, two frames",
             )
             axes.plot(
                 predicted.mean_dn[:, c] - dark_predicted.mean_dn[0, c],
@@ -127,9 +127,9 @@ def main(out_dir: Path) -> None:
     variances.set(xlabel="mean minus dark mean (DN)", ylabel="temporal variance (DN²)", ylim=(0.0, None))
     curves.set_title("photon transfer: slopes 0 and 1/2, drop at full well")
     variances.set_title("slope of the variance: system gain")
-    curves.legend(fontsize=8)
-    variances.legend(fontsize=8)
-    save_figure(figure, out_dir / "10_photon_transfer.png", dpi=80)
+    curves.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    variances.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    save_figure(figure, out_dir / "10_photon_transfer.png", dpi=140)
 
     # %% Checks.
     gain_dn_per_e = 2**BITS * ELEMENTARY_CHARGE_C / (V_SAT_V * np.array(CAPACITANCE_F))

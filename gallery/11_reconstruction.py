@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import skimage.data
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Rectangle
 
 import foveasim as fs
 from foveasim._io.encodings import encode_srgb_values
@@ -28,6 +29,8 @@ RADIANCE_W_M2_SR_NM = 0.01
 FIELD_UM, N_PIXELS = 1024.0, 512
 #: The maximum irradiance gives two thirds of the highest code for all site sizes.
 CAPACITANCE_F_PER_UM2 = 6e-17
+#: Pixels without photosites: none of the grey levels of a picture.
+NO_DATA = {"facecolor": "0.93", "edgecolor": "0.6", "hatch": "////", "linewidth": 0.0, "label": "no photosites"}
 METHODS = ("cells", "linear", "natural", "least_squares")
 
 
@@ -70,24 +73,26 @@ def main(out_dir: Path) -> None:
 
     # %% Figure: complete pictures, and their centres.
     white = float(np.nanmax(reference.data))
-    figure = Figure(figsize=(20, 8.6), layout="constrained")
-    axes = figure.subplots(2, 5)
+    figure = Figure(figsize=(8.0, 11.0), layout="constrained")
+    axes = figure.subplots(4, 3)
     panels = {"reference": reference, **pictures}
     left, bottom, right, top = grid.bounds_um
-    for column, (name, picture) in enumerate(panels.items()):
+    for (name, picture), complete, centre in zip(panels.items(), axes[:2].flat, axes[2:].flat, strict=False):
         shown = encode_srgb_values(np.clip(picture.data[0] / white, 0.0, 1.0))
-        for panel in axes[:, column]:
-            panel.set_facecolor("tab:blue")  # no data
+        for panel in (complete, centre):
+            panel.add_patch(Rectangle((left, bottom), right - left, top - bottom, **NO_DATA))
             panel.imshow(
-                shown, origin="lower", cmap="gray", vmin=0.0, vmax=1.0, extent=(left, right, bottom, top), zorder=1
+                shown, origin="lower", cmap="gray", vmin=0.0, vmax=1.0, extent=(left, right, bottom, top), zorder=2
             )
             panel.set_xticks([])
             panel.set_yticks([])
-        axes[1, column].set(xlim=(-150.0, 150.0), ylim=(-150.0, 150.0))
-        axes[0, column].set_title(name if name not in quality_db else f"{name}: {quality_db[name]:.1f} dB")
-    axes[0, 0].set_ylabel("complete")
-    axes[1, 0].set_ylabel("central 300 µm")
-    save_figure(figure, out_dir / "11_reconstruction.png", dpi=70)
+        centre.set(xlim=(-150.0, 150.0), ylim=(-150.0, 150.0))
+        complete.set_title(name if name not in quality_db else f"{name}: {quality_db[name]:.1f} dB", fontsize=10)
+        centre.set_title(f"{name}, central 300 µm", fontsize=10)
+    for panel in axes[1::2, 2]:
+        panel.set_axis_off()
+        panel.legend(handles=[Patch(**NO_DATA)], loc="center", frameon=False)
+    save_figure(figure, out_dir / "11_reconstruction.png", dpi=140)
 
     # %% Files for other programs: a PNG file of 16 bits for display, and a TIFF file of the values.
     pictures["least_squares"].save(out_dir / "11_least_squares.png", white, encode_srgb=True, bits=16)

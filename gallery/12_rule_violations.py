@@ -57,18 +57,18 @@ def main(out_dir: Path) -> None:
     report = layout.check(RULES)
 
     # %% Sizes of the sites with readout lines, and the readout line of each site.
-    figure = Figure(figsize=(15, 5.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure = Figure(figsize=(8.0, 8.8), layout="constrained")
+    left, right = figure.subplots(2, 1)
     layout.plot("size_um", overlay="readout_lines", ax=left)
-    left.set_title("sizes of the sites, and readout lines")
+    left.set_title("sizes, and readout lines", fontsize=10)
     layout.plot("readout_line", ax=right)
-    right.set_title("readout line of each site")
-    save_figure(figure, out_dir / "12_layout.png", dpi=80)
+    right.set_title("readout line of each site", fontsize=10)
+    save_figure(figure, out_dir / "12_layout.png", dpi=140)
 
     # %% Violations.
     print(report)
-    axes = report.plot(layout, figure_inches=9.0)
-    save_figure(axes.figure, out_dir / "12_violations.png", dpi=100)
+    axes = report.plot(layout, figure_inches=8.0)
+    save_figure(axes.figure, out_dir / "12_violations.png", dpi=140)
 
     # %% Checks.
     assert {result.rule: len(result) for result in report.results} == EXPECTED

@@ -29,30 +29,30 @@ def main(out_dir: Path) -> None:
     mosaic = fs.layout.graph_colouring(layout, 3)
     rings_alone = fs.layout.log_polar(n_sectors=36, min_size_um=4.0, r_max_um=102.0)
     readout = fs.layout.readout_by(rings_alone, "sector")
-    figure = Figure(figsize=(14.0, 11.0), layout="constrained")
+    figure = Figure(figsize=(8.0, 7.0), layout="constrained")
     axes = figure.subplots(2, 2)
     layout.plot("size_um", ax=axes[0, 0])
-    axes[0, 0].set_title("by size")
+    axes[0, 0].set_title("by size", fontsize=10)
     mosaic.plot("channel", ax=axes[0, 1])
-    axes[0, 1].set_title("three filters, different for neighbours")
+    axes[0, 1].set_title("three filters, different for neighbours", fontsize=10)
     readout.plot("readout_line", overlay="readout_lines", legend=False, ax=axes[1, 0])
-    axes[1, 0].set_title("by readout line, one per sector")
+    axes[1, 0].set_title("by readout line, one per sector", fontsize=10)
     layout.plot(overlay="adjacency", ax=axes[1, 1])
-    axes[1, 1].set_title("adjacency of the photosites")
+    axes[1, 1].set_title("adjacency of the photosites", fontsize=10)
     for ax in axes.flat:
         ax.set(xlim=(-80.0, 80.0), ylim=(-80.0, 80.0))
-    save_figure(figure, out_dir / "13_ways_to_draw.png", dpi=80)
+    save_figure(figure, out_dir / "13_ways_to_draw.png", dpi=140)
 
     # %% A million hexagons with the values of a zone plate at their centroids, and an enlarged part.
     hexagons = fs.layout.hexagonal(n_columns=1000, n_rows=1000, pitch_um=1.0)
     radius_um = np.hypot(*hexagons.centroid_um.T)
     rings = np.cos(np.pi * radius_um**2 / 900.0)
-    figure = Figure(figsize=(14.0, 6.4), layout="constrained")
+    figure = Figure(figsize=(8.0, 4.0), layout="constrained")
     for ax, half_um in zip(figure.subplots(1, 2), (None, 22.0), strict=True):
         hexagons.plot(rings, label="cos(π r² / 900 µm²)", ax=ax, legend=half_um is not None)
         if half_um is not None:
             ax.set(xlim=(410.0 - half_um, 410.0 + half_um), ylim=(-half_um, half_um))
-    save_figure(figure, out_dir / "13_a_million.png", dpi=80)
+    save_figure(figure, out_dir / "13_a_million.png", dpi=92)
 
     # %% Photosite at each pixel, and areas counted in pixels.
     half_um = 300.0

@@ -50,6 +50,7 @@ def main(out_dir: Path) -> None:
         size_px=(1280, 800),
         ambient_occlusion=renderer == "pyvista",
         renderer=renderer,
+        labels=True,
     )
 
     # %% Complete stack, for an interactive web page or a 3D printer.

@@ -52,14 +52,14 @@ def main(out_dir: Path) -> None:
     zone_capture, fine_capture = capture(zones), capture(fine)
 
     # %% Both pictures, and the central zone.
-    figure = Figure(figsize=(13.0, 4.6), layout="constrained")
+    figure = Figure(figsize=(8.0, 3.2), layout="constrained")
     centre = fs.Grid((512, 512), 0.5, (-128.0, -128.0))
     for ax, (title, shot, grid) in zip(
         figure.subplots(1, 3),
         (
-            (f"{fine.n_sites:,} pixels of 4 µm", fine_capture, None),
-            (f"{zones.n_sites:,} pixels of 4, 8, 16 and 32 µm", zone_capture, None),
-            ("central zone: 4,096 pixels of 4 µm", zone_capture, centre),
+            (f"{fine.n_sites:,} pixels\nof 4 µm", fine_capture, None),
+            (f"{zones.n_sites:,} pixels\nof 4, 8, 16 and 32 µm", zone_capture, None),
+            ("central zone:\n4,096 pixels of 4 µm", zone_capture, centre),
         ),
         strict=True,
     ):
@@ -67,9 +67,9 @@ def main(out_dir: Path) -> None:
         image = picture.to_image(shot.white_dn, encode_srgb=True)
         x_min, y_min, x_max, y_max = picture.grid.bounds_um
         ax.imshow(image[..., 0], cmap="gray", vmin=0, vmax=255, extent=(x_min, x_max, y_min, y_max))
-        ax.set_title(title)
+        ax.set_title(title, fontsize=10)
         ax.set_xlabel("x / µm")
-    save_figure(figure, out_dir / "16_four_zones.png", dpi=110)
+    save_figure(figure, out_dir / "16_four_zones.png", dpi=140)
 
     # %% Additivity: the charge of every pixel is the sum over the small pixels in the same area.
     column, row = (np.floor(fine.centroid_um / SMALLEST_UM).astype(int) + n_side // 2).T

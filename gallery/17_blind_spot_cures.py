@@ -41,7 +41,7 @@ def main(out_dir: Path) -> None:
     )
     optics = fs.Optics(focal_length_mm=8.0, f_number=2.8)
 
-    figure = Figure(figsize=(13.0, 6.9), layout="constrained")
+    figure = Figure(figsize=(8.0, 4.9), layout="constrained")
     axes = figure.subplots(2, 4)
     uncovered_um2, sizes_um = {}, {}
     for k, (fovea, name) in enumerate(FOVEAS.items()):
@@ -62,7 +62,7 @@ def main(out_dir: Path) -> None:
         axes[0, k].imshow(
             np.dstack((image[..., :1],) * 3 + (image[..., 1:],)), extent=(x_min, x_max, y_min, y_max), origin="upper"
         )
-        axes[0, k].set_title(f"{name}: {layout.n_sites:,} photosites")
+        axes[0, k].set_title(f"{name}:\n{layout.n_sites:,} photosites", fontsize=10)
         inner = fs.layout.clip(layout, shapely.box(*INNER_BOUNDS_UM), cut="drop")
         inner.plot(ax=axes[1, k])
         axes[1, k].set(xlim=INNER_BOUNDS_UM[::2], ylim=INNER_BOUNDS_UM[1::2], ylabel="")
@@ -72,7 +72,7 @@ def main(out_dir: Path) -> None:
         is_within = np.hypot(x_um, y_um) < 125.0
         uncovered_um2[fovea] = float((1.0 - picture.coverage[is_within]).sum()) * CENTRE.cell_area_um2
         sizes_um[fovea] = float(np.sqrt(layout.area_um2.min()))
-    save_figure(figure, out_dir / "17_blind_spot_cures.png", dpi=110)
+    save_figure(figure, out_dir / "17_blind_spot_cures.png", dpi=140)
 
     # %% Checks.
     for fovea, area_um2 in uncovered_um2.items():

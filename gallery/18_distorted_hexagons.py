@@ -45,8 +45,8 @@ def main(out_dir: Path) -> None:
     distorted = fs.Camera(optics=optics, sensor=sensor, distortion=LENS).capture(scene, exposure_s=0.02, seed=0)
 
     # %% Captures of both lenses, and undistorted outlines of larger hexagons.
-    figure = Figure(figsize=(15.0, 3.4), layout="constrained")
-    axes = figure.subplots(1, 3)
+    figure = Figure(figsize=(8.0, 6.6), layout="constrained")
+    axes = list(figure.subplot_mosaic("AB;CC", height_ratios=(1.0, 1.5)).values())
     ideal.plot(ax=axes[0])
     axes[0].set_title("ideal lens")
     distorted.plot(ax=axes[1])
@@ -57,7 +57,7 @@ def main(out_dir: Path) -> None:
     )
     undistorted.plot(undistorted.area_um2 / large_hexagons.area_um2, label="undistorted area / area", ax=axes[2])
     axes[2].set_title("undistorted outlines of 100 µm hexagons")
-    save_figure(figure, out_dir / "18_distorted_hexagons.png", dpi=110)
+    save_figure(figure, out_dir / "18_distorted_hexagons.png", dpi=140)
 
     # %% Uniform irradiance: the power of a hexagon is proportional to its undistorted area.
     grid = fs.Grid((1000, 1500), 2.0, (-1500.0, -1000.0))

@@ -94,8 +94,8 @@ def main(out_dir: Path) -> None:
         "squares": fs.layout.grid(n_x=56, n_y=56, pitch_um=PITCH_UM),
         "hexagons": fs.layout.hexagonal(n_columns=56, n_rows=64, pitch_um=PITCH_UM),
     }
-    figure = Figure(figsize=(15, 4.8), layout="constrained")
-    axes = figure.subplots(1, 3)
+    figure = Figure(figsize=(8.0, 12.0), layout="constrained")
+    axes = figure.subplots(3, 1)
     worst = {}
     for (name, layout), colour in zip(sensors.items(), ("tab:blue", "tab:orange"), strict=True):
         per_mm, measured, expected, pixel = edge_and_closed_form(layout)
@@ -108,7 +108,7 @@ def main(out_dir: Path) -> None:
         print(f"{name}: largest error {100.0 * worst[name]:.2f} % up to the Nyquist frequency, {nyquist:.1f} per mm")
     axes[0].set(xlabel="line pairs per mm", ylabel="MTF", xlim=(0, 1e3 / PITCH_UM), ylim=(0, 1.02))
     axes[0].set_title(f"pitch {PITCH_UM:g} µm; vertical lines: Nyquist frequencies")
-    axes[0].legend(fontsize=8)
+    axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
 
     # %% Nyquist frequencies of the bundled layouts against eccentricity.
     layouts = {name: read_any_layout(path).layout for name, path in bundled_layouts().items()}
@@ -127,10 +127,10 @@ def main(out_dir: Path) -> None:
     for part, title in zip(
         axes[1:], ("foveal: median and range of sites and filters", "uniform: median of filters"), strict=True
     ):
-        part.set(xlabel="eccentricity (µm)", ylabel="Nyquist frequency (line pairs per mm)", xscale="log", yscale="log")
+        part.set(xlabel="eccentricity (µm)", ylabel="Nyquist frequency (per mm)", xscale="log", yscale="log")
         part.set_title(title)
-        part.legend(fontsize=8)
-    save_figure(figure, out_dir / "19_mtf_and_nyquist.png", dpi=90)
+        part.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    save_figure(figure, out_dir / "19_mtf_and_nyquist.png", dpi=140)
 
     # %% Aliasing of a sine above the Nyquist frequency.
     shown = layouts | {
@@ -138,9 +138,9 @@ def main(out_dir: Path) -> None:
         "sunflower": fs.layout.sunflower(n_sites=2500, spacing_um=PITCH_UM),
         "Voronoi, uniform density": fs.layout.voronoi(n_sites=2500, size_um=(200.0, 200.0), seed=1),
     }
-    figure = Figure(figsize=(16, 10.2), layout="constrained")
+    figure = Figure(figsize=(8.0, 13.6), layout="constrained")
     alias_ratio = {}
-    for axes, (name, layout) in zip(figure.subplots(3, 5).ravel(), shown.items(), strict=True):
+    for axes, (name, layout) in zip(figure.subplots(5, 3).ravel(), shown.items(), strict=True):
         points, alias = spectra(layout, is_foveal=is_foveal.get(name, False))
         alias_ratio[name] = alias.alias_fraction / alias.baseband_fraction
         reach = points.frequency_per_mm[-1] / points.nyquist_per_mm
@@ -159,9 +159,9 @@ def main(out_dir: Path) -> None:
         axes.set_title(f"{name}\nalias {100.0 * alias_ratio[name]:.0f} % of the sine", fontsize=10)
         axes.set(xticks=(-2, 0, 2), yticks=(-2, 0, 2))
     figure.suptitle(
-        "power spectra of sampling points, frequencies in units of Nyquist (circle): a sine (+) and its strongest alias (×)"
+        "power spectra of sampling points, frequencies in units of Nyquist (circle):\na sine (+) and its strongest alias (×)"
     )
-    save_figure(figure, out_dir / "19_sampling_spectra.png", dpi=70)
+    save_figure(figure, out_dir / "19_sampling_spectra.png", dpi=140)
 
     # %% Checks.
     for name in ("bayer_grid", "sunflower", "Voronoi, uniform density"):

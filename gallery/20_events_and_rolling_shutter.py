@@ -125,11 +125,11 @@ def main(out_dir: Path) -> None:
         abs(np.exp(1j * N_BLADES * (on_angle - 2.0 * np.pi * candidate * on_s)).sum()) for candidate in candidates
     ]
     turns_per_s = candidates[int(np.argmax(coherence))]
-    print(f"{len(events):,} events: {turns_per_s:.3f} turns per second; {len(spikes):,} spikes")
+    print(f"{len(events):,} events:\n{turns_per_s:.3f} turns per second; {len(spikes):,} spikes")
 
     # %% Figure.
-    figure = Figure(figsize=(15, 9.4), layout="constrained")
-    axes = figure.subplots(2, 3)
+    figure = Figure(figsize=(8.0, 10.6), layout="constrained")
+    axes = figure.subplots(3, 2).reshape(2, 3)
     max_dn = float(np.quantile(global_shutter.code, 0.999))
     plot_sites(axes[0, 0], grid, global_shutter.code, "gray", max_dn, "global shutter")
     plot_sites(
@@ -138,12 +138,12 @@ def main(out_dir: Path) -> None:
         rolling_shutter.code,
         "gray",
         max_dn,
-        f"rolling shutter, {1e3 * LINE_S:g} ms per line, bottom first",
+        f"rolling shutter, {1e3 * LINE_S:g} ms per line,\nbottom first",
     )
-    plot_sites(axes[0, 2], grid, skewed.code, "gray", max_dn, f"moving bar, skew {skew_um:.3f} µm per line")
+    plot_sites(axes[0, 2], grid, skewed.code, "gray", max_dn, f"moving bar,\nskew {skew_um:.3f} µm per line")
     last = events.between(FRAME_S * (N_FRAMES - 1) - 4e-3, FRAME_S * N_FRAMES)
     balance = (last.counts(polarity=1) - last.counts(polarity=-1)).astype(np.float64)
-    plot_sites(axes[1, 0], rings, balance, "RdBu", 4.0, "events of the last 4 ms: ON blue, OFF red")
+    plot_sites(axes[1, 0], rings, balance, "RdBu", 4.0, "events of the last 4 ms:\nON blue, OFF red")
     for polarity, colour in ((1, "tab:blue"), (-1, "tab:red")):
         is_shown = events.polarity == polarity
         axes[1, 1].plot(1e3 * events.t_s[is_shown], np.degrees(angle[events.site[is_shown]]), ",", color=colour)
@@ -151,8 +151,10 @@ def main(out_dir: Path) -> None:
     axes[1, 1].set_title(f"{len(events):,} events: {turns_per_s:.3f} turns per second")
     early = spikes.between(0.0, 4e-3)
     per_s = early.counts() / 4e-3
-    plot_sites(axes[1, 2], rings, per_s, "gray", float(np.quantile(per_s, 0.99)), "spikes per second in the first 4 ms")
-    save_figure(figure, out_dir / "20_events_and_rolling_shutter.png", dpi=80)
+    plot_sites(
+        axes[1, 2], rings, per_s, "gray", float(np.quantile(per_s, 0.99)), "spikes per second\nin the first 4 ms"
+    )
+    save_figure(figure, out_dir / "20_events_and_rolling_shutter.png", dpi=140)
 
     # %% Checks.
     assert np.isclose(skew_um, expected_um, rtol=0.01)

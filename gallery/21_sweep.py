@@ -37,7 +37,7 @@ def main(out_dir: Path) -> None:
     # %% Effect of each parameter.
     relative_snr = 1.0 / np.sqrt(1.0 + 4.0 * (f_number * (1.0 + MAGNIFICATION)) ** 2)
     expected = relative_snr * np.mean(snr / relative_snr, axis=1, keepdims=True)
-    figure = Figure(figsize=(11.0, 4.4), layout="constrained")
+    figure = Figure(figsize=(8.0, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     left.loglog(f_number, expected[0], color="black", linewidth=1, label=r"$\propto 1 / \sqrt{1 + 4 N^2}$")
     left.loglog(f_number, expected[1:].T, color="black", linewidth=1)
@@ -56,7 +56,7 @@ def main(out_dir: Path) -> None:
     for ax in (left, right):
         ax.grid(color="0.9")
         ax.legend(frameon=False)
-    save_figure(figure, out_dir / "21_sweep.png", dpi=110)
+    save_figure(figure, out_dir / "21_sweep.png", dpi=140)
 
     # %% Checks.
     assert not any(results["error"].to_numpy().ravel())

@@ -96,7 +96,7 @@ def main(out_dir: Path) -> None:
     ax.set(xscale="log", xlabel="photosites", ylabel="PSNR relative to the optical image / dB")
     ax.grid(color="0.9")
     ax.legend(frameon=False)
-    save_figure(figure, out_dir / "22_study.png", dpi=110)
+    save_figure(figure, out_dir / "22_study.png", dpi=140)
 
     # %% Checks.
     for trial in front:

@@ -83,8 +83,8 @@ def main(out_dir: Path) -> None:
         boxes=[[[*FACE_PX, FACE]]],
         fit="cover",
     )
-    figure = Figure(figsize=(14, 7.8), layout="constrained")
-    for k, axes in enumerate(figure.subplots(2, N_CAMERAS // 2).ravel()):
+    figure = Figure(figsize=(8.0, 10.0), layout="constrained")
+    for k, axes in enumerate(figure.subplots(N_CAMERAS // 2, 2).ravel()):
         sample, capture = data[k], data.capture(k)
         x0, y0, x1, y1 = capture.layout.bounds_um
         axes.imshow(picture_on_grey(capture), extent=(x0, x1, y0, y1))
@@ -95,14 +95,14 @@ def main(out_dir: Path) -> None:
             f"f/{drawn['optics.f_number']:.1f}, {1e3 * drawn['exposure_s']:.0f} ms, "
             f"{drawn['sensor.read_noise_e']:.1f} e- read noise, {drawn['sensor.bits']} bits\n"
             f"{capture.layout.n_sites:,} sites, {sample['box_covers'][0].sum():,} on the face",
-            fontsize=9,
+            fontsize=10,
         )
         axes.set_axis_off()
-    save_figure(figure, out_dir / "23_random_cameras.png", dpi=75)
+    save_figure(figure, out_dir / "23_random_cameras.png", dpi=140)
 
     # %% Denoising: noise realisations, and their mean, computed analytically.
     noisy = explore.denoising([photograph], SHOT, cameras=3, draws=N_DRAWS, fit="cover", changes=DIM)
-    figure = Figure(figsize=(11, 7.6), layout="constrained")
+    figure = Figure(figsize=(8.0, 6.2), layout="constrained")
     ratios = []
     for axes, first in zip(figure.subplots(2, 3).T, range(0, len(noisy), N_DRAWS), strict=True):
         samples = [noisy[k] for k in range(first, first + N_DRAWS)]
@@ -113,16 +113,16 @@ def main(out_dir: Path) -> None:
         drawn = samples[0]["settings"]
         print(f"{1e6 * drawn['exposure_s']:.0f} µs: mean squared error / predicted variance {ratios[-1]:.4f}")
         titles = (
-            f"code: {1e6 * drawn['exposure_s']:.0f} µs, {drawn['sensor.read_noise_e']:.1f} e- read noise",
-            f"expected code, rms error {np.sqrt(np.mean(np.square(errors_dn))):.1f} DN",
+            f"code: {1e6 * drawn['exposure_s']:.0f} µs,\n{drawn['sensor.read_noise_e']:.1f} e- read noise",
+            f"expected code,\nrms error {np.sqrt(np.mean(np.square(errors_dn))):.1f} DN",
         )
         mean_dn = samples[0]["expected_dn"]
         target = replace(capture, code=np.rint(mean_dn).astype(capture.code.dtype))
         for part, plotted, title in zip(axes, (capture, target), titles, strict=True):
             part.imshow(picture_on_grey(plotted, float(np.percentile(mean_dn, 99.0))))
-            part.set_title(title, fontsize=9)
+            part.set_title(title, fontsize=10)
             part.set_axis_off()
-    save_figure(figure, out_dir / "23_denoising.png", dpi=75)
+    save_figure(figure, out_dir / "23_denoising.png", dpi=140)
 
     # %% Write the dataset in shards, and read it back.
     with tempfile.TemporaryDirectory() as directory:

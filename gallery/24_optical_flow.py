@@ -289,7 +289,8 @@ def show_sensors(axes: Sequence[Axes], view: View, layouts: dict[str, fs.Layout]
     for axis, (title, picture) in zip(axes, shown.items(), strict=True):
         grey = encode_srgb_values(np.clip(picture / np.percentile(true, 99.5), 0.0, 1.0))
         axis.imshow(grey, cmap="gray", origin="lower", extent=(x_min, x_max, y_min, y_max), interpolation="nearest")
-        axis.set(title=title, xticks=[], yticks=[], xlim=(-260, 260), ylim=(-260, 260))
+        axis.set_title(title.replace(": ", ":\n"), fontsize=10)
+        axis.set(xticks=[], yticks=[], xlim=(-260, 260), ylim=(-260, 260))
         axis.set_facecolor("white")
         axis.add_patch(Circle((0, 0), TARGET_RADIUS_UM, fill=False, edgecolor="gold", linewidth=1.5))
     for ring, n_parts in enumerate(PARTS[1:], start=1):
@@ -299,7 +300,7 @@ def show_sensors(axes: Sequence[Axes], view: View, layouts: dict[str, fs.Layout]
             along = np.array([np.cos(angle), np.sin(angle)])
             axes[0].plot(*np.outer(along, (inner_um, outer_um)), color="w", linewidth=0.8)
     axes[0].plot([-240, -140], [-240, -240], color="k", linewidth=3)
-    axes[0].text(-190, -232, "100 µm", ha="center", va="bottom", color="k", fontsize=9)
+    axes[0].text(-190, -232, "100 µm", ha="center", va="bottom", color="k", fontsize=10)
 
 
 def show_task(axes: Axes, results: dict[str, list[MotionErrors]], task: Task) -> None:
@@ -307,7 +308,7 @@ def show_task(axes: Axes, results: dict[str, list[MotionErrors]], task: Task) ->
     lowest_um = 0.02
     fewest = {name: fewest_sites(family, task.allowed_um) for name, family in results.items()}
     axes.axhline(MOTION_UM, color="0.6", linewidth=0.8, linestyle=":")
-    axes.text(18_500, 1.04 * MOTION_UM, "zero-motion estimate", color="0.5", fontsize=9, va="bottom", ha="right")
+    axes.text(18_500, 1.04 * MOTION_UM, "zero-motion estimate", color="0.5", fontsize=10, va="bottom", ha="right")
     axes.axhline(task.allowed_um, color="k", linewidth=0.8)
     axes.text(18_500, 1.04 * task.allowed_um, f"ε = {task.allowed_um:g} µm", fontsize=10, va="bottom", ha="right")
     for name, family in results.items():
@@ -346,8 +347,8 @@ def main(out_dir: Path, *, is_large: bool = False) -> None:
     results = [family_errors(views, task, is_large=is_large) for task in TASKS]
 
     # %% Figure.
-    figure = Figure(figsize=(12.6, 9.6), layout="constrained")
-    axes = figure.subplot_mosaic("AABBCC;DDDEEE", height_ratios=(1.0, 1.15))
+    figure = Figure(figsize=(8.0, 12.4), layout="constrained")
+    axes = figure.subplot_mosaic("ABC;DDD;EEE", height_ratios=(1.0, 1.6, 1.6))
     small_foveal = foveal(16, MIN_SIZE_UM)
     show_sensors(
         [axes[k] for k in "ABC"], views[0], {"uniform grid": uniform(small_foveal.n_sites), "foveal": small_foveal}
@@ -355,8 +356,8 @@ def main(out_dir: Path, *, is_large: bool = False) -> None:
     for key, task, families in zip("DE", TASKS, results, strict=True):
         show_task(axes[key], families, task)
     lines, labels = axes["D"].get_legend_handles_labels()
-    figure.legend(lines, labels, frameon=False, ncols=6, fontsize=8.5, columnspacing=1.5, loc="outside lower center")
-    save_figure(figure, out_dir / "24_optical_flow.png", dpi=100)
+    figure.legend(lines, labels, frameon=False, ncols=2, columnspacing=1.5, loc="outside lower center")
+    save_figure(figure, out_dir / "24_optical_flow.png", dpi=140)
 
     # %% Checks.
     for task, families in zip(TASKS, results, strict=True):

@@ -82,19 +82,19 @@ def main(out_dir: Path) -> None:
     # %% Frames of uniform irradiance, and their prediction.
     frames = np.stack([camera.capture(power_map, exposure_s=EXPOSURE_S, seed=1, frame=k).code for k in range(N_FRAMES)])
     mean_dn, variance_dn2 = camera.predict(power_map, exposure_s=EXPOSURE_S)
-    figure = Figure(figsize=(13, 4.6), layout="constrained")
+    figure = Figure(figsize=(8.0, 3.1), layout="constrained")
     pictures = {"one frame": frames[0], "mean of the frames": frames.mean(axis=0), "predicted mean": mean_dn}
     for axes, (title, values) in zip(figure.subplots(1, 3), pictures.items(), strict=True):
         axes.imshow(values.reshape(N_SIDE, N_SIDE), origin="lower", cmap="gray", vmin=mean_dn.min(), vmax=mean_dn.max())
         axes.set_title(title)
         axes.set_axis_off()
-    save_figure(figure, out_dir / "25_own_effects.png", dpi=70)
+    save_figure(figure, out_dir / "25_own_effects.png", dpi=140)
 
     # %% Noise budget, with a bar for each effect.
     budget = fs.sensor.noise_budget(sensor, rate_e_per_s, EXPOSURE_S)
     figure = Figure(figsize=(7.0, 4.5), layout="constrained")
     plot_noise_budget(budget, ax=figure.add_subplot())
-    save_figure(figure, out_dir / "25_noise_budget.png", dpi=90)
+    save_figure(figure, out_dir / "25_noise_budget.png", dpi=140)
 
     # %% Checks.
     ratio = np.sqrt(frames.var(axis=0, ddof=1).mean() / variance_dn2.mean())

@@ -8,17 +8,31 @@ import sys
 from pathlib import Path
 
 import pytest
+from matplotlib.text import Text
 
 import foveasim
+import foveasim.view
 
 GALLERY = Path(foveasim.__file__).parents[1] / "gallery"
 SCRIPTS = sorted(GALLERY.glob("*.py"))
+#: Width at which the site shows a figure: 736 pixels of 1/96 inch; and the smallest text there.
+SHOWN_INCHES, MIN_TEXT_PT = 736 / 96, 9.0
 
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda p: p.stem)
 def test_script_runs_and_writes_its_pictures(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "out").mkdir()
+    small = []
+    save = foveasim.view.save_figure
+
+    def save_and_measure(figure, path, dpi=150.0):
+        scale = min(1.0, SHOWN_INCHES / figure.get_size_inches()[0])
+        texts = [text for text in figure.findobj(Text) if text.get_visible() and text.get_text().strip()]
+        small.extend(f"{path.name}: {text.get_text()!r}" for text in texts if scale * text.get_size() < MIN_TEXT_PT)
+        save(figure, path, dpi=dpi)
+
+    monkeypatch.setattr(foveasim.view, "save_figure", save_and_measure)
     spec = importlib.util.spec_from_file_location(f"gallery_{path.stem}", path)
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, spec.name, module)  # dataclasses look their modules up
@@ -26,6 +40,7 @@ def test_script_runs_and_writes_its_pictures(path, tmp_path, monkeypatch):
 
     module.main(tmp_path / "out")
 
+    assert small == []
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
     written = sorted((tmp_path / "out").iterdir())
     assert written

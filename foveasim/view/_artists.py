@@ -111,7 +111,7 @@ class ScaleBar(Artist):
         length_um = nice_length_um(MAX_BAR_FRACTION * (high_um - low_um))
         length = length_um / (high_um - low_um) * window.width
         x, y, pad = window.x0 + 9 * pt, window.y0 + 9 * pt, 4 * pt
-        text = Text(x + 0.5 * length, y + 5 * pt, format_length(length_um), fontsize=8, ha="center", va="bottom")
+        text = Text(x + 0.5 * length, y + 5 * pt, format_length(length_um), fontsize=10, ha="center", va="bottom")
         text.set_figure(self.axes.figure)
         width = max(length, text.get_window_extent(renderer).width)
         x += 0.5 * (width - length)
@@ -119,7 +119,7 @@ class ScaleBar(Artist):
         style: dict[str, Any] = {"transform": IdentityTransform(), "linewidth": 0.0}
         left = x - 0.5 * (width - length)
         parts = (
-            FancyBboxPatch((left, y), width, 15 * pt, boxstyle=f"round,pad={pad}", fc="white", alpha=0.8, **style),
+            FancyBboxPatch((left, y), width, 17 * pt, boxstyle=f"round,pad={pad}", fc="white", alpha=0.8, **style),
             Rectangle((x, y), length, 3 * pt, facecolor="black", **style),
             text,
         )

@@ -97,7 +97,7 @@ def plot_report(
     if violated:
         below = ax.transAxes + ScaledTranslation(0.0, -LEGEND_BELOW_PT / 72.0, ax.figure.dpi_scale_trans)
         ax.legend(
-            loc="upper left", bbox_to_anchor=(0.0, 0.0), bbox_transform=below, borderaxespad=0.0, fontsize="small",
+            loc="upper left", bbox_to_anchor=(0.0, 0.0), bbox_transform=below, borderaxespad=0.0, fontsize="medium",
             frameon=False, markerscale=CIRCLE_PT / (CIRCLE_PT + CIRCLE_STEP_PT * (len(violated) - 1)),
         )  # fmt: skip
     return ax
@@ -136,6 +136,6 @@ def _annotate(ax: Axes, text: str, position_um: NDArray[np.float64], k: int) -> 
     colour, offset_pt = RULE_COLOURS[k % len(RULE_COLOURS)], 0.4 * (CIRCLE_PT + k * CIRCLE_STEP_PT) + 2.0
     ax.annotate(
         text, (float(position_um[0]), float(position_um[1])), (offset_pt, offset_pt),
-        textcoords="offset points", color=colour, fontsize=8, path_effects=[withStroke(linewidth=2.5, foreground="white")],
+        textcoords="offset points", color=colour, fontsize=10, path_effects=[withStroke(linewidth=2.5, foreground="white")],
         zorder=6, annotation_clip=True,
     )  # fmt: skip
