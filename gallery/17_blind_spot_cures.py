@@ -41,7 +41,7 @@ def main(out_dir: Path) -> None:
     )
     optics = fs.Optics(focal_length_mm=8.0, f_number=2.8)
 
-    figure = Figure(figsize=(8.0, 4.9), layout="constrained")
+    figure = Figure(figsize=(8.0, 4.5), layout="constrained")
     axes = figure.subplots(2, 4)
     uncovered_um2, sizes_um = {}, {}
     for k, (fovea, name) in enumerate(FOVEAS.items()):

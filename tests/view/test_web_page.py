@@ -1710,3 +1710,47 @@ def test_listed_letter_keys_have_functions(visit, make):
     assert letters == {key.lower() for key in re.findall(r'event\.key === "([a-z])"', script)}
     is_shown = page.evaluate("[...document.querySelectorAll('.for-rules')].some((one) => !one.hidden)")
     assert not is_shown
+
+
+@pytest.mark.needs("chromium")
+def test_second_capture_shares_view_and_scale(visit):
+    second = replace(CAPTURE, electrons=CAPTURE.electrons * 2)
+    page = visit(web_page(CAPTURE, second=second), hash_text="#by=electrons&second=second-electrons", viewport={"width": 900, "height": 500})  # fmt: skip
+    assert page.evaluate("foveasim.second") == "second-electrons"
+    high = 2 * CAPTURE.electrons.max() - CAPTURE.electrons.min()
+    for site in (3, 40, 119):
+        for electrons, handle in ((CAPTURE.electrons, "colour"), (second.electrons, "secondColour")):
+            step = round(255 * (electrons[site] - CAPTURE.electrons.min()) / high)
+            expected = np.rint(255 * np.array(colormaps["viridis"](step))[:3]).tolist()
+            assert page.evaluate(f"site => foveasim.{handle}(site)", site) == expected
+
+    # The wheel over one map zooms both; the site under the mouse is marked in both.
+    box = page.locator("#second-marks").bounding_box()
+    page.mouse.move(box["x"] + 60, box["y"] + 80)
+    page.mouse.wheel(0, -300)
+    page.evaluate("() => new Promise(requestAnimationFrame)")
+    view, other = page.evaluate("[foveasim.view, foveasim.secondView]")
+    assert [other[name] for name in ("x", "y", "scale")] == [view[name] for name in ("x", "y", "scale")]
+    view = other
+    x_um, y_um = (
+        view["x"] + (60 - view["width"] / 2) / view["scale"],
+        view["y"] - (80 - view["height"] / 2) / view["scale"],
+    )
+    page.mouse.move(box["x"] + 60, box["y"] + 80)
+    assert page.evaluate("foveasim.hovered") == site_at(MOSAIC, x_um, y_um) >= 0
+    assert row(page, "second electrons") == f"{second.electrons[site_at(MOSAIC, x_um, y_um)]:,} e⁻"
+    page.select_option("#second-column", "")
+    until(page, "foveasim.second === null")
+    assert page.locator("#second").is_hidden()
+
+
+@pytest.mark.parametrize(
+    ("second", "message"),
+    [
+        (3, "'second' must be a Capture, got a int"),
+        (capture_of(fs.layout.grid(n_x=2, n_y=2, pitch_um=1.0), ("all",)), "'second' must be a capture of this layout of 120 sites, got one of 4 sites"),
+    ],
+)  # fmt: skip
+def test_invalid_second_capture_raises(second, message):
+    with pytest.raises(ParameterError, match=message):
+        web_page(CAPTURE, second=second)

@@ -11,6 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from foveasim._core.rings import same_rings
 from foveasim._core.validation import UNIT_SUFFIXES, Floats
 from foveasim.capture import Capture
 from foveasim.errors import GeometryError, ParameterError, SimulationError
@@ -29,6 +30,8 @@ from foveasim.view.web._shapes import shapes_of
 
 __all__ = ["Content", "content_of", "describe_sites"]
 
+#: Columns of a second capture.
+SECOND = ("picture", "code", "electrons", "expected_e", "snr")
 #: Longer side of the picture.
 PICTURE_PIXELS = 800
 #: Largest number of listed violations per rule, the worst first.
@@ -59,7 +62,9 @@ class Content:
     picture_png: bytes
 
 
-def content_of(data: Layout | Capture, report: Report | None = None, *, name: str = "") -> Content:
+def content_of(
+    data: Layout | Capture, report: Report | None = None, *, second: Capture | None = None, name: str = ""
+) -> Content:
     """
     Return the data of a page.
 
@@ -68,13 +73,15 @@ def content_of(data: Layout | Capture, report: Report | None = None, *, name: st
     data : Layout or Capture
     report : Report, optional
         Check of the same layout.
+    second : Capture, optional
+        Capture of the same layout, for comparison.
     name : str
         Heading; by default the generator of the layout.
 
     Raises
     ------
     ParameterError
-        When the data is neither, or the report is of another number of sites.
+        When the data is neither, or the report or the second capture is of another layout.
     GeometryError
         When the layout has no sites.
     """
@@ -85,6 +92,8 @@ def content_of(data: Layout | Capture, report: Report | None = None, *, name: st
         raise ParameterError(
             "report", f"must be a check of this layout of {layout.n_sites:,} sites, got one of {report.n_sites:,}"
         )
+    if second is not None:
+        about["columns"] += _second_columns(layout, second, arrays)
     arrays |= _outlines(layout)
     picture, position = _picture(layout, data if isinstance(data, Capture) else None)
     rules = [] if report is None else _rules(report, arrays)
@@ -204,6 +213,29 @@ def _columns(layout: Layout, capture: Capture | None, arrays: dict[str, NDArray[
             values = layout.columns[key]
             add(key, label, unit, values.astype(str) if _is_categorical(values) and not unit else values)
     return columns
+
+
+def _second_columns(layout: Layout, second: Capture, arrays: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:
+    """Return the measured columns of a second capture, and add their arrays."""
+    if not isinstance(second, Capture):
+        raise ParameterError("second", f"must be a Capture, got a {type(second).__name__}")
+    if not same_rings(layout, second.layout):
+        raise ParameterError(
+            "second",
+            f"must be a capture of this layout of {layout.n_sites:,} sites, got one of {second.layout.n_sites:,} sites",
+        )
+    own: dict[str, NDArray[Any]] = {}
+    measured = [column for column in _columns(layout, second, own) if column["key"] in SECOND]
+    arrays |= {f"second-{column['array']}": own[column["array"]] for column in measured}
+    return [
+        {
+            **column,
+            "key": f"second-{column['key']}",
+            "label": f"second {column['label']}",
+            "array": f"second-{column['array']}",
+        }
+        for column in measured
+    ]
 
 
 def _signal_to_noise(capture: Capture) -> Floats | None:

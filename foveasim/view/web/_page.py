@@ -35,7 +35,9 @@ IMPORT = re.compile(r'^import \{[\w$, ]+\} from "\./(\w+\.js)";\n', re.MULTILINE
 EXPORT = re.compile(r"^export (?=(?:async )?function |class |const )", re.MULTILINE)
 
 
-def web_page(data: Layout | Capture, *, report: Report | None = None, name: str = "") -> str:
+def web_page(
+    data: Layout | Capture, *, report: Report | None = None, second: Capture | None = None, name: str = ""
+) -> str:
     """
     Return a page to explore a layout or a capture in a browser.
 
@@ -46,6 +48,8 @@ def web_page(data: Layout | Capture, *, report: Report | None = None, name: str 
     data : Layout or Capture
     report : Report, optional
         Check of this layout, whose violations are listed and marked.
+    second : Capture, optional
+        Capture of the same layout, shown in a second map with the same view and the same scales.
     name : str
         Heading; by default the generator of the layout.
 
@@ -57,7 +61,7 @@ def web_page(data: Layout | Capture, *, report: Report | None = None, name: str 
     Raises
     ------
     ParameterError
-        When the data is neither, or the report is of another layout.
+        When the data is neither, or the report or the second capture is of another layout.
     GeometryError
         When the layout has no sites.
 
@@ -68,7 +72,7 @@ def web_page(data: Layout | Capture, *, report: Report | None = None, name: str 
     >>> "<title>a small grid</title>" in page
     True
     """
-    return page_of(content_of(data, report, name=name))
+    return page_of(content_of(data, report, second=second, name=name))
 
 
 def page_of(content: Content) -> str:
@@ -87,7 +91,14 @@ def page_of(content: Content) -> str:
     )
 
 
-def write_web_page(data: Layout | Capture, path: str | Path, *, report: Report | None = None, name: str = "") -> None:
+def write_web_page(
+    data: Layout | Capture,
+    path: str | Path,
+    *,
+    report: Report | None = None,
+    second: Capture | None = None,
+    name: str = "",
+) -> None:
     """
     Write :func:`web_page` to a file atomically.
 
@@ -97,6 +108,7 @@ def write_web_page(data: Layout | Capture, path: str | Path, *, report: Report |
     path : path
         With the extension ``.html``.
     report : Report, optional
+    second : Capture, optional
     name : str
         Heading; by default the generator of the layout.
 
@@ -107,7 +119,7 @@ def write_web_page(data: Layout | Capture, path: str | Path, *, report: Report |
     ParameterError, GeometryError
         As for :func:`web_page`.
     """
-    write_page(path, lambda: web_page(data, report=report, name=name))
+    write_page(path, lambda: web_page(data, report=report, second=second, name=name))
 
 
 def write_page(path: str | Path, page: Callable[[], str]) -> None:

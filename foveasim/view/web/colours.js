@@ -21,14 +21,17 @@ function lit(fraction, colour, palette) {
 //   grey   numbers as grey levels
 //   lit    numbers as brightness of the colour of each site's filter
 //   kinds  integers of categories
+// alsoValues are other values that the scale includes.
 export class Scale {
-  constructor(column, values, filterOf, palette, wantsLog, wantedMap) {
+  constructor(column, values, filterOf, palette, { wantsLog, wantedMap, alsoValues } = {}) {
     Object.assign(this, { column, values, filterOf, palette });
     let low = Infinity, high = -Infinity;
-    for (let i = 0; i < values.length; i++) {
-      const v = values[i];
-      if (v < low && v > -Infinity) low = v;
-      if (v > high && v < Infinity) high = v;
+    for (const part of [values, alsoValues || []]) {
+      for (let i = 0; i < part.length; i++) {
+        const v = part[i];
+        if (v < low && v > -Infinity) low = v;
+        if (v > high && v < Infinity) high = v;
+      }
     }
     if (low === Infinity) { low = 0; high = 0; }
     this.lowest = low;

@@ -23,7 +23,7 @@ const STEPS = 72;
 const state = {
   sites: null, map: null, columns: [], scale: null, column: null, range: null, wantsLog: undefined,
   hovered: -1, others: [], pinned: -1, cursor: null, chosen: null, shownViolations: 0, drawn: 0, drawMs: 0, loaded: false, isSlow: false,
-  wantedMap: null, tool: null, start: null, ruler: null, selection: null, selected: [],
+  wantedMap: null, second: null, secondMap: null, tool: null, start: null, ruler: null, selection: null, selected: [],
 };
 const loading = new Map();
 const asks = { map: false, marks: false };
@@ -46,24 +46,77 @@ async function valuesOf(column) {
 
 async function colourBy(key, range = null) {
   const column = about.columns.find((c) => c.key === key) || about.columns[0];
-  const values = await valuesOf(column);
-  state.filterOf = about.filter && column.kind === "lit" ? await array(about.filter) : null;
+  await valuesOf(column);
   if (state.column !== column) state.wantsLog = undefined;
   state.column = column;
   state.range = range;
-  state.scale = new Scale(column, values, state.filterOf, about.palette, state.wantsLog, state.wantedMap);
+  state.scale = await scaleOf(column, state.second);
   $("colouring").value = column.key;
   repaint();
   drawLegend();
   fillRange();
+  if (state.second) await showSecond(state.second.column.key);
   rememberView();
   report("by", column.key);
 }
 
+// The scale of a column; with the values of the other map if that shows the same quantity, so that colours are comparable.
+async function scaleOf(column, other) {
+  const filterOf = about.filter && column.kind === "lit" ? await array(about.filter) : null, quantity = (one) => one.key.replace(/^second-/, "");
+  const alsoValues = other && quantity(other.column) === quantity(column) ? await valuesOf(other.column) : null;
+  return new Scale(column, await valuesOf(column), filterOf, about.palette, { wantsLog: state.wantsLog, wantedMap: state.wantedMap, alsoValues });
+}
+
 function repaint() {
-  state.scale.paint(state.map.colours, state.range, groundColour());
-  state.map.sendColours();
+  for (const { map, scale } of [state, ...(state.second ? [state.second] : [])]) {
+    scale.paint(map.colours, map === state.map ? state.range : null, groundColour());
+    map.sendColours();
+  }
   ask("map");
+}
+
+// -- the second map ---------------------------------------------------------------------------------------------------------
+
+// Shows another column in a map next to the first one, with the same view; an empty key hides it.
+async function showSecond(key) {
+  const column = about.columns.find((one) => one.key === key), main = document.querySelector("main"), wasShown = Boolean(state.second);
+  $("second-column").value = column ? key : "";
+  $("second").hidden = !column;
+  main.classList.toggle("two-maps", Boolean(column));
+  if (!column) {
+    state.second = null;
+    if (wasShown && state.column) state.scale = await scaleOf(state.column, null);
+  } else {
+    state.secondMap = state.secondMap || createSecond();
+    const { map, overview } = state.secondMap;
+    state.second = { column, map, overview, scale: await scaleOf(column, state.column && state) };
+    $("second-title").textContent = titleOf(column);
+    if (state.column) state.scale = await scaleOf(state.column, state.second);
+  }
+  if (Boolean(column) !== wasShown) resize();
+  repaint();
+  drawLegend();
+  rememberView();
+}
+
+function createSecond() {
+  const map = new SensorMap($("second-cells"), state.sites, state.renderer), overview = new Overview($("second-overview"), state.sites), first = state.map;
+  listenToPointers($("second-marks"), {
+    drag: (dx, dy) => { first.set(first.x - dx / first.scale, first.y + dy / first.scale, first.scale); moved(); },
+    pinch: (factor, px, py) => { first.zoom(factor, px, py); moved(); },
+    wheel: (factor, px, py) => { first.zoom(factor, px, py); moved(); },
+    click: () => pin(state.hovered),
+    move: (px, py) => hover(map.fromX(px), map.fromY(py), "second"),
+    leave,
+  });
+  return { map, overview };
+}
+
+function drawSecond() {
+  const { map, overview, scale } = state.second, first = state.map;
+  map.set(first.x, first.y, first.scale);
+  map.draw(groundColour());
+  overview.update(map, scale, null);
 }
 
 function groundColour() {
@@ -195,6 +248,7 @@ function drawMap() {
   const start = performance.now();
   state.map.draw(groundColour());
   state.overview.update(state.map, state.scale, state.range);
+  if (state.second) drawSecond();
   drawLines();
   drawScaleBar();
   state.drawn++;
@@ -259,9 +313,9 @@ function outline(context, trace, widths, inks) {
   });
 }
 
-function drawMarks() {
-  const { map, sites, violations, cursor } = state, { context, width, height } = state.marks;
-  context.clearRect(0, 0, width, height);
+// Outlines the pinned and the hovered site on a map.
+function drawSites(context, map) {
+  const { sites } = state;
   const ring = (site, inks) => {
     const [a, b, c, d] = sites.box.subarray(4 * site, 4 * site + 4);
     outline(context, () => sites.trace(context, site, map), [5, 2.5], inks);
@@ -270,18 +324,32 @@ function drawMarks() {
       outline(context, () => context.arc(map.toX(0.5 * (a + c)), map.toY(0.5 * (b + d)), 9, 0, 7), [4, 2], inks);
     }
   };
+  if (state.pinned >= 0) ring(state.pinned, ["#ffffff", "#1f5fbf"]);
+  if (state.hovered >= 0 && state.hovered !== state.pinned) ring(state.hovered, ["#ffffff", "#10151f"]);
+}
+
+function drawCursor(context, map) {
+  const x = map.toX(state.cursor.x), y = map.toY(state.cursor.y);
+  const cross = () => { for (const [u, v] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) { context.moveTo(x + 4 * u, y + 4 * v); context.lineTo(x + 13 * u, y + 13 * v); } };
+  outline(context, cross, [4, 2], ["#ffffff", "#10151f"]);
+}
+
+function drawMarks() {
+  const { map, violations, cursor } = state, { context, width, height } = state.marks;
+  context.clearRect(0, 0, width, height);
   if (state.chosen !== null) {
     outline(context, () => violations.trace(context, state.chosen, map), [8, 4], ["#ffffff", "#d3261b"]);
     const [a, b, c, d] = violations.boxes.subarray(4 * state.chosen, 4 * state.chosen + 4);
     const radius = Math.max(16, 0.75 * map.scale * Math.hypot(c - a, d - b));
     outline(context, () => context.arc(map.toX(0.5 * (a + c)), map.toY(0.5 * (b + d)), radius, 0, 7), [4, 2], ["#ffffff", "#d3261b"]);
   }
-  if (state.pinned >= 0) ring(state.pinned, ["#ffffff", "#1f5fbf"]);
-  if (state.hovered >= 0 && state.hovered !== state.pinned) ring(state.hovered, ["#ffffff", "#10151f"]);
-  if (cursor && cursor.from !== "mouse") {
-    const x = map.toX(cursor.x), y = map.toY(cursor.y);
-    const cross = () => { for (const [u, v] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) { context.moveTo(x + 4 * u, y + 4 * v); context.lineTo(x + 13 * u, y + 13 * v); } };
-    outline(context, cross, [4, 2], ["#ffffff", "#10151f"]);
+  drawSites(context, map);
+  if (cursor && cursor.from !== "mouse") drawCursor(context, map);
+  if (state.second) {
+    const second = fitted($("second-marks"));
+    second.context.clearRect(0, 0, second.width, second.height);
+    drawSites(second.context, state.second.map);
+    if (cursor && cursor.from !== "second") drawCursor(second.context, state.second.map);
   }
   drawTools(context);
   drawPictureMarks();
@@ -467,6 +535,7 @@ function resize() {
   state.marks = fitted($("marks"));
   if (isWhole) map.set(map.middle[0], map.middle[1], map.fitScale());
   else map.set(map.x, map.y, map.scale);
+  if (state.second) state.second.map.resize($("second").clientWidth, $("second").clientHeight);
   if (state.scale) drawLegend();
   ask("map");
 }
@@ -762,6 +831,7 @@ function viewHash() {
   words.set("by", column.key);
   if (range) words.set("range", range.map((v) => Number(v.toPrecision(7))).join(" "));
   if (state.wantedMap) words.set("map", state.wantedMap);
+  if (state.second) words.set("second", state.second.column.key);
   if (state.selection) words.set("select", state.selection.flat().map((v) => Number(v.toPrecision(9))).join(" "));
   if (pinned >= 0) words.set("site", pinned);
   return "#" + words;
@@ -882,6 +952,7 @@ async function open() {
     return;
   }
   state.isSlow = renderer.isSlow;
+  state.renderer = renderer;
   const names = ["xy_um", "position", "ring_sizes", "cut_sites", "cut_counts", "cuts", ...(about.arrays.site_rings ? ["site_rings"] : [])];
   const arrays = Object.fromEntries(await Promise.all(names.map(async (name) => [name, await array(name)])));
   state.sites = new Sites(arrays, about);
@@ -889,11 +960,14 @@ async function open() {
   state.overview = new Overview($("overview"), state.sites);
   if (!state.map.gl) throw new Error("WebGL2 was lost");
   listenToLosses();
-  $("colouring").append(...about.columns.map((column) => {
-    const option = make("option", titleOf(column));
-    option.value = column.key;
-    return option;
-  }));
+  for (const id of ["colouring", "second-column"]) {
+    $(id).append(...about.columns.map((column) => {
+      const option = make("option", titleOf(column));
+      option.value = column.key;
+      return option;
+    }));
+  }
+  $("second-column").addEventListener("change", () => showSecond($("second-column").value));
   $("colouring").addEventListener("change", () => colourBy($("colouring").value));
   state.map.resize($("map").clientWidth, $("map").clientHeight);
   state.lines = fitted($("lines"));
@@ -907,6 +981,8 @@ async function open() {
   listenToPicture();
   listenToTools();
   listenToMeasurements();
+  const second = about.columns.find((column) => column.key.startsWith("second-")), asked = new URLSearchParams(location.hash.slice(1)).get("second");
+  if (asked !== null || second) await showSecond(asked !== null ? asked : second.key);
   tellSite();
   drawAsked();
   $("opening").hidden = true;
@@ -958,6 +1034,9 @@ const handle = {
   get tool() { return state.tool; },
   get table() { return tableOf(state.sites, about.columns, state.selected); },
   get colourMap() { return state.scale.map; },
+  get second() { return state.second && state.second.column.key; },
+  get secondView() { const { x, y, scale, width, height } = state.second.map; return { x, y, scale, width, height }; },
+  secondColour: (site) => state.second.scale.colour(site),
   get hasOverview() { return !$("overview").hidden; },
   // Colours of the overview as drawn, (r, g, b, a) of all pixels, top row first.
   overview: () => {

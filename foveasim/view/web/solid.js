@@ -88,7 +88,7 @@ async function colourBy(key) {
   state.scale = null;
   if (column) {
     const filterOf = about.filter && column.kind === "lit" ? await unpack(about.filter, about.arrays[about.filter]) : null;
-    state.scale = new Scale(column, await valuesOf(column), filterOf, about.palette, undefined, $("colour-map").value);
+    state.scale = new Scale(column, await valuesOf(column), filterOf, about.palette, { wantedMap: $("colour-map").value });
     drawLegend();
   }
   for (const part of view.parts) view.setColours(part, state.scale && siteBytes(state.scale));
