@@ -106,5 +106,5 @@ def add_strip(
     # Under the leader lines, pixel by pixel.
     figure.figimage(picture, 0, 0, origin="upper", zorder=-1)
     axes.patch.set_visible(False)
-    canvas.draw()
-    return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])
+    canvas.draw()  # type: ignore[no-untyped-call]
+    return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])  # type: ignore[no-untyped-call]

@@ -1726,17 +1726,16 @@ def test_second_capture_shares_view_and_scale(visit):
 
     # The wheel over one map zooms both; the site under the mouse is marked in both.
     box = page.locator("#second-marks").bounding_box()
-    page.mouse.move(box["x"] + 60, box["y"] + 80)
+    px, py = round(0.5 * box["width"]) + 20, round(0.5 * box["height"]) - 10
+    page.mouse.move(box["x"] + px, box["y"] + py)
     page.mouse.wheel(0, -300)
     page.evaluate("() => new Promise(requestAnimationFrame)")
     view, other = page.evaluate("[foveasim.view, foveasim.secondView]")
     assert [other[name] for name in ("x", "y", "scale")] == [view[name] for name in ("x", "y", "scale")]
     view = other
-    x_um, y_um = (
-        view["x"] + (60 - view["width"] / 2) / view["scale"],
-        view["y"] - (80 - view["height"] / 2) / view["scale"],
-    )
-    page.mouse.move(box["x"] + 60, box["y"] + 80)
+    x_um = view["x"] + (px - view["width"] / 2) / view["scale"]
+    y_um = view["y"] - (py - view["height"] / 2) / view["scale"]
+    page.mouse.move(box["x"] + px, box["y"] + py)
     assert page.evaluate("foveasim.hovered") == site_at(MOSAIC, x_um, y_um) >= 0
     assert row(page, "second electrons") == f"{second.electrons[site_at(MOSAIC, x_um, y_um)]:,} e⁻"
     page.select_option("#second-column", "")
