@@ -1753,3 +1753,26 @@ def test_second_capture_shares_view_and_scale(visit):
 def test_invalid_second_capture_raises(second, message):
     with pytest.raises(ParameterError, match=message):
         web_page(CAPTURE, second=second)
+
+
+@pytest.mark.needs("chromium")
+def test_optical_image_shares_cursor(visit):
+    light = np.zeros((3, 20, 30), np.float32)
+    light[0, :10], light[2, 10:] = 1.0, 1.0  # 450 nm below, 620 nm above
+    optical_image = fs.PowerMap(light, fs.Grid.centred((20, 30), 2.0), np.array([450.0, 540.0, 620.0]))
+    page = visit(web_page(CAPTURE, optical_image=optical_image), viewport={"width": 900, "height": 900})
+    assert page.inner_text("#picture-heading") == "Optical image"
+    colour = (
+        "([x, y]) => { const image = document.getElementById('picture'), canvas = document.createElement('canvas');"
+        " canvas.width = image.naturalWidth; canvas.height = image.naturalHeight; const context = canvas.getContext('2d');"
+        " context.drawImage(image, 0, 0); return [...context.getImageData(x, y, 1, 1).data]; }"
+    )
+    assert page.evaluate(colour, [15, 3]) == [255, 0, 0, 255]
+    assert page.evaluate(colour, [15, 16]) == [0, 0, 255, 255]
+    # The frame shows 60 x 40 µm: a quarter of its width to the right of the centre is 15 µm, outside; a tenth 6 µm, inside.
+    page.locator("#picture").scroll_into_view_if_needed()
+    box = page.locator("#picture").bounding_box()
+    page.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 0.45 * box["height"])
+    assert page.evaluate("foveasim.hovered") == site_at(MOSAIC, 6.0, 2.0)
+    with pytest.raises(ParameterError, match="'optical_image' must be a PowerMap, got a ndarray"):
+        web_page(CAPTURE, optical_image=light)

@@ -15,6 +15,7 @@ from foveasim._core.rings import same_rings
 from foveasim._core.validation import UNIT_SUFFIXES, Floats
 from foveasim.capture import Capture
 from foveasim.errors import GeometryError, ParameterError, SimulationError
+from foveasim.fields import PowerMap
 from foveasim.layout import Layout, Report
 from foveasim.view.site_colours import (
     CATEGORY_COLOURS,
@@ -23,6 +24,7 @@ from foveasim.view.site_colours import (
     NO_DATA,
     Rgb,
     colours_of,
+    encode_light,
 )
 from foveasim.view.site_pictures import site_picture
 from foveasim.view.web._pack import back_references, to_smallest_type
@@ -34,6 +36,8 @@ __all__ = ["Content", "content_of", "describe_sites"]
 SECOND = ("picture", "code", "electrons", "expected_e", "snr")
 #: Longer side of the picture.
 PICTURE_PIXELS = 800
+#: Fraction of the cells of an optical image that are not brighter than white.
+WHITE_QUANTILE = 0.995
 #: Largest number of listed violations per rule, the worst first.
 MAX_LISTED = 2000
 #: Larger integers are written as strings: numbers in JavaScript are float64.
@@ -54,16 +58,24 @@ class Content:
     arrays : mapping of str to array
         Arrays by their names in ``about``.
     picture_png : bytes
-        Picture of the capture, or of the sites of a layout.
+        Picture of the capture or of the sites of a layout, or the optical image.
+    picture_alt : str
+        Its description.
     """
 
     about: Mapping[str, Any]
     arrays: Mapping[str, NDArray[Any]]
     picture_png: bytes
+    picture_alt: str
 
 
 def content_of(
-    data: Layout | Capture, report: Report | None = None, *, second: Capture | None = None, name: str = ""
+    data: Layout | Capture,
+    report: Report | None = None,
+    *,
+    second: Capture | None = None,
+    optical_image: PowerMap | None = None,
+    name: str = "",
 ) -> Content:
     """
     Return the data of a page.
@@ -75,6 +87,8 @@ def content_of(
         Check of the same layout.
     second : Capture, optional
         Capture of the same layout, for comparison.
+    optical_image : PowerMap, optional
+        Shown instead of the picture of the capture or the layout.
     name : str
         Heading; by default the generator of the layout.
 
@@ -85,6 +99,8 @@ def content_of(
     GeometryError
         When the layout has no sites.
     """
+    from PIL import Image
+
     about, arrays, layout = describe_sites(data, name=name)
     if report is not None and not isinstance(report, Report):
         raise ParameterError("report", f"must be a Report of a check, got a {type(report).__name__}")
@@ -95,9 +111,17 @@ def content_of(
     if second is not None:
         about["columns"] += _second_columns(layout, second, arrays)
     arrays |= _outlines(layout)
-    picture, position = _picture(layout, data if isinstance(data, Capture) else None)
+    alt = "Picture of the capture" if isinstance(data, Capture) else "Photosites of the layout"
+    if optical_image is None:
+        pixels, bounds_um = _picture(layout, data if isinstance(data, Capture) else None)
+    else:
+        pixels, bounds_um = _optical_picture(optical_image)
+        about["picture_name"] = alt = "Optical image"
+    file = BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(file, "PNG")
+    position = {"bounds_um": bounds_um, "width": pixels.shape[1], "height": pixels.shape[0]}
     rules = [] if report is None else _rules(report, arrays)
-    return Content({**about, "picture": position, "rules": rules}, arrays, picture)
+    return Content({**about, "picture": position, "rules": rules}, arrays, file.getvalue(), alt)
 
 
 def describe_sites(data: Layout | Capture, *, name: str = "") -> tuple[dict[str, Any], dict[str, NDArray[Any]], Layout]:
@@ -291,14 +315,12 @@ def _hex(colour: Rgb) -> str:
 # -- picture, rules, notes ----------------------------------------------------------------------------------------------
 
 
-def _picture(layout: Layout, capture: Capture | None) -> tuple[bytes, dict[str, Any]]:
+def _picture(layout: Layout, capture: Capture | None) -> tuple[NDArray[np.uint8], tuple[float, ...]]:
     """
-    Return the picture as a PNG, and its position.
+    Return the picture, top row first, and its bounds.
 
     For a layout, the picture shows the sites in the colours of their channels or sizes.
     """
-    from PIL import Image
-
     if capture is not None:
         picture = capture.picture(max_pixels=PICTURE_PIXELS)
         white = capture.white_dn
@@ -314,10 +336,29 @@ def _picture(layout: Layout, capture: Capture | None) -> tuple[bytes, dict[str, 
         shape = (max(1, round((y_max - y_min) / pixel_um)), max(1, round((x_max - x_min) / pixel_um)))
         by = "channel" if "channel" in layout.columns and _is_index(layout.columns["channel"]) else "size_um"
         pixels = site_picture(layout, colours_of(layout, by), shape)[::-1]
-    file = BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(file, "PNG")
-    height, width = pixels.shape[:2]
-    return file.getvalue(), {"bounds_um": bounds_um, "width": width, "height": height}
+    return pixels, bounds_um
+
+
+def _optical_picture(power_map: PowerMap) -> tuple[NDArray[np.uint8], tuple[float, ...]]:
+    """
+    Return the optical image as a picture, top row first, and its bounds.
+
+    Three bands are shown as red, green and blue by their wavelengths, others by their sum.
+    """
+    if not isinstance(power_map, PowerMap):
+        raise ParameterError("optical_image", f"must be a PowerMap, got a {type(power_map).__name__}")
+    # Means of blocks of cells; incomplete blocks at the upper and right end are cropped.
+    n_bands, n_y, n_x = power_map.data.shape
+    block = max(1, -(-max(n_y, n_x) // PICTURE_PIXELS))
+    rows, columns = n_y // block, n_x // block
+    cells = power_map.data[:, : rows * block, : columns * block].reshape(n_bands, rows, block, columns, block)
+    light = cells.mean(axis=(2, 4), dtype=np.float64)
+    light = light[np.argsort(-power_map.wavelength_nm)] if n_bands == 3 else light.sum(axis=0, keepdims=True)
+    white = np.quantile(light, WHITE_QUANTILE)
+    x_min, y_min, _, _ = power_map.grid.bounds_um
+    width_um, height_um = columns * block * power_map.grid.pitch_x_um, rows * block * power_map.grid.pitch_y_um
+    pixels = encode_light(np.broadcast_to(np.moveaxis(light / (white or 1.0), 0, -1), (rows, columns, 3)))[::-1]
+    return pixels, (x_min, y_min, x_min + width_um, y_min + height_um)
 
 
 def _rules(report: Report, arrays: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:

@@ -17,6 +17,7 @@ from typing import Any
 from foveasim._io.atomic import atomic_write
 from foveasim.capture import Capture
 from foveasim.errors import FileError
+from foveasim.fields import PowerMap
 from foveasim.layout import Layout, Report
 from foveasim.view.web._content import Content, content_of
 from foveasim.view.web._pack import pack
@@ -36,7 +37,12 @@ EXPORT = re.compile(r"^export (?=(?:async )?function |class |const )", re.MULTIL
 
 
 def web_page(
-    data: Layout | Capture, *, report: Report | None = None, second: Capture | None = None, name: str = ""
+    data: Layout | Capture,
+    *,
+    report: Report | None = None,
+    second: Capture | None = None,
+    optical_image: PowerMap | None = None,
+    name: str = "",
 ) -> str:
     """
     Return a page to explore a layout or a capture in a browser.
@@ -50,6 +56,9 @@ def web_page(
         Check of this layout, whose violations are listed and marked.
     second : Capture, optional
         Capture of the same layout, shown in a second map with the same view and the same scales.
+    optical_image : PowerMap, optional
+        Image of the ideal lens, such as ``optics.power_map(scene)``, next to the map with a common cursor; by default the
+        picture of the capture, or the sites of the layout. With lens distortion, positions in both differ.
     name : str
         Heading; by default the generator of the layout.
 
@@ -72,7 +81,7 @@ def web_page(
     >>> "<title>a small grid</title>" in page
     True
     """
-    return page_of(content_of(data, report, second=second, name=name))
+    return page_of(content_of(data, report, second=second, optical_image=optical_image, name=name))
 
 
 def page_of(content: Content) -> str:
@@ -86,7 +95,7 @@ def page_of(content: Content) -> str:
         about,
         {key: text for key, (_, text) in arrays.items()},
         title=str(content.about["name"]),
-        alt="Picture of the capture" if content.about["kind"] == "capture" else "Photosites of the layout",
+        alt=content.picture_alt,
         picture="data:image/png;base64," + base64.b64encode(content.picture_png).decode(),
     )
 
@@ -97,6 +106,7 @@ def write_web_page(
     *,
     report: Report | None = None,
     second: Capture | None = None,
+    optical_image: PowerMap | None = None,
     name: str = "",
 ) -> None:
     """
@@ -109,6 +119,7 @@ def write_web_page(
         With the extension ``.html``.
     report : Report, optional
     second : Capture, optional
+    optical_image : PowerMap, optional
     name : str
         Heading; by default the generator of the layout.
 
@@ -119,7 +130,7 @@ def write_web_page(
     ParameterError, GeometryError
         As for :func:`web_page`.
     """
-    write_page(path, lambda: web_page(data, report=report, second=second, name=name))
+    write_page(path, lambda: web_page(data, report=report, second=second, optical_image=optical_image, name=name))
 
 
 def write_page(path: str | Path, page: Callable[[], str]) -> None:

@@ -946,6 +946,7 @@ async function open() {
   startTheme(showTheme);
   listenToHelp();
   $("notes").textContent = about.notes.join(" · ");
+  if (about.picture_name) $("picture-heading").textContent = about.picture_name;
   const renderer = findRenderer();
   if (!renderer) {
     showPlain("This browser has no WebGL2, which the map needs; only the picture is shown.");
