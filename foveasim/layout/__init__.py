@@ -38,6 +38,7 @@ from foveasim.layout.generators.voronoi import voronoi
 from foveasim.layout.generators.zones import zones
 from foveasim.layout.model import Layout
 from foveasim.layout.readout import nearest_bus, readout_by, readout_order
+from foveasim.layout.site_counts import SolveFor
 from foveasim.layout.summary import Summary, describe
 
 __all__ = [
@@ -57,6 +58,7 @@ __all__ = [
     "Routing",
     "Rule",
     "RuleResult",
+    "SolveFor",
     "Summary",
     "Violation",
     "WrittenLayout",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ParamSpec
 
 import numpy as np
@@ -15,6 +15,7 @@ from foveasim._core.provenance import to_plain_data
 from foveasim._core.registry import Registry
 from foveasim.errors import SimulationError
 from foveasim.layout.model import Layout
+from foveasim.layout.site_counts import SolveFor, layout_with_n_sites, select_unknown
 
 __all__ = ["LAYOUTS", "layout_family"]
 
@@ -26,7 +27,7 @@ LAYOUTS: Registry[Callable[..., Layout]] = Registry("layout family", "foveasim.l
 
 
 def layout_family(
-    *, example: Mapping[str, Any], picture: str | None = None
+    *, example: Mapping[str, Any], picture: str | None = None, solve_for: Sequence[SolveFor] = ()
 ) -> Callable[[Callable[P, Layout]], Callable[P, Layout]]:
     """
     Register a generator, and record its parameters in the provenance of layouts.
@@ -37,11 +38,14 @@ def layout_family(
         Parameters of a small layout, used by the gallery and by the tests of all families.
     picture : str, optional
         Name of the parameter that is the path of a picture in settings files.
+    solve_for : sequence of SolveFor
+        Parameters that the number of sites determines, in order of preference: the first one that is None is solved for when
+        the parameter ``n_sites`` is given. The generator declares ``n_sites: int | None = None`` and never receives it.
 
     Notes
     -----
-    The decorated function has the attributes ``example`` and ``picture``. Parameters are recorded as plain data. To record
-    one in another form, a generator includes it in the ``"parameters"`` of its own provenance.
+    The decorated function has the attributes ``example``, ``picture`` and ``solve_for``. Parameters are recorded as plain
+    data. To record one in another form, a generator includes it in the ``"parameters"`` of its own provenance.
 
     Examples
     --------
@@ -57,19 +61,33 @@ def layout_family(
         name = generator.__name__
         checked = check_arguments(generator)
 
+        def generate(parameters: Mapping[str, Any]) -> Layout:
+            given = inspect.BoundArguments(signature, dict(parameters))  # type: ignore[arg-type]
+            return generator(*given.args, **given.kwargs)
+
         @functools.wraps(checked)
         def family(*args: P.args, **kwargs: P.kwargs) -> Layout:
-            layout = checked(*args, **kwargs)
+            try:
+                given = signature.bind(*args, **kwargs)
+            except TypeError:
+                return checked(*args, **kwargs)  # raises the error of a call
+            given.apply_defaults()
+            unknown = select_unknown(name, solve_for, given.arguments) if solve_for else None
+            if unknown is None:
+                layout = generator(*args, **kwargs)
+            else:
+                layout, given.arguments[unknown.name] = layout_with_n_sites(name, generate, unknown, given.arguments)
             if not isinstance(layout, Layout):
                 raise SimulationError(f"the layout family '{name}' must return a Layout, got a {type(layout).__name__}")
-            given = signature.bind(*args, **kwargs)
-            given.apply_defaults()
+            if solve_for:
+                given.arguments["n_sites"] = None  # the value that was found reproduces the layout
             own = dict(layout.provenance)
             own.pop("made_by", None)
             parameters = {key: _to_plain(value) for key, value in given.arguments.items()} | own.pop("parameters", {})
             return layout.with_provenance({"generator": name, "parameters": parameters, **own})
 
         family.example, family.picture = dict(example), picture  # type: ignore[attr-defined]
+        family.solve_for = tuple(solve_for)  # type: ignore[attr-defined]
         return LAYOUTS.register(name, family)
 
     return decorate

@@ -20,6 +20,7 @@ from foveasim.errors import ParameterError
 from foveasim.layout.families import layout_family
 from foveasim.layout.generators._annuli import ring_outlines
 from foveasim.layout.model import Layout
+from foveasim.layout.site_counts import SolveFor
 
 __all__ = ["foveal_cartesian"]
 
@@ -29,8 +30,26 @@ RATIO_ROUNDING = 1e-9
 CORNER_ROUNDING = 1e-12
 
 
-@layout_family(example={"n_rings": 12, "pitch_um": 1.0, "n_fovea": 4, "ring_ratio": 1.2})
-def foveal_cartesian(n_rings: int, *, ring_ratio: float, pitch_um: float, n_fovea: int = 1) -> Layout:
+@layout_family(
+    example={"n_rings": 12, "pitch_um": 1.0, "n_fovea": 4, "ring_ratio": 1.2},
+    solve_for=(
+        SolveFor(
+            name="n_rings",
+            is_integer=True,
+            is_increasing=True,
+            guess=lambda n_sites, _: 0.5 * (math.sqrt(n_sites) + 1.0),
+            count=lambda parameters: float((2 * parameters["n_rings"] - 1) ** 2),
+        ),
+    ),
+)
+def foveal_cartesian(
+    n_rings: int | None = None,
+    *,
+    ring_ratio: float,
+    pitch_um: float,
+    n_fovea: int = 1,
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
+) -> Layout:
     """
     Generate square rings of rectangles that grow geometrically around the optical axis.
 
@@ -54,14 +73,16 @@ def foveal_cartesian(n_rings: int, *, ring_ratio: float, pitch_um: float, n_fove
 
     Parameters
     ----------
-    n_rings : int
-        Number of rings, including the central square.
     ring_ratio : float
         Ratio of the outer to the inner side of a ring outside the fovea, > 1.
     pitch_um : float, µm
         Side of the central square, and of all squares of the fovea.
+    n_rings : int
+        Number of rings, including the central square.
     n_fovea : int
         Number of rings of the fovea, a grid with ``2 n_fovea - 1`` squares per side; the central square alone by default.
+    n_sites : int, optional
+        Number of sites, instead of ``n_rings``, within 1 %; possible are the squares of odd numbers.
 
     Returns
     -------

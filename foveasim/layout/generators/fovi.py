@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +15,7 @@ from foveasim.layout._regions import disc
 from foveasim.layout._voronoi import voronoi_cells
 from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
+from foveasim.layout.site_counts import SolveFor
 
 __all__ = ["fovi"]
 
@@ -22,8 +25,47 @@ MAX_RINGS = 10_000
 CHORDS_PER_SITE = 4
 
 
-@layout_family(example={"fov_um": 36.0, "a_um": 3.0, "n_rings": 12})
-def fovi(fov_um: float, *, a_um: float, n_rings: int, n_chords: int | None = None) -> Layout:
+def _count_sites(parameters: Mapping[str, Any]) -> float:
+    """Return the number of sites for parameters of :func:`fovi`."""
+    n_rings, a_um, fov_um = (parameters[name] for name in ("n_rings", "a_um", "fov_um"))
+    return float(_sites_per_ring(_radii_um(fov_um, a_um, n_rings)).sum()) if n_rings <= MAX_RINGS else math.inf
+
+
+def _guess_rings(n_sites: int, parameters: Mapping[str, Any]) -> float:
+    """Return the number of rings for spacings that are proportional to the radius."""
+    a_um = parameters["a_um"]
+    return 1.0 if a_um is None else math.sqrt(n_sites * math.log1p(0.5 * parameters["fov_um"] / a_um) / (2.0 * math.pi))
+
+
+@layout_family(
+    example={"fov_um": 36.0, "a_um": 3.0, "n_rings": 12},
+    solve_for=(
+        SolveFor(
+            name="n_rings",
+            is_integer=True,
+            is_increasing=True,
+            guess=_guess_rings,
+            count=_count_sites,
+            needs=("a_um",),
+        ),
+        SolveFor(
+            name="a_um",
+            is_integer=False,
+            is_increasing=True,
+            guess=lambda _, parameters: 0.1 * parameters["fov_um"],
+            count=_count_sites,
+            needs=("n_rings",),
+        ),
+    ),
+)
+def fovi(
+    fov_um: float,
+    *,
+    a_um: float | None = None,
+    n_rings: int | None = None,
+    n_chords: int | None = None,
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
+) -> Layout:
     """
     Generate isotropic rings around a central site, with a spacing that grows outwards.
 
@@ -48,6 +90,8 @@ def fovi(fov_um: float, *, a_um: float, n_rings: int, n_chords: int | None = Non
     n_chords : int, optional
         Number of sides of the regular polygon that approximates the circular outline of the layout; by default 4 for each
         site of the outermost ring.
+    n_sites : int, optional
+        Number of sites, instead of ``n_rings``, within 1 %; or instead of ``a_um``, for a given number of rings.
 
     Returns
     -------
@@ -74,10 +118,7 @@ def fovi(fov_um: float, *, a_um: float, n_rings: int, n_chords: int | None = Non
     """
     fov_um, a_um = check_length_um("fov_um", fov_um), check_length_um("a_um", a_um)
     n_rings = check_count("n_rings", n_rings, at_most=MAX_RINGS)
-    step = math.log1p(0.5 * fov_um / a_um) / n_rings
-    # e^w - a with w = ln a + i step, without cancellation
-    r_um = a_um * np.expm1(step * np.arange(n_rings + 2))
-    r_um[n_rings] = 0.5 * fov_um
+    r_um = _radii_um(fov_um, a_um, n_rings)
     counts = _sites_per_ring(r_um)
     check_sites(int(counts.sum()))
     ring = np.repeat(np.arange(n_rings + 1), counts)
@@ -85,7 +126,7 @@ def fovi(fov_um: float, *, a_um: float, n_rings: int, n_chords: int | None = Non
     angle_rad = 2.0 * math.pi * sector / counts[ring]
     centres_um = r_um[ring][:, np.newaxis] * np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1)
 
-    radius_um = a_um * math.expm1(step * (n_rings + 0.5))
+    radius_um = a_um * math.expm1(_step(fov_um, a_um, n_rings) * (n_rings + 0.5))
     if n_chords is None:
         n_sides = max(CHORDS_PER_SITE * int(counts[-1]), _min_chords(0.5 * fov_um, radius_um))
     else:
@@ -100,6 +141,19 @@ def fovi(fov_um: float, *, a_um: float, n_rings: int, n_chords: int | None = Non
             "radius_um": radius_um,
         },
     )
+
+
+def _step(fov_um: float, a_um: float, n_rings: int) -> float:
+    """Return the difference of w between rings."""
+    return math.log1p(0.5 * fov_um / a_um) / n_rings
+
+
+def _radii_um(fov_um: float, a_um: float, n_rings: int) -> Floats:
+    """Return the radii (n_rings + 2,) of the rings, of the central site, and of one further ring."""
+    # e^w - a with w = ln a + i step, without cancellation
+    r_um = a_um * np.expm1(_step(fov_um, a_um, n_rings) * np.arange(n_rings + 2))
+    r_um[n_rings] = 0.5 * fov_um
+    return np.asarray(r_um)
 
 
 def _sites_per_ring(r_um: Floats) -> Ints:

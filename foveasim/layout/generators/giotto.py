@@ -9,7 +9,8 @@ fovea and a diameter of R smallest pixels, ``λ (λ^E - 1) / (λ - 1) = R / 2 - 
 from __future__ import annotations
 
 import math
-from typing import get_args
+from collections.abc import Mapping
+from typing import Any, get_args
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from foveasim.layout.families import layout_family
 from foveasim.layout.generators._annuli import MIN_SITES_PER_RHO, Fovea, Ring, annuli, fovea_rings
 from foveasim.layout.generators.tiling import with_hexagons
 from foveasim.layout.model import Layout
+from foveasim.layout.site_counts import SolveFor
 
 __all__ = ["giotto", "giotto_ratio"]
 
@@ -48,17 +50,42 @@ def giotto_ratio(*, n_rho: int, n_fovea: int, n_across: int) -> float:
     return math.exp(_log_ratio(n_rho, n_fovea, n_across))
 
 
-@layout_family(example={"n_rho": 16, "n_theta": 36, "n_fovea": 6, "n_across": 60, "unit_um": 0.6})
+def _count_sites(parameters: Mapping[str, Any]) -> float | None:
+    """Return the number of sites for parameters of :func:`giotto`; None where it requires a layout."""
+    n_rho, n_theta, n_fovea = (parameters[name] for name in ("n_rho", "n_theta", "n_fovea"))
+    fovea = parameters["fovea"]
+    if fovea not in {"rings", "linear", "none"}:
+        return None
+    inside: list[Ring] = []
+    if fovea != "none":
+        _, inside = fovea_rings(fovea, n_rings=n_fovea, n_sectors=n_theta, n_per_ring=n_theta // n_fovea, n_chords=1)
+    return float((n_rho - n_fovea) * n_theta + sum(ring.n_sites for ring in inside))
+
+
+@layout_family(
+    example={"n_rho": 16, "n_theta": 36, "n_fovea": 6, "n_across": 60, "unit_um": 0.6},
+    solve_for=(
+        SolveFor(
+            name="n_theta",
+            is_integer=True,
+            is_increasing=True,
+            guess=lambda n_sites, parameters: n_sites / parameters["n_rho"],
+            count=_count_sites,
+            at_least=3,
+        ),
+    ),
+)
 def giotto(
     *,
     n_rho: int,
-    n_theta: int,
     n_fovea: int,
     n_across: int,
     unit_um: float,
+    n_theta: int | None = None,
     fovea: Fovea = "rings",
     stagger: bool = True,
     chords_per_arc: int = 1,
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
 ) -> Layout:
     """
     Generate ``n_fovea`` rings of unit height, then rings that grow by the ratio λ.
@@ -80,14 +107,14 @@ def giotto(
     ----------
     n_rho : int
         Number of rings, including ring 0.
-    n_theta : int
-        Number of sites per ring outside the fovea; at least 3 per ring of the fovea.
     n_fovea : int
         Number of rings of the fovea, whose radius is ``n_fovea - 0.5``.
     n_across : int
         Diameter of the layout in smallest pixels, more than ``2 n_rho - 1``.
     unit_um : float, µm
         Size of the smallest pixel: the height of the rings of the fovea.
+    n_theta : int
+        Number of sites per ring outside the fovea; at least 3 per ring of the fovea.
     fovea : {"rings", "linear", "hexagons", "none"}
         Filling of the fovea. ``"rings"``: rings of (n_theta // n_fovea) · ρ sites. ``"linear"``: rings with some of the
         sector boundaries outside, and sites at least one unit wide if n_theta has suitable divisors. ``"hexagons"``: hexagons
@@ -98,6 +125,8 @@ def giotto(
         Number of straight edges that approximate an arc. With ``stagger`` and an odd number, arcs outside the fovea have
         twice as many. In the fovea, arcs include the corners of the neighbours on the other side, so there are no gaps or
         overlaps.
+    n_sites : int, optional
+        Number of sites, instead of ``n_theta``, within 1 %.
 
     Returns
     -------
@@ -160,7 +189,7 @@ def giotto(
     first = n_rho - len(rings)
 
     xy_um, offsets, ring, sector = annuli(radii * unit_um, rings)
-    n_sites = np.array([r.n_sites for r in rings])
+    per_ring = np.array([r.n_sites for r in rings])
     provenance = {
         "ring_ratio": math.exp(log_ratio),
     }
@@ -170,7 +199,7 @@ def giotto(
         xy_um,
         offsets,
         np.arange(offsets.size),
-        {"ring": first + ring, "sector": sector, "readout_line": sector * n_theta // n_sites[ring]},
+        {"ring": first + ring, "sector": sector, "readout_line": sector * n_theta // per_ring[ring]},
         provenance,
     )
     return with_hexagons(layout, unit_um, n_theta) if fovea == "hexagons" else layout

@@ -3,29 +3,53 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from foveasim._core.validation import Floats, check_count, check_length_um, check_number, check_sites
+from foveasim._core.validation import Floats, check_count, check_length_um, check_number, check_sites, finite_array
 from foveasim.errors import ParameterError
 from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
+from foveasim.layout.site_counts import SolveFor
 
 __all__ = ["grid"]
 
+#: Rows that exceed the height of a field by rounding fit in it.
+FIT_ROUNDING = 1.0 + 1e-9
 
-@layout_family(example={"n_x": 14, "n_y": 14, "pitch_um": 2.0, "trench_um": 0.3, "stagger": True})
+
+def _count_cells(parameters: Mapping[str, Any]) -> float:
+    """Return the number of cells for parameters of :func:`grid`."""
+    n_x, n_y, _ = cells_in_field(parameters["n_x"], parameters["n_y"], parameters["pitch_um"], parameters["size_um"])
+    return float(n_x * n_y)
+
+
+def guess_columns(n_sites: int, parameters: Mapping[str, Any]) -> float:
+    """Return the number of columns of a field of square cells."""
+    if parameters.get("n_y") is not None:
+        return float(n_sites / parameters["n_y"])
+    width_um, height_um = (1.0, 1.0) if parameters["size_um"] is None else parameters["size_um"]
+    return math.sqrt(n_sites * width_um / height_um)
+
+
+@layout_family(
+    example={"n_x": 14, "n_y": 14, "pitch_um": 2.0, "trench_um": 0.3, "stagger": True},
+    solve_for=(SolveFor(name="n_x", is_integer=True, is_increasing=True, guess=guess_columns, count=_count_cells),),
+)
 def grid(
-    n_x: int,
-    n_y: int,
-    pitch_um: float,
+    n_x: int | None = None,
+    n_y: int | None = None,
+    pitch_um: float | None = None,
     *,
+    size_um: tuple[float, float] | None = None,
     pitch_y_um: float | None = None,
     width_um: float | None = None,
     trench_um: float | None = None,
     fill_factor: float | None = None,
     stagger: bool = False,
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
 ) -> Layout:
     """
     Generate square or rectangular photosites in rows and columns around the optical axis.
@@ -41,9 +65,11 @@ def grid(
     Parameters
     ----------
     n_x, n_y : int
-        Number of columns and rows.
+        Number of columns and rows; by default as many rows as columns.
     pitch_um : float, µm
         Pitch of the columns.
+    size_um : (width, height), optional, µm
+        Size of the field, instead of the pitch: the columns fill the width, and by default as many rows as fit in the height.
     pitch_y_um : float, optional, µm
         Pitch of the rows; ``pitch_um`` by default.
     width_um : float, optional, µm
@@ -55,6 +81,8 @@ def grid(
         sites have the aspect ratio of the cells.
     stagger : bool
         Shift every second row, from the second, by half a pitch to the right.
+    n_sites : int, optional
+        Number of sites, instead of ``n_x``, within 1 %.
 
     Returns
     -------
@@ -64,10 +92,15 @@ def grid(
     Raises
     ------
     ParameterError
-        When a number is out of range, the width exceeds the pitch, or the width is specified twice.
+        When a number is out of range, the width exceeds the pitch, or a width or the pitch is specified twice.
+
+    Examples
+    --------
+    >>> layout = grid(n_sites=14_000, size_um=(1380.0, 1380.0))
+    >>> layout.n_sites, round(layout.provenance["parameters"]["size_um"][0] / 118, 3)
+    (13924, 11.695)
     """
-    n_x, n_y = check_count("n_x", n_x), check_count("n_y", n_y)
-    pitch_um = check_length_um("pitch_um", pitch_um)
+    n_x, n_y, pitch_um = cells_in_field(n_x, n_y, pitch_um, size_um)
     if pitch_y_um is not None:
         pitch_y_um = check_length_um("pitch_y_um", pitch_y_um)
         if width_um is not None:
@@ -84,6 +117,51 @@ def grid(
         corners,
         {"row": row, "column": column, "readout_line": column},
     )
+
+
+def cells_in_field(
+    n_x: int | None, n_y: int | None, pitch_um: float | None, size_um: tuple[float, float] | None
+) -> tuple[int, int, float]:
+    """
+    Return the number of columns and rows, and the pitch, of square cells from their number, pitch or field.
+
+    Raises
+    ------
+    ParameterError
+        When a number is out of range, or neither or both of pitch and field are given.
+    """
+    n_x = check_count("n_x", n_x)
+    width_um, height_um = check_field_um(pitch_um, size_um)
+    if width_um is None:
+        return n_x, n_x if n_y is None else check_count("n_y", n_y), check_length_um("pitch_um", pitch_um)
+    pitch_um = width_um / n_x
+    return (
+        n_x,
+        max(1, math.floor(height_um / pitch_um * FIT_ROUNDING)) if n_y is None else check_count("n_y", n_y),
+        pitch_um,
+    )
+
+
+def check_field_um(
+    pitch_um: float | None, size_um: tuple[float, float] | None
+) -> tuple[float, float] | tuple[None, None]:
+    """
+    Return the size of a field, or None twice when the pitch is given instead.
+
+    Raises
+    ------
+    ParameterError
+        When neither or both are given, or a length is out of range.
+    """
+    if (pitch_um is None) == (size_um is None):
+        raise ParameterError("pitch_um", "or 'size_um' must be given, but only one of them")
+    if size_um is None:
+        return None, None
+    size = finite_array("size_um", size_um, ndim=1)
+    if size.shape != (2,):
+        raise ParameterError("size_um", "must be two numbers (width, height)", size_um, "µm")
+    width_um, height_um = (check_length_um("size_um", float(length)) for length in size)
+    return width_um, height_um
 
 
 def linear_fill_factor(

@@ -3,28 +3,55 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import numpy as np
 
 from foveasim._core.validation import check_choice, check_count, check_length_um, check_sites
 from foveasim.layout.families import layout_family
-from foveasim.layout.generators.grid import linear_fill_factor
+from foveasim.layout.generators.grid import FIT_ROUNDING, check_field_um, linear_fill_factor
 from foveasim.layout.model import Layout
+from foveasim.layout.site_counts import SolveFor
 
 __all__ = ["hexagonal"]
 
+#: Distance between rows, and height of a hexagon from corner to corner, in pitches.
+ROW_PITCH, HEIGHT = 0.5 * math.sqrt(3.0), 2.0 / math.sqrt(3.0)
 
-@layout_family(example={"n_columns": 14, "n_rows": 16, "pitch_um": 2.0})
+
+def _count_cells(parameters: Mapping[str, Any]) -> float:
+    """Return the number of hexagons for parameters of :func:`hexagonal`."""
+    names = ("n_columns", "n_rows", "pitch_um", "size_um", "orientation")
+    n_columns, n_rows, _ = _cells_in_field(*(parameters[name] for name in names))
+    return float(n_columns * n_rows)
+
+
+def _guess_columns(n_sites: int, parameters: Mapping[str, Any]) -> float:
+    """Return the number of hexagons per row of a field."""
+    if parameters["n_rows"] is not None:
+        return float(n_sites / parameters["n_rows"])
+    width_um, height_um = (1.0, 1.0) if parameters["size_um"] is None else parameters["size_um"]
+    return math.sqrt(n_sites * ROW_PITCH * width_um / height_um)
+
+
+@layout_family(
+    example={"n_columns": 14, "n_rows": 16, "pitch_um": 2.0},
+    solve_for=(
+        SolveFor(name="n_columns", is_integer=True, is_increasing=True, guess=_guess_columns, count=_count_cells),
+    ),
+)
 def hexagonal(
-    n_columns: int,
-    n_rows: int,
-    pitch_um: float,
+    n_columns: int | None = None,
+    n_rows: int | None = None,
+    pitch_um: float | None = None,
     *,
+    size_um: tuple[float, float] | None = None,
     width_um: float | None = None,
     trench_um: float | None = None,
     fill_factor: float | None = None,
     orientation: Literal["pointy", "flat"] = "pointy",
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
 ) -> Layout:
     """
     Generate closely packed regular hexagons around the optical axis.
@@ -41,9 +68,12 @@ def hexagonal(
     Parameters
     ----------
     n_columns, n_rows : int
-        Sites per row, and rows; for ``"flat"`` rows are vertical.
+        Sites per row, and rows; for ``"flat"`` rows are vertical. By default as many rows as fill a square.
     pitch_um : float, µm
         Pitch: distance between the centres of neighbours.
+    size_um : (width, height), optional, µm
+        Size of the field, instead of the pitch: rows fill its width (for ``"flat"`` its height), and by default as many rows
+        as fit across.
     width_um : float, optional, µm
         Distance between opposite sides of the photosensitive hexagon; the pitch by default.
     trench_um : float, optional, µm
@@ -52,6 +82,8 @@ def hexagonal(
         Instead of the width: photosensitive fraction of a cell, ``(width / pitch)²``.
     orientation : {"pointy", "flat"}
         Orientation: a corner or a flat side at the top.
+    n_sites : int, optional
+        Number of sites, instead of ``n_columns``, within 1 %.
 
     Returns
     -------
@@ -63,10 +95,9 @@ def hexagonal(
     ParameterError
         When a number is out of range, the width exceeds the pitch, or the width is specified twice.
     """
-    n_columns, n_rows = check_count("n_columns", n_columns), check_count("n_rows", n_rows)
-    pitch_um = check_length_um("pitch_um", pitch_um)
-    fraction = linear_fill_factor(pitch_um, width_um, trench_um, fill_factor)
     check_choice("orientation", orientation, ("pointy", "flat"))
+    n_columns, n_rows, pitch_um = _cells_in_field(n_columns, n_rows, pitch_um, size_um, orientation)
+    fraction = linear_fill_factor(pitch_um, width_um, trench_um, fill_factor)
     check_sites(n_columns * n_rows)
     row, column = (index.ravel() for index in np.divmod(np.arange(n_rows * n_columns), n_columns))
     # All corners lie on a lattice of half pitches and half sides, so shared corners are bit-identical.
@@ -81,3 +112,27 @@ def hexagonal(
         rings_um,
         {"row": row, "column": column, "readout_line": column},
     )
+
+
+def _cells_in_field(
+    n_columns: int | None,
+    n_rows: int | None,
+    pitch_um: float | None,
+    size_um: tuple[float, float] | None,
+    orientation: str,
+) -> tuple[int, int, float]:
+    """Return the number of hexagons per row, of rows, and the pitch, from their number, pitch or field."""
+    n_columns = check_count("n_columns", n_columns)
+    width_um, height_um = check_field_um(pitch_um, size_um)
+    if width_um is None:
+        pitch_um = check_length_um("pitch_um", pitch_um)
+        across = n_columns + 0.5
+    else:
+        if orientation == "flat":
+            width_um, height_um = height_um, width_um
+        # Every second row is shifted by half a pitch; a single row ends half a pitch before the end of the field.
+        pitch_um = width_um / (n_columns + 0.5)
+        across = height_um / pitch_um
+    if n_rows is not None:
+        return n_columns, check_count("n_rows", n_rows), pitch_um
+    return n_columns, max(1, math.floor((across - HEIGHT) / ROW_PITCH * FIT_ROUNDING) + 1), pitch_um

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, get_args
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from foveasim.layout.families import layout_family
 from foveasim.layout.generators._annuli import MIN_SITES_PER_RHO, Annuli, Fovea, Ring, annuli, fovea_rings
 from foveasim.layout.generators.tiling import with_hexagons
 from foveasim.layout.model import Layout, valid_sites
+from foveasim.layout.site_counts import SolveFor
 
 __all__ = ["log_polar", "square_ring_ratio"]
 
@@ -50,11 +52,48 @@ def square_ring_ratio(n_sectors: int) -> float:
     return (1.0 + s) / (1.0 - s)
 
 
-@layout_family(example={"n_sectors": 36, "min_size_um": 1.0, "r_max_um": 18.0, "fovea": "hexagons"})
+def _count_sites(parameters: Mapping[str, Any]) -> float | None:
+    """Return the number of sites for parameters of :func:`log_polar`; None where it requires a layout."""
+    p = parameters
+    if p["fovea"] not in {"none", "rings", "linear"}:
+        return None
+    n_sectors, n_chords = p["n_sectors"], p["chords_per_arc"] * (2 if p["stagger"] and p["chords_per_arc"] % 2 else 1)
+    lengths = (p[name] for name in ("r_max_um", "min_size_um", "r_min_um", "n_rings", "ring_ratio"))
+    radii_um, ratio = _rings(n_sectors, *lengths, p["fovea"], n_chords)
+    if p["fovea"] == "none":
+        return float(n_sectors * (radii_um.size - 1))
+    filling: Literal["rings", "linear"] = "rings" if p["fovea"] == "rings" else "linear"
+    around = [Ring(n_sectors, 0, n_chords)]
+    _, per_ring = _with_fovea(filling, radii_um[:2], around, ratio, p["min_size_um"] or 0.0, p["chords_per_arc"])
+    return float(per_ring.sum() + n_sectors * (radii_um.size - 2))
+
+
+@layout_family(
+    example={"n_sectors": 36, "min_size_um": 1.0, "r_max_um": 18.0, "fovea": "hexagons"},
+    solve_for=(
+        SolveFor(
+            name="n_sectors",
+            is_integer=True,
+            is_increasing=True,
+            guess=lambda n_sites, _: math.sqrt(math.pi * n_sites),
+            count=_count_sites,
+            at_least=3,
+        ),
+        SolveFor(
+            name="min_size_um",
+            is_integer=False,
+            is_increasing=False,
+            guess=lambda n_sites, parameters: 0.2 * parameters["r_max_um"] / math.sqrt(n_sites),
+            count=_count_sites,
+            needs=("n_sectors",),
+            is_optional=True,
+        ),
+    ),
+)
 def log_polar(
-    n_sectors: int,
-    r_max_um: float,
+    n_sectors: int | None = None,
     *,
+    r_max_um: float,
     min_size_um: float | None = None,
     r_min_um: float | None = None,
     n_rings: int | None = None,
@@ -62,6 +101,7 @@ def log_polar(
     fovea: Fovea = "none",
     stagger: bool = False,
     chords_per_arc: int = 1,
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
 ) -> Layout:
     """
     Generate rings of ``n_sectors`` sites that grow outwards by ``ring_ratio``.
@@ -109,6 +149,8 @@ def log_polar(
         Number of straight edges that approximate an arc. The area is that of the arcs times ``sin(d)/d``, where d is the
         angle of one chord. With ``stagger`` and an odd number, arcs have twice as many, so that neighbours share their
         corners without gaps or overlaps.
+    n_sites : int, optional
+        Number of sites, instead of ``n_sectors``, within 1 %; or instead of ``min_size_um``, for a given number of sectors.
 
     Returns
     -------
@@ -126,10 +168,60 @@ def log_polar(
     -----
     LayoutWarning
         When the outermost ring ends below 0.9 ``r_max_um``, which a large ratio may cause.
+
+    Examples
+    --------
+    >>> layout = log_polar(n_sites=14_000, min_size_um=2.0, r_max_um=690.0)
+    >>> layout.n_sites, layout.provenance["parameters"]["n_sectors"]
+    (14060, 190)
     """
     n_sectors = check_count("n_sectors", n_sectors, at_least=3, at_most=MAX_SITES)
     check_choice("fovea", fovea, get_args(Fovea))
     chords_per_arc = check_count("chords_per_arc", chords_per_arc, at_most=1000)
+    n_chords = chords_per_arc * (2 if stagger and chords_per_arc % 2 else 1)
+    radii_um, ratio = _rings(n_sectors, r_max_um, min_size_um, r_min_um, n_rings, ring_ratio, fovea, n_chords)
+    _warn_of_reach(radii_um, ratio, r_max_um)
+    rings = [Ring(n_sectors, int(stagger and i % 2 == 1), n_chords) for i in range(radii_um.size - 1)]
+    if fovea in {"rings", "linear"}:
+        sites, per_ring = _with_fovea(
+            "rings" if fovea == "rings" else "linear", radii_um, rings, ratio, min_size_um or 0.0, chords_per_arc
+        )
+    else:
+        sites, per_ring = annuli(radii_um, rings), np.full(len(rings), n_sectors)
+    provenance: dict[str, Any] = {}
+    if fovea == "none":
+        provenance["blind_radius_um"] = float(radii_um[0])
+    layout = Layout(
+        sites.xy_um,
+        sites.ring_offsets,
+        np.arange(sites.ring_offsets.size),
+        {"ring": sites.ring, "sector": sites.sector, "readout_line": sites.sector * n_sectors // per_ring[sites.ring]},
+        provenance,
+    )
+    if fovea == "hexagons":
+        size_um = math.sqrt(layout.area_um2[:n_sectors].min()) if min_size_um is None else min_size_um
+        return with_hexagons(layout, size_um, n_sectors)
+    return layout
+
+
+class _Rings(NamedTuple):
+    """Radii (n_ring + 1,) of the circles between rings, and the ratio of adjacent ones."""
+
+    radii_um: Floats
+    ratio: float
+
+
+def _rings(
+    n_sectors: int,
+    r_max_um: float,
+    min_size_um: float | None,
+    r_min_um: float | None,
+    n_rings: int | None,
+    ring_ratio: float | None,
+    fovea: Fovea,
+    n_chords: int,
+) -> _Rings:
+    """Return the rings for parameters of :func:`log_polar`, with the final number of chords per arc."""
     r_max_um = check_length_um("r_max_um", r_max_um)
     for name, length_um in (("min_size_um", min_size_um), ("r_min_um", r_min_um)):
         if length_um is not None:
@@ -152,32 +244,10 @@ def log_polar(
     else:
         ratio = square_ring_ratio(n_sectors)
 
-    n_chords = chords_per_arc * (2 if stagger and chords_per_arc % 2 else 1)
     smallest_um = 0.0
     if min_size_um is not None:
         smallest_um = min_size_um * _radius_per_size(n_sectors, ratio, n_chords, fovea, is_given=r_min_um is not None)
-    radii_um = _ring_radii_um(n_sectors, ratio, r_min_um, r_max_um, smallest_um, n_rings)
-    rings = [Ring(n_sectors, int(stagger and i % 2 == 1), n_chords) for i in range(radii_um.size - 1)]
-    if fovea in {"rings", "linear"}:
-        sites, n_sites = _with_fovea(
-            "rings" if fovea == "rings" else "linear", radii_um, rings, ratio, min_size_um or 0.0, chords_per_arc
-        )
-    else:
-        sites, n_sites = annuli(radii_um, rings), np.full(len(rings), n_sectors)
-    provenance: dict[str, Any] = {}
-    if fovea == "none":
-        provenance["blind_radius_um"] = float(radii_um[0])
-    layout = Layout(
-        sites.xy_um,
-        sites.ring_offsets,
-        np.arange(sites.ring_offsets.size),
-        {"ring": sites.ring, "sector": sites.sector, "readout_line": sites.sector * n_sectors // n_sites[sites.ring]},
-        provenance,
-    )
-    if fovea == "hexagons":
-        size_um = math.sqrt(layout.area_um2[:n_sectors].min()) if min_size_um is None else min_size_um
-        return with_hexagons(layout, size_um, n_sectors)
-    return layout
+    return _Rings(_ring_radii_um(n_sectors, ratio, r_min_um, r_max_um, smallest_um, n_rings), ratio)
 
 
 def _with_fovea(
@@ -267,6 +337,11 @@ def _ring_radii_um(
             "µm",
             "enlarge it, or take fewer sectors or a smaller minimum size",
         )
+    return radii_um
+
+
+def _warn_of_reach(radii_um: Floats, ratio: float, r_max_um: float) -> None:
+    """Warn when the outermost ring leaves a large part of the field uncovered."""
     if radii_um[-1] < MIN_REACH * r_max_um:
         last_um, next_um = float(radii_um[-1]), float(radii_um[-1]) * ratio
         warn(
@@ -275,4 +350,3 @@ def _ring_radii_um(
             f"'r_min_um' = {radii_um[0]:.6g} µm for rings that end at 'r_max_um'",
             LayoutWarning,
         )
-    return radii_um

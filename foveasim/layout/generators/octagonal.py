@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import numpy as np
 
-from foveasim._core.validation import Bools, Ints, check_choice, check_count, check_length_um, check_sites
+from foveasim._core.validation import Bools, Ints, check_choice, check_length_um, check_sites
 from foveasim.layout.families import layout_family
+from foveasim.layout.generators.grid import cells_in_field, guess_columns
 from foveasim.layout.model import Layout
+from foveasim.layout.site_counts import SolveFor
 
 __all__ = ["octagonal"]
 
@@ -22,14 +25,34 @@ DIAMOND = np.array([(1, 0), (2, 1), (1, 2), (0, 1)])
 TOUCHING_ROUNDING = 1e-9
 
 
-@layout_family(example={"n_x": 12, "n_y": 12, "pitch_um": 2.0})
+def _count_cells(parameters: Mapping[str, Any]) -> float:
+    """Return the number of octagons and diamonds for parameters of :func:`octagonal`."""
+    n_x, n_y, _ = cells_in_field(parameters["n_x"], parameters["n_y"], parameters["pitch_um"], parameters["size_um"])
+    more = 1 if parameters["border"] == "cut" else -1
+    return float(n_x * n_y + (n_x + more) * (n_y + more))
+
+
+@layout_family(
+    example={"n_x": 12, "n_y": 12, "pitch_um": 2.0},
+    solve_for=(
+        SolveFor(
+            name="n_x",
+            is_integer=True,
+            is_increasing=True,
+            guess=lambda n_sites, parameters: guess_columns(n_sites // 2, parameters),
+            count=_count_cells,
+        ),
+    ),
+)
 def octagonal(
-    n_x: int,
-    n_y: int,
-    pitch_um: float,
+    n_x: int | None = None,
+    n_y: int | None = None,
+    pitch_um: float | None = None,
     *,
+    size_um: tuple[float, float] | None = None,
     diamond_um: float | None = None,
     border: Literal["whole", "cut"] = "whole",
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
 ) -> Layout:
     """
     Generate octagons on a square grid, with a diamond where four of them meet.
@@ -52,14 +75,18 @@ def octagonal(
     Parameters
     ----------
     n_x, n_y : int
-        Number of columns and rows of octagons.
+        Number of columns and rows of octagons; by default as many rows as columns.
     pitch_um : float, µm
         Pitch of the octagons.
+    size_um : (width, height), optional, µm
+        Size of the field, instead of the pitch: the octagons fill the width, and by default as many rows as fit in the height.
     diamond_um : float, optional, µm
         Side of the diamonds, less than ``pitch_um / √2``; by default ``(√2 - 1) pitch_um``, for regular octagons.
     border : {"whole", "cut"}
         ``"whole"``: diamonds only where four octagons meet. ``"cut"``: also halves and quarters of diamonds along the
         boundary, so that the sites tile the rectangle of ``n_x`` by ``n_y`` pitches.
+    n_sites : int, optional
+        Number of sites, instead of ``n_x``, within 1 %.
 
     Returns
     -------
@@ -81,8 +108,7 @@ def octagonal(
     >>> octagonal(n_x=4, n_y=3, pitch_um=5.0, diamond_um=3.0).area_um2[[0, -1]].round(9).tolist()
     [16.0, 9.0]
     """
-    n_x, n_y = check_count("n_x", n_x), check_count("n_y", n_y)
-    pitch_um = check_length_um("pitch_um", pitch_um)
+    n_x, n_y, pitch_um = cells_in_field(n_x, n_y, pitch_um, size_um)
     if diamond_um is not None:
         diamond_um = check_length_um(
             "diamond_um",

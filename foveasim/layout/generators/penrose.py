@@ -11,6 +11,7 @@ from foveasim._core.validation import MAX_SITES, Bools, Floats, Ints, check_choi
 from foveasim.errors import ParameterError
 from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
+from foveasim.layout.site_counts import SolveFor
 
 __all__ = ["penrose"]
 
@@ -31,8 +32,24 @@ KEY = 2 ** np.array((48, 32, 16, 0), np.int64)
 DECAGON_INRADIUS_RATIO = math.cos(math.pi / 10.0)
 
 
-@layout_family(example={"side_um": 2.0, "size_um": 30.0})
-def penrose(side_um: float, size_um: float, *, shape: Literal["disc", "square"] = "disc") -> Layout:
+@layout_family(
+    example={"side_um": 2.0, "size_um": 30.0},
+    solve_for=(
+        SolveFor(
+            name="side_um",
+            is_integer=False,
+            is_increasing=False,
+            guess=lambda n_sites, parameters: _side_um(n_sites, parameters["size_um"], parameters["shape"] == "disc"),
+        ),
+    ),
+)
+def penrose(
+    side_um: float | None = None,
+    *,
+    size_um: float,
+    shape: Literal["disc", "square"] = "disc",
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
+) -> Layout:
     """
     Generate thick and thin rhombs with fivefold symmetry around the optical axis.
 
@@ -47,12 +64,14 @@ def penrose(side_um: float, size_um: float, *, shape: Literal["disc", "square"] 
 
     Parameters
     ----------
-    side_um : float, µm
-        Side of all rhombs.
     size_um : float, µm
         Diameter of the disc, or side of the square, around the axis that contains the centres of the rhombs.
+    side_um : float, µm
+        Side of all rhombs.
     shape : {"disc", "square"}
         Shape of this region.
+    n_sites : int, optional
+        Number of sites, instead of ``side_um``, within 1 %.
 
     Returns
     -------
@@ -89,6 +108,11 @@ def penrose(side_um: float, size_um: float, *, shape: Literal["disc", "square"] 
         rings_um,
         {"is_thick": is_thick.astype(np.int64)},
     )
+
+
+def _side_um(n_sites: int, size_um: float, is_disc: bool) -> float:
+    """Return the side of rhombs of which a number covers the region."""
+    return size_um * math.sqrt((0.25 * math.pi if is_disc else 1.0) / (n_sites * MEAN_AREA))
 
 
 def _rhombs(side_um: float, size_um: float, is_disc: bool) -> tuple[Floats, Bools]:

@@ -20,6 +20,7 @@ from foveasim._core.validation import (
 from foveasim.errors import ParameterError
 from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
+from foveasim.layout.site_counts import SolveFor
 
 __all__ = ["quadtree"]
 
@@ -35,14 +36,23 @@ MAX_LEVELS = 15
         "n_levels": 4,
     },
     picture="importance",
+    solve_for=(
+        SolveFor(
+            name="limit",
+            is_integer=False,
+            is_increasing=False,
+            guess=lambda n_sites, parameters: 2.0 * float(np.sum(parameters["importance"])) / n_sites,
+        ),
+    ),
 )
 def quadtree(
     importance: ArrayLike,
     *,
     pitch_um: float,
-    limit: float,
     n_levels: int,
+    limit: float | None = None,
     measure: Literal["sum", "peak"] = "sum",
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
 ) -> Layout:
     """
     Generate squares with power-of-two sides, smaller where an importance picture is larger.
@@ -67,12 +77,14 @@ def quadtree(
         Importance >= 0 of each smallest square, the lowest row first; both sides are multiples of 2^n_levels.
     pitch_um : float, µm
         Side of the smallest squares, and pixel pitch of the picture.
-    limit : float
-        Importance above which a square is split.
     n_levels : int
         Maximum number of subdivisions of a largest square.
+    limit : float
+        Importance above which a square is split.
     measure : {"sum", "peak"}
         Importance of a square: the sum or the maximum over its pixels.
+    n_sites : int, optional
+        Number of sites, instead of ``limit``, within 1 %.
 
     Returns
     -------

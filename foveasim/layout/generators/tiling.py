@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
@@ -16,6 +17,7 @@ from foveasim.layout.drc.measurements import is_below_size
 from foveasim.layout.edits import clip, merge_small, union
 from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
+from foveasim.layout.site_counts import SolveFor
 
 __all__ = ["Cells", "fill", "tiling", "with_hexagons"]
 
@@ -33,9 +35,19 @@ SMALL_FRACTION = 0.5
 AREA_ROUNDING = 1e-9
 
 
-@layout_family(example={"pitch_um": 2.0, "radius_um": 14.0})
+def _guess_pitch_um(n_sites: int, parameters: Mapping[str, Any]) -> float:
+    """Return the pitch for which the area of the region is that of all cells."""
+    region = parse_region(**{name: parameters[name] for name in ("size_um", "radius_um", "region")})
+    cell_area = 1.0 if parameters["cells"] == "squares" else 0.5 * math.sqrt(3.0)
+    return math.sqrt(region.area / (n_sites * cell_area))
+
+
+@layout_family(
+    example={"pitch_um": 2.0, "radius_um": 14.0},
+    solve_for=(SolveFor(name="pitch_um", is_integer=False, is_increasing=False, guess=_guess_pitch_um),),
+)
 def tiling(
-    pitch_um: float,
+    pitch_um: float | None = None,
     *,
     cells: Cells = "hexagons",
     size_um: tuple[float, float] | None = None,
@@ -44,6 +56,7 @@ def tiling(
     border: Border = "merge",
     min_size_um: float | None = None,
     origin_um: tuple[float, float] = (0.0, 0.0),
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
 ) -> Layout:
     """
     Generate equal squares or hexagons that fill a region up to its boundary.
@@ -77,6 +90,8 @@ def tiling(
         a cell. Invalid with ``border="cut"``, and with ``"drop"`` if complete cells are smaller.
     origin_um : (x, y), µm
         Centre of one of the cells.
+    n_sites : int, optional
+        Number of sites, instead of ``pitch_um``, within 1 %.
 
     Returns
     -------

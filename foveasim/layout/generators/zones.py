@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, get_args
 
 import numpy as np
 import shapely
 
-from foveasim._core.validation import MAX_LENGTH_UM, Floats, Ints, check_choice, finite_array
+from foveasim._core.validation import MAX_LENGTH_UM, Floats, Ints, check_choice, check_count, finite_array
 from foveasim.errors import ParameterError
 from foveasim.layout._regions import as_region, region_as_plain_data
 from foveasim.layout.edits import union
@@ -17,6 +17,7 @@ from foveasim.layout.families import layout_family
 from foveasim.layout.generators.grid import square_corners_um
 from foveasim.layout.generators.tiling import Cells, tiling
 from foveasim.layout.model import Layout
+from foveasim.layout.site_counts import SolveFor
 
 __all__ = ["zones"]
 
@@ -26,13 +27,49 @@ MAX_PIXELS = 2**14
 INTEGER_ROUNDING = 1e-9
 
 
-@layout_family(example={"side_um": (8.0, 16.0, 32.0), "pitch_um": (1.0, 2.0, 4.0)})
+def _areas_um2(parameters: Mapping[str, Any]) -> tuple[float, Floats]:
+    """Return the width of the innermost zone in µm, and the areas of all zones in µm²."""
+    if parameters["side_um"] is not None:
+        sides_um = np.asarray(parameters["side_um"], dtype=np.float64)
+        return float(sides_um[0]), np.diff(sides_um**2, prepend=0.0)
+    outlines = [as_region(f"outlines_um[{i}]", outline) for i, outline in enumerate(parameters["outlines_um"])]
+    return _width_um(outlines[0]), np.diff([outline.area for outline in outlines], prepend=0.0)
+
+
+def _sites_per_pixel2(parameters: Mapping[str, Any]) -> float:
+    """Return the number of squares over the squared number of pixels across the innermost zone."""
+    width_um, area_um2 = _areas_um2(parameters)
+    return float((area_um2 / 4.0 ** np.arange(area_um2.size)).sum() / width_um**2)
+
+
+def _count_cells(parameters: Mapping[str, Any]) -> float | None:
+    """Return the number of squares in zones of squares; None where it requires a layout."""
+    if parameters["side_um"] is None or parameters["cells"] != "squares":
+        return None
+    return _sites_per_pixel2(parameters) * float(parameters["n_fovea"]) ** 2
+
+
+@layout_family(
+    example={"side_um": (8.0, 16.0, 32.0), "pitch_um": (1.0, 2.0, 4.0)},
+    solve_for=(
+        SolveFor(
+            name="n_fovea",
+            is_integer=True,
+            is_increasing=True,
+            guess=lambda n_sites, parameters: (n_sites / _sites_per_pixel2(parameters)) ** 0.5,
+            count=_count_cells,
+            is_optional=True,
+        ),
+    ),
+)
 def zones(
-    pitch_um: Sequence[float],
+    pitch_um: Sequence[float] | None = None,
     side_um: Sequence[float] | None = None,
     *,
+    n_fovea: int | None = None,
     outlines_um: Sequence[Any] | None = None,
     cells: Cells | Sequence[Cells] = "squares",
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
 ) -> Layout:
     """
     Generate nested zones, each with its own grid around the inner zone.
@@ -53,6 +90,8 @@ def zones(
     ----------
     pitch_um : sequence of float, µm
         Pixel pitch of each zone, from the innermost.
+    n_fovea : int, optional
+        Instead of the pitches: number of pixels across the innermost zone. The pitch doubles from zone to zone.
     side_um : sequence of float, optional, µm
         Increasing sides of square zones around the optical axis. In zones of squares, the side of the zone and that of the
         inner zone must be multiples of the pitch, with an integer number of pixels on each side of the inner zone.
@@ -61,6 +100,8 @@ def zones(
         than half the area of a pixel are merged into the adjacent pixel.
     cells : {"squares", "hexagons"} or a sequence of them
         Shape of the pixels, in all zones or in each. Hexagons are cut at zone boundaries as with arbitrary outlines.
+    n_sites : int, optional
+        Number of sites, instead of ``n_fovea``, within 1 %. Few numbers are possible in square zones of squares.
 
     Returns
     -------
@@ -84,7 +125,7 @@ def zones(
     """
     if (side_um is None) == (outlines_um is None):
         raise ParameterError("side_um", "or 'outlines_um' must be given, but only one of them")
-    pitches_um = finite_array("pitch_um", pitch_um, ndim=1, above=0.0)
+    pitches_um = _pitches_um(pitch_um, n_fovea, side_um, outlines_um)
     shapes = [cells] * pitches_um.size if isinstance(cells, str) else list(cells)
     for i, shape in enumerate(shapes):
         check_choice("cells" if isinstance(cells, str) else f"cells[{i}]", shape, get_args(Cells))
@@ -108,6 +149,27 @@ def zones(
     return layout.with_provenance(
         {"parameters": {"outlines_um": [region_as_plain_data(outline) for outline in outlines_um]}}
     )
+
+
+def _pitches_um(
+    pitch_um: Sequence[float] | None,
+    n_fovea: int | None,
+    side_um: Sequence[float] | None,
+    outlines_um: Sequence[Any] | None,
+) -> Floats:
+    if (pitch_um is None) == (n_fovea is None):
+        raise ParameterError("pitch_um", "or 'n_fovea' must be given, but only one of them")
+    if n_fovea is None:
+        return finite_array("pitch_um", pitch_um, ndim=1, above=0.0)
+    n_fovea = check_count("n_fovea", n_fovea, at_most=MAX_PIXELS)
+    widths_um = side_um if outlines_um is None else [_width_um(as_region("outlines_um[0]", outlines_um[0]))]
+    fovea_um = finite_array("side_um", widths_um, ndim=1, above=0.0)
+    n_zones = len(fovea_um if outlines_um is None else outlines_um)
+    return np.asarray(fovea_um[:1] / n_fovea * 2.0 ** np.arange(n_zones))
+
+
+def _width_um(region: Any) -> float:
+    return float(region.bounds[2] - region.bounds[0])
 
 
 def _sides(side_um: Sequence[float], pitches_um: Floats) -> Floats:
