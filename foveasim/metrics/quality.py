@@ -87,25 +87,52 @@ def ssim(
     ParameterError
         As for :func:`psnr_db`; when the window is even, or no window fits.
     """
-    from scipy.ndimage import minimum_filter
-    from skimage.metrics import structural_similarity
-
     one, other, is_compared = _prepare_comparison(picture, reference, min_coverage)
     window = check_count("window", window, at_least=3)
     if window % 2 == 0:
         raise ParameterError("window", "must be odd", window)
-    fits = minimum_filter(is_compared, size=window, mode="constant", cval=0)
+    peak = _data_range(other[:, is_compared], data_range)
+    # scikit-image requires numbers also in excluded pixels
+    one, other = (np.where(is_compared, plane, 0.0) for plane in (one, other))
+    similarity, fits = ssim_map(one, other, is_compared, peak, window=window)
     if not fits.any():
         raise ParameterError("window", "must fit within the compared pixels", window)
-    peak = _data_range(other[:, is_compared], data_range)
-    one, other = (
-        np.where(is_compared, plane, 0.0) for plane in (one, other)
-    )  # scikit-image requires numbers also in excluded pixels
+    return float(np.mean(similarity[fits]))
+
+
+def ssim_map(
+    one: Floats, other: Floats, is_compared: Bools, data_range: float, *, window: int = 7
+) -> tuple[Floats, Bools]:
+    """
+    Compute the structural similarity of each pixel, a mean over the channels.
+
+    Parameters
+    ----------
+    one, other : (n_channel, n_y, n_x)
+        Finite everywhere.
+    is_compared : (n_y, n_x) bool
+    data_range : float
+        Peak value.
+    window : int, pixels
+        Odd side of the square window.
+
+    Returns
+    -------
+    similarity : (n_y, n_x) float64
+    fits : (n_y, n_x) bool
+        Whether the window of a pixel contains only compared pixels.
+    """
+    from scipy.ndimage import minimum_filter
+    from skimage.metrics import structural_similarity
+
+    fits = minimum_filter(is_compared, size=window, mode="constant", cval=0)
+    if not fits.any():
+        return np.full(is_compared.shape, np.nan), fits
     maps = [
-        structural_similarity(a, b, win_size=window, data_range=peak, full=True)[1]
+        structural_similarity(a, b, win_size=window, data_range=data_range, full=True)[1]
         for a, b in zip(one, other, strict=True)
     ]
-    return float(np.mean(np.array(maps)[:, fits]))
+    return np.mean(maps, axis=0), fits
 
 
 def _prepare_comparison(

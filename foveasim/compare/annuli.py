@@ -1,0 +1,132 @@
+"""Picture quality by eccentricity: PSNR and SSIM in annuli around a fixation point."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from foveasim._core.validation import Bools, Floats, Ints, check_number
+from foveasim.errors import ParameterError
+from foveasim.fields import Grid
+from foveasim.metrics.quality import ssim_map
+from foveasim.reconstruct import Picture
+
+__all__ = ["PictureQuality", "annulus_of", "fit_gain", "quality_by_eccentricity"]
+
+
+class PictureQuality(NamedTuple):
+    """PSNR in dB and SSIM of a picture, in total and in each annulus, with the gain of the picture."""
+
+    psnr_db: float
+    ssim: float
+    psnr_db_by_eccentricity: Floats
+    ssim_by_eccentricity: Floats
+    gain: float
+
+
+def annulus_of(xy_um: Floats, centre_um: tuple[float, float], edges_um: Floats) -> Ints:
+    """Return the index of the annulus of points (..., 2) µm; -1 outside all of them."""
+    r_um = np.hypot(xy_um[..., 0] - centre_um[0], xy_um[..., 1] - centre_um[1])
+    index = np.searchsorted(edges_um, r_um, side="right") - 1
+    return np.where((index >= 0) & (index < edges_um.size - 1), index, -1)
+
+
+def fit_gain(values: Floats, reference: Floats) -> float:
+    """Return the factor of values with the smallest squared difference from a reference."""
+    power = float(np.square(values).sum())
+    return float((values * reference).sum()) / power if power > 0.0 else 1.0
+
+
+def quality_by_eccentricity(
+    picture: Picture,
+    reference: Picture,
+    *,
+    edges_um: Floats,
+    centre_um: tuple[float, float] = (0.0, 0.0),
+    is_compared: Bools | None = None,
+    data_range: float | None = None,
+) -> PictureQuality:
+    """
+    Compute PSNR and SSIM in annuli, after a fit of one gain.
+
+    Parameters
+    ----------
+    picture, reference : Picture
+        Of the same grid and channels.
+    edges_um : (n_annulus + 1,) float64, µm
+        Increasing radii of the annuli.
+    centre_um : (x, y), µm
+        Fixation point.
+    is_compared : (n_y, n_x) bool, optional
+        Compared pixels; by default those where both have a value and a coverage of at least one half.
+    data_range : float, optional
+        Peak value for both measures; by default the range of the reference over the compared pixels.
+
+    Returns
+    -------
+    PictureQuality
+        NaN in annuli without compared pixels.
+
+    Raises
+    ------
+    ParameterError
+        When the grids or channels differ, or no pixel can be compared.
+    """
+    for name, one in (("picture", picture), ("reference", reference)):
+        if not isinstance(one, Picture):
+            raise ParameterError(name, f"must be a foveasim.Picture, got a {type(one).__name__}")
+    if picture.grid != reference.grid:
+        raise ParameterError(
+            "reference",
+            f"must have the same grid as the picture, {_describe(picture.grid)}, got {_describe(reference.grid)}; "
+            "pass the same grid= to both",
+        )
+    if picture.data.shape != reference.data.shape:
+        raise ParameterError(
+            "reference", f"must have the same {picture.data.shape[0]} channels as the picture", reference.data.shape[0]
+        )
+    one, other = (np.asarray(p.data, np.float64) for p in (picture, reference))
+    known = np.isfinite(one).all(axis=0) & np.isfinite(other).all(axis=0)
+    if is_compared is None:
+        is_compared = np.minimum(picture.coverage, reference.coverage) >= 0.5
+    compared = known & is_compared
+    if not compared.any():
+        raise ParameterError("picture", "must have at least one pixel in common with the reference")
+    if data_range is None:
+        data_range = float(np.ptp(other[:, compared]))
+    data_range = check_number("data_range", data_range, above=0.0)
+    gain = fit_gain(one[:, compared], other[:, compared])
+    error = np.where(compared, np.square(gain * one - other).mean(axis=0), 0.0)
+    similarity, fits = ssim_map(np.where(compared, gain * one, 0.0), np.where(compared, other, 0.0), compared, data_range)
+    grid = picture.grid
+    centres_um = np.stack(np.meshgrid(grid.x_um, grid.y_um), axis=-1)
+    annulus = annulus_of(centres_um, centre_um, np.asarray(edges_um, np.float64))
+    n = len(edges_um) - 1
+    return PictureQuality(
+        psnr_db=_psnr_db(float(error[compared].mean()), data_range),
+        ssim=float(similarity[fits].mean()) if fits.any() else float("nan"),
+        psnr_db_by_eccentricity=_psnr_db(_means(error, annulus, compared, n), data_range),
+        ssim_by_eccentricity=_means(similarity, annulus, fits, n),
+        gain=gain,
+    )
+
+
+def _psnr_db(mean_square: Floats | float, data_range: float) -> Floats | float:
+    with np.errstate(divide="ignore"):
+        found = 10.0 * np.log10(data_range**2 / np.asarray(mean_square))
+    return float(found) if np.ndim(mean_square) == 0 else found
+
+
+def _means(values: Floats, annulus: Ints, is_used: Bools, n: int) -> Floats:
+    """Return the mean over the used pixels of each annulus; NaN without any."""
+    used = is_used & (annulus >= 0)
+    sums = np.bincount(annulus[used], values[used], minlength=n)
+    counts = np.bincount(annulus[used], minlength=n)
+    return np.divide(sums, counts, out=np.full(n, np.nan), where=counts > 0)
+
+
+def _describe(grid: Grid) -> str:
+    n_y, n_x = grid.shape
+    x_um, y_um = grid.origin_um
+    return f"{n_x} x {n_y} pixels of {grid.pitch_x_um:.4g} µm from ({x_um:.4g}, {y_um:.4g}) µm"

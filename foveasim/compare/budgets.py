@@ -1,0 +1,106 @@
+"""Budgets of cameras: number of sites, data rate, covered area, and read noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from foveasim._core.validation import check_choice, check_number
+from foveasim.camera import Camera
+from foveasim.errors import ParameterError, format_value
+
+__all__ = ["BUDGETS", "Budget", "budget_of", "check_equal_budgets"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """
+    Budget of a camera.
+
+    Attributes
+    ----------
+    n_sites : int
+    data_rate_bit_per_s : float, bit/s
+        Sum of bit depth times frame rate over all sites, without blanking.
+    area_um2 : float, µm²
+        Total area of the sites.
+    read_noise_e2 : float, e-²
+        Sum of the variances of the read noise over all sites.
+    """
+
+    n_sites: int
+    data_rate_bit_per_s: float
+    area_um2: float
+    read_noise_e2: float
+
+
+#: Names of budgets, with the attribute, the title and the unit of each.
+BUDGETS = {
+    "n_sites": ("n_sites", "number of sites", ""),
+    "data_rate": ("data_rate_bit_per_s", "data rate", "bit/s"),
+    "area": ("area_um2", "area of the sites", "µm²"),
+    "read_noise": ("read_noise_e2", "sum of read-noise variances", "e-²"),
+}
+assert {attribute for attribute, _, _ in BUDGETS.values()} == {field.name for field in fields(Budget)}
+
+
+def budget_of(camera: Camera, frames_per_s: float) -> Budget:
+    """
+    Return the budget of a camera.
+
+    Parameters
+    ----------
+    camera : Camera
+    frames_per_s : float, 1/s
+
+    Raises
+    ------
+    ParameterError
+        When an argument is invalid.
+    """
+    if not isinstance(camera, Camera):
+        raise ParameterError("camera", f"must be a foveasim.Camera, got a {type(camera).__name__}")
+    frames_per_s = check_number("frames_per_s", frames_per_s, above=0.0)
+    sensor = camera.sensor
+    n_sites = sensor.layout.n_sites
+    return Budget(
+        n_sites=n_sites,
+        data_rate_bit_per_s=n_sites * sensor.bits * frames_per_s,
+        area_um2=float(sensor.layout.area_um2.sum()),
+        read_noise_e2=float(np.square(np.broadcast_to(sensor.read_noise_e, (n_sites,))).sum()),
+    )
+
+
+def check_equal_budgets(budgets: Mapping[str, Budget], budget: str | None, tolerance: float) -> None:
+    """
+    Check that cameras have the same budget.
+
+    Parameters
+    ----------
+    budgets : mapping of str to Budget
+    budget : {"n_sites", "data_rate", "area", "read_noise"} or None
+        The budget to compare; None for no check.
+    tolerance : float
+        Largest relative difference from the first camera.
+
+    Raises
+    ------
+    ParameterError
+        When the budget of a camera differs by more.
+    """
+    tolerance = check_number("tolerance", tolerance, at_least=0.0)
+    if budget is None:
+        return
+    attribute, title, unit = BUDGETS[check_choice("budget", budget, tuple(BUDGETS))]
+    (first, reference), *others = ((name, getattr(found, attribute)) for name, found in budgets.items())
+    for name, value in others:
+        if abs(value - reference) > tolerance * abs(reference):
+            shown = [f"{number:,.6g} {unit}".rstrip() for number in (reference, value)]
+            raise ParameterError(
+                "budget",
+                f"'{budget}' must be equal within {100.0 * tolerance:g} %: the {title} of {format_value(first)} is {shown[0]}, "
+                f"that of {format_value(name)} {shown[1]}",
+                hint="use layouts of equal budget (n_sites= of a generator), a larger tolerance, or no budget",
+            )
