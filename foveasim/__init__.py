@@ -45,7 +45,7 @@ from foveasim.scene import Scene
 from foveasim.sensor import FilterSet, GaussianCurve, PolynomialCurve, Sensor, SiliconQE, rgb_filters
 
 if TYPE_CHECKING:
-    from foveasim import explore
+    from foveasim import compare, explore
     from foveasim.config import read_layout
 
 __all__ = [
@@ -66,6 +66,7 @@ __all__ = [
     "Sensor",
     "SiliconQE",
     "__version__",
+    "compare",
     "distortion",
     "errors",
     "explore",
@@ -94,8 +95,8 @@ for _module in (
     check_public_calls(f"{__name__}.{_module}")
 check_public_calls(__name__)
 
-#: Names that are imported when they are used, and the modules that have them: both load the models of settings.
-_LAZY = {"explore": "foveasim.explore", "read_layout": "foveasim.config"}
+#: Names that are imported when they are used, and the modules that have them.
+_LAZY = {"compare": "foveasim.compare", "explore": "foveasim.explore", "read_layout": "foveasim.config"}
 
 if not TYPE_CHECKING:  # type checkers would take any name for an attribute
 

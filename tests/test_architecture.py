@@ -28,6 +28,7 @@ LAYERS = [
     {"capture"},
     {"camera"},
     {"metrics", "video", "view"},
+    {"compare"},
     {"config"},
     {"explore"},
     {"cli"},

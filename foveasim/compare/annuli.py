@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from foveasim._core.validation import Bools, Floats, Ints, check_number
 from foveasim.errors import ParameterError
@@ -32,7 +33,7 @@ def annulus_of(xy_um: Floats, centre_um: tuple[float, float], edges_um: Floats) 
     return np.where((index >= 0) & (index < edges_um.size - 1), index, -1)
 
 
-def fit_gain(values: Floats, reference: Floats) -> float:
+def fit_gain(values: NDArray[np.float64], reference: NDArray[np.float64]) -> float:
     """Return the factor of values with the smallest squared difference from a reference."""
     power = float(np.square(values).sum())
     return float((values * reference).sum()) / power if power > 0.0 else 1.0
@@ -98,13 +99,15 @@ def quality_by_eccentricity(
     data_range = check_number("data_range", data_range, above=0.0)
     gain = fit_gain(one[:, compared], other[:, compared])
     error = np.where(compared, np.square(gain * one - other).mean(axis=0), 0.0)
-    similarity, fits = ssim_map(np.where(compared, gain * one, 0.0), np.where(compared, other, 0.0), compared, data_range)
+    similarity, fits = ssim_map(
+        np.where(compared, gain * one, 0.0), np.where(compared, other, 0.0), compared, data_range
+    )
     grid = picture.grid
     centres_um = np.stack(np.meshgrid(grid.x_um, grid.y_um), axis=-1)
     annulus = annulus_of(centres_um, centre_um, np.asarray(edges_um, np.float64))
     n = len(edges_um) - 1
     return PictureQuality(
-        psnr_db=_psnr_db(float(error[compared].mean()), data_range),
+        psnr_db=float(_psnr_db(np.asarray(error[compared].mean()), data_range)),
         ssim=float(similarity[fits].mean()) if fits.any() else float("nan"),
         psnr_db_by_eccentricity=_psnr_db(_means(error, annulus, compared, n), data_range),
         ssim_by_eccentricity=_means(similarity, annulus, fits, n),
@@ -112,10 +115,9 @@ def quality_by_eccentricity(
     )
 
 
-def _psnr_db(mean_square: Floats | float, data_range: float) -> Floats | float:
+def _psnr_db(mean_square: NDArray[np.float64], data_range: float) -> Floats:
     with np.errstate(divide="ignore"):
-        found = 10.0 * np.log10(data_range**2 / np.asarray(mean_square))
-    return float(found) if np.ndim(mean_square) == 0 else found
+        return np.asarray(10.0 * np.log10(data_range**2 / mean_square))
 
 
 def _means(values: Floats, annulus: Ints, is_used: Bools, n: int) -> Floats:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.validation import Floats, finite_array
 from foveasim.errors import ParameterError
@@ -28,17 +28,23 @@ WIDTH_RATIO = 2.0
 MAX_DISTANCE_FRACTION = 0.4
 
 
-def gaussian_information_bits(signal_covariance: ArrayLike, noise_covariance: ArrayLike) -> float:
+def gaussian_information_bits(
+    signal_covariance: ArrayLike,
+    noise_variance: ArrayLike | None = None,
+    *,
+    noise_covariance: ArrayLike | None = None,
+) -> float:
     """
-    Compute the information of Gaussian readings about Gaussian scenes.
+    Compute the information of readings about scenes, by Gaussian models of both.
 
     Parameters
     ----------
     signal_covariance : (n, n)
         Covariance of the expected readings over the scenes.
-    noise_covariance : (n,), (n_scene, n) or (n, n)
-        Noise variance of each reading; or, for noise that depends on the scene, as a sample of scenes with at least two
-        dimensions and another number of rows than columns; or the covariance of correlated noise.
+    noise_variance : (n,) or (n_scene, n)
+        Noise variance of each reading; for noise that depends on the scene, in a sample of scenes.
+    noise_covariance : (n, n), optional
+        Instead of the variances: covariance of correlated noise.
 
     Returns
     -------
@@ -47,7 +53,7 @@ def gaussian_information_bits(signal_covariance: ArrayLike, noise_covariance: Ar
     Raises
     ------
     ParameterError
-        When shapes do not match, or a covariance is not positive definite.
+        When shapes do not match, a covariance is not positive definite, or not exactly one kind of noise is given.
 
     Notes
     -----
@@ -57,28 +63,32 @@ def gaussian_information_bits(signal_covariance: ArrayLike, noise_covariance: Ar
 
     Examples
     --------
-    >>> float(gaussian_information_bits([[3.0]], [1.0]))
+    >>> gaussian_information_bits([[3.0]], [1.0])
     1.0
     """
     signal = finite_array("signal_covariance", signal_covariance, ndim=2)
     n = signal.shape[0]
-    noise = finite_array("noise_covariance", noise_covariance)
-    if signal.shape != (n, n) or noise.ndim not in (1, 2) or noise.shape[-1] != n:
-        raise ParameterError(
-            "noise_covariance", f"must match the signal covariance of shape {signal.shape}", list(noise.shape)
-        )
-    if noise.ndim == 2 and noise.shape == (n, n) and (n > 1 or noise.size == 1):
-        total, conditional = signal + noise, _log2_det("noise_covariance", noise)
+    if signal.shape != (n, n):
+        raise ParameterError("signal_covariance", "must be square", list(signal.shape))
+    if (noise_variance is None) == (noise_covariance is None):
+        raise ParameterError("noise_variance", "or 'noise_covariance' must be given, but only one of them")
+    if noise_covariance is not None:
+        noise = finite_array("noise_covariance", noise_covariance, ndim=2)
+        if noise.shape != (n, n):
+            raise ParameterError("noise_covariance", f"must have the shape {(n, n)}", list(noise.shape))
+        conditional = _log2_det("noise_covariance", noise)
     else:
-        variances = np.atleast_2d(noise)
-        if variances.min() <= 0.0:
-            raise ParameterError("noise_covariance", "must be > 0", float(variances.min()))
-        total = signal + np.diag(variances.mean(axis=0))
+        variances = np.atleast_2d(finite_array("noise_variance", noise_variance, above=0.0))
+        if variances.ndim != 2 or variances.shape[1] != n:
+            raise ParameterError(
+                "noise_variance", f"must have the shape ({n},) or (n_scene, {n})", list(variances.shape)
+            )
+        noise = np.diag(variances.mean(axis=0))
         conditional = float(np.log2(variances).sum(axis=1).mean())
-    return 0.5 * (_log2_det("signal_covariance", total) - conditional)
+    return 0.5 * (_log2_det("signal_covariance", signal + noise) - conditional)
 
 
-def _log2_det(name: str, matrix: Floats) -> float:
+def _log2_det(name: str, matrix: NDArray[np.float64]) -> float:
     try:
         root = np.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:
@@ -179,8 +189,8 @@ def scene_covariance(images: ArrayLike, pitch_um: float) -> SceneCovariance:
 def site_information_bits(
     layout: Layout,
     covariance: SceneCovariance,
-    gain: Floats,
-    noise_variance: Floats,
+    gain: ArrayLike,
+    noise_variance: ArrayLike,
     *,
     n_conditions: int = N_CONDITIONS,
 ) -> Floats:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.validation import Bools, Floats, as_numbers, check_count, check_number
 from foveasim.errors import ParameterError
@@ -101,7 +101,7 @@ def ssim(
 
 
 def ssim_map(
-    one: Floats, other: Floats, is_compared: Bools, data_range: float, *, window: int = 7
+    one: NDArray[np.float64], other: NDArray[np.float64], is_compared: Bools, data_range: float, *, window: int = 7
 ) -> tuple[Floats, Bools]:
     """
     Compute the structural similarity of each pixel, a mean over the channels.

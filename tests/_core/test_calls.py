@@ -139,8 +139,8 @@ def test_registered_generators_are_checked():
         (lambda: fs.layout.grid(4, 3, 2.0), lambda: fs.layout.grid(n_x=4, n_y=3, pitch_um=2.0)),
         (lambda: fs.layout.hexagonal(4, 3, 2.0), lambda: fs.layout.hexagonal(n_columns=4, n_rows=3, pitch_um=2.0)),
         (lambda: fs.layout.octagonal(4, 3, 2.0), lambda: fs.layout.octagonal(n_x=4, n_y=3, pitch_um=2.0)),
-        (lambda: fs.layout.log_polar(24, 54.7, min_size_um=2.0), lambda: fs.layout.log_polar(n_sectors=24, r_max_um=54.7, min_size_um=2.0)),
-        (lambda: fs.layout.penrose(2.0, 20.0), lambda: fs.layout.penrose(side_um=2.0, size_um=20.0)),
+        (lambda: fs.layout.log_polar(24, r_max_um=54.7, min_size_um=2.0), lambda: fs.layout.log_polar(n_sectors=24, r_max_um=54.7, min_size_um=2.0)),
+        (lambda: fs.layout.penrose(2.0, size_um=20.0), lambda: fs.layout.penrose(side_um=2.0, size_um=20.0)),
         (lambda: fs.layout.sunflower(50, 2.0), lambda: fs.layout.sunflower(n_sites=50, spacing_um=2.0)),
         (lambda: fs.layout.tiling(2.0, radius_um=9.0), lambda: fs.layout.tiling(pitch_um=2.0, radius_um=9.0)),
         (lambda: fs.layout.zones((1.0, 2.0), (8.0, 16.0)), lambda: fs.layout.zones(pitch_um=(1.0, 2.0), side_um=(8.0, 16.0))),
@@ -155,6 +155,6 @@ def test_generators_accept_sizes_by_position(by_position, by_name):
 
 def test_warnings_point_to_user_code():
     with pytest.warns(fs.errors.LayoutWarning) as caught:
-        fs.layout.log_polar(24, 50.0, min_size_um=2.0)
+        fs.layout.log_polar(24, r_max_um=50.0, min_size_um=2.0)
 
     assert caught[0].filename == __file__

@@ -1,0 +1,38 @@
+"""
+Comparison of cameras and layouts at equal budget.
+
+Pictures, their quality by eccentricity, signal-to-noise ratio, resolution, aliasing, information and precision of motion.
+"""
+
+from __future__ import annotations
+
+from foveasim.compare.annuli import PictureQuality, quality_by_eccentricity
+from foveasim.compare.budgets import BUDGETS, Budget, budget_of
+from foveasim.compare.comparison import Comparison, cameras, layouts
+from foveasim.compare.information import (
+    SceneCovariance,
+    gaussian_information_bits,
+    scene_covariance,
+    site_information_bits,
+)
+from foveasim.compare.measure import MEASURES, Measure
+from foveasim.compare.setup import default_sensor, photograph_scenes
+
+__all__ = [
+    "BUDGETS",
+    "MEASURES",
+    "Budget",
+    "Comparison",
+    "Measure",
+    "PictureQuality",
+    "SceneCovariance",
+    "budget_of",
+    "cameras",
+    "default_sensor",
+    "gaussian_information_bits",
+    "layouts",
+    "photograph_scenes",
+    "quality_by_eccentricity",
+    "scene_covariance",
+    "site_information_bits",
+]

@@ -1,0 +1,582 @@
+"""Comparison of cameras at equal budget, with the same scenes, lens, exposure and picture grid."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim._core.extras import needs
+from foveasim._core.provenance import copy_plain_data, to_plain_data, versions
+from foveasim._core.validation import Floats, check_count, check_number, finite_array, read_only
+from foveasim.camera import Camera
+from foveasim.compare.annuli import quality_by_eccentricity
+from foveasim.compare.budgets import BUDGETS, Budget, budget_of, check_equal_budgets
+from foveasim.compare.information import scene_covariance
+from foveasim.compare.measure import (
+    MEASURES,
+    SceneMeasures,
+    information_by_annulus,
+    layout_measures,
+    scene_measures,
+    size_records,
+)
+from foveasim.compare.setup import cameras_of, field_um, photograph_scenes
+from foveasim.errors import ParameterError, format_value
+from foveasim.fields import Grid, PowerMap
+from foveasim.layout import Layout
+from foveasim.optics import Optics
+from foveasim.reconstruct import Picture
+from foveasim.scene import Scene
+from foveasim.sensor import Sensor
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.figure import Figure
+    from rich.console import RenderableType
+
+__all__ = ["Comparison", "cameras", "layouts"]
+
+Method = Literal["cells", "linear", "natural", "least_squares"]
+
+#: Coverage from which a pixel belongs to a camera's picture.
+MIN_COVERAGE = 0.5
+#: Confidence of the intervals.
+CONFIDENCE = 0.95
+#: Cells of the images for shifts per picture pixel, and margin in picture pixels.
+FINE_CELLS, MARGIN_PIXELS = 2, 4
+BY_ECCENTRICITY = "_by_eccentricity"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Comparison:
+    """
+    Result of a comparison.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Names of the cameras.
+    scenes : tuple of str
+    budgets : tuple of Budget
+        One per camera.
+    edges_um : (n_annulus + 1,) float64, µm
+        Radii of the annuli around ``centre_um``.
+    centre_um : (x, y), µm
+        Fixation point.
+    values : mapping of str to array
+        Measures by name: (n_camera, n_scene) or (n_camera,); and ``NAME_by_eccentricity`` with an axis of annuli.
+    coverage : (n_camera,) float64
+        Fraction of the common field, the pixels that any camera covers, that each camera covers.
+    compared_fraction : float
+        Fraction of the field that all cameras cover: pictures are compared there.
+    pictures : mapping of str to list of Picture
+        Pictures of each camera for each scene, with the gain that was fitted; those of ``ideal`` are the references.
+    sizes : mapping of str to list of dict
+        Size classes of each camera: size in µm, number of sites, area fraction.
+    settings : mapping
+        Plain data: budget, exposure, seed, optics, sensors, layouts, versions.
+    """
+
+    names: tuple[str, ...]
+    scenes: tuple[str, ...]
+    budgets: tuple[Budget, ...]
+    edges_um: Floats
+    centre_um: tuple[float, float]
+    values: Mapping[str, Floats]
+    coverage: Floats
+    compared_fraction: float
+    pictures: Mapping[str, Sequence[Picture]]
+    ideal: Sequence[Picture]
+    sizes: Mapping[str, Sequence[Mapping[str, Any]]]
+    settings: Mapping[str, Any]
+
+    def __repr__(self) -> str:
+        return f"Comparison({', '.join(map(format_value, self.names))}; {len(self.scenes)} scenes)"
+
+    def summary(self, name: str, *, by_eccentricity: bool = False) -> tuple[Floats, Floats]:
+        """
+        Return mean over the scenes and half width of the confidence interval of a measure.
+
+        Parameters
+        ----------
+        name : str
+            A name in :data:`MEASURES`.
+        by_eccentricity : bool
+            Whether to return values per annulus.
+
+        Returns
+        -------
+        mean, half_width : (n_camera,) or (n_camera, n_annulus) float64
+            Half width of the 95 % interval of Student's t over the scenes; NaN for one scene, 0 for measures of layouts.
+        """
+        measure = _measure(name)
+        values = self.values[name + (BY_ECCENTRICITY if by_eccentricity else "")]
+        return _interval(values) if measure.has_scenes else (values, np.zeros_like(values))
+
+    def differences(self, name: str, *, by_eccentricity: bool = False) -> tuple[Floats, Floats]:
+        """
+        Return the mean difference of a measure from the first camera, with its confidence interval.
+
+        Parameters
+        ----------
+        name, by_eccentricity
+            As for :meth:`summary`.
+
+        Returns
+        -------
+        mean, half_width : (n_camera,) or (n_camera, n_annulus) float64
+            Differences are paired by scene, so that the interval does not contain the variation between scenes.
+        """
+        measure = _measure(name)
+        values = self.values[name + (BY_ECCENTRICITY if by_eccentricity else "")]
+        with np.errstate(invalid="ignore"):  # infinite PSNR of identical pictures
+            difference = np.where(values == values[:1], 0.0, values - values[:1])
+        return _interval(difference) if measure.has_scenes else (difference, np.zeros_like(difference))
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return one dict per camera: its budget, its coverage, and mean and half width of every measure."""
+        rows = []
+        for k, name in enumerate(self.names):
+            row: dict[str, Any] = {"camera": name, **asdict(self.budgets[k]), "coverage": float(self.coverage[k])}
+            for measure in MEASURES:
+                mean, half_width = self.summary(measure)
+                row[measure] = float(mean[k])
+                if MEASURES[measure].has_scenes:
+                    row[f"{measure}_half_width"] = float(half_width[k])
+            rows.append(row)
+        return rows
+
+    def to_xarray(self) -> xr.Dataset:
+        """
+        Return all values as a labelled dataset.
+
+        Returns
+        -------
+        xarray.Dataset
+            Dimensions ``camera``, ``scene``, ``annulus``, with the radii of the annuli and the budgets as coordinates.
+
+        Raises
+        ------
+        ParameterError
+            When xarray is missing.
+        """
+        try:
+            import xarray as xr
+        except ImportError:
+            raise ParameterError("to_xarray", needs("xarray", "maps")) from None
+        variables = {}
+        for name, measure in MEASURES.items():
+            dims = ("camera", "scene") if measure.has_scenes else ("camera",)
+            attributes = {"units": measure.unit or "1", "long_name": measure.title}
+            variables[name] = (dims, self.values[name], attributes)
+            variables[name + BY_ECCENTRICITY] = ((*dims, "annulus"), self.values[name + BY_ECCENTRICITY], attributes)
+        variables["coverage"] = (("camera",), self.coverage, {"units": "1"})
+        coordinates: dict[str, Any] = {
+            "camera": list(self.names),
+            "scene": list(self.scenes),
+            "from_um": ("annulus", self.edges_um[:-1], {"units": "µm"}),
+            "to_um": ("annulus", self.edges_um[1:], {"units": "µm"}),
+        }
+        for attribute, _, unit in BUDGETS.values():
+            numbers = [getattr(budget, attribute) for budget in self.budgets]
+            coordinates[attribute] = ("camera", numbers, {"units": unit or "1"})
+        return xr.Dataset(variables, coordinates, {"settings": json.dumps(self.settings)})
+
+    def plot(self) -> Figure:
+        """Draw all measures against eccentricity, with confidence intervals, as a matplotlib figure."""
+        from foveasim.compare.figures import overview
+
+        return overview(self)
+
+    def write(self, path: str | Path) -> None:
+        """
+        Write a report as an HTML page that needs no network.
+
+        Parameters
+        ----------
+        path : path
+            With the extension ``.html``; written atomically.
+
+        Raises
+        ------
+        FileError
+            When the extension is another, or the file cannot be written.
+        """
+        from foveasim.compare.report import report_page
+        from foveasim.view.web._page import write_page
+
+        write_page(path, lambda: report_page(self))
+
+    def __str__(self) -> str:
+        columns = [("", *self.names), *(tuple(row) for row in self._rows())]
+        widths = [max(len(row[k]) for row in columns) for k in range(len(self.names) + 1)]
+        return "\n".join(
+            "  ".join(
+                cell.ljust(width) if k == 0 else cell.rjust(width)
+                for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+            ).rstrip()
+            for row in columns
+        )
+
+    def __rich__(self) -> RenderableType:
+        from rich.table import Table
+
+        from foveasim._io.terminal import as_plain_text
+
+        table = Table(box=None)
+        table.add_column("")
+        for name in self.names:
+            table.add_column(as_plain_text(name), justify="right")
+        for row in self._rows():
+            table.add_row(*map(as_plain_text, row))
+        return table
+
+    def _rows(self) -> list[list[str]]:
+        """Return title and one value per camera of each row of the table."""
+        rows = []
+        for attribute, title, unit in BUDGETS.values():
+            numbers = [getattr(budget, attribute) for budget in self.budgets]
+            rows.append([f"{title} / {unit}" if unit else title, *(format_number(x) for x in numbers)])
+        rows.append(["coverage of the field / %", *(f"{100.0 * part:.1f}" for part in self.coverage)])
+        for name, measure in MEASURES.items():
+            mean, half_width = self.summary(name)
+            title = f"{measure.title} / {measure.unit}" if measure.unit else measure.title
+            rows.append([title, *(format_interval(*pair) for pair in zip(mean, half_width, strict=True))])
+        return rows
+
+
+def cameras(
+    cameras: Mapping[str, Camera],
+    scenes: Mapping[str, Scene | PowerMap] | None = None,
+    *,
+    exposure_s: float,
+    seed: int = 0,
+    budget: str | None = "n_sites",
+    tolerance: float = 0.02,
+    frames_per_s: float | Mapping[str, float] | None = None,
+    centre_um: tuple[float, float] = (0.0, 0.0),
+    n_annuli: int = 8,
+    max_pixels: int = 256,
+    method: Method = "cells",
+    progress: Callable[[int, int], None] | None = None,
+) -> Comparison:
+    """
+    Compare cameras of equal budget, with the same scenes, lens and exposure.
+
+    Parameters
+    ----------
+    cameras : mapping of str to Camera
+        Two or more, with the same optics and distortion.
+    scenes : mapping of str to Scene or PowerMap, optional
+        By default five photographs that fill the field (:func:`photograph_scenes`).
+    exposure_s : float, s
+    seed : int
+        Seed of the noise, the same for all cameras.
+    budget : {"n_sites", "data_rate", "area", "read_noise"} or None
+        Budget that must be equal; None for any budgets.
+    tolerance : float
+        Largest relative difference of the budgets from that of the first camera.
+    frames_per_s : float, or mapping of str to float, optional, 1/s
+        Frame rate for the data rate, of all cameras or by name; by default one frame per exposure.
+    centre_um : (x, y), µm
+        Fixation point, the centre of the annuli.
+    n_annuli : int
+        Number of annuli of equal width, out to the largest distance of a site.
+    max_pixels : int
+        Pixels along the longer side of the pictures, which have a common grid.
+    method : {"cells", "linear", "natural", "least_squares"}
+        Reconstruction, as for :meth:`Capture.picture`.
+    progress : function of (n_done, n), optional
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    ParameterError
+        When budgets differ, cameras have different lenses, or a value is out of range.
+
+    Notes
+    -----
+    The reference of a picture is the ideal image on its grid: exact means of the irradiance, with the spectral response of the
+    camera. One gain per picture is fitted. Pictures are compared where all cameras cover at least half of a pixel.
+    """
+    named = _check_cameras(cameras)
+    exposure_s = check_number("exposure_s", exposure_s, above=0.0)
+    seed = check_count("seed", seed, at_least=0)
+    n_annuli = check_count("n_annuli", n_annuli, at_most=1000)
+    max_pixels = check_count("max_pixels", max_pixels, at_least=16, at_most=4096)
+    centre = finite_array("centre_um", centre_um, ndim=1)
+    if centre.size != 2:
+        raise ParameterError("centre_um", "must be two numbers (x, y)", centre_um, "µm")
+    fixation = float(centre[0]), float(centre[1])
+    budgets = {name: budget_of(camera, _rate(frames_per_s, name, exposure_s)) for name, camera in named.items()}
+    check_equal_budgets(budgets, budget, tolerance)
+    sensors = {name: camera.sensor for name, camera in named.items()}
+    all_layouts = [sensor.layout for sensor in sensors.values()]
+    first = next(iter(named.values()))
+    if scenes is None:
+        scenes = photograph_scenes(field_um(all_layouts), first.optics)  # type: ignore[arg-type]
+    if not isinstance(scenes, Mapping) or not scenes:
+        raise ParameterError("scenes", "must be a mapping of names to at least one scene", scenes)
+    n_steps = len(named) * (len(scenes) + 1)
+    n_done = 0
+
+    def advance() -> None:
+        nonlocal n_done
+        n_done += 1
+        if progress is not None:
+            progress(n_done, n_steps)
+
+    low, high = (
+        extreme([np.asarray(layout.bounds_um)[part] for layout in all_layouts], axis=0)
+        for extreme, part in ((np.min, slice(0, 2)), (np.max, slice(2, 4)))
+    )
+    grid = _grid(low, high, max_pixels, 0)
+    fine = _grid(low, high, FINE_CELLS * max_pixels, FINE_CELLS * MARGIN_PIXELS)
+    reach_um = max(float(np.hypot(*(layout.centroid_um - centre).T).max()) for layout in all_layouts)
+    edges_um = np.linspace(0.0, reach_um * (1.0 + 1e-9), n_annuli + 1)
+
+    # Captures and pictures, scene by scene.
+    ideal: dict[str, list[Picture]] = {name: [] for name in named}
+    found: dict[str, list[SceneMeasures]] = {name: [] for name in named}
+    raw: dict[str, list[Picture]] = {name: [] for name in named}
+    for scene_name, light in scenes.items():
+        if not isinstance(light, Scene | PowerMap):
+            raise ParameterError("scenes", f"must be scenes or power maps, got a {type(light).__name__}", scene_name)
+        power_map = first.power_map(light) if isinstance(light, Scene) else light
+        for name, camera in named.items():
+            capture = camera.capture(light, exposure_s=exposure_s, seed=seed)
+            raw[name].append(capture.picture(method, of="light_e", per="um2", grid=grid, sensor=camera.sensor))
+            ideal[name].append(camera.reference(power_map, grid, exposure_s=exposure_s))
+            image = camera.reference(power_map, fine, exposure_s=exposure_s)
+            found[name].append(scene_measures(camera, capture, image, fixation, edges_um))
+            advance()
+
+    # Quality where all cameras have values.
+    covered = {name: pictures[0].coverage >= MIN_COVERAGE for name, pictures in raw.items()}
+    is_common = np.all([*covered.values()], axis=0)
+    is_field = np.any([*covered.values()], axis=0)
+    if not is_common.any():
+        raise ParameterError("cameras", "must have a common part of the field; the layouts do not overlap")
+    values: dict[str, list[Any]] = {key: [] for name in MEASURES for key in (name, name + BY_ECCENTRICITY)}
+    pictures: dict[str, list[Picture]] = {}
+    covariance = scene_covariance(
+        [np.mean(picture.data, axis=0) for picture in next(iter(ideal.values()))], grid.pitch_x_um
+    )
+    mean_e_per_um2 = float(np.mean([np.nanmean(picture.data) for picture in next(iter(ideal.values()))]))
+    light = next(iter(scenes.values()))
+    distance_m = float(light.distance_m) if isinstance(light, Scene) else None
+    wavelength_nm = float(np.mean(light.wavelength_nm))
+    density_per_um2 = budgets[next(iter(named))].n_sites / budgets[next(iter(named))].area_um2
+    wave_per_mm = 1.5 * 1e3 * 0.5 * density_per_um2**0.5
+    for name, camera in named.items():
+        qualities = [
+            quality_by_eccentricity(one, other, edges_um=edges_um, centre_um=fixation, is_compared=is_common)
+            for one, other in zip(raw[name], ideal[name], strict=True)
+        ]
+        totals: dict[str, Any] = {key: [getattr(q, key) for q in qualities] for key in ("psnr_db", "ssim")}
+        annuli: dict[str, Any] = {
+            key: [getattr(q, key + BY_ECCENTRICITY) for q in qualities] for key in ("psnr_db", "ssim")
+        }
+        for key in ("snr_db", "shift_sigma_um"):
+            totals[key] = [one.totals[key] for one in found[name]]
+            annuli[key] = [one.annuli[key] for one in found[name]]
+        channel_means = np.nanmean([picture.data for picture in ideal[name]], axis=(0, 2, 3))
+        response = channel_means[found[name][0].capture.filter_of_site] / mean_e_per_um2 * camera.sensor.sensitivity
+        noise_e = [one.signals.noise_e for one in found[name]]
+        for target, part in zip(
+            (totals, annuli),
+            information_by_annulus(camera, covariance, response, noise_e, fixation, edges_um),
+            strict=True,
+        ):
+            target.update(part)
+        for target, part in zip(
+            (totals, annuli),
+            layout_measures(camera, wavelength_nm, distance_m, fixation, edges_um, wave_per_mm),
+            strict=True,
+        ):
+            target.update(part)
+        for key in MEASURES:
+            values[key].append(totals[key])
+            values[key + BY_ECCENTRICITY].append(annuli[key])
+        pictures[name] = [
+            Picture((q.gain * one.data).astype(np.float32), one.coverage, grid)
+            for q, one in zip(qualities, raw[name], strict=True)
+        ]
+        advance()
+    return Comparison(
+        names=tuple(named),
+        scenes=tuple(map(str, scenes)),
+        budgets=tuple(budgets.values()),
+        edges_um=read_only(edges_um),
+        centre_um=fixation,
+        values={key: read_only(np.asarray(rows, np.float64)) for key, rows in values.items()},
+        coverage=read_only(
+            np.array([np.count_nonzero(part) for part in covered.values()]) / np.count_nonzero(is_field)
+        ),
+        compared_fraction=float(np.count_nonzero(is_common) / np.count_nonzero(is_field)),
+        pictures=pictures,
+        ideal=next(iter(ideal.values())),
+        sizes={name: size_records(camera) for name, camera in named.items()},
+        settings={
+            "budget": budget,
+            "tolerance": tolerance,
+            "exposure_s": exposure_s,
+            "seed": seed,
+            "method": method,
+            "wave_per_mm": wave_per_mm,
+            "optics": to_plain_data(first.optics),
+            "distortion": None if first.distortion is None else to_plain_data(first.distortion),
+            "cameras": {
+                name: {
+                    "sensor": {k: v for k, v in to_plain_data(sensor).items() if k != "layout"},
+                    "layout": to_plain_data(dict(sensor.layout.provenance)),  # type: ignore[attr-defined]
+                }
+                for name, sensor in sensors.items()
+            },
+            "versions": copy_plain_data(versions()),
+        },
+    )
+
+
+def layouts(
+    layouts: Mapping[str, Layout],
+    scenes: Mapping[str, Scene | PowerMap] | None = None,
+    *,
+    optics: Optics | None = None,
+    sensor: Callable[[Layout], Sensor] | None = None,
+    exposure_s: float = 1 / 60,
+    **options: Any,
+) -> Comparison:
+    """
+    Compare layouts of equal budget, in cameras of the same design.
+
+    Parameters
+    ----------
+    layouts : mapping of str to Layout
+    scenes : mapping of str to Scene or PowerMap, optional
+        As for :func:`cameras`.
+    optics : Optics, optional
+        By default a lens of 8 mm and f/2.8.
+    sensor : function of a layout, optional
+        Returns the sensor of a layout; :func:`default_sensor` by default.
+    exposure_s : float, s
+    **options
+        As for :func:`cameras`.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    ParameterError
+        As for :func:`cameras`.
+
+    Examples
+    --------
+    ::
+
+        foveal = fs.layout.log_polar(n_sites=14_000, min_size_um=2.0, r_max_um=690.0)
+        square = fs.layout.grid(n_sites=14_000, size_um=(1223.0, 1223.0))
+        fs.compare.layouts({"foveal": foveal, "square": square}).write("report.html")
+    """
+    if not isinstance(layouts, Mapping):
+        raise ParameterError("layouts", f"must be a mapping of names to layouts, got a {type(layouts).__name__}")
+    for name, layout in layouts.items():
+        if not isinstance(layout, Layout):
+            raise ParameterError("layouts", f"must be layouts, got a {type(layout).__name__} for {format_value(name)}")
+    return cameras(cameras_of(layouts, optics, sensor), scenes, exposure_s=exposure_s, **options)
+
+
+def format_number(value: float) -> str:
+    """Format a number with at most five digits, or as an integer with separators."""
+    if isinstance(value, int) or abs(value) >= 1e4:
+        return f"{value:,.0f}"
+    return f"{value:.5g}"
+
+
+def format_interval(mean: float, half_width: float) -> str:
+    """
+    Format a mean with its confidence interval.
+
+    Examples
+    --------
+    >>> format_interval(25.123, 0.52), format_interval(25.123, 0.0), format_interval(float("nan"), 0.0)
+    ('25.12 ± 0.52', '25.12', '–')
+    """
+    if not np.isfinite(mean):
+        return "∞" if mean > 0 else "–"
+    if not np.isfinite(half_width) or half_width == 0.0:
+        return f"{mean:,.4g}" if abs(mean) < 1e4 else f"{mean:,.0f}"
+    digits = min(max(0, 1 - int(np.floor(np.log10(half_width)))), 6)
+    return f"{mean:,.{digits}f} ± {half_width:,.{digits}f}"
+
+
+def _check_cameras(cameras: Mapping[str, Camera]) -> dict[str, Camera]:
+    if not isinstance(cameras, Mapping):
+        raise ParameterError("cameras", f"must be a mapping of names to cameras, got a {type(cameras).__name__}")
+    if len(cameras) < 2:
+        raise ParameterError("cameras", "must be at least two", len(cameras))
+    named = {str(name): camera for name, camera in cameras.items()}
+    for name, camera in named.items():
+        if not isinstance(camera, Camera):
+            raise ParameterError("cameras", f"must be cameras, got a {type(camera).__name__} for {format_value(name)}")
+    (first_name, first), *others = named.items()
+    for name, camera in others:
+        pair = f"{format_value(first_name)} and {format_value(name)}"
+        for part in ("optics", "distortion"):
+            if to_plain_data(getattr(camera, part)) != to_plain_data(getattr(first, part)):
+                raise ParameterError("cameras", f"must have the same {part}: those of {pair} differ")
+        if camera.sensor.filter_names != first.sensor.filter_names:
+            raise ParameterError("cameras", f"must have the same colour filters: those of {pair} differ")
+    return named
+
+
+def _rate(frames_per_s: float | Mapping[str, float] | None, name: str, exposure_s: float) -> float:
+    if frames_per_s is None:
+        return 1.0 / exposure_s
+    if isinstance(frames_per_s, Mapping):
+        if name not in frames_per_s:
+            raise ParameterError("frames_per_s", f"must have a rate for {format_value(name)}", list(frames_per_s))
+        return frames_per_s[name]
+    return frames_per_s
+
+
+def _grid(low: NDArray[np.float64], high: NDArray[np.float64], max_pixels: int, margin: int) -> Grid:
+    """Return a grid of square pixels over a rectangle, with some more on each side."""
+    pitch_um = float((high - low).max()) / max_pixels
+    n_x, n_y = (int(np.ceil(length / pitch_um - 1e-6)) + 2 * margin for length in high - low)
+    centre = 0.5 * (low + high)
+    return Grid(
+        (n_y, n_x), pitch_um, (float(centre[0] - 0.5 * n_x * pitch_um), float(centre[1] - 0.5 * n_y * pitch_um))
+    )
+
+
+def _measure(name: str) -> Any:
+    if name not in MEASURES:
+        raise ParameterError("name", f"must be one of {', '.join(MEASURES)}", name)
+    return MEASURES[name]
+
+
+def _interval(values: NDArray[np.float64]) -> tuple[Floats, Floats]:
+    """Return mean and half width of the confidence interval over axis 1, of the scenes with a value."""
+    from scipy.stats import t
+
+    is_known = np.isfinite(values)
+    n = is_known.sum(axis=1)
+    # Without any finite value the mean is the value itself: an infinite PSNR, or NaN.
+    mean = np.divide(np.where(is_known, values, 0.0).sum(axis=1), n, out=values[:, 0].copy(), where=n > 0)
+    with np.errstate(invalid="ignore"):
+        deviation = np.where(is_known, values - mean[:, np.newaxis], 0.0)
+    variance = np.divide(np.square(deviation).sum(axis=1), n - 1, out=np.full(mean.shape, np.nan), where=n > 1)
+    factor = t.ppf(0.5 + 0.5 * CONFIDENCE, np.maximum(n - 1, 1))
+    return mean, factor * np.sqrt(variance / np.maximum(n, 1))

@@ -1,0 +1,134 @@
+"""Figures of a comparison: measures against eccentricity, and area by size class."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from foveasim.compare.measure import MEASURES
+from foveasim.errors import printable
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from foveasim.compare.comparison import Comparison
+
+__all__ = ["COLOURS", "draw_measure", "draw_sizes", "measure_figure", "overview", "sizes_figure"]
+
+#: Colours of the cameras, distinguishable with colour-vision deficiencies and on light and dark pages, and their markers.
+COLOURS = ("#2f7fd6", "#e0862a", "#1f9e77", "#c95fb0", "#8a8f2e", "#c8474b", "#7a68d8", "#4aa3b5")
+MARKERS = "osD^vP*X"
+FIGURE_INCHES = (4.7, 3.1)
+#: Measures with logarithmic axes.
+LOGARITHMIC = {"information_bit_per_mm2", "shift_sigma_um", "nyquist_per_mm", "mtf50_per_mm"}
+MAX_NAME = 28
+
+
+def draw_measure(comparison: Comparison, name: str, axes: Axes) -> None:
+    """Draw one measure of all cameras against eccentricity, with confidence intervals."""
+    measure = MEASURES[name]
+    mean, half_width = comparison.summary(name, by_eccentricity=True)
+    r_um = 0.5 * (comparison.edges_um[1:] + comparison.edges_um[:-1])
+    for k, (y, error) in enumerate(zip(mean, half_width, strict=True)):
+        style: dict[str, Any] = {
+            "color": COLOURS[k % len(COLOURS)],
+            "marker": MARKERS[k % len(MARKERS)],
+            "markersize": 4,
+        }
+        is_finite = np.isfinite(y)
+        axes.plot(r_um[is_finite], y[is_finite], linewidth=1.6, label=_short(comparison.names[k]), **style)
+        if measure.has_scenes and np.isfinite(error[is_finite]).any():
+            axes.fill_between(
+                r_um[is_finite],
+                (y - error)[is_finite],
+                (y + error)[is_finite],
+                color=style["color"],
+                alpha=0.16,
+                linewidth=0.0,
+            )
+    if name in LOGARITHMIC and (mean[np.isfinite(mean)] > 0.0).all() and np.isfinite(mean).any():
+        axes.set_yscale("log")
+        positive = mean[np.isfinite(mean)]
+        axes.set_ylim(0.6 * positive.min(), 1.6 * positive.max())
+    axes.set_xlabel("eccentricity / µm")
+    axes.set_ylabel(f"{measure.title} / {measure.unit}" if measure.unit else measure.title)
+    axes.set_xlim(0.0, comparison.edges_um[-1])
+
+
+def draw_sizes(comparison: Comparison, axes: Axes) -> None:
+    """Draw the area fraction of each size class of all cameras."""
+    for k, name in enumerate(comparison.names):
+        rows = comparison.sizes[name]
+        size_um = [row["size_um"] for row in rows]
+        fraction = [100.0 * row["area_fraction"] for row in rows]
+        colour, marker = COLOURS[k % len(COLOURS)], MARKERS[k % len(MARKERS)]
+        axes.vlines(size_um, 0.0, fraction, color=colour, linewidth=2.2, alpha=0.7)
+        axes.plot(size_um, fraction, color=colour, marker=marker, markersize=5, linewidth=0.8, label=_short(name))
+    axes.set_xscale("log")
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("pixel size / µm")
+    axes.set_ylabel("area / %")
+
+
+def measure_figure(comparison: Comparison, name: str, ink: str = "black", faint: str = "0.9") -> Figure:
+    """Return a figure of one measure against eccentricity."""
+    return _figure(lambda axes: draw_measure(comparison, name, axes), ink, faint)
+
+
+def sizes_figure(comparison: Comparison, ink: str = "black", faint: str = "0.9") -> Figure:
+    """Return a figure of the area by size class."""
+    return _figure(lambda axes: draw_sizes(comparison, axes), ink, faint)
+
+
+def overview(comparison: Comparison) -> Figure:
+    """Return a figure of all measures against eccentricity and of the size classes."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context({"text.parse_math": False}):
+        n_columns = 3
+        n_rows = -(-(len(MEASURES) + 1) // n_columns)
+        figure = Figure(figsize=(4.3 * n_columns, 2.9 * n_rows), layout="constrained")
+        axes = figure.subplots(n_rows, n_columns).ravel()
+        for name, one in zip(MEASURES, axes[: len(MEASURES)], strict=True):
+            draw_measure(comparison, name, one)
+            _style(one, "black", "0.9")
+        draw_sizes(comparison, axes[len(MEASURES)])
+        _style(axes[len(MEASURES)], "black", "0.9")
+        for one in axes[len(MEASURES) + 1 :]:
+            one.set_visible(False)
+        handles, labels = axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
+    return figure
+
+
+def _figure(draw: Any, ink: str, faint: str) -> Figure:
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context({"text.parse_math": False}):
+        figure = Figure(figsize=FIGURE_INCHES, layout="constrained")
+        axes = figure.add_subplot()
+        draw(axes)
+        _style(axes, ink, faint)
+        legend = axes.legend(frameon=False, fontsize=9, labelcolor=ink)
+        for text in legend.get_texts():
+            text.set_parse_math(False)
+    return figure
+
+
+def _style(axes: Axes, ink: str, faint: str) -> None:
+    axes.grid(color=faint, linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.tick_params(which="both", colors=ink)
+    for spine in axes.spines.values():
+        spine.set_color(ink)
+    for label in (axes.xaxis.label, axes.yaxis.label):
+        label.set_color(ink)
+
+
+def _short(name: str) -> str:
+    name = printable(name)
+    return name if len(name) <= MAX_NAME else name[: MAX_NAME - 1] + "…"

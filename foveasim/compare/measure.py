@@ -1,0 +1,246 @@
+"""Measures of one camera: of its layout, and of its captures of scenes."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim._core.validation import Bools, Floats, Ints
+from foveasim.camera import Camera
+from foveasim.capture import Capture
+from foveasim.compare.annuli import annulus_of
+from foveasim.compare.information import SceneCovariance, site_information_bits
+from foveasim.errors import CoverageWarning, ParameterError
+from foveasim.metrics import (
+    aliasing_spectrum,
+    flow_bound,
+    nyquist_per_mm,
+    polygon_mtf,
+    site_gradients_e_per_um,
+    size_classes_um,
+)
+from foveasim.reconstruct import Picture
+from foveasim.sensor import signal_to_noise
+from foveasim.sensor.signal_to_noise import SiteSignals
+from foveasim.units import per_mm_from_per_um
+
+__all__ = ["MEASURES", "Measure", "SceneMeasures", "information_by_annulus", "layout_measures", "scene_measures"]
+
+#: Sites of an annulus that represent its aperture MTF, and directions of the waves.
+MTF_SITES, MTF_ANGLES_DEG = 24, (0.0, 45.0, 90.0, 135.0)
+#: Frequencies of the MTF, and the highest one in units of 1 / size of the smallest site.
+MTF_FREQUENCIES, MAX_FREQUENCY = 200, 1.5
+#: Smallest number of sites for the spectrum of a region.
+MIN_REGION_SITES = 12
+UM2_PER_MM2 = 1e6
+
+
+@dataclass(frozen=True)
+class Measure:
+    """Title, unit and definition of a measure; whether it depends on the scene, and whether larger values are better."""
+
+    title: str
+    unit: str
+    definition: str
+    has_scenes: bool
+    is_larger_better: bool | None = True
+
+
+#: Measures by the names of their variables; each also has a variable ``NAME_by_eccentricity``.
+MEASURES = {
+    "psnr_db": Measure(
+        "PSNR", "dB", "peak signal-to-noise ratio of the picture, with the range of the ideal picture as peak", True
+    ),
+    "ssim": Measure("SSIM", "", "structural similarity of the picture and the ideal picture", True),
+    "snr_db": Measure("SNR per site", "dB", "signal-to-noise ratio of a site, mean over the sites, 20 log₁₀", True),
+    "information_bit_per_site": Measure(
+        "information per site", "bit", "Gaussian estimate of the information about the scenes, per site", True
+    ),
+    "information_bit_per_mm2": Measure(
+        "information per area", "bit/mm²", "the same, per area of the sites", True
+    ),
+    "shift_sigma_um": Measure(
+        "precision of a shift", "µm", "smallest standard deviation of an estimated image shift, rms of x and y", True, False
+    ),
+    "nyquist_per_mm": Measure("Nyquist frequency", "1/mm", "median over the sites, from the spacing of their rows", False),
+    "mtf50_per_mm": Measure(
+        "MTF50", "1/mm", "frequency at which the product of optics and aperture MTF is one half", False
+    ),
+    "alias_fraction": Measure(
+        "alias contrast",
+        "",
+        "largest contrast of an alias of a sine wave at 1.5 times the Nyquist frequency of a square grid with as many sites "
+        "per area as the first camera",
+        False,
+        False,
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class SceneMeasures:
+    """Signals of a capture, and measures of its sites; the values of an annulus without sites are NaN."""
+
+    capture: Capture
+    signals: SiteSignals
+    totals: dict[str, float]
+    annuli: dict[str, Floats]
+
+
+def layout_measures(
+    camera: Camera,
+    wavelength_nm: float,
+    distance_m: float,
+    centre_um: tuple[float, float],
+    edges_um: Floats,
+    wave_per_mm: float,
+) -> tuple[dict[str, float], dict[str, Floats]]:
+    """Return the measures that do not depend on a scene: in total, and in each annulus."""
+    layout = camera.sensor.layout
+    annulus = annulus_of(layout.centroid_um, centre_um, edges_um)
+    n = edges_um.size - 1
+    nyquist = nyquist_per_mm(layout)
+    frequency = np.linspace(
+        0.0, MAX_FREQUENCY * float(per_mm_from_per_um(1.0 / np.sqrt(layout.area_um2.min()))), MTF_FREQUENCIES
+    )
+    lens = camera.optics.mtf(frequency, wavelength_nm, distance_m=distance_m)
+
+    def mtf50(sites: Ints) -> float:
+        if not sites.size:
+            return float("nan")
+        chosen = sites[np.linspace(0, sites.size - 1, min(MTF_SITES, sites.size)).astype(np.int64)]
+        apertures = [polygon_mtf(layout[chosen], frequency, angle_deg=angle).mean(axis=0) for angle in MTF_ANGLES_DEG]
+        return _first_crossing(frequency, lens * np.mean(apertures, axis=0))
+
+    def alias(centre: tuple[float, float], radius_um: float | None) -> float:
+        if (
+            radius_um is not None
+            and np.count_nonzero(np.hypot(*(layout.centroid_um - centre).T) < radius_um) < MIN_REGION_SITES
+        ):
+            return float("nan")
+        try:
+            found = aliasing_spectrum(layout, (wave_per_mm, 0.0), centre_um=centre, radius_um=radius_um)
+        except ParameterError:
+            return float("nan")  # too few sites
+        return found.alias_fraction * float(camera.optics.mtf(wave_per_mm, wavelength_nm, distance_m=distance_m))
+
+    order = np.argsort(layout.area_um2, kind="stable")
+    by_annulus = [order[annulus[order] == k] for k in range(n)]
+    width_um = np.diff(edges_um)
+    middle_um = 0.5 * (edges_um[1:] + edges_um[:-1])
+    # The innermost region is centred; others are to the right of the fixation point.
+    centres = [(centre_um[0] + (r if k else 0.0), centre_um[1]) for k, r in enumerate(middle_um.tolist())]
+    radii = [width if k == 0 else max(0.5 * width, 0.25 * middle_um[k]) for k, width in enumerate(width_um.tolist())]
+    totals = {
+        "nyquist_per_mm": float(np.nanmedian(nyquist)) if np.isfinite(nyquist).any() else float("nan"),
+        "mtf50_per_mm": mtf50(order),
+        "alias_fraction": alias(centre_um, None),
+    }
+    annuli = {
+        "nyquist_per_mm": np.array([_median(nyquist[sites]) for sites in by_annulus]),
+        "mtf50_per_mm": np.array([mtf50(sites) for sites in by_annulus]),
+        "alias_fraction": np.array([alias(c, r) for c, r in zip(centres, radii, strict=True)]),
+    }
+    return totals, annuli
+
+
+def scene_measures(
+    camera: Camera, capture: Capture, image: Picture, centre_um: tuple[float, float], edges_um: Floats
+) -> SceneMeasures:
+    """Return signal-to-noise ratio and precision of a shift for a capture with its ideal image in e-/µm²."""
+    sensor, layout = camera.sensor, camera.sensor.layout
+    exposure_s = float(capture.settings["exposure_s"])
+    dark_e = sensor.expected_electrons(np.zeros(layout.n_sites), exposure_s)
+    signals = signal_to_noise(sensor, capture.expected_e, dark_e)
+    annulus = annulus_of(layout.centroid_um, centre_um, edges_um)
+    n = edges_um.size - 1
+    sums = np.bincount(annulus[annulus >= 0], signals.ratio[annulus >= 0], minlength=n)
+    counts = np.bincount(annulus[annulus >= 0], minlength=n)
+    ratio = np.divide(sums, counts, out=np.full(n, np.nan), where=counts > 0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CoverageWarning)
+        gradient = np.zeros((layout.n_sites, 2))
+        for c in np.unique(capture.filter_of_site):
+            sites = np.flatnonzero(capture.filter_of_site == c)
+            density = np.where(np.isfinite(image.data[c]), image.data[c], 0.0)
+            gradient[sites] = site_gradients_e_per_um(layout[sites], density, image.grid)
+    gradient *= np.broadcast_to(sensor.sensitivity, (layout.n_sites,))[:, np.newaxis]
+    variance_e2 = np.square(signals.noise_e)
+    everything = flow_bound(gradient, variance_e2)
+    parts = flow_bound(gradient, variance_e2, regions=annulus)
+    sigma_um = np.full(n, np.nan)
+    sigma_um[parts.regions] = _rms(parts.sigma_um)
+    with np.errstate(divide="ignore"):
+        return SceneMeasures(
+            capture,
+            signals,
+            {
+                "snr_db": float(20.0 * np.log10(signals.ratio.mean())),
+                "shift_sigma_um": float(_rms(everything.sigma_um)[0]),
+            },
+            {"snr_db": 20.0 * np.log10(ratio), "shift_sigma_um": sigma_um},
+        )
+
+
+def information_by_annulus(
+    camera: Camera,
+    covariance: SceneCovariance,
+    response: NDArray[np.float64],
+    noise_e: list[Floats],
+    centre_um: tuple[float, float],
+    edges_um: Floats,
+) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    """
+    Return the information per site and per mm², (n_scene,) and (n_scene, n_annulus).
+
+    ``response`` is the ratio of each site's irradiance in electrons to that of the covariance.
+    """
+    layout = camera.sensor.layout
+    bits = site_information_bits(layout, covariance, layout.area_um2 * response, np.square(noise_e))
+    annulus = annulus_of(layout.centroid_um, centre_um, edges_um)
+    n, inside = edges_um.size - 1, annulus >= 0
+    sums = np.stack([np.bincount(annulus[inside], row[inside], minlength=n) for row in bits])
+    counts = np.bincount(annulus[inside], minlength=n).astype(np.float64)
+    area_mm2 = np.bincount(annulus[inside], layout.area_um2[inside], minlength=n) / UM2_PER_MM2
+    counts[counts == 0.0], area_mm2[area_mm2 == 0.0] = np.nan, np.nan
+    totals = {
+        "information_bit_per_site": bits.mean(axis=1),
+        "information_bit_per_mm2": bits.sum(axis=1) / (layout.area_um2.sum() / UM2_PER_MM2),
+    }
+    return totals, {"information_bit_per_site": sums / counts, "information_bit_per_mm2": sums / area_mm2}
+
+
+def size_records(camera: Camera) -> list[dict[str, Any]]:
+    """Return size, number of sites and area fraction of each size class."""
+    layout = camera.sensor.layout
+    size_um, position = np.unique(size_classes_um(layout), return_inverse=True)
+    counts = np.bincount(position.ravel())
+    area_um2 = np.bincount(position.ravel(), layout.area_um2)
+    fraction = area_um2 / area_um2.sum()
+    rows = zip(size_um.tolist(), counts.tolist(), fraction.tolist(), strict=True)
+    return [{"size_um": size, "n_sites": n, "area_fraction": part} for size, n, part in rows]
+
+
+def _rms(values: NDArray[np.float64]) -> Floats:
+    return np.sqrt(np.mean(np.square(values), axis=-1))
+
+
+def _median(values: NDArray[np.float64]) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else float("nan")
+
+
+def _first_crossing(frequency_per_mm: Floats, mtf: Floats, level: float = 0.5) -> float:
+    """Return the first frequency at which an MTF falls to a level, by linear interpolation; NaN if it does not."""
+    below: Bools = mtf < level
+    if not below.any():
+        return float("nan")
+    k = int(below.argmax())
+    if k == 0:
+        return 0.0
+    part = (mtf[k - 1] - level) / (mtf[k - 1] - mtf[k])
+    return float(frequency_per_mm[k - 1] + part * (frequency_per_mm[k] - frequency_per_mm[k - 1]))

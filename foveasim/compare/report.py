@@ -1,0 +1,182 @@
+"""Report of a comparison as a web page."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim.compare.budgets import BUDGETS
+from foveasim.compare.figures import measure_figure, sizes_figure
+from foveasim.compare.measure import MEASURES
+from foveasim.reconstruct import Picture
+from foveasim.view.web._report_page import (
+    FAINT,
+    INK,
+    ReportFigure,
+    ReportSection,
+    ReportTable,
+    drawn_figure,
+    picture_figure,
+    report_html,
+)
+
+if TYPE_CHECKING:
+    from foveasim.compare.comparison import Comparison
+
+__all__ = ["report_page"]
+
+#: Scenes whose pictures are shown, and quantile of the ideal picture that is shown as white.
+MAX_SHOWN_SCENES, WHITE_QUANTILE = 3, 0.995
+#: Coverage of the field below which the missing part is stated.
+COMPLETE = 0.995
+
+
+def report_page(comparison: Comparison) -> str:
+    """Return the report of a comparison as HTML."""
+    names = comparison.names
+    return report_html(
+        "Comparison of " + " and ".join([", ".join(names[:-1]), names[-1]]),
+        [
+            _summary(comparison),
+            ReportSection(
+                "Pictures",
+                ("Pixels without photosites are transparent. All pictures of a scene have the same white.",),
+                figures=_pictures(comparison),
+            ),
+            _eccentricity(comparison),
+            _sizes(comparison),
+            _definitions(comparison),
+        ],
+    )
+
+
+def _summary(comparison: Comparison) -> ReportSection:
+    from foveasim.compare.comparison import format_interval, format_number
+
+    budget, n = comparison.settings["budget"], len(comparison.scenes)
+    equal = (
+        f"Equal budget: {BUDGETS[budget][1]}, within {100.0 * comparison.settings['tolerance']:g} %."
+        if budget is not None
+        else "The budgets are not equal."
+    )
+    scenes = f"{n} scenes" if n > 1 else "one scene, without confidence intervals"
+    notes = [
+        (
+            f"{equal} Same lens, exposure of {1e3 * comparison.settings['exposure_s']:.4g} ms, and picture grid; {scenes}: "
+            f"{', '.join(comparison.scenes)}."
+        )
+    ]
+    missing = [
+        f"{name} does not cover {100.0 * (1.0 - part):.1f} %"
+        for name, part in zip(comparison.names, comparison.coverage, strict=True)
+        if part < COMPLETE
+    ]
+    if missing:
+        notes.append(
+            f"Of the field that any camera covers, {'; '.join(missing)}. Pictures are compared in the "
+            f"{100.0 * comparison.compared_fraction:.1f} % that all cover."
+        )
+    budgets = [
+        [f"{title} / {unit}" if unit else title, *(format_number(getattr(b, attribute)) for b in comparison.budgets)]
+        for attribute, title, unit in BUDGETS.values()
+    ]
+    means, differences = [], []
+    for name, measure in MEASURES.items():
+        head = f"{measure.title} / {measure.unit}" if measure.unit else measure.title
+        means.append([head, *(format_interval(*p) for p in zip(*comparison.summary(name), strict=True))])
+        pairs = [*zip(*comparison.differences(name), strict=True)][1:]
+        differences.append([head, *(format_interval(*pair) for pair in pairs)])
+    interval = "mean ± half width of the 95 % confidence interval over the scenes (Student's t)"
+    return ReportSection(
+        "Summary",
+        notes,
+        (
+            ReportTable(("Budget", *comparison.names), budgets, "Budgets of the cameras."),
+            ReportTable(("Measure", *comparison.names), means, f"Over the complete field: {interval}."),
+            ReportTable(
+                ("Difference", *comparison.names[1:]),
+                differences,
+                f"Differences from {comparison.names[0]}, paired by scene: {interval}.",
+            ),
+        ),
+    )
+
+
+def _pictures(comparison: Comparison) -> list[ReportFigure]:
+    figures = []
+    for k, scene in enumerate(comparison.scenes[:MAX_SHOWN_SCENES]):
+        ideal = comparison.ideal[k]
+        white = np.array([np.nanquantile(channel, WHITE_QUANTILE) for channel in ideal.data])
+        figures.append(picture_figure(_pixels(ideal, white), "ideal", f"{scene}: irradiance on the picture grid."))
+        for i, name in enumerate(comparison.names):
+            psnr = comparison.values["psnr_db"][i, k]
+            figures.append(
+                picture_figure(_pixels(comparison.pictures[name][k], white), name, f"{scene}: PSNR {psnr:.1f} dB.")
+            )
+    return figures
+
+
+def _pixels(picture: Picture, white: NDArray[np.float64]) -> NDArray[np.uint8]:
+    if picture.data.shape[0] not in (1, 3):  # filters that are not red, green and blue are shown as their mean
+        picture = Picture(picture.data.mean(axis=0, keepdims=True), picture.coverage, picture.grid)
+        white = np.array([white.mean()])
+    return np.asarray(picture.to_image(np.maximum(white, 1e-12), encode_srgb=True), np.uint8)
+
+
+def _eccentricity(comparison: Comparison) -> ReportSection:
+    x_um, y_um = comparison.centre_um
+    intervals = ", with 95 % confidence intervals over the scenes" if len(comparison.scenes) > 1 else ""
+    figures = [
+        drawn_figure(
+            measure_figure(comparison, name, INK, FAINT),
+            measure.title,
+            f"{measure.definition[0].upper()}{measure.definition[1:]}{intervals if measure.has_scenes else ''}.",
+        )
+        for name, measure in MEASURES.items()
+    ]
+    note = f"In annuli around the fixation point ({x_um:g}, {y_um:g}) µm."
+    return ReportSection("By eccentricity", (note,), figures=figures)
+
+
+def _sizes(comparison: Comparison) -> ReportSection:
+    rows = [
+        [name, f"{row['size_um']:.4g}", f"{row['n_sites']:,}", f"{100.0 * row['area_fraction']:.1f}"]
+        for name in comparison.names
+        for row in comparison.sizes[name]
+    ]
+    return ReportSection(
+        "Area by pixel size",
+        tables=[ReportTable(("Camera", "size / µm", "sites", "area / %"), rows, "Size classes of equal ratios.")],
+        figures=[
+            drawn_figure(
+                sizes_figure(comparison, INK, FAINT),
+                "Area by pixel size",
+                "Fraction of the area of the sites in each class.",
+            )
+        ],
+    )
+
+
+def _definitions(comparison: Comparison) -> ReportSection:
+    notes = [
+        (
+            "PSNR and SSIM compare each picture with the exact means of the ideal irradiance over its pixels, after a fit of one "
+            "gain, where all cameras cover at least half of a pixel."
+        ),
+        (
+            "Information is that of Gaussian readings about Gaussian scenes with the isotropic covariance of these scenes, by the "
+            "chain rule over nearest neighbours. It is an estimate for the comparison of sensors, not a bound for photographs."
+        ),
+        "The precision of a shift is the Cramér–Rao bound for a known image and the sites of an annulus.",
+    ]
+    versions = comparison.settings["versions"]
+    found = ", ".join(f"{name} {version}" for name, version in versions.items())
+    notes.append(f"Seed {comparison.settings['seed']}; {found}.")
+    return ReportSection(
+        "Definitions and settings",
+        notes,
+        folded=("Settings of the comparison", json.dumps(comparison.settings, indent=1, ensure_ascii=False)),
+    )

@@ -1,0 +1,160 @@
+"""Pages of reports: sections of paragraphs, tables and figures, without scripts."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["ReportFigure", "ReportSection", "ReportTable", "drawn_figure", "picture_figure", "report_html"]
+
+#: Colours of lines and text in figures, which the page replaces by those of its light or dark theme.
+INK, FAINT = "#010203", "#040506"
+#: Replacements in the light and the dark theme.
+LIGHT, DARK = {INK: "#1b2230", FAINT: "#d5d9e0"}, {INK: "#e8ebf0", FAINT: "#404857"}
+POLICY = "default-src 'none'; style-src '{style}'; img-src data:; base-uri 'none'; form-action 'none'"
+
+
+@dataclass(frozen=True)
+class ReportFigure:
+    """Figure with its caption; ``dark`` is the source for dark pages, and ``is_small`` that of a picture of pixels."""
+
+    source: str
+    title: str
+    caption: str
+    dark: str = ""
+    is_small: bool = False
+
+
+@dataclass(frozen=True)
+class ReportTable:
+    """Table of strings: heads of the columns, and rows that begin with their heads."""
+
+    heads: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str
+
+
+@dataclass(frozen=True)
+class ReportSection:
+    """Heading with paragraphs, tables, figures and folded plain text."""
+
+    title: str
+    paragraphs: Sequence[str] = ()
+    tables: Sequence[ReportTable] = ()
+    figures: Sequence[ReportFigure] = ()
+    folded: tuple[str, str] | None = None
+
+
+def drawn_figure(figure: Figure, title: str, caption: str) -> ReportFigure:
+    """
+    Return a matplotlib figure as SVG for light and dark pages.
+
+    Lines and text in the colours ``INK`` and ``FAINT`` have the colours of the theme; the background is transparent.
+    """
+    from matplotlib import rc_context
+
+    encoded = io.BytesIO()
+    with rc_context({"svg.fonttype": "path", "svg.hashsalt": "foveasim", "text.parse_math": False}):
+        figure.savefig(encoded, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    drawing = encoded.getvalue().decode()
+    sources = []
+    for theme in (LIGHT, DARK):
+        themed = drawing
+        for sentinel, colour in theme.items():
+            themed = themed.replace(sentinel, colour)
+        sources.append("data:image/svg+xml;base64," + base64.b64encode(themed.encode()).decode())
+    return ReportFigure(sources[0], title, caption, sources[1])
+
+
+def picture_figure(pixels: NDArray[np.uint8], title: str, caption: str) -> ReportFigure:
+    """Return a picture (n_y, n_x, n_channel), grey or RGB with alpha, as PNG."""
+    from PIL import Image
+
+    encoded = io.BytesIO()
+    Image.fromarray(pixels).save(encoded, format="PNG")
+    return ReportFigure(
+        "data:image/png;base64," + base64.b64encode(encoded.getvalue()).decode(), title, caption, is_small=True
+    )
+
+
+def report_html(title: str, sections: Sequence[ReportSection]) -> str:
+    """
+    Return a self-contained page for light and dark themes; all strings are escaped.
+
+    The first section has no heading.
+    """
+    style = files("foveasim.view.web").joinpath("report.css").read_text(encoding="utf-8")
+    checksum = "sha256-" + base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
+    body = "\n".join(_section(section, is_first=k == 0) for k, section in enumerate(sections))
+    return f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="{html.escape(POLICY.format(style=checksum), quote=False)}">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<meta name="referrer" content="no-referrer">
+<meta name="generator" content="foveasim">
+<title>{_text(title)}</title>
+<link rel="icon" href="data:,">
+<style>{style}</style>
+</head>
+<body>
+<h1>{_text(title)}</h1>
+{body}
+</body>
+</html>
+"""
+
+
+def _section(section: ReportSection, *, is_first: bool) -> str:
+    parts = [] if is_first else [f"<h2>{_text(section.title)}</h2>"]
+    parts += [f"<p>{_text(paragraph)}</p>" for paragraph in section.paragraphs]
+    parts += [_table(table) for table in section.tables]
+    for is_small in (True, False):
+        figures = [_figure(figure) for figure in section.figures if figure.is_small == is_small]
+        if figures:
+            parts.append(f'<div class="figures{" small" if is_small else ""}">\n' + "\n".join(figures) + "\n</div>")
+    if section.folded is not None:
+        head, content = section.folded
+        parts.append(f"<details><summary>{_text(head)}</summary><pre>{_text(content)}</pre></details>")
+    return "<section>\n" + "\n".join(parts) + "\n</section>"
+
+
+def _table(table: ReportTable) -> str:
+    heads = "".join(f'<th scope="col">{_text(head)}</th>' for head in table.heads)
+    rows = "\n".join(
+        f'<tr><th scope="row">{_text(row[0])}</th>' + "".join(f"<td>{_text(cell)}</td>" for cell in row[1:]) + "</tr>"
+        for row in table.rows
+    )
+    return (
+        f'<div class="table" tabindex="0"><table><caption>{_text(table.caption)}</caption>'
+        f"<thead><tr>{heads}</tr></thead>\n<tbody>{rows}</tbody></table></div>"
+    )
+
+
+def _figure(figure: ReportFigure) -> str:
+    image = f'<img src="{figure.source}" alt="{_text(figure.title)}">'
+    if figure.dark:
+        image = f'<picture><source media="(prefers-color-scheme: dark)" srcset="{figure.dark}">{image}</picture>'
+    kind = ' class="pixels"' if figure.is_small else ""
+    return (
+        f"<figure{kind}>{image}<figcaption><b>{_text(figure.title)}</b> {_text(figure.caption)}</figcaption></figure>"
+    )
+
+
+def _text(value: Any) -> str:
+    # Control characters of names in files are not valid in HTML.
+    return html.escape("".join(c if c.isprintable() or c in "\n\t" else "�" for c in str(value)))
