@@ -39,6 +39,8 @@ console = PlainConsole()
 error_console = PlainConsole(stderr=True)
 
 KINDS = "shot, layout, rules, sweep, study or dataset"
+#: Hint after an interruption that preserves results.
+RESUME = "run the same command again to resume"
 LAYOUT_HELP = "YAML, GDSII, OASIS, GeoJSON, GeoParquet or npz file, or the name of a bundled layout."
 Out = Annotated[Path, typer.Option("--out", "-o", help="Directory for the results; created when missing.")]
 Changes = Annotated[
@@ -258,6 +260,51 @@ def view(
 
 
 @app.command()
+def compare(
+    files: Annotated[
+        list[Path], typer.Argument(help="Two or more layouts, or settings files of shots. " + LAYOUT_HELP)
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Write the report to this .html file.")] = Path(
+        "comparison.html"
+    ),
+    budget: Annotated[
+        str,
+        typer.Option("--budget", help="Budget that must be equal: n_sites, data_rate, area, read_noise, or none."),
+    ] = "n_sites",
+    tolerance: Annotated[float, typer.Option("--tolerance", help="Largest relative difference of the budgets.")] = 0.02,
+    pictures: Annotated[
+        list[Path] | None, typer.Option("--picture", help="Photograph to use as a scene; repeatable.")
+    ] = None,
+    exposure_s: Annotated[float | None, typer.Option("--exposure-s", help="Exposure time in seconds.")] = None,
+    frames_per_s: FramesPerS = None,
+    max_pixels: Annotated[int, typer.Option("--pixels", help="Longer side of the pictures.")] = 256,
+    annuli: Annotated[int, typer.Option("--annuli", help="Number of annuli around the optical axis.")] = 8,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of the noise.")] = 0,
+) -> None:
+    """Compare layouts or shots at equal budget, and write a report."""
+    from foveasim.config import compare_files
+    from foveasim.view.web import check_page_path
+
+    check_page_path(out)
+    with _progress("comparing", "nothing was written") as progress:
+        found = compare_files(
+            files,
+            pictures=pictures or (),
+            budget=None if budget == "none" else budget,
+            tolerance=tolerance,
+            exposure_s=exposure_s,
+            frames_per_s=frames_per_s,
+            max_pixels=max_pixels,
+            n_annuli=annuli,
+            seed=seed,
+            progress=progress,
+        )
+        found.write(out)
+    console.print(found)
+    _report(f"wrote {out}")
+
+
+@app.command()
 def sweep(
     settings: Annotated[Path, typer.Argument(help="YAML file of the sweep: a shot, and the values of its settings.")],
     out: Annotated[
@@ -272,7 +319,7 @@ def sweep(
     from foveasim.explore import read_sweep, run_sweep
 
     plan = read_sweep(settings, metrics=metrics or ())
-    with _progress(settings.stem, f"finished points are stored next to {out}") as progress:
+    with _progress(settings.stem, f"finished points are stored next to {out}, {RESUME}") as progress:
         results = run_sweep(plan, out=out, scheduler=scheduler, workers=workers, retry=retry, progress=progress)
     sizes = " x ".join(f"{n} {name}" for name, n in zip(plan.dims, plan.shape, strict=True))
     _report(f"wrote {out}: {plan.n_points:,} points ({sizes})")
@@ -315,7 +362,7 @@ def study(
     plan = read_study(settings, metrics=metrics or (), n_trials=trials)
     base = storage or str(out or "study.db")
     storage_label = storage_name(base)
-    with _progress(settings.stem, f"finished trials are stored in {storage_label}") as progress:
+    with _progress(settings.stem, f"finished trials are stored in {storage_label}, {RESUME}") as progress:
         found = run_study(plan, storage=base, scheduler=scheduler, workers=workers, progress=progress)
     finished = finished_trials(found)
     failed = [trial.user_attrs["error"] for trial in finished if "error" in trial.user_attrs]
@@ -349,7 +396,7 @@ def dataset(
     n_threads = 1 if workers is None else max(1, thread_count() // max(1, workers))
     with _status("reading pictures and settings"):
         file = read_dataset(settings, n_threads=n_threads)
-    with _progress(settings.stem, f"finished shards are stored in {out}") as progress:
+    with _progress(settings.stem, f"finished shards are stored in {out}, {RESUME}") as progress:
         write_dataset(
             file.dataset, out, per_shard=file.per_shard, workers=workers, scheduler=scheduler, progress=progress
         )
@@ -392,7 +439,7 @@ def video(
         n = run_video(shot, frames, out, frame_s=frame_s, line_s=line_s, stop=stop, n_threads=threads, progress=True)
     except KeyboardInterrupt:
         n = count_recorded_frames(out) if is_store and partial_path(out).is_dir() else 0
-        stored = f"; {n:,} frames are stored next to {out}, run the same command again to resume" if n else ""
+        stored = f"; {n:,} frames are stored next to {out}, {RESUME}" if n else ""
         _exit(f"interrupted{stored}", INTERRUPTED)
     status = f"{out} was already complete" if was_finished else f"wrote {out}"
     _report(f"{status}: {n:,} frames")
@@ -471,8 +518,8 @@ def _main() -> None:
 
 
 @contextmanager
-def _progress(name: str, stored: str) -> Iterator[Callable[[int, int], None]]:
-    """Show a progress bar with the remaining time; Ctrl-C exits with a hint to resume."""
+def _progress(name: str, note: str) -> Iterator[Callable[[int, int], None]]:
+    """Show a progress bar with the remaining time; Ctrl-C exits with a note."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -494,7 +541,7 @@ def _progress(name: str, stored: str) -> Iterator[Callable[[int, int], None]]:
     try:
         yield show
     except KeyboardInterrupt:
-        _exit(f"interrupted; {stored}, run the same command again to resume", INTERRUPTED)
+        _exit(f"interrupted; {note}", INTERRUPTED)
     finally:
         if progress.live.is_started:
             progress.stop()

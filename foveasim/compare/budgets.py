@@ -100,7 +100,7 @@ def check_equal_budgets(budgets: Mapping[str, Budget], budget: str | None, toler
             shown = [f"{number:,.6g} {unit}".rstrip() for number in (reference, value)]
             raise ParameterError(
                 "budget",
-                f"'{budget}' must be equal within {100.0 * tolerance:g} %: the {title} of {format_value(first)} is {shown[0]}, "
+                f"must be equal within {100.0 * tolerance:g} %: the {title} of {format_value(first)} is {shown[0]}, "
                 f"that of {format_value(name)} {shown[1]}",
                 hint="use layouts of equal budget (n_sites= of a generator), a larger tolerance, or no budget",
             )

@@ -26,7 +26,7 @@ from foveasim.compare.measure import (
     scene_measures,
     size_records,
 )
-from foveasim.compare.setup import cameras_of, field_um, photograph_scenes
+from foveasim.compare.setup import DEFAULT_EXPOSURE_S, cameras_of, field_um, photograph_scenes
 from foveasim.errors import ParameterError, format_value
 from foveasim.fields import Grid, PowerMap
 from foveasim.layout import Layout
@@ -453,7 +453,7 @@ def layouts(
     *,
     optics: Optics | None = None,
     sensor: Callable[[Layout], Sensor] | None = None,
-    exposure_s: float = 1 / 60,
+    exposure_s: float = DEFAULT_EXPOSURE_S,
     **options: Any,
 ) -> Comparison:
     """

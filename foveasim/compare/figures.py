@@ -11,6 +11,7 @@ from foveasim.errors import printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
     from foveasim.compare.comparison import Comparison
@@ -52,6 +53,7 @@ def draw_measure(comparison: Comparison, name: str, axes: Axes) -> None:
         axes.set_yscale("log")
         positive = mean[np.isfinite(mean)]
         axes.set_ylim(0.6 * positive.min(), 1.6 * positive.max())
+        _label_plainly(axes.yaxis)
     axes.set_xlabel("eccentricity / µm")
     axes.set_ylabel(f"{measure.title} / {measure.unit}" if measure.unit else measure.title)
     axes.set_xlim(0.0, comparison.edges_um[-1])
@@ -67,6 +69,7 @@ def draw_sizes(comparison: Comparison, axes: Axes) -> None:
         axes.vlines(size_um, 0.0, fraction, color=colour, linewidth=2.2, alpha=0.7)
         axes.plot(size_um, fraction, color=colour, marker=marker, markersize=5, linewidth=0.8, label=_short(name))
     axes.set_xscale("log")
+    _label_plainly(axes.xaxis)
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("pixel size / µm")
     axes.set_ylabel("area / %")
@@ -117,6 +120,15 @@ def _figure(draw: Any, ink: str, faint: str) -> Figure:
         for text in legend.get_texts():
             text.set_parse_math(False)
     return figure
+
+
+def _label_plainly(axis: Axis) -> None:
+    """Label a logarithmic axis with plain numbers, without the markup of powers."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}" if value < 1e6 else f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _style(axes: Axes, ink: str, faint: str) -> None:

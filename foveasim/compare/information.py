@@ -23,7 +23,7 @@ N_CONDITIONS, N_CANDIDATES = 14, 44
 #: Matrix elements that are computed at a time; limits the memory.
 BLOCK_ELEMENTS = 1 << 21
 #: Ratio of the widths of adjacent Gaussian components of a covariance.
-WIDTH_RATIO = 2.0
+WIDTH_RATIO = 1.5
 #: Largest distance of the covariance as a fraction of the field, beyond which too few pairs contribute.
 MAX_DISTANCE_FRACTION = 0.4
 

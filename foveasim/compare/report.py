@@ -105,18 +105,19 @@ def _summary(comparison: Comparison) -> ReportSection:
     )
 
 
-def _pictures(comparison: Comparison) -> list[ReportFigure]:
-    figures = []
+def _pictures(comparison: Comparison) -> list[list[ReportFigure]]:
+    rows = []
     for k, scene in enumerate(comparison.scenes[:MAX_SHOWN_SCENES]):
         ideal = comparison.ideal[k]
         white = np.array([np.nanquantile(channel, WHITE_QUANTILE) for channel in ideal.data])
-        figures.append(picture_figure(_pixels(ideal, white), "ideal", f"{scene}: irradiance on the picture grid."))
+        row = [picture_figure(_pixels(ideal, white), "ideal", f"{scene}: irradiance on the picture grid.")]
         for i, name in enumerate(comparison.names):
             psnr = comparison.values["psnr_db"][i, k]
-            figures.append(
+            row.append(
                 picture_figure(_pixels(comparison.pictures[name][k], white), name, f"{scene}: PSNR {psnr:.1f} dB.")
             )
-    return figures
+        rows.append(row)
+    return rows
 
 
 def _pixels(picture: Picture, white: NDArray[np.float64]) -> NDArray[np.uint8]:
@@ -138,7 +139,7 @@ def _eccentricity(comparison: Comparison) -> ReportSection:
         for name, measure in MEASURES.items()
     ]
     note = f"In annuli around the fixation point ({x_um:g}, {y_um:g}) µm."
-    return ReportSection("By eccentricity", (note,), figures=figures)
+    return ReportSection("By eccentricity", (note,), figures=[figures])
 
 
 def _sizes(comparison: Comparison) -> ReportSection:
@@ -147,28 +148,25 @@ def _sizes(comparison: Comparison) -> ReportSection:
         for name in comparison.names
         for row in comparison.sizes[name]
     ]
+    figure = drawn_figure(
+        sizes_figure(comparison, INK, FAINT), "Area by pixel size", "Fraction of the area of the sites in each class."
+    )
     return ReportSection(
         "Area by pixel size",
         tables=[ReportTable(("Camera", "size / µm", "sites", "area / %"), rows, "Size classes of equal ratios.")],
-        figures=[
-            drawn_figure(
-                sizes_figure(comparison, INK, FAINT),
-                "Area by pixel size",
-                "Fraction of the area of the sites in each class.",
-            )
-        ],
+        figures=[[figure]],
     )
 
 
 def _definitions(comparison: Comparison) -> ReportSection:
     notes = [
         (
-            "PSNR and SSIM compare each picture with the exact means of the ideal irradiance over its pixels, after a fit of one "
-            "gain, where all cameras cover at least half of a pixel."
+            "PSNR and SSIM compare each picture with the exact means of the ideal irradiance over its pixels, after a fit of "
+            "one gain, where all cameras cover at least half of a pixel."
         ),
         (
-            "Information is that of Gaussian readings about Gaussian scenes with the isotropic covariance of these scenes, by the "
-            "chain rule over nearest neighbours. It is an estimate for the comparison of sensors, not a bound for photographs."
+            "Information is that of Gaussian readings about Gaussian scenes with the isotropic covariance of these scenes, by "
+            "the chain rule over nearest neighbours: an estimate to compare sensors, not a bound for photographs."
         ),
         "The precision of a shift is the Cramér–Rao bound for a known image and the sites of an annulus.",
     ]

@@ -28,6 +28,7 @@ FIELD_MARGIN = 1.04
 #: the photographs at 1/60 s, and a distance of the scenes.
 DEFAULT_FOCAL_MM, DEFAULT_F_NUMBER, DEFAULT_DISTANCE_M = 8.0, 2.8, 1.0
 DEFAULT_RADIANCE_W_M2_SR_NM, DEFAULT_WAVELENGTH_NM, DEFAULT_BAND_NM = 0.008, 550.0, 100.0
+DEFAULT_EXPOSURE_S = 1 / 60
 CAPACITANCE_F_PER_UM2, READ_NOISE_E, QE, BITS = 1.5e-16, 2.0, 0.6, 10
 
 
@@ -64,7 +65,7 @@ def photograph_scenes(
     distance_m: float = DEFAULT_DISTANCE_M,
     peak_radiance_w_m2_sr_nm: float = DEFAULT_RADIANCE_W_M2_SR_NM,
     wavelength_nm: Sequence[float] = (DEFAULT_WAVELENGTH_NM,),
-    band_width_nm: float | None = DEFAULT_BAND_NM,
+    band_width_nm: float | Sequence[float] | None = DEFAULT_BAND_NM,
 ) -> dict[str, Scene]:
     """
     Return scenes of photographs, cropped to squares, whose images fill a field.

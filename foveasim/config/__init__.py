@@ -7,6 +7,7 @@ Each section names a call of the package and its parameters: file and Python hav
 from __future__ import annotations
 
 from foveasim._core.calls import check_public_calls
+from foveasim.config._comparing import compare_files
 from foveasim.config._objects import (
     YAML_EXTENSIONS,
     LayoutFile,
@@ -52,6 +53,7 @@ __all__ = [
     "bundled_layouts",
     "check_directory",
     "check_settings",
+    "compare_files",
     "demo_settings",
     "picture_path",
     "put_setting",

@@ -48,12 +48,12 @@ class ReportTable:
 
 @dataclass(frozen=True)
 class ReportSection:
-    """Heading with paragraphs, tables, figures and folded plain text."""
+    """Heading with paragraphs, tables, rows of figures and folded plain text."""
 
     title: str
     paragraphs: Sequence[str] = ()
     tables: Sequence[ReportTable] = ()
-    figures: Sequence[ReportFigure] = ()
+    figures: Sequence[Sequence[ReportFigure]] = ()
     folded: tuple[str, str] | None = None
 
 
@@ -123,10 +123,9 @@ def _section(section: ReportSection, *, is_first: bool) -> str:
     parts = [] if is_first else [f"<h2>{_text(section.title)}</h2>"]
     parts += [f"<p>{_text(paragraph)}</p>" for paragraph in section.paragraphs]
     parts += [_table(table) for table in section.tables]
-    for is_small in (True, False):
-        figures = [_figure(figure) for figure in section.figures if figure.is_small == is_small]
-        if figures:
-            parts.append(f'<div class="figures{" small" if is_small else ""}">\n' + "\n".join(figures) + "\n</div>")
+    for row in section.figures:
+        kind = "figures small" if all(figure.is_small for figure in row) else "figures"
+        parts.append(f'<div class="{kind}">\n' + "\n".join(map(_figure, row)) + "\n</div>")
     if section.folded is not None:
         head, content = section.folded
         parts.append(f"<details><summary>{_text(head)}</summary><pre>{_text(content)}</pre></details>")
@@ -140,7 +139,8 @@ def _table(table: ReportTable) -> str:
         for row in table.rows
     )
     return (
-        f'<div class="table" tabindex="0"><table><caption>{_text(table.caption)}</caption>'
+        f'<p class="caption">{_text(table.caption)}</p>\n'
+        f'<div class="table" tabindex="0"><table aria-label="{_text(table.caption)}">'
         f"<thead><tr>{heads}</tr></thead>\n<tbody>{rows}</tbody></table></div>"
     )
 

@@ -1,0 +1,251 @@
+"""Comparison at equal budget: identical cameras are equal, finer grids are better, unequal budgets are rejected."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+import foveasim as fs
+from foveasim.compare import MEASURES, quality_by_eccentricity
+from foveasim.compare.comparison import _interval
+from foveasim.errors import FileError, ParameterError
+from foveasim.reconstruct import Picture
+
+OPTIONS = {"n_annuli": 4, "max_pixels": 64}
+
+
+def photographs():
+    """Return two pictures with structure at all scales."""
+    rng = np.random.default_rng(5)
+    y, x = np.mgrid[:96, :96] / 96.0
+    pictures = {}
+    for k in range(3):
+        waves = sum(
+            np.sin(2.0 * np.pi * (f * x + g * y + p)) / (1.0 + f) for f, g, p in rng.uniform(0.0, 12.0, (12, 3))
+        )
+        pictures[f"picture {k}"] = np.uint8(np.interp(waves, (waves.min(), waves.max()), (5, 250)))
+    return pictures
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return fs.compare.photograph_scenes(160.0, pictures=photographs())
+
+
+@pytest.fixture(scope="module")
+def foveal():
+    return fs.layout.log_polar(n_sites=1037, min_size_um=1.5, r_max_um=80.0, stagger=True)
+
+
+@pytest.fixture(scope="module")
+def compared(foveal, scenes):
+    square = fs.layout.grid(n_sites=1024, size_um=(160.0, 160.0))
+    layouts = {"foveal": foveal, "square": square, "again <b>": foveal}
+    return fs.compare.layouts(layouts, scenes, **OPTIONS)
+
+
+def test_identical_layouts_have_identical_measures(compared):
+    for name in MEASURES:
+        for key in (name, f"{name}_by_eccentricity"):
+            values = compared.values[key]
+            np.testing.assert_array_equal(values[0], values[2])
+        mean, half_width = compared.differences(name)
+        assert mean[0] == mean[2] == 0.0
+        assert half_width[2] == 0.0
+    assert any(compared.differences(name)[0][1] != 0.0 for name in MEASURES)
+
+
+def test_fovea_is_better_at_centre_only(compared):
+    psnr, _ = compared.summary("psnr_db", by_eccentricity=True)
+    nyquist, _ = compared.summary("nyquist_per_mm", by_eccentricity=True)
+    per_mm2, _ = compared.summary("information_bit_per_mm2", by_eccentricity=True)
+
+    for values in (psnr, nyquist, per_mm2):
+        assert values[0, 0] > values[1, 0]
+        assert values[0, 2] < values[1, 2]
+
+
+def test_blind_spot_is_stated_and_excluded(compared, foveal):
+    blind_um = foveal.provenance["blind_radius_um"]
+
+    assert compared.coverage[1] > compared.coverage[0]
+    assert compared.compared_fraction <= compared.coverage.min()
+    assert np.isnan(compared.pictures["foveal"][0].data[0, 32, 32])
+    assert blind_um > compared.pictures["foveal"][0].grid.pitch_um
+
+
+def test_uniform_grid_has_known_frequencies(compared):
+    side_um = 160.0 / round(np.sqrt(compared.budgets[1].n_sites))
+
+    assert compared.values["nyquist_per_mm"][1] == pytest.approx(500.0 / side_um)
+    # The lens lowers the MTF50 of a square aperture, 0.603 / side along x.
+    assert 0.3 * 603.0 / side_um < compared.values["mtf50_per_mm"][1] < 650.0 / side_um
+
+
+def test_finer_grid_has_higher_psnr(scenes):
+    grids = {f"{n}": fs.layout.grid(n_x=n, size_um=(160.0, 160.0)) for n in (16, 32, 64)}
+    found = fs.compare.layouts(grids, scenes, budget=None, **OPTIONS)
+    psnr, _ = found.summary("psnr_db")
+    ssim, _ = found.summary("ssim")
+
+    assert psnr[0] + 1.0 < psnr[1] < psnr[2] - 1.0
+    assert ssim[0] < ssim[1] < ssim[2]
+
+
+def test_budgets_follow_from_the_sensor(foveal):
+    noise_e = np.linspace(1.0, 3.0, foveal.n_sites)
+    sensor = fs.Sensor(foveal, bits=12, read_noise_e=noise_e)
+    camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=4.0), sensor=sensor)
+
+    found = fs.compare.budget_of(camera, 25.0)
+
+    assert found.n_sites == foveal.n_sites
+    assert found.data_rate_bit_per_s == foveal.n_sites * 12 * 25
+    assert found.area_um2 == pytest.approx(sum(polygon.area for polygon in foveal.polygons()))
+    assert found.read_noise_e2 == pytest.approx(sum(sigma**2 for sigma in noise_e))
+
+
+def test_unequal_budgets_are_rejected(scenes):
+    grids = {"a": fs.layout.grid(n_x=20, size_um=(80.0, 80.0)), "b": fs.layout.grid(n_x=21, size_um=(80.0, 80.0))}
+
+    with pytest.raises(ParameterError, match=r"within 2 %: the number of sites of 'a' is 400, that of 'b' 441; use"):
+        fs.compare.layouts(grids, scenes, **OPTIONS)
+    found = fs.compare.layouts(grids, {"one": scenes["picture 0"]}, budget="area", **OPTIONS)
+    assert found.budgets[0].area_um2 == pytest.approx(found.budgets[1].area_um2)
+    assert np.isnan(found.summary("psnr_db")[1]).all()
+
+
+def cameras_of(layout, **optics):
+    lens = fs.Optics(**{"focal_length_mm": 8.0, "f_number": 4.0, **optics})
+    return fs.Camera(optics=lens, sensor=fs.compare.default_sensor(layout))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda one: {"a": one}, "must be at least two, got 1"),
+        (lambda one: [one, one], "must be a mapping of names to cameras, got a list"),
+        (lambda one: {"a": one, "b": 3}, "must be cameras, got a int for 'b'"),
+        (
+            lambda one: {"a": one, "b": cameras_of(one.sensor.layout, f_number=2.0)},
+            "must have the same optics: those of 'a' and 'b' differ",
+        ),
+    ],
+)
+def test_invalid_cameras_are_explained(change, message, foveal):
+    with pytest.raises(ParameterError, match=message):
+        fs.compare.cameras(change(cameras_of(foveal)), exposure_s=0.01)
+
+
+def test_invalid_options_are_explained(foveal, scenes):
+    pair = {"a": foveal, "b": foveal}
+
+    with pytest.raises(ParameterError, match="'budget' must be one of 'n_sites', 'data_rate', 'area', 'read_noise'"):
+        fs.compare.layouts(pair, scenes, budget="sites")
+    with pytest.raises(ParameterError, match="'frames_per_s' must have a rate for 'b'"):
+        fs.compare.layouts(pair, scenes, frames_per_s={"a": 10.0})
+    with pytest.raises(ParameterError, match="'scenes' must be a mapping"):
+        fs.compare.layouts(pair, [scenes["picture 0"]])
+
+
+def flat_picture(values, grid):
+    return Picture(np.asarray(values, np.float32)[np.newaxis], np.ones(grid.shape, np.float32), grid)
+
+
+def test_psnr_of_white_noise_matches_variance():
+    grid, rng = fs.Grid.centred((200, 200), 1.0), np.random.default_rng(2)
+    x, y = np.meshgrid(grid.x_um, grid.y_um)
+    ideal = 100.0 + 50.0 * np.sign(x)
+    sigma = np.where(np.hypot(x, y) < 50.0, 2.0, 5.0)
+    noisy = flat_picture((ideal + sigma * rng.standard_normal(grid.shape)) / 3.0, grid)
+
+    found = quality_by_eccentricity(noisy, flat_picture(ideal, grid), edges_um=np.array([0.0, 50.0, 100.0]))
+
+    expected = 20.0 * np.log10(100.0 / np.array([2.0, 5.0]))
+    # Relative standard deviation of a variance: sqrt(2 / n).
+    tolerance = 5.0 * 10.0 / np.log(10.0) * np.sqrt(2.0 / np.array([7854.0, 23562.0]))
+    assert found.gain == pytest.approx(3.0, rel=2e-3)
+    assert (np.abs(found.psnr_db_by_eccentricity - expected) < tolerance).all()
+    assert found.ssim_by_eccentricity[0] > found.ssim_by_eccentricity[1]
+
+
+def test_totals_match_metrics_of_pictures():
+    grid, rng = fs.Grid.centred((40, 40), 1.0), np.random.default_rng(3)
+    one, other = (flat_picture(rng.uniform(1.0, 2.0, grid.shape), grid) for _ in range(2))
+
+    found = quality_by_eccentricity(one, other, edges_um=np.array([0.0, 100.0]))
+    scaled = flat_picture(found.gain * one.data[0], grid)
+
+    assert found.psnr_db == pytest.approx(fs.metrics.psnr_db(scaled, other), abs=1e-4)
+    assert found.psnr_db_by_eccentricity[0] == pytest.approx(found.psnr_db)
+    assert found.ssim == pytest.approx(fs.metrics.ssim(scaled, other), abs=1e-4)
+
+
+def test_pictures_of_other_grids_are_rejected():
+    one = flat_picture(np.ones((8, 8)), fs.Grid.centred((8, 8), 1.0))
+    other = flat_picture(np.ones((8, 8)), fs.Grid.centred((8, 8), 1.5))
+
+    with pytest.raises(
+        ParameterError, match=r"same grid as the picture, 8 x 8 pixels of 1 µm .* got 8 x 8 pixels of 1.5"
+    ):
+        quality_by_eccentricity(one, other, edges_um=np.array([0.0, 10.0]))
+
+
+def test_intervals_are_those_of_student():
+    mean, half_width = _interval(np.array([[1.0, 2.0, 3.0, 4.0], [2.0, 2.0, 2.0, np.nan]]))
+
+    np.testing.assert_allclose(mean, [2.5, 2.0])
+    # t(0.975, 3) = 3.18245, s = sqrt(5/3)
+    np.testing.assert_allclose(half_width, [3.18245 * np.sqrt(5.0 / 3.0) / 2.0, 0.0], rtol=1e-5)
+
+
+def test_dataset_has_units_and_settings(compared):
+    data = compared.to_xarray()
+
+    assert data["psnr_db_by_eccentricity"].dims == ("camera", "scene", "annulus")
+    assert data["psnr_db"].sel(camera="square").shape == (3,)
+    assert data["shift_sigma_um"].attrs["units"] == "µm"
+    assert data["n_sites"].values.tolist() == [budget.n_sites for budget in compared.budgets]
+    assert json.loads(data.attrs["settings"])["seed"] == 0
+    records = compared.records()
+    assert records[1]["psnr_db"] == pytest.approx(float(data["psnr_db"].sel(camera="square").mean()))
+
+
+def test_report_is_escaped_and_self_contained(compared, tmp_path):
+    compared.write(tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+    assert "again &lt;b&gt;" in page
+    assert "again <b>" not in page
+    assert not re.search(r"(src|href|srcset)=\"(?!data:)", page)
+    assert page.count("<img ") == len(re.findall(r"<figcaption><b>[^<]+</b> [^<]+\.</figcaption>", page))
+    with pytest.raises(FileError, match=r"must end in \.html"):
+        compared.write(tmp_path / "report.pdf")
+
+
+def test_overview_draws_every_measure(compared):
+    figure = compared.plot()
+    labels = {axes.get_ylabel().split(" / ")[0] for axes in figure.axes}
+
+    assert labels >= {measure.title for measure in MEASURES.values()}
+    figure.canvas.draw()
+
+
+def test_table_lists_cameras_and_measures(compared):
+    lines = str(compared).splitlines()
+
+    assert all(name in lines[0] for name in compared.names)
+    assert sum("±" in line for line in lines) >= 4
+
+
+def test_progress_counts_to_its_total(scenes, foveal):
+    counts = []
+    fs.compare.layouts(
+        {"a": foveal, "b": foveal}, scenes, progress=lambda done, total: counts.append((done, total)), **OPTIONS
+    )
+
+    assert counts == [(k, 8) for k in range(1, 9)]
