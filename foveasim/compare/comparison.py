@@ -71,7 +71,7 @@ class Comparison:
         Fixation point.
     values : mapping of str to array
         Measures by name: (n_camera, n_scene) or (n_camera,); and ``NAME_by_eccentricity`` with an axis of annuli.
-    coverage : (n_camera,) float64
+    coverage_fraction : (n_camera,) float64
         Fraction of the common field, the pixels that any camera covers, that each camera covers.
     compared_fraction : float
         Fraction of the field that all cameras cover: pictures are compared there.
@@ -89,7 +89,7 @@ class Comparison:
     edges_um: Floats
     centre_um: tuple[float, float]
     values: Mapping[str, Floats]
-    coverage: Floats
+    coverage_fraction: Floats
     compared_fraction: float
     pictures: Mapping[str, Sequence[Picture]]
     ideal: Sequence[Picture]
@@ -143,7 +143,11 @@ class Comparison:
         """Return one dict per camera: its budget, its coverage, and mean and half width of every measure."""
         rows = []
         for k, name in enumerate(self.names):
-            row: dict[str, Any] = {"camera": name, **asdict(self.budgets[k]), "coverage": float(self.coverage[k])}
+            row: dict[str, Any] = {
+                "camera": name,
+                **asdict(self.budgets[k]),
+                "coverage_fraction": float(self.coverage_fraction[k]),
+            }
             for measure in MEASURES:
                 mean, half_width = self.summary(measure)
                 row[measure] = float(mean[k])
@@ -176,7 +180,7 @@ class Comparison:
             attributes = {"units": measure.unit or "1", "long_name": measure.title}
             variables[name] = (dims, self.values[name], attributes)
             variables[name + BY_ECCENTRICITY] = ((*dims, "annulus"), self.values[name + BY_ECCENTRICITY], attributes)
-        variables["coverage"] = (("camera",), self.coverage, {"units": "1"})
+        variables["coverage_fraction"] = (("camera",), self.coverage_fraction, {"units": "1"})
         coordinates: dict[str, Any] = {
             "camera": list(self.names),
             "scene": list(self.scenes),
@@ -243,7 +247,7 @@ class Comparison:
         for attribute, title, unit in BUDGETS.values():
             numbers = [getattr(budget, attribute) for budget in self.budgets]
             rows.append([f"{title} / {unit}" if unit else title, *(format_number(x) for x in numbers)])
-        rows.append(["coverage of the field / %", *(f"{100.0 * part:.1f}" for part in self.coverage)])
+        rows.append(["coverage of the field / %", *(f"{100.0 * part:.1f}" for part in self.coverage_fraction)])
         for name, measure in MEASURES.items():
             mean, half_width = self.summary(name)
             title = f"{measure.title} / {measure.unit}" if measure.unit else measure.title
@@ -419,7 +423,7 @@ def cameras(
         edges_um=read_only(edges_um),
         centre_um=fixation,
         values={key: read_only(np.asarray(rows, np.float64)) for key, rows in values.items()},
-        coverage=read_only(
+        coverage_fraction=read_only(
             np.array([np.count_nonzero(part) for part in covered.values()]) / np.count_nonzero(is_field)
         ),
         compared_fraction=float(np.count_nonzero(is_common) / np.count_nonzero(is_field)),

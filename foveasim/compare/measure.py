@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,6 +38,8 @@ MTF_FREQUENCIES, MAX_FREQUENCY = 200, 1.5
 #: Smallest number of sites for the spectrum of a region.
 MIN_REGION_SITES = 12
 UM2_PER_MM2 = 1e6
+#: Level of MTF50.
+HALF = 0.5
 
 
 @dataclass(frozen=True)
@@ -87,8 +90,8 @@ class SceneMeasures:
 
     capture: Capture
     signals: SiteSignals
-    totals: dict[str, float]
-    annuli: dict[str, Floats]
+    totals: Mapping[str, Any]
+    annuli: Mapping[str, Any]
 
 
 def layout_measures(
@@ -116,14 +119,14 @@ def layout_measures(
         apertures = [polygon_mtf(layout[chosen], frequency, angle_deg=angle).mean(axis=0) for angle in MTF_ANGLES_DEG]
         return _first_crossing(frequency, lens * np.mean(apertures, axis=0))
 
-    def alias(centre: tuple[float, float], radius_um: float | None) -> float:
+    def alias(middle_um: tuple[float, float], radius_um: float | None) -> float:
         if (
             radius_um is not None
-            and np.count_nonzero(np.hypot(*(layout.centroid_um - centre).T) < radius_um) < MIN_REGION_SITES
+            and np.count_nonzero(np.hypot(*(layout.centroid_um - middle_um).T) < radius_um) < MIN_REGION_SITES
         ):
             return float("nan")
         try:
-            found = aliasing_spectrum(layout, (wave_per_mm, 0.0), centre_um=centre, radius_um=radius_um)
+            found = aliasing_spectrum(layout, (wave_per_mm, 0.0), centre_um=middle_um, radius_um=radius_um)
         except ParameterError:
             return float("nan")  # too few sites
         return found.alias_fraction * float(camera.optics.mtf(wave_per_mm, wavelength_nm, distance_m=distance_m))
@@ -131,10 +134,10 @@ def layout_measures(
     order = np.argsort(layout.area_um2, kind="stable")
     by_annulus = [order[annulus[order] == k] for k in range(n)]
     width_um = np.diff(edges_um)
-    middle_um = 0.5 * (edges_um[1:] + edges_um[:-1])
+    ring_um = 0.5 * (edges_um[1:] + edges_um[:-1])
     # The innermost region is centred; others are to the right of the fixation point.
-    centres = [(centre_um[0] + (r if k else 0.0), centre_um[1]) for k, r in enumerate(middle_um.tolist())]
-    radii = [width if k == 0 else max(0.5 * width, 0.25 * middle_um[k]) for k, width in enumerate(width_um.tolist())]
+    centres = [(centre_um[0] + (r if k else 0.0), centre_um[1]) for k, r in enumerate(ring_um.tolist())]
+    radii = [width if k == 0 else max(0.5 * width, 0.25 * ring_um[k]) for k, width in enumerate(width_um.tolist())]
     totals = {
         "nyquist_per_mm": float(np.nanmedian(nyquist)) if np.isfinite(nyquist).any() else float("nan"),
         "mtf50_per_mm": mtf50(order),
@@ -234,13 +237,13 @@ def _median(values: NDArray[np.float64]) -> float:
     return float(np.median(known)) if known.size else float("nan")
 
 
-def _first_crossing(frequency_per_mm: Floats, mtf: Floats, level: float = 0.5) -> float:
-    """Return the first frequency at which an MTF falls to a level, by linear interpolation; NaN if it does not."""
-    below: Bools = mtf < level
+def _first_crossing(frequency_per_mm: Floats, mtf: Floats) -> float:
+    """Return the first frequency at which an MTF falls to one half, by linear interpolation; NaN if it does not."""
+    below: Bools = mtf < HALF
     if not below.any():
         return float("nan")
     k = int(below.argmax())
     if k == 0:
         return 0.0
-    part = (mtf[k - 1] - level) / (mtf[k - 1] - mtf[k])
+    part = (mtf[k - 1] - HALF) / (mtf[k - 1] - mtf[k])
     return float(frequency_per_mm[k - 1] + part * (frequency_per_mm[k] - frequency_per_mm[k - 1]))

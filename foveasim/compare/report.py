@@ -71,7 +71,7 @@ def _summary(comparison: Comparison) -> ReportSection:
     ]
     missing = [
         f"{name} does not cover {100.0 * (1.0 - part):.1f} %"
-        for name, part in zip(comparison.names, comparison.coverage, strict=True)
+        for name, part in zip(comparison.names, comparison.coverage_fraction, strict=True)
         if part < COMPLETE
     ]
     if missing:

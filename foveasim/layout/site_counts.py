@@ -11,7 +11,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 from foveasim._core.validation import MAX_SITES, check_count
 from foveasim.errors import FoveasimError, ParameterError
@@ -32,6 +32,11 @@ STEP_EXPONENT = 0.7
 NEIGHBOURS = 16
 #: Largest number of layouts that are generated from the best candidates until one is valid.
 MAX_CANDIDATES = 40
+
+
+#: First value of a search from the number of sites and the parameters, and number of sites from the parameters.
+Guess: TypeAlias = Callable[[int, Mapping[str, Any]], float]
+Count: TypeAlias = Callable[[Mapping[str, Any]], float | None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,8 +68,8 @@ class SolveFor:
     name: str
     is_integer: bool
     is_increasing: bool
-    guess: Callable[[int, Mapping[str, Any]], float]
-    count: Callable[[Mapping[str, Any]], float | None] | None = None
+    guess: Guess
+    count: Count | None = None
     needs: tuple[str, ...] = ()
     is_optional: bool = False
     at_least: int = 1
@@ -178,8 +183,9 @@ class _Search:
             self.built = found
         return found
 
-    def distance(self, n_sites: float) -> float:
-        return abs(n_sites - self.target)
+    def distance(self, value: float) -> float:
+        """Return the difference of a number of sites from the target."""
+        return abs(value - self.target)
 
     def round(self, value: float) -> float:
         return max(self.unknown.at_least, round(value)) if self.unknown.is_integer else value
@@ -194,15 +200,15 @@ class _Search:
         is_up = self.unknown.is_increasing == (n_low < self.target)
         factor = min(max(math.exp(STEP_EXPONENT * abs(math.log(self.target / n_low))), MIN_FACTOR), MAX_FACTOR)
         for _ in range(MAX_WIDENINGS):
-            far = self.round(low * factor if is_up else low / factor)
-            if far == low and self.unknown.is_integer:
-                far = max(self.unknown.at_least, low + (1 if is_up else -1))
-            if far == low:
+            bound = self.round(low * factor if is_up else low / factor)
+            if bound == low and self.unknown.is_integer:
+                bound = max(self.unknown.at_least, low + (1 if is_up else -1))
+            if bound == low:
                 return
-            if not self.is_before(far, low):
-                self.refine(low, far)
+            if not self.is_before(bound, low):
+                self.refine(low, bound)
                 return
-            low, factor = far, min(factor**2, MAX_FACTOR)
+            low, factor = bound, min(factor**2, MAX_FACTOR)
 
     def start(self) -> float:
         """Return a valid value near the guess; the generator raises when there is none."""
@@ -225,11 +231,11 @@ class _Search:
             return False
         return n_low < n_sites < self.target if n_low < self.target else n_low >= n_sites >= self.target
 
-    def refine(self, low: float, far: float) -> None:
+    def refine(self, low: float, bound: float) -> None:
         """Search between a value on one side of the target and one that is on the other side, or not valid."""
         for step in range(MAX_STEPS):
-            middle = self.round(self.between(low, far, step))
-            if middle in (low, far) or (not self.unknown.is_integer and abs(math.log(far / low)) < 1e-12):
+            middle = self.round(self.between(low, bound, step))
+            if middle in (low, bound) or (not self.unknown.is_integer and abs(math.log(bound / low)) < 1e-12):
                 return
             n_sites = self.count(middle)
             if n_sites is not None and self.distance(n_sites) <= self.enough():
@@ -237,20 +243,20 @@ class _Search:
             if n_sites == self.counts[low] or self.is_before(middle, low):
                 low = middle
             else:
-                far = middle
+                bound = middle
 
     def enough(self) -> float:
         """Return the difference of the number of sites at which the search ends."""
         return (GOOD_FRACTION if self.has_cheap_counts else GOOD_FRACTION_OF_LAYOUTS) * self.target
 
-    def between(self, low: float, far: float, step: int) -> float:
+    def between(self, low: float, bound: float, step: int) -> float:
         """Return a value between two others, by interpolation of the logarithms in every second step."""
-        fraction, n_low, n_far = 0.5, self.counts[low], self.counts[far]
+        fraction, n_low, n_far = 0.5, self.counts[low], self.counts[bound]
         if step % 2 == 0 and n_low is not None and n_far is not None and n_low != n_far:
             fraction = math.log(self.target / n_low) / math.log(n_far / n_low)
-        value = low * (far / low) ** min(max(fraction, 0.01), 0.99)
-        if self.unknown.is_integer and abs(far - low) > 1:
-            value = min(max(value, min(low, far) + 1), max(low, far) - 1)
+        value = low * (bound / low) ** min(max(fraction, 0.01), 0.99)
+        if self.unknown.is_integer and abs(bound - low) > 1:
+            value = min(max(value, min(low, bound) + 1), max(low, bound) - 1)
         return value
 
     def sorted_values(self) -> list[float]:

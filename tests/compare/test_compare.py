@@ -71,8 +71,8 @@ def test_fovea_is_better_at_centre_only(compared):
 def test_blind_spot_is_stated_and_excluded(compared, foveal):
     blind_um = foveal.provenance["blind_radius_um"]
 
-    assert compared.coverage[1] > compared.coverage[0]
-    assert compared.compared_fraction <= compared.coverage.min()
+    assert compared.coverage_fraction[1] > compared.coverage_fraction[0]
+    assert compared.compared_fraction <= compared.coverage_fraction.min()
     assert np.isnan(compared.pictures["foveal"][0].data[0, 32, 32])
     assert blind_um > compared.pictures["foveal"][0].grid.pitch_um
 
