@@ -24,9 +24,11 @@ from foveasim.fields import Grid
 from foveasim.layout import Layout
 from foveasim.layout.packed import layout_from_arrays, layout_to_arrays
 from foveasim.reconstruct import (
+    CorticalImage,
     Picture,
     SiteEstimates,
     cells,
+    cortical,
     electrons_per_code,
     estimate_from_charge,
     estimate_from_code,
@@ -35,6 +37,7 @@ from foveasim.reconstruct import (
     linear,
     natural,
     raster_grid,
+    to_cortical,
 )
 from foveasim.sensor import Sensor, signal_to_noise
 
@@ -205,21 +208,9 @@ class Capture:
         n_filters = len(self.filter_names)
         is_in_filter = self.filter_of_site == np.arange(n_filters)[:, np.newaxis]
         is_fitted = method == "least_squares"
-        is_estimated = is_fitted or of == "light_e"
-        electronics = self._electronics(sensor) if is_estimated or per == "um2" else None
-        values = np.asarray(self.code if of == "light_e" else getattr(self, of), dtype=np.float64)
-        response = np.ones(self.layout.n_sites)
-        if electronics is not None:
-            response = self.layout.area_um2 * electronics.sensitivity
-            e_per_dn = electrons_per_code(electronics) if of == "code" else np.ones(values.size)
-            response = response * (np.mean(e_per_dn) / e_per_dn)
-            if is_estimated:
-                estimates = self._estimates(electronics, of)
-                values = estimates.light_e / e_per_dn
-                if is_fitted:
-                    values[estimates.is_saturated] = np.nan
-                    options = {"variance": estimates.variance_e2 / e_per_dn**2, **options}
+        values, response, variance = self._values_and_response(of, per, sensor, is_fitted=is_fitted)
         if is_fitted:
+            options = {"variance": variance, **options}
             scale = float(response.mean()) if per == "site" else 1.0
             is_present = is_in_filter.any(axis=1)
             channels = np.where(is_in_filter[is_present], values, np.nan)
@@ -238,6 +229,67 @@ class Capture:
         # A filter that no site has is black, as in cells.
         channels = np.where(is_in_filter, values, np.where(is_in_filter.any(axis=1, keepdims=True), np.nan, 0.0))
         return methods[method](self.layout, channels, grid, **options)
+
+    def cortical(
+        self,
+        *,
+        of: Literal["code", "electrons", "expected_e", "light_e"] = "code",
+        per: Literal["site", "um2"] = "site",
+        n_rings: int | None = None,
+        n_sectors: int | None = None,
+        r_min_um: float | None = None,
+        r_max_um: float | None = None,
+        centre_um: tuple[float, float] | None = None,
+        max_pixels: int = 1024,
+        sensor: Sensor | None = None,
+    ) -> CorticalImage:
+        """
+        Return the values as a log-polar image of rings and sectors.
+
+        On layouts of rings with equal sectors it has exactly one pixel per site, and one channel, also with colour filters.
+        With ``n_rings`` and ``n_sectors``, and thus for any layout, the picture of :meth:`picture` is resampled.
+
+        Parameters
+        ----------
+        of, per, sensor
+            As for :meth:`picture`.
+        n_rings, n_sectors : int, optional
+            Shape of the resampled image.
+        r_min_um, r_max_um, centre_um : optional, µm
+            Radii and centre of the resampled image: see :func:`foveasim.reconstruct.to_cortical`. By default the centre is
+            the optical axis, and the outermost ring touches the nearest side of the bounds of the layout.
+        max_pixels : int
+            Pixels along the longer side of the picture that is resampled.
+
+        Returns
+        -------
+        CorticalImage
+            :func:`foveasim.reconstruct.from_cortical` is the inverse.
+
+        Raises
+        ------
+        ParameterError
+            When the layout does not have such rings and no shape is given, or as for :meth:`picture`.
+        """
+        check_choice("of", of, ("code", "electrons", "expected_e", "light_e"))
+        check_choice("per", per, ("site", "um2"))
+        self._check_sensor(sensor)
+        if n_rings is None and n_sectors is None:
+            for name, value in (("r_min_um", r_min_um), ("r_max_um", r_max_um), ("centre_um", centre_um)):
+                if value is not None:
+                    raise ParameterError(name, "must be used with 'n_rings' and 'n_sectors'", value, "µm")
+            values, response, _ = self._values_and_response(of, per, sensor)
+            return cortical(self.layout, values / (response if per == "um2" else 1.0))
+        if n_rings is None or n_sectors is None:
+            raise ParameterError("n_rings", "and 'n_sectors' must be given together")
+        centre = (0.0, 0.0) if centre_um is None else centre_um
+        if r_max_um is None:
+            x0, y0, x1, y1 = self.layout.bounds_um
+            r_max_um = min(x1 - centre[0], y1 - centre[1], centre[0] - x0, centre[1] - y0)
+        picture = self.picture(max_pixels=max_pixels, of=of, per=per, sensor=sensor)
+        return to_cortical(
+            picture, n_rings=n_rings, n_sectors=n_sectors, r_min_um=r_min_um, r_max_um=r_max_um, centre_um=centre
+        )
 
     def signal_to_noise(self, *, sensor: Sensor | None = None) -> Floats:
         """
@@ -271,6 +323,29 @@ class Capture:
             raise ParameterError(
                 "sensor", "must be the Sensor of the capture's layout, with the same sites in the same order", sensor
             )
+
+    def _values_and_response(
+        self, of: str, per: str, sensor: Sensor | None, *, is_fitted: bool = False
+    ) -> tuple[Floats, Floats, Floats | None]:
+        """
+        Return values and responses of the sites, and the variances of estimated values.
+
+        Values are estimated photoelectrons for ``"light_e"`` and for fits, which exclude saturated sites.
+        """
+        is_estimated = is_fitted or of == "light_e"
+        values = np.asarray(self.code if of == "light_e" else getattr(self, of), dtype=np.float64)
+        if not is_estimated and per != "um2":
+            return values, np.ones(values.size), None
+        electronics = self._electronics(sensor)
+        e_per_dn = electrons_per_code(electronics) if of == "code" else np.ones(values.size)
+        response = self.layout.area_um2 * electronics.sensitivity * (np.mean(e_per_dn) / e_per_dn)
+        if not is_estimated:
+            return values, response, None
+        estimates = self._estimates(electronics, of)
+        values = estimates.light_e / e_per_dn
+        if is_fitted:
+            values[estimates.is_saturated] = np.nan
+        return values, response, estimates.variance_e2 / e_per_dn**2
 
     def _electronics(self, sensor: Sensor | None) -> Sensor:
         """Return the given sensor, or the one in the settings."""

@@ -4,8 +4,9 @@ What does a fovea gain over a square grid with the same number of photosites, an
 New here: ``n_sites=`` of layout generators, and ``foveasim.compare``: pictures, quality by eccentricity and information of
 cameras at equal budget.
 
-Expect: of two sensors with 4,096 photosites, the foveal one has a PSNR at least 5 dB higher around the gaze, at least 2 dB lower
-in the periphery, and at least 3 times as much information per area at the gaze; the total information differs by less than 40 %.
+Expect: of two sensors with 4,096 photosites, the foveal one has a PSNR at least 5 dB higher around the gaze, at least 2 dB
+lower in the periphery, and at least 3 times as much information per area at the gaze; the total information differs by less
+than 40 %.
 """
 
 from __future__ import annotations
