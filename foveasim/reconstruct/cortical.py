@@ -36,8 +36,8 @@ from foveasim.reconstruct.picture import Picture
 
 __all__ = ["CorticalImage", "cortical", "from_cortical", "to_cortical"]
 
-#: Largest difference of radii and angles of a ring from those of equal sectors, relative to the radius and to a sector.
-RING_ROUNDING = 1e-6
+#: Largest relative difference of the radii of a ring, and largest difference of centroids from equal sectors, in sectors.
+RING_ROUNDING, SECTOR_ROUNDING = 1e-6, 0.05
 #: Fraction of valid neighbours below which an interpolated value is unknown.
 MIN_KNOWN = 0.5
 MAX_SIDE = 2**15
@@ -164,12 +164,16 @@ def cortical(layout: Layout, values: ArrayLike) -> CorticalImage:
     step_rad = 2.0 * math.pi / n_sectors
     xy_um = layout.centroid_um[sites] - centre_um
     angle_rad = np.arctan2(xy_um[..., 1], xy_um[..., 0])
-    start_rad = angle_rad[:, 0] - 0.5 * step_rad
-    start_rad = np.where(np.abs(start_rad) < RING_ROUNDING * step_rad, 0.0, start_rad)
-    expected = start_rad[:, np.newaxis] + (np.arange(n_sectors) + 0.5) * step_rad
-    off = np.abs((angle_rad - expected + math.pi) % (2.0 * math.pi) - math.pi)
+    # In sectors, relative to the outermost ring; the first ring may have corners of a fovea, which move its centroids.
+    first_rad = float(angle_rad[-1, 0]) - 0.5 * step_rad
+    lead = (angle_rad - first_rad) / step_rad - (np.arange(n_sectors) + 0.5)
+    lead = (lead - lead[:, :1] + 0.5 * n_sectors) % n_sectors - 0.5 * n_sectors + lead[:, :1]
+    start = lead.mean(axis=1)
+    rounded = np.rint(2.0 * start) / 2.0
+    start = np.where(np.abs(start - rounded) < SECTOR_ROUNDING, rounded, start)
+    start_rad = (first_rad if abs(first_rad) > RING_ROUNDING * step_rad else 0.0) + start * step_rad
     are_adjacent = np.abs(smallest_um[1:] - largest_um[:-1]) <= RING_ROUNDING * largest_um[-1]
-    if off.max() > RING_ROUNDING * step_rad + 1e-12 or not are_adjacent.all():
+    if np.abs(lead - start[:, np.newaxis]).max() > SECTOR_ROUNDING or not are_adjacent.all():
         raise ParameterError("layout", "must have concentric rings of equal sectors", hint=RESAMPLE)
     return CorticalImage(
         data=channels[:, sites],

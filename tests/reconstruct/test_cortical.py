@@ -134,10 +134,9 @@ def test_inverse_matches_opencv():
     ours = from_cortical(image, fs.Grid.centred((n, n), 1.0)).data[0]
 
     y, x = np.mgrid[:n, :n] - centre
-    # Theirs is not periodic: pixels between the last and the first angle are undefined.
-    is_periodic = np.abs(np.arctan2(y, x)) > 2.0 * 2.0 * np.pi / n_angles
-    inside = (np.hypot(x, y) > 4.0) & (np.hypot(x, y) < 50.0) & is_periodic
-    np.testing.assert_allclose(ours[inside], theirs[inside], atol=0.02)
+    inside = (np.hypot(x, y) > 4.0) & (np.hypot(x, y) < 50.0)
+    # Some versions of OpenCV leave a few pixels undefined.
+    assert np.mean(np.abs(ours - theirs)[inside] < 0.02) > 0.99
 
 
 def test_angles_increase_counter_clockwise():
@@ -219,7 +218,7 @@ def test_bad_arguments_are_explained(capture):
         shot.cortical(n_rings=4)
     with pytest.raises(ParameterError, match="'r_max_um' must be used with 'n_rings'"):
         shot.cortical(r_max_um=4.0)
-    with pytest.raises(ParameterError, match="'r_min_um' must be > 0 and < 4, the outer radius, got 5.0 µm"):
+    with pytest.raises(ParameterError, match=r"'r_min_um' must be > 0 and < 4, the outer radius, got 5\.0 µm"):
         to_cortical(picture, n_rings=4, n_sectors=8, r_min_um=5.0, r_max_um=4.0)
     with pytest.raises(ParameterError, match="'method' must be one of 'linear', 'nearest'"):
         from_cortical(shot.cortical(), picture.grid, method="cubic")
