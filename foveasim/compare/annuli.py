@@ -17,7 +17,7 @@ __all__ = ["PictureQuality", "annulus_of", "fit_gain", "quality_by_eccentricity"
 
 
 class PictureQuality(NamedTuple):
-    """PSNR in dB and SSIM of a picture, in total and in each annulus, with the gain of the picture."""
+    """PSNR in dB and SSIM of a picture, in total and by annulus, and its fitted gain."""
 
     psnr_db: float
     ssim: float
@@ -74,9 +74,9 @@ def quality_by_eccentricity(
     ParameterError
         When the grids or channels differ, or no pixel can be compared.
     """
-    for name, one in (("picture", picture), ("reference", reference)):
-        if not isinstance(one, Picture):
-            raise ParameterError(name, f"must be a foveasim.Picture, got a {type(one).__name__}")
+    for name, given in (("picture", picture), ("reference", reference)):
+        if not isinstance(given, Picture):
+            raise ParameterError(name, f"must be a foveasim.Picture, got a {type(given).__name__}")
     if picture.grid != reference.grid:
         raise ParameterError(
             "reference",

@@ -1,4 +1,4 @@
-"""Comparison of cameras at equal budget, with the same scenes, lens, exposure and picture grid."""
+"""Comparison of cameras at equal budget: the same scenes, lens, exposure and grid."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from foveasim.compare.measure import (
     SceneMeasures,
     information_by_annulus,
     layout_measures,
+    layout_of,
     scene_measures,
     size_records,
 )
@@ -101,7 +102,7 @@ class Comparison:
 
     def summary(self, name: str, *, by_eccentricity: bool = False) -> tuple[Floats, Floats]:
         """
-        Return mean over the scenes and half width of the confidence interval of a measure.
+        Return mean and half width of the confidence interval of a measure.
 
         Parameters
         ----------
@@ -121,7 +122,7 @@ class Comparison:
 
     def differences(self, name: str, *, by_eccentricity: bool = False) -> tuple[Floats, Floats]:
         """
-        Return the mean difference of a measure from the first camera, with its confidence interval.
+        Return mean difference from the first camera, and half width of its interval.
 
         Parameters
         ----------
@@ -140,7 +141,7 @@ class Comparison:
         return _interval(difference) if measure.has_scenes else (difference, np.zeros_like(difference))
 
     def records(self) -> list[dict[str, Any]]:
-        """Return one dict per camera: its budget, its coverage, and mean and half width of every measure."""
+        """Return one dict per camera, with its budget, its coverage and all measures."""
         rows = []
         for k, name in enumerate(self.names):
             row: dict[str, Any] = {
@@ -193,7 +194,7 @@ class Comparison:
         return xr.Dataset(variables, coordinates, {"settings": json.dumps(self.settings)})
 
     def plot(self) -> Figure:
-        """Draw all measures against eccentricity, with confidence intervals, as a matplotlib figure."""
+        """Draw all measures against eccentricity, with confidence intervals."""
         from foveasim.compare.figures import overview
 
         return overview(self)
@@ -324,10 +325,10 @@ def cameras(
     budgets = {name: budget_of(camera, _rate(frames_per_s, name, exposure_s)) for name, camera in named.items()}
     check_equal_budgets(budgets, budget, tolerance)
     sensors = {name: camera.sensor for name, camera in named.items()}
-    all_layouts = [sensor.layout for sensor in sensors.values()]
+    all_layouts = [layout_of(camera) for camera in named.values()]
     first = next(iter(named.values()))
     if scenes is None:
-        scenes = photograph_scenes(field_um(all_layouts), first.optics)  # type: ignore[arg-type]
+        scenes = photograph_scenes(field_um(all_layouts), first.optics)
     if not isinstance(scenes, Mapping) or not scenes:
         raise ParameterError("scenes", "must be a mapping of names to at least one scene", scenes)
     n_steps = len(named) * (len(scenes) + 1)
@@ -396,18 +397,12 @@ def cameras(
         channel_means = np.nanmean([picture.data for picture in ideal[name]], axis=(0, 2, 3))
         response = channel_means[found[name][0].capture.filter_of_site] / mean_e_per_um2 * camera.sensor.sensitivity
         noise_e = [one.signals.noise_e for one in found[name]]
-        for target, part in zip(
-            (totals, annuli),
+        for total, by_annulus in (
             information_by_annulus(camera, covariance, response, noise_e, fixation, edges_um),
-            strict=True,
-        ):
-            target.update(part)
-        for target, part in zip(
-            (totals, annuli),
             layout_measures(camera, wavelength_nm, distance_m, fixation, edges_um, wave_per_mm),
-            strict=True,
         ):
-            target.update(part)
+            totals.update(total)
+            annuli.update(by_annulus)
         for key in MEASURES:
             values[key].append(totals[key])
             values[key + BY_ECCENTRICITY].append(annuli[key])
@@ -442,7 +437,7 @@ def cameras(
             "cameras": {
                 name: {
                     "sensor": {k: v for k, v in to_plain_data(sensor).items() if k != "layout"},
-                    "layout": to_plain_data(dict(sensor.layout.provenance)),  # type: ignore[attr-defined]
+                    "layout": to_plain_data(dict(layout_of(named[name]).provenance)),
                 }
                 for name, sensor in sensors.items()
             },
@@ -572,7 +567,7 @@ def _measure(name: str) -> Any:
 
 
 def _interval(values: NDArray[np.float64]) -> tuple[Floats, Floats]:
-    """Return mean and half width of the confidence interval over axis 1, of the scenes with a value."""
+    """Return mean and half width of the confidence interval over axis 1, without NaN."""
     from scipy.stats import t
 
     is_known = np.isfinite(values)

@@ -35,7 +35,7 @@ def gaussian_information_bits(
     noise_covariance: ArrayLike | None = None,
 ) -> float:
     """
-    Compute the information of readings about scenes, by Gaussian models of both.
+    Compute the information of readings about scenes by a Gaussian model.
 
     Parameters
     ----------
@@ -72,7 +72,8 @@ def gaussian_information_bits(
         raise ParameterError("signal_covariance", "must be square", list(signal.shape))
     if (noise_variance is None) == (noise_covariance is None):
         raise ParameterError("noise_variance", "or 'noise_covariance' must be given, but only one of them")
-    if noise_covariance is not None:
+    if noise_variance is None:
+        assert noise_covariance is not None
         noise = finite_array("noise_covariance", noise_covariance, ndim=2)
         if noise.shape != (n, n):
             raise ParameterError("noise_covariance", f"must have the shape {(n, n)}", list(noise.shape))
@@ -98,7 +99,7 @@ def _log2_det(name: str, matrix: NDArray[np.float64]) -> float:
 
 class SceneCovariance:
     """
-    Isotropic covariance of image irradiance, a sum of Gaussians ``Σ_k a_k exp(-d² / 2 σ_k²)``.
+    Isotropic covariance of irradiance, a sum of Gaussians ``Σ a_k exp(-d² / 2 σ_k²)``.
 
     Parameters
     ----------
@@ -107,7 +108,7 @@ class SceneCovariance:
     sigma_um : (n_component,), µm
     """
 
-    def __init__(self, amplitude: Floats, sigma_um: Floats) -> None:
+    def __init__(self, amplitude: ArrayLike, sigma_um: ArrayLike) -> None:
         self.amplitude, self.sigma_um = np.asarray(amplitude, np.float64), np.asarray(sigma_um, np.float64)
 
     def at(self, distance_um: ArrayLike) -> Floats:
@@ -255,7 +256,7 @@ def site_information_bits(
 
 
 def _second_moments_um2(layout: Layout) -> Floats:
-    """Return the central second moments xx, yy, xy of the sites over their area, (n_site, 3) µm²."""
+    """Return the second moments xx, yy, xy of the sites over their area, (n_site, 3) µm²."""
     n_vertices = np.diff(layout.ring_offsets)
     n_rings = np.diff(layout.site_offsets)
     site = np.repeat(np.repeat(np.arange(layout.n_sites), n_rings), n_vertices)

@@ -16,6 +16,7 @@ from foveasim.capture import Capture
 from foveasim.compare.annuli import annulus_of
 from foveasim.compare.information import SceneCovariance, site_information_bits
 from foveasim.errors import CoverageWarning, ParameterError
+from foveasim.layout import Layout
 from foveasim.metrics import (
     aliasing_spectrum,
     flow_bound,
@@ -29,7 +30,16 @@ from foveasim.sensor import signal_to_noise
 from foveasim.sensor.signal_to_noise import SiteSignals
 from foveasim.units import per_mm_from_per_um
 
-__all__ = ["MEASURES", "Measure", "SceneMeasures", "information_by_annulus", "layout_measures", "scene_measures"]
+__all__ = [
+    "MEASURES",
+    "Measure",
+    "SceneMeasures",
+    "information_by_annulus",
+    "layout_measures",
+    "layout_of",
+    "scene_measures",
+    "size_records",
+]
 
 #: Sites of an annulus that represent its aperture MTF, and directions of the waves.
 MTF_SITES, MTF_ANGLES_DEG = 24, (0.0, 45.0, 90.0, 135.0)
@@ -44,13 +54,12 @@ HALF = 0.5
 
 @dataclass(frozen=True)
 class Measure:
-    """Title, unit and definition of a measure; whether it depends on the scene, and whether larger values are better."""
+    """Title, unit and definition of a measure, and whether it depends on the scene."""
 
     title: str
     unit: str
     definition: str
     has_scenes: bool
-    is_larger_better: bool | None = True
 
 
 #: Measures by the names of their variables; each also has a variable ``NAME_by_eccentricity``.
@@ -67,7 +76,7 @@ MEASURES = {
         "information per area", "bit/mm²", "the same, per area of the sites", True
     ),
     "shift_sigma_um": Measure(
-        "precision of a shift", "µm", "smallest standard deviation of an estimated image shift, rms of x and y", True, False
+        "precision of a shift", "µm", "smallest standard deviation of an estimated image shift, rms of x and y", True
     ),
     "nyquist_per_mm": Measure("Nyquist frequency", "1/mm", "median over the sites, from the spacing of their rows", False),
     "mtf50_per_mm": Measure(
@@ -79,14 +88,13 @@ MEASURES = {
         "largest contrast of an alias of a sine wave at 1.5 times the Nyquist frequency of a square grid with as many sites "
         "per area as the first camera",
         False,
-        False,
     ),
 }  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class SceneMeasures:
-    """Signals of a capture, and measures of its sites; the values of an annulus without sites are NaN."""
+    """Signals of a capture, and measures of its sites; NaN for an annulus without sites."""
 
     capture: Capture
     signals: SiteSignals
@@ -94,16 +102,22 @@ class SceneMeasures:
     annuli: Mapping[str, Any]
 
 
+def layout_of(camera: Camera) -> Layout:
+    """Return the layout of a camera."""
+    assert isinstance(camera.sensor.layout, Layout)  # guaranteed by Camera
+    return camera.sensor.layout
+
+
 def layout_measures(
     camera: Camera,
     wavelength_nm: float,
-    distance_m: float,
+    distance_m: float | None,
     centre_um: tuple[float, float],
     edges_um: Floats,
     wave_per_mm: float,
 ) -> tuple[dict[str, float], dict[str, Floats]]:
-    """Return the measures that do not depend on a scene: in total, and in each annulus."""
-    layout = camera.sensor.layout
+    """Return the measures that do not depend on a scene, in total and by annulus."""
+    layout = layout_of(camera)
     annulus = annulus_of(layout.centroid_um, centre_um, edges_um)
     n = edges_um.size - 1
     nyquist = nyquist_per_mm(layout)
@@ -154,8 +168,8 @@ def layout_measures(
 def scene_measures(
     camera: Camera, capture: Capture, image: Picture, centre_um: tuple[float, float], edges_um: Floats
 ) -> SceneMeasures:
-    """Return signal-to-noise ratio and precision of a shift for a capture with its ideal image in e-/µm²."""
-    sensor, layout = camera.sensor, camera.sensor.layout
+    """Return SNR and precision of a shift for a capture and its ideal image in e-/µm²."""
+    sensor, layout = camera.sensor, layout_of(camera)
     exposure_s = float(capture.settings["exposure_s"])
     dark_e = sensor.expected_electrons(np.zeros(layout.n_sites), exposure_s)
     signals = signal_to_noise(sensor, capture.expected_e, dark_e)
@@ -202,7 +216,7 @@ def information_by_annulus(
 
     ``response`` is the ratio of each site's irradiance in electrons to that of the covariance.
     """
-    layout = camera.sensor.layout
+    layout = layout_of(camera)
     bits = site_information_bits(layout, covariance, layout.area_um2 * response, np.square(noise_e))
     annulus = annulus_of(layout.centroid_um, centre_um, edges_um)
     n, inside = edges_um.size - 1, annulus >= 0
@@ -219,7 +233,7 @@ def information_by_annulus(
 
 def size_records(camera: Camera) -> list[dict[str, Any]]:
     """Return size, number of sites and area fraction of each size class."""
-    layout = camera.sensor.layout
+    layout = layout_of(camera)
     size_um, position = np.unique(size_classes_um(layout), return_inverse=True)
     counts = np.bincount(position.ravel())
     area_um2 = np.bincount(position.ravel(), layout.area_um2)
@@ -238,7 +252,7 @@ def _median(values: NDArray[np.float64]) -> float:
 
 
 def _first_crossing(frequency_per_mm: Floats, mtf: Floats) -> float:
-    """Return the first frequency at which an MTF falls to one half, by linear interpolation; NaN if it does not."""
+    """Return the first frequency at which an MTF falls to one half; NaN if it does not."""
     below: Bools = mtf < HALF
     if not below.any():
         return float("nan")

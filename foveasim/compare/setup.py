@@ -1,4 +1,4 @@
-"""Scenes and cameras of a comparison: photographs that fill the field, and a common camera for layouts."""
+"""Scenes that fill the field of a comparison, and cameras of the same design."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ CAPACITANCE_F_PER_UM2, READ_NOISE_E, QE, BITS = 1.5e-16, 2.0, 0.6, 10
 
 def default_sensor(layout: Layout) -> Sensor:
     """
-    Return a monochrome sensor of 10 bits, whose capacitance is proportional to the area of a site.
+    Return a monochrome sensor of 10 bits with capacitances in proportion to area.
 
     It has a quantum efficiency of 0.6 and 2 e- of read noise per site. All sites saturate at the same irradiance.
 
@@ -53,7 +53,7 @@ def default_optics() -> Optics:
 
 
 def field_um(layouts: Iterable[Layout]) -> float:
-    """Return the side of the smallest square around the optical axis that contains all layouts, µm."""
+    """Return the side of the smallest centred square that contains all layouts, µm."""
     return 2.0 * max(float(np.abs(layout.bounds_um).max()) for layout in layouts)
 
 

@@ -62,7 +62,9 @@ def compare_files(
         read = [read_any_layout(path).layout for path in paths]
         cameras = cameras_of(dict(zip(names, read, strict=True)), None, None)
         first = next(iter(cameras.values()))
-        scenes = compare.photograph_scenes(field_um(read), first.optics, pictures=list(pictures) or None)
+        scenes: dict[str, Scene | PowerMap] = dict(
+            compare.photograph_scenes(field_um(read), first.optics, pictures=list(pictures) or None)
+        )
         exposure_s = DEFAULT_EXPOSURE_S if exposure_s is None else exposure_s
     else:
         shots = dict(zip(names, [read_shot(path) for path in found], strict=True))
@@ -77,7 +79,7 @@ def compare_files(
                     hint="specify a common one",
                 )
             exposure_s = exposures_s.pop()
-        scenes = _photographs(shots, pictures) if pictures else _scenes(shots, found)
+        scenes = dict(_photographs(shots, pictures)) if pictures else _scenes(shots, found)
     return compare.cameras(cameras, scenes, exposure_s=exposure_s, progress=progress, **options)
 
 

@@ -62,7 +62,7 @@ def layout_family(
         checked = check_arguments(generator)
 
         def generate(parameters: Mapping[str, Any]) -> Layout:
-            given = inspect.BoundArguments(signature, dict(parameters))  # type: ignore[arg-type]
+            given = inspect.BoundArguments(signature, dict(parameters))
             return generator(*given.args, **given.kwargs)
 
         @functools.wraps(checked)

@@ -142,7 +142,7 @@ def layout_with_n_sites(
 
 
 class _Search:
-    """Numbers of sites by value of the unknown parameter, with the layout nearest to the target."""
+    """Numbers of sites by value of the unknown parameter, and the nearest layout."""
 
     def __init__(
         self,
@@ -224,7 +224,7 @@ class _Search:
         raise ParameterError("n_sites", "must be a possible number of sites", self.target)
 
     def is_before(self, value: float, low: float) -> bool:
-        """Return whether a value is valid, and on the same side of the target as another, but nearer."""
+        """Return whether a value is valid, on the same side of the target, and nearer."""
         n_sites, n_low = self.count(value), self.counts[low]
         assert n_low is not None
         if n_sites is None:
@@ -232,7 +232,7 @@ class _Search:
         return n_low < n_sites < self.target if n_low < self.target else n_low >= n_sites >= self.target
 
     def refine(self, low: float, bound: float) -> None:
-        """Search between a value on one side of the target and one that is on the other side, or not valid."""
+        """Search between a value on one side, and one on the other side or not valid."""
         for step in range(MAX_STEPS):
             middle = self.round(self.between(low, bound, step))
             if middle in (low, bound) or (not self.unknown.is_integer and abs(math.log(bound / low)) < 1e-12):
@@ -250,7 +250,7 @@ class _Search:
         return (GOOD_FRACTION if self.has_cheap_counts else GOOD_FRACTION_OF_LAYOUTS) * self.target
 
     def between(self, low: float, bound: float, step: int) -> float:
-        """Return a value between two others, by interpolation of the logarithms in every second step."""
+        """Return a value between two others, interpolated in every second step."""
         fraction, n_low, n_far = 0.5, self.counts[low], self.counts[bound]
         if step % 2 == 0 and n_low is not None and n_far is not None and n_low != n_far:
             fraction = math.log(self.target / n_low) / math.log(n_far / n_low)
@@ -265,7 +265,7 @@ class _Search:
         return sorted(known, key=lambda value: (self.distance(known[value]), value))
 
     def nearest_layout(self) -> tuple[Layout, float, list[warnings.WarningMessage]]:
-        """Generate the layout nearest to the target, from the best candidates that the generator accepts."""
+        """Generate the nearest layout, from the best values that the generator accepts."""
         best = self.sorted_values()[0]
         try:
             found = self.build(best)

@@ -1,5 +1,5 @@
 """
-Log-polar images: rings along one axis and sectors along the other, as in models of the visual cortex.
+Log-polar images of rings and sectors, as in models of the visual cortex.
 
 On layouts of rings with equal numbers of sectors, the image has exactly one pixel per site. Any other picture is resampled.
 
@@ -91,7 +91,7 @@ class CorticalImage:
 
     @property
     def ring_centre_um(self) -> Floats:
-        """Radius of the centre line of each ring, (n_ring,) µm: the geometric mean of its circles, without the offset."""
+        """Radius of the centre line of each ring, (n_ring,) µm, in the logarithm."""
         shifted = self.radius_um + self.offset_um
         return np.sqrt(shifted[1:] * shifted[:-1]) - self.offset_um
 
@@ -196,7 +196,7 @@ def to_cortical(
     offset_um: float = 0.0,
 ) -> CorticalImage:
     """
-    Resample a picture to a log-polar image, by bilinear interpolation at the centres of its pixels.
+    Resample a picture to a log-polar image by bilinear interpolation.
 
     Parameters
     ----------
@@ -319,7 +319,7 @@ def from_cortical(image: CorticalImage, grid: Grid, *, method: str = "linear") -
 
 
 def _sites_of_rings(layout: Layout) -> Ints:
-    """Return the sites (n_ring, n_sector) of the rings with as many sectors as the outermost one."""
+    """Return the sites (n_ring, n_sector) of rings with as many sectors as the last."""
     if not {"ring", "sector"} <= set(layout.columns) or layout.n_sites == 0:
         raise ParameterError("layout", "must have the columns 'ring' and 'sector'", hint=RESAMPLE)
     ring, sector = layout.columns["ring"], layout.columns["sector"]

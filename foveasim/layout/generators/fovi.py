@@ -149,7 +149,7 @@ def _step(fov_um: float, a_um: float, n_rings: int) -> float:
 
 
 def _radii_um(fov_um: float, a_um: float, n_rings: int) -> Floats:
-    """Return the radii (n_rings + 2,) of the rings, of the central site, and of one further ring."""
+    """Return the radii (n_rings + 2,) of the centre, the rings, and one further ring."""
     # e^w - a with w = ln a + i step, without cancellation
     r_um = a_um * np.expm1(_step(fov_um, a_um, n_rings) * np.arange(n_rings + 2))
     r_um[n_rings] = 0.5 * fov_um

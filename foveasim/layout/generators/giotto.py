@@ -51,7 +51,7 @@ def giotto_ratio(*, n_rho: int, n_fovea: int, n_across: int) -> float:
 
 
 def _count_sites(parameters: Mapping[str, Any]) -> float | None:
-    """Return the number of sites for parameters of :func:`giotto`; None where it requires a layout."""
+    """Return the number of sites of :func:`giotto`; None where it requires a layout."""
     n_rho, n_theta, n_fovea = (parameters[name] for name in ("n_rho", "n_theta", "n_fovea"))
     fovea = parameters["fovea"]
     if fovea not in {"rings", "linear", "none"}:

@@ -123,7 +123,7 @@ def cells_in_field(
     n_x: int | None, n_y: int | None, pitch_um: float | None, size_um: tuple[float, float] | None
 ) -> tuple[int, int, float]:
     """
-    Return the number of columns and rows, and the pitch, of square cells from their number, pitch or field.
+    Return columns, rows and pitch of square cells, from their pitch or field.
 
     Raises
     ------
@@ -131,22 +131,17 @@ def cells_in_field(
         When a number is out of range, or neither or both of pitch and field are given.
     """
     n_x = check_count("n_x", n_x)
-    width_um, height_um = check_field_um(pitch_um, size_um)
-    if width_um is None:
+    field_um = check_field_um(pitch_um, size_um)
+    if field_um is None:
         return n_x, n_x if n_y is None else check_count("n_y", n_y), check_length_um("pitch_um", pitch_um)
-    pitch_um = width_um / n_x
-    return (
-        n_x,
-        max(1, math.floor(height_um / pitch_um * FIT_ROUNDING)) if n_y is None else check_count("n_y", n_y),
-        pitch_um,
-    )
+    pitch_um = field_um[0] / n_x
+    n_fitting = max(1, math.floor(field_um[1] / pitch_um * FIT_ROUNDING))
+    return n_x, n_fitting if n_y is None else check_count("n_y", n_y), pitch_um
 
 
-def check_field_um(
-    pitch_um: float | None, size_um: tuple[float, float] | None
-) -> tuple[float, float] | tuple[None, None]:
+def check_field_um(pitch_um: float | None, size_um: tuple[float, float] | None) -> tuple[float, float] | None:
     """
-    Return the size of a field, or None twice when the pitch is given instead.
+    Return the size of a field, or None when the pitch is given instead.
 
     Raises
     ------
@@ -156,7 +151,7 @@ def check_field_um(
     if (pitch_um is None) == (size_um is None):
         raise ParameterError("pitch_um", "or 'size_um' must be given, but only one of them")
     if size_um is None:
-        return None, None
+        return None
     size = finite_array("size_um", size_um, ndim=1)
     if size.shape != (2,):
         raise ParameterError("size_um", "must be two numbers (width, height)", size_um, "µm")

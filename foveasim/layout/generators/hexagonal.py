@@ -121,15 +121,14 @@ def _cells_in_field(
     size_um: tuple[float, float] | None,
     orientation: str,
 ) -> tuple[int, int, float]:
-    """Return the number of hexagons per row, of rows, and the pitch, from their number, pitch or field."""
+    """Return hexagons per row, rows and pitch, from the pitch or the field."""
     n_columns = check_count("n_columns", n_columns)
-    width_um, height_um = check_field_um(pitch_um, size_um)
-    if width_um is None:
+    field_um = check_field_um(pitch_um, size_um)
+    if field_um is None:
         pitch_um = check_length_um("pitch_um", pitch_um)
         across = n_columns + 0.5
     else:
-        if orientation == "flat":
-            width_um, height_um = height_um, width_um
+        width_um, height_um = field_um if orientation == "pointy" else field_um[::-1]
         # Every second row is shifted by half a pitch; a single row ends half a pitch before the end of the field.
         pitch_um = width_um / (n_columns + 0.5)
         across = height_um / pitch_um

@@ -53,13 +53,13 @@ def square_ring_ratio(n_sectors: int) -> float:
 
 
 def _count_sites(parameters: Mapping[str, Any]) -> float | None:
-    """Return the number of sites for parameters of :func:`log_polar`; None where it requires a layout."""
+    """Return the number of sites of :func:`log_polar`; None where it requires a layout."""
     p = parameters
     if p["fovea"] not in {"none", "rings", "linear"}:
         return None
     n_sectors, n_chords = p["n_sectors"], p["chords_per_arc"] * (2 if p["stagger"] and p["chords_per_arc"] % 2 else 1)
-    lengths = (p[name] for name in ("r_max_um", "min_size_um", "r_min_um", "n_rings", "ring_ratio"))
-    radii_um, ratio = _rings(n_sectors, *lengths, p["fovea"], n_chords)
+    limits = {name: p[name] for name in ("r_max_um", "min_size_um", "r_min_um", "n_rings", "ring_ratio", "fovea")}
+    radii_um, ratio = _rings(n_sectors, n_chords=n_chords, **limits)
     if p["fovea"] == "none":
         return float(n_sectors * (radii_um.size - 1))
     filling: Literal["rings", "linear"] = "rings" if p["fovea"] == "rings" else "linear"
@@ -221,7 +221,7 @@ def _rings(
     fovea: Fovea,
     n_chords: int,
 ) -> _Rings:
-    """Return the rings for parameters of :func:`log_polar`, with the final number of chords per arc."""
+    """Return the rings of :func:`log_polar`, for a final number of chords per arc."""
     r_max_um = check_length_um("r_max_um", r_max_um)
     for name, length_um in (("min_size_um", min_size_um), ("r_min_um", r_min_um)):
         if length_um is not None:

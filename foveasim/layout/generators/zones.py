@@ -28,7 +28,7 @@ INTEGER_ROUNDING = 1e-9
 
 
 def _areas_um2(parameters: Mapping[str, Any]) -> tuple[float, Floats]:
-    """Return the width of the innermost zone in µm, and the areas of all zones in µm²."""
+    """Return the width of the innermost zone, µm, and the areas of all zones, µm²."""
     if parameters["side_um"] is not None:
         sides_um = np.asarray(parameters["side_um"], dtype=np.float64)
         return float(sides_um[0]), np.diff(sides_um**2, prepend=0.0)
@@ -37,7 +37,7 @@ def _areas_um2(parameters: Mapping[str, Any]) -> tuple[float, Floats]:
 
 
 def _sites_per_pixel2(parameters: Mapping[str, Any]) -> float:
-    """Return the number of squares over the squared number of pixels across the innermost zone."""
+    """Return the number of squares over the squared number across the innermost zone."""
     width_um, area_um2 = _areas_um2(parameters)
     return float((area_um2 / 4.0 ** np.arange(area_um2.size)).sum() / width_um**2)
 
@@ -159,10 +159,10 @@ def _pitches_um(
 ) -> Floats:
     if (pitch_um is None) == (n_fovea is None):
         raise ParameterError("pitch_um", "or 'n_fovea' must be given, but only one of them")
-    if n_fovea is None:
+    if pitch_um is not None:
         return finite_array("pitch_um", pitch_um, ndim=1, above=0.0)
     n_fovea = check_count("n_fovea", n_fovea, at_most=MAX_PIXELS)
-    widths_um = side_um if outlines_um is None else [_width_um(as_region("outlines_um[0]", outlines_um[0]))]
+    widths_um = (side_um or ()) if outlines_um is None else [_width_um(as_region("outlines_um[0]", outlines_um[0]))]
     fovea_um = finite_array("side_um", widths_um, ndim=1, above=0.0)
     n_zones = len(fovea_um if outlines_um is None else outlines_um)
     return np.asarray(fovea_um[:1] / n_fovea * 2.0 ** np.arange(n_zones))

@@ -28,7 +28,7 @@ POLICY = "default-src 'none'; style-src '{style}'; img-src data:; base-uri 'none
 
 @dataclass(frozen=True)
 class ReportFigure:
-    """Figure with its caption; ``dark`` is the source for dark pages, and ``is_small`` that of a picture of pixels."""
+    """Figure with its caption, and another source for dark pages; small for pixels."""
 
     source: str
     title: str
