@@ -22,6 +22,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = {
     "_io": {"maps", "pictures"},
     "capture": {"maps"},
+    "compare": {"maps"},
     "explore": {"explore", "learn"},
     "layout": {"klayout", "layout", "parquet"},
     "maps": {"maps"},

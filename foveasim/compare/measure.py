@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -85,8 +86,8 @@ MEASURES = {
     "alias_fraction": Measure(
         "alias contrast",
         "",
-        "largest contrast of an alias of a sine wave at 1.5 times the Nyquist frequency of a square grid with as many sites "
-        "per area as the first camera",
+        "largest contrast of an alias of a sine wave along x, at 1.5 times the Nyquist frequency of a square grid with as many "
+        "sites per area as the first camera",
         False,
     ),
 }  # fmt: skip
@@ -133,11 +134,8 @@ def layout_measures(
         apertures = [polygon_mtf(layout[chosen], frequency, angle_deg=angle).mean(axis=0) for angle in MTF_ANGLES_DEG]
         return _first_crossing(frequency, lens * np.mean(apertures, axis=0))
 
-    def alias(middle_um: tuple[float, float], radius_um: float | None) -> float:
-        if (
-            radius_um is not None
-            and np.count_nonzero(np.hypot(*(layout.centroid_um - middle_um).T) < radius_um) < MIN_REGION_SITES
-        ):
+    def alias(middle_um: tuple[float, float], radius_um: float) -> float:
+        if np.count_nonzero(np.hypot(*(layout.centroid_um - middle_um).T) < radius_um) < MIN_REGION_SITES:
             return float("nan")
         try:
             found = aliasing_spectrum(layout, (wave_per_mm, 0.0), centre_um=middle_um, radius_um=radius_um)
@@ -152,15 +150,20 @@ def layout_measures(
     # The innermost region is centred; others are to the right of the fixation point.
     centres = [(centre_um[0] + (r if k else 0.0), centre_um[1]) for k, r in enumerate(ring_um.tolist())]
     radii = [width if k == 0 else max(0.5 * width, 0.25 * ring_um[k]) for k, width in enumerate(width_um.tolist())]
-    totals = {
-        "nyquist_per_mm": float(np.nanmedian(nyquist)) if np.isfinite(nyquist).any() else float("nan"),
-        "mtf50_per_mm": mtf50(order),
-        "alias_fraction": alias(centre_um, None),
-    }
     annuli = {
         "nyquist_per_mm": np.array([_median(nyquist[sites]) for sites in by_annulus]),
         "mtf50_per_mm": np.array([mtf50(sites) for sites in by_annulus]),
         "alias_fraction": np.array([alias(c, r) for c, r in zip(centres, radii, strict=True)]),
+    }
+    # A larger region would contain waves of many local frequencies: the total is the mean over the area.
+    area_um2 = np.array([layout.area_um2[sites].sum() for sites in by_annulus])
+    weights = np.where(np.isfinite(annuli["alias_fraction"]), area_um2, 0.0)
+    totals = {
+        "nyquist_per_mm": _median(nyquist),
+        "mtf50_per_mm": mtf50(order),
+        "alias_fraction": float(np.nansum(weights * annuli["alias_fraction"]) / weights.sum())
+        if weights.any()
+        else math.nan,
     }
     return totals, annuli
 
