@@ -206,7 +206,7 @@ class EccentricityTable:
             "lowest": (centre_um, self.nyquist_min_per_mm),
         }
         labels = "eccentricity / µm", "Nyquist frequency / (line pairs per mm)"
-        return plot_curves(curves, *labels, logarithmic="y", ax=ax)
+        return plot_curves(curves, *labels, logarithmic="y", marker=".", ax=ax)
 
     def _repr_html_(self) -> str:
         from foveasim.view import to_html

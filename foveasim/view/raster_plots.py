@@ -15,6 +15,7 @@ from foveasim.reconstruct import Picture
 from foveasim.scene import Scene
 from foveasim.sensor import rgb_filters
 from foveasim.view.figures import new_axes
+from foveasim.view.site_colours import BACKGROUND, as_fractions
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -136,7 +137,7 @@ def plot_picture(
         x0, y0, x1, y1 = picture.grid.bounds_um
         ax = new_axes(figure_inches, (y1 - y0) / (x1 - x0)) if ax is None else ax
         ax.imshow(picture.to_image(white, encode_srgb=encode_srgb), extent=(x0, x1, y0, y1))
-        ax.set(xlabel="x / µm", ylabel="y / µm")
+        ax.set(xlabel="x / µm", ylabel="y / µm", facecolor=as_fractions(BACKGROUND))
         return ax
     if n_channels > 1 and channel is None:
         raise ParameterError("channel", f"must be given for a picture of {n_channels} channels")
@@ -158,7 +159,7 @@ def _draw_values(
     ax = new_axes(figure_inches, (y1 - y0) / (x1 - x0)) if ax is None else ax
     image = ax.imshow(values, cmap=colour_map, extent=(x0, x1, y0, y1))
     ax.figure.colorbar(image, ax=ax, label=label, shrink=0.8, aspect=30.0, pad=0.02)
-    ax.set(xlabel="x / µm", ylabel="y / µm")
+    ax.set(xlabel="x / µm", ylabel="y / µm", facecolor=as_fractions(BACKGROUND))
     return ax
 
 

@@ -563,6 +563,11 @@ def test_inconsistent_dark_series_raises():
 
 def test_results_have_repr_and_are_immutable(result):
     assert repr(result) == "Emva1288(52 levels, 2 classes)"
+    rows = result.records()
+    assert [row["class"] for row in rows] == result.classes.tolist()
+    assert [row["gain_dn_per_e"] for row in rows] == result.gain_dn_per_e.tolist()
+    assert [row["dynamic_range_db"] for row in rows] == result.dynamic_range_db.tolist()
+    assert "saturation / photons" in result._repr_html_()
     assert repr(result.transfer) == "PhotonTransfer(52 levels, 2 classes of 70000 sites)"
     with pytest.raises(ValueError, match="read-only"):
         result.qe[0] = 1.0

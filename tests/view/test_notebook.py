@@ -18,6 +18,7 @@ from foveasim.errors import ParameterError
 from foveasim.view import to_html, to_png
 from foveasim.view.notebook._blocks import facts, panel, table
 from foveasim.view.notebook._thumbnails import THUMBNAIL_PIXELS, encode_png
+from foveasim.view.site_colours import BACKGROUND
 
 MAX_THUMBNAIL_BYTES, MAX_HTML_BYTES = 60_000, 120_000
 SITES = fs.layout.log_polar(24, 54.7, min_size_um=2.0)
@@ -154,6 +155,14 @@ def test_layout_thumbnail_is_transparent_outside_sites():
 
     assert np.all(alpha[(r > 1.05) | (r < r_min - 0.1)] == 0)
     assert np.all(alpha[(r < 0.95) & (r > r_min + 0.1)] == 255)
+
+
+def test_capture_thumbnail_has_background(capture):
+    (png,) = pictures_of(capture._repr_html_())
+    pixels = pixels_of(png)
+
+    assert np.all(pixels[..., 3] == 255)
+    assert tuple(pixels[0, 0, :3]) == BACKGROUND
 
 
 def test_picture_is_upright_and_transparent_without_data():

@@ -15,7 +15,7 @@ from foveasim.layout.drc.rules import Report
 from foveasim.view.id_map import SitePixels
 from foveasim.view.notebook._blocks import Html, picture
 from foveasim.view.rule_plots import MAX_SHOWN, RULE_COLOURS
-from foveasim.view.site_colours import BOUNDARY, SiteColours, colours_of
+from foveasim.view.site_colours import BACKGROUND, BOUNDARY, Rgb, SiteColours, colours_of
 
 __all__ = ["THUMBNAIL_PIXELS", "encode_png", "report_thumbnail", "site_thumbnail", "thumbnail"]
 
@@ -80,7 +80,11 @@ def thumbnail(pixels: NDArray[np.uint8], alt: str, caption: str = "") -> Html:
 
 
 def site_thumbnail(data: Layout | Capture, alt: str) -> Html:
-    """Return a picture of a layout or a capture, transparent between photosites."""
+    """
+    Return a picture of a layout, transparent between photosites, or of a capture.
+
+    Captures have the background of plots, on which black and white photosites are visible.
+    """
     layout = data.layout if isinstance(data, Capture) else data
     if not layout.n_sites:
         return Html()
@@ -88,7 +92,8 @@ def site_thumbnail(data: Layout | Capture, alt: str) -> Html:
     colours = colours_of(data, by)
     scale = colours.scale
     caption = colours.title if scale is None else f"{colours.title}, {scale.low:.4g} to {scale.high:.4g}"
-    return thumbnail(_site_pixels(layout, colours), alt, caption)
+    background = BACKGROUND if isinstance(data, Capture) else None
+    return thumbnail(_site_pixels(layout, colours, background=background), alt, caption)
 
 
 def _quantity_of(layout: Layout) -> str | None:
@@ -99,15 +104,17 @@ def _quantity_of(layout: Layout) -> str | None:
     return "size_um" if layout.area_um2.max() > (1.0 + SIZE_ROUNDING) * layout.area_um2.min() else None
 
 
-def _site_pixels(layout: Layout, colours: SiteColours, scale: int = 1) -> NDArray[np.uint8]:
-    """Return the colours of the sites, (n_y, n_x, 4), top row first."""
+def _site_pixels(
+    layout: Layout, colours: SiteColours, scale: int = 1, background: Rgb | None = None
+) -> NDArray[np.uint8]:
+    """Return the colours of the sites, (n_y, n_x, 4), or 3 with a background, top row first."""
     x0, y0, x1, y1 = layout.bounds_um
     um_per_pixel = max(x1 - x0, y1 - y0) / (scale * THUMBNAIL_PIXELS)
     n_x, n_y = (max(MIN_PIXELS, round(length / um_per_pixel)) for length in (x1 - x0, y1 - y0))
     pixels = SitePixels.from_layout(layout, (n_y, n_x))
     site_pixels = math.sqrt(float(np.median(layout.area_um2))) / um_per_pixel
     has_boundaries = colours.has_boundaries and site_pixels >= MIN_SITE_PIXELS * scale
-    return pixels.picture(colours.rgb, background=None, boundary=BOUNDARY if has_boundaries else None)[::-1]
+    return pixels.picture(colours.rgb, background=background, boundary=BOUNDARY if has_boundaries else None)[::-1]
 
 
 def report_thumbnail(report: Report, alt: str) -> Html:
