@@ -120,7 +120,8 @@ class Registry(Mapping[str, T], Generic[T]):
         def attribute(name: str) -> T:
             if not name.startswith("_") and name in self:
                 return self[name]
-            hint = did_you_mean(name, {*self, *(own for own in vars(sys.modules[module]) if not own.startswith("_"))})
+            own = (each for each in vars(sys.modules.get(module, object)) if not each.startswith("_"))
+            hint = did_you_mean(name, {*self, *own})
             raise AttributeError(f"module '{module}' has no attribute '{name}'{'; ' if hint else ''}{hint}")
 
         return attribute

@@ -726,7 +726,7 @@ def test_missing_curve_file_is_rejected(tmp_path, read, name, message):
     ("column", "message"),
     [
         (None, "has 2 value columns; specify one of R, G"),
-        ("B", "has no column 'B'; the columns are R, G, or 1 to 2"),
+        ("B", "has no column 'B'; possible: 'R', 'G', or 1 to 2"),
         (0, "has no column 0"),
         (3, "has no column 3"),
         (True, "has no column True"),

@@ -85,7 +85,7 @@ def trials_table(optuna_study: optuna.Study) -> pd.DataFrame:
     try:
         import pandas as pd
     except ImportError:
-        raise ParameterError("trials_table", needs("pandas")) from None
+        raise ParameterError("trials_table", needs("pandas", "explore")) from None
     best = {trial.number for trial in optuna_study.best_trials}
     rows = []
     for trial in finished_trials(optuna_study):

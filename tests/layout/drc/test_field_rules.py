@@ -201,7 +201,7 @@ def test_rule_files_accept_presets_readout_routing(tmp_path):
     assert rules.routing == Routing(width_um=0.14, space_um=0.14, direction="upwards")
     assert read_layout_file(tmp_path / "layout.yaml").rules == DesignRules(min_size_um=2.2)
     (tmp_path / "rules.yaml").write_text("preset: sky\n")
-    with pytest.raises(ConfigError, match=r"rules.yaml: preset: must be one of 'sky130_met1'"):
+    with pytest.raises(ConfigError, match=r"rules.yaml:1:1: preset: must be one of 'sky130_met1'"):
         read_rules(tmp_path / "rules.yaml")
     (tmp_path / "rules.yaml").write_text("max_track_utilisation: 1.0\nrouting: {width_um: -0.14, space_um: 0.14}\n")
     with pytest.raises(ConfigError, match=r"routing.width_um: must be > 0, got -0.14"):
