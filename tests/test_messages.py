@@ -253,6 +253,27 @@ WRONG = {
 }  # fmt: skip
 
 
+#: Numbers that would overflow, and the beginning of the line that they give.
+ABSURD = {
+    "optics.zernike={coefficients: {4: 1.0e+308}}": "optics.zernike.coefficients[4]: must be <= 100000 everywhere",
+    "optics.zernike={coefficients: {4: -1.0e+308}, unit: waves}": "optics.zernike.coefficients[4]: must be >= -100000",
+    "optics.seidel={spherical_um: 1.0e+308}": "optics.seidel.spherical_um: must be <= 100000",
+    "scene.radiance_w_m2_sr_nm=1.0e+308": "scene.radiance_w_m2_sr_nm: must be <= 1e+24",
+    "scene.band_width_nm=1.0e+308": "scene.band_width_nm: must be <= 1e+06",
+    "sensor.read_noise_e=1.0e+308": "sensor.read_noise_e: must be <= 1e+07",
+    "exposure_s=1.0e+308": "exposure_s: must be 0, or from 1e-12 to 1e+07",
+}
+
+
+@pytest.mark.parametrize(("change", "line"), ABSURD.items(), ids=ABSURD)
+def test_absurd_numbers_give_one_line(folder, change, line):
+    with pytest.raises(ConfigError) as caught:
+        read_shot("shot.yaml", [change])
+
+    assert str(caught.value).startswith(f"shot.yaml: --set {line}")
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize(("give", "line"), WRONG.values(), ids=WRONG)
 def test_wrong_names_give_one_line(folder, give, line):
     with pytest.raises(FoveasimError) as caught:

@@ -109,7 +109,7 @@ def test_sorting_is_stable():
     ("keys", "message"),
     [
         ((), "'keys' must be one or more columns or arrays"),
-        (("nothing",), "'keys' must be values or columns of the layout, which has"),
+        (("nothing",), "'keys' must be values or columns of the layout, got 'nothing'; possible: "),
         (([1, 2],), "'keys' must have one value for each of the 13312 sites"),
     ],
 )

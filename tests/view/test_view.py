@@ -425,7 +425,10 @@ def test_oversized_drawing_raises_without_output(tmp_path):
         ({"by": [1j, 2.0]}, "'by' must be an array of numbers"),
         ({"by": np.array([1.0, np.inf])}, "'by' must be finite everywhere, or NaN"),
         ({"by": np.full((2, 3), np.nan)}, "'by' must be finite everywhere"),
-        ({"by": "code"}, "'by' must be one of area_um2, channel, readout_line, size_um, or an array, got 'code'"),
+        (
+            {"by": "code"},
+            "'by' must be a column or an array, got 'code'; possible: 'area_um2', 'channel', 'readout_line', 'size_um'",
+        ),
         ({"overlay": "lines"}, "'overlay' must be one of 'readout_lines', 'adjacency'"),
         ({"overlay": "readout_lines"}, "'readout_line' must be a column of the layout"),
     ],
