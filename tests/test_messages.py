@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import pickle
@@ -15,9 +16,10 @@ from PIL import Image
 
 import foveasim as fs
 from foveasim import explore
-from foveasim._core.names import MAX_LISTED, closest_name, list_names, missing_path, possible_names
+from foveasim._core.names import MAX_LISTED, OTHER_TERMS, closest_name, list_names, missing_path, possible_names
 from foveasim.config import Source, build_shot, read_any_layout, read_rules, read_shot
 from foveasim.errors import ConfigError, FoveasimError
+from foveasim.layout import LAYOUTS
 
 SHOT = """\
 scene:
@@ -299,7 +301,7 @@ def test_misspelt_attributes_name_closest(module, name):
     [
         ("gapum", ["pitch_um", "gap_um"], "gap_um"),
         ("Gap-UM", ["pitch_um", "gap_um"], "gap_um"),
-        ("trench_um", ["pitch_um", "gap_um"], "gap_um"),
+        ("gap_um", ["pitch_um", "trench_um"], "trench_um"),
         ("dark_current", ["read_noise_e", "dark_e_per_s"], "dark_e_per_s"),
         ("zzz", ["pitch_um", "gap_um"], None),
         ("", ["pitch_um"], None),
@@ -376,3 +378,11 @@ def test_study_trial_names_closest_result():
 def test_unknown_field_of_dataset_is_named():
     with pytest.raises(FoveasimError, match="did you mean 'code'"):
         explore.Dataset(np.ones((1, 4, 4), np.uint8), {}, fields=["codes"])
+
+
+def test_terms_of_other_programs_have_equivalents():
+    signatures = [*LAYOUTS.values(), fs.Sensor, fs.Optics, fs.DesignRules, fs.Camera.capture]
+    names = {name for call in signatures for name in inspect.signature(call).parameters}
+
+    for term, beginnings in OTHER_TERMS.items():
+        assert all(any(name.startswith(begin) for name in names) for begin in beginnings), term

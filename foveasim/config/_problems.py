@@ -54,7 +54,7 @@ def _problems(kind: Any, data: dict[str, Any], error: ValidationError) -> list[t
     """Return the path and the description of every distinct problem."""
     found = [(_key_path(data, item), item) for item in error.errors(include_url=False)]
     # For a union, pydantic reports a problem for every type: only those of the deepest key matter.
-    problems = []
+    problems: list[tuple[tuple[str, ...], str]] = []
     # Unknown keys first: a misspelt key is also missing.
     for key_path, item in sorted(found, key=lambda each: each[1]["type"] != "extra_forbidden"):
         is_type = item["type"].endswith("_type") or (

@@ -440,7 +440,7 @@ def with_file_context(path: Path) -> Iterator[None]:
     try:
         yield
     except ParameterError as error:
-        sections = ([VARY], ["search"], ["set"], ["objectives"], ["constraints"], [])
+        sections: tuple[list[str], ...] = ([VARY], ["search"], ["set"], ["objectives"], ["constraints"], [])
         positions = (position_of(path, [*section, error.name], is_exact=True) for section in sections)
         raise ConfigError(path, str(error), position=next(filter(None, positions), None)) from None
     except ConfigError as error:
