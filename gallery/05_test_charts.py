@@ -101,13 +101,14 @@ def main(out_dir: Path) -> None:
     distance_um = layout.centroid_um @ [np.cos(angle), np.sin(angle)]
 
     figure = Figure(figsize=(8.0, 7.4), layout="constrained")
-    plot_capture(capture, ax=figure.add_subplot(2, 2, 1))
-    axes = figure.add_subplot(2, 2, 2)
+    panels = figure.subplot_mosaic("AB;CC")
+    plot_capture(capture, ax=panels["A"])
+    axes = panels["B"]
     axes.plot(distance_um, capture.expected_e, ".", markersize=2)
     axes.set_xlim(-15, 15)
-    axes.set_xlabel("distance of the site from the edge / µm")
+    axes.set_xlabel("distance from the edge / µm")
     axes.set_ylabel("expected charge / e-")
-    axes = figure.add_subplot(2, 1, 2)
+    axes = panels["C"]
     axes.plot(PER_MM, measured, "o", markersize=3, label="slanted edge")
     axes.plot(PER_MM, expected, label="closed form, lens × hexagon")
     axes.set_xlabel("line pairs per mm on the sensor")

@@ -145,7 +145,9 @@ def main(out_dir: Path) -> None:
     axes.set_aspect("equal")
     axes.set_xlabel("x / µm")
     axes.set_ylabel("y / µm")
-    axes.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), frameon=False)
+    rest = figure.add_subplot(3, 2, 6)
+    rest.set_axis_off()
+    rest.legend(*axes.get_legend_handles_labels(), title="point sources", loc="center", frameon=False)
     save_figure(figure, out_dir / "07_distortion.png", dpi=140)
 
     # %% Checks.

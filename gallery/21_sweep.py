@@ -55,7 +55,7 @@ def main(out_dir: Path) -> None:
     right.set_xticks([], minor=True)
     for ax in (left, right):
         ax.grid(color="0.9")
-        ax.legend(frameon=False)
+        ax.legend(frameon=False, loc="lower left" if ax is left else "upper left")
     save_figure(figure, out_dir / "21_sweep.png", dpi=140)
 
     # %% Checks.
