@@ -196,6 +196,9 @@ def test_boundaries_drawn_between_sites():
         drawn,
         (at[:, None] & (within[None] & (np.arange(6) < 5)[None])) | (at[None] & (within & (np.arange(6) < 5))[:, None]),
     )
+    assert np.array_equal(pixels.boundary_fraction(), drawn.astype(float))
+    fine = SitePixels.from_layout(L.grid(n_x=2, n_y=2, pitch_um=2.0), (2, 2), (-3, -3, 3, 3), n_samples=3)
+    assert np.array_equal(fine.boundary_fraction(), drawn.reshape(2, 3, 2, 3).mean(axis=(1, 3)))
 
 
 @pytest.mark.parametrize(

@@ -336,7 +336,7 @@ def _picture(layout: Layout, capture: Capture | None) -> tuple[NDArray[np.uint8]
         shape = (max(1, round((y_max - y_min) / pixel_um)), max(1, round((x_max - x_min) / pixel_um)))
         by = "channel" if "channel" in layout.columns and _is_index(layout.columns["channel"]) else "size_um"
         pixels = site_picture(layout, colours_of(layout, by), shape)[::-1]
-    return pixels, bounds_um
+    return np.asarray(pixels, np.uint8), bounds_um
 
 
 def _optical_picture(power_map: PowerMap) -> tuple[NDArray[np.uint8], tuple[float, ...]]:
