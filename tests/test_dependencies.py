@@ -32,8 +32,12 @@ EXTRAS = {
 }
 #: Extras of what is not part of the package.
 FOLDERS = {"tests": {"dev"}, "benchmarks": {"dev", "learn"}, "gallery": {"dev"}, "docs": {"docs"}}
-#: What may name PyTorch: the only tests that run where it is installed, and the check whether it is.
-TORCH_TESTS = {ROOT / "tests" / "explore" / "test_dataset_torch.py", ROOT / "tests" / "conftest.py"}
+#: What may name PyTorch or gdsfactory: the only tests that run where they are installed, and the check whether they are.
+OPTIONAL_TESTS = {
+    ROOT / "tests" / "explore" / "test_dataset_torch.py",
+    ROOT / "tests" / "layout" / "files" / "test_chip_files_gdsfactory.py",
+    ROOT / "tests" / "conftest.py",
+}
 #: Distributions that no line imports.
 INDIRECT = {
     "cryptography": "distributed makes the keys of a sweep's own scheduler with it",
@@ -119,7 +123,7 @@ def test_imports_of_package_are_declared(path):
 
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_imports_of_folders_are_declared(folder):
-    paths = sorted(set((ROOT / folder).rglob("*.py")) - TORCH_TESTS)
+    paths = sorted(set((ROOT / folder).rglob("*.py")) - OPTIONAL_TESTS)
     found = {path: undeclared_imports(path, FOLDERS[folder]) for path in paths}
 
     assert found

@@ -192,7 +192,7 @@ def _near_pairs(box_um: Floats, reach_um: float) -> tuple[Ints, Ints]:
 @dataclass(frozen=True, slots=True)
 class Measurement:
     """
-    Measured values, with functions that return their sites and markers, and a note for the report.
+    Measured values, with functions that return their sites and markers, and a note.
 
     ``sites(positions)`` returns the sites of the values at some positions (site i by default), ``markers(positions)`` the
     marker geometries (those sites by default). Both are called for values that violate the rule only.

@@ -80,7 +80,7 @@ class Shapes:
     def place_sites(
         self, matrix: NDArray[np.float64], offsets: NDArray[np.float64], identity: NDArray[np.int64]
     ) -> Shapes:
-        """Return copies that are different sites: photosite, line and index in the array per copy, (n, 3)."""
+        """Return copies that are sites: photosite, line and index in the array, (n, 3)."""
         import numpy as np
 
         copies = self.place(matrix, offsets)
@@ -416,10 +416,10 @@ def _matrix(angle_rad: float, magnification: float, is_mirrored: bool) -> NDArra
 
 def _site_numbers(reference: Any, offsets: NDArray[np.float64], line: int) -> NDArray[np.int64] | None:
     """
-    Return photosite, line of the columns and index in the array for each copy, (n, 3), or None without numbers.
+    Return the identities of the copies of a numbered reference, or None.
 
-    Columns and rows follow from the offsets, as programs store arrays in different orders. An array that another program
-    changed has no numbers.
+    These are photosite, line of the columns and index in the array, (n, 3). Columns and rows follow from the offsets, as
+    programs store arrays in different orders. An array that another program changed has no numbers.
     """
     import numpy as np
 
@@ -436,7 +436,7 @@ def _site_numbers(reference: Any, offsets: NDArray[np.float64], line: int) -> ND
 
 
 def _array_number(reference: Any) -> tuple[int, int, int, int, int] | None:
-    """Return the number of the first site, the steps, and the columns and rows, from the properties of a reference."""
+    """Return first site, steps, columns and rows from the properties of a reference."""
     text = reference.get_gds_property(NUMBER_PROPERTY)
     if isinstance(text, str):
         match = NUMBERS.fullmatch(text) or NUMBER.fullmatch(text)
@@ -502,7 +502,7 @@ def _site(polygon: Any) -> tuple[int, int, int]:
 
 
 def _columns(element: Any) -> str:
-    """Return the column string of words ``name=value`` of a polygon or reference, empty where it has none."""
+    """Return the column string of a polygon or reference, empty where it has none."""
     text = element.get_gds_property(COLUMNS_PROPERTY)
     if text is None:
         values = element.get_property("columns")

@@ -124,7 +124,7 @@ def congruence_classes(xy_dbu: Ints, ring_offsets: Ints, site_offsets: Ints) -> 
 
 
 def _vertex_hash(vertex: Ints, position: Ints) -> NDArray[np.uint64]:
-    """Return a hash of each vertex and its position in the site; the hash of a site is their sum modulo 2^64."""
+    """Return hashes of vertices and their positions; that of a site is their sum modulo 2^64."""
     mixed = (position + 1).astype(np.uint64) * _MIX[0]
     for axis in range(vertex.shape[1]):
         mixed = (mixed ^ vertex[:, axis].astype(np.uint64)) * _MIX[axis + 1]

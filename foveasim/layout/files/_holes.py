@@ -1,4 +1,8 @@
-"""Polygons without holes, as GDSII and OASIS require them: division of sites with holes, and keyholes of other programs."""
+"""
+Polygons without holes, as GDSII and OASIS require them.
+
+Sites with holes are divided into parts; keyholes of other programs are converted to holes.
+"""
 
 from __future__ import annotations
 

@@ -42,7 +42,9 @@ _keys = types.Array(types.int64, 1, "C", readonly=True)
 @njit(types.Array(types.boolean, 1, "C")(_table, _keys, types.int64))
 def progressions(rows, group, at_most):
     """
-    Divide rows into arithmetic progressions: successive rows of a group with a constant difference.
+    Divide rows into arithmetic progressions.
+
+    Successive rows of a progression have a constant difference, and are in the same group.
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 """
-Layer maps of GDSII and OASIS files: layer and datatype of each kind of shape, and the table of derived layers.
+Layer maps of GDSII and OASIS files, and the table of derived layers.
 
 A layer map is a mapping from names to layers:
 
@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 
 from foveasim._core.registry import Registry
 from foveasim._core.validation import check_count, check_number
-from foveasim._io.yaml_files import read_yaml
 from foveasim.errors import ConfigError, ParameterError
 from foveasim.layout.model import Layout
 
@@ -204,6 +203,8 @@ def read_layer_map(path: str | Path) -> dict[str, Any]:
     ConfigError
         When the file is missing, or not a mapping in YAML.
     """
+    from foveasim._io.yaml_files import read_yaml
+
     layers: dict[str, Any] = read_yaml(Path(path))
     return layers
 

@@ -189,7 +189,7 @@ def write(
 
 
 def _drawn_layers(layout: Layout, layer: Any, layers: Any, filter_names: Sequence[str] | None) -> list[DrawnLayer]:
-    """Return the layers of the file, by default that of the photosites with the channel as datatype."""
+    """Return the layers of the file, by default photosites with the channel as datatype."""
     if layers is not None and layer is not None:
         raise ParameterError("layer", "must not be given with 'layers'", layer, hint="set layers={'photosite': ...}")
     if layers is None:
@@ -217,7 +217,7 @@ def _drawn_layers(layout: Layout, layer: Any, layers: Any, filter_names: Sequenc
 
 
 def _stored_columns(layout: Layout, drawn: list[DrawnLayer]) -> dict[str, NDArray[Any]]:
-    """Return the columns to store; the channel first, unless it is represented by several datatypes."""
+    """Return the columns to store; the channel first, unless datatypes represent it."""
     others = {name: column for name, column in layout.columns.items() if name != CHANNEL}
     is_datatype = any(d.datatype is None for d in drawn) and bool((layout.channel != layout.channel[:1]).any())
     return others if is_datatype or CHANNEL not in layout.columns else {CHANNEL: layout.columns[CHANNEL], **others}
@@ -226,7 +226,7 @@ def _stored_columns(layout: Layout, drawn: list[DrawnLayer]) -> dict[str, NDArra
 def _divide(
     drawing: _Drawing, stack_of: Ints, origin: Ints, columns: Mapping[str, NDArray[Any]], *, hierarchy: bool
 ) -> tuple[Arrays, Arrays]:
-    """Return the arrays that are written as references, and the other sites as arrays of 1 x 1."""
+    """Return the arrays that become references, and the other sites as arrays of 1 x 1."""
     if not hierarchy or stack_of.size == 0:
         nowhere = np.zeros(0, np.int64)
         return single_sites(nowhere, columns), single_sites(np.arange(stack_of.size), columns)
@@ -243,10 +243,10 @@ def _divide(
 @dataclass(frozen=True)
 class _Drawing:
     """
-    Shapes of congruent sites on all layers, as packed rings without holes, relative to the origins of the sites.
+    Shapes of congruent sites on all layers, relative to the origins of the sites.
 
-    A stack consists of the shapes of a site. ``number`` and ``part`` have the shape (n_ring, 2): layer and datatype; number of
-    the part and number of parts of a divided photosite, or 0 and 0.
+    The rings are packed and have no holes. A stack consists of the shapes of a site. ``number`` and ``part`` have the shape
+    (n_ring, 2): layer and datatype; number of the part and number of parts of a divided photosite, or 0 and 0.
     """
 
     xy_dbu: Ints
@@ -339,7 +339,7 @@ def _draw(
 def _derived_rings(
     drawn: DrawnLayer, models: Layout, first: Ints, dbu_um: float, max_vertices: int | None
 ) -> tuple[Ints, Ints, Ints, list[Floats]]:
-    """Return the rings of a derived layer as :func:`hole_free_rings` does; the first index is that of the stack."""
+    """Return stack, part, number of parts and rings of a derived layer, without holes."""
     polygons = drawn.shapes(models)
     parts, stack = shapely.get_parts(polygons, return_index=True)
     is_area = shapely.area(parts) > 0.0
@@ -363,7 +363,7 @@ def _derived_rings(
 def _references(
     gdstk: Any, drawing: _Drawing, arrays: Arrays, stack_of: Ints, origin: Ints, dbu_um: float, *, is_oasis: bool
 ) -> tuple[list[Any], list[Any], list[tuple[int, ...]]]:
-    """Return cells of sites, references to them for all arrays, and the numbers of the sites of the references."""
+    """Return cells of sites, and for all arrays references to them and their numbers."""
     stack = stack_of[arrays.first]
     used, first_use = np.unique(stack, return_index=True)
     cells = {}
@@ -445,7 +445,7 @@ def _set_oasis_properties(
 
 
 def _set_number(element: Any, number: tuple[int, ...], *, is_oasis: bool) -> None:
-    """Set the number of a site, of a part (with part and number of parts), or of an array (with steps and size)."""
+    """Set the number of a site, of a part of it, or of an array with steps and size."""
     if is_oasis:
         element.set_property("photosites" if len(number) == 5 else "photosite", list(number))
     else:
@@ -491,7 +491,7 @@ def _warn_of_rounding(layout: Layout, snapped: Layout, dbu_um: float) -> None:
 
 
 def _snap_to_grid(layout: Layout, dbu_um: float) -> tuple[Ints, Layout]:
-    """Round the vertices of a layout to the database grid, and check the photosites; return integers and µm."""
+    """Round the vertices to the database grid, and check the sites; return integers and µm."""
     xy_dbu = np.rint(layout.xy_um / dbu_um)
     if xy_dbu.size and np.abs(xy_dbu).max() > MAX_DBU:
         raise ParameterError(
@@ -587,7 +587,7 @@ def read(
 def _selection(
     layer: Any, layers: Any, channels: Any, filter_names: Sequence[str] | None
 ) -> tuple[list[LayerNumber] | None, dict[LayerNumber, int]]:
-    """Return the layers of the photosites, or None for the default, and the channels of filter layers."""
+    """Return the layers of the photosites (None: default), and the channels of filters."""
     wanted = None if layer is None else parse_selection(layer)
     filters = {} if channels is None else parse_channels(channels, filter_names)
     if layers is not None:
@@ -684,7 +684,7 @@ def _check_oasis(path: Path, data: bytes) -> None:
 class _Shapes:
     """Shapes from the sandbox process: see :class:`foveasim.layout.files._gdstk.Shapes`."""
 
-    xy_dbu: Floats
+    xy_dbu: NDArray[Any]
     counts: Ints
     tags: Ints
     lines: bytes

@@ -581,23 +581,6 @@ def test_rounding_within_tolerance_is_silent(tmp_path):
     fs.layout.grid(n_x=9, n_y=9, pitch_um=2.0).write(tmp_path / "a.gds", dbu_um=0.005)
 
 
-# -- gdsfactory -------------------------------------------------------------------------------------------------------
-
-
-def test_gdsfactory_preserves_cells_and_sites(bayer, tmp_path):
-    gf = pytest.importorskip("gdsfactory")
-    gf.gpdk.PDK.activate()
-    bayer.write(tmp_path / "chip.gds", layers=MAP)
-    component = gf.import_gds(tmp_path / "chip.gds")
-    counts = {layer: len(polygons) for layer, polygons in component.get_polygons(by="tuple").items()}
-    again = fs.read_layout(component.write_gds(tmp_path / "again.gds"))
-
-    assert component.name == "SENSOR"
-    assert len(component.insts) <= 4
-    assert (counts[77, 3], counts[20, 0], counts[10, 0]) == (360, 360, np.count_nonzero(bayer.channel == 0))
-    assert_lossless(again, bayer)
-
-
 # -- untrusted files --------------------------------------------------------------------------------------------------
 
 
