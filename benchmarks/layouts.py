@@ -30,10 +30,10 @@ def bench_layouts(report: Report, n_sites: int) -> None:
     few = hexagonal(n_columns=250, n_rows=PEER_SITES // 250, pitch_um=3.0, trench_um=0.3)
     _against_klayout(report, few)
     _against_loops(report, few[:SLOW_PEER_SITES], hexagons[:SLOW_PEER_SITES])
-    _against_gdstk(report, "squares", grid(n_x=side, n_y=side, pitch_um=2.2), (2.0, 0.5))
+    _against_gdstk(report, "squares", grid(n_x=side, n_y=side, pitch_um=2.2), (0.7, 0.07))
     n_rings = round(n_sites * RING_SITES / 1e6 / RING_SECTORS)
     rings = log_polar(n_sectors=RING_SECTORS, n_rings=n_rings, r_min_um=100.0, r_max_um=3000.0)
-    _against_gdstk(report, "log-polar sites", rings, (0.05, 0.05))
+    _against_gdstk(report, "log-polar sites", rings, (0.1, 0.01))
 
 
 def every_rule(layout: Layout, **changes: Any) -> DesignRules:

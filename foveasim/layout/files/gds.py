@@ -273,17 +273,19 @@ class _Drawing:
         vertex = np.repeat(self.ring_offsets[:-1][ring], n_vertices) + positions_in_runs(n_vertices)
         xy_um = _to_um(self.xy_dbu[vertex] + np.repeat(origin, n_vertices, axis=0), dbu_um)
         stops = np.cumsum(n_vertices)
-        return [
-            gdstk.Polygon(xy_um[a:b], layer, datatype)
-            for a, b, (layer, datatype) in zip(
-                (stops - n_vertices).tolist(), stops.tolist(), self.number[ring].tolist(), strict=True
+        numbers = self.number[ring].T.tolist()
+        return list(
+            map(
+                gdstk.Polygon,
+                map(xy_um.__getitem__, map(slice, (stops - n_vertices).tolist(), stops.tolist())),
+                *numbers,
             )
-        ]
+        )
 
     def numbers(self, ring: Ints, site: Ints) -> list[tuple[int, ...]]:
         """Return the numbers of the given sites, with the parts of divided ones."""
-        rows = zip(site.tolist(), self.part[ring].tolist(), strict=True)
-        return [(s, part, n) if n else (s,) for s, (part, n) in rows]
+        part, n_parts = self.part[ring].T.tolist()
+        return [(s, k, n) if n else (s,) for s, k, n in zip(site.tolist(), part, n_parts, strict=True)]
 
 
 def _draw(
@@ -420,8 +422,8 @@ def _set_gds_properties(
         # gdstk writes properties in reverse order of setting.
         for element, k in zip(elements, array.tolist(), strict=True):
             element.set_gds_property(2, strings[k])
-    for element, number in zip(elements, numbers, strict=True):
-        _set_number(element, number, is_oasis=False)
+    for element, text in zip(elements, texts, strict=True):
+        element.set_gds_property(1, text)
     return dropped
 
 
@@ -453,10 +455,12 @@ def _set_number(element: Any, number: tuple[int, ...], *, is_oasis: bool) -> Non
 
 
 def _number_text(number: tuple[int, ...]) -> str:
+    if len(number) == 1:
+        return f"photosite {number[0]}"
     if len(number) == 5:
         first, step_i, step_j, n_x, n_y = number
         return f"photosites {linear_text(first, step_i, step_j)} of {n_x}x{n_y}"
-    return f"photosite {number[0]}" + (f" part {number[1]} of {number[2]}" if len(number) == 3 else "")
+    return f"photosite {number[0]} part {number[1]} of {number[2]}"
 
 
 def _gdstk(path: Path) -> Any:
