@@ -8,6 +8,7 @@ import inspect
 import runpy
 import shutil
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +24,7 @@ project_copyright = author
 version = release = foveasim.__version__
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "numpydoc",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
@@ -38,6 +39,11 @@ html_title = "foveasim"
 html_static_path: list[str] = []
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
+# Notebooks are executed, and again only after changes.
+nb_execution_mode = "cache"
+nb_execution_timeout = 300
+nb_execution_raise_on_error = True
+nb_execution_excludepatterns = [] if find_spec("torch") else ["notebooks/dataset_in_pytorch.ipynb"]
 autosummary_generate = True
 autodoc_typehints = "none"  # numpydoc's parameter lists contain types, shapes and units
 numpydoc_show_class_members = False

@@ -38,7 +38,6 @@ from foveasim.sensor import Sensor
 
 if TYPE_CHECKING:
     import xarray as xr
-    from matplotlib.figure import Figure
     from rich.console import RenderableType
 
 __all__ = ["Comparison", "cameras", "layouts"]
@@ -193,8 +192,15 @@ class Comparison:
             coordinates[attribute] = ("camera", numbers, {"units": unit or "1"})
         return xr.Dataset(variables, coordinates, {"settings": json.dumps(self.settings)})
 
-    def plot(self) -> Figure:
-        """Draw all measures against eccentricity, with confidence intervals."""
+    def plot(self) -> NDArray[Any]:
+        """
+        Draw all measures against eccentricity, with confidence intervals, and the areas of size classes.
+
+        Returns
+        -------
+        axes : (n_measure + 1,) array of matplotlib axes
+            Of a new figure.
+        """
         from foveasim.compare.figures import overview
 
         return overview(self)
@@ -228,6 +234,15 @@ class Comparison:
             ).rstrip()
             for row in columns
         )
+
+    def records(self) -> list[dict[str, str]]:
+        """Return the table: for each budget and measure a title, and one string per camera."""
+        return [dict(zip(("measure", *self.names), row, strict=True)) for row in self._rows()]
+
+    def _repr_html_(self) -> str:
+        from foveasim.view import to_html
+
+        return to_html(self)
 
     def __rich__(self) -> RenderableType:
         from rich.table import Table

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from foveasim.compare.measure import MEASURES
 from foveasim.errors import printable
@@ -85,16 +86,17 @@ def sizes_figure(comparison: Comparison, ink: str = "black", faint: str = "0.9")
     return _figure(lambda axes: draw_sizes(comparison, axes), ink, faint)
 
 
-def overview(comparison: Comparison) -> Figure:
-    """Return a figure of all measures against eccentricity and of the size classes."""
+def overview(comparison: Comparison) -> NDArray[Any]:
+    """Draw all measures against eccentricity and the size classes on a new figure; return its axes."""
     from matplotlib import rc_context
-    from matplotlib.figure import Figure
+
+    from foveasim.view.figures import new_figure
 
     with rc_context({"text.parse_math": False}):
         n_columns = 3
         n_rows = -(-(len(MEASURES) + 1) // n_columns)
-        figure = Figure(figsize=(4.3 * n_columns, 2.9 * n_rows), layout="constrained")
-        axes = figure.subplots(n_rows, n_columns).ravel()
+        figure = new_figure(4.3 * n_columns, 2.9 * n_rows)
+        axes: NDArray[Any] = figure.subplots(n_rows, n_columns).ravel()
         for name, one in zip(MEASURES, axes[: len(MEASURES)], strict=True):
             draw_measure(comparison, name, one)
             _style(one, "black", "0.9")
@@ -104,7 +106,7 @@ def overview(comparison: Comparison) -> Figure:
             one.set_visible(False)
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
-    return figure
+    return axes[: len(MEASURES) + 1]
 
 
 def _figure(draw: Any, ink: str, faint: str) -> Figure:

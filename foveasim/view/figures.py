@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-__all__ = ["hidden_figures", "new_axes"]
+__all__ = ["hidden_figures", "new_axes", "new_figure"]
 
 #: Smallest ratio of a figure's shorter side to its longer one, which leaves space for axes, labels and colour bars.
 MIN_ASPECT_RATIO = 0.4
@@ -43,14 +44,18 @@ def new_axes(figure_inches: float, ratio: float = 1.0) -> Axes:
     lists.
     """
     width, height = max(MIN_ASPECT_RATIO, min(1.0, 1.0 / ratio)), max(MIN_ASPECT_RATIO, min(1.0, ratio))
-    size_inches = figure_inches * width, figure_inches * height
+    return new_figure(figure_inches * width, figure_inches * height).add_subplot()
+
+
+def new_figure(width_inches: float, height_inches: float) -> Figure:
+    """Return an empty figure, made by pyplot as in :func:`new_axes`."""
     if _is_shown():
         from matplotlib import pyplot as plt
 
-        return plt.figure(figsize=size_inches, layout="constrained").add_subplot()
+        return plt.figure(figsize=(width_inches, height_inches), layout="constrained")
     from matplotlib.figure import Figure
 
-    return Figure(figsize=size_inches, layout="constrained").add_subplot()
+    return Figure(figsize=(width_inches, height_inches), layout="constrained")
 
 
 @contextmanager
