@@ -10,7 +10,8 @@ import pytest
 nbformat = pytest.importorskip("nbformat")
 nbclient = pytest.importorskip("nbclient")
 
-NOTEBOOKS = sorted((Path(__file__).parents[1] / "docs" / "notebooks").glob("*.ipynb"))
+ROOT = Path(__file__).parents[1]
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 #: Requirements of notebooks.
 NEEDS = {"dataset_in_pytorch": [pytest.mark.needs("torch")], "lecture_in_3d": [pytest.mark.needs("renderer")]}
 #: Message of the first run on a machine.
@@ -24,6 +25,7 @@ def stems(paths):
 @pytest.mark.parametrize("path", stems(NOTEBOOKS))
 def test_notebook_runs_and_shows_results(path, tmp_path, monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
+    monkeypatch.setenv("PYTHONPATH", str(ROOT), prepend=os.pathsep)
     notebook = nbformat.read(path, 4)
     client = nbclient.NotebookClient(
         notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}

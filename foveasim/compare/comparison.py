@@ -235,14 +235,10 @@ class Comparison:
             for row in columns
         )
 
-    def records(self) -> list[dict[str, str]]:
-        """Return the table: for each budget and measure a title, and one string per camera."""
-        return [dict(zip(("measure", *self.names), row, strict=True)) for row in self._rows()]
-
     def _repr_html_(self) -> str:
-        from foveasim.view import to_html
+        from foveasim.view.notebook import html_table
 
-        return to_html(self)
+        return html_table(repr(self), ("", *self.names), self._rows())
 
     def __rich__(self) -> RenderableType:
         from rich.table import Table

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from foveasim.view.notebook._objects import to_html, to_png
+from foveasim.view.notebook._objects import html_table, to_html, to_png
 
-__all__ = ["to_html", "to_png"]
+__all__ = ["html_table", "to_html", "to_png"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from functools import singledispatch
 from typing import Any, cast
@@ -32,7 +32,7 @@ from foveasim.view.raster_plots import picture_pixels, power_map_pixels, scene_p
 from foveasim.view.rule_plots import RULE_COLOURS
 from foveasim.view.site_colours import title_of
 
-__all__ = ["to_html", "to_png"]
+__all__ = ["html_table", "to_html", "to_png"]
 
 #: Longer side and largest size of the PNG of a picture.
 PNG_PIXELS, MAX_PNG_BYTES = 640, 400_000
@@ -63,7 +63,12 @@ def to_html(item: Any) -> str:
         raise ParameterError("item", "must be an object of foveasim with figures to show", item)
     records = item.records()
     headings = list(records[0]) if records else []
-    return panel(repr(item), table([title_of(name) for name in headings], [list(row.values()) for row in records]))
+    return html_table(repr(item), [title_of(name) for name in headings], [list(row.values()) for row in records])
+
+
+def html_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Return a titled table as HTML for notebooks."""
+    return panel(title, table(headings, rows))
 
 
 def to_png(picture: Picture) -> bytes:

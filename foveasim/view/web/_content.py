@@ -373,7 +373,8 @@ def _rules(report: Report, arrays: dict[str, NDArray[Any]]) -> list[dict[str, An
         sites += [violation.site_ids for violation in listed]
         markers += [violation.marker for violation in listed]
         rules.append({
-            "name": result.rule, "description": "; ".join(filter(None, (result.description, result.note))), "limit": _finite(result.limit), "unit": result.unit,
+            "name": result.rule, "description": "; ".join(filter(None, (result.description, result.note))),
+            "limit": _finite(result.limit), "unit": result.unit,
             "count": len(result), "listed": len(listed), "waiver": result.waiver,
         })  # fmt: skip
     parts, owner = shapely.get_parts(np.array(markers, dtype=object), return_index=True)
