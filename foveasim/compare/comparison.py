@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,9 @@ from foveasim._core.extras import needs
 from foveasim._core.provenance import copy_plain_data, to_plain_data, versions
 from foveasim._core.validation import Floats, check_count, check_number, finite_array, read_only
 from foveasim.camera import Camera
-from foveasim.compare.annuli import quality_by_eccentricity
+from foveasim.compare.annuli import PictureQuality, quality_by_eccentricity
 from foveasim.compare.budgets import BUDGETS, Budget, budget_of, check_equal_budgets
-from foveasim.compare.information import scene_covariance
+from foveasim.compare.information import SceneCovariance, scene_covariance
 from foveasim.compare.measure import (
     MEASURES,
     SceneMeasures,
@@ -35,6 +35,7 @@ from foveasim.optics import Optics
 from foveasim.reconstruct import Picture
 from foveasim.scene import Scene
 from foveasim.sensor import Sensor
+from foveasim.units import per_mm_from_per_um
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -50,6 +51,8 @@ MIN_COVERAGE = 0.5
 CONFIDENCE = 0.95
 #: Cells of the images for shifts per picture pixel, and margin in picture pixels.
 FINE_CELLS, MARGIN_PIXELS = 2, 4
+#: Frequency of the waves for aliases, in Nyquist frequencies of a square grid; relative margin of the outermost annulus.
+WAVE_NYQUISTS, EDGE_ROUNDING = 1.5, 1e-9
 BY_ECCENTRICITY = "_by_eccentricity"
 
 
@@ -335,9 +338,8 @@ def cameras(
     fixation = float(centre[0]), float(centre[1])
     budgets = {name: budget_of(camera, _rate(frames_per_s, name, exposure_s)) for name, camera in named.items()}
     check_equal_budgets(budgets, budget, tolerance)
-    sensors = {name: camera.sensor for name, camera in named.items()}
     all_layouts = [layout_of(camera) for camera in named.values()]
-    first = next(iter(named.values()))
+    first_name, first = next(iter(named.items()))
     if scenes is None:
         scenes = photograph_scenes(field_um(all_layouts), first.optics)
     if not isinstance(scenes, Mapping) or not scenes:
@@ -351,90 +353,53 @@ def cameras(
         if progress is not None:
             progress(n_done, n_steps)
 
-    low, high = (
-        extreme([np.asarray(layout.bounds_um)[part] for layout in all_layouts], axis=0)
-        for extreme, part in ((np.min, slice(0, 2)), (np.max, slice(2, 4)))
-    )
-    grid = _grid(low, high, max_pixels, 0)
-    fine = _grid(low, high, FINE_CELLS * max_pixels, FINE_CELLS * MARGIN_PIXELS)
-    reach_um = max(float(np.hypot(*(layout.centroid_um - centre).T).max()) for layout in all_layouts)
-    edges_um = np.linspace(0.0, reach_um * (1.0 + 1e-9), n_annuli + 1)
-
-    # Captures and pictures, scene by scene.
-    ideal: dict[str, list[Picture]] = {name: [] for name in named}
-    found: dict[str, list[SceneMeasures]] = {name: [] for name in named}
-    raw: dict[str, list[Picture]] = {name: [] for name in named}
-    for scene_name, light in scenes.items():
-        if not isinstance(light, Scene | PowerMap):
-            raise ParameterError("scenes", f"must be scenes or power maps, got a {type(light).__name__}", scene_name)
-        power_map = first.power_map(light) if isinstance(light, Scene) else light
-        for name, camera in named.items():
-            capture = camera.capture(light, exposure_s=exposure_s, seed=seed)
-            raw[name].append(capture.picture(method, of="light_e", per="um2", grid=grid, sensor=camera.sensor))
-            ideal[name].append(camera.reference(power_map, grid, exposure_s=exposure_s))
-            image = camera.reference(power_map, fine, exposure_s=exposure_s)
-            found[name].append(scene_measures(camera, capture, image, fixation, edges_um))
-            advance()
-
-    # Quality where all cameras have values.
-    covered = {name: pictures[0].coverage >= MIN_COVERAGE for name, pictures in raw.items()}
-    is_common = np.all([*covered.values()], axis=0)
-    is_field = np.any([*covered.values()], axis=0)
+    field = _field(all_layouts, fixation, n_annuli, max_pixels)
+    shots = _simulate(named, scenes, field, exposure_s, seed, method, advance)
+    covered = {name: one.pictures[0].coverage >= MIN_COVERAGE for name, one in shots.items()}
+    is_common, is_field = (combine([*covered.values()], axis=0) for combine in (np.all, np.any))
     if not is_common.any():
         raise ParameterError("cameras", "must have a common part of the field; the layouts do not overlap")
+    ideal = shots[first_name].ideal
+    covariance = scene_covariance([np.mean(picture.data, axis=0) for picture in ideal], field.grid.pitch_x_um)
+    density_per_um2 = budgets[first_name].n_sites / budgets[first_name].area_um2
+    wave_per_mm = WAVE_NYQUISTS * float(per_mm_from_per_um(0.5 * np.sqrt(density_per_um2)))
     values: dict[str, list[Any]] = {key: [] for name in MEASURES for key in (name, name + BY_ECCENTRICITY)}
     pictures: dict[str, list[Picture]] = {}
-    covariance = scene_covariance(
-        [np.mean(picture.data, axis=0) for picture in next(iter(ideal.values()))], grid.pitch_x_um
-    )
-    mean_e_per_um2 = float(np.mean([np.nanmean(picture.data) for picture in next(iter(ideal.values()))]))
-    light = next(iter(scenes.values()))
-    distance_m = float(light.distance_m) if isinstance(light, Scene) else None
-    wavelength_nm = float(np.mean(light.wavelength_nm))
-    density_per_um2 = budgets[next(iter(named))].n_sites / budgets[next(iter(named))].area_um2
-    wave_per_mm = 1.5 * 1e3 * 0.5 * density_per_um2**0.5
     for name, camera in named.items():
         qualities = [
-            quality_by_eccentricity(one, other, edges_um=edges_um, centre_um=fixation, is_compared=is_common)
-            for one, other in zip(raw[name], ideal[name], strict=True)
+            quality_by_eccentricity(one, other, edges_um=field.edges_um, centre_um=fixation, is_compared=is_common)
+            for one, other in zip(shots[name].pictures, shots[name].ideal, strict=True)
         ]
-        totals: dict[str, Any] = {key: [getattr(q, key) for q in qualities] for key in ("psnr_db", "ssim")}
-        annuli: dict[str, Any] = {
-            key: [getattr(q, key + BY_ECCENTRICITY) for q in qualities] for key in ("psnr_db", "ssim")
-        }
-        for key in ("snr_db", "shift_sigma_um"):
-            totals[key] = [one.totals[key] for one in found[name]]
-            annuli[key] = [one.annuli[key] for one in found[name]]
-        channel_means = np.nanmean([picture.data for picture in ideal[name]], axis=(0, 2, 3))
-        response = channel_means[found[name][0].capture.filter_of_site] / mean_e_per_um2 * camera.sensor.sensitivity
-        noise_e = [one.signals.noise_e for one in found[name]]
-        for total, by_annulus in (
-            information_by_annulus(camera, covariance, response, noise_e, fixation, edges_um),
-            layout_measures(camera, wavelength_nm, distance_m, fixation, edges_um, wave_per_mm),
-        ):
-            totals.update(total)
-            annuli.update(by_annulus)
-        for key in MEASURES:
-            values[key].append(totals[key])
-            values[key + BY_ECCENTRICITY].append(annuli[key])
+        found = _camera_values(
+            camera,
+            shots[name],
+            qualities,
+            covariance,
+            _mean_e_per_um2(ideal),
+            field,
+            wave_per_mm,
+            next(iter(scenes.values())),
+        )
+        for key, row in found.items():
+            values[key].append(row)
+        scale = float(_mean_e_per_um2(ideal) / _mean_e_per_um2(shots[name].ideal))
         pictures[name] = [
-            Picture((q.gain * one.data).astype(np.float32), one.coverage, grid)
-            for q, one in zip(qualities, raw[name], strict=True)
+            Picture((scale * quality.gain * one.data).astype(np.float32), one.coverage, field.grid)
+            for quality, one in zip(qualities, shots[name].pictures, strict=True)
         ]
         advance()
+    n_field = np.count_nonzero(is_field)
     return Comparison(
         names=tuple(named),
         scenes=tuple(map(str, scenes)),
         budgets=tuple(budgets.values()),
-        edges_um=read_only(edges_um),
+        edges_um=read_only(field.edges_um),
         centre_um=fixation,
         values={key: read_only(np.asarray(rows, np.float64)) for key, rows in values.items()},
-        coverage_fraction=read_only(
-            np.array([np.count_nonzero(part) for part in covered.values()]) / np.count_nonzero(is_field)
-        ),
-        compared_fraction=float(np.count_nonzero(is_common) / np.count_nonzero(is_field)),
+        coverage_fraction=read_only(np.array([np.count_nonzero(part) for part in covered.values()]) / n_field),
+        compared_fraction=float(np.count_nonzero(is_common) / n_field),
         pictures=pictures,
-        ideal=next(iter(ideal.values())),
+        ideal=ideal,
         sizes={name: size_records(camera) for name, camera in named.items()},
         settings={
             "budget": budget,
@@ -447,14 +412,107 @@ def cameras(
             "distortion": None if first.distortion is None else to_plain_data(first.distortion),
             "cameras": {
                 name: {
-                    "sensor": {k: v for k, v in to_plain_data(sensor).items() if k != "layout"},
-                    "layout": to_plain_data(dict(layout_of(named[name]).provenance)),
+                    "sensor": {k: v for k, v in to_plain_data(camera.sensor).items() if k != "layout"},
+                    "layout": to_plain_data(dict(layout_of(camera).provenance)),
                 }
-                for name, sensor in sensors.items()
+                for name, camera in named.items()
             },
             "versions": copy_plain_data(versions()),
         },
     )
+
+
+class _Field(NamedTuple):
+    """Fixation point, annuli, and the grids of pictures and of images for shifts."""
+
+    centre_um: tuple[float, float]
+    edges_um: Floats
+    grid: Grid
+    fine_grid: Grid
+
+
+class _Shots(NamedTuple):
+    """Pictures, ideal pictures and measures of the captures of a camera, one per scene."""
+
+    pictures: list[Picture]
+    ideal: list[Picture]
+    measures: list[SceneMeasures]
+
+
+def _field(all_layouts: Sequence[Layout], centre_um: tuple[float, float], n_annuli: int, max_pixels: int) -> _Field:
+    """Return the common field of layouts."""
+    bounds_um = np.array([layout.bounds_um for layout in all_layouts])
+    low, high = bounds_um[:, :2].min(axis=0), bounds_um[:, 2:].max(axis=0)
+    reach_um = max(float(np.hypot(*(layout.centroid_um - centre_um).T).max()) for layout in all_layouts)
+    return _Field(
+        centre_um,
+        np.linspace(0.0, reach_um * (1.0 + EDGE_ROUNDING), n_annuli + 1),
+        _grid(low, high, max_pixels, 0),
+        _grid(low, high, FINE_CELLS * max_pixels, FINE_CELLS * MARGIN_PIXELS),
+    )
+
+
+def _simulate(
+    named: Mapping[str, Camera],
+    scenes: Mapping[str, Scene | PowerMap],
+    field: _Field,
+    exposure_s: float,
+    seed: int,
+    method: Method,
+    advance: Callable[[], None],
+) -> dict[str, _Shots]:
+    """Capture all scenes with all cameras, and reconstruct the pictures on the common grid."""
+    shots = {name: _Shots([], [], []) for name in named}
+    first = next(iter(named.values()))
+    for scene_name, light in scenes.items():
+        if not isinstance(light, Scene | PowerMap):
+            raise ParameterError("scenes", f"must be scenes or power maps, got a {type(light).__name__}", scene_name)
+        power_map = first.power_map(light) if isinstance(light, Scene) else light
+        for name, camera in named.items():
+            capture = camera.capture(light, exposure_s=exposure_s, seed=seed)
+            image = camera.reference(power_map, field.fine_grid, exposure_s=exposure_s)
+            shots[name].pictures.append(
+                capture.picture(method, of="light_e", per="um2", grid=field.grid, sensor=camera.sensor)
+            )
+            shots[name].ideal.append(camera.reference(power_map, field.grid, exposure_s=exposure_s))
+            shots[name].measures.append(scene_measures(camera, capture, image, field.centre_um, field.edges_um))
+            advance()
+    return shots
+
+
+def _camera_values(
+    camera: Camera,
+    shots: _Shots,
+    qualities: Sequence[PictureQuality],
+    covariance: SceneCovariance,
+    mean_e_per_um2: float,
+    field: _Field,
+    wave_per_mm: float,
+    light: Scene | PowerMap,
+) -> dict[str, Any]:
+    """Return all measures of a camera, over scenes and annuli."""
+    totals: dict[str, Any] = {key: [getattr(q, key) for q in qualities] for key in ("psnr_db", "ssim")}
+    annuli: dict[str, Any] = {key: [getattr(q, key + BY_ECCENTRICITY) for q in qualities] for key in totals}
+    for key in ("snr_db", "shift_sigma_um"):
+        totals[key] = [one.totals[key] for one in shots.measures]
+        annuli[key] = [one.annuli[key] for one in shots.measures]
+    channel_e_per_um2 = np.nanmean([picture.data for picture in shots.ideal], axis=(0, 2, 3))
+    filter_of_site = shots.measures[0].capture.filter_of_site
+    response = channel_e_per_um2[filter_of_site] / mean_e_per_um2 * camera.sensor.sensitivity
+    noise_e = [one.signals.noise_e for one in shots.measures]
+    distance_m = float(light.distance_m) if isinstance(light, Scene) else None
+    wavelength_nm = float(np.mean(light.wavelength_nm))
+    for total, by_annulus in (
+        information_by_annulus(camera, covariance, response, noise_e, field.centre_um, field.edges_um),
+        layout_measures(camera, wavelength_nm, distance_m, field.centre_um, field.edges_um, wave_per_mm),
+    ):
+        totals.update(total)
+        annuli.update(by_annulus)
+    return {name: totals[name] for name in MEASURES} | {name + BY_ECCENTRICITY: annuli[name] for name in MEASURES}
+
+
+def _mean_e_per_um2(pictures: Sequence[Picture]) -> float:
+    return float(np.mean([np.nanmean(picture.data) for picture in pictures]))
 
 
 def layouts(
