@@ -285,7 +285,9 @@ def _spaces(case: Case) -> Measurement:
         found.distance_um[near],
         lambda k: found.sites_of(near[k]),
         lambda k: shapely.shortest_line(case.shapes(found.first[near[k]]), case.shapes(found.second[near[k]])),
-        f"{n_abutting} pairs of sites touch and have no space; check inset outlines" if n_abutting else "",
+        f"not checked: {n_abutting} pair{'s' * (n_abutting != 1)} of touching sites; apply inset first"
+        if n_abutting
+        else "",
     )
 
 

@@ -431,7 +431,7 @@ class Report:
             )
             table.add_row(r.rule, verdict, f"{r.values.size}", worst, f"{r.limit:g}", r.unit)
         notes = [f"{r.rule}: {r.note}" for r in self.results if r.note]
-        table.caption = "\n".join(notes) or None
+        table.caption, table.caption_justify = "\n".join(notes) or None, "left"
         return table
 
 
