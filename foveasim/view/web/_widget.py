@@ -22,7 +22,7 @@ class _Sites(traitlets.TraitType[Ints, Any]):
 
     info_text = "indices of sites, or one boolean per site"
 
-    def validate(self, widget: SitesWidget, value: Any) -> Ints:  # type: ignore[override]
+    def validate(self, widget: SitesWidget, value: Any) -> Ints:
         """Return an array of indices; booleans select sites."""
         sites = as_numbers("selected", value, keep_type=True)
         if sites.dtype == np.bool_ and sites.shape == (widget.n_sites,):
