@@ -49,13 +49,12 @@ SPECTRUM = {"nyquist_per_mm": 250.0, "peak_per_mm": 1.0, "frequency_per_mm": MAN
 SHOT = {
     "scene": {
         "kind": "picture",
-        "pitch_um": 300.0,
         "distance_m": 1.0,
         "peak_radiance_w_m2_sr_nm": 0.05,
         "wavelength_nm": [620, 550],
     },
     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
-    "layout": {"generator": "grid", "parameters": {"n_x": 4, "n_y": 4, "pitch_um": 2.0}},
+    "layout": {"generator": "grid", "parameters": {"n_x": 40, "n_y": 40, "pitch_um": 2.0}},
     "sensor": {},
     "exposure_s": 0.01,
 }
@@ -70,7 +69,7 @@ def examples(tmp_path_factory):
     explore.write_dataset(dataset, directory / "samples", per_shard=2)
     shot = config.Shot(name="shot", scene=SCENE, camera=CAMERA, rules=None, exposure_s=0.01, seed=0)
     plan = explore.Plan(
-        source=Path("sweep.yaml"), settings={"a": list(range(100))}, values={"sensor.bits": list(range(100))}, mode="zip",
+        source=config.Source(file=Path("sweep.yaml")), written=config.Source(file=Path("sweep.yaml")), settings={"a": list(range(100))}, values={"sensor.bits": list(range(100))}, mode="zip",
         repeats=1, seed=0, metrics={}, files={},
     )  # fmt: skip
     solids = view.solids(fs.layout.grid(2, 2, 5.0), view.SensorStack())

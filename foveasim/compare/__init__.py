@@ -6,6 +6,7 @@ Pictures, their quality by eccentricity, signal-to-noise ratio, resolution, alia
 
 from __future__ import annotations
 
+from foveasim._core.calls import check_public_calls
 from foveasim.compare.annuli import PictureQuality, quality_by_eccentricity
 from foveasim.compare.budgets import BUDGETS, Budget, budget_of
 from foveasim.compare.comparison import Comparison, cameras, layouts
@@ -36,3 +37,5 @@ __all__ = [
     "scene_covariance",
     "site_information_bits",
 ]
+
+check_public_calls(__name__)

@@ -197,12 +197,12 @@ class Comparison:
 
     def plot(self) -> NDArray[Any]:
         """
-        Draw all measures against eccentricity, with confidence intervals, and the areas of size classes.
+        Draw all measures against eccentricity, and the areas of size classes.
 
         Returns
         -------
         axes : (n_measure + 1,) array of matplotlib axes
-            Of a new figure.
+            Of a new figure, with confidence intervals.
         """
         from foveasim.compare.figures import overview
 

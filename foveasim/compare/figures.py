@@ -87,15 +87,15 @@ def sizes_figure(comparison: Comparison, ink: str = "black", faint: str = "0.9")
 
 
 def overview(comparison: Comparison) -> NDArray[Any]:
-    """Draw all measures against eccentricity and the size classes on a new figure; return its axes."""
+    """Draw all measures against eccentricity, and the size classes, on new axes."""
     from matplotlib import rc_context
 
-    from foveasim.view.figures import new_figure
+    from foveasim.view.plots.figures import new_figure
 
     with rc_context({"text.parse_math": False}):
         n_columns = 3
         n_rows = -(-(len(MEASURES) + 1) // n_columns)
-        figure = new_figure(4.3 * n_columns, 2.9 * n_rows)
+        figure = new_figure((4.3 * n_columns, 2.9 * n_rows))
         axes: NDArray[Any] = figure.subplots(n_rows, n_columns).ravel()
         for name, one in zip(MEASURES, axes[: len(MEASURES)], strict=True):
             draw_measure(comparison, name, one)

@@ -6,20 +6,28 @@ matplotlib is imported when something is drawn.
 
 from __future__ import annotations
 
-from foveasim.view.figures import hidden_figures
 from foveasim.view.id_map import SitePixels, id_map, site_at
 from foveasim.view.meshes import Mesh, polydata, prisms
-from foveasim.view.notebook import to_html, to_png
-from foveasim.view.plots import plot_capture, plot_curves, plot_layout, plot_noise_budget, save_drawing, save_figure
-from foveasim.view.raster_plots import plot_picture, plot_power_map, plot_scene
+from foveasim.view.notebook import to_html, to_png, widget
+from foveasim.view.plots import (
+    hidden_figures,
+    plot_capture,
+    plot_curves,
+    plot_layout,
+    plot_noise_budget,
+    plot_picture,
+    plot_power_map,
+    plot_report,
+    plot_scene,
+    save_drawing,
+    save_figure,
+)
 from foveasim.view.render3d import Viewpoint, plotter, render, show, show_columns, sites_in_view
 from foveasim.view.renderer import find_renderer
-from foveasim.view.rule_plots import plot_report
 from foveasim.view.site_colours import SiteColours, colours_of, site_colours
 from foveasim.view.site_pictures import picture_colours, site_picture
 from foveasim.view.solids import PartReport, SensorStack, Solids, SolidsReport, solids, stack, write_meshes
 from foveasim.view.web import solid_page, web_page, write_solid_page, write_web_page
-from foveasim.view.widgets import widget
 
 __all__ = [
     "Mesh",

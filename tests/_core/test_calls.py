@@ -22,7 +22,7 @@ from foveasim.layout.generators.grid import grid as grid_of_module
 
 MODULES = runpy.run_path(str(Path(__file__).parents[2] / "docs" / "conf.py"))["MODULES"]
 SITES = fs.layout.grid(3, 3, 2.0)
-GRID = r"grid\(n_x, n_y, pitch_um, \*, pitch_y_um=None, .*\)"
+GRID = r"grid\(n_x=None, n_y=None, pitch_um=None, \*, size_um=None, .*\)"
 
 
 @pytest.mark.parametrize(
@@ -30,8 +30,8 @@ GRID = r"grid\(n_x, n_y, pitch_um, \*, pitch_y_um=None, .*\)"
     [
         (lambda: fs.layout.grid(3, 3, pich_um=2.0), rf"^'pich_um' must be an argument of {GRID}; did you mean 'pitch_um'\?$"),
         (lambda: fs.layout.grid(nx=3, n_y=3, pitch_um=2.0), r"'nx' must be an argument of .*; did you mean 'n_x'\?$"),
-        (lambda: fs.layout.grid(3, 3), rf"^'pitch_um' must be given: {GRID}$"),
-        (fs.layout.grid, rf"^'n_x' and 'n_y' and 'pitch_um' must be given: {GRID}$"),
+        (lambda: fs.layout.log_polar(24), r"^'r_max_um' must be given: log_polar\(n_sectors=None, \*, r_max_um, .*\)$"),
+        (fs.layout.clip, r"^'layout' and 'region' must be given: clip\(layout, region, \*, cut='pieces'\)$"),
         (lambda: fs.layout.grid(3, 3, 2.0, 4.0), rf"^'grid' must have at most 3 positional arguments, got 4 by position: {GRID}$"),
         (lambda: fs.layout.grid(3, 3, 2.0, n_x=4), rf"^'n_x' must be given once, by position or by name: {GRID}$"),
         (lambda: fs.Camera(1, 2), r"^'Camera' must have named arguments only, got 2 by position: Camera\(\*, optics, sensor, "),
@@ -102,7 +102,7 @@ def test_all_public_calls_are_checked():
 
 def test_signatures_and_examples_remain_visible():
     assert list(inspect.signature(fs.layout.grid).parameters)[:3] == ["n_x", "n_y", "pitch_um"]
-    assert get_type_hints(fs.layout.grid)["n_x"] is int
+    assert get_type_hints(fs.layout.grid)["stagger"] is bool
     assert inspect.signature(fs.Sensor).parameters["bits"].default == 8
     assert fs.view.id_map.__doc__.strip().startswith("Return the photosite under")
     assert "@layout_family" in inspect.getsource(fs.layout.grid)

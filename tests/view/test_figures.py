@@ -15,7 +15,7 @@ from nbclient import NotebookClient
 
 import foveasim as fs
 from foveasim.view import figures, hidden_figures
-from foveasim.view.figures import new_axes
+from foveasim.view.plots.figures import new_axes
 
 SITES = fs.layout.grid(4, 3, 2.0)
 INLINE = "module://matplotlib_inline.backend_inline"

@@ -9,7 +9,7 @@ import foveasim as fs
 from foveasim import metrics
 from foveasim.errors import ParameterError
 from foveasim.view import plot_curves, plot_picture
-from foveasim.view.raster_plots import block_means, power_map_pixels, scene_pixels
+from foveasim.view.plots.rasters import block_means, power_map_pixels, scene_pixels
 
 GRID = fs.Grid((20, 40), 0.5, (-3.0, -2.0))
 

@@ -24,7 +24,7 @@ from foveasim.view import (
     site_colours,
 )
 from foveasim.view._artists import SiteImage, format_length, nice_length_um
-from foveasim.view.plots import MAX_OUTLINES
+from foveasim.view.plots.sites import MAX_OUTLINES
 from foveasim.view.site_colours import BACKGROUND, CATEGORY_COLOURS, FILTER_COLOURS, NO_DATA
 
 FRAME = shapely.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)], [[(2, 2), (2, 6), (6, 6), (6, 2)]])
@@ -103,7 +103,7 @@ def test_image_matches_outlines(tmp_path, monkeypatch):
     colours = np.random.default_rng(0).integers(0, 256, (layout.n_sites, 3), dtype=np.uint8)
     pictures = []
     for max_outlines in (0, 10**6):
-        monkeypatch.setattr("foveasim.view.plots.MAX_OUTLINES", max_outlines)
+        monkeypatch.setattr("foveasim.view.plots.sites.MAX_OUTLINES", max_outlines)
         axes = plot_layout(layout, colours, scale_bar=False, ax=bare_axes(4, 4))
         assert bool(axes.images) == (max_outlines == 0)
         pictures.append(render_pixels(axes, tmp_path).astype(float))

@@ -3,5 +3,6 @@
 from __future__ import annotations
 
 from foveasim.view.notebook._objects import html_table, to_html, to_png
+from foveasim.view.notebook._widget import widget
 
-__all__ = ["html_table", "to_html", "to_png"]
+__all__ = ["html_table", "to_html", "to_png", "widget"]

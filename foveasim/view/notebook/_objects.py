@@ -28,8 +28,8 @@ from foveasim.view.notebook._thumbnails import (
     site_thumbnail,
     thumbnail,
 )
-from foveasim.view.raster_plots import picture_pixels, power_map_pixels, scene_pixels
-from foveasim.view.rule_plots import RULE_COLOURS
+from foveasim.view.plots.rasters import picture_pixels, power_map_pixels, scene_pixels
+from foveasim.view.plots.rules import RULE_COLOURS
 from foveasim.view.site_colours import title_of
 
 __all__ = ["html_table", "to_html", "to_png"]

@@ -14,7 +14,7 @@ from foveasim.layout import Layout
 from foveasim.layout.drc.rules import Report
 from foveasim.view.id_map import SitePixels
 from foveasim.view.notebook._blocks import Html, picture
-from foveasim.view.rule_plots import MAX_SHOWN, RULE_COLOURS
+from foveasim.view.plots.rules import MAX_SHOWN, RULE_COLOURS
 from foveasim.view.site_colours import BACKGROUND, BOUNDARY, Rgb, SiteColours, colours_of
 
 __all__ = ["THUMBNAIL_PIXELS", "encode_png", "report_thumbnail", "site_thumbnail", "thumbnail"]

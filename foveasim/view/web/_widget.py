@@ -1,4 +1,4 @@
-"""Widget that contains the page of a layout or capture; imports anywidget, and is imported on use."""
+"""Widget with the page of a layout or capture, by anywidget; imported on use."""
 
 from __future__ import annotations
 

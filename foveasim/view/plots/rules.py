@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
 from foveasim.layout.drc.rules import Report, RuleResult
-from foveasim.view.figures import new_axes
-from foveasim.view.plots import plot_layout
+from foveasim.view.plots.figures import new_axes
+from foveasim.view.plots.sites import plot_layout
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -16,8 +16,8 @@ from foveasim._io.atomic import atomic_write
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
 from foveasim.layout import Layout, readout_order
-from foveasim.view.figures import new_axes
 from foveasim.view.id_map import site_at
+from foveasim.view.plots.figures import new_axes
 from foveasim.view.site_colours import BACKGROUND, BOUNDARY, CATEGORY_COLOURS, SiteColours, as_fractions, colours_of
 
 if TYPE_CHECKING:

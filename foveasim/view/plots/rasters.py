@@ -14,7 +14,7 @@ from foveasim.fields import PowerMap, to_file_rows
 from foveasim.reconstruct import Picture
 from foveasim.scene import Scene
 from foveasim.sensor import rgb_filters
-from foveasim.view.figures import new_axes
+from foveasim.view.plots.figures import new_axes
 from foveasim.view.site_colours import BACKGROUND, as_fractions
 
 if TYPE_CHECKING:

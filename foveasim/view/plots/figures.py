@@ -44,18 +44,18 @@ def new_axes(figure_inches: float, ratio: float = 1.0) -> Axes:
     lists.
     """
     width, height = max(MIN_ASPECT_RATIO, min(1.0, 1.0 / ratio)), max(MIN_ASPECT_RATIO, min(1.0, ratio))
-    return new_figure(figure_inches * width, figure_inches * height).add_subplot()
+    return new_figure((figure_inches * width, figure_inches * height)).add_subplot()
 
 
-def new_figure(width_inches: float, height_inches: float) -> Figure:
+def new_figure(figure_inches: tuple[float, float]) -> Figure:
     """Return an empty figure, made by pyplot as in :func:`new_axes`."""
     if _is_shown():
         from matplotlib import pyplot as plt
 
-        return plt.figure(figsize=(width_inches, height_inches), layout="constrained")
+        return plt.figure(figsize=figure_inches, layout="constrained")
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width_inches, height_inches), layout="constrained")
+    return Figure(figsize=figure_inches, layout="constrained")
 
 
 @contextmanager
