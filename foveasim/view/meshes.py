@@ -230,6 +230,7 @@ def prisms(
     *,
     by: str | ArrayLike | None = None,
     max_height_um: float | None = None,
+    has_floor: bool = False,
 ) -> Mesh:
     """
     Return photosites as prisms whose heights show their values.
@@ -244,11 +245,13 @@ def prisms(
         Quantity shown by the colour, as in :func:`foveasim.view.colours_of`; by default that of the height.
     max_height_um : float, µm
         Height of the tallest prism; 0.15 of the layout's longer side by default.
+    has_floor : bool
+        Whether the prisms have bottom faces, which are visible from below and through cuts only.
 
     Returns
     -------
     Mesh
-        Without bottom faces. ``values`` are those that the height shows.
+        ``values`` are those that the height shows.
 
     Raises
     ------
@@ -281,7 +284,7 @@ def prisms(
     )
     max_value = float(values.max())
     heights_um = values * (max_height_um / max_value if max_value > 0.0 else 0.0)
-    points_um, triangles, photosite = extrude(layout, triangulate(layout), 0.0, heights_um, has_floor=False)
+    points_um, triangles, photosite = extrude(layout, triangulate(layout), 0.0, heights_um, has_floor=has_floor)
     return Mesh(
         name="columns",
         points_um=points_um,

@@ -900,7 +900,7 @@ BIG = fs.layout.mosaic(fs.layout.grid(n_x=90, n_y=70, pitch_um=2.0), ("RG", "GB"
     ids=["notches and holes", "stack", "stack cut open", "tiles"],
 )
 def test_packed_surfaces_return_every_triangle(layout, meshes, n_tiles):
-    about, arrays = bodies_of(meshes, layout, are_closed=True)
+    about, arrays = bodies_of(meshes, layout)
     for mesh, (name, triangles_um, sites, rgb) in zip(meshes, surfaces_of(about, arrays), strict=True):
         corners = mesh.triangles
         expected = in_one_order(mesh.points_um[corners], mesh.photosite[corners[:, 0]], mesh.colours[corners[:, 0]])
@@ -925,9 +925,9 @@ def test_unshowable_surfaces_raise_by_name():
         (replace(mesh, photosite=mesh.photosite + 1), "must be of photosites 0 to 119, got others in 'wells'"),
     ):
         with pytest.raises(ParameterError, match=message):
-            bodies_of([changed], MOSAIC, are_closed=True)
+            bodies_of([changed], MOSAIC)
     with pytest.raises(GeometryError, match="must have at least one triangle"):
-        bodies_of([replace(mesh, triangles=mesh.triangles[:0])], MOSAIC, are_closed=True)
+        bodies_of([replace(mesh, triangles=mesh.triangles[:0])], MOSAIC)
 
 
 def test_solid_page_needs_no_trimesh(monkeypatch):
@@ -978,7 +978,7 @@ def columns_of(layout):
     capture = capture_of(layout, filters=("all",) * (int(layout.channel.max()) + 1))
     x0, y0, x1, y1 = layout.bounds_um
     roofs_um = 0.15 * max(x1 - x0, y1 - y0) * capture.code / capture.code.max()
-    return solid_page(capture), [("columns", layout.polygons(), np.zeros(layout.n_sites), roofs_um)], False
+    return solid_page(capture), [("columns", layout.polygons(), np.zeros(layout.n_sites), roofs_um)], True
 
 
 def stack_prisms():

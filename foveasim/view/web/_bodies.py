@@ -33,19 +33,15 @@ STEPS_PER_FEATURE = 2**12
 SITES_PER_TILE = 1500
 
 
-def bodies_of(
-    meshes: Sequence[Mesh], layout: Layout, *, are_closed: bool
-) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def bodies_of(meshes: Sequence[Mesh], layout: Layout) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """
     Return surfaces as plain data and arrays for ``bodies.js``.
 
     Parameters
     ----------
     meshes : sequence of Mesh
-        Surfaces of photosites of the layout; -1 for no photosite.
+        Closed surfaces of photosites of the layout; -1 for no photosite.
     layout : Layout
-    are_closed : bool
-        Whether the surfaces are closed, so that back faces are not visible from outside.
 
     Returns
     -------
@@ -103,7 +99,6 @@ def bodies_of(
                 "name": mesh.name,
                 "n_runs": int(piece["run_sites"].size),
                 "n_tiles": int(piece["tile_runs"].size),
-                "is_closed": are_closed,
             }
             for mesh, piece in zip(meshes, pieces, strict=True)
         ],

@@ -45,14 +45,12 @@ def solid_page(data: Layout | Capture, *, solids: Solids | None = None, name: st
     """
     about, arrays, layout = describe_sites(data, name=name)
     if solids is None and isinstance(data, Capture):
-        meshes: Sequence[Mesh] = (prisms(data),)
-        meshes_are_closed = False  # prisms have no bottom faces
+        meshes: Sequence[Mesh] = (prisms(data, has_floor=True),)
         shown = "Column heights show the codes."
     else:
         meshes = (solids_of(data) if solids is None else solids).meshes
-        meshes_are_closed = True
         shown = "z points toward the lens."
-    bodies, surfaces = bodies_of(meshes, layout, are_closed=meshes_are_closed)
+    bodies, surfaces = bodies_of(meshes, layout)
     arrays |= {**surfaces, "area_um2": layout.area_um2}
     packed = {key: pack(values) for key, values in arrays.items()}
     return assemble_page(

@@ -3,7 +3,7 @@
 import { offsetsOf, positionsOf } from "./unpack.js";
 
 export class Bodies {
-  // about: { lattice_um, origin_um, low_um, high_um, list: [{ name, n_runs, n_tiles, is_closed }] }; arrays by their names in the page.
+  // about: { lattice_um, origin_um, low_um, high_um, list: [{ name, n_runs, n_tiles }] }; arrays by their names in the page.
   constructor(about, arrays) {
     this.lattice = about.lattice_um;
     this.origin = about.origin_um;
@@ -16,8 +16,8 @@ export class Bodies {
     this.firstTriangle = offsetsOf(arrays.run_triangles);
     this.position = positionsOf(arrays.positions);
     let run = 0, tile = 0;
-    this.list = about.list.map(({ name, n_runs, n_tiles, is_closed }) => {
-      const body = { name, isClosed: is_closed, runs: [run, run + n_runs], tiles: [tile, tile + n_tiles] };
+    this.list = about.list.map(({ name, n_runs, n_tiles }) => {
+      const body = { name, runs: [run, run + n_runs], tiles: [tile, tile + n_tiles] };
       run += n_runs;
       tile += n_tiles;
       body.nTriangles = this.firstTriangle[run] - this.firstTriangle[run - n_runs];

@@ -95,7 +95,7 @@ export class SolidView {
     this.orbit = orbit;
     this.nSites = nSites;
     this.wantedSamples = renderer.isSlow ? 0 : SAMPLES;
-    this.parts = bodies.list.map((body) => ({ name: body.name, nTriangles: body.nTriangles, isClosed: body.isClosed, isVisible: true, painted: null, body }));
+    this.parts = bodies.list.map((body) => ({ name: body.name, nTriangles: body.nTriangles, isVisible: true, painted: null, body }));
     this.ground = [0, 0, 0];
     this.hovered = -1;
     this.pinned = -1;
@@ -283,14 +283,13 @@ export class SolidView {
     gl.uniformMatrix4fv(at.toClip, false, orbit.toClip);
     gl.uniform4f(at.cut, ...this._cutPlane());
     this._findPlanes(cx, cy, cz, unit);
-    // Open parts show their inside to an eye below, and only there.
-    const isAbove = target[2] + distance * orbit.toEye[2] >= orbit.low(2);
+    // Back faces are visible through a cut only.
+    if (this.cut) gl.disable(gl.CULL_FACE);
+    else gl.enable(gl.CULL_FACE);
     gl.activeTexture(gl.TEXTURE0);
     for (let k = 0; k < this.parts.length; k++) {
       const part = this.parts[k], { tiles } = part;
       if (!part.isVisible) continue;
-      if (!this.cut && (part.isClosed || isAbove)) gl.enable(gl.CULL_FACE);
-      else gl.disable(gl.CULL_FACE);
       if (at.part !== undefined) gl.uniform1ui(at.part, k + 1);
       gl.bindTexture(gl.TEXTURE_2D, part.colours);
       gl.bindVertexArray(part.vertices);
