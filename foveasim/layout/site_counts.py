@@ -25,6 +25,8 @@ SITE_TOLERANCE = 0.01
 GOOD_FRACTION, GOOD_FRACTION_OF_LAYOUTS = 1e-3, 4e-3
 #: Largest number of steps to a bracket, and within it; smallest and largest factor of a step.
 MAX_WIDENINGS, MAX_STEPS, MIN_FACTOR, MAX_FACTOR = 64, 64, 1.02, 2.0
+#: Powers of 2 around the guess that are tried until a value is valid; few with layouts, which may have very many sites.
+MAX_GUESSES, MAX_GUESSES_OF_LAYOUTS = 16, 2
 #: Exponent of the first step in the ratio of counts: above 1/2, the exponent of a length in the number of sites.
 STEP_EXPONENT = 0.7
 #: Integers on either side of the best one that are tried: counts of integer rings are not strictly monotonic, and not every
@@ -216,7 +218,7 @@ class _Search:
             guess = max(float(self.unknown.guess(self.target, self.parameters)), 1e-300)
         except (ArithmeticError, TypeError, ValueError):
             guess = 1.0  # the generator reports invalid parameters
-        for k in range(MAX_WIDENINGS // 4):
+        for k in range(MAX_GUESSES if self.unknown.count is not None else MAX_GUESSES_OF_LAYOUTS):
             for value in (self.round(guess * 2.0**-k), self.round(guess * 2.0**k)):
                 if self.count(value) is not None:
                     return value

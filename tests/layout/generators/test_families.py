@@ -200,12 +200,15 @@ def values_of(name, hint):
 
 @st.composite
 def parameters_of(draw, call):
-    """Random parameters of a generator; those with a default are often omitted."""
+    """Random parameters of a generator; those with a default are often omitted, and 'n_sites' always."""
     hints = get_type_hints(call)
+    unknowns = {unknown.name for unknown in call.solve_for if not unknown.is_optional}
     found = {}
     for name, parameter in inspect.signature(call).parameters.items():
+        if name == "n_sites":
+            continue
         values = values_of(name, hints[name])
-        is_required = parameter.default is inspect.Parameter.empty or name == "min_size_um"
+        is_required = parameter.default is inspect.Parameter.empty or name in {"min_size_um", *unknowns}
         if values is None:
             assert not is_required, f"no values for '{name}' of {call.__name__}: extend values_of"
         elif is_required or draw(st.booleans()):
