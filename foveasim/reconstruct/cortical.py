@@ -172,6 +172,7 @@ def cortical(layout: Layout, values: ArrayLike) -> CorticalImage:
     rounded = np.rint(2.0 * start) / 2.0
     start = np.where(np.abs(start - rounded) < SECTOR_ROUNDING, rounded, start)
     start_rad = (first_rad if abs(first_rad) > RING_ROUNDING * step_rad else 0.0) + start * step_rad
+    start_rad = np.where(np.abs(start_rad) < RING_ROUNDING * step_rad, 0.0, start_rad)
     are_adjacent = np.abs(smallest_um[1:] - largest_um[:-1]) <= RING_ROUNDING * largest_um[-1]
     if np.abs(lead - start[:, np.newaxis]).max() > SECTOR_ROUNDING or not are_adjacent.all():
         raise ParameterError("layout", "must have concentric rings of equal sectors", hint=RESAMPLE)
