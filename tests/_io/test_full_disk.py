@@ -39,7 +39,8 @@ pixels = modes.EventPixels(camera.sensor, contrast_on=0.2, contrast_off=0.2)
 events = pixels.events((np.exp(rng.normal(size=900)) * 1e5 for _ in range(9)), frame_s=1 / 60, seed=0)
 solids = view.solids(layout[:30])
 table = {
-    **{f"layout.{e}": layout.write for e in ("gds", "oas", "geojson", "parquet", "npz", "svg")},
+    **{f"layout.{e}": layout.write for e in ("geojson", "parquet", "npz", "svg")},
+    **{f"layout.{e}": lambda path: layout.write(path, hierarchy=False) for e in ("gds", "oas")},
     **{f"picture.{e}": lambda p: write_picture(p, noise) for e in ("png", "jpg", "webp", "bmp", "tga", "ppm", "jp2", "tif")},
     "16bit.png": lambda p: write_picture(p, noise.astype(np.uint16)),
     "picture.exr": lambda p: write_picture(p, noise.astype(np.float32)),
