@@ -12,7 +12,7 @@ import pytest
 import shapely
 
 import foveasim as fs
-from foveasim import config, distortion, explore, layout, metrics, modes, optics, reconstruct, sensor, video, view
+from foveasim import compare, config, distortion, explore, layout, metrics, modes, optics, reconstruct, sensor, video, view
 from foveasim._core.short_repr import format_field, short_repr
 from foveasim.layout import drc
 from foveasim.maps import Found
