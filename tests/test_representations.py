@@ -12,7 +12,20 @@ import pytest
 import shapely
 
 import foveasim as fs
-from foveasim import compare, config, distortion, explore, layout, metrics, modes, optics, reconstruct, sensor, video, view
+from foveasim import (
+    compare,
+    config,
+    distortion,
+    explore,
+    layout,
+    metrics,
+    modes,
+    optics,
+    reconstruct,
+    sensor,
+    video,
+    view,
+)
 from foveasim._core.short_repr import format_field, short_repr
 from foveasim.layout import drc
 from foveasim.maps import Found
@@ -115,6 +128,11 @@ def examples(tmp_path_factory):
         plan, explore.StudyPlan(base=plan, search={}, objectives={"m": "minimize"}, constraints={}, n_trials=1, batch=1, name="study", directory=directory, files={}),
         config.LayoutFile(layout=SITES, rules=fs.DesignRules(min_size_um=1.0), source="sites.npz"), config.Result(shot, capture, REPORT, 0.1), shot,
         config.Viewable(capture, REPORT, "capture"), drc.Case(SITES, fs.DesignRules(min_size_um=1.0)), drc.Measurement(MANY),
+        config.Source(file=Path("sweep.yaml"), keys=("shot",), index="3"), layout.SolveFor(name="n_x", is_integer=True, is_increasing=True, guess=len),
+        compare.budget_of(CAMERA, 30.0), compare.MEASURES["psnr_db"], compare.SceneCovariance(np.ones(50), np.ones(50)),
+        compare.quality_by_eccentricity(capture.picture(), capture.picture(), edges_um=np.array([0.0, 20.0])),
+        compare.cameras({"a": CAMERA, "b": CAMERA}, {"flat": SCENE}, exposure_s=0.01, n_annuli=2),
+        reconstruct.CorticalImage(data=np.ones((1, 20, 30)), radius_um=np.arange(21.0), start_rad=np.zeros(20)),
         dataset, explore.DatasetFile(dataset=dataset, per_shard=None), explore.open_dataset(directory / "samples"),
     ]  # fmt: skip
 

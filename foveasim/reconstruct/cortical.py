@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import (
     Floats,
     Images,
@@ -72,6 +73,8 @@ class CorticalImage:
     centre_um: tuple[float, float] = (0.0, 0.0)
     offset_um: float = 0.0
     sites: Ints | None = None
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         data = np.asarray(as_numbers("data", self.data, missing_is_nan=True))
