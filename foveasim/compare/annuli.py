@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats, Ints, check_number
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid
@@ -24,6 +25,9 @@ class PictureQuality(NamedTuple):
     psnr_db_by_eccentricity: Floats
     ssim_by_eccentricity: Floats
     gain: float
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def annulus_of(xy_um: Floats, centre_um: tuple[float, float], edges_um: Floats) -> Ints:

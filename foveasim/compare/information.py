@@ -111,6 +111,9 @@ class SceneCovariance:
     def __init__(self, amplitude: ArrayLike, sigma_um: ArrayLike) -> None:
         self.amplitude, self.sigma_um = np.asarray(amplitude, np.float64), np.asarray(sigma_um, np.float64)
 
+    def __repr__(self) -> str:
+        return f"SceneCovariance({self.amplitude.size} Gaussians)"
+
     def at(self, distance_um: ArrayLike) -> Floats:
         """Return the covariance of two points at a distance in µm."""
         d2 = np.square(np.asarray(distance_um, np.float64))[..., np.newaxis]
