@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from foveasim._core.user_warnings import warn
 from foveasim._core.validation import MAX_SITES, check_count
 from foveasim.errors import FoveasimError, ParameterError
 from foveasim.layout.model import Layout
@@ -139,7 +140,7 @@ def layout_with_n_sites(
             hint=f"the nearest is {layout.n_sites} with '{unknown.name}' = {shown}",
         )
     for warning in caught:
-        warnings.warn(warning.message, warning.category, stacklevel=4)
+        warn(str(warning.message), warning.category)
     return layout, value
 
 

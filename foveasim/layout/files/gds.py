@@ -24,7 +24,6 @@ References: Calma, GDSII Stream Format Manual 6.0 (1987); SEMI P39, OASIS.
 
 from __future__ import annotations
 
-import warnings
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -39,6 +38,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.extras import needs
 from foveasim._core.rings import positions_in_runs, ring_moments
+from foveasim._core.user_warnings import warn
 from foveasim._core.validation import MAX_SITES, Floats, Ints, check_number
 from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import FileFormat, as_file_error
@@ -486,11 +486,10 @@ def _warn_of_rounding(layout: Layout, snapped: Layout, dbu_um: float) -> None:
     vertex = int(np.argmax(displacement_nm))
     if displacement_nm[vertex] > ROUNDING_TOLERANCE_NM:
         site = int(np.searchsorted(layout.ring_offsets[layout.site_offsets], vertex, side="right")) - 1
-        warnings.warn(
+        warn(
             f"rounding to the database unit of {1e3 * dbu_um:g} nm moves a vertex of site {site} by "
             f"{displacement_nm[vertex]:.3g} nm, more than {ROUNDING_TOLERANCE_NM:g} nm; use dbu_um={DEFAULT_DBU_UM:g}",
             LayoutWarning,
-            stacklevel=5,
         )
 
 
