@@ -1066,7 +1066,7 @@ def test_sweep_file_imports_no_code(directory):
     result = subprocess.run([*COMMAND[:4], "bad.yaml"], cwd=directory, capture_output=True, text=True, check=False)
 
     assert result.returncode == 2
-    assert "'metrics' must be one of" in result.stderr
+    assert "'metrics' must be names of metrics" in result.stderr
     assert len(result.stderr.splitlines()) == 1
     assert not (directory / "imported").exists()
 
