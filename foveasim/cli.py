@@ -269,7 +269,9 @@ def compare(
     ),
     budget: Annotated[
         str,
-        typer.Option("--budget", help="Budget that must be equal: n_sites, data_rate, area, read_noise, or none."),
+        typer.Option(
+            "--budget", help="Budget that must be equal: n_sites, data_rate, readout_time, area, read_noise, or none."
+        ),
     ] = "n_sites",
     tolerance: Annotated[float, typer.Option("--tolerance", help="Largest relative difference of the budgets.")] = 0.02,
     pictures: Annotated[

@@ -1,4 +1,4 @@
-"""Budgets of cameras: number of sites, data rate, covered area, and read noise."""
+"""Budgets of cameras: number of sites, data rate, readout time, covered area, and read noise."""
 
 from __future__ import annotations
 
@@ -24,6 +24,9 @@ class Budget:
     n_sites : int
     data_rate_bit_per_s : float, bit/s
         Sum of bit depth times frame rate over all sites, without blanking.
+    readout_steps : int
+        Readout time in units of the time of one site: the number of sites on the longest readout line, as the lines are read
+        in parallel and the sites of a line in sequence.
     area_um2 : float, µm²
         Total area of the sites.
     read_noise_e2 : float, e-²
@@ -32,6 +35,7 @@ class Budget:
 
     n_sites: int
     data_rate_bit_per_s: float
+    readout_steps: int
     area_um2: float
     read_noise_e2: float
 
@@ -40,6 +44,7 @@ class Budget:
 BUDGETS = {
     "n_sites": ("n_sites", "number of sites", ""),
     "data_rate": ("data_rate_bit_per_s", "data rate", "bit/s"),
+    "readout_time": ("readout_steps", "readout time", "steps"),
     "area": ("area_um2", "area of the sites", "µm²"),
     "read_noise": ("read_noise_e2", "sum of read-noise variances", "e-²"),
 }
@@ -68,6 +73,7 @@ def budget_of(camera: Camera, frames_per_s: float) -> Budget:
     return Budget(
         n_sites=n_sites,
         data_rate_bit_per_s=n_sites * sensor.bits * frames_per_s,
+        readout_steps=int(np.unique(sensor.layout.readout_line, return_counts=True)[1].max(initial=0)),
         area_um2=float(sensor.layout.area_um2.sum()),
         read_noise_e2=float(np.square(np.broadcast_to(sensor.read_noise_e, (n_sites,))).sum()),
     )
@@ -80,7 +86,7 @@ def check_equal_budgets(budgets: Mapping[str, Budget], budget: str | None, toler
     Parameters
     ----------
     budgets : mapping of str to Budget
-    budget : {"n_sites", "data_rate", "area", "read_noise"} or None
+    budget : {"n_sites", "data_rate", "readout_time", "area", "read_noise"} or None
         The budget to compare; None for no check.
     tolerance : float
         Largest relative difference from the first camera.

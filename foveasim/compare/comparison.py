@@ -297,7 +297,7 @@ def cameras(
     exposure_s : float, s
     seed : int
         Seed of the noise, the same for all cameras.
-    budget : {"n_sites", "data_rate", "area", "read_noise"} or None
+    budget : {"n_sites", "data_rate", "readout_time", "area", "read_noise"} or None
         Budget that must be equal; None for any budgets.
     tolerance : float
         Largest relative difference of the budgets from that of the first camera.

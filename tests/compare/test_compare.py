@@ -106,6 +106,17 @@ def test_budgets_follow_from_the_sensor(foveal):
     assert found.data_rate_bit_per_s == foveal.n_sites * 12 * 25
     assert found.area_um2 == pytest.approx(sum(polygon.area for polygon in foveal.polygons()))
     assert found.read_noise_e2 == pytest.approx(sum(sigma**2 for sigma in noise_e))
+    assert found.readout_steps == max(
+        foveal.readout_line.tolist().count(line) for line in set(foveal.readout_line.tolist())
+    )
+
+
+def test_readout_time_is_longest_line():
+    wide = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=4.0), sensor=fs.Sensor(fs.layout.grid(30, 8, 2.0)))
+    single = wide.replace(sensor=fs.Sensor(wide.sensor.layout.with_columns(readout_line=np.zeros(240, np.int64))))
+
+    assert fs.compare.budget_of(wide, 30.0).readout_steps == 8  # columns are read in parallel
+    assert fs.compare.budget_of(single, 30.0).readout_steps == 240
 
 
 def test_unequal_budgets_are_rejected(scenes):
