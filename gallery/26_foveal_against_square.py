@@ -39,7 +39,7 @@ def compare() -> fs.compare.Comparison:
 
 def draw(found: fs.compare.Comparison) -> Figure:
     """Draw the pictures of one scene, and three measures against eccentricity."""
-    figure = Figure(figsize=(11.0, 7.2), layout="constrained")
+    figure = Figure(figsize=(8.0, 5.6), layout="constrained")
     axes = figure.subplots(2, 3)
     scene = found.scenes.index("astronaut")
     white = np.nanquantile(found.ideal[scene].data, 0.995)
@@ -62,7 +62,7 @@ def main(out_dir: Path) -> None:
     """Write the figure to a directory, and check the differences."""
     found = compare()
     figure = draw(found)
-    save_figure(figure, out_dir / "26_foveal_against_square.png", dpi=100)
+    save_figure(figure, out_dir / "26_foveal_against_square.png", dpi=140)
     print(found)
 
     (foveal, square), _ = found.summary("psnr_db", by_eccentricity=True)

@@ -141,6 +141,7 @@ def test_wrong_extensions_give_messages():
     with pytest.raises(ParameterError, match="'custom' must be a mapping of rule name to limit, got 3"):
         foveasim.DesignRules(custom=3)
     with pytest.raises(
-        ParameterError, match="'digits' is not an option of any format, got 3; possible: 'cell', 'layer'"
+        ParameterError,
+        match=r"'digits' is not an option of any format, got 3; possible: 'cell', 'channels', .*'layer', 'layers'",
     ):
         foveasim.read_layout("prima_100", digits=3)

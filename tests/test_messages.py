@@ -250,7 +250,7 @@ WRONG = {
     ),
     "kind of a schema": (
         lambda: explore.schema_of("shto"),
-        "'kind' must be one of 'shot', 'sweep', 'study', 'dataset', got 'shto'; did you mean 'shot'?",
+        "'kind' must be one of 'shot', 'layout', 'rules', 'sweep', 'study', 'dataset', got 'shto'; did you mean 'shot'?",
     ),
 }  # fmt: skip
 

@@ -154,7 +154,9 @@ def test_invalid_cameras_are_explained(change, message, foveal):
 def test_invalid_options_are_explained(foveal, scenes):
     pair = {"a": foveal, "b": foveal}
 
-    with pytest.raises(ParameterError, match="'budget' must be one of 'n_sites', 'data_rate', 'area', 'read_noise'"):
+    with pytest.raises(
+        ParameterError, match="'budget' must be one of 'n_sites', 'data_rate', 'readout_time', 'area', 'read_noise'"
+    ):
         fs.compare.layouts(pair, scenes, budget="sites")
     with pytest.raises(ParameterError, match="'frames_per_s' must have a rate for 'b'"):
         fs.compare.layouts(pair, scenes, frames_per_s={"a": 10.0})

@@ -333,10 +333,10 @@ def test_framing_follows_settings(shot_file):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ("scene.fit=crop", r"shot\.yaml: scene\.fit: must be 'cover', 'contain' or 'width', got \"crop\"$"),
+        ("scene.fit=crop", r"shot\.yaml: --set scene\.fit: must be one of 'cover', 'contain', 'width', got \"crop\"$"),
         (
             "scene.pitch_um=70",
-            r"shot\.yaml: scene\.fit: must not be given together with 'pitch_um', got 'cover'; choose one of .* to null$",
+            r"shot\.yaml:2:\d+: scene\.fit: must not be given together with 'pitch_um', got 'cover'; choose one of .* to null$",
         ),
         (
             "layout.move_um=[900, 0]; scene.fit=contain",

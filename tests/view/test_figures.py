@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from nbclient import NotebookClient
 
 import foveasim as fs
-from foveasim.view import figures, hidden_figures
+from foveasim.view.plots import figures, hidden_figures
 from foveasim.view.plots.figures import new_axes
 
 SITES = fs.layout.grid(4, 3, 2.0)

@@ -21,7 +21,7 @@ from foveasim.view.notebook._thumbnails import THUMBNAIL_PIXELS, encode_png
 from foveasim.view.site_colours import BACKGROUND
 
 MAX_THUMBNAIL_BYTES, MAX_HTML_BYTES = 60_000, 120_000
-SITES = fs.layout.log_polar(24, 54.7, min_size_um=2.0)
+SITES = fs.layout.log_polar(24, r_max_um=54.7, min_size_um=2.0)
 SENSOR = fs.Sensor(
     SITES, read_noise_e=1.5, prnu_fraction=0.01, dark_e_per_s=np.linspace(1.0, 2.0, SITES.n_sites), capacitance_f=5e-15
 )

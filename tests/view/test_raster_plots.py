@@ -130,7 +130,7 @@ def test_results_are_drawn_as_curves():
     assert np.array_equal(axes.lines[1].get_ydata(), transfer.temporal_variance_dn2[:, 1])
     assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
 
-    table = metrics.nyquist_vs_eccentricity(fs.layout.log_polar(24, 54.7, min_size_um=2.0), n_bins=4)
+    table = metrics.nyquist_vs_eccentricity(fs.layout.log_polar(24, r_max_um=54.7, min_size_um=2.0), n_bins=4)
     lines = {line.get_label(): line.get_ydata() for line in table.plot().lines}
     assert np.array_equal(lines["median"], table.nyquist_per_mm, equal_nan=True)
     assert list(lines) == ["highest", "median", "lowest"]

@@ -39,7 +39,9 @@ async ([source, state]) => {
     off: (event, call) => { listeners[event] = listeners[event].filter((each) => each !== call); },
     listeners,
   };
+  state.selected = new DataView(Uint8Array.from(state.selected).buffer);
   window.model.close = widget.render({ model: window.model, el: document.body });
+  await new Promise((done) => document.querySelector("iframe").addEventListener("load", done, { once: true }));
 }
 """
 #: Sets a trait of the model, as a message of the kernel does; bytes arrive as a view of a larger buffer.
@@ -83,11 +85,11 @@ def show(browser):
             page.evaluate(SET, [change.name, list(sent) if is_bytes else sent, is_bytes])
 
         page.expose_function("toPython", receive)
-        state = {name: widget.get_state(name)[name] for name in ("page", "height_px", "by", "pinned", "hovered")}
+        names = ("page", "height_px", "by", "pinned", "hovered", "selected")
+        state = {name: widget.get_state(name)[name] for name in names}
+        state["selected"] = list(state["selected"])
         page.evaluate(OPEN, [base64.b64encode(widget._esm.encode()).decode(), state])
-        page.evaluate(SET, ["selected", list(widget.get_state("selected")["selected"]), True])
         (frame,) = page.main_frame.child_frames
-        until(frame, lambda: frame.evaluate("Boolean(window.foveasim)"))
         frame.evaluate("foveasim.complete")
         widget.observe(send, ["by", "pinned", "selected", "height_px"])
         return page, frame
