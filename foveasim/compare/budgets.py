@@ -1,4 +1,4 @@
-"""Budgets of cameras: number of sites, data rate, readout time, covered area, and read noise."""
+"""Budgets of cameras: number of sites, data rate, readout time, area, and read noise."""
 
 from __future__ import annotations
 
