@@ -12,10 +12,10 @@ import functools
 import inspect
 import sys
 from collections.abc import Callable, Mapping
-from difflib import get_close_matches
 from types import FunctionType
 from typing import Any, ParamSpec, TypeVar, cast
 
+from foveasim._core.names import did_you_mean
 from foveasim.errors import ArgumentError
 
 __all__ = ["check_arguments", "check_public_calls"]
@@ -26,8 +26,6 @@ R = TypeVar("R")
 MAX_SIGNATURE = 150
 #: Characters of a default in a signature.
 MAX_DEFAULT = 12
-#: Similarity of a name to the closest parameter.
-MIN_SIMILARITY = 0.5
 #: Parameters that Python passes.
 BOUND = ("self", "cls")
 #: Attribute of checked functions.
@@ -121,9 +119,7 @@ def _find_problem(call: Callable[..., Any], args: tuple[Any, ...], kwargs: Mappi
     unknown = [] if inspect.Parameter.VAR_KEYWORD in kinds else [key for key in kwargs if key not in by_name]
     if unknown:
         free = [key for key in by_name if key not in given]
-        closest = get_close_matches(unknown[0], free, n=1, cutoff=MIN_SIMILARITY)
-        hint = f"did you mean '{closest[0]}'?" if closest else ""
-        return ArgumentError(unknown[0], f"must be an argument of {shown}", hint=hint)
+        return ArgumentError(unknown[0], f"must be an argument of {shown}", hint=did_you_mean(unknown[0], free))
     twice = [key for key in by_position[: len(args)] if key in kwargs]
     if twice:
         return ArgumentError(twice[0], f"must be given once, by position or by name: {shown}")

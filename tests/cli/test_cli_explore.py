@@ -131,7 +131,7 @@ def foveasim(folder, monkeypatch, capsys):
     return run
 
 
-def told(study):
+def results_of(study):
     """Return numbers, states, parameters and values of a study's trials."""
     return [(t.params, t.values, t.user_attrs.get("error")) for t in explore.finished_trials(study)]
 
@@ -165,7 +165,7 @@ def test_study_command_equals_call(foveasim, folder):
     code, said, wrong = foveasim("study", "study.yaml")
 
     assert (code, wrong) == (0, "")
-    assert told(stored(folder / "study.db")) == told(called)
+    assert results_of(stored(folder / "study.db")) == results_of(called)
     assert "wrote study.db: 14 trials" in said
     shown = [line.split() for line in said.splitlines() if len(line.split()) == 6 and line.split()[0].isdigit()]
     best = {trial.number: trial for trial in called.best_trials}
@@ -188,7 +188,7 @@ def test_extended_study_equals_longer_study(foveasim, folder):
     # Fewer trials than exist: the study is unchanged.
     assert "14 trials" in foveasim("study", "study.yaml", "--trials", 2, "--storage", "sqlite:///few.db")[1]
 
-    assert told(stored(folder / "few.db")) == told(called_study())
+    assert results_of(stored(folder / "few.db")) == results_of(called_study())
 
 
 def n_begun(path):
@@ -233,7 +233,7 @@ def test_study_interrupted_twice_resumes_identically(folder):
 
     assert ended(None, folder, 0) == (0, "")
     found = stored(folder / "study.db")
-    assert told(found) == told(called_study(n_trials=40))
+    assert results_of(found) == results_of(called_study(n_trials=40))
     assert {trial.user_attrs["patient"] > 0.0 for trial in explore.finished_trials(found)} == {True}
 
 
@@ -775,17 +775,17 @@ def test_results_depend_on_nested_layout_files(folder):
     (folder / "deep" / "layout.yaml").write_text(json.dumps({"generator": "voronoi", "parameters": density}))
     (folder / "shot.yaml").write_text(json.dumps(SHOT | {"layout": "deep/layout.yaml"}))
     (folder / "photographed.yaml").write_text(json.dumps(PHOTOGRAPHED | {"layout": "deep/layout.yaml"}))
-    told = []
+    plans = []
     for level in (100, 200):
         Image.fromarray(np.full((8, 8), level, np.uint8)).save(folder / "deep" / "density.png")
-        told.append(
+        plans.append(
             [
                 explore.plan_sweep(folder / "shot.yaml", {"sensor.bits": [8]}).to_dict(),
                 explore.Dataset(folder / "photos", folder / "photographed.yaml").to_dict(),
             ]
         )
 
-    for one, other in zip(*told, strict=True):
+    for one, other in zip(*plans, strict=True):
         assert [Path(file).name for file in one["files"]] == ["layout.yaml", "density.png"]
         assert {key for key in one if one[key] != other[key]} == {"files"}
 

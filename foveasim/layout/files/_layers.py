@@ -21,7 +21,6 @@ import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -29,6 +28,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from foveasim._core.names import possible_names
 from foveasim._core.registry import Registry
 from foveasim._core.validation import check_count, check_number
 from foveasim.errors import ConfigError, ParameterError
@@ -263,9 +263,7 @@ def _drawn_layer(name: str, value: Any, filter_names: Sequence[str]) -> DrawnLay
         channel = parse_channel("layers", name.removeprefix(FILTER), filter_names)
     elif name != PHOTOSITE and name not in DERIVED_LAYERS:
         known = [PHOTOSITE, *(FILTER + n for n in filter_names), *DERIVED_LAYERS]
-        closest = get_close_matches(name.replace(" ", "_").replace("-", "_"), known, n=1)
-        hint = f"did you mean '{closest[0]}'?" if closest else f"available: {', '.join(known)}"
-        raise ParameterError("layers", "must have names of layers as keys", name, hint=hint)
+        raise ParameterError("layers", "must have names of layers as keys", name, hint=possible_names(name, known))
     if isinstance(value, Mapping):
         parameters = dict(value)
         value = parameters.pop("layer", None)

@@ -185,7 +185,7 @@ def test_registered_derived_layer_is_written(bayer, tmp_path, monkeypatch):
         ({}, "'layers' must be a mapping of names to layers"),
         ({"well": 2}, "'layers' must contain the layer 'photosite'"),
         ({"photosite": 1, "metal keep-out": 2}, "got 'metal keep-out'; did you mean 'metal_keep_out'?"),
-        ({"photosite": 1, "nonsense": 2}, "available: photosite, filter_R, .*, well"),
+        ({"photosite": 1, "nonsense": 2}, "possible: 'photosite', 'filter_R', .*, 'well'"),
         ({"photosite": 1, "well": "1/0"}, "'photosite' and 'well' are both 1/0"),
         ({"photosite": "77:3"}, r"'layers\[photosite\]' must be a layer, such as \(77, 3\) or '77/3', got '77:3'"),
         ({"photosite": (1, 2, 3)}, "must be a layer"),
