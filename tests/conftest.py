@@ -11,6 +11,9 @@ from pathlib import Path
 
 import pytest
 
+# Processes that tests start read the package as bytecode, without compilation of every module.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 
 def renderer_is_missing():
     from foveasim.view import find_renderer
