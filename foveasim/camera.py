@@ -490,7 +490,7 @@ class Camera:
         return {
             "optics": to_plain_data(self._optics),
             "distortion": None if self._distortion is None else to_plain_data(self._distortion),
-            "sensor": {k: v for k, v in to_plain_data(self._sensor).items() if k != "layout"},
+            "sensor": to_plain_data(self._sensor, without=("layout",)),
             "layout": to_plain_data(dict(self._layout.provenance)),
         }
 
@@ -791,17 +791,30 @@ class Camera:
         smallest = min(integrators, key=lambda integrator: integrator.grid.cell_area_um2)
         self._warn_of_coverage(source, smallest, is_moving=position_um is not None)
         rate_e_per_s = np.zeros(self._layout.n_sites)
-        for image, cells, weight in maps:
+        for image, cells, where, weight in maps:
             with clock.stage("integration"):
-                rate_e_per_s += weight * w_from_w_m2_um2(integrators[image](cells))
+                if image == 0 and weight is None:  # each site belongs to one filter
+                    integrators[0](cells, where=where, out=rate_e_per_s)
+                else:
+                    power = integrators[image](cells, where=where)
+                    rate_e_per_s += power if weight is None else np.multiply(power, weight, out=power)
             del cells
-        self._check_rates(light, rate_e_per_s)
-        return np.maximum(rate_e_per_s, 0.0)
+        with clock.stage("integration"):
+            rate_e_per_s *= w_from_w_m2_um2(1.0)
+            self._check_rates(light, rate_e_per_s)
+            return np.maximum(rate_e_per_s, 0.0, out=rate_e_per_s)
+
+    @cached_property
+    def _sites_of_filter(self) -> dict[int, Bools | None]:
+        """Sites of each filter that occurs, (n_site,); None for all sites."""
+        filter_of_site = self._sensor.filter_of_site
+        used = [int(c) for c in np.flatnonzero(np.bincount(filter_of_site))]
+        return dict.fromkeys(used) if len(used) == 1 else {c: read_only(filter_of_site == c) for c in used}
 
     def _bands(self, power_map: PowerMap, e_per_j: Floats) -> Iterator[_WeightedMap]:
         """Yield each band of a power map, with every site's photoelectrons per joule in it."""
         for band, cells in enumerate(power_map.data):
-            yield _WeightedMap(0, cells, e_per_j[self._sensor.filter_of_site, band])
+            yield _WeightedMap(0, cells, None, e_per_j[self._sensor.filter_of_site, band])
 
     def _images(
         self,
@@ -813,12 +826,11 @@ class Camera:
         cached: ImageCache | None,
     ) -> Iterator[_WeightedMap]:
         """
-        Yield the photoelectron map of each filter, with weight 1 at its sites and 0 at others.
+        Yield the photoelectron map of each filter, with its sites.
 
         One inverse transform per filter and image, for any number of wavelengths.
         """
-        filter_of_site = self._sensor.filter_of_site
-        used = np.unique(filter_of_site)
+        used = np.array(list(self._sites_of_filter), np.int64)
 
         # As a function, without a reference in this generator: one map is in memory at a time.
         def image(grid: Grid, c: int, maps: Iterator[NDArray[Any]]) -> NDArray[Any]:
@@ -833,16 +845,20 @@ class Camera:
             new = used if cached is None else np.array([c for c in used if (grid, c) not in cached], np.int64)
             maps = optics.weighted_maps(scene, e_per_j[new] * is_in_image, grid=grid, n_threads=self._n_threads)
             for c in used:
-                yield _WeightedMap(k, image(grid, c, maps), (filter_of_site == c).astype(np.float64))
+                yield _WeightedMap(k, image(grid, int(c), maps), self._sites_of_filter[int(c)], None)
 
     def _check_rates(self, light: Scene | PowerMap, rate_e_per_s: Floats) -> None:
         """Raise or warn when rates are not finite, or negative beyond rounding."""
+        # Minimum and maximum propagate NaN, and need no array.
+        lowest, highest = (float(find(rate_e_per_s, initial=0.0)) for find in (np.min, np.max))
+        if lowest == 0.0 and highest < np.inf:
+            return
         if not np.isfinite(rate_e_per_s).all():
             bad = int(np.flatnonzero(~np.isfinite(rate_e_per_s))[0])
             raise SimulationError(
                 f"irradiance on site {bad} must be finite; the power map contains NaN or infinity there"
             )
-        is_negative = rate_e_per_s < -NEGATIVE_ROUNDING * float(rate_e_per_s.max(initial=0.0))
+        is_negative = rate_e_per_s < -NEGATIVE_ROUNDING * highest
         if not is_negative.any():
             return
         order = self.order(light)
@@ -880,7 +896,7 @@ class Camera:
         if fit in ("contain", "width"):
             return
         image_um, layout_um = integrator.grid.bounds_um, integrator.bounds_um
-        n_uncovered = int(np.count_nonzero(integrator.uncovered_um2)) - n_outside
+        n_uncovered = integrator.n_uncovered - n_outside
         if n_uncovered:
             remedy = (
                 "use fit='cover', or a larger pitch_um or field_of_view_deg"
@@ -914,11 +930,17 @@ class Camera:
 
 
 class _WeightedMap(NamedTuple):
-    """A power map, the index of its grid, and a weight for every site's power, (n_site,)."""
+    """
+    A power map, and the index of its grid.
+
+    ``where`` are the sites that it contributes to, (n_site,), None for all; ``weight`` is a factor on their powers, (n_site,),
+    None for 1.
+    """
 
     image: int
     cells: NDArray[Any]
-    weight: Floats
+    where: Bools | None
+    weight: Floats | None
 
 
 class _Clock:

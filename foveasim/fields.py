@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Grid",
+    "Lattice",
     "PackedRings",
     "Pitch",
     "PointMap",
@@ -66,6 +67,32 @@ class PackedRings(Protocol):
 
         Site s has the rings ``site_offsets[s] : site_offsets[s + 1]``; outer rings are counter-clockwise.
         """
+
+
+class Lattice(Protocol):
+    """Rectangles in rows and columns: site ``row * n_column + column`` is ``x_um[column]`` by ``y_um[row]``."""
+
+    @property
+    def x_um(self) -> Floats:
+        """Lower and upper x of each column, (n_column, 2)."""
+
+    @property
+    def y_um(self) -> Floats:
+        """Lower and upper y of each row, (n_row, 2)."""
+
+    @property
+    def n_sites(self) -> int:
+        """Number of sites."""
+
+    @property
+    def bounds_um(self) -> tuple[float, float, float, float]:
+        """Bounding box x_min, y_min, x_max, y_max."""
+
+    def rings(self, first: int = 0, last: int | None = None) -> tuple[Floats, Ints, Ints]:
+        """Return packed rings of the sites ``first`` to ``last - 1``."""
+
+    def site_bounds_um(self) -> Floats:
+        """Return x_min, y_min, x_max, y_max of each site, (n_site, 4)."""
 
 
 class PointMap(Protocol):

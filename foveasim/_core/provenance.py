@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib.metadata import version
@@ -22,11 +22,12 @@ MAX_LISTED_VALUES = 64
 _ATOMS = frozenset({str, int, float, bool, type(None)})
 
 
-def to_plain_data(value: Any) -> Any:
+def to_plain_data(value: Any, *, without: Collection[str] = ()) -> Any:
     """
     Convert an object to plain data: numbers, strings, lists and dicts.
 
-    A dataclass becomes a dict of its class name and public fields; a large array becomes its shape, dtype and SHA-256.
+    A dataclass becomes a dict of its class name and public fields, except those in ``without``; a large array becomes its
+    shape, dtype and SHA-256.
     """
     if value is None or isinstance(value, bool | int | float | str):
         return value
@@ -44,7 +45,11 @@ def to_plain_data(value: Any) -> Any:
     if is_dataclass(value):
         return {
             "kind": type(value).__name__,
-            **{f.name: to_plain_data(getattr(value, f.name)) for f in fields(value) if not f.name.startswith("_")},
+            **{
+                f.name: to_plain_data(getattr(value, f.name))
+                for f in fields(value)
+                if not f.name.startswith("_") and f.name not in without
+            },
         }
     return repr(value)
 

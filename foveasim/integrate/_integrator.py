@@ -11,19 +11,17 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.rings import site_area_um2
 from foveasim._core.threads import thread_count
-from foveasim._core.validation import Floats, Ints, check_choice, check_count, finite_array, read_only, unmasked
+from foveasim._core.validation import Floats, Ints, check_choice, check_count, finite_array, unmasked
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid, PackedRings, PointMap
 from foveasim.integrate._outlines import Outlines, UndistortedOutlines, outlines_of
 from foveasim.integrate._plan import Plan, compile_plan
+from foveasim.integrate._rectangles import LatticePlan, RectanglePlan, rectangle_plan
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 __all__ = ["Integrator"]
-
-#: Tolerance for rounding errors of vertices outside the grid, relative to the largest grid coordinate.
-UNCOVERED_ROUNDING = 1e-12
 
 
 class Integrator:
@@ -105,7 +103,8 @@ class Integrator:
         order: Literal[1, 2] = 1,
         n_threads: int | None = None,
     ) -> None:
-        if not all(hasattr(layout, name) for name in ("xy_um", "ring_offsets", "site_offsets")):
+        has_lattice = getattr(layout, "lattice", None) is not None
+        if not has_lattice and not all(hasattr(layout, name) for name in ("xy_um", "ring_offsets", "site_offsets")):
             raise ParameterError("layout", f"must be a Layout or packed rings, got a {type(layout).__name__}")
         if not isinstance(grid, Grid):
             raise ParameterError("grid", f"must be a Grid, got a {type(grid).__name__}")
@@ -120,26 +119,41 @@ class Integrator:
             if not hasattr(distortion, "undistort"):
                 raise ParameterError("distortion", "must be a lens of foveasim.distortion", distortion)
             outlines = UndistortedOutlines(layout, distortion, min(grid.pitch_x_um, grid.pitch_y_um))
-        self._plan: Plan = compile_plan(outlines, layout.site_offsets.size - 1, grid, self.n_threads, self.order)
+        self._layout, self._outlines = layout, outlines
+        self._gain: Floats | None = None
+        rectangles = rectangle_plan(layout, grid, self.order) if distortion is None else None
+        if rectangles is not None:
+            self._passes: Plan | RectanglePlan | LatticePlan = rectangles
+            return
+        self._passes, area_um2 = self._compile()
+        is_outside = self._passes.coverage.is_outside
+        if distortion is not None and (conserve == "density" or is_outside.any()):
+            self._gain = np.where(is_outside, 0.0, 1.0)
+            if conserve == "density":
+                self._gain *= site_area_um2(layout.xy_um, layout.ring_offsets, layout.site_offsets) / area_um2
+
+    def _compile(self) -> tuple[Plan, Floats]:
+        """Return the spans of all outlines, and their areas."""
+        n_sites = self._layout.n_sites if hasattr(self._layout, "n_sites") else self._layout.site_offsets.size - 1
+        plan, area_um2 = compile_plan(self._outlines, n_sites, self.grid, self.n_threads, self.order)
         # A lens preserves the winding: the undistorted image of a clockwise outline is also clockwise.
-        clockwise = np.flatnonzero(self._plan.area_um2 <= 0.0)
+        clockwise = np.flatnonzero(area_um2 <= 0.0)
         if clockwise.size:
             raise GeometryError(
                 f"the outline of site {clockwise[0]} must be counter-clockwise with a positive area; use Layout.from_polygons",
                 tuple(int(i) for i in clockwise),
             )
-        self._gain: Floats | None = None
-        if distortion is not None and (conserve == "density" or self._plan.is_outside.any()):
-            self._gain = np.where(self._plan.is_outside, 0.0, 1.0)
-            if conserve == "density":
-                self._gain *= (
-                    site_area_um2(layout.xy_um, layout.ring_offsets, layout.site_offsets) / self._plan.area_um2
-                )
+        return plan, area_um2
+
+    @cached_property
+    def _plan(self) -> Plan:
+        """Spans of all outlines; rectangles need them for matrices and adjoints only."""
+        return self._passes if isinstance(self._passes, Plan) else self._compile()[0]
 
     @property
     def sites_outside_image_circle(self) -> Ints:
         """Indices of sites outside the image circle of the lens, which receive no power."""
-        return np.flatnonzero(self._plan.is_outside)
+        return np.flatnonzero(self._passes.coverage.is_outside)
 
     def __repr__(self) -> str:
         return f"Integrator({self.n_sites} sites on {self.grid})"
@@ -147,52 +161,55 @@ class Integrator:
     @property
     def n_sites(self) -> int:
         """Number of sites."""
-        return self._plan.n_sites
+        return self._passes.n_sites
 
-    @cached_property
+    @property
     def bounds_um(self) -> tuple[float, float, float, float]:
         """
         Bounding box (x_min, y_min, x_max, y_max) of the outlines in the plane of the map, µm.
 
         Sites outside the image circle do not count; NaN without others.
         """
-        bounds_um = self._plan.bounds_um[~self._plan.is_outside]
-        if not bounds_um.size:
-            return np.nan, np.nan, np.nan, np.nan
-        x0, y0 = bounds_um[:, :2].min(axis=0).tolist()
-        x1, y1 = bounds_um[:, 2:].max(axis=0).tolist()
-        return x0, y0, x1, y1
+        return self._passes.coverage.bounds_um
 
-    @cached_property
+    @property
     def uncovered_um2(self) -> Floats:
         """
         Area of each site outside the grid or the image circle, (n_site,) µm².
 
         Areas are measured in the plane of the map.
         """
-        plan, (x_min, y_min, x_max, y_max) = self._plan, self.grid.bounds_um
-        rounding_um = UNCOVERED_ROUNDING * max(map(abs, self.grid.bounds_um))
-        low_um, high_um = plan.bounds_um[:, :2], plan.bounds_um[:, 2:]
-        beyond_um = np.maximum(np.array([x_min, y_min]) - low_um, high_um - np.array([x_max, y_max])).max(
-            axis=1, initial=-np.inf
-        )
-        rest_um2 = np.clip(plan.area_um2 - plan.covered_um2, 0.0, plan.area_um2)
-        rest_um2 = np.where(beyond_um > rounding_um, rest_um2, 0.0)
-        return read_only(np.where(plan.is_outside, plan.area_um2, rest_um2))
+        return self._passes.coverage.uncovered_um2
 
-    def __call__(self, power_map: ArrayLike) -> Floats:
+    @cached_property
+    def n_uncovered(self) -> int:
+        """Number of sites that extend beyond the grid or the image circle."""
+        return self._passes.coverage.n_uncovered
+
+    def __call__(self, power_map: ArrayLike, *, where: ArrayLike | None = None, out: Floats | None = None) -> Floats:
         """
-        Integrate a map over every site.
+        Integrate a map over every site, or over some of them.
 
         Parameters
         ----------
         power_map : (..., n_y, n_x) float32 or float64
             Cell means, bottom row first. Other dtypes are converted to float64. A site that reads a NaN returns NaN. Masked
             arrays are rejected, because the value of a masked cell is undefined.
+        where : (n_site,) bool, optional
+            Sites to integrate; by default all. The cells of other sites are not read: with a mosaic of filters, the maps of all
+            filters together cost little more than one map.
+        out : (..., n_site) float64, optional
+            Array for the result; its elements where ``where`` is False remain unchanged.
 
         Returns
         -------
         power : (..., n_site) float64, unit of the map times µm²
+            ``out``, or a new array with 0 where ``where`` is False.
+
+        Raises
+        ------
+        ParameterError
+            When an array has another shape or type.
         """
         power_map = unmasked("power_map", power_map)
         try:
@@ -214,12 +231,29 @@ class Integrator:
             if not np.can_cast(cells.dtype, np.float64):
                 raise ParameterError("power_map", f"must contain real numbers, got the dtype {cells.dtype}")
             cells = cells.astype(np.float64)
-        power = np.empty((*cells.shape[:-2], self.n_sites))
+        shape = *cells.shape[:-2], self.n_sites
+        mask = np.zeros(0, bool)
+        if where is not None:
+            mask = np.ascontiguousarray(where)
+            if mask.dtype != np.bool_ or mask.shape != (self.n_sites,):
+                raise ParameterError(
+                    "where", f"must be {self.n_sites} booleans, one per site, got {mask.dtype} of shape {mask.shape}"
+                )
+        power = out
+        if power is None:
+            power = np.zeros(shape) if where is not None else np.empty(shape)
+        elif not (
+            isinstance(power, np.ndarray)
+            and power.dtype == np.float64
+            and power.shape == shape
+            and power.flags.c_contiguous
+        ):
+            raise ParameterError("out", f"must be a C-contiguous float64 array of shape {shape}", out)
         for band in np.ndindex(*cells.shape[:-2]):
-            power[band] = self._plan.gather(np.ascontiguousarray(cells[band]), self.n_threads)
-        power *= self.grid.cell_area_um2
+            cell_means = np.ascontiguousarray(cells[band])
+            self._passes.gather(cell_means, power[band], self.grid.cell_area_um2, mask, self.n_threads)
         if self._gain is not None:
-            power *= self._gain
+            np.multiply(power, self._gain, out=power, where=mask if mask.size else True)
         return power
 
     def spread(self, values: ArrayLike) -> Floats:

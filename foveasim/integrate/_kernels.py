@@ -5,17 +5,18 @@ Coordinates are in *cells* of the grid, ``u = (x - x0) / pitch_x`` to the right 
 that cell ``[iy, ix]`` is the unit square from ``(ix, iy)`` to ``(ix + 1, iy + 1)``.
 
 By Green's theorem the overlap of a site with a cell is a sum over the edges of the site (:func:`trace_sites`). The
-result is stored run-length encoded. A **span** is one row of ``spans``, five integers: a site, a row of the grid, a
-first column, the number ``n_partial`` of cells with individual weights (their overlap with the site, 0 to 1), and the
-number ``n_run`` of subsequent cells with one common weight (the interior of the site: 1). A frame then costs one pass
-over the map, a multiplication for each cell that an outline cuts, and additions in the interior (:func:`gather`). No sum
-runs along a complete row, so a bright source does not reduce the precision of a dark site in the same row.
+result is stored run-length encoded. A **span** is one row of ``spans``, integers: a site, a first column, the number
+``n_partial`` of cells with individual weights (their overlap with the site, 0 to 1), the number ``n_run`` of subsequent
+cells with one common weight (the interior of the site: 1), and while sites are traced the row of the grid. A frame then
+costs one pass over the map, a multiplication for each cell that an outline cuts, and additions in the interior
+(:func:`gather`). No sum runs along a complete row, so a bright source does not reduce the precision of a dark site in the
+same row.
 
-At **second order** the cells that an outline cuts are also listed as rows of ``cuts`` (a site, a row, a column), each
-with a row of ``moments``: the first moments of the overlap about the cell centre, along u and along v, divided by the
-distance in cells between the two neighbours whose difference is the gradient (2; 1 at the boundary of the map, where the
-cell itself replaces the missing neighbour). Cells that are covered completely have no moments, and their neighbours are
-not read. At first order both arrays are empty.
+At **second order** the cells that an outline cuts are also listed as rows of ``cuts`` (a site, a column, and while sites
+are traced a row), each with a row of ``moments``: the first moments of the overlap about the cell centre, along u and along
+v, divided by the distance in cells between the two neighbours whose difference is the gradient (2; 1 at the boundary of the
+map, where the cell itself replaces the missing neighbour). Cells that are covered completely have no moments, and their
+neighbours are not read. At first order both arrays are empty.
 
 The kernels use arrays only, release the global interpreter lock, and are compiled for explicit types when this module
 is imported; the machine code is cached on disk.
@@ -30,6 +31,7 @@ from foveasim._core.jit import njit
 
 __all__ = [
     "COLUMN",
+    "CUT_ROW",
     "N_PARTIAL",
     "N_RUN",
     "ROW",
@@ -43,9 +45,11 @@ __all__ = [
     "trace_sites",
 ]
 
-#: Columns of ``spans``; the first three are also the columns of ``cuts``. In a finished plan the first column is the index
-#: of the accumulator instead of the site.
-SITE, ROW, COLUMN, N_PARTIAL, N_RUN = range(5)
+#: Columns of ``spans``. A finished plan is in the order of the rows and has no column ``ROW``; its first column is the index of
+#: the accumulator instead of the site.
+SITE, COLUMN, N_PARTIAL, N_RUN, ROW = range(5)
+#: Third column of ``cuts`` while sites are traced; the first two are as in ``spans``.
+CUT_ROW = 2
 
 #: Cells per block of the partial sums of a row: fastest measured value (eight float32 convert to one vector of float64).
 BLOCK = 8
@@ -68,6 +72,7 @@ def _input(dtype, ndim):
 _ints = _input(types.int64, 1)
 _floats = _input(types.float64, 1)
 _points = _input(types.float64, 2)
+_flags = _input(types.boolean, 1)
 _spans = _input(types.int32, 2)
 _cuts = _input(types.int32, 2)
 _count = types.int64
@@ -330,7 +335,7 @@ def _write_cuts(first_cell, links, moment, climb, n_y, n_x, site, row, cuts, mom
             v_moment = v_moment if abs(v_moment) > rounding else 0.0
             if u_moment != 0.0 or v_moment != 0.0:
                 cuts[n_cuts, SITE] = site
-                cuts[n_cuts, ROW] = row
+                cuts[n_cuts, CUT_ROW] = row
                 cuts[n_cuts, COLUMN] = c
                 moments[n_cuts, 0] = u_moment * _gradient_scale(c, n_x)
                 moments[n_cuts, 1] = v_moment * _gradient_scale(row, n_y)
@@ -542,7 +547,6 @@ def sort_spans(spans, weights, next_span, next_weight, first_slot, rows_per_band
         to = next_span[row]
         next_span[row] += 1
         out_spans[to, SITE] = first_slot[spans[i, SITE]] + row // rows_per_band
-        out_spans[to, ROW] = row
         out_spans[to, COLUMN] = spans[i, COLUMN]
         out_spans[to, N_PARTIAL] = spans[i, N_PARTIAL]
         out_spans[to, N_RUN] = spans[i, N_RUN]
@@ -561,12 +565,11 @@ def sort_cuts(cuts, moments, next_cut, first_slot, rows_per_band, out_cuts, out_
     """Copy cuts and their moments into row order, as :func:`sort_spans`."""
     i = 0
     while i < cuts.shape[0]:
-        site, row = cuts[i, SITE], cuts[i, ROW]
+        site, row = cuts[i, SITE], cuts[i, CUT_ROW]
         slot = first_slot[site] + row // rows_per_band
         to = next_cut[row]
-        while i < cuts.shape[0] and cuts[i, ROW] == row and cuts[i, SITE] == site:
+        while i < cuts.shape[0] and cuts[i, CUT_ROW] == row and cuts[i, SITE] == site:
             out_cuts[to, SITE] = slot
-            out_cuts[to, ROW] = row
             out_cuts[to, COLUMN] = cuts[i, COLUMN]
             out_moments[to, 0] = moments[i, 0]
             out_moments[to, 1] = moments[i, 1]
@@ -582,20 +585,25 @@ def _add_gradients(cells, row, row_cuts, cuts, moments, slots):
     line, below, above = cells[row], cells[max(row - 1, 0)], cells[min(row + 1, n_y - 1)]
     for i in range(row_cuts[row], row_cuts[row + 1]):
         c = cuts[i, COLUMN]
-        along_u = float(line[min(c + 1, n_x - 1)]) - float(line[max(c - 1, 0)])
-        along_v = float(above[c]) - float(below[c])
+        # numpy's type: ``float`` of a float32 is a float32 in numba.
+        along_u = np.float64(line[min(c + 1, n_x - 1)]) - np.float64(line[max(c - 1, 0)])
+        along_v = np.float64(above[c]) - np.float64(below[c])
         slots[cuts[i, SITE]] += moments[i, 0] * along_u + moments[i, 1] * along_v
 
 
 @njit(
     [
-        types.void(_input(cell, 2), _count, _count, _ints, _ints, _spans, _floats, _ints, _cuts, _points, _float_list)
+        types.void(
+            _input(cell, 2), _count, _count, _ints, _ints, _spans, _floats, _ints, _cuts, _points, _flags, _float_list
+        )
         for cell in (types.float32, types.float64)
     ],
 )
-def gather(cells, first_row, last_row, row_spans, row_weights, spans, weights, row_cuts, cuts, moments, slots):
+def gather(cells, first_row, last_row, row_spans, row_weights, spans, weights, row_cuts, cuts, moments, where, slots):
     """
     Add weight x cell over the rows ``first_row .. last_row - 1`` of a map to the slots.
+
+    Slots where ``where`` is False are not computed; an empty array stands for all True.
 
     The map is read in a single pass: each row is summed in blocks of ``BLOCK`` cells, which the runs of spans use. The four
     neighbours of a cell in ``cuts`` are read again for moment x gradient while they are in the processor cache.
@@ -618,6 +626,9 @@ def gather(cells, first_row, last_row, row_spans, row_weights, spans, weights, r
             column = spans[i, COLUMN]
             n_partial = spans[i, N_PARTIAL]
             n_run = spans[i, N_RUN]
+            if where.size > 0 and not where[spans[i, SITE]]:
+                p += n_partial + (1 if n_run > 0 else 0)
+                continue
             total = 0.0
             for k in range(n_partial):
                 total += weights[p + k] * line[column + k]

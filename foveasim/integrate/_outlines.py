@@ -9,7 +9,7 @@ import numpy as np
 
 from foveasim._core.rings import next_vertex, positions_in_runs
 from foveasim._core.validation import Bools, Floats, Ints
-from foveasim.fields import PackedRings, PointMap
+from foveasim.fields import Lattice, PackedRings, PointMap
 
 __all__ = ["Outlines", "UndistortedOutlines", "outline_bounds_um", "outlines_of"]
 
@@ -37,6 +37,9 @@ class Outlines(NamedTuple):
 
 def outlines_of(layout: PackedRings, first: int, last: int) -> Outlines:
     """Return the outlines of the sites ``first`` to ``last - 1`` in the sensor plane."""
+    lattice: Lattice | None = getattr(layout, "lattice", None)
+    if lattice is not None:
+        return Outlines(*lattice.rings(first, last), np.zeros(last - first, bool))
     site_offsets = layout.site_offsets[first : last + 1]
     ring_offsets = layout.ring_offsets[site_offsets[0] : site_offsets[-1] + 1]
     return Outlines(
@@ -118,10 +121,14 @@ def outline_bounds_um(layout: PackedRings, distortion: PointMap | None = None) -
     x_min, y_min, x_max, y_max : float, µm
         NaN if there are no sites. With a lens, curved edges are within 1e-6 of the larger side of the layout.
     """
+    lattice: Lattice | None = getattr(layout, "lattice", None)
+    if lattice is not None and distortion is None:
+        return lattice.bounds_um
     xy_um, n_sites = layout.xy_um, layout.site_offsets.size - 1
     if not xy_um.size:
         return np.nan, np.nan, np.nan, np.nan
-    low_um, high_um = xy_um.min(axis=0), xy_um.max(axis=0)
+    # Column by column: many times faster than a reduction along axis 0.
+    low_um, high_um = (np.array([find(xy_um[:, axis]) for axis in (0, 1)]) for find in (np.min, np.max))
     if distortion is not None:
         tolerance_um = BOUNDS_TOLERANCE * float((high_um - low_um).max())
         outlines_between = UndistortedOutlines(layout, distortion, tolerance_um / CHORD_TOLERANCE)

@@ -13,6 +13,7 @@ from foveasim._core.rings import positions_in_runs, to_frame
 from foveasim._core.threads import parallel_map
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.fields import Grid
+from foveasim.integrate._coverage import Coverage
 from foveasim.integrate._outlines import Outlines
 
 if TYPE_CHECKING:
@@ -41,11 +42,11 @@ class Plan:
     n_sites : int
     row_spans, row_weights : (n_y + 1,) int64
         Index of the first span and the first weight of each row.
-    spans : (n_span, 5) int32
+    spans : (n_span, 4) int32
     weights : (n_weight,) float64
     row_cuts : (n_y + 1,) int64
         Index of the first cut of each row.
-    cuts : (n_cut, 3) int32
+    cuts : (n_cut, 2) int32
         Cells that an outline cuts; empty at first order.
     moments : (n_cut, 2) float64
         Weights of the differences of the neighbours along x and along y.
@@ -53,12 +54,8 @@ class Plan:
         Height of the bands of rows that are summed separately.
     first_slot : (n_site + 1,) int64
         Site s has the slots ``first_slot[s] : first_slot[s + 1]``, one per band.
-    area_um2, covered_um2 : (n_site,) float64, µm²
-        Area of each outline, and its area on the grid.
-    bounds_um : (n_site, 4) float64, µm
-        Bounds of each outline: x_min, y_min, x_max, y_max.
-    is_outside : (n_site,) bool
-        Sites with a vertex outside the image circle.
+    coverage : Coverage
+        Position of the sites relative to the grid and the image circle.
     """
 
     grid: Grid
@@ -72,10 +69,7 @@ class Plan:
     moments: Floats
     rows_per_band: int
     first_slot: Ints
-    area_um2: Floats
-    covered_um2: Floats
-    bounds_um: Floats
-    is_outside: Bools
+    coverage: Coverage
 
     def _pass(self, kernel: Callable[..., None], read: NDArray[Any], written: NDArray[Any], n_threads: int) -> None:
         """Run a kernel over all bands of rows, which write to disjoint elements."""
@@ -88,21 +82,35 @@ class Plan:
 
         parallel_map(band, range(0, n_y, self.rows_per_band), 1 if n_y * n_x <= SMALL_MAP else n_threads)
 
-    def gather(self, cells: NDArray[Any], n_threads: int) -> Floats:
+    def gather(self, cells: NDArray[np.floating], out: Floats, scale: float, where: Bools, n_threads: int) -> None:
         """
-        Return the sum of weight x cell for every site, (n_site,).
+        Write scale x sum of weight x cell for every site.
 
-        The map is (n_y, n_x) float32 or float64, C-contiguous.
+        Parameters
+        ----------
+        cells : (n_y, n_x) float32 or float64
+            C-contiguous map.
+        out : (n_site,) float64
+        scale : float
+        where : (n_site,) or (0,) bool
+            Sites that are computed; other elements of ``out`` are unchanged. Empty for all sites.
+        n_threads : int
         """
         from foveasim.integrate import _kernels
 
+        n_slots = np.diff(self.first_slot)
         slots = np.zeros(int(self.first_slot[-1]))
-        self._pass(_kernels.gather, cells, slots, n_threads)
+        is_needed = np.repeat(where, n_slots) if where.size else where
+
+        def kernel(read: NDArray[Any], first_row: int, last_row: int, *arrays: NDArray[Any]) -> None:
+            _kernels.gather(read, first_row, last_row, *arrays[:-1], is_needed, arrays[-1])
+
+        self._pass(kernel, cells, slots, n_threads)
         sums = np.zeros(self.n_sites)
-        is_on_grid = np.diff(self.first_slot) > 0
+        is_on_grid = n_slots > 0
         if is_on_grid.any():
             sums[is_on_grid] = np.add.reduceat(slots, self.first_slot[:-1][is_on_grid])
-        return sums
+        np.multiply(sums, scale, out=out, where=where if where.size else True)
 
     def scatter(self, values: Floats, n_threads: int) -> Floats:
         """Return the sum of weight x site value for every cell, (n_y, n_x): the adjoint of gather."""
@@ -131,7 +139,7 @@ class Plan:
         k = positions_in_runs(n_cells)
         at = np.repeat(first_weight, n_cells) + np.minimum(k, np.repeat(n_partial, n_cells))
         n_y, n_x = self.grid.shape
-        start = self.spans[:, _kernels.ROW].astype(np.int64) * n_x + self.spans[:, _kernels.COLUMN]
+        start = np.repeat(np.arange(n_y) * n_x, np.diff(self.row_spans)) + self.spans[:, _kernels.COLUMN]
         cell = np.repeat(start, n_cells) + k
         slot_site = np.repeat(np.arange(self.n_sites), np.diff(self.first_slot))
         site = np.repeat(slot_site[self.spans[:, _kernels.SITE]], n_cells)
@@ -143,7 +151,8 @@ class Plan:
 
     def _gradients(self, slot_site: Ints) -> tuple[Floats, Ints, Ints]:
         """Return the matrix entries of the cuts: weights, sites and cells."""
-        slot, row, column = self.cuts.T.astype(np.int64)
+        slot, column = self.cuts.T.astype(np.int64)
+        row = np.repeat(np.arange(self.grid.shape[0]), np.diff(self.row_cuts))
         weights, sites, cells = [], [], []
         # Offsets of the neighbours (rows up, columns to the right), and the axis and sign of the difference.
         for up, right, axis, sign in ((0, 1, 0, 1), (0, -1, 0, -1), (1, 0, 1, 1), (-1, 0, 1, -1)):
@@ -173,9 +182,9 @@ class _TracedSites(NamedTuple):
 
 def compile_plan(
     outlines: Callable[[int, int], Outlines], n_sites: int, grid: Grid, n_threads: int, order: int = 1
-) -> Plan:
+) -> tuple[Plan, Floats]:
     """
-    Trace every outline on the grid and sort the spans by the rows of the grid.
+    Trace every outline on the grid and sort the spans by the rows of the grid; also return the signed areas, (n_site,) µm².
 
     ``outlines(first, last)`` returns the outlines of the sites ``first`` to ``last - 1``. It is called for one piece of the
     layout at a time, so that undistorted outlines are traced while they are in the cache, and memory use is limited.
@@ -202,9 +211,9 @@ def compile_plan(
     n_bands = np.where(last_row > first_row, (last_row - 1) // rows_per_band - first_row // rows_per_band + 1, 0)
     first_slot = np.concatenate(([0], np.cumsum(n_bands)))
 
-    out_spans = np.empty((int(row_spans[-1]), 5), np.int32)
+    out_spans = np.empty((int(row_spans[-1]), 4), np.int32)
     out_weights = np.empty(int(row_weights[-1]))
-    out_cuts = np.empty((int(row_cuts[-1]), 3), np.int32)
+    out_cuts = np.empty((int(row_cuts[-1]), 2), np.int32)
     out_moments = np.empty((int(row_cuts[-1]), 2))
     slot_of_band_0 = first_slot[:-1] - first_row // rows_per_band
 
@@ -214,7 +223,8 @@ def compile_plan(
         _kernels.sort_cuts(t.cuts, t.moments, next_cut[i], *slots, out_cuts, out_moments)
 
     parallel_map(sort, range(len(traced)), n_threads)
-    return Plan(
+    area_um2 = np.concatenate([np.zeros(0), *(t.area_um2 for t in traced)])
+    plan = Plan(
         grid=grid,
         n_sites=n_sites,
         row_spans=row_spans,
@@ -226,11 +236,15 @@ def compile_plan(
         moments=out_moments,
         rows_per_band=rows_per_band,
         first_slot=first_slot,
-        area_um2=np.concatenate([np.zeros(0), *(t.area_um2 for t in traced)]),
-        covered_um2=np.concatenate([np.zeros(0), *(t.covered_um2 for t in traced)]),
-        bounds_um=bounds_um,
-        is_outside=np.concatenate([np.zeros(0, bool), *(t.is_outside for t in traced)]),
+        coverage=Coverage.of_sites(
+            grid,
+            bounds_um,
+            area_um2,
+            np.concatenate([np.zeros(0), *(t.covered_um2 for t in traced)]),
+            np.concatenate([np.zeros(0, bool), *(t.is_outside for t in traced)]),
+        ),
     )
+    return plan, area_um2
 
 
 def _trace(outlines: Outlines, first_site: int, grid: Grid, order: int) -> _TracedSites:
@@ -250,7 +264,7 @@ def _trace(outlines: Outlines, first_site: int, grid: Grid, order: int) -> _Trac
         moments,
         row_spans=np.bincount(spans[:, _kernels.ROW], minlength=n_y),
         row_weights=np.bincount(spans[:, _kernels.ROW], n_weights, minlength=n_y).astype(np.int64),
-        row_cuts=np.bincount(cuts[:, _kernels.ROW], minlength=n_y),
+        row_cuts=np.bincount(cuts[:, _kernels.CUT_ROW], minlength=n_y),
         area_um2=area_um2,
         covered_um2=covered * grid.cell_area_um2,
         bounds_um=bounds_um,

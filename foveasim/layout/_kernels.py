@@ -13,6 +13,7 @@ __all__ = [
     "aspect_ratios",
     "colour_greedily",
     "contacts",
+    "fill_rectangles",
     "intersecting_boxes",
     "min_widths",
     "overhangs",
@@ -28,6 +29,19 @@ _flags = types.Array(types.boolean, 1, "C")
 #: corners of octagons and the almost right angles between a chord and a side would count as widths. No two edges of a regular
 #: polygon enclose an angle with this cosine.
 MIN_FACING_COSINE = 0.9
+
+
+@njit(types.void(_points, _points, types.int64, types.float64[:, ::1]))
+def fill_rectangles(x, y, first, xy):
+    """Write the corners of the sites of a lattice from site ``first`` on, counter-clockwise, four rows of ``xy`` each."""
+    n_x = x.shape[0]
+    for k in range(xy.shape[0] // 4):
+        row, column = (first + k) // n_x, (first + k) % n_x
+        x0, x1, y0, y1 = x[column, 0], x[column, 1], y[row, 0], y[row, 1]
+        xy[4 * k, 0], xy[4 * k, 1] = x0, y0
+        xy[4 * k + 1, 0], xy[4 * k + 1, 1] = x1, y0
+        xy[4 * k + 2, 0], xy[4 * k + 2, 1] = x1, y1
+        xy[4 * k + 3, 0], xy[4 * k + 3, 1] = x0, y1
 
 
 @njit()

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.random_streams import Streams
-from foveasim._core.validation import check_count, finite_array
+from foveasim._core.validation import check_count, finite_array, freeze
 from foveasim.errors import ParameterError
 from foveasim.layout.adjacency import adjacency
 from foveasim.layout.model import Layout
@@ -66,10 +66,14 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
             f"must have the columns {' or '.join(' and '.join(p) for p in INDEX_COLUMNS)}, got {sorted(layout.columns)}",
             hint="set the column with with_columns(channel=...)",
         )
-    channels = np.array([[names.index(letter) for letter in row] for row in rows])
-    row, column = (layout.index_column(name) for name in pair)
-    return layout._with_columns(  # noqa: SLF001 -- of the same subpackage
-        {"channel": channels[row % channels.shape[0], column % channels.shape[1]]},
+    channels = np.array([[names.index(letter) for letter in row] for row in rows], np.int16)
+    row, column = (layout._checked_indices(name) for name in pair)  # noqa: SLF001 -- of the same subpackage
+    n_rows, n_columns = (np.array(n, np.uint16) for n in channels.shape)
+    position = (row % n_rows).astype(np.int32)
+    position *= n_columns
+    position += column % n_columns
+    return layout._with_columns(  # noqa: SLF001
+        {"channel": freeze(channels.ravel()[position])},
         f"mosaic {' '.join(rows)} of {names}",
     )
 

@@ -34,10 +34,13 @@ from foveasim._core.validation import (
     check_number,
     exact_integers,
     finite_array,
+    freeze,
+    own,
     read_only,
     unmasked,
 )
 from foveasim.errors import GeometryError, ParameterError, printable
+from foveasim.layout.lattice import RectangleLattice
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,6 +55,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Layout"]
 
+#: Arrays of the outlines.
+RINGS = ("xy_um", "ring_offsets", "site_offsets")
 #: A smaller extent of a layout indicates wrong units.
 MIN_LAYOUT_UM = 1e-3
 #: Area of a ring, relative to its bounding box, below which it is degenerate in float64.
@@ -113,10 +118,20 @@ class Layout:
     site_offsets: Ints
     columns: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    #: Rows and columns of rectangles whose vertices are computed when they are read, or None.
+    lattice: RectangleLattice | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self._store()
         _require_valid_holes(self)
+
+    def __getattr__(self, name: str) -> Any:
+        # Only called for attributes that are not set: the rings of a lattice.
+        if name not in RINGS or self.lattice is None:
+            raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'")
+        for ring_name, array in zip(RINGS, self.lattice.rings(), strict=True):
+            object.__setattr__(self, ring_name, freeze(array))
+        return getattr(self, name)
 
     @classmethod
     def _from_checked(cls, *fields: Any) -> Layout:
@@ -131,34 +146,42 @@ class Layout:
     def with_provenance(self, provenance: Mapping[str, Any]) -> Layout:
         """Return the layout with another provenance record of plain data."""
         layout = object.__new__(type(self))
-        for name in ("xy_um", "ring_offsets", "site_offsets", "columns"):
-            object.__setattr__(layout, name, getattr(self, name))
+        layout.__dict__.update(self.__dict__)
         object.__setattr__(layout, "provenance", MappingProxyType(copy_plain_data(dict(provenance))))
         return layout
 
     def _store(self) -> None:
-        """Check the structure of the fields, and store read-only copies."""
-        xy_um = finite_array("xy_um", self.xy_um, ndim=2)
-        if xy_um.shape[1:] != (2,):
+        """Check the structure of the fields, and store read-only arrays."""
+        xy_um = as_numbers("xy_um", self.xy_um)
+        if xy_um.ndim != 2:
+            raise ParameterError("xy_um", f"must have 2 dimensions, got the shape {xy_um.shape}")
+        if xy_um.shape[1] != 2:
             raise ParameterError("xy_um", f"must have the shape (n_vertex, 2), got {xy_um.shape}")
         ring_offsets = _offsets("ring_offsets", self.ring_offsets, 3, xy_um.shape[0], "vertices")
         site_offsets = _offsets("site_offsets", self.site_offsets, 1, ring_offsets.size - 1, "rings")
-        if xy_um.size and np.abs(xy_um).max() > MAX_LENGTH_UM:
-            raise GeometryError(f"the layout must lie within {MAX_LENGTH_UM:g} µm of the origin; coordinates are in µm")
+        if xy_um.size:
+            # Minimum and maximum propagate NaN, and need no array as large as the vertices.
+            largest_um = max(-float(xy_um.min()), float(xy_um.max()))
+            if not np.isfinite(largest_um):
+                finite_array("xy_um", xy_um)  # raises an error with the position
+            _require_near_origin(largest_um)
+        object.__setattr__(self, "xy_um", own(np.ascontiguousarray(xy_um)))
+        object.__setattr__(self, "ring_offsets", own(ring_offsets))
+        object.__setattr__(self, "site_offsets", own(site_offsets))
+        self._store_columns()
+
+    def _store_columns(self) -> None:
+        """Check columns and provenance, and store them as read-only data."""
         columns = {}
         for name, values in self.columns.items():
             column = _column(name, values)
-            if column.shape != (site_offsets.size - 1,):
+            if column.shape != (self.n_sites,):
                 raise ParameterError(
-                    name,
-                    f"must have one value for each of the {site_offsets.size - 1} sites, got the shape {column.shape}",
+                    name, f"must have one value for each of the {self.n_sites} sites, got the shape {column.shape}"
                 )
             if name in INDEX_NAMES:
                 _require_indices(name, column)
-            columns[name] = read_only(column)
-        object.__setattr__(self, "xy_um", read_only(np.array(xy_um, order="C")))
-        object.__setattr__(self, "ring_offsets", read_only(ring_offsets))
-        object.__setattr__(self, "site_offsets", read_only(site_offsets))
+            columns[name] = column
         object.__setattr__(self, "columns", MappingProxyType(columns))
         object.__setattr__(self, "provenance", MappingProxyType(copy_plain_data(self.provenance)))
 
@@ -198,6 +221,35 @@ class Layout:
         return cls.from_equal_rings(corners, columns, {"made_by": "from_rectangles"})
 
     @classmethod
+    def from_lattice(
+        cls,
+        lattice: RectangleLattice,
+        columns: Mapping[str, ArrayLike] | None = None,
+        provenance: Mapping[str, Any] | None = None,
+    ) -> Layout:
+        """
+        Build a layout of rectangles in rows and columns, whose vertices are computed when they are read.
+
+        Parameters
+        ----------
+        lattice : RectangleLattice
+        columns, provenance : mappings
+            As for the class.
+
+        Raises
+        ------
+        GeometryError
+            When a coordinate is too large.
+        """
+        if lattice.n_sites:
+            _require_near_origin(float(np.abs(lattice.bounds_um).max()))
+        layout = object.__new__(cls)
+        for name, value in (("lattice", lattice), ("columns", columns or {}), ("provenance", provenance or {})):
+            object.__setattr__(layout, name, value)
+        layout._store_columns()
+        return layout
+
+    @classmethod
     def from_equal_rings(
         cls,
         rings_um: Floats,
@@ -215,13 +267,9 @@ class Layout:
             As for the class.
         """
         n_sites, n_vertices = rings_um.shape[:2]
-        return cls(
-            rings_um.reshape(-1, 2),
-            np.arange(n_sites + 1) * n_vertices,
-            np.arange(n_sites + 1),
-            {name: _column(name, values) for name, values in (columns or {}).items()},
-            provenance or {},
-        )
+        site_offsets = freeze(np.arange(n_sites + 1))
+        xy_um, ring_offsets = rings_um.reshape(-1, 2), freeze(n_vertices * site_offsets)
+        return cls(xy_um, ring_offsets, site_offsets, cast(Any, columns or {}), provenance or {})
 
     @classmethod
     def from_polygons(
@@ -304,15 +352,17 @@ class Layout:
     @property
     def n_sites(self) -> int:
         """Number of photosites."""
-        return self.site_offsets.size - 1
+        return self.site_offsets.size - 1 if self.lattice is None else self.lattice.n_sites
 
     def __len__(self) -> int:
         return self.n_sites
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Read-only mappings cannot be pickled.
-        fields = (self.xy_um, self.ring_offsets, self.site_offsets, dict(self.columns), dict(self.provenance))
-        return Layout._from_checked, fields
+        data = dict(self.columns), dict(self.provenance)
+        if self.lattice is not None:
+            return Layout.from_lattice, (self.lattice, *data)
+        return Layout._from_checked, (self.xy_um, self.ring_offsets, self.site_offsets, *data)
 
     def __repr__(self) -> str:
         origin = self.provenance.get("generator", self.provenance.get("made_by", "packed rings"))
@@ -342,6 +392,10 @@ class Layout:
         ParameterError
             When the layout has no such column, or its values are not valid indices.
         """
+        return self._checked_indices(name).astype(np.int64)
+
+    def _checked_indices(self, name: str) -> NDArray[np.integer[Any]]:
+        """Return a column of indices with its own type of integers."""
         if name not in self.columns:
             hint = possible_names(name, sorted(self.columns))
             raise ParameterError(name, "must be a column of the layout", hint=hint)
@@ -349,11 +403,14 @@ class Layout:
         if column.dtype.kind not in "iu":
             raise ParameterError(name, f"must contain integers from 0 to {MAX_SITES}", column)
         _require_indices(name, column)
-        return column.astype(np.int64)
+        return column
 
     @cached_property
     def _moments(self) -> tuple[Floats, Floats]:
-        area_um2, centroid_um = site_moments(self.xy_um, self.ring_offsets, self.site_offsets)
+        if self.lattice is not None:
+            area_um2, centroid_um = self.lattice.moments()
+        else:
+            area_um2, centroid_um = site_moments(self.xy_um, self.ring_offsets, self.site_offsets)
         return read_only(area_um2), read_only(centroid_um)
 
     @property
@@ -369,6 +426,8 @@ class Layout:
     @cached_property
     def site_bounds_um(self) -> Floats:
         """Bounding box (x_min, y_min, x_max, y_max) of each site, (n_site, 4) µm."""
+        if self.lattice is not None:
+            return read_only(self.lattice.site_bounds_um())
         return read_only(site_bounds_um(self.xy_um, self.ring_offsets, self.site_offsets))
 
     @property
@@ -376,6 +435,8 @@ class Layout:
         """Bounding box (x_min, y_min, x_max, y_max) of the layout, µm."""
         if self.n_sites == 0:
             raise GeometryError("the layout has no sites, so its bounds are undefined")
+        if self.lattice is not None:
+            return self.lattice.bounds_um
         x_um, y_um = self.xy_um[:, 0], self.xy_um[:, 1]  # separately: many times faster than a reduction along axis 0
         return float(x_um.min()), float(y_um.min()), float(x_um.max()), float(y_um.max())
 
@@ -462,15 +523,18 @@ class Layout:
         return self._with_columns(columns, f"columns {', '.join(columns)} set")
 
     def _with_columns(self, columns: Mapping[str, ArrayLike], step: str) -> Layout:
-        merged = {**self.columns, **{name: _column(name, values) for name, values in columns.items()}}
-        return Layout._from_checked(
-            self.xy_um, self.ring_offsets, self.site_offsets, merged, self._extend_provenance(step)
-        )
+        layout = self.with_provenance(self._extend_provenance(step))
+        object.__setattr__(layout, "columns", {**self.columns, **columns})
+        layout._store_columns()  # noqa: SLF001 -- of the same class
+        return layout
 
     def translate(self, dx_um: float, dy_um: float) -> Layout:
         """Translate the layout by (dx, dy) in µm."""
-        step = np.array([check_number("dx_um", dx_um), check_number("dy_um", dy_um)])
-        return self._with_vertices(self.xy_um + step, f"translated by ({dx_um:g}, {dy_um:g}) µm")
+        shift_um = np.array([check_number("dx_um", dx_um), check_number("dy_um", dy_um)])
+        step = f"translated by ({dx_um:g}, {dy_um:g}) µm"
+        if self.lattice is not None:
+            return Layout.from_lattice(self.lattice.scaled(1.0, shift_um), self.columns, self._extend_provenance(step))
+        return self._with_vertices(self.xy_um + shift_um, step)
 
     def rotate(self, angle_deg: float, origin_um: tuple[float, float] = (0.0, 0.0)) -> Layout:
         """Rotate counter-clockwise about a point; multiples of 90° about the origin are exact."""
@@ -487,7 +551,11 @@ class Layout:
         """Scale the layout about a point."""
         factor = check_number("factor", factor, above=0.0)
         centre = _point("origin_um", origin_um)
-        return self._with_vertices((self.xy_um - centre) * factor + centre, f"scaled by {factor:g}")
+        step = f"scaled by {factor:g}"
+        if self.lattice is not None:
+            about = self.lattice.scaled(1.0, -centre).scaled(factor, centre)
+            return Layout.from_lattice(about, self.columns, self._extend_provenance(step))
+        return self._with_vertices((self.xy_um - centre) * factor + centre, step)
 
     def _with_vertices(self, xy_um: Floats, step: str) -> Layout:
         return Layout._from_checked(
@@ -562,10 +630,10 @@ class Layout:
 
 def _offsets(name: str, offsets: ArrayLike, at_least: int, total: int, item_name: str) -> Ints:
     """Return offsets as int64 after checks of their range and smallest step."""
-    array = np.array(unmasked(name, offsets))
+    array = np.asarray(unmasked(name, offsets))
     if array.ndim != 1 or array.size < 1 or array.dtype.kind not in "iu":
         raise ParameterError(name, "must be a list of integers", offsets)
-    array = array.astype(np.int64)
+    array = np.ascontiguousarray(array, np.int64)
     if array[0] != 0 or array[-1] != total:
         raise ParameterError(name, f"must begin at 0 and end at {total}, the number of {item_name}", array)
     small = np.flatnonzero(np.diff(array) < at_least)
@@ -577,10 +645,10 @@ def _offsets(name: str, offsets: ArrayLike, at_least: int, total: int, item_name
 
 
 def _column(name: str, values: ArrayLike) -> NDArray[Any]:
-    """Convert a data column to an array of numbers or strings."""
+    """Convert a data column to a read-only array of numbers or strings."""
     values = unmasked(name, values)
     try:
-        column = np.array(values)
+        column = own(np.asarray(values))
     except ValueError:
         raise ParameterError(name, "must have one value for each site", values) from None
     is_as_given = isinstance(values, np.ndarray) and values.dtype.kind == "f"
@@ -590,10 +658,15 @@ def _column(name: str, values: ArrayLike) -> NDArray[Any]:
             integers = exact_integers([int(item) for item in items])
             if integers is None:
                 raise ParameterError(name, f"must contain {INTEGER_RANGES}", values)
-            return integers
+            return read_only(integers)
     if column.dtype.hasobject:
         raise ParameterError(name, "must be an array of numbers or strings", values)
     return column
+
+
+def _require_near_origin(largest_um: float) -> None:
+    if largest_um > MAX_LENGTH_UM:
+        raise GeometryError(f"the layout must lie within {MAX_LENGTH_UM:g} µm of the origin; coordinates are in µm")
 
 
 def _require_indices(name: str, column: NDArray[Any]) -> None:

@@ -8,9 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from foveasim._core.validation import Floats, check_count, check_length_um, check_number, check_sites, finite_array
+from foveasim._core.validation import (
+    Floats,
+    check_count,
+    check_length_um,
+    check_number,
+    check_sites,
+    finite_array,
+    freeze,
+)
 from foveasim.errors import ParameterError
 from foveasim.layout.families import layout_family
+from foveasim.layout.lattice import RectangleLattice
 from foveasim.layout.model import Layout
 from foveasim.layout.site_counts import SolveFor
 
@@ -105,18 +114,22 @@ def grid(
         pitch_y_um = check_length_um("pitch_y_um", pitch_y_um)
         if width_um is not None:
             raise ParameterError("width_um", "must be replaced by 'trench_um' if 'pitch_y_um' is given", width_um)
-    fractions = [
-        linear_fill_factor(p_um, width_um, trench_um, fill_factor)
-        for p_um in (pitch_um, pitch_um if pitch_y_um is None else pitch_y_um)
-    ]
+    pitches_um = pitch_um, pitch_um if pitch_y_um is None else pitch_y_um
+    fractions = [linear_fill_factor(p_um, width_um, trench_um, fill_factor) for p_um in pitches_um]
     check_sites(n_x * n_y)
-    row, column = (index.ravel() for index in np.divmod(np.arange(n_y * n_x), n_x))
-    shift = 0.5 * (row % 2) - 0.25 * (n_y > 1) if stagger else 0.0
+    # 32 bits: products of an index and the number of columns do not overflow.
+    row = freeze(np.repeat(np.arange(n_y, dtype=np.int32), n_x))
+    column = freeze(np.tile(np.arange(n_x, dtype=np.int32), n_y))
+    columns = {"row": row, "column": column, "readout_line": column}
+    if not stagger:
+        x_um, y_um = (
+            (np.arange(n)[:, np.newaxis] - 0.5 * n + cell_interval(fraction)) * p_um
+            for n, fraction, p_um in zip((n_x, n_y), fractions, pitches_um, strict=True)
+        )
+        return Layout.from_lattice(RectangleLattice(x_um, y_um), columns)
+    shift: Floats = 0.5 * (row % 2) - 0.25 * (n_y > 1)
     corners = square_corners_um(column - 0.5 * n_x + shift, row - 0.5 * n_y, pitch_um, pitch_y_um, fractions)
-    return Layout.from_equal_rings(
-        corners,
-        {"row": row, "column": column, "readout_line": column},
-    )
+    return Layout.from_equal_rings(corners, columns)
 
 
 def cells_in_field(
@@ -185,6 +198,12 @@ def linear_fill_factor(
     return None
 
 
+def cell_interval(fraction: float | None) -> Floats:
+    """Return both ends of a centred fraction of the interval from 0 to 1, or of all of it, (2,)."""
+    margin = 0.0 if fraction is None else 0.5 * (1.0 - fraction)
+    return np.array([margin, 1.0 - margin])
+
+
 def square_corners_um(
     x: Floats,
     y: Floats,
@@ -198,7 +217,6 @@ def square_corners_um(
     ``x`` and ``y`` are the lower left corners of the cells in pitches. Corners that neighbours share are bit-identical when
     cells tile.
     """
-    margins = [0.0 if fraction is None else 0.5 * (1.0 - fraction) for fraction in fractions]
-    (x0, y0), (x1, y1) = margins, [1.0 - margin for margin in margins]
+    (x0, x1), (y0, y1) = (cell_interval(fraction) for fraction in fractions)
     steps = np.stack([np.stack((x + dx, y + dy), axis=-1) for dx, dy in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], 1)
     return np.asarray(steps * np.array([pitch_um, pitch_um if pitch_y_um is None else pitch_y_um]))

@@ -1,0 +1,89 @@
+"""Areas of sites outside a grid or outside the image circle of a lens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from foveasim._core.validation import Bools, Floats, read_only
+from foveasim.fields import Grid
+
+__all__ = ["Coverage"]
+
+#: Tolerance for rounding errors of vertices outside the grid, relative to the largest grid coordinate.
+UNCOVERED_ROUNDING = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """
+    Position of sites relative to a grid and to the image circle.
+
+    Attributes
+    ----------
+    bounds_um : (x_min, y_min, x_max, y_max), µm
+        Bounds of all outlines inside the image circle; NaN without any.
+    uncovered_um2 : (n_site,) float64, µm²
+        Area of each site outside the grid or the image circle; without memory if all are 0.
+    is_outside : (n_site,) bool
+        Sites with a vertex outside the image circle; without memory if there are none.
+    """
+
+    bounds_um: tuple[float, float, float, float]
+    uncovered_um2: Floats
+    is_outside: Bools
+
+    @property
+    def n_uncovered(self) -> int:
+        """Number of sites that are partly or completely uncovered."""
+        return 0 if self.uncovered_um2.strides == (0,) else int(np.count_nonzero(self.uncovered_um2))
+
+    @classmethod
+    def within(cls, grid: Grid, bounds_um: tuple[float, float, float, float], n_sites: int) -> Coverage | None:
+        """Return the coverage of sites that all lie on a grid, or None if their bounds exceed it."""
+        if n_sites and not bool(_beyond_um(grid, np.array([bounds_um]))[0] <= 0.0):
+            return None
+        return cls(bounds_um, np.broadcast_to(0.0, n_sites), np.broadcast_to(np.False_, n_sites))
+
+    @classmethod
+    def of_sites(
+        cls, grid: Grid, bounds_um: Floats, area_um2: Floats, covered_um2: Floats, is_outside: Bools | None = None
+    ) -> Coverage:
+        """
+        Return the coverage of sites.
+
+        Parameters
+        ----------
+        grid : Grid
+        bounds_um : (n_site, 4) float64, µm
+        area_um2, covered_um2 : (n_site,) float64, µm²
+            Area of each outline, and its area on the grid.
+        is_outside : (n_site,) bool, optional
+            Sites outside the image circle.
+        """
+        n_sites = area_um2.size
+        if is_outside is None or not is_outside.any():
+            is_outside = np.broadcast_to(np.False_, n_sites)
+        inside_um = bounds_um if not is_outside.any() else bounds_um[~is_outside]
+        extent_um = (np.nan, np.nan, np.nan, np.nan)
+        if inside_um.size:
+            x0, y0, x1, y1 = (
+                float(find(inside_um[:, k])) for find, k in ((np.min, 0), (np.min, 1), (np.max, 2), (np.max, 3))
+            )
+            extent_um = x0, y0, x1, y1
+        if not is_outside.any():
+            complete = cls.within(grid, extent_um, n_sites)
+            if complete is not None:
+                return complete
+        rest_um2 = np.clip(area_um2 - covered_um2, 0.0, area_um2)
+        rest_um2 = np.where(_beyond_um(grid, bounds_um) > 0.0, rest_um2, 0.0)
+        return cls(extent_um, read_only(np.where(is_outside, area_um2, rest_um2)), is_outside)
+
+
+def _beyond_um(grid: Grid, bounds_um: Floats) -> Floats:
+    """Return the distance of bounds beyond the grid, more than by rounding, (n,) µm; at most 0 inside."""
+    x0, y0, x1, y1 = grid.bounds_um
+    rounding_um = UNCOVERED_ROUNDING * max(map(abs, grid.bounds_um))
+    beyond_um = np.maximum(np.array([x0, y0]) - bounds_um[:, :2], bounds_um[:, 2:] - np.array([x1, y1]))
+    return np.asarray(beyond_um.max(axis=1, initial=-np.inf) - rounding_um)

@@ -1,0 +1,268 @@
+"""
+Numba kernels for axis-aligned rectangles: recognition, and integration without a plan.
+
+Coordinates are in cells of the grid, as in ``_kernels``. The overlap of a rectangle with a cell is the product of the overlaps
+along x and along y. Along an axis a rectangle covers the cells ``first`` to ``last``, the outermost ones partly:
+
+    low                          high             weight 1 between, w_first and w_last at the ends
+     ├────┼─────────┼─────────┼───┤               moments about the centre of a cell: m_first, m_last
+    first                      last
+
+At second order the integral over a cell is ``mean * area + gradient_u * moment_u + gradient_v * moment_v``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import types
+
+from foveasim._core.jit import njit
+
+__all__ = ["find_rectangles", "gather_lattice", "gather_rectangles"]
+
+#: Covered fractions of the outermost cells up to this value are rounding errors.
+NO_COVERAGE = 4e-15
+#: Number of independent partial sums along a row.
+BLOCK = 8
+
+
+def _input(dtype, ndim):
+    return types.Array(dtype, ndim, "C", readonly=True)
+
+
+_ints = _input(types.int64, 1)
+_points = _input(types.float64, 2)
+_flags = _input(types.boolean, 1)
+
+
+@njit(types.float64[:, ::1](_points, _ints, _ints))
+def find_rectangles(xy, ring_offsets, site_offsets):
+    """
+    Return x_min, y_min, x_max, y_max of every site, (n_site, 4), or (0, 4) if a site is not an axis-aligned rectangle.
+
+    Clockwise outlines, and rectangles without an area, are not recognised.
+    """
+    n_sites = site_offsets.size - 1
+    if ring_offsets.size - 1 != n_sites or xy.shape[0] != 4 * n_sites:
+        return np.empty((0, 4))
+    # Most other layouts are recognised by their first sites, before memory is allocated.
+    for n in (min(n_sites, 4), n_sites):
+        out = np.empty((n, 4))
+        for site in range(n):
+            i = ring_offsets[site]
+            if ring_offsets[site + 1] != i + 4:
+                return np.empty((0, 4))
+            if xy[i, 1] != xy[i + 1, 1]:  # the first edge is vertical
+                i += 1
+            a, b, c, d = i, i + 1, i + 2, i + 3
+            d = d if d < ring_offsets[site + 1] else ring_offsets[site]
+            if not (xy[a, 1] == xy[b, 1] and xy[b, 0] == xy[c, 0] and xy[c, 1] == xy[d, 1] and xy[d, 0] == xy[a, 0]):
+                return np.empty((0, 4))
+            width, height = xy[b, 0] - xy[a, 0], xy[c, 1] - xy[b, 1]
+            if not ((width > 0.0 and height > 0.0) or (width < 0.0 and height < 0.0)):
+                return np.empty((0, 4))
+            out[site, 0], out[site, 1] = min(xy[a, 0], xy[c, 0]), min(xy[a, 1], xy[c, 1])
+            out[site, 2], out[site, 3] = max(xy[a, 0], xy[c, 0]), max(xy[a, 1], xy[c, 1])
+    return out
+
+
+@njit(inline="always")
+def _covered_cells(low, high, n):
+    """Return (first, last, w_first, w_last, m_first, m_last) of an interval on ``n`` cells; last < first if it covers none."""
+    low, high = max(low, 0.0), min(high, float(n))
+    if not high > low:
+        return 0, -1, 0.0, 0.0, 0.0, 0.0
+    first, last = int(np.floor(low)), int(np.ceil(high)) - 1
+    if first < last and first + 1 - low <= NO_COVERAGE:
+        first += 1
+        low = float(first)
+    if first < last and high - last <= NO_COVERAGE:
+        high = float(last)
+        last -= 1
+    if first == last:
+        return first, last, high - low, 0.0, (high - low) * (0.5 * (low + high) - first - 0.5), 0.0
+    w_first, w_last = first + 1 - low, high - last
+    return first, last, w_first, w_last, 0.5 * w_first * (low - first), 0.5 * w_last * (high - last - 1.0)
+
+
+@njit(inline="always")
+def _sum_cells(line, start, stop):
+    """Return the sum of the cells ``start`` to ``stop - 1`` of a row in float64."""
+    total = 0.0
+    c = start
+    if stop - start >= 2 * BLOCK:
+        a0, a1, a2, a3, a4, a5, a6, a7 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        while c + BLOCK <= stop:
+            a0 += line[c]
+            a1 += line[c + 1]
+            a2 += line[c + 2]
+            a3 += line[c + 3]
+            a4 += line[c + 4]
+            a5 += line[c + 5]
+            a6 += line[c + 6]
+            a7 += line[c + 7]
+            c += BLOCK
+        total = ((a0 + a1) + (a2 + a3)) + ((a4 + a5) + (a6 + a7))
+    while c < stop:
+        total += line[c]
+        c += 1
+    return total
+
+
+@njit(inline="always")
+def _along_row(line, first, last, w_first, w_last):
+    """Return the integral of a row over an interval."""
+    total = w_first * line[first]
+    if last > first:
+        total += w_last * line[last]
+        if last > first + 1:
+            total += _sum_cells(line, first + 1, last)
+    return total
+
+
+@njit(inline="always")
+def _difference(line, c):
+    """Return the gradient of a row at a cell, per cell; 0 along a single cell."""
+    n = line.size
+    if n == 1:
+        return 0.0
+    step = np.float64(line[min(c + 1, n - 1)]) - np.float64(line[max(c - 1, 0)])
+    return 0.5 * step if 0 < c < n - 1 else step
+
+
+@njit(inline="always")
+def _tilt(cells, row, first, last, w_first, w_last):
+    """Return the integral over an interval of the gradient along v of a row, per cell; 0 along a single cell."""
+    n = cells.shape[0]
+    if n == 1:
+        return 0.0
+    above = _along_row(cells[min(row + 1, n - 1)], first, last, w_first, w_last)
+    below = _along_row(cells[max(row - 1, 0)], first, last, w_first, w_last)
+    return 0.5 * (above - below) if 0 < row < n - 1 else above - below
+
+
+@njit(inline="always")
+def _integral(cells, u, v, order):
+    """Return the integral over a rectangle, from its covered cells along x and along y."""
+    first, last, w_first, w_last, m_first, m_last = u
+    bottom, top, w_bottom, w_top, m_bottom, m_top = v
+    total = 0.0
+    if last < first:
+        return total
+    for row in range(bottom, top + 1):
+        weight = w_bottom if row == bottom else (w_top if row == top else 1.0)
+        line = cells[row]
+        value = _along_row(line, first, last, w_first, w_last)
+        if order == 2:
+            if m_first != 0.0:
+                value += m_first * _difference(line, first)
+            if m_last != 0.0:
+                value += m_last * _difference(line, last)
+        total += weight * value
+    if order == 2:
+        if m_bottom != 0.0 and top >= bottom:
+            total += m_bottom * _tilt(cells, bottom, first, last, w_first, w_last)
+        if m_top != 0.0:
+            total += m_top * _tilt(cells, top, first, last, w_first, w_last)
+    return total
+
+
+@njit(
+    [
+        types.void(
+            _input(cell, 2), _points, types.int64, types.int64, _flags, types.float64, types.int64, types.float64[::1]
+        )
+        for cell in (types.float32, types.float64)
+    ]
+)
+def gather_rectangles(cells, bounds, first_site, last_site, where, scale, order, out):
+    """
+    Write scale x integral of the sites ``first_site`` to ``last_site - 1``.
+
+    ``bounds`` is (n_site, 4), in cells; ``where`` is empty, or False at sites that are not written.
+    """
+    n_y, n_x = cells.shape
+    for site in range(first_site, last_site):
+        if where.size == 0 or where[site]:
+            u = _covered_cells(bounds[site, 0], bounds[site, 2], n_x)
+            v = _covered_cells(bounds[site, 1], bounds[site, 3], n_y)
+            out[site] = scale * _integral(cells, u, v, order)
+
+
+@njit(
+    [
+        types.void(
+            _input(cell, 2),
+            _points,
+            _points,
+            types.int64,
+            types.int64,
+            _flags,
+            types.float64,
+            types.int64,
+            types.float64[::1],
+        )
+        for cell in (types.float32, types.float64)
+    ]
+)
+def gather_lattice(cells, u, v, first_row, last_row, where, scale, order, out):
+    """
+    Write scale x integral of the sites in the rows ``first_row`` to ``last_row - 1`` of a lattice.
+
+    ``u`` is (n_column, 2) and ``v`` is (n_row, 2), in cells. At first order, without ``where``, a row of the map is integrated
+    once over all columns.
+    """
+    n_y, n_x = cells.shape
+    n_columns = u.shape[0]
+    firsts, lasts = np.empty(n_columns, np.int64), np.empty(n_columns, np.int64)
+    weights = np.empty((n_columns, 4))
+    is_narrow = True
+    for i in range(n_columns):
+        firsts[i], lasts[i], weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3] = _covered_cells(
+            u[i, 0], u[i, 1], n_x
+        )
+        is_narrow &= 0 <= lasts[i] - firsts[i] <= 1
+    w_first, w_last = weights[:, 0].copy(), weights[:, 1].copy()
+    along = np.empty(n_columns)
+    done = -1  # the row of the map in ``along``
+    chosen = np.empty(n_columns, np.int64)
+    for j in range(first_row, last_row):
+        covered = _covered_cells(v[j, 0], v[j, 1], n_y)
+        bottom, top, w_bottom, w_top = covered[:4]
+        start = j * n_columns
+        n_chosen = 0
+        for i in range(n_columns):
+            chosen[n_chosen] = i
+            n_chosen += 1 if where.size == 0 or where[start + i] else 0
+        if order == 2:
+            for k in range(n_chosen):
+                i = chosen[k]
+                columns = (firsts[i], lasts[i], weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3])
+                out[start + i] = scale * _integral(cells, columns, covered, order)
+            continue
+        for k in range(n_chosen):
+            out[start + chosen[k]] = 0.0
+        for row in range(bottom, top + 1):
+            line = cells[row]
+            weight = scale * (w_bottom if row == bottom else (w_top if row == top else 1.0))
+            if n_chosen < n_columns:
+                for k in range(n_chosen):
+                    i = chosen[k]
+                    value = 0.0
+                    if is_narrow:
+                        value = w_first[i] * line[firsts[i]] + w_last[i] * line[lasts[i]]
+                    elif lasts[i] >= firsts[i]:
+                        value = _along_row(line, firsts[i], lasts[i], w_first[i], w_last[i])
+                    out[start + i] += weight * value
+                continue
+            if row != done:
+                done = row
+                for i in range(n_columns):
+                    if is_narrow:
+                        along[i] = w_first[i] * line[firsts[i]] + w_last[i] * line[lasts[i]]
+                    elif lasts[i] >= firsts[i]:
+                        along[i] = _along_row(line, firsts[i], lasts[i], w_first[i], w_last[i])
+                    else:
+                        along[i] = 0.0
+            for i in range(n_columns):
+                out[start + i] += weight * along[i]
