@@ -127,7 +127,7 @@ def grid(
             for n, fraction, p_um in zip((n_x, n_y), fractions, pitches_um, strict=True)
         )
         return Layout.from_lattice(RectangleLattice(x_um, y_um), columns)
-    shift: Floats = 0.5 * (row % 2) - 0.25 * (n_y > 1)
+    shift = 0.5 * (row % 2).astype(np.float64) - 0.25 * (n_y > 1)
     corners = square_corners_um(column - 0.5 * n_x + shift, row - 0.5 * n_y, pitch_um, pitch_y_um, fractions)
     return Layout.from_equal_rings(corners, columns)
 
