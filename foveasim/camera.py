@@ -303,6 +303,7 @@ class Camera:
         order: Literal[1, 2] = 1,
         n_grids: int = 1,
         position_um: Position = (0.0, 0.0),
+        compiled: bool = True,
     ) -> Integrator:
         """
         Return the sensor's layout compiled for a grid.
@@ -316,6 +317,8 @@ class Camera:
             Number of grids that are used together: the cache has room for them.
         position_um : (x, y), µm
             Position of the layout's origin in the image.
+        compiled : bool
+            As for :class:`Integrator`. An integrator that is requested again is compiled in any case.
 
         Returns
         -------
@@ -324,9 +327,16 @@ class Camera:
         """
         key = grid, order, position_um
         integrator = self._integrators.get(key)
-        if integrator is None:
+        if integrator is None or not integrator.is_compiled:
             layout = self._layout.translate(*position_um) if any(position_um) else self._layout
-            integrator = Integrator(layout, grid, distortion=self._distortion, order=order, n_threads=self._n_threads)
+            integrator = Integrator(
+                layout,
+                grid,
+                distortion=self._distortion,
+                order=order,
+                compiled=compiled or integrator is not None,
+                n_threads=self._n_threads,
+            )
         # The most recent entry is not moved: threads that compute further frames look it up at the same time.
         if next(reversed(self._integrators), None) != key:
             self._integrators.pop(key, None)
@@ -578,7 +588,7 @@ class Camera:
         layout is compiled once.
 
         The image of a repeated frame (the same object) is computed once, also for a moving gaze. A position shifts the
-        photosites' outlines, so that fractions of a cell are exact; the layout is compiled for each new position.
+        photosites' outlines, so that fractions of a cell are exact; the layout is compiled for positions that are repeated.
 
         With ``frame_s``, a capture integrates all frames during its exposure, weighted by their time; the last frame lasts
         until the last exposure ends.
@@ -785,7 +795,13 @@ class Camera:
         with clock.stage("compile layout"):
             order = self.order(light)
             integrators = [
-                self.integrator(grid, order=order, n_grids=len(grids), position_um=position_um or (0.0, 0.0))
+                self.integrator(
+                    grid,
+                    order=order,
+                    n_grids=len(grids),
+                    position_um=position_um or (0.0, 0.0),
+                    compiled=position_um is None,  # a moving gaze is at most positions only once
+                )
                 for grid in grids
             ]
         smallest = min(integrators, key=lambda integrator: integrator.grid.cell_area_um2)

@@ -47,6 +47,11 @@ class Coverage:
         return cls(bounds_um, np.broadcast_to(0.0, n_sites), np.broadcast_to(np.False_, n_sites))
 
     @classmethod
+    def extent_within(cls, grid: Grid, bounds_um: Floats) -> Coverage | None:
+        """Return the coverage of sites with the given bounds, (n_site, 4) µm, or None if one extends beyond the grid."""
+        return cls.within(grid, _extent_um(bounds_um), bounds_um.shape[0])
+
+    @classmethod
     def of_sites(
         cls, grid: Grid, bounds_um: Floats, area_um2: Floats, covered_um2: Floats, is_outside: Bools | None = None
     ) -> Coverage:
@@ -64,21 +69,24 @@ class Coverage:
         """
         n_sites = area_um2.size
         if is_outside is None or not is_outside.any():
-            is_outside = np.broadcast_to(np.False_, n_sites)
-        inside_um = bounds_um if not is_outside.any() else bounds_um[~is_outside]
-        extent_um = (np.nan, np.nan, np.nan, np.nan)
-        if inside_um.size:
-            x0, y0, x1, y1 = (
-                float(find(inside_um[:, k])) for find, k in ((np.min, 0), (np.min, 1), (np.max, 2), (np.max, 3))
-            )
-            extent_um = x0, y0, x1, y1
-        if not is_outside.any():
-            complete = cls.within(grid, extent_um, n_sites)
+            complete = cls.extent_within(grid, bounds_um)
             if complete is not None:
                 return complete
+            is_outside = np.broadcast_to(np.False_, n_sites)
+        extent_um = _extent_um(bounds_um[~is_outside] if is_outside.any() else bounds_um)
         rest_um2 = np.clip(area_um2 - covered_um2, 0.0, area_um2)
         rest_um2 = np.where(_beyond_um(grid, bounds_um) > 0.0, rest_um2, 0.0)
         return cls(extent_um, read_only(np.where(is_outside, area_um2, rest_um2)), is_outside)
+
+
+def _extent_um(bounds_um: Floats) -> tuple[float, float, float, float]:
+    """Return the bounds of all sites; NaN without any."""
+    if not bounds_um.size:
+        return np.nan, np.nan, np.nan, np.nan
+    (x0, y0), (x1, y1) = (
+        (float(find(bounds_um[:, k])), float(find(bounds_um[:, k + 1]))) for find, k in ((np.min, 0), (np.max, 2))
+    )
+    return x0, y0, x1, y1
 
 
 def _beyond_um(grid: Grid, bounds_um: Floats) -> Floats:

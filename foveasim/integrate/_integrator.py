@@ -17,6 +17,7 @@ from foveasim.fields import Grid, PackedRings, PointMap
 from foveasim.integrate._outlines import Outlines, UndistortedOutlines, outlines_of
 from foveasim.integrate._plan import Plan, compile_plan
 from foveasim.integrate._rectangles import LatticePlan, RectanglePlan, rectangle_plan
+from foveasim.integrate._traced import TracedOutlines
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -43,6 +44,9 @@ class Integrator:
     order : {1, 2}
         Order of the reconstruction within cells: 1 treats cells as constant, 2 as a mean with a gradient, so that linear maps
         are also exact.
+    compiled : bool
+        Whether to store the overlaps of sites and cells. Without, the outlines are traced at every call: for layouts and
+        positions that are used for one or two maps. Axis-aligned rectangles need no overlaps in either case.
     n_threads : int, optional
         Number of threads, by default all cores of the process. Results are bit-identical for any number.
 
@@ -101,6 +105,7 @@ class Integrator:
         distortion: PointMap | None = None,
         conserve: Literal["flux", "density"] = "flux",
         order: Literal[1, 2] = 1,
+        compiled: bool = True,
         n_threads: int | None = None,
     ) -> None:
         has_lattice = getattr(layout, "lattice", None) is not None
@@ -119,13 +124,20 @@ class Integrator:
             if not hasattr(distortion, "undistort"):
                 raise ParameterError("distortion", "must be a lens of foveasim.distortion", distortion)
             outlines = UndistortedOutlines(layout, distortion, min(grid.pitch_x_um, grid.pitch_y_um))
-        self._layout, self._outlines = layout, outlines
+        self._outlines = outlines
+        self._n_sites: int = layout.n_sites if hasattr(layout, "n_sites") else layout.site_offsets.size - 1
         self._gain: Floats | None = None
+        self._passes: Plan | TracedOutlines | RectanglePlan | LatticePlan
         rectangles = rectangle_plan(layout, grid, self.order) if distortion is None else None
         if rectangles is not None:
-            self._passes: Plan | RectanglePlan | LatticePlan = rectangles
+            self._passes = rectangles
             return
-        self._passes, area_um2 = self._compile()
+        if compiled:
+            self._passes, area_um2 = self._compile()
+        else:
+            self._passes = TracedOutlines(outlines, self._n_sites, grid, self.order, self.n_threads)
+            area_um2 = self._passes.area_um2
+            _require_counter_clockwise(area_um2)
         is_outside = self._passes.coverage.is_outside
         if distortion is not None and (conserve == "density" or is_outside.any()):
             self._gain = np.where(is_outside, 0.0, 1.0)
@@ -134,15 +146,8 @@ class Integrator:
 
     def _compile(self) -> tuple[Plan, Floats]:
         """Return the spans of all outlines, and their areas."""
-        n_sites = self._layout.n_sites if hasattr(self._layout, "n_sites") else self._layout.site_offsets.size - 1
-        plan, area_um2 = compile_plan(self._outlines, n_sites, self.grid, self.n_threads, self.order)
-        # A lens preserves the winding: the undistorted image of a clockwise outline is also clockwise.
-        clockwise = np.flatnonzero(area_um2 <= 0.0)
-        if clockwise.size:
-            raise GeometryError(
-                f"the outline of site {clockwise[0]} must be counter-clockwise with a positive area; use Layout.from_polygons",
-                tuple(int(i) for i in clockwise),
-            )
+        plan, area_um2 = compile_plan(self._outlines, self._n_sites, self.grid, self.n_threads, self.order)
+        _require_counter_clockwise(area_um2)
         return plan, area_um2
 
     @cached_property
@@ -159,9 +164,14 @@ class Integrator:
         return f"Integrator({self.n_sites} sites on {self.grid})"
 
     @property
+    def is_compiled(self) -> bool:
+        """Whether calls use stored overlaps, or are as fast without."""
+        return not isinstance(self._passes, TracedOutlines)
+
+    @property
     def n_sites(self) -> int:
         """Number of sites."""
-        return self._passes.n_sites
+        return self._n_sites
 
     @property
     def bounds_um(self) -> tuple[float, float, float, float]:
@@ -293,3 +303,13 @@ class Integrator:
         if self._gain is not None:
             matrix = matrix.multiply(self._gain[:, np.newaxis]).tocsr()
         return matrix
+
+
+def _require_counter_clockwise(area_um2: Floats) -> None:
+    # A lens preserves the winding: the undistorted image of a clockwise outline is also clockwise.
+    clockwise = np.flatnonzero(area_um2 <= 0.0)
+    if clockwise.size:
+        raise GeometryError(
+            f"the outline of site {clockwise[0]} must be counter-clockwise with a positive area; use Layout.from_polygons",
+            tuple(int(i) for i in clockwise),
+        )

@@ -38,6 +38,7 @@ __all__ = [
     "SITE",
     "count_pieces",
     "gather",
+    "integrate_sites",
     "measure_sites",
     "scatter",
     "sort_cuts",
@@ -58,10 +59,17 @@ MIN_RUN = 12
 #: Weights below this fraction of the total height of the edges in a row are rounding errors. The limit is for up to eight
 #: pieces and increases in proportion to their number.
 NO_COVERAGE = 2e-15
-#: End of a linked list.
-END = -1
-#: Largest bounding box, in columns and rows, with preallocated scratch cells; too few columns for a run.
-BOX_COLUMNS, BOX_ROWS = MIN_RUN + 1, 64
+#: Largest number of cells of a box that are accumulated together; larger boxes are divided into strips of rows.
+BOX_CELLS = 2**16
+#: Cells of float32 in a cache line.
+LINE_CELLS = 16
+#: A sum of cells that does not occur.
+NEVER = 1.2345678e300
+#: Multiplication by this sequence maps a power of 2 to a unique value of 6 bits.
+DE_BRUIJN = np.uint64(0x03F79D71B4CB0A89)
+BIT_POSITIONS = np.zeros(64, np.int64)
+for _bit in range(64):
+    BIT_POSITIONS[(0x03F79D71B4CB0A89 << _bit & (2**64 - 1)) >> 58] = _bit
 
 
 def _input(dtype, ndim):
@@ -83,57 +91,33 @@ _moment_list = types.float64[:, ::1]
 _int_list = types.int64[::1]
 
 
-@njit()
-def _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x, n_rows):
-    """Return the maximum number of cells that the edges of rings touch."""
-    bound = 0
-    for ring in range(first_ring, last_ring):
-        start, stop = ring_offsets[ring], ring_offsets[ring + 1]
-        a = stop - 1
-        for b in range(start, stop):
-            rows = min(max(uv[b, 1], 0.0), float(n_y)) - min(max(uv[a, 1], 0.0), float(n_y))
-            columns = min(max(uv[b, 0], 0.0), float(n_x)) - min(max(uv[a, 0], 0.0), float(n_x))
-            bound += int(abs(rows)) + int(abs(columns)) + 4
-            a = b
-    return min(bound, n_rows * (n_x + 1))
+@njit(inline="always")
+def _lowest_bit(word):
+    """Return the position of the lowest bit of a word that is not 0."""
+    return BIT_POSITIONS[((word & (~word + np.uint64(1))) * DE_BRUIJN) >> np.uint64(58)]
 
 
 @njit(inline="always")
-def _find_cell(head, recent, links, n_cells, row, column):
-    """
-    Return the index of scratch cell (row, column) and the number of cells.
+def _set_bits(words, offset, first, last):
+    """Set the bits ``first`` to ``last`` of the words from ``offset`` on."""
+    ones = ~np.uint64(0)
+    for k in range(first >> 6, (last >> 6) + 1):
+        low, high = max(first - 64 * k, 0), min(last - 64 * k, 63)
+        words[offset + k] |= (ones >> np.uint64(63 - high + low)) << np.uint64(low)
 
-    ``links[i]`` is (column, next, previous cell of the row); the list of a row is in column order. The search begins at
-    the most recent cell of the row, because successive cells of an outline are adjacent.
-    """
-    here = recent[row]
-    if here == END:
-        links[n_cells, 0] = column
-        links[n_cells, 1] = END
-        links[n_cells, 2] = END
-        head[row] = n_cells
-        recent[row] = n_cells
-        return n_cells, n_cells + 1
-    while links[here, 0] < column and links[here, 1] != END:
-        here = links[here, 1]
-    while links[here, 0] > column and links[here, 2] != END:
-        here = links[here, 2]
-    if links[here, 0] != column:
-        before = here if links[here, 0] < column else END
-        after = links[here, 1] if links[here, 0] < column else here
-        here = n_cells
-        links[here, 0] = column
-        links[here, 1] = after
-        links[here, 2] = before
-        if after != END:
-            links[after, 2] = here
-        if before != END:
-            links[before, 1] = here
-        else:
-            head[row] = here
-        n_cells += 1
-    recent[row] = here
-    return here, n_cells
+
+@njit(inline="always")
+def _touched_columns(touched, row, n_words, columns):
+    """List the columns of a row that edges touch, in ascending order from the left of the box; clear their bits."""
+    n = 0
+    for k in range(n_words):
+        word = touched[row * n_words + k]
+        touched[row * n_words + k] = np.uint64(0)
+        while word != np.uint64(0):
+            columns[n] = 64 * k + _lowest_bit(word)
+            n += 1
+            word &= word - np.uint64(1)
+    return n
 
 
 @njit(inline="always")
@@ -153,68 +137,53 @@ def _add_moments(moment, ua, ub, va, vb, height):
 
 
 @njit(inline="always")
-def _trace_edge(
-    ua, va, ub, vb, n_y, n_x, bottom, left_column, box_columns, head, recent, climb, links, cover, moment, n_cells
-):
+def _add_edge(ua, va, ub, vb, n_x, bottom, top, left, n_columns, n_words, rows, cover, moment, touched):
     """
-    Add one edge to the scratch cells and return their number.
+    Add one edge to the cells of a box, the rows ``bottom`` to ``top - 1`` and ``n_columns`` columns from ``left`` on.
 
-    With ``box_columns`` > 0 the cells are preallocated row by row for a box with the corner (``bottom``, ``left_column``);
-    otherwise they are created when an edge touches them.
-
-    ``cover[i]`` is (height, area): the signed height of the edge pieces in the cell, and the area between them and the left
-    boundary of the cell. ``climb[row]`` is (sum of the unsigned heights of all pieces in the row, number of pieces). At second
-    order ``moment[i]`` is as in :func:`_add_moments`.
+    ``cover[cell]`` is (height, area): the signed height of the edge pieces in the cell, and the area between them and the left
+    boundary of the cell. ``rows[row]`` is (sum of the signed heights, sum of the unsigned heights, number of pieces). At second
+    order ``moment[cell]`` is as in :func:`_add_moments`. A bit of ``touched`` is set for each cell.
     """
     sign = 1.0
     if va > vb:  # always upwards, so that adjacent sites split a shared edge at the same points
         ua, va, ub, vb = ub, vb, ua, va
         sign = -1.0
-    if va == vb or va >= n_y or vb <= 0.0:
-        return n_cells
+    if va == vb or va >= top or vb <= bottom:
+        return
     slope = (ub - ua) / (vb - va)
     steepness = (vb - va) / abs(ub - ua) if ub != ua else 0.0
     if not np.isfinite(steepness):  # vertical up to rounding
         steepness = 0.0
     u_low, u_high = min(ua, ub), max(ua, ub)
-    top = min(vb, float(n_y))
-    row = int(np.floor(max(va, 0.0)))
-    while row < top:
+    end = min(vb, float(top))
+    row = int(np.floor(max(va, float(bottom))))
+    while row < end:
         low = max(va, float(row))
         high = min(vb, row + 1.0)
-        left = ua if low == va else min(max(ua + (low - va) * slope, u_low), u_high)
-        right = ub if high == vb else min(max(ua + (high - va) * slope, u_low), u_high)
+        left_u = ua if low == va else min(max(ua + (low - va) * slope, u_low), u_high)
+        right_u = ub if high == vb else min(max(ua + (high - va) * slope, u_low), u_high)
         v_left = low - (row + 0.5)  # relative to the centre of the row
         direction = 1.0
-        if left > right:
-            left, right = right, left
+        if left_u > right_u:
+            left_u, right_u = right_u, left_u
             v_left = high - (row + 0.5)
             direction = -1.0
-        if right > 0.0 or left == 0.0:  # pieces left of the map have no cell on their left
+        if right_u > 0.0 or left_u == 0.0:  # pieces left of the map have no cell on their left
             rise = high - low
-            climb[row - bottom, 0] += rise
-            u = max(left, 0.0)
-            climbed = (u - left) * steepness
-            column = int(min(u, float(n_x)))
+            i_row = row - bottom
+            u = max(left_u, 0.0)
+            climbed = (u - left_u) * steepness
+            first = int(min(u, float(n_x)))
+            column = first
+            cell = i_row * n_columns + first - left
+            before = climbed
             while True:
                 # An edge right of the map has every cell of the row on its left: it is assigned to column n_x.
-                is_last = right <= column + 1.0 or column == n_x
-                u_next = right if is_last else column + 1.0
-                height = rise if is_last else (u_next - left) * steepness
+                is_last = right_u <= column + 1.0 or column == n_x
+                u_next = right_u if is_last else column + 1.0
+                height = rise if is_last else (u_next - left_u) * steepness
                 piece = sign * (height - climbed)
-                climb[row - bottom, 1] += 1.0
-                if box_columns > 0:
-                    cell, count = (row - bottom) * box_columns + column - left_column, n_cells
-                else:
-                    cell, count = _find_cell(head, recent, links, n_cells, row - bottom, column)
-                if count > n_cells:
-                    cover[cell, 0] = 0.0
-                    cover[cell, 1] = 0.0
-                    if moment.shape[0] > 0:
-                        moment[cell, 0] = 0.0
-                        moment[cell, 1] = 0.0
-                        moment[cell, 2] = 0.0
-                    n_cells = count
                 cover[cell, 0] += piece
                 if column < n_x:
                     cover[cell, 1] += piece * (0.5 * (u + u_next) - column)
@@ -227,8 +196,12 @@ def _trace_edge(
                 u = u_next
                 climbed = height
                 column += 1
+                cell += 1
+            rows[i_row, 0] += sign * (rise - before)
+            rows[i_row, 1] += rise
+            rows[i_row, 2] += column - first + 1
+            _set_bits(touched, i_row * n_words, first - left, column - left)
         row += 1
-    return n_cells
 
 
 @njit(inline="always")
@@ -245,32 +218,28 @@ def _grow(array, n_used, n_more):
 
 
 @njit(inline="always")
-def _rounding(climb):
+def _rounding(rows, i_row):
     """Return the rounding error of weights and moments in a row."""
-    return NO_COVERAGE * climb[0] * max(climb[1] / 8.0, 1.0)
+    return NO_COVERAGE * rows[i_row, 1] * max(rows[i_row, 2] / 8.0, 1.0)
 
 
 @njit(inline="always")
-def _write_row(first_cell, links, cover, climb, n_x, site, row, spans, n_spans, weights, n_weights):
+def _write_row(columns, n_touched, left, cover, base, rows, i_row, n_x, site, row, spans, n_spans, weights, n_weights):
     """Append the spans of one row of one site; return the new counts and the covered area."""
-    winding = 0.0  # weight of the cells before the next touched cell: sum of the heights from that cell on
-    here = first_cell
-    while here != END:
-        winding += cover[here, 0]
-        here = links[here, 1]
-    rounding = _rounding(climb)
+    winding = rows[i_row, 0]  # weight of the cells before the next touched cell: sum of the heights from that cell on
+    rounding = _rounding(rows, i_row)
     covered = 0.0
     column = 0  # the next column to be written
     is_open = False  # whether the last span can be extended
-    here = first_cell
-    while here != END:
-        n_between = links[here, 0] - column
+    for k in range(n_touched):
+        at = columns[k]
+        n_between = left + at - column
         is_run = n_between >= MIN_RUN
         for is_touched in (False, True):
             if is_touched:
-                column = links[here, 0]
+                column = left + at
                 n_cells = 1 if column < n_x else 0
-                weight = cover[here, 1] + (winding - cover[here, 0])
+                weight = cover[base + at, 1] + (winding - cover[base + at, 0])
             else:
                 n_cells = n_between
                 weight = winding
@@ -298,9 +267,8 @@ def _write_row(first_cell, links, cover, climb, n_x, site, row, spans, n_spans, 
                     weights[n_weights] = weight
                     n_weights += 1
                 is_open = True
-        winding -= cover[here, 0]
-        column = links[here, 0] + 1
-        here = links[here, 1]
+        winding -= cover[base + at, 0]
+        column = left + at + 1
     return n_spans, n_weights, covered
 
 
@@ -313,24 +281,22 @@ def _gradient_scale(index, n):
 
 
 @njit(inline="always")
-def _write_cuts(first_cell, links, moment, climb, n_y, n_x, site, row, cuts, moments, n_cuts):
+def _write_cuts(columns, n_touched, left, moment, base, rows, i_row, n_y, n_x, site, row, cuts, moments, n_cuts):
     """Append the cuts of one row of one site; return their new number."""
     tilt = 0.0  # moment along v of the cells before the next touched cell
-    here = first_cell
-    while here != END:
-        tilt += moment[here, 0]
-        here = links[here, 1]
-    rounding = _rounding(climb)
+    for k in range(n_touched):
+        tilt += moment[base + columns[k], 0]
+    rounding = _rounding(rows, i_row)
     column = 0  # the next column to be written
-    here = first_cell
-    while here != END:
-        touched = links[here, 0]
+    for k in range(n_touched):
+        at = columns[k]
+        cell = left + at
         if abs(tilt) <= rounding:
-            column = touched
-        for c in range(column, min(touched + 1, n_x)):
+            column = cell
+        for c in range(column, min(cell + 1, n_x)):
             u_moment, v_moment = 0.0, tilt
-            if c == touched:
-                u_moment, v_moment = moment[here, 1], moment[here, 2] + (tilt - moment[here, 0])
+            if c == cell:
+                u_moment, v_moment = moment[base + at, 1], moment[base + at, 2] + (tilt - moment[base + at, 0])
             u_moment = u_moment if abs(u_moment) > rounding else 0.0
             v_moment = v_moment if abs(v_moment) > rounding else 0.0
             if u_moment != 0.0 or v_moment != 0.0:
@@ -340,10 +306,97 @@ def _write_cuts(first_cell, links, moment, climb, n_y, n_x, site, row, cuts, mom
                 moments[n_cuts, 0] = u_moment * _gradient_scale(c, n_x)
                 moments[n_cuts, 1] = v_moment * _gradient_scale(row, n_y)
                 n_cuts += 1
-        tilt -= moment[here, 0]
-        column = touched + 1
-        here = links[here, 1]
+        tilt -= moment[base + at, 0]
+        column = cell + 1
     return n_cuts
+
+
+@njit(inline="always")
+def _sum_cells(cells, row, start, stop):
+    """Return the sum of the cells ``start`` to ``stop - 1`` of a row in float64."""
+    total = 0.0
+    c = start
+    if stop - start >= 2 * BLOCK:
+        a0, a1, a2, a3, a4, a5, a6, a7 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        while c + BLOCK <= stop:
+            a0 += cells[row, c]
+            a1 += cells[row, c + 1]
+            a2 += cells[row, c + 2]
+            a3 += cells[row, c + 3]
+            a4 += cells[row, c + 4]
+            a5 += cells[row, c + 5]
+            a6 += cells[row, c + 6]
+            a7 += cells[row, c + 7]
+            c += BLOCK
+        total = ((a0 + a1) + (a2 + a3)) + ((a4 + a5) + (a6 + a7))
+    while c < stop:
+        total += cells[row, c]
+        c += 1
+    return total
+
+
+@njit(inline="always")
+def _sum_row(columns, n_touched, left, cover, base, rows, i_row, cells, row):
+    """Return the sum of weight x cell over one row of one site; as :func:`_write_row`."""
+    n_x = cells.shape[1]
+    winding = rows[i_row, 0]
+    rounding = _rounding(rows, i_row)
+    total = 0.0
+    column = 0
+    for k in range(n_touched):
+        at = columns[k]
+        cell = left + at
+        if cell > column and abs(winding) > rounding:
+            total += winding * _sum_cells(cells, row, column, cell)
+        weight = cover[base + at, 1] + (winding - cover[base + at, 0])
+        if cell < n_x and abs(weight) > rounding:
+            total += weight * cells[row, cell]
+        winding -= cover[base + at, 0]
+        column = cell + 1
+    return total
+
+
+@njit(inline="always")
+def _sum_gradients(columns, n_touched, left, moment, base, rows, i_row, cells, row):
+    """Return the sum of moment x gradient over one row of one site; as :func:`_write_cuts`."""
+    n_y, n_x = cells.shape
+    below, above = max(row - 1, 0), min(row + 1, n_y - 1)
+    along_v = _gradient_scale(row, n_y)
+    tilt = 0.0
+    for k in range(n_touched):
+        tilt += moment[base + columns[k], 0]
+    rounding = _rounding(rows, i_row)
+    total = 0.0
+    column = 0
+    for k in range(n_touched):
+        at = columns[k]
+        cell = left + at
+        if cell > column and abs(tilt) > rounding:
+            total += along_v * tilt * (_sum_cells(cells, above, column, cell) - _sum_cells(cells, below, column, cell))
+        if cell < n_x:
+            u_moment, v_moment = moment[base + at, 1], moment[base + at, 2] + (tilt - moment[base + at, 0])
+            if abs(u_moment) > rounding:
+                step = np.float64(cells[row, min(cell + 1, n_x - 1)]) - np.float64(cells[row, max(cell - 1, 0)])
+                total += _gradient_scale(cell, n_x) * u_moment * step
+            if abs(v_moment) > rounding:
+                total += along_v * v_moment * (np.float64(cells[above, cell]) - np.float64(cells[below, cell]))
+        tilt -= moment[base + at, 0]
+        column = cell + 1
+    return total
+
+
+@njit(inline="always")
+def _box(uv, start, stop, n_y, n_x):
+    """Return bottom and top row, left column and number of columns of the cells that vertices reach on the map."""
+    u_low, v_low, u_high, v_high = np.inf, np.inf, -np.inf, -np.inf
+    for i in range(start, stop):
+        u_low, u_high = min(u_low, uv[i, 0]), max(u_high, uv[i, 0])
+        v_low, v_high = min(v_low, uv[i, 1]), max(v_high, uv[i, 1])
+    if not (v_high > 0.0 and v_low < n_y):
+        return 0, 0, 0, 0
+    left = int(min(max(u_low, 0.0), float(n_x)))
+    n_columns = int(min(max(u_high, 0.0), float(n_x))) - left + 1
+    return int(np.floor(max(v_low, 0.0))), int(np.ceil(min(v_high, float(n_y)))), left, n_columns
 
 
 @njit(types.Tuple((_float_list, _moment_list))(_points, _ints, _ints))
@@ -399,6 +452,51 @@ def count_pieces(xy, ring_offsets, first, step, pieces_per_length, max_pieces):
     return out
 
 
+@njit(inline="always")
+def _add_rings(
+    uv, ring_offsets, first_ring, last_ring, n_x, bottom, top, left, n_columns, rows, cover, moment, touched
+):
+    """Add the edges of rings to the cells of a box; see :func:`_add_edge`."""
+    n_words = (n_columns + 63) >> 6
+    for ring in range(first_ring, last_ring):
+        start, stop = ring_offsets[ring], ring_offsets[ring + 1]
+        a = stop - 1
+        for b in range(start, stop):
+            _add_edge(
+                uv[a, 0],
+                uv[a, 1],
+                uv[b, 0],
+                uv[b, 1],
+                n_x,
+                bottom,
+                top,
+                left,
+                n_columns,
+                n_words,
+                rows,
+                cover,
+                moment,
+                touched,
+            )
+            a = b
+
+
+@njit(inline="always")
+def _clear_row(columns, n_touched, i_row, n_columns, rows, cover, moment):
+    """Set the accumulators of a row to 0."""
+    rows[i_row, 0] = 0.0
+    rows[i_row, 1] = 0.0
+    rows[i_row, 2] = 0.0
+    for k in range(n_touched):
+        cell = i_row * n_columns + columns[k]
+        cover[cell, 0] = 0.0
+        cover[cell, 1] = 0.0
+        if moment.shape[0] > 0:
+            moment[cell, 0] = 0.0
+            moment[cell, 1] = 0.0
+            moment[cell, 2] = 0.0
+
+
 @njit(
     types.Tuple((_span_list, _float_list, _cut_list, _moment_list, _float_list))(
         _points, _ints, _ints, _count, _count, _count, _count
@@ -431,103 +529,125 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
     spans = np.empty((4 * n_sites + 64, 5), np.int32)
     weights = np.empty(16 * n_sites + 64, np.float64)
     has_moments = order == 2
-    n_cuts = 0
-    capacity = 0  # capacity for all cuts except those along horizontal edges
-    if has_moments:
-        first_ring, last_ring = site_offsets[0], site_offsets[n_sites]
-        capacity = n_x + _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x, n_y * n_sites)
-    cuts = np.empty((capacity, 3), np.int32)
+    cuts = np.empty((8 * n_sites + n_x if has_moments else 0, 3), np.int32)
     moments = np.empty((cuts.shape[0], 2), np.float64)
-    n_spans = 0
-    n_weights = 0
-    head = np.empty(64, np.int32)
-    recent = np.empty(64, np.int32)
-    climb = np.empty((64, 2), np.float64)
-    links = np.empty((256, 3), np.int32)
-    cover = np.empty((256, 2), np.float64)
-    moment = np.empty((256 if has_moments else 0, 3), np.float64)
+    n_spans, n_weights, n_cuts = 0, 0, 0
+    # Accumulators of a box of cells; all are 0 between boxes.
+    rows = np.zeros((64, 3))
+    cover = np.zeros((1024, 2))
+    moment = np.zeros((1024 if has_moments else 0, 3))
+    touched = np.zeros(64, np.uint64)
+    columns = np.empty(n_x + 1, np.int64)
 
     for i_site in range(n_sites):
         site = first_site + i_site
         first_ring, last_ring = site_offsets[i_site], site_offsets[i_site + 1]
-        u_low, v_low, u_high, v_high = np.inf, np.inf, -np.inf, -np.inf
-        for i in range(ring_offsets[first_ring], ring_offsets[last_ring]):
-            u_low, u_high = min(u_low, uv[i, 0]), max(u_high, uv[i, 0])
-            v_low, v_high = min(v_low, uv[i, 1]), max(v_high, uv[i, 1])
-        if not (v_high > 0.0 and v_low < n_y):
-            continue
-        bottom = int(np.floor(max(v_low, 0.0)))
-        n_rows = int(np.ceil(min(v_high, float(n_y)))) - bottom
-        left_column = int(min(max(u_low, 0.0), float(n_x)))
-        box_columns = int(min(max(u_high, 0.0), float(n_x))) - left_column + 1
-        if box_columns <= BOX_COLUMNS and n_rows <= BOX_ROWS:
-            size = n_rows * box_columns
-        else:
-            box_columns = 0
-            size = _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x, n_rows)
-        if head.size < n_rows:
-            head = np.empty(2 * n_rows, np.int32)
-            recent = np.empty(2 * n_rows, np.int32)
-            climb = np.empty((2 * n_rows, 2), np.float64)
-        if links.shape[0] < size:
-            links = np.empty((2 * size, 3), np.int32)
-            cover = np.empty((2 * size, 2), np.float64)
-            moment = np.empty((2 * size if has_moments else 0, 3), np.float64)
-        head[:n_rows] = END
-        recent[:n_rows] = END
-        climb[:n_rows] = 0.0
-        n_cells = n_rows * box_columns
-        if box_columns > 0:
-            for row in range(n_rows):
-                first = row * box_columns
-                head[row] = first
-                for column in range(box_columns):
-                    links[first + column, 0] = left_column + column
-                    links[first + column, 1] = first + column + 1
-                links[first + box_columns - 1, 1] = END
-        cover[:n_cells] = 0.0
-        if has_moments:
-            moment[:n_cells] = 0.0
-        for ring in range(first_ring, last_ring):
-            start, stop = ring_offsets[ring], ring_offsets[ring + 1]
-            a = stop - 1
-            for b in range(start, stop):
-                n_cells = _trace_edge(
-                    uv[a, 0],
-                    uv[a, 1],
-                    uv[b, 0],
-                    uv[b, 1],
-                    n_y,
-                    n_x,
-                    bottom,
-                    left_column,
-                    box_columns,
-                    head,
-                    recent,
-                    climb,
-                    links,
-                    cover,
-                    moment,
-                    n_cells,
-                )
-                a = b
-        # A touched cell adds at most two spans, its own weight, and one weight of a run or the weights of a short run.
-        spans = _grow(spans, n_spans, 2 * n_cells)
-        weights = _grow(weights, n_weights, MIN_RUN * n_cells)
-        for row in range(n_rows):
-            n_spans, n_weights, area = _write_row(
-                head[row], links, cover, climb[row], n_x, site, bottom + row, spans, n_spans, weights, n_weights
+        first_row, last_row, left, n_columns = _box(uv, ring_offsets[first_ring], ring_offsets[last_ring], n_y, n_x)
+        n_words = (n_columns + 63) >> 6
+        step = max(1, BOX_CELLS // max(n_columns, 1))
+        for bottom in range(first_row, last_row, step):
+            top = min(bottom + step, last_row)
+            if rows.shape[0] < top - bottom:
+                rows = np.zeros((2 * (top - bottom), 3))
+            if touched.size < (top - bottom) * n_words:
+                touched = np.zeros(2 * (top - bottom) * n_words, np.uint64)
+            if cover.shape[0] < (top - bottom) * n_columns:
+                cover = np.zeros((2 * (top - bottom) * n_columns, 2))
+                moment = np.zeros((cover.shape[0] if has_moments else 0, 3))
+            _add_rings(
+                uv, ring_offsets, first_ring, last_ring, n_x, bottom, top, left, n_columns, rows, cover, moment, touched
             )
-            covered[i_site] += area
-        if has_moments:
-            for row in range(n_rows):
-                if n_cuts + n_x > cuts.shape[0]:
-                    cuts = _grow(cuts, n_cuts, n_x)
-                    moments = _grow(moments, n_cuts, n_x)
-                n_cuts = _write_cuts(
-                    head[row], links, moment, climb[row], n_y, n_x, site, bottom + row, cuts, moments, n_cuts
+            for row in range(bottom, top):
+                i_row = row - bottom
+                n_touched = _touched_columns(touched, i_row, n_words, columns)
+                base = i_row * n_columns
+                # A touched cell adds at most two spans, its own weight, and one weight of a run or the weights of a short run.
+                spans = _grow(spans, n_spans, 2 * n_touched)
+                weights = _grow(weights, n_weights, MIN_RUN * n_touched)
+                n_spans, n_weights, area = _write_row(
+                    columns,
+                    n_touched,
+                    left,
+                    cover,
+                    base,
+                    rows,
+                    i_row,
+                    n_x,
+                    site,
+                    row,
+                    spans,
+                    n_spans,
+                    weights,
+                    n_weights,
                 )
+                covered[i_site] += area
+                if has_moments:
+                    if n_cuts + n_x > cuts.shape[0]:
+                        cuts = _grow(cuts, n_cuts, n_x)
+                        moments = _grow(moments, n_cuts, n_x)
+                    n_cuts = _write_cuts(
+                        columns, n_touched, left, moment, base, rows, i_row, n_y, n_x, site, row, cuts, moments, n_cuts
+                    )
+                _clear_row(columns, n_touched, i_row, n_columns, rows, cover, moment)
     return spans[:n_spans].copy(), weights[:n_weights].copy(), cuts[:n_cuts], moments[:n_cuts], covered
+
+
+@njit(
+    [
+        types.void(_input(cell, 2), _points, _ints, _ints, _flags, _count, types.float64, _float_list)
+        for cell in (types.float32, types.float64)
+    ],
+)
+def integrate_sites(cells, uv, ring_offsets, site_offsets, where, order, scale, out):
+    """
+    Write scale x integral of sites, without spans.
+
+    Sites where ``where`` is False are not computed; an empty array stands for all True. Outlines are traced as by
+    :func:`trace_sites`, and the cells of a row are summed as soon as it has been traced.
+    """
+    n_y, n_x = cells.shape
+    has_moments = order == 2
+    rows = np.zeros((64, 3))
+    cover = np.zeros((1024, 2))
+    moment = np.zeros((1024 if has_moments else 0, 3))
+    touched = np.zeros(64, np.uint64)
+    columns = np.empty(n_x + 1, np.int64)
+    for i_site in range(site_offsets.size - 1):
+        if where.size > 0 and not where[i_site]:
+            continue
+        first_ring, last_ring = site_offsets[i_site], site_offsets[i_site + 1]
+        first_row, last_row, left, n_columns = _box(uv, ring_offsets[first_ring], ring_offsets[last_ring], n_y, n_x)
+        n_words = (n_columns + 63) >> 6
+        step = max(1, BOX_CELLS // max(n_columns, 1))
+        total = 0.0
+        for bottom in range(first_row, last_row, step):
+            top = min(bottom + step, last_row)
+            if rows.shape[0] < top - bottom:
+                rows = np.zeros((2 * (top - bottom), 3))
+            if touched.size < (top - bottom) * n_words:
+                touched = np.zeros(2 * (top - bottom) * n_words, np.uint64)
+            if cover.shape[0] < (top - bottom) * n_columns:
+                cover = np.zeros((2 * (top - bottom) * n_columns, 2))
+                moment = np.zeros((cover.shape[0] if has_moments else 0, 3))
+            # Read one cell of each cache line: these loads overlap, while those of the rows below would be waited for.
+            probe = 0.0
+            for row in range(bottom, top):
+                for c in range(left, min(left + n_columns, n_x), LINE_CELLS):
+                    probe += cells[row, c]
+            if probe == NEVER:  # so that the loop is not optimised away
+                total += 1.0
+            _add_rings(
+                uv, ring_offsets, first_ring, last_ring, n_x, bottom, top, left, n_columns, rows, cover, moment, touched
+            )
+            for row in range(bottom, top):
+                i_row = row - bottom
+                n_touched = _touched_columns(touched, i_row, n_words, columns)
+                base = i_row * n_columns
+                total += _sum_row(columns, n_touched, left, cover, base, rows, i_row, cells, row)
+                if has_moments:
+                    total += _sum_gradients(columns, n_touched, left, moment, base, rows, i_row, cells, row)
+                _clear_row(columns, n_touched, i_row, n_columns, rows, cover, moment)
+        out[i_site] = scale * total
 
 
 @njit(

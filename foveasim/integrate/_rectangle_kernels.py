@@ -17,13 +17,12 @@ import numpy as np
 from numba import types
 
 from foveasim._core.jit import njit
+from foveasim.integrate._kernels import _sum_cells
 
 __all__ = ["find_rectangles", "gather_lattice", "gather_rectangles"]
 
 #: Covered fractions of the outermost cells up to this value are rounding errors.
 NO_COVERAGE = 4e-15
-#: Number of independent partial sums along a row.
-BLOCK = 8
 
 
 def _input(dtype, ndim):
@@ -86,47 +85,23 @@ def _covered_cells(low, high, n):
 
 
 @njit(inline="always")
-def _sum_cells(line, start, stop):
-    """Return the sum of the cells ``start`` to ``stop - 1`` of a row in float64."""
-    total = 0.0
-    c = start
-    if stop - start >= 2 * BLOCK:
-        a0, a1, a2, a3, a4, a5, a6, a7 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        while c + BLOCK <= stop:
-            a0 += line[c]
-            a1 += line[c + 1]
-            a2 += line[c + 2]
-            a3 += line[c + 3]
-            a4 += line[c + 4]
-            a5 += line[c + 5]
-            a6 += line[c + 6]
-            a7 += line[c + 7]
-            c += BLOCK
-        total = ((a0 + a1) + (a2 + a3)) + ((a4 + a5) + (a6 + a7))
-    while c < stop:
-        total += line[c]
-        c += 1
-    return total
-
-
-@njit(inline="always")
-def _along_row(line, first, last, w_first, w_last):
+def _along_row(cells, row, first, last, w_first, w_last):
     """Return the integral of a row over an interval."""
-    total = w_first * line[first]
+    total = w_first * cells[row, first]
     if last > first:
-        total += w_last * line[last]
+        total += w_last * cells[row, last]
         if last > first + 1:
-            total += _sum_cells(line, first + 1, last)
+            total += _sum_cells(cells, row, first + 1, last)
     return total
 
 
 @njit(inline="always")
-def _difference(line, c):
+def _difference(cells, row, c):
     """Return the gradient of a row at a cell, per cell; 0 along a single cell."""
-    n = line.size
+    n = cells.shape[1]
     if n == 1:
         return 0.0
-    step = np.float64(line[min(c + 1, n - 1)]) - np.float64(line[max(c - 1, 0)])
+    step = np.float64(cells[row, min(c + 1, n - 1)]) - np.float64(cells[row, max(c - 1, 0)])
     return 0.5 * step if 0 < c < n - 1 else step
 
 
@@ -136,8 +111,8 @@ def _tilt(cells, row, first, last, w_first, w_last):
     n = cells.shape[0]
     if n == 1:
         return 0.0
-    above = _along_row(cells[min(row + 1, n - 1)], first, last, w_first, w_last)
-    below = _along_row(cells[max(row - 1, 0)], first, last, w_first, w_last)
+    above = _along_row(cells, min(row + 1, n - 1), first, last, w_first, w_last)
+    below = _along_row(cells, max(row - 1, 0), first, last, w_first, w_last)
     return 0.5 * (above - below) if 0 < row < n - 1 else above - below
 
 
@@ -151,13 +126,12 @@ def _integral(cells, u, v, order):
         return total
     for row in range(bottom, top + 1):
         weight = w_bottom if row == bottom else (w_top if row == top else 1.0)
-        line = cells[row]
-        value = _along_row(line, first, last, w_first, w_last)
+        value = _along_row(cells, row, first, last, w_first, w_last)
         if order == 2:
             if m_first != 0.0:
-                value += m_first * _difference(line, first)
+                value += m_first * _difference(cells, row, first)
             if m_last != 0.0:
-                value += m_last * _difference(line, last)
+                value += m_last * _difference(cells, row, last)
         total += weight * value
     if order == 2:
         if m_bottom != 0.0 and top >= bottom:
@@ -252,7 +226,7 @@ def gather_lattice(cells, u, v, first_row, last_row, where, scale, order, out):
                     if is_narrow:
                         value = w_first[i] * line[firsts[i]] + w_last[i] * line[lasts[i]]
                     elif lasts[i] >= firsts[i]:
-                        value = _along_row(line, firsts[i], lasts[i], w_first[i], w_last[i])
+                        value = _along_row(cells, row, firsts[i], lasts[i], w_first[i], w_last[i])
                     out[start + i] += weight * value
                 continue
             if row != done:
@@ -261,7 +235,7 @@ def gather_lattice(cells, u, v, first_row, last_row, where, scale, order, out):
                     if is_narrow:
                         along[i] = w_first[i] * line[firsts[i]] + w_last[i] * line[lasts[i]]
                     elif lasts[i] >= firsts[i]:
-                        along[i] = _along_row(line, firsts[i], lasts[i], w_first[i], w_last[i])
+                        along[i] = _along_row(cells, row, firsts[i], lasts[i], w_first[i], w_last[i])
                     else:
                         along[i] = 0.0
             for i in range(n_columns):

@@ -52,12 +52,13 @@ def test_zoo_weights_equal_rational_clipping(name):
     assert weights_of(POLYGONS[name]) == pytest.approx(expected, rel=EXACT, abs=1e-15)
 
 
+@pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("name", POLYGONS)
-def test_zoo_sums_equal_rational_clipping(name):
+def test_zoo_sums_equal_rational_clipping(name, compiled):
     expected = float((exact_weights(POLYGONS[name], SHAPE) * MAP).sum())
     layout = fs.Layout.from_polygons([POLYGONS[name]])
 
-    assert fs.Integrator(layout, GRID)(MAP)[0] == pytest.approx(expected, rel=EXACT, abs=0.0)
+    assert fs.Integrator(layout, GRID, compiled=compiled)(MAP)[0] == pytest.approx(expected, rel=EXACT, abs=0.0)
 
 
 @settings(max_examples=300, deadline=None, derandomize=True)
@@ -66,7 +67,8 @@ def test_random_polygons_equal_rational_clipping(polygon):
     expected = float((exact_weights(polygon, SHAPE) * MAP).sum())
     layout = fs.Layout.from_polygons([polygon])
 
-    assert fs.Integrator(layout, GRID)(MAP)[0] == pytest.approx(expected, rel=EXACT, abs=0.0)
+    for compiled in (True, False):
+        assert fs.Integrator(layout, GRID, compiled=compiled)(MAP)[0] == pytest.approx(expected, rel=EXACT, abs=0.0)
 
 
 @settings(max_examples=2500, deadline=None, derandomize=True)
