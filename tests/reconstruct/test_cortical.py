@@ -135,8 +135,10 @@ def test_inverse_matches_opencv():
 
     y, x = np.mgrid[:n, :n] - centre
     inside = (np.hypot(x, y) > 4.0) & (np.hypot(x, y) < 50.0)
-    # Some versions of OpenCV leave a few pixels undefined.
-    assert np.mean(np.abs(ours - theirs)[inside] < 0.02) > 0.99
+    # Some versions of OpenCV leave a few pixels undefined, also as signalling NaN.
+    with np.errstate(invalid="ignore"):
+        is_close = np.abs(ours - theirs) < 0.02
+    assert np.mean(is_close[inside]) > 0.99
 
 
 def test_angles_increase_counter_clockwise():
