@@ -448,15 +448,15 @@ class Camera:
         """Simulate the sensor for photoelectron rates."""
         sensor = self._sensor
         with clock.stage("sensor"):
-            expected_e = sensor.expected_electrons(photo_e_per_s, exposure_s)
-            electrons = sensor.collect(expected_e, streams=streams, n_threads=self._n_threads)
-            code = sensor.read(electrons, streams=streams, n_threads=self._n_threads)
+            expected_e, electrons, code = sensor.expose(
+                photo_e_per_s, exposure_s, streams=streams, n_threads=self._n_threads
+            )
         return Capture(
             layout=self._layout,
             code=read_only(code),
             electrons=read_only(electrons),
             expected_e=read_only(expected_e),
-            filter_of_site=read_only(sensor.filter_of_site),
+            filter_of_site=sensor.filter_of_site,
             filter_names=sensor.filter_names,
             bits=sensor.bits,
             white_dn=self._white(light),
@@ -824,7 +824,7 @@ class Camera:
     def _sites_of_filter(self) -> dict[int, Bools | None]:
         """Sites of each filter that occurs, (n_site,); None for all sites."""
         filter_of_site = self._sensor.filter_of_site
-        used = [int(c) for c in np.flatnonzero(np.bincount(filter_of_site))]
+        used = self._sensor.filters_used.tolist()
         return dict.fromkeys(used) if len(used) == 1 else {c: read_only(filter_of_site == c) for c in used}
 
     def _bands(self, power_map: PowerMap, e_per_j: Floats) -> Iterator[_WeightedMap]:
@@ -846,7 +846,7 @@ class Camera:
 
         One inverse transform per filter and image, for any number of wavelengths.
         """
-        used = np.array(list(self._sites_of_filter), np.int64)
+        used = self._sensor.filters_used
 
         # As a function, without a reference in this generator: one map is in memory at a time.
         def image(grid: Grid, c: int, maps: Iterator[NDArray[Any]]) -> NDArray[Any]:

@@ -1,5 +1,5 @@
 """
-Counter-based random numbers: Philox generators, and Gaussian numbers from their words.
+Counter-based random numbers: Philox generators, and uniform and Gaussian numbers from their words.
 
 A Philox generator maps a counter and a key to random words: J. K. Salmon, M. A. Moraes, R. O. Dror and D. E. Shaw, Parallel
 random numbers: as easy as 1, 2, 3 (SC11), section 3.3. All generators use ten rounds. Words of 32 bits are stored in 64-bit
@@ -15,7 +15,16 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = ["philox_2x32", "philox_4x32", "philox_4x64", "standard_normal", "uniform"]
+__all__ = [
+    "BATCH",
+    "add_normals",
+    "fill_normals",
+    "fill_uniforms",
+    "philox_2x32",
+    "philox_4x32",
+    "philox_4x64",
+    "uniform",
+]
 
 #: Multipliers and Weyl increments of Philox 4x64.
 _M0, _M1 = np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157)
@@ -25,21 +34,24 @@ _M0_32, _M1_32 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
 _W0_32, _W1_32 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
 _M_32 = np.uint64(0xD256D193)
 _LOW, _32, _11 = np.uint64(0xFFFFFFFF), np.uint64(32), np.uint64(11)
-_ONE_IN_2_53, _ONE_IN_2_32, _ONE_IN_2_64, _2_31 = 2.0**-53, 2.0**-32, 2.0**-64, 2.0**31
-#: Pairs of Gaussian numbers per block: the buffers of a block fit in the L1 cache.
-BLOCK_PAIRS = 512
-#: Lowest bit of the exponent of a float64; bit patterns of 1.0 and sqrt(1/2); mask of the mantissa.
-_EXPONENT = 52
-_ONE = np.float64(1.0).view(np.int64)
-_SQRT_HALF = np.float64(math.sqrt(0.5)).view(np.int64)
-_MANTISSA = np.int64((1 << _EXPONENT) - 1)
-_BIAS = 1023
-_LN_2 = math.log(2.0)
-_HALF_PI_IN_2_32 = 0.5 * math.pi * _ONE_IN_2_32
-#: Taylor series of sine and cosine, error 2e-14 up to pi / 4, and of 2 artanh, error 1e-14 up to 0.172.
-_S3, _S5, _S7, _S9, _S11, _S13 = ((-1.0) ** k / math.factorial(2 * k + 1) for k in range(1, 7))
-_C2, _C4, _C6, _C8, _C10, _C12, _C14 = ((-1.0) ** k / math.factorial(2 * k) for k in range(1, 8))
-_L1, _L3, _L5, _L7, _L9, _L11, _L13, _L15, _L17 = (2.0 / k for k in range(1, 18, 2))
+_12, _ONE_IN_2_53, _ONE_IN_2_52 = np.uint64(12), 2.0**-53, 2.0**-52
+#: Number of random numbers that are computed at a time: their buffers fit in the L1 cache.
+BATCH = 1024
+_QUARTER, _HALF = BATCH // 4, BATCH // 2
+#: Last words of the counters, so that Gaussian and uniform numbers of a key are independent.
+_NORMALS, _UNIFORMS = np.uint64(0), np.uint64(1)
+#: Lowest bit of the exponent of a float32; bit patterns of 1.0 and sqrt(1/2); mask of the mantissa.
+_EXPONENT, _BIAS = np.int32(23), np.int32(127)
+_ONE = np.float32(1.0).view(np.int32)
+_SQRT_HALF = np.float32(math.sqrt(0.5)).view(np.int32)
+_MANTISSA = np.int32((1 << 23) - 1)
+_LN_2, _ONE_IN_2_32, _ONE_IN_2_33 = np.float32(math.log(2.0)), np.float32(2.0**-32), np.float32(2.0**-33)
+_QUARTER_PI_IN_2_31 = np.float32(0.25 * math.pi * 2.0**-31)
+_1 = np.float32(1.0)
+#: Taylor series of sine and cosine up to pi / 4, and of 2 artanh up to 0.172: errors below the resolution of float32.
+_S3, _S5, _S7, _S9 = (np.float32((-1.0) ** k / math.factorial(2 * k + 1)) for k in range(1, 5))
+_C2, _C4, _C6, _C8, _C10 = (np.float32((-1.0) ** k / math.factorial(2 * k)) for k in range(1, 6))
+_L1, _L3, _L5, _L7, _L9 = (np.float32(2.0 / k) for k in range(1, 10, 2))
 
 
 @njit(inline="always")
@@ -98,14 +110,15 @@ def uniform(word):
     return (np.float64(word >> _11) + 0.5) * _ONE_IN_2_53
 
 
-@njit(types.void(types.uint64, types.float64[::1]), error_model="numpy")
-def standard_normal(key, out):
+@njit(types.void(types.uint64, types.int64, types.uint32[::1], types.float32[::1]), error_model="numpy")
+def fill_normals(key, batch, words, out):
     """
-    Fill an array with standard Gaussian numbers.
+    Compute a batch of standard Gaussian numbers.
 
-    Number ``i`` depends only on the key and ``i``. Counter ``i // 2`` of Philox 4x32 gives a pair of numbers by the method of
-    G. E. P. Box and M. E. Muller, A note on the generation of random normal deviates (Ann. Math. Statist. 29, 1958): the radius
-    is ``sqrt(-2 ln u)`` with u from 64 bits, the angle is in the first quadrant, and two bits give the signs.
+    Number ``i`` of batch ``b`` depends only on the key, ``b`` and ``i``. ``words``, a buffer, and ``out`` have size ``BATCH``.
+    Each counter of Philox 4x32 gives two pairs of numbers by the method of G. E. P. Box and M. E. Muller, A note on the
+    generation of random normal deviates (Ann. Math. Statist. 29, 1958): the radius is ``sqrt(-2 ln u)`` with u from one word,
+    so that numbers are below 6.8. Of a second word, 30 bits are the angle in the first quadrant, and two bits the signs.
 
     Notes
     -----
@@ -113,41 +126,65 @@ def standard_normal(key, out):
     at most pi/4, so sine and cosine need no range reduction. Logarithm, sine and cosine are evaluated by sums and products in a
     fixed order: the compiler vectorises them, and results are bit-identical on every machine.
     """
-    u, angle, signs = np.empty(BLOCK_PAIRS), np.empty(BLOCK_PAIRS), np.empty(BLOCK_PAIRS, np.int32)
-    mantissa, exponent = np.empty(BLOCK_PAIRS), np.empty(BLOCK_PAIRS)
-    u_bits, mantissa_bits = u.view(np.int64), mantissa.view(np.int64)
     key_0, key_1, zero = key & _LOW, key >> _32, np.uint64(0)
-    n_pairs = (out.size + 1) // 2
-    for first in range(0, n_pairs, BLOCK_PAIRS):
-        n = min(BLOCK_PAIRS, n_pairs - first)
-        for j in range(n):
-            counter = np.uint64(first + j)
-            a, b, c, d = philox_4x32(key_0, key_1, counter & _LOW, counter >> _32, zero, zero)
-            # One vector instruction converts signed 32-bit integers to floating-point numbers.
-            low = (np.float64(np.int32(b)) + (_2_31 + 0.5)) * _ONE_IN_2_64
-            u[j] = (np.float64(np.int32(a)) + _2_31) * _ONE_IN_2_32 + low
-            angle[j] = (np.float64(np.int32(c)) + 0.5) * _HALF_PI_IN_2_32
-            signs[j] = np.int32(d)
-        for j in range(n):
-            bits = u_bits[j] + (_ONE - _SQRT_HALF)
-            exponent[j] = np.float64(np.int32(bits >> _EXPONENT) - _BIAS)
-            mantissa_bits[j] = (bits & _MANTISSA) + _SQRT_HALF
-        for j in range(n):
-            # ln m = 2 artanh y, with the mantissa m between sqrt(1/2) and sqrt(2).
-            y = (mantissa[j] - 1.0) / (mantissa[j] + 1.0)
-            z = y * y
-            log = _L9 + z * (_L11 + z * (_L13 + z * (_L15 + z * _L17)))
-            log = y * (_L1 + z * (_L3 + z * (_L5 + z * (_L7 + z * log))))
-            radius = math.sqrt(-(exponent[j] * _LN_2 + log))
-            z = angle[j] * angle[j]
-            sine = angle[j] * (1.0 + z * (_S3 + z * (_S5 + z * (_S7 + z * (_S9 + z * (_S11 + z * _S13))))))
-            cosine = 1.0 + z * (_C2 + z * (_C4 + z * (_C6 + z * (_C8 + z * (_C10 + z * (_C12 + z * _C14))))))
-            u[j] = math.copysign(radius * (cosine + sine), np.float64(signs[j]))
-            angle[j] = math.copysign(radius * (cosine - sine), np.float64(np.int32(signs[j] << 1)))
-        begin = 2 * first
-        n_complete = min(n, (out.size - begin) // 2)
-        for j in range(n_complete):
-            out[begin + 2 * j] = u[j]
-            out[begin + 2 * j + 1] = angle[j]
-        if n_complete < n:
-            out[begin + 2 * n_complete] = u[n_complete]
+    first = np.uint64(batch * _QUARTER)
+    w0, w1, w2, w3 = words[:_QUARTER], words[_QUARTER:_HALF], words[_HALF : 3 * _QUARTER], words[3 * _QUARTER :]
+    for j in range(_QUARTER):
+        counter = first + np.uint64(j)
+        a, b, c, d = philox_4x32(key_0, key_1, counter & _LOW, counter >> _32, zero, _NORMALS)
+        w0[j], w1[j], w2[j], w3[j] = np.uint32(a), np.uint32(b), np.uint32(c), np.uint32(d)
+    # The first half of the words gives radii, the second half angles and signs.
+    x, y, angles = out[:_HALF], out[_HALF:], words[_HALF:].view(np.int32)
+    x_bits = x.view(np.int32)
+    for j in range(_HALF):
+        x[j] = np.float32(words[j]) * _ONE_IN_2_32 + _ONE_IN_2_33
+    for j in range(_HALF):
+        bits = np.int32(x_bits[j] + (_ONE - _SQRT_HALF))
+        y[j] = np.float32(np.int32((bits >> _EXPONENT) - _BIAS))
+        x_bits[j] = (bits & _MANTISSA) + _SQRT_HALF
+    for j in range(_HALF):
+        # ln m = 2 artanh t, with the mantissa m between sqrt(1/2) and sqrt(2).
+        t = (x[j] - _1) / (x[j] + _1)
+        z = t * t
+        radius = np.sqrt(-(y[j] * _LN_2 + t * (_L1 + z * (_L3 + z * (_L5 + z * (_L7 + z * _L9))))))
+        word = angles[j]
+        angle = np.float32(np.int32(word << np.int32(2))) * _QUARTER_PI_IN_2_31
+        z = angle * angle
+        sine = angle * (_1 + z * (_S3 + z * (_S5 + z * (_S7 + z * _S9))))
+        cosine = _1 + z * (_C2 + z * (_C4 + z * (_C6 + z * (_C8 + z * _C10))))
+        x[j] = np.copysign(radius * (cosine + sine), np.float32(word))
+        y[j] = np.copysign(radius * (cosine - sine), np.float32(np.int32(word << np.int32(1))))
+
+
+@njit(types.void(types.uint64, types.int64, types.float64[::1], types.float64[::1]), error_model="numpy")
+def fill_uniforms(key, batch, first, second):
+    """
+    Compute a batch of pairs of uniform numbers in the open interval (0, 1), in multiples of 2**-53.
+
+    Pair ``i`` of batch ``b`` depends only on the key, ``b`` and ``i``: one counter of Philox 4x32. The arrays have size
+    ``BATCH``.
+    """
+    key_0, key_1, zero = key & _LOW, key >> _32, np.uint64(0)
+    for j in range(BATCH):
+        counter = np.uint64(batch * BATCH + j)
+        a, b, c, d = philox_4x32(key_0, key_1, counter & _LOW, counter >> _32, zero, _UNIFORMS)
+        first[j] = (np.float64(((a << _32) | b) >> _12) + 0.5) * _ONE_IN_2_52
+        second[j] = (np.float64(((c << _32) | d) >> _12) + 0.5) * _ONE_IN_2_52
+
+
+@njit(
+    types.void(types.float64[::1], types.Array(types.float64, 1, "C", readonly=True), types.uint64), error_model="numpy"
+)
+def add_normals(values, deviation, key):
+    """Add Gaussian numbers with a standard deviation per value, or of size 1 for all, in place."""
+    words, normals = np.empty(BATCH, np.uint32), np.empty(BATCH, np.float32)
+    for first in range(0, values.size, BATCH):
+        fill_normals(key, first // BATCH, words, normals)
+        part = values[first : first + BATCH]
+        if deviation.size == 1:
+            for j in range(part.size):
+                part[j] += deviation[0] * np.float64(normals[j])
+        else:
+            sigma = deviation[first : first + BATCH]
+            for j in range(part.size):
+                part[j] += sigma[j] * np.float64(normals[j])

@@ -12,9 +12,10 @@ import math
 import numpy as np
 from numba import types
 
-from foveasim._core._kernels import philox_2x32, philox_4x64, uniform
+from foveasim._core._kernels import BATCH, fill_normals, fill_uniforms, philox_2x32, philox_4x64, uniform
 from foveasim._core.jit import njit
 from foveasim.sensor.adc import ConversionTables
+from foveasim.sensor.effects.shot import PoissonTables
 from foveasim.sensor.prediction import ChargeDistributions, Quadrature, Transfer
 
 __all__ = [
@@ -35,9 +36,12 @@ ADC_LINEAR, ADC_ROOT, ADC_LOG, ADC_TABLE = range(4)
 #: Tolerance of code transitions, in codes: covers the rounding error of a division.
 CODE_ROUNDING = 1e-9
 #: Variance of rounding to integers: a uniform distribution of width 1.
-ROUNDING_VARIANCE = 1.0 / 12.0
+ROUNDING_VARIANCE = np.float32(1.0 / 12.0)
 #: Quadratic coefficient of the Poisson approximation and its 1/λ correction: see foveasim.sensor.effects.ShotNoise.
-QUADRATIC, QUADRATIC_CORRECTION = 1.0 / 6.0, 11.0 / 648.0
+QUADRATIC, QUADRATIC_CORRECTION = np.float32(1.0 / 6.0), np.float32(11.0 / 648.0)
+ONE, TWO = np.float32(1.0), np.float32(2.0)
+#: Upper limit of Poisson draws with a mean below 1: larger ones have a probability below 1e-18.
+MAX_ADDED = 20
 #: Upper limit of charges: 2**62 fits int64 with headroom for sums.
 MAX_CHARGE_E = 2.0**62
 #: Upper limit of a Poisson draw above its mean: this many standard deviations plus this many electrons.
@@ -54,6 +58,7 @@ SQRT_HALF, SQRT_TWO_PI = math.sqrt(0.5), math.sqrt(2.0 * math.pi)
 
 _floats = types.Array(types.float64, 1, "C", readonly=True)
 _ints = types.Array(types.int64, 1, "C", readonly=True)
+_lines = types.Array(types.int32, 1, "C", readonly=True)
 _words = types.Array(types.uint64, 1, "C", readonly=True)
 _points = types.Array(types.float64, 2, "C", readonly=True)
 _number, _count = types.float64, types.int64
@@ -61,6 +66,9 @@ _adc = types.NamedTuple(
     (_number, _count, _number, _floats, _count, _floats, _number, types.uint64, _floats), ConversionTables
 )
 _charges = types.NamedTuple((_floats, _floats, _floats, _floats, _floats, _number, types.boolean), ChargeDistributions)
+_poisson_tables = types.NamedTuple(
+    (types.Array(types.float64, 2, "C", readonly=True), types.Array(types.uint16, 2, "C", readonly=True)), PoissonTables
+)
 _transfer = types.NamedTuple((_floats, _floats, _floats, _floats, _number, _number), Transfer)
 _quadrature = types.NamedUniTuple(_floats, 2, Quadrature)
 
@@ -106,40 +114,61 @@ def count_ray_intersections(xy, ring_offsets, site_offsets, centroid, directions
 
 
 @njit(inline="always")
-def _poisson(mean, z):
-    """Invert the Poisson distribution at the cumulative probability of a Gaussian number."""
-    wanted = 0.5 * math.erfc(-z * math.sqrt(0.5))
-    probability = math.exp(-mean)
-    cumulated = probability
-    n = 0
-    last = int(mean + MAX_DRAW_SIGMAS * math.sqrt(mean)) + MAX_DRAW_MARGIN_E
-    while wanted > cumulated and n < last:
-        n += 1
-        probability *= mean / n
-        cumulated += probability
-    return n
-
-
-@njit(types.void(_floats, _floats, types.float64, types.int64[::1]), error_model="numpy")
-def draw_poisson(expected_e, z, gaussian_above_e, electrons):
+def _poisson(mean, first, second, tables):
     """
-    Convert Gaussian numbers to Poisson draws.
+    Draw a Poisson number from two uniform numbers: the sum of draws of the integral and of the fractional part of the mean.
+
+    Both are inversions of the cumulative distribution, the first one by a table.
+    """
+    row = int(mean)
+    n = np.int64(tables.guide[row, int(first * tables.guide.shape[1])])
+    while tables.cumulative_fraction[row, n] <= first:
+        n += 1
+    fraction = mean - row
+    probability = math.exp(-fraction)
+    cumulated = probability
+    added = 0
+    while cumulated <= second and added < MAX_ADDED:
+        added += 1
+        probability *= fraction / added
+        cumulated += probability
+    return np.float64(n + added)
+
+
+@njit(types.void(types.float64[::1], types.float64, _poisson_tables, types.uint64), error_model="numpy")
+def draw_poisson(charge_e, gaussian_above_e, tables, key):
+    """
+    Replace expectations by Poisson draws, in whole electrons.
 
     Draws are exact up to the mean ``gaussian_above_e``; above it, their first three moments are correct.
     """
-    # The first loop has no branches so that the compiler vectorises it.
-    charge = np.empty(PIECE)
-    for first in range(0, expected_e.size, PIECE):
-        sites = slice(first, min(first + PIECE, expected_e.size))
-        means, normals, out = expected_e[sites], z[sites], electrons[sites]
-        for j in range(means.size):
-            mean = max(means[j], gaussian_above_e)
-            c = QUADRATIC + QUADRATIC_CORRECTION / mean
-            deviation = math.sqrt(mean - ROUNDING_VARIANCE - 2.0 * c * c)
-            drawn = mean + deviation * normals[j] + c * (normals[j] * normals[j] - 1.0)
-            charge[j] = np.rint(min(max(drawn, 0.0), MAX_CHARGE_E))
-        for j in range(means.size):
-            out[j] = _poisson(means[j], normals[j]) if means[j] <= gaussian_above_e else int(charge[j])
+    words, normals, drawn = np.empty(BATCH, np.uint32), np.empty(BATCH, np.float32), np.empty(BATCH)
+    first, second = np.empty(BATCH), np.empty(BATCH)
+    lowest = np.float32(gaussian_above_e)
+    for begin in range(0, charge_e.size, BATCH):
+        charges = charge_e[begin : begin + BATCH]
+        n_exact = 0
+        n_zero = 0
+        for j in range(charges.size):
+            n_exact += charges[j] <= gaussian_above_e
+            n_zero += charges[j] <= 0.0
+        if n_exact < charges.size:
+            fill_normals(key, begin // BATCH, words, normals)
+            # This loop has no branches so that the compiler vectorises it. The deviation from the mean is a float32.
+            for j in range(charges.size):
+                mean, z = max(np.float32(charges[j]), lowest), normals[j]
+                c = QUADRATIC + QUADRATIC_CORRECTION / mean
+                deviation = np.sqrt(mean - ROUNDING_VARIANCE - TWO * c * c) * z + c * (z * z - ONE)
+                drawn[j] = np.rint(min(max(charges[j] + np.float64(deviation), 0.0), MAX_CHARGE_E))
+        if n_exact > n_zero:
+            fill_uniforms(key, begin // BATCH, first, second)
+        for j in range(charges.size):
+            if charges[j] > gaussian_above_e:
+                charges[j] = drawn[j]
+            elif charges[j] > 0.0:
+                charges[j] = _poisson(charges[j], first[j], second[j], tables)
+            else:
+                charges[j] = 0.0
 
 
 @njit(inline="always")
@@ -181,10 +210,16 @@ def _relative_voltage(v, v_sat_v):
 
 
 @njit(inline="always")
+def _index(position):
+    """Truncate to an index; unsigned integers avoid the check for negative indices."""
+    return np.uint32(np.int32(position))
+
+
+@njit(inline="always")
 def _add_inl(value, n_codes, inl):
     """Add the integral nonlinearity to an unquantised code."""
     position = min(value / n_codes, 1.0) * (inl.size - 1)
-    k = np.uint32(min(int(position), inl.size - 2))  # unsigned: avoids the check for negative indices
+    k = _index(min(position, inl.size - 2.0))
     return value + (inl[k] + (position - k) * (inl[k + 1] - inl[k]))
 
 
@@ -207,7 +242,7 @@ def _dnl_position(key, line, code, n_quantiles):
 @njit(inline="always")
 def _interpolate(quantiles, position):
     """Interpolate quantiles linearly."""
-    k = np.uint32(position)
+    k = _index(position)
     return quantiles[k] + (position - k) * (quantiles[k + 1] - quantiles[k])
 
 
@@ -220,7 +255,7 @@ def _dnl_normal(key, line, code, quantiles):
 @njit(inline="always")
 def _quantise(value, n_codes):
     """Quantise to a code in float64."""
-    return np.float64(int(min(max(value + CODE_ROUNDING, 0.0), n_codes - 1.0)))
+    return np.float64(np.int32(min(max(value + CODE_ROUNDING, 0.0), n_codes - 1.0)))
 
 
 @njit(inline="always")
@@ -278,7 +313,7 @@ def _charge_at_code(value, site, adc):
     return (v - sense_v) / per_e
 
 
-@njit([types.void(_floats, _ints, _adc, code[::1]) for code in (types.uint8, types.uint16)], error_model="numpy")
+@njit([types.void(_floats, _lines, _adc, code[::1]) for code in (types.uint8, types.uint16)], error_model="numpy")
 def convert(voltage_v, line, adc, code):
     """
     Convert voltages to codes: clipping, companding, INL, DNL, quantisation.
@@ -289,13 +324,20 @@ def convert(voltage_v, line, adc, code):
     # does not check divisions.
     value, position = np.empty(PIECE), np.empty(PIECE)
     n_codes, inl, dnl, quantiles = adc.n_codes, adc.inl, adc.dnl_dn, adc.quantiles
+    log_range = math.log1p(adc.log_strength)
     for first in range(0, voltage_v.size, PIECE):
         n = min(PIECE, voltage_v.size - first)
         sites = slice(first, first + n)
         volts, lines, codes = voltage_v[sites], line[sites], code[sites]
         for j in range(n):
             value[j] = _relative_voltage(volts[j], adc.v_sat_v)
-        if adc.companding_index != ADC_LINEAR:
+        if adc.companding_index == ADC_ROOT:
+            for j in range(n):
+                value[j] = math.sqrt(value[j])
+        elif adc.companding_index == ADC_LOG:
+            for j in range(n):
+                value[j] = math.log1p(adc.log_strength * value[j]) / log_range
+        elif adc.companding_index == ADC_TABLE:
             for j in range(n):
                 value[j] = _compand(value[j], adc)
         for j in range(n):
@@ -304,12 +346,12 @@ def convert(voltage_v, line, adc, code):
             for j in range(n):
                 value[j] = _add_inl(value[j], n_codes, inl)
         for j in range(n):
-            codes[j] = int(_quantise(value[j], n_codes))
+            codes[j] = np.int32(_quantise(value[j], n_codes))
         if dnl > 0.0:
             for j in range(n):
                 position[j] = _dnl_position(adc.dnl_key, lines[j], codes[j], quantiles.size)
             for j in range(n):
-                codes[j] = int(_quantise(value[j] + dnl * _interpolate(quantiles, position[j]), n_codes))
+                codes[j] = np.int32(_quantise(value[j] + dnl * _interpolate(quantiles, position[j]), n_codes))
 
 
 @njit(inline="always")
@@ -389,7 +431,7 @@ def _discretise_charge(mean, is_poisson, well_e, quadrature, nodes, weights):
     return n + 1
 
 
-@njit(types.void(_charges, _transfer, _ints, _adc, _quadrature, types.float64[::1], types.float64[::1]))
+@njit(types.void(_charges, _transfer, _lines, _adc, _quadrature, types.float64[::1], types.float64[::1]))
 def predict_codes(charges, transfer, line, adc, quadrature, mean_dn, variance_dn2):
     """
     Compute mean and variance of the code of each site.
@@ -422,7 +464,10 @@ def predict_codes(charges, transfer, line, adc, quadrature, mean_dn, variance_dn
             nonlinearity,
         )
         if site[0] * site[2] == 0.0:
-            mean_dn[i], variance_dn2[i] = _quantise_with_dnl(_unquantised_code(0.0, site, adc), line[i], adc), 0.0
+            mean_dn[i], variance_dn2[i] = (
+                _quantise_with_dnl(_unquantised_code(0.0, site, adc), _value_of_site(line, i), adc),
+                0.0,
+            )
             continue
         reach = (
             RANGE_SIGMAS * math.sqrt(deviation**2 + sigma**2) + half_step + (MAX_DRAW_MARGIN_E if n_nodes > 1 else 1.0)
@@ -448,7 +493,7 @@ def predict_codes(charges, transfer, line, adc, quadrature, mean_dn, variance_dn
             # DNL adds at most one transition inside each code interval.
             jump = 1.0
             if adc.dnl_dn > 0.0:
-                moved = adc.dnl_dn * _dnl_normal(adc.dnl_key, line[i], k, adc.quantiles)
+                moved = adc.dnl_dn * _dnl_normal(adc.dnl_key, _value_of_site(line, i), k, adc.quantiles)
                 jump = math.ceil(k + moved) - (k + moved)
             for part in range(2):
                 transition = k + jump if part == 0 else k + 1.0
@@ -467,7 +512,7 @@ def predict_codes(charges, transfer, line, adc, quadrature, mean_dn, variance_dn
                     )
                 )
                 centre = 0.5 * (at + end) if end < np.inf else max(at, high) + 1.0
-                code = _quantise_with_dnl(_unquantised_code(centre, site, adc), line[i], adc)
+                code = _quantise_with_dnl(_unquantised_code(centre, site, adc), _value_of_site(line, i), adc)
                 total += code * (below - cumulated)
                 squares += code * code * (below - cumulated)
                 at, cumulated = end, below

@@ -1,18 +1,16 @@
-"""Blocks of sites for random streams, and pieces of blocks for the CPU cache."""
+"""Blocks of sites: units of work for threads, of random streams, and for the CPU cache."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 from foveasim._core.threads import parallel_map, thread_count
 
-__all__ = ["BLOCK_SITES", "for_each_block", "pieces"]
+__all__ = ["BLOCK_SITES", "for_each_block"]
 
-#: Number of sites per random stream of an effect. It is fixed so that draws do not depend on the number of threads.
-BLOCK_SITES = 1 << 16
-#: Number of sites processed at a time; draws do not depend on it. A few arrays of this length fit the L2 cache (256 KiB each),
-#: and the interpreter overhead per site, which threads cannot parallelise, is small.
-PIECE_SITES = 1 << 15
+#: Number of sites per block. It is fixed so that draws do not depend on the number of threads. A few arrays of this length fit
+#: the L2 cache (256 KiB each), and the interpreter overhead per site, which threads cannot parallelise, is small.
+BLOCK_SITES = 1 << 15
 
 
 def for_each_block(n_sites: int, work: Callable[[int, slice], None], n_threads: int | None = None) -> None:
@@ -23,9 +21,3 @@ def for_each_block(n_sites: int, work: Callable[[int, slice], None], n_threads: 
         range(n_blocks),
         thread_count(n_threads),
     )
-
-
-def pieces(block: slice) -> Iterator[slice]:
-    """Split a block of sites into slices of at most ``PIECE_SITES``."""
-    for first in range(block.start, block.stop, PIECE_SITES):
-        yield slice(first, min(first + PIECE_SITES, block.stop))

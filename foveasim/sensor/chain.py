@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
+from itertools import groupby
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -10,20 +11,26 @@ from numpy.typing import NDArray
 
 from foveasim._core.names import possible_names
 from foveasim._core.random_streams import Streams
-from foveasim._core.validation import Floats
+from foveasim._core.validation import Floats, Ints
 from foveasim.errors import ParameterError, SimulationError
-from foveasim.sensor.blocks import for_each_block, pieces
+from foveasim.sensor.adc import ConversionTables
+from foveasim.sensor.blocks import for_each_block
 from foveasim.sensor.effects import STAGES, STANDARD, Effect, FixedFactor, FixedOffset, Sites
 
 __all__ = [
+    "ChargeCheck",
+    "Conversion",
     "Factor",
+    "FullWell",
     "Nonlinearity",
     "Offset",
+    "Save",
     "Step",
     "apply_steps",
     "check_effects",
     "check_names",
     "merge_steps",
+    "run_steps",
     "sort_by_stage",
 ]
 
@@ -90,13 +97,70 @@ class Nonlinearity(_Deterministic):
         return values
 
 
+class ChargeCheck(_Deterministic):
+    """
+    Check that charges are at least a limit, in e-, and not NaN.
+
+    Raises
+    ------
+    ParameterError
+        With the name of the charges and the smallest one of the block.
+    """
+
+    def __init__(self, name: str, at_least: float) -> None:
+        super().__init__(at_least)
+        self.parameter, self.at_least = name, at_least
+
+    def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
+        """Return the values unchanged."""
+        _ = sites, rng
+        if values.size and not (smallest := float(np.min(values))) >= self.at_least:
+            raise ParameterError(self.parameter, f"must be >= {self.at_least:g} everywhere", smallest, "e-")
+        return values
+
+
+class FullWell(_Deterministic):
+    """Upper limit of the charge, an array (n_site,) or a number."""
+
+    def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
+        """Return the values, at most the limit."""
+        _ = rng
+        return np.minimum(values, sites.select(self.values), out=values)
+
+
+class Save(_Deterministic):
+    """Copy of the values to an array (n_site,) of any type."""
+
+    def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
+        """Return the values unchanged."""
+        _ = rng
+        self.values[sites.index] = values
+        return values
+
+
+class Conversion(_Deterministic):
+    """Conversion of voltages to codes, which are written to an array (n_site,)."""
+
+    def __init__(self, code: NDArray[Any], line: Ints, tables: ConversionTables) -> None:
+        super().__init__(code)
+        self.line, self.tables = line, tables
+
+    def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
+        """Return the voltages unchanged."""
+        from foveasim.sensor import _kernels
+
+        _ = rng
+        _kernels.convert(values, sites.select(self.line), self.tables, self.values[sites.index])
+        return values
+
+
 #: Effect or deterministic step.
 Step: TypeAlias = Effect | _Deterministic
 
 
 def merge_steps(steps: Iterable[Step], sites: Sites) -> tuple[Step, ...]:
     """
-    Merge consecutive factors, and consecutive offsets, into single steps.
+    Merge consecutive factors, and consecutive offsets, into single steps, and omit factors of 1 and offsets of 0.
 
     The result is the same to rounding. Merging avoids passes over the sites and reads of patterns from memory.
     """
@@ -114,7 +178,13 @@ def merge_steps(steps: Iterable[Step], sites: Sites) -> tuple[Step, ...]:
             steps_merged[-1] = Offset(previous.values + current.values)
         else:
             steps_merged.append(current)
-    return tuple(steps_merged)
+    return tuple(step for step in steps_merged if not _is_neutral(step))
+
+
+def _is_neutral(step: Step) -> bool:
+    """Whether the step is a factor of 1 or an offset of 0."""
+    neutral = 1.0 if isinstance(step, Factor) else 0.0 if isinstance(step, Offset) else None
+    return neutral is not None and isinstance(step, _Deterministic) and step.values.size == 1 and step.values == neutral
 
 
 def sort_by_stage(effects: Iterable[Effect]) -> tuple[Effect, ...]:
@@ -188,11 +258,32 @@ def apply_steps(
     sites: Sites,
     streams: Streams | None = None,
     n_threads: int | None = None,
-    out: NDArray[Any] | None = None,
-    last: Callable[[Any, Sites, NDArray[Any]], None] | None = None,
-) -> NDArray[Any]:
+) -> Floats:
     """
-    Apply steps of the chain to the values of all sites.
+    Return the values of all sites after steps of the chain, (n_site,) float64.
+
+    Parameters
+    ----------
+    steps, values, sites, streams, n_threads
+        As for :func:`run_steps`.
+    """
+    out = np.empty(sites.n_sites)
+    run_steps((*steps, Save(out)), values, sites=sites, streams=streams, n_threads=n_threads)
+    return out
+
+
+def run_steps(
+    steps: Iterable[Step],
+    values: Any,
+    *,
+    sites: Sites,
+    streams: Streams | None = None,
+    n_threads: int | None = None,
+) -> None:
+    """
+    Run steps of the chain, which write their results with :class:`Save` and :class:`Conversion`.
+
+    Consecutive local steps process one block of sites after another, which stays in the cache for all of them.
 
     Parameters
     ----------
@@ -205,33 +296,21 @@ def apply_steps(
         Random streams of the frame; required for temporal steps.
     n_threads : int, optional
         Number of threads; all cores by default. Results do not depend on it.
-    out : (n_site,), optional
-        Array for the result; a float64 array by default.
-    last : callable, optional
-        Called as ``last(values, sites, out)`` for each piece of sites; it writes to that part of ``out``.
-
-    Returns
-    -------
-    out : (n_site,)
     """
-    local: list[Step] = []
     is_own = False
-    for step in steps:
-        if step.is_local:
-            local.append(step)
+    groups = [(is_local, list(group)) for is_local, group in groupby(steps, key=lambda step: step.is_local)]
+    for number, (is_local, group) in enumerate(groups):
+        if is_local:
+            before = values
+            if number + 1 < len(groups):
+                values, is_own = np.empty(sites.n_sites), True
+                group.append(Save(values))
+            _run_local_steps(group, before, sites, streams, n_threads)
             continue
-        if local:
-            values = _apply_local_steps(local, values, np.empty(sites.n_sites), None, sites, streams, n_threads)
-            is_own = True
-        rng: Any = streams.of(step.name) if step.is_temporal and streams is not None else None
         all_sites = sites.block(slice(None), n_threads=n_threads)
-        own_values = values if is_own else np.array(values, np.float64)
-        values, local, is_own = _apply_step(step, own_values, all_sites, rng), [], True
-    if not local and out is None:
-        return np.asarray(values)
-    return _apply_local_steps(
-        local, values, np.empty(sites.n_sites) if out is None else out, last, sites, streams, n_threads
-    )
+        for step in group:
+            rng: Any = streams.of(step.name) if step.is_temporal and streams is not None else None
+            values, is_own = _apply_step(step, values if is_own else np.array(values, np.float64), all_sites, rng), True
 
 
 def _apply_step(step: Step, values: Any, sites: Sites, rng: Any) -> Any:
@@ -245,29 +324,15 @@ def _apply_step(step: Step, values: Any, sites: Sites, rng: Any) -> Any:
     return found
 
 
-def _apply_local_steps(
-    steps: Sequence[Step],
-    values: Any,
-    out: NDArray[Any],
-    last: Callable[[Any, Sites, NDArray[Any]], None] | None,
-    sites: Sites,
-    streams: Streams | None,
-    n_threads: int | None,
-) -> NDArray[Any]:
-    """Apply local steps piece by piece, so that each piece stays in the cache for all steps."""
+def _run_local_steps(
+    steps: Sequence[Step], values: Any, sites: Sites, streams: Streams | None, n_threads: int | None
+) -> None:
+    """Run local steps block by block."""
 
-    def block(number: int, block_slice: slice) -> None:
-        rngs: list[Any] = [
-            streams.of(step.name, number) if step.is_temporal and streams is not None else None for step in steps
-        ]
-        for index in pieces(block_slice):
-            part, part_sites = values[index].astype(np.float64), sites.block(index)
-            for step, rng in zip(steps, rngs, strict=True):
-                part = _apply_step(step, part, part_sites, rng)
-            if last is None:
-                out[index] = part
-            else:
-                last(part, part_sites, out[index])
+    def block(number: int, index: slice) -> None:
+        part, part_sites = values[index].astype(np.float64), sites.block(index)
+        for step in steps:
+            rng: Any = streams.of(step.name, number) if step.is_temporal and streams is not None else None
+            part = _apply_step(step, part, part_sites, rng)
 
-    for_each_block(out.size, block, n_threads)
-    return out
+    for_each_block(sites.n_sites, block, n_threads)

@@ -12,26 +12,31 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.names import possible_names
 from foveasim._core.random_streams import Streams
-from foveasim._core.validation import Floats, Ints, check_choice, check_count, check_number, read_only, unmasked
+from foveasim._core.validation import Floats, Ints, check_count, check_number, read_only, unmasked
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.sensor.adc import ADC, Companding, ConversionTables
 from foveasim.sensor.blocks import for_each_block
 from foveasim.sensor.chain import (
+    ChargeCheck,
+    Conversion,
     Factor,
+    FullWell,
     Nonlinearity,
     Offset,
+    Save,
     Step,
     apply_steps,
     check_effects,
     check_names,
     merge_steps,
+    run_steps,
     sort_by_stage,
 )
 from foveasim.sensor.device import Device
 from foveasim.sensor.effects import EFFECTS, STANDARD, Effect, Photosites, Sites, dark_current_factor
 from foveasim.sensor.effects.contract import FixedFactor, FixedOffset
 from foveasim.sensor.effects.crosstalk import Diffusion, InterPixelCapacitance, KernelCrosstalk
-from foveasim.sensor.effects.shot import MAX_CHARGE_E, ShotChoice, ShotNoise
+from foveasim.sensor.effects.shot import ShotChoice, ShotNoise
 from foveasim.sensor.limits import LIMITS, check_plausible, check_plausible_array
 from foveasim.sensor.prediction import (
     ChargeDistributions,
@@ -49,8 +54,6 @@ if TYPE_CHECKING:
 
 __all__ = ["PerSite", "Photosites", "Sensor"]
 
-#: Maximum mean of exact Poisson draws by inversion, the cost of which is proportional to the mean.
-MAX_INVERSION_MEAN_E = 700.0
 #: Parameters with one value or one per site, and parameters with one value only.
 _PER_SITE = ("sensitivity", "dark_e_per_s", "full_well_e", "read_noise_e", "capacitance_f")
 _NUMBERS = (
@@ -205,9 +208,7 @@ class Sensor:
                 object.__setattr__(self, name, self._per_site(name, value))
         numbers: dict[str, float] = {
             **{name: check_plausible(name, getattr(self, name)) for name in _NUMBERS},
-            "gaussian_above_e": check_number(
-                "gaussian_above_e", self.gaussian_above_e, at_least=10.0, at_most=MAX_INVERSION_MEAN_E
-            ),
+            "gaussian_above_e": check_number("gaussian_above_e", self.gaussian_above_e),
             "device_seed": check_count("device_seed", self.device_seed, at_least=0),
         }
         if numbers["pedestal_v"] >= numbers["v_sat_v"]:
@@ -232,7 +233,7 @@ class Sensor:
         for name in ("ktc_noise", "cds"):
             if not isinstance(getattr(self, name), bool):
                 raise ParameterError(name, "must be True or False", getattr(self, name))
-        check_choice("shot_noise", self.shot_noise, ("auto", "exact", "off"))
+        ShotNoise(self.shot_noise, self.gaussian_above_e)
         for name, kinds in (("crosstalk", (Diffusion, KernelCrosstalk)), ("coupling", (InterPixelCapacitance,))):
             part = getattr(self, name)
             if part is not None and not isinstance(part, kinds):
@@ -342,10 +343,17 @@ class Sensor:
         """Names of the filters."""
         return tuple(self._filter_set.names or ())
 
-    @property
+    @cached_property
     def filter_of_site(self) -> Ints:
-        """Index of each site's filter, (n_site,)."""
-        return np.zeros(self.layout.n_sites, np.int64) if self.filters is None else self.layout.channel
+        """Index of each site's filter, (n_site,), of the smallest signed integer type."""
+        if self.filters is None:
+            return read_only(np.zeros(self.layout.n_sites, np.int8))
+        return read_only(self.layout.channel.astype(np.min_scalar_type(-self.n_filters)))
+
+    @cached_property
+    def filters_used(self) -> Ints:
+        """Indices of the filters of the layout's sites, in ascending order."""
+        return read_only(np.flatnonzero(np.bincount(self.filter_of_site)))
 
     def _transmission(self, wavelength_nm: Floats) -> Floats:
         """Compute filter times quantum efficiency, (n_filter, n_wavelength)."""
@@ -557,30 +565,16 @@ class Sensor:
         ParameterError
             If the exposure is negative or implausible.
         """
-        exposure_s = check_plausible("exposure_s", exposure_s)
-        photo = np.broadcast_to(np.asarray(unmasked("photo_e_per_s", photo_e_per_s)), self.layout.n_sites)
-        steps = (*self._before_exposure, Factor(exposure_s), *self._effects_at("expected"))
+        photo, steps = self._exposure(photo_e_per_s, exposure_s)
         return apply_steps(steps, photo, sites=self.sites, n_threads=n_threads)
 
     def collect(self, expected_e: Floats, *, streams: Streams, n_threads: int | None = None) -> Ints:
         """Draw the collected charge, (n_site,) int64 e-: shot noise, then full well."""
-        expected_e = self._validate_charges("expected_e", expected_e)
-        well_e = np.minimum(self.well_e, MAX_CHARGE_E).astype(np.int64)
-
-        def clip_at_full_well(electrons: Ints, sites: Sites, out: Ints) -> None:
-            np.minimum(electrons, sites.select(well_e), out=out)
-
+        expected_e = self._check_size("expected_e", expected_e)
         electrons = np.empty(expected_e.size, np.int64)
-        steps = [self.shot]
-        return apply_steps(
-            steps,
-            expected_e,
-            sites=self.sites,
-            streams=streams,
-            n_threads=n_threads,
-            out=electrons,
-            last=clip_at_full_well,
-        )
+        steps = (*self._collection, Save(electrons))
+        run_steps(steps, expected_e, sites=self.sites, streams=streams, n_threads=n_threads)
+        return electrons
 
     def read(self, electrons: Ints, *, streams: Streams, n_threads: int | None = None) -> NDArray[Any]:
         """
@@ -590,33 +584,87 @@ class Sensor:
         the ADC. For a linear ADC, code ``k`` covers the voltages from ``k * V_sat / 2**bits`` to
         ``(k + 1) * V_sat / 2**bits``.
         """
-        from foveasim.sensor import _kernels
+        electrons = self._check_size("electrons", electrons)
+        conversion = self._conversion()
+        steps = (ChargeCheck("electrons", -np.inf), *self._after_collection, conversion)
+        run_steps(steps, electrons, sites=self.sites, streams=streams, n_threads=n_threads)
+        return conversion.values
 
-        electrons = self._validate_charges("electrons", electrons, at_least=-np.inf)
-        line = np.ascontiguousarray(self.layout.readout_line)
-        tables = self._tables
+    def expose(
+        self, photo_e_per_s: Floats, exposure_s: float, *, streams: Streams, n_threads: int | None = None
+    ) -> tuple[Floats, Ints, NDArray[Any]]:
+        """
+        Simulate an exposure: :meth:`expected_electrons`, :meth:`collect` and :meth:`read` in one pass over the sites.
 
-        def convert(voltage_v: Floats, sites: Sites, code: NDArray[Any]) -> None:
-            _kernels.convert(voltage_v, sites.select(line), tables, code)
+        Parameters
+        ----------
+        photo_e_per_s : (n_site,) float64, e-/s
+            Photoelectron rate, as from :meth:`foveasim.Camera.photoelectrons_per_s`.
+        exposure_s : float, s
+        streams : Streams
+            Random streams of the frame.
+        n_threads : int, optional
+            Number of threads; all cores by default. Results do not depend on it.
 
-        code = np.empty(electrons.size, np.uint8 if self.bits <= 8 else np.uint16)
-        steps = self._after_collection
-        return apply_steps(
-            steps, electrons, sites=self.sites, streams=streams, n_threads=n_threads, out=code, last=convert
+        Returns
+        -------
+        expected_e : (n_site,) float64, e-
+            Expected charge.
+        electrons : (n_site,) int64, e-
+            Collected charge.
+        code : (n_site,) uint8 or uint16, DN
+
+        Raises
+        ------
+        ParameterError
+            If the exposure is negative or implausible, or an expected charge is negative.
+        """
+        photo, steps = self._exposure(photo_e_per_s, exposure_s)
+        expected_e, electrons = np.empty(photo.size), np.empty(photo.size, np.int64)
+        conversion = self._conversion()
+        run_steps(
+            (*steps, Save(expected_e), *self._collection, Save(electrons), *self._after_collection, conversion),
+            photo,
+            sites=self.sites,
+            streams=streams,
+            n_threads=n_threads,
         )
+        return expected_e, electrons, conversion.values
+
+    def _exposure(self, photo_e_per_s: Floats, exposure_s: float) -> tuple[Floats, tuple[Step, ...]]:
+        """Return the rates of all sites, and the steps from them to the expected charges."""
+        exposure_s = check_plausible("exposure_s", exposure_s)
+        photo = np.broadcast_to(np.asarray(unmasked("photo_e_per_s", photo_e_per_s)), self.layout.n_sites)
+        return photo, (*self._before_exposure, Factor(exposure_s), *self._effects_at("expected"))
+
+    @cached_property
+    def _collection(self) -> tuple[Step, ...]:
+        """Steps from the expected to the collected charges."""
+        steps: list[Step] = [ChargeCheck("expected_e", 0.0), self.shot]
+        if self.full_well_e is not None:
+            steps.append(FullWell(self.well_e))
+        return tuple(steps)
+
+    def _conversion(self) -> Conversion:
+        """Return the conversion of voltages to codes, with a new array for the codes."""
+        code = np.empty(self.layout.n_sites, np.uint8 if self.bits <= 8 else np.uint16)
+        return Conversion(code, self._line, self._tables)
+
+    @cached_property
+    def _line(self) -> NDArray[np.int32]:
+        """Readout line of each site, (n_site,); 0, (1,), without DNL, which alone differs between lines."""
+        return read_only(self.layout.readout_line.astype(np.int32) if self.dnl_dn else np.zeros(1, np.int32))
 
     @cached_property
     def _tables(self) -> ConversionTables:
         return self.adc.tables(self.v_sat_v, self.device.key("dnl")[0])
 
-    def _validate_charges(self, name: str, charge_e: ArrayLike, at_least: float = 0.0) -> NDArray[Any]:
+    def _check_size(self, name: str, charge_e: ArrayLike) -> NDArray[Any]:
         charges = np.asarray(unmasked(name, charge_e))
         if charges.shape != (self.layout.n_sites,):
             raise ParameterError(
                 name, f"must have one value for each of the {self.layout.n_sites} sites, got the shape {charges.shape}"
             )
-        if charges.size and not np.min(charges) >= at_least:
-            raise ParameterError(name, f"must be >= {at_least:g} everywhere", float(np.min(charges)), "e-")
         return charges
 
     def validate_charges(self, name: str, charge_e: ArrayLike) -> Floats:
@@ -628,7 +676,8 @@ class Sensor:
         ParameterError
             If the number of charges is not the number of sites, or a charge is negative.
         """
-        return np.ascontiguousarray(self._validate_charges(name, charge_e), np.float64)
+        charges = np.ascontiguousarray(self._check_size(name, charge_e), np.float64)
+        return ChargeCheck(name, 0.0).apply(charges, sites=self.sites, rng=None)
 
     def calibrate(
         self, *, exposure_s: float, flat_e: ArrayLike, n_frames: int, seed: int, **options: Any
@@ -715,10 +764,9 @@ class Sensor:
             drawn_e, drawn_e2 = model.mean_e, model.variance_e2
             is_drawn, well_e = False, np.array([np.inf])
         sigma_e, transfer = np.sqrt(model.gaussian_e2), model.transfer
-        line = np.ascontiguousarray(self.layout.readout_line)
 
         def block(_: int, sites: slice) -> None:
-            def part(values: Floats) -> Floats:
+            def part(values: NDArray[Any]) -> NDArray[Any]:
                 return read_only(self.sites.block(sites).select(values).view())
 
             _kernels.predict_codes(
@@ -737,7 +785,7 @@ class Sensor:
                     scale=part(transfer.scale),
                     output_v=part(transfer.output_v),
                 ),
-                line[sites],
+                part(self._line),
                 self._tables,
                 quadrature(),
                 mean_dn[sites],

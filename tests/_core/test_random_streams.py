@@ -1,4 +1,4 @@
-"""Random streams by seed, frame and effect; counter-based generators; Gaussian numbers."""
+"""Random streams by seed, frame and effect; counter-based generators; uniform and Gaussian numbers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 import scipy.stats
 
 from foveasim._core import _kernels
-from foveasim._core.random_streams import Streams, standard_normal
+from foveasim._core.random_streams import Streams, random_key
 from foveasim.errors import ParameterError
 
 N_DRAWS = 100_000
@@ -98,6 +98,23 @@ def test_integers_of_any_type_are_equal_seeds():
     assert all(a == b for a, b in itertools.pairwise(values))
 
 
+def test_blocks_of_an_effect_have_independent_streams():
+    blocks = np.array([Streams(7, 3).of("read", block).standard_normal(N_DRAWS) for block in range(6)])
+    whole = Streams(7, 3).of("read").standard_normal(N_DRAWS)
+
+    correlation = np.corrcoef([*blocks, whole])
+    assert np.abs(correlation[~np.eye(7, dtype=bool)]).max() < 5.0 / math.sqrt(N_DRAWS)
+    np.testing.assert_array_equal(Streams(7, 3).of("read", 4).standard_normal(N_DRAWS), blocks[4])
+
+
+@pytest.mark.parametrize(
+    "other", [(8, 3, "read", 1), (7, 4, "read", 1), (7, 3, "reset", 1), (7, 3, "read", 2)], ids=str
+)
+def test_keys_of_blocks_are_distinct(other):
+    first, second = (random_key(Streams(seed, frame).of(*what)) for seed, frame, *what in ((7, 3, "read", 1), other))
+    assert first != second
+
+
 # -- counter-based generators -----------------------------------------------------------------------------------------
 
 MASK_32 = 2**32 - 1
@@ -138,33 +155,53 @@ def test_philox_4x32_matches_published_values(key, counter, words):
     assert known(_kernels.philox_4x32, key, counter) == words
 
 
-# -- Gaussian numbers -------------------------------------------------------------------------------------------------
+# -- Gaussian and uniform numbers -------------------------------------------------------------------------------------
+
+BATCH = _kernels.BATCH
+ONE = np.ones(1)
+ONE.flags.writeable = False
 
 
 def normals(key, n):
-    numbers = np.empty(n)
-    _kernels.standard_normal(np.uint64(key), numbers)
+    numbers = np.zeros(n)
+    _kernels.add_normals(numbers, ONE, np.uint64(key))
     return numbers
 
 
-def reference_pair(key, counter):
-    """Return a pair of Gaussian numbers by the Box-Muller method with functions of the math module."""
-    key_0, key_1 = key & MASK_32, key >> 32
-    c0, c1, c2, c3 = known(_kernels.philox_4x32, (key_0, key_1), (counter & MASK_32, counter >> 32, 0, 0))
-    # The words are read as signed; adding 2**31 modulo 2**32 makes them positive.
-    c0, c1, angle = ((word + 2**31) % 2**32 for word in (c0, c1, c2))
-    u = (c0 * 2**32 + c1 + 0.5) / 2**64
-    radius = math.sqrt(-2.0 * math.log(u))
-    theta = math.pi / 2.0 * (angle + 0.5) / 2**32
-    signs = (-1.0 if c3 >> 31 else 1.0, -1.0 if c3 >> 30 & 1 else 1.0)
-    return signs[0] * radius * math.sin(theta), signs[1] * radius * math.cos(theta)
+def uniforms(key, n_batches):
+    """Return pairs of uniform numbers, (2, n)."""
+    pairs = np.empty((2, n_batches, BATCH))
+    for batch in range(n_batches):
+        _kernels.fill_uniforms(np.uint64(key), batch, *pairs[:, batch])
+    return pairs.reshape(2, -1)
+
+
+def key_of(seed):
+    return int(random_key(Streams(seed).of("read", 0)))
+
+
+def reference_normal(key, i):
+    """Return Gaussian number ``i`` by the Box-Muller method with functions of the math module."""
+    batch, place = divmod(i, BATCH)
+    is_second, pair = divmod(place, BATCH // 2)
+    which, offset = divmod(pair, BATCH // 4)
+    counter = batch * (BATCH // 4) + offset
+    words = known(_kernels.philox_4x32, (key & MASK_32, key >> 32), (counter & MASK_32, counter >> 32, 0, 0))
+    radius = math.sqrt(-2.0 * math.log((words[which] + 0.5) / 2**32))
+    word = words[2 + which]
+    # The lower 30 bits, read as signed, are the angle from the diagonal of the quadrant.
+    angle = ((word << 2 & MASK_32) ^ 2**31) - 2**31
+    theta = math.pi / 4.0 * (1.0 + angle / 2**31)
+    sign = -1.0 if word >> (30 if is_second else 31) & 1 else 1.0
+    return sign * radius * (math.cos(theta) if is_second else math.sin(theta))
 
 
 @pytest.mark.parametrize("key", [0, 1, 2**63, 2**64 - 1])
 def test_gaussian_numbers_match_box_muller_method(key):
-    expected = np.ravel([reference_pair(key, counter) for counter in range(1500)])
-    np.testing.assert_allclose(normals(key, 3000), expected, rtol=1e-7, atol=1e-9)
-    assert np.abs(normals(key, 3000) - expected).max() < 1e-12
+    expected = np.array([reference_normal(key, i) for i in range(3000)])
+    # The numbers have the resolution of float32.
+    np.testing.assert_allclose(normals(key, 3000), expected, rtol=1e-6, atol=1e-5)
+    assert np.sqrt(np.mean((normals(key, 3000) - expected) ** 2)) < 3e-7
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 1023, 1024, 1025, 3001])
@@ -172,9 +209,19 @@ def test_shorter_draws_are_prefixes(n):
     np.testing.assert_array_equal(normals(5, n), normals(5, 5000)[:n])
 
 
+def test_normals_scale_with_deviation_of_each_value():
+    deviation, values = np.linspace(0.0, 2.0, 2500), np.arange(2500.0)
+    expected = values + deviation * normals(9, 2500)
+    deviation.flags.writeable = False
+
+    _kernels.add_normals(values, deviation, np.uint64(9))
+
+    np.testing.assert_array_equal(values, expected)
+
+
 def test_gaussian_numbers_have_gaussian_moments():
     n = 4_000_000
-    z = standard_normal(Streams(11).of("read"), n)
+    z = normals(key_of(11), n)
     # Variance of the mean of z**k: (E z**2k - (E z**k)**2) / n, with E z**2k = (2k - 1)!!.
     for k, moment, square in ((1, 0, 1), (2, 1, 3), (3, 0, 15), (4, 3, 105), (5, 0, 945), (6, 15, 10395)):
         assert np.mean(z**k) == pytest.approx(moment, abs=5.0 * math.sqrt((square - moment**2) / n))
@@ -182,7 +229,7 @@ def test_gaussian_numbers_have_gaussian_moments():
 
 def test_gaussian_numbers_have_gaussian_tails():
     n = 4_000_000
-    z = standard_normal(Streams(12).of("read"), n)
+    z = normals(key_of(12), n)
     edges = np.array([-np.inf, -4.5, -4.0, -3.0, -2.0, -1.0, -0.1, 0.0, 0.1, 1.0, 2.0, 3.0, 4.0, 4.5, np.inf])
     expected = n * np.diff(scipy.stats.norm.cdf(edges))
     # Cancellation near 1: use the symmetric tail.
@@ -191,16 +238,52 @@ def test_gaussian_numbers_have_gaussian_tails():
     assert scipy.stats.kstest(z[:500_000], "norm").pvalue > 1e-6
 
 
+def test_far_gaussian_tail_has_expected_frequency():
+    """Numbers beyond five standard deviations come from the lowest words: 6 in 10**7."""
+    counts = [np.count_nonzero(np.abs(normals(key, 2_000_000)) > 5.0) for key in range(25)]
+    expected = 50e6 * 2.0 * scipy.stats.norm.sf(5.0)
+    assert abs(sum(counts) - expected) < 5.0 * math.sqrt(expected)
+
+
 def test_neighbouring_numbers_are_independent():
     n = 1_000_000
-    z = standard_normal(Streams(13).of("read"), n)
+    z = normals(key_of(13), n)
     for function in (lambda x: x, np.square, np.abs):
         values = function(z) - function(z).mean()
-        for lag in (1, 2, 3, 1023, 1024):
+        for lag in (1, 2, 3, 255, 256, 511, 512, 1023, 1024):
             assert abs(np.corrcoef(values[:-lag], values[lag:])[0, 1]) < 5.0 / math.sqrt(n)
 
 
-def test_successive_draws_differ():
+@pytest.mark.parametrize("other", [1, 2**32, 2**63])
+def test_neighbouring_keys_are_independent(other):
+    n = 1_000_000
+    for function in (lambda x: x, np.square):
+        correlation = np.corrcoef(function(normals(2**40, n)), function(normals(2**40 ^ other, n)))[0, 1]
+        assert abs(correlation) < 5.0 / math.sqrt(n)
+
+
+def test_uniform_numbers_are_uniform_and_independent():
+    first, second = uniforms(key_of(14), 1000)
+    n = first.size
+    for u in (first, second):
+        assert 0.0 < u.min() < u.max() < 1.0
+        assert scipy.stats.chisquare(np.bincount((u * 1000.0).astype(int), minlength=1000)).pvalue > 1e-6
+        # Lower bits: the position within an interval of 2**-20 is uniform, too.
+        assert scipy.stats.kstest(u[:200_000] * 2**20 % 1.0, "uniform").pvalue > 1e-6
+        for lag in (1, 2, 1023, 1024):
+            assert abs(np.corrcoef(u[:-lag], u[lag:])[0, 1]) < 5.0 / math.sqrt(n)
+    cells = np.histogram2d(first, second, bins=30, range=((0.0, 1.0), (0.0, 1.0)))[0]
+    assert scipy.stats.chisquare(cells.ravel()).pvalue > 1e-6
+
+
+def test_uniform_and_gaussian_numbers_are_independent():
+    pairs, z = uniforms(3, 1000), normals(3, 1000 * BATCH)
+    for u in pairs:
+        for values in (z, np.abs(z)):
+            assert abs(np.corrcoef(u, values)[0, 1]) < 5.0 / math.sqrt(z.size)
+
+
+def test_successive_keys_of_a_generator_differ():
     rng = Streams(1).of("read")
-    first, second = standard_normal(rng, 1000), standard_normal(rng, 1000)
-    assert np.intersect1d(first, second).size == 0
+    first, second = normals(random_key(rng), 1000), normals(random_key(rng), 1000)
+    assert np.intersect1d(first, second).size < 3

@@ -268,6 +268,79 @@ def test_draws_are_independent_of_thread_count():
         assert np.array_equal(code, noisy.read(first, streams=Streams(1), n_threads=n_threads))
 
 
+@pytest.mark.parametrize("n_threads", [1, 2, 7])
+@pytest.mark.parametrize(
+    "extra", [{}, {"crosstalk": fs.sensor.Diffusion(spread_um=0.3)}, {"shot_noise": "exact"}], ids=str
+)
+def test_exposure_in_one_pass_equals_its_steps(extra, n_threads):
+    noisy = sensor(**{**ALL, "crosstalk": None, "full_well_e": 450.0, "pedestal_v": 0.1, **extra})
+    rate_e_per_s = np.random.default_rng(0).uniform(0.0, 900.0, N)
+    streams = Streams(1, 2)
+    expected_e = noisy.expected_electrons(rate_e_per_s, 0.5, n_threads=1)
+    electrons = noisy.collect(expected_e, streams=streams, n_threads=1)
+    code = noisy.read(electrons, streams=streams, n_threads=1)
+
+    found = noisy.expose(rate_e_per_s, 0.5, streams=streams, n_threads=n_threads)
+
+    for values, wanted in zip(found, (expected_e, electrons, code), strict=True):
+        assert values.dtype == wanted.dtype
+        assert np.array_equal(values, wanted)
+
+
+def test_negative_rates_are_rejected_in_one_pass():
+    rate_e_per_s = np.ones(N)
+    rate_e_per_s[-1] = -7.0
+    with pytest.raises(ParameterError, match=r"'expected_e' must be >= 0 everywhere, got -7\.0 e-"):
+        sensor().expose(rate_e_per_s, 1.0, streams=Streams(0))
+
+
+def test_draws_depend_on_site_index_only():
+    """The first sites of a larger layout have the same draws, also within a block."""
+    options = {**FINE, "shot_noise": "auto", "read_noise_e": 4.0, "ktc_noise": True, "pedestal_v": 0.3}
+    rate_e_per_s = np.random.default_rng(1).uniform(0.0, 300.0, N)
+    large = Sensor(MANY, **options).expose(rate_e_per_s, 1.0, streams=Streams(5))
+
+    for n in (1, 3, 1025, 40_001):
+        small = Sensor(MANY[:n], **options).expose(rate_e_per_s[:n], 1.0, streams=Streams(5))
+        assert all(np.array_equal(few, many[:n]) for few, many in zip(small, large, strict=True))
+
+
+@pytest.mark.parametrize("mean_e", [1e-3, 0.97, 1.0, 7.3, 29.999, 64.5, 99.9, 400.25, 699.5])
+def test_exact_draws_have_poisson_probabilities(mean_e):
+    n = 2_000_000
+    electrons = fs.sensor.draw_shot_noise(np.full(n, mean_e), "auto", 700.0, Streams(21))
+
+    distribution = scipy.stats.poisson(mean_e)
+    edges = np.arange(distribution.ppf(20.0 / n), distribution.isf(20.0 / n))
+    counts = np.histogram(electrons, np.concatenate(([-np.inf], edges + 0.5, [np.inf])))[0]
+    wanted = n * np.diff(np.concatenate(([0.0], distribution.cdf(edges), [1.0])))
+    assert scipy.stats.chisquare(counts, wanted).pvalue > 1e-6
+
+
+def test_exact_draws_follow_mean_of_each_site():
+    """Scaled residuals of means between 0 and 700 have the Poisson variance and skewness."""
+    mean_e = np.random.default_rng(2).uniform(0.5, 700.0, 2_000_000)
+    z = (fs.sensor.draw_shot_noise(mean_e, "auto", 700.0, Streams(22)) - mean_e) / np.sqrt(mean_e)
+
+    for values, wanted in ((z, 0.0), (z**2, 1.0), (z**3, np.mean(mean_e**-0.5))):
+        assert abs(values.mean() - wanted) < SIGMAS * values.std() / math.sqrt(z.size)
+    for lag in (1, 2, 1024):
+        assert abs(np.corrcoef(z[:-lag], z[lag:])[0, 1]) < SIGMAS / math.sqrt(z.size)
+
+
+@pytest.mark.parametrize("gaussian_above_e", [5.0, 1e9, math.nan])
+def test_implausible_poisson_limit_is_rejected(gaussian_above_e):
+    with pytest.raises(ParameterError, match="'gaussian_above_e' must be "):
+        fs.sensor.draw_shot_noise(np.ones(3), "auto", gaussian_above_e, Streams(0))
+
+
+@pytest.mark.parametrize("how", ["auto", "exact", "off"])
+def test_invalid_expectations_are_rejected(how):
+    for value in (-1.0, math.nan):
+        with pytest.raises(ParameterError, match="'expected_e' must be >= 0 everywhere, got"):
+            fs.sensor.draw_shot_noise([3.0, value], how, 100.0, Streams(0))
+
+
 def reset_noise_e(some):
     return noise_budget(some, np.zeros(N), 0.0)["reset"]
 

@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Literal, Protocol, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.random_streams import standard_normal
+from foveasim._core.random_streams import random_key
 from foveasim._core.registry import Registry
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, Ints, read_only
@@ -333,9 +333,9 @@ class AdditiveNoise(Effect):
 
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
         """Return the values plus a Gaussian draw."""
-        noise = standard_normal(rng, values.size)
-        noise *= sites.pattern(self, self.deviation)
-        values += noise
+        from foveasim._core import _kernels
+
+        _kernels.add_normals(values, sites.pattern(self, self.deviation), random_key(rng))
         return values
 
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:

@@ -2,26 +2,68 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from functools import cache
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from foveasim._core.random_streams import Streams, standard_normal
-from foveasim._core.validation import Floats, Ints, unmasked
-from foveasim.sensor.blocks import for_each_block, pieces
+from foveasim._core.random_streams import Streams, random_key
+from foveasim._core.validation import Floats, Ints, check_choice, check_number, read_only, unmasked
+from foveasim.errors import ParameterError
+from foveasim.sensor.blocks import for_each_block
 from foveasim.sensor.effects.contract import Effect, Sites, Stage
 
-__all__ = ["MAX_CHARGE_E", "ShotChoice", "ShotNoise", "draw_shot_noise"]
+__all__ = ["MAX_CHARGE_E", "PoissonTables", "ShotChoice", "ShotNoise", "draw_shot_noise"]
 
 ShotChoice = Literal["auto", "exact", "off"]
 
+#: Maximum mean of exact Poisson draws by inversion: its tables have 6 MB.
+MAX_INVERSION_MEAN_E = 700.0
 #: Limit of numpy's Poisson generator. Larger expectations are rounded: their relative shot noise is below 1e-9.
 MAX_EXACT_E = 1e18
 #: Upper limit of charges: 2**62 fits int64 with headroom for sums.
 MAX_CHARGE_E = 2.0**62
 #: Variance of rounding to integers.
 ROUNDING_E2 = 1.0 / 12.0
+#: Number of intervals of the guide table; a power of 2, so that intervals are exact.
+N_GUIDE = 512
+#: Cumulative Poisson probabilities reach 1 in float64 this many standard deviations plus this many electrons above the mean.
+TABLE_SIGMAS, TABLE_MARGIN_E = 10, 20
+
+
+class PoissonTables(NamedTuple):
+    """
+    Cumulative Poisson distributions of integral means, for the kernels.
+
+    Attributes
+    ----------
+    cumulative_fraction : (n_mean, n_count) float64
+        Probability that a draw with mean ``m`` is at most ``k``.
+    guide : (n_mean, N_GUIDE) uint16
+        Smallest k whose cumulative probability exceeds the lower end of each of ``N_GUIDE`` equal intervals of probability: the
+        search starts there (H. C. Chen and Y. Asau, AIIE Transactions 6, 163, 1974).
+    """
+
+    cumulative_fraction: Floats
+    guide: NDArray[np.uint16]
+
+
+@cache
+def poisson_tables(max_mean: int) -> PoissonTables:
+    """Compute the distributions with means from 0 to an integer, once per process."""
+    from scipy.special import pdtr
+
+    n_count = max_mean + TABLE_SIGMAS * math.isqrt(max_mean) + TABLE_MARGIN_E
+    means = np.arange(max_mean + 1.0)
+    cumulative = pdtr(np.arange(n_count), means[:, np.newaxis])
+    cumulative[0] = 1.0
+    starts = np.arange(N_GUIDE) / N_GUIDE
+    guide = np.stack([np.searchsorted(row, starts, side="right") for row in cumulative]).astype(np.uint16)
+    cumulative[:, -1] = np.inf
+    return PoissonTables(read_only(cumulative), read_only(guide))
 
 
 @dataclass(frozen=True)
@@ -32,10 +74,12 @@ class ShotNoise(Effect):
     Parameters
     ----------
     how : {"auto", "exact", "off"}
-        ``"auto"``: exact Poisson draws for expectations up to ``gaussian_above_e``; above it, a rounded quadratic function of
-        a Gaussian number with the mean, variance and third central moment of the Poisson distribution. A site's draw does not
-        depend on the expectations of other sites. ``"exact"``: Poisson draws everywhere. ``"off"``: the rounded expectation.
+        ``"auto"``: exact Poisson draws for expectations up to ``gaussian_above_e``, by inversion; above it, a rounded quadratic
+        function of a Gaussian number with the mean, variance and third central moment of the Poisson distribution. A site's
+        draw does not depend on the expectations of other sites. ``"exact"``: Poisson draws everywhere. ``"off"``: the rounded
+        expectation.
     gaussian_above_e : float, e-
+        From 10 to 700.
 
     Notes
     -----
@@ -53,26 +97,28 @@ class ShotNoise(Effect):
     how: ShotChoice = "auto"
     gaussian_above_e: float = 100.0
 
+    def __post_init__(self) -> None:
+        check_choice("shot_noise", self.how, ("auto", "exact", "off"))
+        check_number("gaussian_above_e", self.gaussian_above_e, at_least=10.0, at_most=MAX_INVERSION_MEAN_E)
+
     @property
     def is_drawn(self) -> bool:
         """Whether charges are drawn, rather than only rounded."""
         return self.how != "off"
 
-    def apply(self, values: Floats, *, sites: Sites | None, rng: np.random.Generator) -> Any:
-        """Return the drawn charges, (n,) int64 e-."""
+    def apply(self, values: Floats, *, sites: Sites | None, rng: np.random.Generator) -> Floats:
+        """Return the drawn charges, (n,) e-, in whole electrons."""
         from foveasim.sensor import _kernels
 
         _ = sites
-        if self.how == "off":
-            return np.rint(np.clip(values, 0.0, MAX_CHARGE_E)).astype(np.int64)
         if self.how == "auto":
-            electrons = np.empty(values.size, np.int64)
-            _kernels.draw_poisson(values, standard_normal(rng, values.size), self.gaussian_above_e, electrons)
-            return electrons
-        is_beyond = values > MAX_EXACT_E
-        electrons = rng.poisson(np.where(is_beyond, 0.0, values))
-        electrons[is_beyond] = np.rint(np.minimum(values[is_beyond], MAX_CHARGE_E)).astype(np.int64)
-        return electrons
+            tables = poisson_tables(int(self.gaussian_above_e))
+            _kernels.draw_poisson(values, self.gaussian_above_e, tables, random_key(rng))
+            return values
+        if self.how == "exact":
+            is_drawn = values <= MAX_EXACT_E
+            values[is_drawn] = rng.poisson(values[is_drawn])
+        return np.rint(np.clip(values, 0.0, MAX_CHARGE_E, out=values), out=values)
 
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites | None = None) -> tuple[Floats, Floats]:
         """Return the mean, and the variance plus shot noise, or plus rounding if not drawn."""
@@ -100,15 +146,20 @@ def draw_shot_noise(
     -------
     electrons : (n_site,) int64, e-
         Non-negative.
+
+    Raises
+    ------
+    ParameterError
+        If an expectation is negative or NaN, or ``gaussian_above_e`` is out of range.
     """
     expected_e = np.ascontiguousarray(unmasked("expected_e", expected_e), np.float64)
+    if expected_e.size and not (smallest := float(np.min(expected_e))) >= 0.0:
+        raise ParameterError("expected_e", "must be >= 0 everywhere", smallest, "e-")
     shot = ShotNoise(how, gaussian_above_e)
     electrons = np.empty(expected_e.size, np.int64)
 
     def block(number: int, sites: slice) -> None:
-        rng = streams.of(shot.name, number)
-        for piece in pieces(sites):
-            electrons[piece] = shot.apply(expected_e[piece], sites=None, rng=rng)
+        electrons[sites] = shot.apply(expected_e[sites].copy(), sites=None, rng=streams.of(shot.name, number))
 
     for_each_block(expected_e.size, block, n_threads)
     return electrons
