@@ -41,7 +41,8 @@ def assert_agree(sensor, expected_e):
     codes = draw_codes(sensor, expected_e)
     mean_error = np.sqrt(variance_dn2 / N_DRAWS) + 1e-3 / np.sqrt(N_DRAWS)
     excess = (codes - codes.mean(axis=0)) ** 2
-    variance_error = np.sqrt(np.maximum(excess.var(axis=0), 1e-12) / N_DRAWS)
+    # The second term is the error of the sample mean, squared: the only one of a code with two values of probability 1/2.
+    variance_error = np.sqrt(np.maximum(excess.var(axis=0), 1e-12) / N_DRAWS) + SIGMAS * variance_dn2 / N_DRAWS
 
     off_mean = np.abs(codes.mean(axis=0) - mean_dn) / np.maximum(mean_error, 1e-9)
     off_variance = np.abs(codes.var(axis=0) - variance_dn2) / np.maximum(variance_error, 1e-9)
