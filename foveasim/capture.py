@@ -116,10 +116,12 @@ class Capture:
                 raise ParameterError(
                     name, f"must be numbers of the shape {shape}, got {values.dtype} of {values.shape}"
                 )
-            if values.size and not (np.isfinite(values).all() and values.min() >= 0):
+            # NaN fails the comparisons.
+            smallest, largest = (values.min(), values.max()) if values.size else (0, 0)
+            if not (smallest >= 0 and largest < np.inf):
                 raise ParameterError(name, "must be finite and >= 0 everywhere")
-            if limit is not None and values.size and values.max() > limit:
-                raise ParameterError(name, f"must be <= {limit} everywhere", int(values.max()))
+            if limit is not None and largest > limit:
+                raise ParameterError(name, f"must be <= {limit} everywhere", int(largest))
             object.__setattr__(self, name, own(values))
         # Captures of one camera share settings; a copy lets users edit those of one.
         object.__setattr__(self, "settings", copy_plain_data(self.settings))

@@ -393,6 +393,15 @@ def finite_array(
     array = as_numbers(name, value)
     if ndim is not None and array.ndim != ndim:
         raise ParameterError(name, f"must have {ndim} dimension{'s' * (ndim != 1)}, got the shape {array.shape}")
+    # Two reductions decide for valid arrays, without temporary arrays.
+    smallest, largest = (array.min(), array.max()) if array.size else (np.nan, np.nan)
+    is_within = (
+        (at_least is None or smallest >= at_least)
+        and (above is None or smallest > above)
+        and (at_most is None or largest <= at_most)
+    )
+    if is_within and np.isfinite(smallest) and np.isfinite(largest):
+        return array
     for is_bad, rule in (
         (~np.isfinite(array), "must be finite"),
         (array < at_least if at_least is not None else None, f"must be >= {at_least}"),
