@@ -28,6 +28,7 @@ __all__ = [
     "count_ray_intersections",
     "device_uniforms",
     "draw_poisson",
+    "mix",
     "predict_codes",
 ]
 
@@ -169,6 +170,23 @@ def draw_poisson(charge_e, gaussian_above_e, tables, key):
                 charges[j] = _poisson(charges[j], first[j], second[j], tables)
             else:
                 charges[j] = 0.0
+
+
+@njit(
+    [types.void(_floats, index, index, _floats, types.int64, types.float64[::1]) for index in (_lines, _ints)],
+    error_model="numpy",
+)
+def mix(fractions, columns, offsets, charge_e, first, mixed_e):
+    """Multiply rows of a sparse matrix, from row ``first``, by the charges of all sites."""
+    # Unsigned indices avoid the check for negative ones.
+    k = np.uint64(offsets[first])
+    for i in range(mixed_e.size):
+        end = np.uint64(offsets[first + i + 1])
+        total = 0.0
+        while k < end:
+            total += fractions[k] * charge_e[np.uint64(columns[k])]
+            k += np.uint64(1)
+        mixed_e[i] = total
 
 
 @njit(inline="always")

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.short_repr import short_repr
-from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import (
     Floats,
     Ints,
@@ -29,7 +28,7 @@ from foveasim._core.validation import (
     finite_array,
 )
 from foveasim.errors import ParameterError, SimulationError
-from foveasim.sensor.blocks import BLOCK_SITES
+from foveasim.sensor.blocks import for_each_block
 from foveasim.sensor.effects.contract import Effect, Sites, Stage
 
 if TYPE_CHECKING:
@@ -122,30 +121,30 @@ class CrosstalkOperator:
         -----
         The cost is one sparse product per step, 5 ns per site for hexagons.
         """
-        # Sparse matrices multiply columns, so sites are moved to the first axis.
-        columns = np.moveaxis(self._per_site("charge_e", charge_e), -1, 0)
-        mixed = columns.reshape(columns.shape[0], -1) if columns.ndim > 1 else columns
+        charges = self._per_site("charge_e", charge_e)
+        mixed = np.ascontiguousarray(charges, np.float64).reshape(math.prod(charges.shape[:-1]), charges.shape[-1])
         for _ in range(self.n_steps):
-            mixed = self._product(mixed, n_threads)
-        return np.ascontiguousarray(np.moveaxis(mixed.reshape(columns.shape), 0, -1))
+            mixed = self._step(mixed, n_threads)
+        return mixed.reshape(charges.shape)
 
-    def _product(self, columns: Floats, n_threads: int | None) -> Floats:
-        """Multiply the matrix by columns, in blocks of rows."""
-        if len(self._row_blocks) < 2:
-            return np.asarray(self.matrix @ columns)
-        out = np.empty_like(columns)
+    def _step(self, rows: Floats, n_threads: int | None) -> Floats:
+        """Apply one step to charges (n, n_site), in blocks of sites."""
+        from foveasim.sensor import _kernels
 
-        def multiply(block: tuple[slice, csr_array[Any]]) -> None:
-            rows, matrix = block
-            out[rows] = matrix @ columns
+        out = np.empty_like(rows)
 
-        parallel_map(multiply, self._row_blocks, thread_count(n_threads))
+        def block(_: int, sites: slice) -> None:
+            for before, after in zip(rows, out, strict=True):
+                _kernels.mix(*self._arrays, before, sites.start, after[sites])
+
+        for_each_block(rows.shape[1], block, n_threads)
         return out
 
     @cached_property
-    def _row_blocks(self) -> list[tuple[slice, csr_array[Any]]]:
-        starts = range(0, self.matrix.shape[0], BLOCK_SITES)
-        return [(rows := slice(start, start + BLOCK_SITES), self.matrix[rows]) for start in starts]
+    def _arrays(self) -> tuple[Floats, Ints, Ints]:
+        """Values, column indices and row offsets of the matrix, for the kernel."""
+        matrix = self.matrix
+        return np.ascontiguousarray(matrix.data, np.float64), matrix.indices, matrix.indptr
 
     def variance(self, variance: ArrayLike) -> Floats:
         """
