@@ -15,6 +15,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
@@ -216,7 +217,8 @@ def bench_distortion(report: Report, shape: tuple[int, int]) -> None:
 
 
 def bench_sensor(report: Report, n_side: int) -> None:
-    """Compare the electronic chain with all noise on with its bound per site and with numpy's Gaussian numbers."""
+    """Compare exposures with their bounds of processor time per site, and with numpy's Gaussian numbers for them."""
+    bench_shot_and_read_noise(report, 2 * n_side)
     layout = fs.layout.hexagonal(n_columns=n_side, n_rows=n_side, pitch_um=2.0)
     layout = layout.with_columns(readout_line=np.arange(layout.n_sites) % n_side)
     sensor = fs.Sensor(
@@ -243,30 +245,60 @@ def bench_sensor(report: Report, n_side: int) -> None:
         dnl_dn=0.5,
         capacitance_f=2e-15,
     )
-    light_e_per_s = np.full(layout.n_sites, 5000.0)
+    rate_e_per_s = np.full(layout.n_sites, 5000.0)
 
-    def chain() -> np.ndarray:
-        streams = Streams(1)
-        return sensor.read(
-            sensor.collect(sensor.expected_electrons(light_e_per_s, 1.0), streams=streams), streams=streams
-        )
+    def exposure() -> object:
+        return sensor.expose(rate_e_per_s, 1.0, streams=Streams(1))
 
-    def numbers() -> None:
-        # Shot, reset and read noise.
-        for effect in ("shot", "reset", "read"):
-            for_each_block(
-                layout.n_sites, lambda k, sites, e=effect: Streams(1).of(e, k).standard_normal(sites.stop - sites.start)
-            )
-
-    times = best_s({"chain": chain, "numbers": numbers}, 8)
-    ns = 1e9 * times["chain"] / layout.n_sites
-    report.add(f"sensor, every noise, {layout.n_sites:,} sites", f"{ns:.3g} ns", "per site", "", ns, 30)
-    report.slower_than("the same", times["chain"], "numpy's Gaussian numbers for it", times["numbers"], 2)
+    # Shot, reset and read noise.
+    numbers = gaussian_numbers(layout.n_sites, 3)
+    times = best_s({"exposure": exposure, "numbers": numbers}, 8, time.process_time)
+    add_per_site(report, f"sensor, every noise, {layout.n_sites:,} sites", times["exposure"], layout.n_sites, 30)
+    report.slower_than("the same", times["exposure"], "numpy's Gaussian numbers for it", times["numbers"], 1.25)
     tracemalloc.start()
-    chain()
+    exposure()
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     report.add("memory of the same", "", "float64 arrays (n_site,)", "", peak / (8 * layout.n_sites), 4)
+
+
+def bench_shot_and_read_noise(report: Report, n_side: int) -> None:
+    """Compare shot and read noise at high and low charges, and the sensor part of a capture, with their bounds."""
+    layout = fs.layout.grid(n_x=n_side, n_y=n_side, pitch_um=2.0)
+    sensor = fs.Sensor(layout, read_noise_e=3.0, bits=12)
+    camera = fs.Camera(optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=sensor)
+    light = fs.PowerMap.from_array(np.ones((8, 8)), pitch_um=0.25 * n_side, wavelength_nm=550.0)
+    many, few = np.full(layout.n_sites, 5000.0), np.full(layout.n_sites, 10.0)
+    times = best_s(
+        {
+            "many": lambda: sensor.expose(many, 1.0, streams=Streams(1)),
+            "few": lambda: sensor.expose(few, 1.0, streams=Streams(1)),
+            "capture": lambda: camera.capture(light, exposure_s=1.0, seed=1, photo_e_per_s=many),
+            "numbers": gaussian_numbers(layout.n_sites, 2),
+        },
+        6,
+        time.process_time,
+    )
+    add_per_site(report, f"sensor, shot and read noise, {layout.n_sites:,} sites", times["many"], layout.n_sites, 20)
+    report.slower_than("the same", times["many"], "numpy's Gaussian numbers for it", times["numbers"], 0.75)
+    add_per_site(report, "the same at 10 e-, exact Poisson draws", times["few"], layout.n_sites, 25)
+    add_per_site(report, "capture of known rates", times["capture"], layout.n_sites, 20)
+
+
+def add_per_site(report: Report, what: str, s: float, n_sites: int, at_most_ns: float) -> None:
+    """Add the processor time per site, with its bound."""
+    report.add(what, f"{s:.4g} s", "processor time, ns per site", "", 1e9 * s / n_sites, at_most_ns)
+
+
+def gaussian_numbers(n_sites: int, n_effects: int) -> Callable[[], object]:
+    """Return a function that draws numpy's Gaussian numbers of several effects."""
+
+    def draw(block: int, sites: slice) -> None:
+        rng = np.random.default_rng(block)
+        for _ in range(n_effects):
+            rng.standard_normal(sites.stop - sites.start)
+
+    return lambda: for_each_block(n_sites, draw)
 
 
 MEMORY_PROBE = """

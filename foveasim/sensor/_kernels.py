@@ -236,7 +236,8 @@ def _index(position):
 @njit(inline="always")
 def _add_inl(value, n_codes, inl):
     """Add the integral nonlinearity to an unquantised code."""
-    position = min(value / n_codes, 1.0) * (inl.size - 1)
+    # The number of codes is a power of 2: its inverse is exact.
+    position = min(value * (1.0 / n_codes), 1.0) * (inl.size - 1)
     k = _index(min(position, inl.size - 2.0))
     return value + (inl[k] + (position - k) * (inl[k + 1] - inl[k]))
 

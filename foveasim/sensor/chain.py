@@ -129,7 +129,14 @@ class FullWell(_Deterministic):
 
 
 class Save(_Deterministic):
-    """Copy of the values to an array (n_site,) of any type."""
+    """Copy of the values of all sites to ``values``, an array (n_site,) of any type."""
+
+    def __init__(self, dtype: type = np.float64) -> None:
+        super().__init__(np.empty(0, dtype))
+
+    def allocate(self, n_sites: int) -> None:
+        """Allocate the array; elements are undefined."""
+        self.values = np.empty(n_sites, self.values.dtype)
 
     def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
         """Return the values unchanged."""
@@ -267,9 +274,9 @@ def apply_steps(
     steps, values, sites, streams, n_threads
         As for :func:`run_steps`.
     """
-    out = np.empty(sites.n_sites)
-    run_steps((*steps, Save(out)), values, sites=sites, streams=streams, n_threads=n_threads)
-    return out
+    result = Save()
+    run_steps((*steps, result), values, sites=sites, streams=streams, n_threads=n_threads)
+    return result.values
 
 
 def run_steps(
@@ -300,17 +307,26 @@ def run_steps(
     is_own = False
     groups = [(is_local, list(group)) for is_local, group in groupby(steps, key=lambda step: step.is_local)]
     for number, (is_local, group) in enumerate(groups):
-        if is_local:
-            before = values
-            if number + 1 < len(groups):
-                values, is_own = np.empty(sites.n_sites), True
-                group.append(Save(values))
-            _run_local_steps(group, before, sites, streams, n_threads)
+        if not is_local:
+            all_sites = sites.block(slice(None), n_threads=n_threads)
+            for step in group:
+                rng: Any = streams.of(step.name) if step.is_temporal and streams is not None else None
+                own_values = values if is_own else np.array(values, np.float64)
+                values, is_own = _apply_step(step, own_values, all_sites, rng), True
             continue
-        all_sites = sites.block(slice(None), n_threads=n_threads)
+        first, before, result = group[0], values, Save()
+        if is_own and isinstance(first, Save) and first.values.dtype == values.dtype:
+            # Shared instead of copied: local steps modify only copies of blocks.
+            first.values = values
+            del group[0]
+        if number + 1 < len(groups):
+            group.append(result)
         for step in group:
-            rng: Any = streams.of(step.name) if step.is_temporal and streams is not None else None
-            values, is_own = _apply_step(step, values if is_own else np.array(values, np.float64), all_sites, rng), True
+            if isinstance(step, Save):
+                step.allocate(sites.n_sites)
+        if group:
+            _run_local_steps(group, before, sites, streams, n_threads)
+        values, is_own = result.values, True
 
 
 def _apply_step(step: Step, values: Any, sites: Sites, rng: Any) -> Any:

@@ -571,10 +571,10 @@ class Sensor:
     def collect(self, expected_e: Floats, *, streams: Streams, n_threads: int | None = None) -> Ints:
         """Draw the collected charge, (n_site,) int64 e-: shot noise, then full well."""
         expected_e = self._check_size("expected_e", expected_e)
-        electrons = np.empty(expected_e.size, np.int64)
-        steps = (*self._collection, Save(electrons))
+        electrons = Save(np.int64)
+        steps = (*self._collection, electrons)
         run_steps(steps, expected_e, sites=self.sites, streams=streams, n_threads=n_threads)
-        return electrons
+        return electrons.values
 
     def read(self, electrons: Ints, *, streams: Streams, n_threads: int | None = None) -> NDArray[Any]:
         """
@@ -620,16 +620,15 @@ class Sensor:
             If the exposure is negative or implausible, or an expected charge is negative.
         """
         photo, steps = self._exposure(photo_e_per_s, exposure_s)
-        expected_e, electrons = np.empty(photo.size), np.empty(photo.size, np.int64)
-        conversion = self._conversion()
+        expected_e, electrons, conversion = Save(), Save(np.int64), self._conversion()
         run_steps(
-            (*steps, Save(expected_e), *self._collection, Save(electrons), *self._after_collection, conversion),
+            (*steps, expected_e, *self._collection, electrons, *self._after_collection, conversion),
             photo,
             sites=self.sites,
             streams=streams,
             n_threads=n_threads,
         )
-        return expected_e, electrons, conversion.values
+        return expected_e.values, electrons.values, conversion.values
 
     def _exposure(self, photo_e_per_s: Floats, exposure_s: float) -> tuple[Floats, tuple[Step, ...]]:
         """Return the rates of all sites, and the steps from them to the expected charges."""
