@@ -77,7 +77,7 @@ class Capture:
         Collected charge, with shot noise, clipped at the full well capacity.
     expected_e : (n_site,) float64, e-
         Expected charge.
-    filter_of_site : (n_site,) int64
+    filter_of_site : (n_site,) signed integers
         Index of each site's colour filter.
     filter_names : tuple of str
     bits : int

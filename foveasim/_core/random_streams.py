@@ -41,7 +41,8 @@ def random_key(rng: np.random.Generator) -> np.uint64:
 @lru_cache(maxsize=64)
 def _block_key(seed: int, frame: int, effect: str) -> NDArray[np.uint64]:
     """Return the key of the generators of all blocks of sites of an effect."""
-    return np.random.SeedSequence(seed, spawn_key=(frame, crc32(effect.encode()))).generate_state(2, np.uint64)
+    seeds = np.random.SeedSequence(seed, spawn_key=(frame, crc32(effect.encode())))
+    return np.asarray(seeds.generate_state(2, np.uint64), np.uint64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +65,7 @@ class Streams:
     Notes
     -----
     A stream depends only on (seed, frame, name of the effect), not on the order of calls or on the number of threads or
-    processes.
+    processes. The draws of a site depend on its index in the layout, not on the number of sites.
 
     Stability: with the same versions of this package and of numpy, a seed gives bit-identical numbers on any machine; every
     capture records both versions. Numbers may change between versions: numpy guarantees the raw words of its generators, not

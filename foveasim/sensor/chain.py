@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.names import possible_names
 from foveasim._core.random_streams import Streams
-from foveasim._core.validation import Floats, Ints
+from foveasim._core.validation import Floats
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.sensor.adc import ConversionTables
 from foveasim.sensor.blocks import for_each_block
@@ -148,7 +148,7 @@ class Save(_Deterministic):
 class Conversion(_Deterministic):
     """Conversion of voltages to codes, which are written to an array (n_site,)."""
 
-    def __init__(self, code: NDArray[Any], line: Ints, tables: ConversionTables) -> None:
+    def __init__(self, code: NDArray[Any], line: NDArray[np.int32], tables: ConversionTables) -> None:
         super().__init__(code)
         self.line, self.tables = line, tables
 

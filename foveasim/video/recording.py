@@ -75,7 +75,7 @@ class Recording:
         Layout of the photosites.
     filter_names : tuple of str
         Names of the colour filters.
-    filter_of_site : (n_site,) int64
+    filter_of_site : (n_site,) signed integers
         Index of the filter of each site.
     bits : int
         Bit depth of the codes.
@@ -90,7 +90,7 @@ class Recording:
     frame: NDArray[np.int64]
     layout: Layout
     filter_names: tuple[str, ...]
-    filter_of_site: NDArray[np.int64]
+    filter_of_site: NDArray[Any]
     bits: int
     white_dn: Floats
     settings: dict[str, Any]

@@ -14,7 +14,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import (
@@ -141,7 +141,7 @@ class CrosstalkOperator:
         return out
 
     @cached_property
-    def _arrays(self) -> tuple[Floats, Ints, Ints]:
+    def _arrays(self) -> tuple[Floats, NDArray[Any], NDArray[Any]]:
         """Values, column indices and row offsets of the matrix, for the kernel."""
         matrix = self.matrix
         return np.ascontiguousarray(matrix.data, np.float64), matrix.indices, matrix.indptr
