@@ -800,7 +800,7 @@ class Camera:
                     order=order,
                     n_grids=len(grids),
                     position_um=position_um or (0.0, 0.0),
-                    compiled=position_um is None,  # a moving gaze is at most positions only once
+                    compiled=position_um is None,  # most positions of a moving gaze occur once
                 )
                 for grid in grids
             ]
