@@ -1,9 +1,14 @@
 """
 Power maps from the basis images of a scene, by Fourier transforms.
 
-The cost is one forward transform per basis image and one inverse transform per map. Where aberrations differ over the
-field, the picture is divided into overlapping isoplanatic patches with linear weights, each with the PSF at its own centre
-(overlap-add). This interpolates the PSF linearly between patch centres.
+The cost is one forward transform per basis image and one inverse transform per map. Maps and basis images that contribute to
+each other form a group (:class:`Group`). In a group with more basis images than maps, such as the bands of a hyperspectral
+scene behind three colour filters, the maps are summed together: each basis image is transformed, added to the spectra of all
+maps and dropped. In other groups the spectra of all basis images are stored, and maps are computed when they are requested.
+Memory is therefore limited to one spectrum per map or basis image, the smaller number of the two, plus one, and to one map.
+
+Where aberrations differ over the field, the picture is divided into overlapping isoplanatic patches with linear weights, each
+with the PSF at its own centre (overlap-add). This interpolates the PSF linearly between patch centres.
 """
 
 from __future__ import annotations
@@ -12,24 +17,68 @@ import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from foveasim._core.validation import Bools, Floats, Images, Ints
+from foveasim._core.validation import Floats, Images, Ints
 from foveasim.fields import Grid
 from foveasim.optics._aperture import Aperture
-from foveasim.optics._transform import Transform, source_pixels
+from foveasim.optics._transform import Factor, Transform, source_pixels
 from foveasim.optics.otf import Tables
 
 __all__ = ["Imaging", "isoplanatic_error", "isoplanatic_maps", "reach_cells"]
 
-#: Callable of (weights of a sum, transform, tables) that returns the cached factor on a spectrum, or None.
-FactorLookup = Callable[[Floats, Transform, Tables], NDArray[Any] | None]
+#: Callable of (weights of a sum, transform, tables) that returns the transfer function of a sum, cached or not.
+FactorLookup = Callable[[Floats, Transform, Tables], Factor]
 #: Comparison of the PSFs of neighbouring patches: points along either axis, and margin in λN beyond the geometric blur.
 COMPARISON_POINTS, COMPARISON_LAMBDA_N = 257, 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """
+    Basis images that are added to maps in one pass, and the sums of OTFs by which they are multiplied.
+
+    Attributes
+    ----------
+    outputs, basis : (n_output,), (n_basis,)
+        Indices of the maps and the basis images.
+    sums : (n_sum, n_wavelength)
+        Weights of the wavelengths in each sum of OTFs.
+    coefficients : (n_output, n_basis, n_sum)
+        Weight of each sum in the transfer function from a basis image to a map.
+    """
+
+    outputs: Ints
+    basis: Ints
+    sums: Floats
+    coefficients: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """
+    Maps and basis images that contribute to each other, and to no others.
+
+    Attributes
+    ----------
+    basis : (n_basis,)
+    steps : sequence of Step
+        One step per basis image, to all maps, if there are more basis images than maps; else one step for every n_basis maps,
+        from all basis images.
+    """
+
+    basis: Ints
+    steps: tuple[Step, ...]
+
+    @property
+    def is_summed_together(self) -> bool:
+        """Whether each step adds one basis image to all maps."""
+        return self.steps[0].basis.size < self.basis.size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +114,7 @@ class Imaging:
     real : float32 or float64
     n_threads : int
     cached_factor : callable
-        Look-up of cached factors.
+        Look-up of transfer functions.
     """
 
     basis: Images
@@ -86,19 +135,46 @@ class Imaging:
     n_threads: int
     cached_factor: FactorLookup
 
-    def is_needed(self) -> Bools:
-        """Return whether each basis image contributes to each output, (n_output, n_basis)."""
-        return np.array(
-            [
-                [bool(np.any(output * irradiance_w_m2)) for irradiance_w_m2 in self.irradiance_w_m2]
-                for output in self.weights
-            ],
-            bool,
-        )
+    @cached_property
+    def groups(self) -> tuple[Group, ...]:
+        """Groups of maps, in the order of the first map of each."""
+        from scipy.sparse import csr_array
+        from scipy.sparse.csgraph import connected_components
+
+        is_needed = np.array([[bool(np.any(w * e)) for e in self.irradiance_w_m2] for w in self.weights], bool)
+        n_outputs, n_basis = is_needed.shape
+        edges = np.zeros((n_outputs + n_basis,) * 2, bool)
+        edges[:n_outputs, n_outputs:] = is_needed
+        _, label = connected_components(csr_array(edges), directed=False)
+        of_output, of_basis = label[:n_outputs], label[n_outputs:]
+        groups = []
+        for k in dict.fromkeys(of_output.tolist()):
+            outputs, basis = np.flatnonzero(of_output == k), np.flatnonzero(of_basis == k)
+            if basis.size > outputs.size:
+                steps = [self._step(outputs, np.array([b])) for b in basis]
+            elif basis.size:
+                batches = range(0, outputs.size, basis.size)
+                steps = [self._step(outputs[first : first + basis.size], basis) for first in batches]
+            else:
+                continue
+            groups.append(Group(basis, tuple(steps)))
+        return tuple(groups)
+
+    def _step(self, outputs: Ints, basis: Ints) -> Step:
+        """Return a pass with the smaller number of sums of OTFs: one per wavelength, or one per map and basis image."""
+        weights = self.weights[outputs, np.newaxis] * self.irradiance_w_m2[basis]
+        is_used = weights.any(axis=(0, 1))
+        is_needed = weights.any(axis=2)
+        if np.count_nonzero(is_used) <= np.count_nonzero(is_needed):
+            return Step(outputs, basis, np.eye(is_used.size)[is_used], weights[:, :, is_used])
+        coefficients = np.zeros((*is_needed.shape, np.count_nonzero(is_needed)))
+        coefficients[(*np.nonzero(is_needed), np.arange(coefficients.shape[2]))] = 1.0
+        return Step(outputs, basis, weights[is_needed], coefficients)
 
     def sums(self) -> list[Floats]:
         """Return the wavelength weights of all required tables."""
-        return [self.weights[c] * self.irradiance_w_m2[b] for c, b in np.argwhere(self.is_needed())]
+        found = {weight.tobytes(): weight for group in self.groups for step in group.steps for weight in step.sums}
+        return list(found.values())
 
     def sources(self) -> tuple[Ints, Ints]:
         """Return the picture rows and columns of the padded rows and columns; -1 for zero."""
@@ -124,42 +200,52 @@ class Imaging:
         """Yield maps with the same PSF over the whole field, computed lazily."""
         transform = self.transform(*self.sources(), self.grid.shape)
 
-        def spectrum(b: int) -> NDArray[Any]:
-            return transform.forward(self.basis[b], self.tangent2_x, self.tangent2_y, self.falloff_power)
+        def write_spectrum(b: int, out: NDArray[Any]) -> None:
+            transform.forward(self.basis[b], self.tangent2_x, self.tangent2_y, self.falloff_power, out)
 
-        return self._maps(transform, spectrum, table_of, self.cached_factor)
+        return self._maps(transform, write_spectrum, lambda weight: self.cached_factor(weight, transform, table_of))
 
     def _maps(
         self,
         transform: Transform,
-        spectrum_of: Callable[[int], NDArray[Any]],
-        table_of: Tables,
-        cached_factor: FactorLookup | None = None,
+        write_spectrum: Callable[[int, NDArray[Any]], None],
+        factor_of: Callable[[Floats], Factor],
     ) -> Iterator[NDArray[Any]]:
-        is_needed = self.is_needed()
-        spectra: dict[int, NDArray[Any]] = {}
-        for c, output in enumerate(self.weights):
-            total: NDArray[Any] | None = None
-            for b in (int(b) for b in np.flatnonzero(is_needed[c])):
-                if b not in spectra:
-                    spectra[b] = spectrum_of(b)
-                is_last_use = not is_needed[c + 1 :, b].any()
-                is_first_term = total is None
-                spectrum = transform.refine(spectra[b])
-                # A copy may be overwritten, and so may a spectrum at its last use.
-                is_free = is_last_use or spectrum is not spectra[b]
-                if is_last_use:
-                    del spectra[b]
-                if total is None:
-                    total = spectrum if is_free else np.empty_like(spectrum)
-                weight = output * self.irradiance_w_m2[b]
-                factor = cached_factor and cached_factor(weight, transform, table_of)
-                if factor is None:
-                    transform.multiply(spectrum, *table_of(weight), total, is_added=not is_first_term)
-                else:
-                    transform.multiply_by(spectrum, factor, total, is_added=not is_first_term)
-                del spectrum
-            yield np.zeros(transform.map_shape, self.real) if total is None else transform.inverse(total)
+        stored: dict[Group, NDArray[Any]] = {}
+
+        def add(spectra: NDArray[Any], step: Step, sums: NDArray[Any], *, is_first: bool, is_last: bool) -> None:
+            factors = [factor_of(weight) for weight in step.sums]
+            transform.add_filtered(spectra, factors, step.coefficients, sums, is_first=is_first, is_last=is_last)
+
+        def sum_together(group: Group) -> NDArray[Any]:
+            spectra, sums = transform.spectra(1), transform.sums(group.steps[0].outputs.size)
+            for step in group.steps:
+                write_spectrum(int(step.basis[0]), spectra[0])
+                add(spectra, step, sums, is_first=step is group.steps[0], is_last=step is group.steps[-1])
+            return sums
+
+        def sum_step(group: Group, step: Step) -> NDArray[Any]:
+            if step is group.steps[0]:
+                stored[group] = transform.spectra(group.basis.size)
+                for spectrum, b in zip(stored[group], group.basis, strict=True):
+                    write_spectrum(int(b), spectrum)
+            is_last = step is group.steps[-1]
+            spectra = stored.pop(group) if is_last else stored[group]
+            # The last maps replace the spectra.
+            is_replaced = is_last and spectra.shape[1:] == transform.spectrum_shape
+            sums = spectra[: step.outputs.size] if is_replaced else transform.sums(step.outputs.size)
+            add(spectra, step, sums, is_first=True, is_last=True)
+            return sums
+
+        starting = {int(step.outputs[0]): (group, step) for group in self.groups for step in group.steps}
+        computed: dict[int, NDArray[Any]] = {}
+        for c in range(len(self.weights)):
+            if c in starting:
+                group, step = starting.pop(c)
+                sums = sum_together(group) if group.is_summed_together else sum_step(group, step)
+                computed |= zip(step.outputs.tolist(), sums, strict=True)
+                del sums
+            yield transform.inverse(computed.pop(c)) if c in computed else np.zeros(transform.map_shape, self.real)
 
     def patch_maps(self, rows: _PatchExtent, columns: _PatchExtent, table_of: Tables) -> Iterator[NDArray[Any]]:
         """Yield the contribution of a patch to every map, over the cells that its PSF reaches."""
@@ -171,11 +257,11 @@ class Imaging:
         inner = picture[rows.pixels, columns.pixels]
         on_axis = np.zeros(shape[1]), np.zeros(shape[0])
 
-        def spectrum(b: int) -> NDArray[Any]:
+        def write_spectrum(b: int, out: NDArray[Any]) -> None:
             inner[:] = self.basis[b][np.ix_(rows.sources, columns.sources)] * window
-            return transform.forward(picture, *on_axis, self.falloff_power)
+            transform.forward(picture, *on_axis, self.falloff_power, out)
 
-        return self._maps(transform, spectrum, table_of)
+        return self._maps(transform, write_spectrum, lambda weight: transform.factor(*table_of(weight)))
 
 
 @dataclass(frozen=True)

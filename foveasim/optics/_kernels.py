@@ -16,13 +16,18 @@ __all__ = [
     "alias_sum",
     "alias_sum_plane",
     "apply_falloff",
-    "multiply",
-    "multiply_otf",
-    "multiply_otf_plane",
+    "filter_and_sum",
+    "load_rows",
+    "pad_lines",
+    "plane_factor",
+    "radial_factor",
     "replicate",
+    "store_rows",
 ]
 
 _floats = types.Array(types.float64, 1, "C", readonly=True)
+#: Columns per pass of a transposition: a cache line of complex64.
+COLUMNS_TOGETHER = 8
 
 
 @njit(
@@ -70,127 +75,108 @@ def apply_falloff(rows, x2, y2, power, source_column, n_before, out):
             line[column] = inner[source_column[column]] if source_column[column] >= 0 else 0.0
 
 
+_PAIRS = ((types.complex64, types.float32), (types.complex128, types.float64))
+
+
+def _in(kind, n_dimensions):
+    """Return the type of a C-contiguous input array."""
+    return types.Array(kind, n_dimensions, "C", readonly=True)
+
+
+@njit([types.void(_in(c, 2), types.int64, c[:, ::1]) for c, _ in _PAIRS])
+def store_rows(rows, first, lines):
+    """
+    Write rows ``first, first + 1, ...`` of a spectrum to its columns, ``lines``.
+
+    Columns of ``rows`` beyond those of the spectrum are omitted.
+    """
+    for begin in range(0, lines.shape[0], COLUMNS_TOGETHER):
+        for row in range(rows.shape[0]):
+            for column in range(begin, min(begin + COLUMNS_TOGETHER, lines.shape[0])):
+                lines[column, first + row] = rows[row, column]
+
+
+@njit([types.void(_in(c, 2), types.int64, c[:, ::1]) for c, _ in _PAIRS])
+def load_rows(lines, first, rows):
+    """Read rows ``first, first + 1, ...`` of a spectrum from its columns: the inverse of :func:`store_rows`."""
+    for begin in range(0, lines.shape[0], COLUMNS_TOGETHER):
+        for row in range(rows.shape[0]):
+            for column in range(begin, min(begin + COLUMNS_TOGETHER, lines.shape[0])):
+                rows[row, column] = lines[column, first + row]
+
+
+@njit([types.void(_in(types.int64, 1), types.int64, types.int64, c[:, ::1]) for c, _ in _PAIRS])
+def pad_lines(source_row, n_before, n_rows, lines):
+    """
+    Write the padding of columns whose picture rows are ``n_before`` to ``n_before + n_rows``.
+
+    ``source_row`` contains the picture row of each row, -1 for zero.
+    """
+    for column in range(lines.shape[0]):
+        line = lines[column]
+        for row in range(n_before):
+            line[row] = line[n_before + source_row[row]] if source_row[row] >= 0 else 0.0
+        for row in range(n_before + n_rows, line.size):
+            line[row] = line[n_before + source_row[row]] if source_row[row] >= 0 else 0.0
+
+
+@njit([types.void(_in(c, 2), types.int64, _in(c, 1), _in(c, 1), types.int64, c[:, ::1]) for c, _ in _PAIRS])
+def replicate(lines, n_columns, phase_x, phase_y, first, out):
+    """
+    Write columns ``first, first + 1, ...`` of a periodically repeated spectrum, times a phase factor.
+
+    The factor is ``phase_y[row] * phase_x[column]``. ``lines`` are columns of the transform of ``n_columns`` real samples along
+    x, from zero frequency to at most half a cycle per sample; the other half is its complex conjugate, mirrored.
+    """
+    n_rows = lines.shape[1]
+    for column in range(out.shape[0]):
+        at = (first + column) % n_columns
+        is_mirrored = at > n_columns // 2
+        line = lines[n_columns - at if is_mirrored else at]
+        for begin in range(0, out.shape[1], n_rows):
+            for row in range(n_rows):
+                value = np.conj(line[(n_rows - row) % n_rows]) if is_mirrored else line[row]
+                out[column, begin + row] = value * (phase_y[begin + row] * phase_x[first + column])
+
+
 @njit(
     [
         types.void(
-            types.Array(c, 2, "C", readonly=True),
-            types.int64,
-            types.Array(c, 1, "C", readonly=True),
-            types.Array(c, 1, "C", readonly=True),
-            types.int64,
-            types.int64,
-            c[:, ::1],
+            _in(r, 1), r, _in(r, 2), _in(r, 2), _in(r, 2), _in(r, 2), _in(r, 2), _in(r, 2), types.int64, r[:, ::1]
         )
-        for c in (types.complex64, types.complex128)
+        for _, r in _PAIRS
     ],
 )
-def replicate(spectrum, n_columns, phase_x, phase_y, first_row, last_row, out):
+def radial_factor(table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, first, out):
     """
-    Write rows of a periodically repeated spectrum, times a phase factor.
-
-    The factor is ``phase_y[row] * phase_x[column]``. ``spectrum`` is the transform of ``n_columns`` real samples along x: its
-    columns range from zero frequency to at most half a cycle per sample; the other half is its complex conjugate, mirrored.
-    """
-    n_rows = spectrum.shape[0]
-    half = n_columns // 2
-    for row in range(first_row, last_row):
-        source = spectrum[row % n_rows]
-        mirrored = spectrum[(n_rows - row % n_rows) % n_rows]
-        for column in range(out.shape[1]):
-            at = column % n_columns
-            value = source[at] if at <= half else np.conj(mirrored[n_columns - at])
-            out[row, column] = value * (phase_y[row] * phase_x[column])
-
-
-@njit(
-    [
-        types.void(
-            types.Array(c, 2, "C", readonly=True),
-            types.Array(r, 1, "C", readonly=True),
-            r,
-            types.Array(r, 2, "C", readonly=True),
-            types.Array(r, 2, "C", readonly=True),
-            types.Array(r, 2, "C", readonly=True),
-            types.Array(r, 2, "C", readonly=True),
-            types.Array(r, 2, "C", readonly=True),
-            types.Array(r, 2, "C", readonly=True),
-            types.boolean,
-            types.int64,
-            types.int64,
-            c[:, ::1],
-        )
-        for c, r in ((types.complex64, types.float32), (types.complex128, types.float64))
-    ],
-)
-def multiply_otf(spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, is_added, first_row, last_row, out):
-    """
-    Compute ``out = spectrum * H`` or ``out += spectrum * H`` over a range of rows.
+    Compute the transfer function H in columns ``first, first + 1, ...`` from a radial table.
 
     ``H`` is the sum of ``table(|f + k|) * gain_x[k] * gain_y[k]`` over the aliases ``k`` of each frequency, plus the sum of
     the products ``far_x[r] * far_y[r]``, a low-rank approximation of the remaining aliases. The table samples a radial
     function at equal steps, 0 beyond its end; ``per_step`` is the number of steps per unit of frequency. ``fx`` and
-    ``gain_x`` are (n_alias, n_x), ``far_x`` is (n_rank, n_x), and likewise for y. ``out`` may be ``spectrum``.
+    ``gain_x`` are (n_alias, n_x), ``far_x`` is (n_rank, n_x), and likewise for y. Each row of ``fy`` is ascending.
     """
-    n_alias, n_x = fx.shape
-    last = table.size - 1
-    h = np.empty(n_x, table.dtype)
-    for row in range(first_row, last_row):
+    last = table.dtype.type(table.size - 1)
+    for column in range(out.shape[0]):
+        ix = first + column
+        h = out[column]
         h[:] = 0.0
         for r in range(far_x.shape[0]):
-            for ix in range(n_x):
-                h[ix] += far_x[r, ix] * far_y[r, row]
-        for ky in range(n_alias):
-            v = fy[ky, row] * per_step
-            if abs(v) >= last:
+            for iy in range(h.size):
+                h[iy] += far_x[r, ix] * far_y[r, iy]
+        for kx in range(fx.shape[0]):
+            u = fx[kx, ix] * per_step
+            if abs(u) >= last:
                 continue
-            for kx in range(n_alias):
-                for ix in range(n_x):
-                    u = fx[kx, ix] * per_step
-                    r = np.sqrt(u * u + v * v)
-                    i = int(min(r, table.dtype.type(last)))
-                    t = r - i
+            reach = np.sqrt((last - u) * (last + u)) / per_step
+            for ky in range(fy.shape[0]):
+                for iy in range(np.searchsorted(fy[ky], -reach), np.searchsorted(fy[ky], reach)):
+                    v = fy[ky, iy] * per_step
+                    s = np.sqrt(u * u + v * v)
+                    i = min(np.int32(s), np.int32(table.size - 2))
+                    t = s - table.dtype.type(i)
                     a = table[i]
-                    b = table[min(i + 1, last)]
-                    h[ix] += (a + t * (b - a)) * gain_x[kx, ix] * gain_y[ky, row] if i < last else table.dtype.type(0.0)
-        if is_added:
-            for ix in range(n_x):
-                out[row, ix] += spectrum[row, ix] * h[ix]
-        else:
-            for ix in range(n_x):
-                out[row, ix] = spectrum[row, ix] * h[ix]
-
-
-@njit(
-    [
-        types.void(
-            types.Array(c, 2, "C", readonly=True),
-            types.Array(h, 2, "C", readonly=True),
-            types.boolean,
-            types.int64,
-            types.int64,
-            c[:, ::1],
-        )
-        for c, h in (
-            (types.complex64, types.float32),
-            (types.complex128, types.float64),
-            (types.complex64, types.complex64),
-            (types.complex128, types.complex128),
-        )
-    ],
-)
-def multiply(spectrum, factor, is_added, first_row, last_row, out):
-    """
-    Compute ``out = spectrum * factor`` or ``out += spectrum * factor`` for some rows.
-
-    The order of operations is that of :func:`multiply_otf`, so that results are bit-identical.
-    """
-    for row in range(first_row, last_row):
-        if is_added:
-            for ix in range(spectrum.shape[1]):
-                out[row, ix] += spectrum[row, ix] * factor[row, ix]
-        else:
-            for ix in range(spectrum.shape[1]):
-                out[row, ix] = spectrum[row, ix] * factor[row, ix]
+                    h[iy] += (a + t * (table[i + 1] - a)) * (gain_x[kx, ix] * gain_y[ky, iy])
 
 
 @njit(inline="always")
@@ -218,48 +204,84 @@ def _interpolate_plane(table, u, v):
 @njit(
     [
         types.void(
-            types.Array(c, 2, "C", readonly=True),
-            types.Array(c, 2, "C", readonly=True),
-            r,
-            types.Array(r, 2, "C", readonly=True),
-            types.Array(r, 2, "C", readonly=True),
-            types.Array(r, 2, "C", readonly=True),
-            types.Array(r, 2, "C", readonly=True),
-            types.Array(c, 2, "C", readonly=True),
-            types.Array(c, 2, "C", readonly=True),
-            types.boolean,
-            types.int64,
-            types.int64,
-            c[:, ::1],
+            _in(c, 2), r, _in(r, 2), _in(r, 2), _in(r, 2), _in(r, 2), _in(c, 2), _in(c, 2), types.int64, c[:, ::1]
         )
-        for c, r in ((types.complex64, types.float32), (types.complex128, types.float64))
+        for c, r in _PAIRS
     ],
 )
-def multiply_otf_plane(
-    spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, is_added, first_row, last_row, out
-):
-    """Compute :func:`multiply_otf` for a square complex table over (f_y, f_x)."""
-    n_alias, n_x = fx.shape
+def plane_factor(table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, first, out):
+    """Compute :func:`radial_factor` for a square complex table over (f_y, f_x); any order of ``fy``."""
     half = table.shape[0] // 2
-    h = np.empty(n_x, table.dtype)
-    for row in range(first_row, last_row):
+    for column in range(out.shape[0]):
+        ix = first + column
+        h = out[column]
         h[:] = 0.0
         for r in range(far_x.shape[0]):
-            for ix in range(n_x):
-                h[ix] += far_x[r, ix] * far_y[r, row]
-        for ky in range(n_alias):
-            v = fy[ky, row] * per_step
-            if abs(v) >= half:
+            for iy in range(h.size):
+                h[iy] += far_x[r, ix] * far_y[r, iy]
+        for kx in range(fx.shape[0]):
+            u = fx[kx, ix] * per_step
+            if abs(u) >= half:
                 continue
-            for kx in range(n_alias):
-                for ix in range(n_x):
-                    h[ix] += _interpolate_plane(table, fx[kx, ix] * per_step, v) * (gain_x[kx, ix] * gain_y[ky, row])
-        if is_added:
-            for ix in range(n_x):
-                out[row, ix] += spectrum[row, ix] * h[ix]
-        else:
-            for ix in range(n_x):
-                out[row, ix] = spectrum[row, ix] * h[ix]
+            for ky in range(fy.shape[0]):
+                for iy in range(h.size):
+                    v = fy[ky, iy] * per_step
+                    if abs(v) < half:
+                        h[iy] += _interpolate_plane(table, u, v) * (gain_x[kx, ix] * gain_y[ky, iy])
+
+
+@njit(
+    [
+        types.void(_in(c, 3), _in(h, 3), _in(r, 3), types.int64, types.boolean, c[:, :, ::1])
+        for c, r in _PAIRS
+        for h in (r, c)
+    ],
+)
+def filter_and_sum(lines, factors, coefficients, first, is_added, out):
+    """
+    Compute ``out[c] = sum_br coefficients[c, b, r] * factors[r] * lines[b]``, or add it to ``out``.
+
+    ``lines`` and ``factors`` are the columns ``first, first + 1, ...`` of spectra and transfer functions. A transfer function
+    that is even along y has only the rows of frequencies >= 0. ``out`` may be ``lines``, if both are one complete spectrum.
+    """
+    n_outputs, n_basis, n_factors = coefficients.shape
+    n_rows, n_half = lines.shape[2], factors.shape[2]
+    n_mirrored = n_rows - n_half
+    h = np.empty(n_half, factors.dtype)
+    for column in range(lines.shape[1]):
+        for c in range(n_outputs):
+            is_first = not is_added
+            total = out[c, first + column]
+            for b in range(n_basis):
+                line = lines[b, column]
+                is_needed = False
+                for r in range(n_factors):
+                    size = coefficients[c, b, r]
+                    if size == 0.0:
+                        continue
+                    factor = factors[r, column]
+                    if is_needed:
+                        for iy in range(n_half):
+                            h[iy] += size * factor[iy]
+                    else:
+                        for iy in range(n_half):
+                            h[iy] = size * factor[iy]
+                        is_needed = True
+                if not is_needed:
+                    continue
+                if is_first:
+                    for iy in range(n_half):
+                        total[iy] = line[iy] * h[iy]
+                    for iy in range(n_mirrored):
+                        total[n_half + iy] = line[n_half + iy] * h[n_mirrored - iy]
+                else:
+                    for iy in range(n_half):
+                        total[iy] += line[iy] * h[iy]
+                    for iy in range(n_mirrored):
+                        total[n_half + iy] += line[n_half + iy] * h[n_mirrored - iy]
+                is_first = False
+            if is_first:
+                total[:] = 0.0
 
 
 @njit(inline="always")

@@ -34,7 +34,7 @@ from foveasim.optics.pupils import Pupil
 from foveasim.units import m_from_mm, m_from_um, um_from_m, um_from_nm
 
 if TYPE_CHECKING:
-    from foveasim.optics._transform import Transform
+    from foveasim.optics._transform import Factor, Transform
 
 __all__ = ["Optics"]
 
@@ -496,9 +496,15 @@ class Optics(PointImages):
         # Cache key: a factor depends on these, the lens and the weights.
         spectrum_key = scene.wavelength_nm.tobytes(), scene.distance_m, grid.shape, grid.pitch_x_um, self._n_fine
 
-        def cached_factor(weight: Floats, transform: Transform, table_of: Tables) -> NDArray[Any] | None:
-            n_numbers = math.prod(transform.spectrum_shape) * (1 if is_clear_circle else 2)
-            return self._cache.factor(spectrum_key, weight, n_numbers, lambda: transform.factor(*table_of(weight)))
+        def cached_factor(weight: Floats, transform: Transform, table_of: Tables) -> Factor:
+            # Factors of a clear circle are real and even.
+            n_numbers = math.prod(transform.spectrum_shape) * 2 // (4 if is_clear_circle else 1)
+            cached = self._cache.factor(
+                spectrum_key, weight, n_numbers, lambda: transform.complete(transform.factor(*table_of(weight)))
+            )
+            if cached is None:
+                return transform.factor(*table_of(weight))
+            return lambda first, last: cached[first:last]
 
         imaging = Imaging(
             basis=scene.basis,

@@ -8,13 +8,18 @@ f + k/p, so that cell means are exact for cells both smaller and larger than the
 Cells may be k times finer than the source pixels. The spectrum of points at the centres of source pixels is periodic: it is
 repeated k x k times, multiplied by the factors of the fine cells, and transformed back at k times the size. The centre of
 the first fine cell is (p - p/k) / 2 before the centre of the first source pixel, which is a phase factor.
+
+Spectra are stored by columns, (n_x, n_y), of which only those below the cut-off frequency are needed. Transforms along y and
+products with transfer functions operate on contiguous blocks of columns, which fit the cache of a core. A transfer function
+that is even along y is stored for frequencies >= 0 only.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.fft
@@ -22,10 +27,15 @@ from numpy.typing import NDArray
 
 from foveasim._core.threads import parallel_map
 from foveasim._core.validation import Floats, Images, Ints
+from foveasim._core.work_arrays import work_array
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.optics.otf import MAX_ALIASES
 
-__all__ = ["Transform", "source_pixels"]
+__all__ = ["Factor", "Transform", "source_pixels"]
+
+#: Callable of (first, last) that returns the columns of a transfer function, (last - first, n): real with the rows of
+#: frequencies >= 0 along y, or complex with all rows.
+Factor: TypeAlias = Callable[[int, int], NDArray[Any]]
 
 #: Largest number of aliases per side that are summed directly at each frequency.
 DIRECT_ALIASES = 1
@@ -39,8 +49,8 @@ NODES_PER_CELL = 4.0
 ALIAS_ACCURACY = 1e-9
 #: Largest width of a padded picture in cells; a wider one indicates a far too small aperture or a wrong unit.
 MAX_PADDED = 1 << 17
-#: Rows per task of a thread.
-ROWS_PER_BLOCK = 64
+#: Rows of a picture and columns of a spectrum per task of a thread.
+ROWS_PER_BLOCK, COLUMNS_PER_BLOCK = 64, 32
 #: Arguments of ``numpy.pad`` for each padding; index -1 denotes zero.
 NUMPY_PADDING: dict[str, dict[str, Any]] = {
     "reflect": {"mode": "reflect"},
@@ -67,8 +77,7 @@ class Transform:
     """
     Fourier transforms of padded pictures of one size.
 
-    A spectrum has all padded rows, but only the columns below the cut-off frequency. Padding rows are copies of picture
-    rows, so they are not transformed separately, and the padded picture is never stored.
+    Padding rows are copies of picture rows, so they are not transformed separately, and the padded picture is never stored.
     """
 
     def __init__(
@@ -99,19 +108,11 @@ class Transform:
         self._is_alternating = oversample % 2 == 0
         self._n_plane_nodes = 2 * ALIAS_NODES + math.ceil(NODES_PER_CELL * blur_cells * oversample)
         n_near = self._n_alias if self._n_alias <= DIRECT_ALIASES else 0
-        k = np.arange(-n_near, n_near + 1)[:, np.newaxis]
-        cycles_y = scipy.fft.fftfreq(self._n_rows) + k
-        cycles_x = scipy.fft.rfftfreq(oversample * columns.size) + k
+        self._aliases = np.arange(-n_near, n_near + 1)[:, np.newaxis]
+        self._cycles_x = scipy.fft.rfftfreq(oversample * columns.size)
         if self._n_alias == 0:
-            cycles_x = cycles_x[:, : int(np.searchsorted(cycles_x[0], f_max)) + 1]
-        self._n_columns = cycles_x.shape[1]
-        self._fx_per_um, self._fy_per_um = ((cycles / self._pitch_um).astype(real) for cycles in (cycles_x, cycles_y))
-        sign = np.where(self._is_alternating & (k % 2 == 1), -1.0, 1.0)
-        self._gain_x, self._gain_y = (
-            (sign * np.sinc(cycles) * np.sinc(self._source_cells * cycles)).astype(real)
-            for cycles in (cycles_x, cycles_y)
-        )
-        self._cycles_x, self._cycles_y = cycles_x[n_near], cycles_y[n_near]
+            self._cycles_x = self._cycles_x[: int(np.searchsorted(self._cycles_x, f_max)) + 1]
+        self._n_columns = self._cycles_x.size
 
     @property
     def map_shape(self) -> tuple[int, int]:
@@ -132,12 +133,12 @@ class Transform:
         Within half a cycle per cell the sum is smooth, so that a few Chebyshev polynomials represent it. For a radial table it
         is an even function, so that half the range suffices.
         """
-        if self._n_alias <= DIRECT_ALIASES:
-            return np.zeros((0, self._cycles_x.size), table.dtype), np.zeros((0, self._cycles_y.size), table.dtype)
         is_radial = table.ndim == 1
-        n_nodes = ALIAS_NODES if is_radial else self._n_plane_nodes
+        to_x, to_y = self._from_radial_nodes if is_radial else self._from_plane_nodes
+        if self._n_alias <= DIRECT_ALIASES:
+            return np.zeros((0, to_x.shape[0]), table.dtype), np.zeros((0, to_y.shape[0]), table.dtype)
         sums = self._kernels.alias_sum if is_radial else self._kernels.alias_sum_plane
-        nodes = np.polynomial.chebyshev.chebpts1(n_nodes)
+        nodes = np.polynomial.chebyshev.chebpts1(to_x.shape[1])
         at_nodes = sums(
             table.astype(np.float64 if is_radial else np.complex128),
             per_step / self._pitch_um,
@@ -149,128 +150,206 @@ class Transform:
         y_modes, sizes, x_modes = np.linalg.svd(at_nodes)
         zero = table[0] if is_radial else table[table.shape[0] // 2, table.shape[0] // 2]
         rank = int(np.searchsorted(-sizes, -ALIAS_ACCURACY * max(float(zero.real), 0.0)))
-        to_coefficients = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, n_nodes - 1))
-
-        def evaluate(cycles: Floats, modes: NDArray[Any]) -> NDArray[Any]:
-            position = 4.0 * np.abs(cycles) - 1.0 if is_radial else 2.0 * cycles
-            polynomials = np.polynomial.chebyshev.chebvander(position, n_nodes - 1)
-            return np.ascontiguousarray((polynomials @ (to_coefficients @ modes)).T.astype(table.dtype))
-
-        far_x = evaluate(self._cycles_x, x_modes[:rank].T)
-        far_y = evaluate(self._cycles_y, y_modes[:, :rank] * sizes[:rank])
+        # Not as matrix products: the threads of BLAS take longer to start than the sums, and would compete with ours.
+        far_x = np.ascontiguousarray(np.einsum("xn,rn->rx", to_x, x_modes[:rank]), table.dtype)
+        far_y = np.ascontiguousarray(np.einsum("yn,nr->ry", to_y, y_modes[:, :rank] * sizes[:rank]), table.dtype)
         # Every alias is 0 at zero frequency: one more product cancels the interpolation error there, which conserves energy.
         dc_x, dc_y = np.zeros((1, far_x.shape[1]), table.dtype), np.zeros((1, far_y.shape[1]), table.dtype)
         dc_x[0, 0], dc_y[0, 0] = 1.0, -(far_x[:, 0] @ far_y[:, 0])
         return np.concatenate((far_x, dc_x)), np.concatenate((far_y, dc_y))
 
-    def _for_each_row_block(self, work: Callable[[int, int], None], n_rows: int) -> None:
-        parallel_map(
-            lambda first: work(first, min(first + ROWS_PER_BLOCK, n_rows)),
-            range(0, n_rows, ROWS_PER_BLOCK),
-            self._n_threads,
-        )
+    @cached_property
+    def _even_cycles_y(self) -> Floats:
+        """Frequencies >= 0 along y, in cycles per cell."""
+        return np.arange(self._n_rows // 2 + 1) / self._n_rows
 
-    def forward(self, image: Images, x2: Floats, y2: Floats, falloff_power: int) -> NDArray[Any]:
-        """Return the spectrum of a picture with relative illumination and padding."""
-        (n_y, _), (top, left) = self._picture_shape, self._n_before
+    @cached_property
+    def _all_cycles_y(self) -> Floats:
+        """Frequencies along y in the order of the transform, in cycles per cell."""
+        cycles = scipy.fft.fftfreq(self._n_rows)
+        # Where the sign of half a cycle matters, it is that of even functions.
+        return np.where((cycles == -0.5) & self._is_alternating, 0.5, cycles)
+
+    @cached_property
+    def _from_radial_nodes(self) -> tuple[Floats, Floats]:
+        """Interpolation matrices (n, n_nodes) of an even function at the frequencies along x and y."""
+        x, y = (_interpolation(4.0 * cycles - 1.0, ALIAS_NODES) for cycles in (self._cycles_x, self._even_cycles_y))
+        return x, y
+
+    @cached_property
+    def _from_plane_nodes(self) -> tuple[Floats, Floats]:
+        """Interpolation matrices (n, n_nodes) at the frequencies along x and y."""
+        x, y = (_interpolation(2.0 * cycles, self._n_plane_nodes) for cycles in (self._cycles_x, self._all_cycles_y))
+        return x, y
+
+    @cached_property
+    def _radial_samples(self) -> list[tuple[NDArray[Any], NDArray[Any]]]:
+        """Frequencies and gains of :meth:`_sample` along x, and along y for a function that is even along y."""
+        return [self._sample(cycles) for cycles in (self._cycles_x, self._even_cycles_y)]
+
+    @cached_property
+    def _plane_samples(self) -> list[tuple[NDArray[Any], NDArray[Any]]]:
+        """Frequencies and gains of :meth:`_sample` along x and y."""
+        return [self._sample(cycles) for cycles in (self._cycles_x, self._all_cycles_y)]
+
+    def _sample(self, cycles: Floats) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the frequencies (1/µm) and gains of the directly summed aliases along one axis, (n_alias, n)."""
+        cycles = cycles + self._aliases
+        sign = np.where(self._is_alternating & (self._aliases % 2 == 1), -1.0, 1.0)
+        gain = sign * np.sinc(cycles) * np.sinc(self._source_cells * cycles)
+        return (cycles / self._pitch_um).astype(self._real), gain.astype(self._real)
+
+    def _for_each_block(self, work: Callable[[int, int], None], n: int, n_per_block: int) -> None:
+        parallel_map(lambda first: work(first, min(first + n_per_block, n)), range(0, n, n_per_block), self._n_threads)
+
+    def spectra(self, n: int) -> NDArray[Any]:
+        """Return uninitialised spectra of n pictures, (n, n_columns, n_rows)."""
         n_columns = min(self._n_columns, self._columns.size // 2 + 1)
-        spectrum = np.empty((self._rows.size, n_columns), np.result_type(self._real, np.complex64))
+        return work_array((n, n_columns, self._rows.size), np.result_type(self._real, np.complex64))
+
+    def sums(self, n: int) -> NDArray[Any]:
+        """Return uninitialised spectra of n maps, (n, n_columns, n_rows)."""
+        return work_array((n, *self.spectrum_shape), np.result_type(self._real, np.complex64))
+
+    @property
+    def spectrum_shape(self) -> tuple[int, int]:
+        """Numbers of columns and rows of the spectrum of a map."""
+        return self._n_columns, self._n_rows
+
+    def forward(self, image: Images, x2: Floats, y2: Floats, falloff_power: int, out: NDArray[Any]) -> None:
+        """Write the spectrum of a picture with relative illumination and padding, (n_columns, n_rows)."""
+        (n_y, _), (top, left) = self._picture_shape, self._n_before
         x2, y2 = x2.astype(self._real), y2.astype(self._real)
 
-        def process_rows(first: int, last: int) -> None:
+        def transform_rows(first: int, last: int) -> None:
             padded = np.empty((last - first, self._columns.size), self._real)
             rows = np.ascontiguousarray(image[first:last])
             self._kernels.apply_falloff(rows, x2, y2[first:last], falloff_power, self._columns, left, padded)
-            spectrum[top + first : top + last] = scipy.fft.rfft(padded, axis=1, overwrite_x=True)[:, :n_columns]
+            self._kernels.store_rows(scipy.fft.rfft(padded, axis=1, overwrite_x=True), top + first, out)
 
-        self._for_each_row_block(process_rows, n_y)
-        for row in (*range(top), *range(top + n_y, self._rows.size)):
-            spectrum[row] = spectrum[top + self._rows[row]] if self._rows[row] >= 0 else 0.0
-        spectrum = scipy.fft.fft(spectrum, axis=0, overwrite_x=True, workers=self._n_threads)
-        if not np.isfinite(spectrum[0, 0]):
+        def transform_columns(first: int, last: int) -> None:
+            lines = out[first:last]
+            self._kernels.pad_lines(self._rows, top, n_y, lines)
+            _in_place(scipy.fft.fft, lines)
+
+        self._for_each_block(transform_rows, n_y, ROWS_PER_BLOCK)
+        self._for_each_block(transform_columns, out.shape[0], COLUMNS_PER_BLOCK)
+        if not np.isfinite(out[0, 0]):
             raise SimulationError("the scene must be finite, got NaN or infinite values; mask or replace them")
-        return spectrum
 
-    def refine(self, spectrum: NDArray[Any]) -> NDArray[Any]:
+    def factor(self, table: NDArray[Any], per_step: float) -> Factor:
         """
-        Return the spectrum of the source points over the frequencies of the map cells.
-
-        Without oversampling this is the same array.
-        """
-        if self._oversample == 1:
-            return spectrum
-        # Factor k per axis: the means of k² times as many cells add up to k² times the sum. The phase shifts the origin.
-        phase_x, phase_y = (
-            (self._oversample * np.exp(-1j * np.pi * (self._oversample - 1) * cycles)).astype(spectrum.dtype)
-            for cycles in (self._cycles_x, self._cycles_y)
-        )
-        out = np.empty(self.spectrum_shape, spectrum.dtype)
-        self._for_each_row_block(
-            lambda first, last: self._kernels.replicate(
-                spectrum, self._columns.size, phase_x, phase_y, first, last, out
-            ),
-            self._n_rows,
-        )
-        return out
-
-    def multiply(
-        self, spectrum: NDArray[Any], table: NDArray[Any], per_step: float, out: NDArray[Any], *, is_added: bool
-    ) -> None:
-        """
-        Write or add a spectrum times a transfer function to ``out``, which may be the spectrum.
+        Return the transfer function of map cells.
 
         The table is radial, (n,) from zero frequency, or square, (2 n + 1, 2 n + 1) centred on zero frequency, with
         ``per_step`` steps per 1/µm.
         """
+        is_radial = table.ndim == 1
+        kernel = self._kernels.radial_factor if is_radial else self._kernels.plane_factor
+        (fx, gain_x), (fy, gain_y) = self._radial_samples if is_radial else self._plane_samples
         far_x, far_y = self._far_aliases(table, per_step)
-        kernel = self._kernels.multiply_otf if table.ndim == 1 else self._kernels.multiply_otf_plane
 
-        def process_rows(first: int, last: int) -> None:
-            kernel(
-                spectrum,
-                table,
-                self._real(per_step),
-                self._fx_per_um,
-                self._fy_per_um,
-                self._gain_x,
-                self._gain_y,
-                far_x,
-                far_y,
-                is_added,
-                first,
-                last,
-                out,
+        def compute(first: int, last: int) -> NDArray[Any]:
+            out = np.empty((last - first, fy.shape[1]), table.dtype)
+            kernel(table, self._real(per_step), fx, fy, gain_x, gain_y, far_x, far_y, first, out)
+            return out
+
+        return compute
+
+    def complete(self, factor: Factor) -> NDArray[Any]:
+        """Return all columns of a transfer function."""
+        blocks = range(0, self._n_columns, COLUMNS_PER_BLOCK)
+        return np.concatenate(
+            parallel_map(
+                lambda first: factor(first, min(first + COLUMNS_PER_BLOCK, self._n_columns)), blocks, self._n_threads
             )
-
-        self._for_each_row_block(process_rows, spectrum.shape[0])
-
-    @property
-    def spectrum_shape(self) -> tuple[int, int]:
-        """Numbers of rows and columns of a spectrum."""
-        return self._n_rows, self._n_columns
-
-    def factor(self, table: NDArray[Any], per_step: float) -> NDArray[Any]:
-        """Return the factor of :meth:`multiply` as an array; real for a radial table."""
-        ones = np.ones(self.spectrum_shape, np.result_type(self._real, np.complex64))
-        self.multiply(ones, table, per_step, ones, is_added=False)
-        return np.ascontiguousarray(ones.real) if table.ndim == 1 else ones
-
-    def multiply_by(self, spectrum: NDArray[Any], factor: NDArray[Any], out: NDArray[Any], *, is_added: bool) -> None:
-        """Compute :meth:`multiply` with a precomputed factor; bit-identical."""
-        self._for_each_row_block(
-            lambda first, last: self._kernels.multiply(spectrum, factor, is_added, first, last, out), spectrum.shape[0]
         )
 
-    def inverse(self, spectrum: NDArray[Any]) -> NDArray[Any]:
-        """Return the picture of a spectrum without padding; overwrites the spectrum."""
+    def add_filtered(
+        self,
+        spectra: NDArray[Any],
+        factors: Sequence[Factor],
+        coefficients: Floats,
+        out: NDArray[Any],
+        *,
+        is_first: bool,
+        is_last: bool,
+    ) -> None:
+        """
+        Add ``sum_br coefficients[c, b, r] * factors[r] * spectra[b]`` to ``out[c]``.
+
+        Parameters
+        ----------
+        spectra : (n_basis, n_columns, n_rows)
+        factors : n_factor transfer functions
+        coefficients : (n_output, n_basis, n_factor)
+        out : (n_output, n_columns, n_rows)
+            May be the first of the spectra, if there are at least as many as outputs and they have the same shape.
+        is_first : bool
+            Whether the result is written to ``out`` instead of being added.
+        is_last : bool
+            Whether to transform the sum back along y, for :meth:`inverse`.
+        """
+        coefficients = np.ascontiguousarray(coefficients, self._real)
+
+        def filter_columns(first: int, last: int) -> None:
+            columns = [factor(first, last) for factor in factors]
+            together = columns[0][np.newaxis] if len(columns) == 1 else np.stack(columns)
+            lines = self._lines(spectra, first, last)
+            self._kernels.filter_and_sum(lines, together, coefficients, first, not is_first, out)
+            if is_last:
+                for output in out:
+                    _in_place(scipy.fft.ifft, output[first:last])
+
+        self._for_each_block(filter_columns, out.shape[1], COLUMNS_PER_BLOCK)
+
+    def _lines(self, spectra: NDArray[Any], first: int, last: int) -> NDArray[Any]:
+        """Return columns of spectra over the frequencies of the map cells; a view of one spectrum if possible."""
+        if self._oversample == 1:
+            # Of several spectra a copy, since the sums may replace them.
+            return spectra[:, first:last] if spectra.shape[0] == 1 else spectra[:, first:last].copy()
+        lines = np.empty((spectra.shape[0], last - first, self._n_rows), spectra.dtype)
+        for spectrum, out in zip(spectra, lines, strict=True):
+            self._kernels.replicate(spectrum, self._columns.size, *self._phases, first, out)
+        return lines
+
+    @cached_property
+    def _phases(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Phase factors along x and y that move the origin to the centre of the first fine cell."""
+        # Factor k per axis: the means of k² times as many cells add up to k² times the sum.
+        x, y = (
+            (self._oversample * np.exp(-1j * np.pi * (self._oversample - 1) * cycles)).astype(
+                np.result_type(self._real, np.complex64)
+            )
+            for cycles in (self._cycles_x, self._all_cycles_y)
+        )
+        return x, y
+
+    def inverse(self, lines: NDArray[Any]) -> NDArray[Any]:
+        """Return the picture, without padding, of a sum that is already transformed along y."""
         n_y, n_x = self.map_shape
         top, left = (self._oversample * before for before in self._n_before)
-        lines = scipy.fft.ifft(spectrum, axis=0, overwrite_x=True, workers=self._n_threads)
-        image = np.empty(self.map_shape, self._real)
+        image = work_array(self.map_shape, self._real)
 
-        def process_rows(first: int, last: int) -> None:
-            padded = scipy.fft.irfft(lines[top + first : top + last], n=self._oversample * self._columns.size, axis=1)
+        def transform_rows(first: int, last: int) -> None:
+            rows = np.empty((last - first, lines.shape[0]), lines.dtype)
+            self._kernels.load_rows(lines, top + first, rows)
+            padded = scipy.fft.irfft(rows, n=self._oversample * self._columns.size, axis=1, overwrite_x=True)
             image[first:last] = padded[:, left : left + n_x]
 
-        self._for_each_row_block(process_rows, n_y)
+        self._for_each_block(transform_rows, n_y, ROWS_PER_BLOCK)
         return image
+
+
+def _interpolation(position: Floats, n_nodes: int) -> Floats:
+    """Return the matrix (n, n_nodes) from values at the Chebyshev nodes to those at positions within -1 to 1."""
+    vandermonde = np.polynomial.chebyshev.chebvander
+    nodes = np.polynomial.chebyshev.chebpts1(n_nodes)
+    return np.asarray(vandermonde(position, n_nodes - 1) @ np.linalg.inv(vandermonde(nodes, n_nodes - 1)))
+
+
+def _in_place(transform: Callable[..., NDArray[Any]], lines: NDArray[Any]) -> None:
+    """Replace lines by their Fourier transforms."""
+    found = transform(lines, axis=1, overwrite_x=True)
+    if not np.may_share_memory(found, lines):  # another backend of scipy.fft
+        lines[:] = found

@@ -74,14 +74,19 @@ class RadialTables:
         n_points = max(TABLE_POINTS[real], int(min(n_wanted, MAX_TABLE_SIZE / cutoff_per_um.size)))
         self._f_per_um, self._cutoff_per_um = np.linspace(0.0, f_max_per_um, n_points), cutoff_per_um
         self._per_step = (n_points - 1) / f_max_per_um
+        self._otfs: dict[int, Floats] = {}
 
-    @cached_property
-    def _otf(self) -> Floats:
-        return circular_otf(self._f_per_um / self._cutoff_per_um[:, np.newaxis])
+    def _otf(self, k: int) -> Floats:
+        if k not in self._otfs:
+            self._otfs[k] = circular_otf(self._f_per_um / self._cutoff_per_um[k])
+        return self._otfs[k]
 
     def __call__(self, weight: Floats) -> tuple[NDArray[Any], float]:
         """Return the table, and its steps per frequency (µm)."""
-        return (weight @ self._otf).astype(self._real), self._per_step
+        total = np.zeros(self._f_per_um.size)
+        for k in np.flatnonzero(weight):
+            total += weight[k] * self._otf(int(k))
+        return total.astype(self._real), self._per_step
 
 
 class PlaneTables:

@@ -131,7 +131,7 @@ def test_cached_lens_gives_bit_identical_maps(changes, precision, pitch_um):
     for scene in scenes:
         fresh = [cells.tobytes() for cells in lens().weighted_maps(scene, weights)]
         assert [cells.tobytes() for cells in cached.weighted_maps(scene, weights)] == fresh
-    assert sum(factor is not None for factor in cached._cache._factors.values()) == 6
+    assert sum(factor is not None for factor in cached._cache._factors.values()) == 3
 
 
 def test_lens_cache_size_is_limited(monkeypatch):

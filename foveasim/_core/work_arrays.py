@@ -1,0 +1,71 @@
+"""
+Reuse of the memory of large arrays.
+
+The first access to fresh memory takes longer than a pass over it. Arrays of :func:`work_array` reuse the memory of earlier ones
+that no object refers to any more, so that repeated captures of one size need no fresh memory.
+"""
+
+from __future__ import annotations
+
+import math
+from threading import RLock
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+__all__ = ["work_array"]
+
+#: Smaller arrays are allocated as usual: the allocator reuses their memory.
+MIN_BYTES = 1 << 20
+#: Limit of the unused memory that is retained; the memory that has been unused for longest is released first.
+MAX_UNUSED_BYTES = 1 << 28
+
+
+class _Memory:
+    """Memory of one array; arrays and their views refer to it, and it returns to the pool with the last of them."""
+
+    def __init__(self, pool: _Pool, buffer: NDArray[np.uint8]) -> None:
+        self._pool, self._buffer = pool, buffer
+        self.__array_interface__ = buffer.__array_interface__
+
+    def __del__(self) -> None:
+        self._pool.put(self._buffer)
+
+
+class _Pool:
+    """Unused buffers, in the order in which they became unused."""
+
+    def __init__(self) -> None:
+        # Reentrant: garbage collection may delete an array, and thus call put, at any allocation.
+        self._lock = RLock()
+        self._unused: list[NDArray[np.uint8]] = []
+
+    def get(self, n_bytes: int) -> NDArray[np.uint8]:
+        with self._lock:
+            for i in reversed(range(len(self._unused))):
+                if self._unused[i].size == n_bytes:
+                    return self._unused.pop(i)
+        return np.empty(n_bytes, np.uint8)
+
+    def put(self, buffer: NDArray[np.uint8]) -> None:
+        with self._lock:
+            self._unused.append(buffer)
+            while sum(unused.size for unused in self._unused) > MAX_UNUSED_BYTES:
+                del self._unused[0]
+
+
+_POOL = _Pool()
+
+
+def work_array(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    """
+    Return an uninitialised C-contiguous array.
+
+    Its memory is reused after the last reference to the array and its views is gone.
+    """
+    dtype = np.dtype(dtype)
+    n_bytes = math.prod(shape) * dtype.itemsize
+    if n_bytes < MIN_BYTES:
+        return np.empty(shape, dtype)
+    return np.asarray(_Memory(_POOL, _POOL.get(n_bytes))).view(dtype).reshape(shape)

@@ -1,0 +1,65 @@
+"""Tests of the reuse of the memory of large arrays."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from foveasim._core import work_arrays
+from foveasim._core.work_arrays import work_array
+
+SHAPE = (512, 1024)
+
+
+@pytest.fixture(autouse=True)
+def empty_pool(monkeypatch):
+    monkeypatch.setattr(work_arrays, "_POOL", work_arrays._Pool())
+
+
+def address(array):
+    return array.__array_interface__["data"][0]
+
+
+def test_memory_is_reused_after_deletion():
+    first = work_array(SHAPE, np.float32)
+    at = address(first)
+    assert address(work_array(SHAPE, np.float32)) != at
+
+    del first
+    again = work_array((SHAPE[1] // 2, SHAPE[0]), np.complex64)
+
+    assert again.shape == (SHAPE[1] // 2, SHAPE[0])
+    assert again.dtype == np.complex64
+    assert again.flags.c_contiguous
+    assert again.flags.writeable
+    assert address(again) == at
+
+
+def test_views_prevent_memory_reuse():
+    whole = work_array(SHAPE, np.float32)
+    at = address(whole)
+    view = whole.reshape(-1)[10:].view(np.uint8)[3:]
+    del whole
+
+    assert address(work_array(SHAPE, np.float32)) != at
+    del view
+    assert at in {address(each) for each in [work_array(SHAPE, np.float32) for _ in range(2)]}
+
+
+def test_unused_memory_is_limited(monkeypatch):
+    n_bytes = 4 * SHAPE[0] * SHAPE[1]
+    monkeypatch.setattr(work_arrays, "MAX_UNUSED_BYTES", 2 * n_bytes)
+    arrays = [work_array(SHAPE, np.float32) for _ in range(4)]
+    del arrays
+
+    assert sum(unused.size for unused in work_arrays._POOL._unused) == 2 * n_bytes
+
+
+def test_threads_never_share_memory():
+    def fill(number):
+        array = work_array(SHAPE, np.int32)
+        array[:] = number
+        return bool((array == number).all())
+
+    with ThreadPoolExecutor(8) as pool:
+        assert all(pool.map(fill, range(200)))
