@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 import scipy.fft
 import shapely
+from dense import bench_dense
 from exploring import bench_exploring
 from learning import bench_learning
 from looking import bench_looking
@@ -354,6 +355,8 @@ def main() -> int:
     for bench in (bench_integrator, bench_optics, bench_distortion, bench_wavelengths, bench_memory):
         with console.status(bench.__name__.replace("_", " ")):
             bench(report, shape)
+    with console.status("bench dense"):
+        bench_dense(report, 512 if is_quick else 2048)
     with console.status("bench sensor"):
         bench_sensor(report, 100 if is_quick else 1000)
     with console.status("bench layouts"):

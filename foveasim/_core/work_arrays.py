@@ -23,7 +23,7 @@ MAX_UNUSED_BYTES = 1 << 28
 
 
 class _Memory:
-    """Memory of one array; arrays and their views refer to it, and it returns to the pool with the last of them."""
+    """Memory of one array, which returns to the pool with its last view."""
 
     def __init__(self, pool: _Pool, buffer: NDArray[np.uint8]) -> None:
         self._pool, self._buffer = pool, buffer

@@ -34,6 +34,8 @@ __all__ = ["Imaging", "isoplanatic_error", "isoplanatic_maps", "reach_cells"]
 
 #: Callable of (weights of a sum, transform, tables) that returns the transfer function of a sum, cached or not.
 FactorLookup = Callable[[Floats, Transform, Tables], Factor]
+#: Callable of weights of a sum that returns its transfer function.
+FactorOf = Callable[[Floats], Factor]
 #: Comparison of the PSFs of neighbouring patches: points along either axis, and margin in λN beyond the geometric blur.
 COMPARISON_POINTS, COMPARISON_LAMBDA_N = 257, 5.0
 
@@ -41,13 +43,13 @@ COMPARISON_POINTS, COMPARISON_LAMBDA_N = 257, 5.0
 @dataclass(frozen=True, eq=False)
 class Step:
     """
-    Basis images that are added to maps in one pass, and the sums of OTFs by which they are multiplied.
+    Basis images that are added to maps in one pass, and their sums of OTFs.
 
     Attributes
     ----------
     outputs, basis : (n_output,), (n_basis,)
         Indices of the maps and the basis images.
-    sums : (n_sum, n_wavelength)
+    weights : (n_sum, n_wavelength)
         Weights of the wavelengths in each sum of OTFs.
     coefficients : (n_output, n_basis, n_sum)
         Weight of each sum in the transfer function from a basis image to a map.
@@ -55,7 +57,7 @@ class Step:
 
     outputs: Ints
     basis: Ints
-    sums: Floats
+    weights: Floats
     coefficients: Floats
 
 
@@ -161,7 +163,8 @@ class Imaging:
         return tuple(groups)
 
     def _step(self, outputs: Ints, basis: Ints) -> Step:
-        """Return a pass with the smaller number of sums of OTFs: one per wavelength, or one per map and basis image."""
+        """Return a pass with one sum of OTFs per wavelength, or per map and basis image."""
+        # The smaller number of the two.
         weights = self.weights[outputs, np.newaxis] * self.irradiance_w_m2[basis]
         is_used = weights.any(axis=(0, 1))
         is_needed = weights.any(axis=2)
@@ -173,7 +176,7 @@ class Imaging:
 
     def sums(self) -> list[Floats]:
         """Return the wavelength weights of all required tables."""
-        found = {weight.tobytes(): weight for group in self.groups for step in group.steps for weight in step.sums}
+        found = {weight.tobytes(): weight for group in self.groups for step in group.steps for weight in step.weights}
         return list(found.values())
 
     def sources(self) -> tuple[Ints, Ints]:
@@ -209,12 +212,12 @@ class Imaging:
         self,
         transform: Transform,
         write_spectrum: Callable[[int, NDArray[Any]], None],
-        factor_of: Callable[[Floats], Factor],
+        factor_of: FactorOf,
     ) -> Iterator[NDArray[Any]]:
         stored: dict[Group, NDArray[Any]] = {}
 
         def add(spectra: NDArray[Any], step: Step, sums: NDArray[Any], *, is_first: bool, is_last: bool) -> None:
-            factors = [factor_of(weight) for weight in step.sums]
+            factors = [factor_of(weight) for weight in step.weights]
             transform.add_filtered(spectra, factors, step.coefficients, sums, is_first=is_first, is_last=is_last)
 
         def sum_together(group: Group) -> NDArray[Any]:

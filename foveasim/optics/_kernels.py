@@ -98,7 +98,7 @@ def store_rows(rows, first, lines):
 
 @njit([types.void(_in(c, 2), types.int64, c[:, ::1]) for c, _ in _PAIRS])
 def load_rows(lines, first, rows):
-    """Read rows ``first, first + 1, ...`` of a spectrum from its columns: the inverse of :func:`store_rows`."""
+    """Read rows of a spectrum from its columns: the inverse of :func:`store_rows`."""
     for begin in range(0, lines.shape[0], COLUMNS_TOGETHER):
         for row in range(rows.shape[0]):
             for column in range(begin, min(begin + COLUMNS_TOGETHER, lines.shape[0])):
@@ -108,9 +108,10 @@ def load_rows(lines, first, rows):
 @njit([types.void(_in(types.int64, 1), types.int64, types.int64, c[:, ::1]) for c, _ in _PAIRS])
 def pad_lines(source_row, n_before, n_rows, lines):
     """
-    Write the padding of columns whose picture rows are ``n_before`` to ``n_before + n_rows``.
+    Write the padding of columns before and after their picture rows.
 
-    ``source_row`` contains the picture row of each row, -1 for zero.
+    The picture rows are ``n_before`` to ``n_before + n_rows``. ``source_row`` contains the picture row of each row, -1 for
+    zero.
     """
     for column in range(lines.shape[0]):
         line = lines[column]
@@ -123,10 +124,11 @@ def pad_lines(source_row, n_before, n_rows, lines):
 @njit([types.void(_in(c, 2), types.int64, _in(c, 1), _in(c, 1), types.int64, c[:, ::1]) for c, _ in _PAIRS])
 def replicate(lines, n_columns, phase_x, phase_y, first, out):
     """
-    Write columns ``first, first + 1, ...`` of a periodically repeated spectrum, times a phase factor.
+    Write columns of a periodically repeated spectrum, times a phase factor.
 
-    The factor is ``phase_y[row] * phase_x[column]``. ``lines`` are columns of the transform of ``n_columns`` real samples along
-    x, from zero frequency to at most half a cycle per sample; the other half is its complex conjugate, mirrored.
+    The columns are ``first, first + 1, ...``; the factor is ``phase_y[row] * phase_x[column]``. ``lines`` are columns of
+    the transform of ``n_columns`` real samples along x, from zero frequency to at most half a cycle per sample; the other
+    half is its complex conjugate, mirrored.
     """
     n_rows = lines.shape[1]
     for column in range(out.shape[0]):
@@ -149,12 +151,13 @@ def replicate(lines, n_columns, phase_x, phase_y, first, out):
 )
 def radial_factor(table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, first, out):
     """
-    Compute the transfer function H in columns ``first, first + 1, ...`` from a radial table.
+    Compute columns of the transfer function H from a radial table.
 
-    ``H`` is the sum of ``table(|f + k|) * gain_x[k] * gain_y[k]`` over the aliases ``k`` of each frequency, plus the sum of
-    the products ``far_x[r] * far_y[r]``, a low-rank approximation of the remaining aliases. The table samples a radial
-    function at equal steps, 0 beyond its end; ``per_step`` is the number of steps per unit of frequency. ``fx`` and
-    ``gain_x`` are (n_alias, n_x), ``far_x`` is (n_rank, n_x), and likewise for y. Each row of ``fy`` is ascending.
+    The columns are ``first, first + 1, ...``. ``H`` is the sum of ``table(|f + k|) * gain_x[k] * gain_y[k]`` over the
+    aliases ``k`` of each frequency, plus the sum of the products ``far_x[r] * far_y[r]``, a low-rank approximation of the
+    remaining aliases. The table samples a radial function at equal steps, 0 beyond its end; ``per_step`` is the number of
+    steps per unit of frequency. ``fx`` and ``gain_x`` are (n_alias, n_x), ``far_x`` is (n_rank, n_x), and likewise for y.
+    Each row of ``fy`` is ascending.
     """
     last = table.dtype.type(table.size - 1)
     for column in range(out.shape[0]):
@@ -210,7 +213,7 @@ def _interpolate_plane(table, u, v):
     ],
 )
 def plane_factor(table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, first, out):
-    """Compute :func:`radial_factor` for a square complex table over (f_y, f_x); any order of ``fy``."""
+    """Compute :func:`radial_factor` for a square complex table, and any order of ``fy``."""
     half = table.shape[0] // 2
     for column in range(out.shape[0]):
         ix = first + column
@@ -239,10 +242,11 @@ def plane_factor(table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, first, o
 )
 def filter_and_sum(lines, factors, coefficients, first, is_added, out):
     """
-    Compute ``out[c] = sum_br coefficients[c, b, r] * factors[r] * lines[b]``, or add it to ``out``.
+    Compute weighted sums of spectra times transfer functions, or add them to ``out``.
 
-    ``lines`` and ``factors`` are the columns ``first, first + 1, ...`` of spectra and transfer functions. A transfer function
-    that is even along y has only the rows of frequencies >= 0. ``out`` may be ``lines``, if both are one complete spectrum.
+    The sums are ``out[c] = sum_br coefficients[c, b, r] * factors[r] * lines[b]``. ``lines`` and ``factors`` are the
+    columns ``first, first + 1, ...`` of spectra and transfer functions. A transfer function that is even along y has only
+    the rows of frequencies >= 0. ``out`` may be ``lines``, if both are one complete spectrum.
     """
     n_outputs, n_basis, n_factors = coefficients.shape
     n_rows, n_half = lines.shape[2], factors.shape[2]

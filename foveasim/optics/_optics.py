@@ -445,6 +445,12 @@ class Optics(PointImages):
         The sum over wavelengths is taken before the inverse transform, and the scene is a sum of B basis images. The cost is
         therefore B forward transforms, and one inverse transform per output, for any number of wavelengths. This cost applies
         to each image size with lateral chromatic aberration, and to each isoplanatic patch with field-dependent aberrations.
+
+        The sums of OTFs that multiply the basis images are evaluated for each wavelength, or for each pair of an output and a
+        basis image, whichever are fewer: a hyperspectral scene of B independent bands requires B.
+
+        Memory: the spectra of the outputs or those of the basis images, whichever are fewer, one more spectrum, and one map.
+        With more basis images than outputs, the first map is available after all forward transforms.
         """
         common = self._refine(self.grid(scene))
         weights = finite_array("weights", weights, ndim=2)
@@ -498,7 +504,8 @@ class Optics(PointImages):
 
         def cached_factor(weight: Floats, transform: Transform, table_of: Tables) -> Factor:
             # Factors of a clear circle are real and even.
-            n_numbers = math.prod(transform.spectrum_shape) * 2 // (4 if is_clear_circle else 1)
+            n_columns, n_rows = transform.spectrum_shape
+            n_numbers = n_columns * (n_rows // 2 + 1 if is_clear_circle else 2 * n_rows)
             cached = self._cache.factor(
                 spectrum_key, weight, n_numbers, lambda: transform.complete(transform.factor(*table_of(weight)))
             )

@@ -172,7 +172,7 @@ class Transform:
 
     @cached_property
     def _from_radial_nodes(self) -> tuple[Floats, Floats]:
-        """Interpolation matrices (n, n_nodes) of an even function at the frequencies along x and y."""
+        """Interpolation matrices (n, n_nodes) of an even function along x and y."""
         x, y = (_interpolation(4.0 * cycles - 1.0, ALIAS_NODES) for cycles in (self._cycles_x, self._even_cycles_y))
         return x, y
 
@@ -184,16 +184,20 @@ class Transform:
 
     @cached_property
     def _radial_samples(self) -> list[tuple[NDArray[Any], NDArray[Any]]]:
-        """Frequencies and gains of :meth:`_sample` along x, and along y for a function that is even along y."""
+        """Frequencies and gains along x, and along y for an even function."""
         return [self._sample(cycles) for cycles in (self._cycles_x, self._even_cycles_y)]
 
     @cached_property
     def _plane_samples(self) -> list[tuple[NDArray[Any], NDArray[Any]]]:
-        """Frequencies and gains of :meth:`_sample` along x and y."""
+        """Frequencies and gains along x and y."""
         return [self._sample(cycles) for cycles in (self._cycles_x, self._all_cycles_y)]
 
     def _sample(self, cycles: Floats) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the frequencies (1/µm) and gains of the directly summed aliases along one axis, (n_alias, n)."""
+        """
+        Return the frequencies and gains of the directly summed aliases along one axis.
+
+        Both are (n_alias, n); frequencies in 1/µm.
+        """
         cycles = cycles + self._aliases
         sign = np.where(self._is_alternating & (self._aliases % 2 == 1), -1.0, 1.0)
         gain = sign * np.sinc(cycles) * np.sinc(self._source_cells * cycles)
@@ -217,7 +221,7 @@ class Transform:
         return self._n_columns, self._n_rows
 
     def forward(self, image: Images, x2: Floats, y2: Floats, falloff_power: int, out: NDArray[Any]) -> None:
-        """Write the spectrum of a picture with relative illumination and padding, (n_columns, n_rows)."""
+        """Write the spectrum of a picture with relative illumination and padding."""
         (n_y, _), (top, left) = self._picture_shape, self._n_before
         x2, y2 = x2.astype(self._real), y2.astype(self._real)
 
@@ -304,7 +308,7 @@ class Transform:
         self._for_each_block(filter_columns, out.shape[1], COLUMNS_PER_BLOCK)
 
     def _lines(self, spectra: NDArray[Any], first: int, last: int) -> NDArray[Any]:
-        """Return columns of spectra over the frequencies of the map cells; a view of one spectrum if possible."""
+        """Return columns of spectra over the frequencies of the map cells."""
         if self._oversample == 1:
             # Of several spectra a copy, since the sums may replace them.
             return spectra[:, first:last] if spectra.shape[0] == 1 else spectra[:, first:last].copy()
@@ -341,11 +345,11 @@ class Transform:
         return image
 
 
-def _interpolation(position: Floats, n_nodes: int) -> Floats:
-    """Return the matrix (n, n_nodes) from values at the Chebyshev nodes to those at positions within -1 to 1."""
+def _interpolation(x: Floats, n_nodes: int) -> Floats:
+    """Return the matrix (n, n_nodes) from values at Chebyshev nodes to those at x within -1 to 1."""
     vandermonde = np.polynomial.chebyshev.chebvander
     nodes = np.polynomial.chebyshev.chebpts1(n_nodes)
-    return np.asarray(vandermonde(position, n_nodes - 1) @ np.linalg.inv(vandermonde(nodes, n_nodes - 1)))
+    return np.asarray(vandermonde(x, n_nodes - 1) @ np.linalg.inv(vandermonde(nodes, n_nodes - 1)))
 
 
 def _in_place(transform: Callable[..., NDArray[Any]], lines: NDArray[Any]) -> None:

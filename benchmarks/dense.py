@@ -1,0 +1,136 @@
+"""
+Captures of sensors with as many photosites as source pixels, in pairs of Fourier transforms of the picture.
+
+A pair is one float64 ``scipy.fft.rfft2`` and one ``irfft2`` of the picture on one thread. Pairs alternate with captures, and
+medians are compared.
+
+    python benchmarks/dense.py             2048 x 2048 photosites
+    python benchmarks/dense.py --quick     512 x 512
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+
+import numpy as np
+import scipy.fft
+from report import Report
+from rich.console import Console
+
+import foveasim as fs
+
+#: Pitch of the photosites and of the cells of the power map; the Airy disc has a diameter of 5.4 µm at f/4.
+PITCH_UM = 3.0
+#: Distance of the scenes, and captures per figure.
+DISTANCE_M, N_REPEATS = 1.0, 5
+#: Bounds in pairs: one band, three bands behind a Bayer mosaic, 31 bands behind it.
+MONO_PAIRS, BAYER_PAIRS, BANDS_PAIRS = 2.5, 4.0, 16.0
+console = Console(width=130)
+
+
+def bench_dense(report: Report, n_side: int) -> None:
+    """Add all rows for square sensors of n_side x n_side photosites."""
+    bench_mono(report, n_side)
+    bench_bayer(report, n_side)
+    bench_bands(report, n_side)
+
+
+def bench_mono(report: Report, n_side: int) -> None:
+    """Repeated captures of one band."""
+    _report_captures(report, "mono", dense_camera(n_side, is_colour=False), dense_scene(n_side, 1), MONO_PAIRS)
+
+
+def bench_bayer(report: Report, n_side: int) -> None:
+    """Repeated captures of a colour picture of three bands behind a Bayer mosaic."""
+    _report_captures(
+        report, "Bayer, 3 bands", dense_camera(n_side, is_colour=True), dense_scene(n_side, 3), BAYER_PAIRS
+    )
+
+
+def bench_bands(report: Report, n_side: int) -> None:
+    """Repeated captures of 31 independent bands behind a Bayer mosaic."""
+    _report_captures(
+        report, "Bayer, 31 bands", dense_camera(n_side, is_colour=True), dense_scene(n_side, 31), BANDS_PAIRS
+    )
+
+
+def dense_optics() -> fs.Optics:
+    """Return a lens with one map cell per source pixel."""
+    return fs.Optics(focal_length_mm=22.0, f_number=4.0, oversample=1)
+
+
+def dense_scene(n_side: int, n_bands: int) -> fs.Scene:
+    """Return random basis images, each of one wavelength."""
+    wavelength_nm = np.linspace(430.0, 670.0, n_bands) if n_bands > 1 else np.array([550.0])
+    return fs.Scene(
+        np.random.default_rng(0).random((n_bands, n_side, n_side), dtype=np.float32),
+        0.2 * np.eye(n_bands),
+        wavelength_nm,
+        np.full(n_bands, 240.0 / n_bands),
+        PITCH_UM / dense_optics().magnification(DISTANCE_M),
+        DISTANCE_M,
+    )
+
+
+def dense_camera(n_side: int, *, is_colour: bool) -> fs.Camera:
+    """Return a camera with one photosite per source pixel, with all noise."""
+    layout = fs.layout.grid(n_x=n_side, n_y=n_side, pitch_um=PITCH_UM)
+    noise = {"dark_e_per_s": 20.0, "full_well_e": 1e6, "read_noise_e": 1.0, "bits": 12}
+    if is_colour:
+        sensor = fs.Sensor(fs.layout.mosaic(layout, ("RG", "GB")), filters="rgb", **noise)
+    else:
+        sensor = fs.Sensor(layout, qe=0.6, **noise)
+    return fs.Camera(optics=dense_optics(), sensor=sensor)
+
+
+def pair_of(n_side: int) -> Callable[[], object]:
+    """Return a call that transforms a float64 picture on one thread and back."""
+    picture = np.random.default_rng(0).random((n_side, n_side))
+    return lambda: scipy.fft.irfft2(scipy.fft.rfft2(picture), s=picture.shape)
+
+
+def medians_s(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+    """Return the median time of each call; calls alternate."""
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(repeats):
+        for name, call in calls.items():
+            start = time.perf_counter()
+            call()
+            seconds[name].append(time.perf_counter() - start)
+    return {name: statistics.median(times) for name, times in seconds.items()}
+
+
+def _report_captures(report: Report, name: str, camera: fs.Camera, scene: fs.Scene, bound: float) -> None:
+    """Compare repeated captures, and the optics alone, with pairs."""
+    n_side = scene.basis.shape[1]
+    weights = camera.sensor.responsivity_e_per_j(scene.wavelength_nm)
+
+    def image() -> None:
+        for cells in camera.optics.weighted_maps(scene, weights):
+            del cells
+
+    def capture() -> None:
+        camera.capture(scene, exposure_s=0.02, seed=0)
+
+    for _ in range(2):  # compiles the layout, and caches the factors of the lens, which it does from the second map on
+        capture()
+    times = medians_s(
+        {"pair": pair_of(n_side), "capture": capture, "again": pair_of(n_side), "optics": image}, N_REPEATS
+    )
+    against = f"rfft2 + irfft2, float64, {n_side} x {n_side}"
+    pair_s = min(times["pair"], times["again"])
+    what = f"{n_side} x {n_side} photosites, {name}"
+    report.slower_than(what, times["capture"], against, pair_s, bound)
+    report.slower_than("its optics alone", times["optics"], against, pair_s)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    is_quick = parser.parse_args().quick
+    own = Report(is_judged=not is_quick)
+    bench_dense(own, 512 if is_quick else 2048)
+    console.print(own.table)
