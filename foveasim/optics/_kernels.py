@@ -213,7 +213,7 @@ def _interpolate_plane(table, u, v):
     ],
 )
 def plane_factor(table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, first, out):
-    """Compute :func:`radial_factor` for a square complex table, and any order of ``fy``."""
+    """Compute :func:`radial_factor` for a square complex table over (f_x, f_y)."""
     half = table.shape[0] // 2
     for column in range(out.shape[0]):
         ix = first + column
@@ -230,7 +230,7 @@ def plane_factor(table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, first, o
                 for iy in range(h.size):
                     v = fy[ky, iy] * per_step
                     if abs(v) < half:
-                        h[iy] += _interpolate_plane(table, u, v) * (gain_x[kx, ix] * gain_y[ky, iy])
+                        h[iy] += _interpolate_plane(table, v, u) * (gain_x[kx, ix] * gain_y[ky, iy])
 
 
 @njit(

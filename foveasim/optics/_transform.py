@@ -134,9 +134,9 @@ class Transform:
         is an even function, so that half the range suffices.
         """
         is_radial = table.ndim == 1
-        to_x, to_y = self._from_radial_nodes if is_radial else self._from_plane_nodes
         if self._n_alias <= DIRECT_ALIASES:
-            return np.zeros((0, to_x.shape[0]), table.dtype), np.zeros((0, to_y.shape[0]), table.dtype)
+            return np.zeros((0, self._n_columns), table.dtype), np.zeros((0, self._n_rows), table.dtype)
+        to_x, to_y = self._from_radial_nodes if is_radial else self._from_plane_nodes
         sums = self._kernels.alias_sum if is_radial else self._kernels.alias_sum_plane
         nodes = np.polynomial.chebyshev.chebpts1(to_x.shape[1])
         at_nodes = sums(
@@ -252,6 +252,7 @@ class Transform:
         kernel = self._kernels.radial_factor if is_radial else self._kernels.plane_factor
         (fx, gain_x), (fy, gain_y) = self._radial_samples if is_radial else self._plane_samples
         far_x, far_y = self._far_aliases(table, per_step)
+        table = np.ascontiguousarray(table.T)  # frequencies along y, as in the columns of a spectrum, are contiguous
 
         def compute(first: int, last: int) -> NDArray[Any]:
             out = np.empty((last - first, fy.shape[1]), table.dtype)
