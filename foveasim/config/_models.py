@@ -239,6 +239,13 @@ def _sensor() -> type[_Section]:
     )
 
 
+def _layout_kind(section: Any) -> str | None:
+    """Return the kind of a layout section."""
+    if not isinstance(section, dict):
+        return "layout generator"
+    return "layout file" if "file" in section else "layout generator" if "generator" in section else None
+
+
 def _layout(rules: type[_Section]) -> Any:
     """Return the union of the sections of all layout generators."""
     fields: dict[str, Any] = {
@@ -272,6 +279,10 @@ def _layout(rules: type[_Section]) -> Any:
     return Annotated[
         Annotated[file, Tag("layout file")] | Annotated[generated, Tag("layout generator")],
         Discriminator(
-            lambda section: "layout file" if isinstance(section, dict) and "file" in section else "layout generator"
+            _layout_kind,
+            custom_error_type="missing_alternative",
+            custom_error_message=(
+                "requires the key 'generator' or 'file'; a layout can also be the name of a bundled one, or the path of a file"
+            ),
         ),
     ]

@@ -109,10 +109,12 @@ def _describe(kind: Any, error: Any, *, is_first: bool) -> str:
             return f"{what}; {hint}" if hint else what
         case "missing":
             return "missing"
-        case "union_tag_not_found":
-            key = error["ctx"]["discriminator"].strip("'")
-            given = closest_name(key, error["input"]) if isinstance(error["input"], dict) else None
-            return f"requires the key '{key}'" + ("" if given is None else f", got '{given}'")
+        case "union_tag_not_found" | "missing_alternative":
+            key = error.get("ctx", {}).get("discriminator")
+            rule, _, others = (f"requires the key {key}" if key else error["msg"]).partition(";")
+            given = error["input"] if isinstance(error["input"], dict) else {}
+            closest = next((name for key in _quoted(rule) if (name := closest_name(key, given))), None)
+            return f"{rule}, got '{closest}'" if closest else f"{rule};{others}" if others else rule
         case "union_tag_invalid":
             known, tag = _quoted(error["ctx"]["expected_tags"]), error["ctx"]["tag"]
             return _not_one_of(known, tag, f"'{tag}'")

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.random_streams import Streams
-from foveasim._core.validation import check_count, finite_array, freeze
+from foveasim._core.validation import Ints, check_count, finite_array, freeze
 from foveasim.errors import ParameterError
 from foveasim.layout.adjacency import adjacency
 from foveasim.layout.model import Layout
@@ -17,6 +17,10 @@ __all__ = ["MOSAICS", "graph_colouring", "mosaic", "random_channels"]
 
 #: Pairs of columns that index the sites in two directions, in order of preference.
 INDEX_COLUMNS = (("row", "column"), ("ring", "sector"))
+#: Largest displacement of a site from its position on a lattice, as a fraction of the pitch.
+LATTICE_TOLERANCE = 0.05
+#: Smallest fraction of occupied positions: that of a disc is 0.79, that of staggered rows 0.5.
+MIN_LATTICE_FRACTION = 2 / 3
 #: Named blocks, row 0 lowest. ``rgbw`` is a Bayer block with one green filter replaced by a clear one.
 MOSAICS = {
     "bayer": ("RG", "GB"),
@@ -34,7 +38,8 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
     Parameters
     ----------
     layout : Layout
-        With the columns ``row`` and ``column``, or ``ring`` and ``sector``.
+        With the columns ``row`` and ``column``, or ``ring`` and ``sector``; or sites on a rectangular lattice, such as those
+        of a GDSII file. Row 0 of a lattice is the lowest, column 0 the leftmost.
     block : str or sequence of str
         Name in :data:`MOSAICS`, or rows of letters, one letter per site: ``("RG", "GB")`` is a Bayer block with red at row
         0, column 0. Row 0 is the lowest.
@@ -45,7 +50,7 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
     Raises
     ------
     ParameterError
-        When the block is not a rectangle of known letters, or the layout has no such columns.
+        When the block is not a rectangle of known letters, or the layout has no such columns and is not a lattice.
     """
     if isinstance(block, str):
         block = MOSAICS.get(block, (block,))
@@ -59,23 +64,48 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
     unknown = sorted(set("".join(rows)) - set(names))
     if unknown:
         raise ParameterError("block", f"must use the letters {names!r}, got {', '.join(map(repr, unknown))}")
-    pair = next((pair for pair in INDEX_COLUMNS if all(name in layout.columns for name in pair)), None)
-    if pair is None:
-        raise ParameterError(
-            "layout",
-            f"must have the columns {' or '.join(' and '.join(p) for p in INDEX_COLUMNS)}, got {sorted(layout.columns)}",
-            hint="set the column with with_columns(channel=...)",
-        )
     channels = np.array([[names.index(letter) for letter in row] for row in rows], np.int16)
-    row, column = (layout._checked_indices(name) for name in pair)  # noqa: SLF001 -- of the same subpackage
+    row, column = _indices(layout)
     n_rows, n_columns = (np.array(n, np.uint16) for n in channels.shape)
     position = (row % n_rows).astype(np.int32)
     position *= n_columns
     position += column % n_columns
-    return layout._with_columns(  # noqa: SLF001
+    return layout._with_columns(  # noqa: SLF001 -- of the same subpackage
         {"channel": freeze(channels.ravel()[position])},
         f"mosaic {' '.join(rows)} of {names}",
     )
+
+
+def _indices(layout: Layout) -> tuple[Ints, Ints]:
+    """Return the indices of each site in two directions, from its columns or its position on a lattice."""
+    pair = next((pair for pair in INDEX_COLUMNS if all(name in layout.columns for name in pair)), None)
+    if pair is not None:
+        return layout._checked_indices(pair[0]), layout._checked_indices(pair[1])  # noqa: SLF001
+    row, column = (_lattice_index(layout, axis) if layout.n_sites else None for axis in (1, 0))
+    if row is not None and column is not None:
+        n_x = int(column.max()) + 1
+        n_positions = n_x * (int(row.max()) + 1)
+        if np.unique(row * n_x + column).size == layout.n_sites >= MIN_LATTICE_FRACTION * n_positions:
+            return row, column
+    raise ParameterError(
+        "layout",
+        f"must have the columns {' or '.join(' and '.join(p) for p in INDEX_COLUMNS)}, or sites on a rectangular lattice, "
+        f"got {sorted(layout.columns)}",
+        hint="add them with with_columns(row=..., column=...), or the filters with with_columns(channel=...)",
+    )
+
+
+def _lattice_index(layout: Layout, axis: int) -> Ints | None:
+    """Return the index of each site on an axis along which the sites have a constant pitch, or None."""
+    position_um, bounds_um = layout.centroid_um[:, axis], layout.site_bounds_um
+    side_um = float((bounds_um[:, axis + 2] - bounds_um[:, axis]).min(initial=np.inf))
+    order = np.argsort(position_um)
+    index = np.zeros(order.size, np.int64)
+    index[order[1:]] = np.cumsum(np.diff(position_um[order]) > 0.5 * side_um)
+    mean_um = np.bincount(index, position_um) / np.bincount(index)
+    pitch_um = (mean_um[-1] - mean_um[0]) / (mean_um.size - 1) if mean_um.size > 1 else side_um
+    is_regular = np.abs(position_um - mean_um[0] - index * pitch_um) <= LATTICE_TOLERANCE * pitch_um
+    return index if is_regular.all() else None
 
 
 def random_channels(layout: Layout, fractions: ArrayLike, *, seed: int) -> Layout:

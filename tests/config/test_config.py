@@ -136,7 +136,11 @@ def test_change_replaces_one_setting(shot_file, change, value):
         ("optics=3", r"optics: must be an object, got 3"),
         ("layout.generator=spiral", r"layout\.generator: must be one of .*'grid', .*, got 'spiral'"),
         ("layout.parameters.pitch_um=0", r"layout\.parameters\.pitch_um: must be > 0, got 0"),
-        ("layout={}", r"layout: requires the key 'generator'"),
+        (
+            "layout={}",
+            r"layout: requires the key 'generator' or 'file'; a layout can also be the name of a bundled one",
+        ),
+        ("layout={file_: a.gds}", r"layout: requires the key 'generator' or 'file', got 'file_'"),
         ("layout.mosaic=[RX]", r"layout\.mosaic\.block: must use the letters 'RGB', got 'X'"),
         ("layout=other.yaml", r"other\.yaml: no such file"),
         ("scene.kind=foto", r"scene\.kind: must be one of 'picture', .*'siemens_star', .*got 'foto'"),

@@ -24,11 +24,12 @@ KLAYOUT_METADATA = "$$$CONTEXT_INFO$$$"
 #: Number of names in a message.
 MAX_LISTED = 5
 #: Memory in bytes per vertex and per polygon while cells are flattened: source, copies and concatenation.
-VERTEX_BYTES, POLYGON_BYTES = 48, 208
+VERTEX_BYTES, POLYGON_BYTES = 48, 224
 #: Limit of the polygons copied between cells, as a multiple of the maximum number of sites.
 MAX_COPY_RATIO = 2
 #: Attributes of the GDSII properties for the number of a photosite and for its columns.
 NUMBER_PROPERTY, COLUMNS_PROPERTY = 1, 2
+UNDIVIDED = re.compile(r"^photosite ([0-9]{1,9})\0*$", re.MULTILINE)
 NUMBER = re.compile(r"photosite ([0-9]{1,9})(?: part ([0-9]{1,9}) of ([0-9]{1,9}))?\0*")
 #: Numbers of the sites of an array: that of its first site, steps from column to column and row to row, columns and rows.
 NUMBERS = re.compile(
@@ -53,9 +54,10 @@ class Shapes:
     xy : (n_vertex, 2) float64, in database units
     counts : (n,) int64
         Vertices of each polygon.
-    tags : (n, 8) int64
+    tags : (n, 9) int64
         Layer, datatype, photosite (-1: unknown), part and number of parts (0: undivided), placement of the cell, line of
-        its columns in the text of all columns (-1: none), index in its array (column + 2^32 row).
+        its columns in the text of all columns (-1: none), index in its array (column + 2^32 row), filter with the outline of
+        the photosite (index in the list of filters, -1: none).
     n_placements : int
         Number of placements of the cell.
     """
@@ -87,7 +89,7 @@ class Shapes:
         copies.tags[:, 5] = 0
         own = np.repeat(identity, len(self.tags), axis=0)
         copies.tags[:, 2] = np.where(copies.tags[:, 2] < 0, -1, own[:, 0])
-        copies.tags[:, 6:] = own[:, 1:]
+        copies.tags[:, 6:8] = own[:, 1:]
         return Shapes(copies.xy, copies.counts, copies.tags, 0)
 
     def is_site(self) -> bool:
@@ -142,7 +144,7 @@ def read(
         Database unit ``dbu_um``, name ``cell``, and ``layers`` of the photosites.
     arrays : list
         ``xy`` in database units, ``counts``, ``tags`` (see :class:`Shapes`) of the photosites, the text of their columns, and
-        the same three arrays of the filters.
+        the same three arrays of the filters without the outline of a photosite.
 
     Raises
     ------
@@ -163,9 +165,12 @@ def read(
     cells = {cell.name: cell for cell in library.cells}
     top = _top_cell(cells, cell)
     order = _post_order(cells, top)
-    layers = _layers_of_sites(cells, order, layers)
-    is_read = _Selection([*layers, *filters])
-    _check_numbers(cells, order, is_read, max_sites, max_memory_bytes)
+    found = _layers_with_shapes(cells, order)
+    layers = _layers_of_sites(found, layers)
+    is_site = {key for key in found if _last_match(key, layers) >= 0}
+    filter_of = {key: k for key in found if (k := _last_match(key, filters)) >= 0}
+    own = {name: _Selected(cells[name], is_site, filter_of) for name in order}
+    _check_numbers(cells, order, own, max_sites, max_memory_bytes)
     # Memory and time of the following steps are bounded.
     limit("RLIMIT_AS", max_memory_bytes)
     limit("RLIMIT_CPU", max_cpu_s)
@@ -173,11 +178,12 @@ def read(
     lines: list[str] = []
     last_use = {child: name for name in order for child in _children(cells, name)}
     for name in order:
-        flat[name] = _flatten(cells[name], flat, lines, is_read, library.unit * 1e6, dbu_um)
+        flat[name] = _flatten(cells[name], own.pop(name), flat, lines, library.unit * 1e6, dbu_um)
         for child in _children(cells, name):
             if last_use[child] == name:
                 del flat[child]
-    sites, covers = (flat[top].select(_Selection(chosen).mask(flat[top].tags)) for chosen in (layers, filters))
+    is_one = _is_on(flat[top].tags, is_site)
+    sites, covers = flat[top].select(is_one), flat[top].select(~is_one)
     text = _column_lines(sites, lines, max_text_bytes)
     about = {"dbu_um": dbu_um, "cell": top, "layers": layers}
     return about, [sites.xy, sites.counts, sites.tags, text, covers.xy, covers.counts, covers.tags]
@@ -186,38 +192,26 @@ def read(
 # -- layers -----------------------------------------------------------------------------------------------------------
 
 
-class _Selection:
-    """Set of layers; a datatype of None stands for all."""
-
-    def __init__(self, layers: list[tuple[int, int | None]]) -> None:
-        self.layers = [(number, kind) for number, kind in layers]
-        self.is_known: dict[tuple[int, int], bool] = {}
-
-    def __call__(self, layer: int, datatype: int) -> bool:
-        """Return whether a layer is in the set."""
-        key = (layer, datatype)
-        if key not in self.is_known:
-            self.is_known[key] = any(layer == n and kind in (None, datatype) for n, kind in self.layers)
-        return self.is_known[key]
-
-    def mask(self, tags: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which shapes are on the layers."""
-        import numpy as np
-
-        is_chosen = np.zeros(len(tags), bool)
-        for number, kind in self.layers:
-            is_chosen |= (tags[:, 0] == number) & ((tags[:, 1] == kind) if kind is not None else True)
-        return is_chosen
+def _last_match(key: tuple[int, int], layers: list[tuple[int, int | None]]) -> int:
+    """Return the index of the last of the layers that a layer and datatype belong to; a datatype of None stands for all."""
+    layer, datatype = key
+    return max(
+        (k for k, (number, kind) in enumerate(layers) if number == layer and kind in (None, datatype)), default=-1
+    )
 
 
-def _layers_of_sites(
-    cells: dict[str, Any], order: list[str], wanted: list[tuple[int, int | None]] | None
-) -> list[tuple[int, int | None]]:
-    """
-    Return the layers of the photosites.
+def _is_on(tags: NDArray[np.int64], layers: set[tuple[int, int]]) -> NDArray[np.bool_]:
+    """Return which shapes are on the layers."""
+    import numpy as np
 
-    By default these are the layers of the shapes with numbers of photosites, or the only layer with shapes.
-    """
+    is_chosen = np.zeros(len(tags), bool)
+    for number, kind in layers:
+        is_chosen |= (tags[:, 0] == number) & (tags[:, 1] == kind)
+    return is_chosen
+
+
+def _layers_with_shapes(cells: dict[str, Any], order: list[str]) -> dict[tuple[int, int], bool]:
+    """Return the layers and datatypes with shapes, and whether one of their shapes has the number of a photosite."""
     found: dict[tuple[int, int], bool] = {}
     for name in order:
         in_cell: dict[tuple[int, int], Any] = {}
@@ -227,6 +221,17 @@ def _layers_of_sites(
             in_cell.update(dict.fromkeys(zip(path.layers, path.datatypes, strict=False)))
         for key, polygon in in_cell.items():
             found[key] = found.get(key, False) or (polygon is not None and _site(polygon)[0] >= 0)
+    return found
+
+
+def _layers_of_sites(
+    found: dict[tuple[int, int], bool], wanted: list[tuple[int, int | None]] | None
+) -> list[tuple[int, int | None]]:
+    """
+    Return the layers of the photosites.
+
+    By default these are the layers of the shapes with numbers of photosites, or the only layer with shapes.
+    """
     if wanted is not None:
         for number, kind in wanted:
             if not any(number == n and kind in (None, d) for n, d in found):
@@ -297,8 +302,74 @@ def _children(cells: dict[str, Any], name: str) -> Iterator[str]:
         yield child
 
 
+class _Selected:
+    """
+    Shapes of a cell on the layers of photosites and filters.
+
+    A filter with the outline of a photosite in the same cell covers no other photosite. It is not expanded with the
+    hierarchy: its index is an attribute of the photosite.
+
+    Attributes
+    ----------
+    polygons, paths : list
+        The filters that are not attributes follow the photosites.
+    filters : list of int
+        Filter of each polygon, -1 for none.
+    copies : list of int
+        Number of repetitions of each polygon.
+    """
+
+    def __init__(self, cell: Any, is_site: set[tuple[int, int]], filter_of: dict[tuple[int, int], int]) -> None:
+        self.polygons = [p for p in cell.polygons if (p.layer, p.datatype) in is_site]
+        self.filters = [filter_of.get((p.layer, p.datatype), -1) for p in self.polygons] if filter_of else []
+        self.paths = cell.paths
+        self.is_site, self.filter_of = is_site, filter_of
+        if filter_of:
+            self._add_filters([p for p in cell.polygons if (p.layer, p.datatype) in filter_of.keys() - is_site])
+        else:
+            self.filters = [-1] * len(self.polygons)
+        self.copies = list(map(_n_copies, self.polygons))
+
+    def _add_filters(self, filters: list[Any]) -> None:
+        sites: dict[bytes, list[int]] = {}
+        for i, site in enumerate(self.polygons):
+            if _n_copies(site) == 1:
+                sites.setdefault(site.points.tobytes(), []).append(i)
+        for polygon in filters:
+            k = self.filter_of[polygon.layer, polygon.datatype]
+            twins = sites.get(polygon.points.tobytes(), []) if _n_copies(polygon) == 1 else []
+            if twins and all(self.filters[i] in (-1, k) for i in twins):
+                for i in twins:
+                    self.filters[i] = k
+            else:
+                self.polygons.append(polygon)
+                self.filters.append(-1)
+
+    def outlines_of_paths(self) -> list[Any]:
+        """Return the outlines of the paths on the layers, repetitions included."""
+        outlines = (q for path in self.paths for p in (path, *path.apply_repetition()) for q in p.to_polygons())
+        return [q for q in outlines if (q.layer, q.datatype) in self.is_site | self.filter_of.keys()]
+
+    def count_polygons(self) -> int:
+        """Count polygons and paths."""
+        return sum(self.copies) + sum(map(_n_copies, self.paths))
+
+    def count_vertices(self, max_vertices: int) -> int:
+        """
+        Count the vertices of polygons and paths.
+
+        Counting stops when the number exceeds ``max_vertices``, as paths may have very many vertices.
+        """
+        n = sum(p.size * k for p, k in zip(self.polygons, self.copies, strict=True))
+        for path in self.paths:
+            if n > max_vertices:
+                break
+            n += _n_copies(path) * sum(p.size for p in path.to_polygons())
+        return n
+
+
 def _check_numbers(
-    cells: dict[str, Any], order: list[str], is_read: _Selection, max_sites: int, max_memory_bytes: int
+    cells: dict[str, Any], order: list[str], own: dict[str, _Selected], max_sites: int, max_memory_bytes: int
 ) -> None:
     """Reject a hierarchy that would flatten to too many sites or too much memory or time."""
     n_polygons: dict[str, int] = {}
@@ -306,36 +377,17 @@ def _check_numbers(
     max_vertices = max_memory_bytes // VERTEX_BYTES
     n_copied = 0
     for name in order:
-        cell = cells[name]
-        references = [(r.cell_name, _n_copies(r)) for r in cell.references]
-        own = sum(map(_n_copies, _polygons(cell, is_read))) + sum(map(_n_copies, cell.paths))
-        n_polygons[name] = own + sum(k * n_polygons[c] for c, k in references)
+        references = [(r.cell_name, _n_copies(r)) for r in cells[name].references]
+        n_polygons[name] = own[name].count_polygons() + sum(k * n_polygons[c] for c, k in references)
         n_copied += n_polygons[name]
-        # References to empty cells require time, too.
-        if max(n_polygons[name], sum(k for _, k in references)) > max_sites or n_copied > MAX_COPY_RATIO * max_sites:
+        if n_polygons[name] > max_sites or n_copied > MAX_COPY_RATIO * max_sites:
             raise FormatError(f"has more than the maximum of {max_sites} sites")
-        n_vertices[name] = _count_vertices(cell, is_read, max_vertices) + sum(k * n_vertices[c] for c, k in references)
+        n_vertices[name] = own[name].count_vertices(max_vertices) + sum(k * n_vertices[c] for c, k in references)
         if VERTEX_BYTES * n_vertices[name] + POLYGON_BYTES * n_polygons[name] > max_memory_bytes:
-            raise FormatError("would flatten to more sites and vertices than the maximum for a file of its size")
-
-
-def _polygons(cell: Any, is_read: _Selection) -> list[Any]:
-    """Return the polygons of a cell on the layers that are read."""
-    return [polygon for polygon in cell.polygons if is_read(polygon.layer, polygon.datatype)]
-
-
-def _count_vertices(cell: Any, is_read: _Selection, max_vertices: int) -> int:
-    """
-    Count the vertices of a cell's polygons and paths.
-
-    Counting stops when the number exceeds ``max_vertices``, as paths may have very many vertices.
-    """
-    n = sum(p.size * _n_copies(p) for p in _polygons(cell, is_read))
-    for path in cell.paths:
-        if n > max_vertices:
-            break
-        n += _n_copies(path) * sum(p.size for p in path.to_polygons())
-    return n
+            raise FormatError(
+                f"has more than the maximum for a file of its size: {n_polygons[name]} sites and filters with "
+                f"{n_vertices[name]} vertices; write it without arrays (hierarchy=False), or read fewer layers"
+            )
 
 
 def _n_copies(element: Any) -> int:
@@ -345,8 +397,8 @@ def _n_copies(element: Any) -> int:
     For arrays, columns times rows can exceed the size that gdstk reports.
     """
     repetition = element.repetition
-    n = repetition.size if repetition.columns is None else repetition.columns * repetition.rows
-    return max(1, n)
+    columns = repetition.columns
+    return max(1, repetition.size if columns is None else columns * repetition.rows)
 
 
 def _format_names(names: Any) -> str:
@@ -362,7 +414,7 @@ def _has_shapes(cell: Any) -> bool:
 
 
 def _flatten(
-    cell: Any, flat: dict[str, Shapes], lines: list[str], is_read: _Selection, unit_um: float, dbu_um: float
+    cell: Any, own: _Selected, flat: dict[str, Shapes], lines: list[str], unit_um: float, dbu_um: float
 ) -> Shapes:
     """
     Return the polygons of a cell and its hierarchy, in database units.
@@ -371,11 +423,13 @@ def _flatten(
     """
     import numpy as np
 
-    parts = [_own_shapes(cell, lines, is_read, unit_um, dbu_um)]
+    parts = [_own_shapes(own, lines, unit_um, dbu_um)]
     n_placements = 1
     groups: dict[tuple[Any, ...], list[NDArray[np.float64]]] = {}
     numbered: dict[tuple[Any, ...], tuple[list[NDArray[np.float64]], list[NDArray[np.int64]]]] = {}
     for r in cell.references:
+        if flat[r.cell_name].counts.size == 0:
+            continue
         offsets = np.asarray(r.repetition.get_offsets(), dtype=np.float64).reshape(-1, 2)
         offsets = offsets if len(offsets) else np.zeros((1, 2))
         key = (r.cell_name, r.rotation or 0.0, r.magnification or 1.0, bool(r.x_reflection))
@@ -464,29 +518,51 @@ def _rotation(angle_rad: float) -> NDArray[np.float64]:
     return np.array([[c, -s], [s, c]])
 
 
-def _own_shapes(cell: Any, lines: list[str], is_read: _Selection, unit_um: float, dbu_um: float) -> Shapes:
+def _own_shapes(own: _Selected, lines: list[str], unit_um: float, dbu_um: float) -> Shapes:
     """Return the polygons of one cell, with paths as polygons and repetitions expanded."""
     import numpy as np
 
-    polygons = _polygons(cell, is_read)
-    for p in list(polygons):
-        if p.repetition.size:
+    polygons, filters = list(own.polygons), list(own.filters)
+    for i, n in enumerate(own.copies):
+        if n > 1:
             # Copies are separate photosites, although they have the same number.
-            polygons += p.apply_repetition()
-    for path in cell.paths:
-        outlines = [q for p in (path, *path.apply_repetition()) for q in p.to_polygons()]
-        polygons += [q for q in outlines if is_read(q.layer, q.datatype)]
+            copies = own.polygons[i].apply_repetition()
+            polygons += copies
+            filters += [filters[i]] * len(copies)
+    outlines = own.outlines_of_paths()
+    polygons += outlines
+    filters += [own.filter_of.get((q.layer, q.datatype), -1) for q in outlines]
     points = [p.points for p in polygons]
     counts = np.fromiter(map(len, points), np.int64, len(points))
     xy = np.concatenate(points) if points else np.zeros((0, 2))
     del points
     xy *= unit_um / dbu_um
     np.rint(xy, out=xy)
-    tags = np.array([(p.layer, p.datatype, *_site(p), 0, -1, 0) for p in polygons], np.int64).reshape(-1, 8)
-    strings = [_columns(p) for p in polygons]
-    tags[:, 6] = np.where(list(map(bool, strings)), len(lines) + np.arange(len(strings)), -1)
+    strings = _column_strings(polygons)
+    tags = np.zeros((len(polygons), 9), np.int64)
+    tags[:, 0] = [p.layer for p in polygons]
+    tags[:, 1] = [p.datatype for p in polygons]
+    tags[:, 2:5] = _sites(polygons)
+    tags[:, 6] = np.where(np.fromiter(map(bool, strings), bool, len(strings)), len(lines) + np.arange(len(strings)), -1)
+    tags[:, 8] = filters
     lines += strings
     return Shapes(xy, counts, tags, 1)
+
+
+def _sites(polygons: list[Any]) -> Any:
+    """Return photosite, part and number of parts of each polygon, (n, 3)."""
+    import numpy as np
+
+    texts = [p.get_gds_property(NUMBER_PROPERTY) for p in polygons]
+    if None not in texts:
+        # A match per line, and no line break within a string.
+        text = "\n".join(texts)
+        numbers = UNDIVIDED.findall(text)
+        if len(numbers) == len(texts) == text.count("\n") + 1:
+            table = np.zeros((len(texts), 3), np.int64)
+            table[:, 0] = list(map(int, numbers))
+            return table
+    return np.array(list(map(_site, polygons)), np.int64).reshape(-1, 3)
 
 
 def _site(polygon: Any) -> tuple[int, int, int]:
@@ -499,6 +575,16 @@ def _site(polygon: Any) -> tuple[int, int, int]:
     if not numbers or not all(isinstance(n, int) and 0 <= n < MAX_SITE for n in numbers):
         return -1, 0, 0
     return (numbers[0], numbers[1], numbers[2]) if len(numbers) == 3 else (numbers[0], 0, 0)
+
+
+def _column_strings(polygons: list[Any]) -> list[str]:
+    """Return the column string of each polygon, empty where it has none."""
+    texts = [p.get_gds_property(COLUMNS_PROPERTY) for p in polygons]
+    if texts and None not in texts:
+        text = "".join(texts)
+        if text.isascii() and text.isprintable() and max(map(len, texts)) <= MAX_CHARS:
+            return texts
+    return list(map(_columns, polygons))
 
 
 def _columns(element: Any) -> str:

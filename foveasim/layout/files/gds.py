@@ -103,7 +103,7 @@ MAX_FLAT_VERTICES = 16
 
 #: Limits of the sandbox process: memory while gdstk reads, and in total; column strings; time; larger for large files.
 MIN_READING_BYTES, READING_PER_BYTE = 2**30, 256
-MIN_MEMORY_BYTES, MEMORY_PER_BYTE, MAX_MEMORY_BYTES = 2**31, 256, 2**35
+MIN_MEMORY_BYTES, MEMORY_PER_BYTE, MAX_MEMORY_BYTES = 2**32, 256, 2**35
 MIN_STRING_BYTES, STRING_BYTES_PER_BYTE = 2**27, 32
 MAX_CPU_S, BYTES_PER_S = 5, 2**20
 #: GDSII record types by data type: none, bit array, 16-bit, 32-bit, 64-bit floating point, string.
@@ -582,7 +582,11 @@ def read(
         except GeometryError:
             layout = layout_from_untrusted(without_keyholes(_merge_parts(pieces, first)), columns, about)
         if filters:
-            channel = _covering_channels(path, layout, _to_um(covers.xy_dbu, answer["dbu_um"]), covers, filters)
+            site = np.repeat(np.arange(first.size), np.diff(np.append(first, piece.size)))
+            number = tags[piece, 8]
+            equal = np.stack((site[number >= 0], number[number >= 0]))
+            covers_um = _to_um(covers.xy_dbu, answer["dbu_um"])
+            channel = _covering_channels(path, layout, equal, covers_um, covers, filters)
             layout = layout.with_columns(channel=channel).with_provenance(about)
         return layout
 
@@ -623,24 +627,36 @@ def _with_channel(
 
 
 def _covering_channels(
-    path: Path, layout: Layout, xy_um: Floats, covers: _Shapes, channels: Mapping[LayerNumber, int]
+    path: Path, layout: Layout, filters: Ints, xy_um: Floats, covers: _Shapes, channels: Mapping[LayerNumber, int]
 ) -> Ints:
     """
     Return the channel of the filter that covers each site.
 
-    A filter covers a site if it contains a point in the interior of the site.
+    A filter covers a site if it contains a point in the interior of the site. ``filters`` are the sites and the filters that
+    have their outlines, as (2, n) indices; ``covers`` are the other filters.
     """
-    layer_channel = np.full(covers.counts.size, -1)
-    for (layer, datatype), channel in channels.items():
-        is_own = (covers.tags[:, 0] == layer) & ((covers.tags[:, 1] == datatype) if datatype is not None else True)
-        layer_channel[is_own] = channel
-    ring_offsets = np.concatenate(([0], np.cumsum(covers.counts)))
-    filters = Layout(xy_um, ring_offsets, np.arange(ring_offsets.size)).polygons()
-    points = shapely.point_on_surface(layout.polygons())
-    site, cover = shapely.STRtree(filters).query(points, predicate="within")
+    channel_of = np.array(list(channels.values()))
+    site, channel = filters[0], channel_of[filters[1]]
     found = np.full(layout.n_sites, -1)
-    found[site] = layer_channel[cover]
+    found[site] = channel
+    if covers.counts.size:
+        number = np.full(covers.counts.size, -1)
+        for k, (layer, datatype) in enumerate(channels):
+            number[
+                (covers.tags[:, 0] == layer) & ((covers.tags[:, 1] == datatype) if datatype is not None else True)
+            ] = k
+        ring_offsets = np.concatenate(([0], np.cumsum(covers.counts)))
+        shapes = Layout(xy_um, ring_offsets, np.arange(ring_offsets.size)).polygons()
+        covered, cover = _covers(layout.polygons(), shapes)
+        site, channel = np.concatenate((site, covered)), np.concatenate((channel, channel_of[number[cover]]))
+        found[site] = channel
     bare = np.flatnonzero(found < 0)
+    if bare.size and filters.size:
+        # Sites that overlap the site of a filter.
+        owners = np.unique(filters[0])
+        covered, cover = _covers(layout[bare].polygons(), layout[owners].polygons())
+        found[bare[covered]] = found[owners[cover]]
+        bare = np.flatnonzero(found < 0)
     if bare.size:
         x, y = layout.centroid_um[bare[0]]
         raise FileError(
@@ -648,7 +664,7 @@ def _covering_channels(
             f"has {bare.size} of {layout.n_sites} photosites without a filter, first site {bare[0]} at ({x:.6g}, {y:.6g}) µm; "
             "add the layer of its filter to channels= or layers=",
         )
-    different = np.flatnonzero(found[site] != layer_channel[cover])
+    different = np.flatnonzero(found[site] != channel)
     if different.size:
         s = int(site[different].min())
         x, y = layout.centroid_um[s]
@@ -656,6 +672,12 @@ def _covering_channels(
             path, f"has filters of several channels over site {s} at ({x:.6g}, {y:.6g}) µm; select one layer"
         )
     return found
+
+
+def _covers(sites: NDArray[Any], shapes: NDArray[Any]) -> tuple[Ints, Ints]:
+    """Return pairs of a site and a shape that contains a point in the interior of the site."""
+    site, shape = shapely.STRtree(shapes).query(shapely.point_on_surface(sites), predicate="within")
+    return site, shape
 
 
 def _check_records(path: Path, data: bytes) -> None:

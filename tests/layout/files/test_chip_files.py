@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 import foveasim as fs
 from foveasim.errors import ConfigError, FileError, GeometryError, LayoutWarning, ParameterError
 from foveasim.layout import DERIVED_LAYERS, Layout
+from foveasim.layout.files import _gdstk
 from foveasim.layout.files._hierarchy import congruence_classes, find_arrays
 
 gdstk = pytest.importorskip("gdstk")
@@ -311,6 +312,31 @@ def test_large_filter_shape_covers_several_sites(tmp_path):
     assert fs.read_layout(tmp_path / "a.gds", layer=1, channels={2: "B", 3: "R"}).channel.tolist() == [2, 2, 0, 0]
 
 
+def test_filter_of_site_covers_overlapping_site(tmp_path):
+    library = gdstk.Library()
+    library.new_cell("A").add(*(gdstk.rectangle((0, 0), (4, 4), layer) for layer in (1, 2)))
+    library.cells[0].add(gdstk.rectangle((1, 1), (2, 2), 1))
+    library.write_gds(tmp_path / "a.gds")
+
+    assert fs.read_layout(tmp_path / "a.gds", layer=1, channels={2: "B"}).channel.tolist() == [2, 2]
+
+
+@pytest.mark.parametrize("layer", [2, 3])
+def test_filters_with_equal_outlines_conflict(tmp_path, layer):
+    # One filter is in the cell of the photosite, the other in its parent.
+    library = gdstk.Library()
+    pixel = library.new_cell("PIXEL").add(*(gdstk.rectangle((0, 0), (2, 2), number) for number in (1, 2)))
+    library.new_cell("A").add(gdstk.Reference(pixel, columns=9, rows=9, spacing=(3, 3)))
+    library["A"].add(gdstk.rectangle((3, 3), (5, 5), layer))
+    library.write_gds(tmp_path / "a.gds")
+    channels = {2: "B", 3: "R"}
+    if layer == 2:
+        assert (fs.read_layout(tmp_path / "a.gds", layer=1, channels=channels).channel == 2).all()
+    else:
+        with pytest.raises(FileError, match=r"has filters of several channels over site \d+ at \(4, 4\) µm"):
+            fs.read_layout(tmp_path / "a.gds", layer=1, channels=channels)
+
+
 def test_site_without_filter_is_reported(foreign):
     with pytest.raises(FileError, match=r"has \d+ of 360 photosites without a filter, first site \d+ at"):
         fs.read_layout(foreign, cell="SENSOR", layer=(77, 3), channels={(10, 0): "R", (11, 2): "G"})
@@ -588,6 +614,51 @@ def test_truncated_hierarchical_file_is_rejected(chip, tmp_path):
     (tmp_path / "a").write_bytes(chip.read_bytes()[:-10])
     with pytest.raises(FileError, match=r"truncated|corrupt"):
         fs.read_layout(tmp_path / "a")
+
+
+def read_with_limit(path, n_sites, layers, filters):
+    """Read with memory for a number of squares."""
+    return _gdstk.read(
+        str(path),
+        limit=lambda *_: None,
+        is_oasis=path.suffix == ".oas",
+        layers=layers,
+        filters=filters,
+        cell=None,
+        max_sites=1000,
+        max_memory_bytes=n_sites * (4 * _gdstk.VERTEX_BYTES + _gdstk.POLYGON_BYTES),
+        max_text_bytes=10_000,
+        max_cpu_s=10,
+    )
+
+
+def test_only_photosites_count_for_limit(chip, bayer):
+    filters = list(FILTERS)
+    _, (_, counts, tags, _, _, other_counts, _) = read_with_limit(chip, bayer.n_sites, [(77, 3)], filters)
+
+    assert counts.size == bayer.n_sites
+    assert other_counts.size == 0
+    assert sorted(tags[:, 8]) == sorted(bayer.channel)
+    with pytest.raises(_gdstk.FormatError, match="has more than the maximum for a file of its size: 360 sites"):
+        read_with_limit(chip, bayer.n_sites - 1, [(77, 3)], filters)
+
+
+def test_filters_of_other_outlines_count_for_limit(chip, bayer):
+    # The wells are read as photosites, so that the outlines of the filters differ.
+    with pytest.raises(_gdstk.FormatError, match="has more than the maximum for a file of its size: 720 sites"):
+        read_with_limit(chip, 2 * bayer.n_sites - 1, [(20, 0)], list(FILTERS))
+
+    assert read_with_limit(chip, 2 * bayer.n_sites, [(20, 0)], list(FILTERS))[1][4].shape == (4 * bayer.n_sites, 2)
+
+
+def test_arrays_of_other_layers_are_not_expanded(tmp_path):
+    library = gdstk.Library()
+    contact = library.new_cell("CONTACT").add(gdstk.rectangle((0, 0), (0.1, 0.1), 9))
+    top = library.new_cell("A").add(gdstk.rectangle((0, 0), (2, 2), 1))
+    top.add(*(gdstk.Reference(contact, columns=30_000, rows=30_000, spacing=(1, 1)) for _ in range(9)))
+    library.write_gds(tmp_path / "a.gds")
+
+    assert fs.read_layout(tmp_path / "a.gds", layer=1).n_sites == 1
 
 
 def test_small_file_of_huge_array_is_rejected(tmp_path):

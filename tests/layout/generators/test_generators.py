@@ -718,11 +718,34 @@ def test_unknown_letter_message_contains_one_value():
     assert str(caught.value).count("got ") == 1
 
 
-def test_mosaic_requires_two_index_columns():
-    layout = Layout.from_rectangles([[0, 0], [1, 0]], 1.0, row=[0, 0])
-
-    with pytest.raises(ParameterError, match=r"'layout' must have the columns row and column or ring and sector"):
+@pytest.mark.parametrize(
+    "layout",
+    [
+        Layout.from_rectangles([[0, 0], [1, 0], [3.2, 0]], 1.0, row=[0, 0, 0]),
+        Layout.from_rectangles([[0, 0], [2, 0], [1, 2], [3, 2], [0, 4], [2, 4]], 1.5),
+        Layout.from_rectangles([[0, 0], [0, 0]], 1.5),
+        Layout.from_polygons(hexagonal(n_columns=9, n_rows=9, pitch_um=2.0).polygons()),
+        Layout.from_polygons(grid(n_x=5, n_y=4, pitch_um=2.0).rotate(10.0).polygons()),
+        Layout.from_polygons([]),
+    ],
+    ids=["uneven", "staggered", "equal positions", "hexagons", "rotated", "empty"],
+)
+def test_mosaic_requires_index_columns_or_lattice(layout):
+    with pytest.raises(
+        ParameterError,
+        match=r"'layout' must have the columns row and column or ring and sector, or sites on a rectangular lattice, got "
+        r"\[.*\]; add them with with_columns\(row=",
+    ):
         mosaic(layout, ("RG", "GB"))
+
+
+@pytest.mark.parametrize("name", ["bayer", "x_trans"])
+def test_lattice_without_columns_gets_mosaic(name):
+    rng = np.random.default_rng(5)
+    layout = grid(n_x=14, n_y=9, pitch_um=2.2, fill_factor=0.8)[rng.permutation(14 * 9)[:100]]
+    other = Layout(layout.xy_um.round(3) + np.array([300.0, -70.0]), layout.ring_offsets, layout.site_offsets)
+
+    assert (mosaic(other, name).channel == mosaic(layout, name).channel).all()
 
 
 @pytest.mark.parametrize("row", [[0.0, 1.5], ["a", "b"]])
