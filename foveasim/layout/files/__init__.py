@@ -27,14 +27,16 @@ from foveasim._io.formats import FileFormat, detect_format, select_writer, valid
 from foveasim.errors import FileError
 from foveasim.layout.files._bundled import bundled_layouts, layout_path
 from foveasim.layout.files._common import WrittenLayout
+from foveasim.layout.files._derived import DERIVED_LAYERS, LayoutLayer
 from foveasim.layout.files._formats import FORMATS
-from foveasim.layout.files._layers import DERIVED_LAYERS, layer_options, read_layer_map
+from foveasim.layout.files._layers import layer_options, read_layer_map
 from foveasim.layout.model import Layout
 
 __all__ = [
     "DERIVED_LAYERS",
     "FORMATS",
     "FileFormat",
+    "LayoutLayer",
     "WrittenLayout",
     "bundled_layouts",
     "check_no_options",

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from foveasim._core.rings import positions_in_runs, ring_moments
 from foveasim._core.validation import Floats, Ints
 from foveasim.layout.files._common import check_sizes
-from foveasim.layout.model import Layout
+from foveasim.layout.model import Layout, valid_sites
 
 __all__ = ["hole_free_rings", "without_keyholes"]
 
@@ -52,8 +52,10 @@ def hole_free_rings(layout: Layout, max_vertices: int | None) -> tuple[Ints, Int
     if not is_cut.any():
         return np.arange(layout.n_sites), n_parts, n_parts, rings_um
     cut = np.flatnonzero(is_cut)
-    parts_of = {
-        int(s): _hole_free_parts(polygon, max_vertices) for s, polygon in zip(cut, layout[cut].polygons(), strict=True)
+    parts_of = _halves(layout, np.flatnonzero(rings_of_site == 2), max_vertices)
+    others = [s for s in cut.tolist() if s not in parts_of]
+    parts_of |= {
+        s: _hole_free_parts(polygon, max_vertices) for s, polygon in zip(others, layout[others].polygons(), strict=True)
     }
     n_parts[cut] = [len(parts) for parts in parts_of.values()]
     n_rings = np.maximum(n_parts, 1)
@@ -61,6 +63,56 @@ def hole_free_rings(layout: Layout, max_vertices: int | None) -> tuple[Ints, Int
     part = positions_in_runs(n_rings) + 1
     pieces = [ring for s, undivided in enumerate(rings_um) for ring in parts_of.get(s, [undivided])]
     return site, np.where(n_parts[site] > 0, part, 0), n_parts[site], pieces
+
+
+def _halves(layout: Layout, sites: Ints, max_vertices: int | None) -> dict[int, list[Floats]]:
+    """
+    Divide polygons with one hole into two rings, where this requires no additional vertex.
+
+    The first and the middle vertex of the outline are connected to the nearest vertices of the hole. Polygons that contain
+    these segments, and whose halves are valid, are in the result.
+    """
+    if sites.size == 0:
+        return {}
+    outline = layout.site_offsets[sites]
+    (start, hole_start), (n, n_hole) = (
+        (each[outline], each[outline + 1]) for each in (layout.ring_offsets[:-1], np.diff(layout.ring_offsets))
+    )
+    owner = np.repeat(np.arange(sites.size), n_hole)
+    hole_xy = layout.xy_um[hole_start[owner] + positions_in_runs(n_hole)]
+    anchor = np.stack((np.zeros_like(n), n // 2))
+    nearest = np.empty_like(anchor)
+    for k in (0, 1):
+        distance = np.hypot(*(hole_xy - layout.xy_um[start + anchor[k]][owner]).T)
+        nearest[k] = np.lexsort((distance, owner))[np.cumsum(n_hole) - n_hole] - (np.cumsum(n_hole) - n_hole)
+    # The first half follows the outline from anchor 0 to 1, and the hole, in its own direction, from 1 back to 0.
+    n_outer = np.stack((anchor[1] + 1, n - anchor[1] + 1)).ravel()
+    n_inner = np.concatenate([(nearest[k] - nearest[1 - k]) % n_hole + 1 for k in (0, 1)])
+    size = n_outer + n_inner
+    half = np.repeat(np.arange(size.size), size)
+    site, position = half % sites.size, positions_in_runs(size)
+    inner = position - n_outer[half]
+    on_outer = start[site] + (anchor.ravel()[half] + position) % n[site]
+    on_hole = hole_start[site] + (nearest[::-1].ravel()[half] + inner) % n_hole[site]
+    rings = Layout._from_checked(  # noqa: SLF001 -- of the same subpackage
+        layout.xy_um[np.where(inner < 0, on_outer, on_hole)],
+        np.concatenate(([0], np.cumsum(size))),
+        np.arange(size.size + 1),
+        {},
+        {},
+    )
+    polygons = layout[sites].polygons()
+    is_divided = (nearest[0] != nearest[1]) & valid_sites(rings).reshape(2, -1).all(axis=0)
+    if max_vertices is not None:
+        is_divided &= (size.reshape(2, -1) <= max_vertices).all(axis=0)
+    for k in (0, 1):
+        ends = np.stack((layout.xy_um[start + anchor[k]], layout.xy_um[hole_start + nearest[k]]), axis=1)
+        is_divided &= shapely.covers(polygons, shapely.linestrings(ends))
+    xy_um, offsets = rings.xy_um, rings.ring_offsets.tolist()
+    return {
+        int(sites[i]): [xy_um[offsets[k] : offsets[k + 1]] for k in (i, i + sites.size)]
+        for i in np.flatnonzero(is_divided).tolist()
+    }
 
 
 def _hole_free_parts(polygon: Any, max_vertices: int | None) -> list[Floats]:

@@ -1,5 +1,5 @@
 """
-Layer maps of GDSII and OASIS files, and the table of derived layers.
+Layer maps of GDSII and OASIS files.
 
 A layer map is a mapping from names to layers:
 
@@ -8,7 +8,7 @@ name                shapes
 ==================  ================================================================================================
 ``photosite``       outlines of all sites
 ``filter_R``        outlines of the sites with this filter; ``filter_0`` for the channel 0
-a derived layer     polygons computed from the outlines: see :data:`DERIVED_LAYERS`
+a derived layer     polygons computed from the outlines, see :data:`foveasim.layout.DERIVED_LAYERS`
 ==================  ================================================================================================
 
 A layer is a pair ``(layer, datatype)``, a string ``"77/3"``, an integer (datatype 0), or a mapping of ``layer`` and of the
@@ -19,23 +19,19 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-import shapely
-from numpy.typing import NDArray
 
 from foveasim._core.names import possible_names
-from foveasim._core.registry import Registry
-from foveasim._core.validation import check_count, check_number
+from foveasim._core.validation import check_count
 from foveasim.errors import ConfigError, ParameterError
-from foveasim.layout.model import Layout
+from foveasim.layout.files._derived import DERIVED_LAYERS, LayoutLayer
 
 __all__ = [
-    "DERIVED_LAYERS",
     "FILTER_NAMES",
     "DrawnLayer",
     "LayerNumber",
@@ -49,8 +45,6 @@ __all__ = [
 
 #: Layer and datatype; None for any datatype.
 LayerNumber: TypeAlias = tuple[int, int | None]
-#: Function of a layout that returns one polygon per site.
-DerivedLayer: TypeAlias = Callable[..., NDArray[Any]]
 
 #: Maximum layer and datatype: some programs read them as signed 16-bit integers.
 MAX_LAYER = 32767
@@ -60,45 +54,8 @@ PHOTOSITE = "photosite"
 FILTER = "filter_"
 #: Names of the channels in the order of ``mosaic`` and of the RGB filters of a sensor.
 FILTER_NAMES = ("R", "G", "B", "W")
-#: Corners are extended by at most this multiple of the offset.
-MITRE_LIMIT = 100.0
 EXAMPLE = "such as (77, 3) or '77/3'"
 _NUMBERS = re.compile(r"([0-9]{1,9})(?:/([0-9]{1,9}))?")
-
-
-# -- derived layers ---------------------------------------------------------------------------------------------------
-
-#: Derived layers by name: functions of a layout, with keywords, that return one polygon per site, (n_site,), in µm. A polygon
-#: depends on the outline of its own site only, because congruent sites are drawn once. Installed packages add derived layers as
-#: entry points of the group ``foveasim.derived_layers``.
-DERIVED_LAYERS: Registry[DerivedLayer] = Registry("derived layer", "foveasim.derived_layers")
-
-
-@DERIVED_LAYERS.register("well")
-def _well(layout: Layout, *, inset_um: float = 0.1) -> NDArray[Any]:
-    """Return the wells of the photodiodes: outlines with an inward offset, half a trench."""
-    return _offset(layout.polygons(), -check_number("inset_um", inset_um, at_least=0.0))
-
-
-@DERIVED_LAYERS.register("microlens")
-def _microlens(layout: Layout, *, inset_um: float = 0.0, corner_radius_um: float = 0.0) -> NDArray[Any]:
-    """Return the bases of the microlenses: outlines without holes, inset, with round corners."""
-    inset_um = check_number("inset_um", inset_um, at_least=0.0)
-    radius_um = check_number("corner_radius_um", corner_radius_um, at_least=0.0)
-    outlines = shapely.polygons(shapely.get_exterior_ring(layout.polygons()))
-    return np.asarray(shapely.buffer(_offset(outlines, -inset_um - radius_um), radius_um, quad_segs=8))
-
-
-@DERIVED_LAYERS.register("metal_keep_out")
-def _metal_keep_out(layout: Layout, *, outset_um: float = 0.0) -> NDArray[Any]:
-    """Return the areas without metal: outlines with an outward offset, inward if negative."""
-    return _offset(layout.polygons(), check_number("outset_um", outset_um))
-
-
-def _offset(polygons: NDArray[Any], distance_um: float) -> NDArray[Any]:
-    if distance_um == 0.0:
-        return polygons
-    return np.asarray(shapely.buffer(polygons, distance_um, join_style="mitre", mitre_limit=MITRE_LIMIT))
 
 
 # -- layer maps -------------------------------------------------------------------------------------------------------
@@ -137,24 +94,10 @@ class DrawnLayer:
         """Whether the shapes are derived from the outlines."""
         return self.name != PHOTOSITE and self.channel is None
 
-    def shapes(self, layout: Layout) -> NDArray[Any]:
-        """
-        Return the polygons of a derived layer, one per site.
-
-        Raises
-        ------
-        ParameterError
-            When a parameter is invalid, or the function does not return one geometry per site.
-        """
-        try:
-            polygons = np.asarray(DERIVED_LAYERS[self.name](layout, **self.parameters))
-        except ParameterError as error:
-            raise ParameterError(f"layers[{self.name}].{error.name}", error.detail) from None
-        if polygons.shape != (layout.n_sites,) or not shapely.is_geometry(polygons).all():
-            raise ParameterError(
-                "layers", f"derived layer '{self.name}' must return one polygon for each of the {layout.n_sites} sites"
-            )
-        return polygons
+    @property
+    def is_of_layout(self) -> bool:
+        """Whether the shapes are those of the complete layout, not of each site."""
+        return self.is_derived and isinstance(DERIVED_LAYERS[self.name], LayoutLayer)
 
 
 def layer_options(words: Sequence[str], map_file: Path | None = None) -> dict[str, Any]:

@@ -24,6 +24,7 @@ References: Calma, GDSII Stream Format Manual 6.0 (1987); SEMI P39, OASIS.
 
 from __future__ import annotations
 
+import re
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -59,6 +60,7 @@ from foveasim.layout.files._common import (
     layout_from_untrusted,
     rounding_report,
 )
+from foveasim.layout.files._derived import shapes_of_layout, shapes_of_sites
 from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.files._hierarchy import Arrays, concatenate, congruence_classes, find_arrays, single_sites
 from foveasim.layout.files._holes import hole_free_rings, without_keyholes
@@ -96,7 +98,7 @@ MAX_DBU = 2**31 - 1
 #: Constant timestamp, for reproducible files.
 TIMESTAMP = datetime(2000, 1, 1)  # noqa: DTZ001 -- GDSII has no time zones
 CELL_NAME = "SENSOR"
-#: Cells of congruent sites are named PIXEL_0, PIXEL_1, ...
+#: Cells of congruent sites are named PIXEL_0, PIXEL_1, ..., others by their layer.
 SITE_CELL = "PIXEL"
 #: An array with more vertices, in all of its sites and layers, is written as a reference: it needs fewer bytes.
 MAX_FLAT_VERTICES = 16
@@ -148,7 +150,8 @@ def write(
         When gdstk is not installed, or the file cannot be written.
     """
     gdstk = _gdstk(path)
-    drawn = _drawn_layers(layout, layer, layers, filter_names)
+    all_drawn = _drawn_layers(layout, layer, layers, filter_names)
+    drawn = [d for d in all_drawn if not d.is_of_layout]
     dbu_um = check_number("dbu_um", dbu_um, at_least=1e-9, at_most=1e3)
     if not isinstance(hierarchy, bool):
         raise ParameterError("hierarchy", "must be True or False", hierarchy)
@@ -160,11 +163,13 @@ def write(
     if any(d.datatype is None or d.channel is not None for d in drawn):
         stack_of = stack_of * (MAX_LAYER + 1) + layout.channel
     _, first, stack_of = np.unique(stack_of, return_index=True, return_inverse=True)
-    drawing = _draw(layout, snapped, first, origin, drawn, dbu_um, None if is_oasis else MAX_GDS_VERTICES)
+    max_vertices = None if is_oasis else MAX_GDS_VERTICES
+    drawing = _draw(layout, snapped, first, origin, drawn, dbu_um, max_vertices)
     columns = _stored_columns(layout, drawn)
     references, flat = _divide(drawing, stack_of, origin, columns, hierarchy=hierarchy)
 
-    cells, elements, numbers = _references(gdstk, drawing, references, stack_of, origin, dbu_um, is_oasis=is_oasis)
+    cells = _cells(gdstk, drawing, stack_of[references.first], dbu_um, [], SITE_CELL, is_oasis=is_oasis)
+    elements, numbers = _references(gdstk, cells, references, stack_of, origin, dbu_um)
     ring, owner = drawing.rings_of(stack_of[flat.first])
     polygons = drawing.polygons(gdstk, ring, origin[flat.first[owner]], dbu_um)
     is_site = drawing.is_site[ring]
@@ -176,8 +181,21 @@ def write(
 
     library = gdstk.Library("FOVEASIM", unit=1e-6, precision=dbu_um * 1e-6)
     shapes = [polygon for polygon, is_one in zip(polygons, is_site.tolist(), strict=True) if not is_one]
+    all_cells = list(cells.values())
+    for d in all_drawn:
+        if d.is_of_layout:
+            complete = Layout._from_checked(  # noqa: SLF001 -- of the same subpackage
+                snapped.xy_um, snapped.ring_offsets, snapped.site_offsets, layout.columns, layout.provenance
+            )
+            drawing, stack_of, origin = _draw_layout(complete, d, dbu_um, max_vertices)
+            references, flat = _divide(drawing, stack_of, origin, {}, hierarchy=hierarchy)
+            cells = _cells(gdstk, drawing, stack_of[references.first], dbu_um, all_cells, d.name, is_oasis=is_oasis)
+            shapes += _references(gdstk, cells, references, stack_of, origin, dbu_um)[0]
+            ring, owner = drawing.rings_of(stack_of[flat.first])
+            shapes += drawing.polygons(gdstk, ring, origin[flat.first[owner]], dbu_um)
+            all_cells += cells.values()
     library.new_cell(CELL_NAME).add(*elements, *shapes)
-    library.add(*cells)
+    library.add(*all_cells)
     with atomic_write(path) as temporary:
         if is_oasis:
             # Rectangles of OASIS do not preserve the first vertex.
@@ -342,7 +360,7 @@ def _derived_rings(
     drawn: DrawnLayer, models: Layout, first: Ints, dbu_um: float, max_vertices: int | None
 ) -> tuple[Ints, Ints, Ints, list[Floats]]:
     """Return stack, part, number of parts and rings of a derived layer, without holes."""
-    polygons = drawn.shapes(models)
+    polygons = shapes_of_sites(drawn.name, models, drawn.parameters)
     parts, stack = shapely.get_parts(polygons, return_index=True)
     is_area = shapely.area(parts) > 0.0
     parts, stack = parts[is_area], stack[is_area]
@@ -362,20 +380,81 @@ def _derived_rings(
     )
 
 
-def _references(
-    gdstk: Any, drawing: _Drawing, arrays: Arrays, stack_of: Ints, origin: Ints, dbu_um: float, *, is_oasis: bool
-) -> tuple[list[Any], list[Any], list[tuple[int, ...]]]:
-    """Return cells of sites, and for all arrays references to them and their numbers."""
-    stack = stack_of[arrays.first]
-    used, first_use = np.unique(stack, return_index=True)
+def _draw_layout(
+    layout: Layout, drawn: DrawnLayer, dbu_um: float, max_vertices: int | None
+) -> tuple[_Drawing, Ints, Ints]:
+    """
+    Draw a layer of the complete layout.
+
+    Returns
+    -------
+    drawing : _Drawing
+        Congruent shapes, a stack each.
+    stack_of : (n,) int64
+        Stack at each position, sorted.
+    origin : (n, 2) int64
+        Positions, in database units; those of a stack in the order of rows and columns.
+    """
+    placed = shapes_of_layout(drawn.name, layout, drawn.parameters)
+    rounded = shapely.transform(placed.polygons, lambda xy_um: _to_um(np.rint(xy_um / dbu_um), dbu_um))
+    invalid = np.flatnonzero(~shapely.is_valid(rounded))
+    rounded[invalid] = shapely.set_precision(placed.polygons[invalid], dbu_um)
+    parts, shape = shapely.get_parts(rounded, return_index=True)
+    is_area = shapely.area(parts) > 0.0
+    parts, shape = parts[is_area], shape[is_area]
+    try:
+        xy_dbu, snapped = _snap_to_grid(Layout.from_polygons(parts), dbu_um)
+    except GeometryError as error:
+        raise GeometryError(f"layer '{drawn.name}': {error}") from None
+    stack, part_origin = congruence_classes(xy_dbu, snapped.ring_offsets, snapped.site_offsets)
+    _, first, stack = np.unique(stack, return_index=True, return_inverse=True)
+    models = snapped[first]
+    vertex_owner = np.repeat(first, np.diff(models.ring_offsets[models.site_offsets]))
+    at_origin = Layout._from_checked(  # noqa: SLF001 -- of the same subpackage
+        models.xy_um - _to_um(part_origin[vertex_owner], dbu_um), models.ring_offsets, models.site_offsets, {}, {}
+    )
+    owner, _, _, rings_um = hole_free_rings(at_origin, max_vertices)
+    xy_um = np.concatenate(rings_um) if rings_um else np.zeros((0, 2))
+    drawing = _Drawing(
+        np.rint(xy_um / dbu_um).astype(np.int64),
+        np.concatenate(([0], np.cumsum(list(map(len, rings_um)), dtype=np.int64))),
+        np.searchsorted(owner, np.arange(first.size + 1)),
+        np.tile(drawn.number, (owner.size, 1)),
+        np.zeros((owner.size, 2), np.int64),
+        np.zeros(owner.size, bool),
+    )
+    # Each position of a shape is one of all of its parts.
+    n_parts = np.bincount(shape, minlength=len(placed.polygons))
+    offset = np.cumsum(n_parts) - n_parts
+    size = n_parts[placed.shape]
+    part = np.repeat(offset[placed.shape], size) + positions_in_runs(size)
+    position = np.rint(placed.position_um / dbu_um).astype(np.int64)
+    origin = part_origin[part] + np.repeat(position, size, axis=0)
+    order = np.lexsort((origin[:, 0], origin[:, 1], stack[part]))
+    return drawing, stack[part][order], origin[order]
+
+
+def _cells(
+    gdstk: Any, drawing: _Drawing, stack: Ints, dbu_um: float, others: list[Any], name: str, *, is_oasis: bool
+) -> dict[int, Any]:
+    """Return the cells of stacks, in the order of their first use; their numbers continue those of other cells."""
     cells = {}
-    for k, s in enumerate(used[np.argsort(first_use)].tolist()):
+    prefix = re.sub(r"[^A-Z0-9]", "_", name.upper())
+    for s in dict.fromkeys(stack.tolist()):
         ring, _ = drawing.rings_of(np.array([s]))
         polygons = drawing.polygons(gdstk, ring, np.zeros((ring.size, 2), np.int64), dbu_um)
         sites = ring[drawing.is_site[ring]]
         for polygon, number in zip(polygons, drawing.numbers(sites, np.zeros_like(sites)), strict=False):
             _set_number(polygon, number, is_oasis=is_oasis)
-        cells[s] = gdstk.Cell(f"{SITE_CELL}_{k}").add(*polygons)
+        cells[s] = gdstk.Cell(f"{prefix}_{len(others) + len(cells)}").add(*polygons)
+    return cells
+
+
+def _references(
+    gdstk: Any, cells: Mapping[int, Any], arrays: Arrays, stack_of: Ints, origin: Ints, dbu_um: float
+) -> tuple[list[Any], list[tuple[int, ...]]]:
+    """Return references to the cells of all arrays, and their numbers."""
+    stack = stack_of[arrays.first]
     references: list[Any] = []
     numbers: list[tuple[int, ...]] = []
     rows = zip(
@@ -397,7 +476,7 @@ def _references(
         spacing = (dx_um or dy_um, dy_um or dx_um)
         references.append(gdstk.Reference(cells[s], at_um, columns=n_x, rows=n_y, spacing=spacing))
         numbers.append((site, *steps, n_x, n_y))
-    return list(cells.values()), references, numbers
+    return references, numbers
 
 
 # -- properties -------------------------------------------------------------------------------------------------------

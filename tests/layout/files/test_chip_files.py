@@ -28,6 +28,7 @@ MAP = {
     "well": {"layer": (20, 0), "inset_um": 0.2},
     "microlens": {"layer": (30, 0), "inset_um": 0.1, "corner_radius_um": 0.3},
     "metal_keep_out": {"layer": "40/1", "outset_um": 0.3},
+    "trench": {"layer": (50, 0), "inset_um": 0.2, "outset_um": 0.12},
 }
 FILTERS = {(10, 0): 0, (11, 2): 1, (12, 0): 2}
 
@@ -87,14 +88,130 @@ def test_layer_map_shapes_match_klayout(chip, bayer):
         (12, 0): region_of(bayer, channel == 2),
         (20, 0): outlines.sized(-200),
         (40, 1): outlines.sized(300),
+        (50, 0): outlines.sized(120) - outlines.sized(-200),
     }
     assert {(i.layer, i.datatype) for i in other.layer_infos()} == {*expected, (30, 0)}
     for (layer, datatype), shapes in expected.items():
         found = region(other, layer, datatype)
-        assert found.count() == shapes.count()
+        assert (layer == 50) or found.count() == shapes.count()
         assert (found ^ shapes).is_empty()
         assert found.area() == shapes.area()
         assert found.bbox() == shapes.bbox()
+
+
+def trench_family(name):
+    grid = fs.layout.grid(n_x=9, n_y=7, pitch_um=2.2, fill_factor=0.8)
+    rings = fs.layout.log_polar(n_sectors=24, r_min_um=20.0, r_max_um=60.0)
+    return {
+        "grid": (fs.layout.mosaic(grid, "bayer"), {"outset_um": 0.12}),
+        "outset beyond neighbours": (grid, {"outset_um": 1.5, "inset_um": 0.05}),
+        "abutting": (fs.layout.grid(n_x=9, n_y=7, pitch_um=2.2), {"inset_um": 0.1}),
+        "hexagons": (fs.layout.hexagonal(n_columns=9, n_rows=8, pitch_um=3.0, trench_um=0.3), {"outset_um": 0.15}),
+        "zones": (
+            fs.layout.inset(fs.layout.zones(pitch_um=(2.0, 4.0), side_um=(16.0, 48.0)), 0.1),
+            {"outset_um": 0.1},
+        ),
+        "octagons": (fs.layout.octagonal(n_x=6, n_y=5, pitch_um=3.0), {"inset_um": 0.12}),
+        "rings": (rings, {"inset_um": 0.1}),
+        "rings with gaps": (fs.layout.inset(rings, 0.1), {"outset_um": 0.08}),
+    }[name]
+
+
+@pytest.mark.parametrize("extension", GDSII_OASIS)
+@pytest.mark.parametrize("hierarchy", [True, False])
+@pytest.mark.parametrize(
+    "name",
+    ["grid", "outset beyond neighbours", "abutting", "hexagons", "zones", "octagons", "rings", "rings with gaps"],
+)
+def test_trench_matches_klayout_booleans(tmp_path, extension, hierarchy, name):
+    layout, parameters = trench_family(name)
+    sizes = {"well": {"layer": 2, "inset_um": 0.0}, "metal_keep_out": {"layer": 3, "outset_um": 0.0}}
+    for other, parameter in (("well", "inset_um"), ("metal_keep_out", "outset_um")):
+        sizes[other][parameter] = parameters.get(parameter, 0.0)
+    layers = {"photosite": 1, "trench": {"layer": (50, 0), **parameters}, **sizes}
+    layout.write(tmp_path / f"a.{extension}", layers=layers, hierarchy=hierarchy)
+    other = in_klayout(tmp_path / f"a.{extension}")
+    sites, kept, grown, trench = (region(other, layer, 0) for layer in (1, 2, 3, 50))
+
+    assert (trench ^ (grown - kept)).is_empty()
+    assert (trench & kept).is_empty()
+    assert ((trench + sites) ^ grown).is_empty()
+    assert max(polygon.num_points() for polygon in trench.each()) <= 8189
+    assert fs.read_layout(tmp_path / f"a.{extension}").n_sites == layout.n_sites
+
+
+def test_frames_between_curved_sites_have_exact_area(tmp_path):
+    # Edges of neighbouring frames intersect off the database grid, where boolean operations of programs round.
+    rings = fs.layout.inset(fs.layout.log_polar(n_sectors=40, r_min_um=20.0, r_max_um=82.4), 0.1)
+    layers = {
+        "photosite": 1,
+        "metal_keep_out": {"layer": 3, "outset_um": 0.1},
+        "trench": {"layer": 50, "outset_um": 0.1},
+    }
+    rings.write(tmp_path / "a.gds", layers=layers)
+    polygons = gdstk.read_gds(tmp_path / "a.gds").cells[0].polygons
+    sites, grown, frames = (sum(p.area() for p in polygons if p.layer == layer) for layer in (1, 3, 50))
+    other = in_klayout(tmp_path / "a.gds")
+
+    assert frames == pytest.approx(grown - sites, rel=1e-12)
+    assert (region(other, 50, 0) ^ (region(other, 3, 0) - region(other, 1, 0))).sized(-1).is_empty()
+
+
+@pytest.mark.parametrize("extension", GDSII_OASIS)
+def test_trench_of_array_is_one_array(tmp_path, extension):
+    layout = fs.layout.mosaic(fs.layout.grid(n_x=200, n_y=100, pitch_um=2.2, fill_factor=0.8), "bayer")
+    layout.write(tmp_path / f"a.{extension}", layers={"photosite": 1, "trench": {"layer": 50, "outset_um": 0.15}})
+    other = in_klayout(tmp_path / f"a.{extension}")
+    (array,) = (i for i in other.top_cell().each_inst() if i.cell.name.startswith("TRENCH"))
+
+    assert sorted((array.na, array.nb)) == [100, 200]
+    assert (tmp_path / f"a.{extension}").stat().st_size < 1300
+
+
+def test_layer_of_layout_has_any_polygons(bayer, tmp_path, monkeypatch):
+    monkeypatch.setattr(DERIVED_LAYERS, "_objects", dict(DERIVED_LAYERS))
+
+    @DERIVED_LAYERS.register("seal ring")
+    @fs.layout.LayoutLayer
+    def seal_ring(layout, *, width_um=5.0):
+        die = shapely.box(*layout.bounds_um)
+        assert "channel" in layout.columns
+        return [die.buffer(width_um, join_style="mitre") - die, shapely.MultiPolygon()]
+
+    bayer.write(tmp_path / "a.gds", layers={"photosite": 1, "seal ring": {"layer": 9, "width_um": 2.0}})
+    other = in_klayout(tmp_path / "a.gds")
+    ring, sites = (region(other, layer, 0) for layer in (9, 1))
+    x0, y0, x1, y1 = np.rint(np.array(bayer.bounds_um) * 1e3)
+
+    assert ring.area() == (x1 - x0 + 4000) * (y1 - y0 + 4000) - (x1 - x0) * (y1 - y0)
+    assert (ring & sites).is_empty()
+
+
+@pytest.mark.parametrize(
+    ("layout", "parameters", "match"),
+    [
+        ("grid", {}, r"'layers\[trench\]\.outset_um' or 'inset_um' must be positive, got 0\.0 µm; the gap between sites"),
+        ("grid", {}, r"is 0\.232 µm, for example: outset_um=0\.116"),
+        ("abutting", {}, "the sites have no gaps, for example: inset_um=0.1"),
+        ("grid", {"outset_um": -0.1}, r"'layers\[trench\]\.outset_um' must be >= 0"),
+        ("grid", {"inset_um": "x"}, r"'layers\[trench\]\.inset_um' must be one number"),
+        ("grid", {"width_um": 1.0}, "must have the keys layer, outset_um, inset_um only, got 'width_um'"),
+    ],
+)  # fmt: skip
+def test_invalid_trenches_are_rejected(tmp_path, layout, parameters, match):
+    with pytest.raises(ParameterError, match=match):
+        trench_family(layout)[0].write(
+            tmp_path / "a.gds", layers={"photosite": 1, "trench": {"layer": 50, **parameters}}
+        )
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("shapes", [None, "x", [1.0], [shapely.Point(0, 0)], [shapely.LineString([(0, 0), (1, 1)])]])
+def test_layer_of_layout_requires_polygons(bayer, tmp_path, monkeypatch, shapes):
+    monkeypatch.setattr(DERIVED_LAYERS, "_objects", dict(DERIVED_LAYERS))
+    DERIVED_LAYERS.register("frame", fs.layout.LayoutLayer(lambda _: shapes))
+    with pytest.raises(ParameterError, match="derived layer 'frame' must return a sequence of shapely polygons"):
+        bayer.write(tmp_path / "a.gds", layers={"photosite": 1, "frame": 2})
 
 
 def test_microlens_has_area_of_rounded_square(chip, bayer):
@@ -110,9 +227,9 @@ def test_pixel_cells_form_arrays(chip, bayer):
     arrays = list(other.top_cell().each_inst())
 
     assert other.top_cell().name == "SENSOR"
-    assert sorted(cell.name for cell in other.each_cell()) == ["PIXEL_0", "PIXEL_1", "PIXEL_2", "SENSOR"]
-    assert sum(max(i.na, 1) * max(i.nb, 1) for i in arrays) == bayer.n_sites
-    assert len(arrays) <= 4
+    assert sorted(cell.name for cell in other.each_cell()) == ["PIXEL_0", "PIXEL_1", "PIXEL_2", "SENSOR", "TRENCH_3"]
+    assert sum(max(i.na, 1) * max(i.nb, 1) for i in arrays if i.cell.name != "TRENCH_3") == bayer.n_sites
+    assert len(arrays) <= 5
     assert not any(other.top_cell().shapes(k).size() for k in other.layer_indexes())
     assert chip.stat().st_size < 4000
 
