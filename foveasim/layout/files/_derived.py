@@ -81,8 +81,8 @@ class PlacedShapes:
 
 #: Function of a layout that returns one polygon per site, or layer of the complete layout.
 DerivedLayer: TypeAlias = Callable[..., NDArray[Any]] | LayoutLayer
-#: Derived layers by name: functions of a layout, with keywords, that return one polygon per site, (n_site,), in µm, or layers of
-#: the complete layout. A polygon of a site depends on the outline of this site only, because congruent sites are drawn once.
+#: Derived layers by name: functions of a layout, with keywords, that return one polygon per site, (n_site,), in µm, or a
+#: :class:`LayoutLayer`. A polygon of a site depends on the outline of this site only, because congruent sites are drawn once.
 #: Installed packages add derived layers as entry points of the group ``foveasim.derived_layers``.
 DERIVED_LAYERS: Registry[DerivedLayer] = Registry("derived layer", "foveasim.derived_layers")
 
