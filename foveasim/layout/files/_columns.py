@@ -87,7 +87,9 @@ def storable_columns(
                 values[k] = linear_text(values[k], *steps[name][k].tolist())
             key = name if PLAIN_NAME.fullmatch(name) else _quote(name)
             longer = n_chars + len(key) + 2 + np.fromiter(map(len, map(str, values)), np.int64, len(values))
-            if (longer <= max_chars).all() and len({v for v in values if isinstance(v, str)}) <= max_strings:
+            # Few strings need no count.
+            has_few = len(values) <= max_strings or len({v for v in values if isinstance(v, str)}) <= max_strings
+            if has_few and (longer <= max_chars).all():
                 stored[key], n_chars = values, longer
                 continue
         dropped.append(name)
@@ -101,8 +103,8 @@ def linear_text(start: int, step_i: int, step_j: int) -> str:
 
 def column_strings(stored: dict[str, list[Any]]) -> list[str]:
     """Return the string of each site."""
-    words = [[f"{key}={value}" for value in values] for key, values in stored.items()]
-    return list(map(" ".join, zip(*words, strict=True)))
+    line = " ".join(f"{key.replace('%', '%%')}=%s" for key in stored)
+    return list(map(line.__mod__, zip(*stored.values(), strict=True))) if stored else []
 
 
 def _values(column: NDArray[Any]) -> list[Any] | None:

@@ -10,7 +10,6 @@ import math
 import re
 import warnings
 from collections.abc import Callable, Iterator
-from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -260,6 +259,8 @@ def _top_cell(cells: dict[str, Any], wanted: str | None) -> str:
     """Return the name of the cell to read."""
     if wanted is not None:
         if wanted not in cells:
+            from difflib import get_close_matches
+
             closest = get_close_matches(wanted, cells, n=1)
             hint = f"did you mean {closest[0]!r}? " if closest else ""
             raise FormatError(f"has no cell {wanted!r}; {hint}possible: {_format_names(cells)}")
@@ -581,6 +582,7 @@ def _column_strings(polygons: list[Any]) -> list[str]:
     """Return the column string of each polygon, empty where it has none."""
     texts = [p.get_gds_property(COLUMNS_PROPERTY) for p in polygons]
     if texts and None not in texts:
+        texts = [text.rstrip("\0") for text in texts]
         text = "".join(texts)
         if text.isascii() and text.isprintable() and max(map(len, texts)) <= MAX_CHARS:
             return texts

@@ -57,7 +57,7 @@ def hole_free_rings(layout: Layout, max_vertices: int | None) -> tuple[Ints, Int
     parts_of |= {
         s: _hole_free_parts(polygon, max_vertices) for s, polygon in zip(others, layout[others].polygons(), strict=True)
     }
-    n_parts[cut] = [len(parts) for parts in parts_of.values()]
+    n_parts[cut] = [len(parts_of[s]) for s in cut.tolist()]
     n_rings = np.maximum(n_parts, 1)
     site = np.repeat(np.arange(layout.n_sites), n_rings)
     part = positions_in_runs(n_rings) + 1

@@ -29,7 +29,7 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
-from itertools import chain, repeat
+from itertools import chain, compress, repeat
 from pathlib import Path
 from typing import Any
 
@@ -173,14 +173,14 @@ def write(
     ring, owner = drawing.rings_of(stack_of[flat.first])
     polygons = drawing.polygons(gdstk, ring, origin[flat.first[owner]], dbu_um)
     is_site = drawing.is_site[ring]
-    elements += [polygon for polygon, is_one in zip(polygons, is_site.tolist(), strict=True) if is_one]
+    elements += compress(polygons, is_site.tolist())
     numbers += drawing.numbers(ring[is_site], flat.first[owner[is_site]])
     array = np.concatenate((np.arange(references.first.size), references.first.size + owner[is_site]))
     set_properties = _set_oasis_properties if is_oasis else _set_gds_properties
     dropped = set_properties(elements, numbers, array, concatenate(references, flat), columns)
 
     library = gdstk.Library("FOVEASIM", unit=1e-6, precision=dbu_um * 1e-6)
-    shapes = [polygon for polygon, is_one in zip(polygons, is_site.tolist(), strict=True) if not is_one]
+    shapes = list(compress(polygons, (~is_site).tolist()))
     all_cells = list(cells.values())
     for d in all_drawn:
         if d.is_of_layout:
@@ -302,6 +302,8 @@ class _Drawing:
 
     def numbers(self, ring: Ints, site: Ints) -> list[tuple[int, ...]]:
         """Return the numbers of the given sites, with the parts of divided ones."""
+        if not self.part.any():
+            return list(zip(site.tolist()))
         part, n_parts = self.part[ring].T.tolist()
         return [(s, k, n) if n else (s,) for s, k, n in zip(site.tolist(), part, n_parts, strict=True)]
 
@@ -490,7 +492,7 @@ def _set_gds_properties(
     columns: Mapping[str, NDArray[Any]],
 ) -> tuple[str, ...]:
     """Set the numbers and columns of sites and arrays; return the dropped columns."""
-    texts = list(map(_number_text, numbers))
+    texts = [f"photosite {number[0]}" if len(number) == 1 else _number_text(number) for number in numbers]
     n_chars = np.fromiter(map(len, texts), np.int64, len(texts))
     longest = np.zeros(arrays.first.size, np.int64)
     np.maximum.at(longest, array, n_chars + n_chars % 2)

@@ -15,6 +15,7 @@ from foveasim.errors import ConfigError, FileError, GeometryError, LayoutWarning
 from foveasim.layout import DERIVED_LAYERS, Layout
 from foveasim.layout.files import _gdstk
 from foveasim.layout.files._hierarchy import congruence_classes, find_arrays
+from foveasim.layout.files._holes import hole_free_rings
 
 gdstk = pytest.importorskip("gdstk")
 klayout = pytest.importorskip("klayout.db")
@@ -700,6 +701,34 @@ def test_congruent_sites_are_equal_up_to_translation(sites):
             is_same = ring_a.shape == ring_b.shape and (ring_a - ring_a.min(0) == ring_b - ring_b.min(0)).all()
             assert (class_of[a] == class_of[b]) == is_same
     assert origin.tolist() == [r.min(0).tolist() for r in rings]
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.tuples(st.integers(3, 12), st.integers(3, 12), st.integers(0, 2**32)), min_size=1, max_size=5))
+def test_parts_of_holed_sites_cover_them(sites):
+    polygons = []
+    for k, (n, n_hole, seed) in enumerate(sites):
+        rng = np.random.default_rng(seed)
+        rings = [
+            (radius_um * rng.uniform(0.4, 1.0, m)) * np.exp(2j * np.pi * (np.arange(m) + rng.random()) / m)
+            for radius_um, m in ((5.0, n), (1.0, n_hole))
+        ]
+        outline, hole = (shapely.Polygon(np.stack((r.real + 20.0 * k, r.imag), 1).round(3)) for r in rings)
+        # Some outlines are concave, and some holes reach beyond them; the last one has two holes.
+        polygons.append(outline - hole if outline.contains(hole) else outline)
+    polygons.append(shapely.box(-20, 0, -10, 9) - shapely.box(-19, 1, -18, 2) - shapely.box(-12, 5, -11, 8))
+    layout = Layout.from_polygons(polygons)
+    site, part, n_parts, rings_um = hole_free_rings(layout, None)
+    parts = shapely.polygons([shapely.LinearRing(ring) for ring in rings_um])
+
+    assert shapely.is_valid(parts).all()
+    assert (np.sort(site) == site).all()
+    for k, polygon in enumerate(polygons):
+        own = parts[site == k]
+        assert part[site == k].tolist() == ([0] if len(own) == 1 else [*range(1, len(own) + 1)])
+        assert (n_parts[site == k] == (0 if len(own) == 1 else len(own))).all()
+        assert shapely.equals(shapely.coverage_union_all(own), polygon)
+        assert shapely.area(own).sum() == pytest.approx(polygon.area, rel=1e-12)
 
 
 # -- rounding ---------------------------------------------------------------------------------------------------------
