@@ -77,7 +77,7 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
 
 
 def _indices(layout: Layout) -> tuple[Ints, Ints]:
-    """Return the indices of each site in two directions, from its columns or its position on a lattice."""
+    """Return indices of sites in two directions, from columns or positions on a lattice."""
     pair = next((pair for pair in INDEX_COLUMNS if all(name in layout.columns for name in pair)), None)
     if pair is not None:
         return layout._checked_indices(pair[0]), layout._checked_indices(pair[1])  # noqa: SLF001
@@ -96,7 +96,7 @@ def _indices(layout: Layout) -> tuple[Ints, Ints]:
 
 
 def _lattice_index(layout: Layout, axis: int) -> Ints | None:
-    """Return the index of each site on an axis along which the sites have a constant pitch, or None."""
+    """Return the indices of sites along an axis, or None where the pitch is not constant."""
     position_um, bounds_um = layout.centroid_um[:, axis], layout.site_bounds_um
     side_um = float((bounds_um[:, axis + 2] - bounds_um[:, axis]).min(initial=np.inf))
     order = np.argsort(position_um)

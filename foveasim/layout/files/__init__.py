@@ -26,9 +26,8 @@ from foveasim._core.registry import import_all
 from foveasim._io.formats import FileFormat, detect_format, select_writer, validate_options
 from foveasim.errors import FileError
 from foveasim.layout.files._bundled import bundled_layouts, layout_path
-from foveasim.layout.files._common import WrittenLayout
+from foveasim.layout.files._common import FORMATS, WrittenLayout
 from foveasim.layout.files._derived import DERIVED_LAYERS, LayoutLayer
-from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.files._layers import layer_options, read_layer_map
 from foveasim.layout.model import Layout
 

@@ -1,4 +1,4 @@
-"""Limits, checks of untrusted files, and write reports shared by all layout formats."""
+"""Table of layout formats, limits, checks of untrusted files, and write reports."""
 
 from __future__ import annotations
 
@@ -12,12 +12,15 @@ import shapely
 from numpy.typing import NDArray
 
 from foveasim._core.provenance import to_plain_data
+from foveasim._core.registry import Registry
 from foveasim._core.rings import site_area_um2
 from foveasim._core.validation import MAX_SITES, Floats
+from foveasim._io.formats import FileFormat
 from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.layout.model import Layout
 
 __all__ = [
+    "FORMATS",
     "WrittenLayout",
     "check_decompressed",
     "check_header",
@@ -32,6 +35,9 @@ __all__ = [
     "string_column",
 ]
 
+#: Formats of layout files. ``read(path, **options)`` returns a :class:`foveasim.Layout`, ``write(layout, path, **options)`` a
+#: :class:`foveasim.layout.WrittenLayout`. Installed packages add formats as entry points of the group ``foveasim.formats``.
+FORMATS: Registry[FileFormat] = Registry("layout format", "foveasim.formats")
 #: Identifier in every file that contains columns and provenance.
 FILE_FORMAT = "foveasim layout"
 FILE_VERSION = 1

@@ -1,5 +1,5 @@
 """
-Derived layers of GDSII and OASIS files: shapes computed from the outlines of the photosites.
+Derived layers of GDSII and OASIS files, computed from the outlines of the sites.
 
 There are two kinds. A function of a layout returns one polygon per site; congruent sites are drawn once. A
 :class:`LayoutLayer` returns the polygons of the complete layout.
@@ -28,6 +28,8 @@ __all__ = ["DERIVED_LAYERS", "LayoutLayer", "PlacedShapes", "shapes_of_layout", 
 MITRE_LIMIT = 100.0
 #: Vertices are compared in units far below any database unit.
 CONGRUENCE_UM = 1e-6
+#: Sites whose neighbours are searched at once, which limits the memory.
+QUERY_SITES = 2**17
 #: Sites whose distances a message is based on.
 SAMPLE_SITES = 1000
 
@@ -112,10 +114,10 @@ def _metal_keep_out(layout: Layout, *, outset_um: float = 0.0) -> NDArray[Any]:
 @LayoutLayer
 def _trench(layout: Layout, *, outset_um: float = 0.0, inset_um: float = 0.0) -> PlacedShapes:
     """
-    Return the trenches around and between sites: outlines with an outward offset, without the sites.
+    Return the area between sites and around them.
 
-    The area of the sites has an inward offset. Each shape is the area of one site: a frame, repeated for congruent sites, or
-    where it reaches into other sites, the area outside these.
+    It consists of the outlines with an outward offset, without those with an inward offset. Each shape is the area of one
+    site: a frame, repeated for congruent sites, or where it reaches into other sites, the area outside these.
     """
     outset_um = check_number("outset_um", outset_um, at_least=0.0)
     inset_um = check_number("inset_um", inset_um, at_least=0.0)
@@ -124,7 +126,7 @@ def _trench(layout: Layout, *, outset_um: float = 0.0, inset_um: float = 0.0) ->
     xy = np.rint(layout.xy_um / CONGRUENCE_UM).astype(np.int64)
     found, origin = congruence_classes(xy, layout.ring_offsets, layout.site_offsets)
     _, first, shape = np.unique(found, return_index=True, return_inverse=True)
-    position_um = origin * CONGRUENCE_UM
+    position_um: Floats = np.asarray(origin * CONGRUENCE_UM, np.float64)
     models = _translate(layout[first].polygons(), -position_um[first])
     grown, kept = _offset(models, outset_um), _offset(models, -inset_um)
     frames = np.asarray(shapely.difference(grown, kept))
@@ -145,10 +147,13 @@ def _overlaps(grown: NDArray[Any], kept: NDArray[Any], shape: Ints, position_um:
     reach, boxes = (shapely.bounds(each)[shape] + np.tile(position_um, 2) for each in (grown, kept))
     # Abutting boxes do not overlap.
     reach += CONGRUENCE_UM * np.array([1.0, 1.0, -1.0, -1.0])
-    candidates = shapely.STRtree(shapely.box(*boxes.T)).query(shapely.box(*reach.T))
-    site, other = candidates[:, candidates[0] != candidates[1]]
+    tree = shapely.STRtree(shapely.box(*boxes.T))
+    candidates = []
+    for start in range(0, shape.size, QUERY_SITES):
+        site, other = tree.query(shapely.box(*reach[start : start + QUERY_SITES].T))
+        candidates.append(np.stack((site + start, other))[:, site + start != other])
+    site, other = np.concatenate(candidates, axis=1) if candidates else np.zeros((2, 0), np.int64)
     inner = shapely.buffer(grown, -CONGRUENCE_UM, join_style="mitre")
-    is_overlap = np.zeros(site.size, bool)
     # Equal pairs of shapes at equal distances are compared once.
     step = np.rint((position_um[other] - position_um[site]) / CONGRUENCE_UM).astype(np.int64)
     pairs, index = np.unique(np.column_stack((shape[site], shape[other], step)), axis=0, return_inverse=True)

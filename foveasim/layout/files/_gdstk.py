@@ -192,7 +192,7 @@ def read(
 
 
 def _last_match(key: tuple[int, int], layers: list[tuple[int, int | None]]) -> int:
-    """Return the index of the last of the layers that a layer and datatype belong to; a datatype of None stands for all."""
+    """Return the index of the last layer of a list that is or contains a layer and datatype."""
     layer, datatype = key
     return max(
         (k for k, (number, kind) in enumerate(layers) if number == layer and kind in (None, datatype)), default=-1
@@ -210,7 +210,7 @@ def _is_on(tags: NDArray[np.int64], layers: set[tuple[int, int]]) -> NDArray[np.
 
 
 def _layers_with_shapes(cells: dict[str, Any], order: list[str]) -> dict[tuple[int, int], bool]:
-    """Return the layers and datatypes with shapes, and whether one of their shapes has the number of a photosite."""
+    """Return the layers with shapes, and whether a shape has the number of a photosite."""
     found: dict[tuple[int, int], bool] = {}
     for name in order:
         in_cell: dict[tuple[int, int], Any] = {}

@@ -54,6 +54,7 @@ from foveasim.layout.files._columns import (
     storable_columns,
 )
 from foveasim.layout.files._common import (
+    FORMATS,
     WrittenLayout,
     check_site_count,
     check_sizes,
@@ -61,7 +62,6 @@ from foveasim.layout.files._common import (
     rounding_report,
 )
 from foveasim.layout.files._derived import shapes_of_layout, shapes_of_sites
-from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.files._hierarchy import Arrays, concatenate, congruence_classes, find_arrays, single_sites
 from foveasim.layout.files._holes import hole_free_rings, without_keyholes
 from foveasim.layout.files._layers import (
@@ -421,7 +421,7 @@ def _draw_layout(
         np.rint(xy_um / dbu_um).astype(np.int64),
         np.concatenate(([0], np.cumsum(list(map(len, rings_um)), dtype=np.int64))),
         np.searchsorted(owner, np.arange(first.size + 1)),
-        np.tile(drawn.number, (owner.size, 1)),
+        np.tile(np.array([drawn.layer, drawn.datatype]), (owner.size, 1)),
         np.zeros((owner.size, 2), np.int64),
         np.zeros(owner.size, bool),
     )
@@ -439,8 +439,8 @@ def _draw_layout(
 def _cells(
     gdstk: Any, drawing: _Drawing, stack: Ints, dbu_um: float, others: list[Any], name: str, *, is_oasis: bool
 ) -> dict[int, Any]:
-    """Return the cells of stacks, in the order of their first use; their numbers continue those of other cells."""
-    cells = {}
+    """Return the cells of stacks in the order of use, numbered after other cells."""
+    cells: dict[int, Any] = {}
     prefix = re.sub(r"[^A-Z0-9]", "_", name.upper())
     for s in dict.fromkeys(stack.tolist()):
         ring, _ = drawing.rings_of(np.array([s]))

@@ -25,6 +25,7 @@ from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import FileFormat, as_file_error
 from foveasim.errors import FileError
 from foveasim.layout.files._common import (
+    FORMATS,
     WrittenLayout,
     check_header,
     check_site_count,
@@ -36,7 +37,6 @@ from foveasim.layout.files._common import (
     restore_column,
     string_column,
 )
-from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.model import Layout
 
 __all__ = ["read", "write"]

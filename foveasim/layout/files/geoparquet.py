@@ -20,6 +20,7 @@ from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import FileFormat, as_file_error
 from foveasim.errors import FileError, ParameterError
 from foveasim.layout.files._common import (
+    FORMATS,
     WrittenLayout,
     check_decompressed,
     check_header,
@@ -33,7 +34,6 @@ from foveasim.layout.files._common import (
     restore_column,
     string_column,
 )
-from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.model import Layout
 
 __all__ = ["MAGIC", "read", "write"]

@@ -15,6 +15,7 @@ from foveasim._io.formats import FileFormat, as_file_error
 from foveasim._io.npz import read_archive, write_archive
 from foveasim.errors import FileError
 from foveasim.layout.files._common import (
+    FORMATS,
     WrittenLayout,
     check_header,
     check_site_count,
@@ -22,7 +23,6 @@ from foveasim.layout.files._common import (
     lossless_report,
     max_decompressed_bytes,
 )
-from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.model import Layout
 from foveasim.layout.packed import is_layout_array, layout_from_arrays, layout_to_arrays
 

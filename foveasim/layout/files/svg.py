@@ -16,8 +16,7 @@ from foveasim._core.validation import check_count
 from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import FileFormat
 from foveasim.errors import ParameterError
-from foveasim.layout.files._common import WrittenLayout, rounding_report
-from foveasim.layout.files._formats import FORMATS
+from foveasim.layout.files._common import FORMATS, WrittenLayout, rounding_report
 from foveasim.layout.model import Layout
 
 __all__ = ["write"]
