@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from functools import cached_property
 from threading import Lock
 from typing import Any, Literal, NamedTuple
@@ -25,7 +26,14 @@ from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, check_count, finite_array, read_only
 from foveasim.capture import Capture
 from foveasim.distortion import Lens
-from foveasim.errors import CoverageWarning, FoveasimWarning, ParameterError, SamplingWarning, SimulationError
+from foveasim.errors import (
+    CoverageWarning,
+    FoveasimWarning,
+    ParameterError,
+    SamplingWarning,
+    SimulationError,
+    type_name,
+)
 from foveasim.fields import Grid, PowerMap
 from foveasim.integrate import Integrator, outline_bounds_um
 from foveasim.layout import Layout
@@ -118,13 +126,13 @@ class Camera:
     ) -> None:
         for name, part, kind in (("optics", optics, Optics), ("sensor", sensor, Sensor)):
             if not isinstance(part, kind):
-                raise ParameterError(name, f"must be a foveasim.{kind.__name__}, got a {type(part).__name__}")
+                raise ParameterError(name, f"must be a foveasim.{kind.__name__}, got {type_name(part)}")
         if not isinstance(sensor.layout, Layout):
-            raise ParameterError("sensor", f"must have a foveasim.Layout, got a {type(sensor.layout).__name__}")
+            raise ParameterError("sensor", f"must have a foveasim.Layout, got {type_name(sensor.layout)}")
         if distortion is not None and not isinstance(distortion, Lens):
             raise ParameterError(
                 "distortion",
-                f"must be a lens model with distort, undistort, focal_um and centre_um, got a {type(distortion).__name__}",
+                f"must be a lens model with distort, undistort, focal_um and centre_um, got {type_name(distortion)}",
             )
         self._optics = optics
         self._sensor = sensor
@@ -204,7 +212,7 @@ class Camera:
             bounding box; when the distance of the scene is at most the focal length.
         """
         if not isinstance(scene, Scene):
-            raise ParameterError("scene", f"must be a Scene, got a {type(scene).__name__}")
+            raise ParameterError("scene", f"must be a Scene, got {type_name(scene)}")
         return scene if scene.pitch_um is not None else self._fit(scene, scene.fit)
 
     def _fit(self, scene: Scene, fit: str | None) -> Scene:
@@ -728,6 +736,7 @@ class Camera:
         -------
         Picture
             Exact means over the pixels, e-/µm², one channel per filter, without noise and dark signal; NaN outside the image.
+            With the white balance of captures.
 
         Raises
         ------
@@ -736,11 +745,11 @@ class Camera:
         """
         exposure_s = check_plausible("exposure_s", exposure_s)
         if not isinstance(light, Scene | PowerMap):
-            raise ParameterError("light", f"must be a Scene or a PowerMap, got a {type(light).__name__}")
+            raise ParameterError("light", f"must be a Scene or a PowerMap, got {type_name(light)}")
         power_map = self.power_map(light) if isinstance(light, Scene) else light
         joules_per_w_m2 = float(w_from_w_m2_um2(exposure_s))
         weights = self._sensor.responsivity_e_per_j(light.wavelength_nm) * joules_per_w_m2
-        return reference(power_map, grid, weights=weights)
+        return replace(reference(power_map, grid, weights=weights), white=self._white(light))
 
     def noise_budget(self, light: Scene | PowerMap, *, exposure_s: float) -> NoiseBudget:
         """
@@ -777,7 +786,7 @@ class Camera:
         filter, or None.
         """
         if not isinstance(light, Scene | PowerMap):
-            raise ParameterError("light", f"must be a Scene or a PowerMap, got a {type(light).__name__}")
+            raise ParameterError("light", f"must be a Scene or a PowerMap, got {type_name(light)}")
         source, light = light, self._with_pitch(light)
         e_per_j = self._sensor.responsivity_e_per_j(light.wavelength_nm)
         with clock.stage("load kernels"):
@@ -1012,7 +1021,7 @@ def _check_frames(frames: object) -> None:
     if not isinstance(frames, Iterable):
         hint = "put a single one into a list" if isinstance(frames, Scene | PowerMap) else ""
         raise ParameterError(
-            "frames", f"must be an iterable of Scenes or PowerMaps, got a {type(frames).__name__}", hint=hint
+            "frames", f"must be an iterable of Scenes or PowerMaps, got {type_name(frames)}", hint=hint
         )
 
 

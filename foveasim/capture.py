@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -179,7 +179,7 @@ class Capture:
         Returns
         -------
         Picture
-            One channel per colour filter; NaN outside the photosites.
+            One channel per colour filter, with the white balance of ``white_dn``; NaN outside the photosites.
 
         Raises
         ------
@@ -194,8 +194,7 @@ class Capture:
         it is scaled to a site of mean response. The ``variance`` is by default that of shot noise, and for codes also that
         of reset, read, RTS and quantisation noise.
         """
-        methods = {"cells": cells, "linear": linear, "natural": natural, "least_squares": least_squares}
-        check_choice("method", method, tuple(methods))
+        check_choice("method", method, ("cells", "linear", "natural", "least_squares"))
         check_choice("of", of, ("code", "electrons", "expected_e", "light_e"))
         check_choice("per", per, ("site", "um2"))
         known = {"n_threads"} | (
@@ -207,6 +206,14 @@ class Capture:
             raise ParameterError(name, f"must be an option of the method {method!r}", hint=hint)
         self._check_sensor(sensor)
         grid = raster_grid(self.layout, max_pixels) if grid is None else grid
+        picture = self._reconstruct(method, grid, of, per, sensor, options)
+        return replace(picture, white=self.white_dn) if (self.white_dn > 0.0).all() else picture
+
+    def _reconstruct(
+        self, method: str, grid: Grid, of: str, per: str, sensor: Sensor | None, options: dict[str, Any]
+    ) -> Picture:
+        """Return the picture of a method, without white balance."""
+        methods = {"cells": cells, "linear": linear, "natural": natural}
         n_filters = len(self.filter_names)
         is_in_filter = self.filter_of_site == np.arange(n_filters)[:, np.newaxis]
         is_fitted = method == "least_squares"

@@ -43,6 +43,8 @@ __all__ = [
     "disk_problem",
     "format_value",
     "printable",
+    "type_name",
+    "with_article",
 ]
 
 
@@ -173,6 +175,34 @@ def format_value(value: Any, *, at_most: int = MAX_VALUE_LENGTH) -> str:
     except Exception:  # noqa: BLE001 -- the repr of any object may raise, and Python rejects very long integers
         return f"an object of type {type(value).__name__}"
     return text if len(text) <= at_most else text[: at_most - 3] + "..."
+
+
+#: Beginnings of words that are pronounced with a vowel, and exceptions.
+_VOWEL, _CONSONANT = (re.compile(p, re.IGNORECASE) for p in (r"[aeiou]|ndarray|xarray", r"u(func|int|ni|se|uid)|one"))
+
+
+def with_article(word: str) -> str:
+    """
+    Return a word after "a" or "an".
+
+    Examples
+    --------
+    >>> with_article("Layout"), with_article("effect"), with_article("ndarray"), with_article("uint8")
+    ('a Layout', 'an effect', 'an ndarray', 'a uint8')
+    """
+    return f"{'an' if _VOWEL.match(word) and not _CONSONANT.match(word) else 'a'} {word}"
+
+
+def type_name(value: object) -> str:
+    """
+    Return the name of the type of a value with its article, for messages.
+
+    Examples
+    --------
+    >>> type_name(3)
+    'an int'
+    """
+    return with_article(type(value).__name__)
 
 
 def _shorten(message: str) -> str:

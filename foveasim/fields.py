@@ -27,7 +27,7 @@ from foveasim._core.validation import (
     unmasked,
     wavelengths_nm,
 )
-from foveasim.errors import ParameterError
+from foveasim.errors import ParameterError, type_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -262,7 +262,7 @@ class PowerMap:
         if data.dtype not in (np.float32, np.float64):
             data = read_only(data.astype(np.float64))
         if not isinstance(self.grid, Grid):
-            raise ParameterError("grid", f"must be a Grid, got a {type(self.grid).__name__}")
+            raise ParameterError("grid", f"must be a Grid, got {type_name(self.grid)}")
         wavelength_nm = wavelengths_nm("wavelength_nm", self.wavelength_nm)
         if data.shape != (wavelength_nm.size, *self.grid.shape):
             raise ParameterError(

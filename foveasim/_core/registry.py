@@ -11,7 +11,7 @@ from pkgutil import iter_modules
 from typing import Any, Generic, TypeVar, overload
 
 from foveasim._core.names import did_you_mean, possible_names
-from foveasim.errors import ParameterError
+from foveasim.errors import ParameterError, with_article
 
 __all__ = ["Registry", "import_all"]
 
@@ -139,5 +139,5 @@ class Registry(Mapping[str, T], Generic[T]):
         if isinstance(name, str) and name in objects:
             return objects[name]
         raise ParameterError(
-            parameter, f"must be the name of a {self.kind}", name, hint=possible_names(name, list(objects))
+            parameter, f"must be the name of {with_article(self.kind)}", name, hint=possible_names(name, list(objects))
         )

@@ -9,7 +9,7 @@ import numpy as np
 
 from foveasim._core.validation import check_choice, check_number
 from foveasim.camera import Camera
-from foveasim.errors import ParameterError, format_value
+from foveasim.errors import ParameterError, format_value, type_name
 
 __all__ = ["BUDGETS", "Budget", "budget_of", "check_equal_budgets"]
 
@@ -66,7 +66,7 @@ def budget_of(camera: Camera, frames_per_s: float) -> Budget:
         When an argument is invalid.
     """
     if not isinstance(camera, Camera):
-        raise ParameterError("camera", f"must be a foveasim.Camera, got a {type(camera).__name__}")
+        raise ParameterError("camera", f"must be a foveasim.Camera, got {type_name(camera)}")
     frames_per_s = check_number("frames_per_s", frames_per_s, above=0.0)
     sensor = camera.sensor
     n_sites = sensor.layout.n_sites

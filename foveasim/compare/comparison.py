@@ -28,7 +28,7 @@ from foveasim.compare.measure import (
     size_records,
 )
 from foveasim.compare.setup import DEFAULT_EXPOSURE_S, cameras_of, field_um, photograph_scenes
-from foveasim.errors import ParameterError, format_value
+from foveasim.errors import ParameterError, format_value, type_name
 from foveasim.fields import Grid, PowerMap
 from foveasim.layout import Layout
 from foveasim.optics import Optics
@@ -466,7 +466,7 @@ def _simulate(
     first = next(iter(named.values()))
     for scene_name, light in scenes.items():
         if not isinstance(light, Scene | PowerMap):
-            raise ParameterError("scenes", f"must be scenes or power maps, got a {type(light).__name__}", scene_name)
+            raise ParameterError("scenes", f"must be scenes or power maps, got {type_name(light)}", scene_name)
         power_map = first.power_map(light) if isinstance(light, Scene) else light
         for name, camera in named.items():
             capture = camera.capture(light, exposure_s=exposure_s, seed=seed)
@@ -558,10 +558,10 @@ def layouts(
         fs.compare.layouts({"foveal": foveal, "square": square}).write("report.html")
     """
     if not isinstance(layouts, Mapping):
-        raise ParameterError("layouts", f"must be a mapping of names to layouts, got a {type(layouts).__name__}")
+        raise ParameterError("layouts", f"must be a mapping of names to layouts, got {type_name(layouts)}")
     for name, layout in layouts.items():
         if not isinstance(layout, Layout):
-            raise ParameterError("layouts", f"must be layouts, got a {type(layout).__name__} for {format_value(name)}")
+            raise ParameterError("layouts", f"must be layouts, got {type_name(layout)} for {format_value(name)}")
     return cameras(cameras_of(layouts, optics, sensor), scenes, exposure_s=exposure_s, **options)
 
 
@@ -591,13 +591,13 @@ def format_interval(mean: float, half_width: float) -> str:
 
 def _check_cameras(cameras: Mapping[str, Camera]) -> dict[str, Camera]:
     if not isinstance(cameras, Mapping):
-        raise ParameterError("cameras", f"must be a mapping of names to cameras, got a {type(cameras).__name__}")
+        raise ParameterError("cameras", f"must be a mapping of names to cameras, got {type_name(cameras)}")
     if len(cameras) < 2:
         raise ParameterError("cameras", "must be at least two", len(cameras))
     named = {str(name): camera for name, camera in cameras.items()}
     for name, camera in named.items():
         if not isinstance(camera, Camera):
-            raise ParameterError("cameras", f"must be cameras, got a {type(camera).__name__} for {format_value(name)}")
+            raise ParameterError("cameras", f"must be cameras, got {type_name(camera)} for {format_value(name)}")
     (first_name, first), *others = named.items()
     for name, camera in others:
         pair = f"{format_value(first_name)} and {format_value(name)}"

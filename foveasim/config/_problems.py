@@ -14,7 +14,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from foveasim._core.names import closest_name, did_you_mean, list_names, possible_names
 from foveasim.config._models import call_of
 from foveasim.config._sources import Source
-from foveasim.errors import ConfigError
+from foveasim.errors import ConfigError, type_name
 
 __all__ = ["validate"]
 
@@ -47,7 +47,7 @@ def validate(source: Source | str | Path | None, kind: Any, data: dict[str, Any]
 
 
 def _reject(value: object) -> None:
-    raise ValueError(f"a {type(value).__name__} is not a number, string, list or section")
+    raise ValueError(f"{type_name(value)} is not a number, string, list or section")
 
 
 def _problems(kind: Any, data: dict[str, Any], error: ValidationError) -> list[tuple[tuple[str, ...], str]]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.validation import Floats, Images, check_choice, check_count, read_only
-from foveasim.errors import ParameterError
+from foveasim.errors import ParameterError, type_name
 from foveasim.fields import Grid, PointMap, PowerMap
 
 __all__ = ["Conserve", "distort_map"]
@@ -85,7 +85,7 @@ def distort_map(
     1.0
     """
     if not isinstance(power_map, PowerMap):
-        raise ParameterError("power_map", f"must be a PowerMap, got a {type(power_map).__name__}")
+        raise ParameterError("power_map", f"must be a PowerMap, got {type_name(power_map)}")
     if not (hasattr(lens, "undistort") and (grid is not None or hasattr(lens, "distort"))):
         raise ParameterError("lens", "must be a lens of foveasim.distortion", lens)
     check_choice("conserve", conserve, get_args(Conserve))
@@ -93,7 +93,7 @@ def distort_map(
     if grid is None:
         grid = _bounding_grid(power_map.grid, lens)
     elif not isinstance(grid, Grid):
-        raise ParameterError("grid", f"must be a Grid, got a {type(grid).__name__}")
+        raise ParameterError("grid", f"must be a Grid, got {type_name(grid)}")
     if math.prod(grid.shape) > MAX_CELLS:
         raise ParameterError("grid", f"must have at most {MAX_CELLS} cells", grid.shape, hint="reduce its shape")
     coefficients = [_spline(band, order) for band in power_map.data]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.provenance import differences
 from foveasim._io.atomic import lock
-from foveasim.errors import FileError, ParameterError
+from foveasim.errors import FileError, ParameterError, type_name
 
 __all__ = ["WORKER_LOST", "Journal", "Record", "Value", "check_same_plan", "check_unique", "journal_path", "to_values"]
 
@@ -78,7 +78,7 @@ def to_values(name: str, given: Any) -> dict[str, Scalar | Value]:
         labels = {str(dim): given.coords[dim].values for dim in given.dims if dim in given.coords}
         return {name: _value(name, given.values, dims, labels)}
     raise ParameterError(
-        name, f"must return a number, a string, a mapping, an array or a labelled array, got a {type(given).__name__}"
+        name, f"must return a number, a string, a mapping, an array or a labelled array, got {type_name(given)}"
     )
 
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from foveasim._core.rings import site_area_um2
 from foveasim._core.threads import thread_count
 from foveasim._core.validation import Floats, Ints, check_choice, check_count, finite_array, unmasked
-from foveasim.errors import GeometryError, ParameterError
+from foveasim.errors import GeometryError, ParameterError, type_name
 from foveasim.fields import Grid, PackedRings, PointMap
 from foveasim.integrate._outlines import Outlines, UndistortedOutlines, outlines_of
 from foveasim.integrate._plan import Plan, compile_plan
@@ -110,9 +110,9 @@ class Integrator:
     ) -> None:
         has_lattice = getattr(layout, "lattice", None) is not None
         if not has_lattice and not all(hasattr(layout, name) for name in ("xy_um", "ring_offsets", "site_offsets")):
-            raise ParameterError("layout", f"must be a Layout or packed rings, got a {type(layout).__name__}")
+            raise ParameterError("layout", f"must be a Layout or packed rings, got {type_name(layout)}")
         if not isinstance(grid, Grid):
-            raise ParameterError("grid", f"must be a Grid, got a {type(grid).__name__}")
+            raise ParameterError("grid", f"must be a Grid, got {type_name(grid)}")
         self.grid = grid
         self.order = check_count(
             "order", order, at_most=2, hint="use 1 for constant cells, 2 for cells with a gradient"
@@ -229,7 +229,7 @@ class Integrator:
         if cells.dtype.hasobject:
             raise ParameterError(
                 "power_map",
-                f"must be an array, got a {type(power_map).__name__}",
+                f"must be an array, got {type_name(power_map)}",
                 hint="pass the attribute .data of a PowerMap",
             )
         if cells.ndim < 2 or cells.shape[-2:] != self.grid.shape:

@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 
 from foveasim._core.validation import MAX_LENGTH_UM, as_numbers, check_length_um, finite_array
-from foveasim.errors import ParameterError
+from foveasim.errors import ParameterError, type_name
 
 __all__ = ["as_region", "disc", "parse_region", "region_as_plain_data"]
 
@@ -66,7 +66,7 @@ def as_region(name: str, region: Any) -> Any:
             raise ParameterError(name, f"must have the shape (n, 2) with n >= 3, got {vertices.shape}")
         outline = shapely.Polygon(vertices)
     if not isinstance(outline, shapely.Polygon | shapely.MultiPolygon):
-        raise ParameterError(name, f"must be a shapely Polygon or MultiPolygon, got a {type(outline).__name__}")
+        raise ParameterError(name, f"must be a shapely Polygon or MultiPolygon, got {type_name(outline)}")
     if outline.is_empty or not outline.is_valid or not outline.area > 0.0:
         raise ParameterError(name, "must be a valid polygon without self-intersections and with a positive area")
     if np.abs(outline.bounds).max() > MAX_LENGTH_UM:

@@ -13,7 +13,7 @@ import shapely
 from foveasim._core.calls import check_arguments
 from foveasim._core.provenance import to_plain_data
 from foveasim._core.registry import Registry
-from foveasim.errors import SimulationError
+from foveasim.errors import SimulationError, type_name
 from foveasim.layout.model import Layout
 from foveasim.layout.site_counts import SolveFor, layout_with_n_sites, select_unknown
 
@@ -78,7 +78,7 @@ def layout_family(
             else:
                 layout, given.arguments[unknown.name] = layout_with_n_sites(name, generate, unknown, given.arguments)
             if not isinstance(layout, Layout):
-                raise SimulationError(f"the layout family '{name}' must return a Layout, got a {type(layout).__name__}")
+                raise SimulationError(f"the layout family '{name}' must return a Layout, got {type_name(layout)}")
             if solve_for:
                 given.arguments["n_sites"] = None  # the value that was found reproduces the layout
             own = dict(layout.provenance)

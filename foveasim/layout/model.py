@@ -39,7 +39,7 @@ from foveasim._core.validation import (
     read_only,
     unmasked,
 )
-from foveasim.errors import GeometryError, ParameterError, printable
+from foveasim.errors import GeometryError, ParameterError, printable, type_name
 from foveasim.layout.lattice import RectangleLattice
 
 if TYPE_CHECKING:
@@ -701,13 +701,12 @@ def _pack_polygons(polygons: Any) -> tuple[Floats, Ints, Ints]:
     is_polygon = np.array([isinstance(g, shapely.Polygon) for g in geometries], bool)
     if not is_polygon.all():
         bad = int(np.flatnonzero(~is_polygon)[0])
-        kind = type(geometries[bad]).__name__
         is_geometry = isinstance(geometries[bad], shapely.Geometry)
         hint = (
             "pass each of its parts as a separate site" if is_geometry else "create one with shapely.Polygon(vertices)"
         )
         raise GeometryError(
-            f"site {bad} must be a shapely Polygon, got a {kind}; {hint}",
+            f"site {bad} must be a shapely Polygon, got {type_name(geometries[bad])}; {hint}",
             (bad,),
         )
     _require(shapely.is_empty(geometries), "is empty")

@@ -29,7 +29,7 @@ from foveasim._core.registry import import_all
 from foveasim._core.validation import freeze
 from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import as_file_error, detect_format, select_writer
-from foveasim.errors import FileError, ParameterError
+from foveasim.errors import FileError, ParameterError, type_name
 from foveasim.fields import Pitch, PowerMap
 from foveasim.maps import _dataset, _exr, _fits, _isetcam, _npy, _tiff  # noqa: F401 -- they register their formats
 from foveasim.maps._common import Found, Given, to_power_map
@@ -139,7 +139,7 @@ def write_power_map(power_map: PowerMap, path: str | Path) -> None:
     >>> write_power_map(power_map, "map.fits")  # doctest: +SKIP
     """
     if not isinstance(power_map, PowerMap):
-        raise ParameterError("power_map", f"must be a PowerMap, got a {type(power_map).__name__}")
+        raise ParameterError("power_map", f"must be a PowerMap, got {type_name(power_map)}")
     path = Path(path)
     form = select_writer(path, MAP_FORMATS)
     assert form.write is not None

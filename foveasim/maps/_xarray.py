@@ -10,7 +10,7 @@ import numpy as np
 from foveasim._core.extras import install_hint
 from foveasim._core.validation import Floats
 from foveasim._io.formats import FormatError
-from foveasim.errors import ParameterError
+from foveasim.errors import ParameterError, type_name
 from foveasim.fields import Grid, Pitch, PowerMap
 from foveasim.maps._common import Found, Given, pitch_of_axes, to_power_map
 from foveasim.maps._units import Unit, length_in_um
@@ -53,7 +53,7 @@ def to_xarray(power_map: PowerMap) -> xr.DataArray:
         If ``power_map`` is not a PowerMap, or xarray is missing.
     """
     if not isinstance(power_map, PowerMap):
-        raise ParameterError("power_map", f"must be a PowerMap, got a {type(power_map).__name__}")
+        raise ParameterError("power_map", f"must be a PowerMap, got {type_name(power_map)}")
     xr = _import_xarray()
     grid = power_map.grid
     return xr.DataArray(
@@ -104,7 +104,7 @@ def from_xarray(
     """
     xr = _import_xarray()
     if not isinstance(data_array, xr.DataArray):
-        raise ParameterError("data_array", f"must be an xarray.DataArray, got a {type(data_array).__name__}")
+        raise ParameterError("data_array", f"must be an xarray.DataArray, got {type_name(data_array)}")
     given = Given(
         pitch_um=pitch_um, wavelength_nm=wavelength_nm, band_width_nm=band_width_nm, unit=unit, origin_um=origin_um
     )

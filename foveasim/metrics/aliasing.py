@@ -42,6 +42,8 @@ STEPS_PER_INVERSE_DIAMETER = 2
 MAX_FREQUENCIES = 4096
 #: Default highest frequency in median Nyquist frequencies; the first peaks of a lattice are at 2.
 DEFAULT_MAX_NYQUISTS = 4.0
+#: Lowest contrast in plots.
+MIN_CONTRAST = 1e-4
 #: Minimum number of sites for a spectrum.
 MIN_SITES = 16
 #: Nonuniform FFT: width of the spreading kernel in cells of a grid with twofold oversampling, and its shape parameter (Barnett,
@@ -173,6 +175,24 @@ class AliasingSpectrum:
 
     __repr__ = short_repr
 
+    def plot(self, *, ax: Axes | None = None) -> Axes:
+        """Draw the contrast in dB, the Nyquist frequency as a circle, and wave and alias, on matplotlib axes."""
+        from matplotlib.patches import Circle
+
+        from foveasim.view import plot_image
+
+        half = self.frequency_per_mm[-1] + 0.5 * (self.frequency_per_mm[1] - self.frequency_per_mm[0])
+        contrast_db = 20.0 * np.log10(np.maximum(self.amplitude, MIN_CONTRAST))
+        labels = "$f_x$ / (line pairs per mm)", "$f_y$ / (line pairs per mm)"
+        ax = plot_image(contrast_db, (-half, -half, half, half), *labels, label="contrast / dB", ax=ax)
+        ax.add_patch(
+            Circle((0.0, 0.0), self.nyquist_per_mm, fill=False, color="white", linestyle="--", label="Nyquist")
+        )
+        for name, at_per_mm, marker in (("wave", self.wave_per_mm, "s"), ("alias", self.alias_per_mm, "o")):
+            ax.plot(*at_per_mm, marker, ms=12, mfc="none", mec="white", ls="none", label=name)
+        ax.legend(facecolor="#606060", labelcolor="white")
+        return ax
+
 
 def sampling_spectrum(
     layout: Layout,
@@ -262,6 +282,10 @@ def aliasing_spectrum(
     Notes
     -----
     Each site measures the exact mean of the wave over its polygon (:func:`polygon_otf`).
+
+    The disc should contain sites of similar size. Over a complete foveal layout, the spectrum is a mean over regions with
+    different aliases: these are spread over many frequencies, so that ``alias_fraction`` is far below that of each region, and
+    the median Nyquist frequency is far above that of the outer sites.
     """
     wave = finite_array("wave_per_mm", wave_per_mm, ndim=1)
     if wave.size != 2:

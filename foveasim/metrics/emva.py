@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, finite_array, read_only
-from foveasim.errors import FoveasimWarning, ParameterError
+from foveasim.errors import FoveasimWarning, ParameterError, type_name
 from foveasim.metrics.photon_transfer import (
     MIN_DARK_DN2,
     PhotonTransfer,
@@ -203,7 +203,7 @@ def emva1288(
     """
     for name, levels in (("frames", frames), ("dark", dark)):
         if not isinstance(levels, Iterable):
-            raise ParameterError(name, f"must be a list of levels, got a {type(levels).__name__}")
+            raise ParameterError(name, f"must be a list of levels, got {type_name(levels)}")
     frames, dark = list(frames), list(dark)
     transfer = photon_transfer(frames, classes=classes)
     dark_transfer = photon_transfer(dark, classes=classes)

@@ -29,7 +29,7 @@ from foveasim._core.validation import (
     read_only,
     unmasked,
 )
-from foveasim.errors import ParameterError
+from foveasim.errors import ParameterError, type_name
 from foveasim.sensor import Sensor
 from foveasim.sensor.adc import QUANTISATION_DN2
 
@@ -308,7 +308,7 @@ def photon_transfer(
         )
     measured, counts, n_sites = [], [], None
     if not isinstance(source, Iterable):
-        raise ParameterError("source", f"must be a foveasim.Sensor or a list of levels, got a {type(source).__name__}")
+        raise ParameterError("source", f"must be a foveasim.Sensor or a list of levels, got {type_name(source)}")
     for k, frames in enumerate(source):
         codes = codes_of(f"frames[{k}]", frames)
         if n_sites is None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.validation import Floats, Ints, check_choice, check_count, finite_array, read_only
-from foveasim.errors import ParameterError
+from foveasim.errors import ParameterError, type_name
 from foveasim.layout import Layout
 from foveasim.units import per_mm_from_per_um
 
@@ -297,7 +297,7 @@ def require_layout(layout: object) -> None:
         When it is not a :class:`foveasim.Layout`.
     """
     if not isinstance(layout, Layout):
-        raise ParameterError("layout", f"must be a foveasim.Layout, got a {type(layout).__name__}")
+        raise ParameterError("layout", f"must be a foveasim.Layout, got {type_name(layout)}")
 
 
 def _min_median_max(values: Floats, position: NDArray[np.intp], n_bins: int) -> tuple[Floats, Floats, Floats]:

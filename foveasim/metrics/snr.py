@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.validation import Bools, Floats, Ints, check_count, check_number, finite_array, read_only
 from foveasim.camera import Camera
 from foveasim.capture import Capture
-from foveasim.errors import ParameterError
+from foveasim.errors import ParameterError, type_name
 from foveasim.fields import PowerMap
 from foveasim.layout import Layout
 from foveasim.metrics.photon_transfer import SiteClasses, codes_of
@@ -371,7 +371,7 @@ def _build_adc(captures: Sequence[Capture], bits: int) -> ADC:
 
 def _sensor_and_layout(camera: Camera) -> tuple[Sensor, Layout]:
     if not isinstance(camera, Camera):
-        raise ParameterError("camera", f"must be a foveasim.Camera, got a {type(camera).__name__}")
+        raise ParameterError("camera", f"must be a foveasim.Camera, got {type_name(camera)}")
     assert isinstance(camera.sensor.layout, Layout)  # guaranteed by Camera
     return camera.sensor, camera.sensor.layout
 

@@ -18,7 +18,7 @@ from foveasim._core.validation import Floats, Ints, as_numbers, check_number, fi
 from foveasim._io.atomic import atomic_write, check_free_space
 from foveasim._io.formats import as_file_error
 from foveasim._io.npz import open_archive, write_archive
-from foveasim.errors import FileError, FoveasimWarning, ParameterError
+from foveasim.errors import FileError, FoveasimWarning, ParameterError, type_name
 from foveasim.layout import Layout
 from foveasim.layout.packed import OUTLINES, layout_from_arrays, layout_to_arrays
 from foveasim.modes import _hdf5
@@ -70,7 +70,7 @@ class Events:
 
     def __post_init__(self) -> None:
         if not isinstance(self.layout, Layout):
-            raise ParameterError("layout", f"must be a foveasim.Layout, got a {type(self.layout).__name__}")
+            raise ParameterError("layout", f"must be a foveasim.Layout, got {type_name(self.layout)}")
         t_s, site, polarity = (as_numbers(name, getattr(self, name), keep_type=True) for name in ARRAYS)
         for name, values, kind in (
             ("t_s", t_s, np.float64),
@@ -415,12 +415,12 @@ def _check_consecutive(name: str, batches: Iterable[Events]) -> Iterator[Events]
     """Yield batches after checking that they have one layout and are consecutive."""
     if isinstance(batches, Events) or not isinstance(batches, Iterable):
         hint = "pass a list of batches" if isinstance(batches, Events) else ""
-        raise ParameterError(name, f"must be batches of events, got a {type(batches).__name__}", hint=hint)
+        raise ParameterError(name, f"must be batches of events, got {type_name(batches)}", hint=hint)
     layout: Layout | None = None
     last_s = 0.0
     for batch in batches:
         if not isinstance(batch, Events):
-            raise ParameterError(name, f"must be Events, got a {type(batch).__name__}")
+            raise ParameterError(name, f"must be Events, got {type_name(batch)}")
         if layout is None:
             layout = batch.layout
         elif batch.layout is not layout and not all(

@@ -21,7 +21,7 @@ from foveasim._core.random_streams import fixed_pattern_key
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Floats, Ints, check_count, finite_array, read_only
-from foveasim.errors import ParameterError, SimulationError
+from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.layout import Layout
 from foveasim.modes.events import Events
 from foveasim.sensor import Sensor
@@ -394,16 +394,16 @@ class SpikingPixels:
 
 def _check_sensor(sensor: object) -> None:
     if not isinstance(sensor, Sensor):
-        raise ParameterError("sensor", f"must be a foveasim.Sensor, got a {type(sensor).__name__}")
+        raise ParameterError("sensor", f"must be a foveasim.Sensor, got {type_name(sensor)}")
     if not isinstance(sensor.layout, Layout):
-        raise ParameterError("sensor", f"must have a foveasim.Layout, got a {type(sensor.layout).__name__}")
+        raise ParameterError("sensor", f"must have a foveasim.Layout, got {type_name(sensor.layout)}")
 
 
 def _check_rates(rates: object) -> None:
     if not isinstance(rates, Iterable):
         raise ParameterError(
             "rates",
-            f"must be an iterable of frames with one rate per site, got a {type(rates).__name__}",
+            f"must be an iterable of frames with one rate per site, got {type_name(rates)}",
             hint="foveasim.Camera.rates computes them from scenes",
         )
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, check_choice, check_count, finite_array
-from foveasim.errors import ParameterError, SimulationError
+from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.layout import Layout
 from foveasim.sensor.limits import check_plausible
 
@@ -69,7 +69,7 @@ class Shutter:
 
     def __post_init__(self) -> None:
         if not isinstance(self.layout, Layout):
-            raise ParameterError("layout", f"must be a foveasim.Layout, got a {type(self.layout).__name__}")
+            raise ParameterError("layout", f"must be a foveasim.Layout, got {type_name(self.layout)}")
         object.__setattr__(self, "frame_s", check_plausible("frame_s", self.frame_s))
         object.__setattr__(self, "line_s", check_plausible("line_s", self.line_s))
         check_choice("between", self.between, ("hold", "linear"))
@@ -131,7 +131,7 @@ class Exposure:
 
     def __init__(self, shutter: Shutter, exposure_s: float) -> None:
         if not isinstance(shutter, Shutter):
-            raise ParameterError("shutter", f"must be a foveasim.modes.Shutter, got a {type(shutter).__name__}")
+            raise ParameterError("shutter", f"must be a foveasim.modes.Shutter, got {type_name(shutter)}")
         exposure_s = check_plausible("exposure_s", exposure_s)
         self._shutter, self.exposure_s = shutter, exposure_s
         self._last = shutter.last_frame(exposure_s)

@@ -24,7 +24,7 @@ from foveasim._core.validation import (
     read_only,
     wavelengths_nm,
 )
-from foveasim.errors import ParameterError, SamplingWarning
+from foveasim.errors import ParameterError, SamplingWarning, type_name
 from foveasim.fields import Grid, PowerMap, SceneLike
 from foveasim.optics._aperture import Aperture, Wavefront, overlaps
 from foveasim.optics._point_images import Point, PointImages
@@ -221,7 +221,7 @@ class Optics(PointImages):
         for name, kind in (("zernike", Zernike), ("seidel", Seidel), ("lateral_colour", LateralColour)):
             part = getattr(self, name)
             if part is not None and not isinstance(part, kind):
-                raise ParameterError(name, f"must be a foveasim.optics.{kind.__name__}, got a {type(part).__name__}")
+                raise ParameterError(name, f"must be a foveasim.optics.{kind.__name__}, got {type_name(part)}")
         if isinstance(self.pupil, Sequence):
             object.__setattr__(self, "pupil", tuple(self.pupil))
         if not all(_is_pupil(pupil) for pupil in self._pupils()):
@@ -302,7 +302,7 @@ class Optics(PointImages):
     def grid(self, scene: SceneLike) -> Grid:
         """Return the sensor-plane grid of the scene pixels, upright and centred on the axis."""
         if not hasattr(scene, "spectrum_w_m2_sr_nm"):
-            raise ParameterError("scene", f"must be a Scene, got a {type(scene).__name__}")
+            raise ParameterError("scene", f"must be a Scene, got {type_name(scene)}")
         shape = scene.basis.shape
         return Grid.centred((shape[1], shape[2]), _pitch_um(scene) * self.magnification(scene.distance_m))
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,10 +31,13 @@ from foveasim._core.validation import (
     own,
     read_only,
 )
-from foveasim.errors import ParameterError
+from foveasim.errors import ParameterError, type_name
 from foveasim.fields import Grid
 from foveasim.layout import Layout
 from foveasim.reconstruct.picture import Picture
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["CorticalImage", "cortical", "from_cortical", "to_cortical"]
 
@@ -65,6 +69,8 @@ class CorticalImage:
         Rings are equidistant in ``log(r + offset_um)``, for the interpolation between them.
     sites : (n_ring, n_sector) int64, optional
         Site of each pixel; None for resampled images.
+    white : (n_channel,) float64, optional
+        Values of white, as of :class:`foveasim.Picture`.
     """
 
     data: Images
@@ -73,6 +79,7 @@ class CorticalImage:
     centre_um: tuple[float, float] = (0.0, 0.0)
     offset_um: float = 0.0
     sites: Ints | None = None
+    white: Floats | None = None
 
     __repr__ = short_repr
 
@@ -91,6 +98,17 @@ class CorticalImage:
             raise ParameterError("sites", f"must have the shape {data.shape[1:]}", list(np.shape(self.sites)))
         for name, values in (("data", data), ("radius_um", radius_um), ("start_rad", start_rad)):
             object.__setattr__(self, name, own(values))
+
+    def plot(self, channel: int | None = None, **options: Any) -> Axes:
+        """Draw on matplotlib axes; see :func:`foveasim.view.plot_cortical`."""
+        from foveasim.view import plot_cortical
+
+        return plot_cortical(self, channel, **options)
+
+    def _repr_html_(self) -> str:
+        from foveasim.view import to_html
+
+        return to_html(self)
 
     @property
     def ring_centre_um(self) -> Floats:
@@ -146,7 +164,7 @@ def cortical(layout: Layout, values: ArrayLike) -> CorticalImage:
         When the layout does not have two or more concentric rings of equal sectors, or there is not one value per site.
     """
     if not isinstance(layout, Layout):
-        raise ParameterError("layout", f"must be a foveasim.Layout, got a {type(layout).__name__}")
+        raise ParameterError("layout", f"must be a foveasim.Layout, got {type_name(layout)}")
     channels = np.atleast_2d(as_numbers("values", values, missing_is_nan=True))
     if channels.ndim != 2 or channels.shape[1] != layout.n_sites:
         raise ParameterError("values", f"must have the shape (..., {layout.n_sites}), got {np.shape(values)}")
@@ -230,7 +248,7 @@ def to_cortical(
     from scipy.ndimage import map_coordinates
 
     if not isinstance(picture, Picture):
-        raise ParameterError("picture", f"must be a foveasim.Picture, got a {type(picture).__name__}")
+        raise ParameterError("picture", f"must be a foveasim.Picture, got {type_name(picture)}")
     n_rings = check_count("n_rings", n_rings, at_most=MAX_SIDE)
     n_sectors = check_count("n_sectors", n_sectors, at_most=MAX_SIDE)
     centre = _centre(centre_um)
@@ -264,7 +282,12 @@ def to_cortical(
         sums = map_coordinates(np.where(is_known, plane, 0.0), (y, x), order=1, mode="constant", cval=0.0)
         channel[:] = np.divide(sums, weights, out=np.full(sums.shape, np.nan), where=weights >= MIN_KNOWN)
     return CorticalImage(
-        data=data, radius_um=edges_um, start_rad=image.start_rad, centre_um=centre, offset_um=offset_um
+        data=data,
+        radius_um=edges_um,
+        start_rad=image.start_rad,
+        centre_um=centre,
+        offset_um=offset_um,
+        white=picture.white,
     )
 
 
@@ -292,7 +315,7 @@ def from_cortical(image: CorticalImage, grid: Grid, *, method: str = "linear") -
         When an argument is invalid.
     """
     if not isinstance(image, CorticalImage):
-        raise ParameterError("image", f"must be a CorticalImage, got a {type(image).__name__}")
+        raise ParameterError("image", f"must be a CorticalImage, got {type_name(image)}")
     check_choice("method", method, ("linear", "nearest"))
     x_um, y_um = np.meshgrid(grid.x_um - image.centre_um[0], grid.y_um - image.centre_um[1])
     r_um, angle_rad = np.hypot(x_um, y_um), np.arctan2(y_um, x_um)
@@ -319,7 +342,7 @@ def from_cortical(image: CorticalImage, grid: Grid, *, method: str = "linear") -
                 weights += known * (part * weight)
         data[:, row, column] = np.divide(total, weights, out=np.full(total.shape, np.nan), where=weights >= MIN_KNOWN)
     coverage = np.isfinite(data).any(axis=0)
-    return Picture(read_only(data.astype(np.float32)), read_only(coverage.astype(np.float32)), grid)
+    return Picture(read_only(data.astype(np.float32)), read_only(coverage.astype(np.float32)), grid, image.white)
 
 
 def _sites_of_rings(layout: Layout) -> Ints:

@@ -46,16 +46,31 @@ class Picture:
         Fraction of each pixel that photosites cover.
     grid : Grid
         Pixels in the sensor plane.
+    white : (n_channel,) float64, optional
+        Values of white in each channel, up to a common factor, for the white balance of colours.
+
+    Raises
+    ------
+    ParameterError
+        When there is not one positive white per channel.
     """
 
     data: Images
     coverage: Images
     grid: Grid
+    white: Floats | None = None
 
     def __post_init__(self) -> None:
         for name, missing_is_nan in (("data", True), ("coverage", False)):
             values = unmasked(name, getattr(self, name), missing_is_nan=missing_is_nan)
             object.__setattr__(self, name, own(np.asarray(values)))
+        if self.white is not None:
+            white = finite_array("white", self.white, ndim=1, above=0.0)
+            if white.size != self.data.shape[0]:
+                raise ParameterError(
+                    "white", f"must be one number for each of the {self.data.shape[0]} channels", white
+                )
+            object.__setattr__(self, "white", own(white))
 
     def __repr__(self) -> str:
         n_channels, n_y, n_x = self.data.shape
@@ -94,7 +109,8 @@ class Picture:
         Parameters
         ----------
         white : number or (n_channel,), optional
-            Values that map to the largest integer; by default the largest value of the picture.
+            Values that map to the largest integer; by default the largest value of the picture, or, for a picture with
+            ``white``, the smallest multiple of it that no value exceeds.
         encode_srgb : bool
             Whether to encode linear values with the sRGB transfer function.
         bits : {8, 16}
@@ -119,7 +135,8 @@ class Picture:
         if bits not in (8, 16):
             raise ParameterError("bits", "must be 8 or 16", bits)
         if white is None:
-            white = float(np.nanmax(self.data, initial=0.0)) or 1.0
+            balance = np.ones(1) if self.white is None else self.white
+            white = balance * (float(np.nanmax(self.data / self._levels(balance), initial=0.0)) or 1.0)
         fraction = np.clip(np.nan_to_num(self.data) / self._levels(white), 0.0, 1.0)
         if encode_srgb:
             fraction = encode_srgb_values(fraction)

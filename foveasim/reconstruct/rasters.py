@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from foveasim._core.validation import Floats, check_count, finite_array, read_only
-from foveasim.errors import ParameterError
+from foveasim.errors import ParameterError, type_name
 from foveasim.fields import Grid, PowerMap
 from foveasim.optics import Optics
 from foveasim.reconstruct.picture import Picture
@@ -104,7 +104,7 @@ def blur_kernel(
     averaged exactly over both the emitting and the receiving pixel.
     """
     if not isinstance(optics, Optics):
-        raise ParameterError("optics", f"must be a foveasim.Optics, got a {type(optics).__name__}")
+        raise ParameterError("optics", f"must be a foveasim.Optics, got {type_name(optics)}")
     shorter_um = min(grid.pitch_x_um, grid.pitch_y_um)
     if radius is None:
         radii = np.arange(1, MAX_RADIUS + 1)

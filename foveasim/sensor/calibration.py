@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Bools, Floats, as_numbers, check_count, check_number, finite_array, own, unmasked
-from foveasim.errors import ParameterError, SimulationError
+from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.sensor.adc import QUANTISATION_DN2
 from foveasim.sensor.effects.crosstalk import Neighbourhood
 from foveasim.sensor.limits import check_plausible, check_plausible_array
@@ -650,4 +650,4 @@ def _sparsity_pattern(matrix: Any) -> csr_array[Any]:
 
 def _require_sensor(sensor: object) -> None:
     if not isinstance(sensor, Sensor):
-        raise ParameterError("sensor", f"must be a foveasim.Sensor, got a {type(sensor).__name__}")
+        raise ParameterError("sensor", f"must be a foveasim.Sensor, got {type_name(sensor)}")

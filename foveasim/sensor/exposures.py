@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.random_streams import Streams
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, Ints, as_numbers, own, unmasked
-from foveasim.errors import ParameterError
+from foveasim.errors import ParameterError, type_name
 from foveasim.sensor.calibration import Calibration, linearise, nominal_e_per_dn
 from foveasim.sensor.chain import apply_steps
 from foveasim.sensor.effects.shot import MAX_CHARGE_E, ROUNDING_E2, draw_shot_noise
@@ -249,7 +249,7 @@ def non_destructive_reads(
     """
     times = _check_increasing("times_s", times_s)
     if not isinstance(sensor, Sensor):
-        raise ParameterError("sensor", f"must be a foveasim.Sensor, got a {type(sensor).__name__}")
+        raise ParameterError("sensor", f"must be a foveasim.Sensor, got {type_name(sensor)}")
     n_sites = sensor.layout.n_sites
     photo = check_plausible_array("photo_e_per_s", photo_e_per_s)
     if photo.shape not in ((), (n_sites,)):

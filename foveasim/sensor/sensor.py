@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.names import possible_names
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Floats, Ints, check_count, check_number, read_only, unmasked
-from foveasim.errors import ParameterError, SimulationError
+from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.sensor.adc import ADC, Companding, ConversionTables
 from foveasim.sensor.blocks import for_each_block
 from foveasim.sensor.chain import (
@@ -194,7 +194,7 @@ class Sensor:
 
     def __post_init__(self) -> None:
         if not all(hasattr(self.layout, name) for name in ("n_sites", "channel", "columns")):
-            raise ParameterError("layout", f"must be a Layout, got a {type(self.layout).__name__}")
+            raise ParameterError("layout", f"must be a Layout, got {type_name(self.layout)}")
         if isinstance(self.qe, list | tuple):
             object.__setattr__(self, "qe", tuple(self.qe))
         elif not callable(self.qe):

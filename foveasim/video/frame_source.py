@@ -18,7 +18,7 @@ from foveasim._core.extras import needs
 from foveasim._core.names import missing_path, possible_names
 from foveasim._core.validation import check_count, check_number
 from foveasim._io.images import PICTURE_EXTENSIONS, check_picture_size, picture_names
-from foveasim.errors import FileError, ParameterError, printable
+from foveasim.errors import FileError, ParameterError, printable, type_name
 from foveasim.scene import Scene
 
 __all__ = ["FrameSource", "list_pictures"]
@@ -82,7 +82,7 @@ class FrameSource:
         **scene: Any,
     ) -> None:
         if template is not None and not isinstance(template, Scene):
-            raise ParameterError("template", f"must be a Scene, got a {type(template).__name__}")
+            raise ParameterError("template", f"must be a Scene, got {type_name(template)}")
         if template is not None and template.basis.shape[0] not in (1, 3):
             raise ParameterError("template", f"must have 1 or 3 basis images, got {template.basis.shape[0]}")
         if template is not None and set(scene) - {"encoding"}:
@@ -113,7 +113,7 @@ class FrameSource:
             self._source = _SinglePass(source) if isinstance(source, Iterator) else source
             self._n_source = len(source) if isinstance(source, Sized) else None
         else:
-            raise ParameterError("source", f"must be a path or an iterable of pictures, got a {type(source).__name__}")
+            raise ParameterError("source", f"must be a path or an iterable of pictures, got {type_name(source)}")
         if frame_s is not None:
             period_s = check_number("frame_s", frame_s, above=0.0)
         self._frame_s = None if period_s is None else period_s * (self._step if frame_s is None else 1)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from foveasim._core.random_streams import Streams
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, check_number, check_shape, finite_array, read_only
-from foveasim.errors import ParameterError
+from foveasim.errors import ParameterError, type_name, with_article
 from foveasim.fields import PowerMap
 from foveasim.optics import Optics
 from foveasim.scene import Scene
@@ -249,5 +249,5 @@ def _parts(
 def _check_types(*arguments: tuple[str, object, tuple[type, ...]]) -> None:
     for name, value, types in arguments:
         if not isinstance(value, types):
-            class_names = " or ".join(type_.__name__ for type_ in types)
-            raise ParameterError(name, f"must be a {class_names}, got a {type(value).__name__}")
+            class_names = " or ".join(with_article(type_.__name__) for type_ in types)
+            raise ParameterError(name, f"must be {class_names}, got {type_name(value)}")

@@ -23,7 +23,7 @@ from foveasim._io.atomic import atomic_directory, lock, remove_directory
 from foveasim._io.formats import as_file_error
 from foveasim._io.zarr_stores import ZARR, check_codecs
 from foveasim.capture import Capture
-from foveasim.errors import FileError, ParameterError
+from foveasim.errors import FileError, ParameterError, type_name
 from foveasim.layout import Layout
 from foveasim.layout.packed import layout_to_arrays
 
@@ -217,7 +217,7 @@ def check_consistent(captures: Iterable[Capture], *, n_before: int = 0) -> Itera
     first: tuple[int, int] | None = None
     for capture in captures:
         if not isinstance(capture, Capture):
-            raise ParameterError("captures", f"must be Captures, got a {type(capture).__name__}")
+            raise ParameterError("captures", f"must be Captures, got {type_name(capture)}")
         kind = capture.layout.n_sites, capture.bits
         first = kind if first is None else first
         if kind != first:

@@ -14,7 +14,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import UNIT_SUFFIXES, Floats, Ints, as_numbers, finite_array, own, unmasked
 from foveasim._io.encodings import decode, encode_srgb_values
 from foveasim.capture import Capture
-from foveasim.errors import ParameterError
+from foveasim.errors import ParameterError, type_name
 from foveasim.layout import Layout
 
 __all__ = [
@@ -205,7 +205,7 @@ def colours_of(data: Layout | Capture, by: str | ArrayLike | None = None, *, lab
     capture = data if isinstance(data, Capture) else None
     layout = data if capture is None else capture.layout
     if not isinstance(layout, Layout):
-        raise ParameterError("data", f"must be a Layout or a Capture, got a {type(data).__name__}")
+        raise ParameterError("data", f"must be a Layout or a Capture, got {type_name(data)}")
     if by is None and capture is None:
         return SiteColours(np.array(SHADES, np.uint8)[_pseudo_random(layout.n_sites, len(SHADES))])
     by = "code" if by is None else by

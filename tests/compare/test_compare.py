@@ -139,7 +139,7 @@ def cameras_of(layout, **optics):
     [
         (lambda one: {"a": one}, "must be at least two, got 1"),
         (lambda one: [one, one], "must be a mapping of names to cameras, got a list"),
-        (lambda one: {"a": one, "b": 3}, "must be cameras, got a int for 'b'"),
+        (lambda one: {"a": one, "b": 3}, "must be cameras, got an int for 'b'"),
         (
             lambda one: {"a": one, "b": cameras_of(one.sensor.layout, f_number=2.0)},
             "must have the same optics: those of 'a' and 'b' differ",

@@ -255,7 +255,7 @@ def test_result_is_independent_of_piece_size(monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"power_map": np.ones((2, 2))}, r"'power_map' must be a PowerMap, got a ndarray"),
+        ({"power_map": np.ones((2, 2))}, r"'power_map' must be a PowerMap, got an ndarray"),
         ({"lens": None}, r"'lens' must be a lens of foveasim\.distortion"),
         ({"grid": (3, 3)}, r"'grid' must be a Grid, got a tuple"),
         ({"conserve": "energy"}, r"'conserve' must be one of 'flux', 'density', got 'energy'"),

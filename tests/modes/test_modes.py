@@ -650,7 +650,7 @@ def test_mismatched_or_missing_batches_are_rejected(join, tmp_path, monkeypatch)
         ([one, Events([0.5], [0], [1], layout)], "must be consecutive in time"),
         (one, "got a Events; pass a list of batches"),
         (None, "got a NoneType"),
-        ([one, 3], "must be Events, got a int"),
+        ([one, 3], "must be Events, got an int"),
         ([], "at least one batch"),
     ):
         with pytest.raises(ParameterError, match=message):

@@ -309,7 +309,7 @@ def test_frames_of_other_types_are_rejected():
         list(camera.video([np.ones((3, 3))], exposure_s=0.01, seed=0))
     with pytest.raises(ParameterError, match="pairs"):
         list(camera.video([(scene_of(pictures(1)[0]), 1.0, 2.0)], exposure_s=0.01, seed=0))
-    with pytest.raises(ParameterError, match="'frames' must be an iterable of Scenes or PowerMaps, got a int"):
+    with pytest.raises(ParameterError, match="'frames' must be an iterable of Scenes or PowerMaps, got an int"):
         camera.rates(5)
     with pytest.raises(ParameterError, match="got a Scene; put a single one into a list"):
         camera.rates(scene_of(pictures(1)[0]))
@@ -441,7 +441,7 @@ def test_invalid_gaze_arguments_are_rejected():
         saccades(duration_s=1e300, frame_s=1e-300, size_um=(1.0, 1.0), seed=0)
     scene, path = scene_of(pictures(1)[0]), GazePath(np.zeros(1), np.zeros((1, 2)))
     for source, gaze, message in (
-        (None, path, "'source' must be a Scene or PowerMap"),
+        (None, path, "'source' must be a Scene or a PowerMap"),
         (scene, None, "'path' must be a GazePath"),
     ):
         with pytest.raises(ParameterError, match=message):

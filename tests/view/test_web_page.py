@@ -200,7 +200,7 @@ def test_page_loads_no_external_resources():
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (lambda: web_page(3), ParameterError, "'data' must be a Layout or a Capture, got a int"),
+        (lambda: web_page(3), ParameterError, "'data' must be a Layout or a Capture, got an int"),
         (lambda: web_page(MIXED_LAYOUT[:0]), GeometryError, "the layout has no sites"),
         (
             lambda: web_page(MIXED_LAYOUT, report="none"),
@@ -1746,7 +1746,7 @@ def test_second_capture_shares_view_and_scale(visit):
 @pytest.mark.parametrize(
     ("second", "message"),
     [
-        (3, "'second' must be a Capture, got a int"),
+        (3, "'second' must be a Capture, got an int"),
         (capture_of(fs.layout.grid(n_x=2, n_y=2, pitch_um=1.0), ("all",)), "'second' must be a capture of this layout of 120 sites, got one of 4 sites"),
     ],
 )  # fmt: skip
@@ -1774,5 +1774,5 @@ def test_optical_image_shares_cursor(visit):
     box = page.locator("#picture").bounding_box()
     page.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 0.45 * box["height"])
     assert page.evaluate("foveasim.hovered") == site_at(MOSAIC, 6.0, 2.0)
-    with pytest.raises(ParameterError, match="'optical_image' must be a PowerMap, got a ndarray"):
+    with pytest.raises(ParameterError, match="'optical_image' must be a PowerMap, got an ndarray"):
         web_page(CAPTURE, optical_image=light)

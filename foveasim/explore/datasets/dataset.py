@@ -23,7 +23,15 @@ from foveasim._core.user_warnings import warn
 from foveasim._core.validation import check_choice, check_count
 from foveasim.capture import Capture
 from foveasim.config import Shot, Source, build_shot, check_settings, put_setting, resolve_files
-from foveasim.errors import ConfigError, FileError, FoveasimError, FoveasimWarning, ParameterError, SimulationError
+from foveasim.errors import (
+    ConfigError,
+    FileError,
+    FoveasimError,
+    FoveasimWarning,
+    ParameterError,
+    SimulationError,
+    type_name,
+)
 from foveasim.explore._files import digests
 from foveasim.explore.datasets.distributions import MAX_INTEGER, MIN_INTEGER, Distribution, parse_distribution
 from foveasim.explore.datasets.labels import (
@@ -504,7 +512,7 @@ def _base_settings(
     The referenced files are appended to ``found``.
     """
     if not isinstance(shot, str | Path | Mapping):
-        raise ParameterError("shot", f"must be a settings file or a mapping of settings, got a {type(shot).__name__}")
+        raise ParameterError("shot", f"must be a settings file or a mapping of settings, got {type_name(shot)}")
     source, data = locate_shot(own, shot)
     data = _copy(data)
     scene = data.get("scene")
@@ -532,7 +540,7 @@ def _to_plain_data(value: Any) -> Any:
         return value.tolist()
     if isinstance(value, Path):
         return str(value)
-    raise TypeError(f"got a {type(value).__name__}")
+    raise TypeError(f"got {type_name(value)}")
 
 
 def _parse_distributions(

@@ -14,7 +14,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats, Ints, finite_array
 from foveasim._io.images import read_picture
 from foveasim.distortion import Lens
-from foveasim.errors import FileError, ParameterError
+from foveasim.errors import FileError, ParameterError, type_name
 from foveasim.fields import Grid, from_file_rows
 from foveasim.integrate import Integrator
 
@@ -320,7 +320,7 @@ def check_per_picture(name: str, given: Any, n: int) -> Sequence[Any]:
         When the object is not a sequence, or has another length.
     """
     if isinstance(given, str | bytes) or not (hasattr(given, "__len__") and hasattr(given, "__getitem__")):
-        raise ParameterError(name, f"must be a sequence with one item per picture, got a {type(given).__name__}")
+        raise ParameterError(name, f"must be a sequence with one item per picture, got {type_name(given)}")
     if len(given) != n:
         raise ParameterError(name, f"must have one item for each of the {n} pictures, got {len(given)}")
     sequence: Sequence[Any] = given

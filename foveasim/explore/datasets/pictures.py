@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.names import missing_path
 from foveasim._io.images import PICTURE_EXTENSIONS, picture_names, pixels_of_image, read_picture
-from foveasim.errors import FileError, ParameterError
+from foveasim.errors import FileError, ParameterError, type_name
 from foveasim.explore._files import digests
 
 __all__ = ["Source", "digest_of", "is_lazy", "source_of"]
@@ -84,8 +84,9 @@ def source_of(pictures: Any) -> Source:
     if isinstance(pictures, np.ndarray):
         return _Array(pictures)
     if isinstance(pictures, Mapping) or not (hasattr(pictures, "__len__") and hasattr(pictures, "__getitem__")):
-        kind = type(pictures).__name__
-        raise ParameterError("pictures", f"must be a directory, a zip file, an array, or a sequence, got a {kind}")
+        raise ParameterError(
+            "pictures", f"must be a directory, a zip file, an array, or a sequence, got {type_name(pictures)}"
+        )
     return _Items(pictures)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from foveasim._core.names import possible_names
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, check_choice, check_count, check_number, finite_array
-from foveasim.errors import GeometryError, ParameterError
+from foveasim.errors import GeometryError, ParameterError, type_name, with_article
 from foveasim.layout.drc.measurements import RULES, Case, Measurement, Rule, min_width_um
 from foveasim.layout.drc.presets import PRESETS
 from foveasim.layout.drc.routing import Readout, Routing
@@ -166,7 +166,7 @@ class DesignRules:
             if value is None and getattr(self, name) is not None:
                 raise ParameterError(required, f"must be given for '{name}'")
             if kind is not None and value is not None and not isinstance(value, kind):
-                raise ParameterError(required, f"must be a {kind.__name__}", value)
+                raise ParameterError(required, f"must be {with_article(kind.__name__)}", value)
         if self.die_um is not None:
             die = finite_array("die_um", self.die_um, ndim=1)
             if die.size != 4 or not (die[0] < die[2] and die[1] < die[3]):
@@ -455,7 +455,7 @@ def check(layout: Layout, rules: DesignRules) -> Report:
         One result per rule with a limit.
     """
     if not isinstance(rules, DesignRules):
-        raise ParameterError("rules", f"must be DesignRules, got a {type(rules).__name__}")
+        raise ParameterError("rules", f"must be DesignRules, got {type_name(rules)}")
     case = Case(layout, rules)
     results = []
     for name, limit in rules.limits().items():

@@ -27,7 +27,7 @@ from foveasim._core.validation import (
     check_pitch_um,
     finite_array,
 )
-from foveasim.errors import ParameterError, SimulationError
+from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.sensor.blocks import for_each_block
 from foveasim.sensor.effects.contract import Effect, Sites, Stage
 
@@ -616,7 +616,7 @@ def _gap_um(max_gap_um: object) -> float | None:
 
 def _require_layout(layout: object) -> None:
     if not all(hasattr(layout, name) for name in ("n_sites", "area_um2", "centroid_um", "adjacency")):
-        raise ParameterError("layout", f"must be a Layout, got a {type(layout).__name__}")
+        raise ParameterError("layout", f"must be a Layout, got {type_name(layout)}")
 
 
 def _shared_um(layout: Neighbourhood, shared_um: csr_array[Any] | None, max_gap_um: float | None) -> csr_array[Any]:

@@ -17,7 +17,7 @@ from foveasim.errors import ParameterError
 from foveasim.fields import PowerMap
 from foveasim.layout import Layout, Report, Summary
 from foveasim.optics import Optics
-from foveasim.reconstruct import Picture
+from foveasim.reconstruct import CorticalImage, Picture
 from foveasim.scene import Scene
 from foveasim.sensor import Sensor
 from foveasim.view.notebook._blocks import Html, bar, escape, facts, panel, swatch, table
@@ -28,7 +28,7 @@ from foveasim.view.notebook._thumbnails import (
     site_thumbnail,
     thumbnail,
 )
-from foveasim.view.plots.rasters import picture_pixels, power_map_pixels, scene_pixels
+from foveasim.view.plots.rasters import cortical_pixels, picture_pixels, power_map_pixels, scene_pixels
 from foveasim.view.plots.rules import RULE_COLOURS
 from foveasim.view.site_colours import title_of
 
@@ -46,8 +46,8 @@ def to_html(item: Any) -> str:
     Parameters
     ----------
     item : object
-        A layout, capture, sensor, camera, scene, power map, picture, lens, summary, report of design rules, or a table: an
-        object with the method ``records``.
+        A layout, capture, sensor, camera, scene, power map, picture, log-polar image, lens, summary, report of design rules,
+        or a table: an object with the method ``records``.
 
     Returns
     -------
@@ -264,6 +264,25 @@ def _picture(picture: Picture) -> str:
     return panel(
         repr(picture), thumbnail(picture_pixels(picture, THUMBNAIL_PIXELS), f"Picture of {n_x} x {n_y} pixels")
     )
+
+
+@to_html.register
+def _cortical_image(image: CorticalImage) -> str:
+    n_channels, n_rings, n_sectors = image.data.shape
+    title = f"Log-polar image of {n_rings:,} rings and {n_sectors:,} sectors"
+    values = image.data[np.isfinite(image.data)]
+    x_um, y_um = image.centre_um
+    rows = {
+        "values": f"{values.min():.4g} to {values.max():.4g}" if values.size else "none",
+        "channels": f"{n_channels}",
+        "radii": f"{image.radius_um[0]:.4g} to {image.radius_um[-1]:.4g} µm",
+        "centre": f"({round(x_um, 6) + 0.0:g}, {round(y_um, 6) + 0.0:g}) µm",
+        "pixels": "resampled" if image.sites is None else "one per photosite",
+    }
+    pixels = thumbnail(
+        cortical_pixels(image, THUMBNAIL_PIXELS), title, "angles from 0 to 360° along x, outermost ring at the top"
+    )
+    return panel(title, pixels, facts(rows))
 
 
 @to_html.register

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from foveasim.view.plots.figures import hidden_figures
-from foveasim.view.plots.rasters import plot_picture, plot_power_map, plot_scene
+from foveasim.view.plots.rasters import plot_cortical, plot_image, plot_picture, plot_power_map, plot_scene
 from foveasim.view.plots.rules import plot_report
 from foveasim.view.plots.sites import (
     plot_capture,
@@ -17,7 +17,9 @@ from foveasim.view.plots.sites import (
 __all__ = [
     "hidden_figures",
     "plot_capture",
+    "plot_cortical",
     "plot_curves",
+    "plot_image",
     "plot_layout",
     "plot_noise_budget",
     "plot_picture",

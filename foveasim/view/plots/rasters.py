@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from foveasim._core.validation import Floats, check_count
 from foveasim._io.encodings import encode_srgb_values
 from foveasim.errors import ParameterError
-from foveasim.fields import PowerMap, to_file_rows
-from foveasim.reconstruct import Picture
+from foveasim.fields import Grid, PowerMap, to_file_rows
+from foveasim.reconstruct import CorticalImage, Picture
 from foveasim.scene import Scene
 from foveasim.sensor import rgb_filters
 from foveasim.view.plots.figures import new_axes
@@ -20,12 +20,24 @@ from foveasim.view.site_colours import BACKGROUND, as_fractions
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["picture_pixels", "plot_picture", "plot_power_map", "plot_scene", "power_map_pixels", "scene_pixels"]
+__all__ = [
+    "cortical_pixels",
+    "picture_pixels",
+    "plot_cortical",
+    "plot_image",
+    "plot_picture",
+    "plot_power_map",
+    "plot_scene",
+    "power_map_pixels",
+    "scene_pixels",
+]
 
 #: Pixels along the longer side of a plot; larger rasters are averaged.
 PLOT_PIXELS = 1600
 #: Filter transmission below which bands have no colour, such as those of infrared.
 MIN_TRANSMISSION = 1e-3
+#: Number of labelled radii of a log-polar image.
+RADIUS_LABELS = 7
 #: Units of the axes of scenes: the smallest in which the longer side is below a thousand.
 LENGTH_UNITS = (("µm", 1.0), ("mm", 1e3), ("m", 1e6), ("km", 1e9))
 
@@ -94,7 +106,7 @@ def plot_power_map(
     shown = power_map.data if band is None else power_map.data[band : band + 1]
     irradiance_w_m2 = block_means(shown, PLOT_PIXELS).sum(axis=0)
     label = "irradiance / (W/m²)" if band is None else f"irradiance at {power_map.wavelength_nm[band]:g} nm / (W/m²)"
-    return _draw_values(to_file_rows(irradiance_w_m2), power_map.grid.bounds_um, label, "viridis", ax, figure_inches)
+    return _draw_values(irradiance_w_m2, power_map.grid.bounds_um, label, "viridis", ax, figure_inches)
 
 
 def plot_picture(
@@ -142,8 +154,102 @@ def plot_picture(
     if n_channels > 1 and channel is None:
         raise ParameterError("channel", f"must be given for a picture of {n_channels} channels")
     channel = check_count("channel", 0 if channel is None else channel, at_least=0, at_most=n_channels - 1)
-    values = to_file_rows(picture.data[channel])
-    return _draw_values(values, picture.grid.bounds_um, "value", "gray", ax, figure_inches)
+    return _draw_values(picture.data[channel], picture.grid.bounds_um, "value", "gray", ax, figure_inches)
+
+
+def plot_image(
+    values: NDArray[Any],
+    bounds: tuple[float, float, float, float],
+    x_label: str,
+    y_label: str,
+    *,
+    label: str = "",
+    colour_map: str = "viridis",
+    ratio: float | None = None,
+    ax: Axes | None = None,
+    figure_inches: float = 8.0,
+) -> Axes:
+    """
+    Draw an array as an image with labelled axes, such as results of :mod:`foveasim.metrics`.
+
+    Parameters
+    ----------
+    values : (n_y, n_x), or (n_y, n_x, 3 or 4) uint8
+        Lowest row first; numbers have a colour bar, NaN is transparent.
+    bounds : (x_min, y_min, x_max, y_max)
+        Outer edges of the image in the units of the axes.
+    x_label, y_label : str
+        Quantity and unit of the axes.
+    label : str
+        Quantity and unit of the values.
+    colour_map : str
+        Name of a matplotlib colour map.
+    ratio : float, optional
+        Height over width of the image; by default x and y have the same scale.
+    ax : matplotlib axes, optional
+        New axes by default.
+    figure_inches : float
+        Longer side of a new figure.
+
+    Returns
+    -------
+    matplotlib axes
+    """
+    x0, y0, x1, y1 = bounds
+    height_over_width = (y1 - y0) / (x1 - x0)
+    ax = new_axes(figure_inches, ratio or height_over_width) if ax is None else ax
+    aspect = 1.0 if ratio is None else ratio / height_over_width
+    image = ax.imshow(values, cmap=colour_map, extent=(x0, x1, y0, y1), origin="lower", aspect=aspect)
+    if np.ndim(values) == 2:
+        ax.figure.colorbar(image, ax=ax, label=label, shrink=0.8, aspect=30.0, pad=0.02)
+    ax.set(xlabel=x_label, ylabel=y_label, facecolor=as_fractions(BACKGROUND))
+    return ax
+
+
+def plot_cortical(
+    image: CorticalImage, channel: int | None = None, *, ax: Axes | None = None, figure_inches: float = 8.0
+) -> Axes:
+    """
+    Draw a log-polar image: angles along x, rings along y, the innermost ring at the bottom.
+
+    Parameters
+    ----------
+    image : CorticalImage
+    channel : int, optional
+        Draws the values of one channel, with a colour bar, as for images of one channel. Required for images of neither 1 nor
+        3 channels; images of 3 channels are shown in colours.
+    ax : matplotlib axes, optional
+        New axes by default.
+    figure_inches : float
+        Longer side of a new figure.
+
+    Returns
+    -------
+    matplotlib axes
+        In degrees and rings, with radii as labels of the rings. Staggered rings are shifted by half a sector.
+
+    Raises
+    ------
+    ParameterError
+        When there is no such channel.
+    """
+    n_channels, n_rings, n_sectors = image.data.shape
+    if n_channels not in (1, 3) and channel is None:
+        raise ParameterError("channel", f"must be given for an image of {n_channels} channels")
+    if n_channels == 3 and channel is None:
+        values: NDArray[Any] = cortical_pixels(image, PLOT_PIXELS)[::-1]
+    else:
+        shown = check_count("channel", 0 if channel is None else channel, at_least=0, at_most=n_channels - 1)
+        values = _unrolled(image)[shown]
+    bounds = (0.0, 0.0, 360.0, float(n_rings))
+    ax = plot_image(
+        values, bounds, "angle / degrees", "radius / µm", label="value", colour_map="gray",
+        ratio=min(1.0, max(0.25, n_rings / n_sectors)), ax=ax, figure_inches=figure_inches,
+    )  # fmt: skip
+    ticks = np.unique(np.linspace(0, n_rings, min(n_rings, RADIUS_LABELS - 1) + 1).round().astype(int))
+    ax.set_yticks(ticks, [f"{image.radius_um[k]:.3g}" for k in ticks])
+    ax.set_xticks(np.arange(0.0, 361.0, 60.0))
+    return ax
 
 
 def _draw_values(
@@ -154,13 +260,10 @@ def _draw_values(
     ax: Axes | None,
     figure_inches: float,
 ) -> Axes:
-    """Draw values, top row first, with a colour bar."""
-    x0, y0, x1, y1 = bounds_um
-    ax = new_axes(figure_inches, (y1 - y0) / (x1 - x0)) if ax is None else ax
-    image = ax.imshow(values, cmap=colour_map, extent=(x0, x1, y0, y1))
-    ax.figure.colorbar(image, ax=ax, label=label, shrink=0.8, aspect=30.0, pad=0.02)
-    ax.set(xlabel="x / µm", ylabel="y / µm", facecolor=as_fractions(BACKGROUND))
-    return ax
+    """Draw values in the sensor plane, lowest row first, with a colour bar."""
+    return plot_image(
+        values, bounds_um, "x / µm", "y / µm", label=label, colour_map=colour_map, ax=ax, figure_inches=figure_inches
+    )
 
 
 # -- pixels of thumbnails and plots ---------------------------------------------------------------------------------------
@@ -193,15 +296,38 @@ def power_map_pixels(power_map: PowerMap, max_pixels: int) -> NDArray[np.uint8]:
 
 def picture_pixels(picture: Picture, max_pixels: int) -> NDArray[np.uint8]:
     """
-    Return a picture as :meth:`foveasim.Picture.to_image`, averaged to a smaller size.
+    Return a picture as :meth:`foveasim.Picture.to_image`, sRGB-encoded, averaged to a smaller size.
 
     Pictures of neither 1 nor 3 channels are shown as the mean of their channels. The result is (n_y, n_x, 2 or 4) uint8, with
     alpha.
     """
     data, coverage = block_means(picture.data, max_pixels), block_means(picture.coverage[np.newaxis], max_pixels)[0]
+    white = picture.white
     if data.shape[0] not in (1, 3):
-        data = data.mean(axis=0, keepdims=True)
-    return np.asarray(Picture(data, coverage, picture.grid).to_image(), np.uint8)
+        data, white = data.mean(axis=0, keepdims=True), None
+    return np.asarray(Picture(data, coverage, picture.grid, white).to_image(encode_srgb=True), np.uint8)
+
+
+def cortical_pixels(image: CorticalImage, max_pixels: int) -> NDArray[np.uint8]:
+    """
+    Return a log-polar image as pixels with alpha, the outermost ring first, sRGB-encoded; larger ones are averaged.
+
+    Images of neither 1 nor 3 channels are shown as the mean of their channels. There are two pixels per sector, so that
+    staggered rings are shifted.
+    """
+    data, white = block_means(_unrolled(image), max_pixels), image.white
+    if data.shape[0] not in (1, 3):
+        data, white = data.mean(axis=0, keepdims=True), None
+    coverage = np.isfinite(data).all(axis=0).astype(np.float32)
+    picture = Picture(data.astype(np.float32), coverage, Grid(coverage.shape, 1.0, (0.0, 0.0)), white)
+    return np.asarray(picture.to_image(encode_srgb=True), np.uint8)
+
+
+def _unrolled(image: CorticalImage) -> NDArray[Any]:
+    """Return the rings at equal angles from 0 to 360 degrees, (n_channel, n_ring, 2 n_sector)."""
+    n_rings, n_sectors = image.data.shape[1:]
+    position = 0.5 * np.arange(2 * n_sectors) + 0.25 - image.start_rad[:, np.newaxis] * (n_sectors / (2.0 * np.pi))
+    return np.asarray(image.data[:, np.arange(n_rings)[:, np.newaxis], np.floor(position).astype(int) % n_sectors])
 
 
 def block_means(images: NDArray[Any], max_pixels: int) -> NDArray[Any]:

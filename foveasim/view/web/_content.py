@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from foveasim._core.rings import same_rings
 from foveasim._core.validation import UNIT_SUFFIXES, Floats
 from foveasim.capture import Capture
-from foveasim.errors import GeometryError, ParameterError, SimulationError
+from foveasim.errors import GeometryError, ParameterError, SimulationError, type_name
 from foveasim.fields import PowerMap
 from foveasim.layout import Layout, Report
 from foveasim.view.site_colours import (
@@ -103,7 +103,7 @@ def content_of(
 
     about, arrays, layout = describe_sites(data, name=name)
     if report is not None and not isinstance(report, Report):
-        raise ParameterError("report", f"must be a Report of a check, got a {type(report).__name__}")
+        raise ParameterError("report", f"must be a Report of a check, got {type_name(report)}")
     if report is not None and report.n_sites != layout.n_sites:
         raise ParameterError(
             "report", f"must be a check of this layout of {layout.n_sites:,} sites, got one of {report.n_sites:,}"
@@ -142,7 +142,7 @@ def describe_sites(data: Layout | Capture, *, name: str = "") -> tuple[dict[str,
         As for :func:`content_of`.
     """
     if not isinstance(data, Layout | Capture):
-        raise ParameterError("data", f"must be a Layout or a Capture, got a {type(data).__name__}")
+        raise ParameterError("data", f"must be a Layout or a Capture, got {type_name(data)}")
     capture = data if isinstance(data, Capture) else None
     layout = data.layout if isinstance(data, Capture) else data
     if layout.n_sites == 0:
@@ -242,7 +242,7 @@ def _columns(layout: Layout, capture: Capture | None, arrays: dict[str, NDArray[
 def _second_columns(layout: Layout, second: Capture, arrays: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:
     """Return the measured columns of a second capture, and add their arrays."""
     if not isinstance(second, Capture):
-        raise ParameterError("second", f"must be a Capture, got a {type(second).__name__}")
+        raise ParameterError("second", f"must be a Capture, got {type_name(second)}")
     if not same_rings(layout, second.layout):
         raise ParameterError(
             "second",
@@ -325,7 +325,8 @@ def _picture(layout: Layout, capture: Capture | None) -> tuple[NDArray[np.uint8]
         picture = capture.picture(max_pixels=PICTURE_PIXELS)
         white = capture.white_dn
         if picture.data.shape[0] not in (1, 3):
-            picture = replace(picture, data=np.mean(picture.data / white.reshape(-1, 1, 1), axis=0, keepdims=True))
+            grey = np.mean(picture.data / white.reshape(-1, 1, 1), axis=0, keepdims=True)
+            picture = replace(picture, data=grey, white=None)
             white = np.ones(1)
         pixels = picture.to_image(white, encode_srgb=True)
         bounds_um = picture.grid.bounds_um
@@ -346,7 +347,7 @@ def _optical_picture(power_map: PowerMap) -> tuple[NDArray[np.uint8], tuple[floa
     Three bands are shown as red, green and blue by their wavelengths, others by their sum.
     """
     if not isinstance(power_map, PowerMap):
-        raise ParameterError("optical_image", f"must be a PowerMap, got a {type(power_map).__name__}")
+        raise ParameterError("optical_image", f"must be a PowerMap, got {type_name(power_map)}")
     # Means of blocks of cells; incomplete blocks at the upper and right end are cropped.
     n_bands, n_y, n_x = power_map.data.shape
     block = max(1, -(-max(n_y, n_x) // PICTURE_PIXELS))

@@ -47,6 +47,7 @@ def solid_page(data: Layout | Capture, *, solids: Solids | None = None, name: st
     if solids is None and isinstance(data, Capture):
         meshes: Sequence[Mesh] = (prisms(data, has_floor=True),)
         shown = "Column heights show the codes."
+        about["colouring"] = about["columns"][0]["key"]
     else:
         meshes = (solids_of(data) if solids is None else solids).meshes
         shown = "z points toward the lens."

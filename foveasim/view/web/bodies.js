@@ -56,6 +56,15 @@ export class Bodies {
     return { positions, sites, indices, tiles };
   }
 
+  // Colours of a body, at most so many, in CSS.
+  coloursOf(body, most) {
+    const colours = this.arrays.run_colours, found = new Set();
+    for (let run = body.runs[0]; run < body.runs[1] && found.size < most; run++) {
+      found.add("rgb(" + colours[3 * run] + "," + colours[3 * run + 1] + "," + colours[3 * run + 2] + ")");
+    }
+    return [...found];
+  }
+
   // Colours of the sites of a body as bytes r, g, b, a, at index site + 1.
   paint(body, bytes) {
     const { run_sites: runSites, run_colours: colours } = this.arrays;

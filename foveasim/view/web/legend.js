@@ -1,10 +1,13 @@
-// Legend of a colour scale: its colours with round values, or the categories with their counts.
+// Legend of a colour scale: its colours with round values, or the categories with their counts; pictures with a legend.
 
 import { brief, clamp, shown } from "./colours.js";
-import { make } from "./page_parts.js";
+import { inkOf, make } from "./page_parts.js";
 
 // More categories than this are not listed.
 const MOST_KINDS = 40;
+// The foot of a picture, in CSS pixels: margin, heights of its rows, width of a colour ramp, size of a swatch.
+const MARGIN = 14, TALL_ROW = 46, LOW_ROW = 22, RAMP = 220, SWATCH = 12;
+const FONT = "13px system-ui, sans-serif";
 
 export const titleOf = (column) => (column.unit ? column.label + " / " + column.unit : column.label);
 
@@ -29,18 +32,32 @@ export function tickLabels(scale) {
   });
 }
 
-// Items of the categories of a scale, and a note if they are not all.
-export function kindItems(scale) {
+// Categories of a scale with their colours and counts, and a note if they are not all.
+export function kindsOf(scale) {
   const { column, values } = scale, counts = new Map();
   for (let i = 0; i < values.length; i++) counts.set(values[i], (counts.get(values[i]) || 0) + 1);
   const kinds = [...counts.keys()].sort((a, b) => a - b);
-  const items = kinds.slice(0, MOST_KINDS).map((kind) => {
-    const item = make("li"), swatch = make("i");
-    swatch.style.background = "rgb(" + scale.kindColour(kind) + ")";
-    item.append(swatch, make("span", (column.names ? column.names[kind] : shown(kind)) + " · " + shown(counts.get(kind))));
-    return item;
-  });
+  const items = kinds.slice(0, MOST_KINDS).map((kind) => ({
+    colours: ["rgb(" + scale.kindColour(kind) + ")"],
+    text: (column.names ? column.names[kind] : shown(kind)) + " · " + shown(counts.get(kind)),
+  }));
   return { items, rest: kinds.length > MOST_KINDS ? "and " + shown(kinds.length - MOST_KINDS) + " more; colours repeat" : "" };
+}
+
+// List item of a text after squares of colours.
+export function swatchItem({ colours, text }) {
+  const item = make("li");
+  item.append(...swatchesOf(colours), make("span", text));
+  return item;
+}
+
+// Squares of colours.
+export function swatchesOf(colours) {
+  return colours.map((colour) => {
+    const swatch = make("i");
+    swatch.style.background = colour;
+    return swatch;
+  });
 }
 
 // Range and mean of the numbers of a scale, with their unit.
@@ -51,4 +68,71 @@ export function summaryOf(scale) {
   return count === 0 ? "no values" :
     shown(scale.lowest) + " to " + shown(scale.highest) + unit + ", mean " + shown(Number((sum / count).toPrecision(5))) + unit +
     (column.note ? " (" + column.note + ")" : "");
+}
+
+// Returns a picture of layers on top of each other, above a foot with the scale bar { text, width }, the title and the
+// colours of a scale, and items { colours, text }. Lengths are CSS pixels.
+export function pictureOf(layers, { width, height, bar, scale, items }) {
+  const picture = document.createElement("canvas"), context = picture.getContext("2d"), ratio = layers[0].width / width;
+  context.font = FONT;
+  const boxes = footOf(context, width - 2 * MARGIN, bar, scale, items);
+  let x = MARGIN, y = height, row = 0;
+  for (const box of boxes) {
+    if (x > MARGIN && x + box.width > width - MARGIN) {
+      x = MARGIN;
+      y += row;
+      row = 0;
+    }
+    Object.assign(box, { x, y });
+    x += box.width + (box.tall === TALL_ROW ? 40 : 16);
+    row = Math.max(row, box.tall);
+  }
+  picture.width = layers[0].width;
+  picture.height = Math.round((y + row + (row === LOW_ROW ? 6 : 0)) * ratio);
+  context.fillStyle = inkOf("--raised");
+  context.fillRect(0, 0, picture.width, picture.height);
+  for (const layer of layers) context.drawImage(layer, 0, 0, layers[0].width, layers[0].height);
+  context.font = FONT;
+  for (const box of boxes) {
+    context.setTransform(ratio, 0, 0, ratio, ratio * box.x, ratio * box.y);
+    context.fillStyle = inkOf("--text");
+    box.draw();
+  }
+  return picture;
+}
+
+// Boxes of the foot of a picture that is at most so wide: width, height, and a function that draws the box at the origin.
+function footOf(context, most, bar, scale, items) {
+  const widthOf = (text) => context.measureText(text).width, isRamp = scale && scale.column.kind !== "kinds";
+  const boxes = [{
+    width: Math.max(bar.width, widthOf(bar.text)), tall: TALL_ROW,
+    draw: () => { context.fillText(bar.text, 0, 18); context.fillRect(0, 26, bar.width, 3); },
+  }];
+  if (isRamp) {
+    const ends = brief(scale.from) + " to " + brief(scale.to) + (scale.isLog ? ", log" : "");
+    const ramp = Math.max(40, Math.min(RAMP, most - 10 - widthOf(ends)));
+    boxes.push({
+      width: Math.max(widthOf(titleOf(scale.column)), ramp + 10 + widthOf(ends)), tall: TALL_ROW,
+      draw: () => {
+        context.fillText(titleOf(scale.column), 0, 18);
+        context.fillText(ends, ramp + 10, 36);
+        context.translate(0, 26);
+        drawRamp(context, scale, ramp, 10);
+      },
+    });
+  } else if (scale) {
+    boxes.push({ width: widthOf(titleOf(scale.column)), tall: LOW_ROW, draw: () => context.fillText(titleOf(scale.column), 0, 18) });
+  }
+  const { items: listed, rest } = isRamp ? { items: [], rest: "" } : scale ? kindsOf(scale) : { items, rest: "" };
+  for (const { colours, text } of rest ? [...listed, { colours: [], text: rest }] : listed) {
+    const before = (SWATCH + 2) * colours.length + (colours.length ? 4 : 0);
+    boxes.push({
+      width: before + widthOf(text), tall: LOW_ROW,
+      draw: () => {
+        context.fillText(text, before, 18);
+        colours.forEach((colour, k) => { context.fillStyle = colour; context.fillRect((SWATCH + 2) * k, 7, SWATCH, SWATCH); });
+      },
+    });
+  }
+  return boxes;
 }

@@ -1,11 +1,11 @@
 // The page: controls, the photosite under the mouse, colours, design rules, picture, links.
 
 import { connect, hasAddress, report } from "./bridge.js";
-import { Scale, brief, bytesOfHex, clamp, formatLength, roundStep, shown, textOf } from "./colours.js";
+import { Scale, bytesOfHex, clamp, formatLength, roundStep, shown, textOf } from "./colours.js";
 import { COLOUR_MAPS } from "./colour_maps.js";
 import { listenToPointers } from "./gestures.js";
 import { findRenderer, fitCanvas, pixelRatio, watchSize } from "./gl.js";
-import { drawRamp, kindItems, summaryOf, tickLabels, titleOf } from "./legend.js";
+import { drawRamp, kindsOf, pictureOf, summaryOf, swatchItem, tickLabels, titleOf } from "./legend.js";
 import { SensorMap } from "./map.js";
 import { downloadTable, lengthText, sitesIn, statisticsRows, tableOf } from "./measure.js";
 import { Overview } from "./overview.js";
@@ -26,13 +26,9 @@ const state = {
   hovered: -1, others: [], pinned: -1, cursor: null, chosen: null, shownViolations: 0, drawn: 0, drawMs: 0, loaded: false, isSlow: false,
   wantedMap: null, second: null, secondMap: null, tool: null, start: null, ruler: null, selection: null, selected: [],
 };
-const loading = new Map();
 const asks = { map: false, marks: false };
 
-function array(name) {
-  if (!loading.has(name)) loading.set(name, unpack(name, about.arrays[name]));
-  return loading.get(name);
-}
+const array = (name) => unpack(name, about.arrays[name]);
 
 // -- columns ------------------------------------------------------------------------------------------------------------
 
@@ -144,8 +140,8 @@ function drawLegend() {
   $("map-label").hidden = !scale.canMap;
   $("colour-map").value = scale.map;
   if (isKinds) {
-    const { items, rest } = kindItems(scale);
-    $("kinds").replaceChildren(...items);
+    const { items, rest } = kindsOf(scale);
+    $("kinds").replaceChildren(...items.map(swatchItem));
     $("summary").textContent = rest;
     return;
   }
@@ -818,37 +814,14 @@ async function copyLink() {
   }
 }
 
-// Returns the displayed map with its scale bar and colour scale.
+// Returns the displayed map with its scale bar and legend.
 function viewAsPicture() {
-  const { map, scale, column } = state, cells = $("cells"), ratio = cells.width / map.width;
-  const picture = document.createElement("canvas"), foot = 46;
-  picture.width = cells.width;
-  picture.height = cells.height + Math.round(foot * ratio);
-  const context = picture.getContext("2d");
-  context.fillStyle = inkOf("--raised");
-  context.fillRect(0, 0, picture.width, picture.height);
+  const { map, scale, scaleBar } = state, cells = $("cells");
   map.draw(groundColour());
-  context.drawImage(cells, 0, 0);
   if (state.overview.isNeeded(map)) state.overview.draw(map, scale, state.range);
-  for (const id of ["overview", "lines", "marks"].filter((name) => !$(name).hidden)) context.drawImage($(id), 0, 0, cells.width, cells.height);
-  context.setTransform(ratio, 0, 0, ratio, 0, 0);
-  context.translate(14, map.height);
-  context.fillStyle = context.strokeStyle = inkOf("--text");
-  context.font = "13px system-ui, sans-serif";
-  context.fillText($("scale-bar").querySelector("span").textContent, 0, 18);
-  context.fillRect(0, 26, state.scaleBar.width, 3);
-  context.translate(state.scaleBar.width + 40, 0);
-  context.fillText(titleOf(column), 0, 18);
-  if (column.kind !== "kinds") {
-    const width = 220;
-    context.translate(0, 26);
-    drawRamp(context, scale, width, 10);
-    context.translate(0, -26);
-    context.fillStyle = inkOf("--text");
-    const ends = brief(scale.from) + " to " + brief(scale.to) + (scale.isLog ? ", log" : "");
-    context.fillText(ends, width + 10, 36);
-  }
-  return picture;
+  const layers = [cells, ...["overview", "lines", "marks"].map($).filter((layer) => !layer.hidden)];
+  const bar = { text: $("scale-bar").querySelector("span").textContent, width: scaleBar.width };
+  return pictureOf(layers, { width: map.width, height: map.height, bar, scale });
 }
 
 function listenToTools() {

@@ -5,7 +5,7 @@ import { COLOUR_MAPS } from "./colour_maps.js";
 import { Scale, bytesOfHex, clamp, formatLength, roundStep, shown, textOf } from "./colours.js";
 import { listenToPointers } from "./gestures.js";
 import { findRenderer, fitCanvas, pixelRatio, textureSize, watchSize } from "./gl.js";
-import { drawRamp, kindItems, summaryOf, tickLabels, titleOf } from "./legend.js";
+import { drawRamp, kindsOf, pictureOf, summaryOf, swatchItem, swatchesOf, tickLabels, titleOf } from "./legend.js";
 import { Orbit } from "./orbit.js";
 import { $, downloadPicture, inkOf, isForPage, listenToHelp, make, notice, speak, startTheme, stayingNotice } from "./page_parts.js";
 import { SolidView } from "./solid_view.js";
@@ -16,6 +16,8 @@ const ARRAYS = ["position_x", "position_y", "positions", "z", "corners", "run_si
 const state = { view: null, area: null, pinned: -1, part: -1, pinnedPart: -1, pointer: null, anchor: null, isAsked: false, scale: null };
 // Steps of the position of the cut.
 const CUT_STEPS = 200;
+// Parts of more colours have no swatches.
+const MOST_SWATCHES = 4;
 const ASIDE = [Math.atan2(-0.9, 0.35), Math.atan2(0.75, Math.hypot(0.35, 0.9))], ABOVE = [-0.5 * Math.PI, 0.5 * Math.PI];
 
 // -- the photosite --------------------------------------------------------------------------------------------------------
@@ -114,8 +116,8 @@ function drawLegend() {
   $("map-label").hidden = !scale.canMap;
   $("colour-map").value = scale.map || COLOUR_MAPS[0];
   if (isKinds) {
-    const { items, rest } = kindItems(scale);
-    $("kinds").replaceChildren(...items);
+    const { items, rest } = kindsOf(scale);
+    $("kinds").replaceChildren(...items.map(swatchItem));
     $("summary").textContent = rest;
     return;
   }
@@ -262,10 +264,24 @@ function listenToTools() {
     state.view.setHeight(factor);
     moved();
   });
-  $("save").addEventListener("click", () => {
-    state.view.draw();
-    downloadPicture($("solid"), about.name);
+  $("save").addEventListener("click", () => downloadPicture(viewAsPicture(), about.name));
+}
+
+// Returns the displayed view with its scale bar, and the legend of its colours or of the visible parts.
+function viewAsPicture() {
+  const { view, scale } = state, { width, tall } = view.orbit, bar = $("scale-bar");
+  const items = view.parts.filter((part) => part.isVisible).map((part) => ({ colours: coloursOf(part), text: part.name }));
+  view.draw();
+  return pictureOf([$("solid")], {
+    width, height: tall, scale, items,
+    bar: { text: bar.querySelector("span").textContent, width: bar.querySelector("i").getBoundingClientRect().width },
   });
+}
+
+// Colours of a part of its own for a legend; none if there are many.
+function coloursOf(part) {
+  const colours = state.view.bodies.coloursOf(part.body, MOST_SWATCHES + 1);
+  return colours.length > MOST_SWATCHES ? [] : colours;
 }
 
 function partItem(part) {
@@ -273,7 +289,7 @@ function partItem(part) {
   box.type = "checkbox";
   box.checked = true;
   box.addEventListener("change", () => { state.view.setVisible(part, box.checked); moved(); });
-  label.append(box, make("span", part.name + " · " + shown(part.nTriangles) + " triangles"));
+  label.append(box, ...swatchesOf(coloursOf(part)), make("span", part.name + " · " + shown(part.nTriangles) + " triangles"));
   item.append(label);
   return item;
 }
@@ -317,6 +333,7 @@ async function open() {
   listenToLosses();
   watchSize($("map"), resize);
   showSite();
+  if (about.colouring) await colourBy(about.colouring);
   state.view.draw();
   drawScaleBar();
   $("opening").hidden = true;
@@ -341,6 +358,7 @@ window.foveasim = {
   },
   lookDown: () => look(ABOVE),
   draw: () => state.view.draw(),
+  picture: () => viewAsPicture().toDataURL("image/png"),
   get hovered() { return state.view.hovered; },
   get pinned() { return state.pinned; },
   get parts() { return state.view.parts.map((part) => part.name); },

@@ -12,7 +12,15 @@ function bytesOfBase64(text) {
   return bytes;
 }
 
-export async function unpack(name, about) {
+const decoded = new Map();
+
+// Returns a promise of an array of the page by its name; it is decoded once, and its element removed.
+export function unpack(name, about) {
+  if (!decoded.has(name)) decoded.set(name, decode(name, about));
+  return decoded.get(name);
+}
+
+async function decode(name, about) {
   const element = document.getElementById("data-" + name);
   const zipped = bytesOfBase64(element.textContent.trim());
   element.remove();
