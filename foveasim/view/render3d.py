@@ -7,7 +7,7 @@ needs OpenGL, and adds windows and ambient occlusion; the software renderer has 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, runtime_checkable
@@ -58,6 +58,10 @@ MIN_SCENE_FRACTION = 0.3
 LABEL_INSET_PX = 3
 #: Right part of a plotter's window for the scalar bar.
 BAR_FRACTION = 0.14
+#: Text and colour of the photosite that is picked in a window.
+PICKING_HINT = "right click: photosite"
+PICKED_TEXT: Mapping[str, Any] = {"position": (12, 12), "font_size": 11, "color": "black", "name": "picked site"}
+PICKED_COLOUR = (255, 140, 0)
 #: Largest side of a picture, to catch mistakes.
 MAX_SIDE_PX = 32_768
 
@@ -298,7 +302,7 @@ def plotter(
     plot = _plotter(meshes, eye, size, BACKGROUND, off_screen=off_screen)
     _add_scalar_bar(plot, meshes)
     if not off_screen:
-        plot.enable_element_picking(callback=picking_reporter(plot, meshes), mode="cell", show_message=False)
+        add_picking(plot, meshes)
     return plot
 
 
@@ -707,8 +711,8 @@ def _add_scalar_bar(plot: Plotter, meshes: list[Mesh]) -> None:
             position_y=0.2,
             width=0.05,
             height=0.6,
-            title_font_size=16,
-            label_font_size=14,
+            title_font_size=20,
+            label_font_size=18,
         )
     else:
         labels = [[name, [part / 255.0 for part in rgb]] for name, rgb in shown.legend]
@@ -717,15 +721,38 @@ def _add_scalar_bar(plot: Plotter, meshes: list[Mesh]) -> None:
         )
 
 
-def picking_reporter(plot: Plotter, meshes: list[Mesh]) -> Callable[[Any], None]:
-    """Return a function that shows the photosite and the value of a picked cell."""
-    titles = [mesh.title or "value" for mesh in meshes]
+def add_picking(plot: Plotter, meshes: list[Mesh]) -> None:
+    """Show the number and the value of a photosite at a right click, and its surface in another colour."""
+    repainted: list[tuple[Any, Any, Any]] = []
 
-    def report(cell: Any) -> None:
-        if cell is None or cell.n_cells == 0 or "site" not in cell.cell_data:
+    def report(_: Any, picker: Any) -> None:
+        while repainted:
+            surface, cells, colours = repainted.pop()
+            surface.cell_data["rgb"][cells] = colours
+            surface.Modified()
+        actor, cell = picker.GetActor(), picker.GetCellId()
+        part = next((mesh for mesh in meshes if actor is not None and actor is plot.actors.get(mesh.name)), None)
+        if part is None or cell < 0:
+            plot.add_text(PICKING_HINT, **PICKED_TEXT)
             return
-        values = [f"{title} {float(cell.cell_data[title][0]):g}" for title in titles if title in cell.cell_data]
-        text = ", ".join([f"site {int(cell.cell_data['site'][0])}", *dict.fromkeys(values)])
-        plot.add_text(text, position="lower_left", font_size=12, color="black", name="picked site")
+        surface = actor.mapper.dataset
+        site = int(surface.cell_data["site"][cell])
+        quantity, _, unit = part.title.partition(" / ")
+        value = f"{quantity} {surface.cell_data[part.title][cell]:.6g} {unit}" if part.title else part.name
+        plot.add_text(f"site {site}, {value}".rstrip(), **PICKED_TEXT)
+        cells = np.flatnonzero(np.asarray(surface.cell_data["site"]) == site)
+        repainted.append((surface, cells, surface.cell_data["rgb"][cells].copy()))
+        surface.cell_data["rgb"][cells] = PICKED_COLOUR
+        surface.Modified()
 
-    return report
+    # Not pyvista's picking of elements, which searches the cell by its position and often misses.
+    plot.enable_point_picking(
+        report,
+        picker="cell",
+        tolerance=0.0,
+        use_picker=True,
+        pickable_window=True,
+        show_point=False,
+        show_message=False,
+    )
+    plot.add_text(PICKING_HINT, **PICKED_TEXT)

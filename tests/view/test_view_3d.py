@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import subprocess
@@ -484,17 +485,30 @@ def test_mesh_values_are_active_and_titled():
 
 
 @pytest.mark.needs("renderer")
-def test_plotter_names_actors_and_picked_sites():
+def test_right_click_finds_visible_site():
     taken = capture()
     plot = plotter(taken, size_px=(300, 200), off_screen=True)
     assert "columns" in plot.actors
     assert [title.strip() for title in list(plot.scalar_bars.keys())] == ["code / DN"]
-    report = render3d.picking_reporter(plot, [prisms(taken)])
+    render3d.add_picking(plot, [prisms(taken)])
+    plot.show(auto_close=False)
     mesh = plot.actors["columns"].mapper.dataset
-    last = mesh.n_cells - 1
-    report(mesh.extract_cells([last]))
-    site = int(mesh.cell_data["site"][last])
-    assert plot.actors["picked site"].GetText(0) == f"site {site}, code / DN {taken.code[site]}"
+    own, picked, is_orange = mesh.cell_data["rgb"].copy(), set(), []
+    for x, y in itertools.product(range(20, 250, 17), range(20, 190, 13)):
+        plot.iren.picker.Pick(x, y, 0, plot.renderer)
+        text = plot.actors["picked site"].GetInput()
+        cells = np.flatnonzero((mesh.cell_data["rgb"] != own).any(axis=1))
+        if text == render3d.PICKING_HINT:
+            assert cells.size == 0
+            continue
+        (site,) = set(mesh.cell_data["site"][cells].tolist())
+        assert text == f"site {site}, code {taken.code[site]} DN"
+        # The picked site is drawn in orange, shaded, at this pixel, except at edges and behind the text.
+        red, green, blue = plot.screenshot(None)[199 - y, x].astype(float)
+        is_orange.append(blue < 10.0 and abs(green / red - 140.0 / 255.0) < 0.05)
+        picked.add(site)
+    assert len(picked) > 20
+    assert np.mean(is_orange) > 0.9
     plot.close()
 
 

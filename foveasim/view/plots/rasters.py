@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.validation import Floats, check_count
 from foveasim._io.encodings import encode_srgb_values
@@ -159,7 +159,7 @@ def plot_picture(
 
 def plot_image(
     values: NDArray[Any],
-    bounds: tuple[float, float, float, float],
+    bounds: ArrayLike,
     x_label: str,
     y_label: str,
     *,
@@ -195,11 +195,11 @@ def plot_image(
     -------
     matplotlib axes
     """
-    x0, y0, x1, y1 = bounds
+    x0, y0, x1, y1 = np.asarray(bounds, np.float64).tolist()
     height_over_width = (y1 - y0) / (x1 - x0)
     ax = new_axes(figure_inches, ratio or height_over_width) if ax is None else ax
     aspect = 1.0 if ratio is None else ratio / height_over_width
-    image = ax.imshow(values, cmap=colour_map, extent=(x0, x1, y0, y1), origin="lower", aspect=aspect)
+    image = ax.imshow(values[::-1], cmap=colour_map, extent=(x0, x1, y0, y1), aspect=aspect)
     if np.ndim(values) == 2:
         ax.figure.colorbar(image, ax=ax, label=label, shrink=0.8, aspect=30.0, pad=0.02)
     ax.set(xlabel=x_label, ylabel=y_label, facecolor=as_fractions(BACKGROUND))
