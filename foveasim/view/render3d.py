@@ -734,6 +734,7 @@ def add_picking(plot: Plotter, meshes: list[Mesh]) -> None:
         part = next((mesh for mesh in meshes if actor is not None and actor is plot.actors.get(mesh.name)), None)
         if part is None or cell < 0:
             plot.add_text(PICKING_HINT, **PICKED_TEXT)
+            plot.render()
             return
         surface = actor.mapper.dataset
         site = int(surface.cell_data["site"][cell])
@@ -744,6 +745,7 @@ def add_picking(plot: Plotter, meshes: list[Mesh]) -> None:
         repainted.append((surface, cells, surface.cell_data["rgb"][cells].copy()))
         surface.cell_data["rgb"][cells] = PICKED_COLOUR
         surface.Modified()
+        plot.render()
 
     # Not pyvista's picking of elements, which searches the cell by its position and often misses.
     plot.enable_point_picking(
