@@ -83,7 +83,7 @@ def main(out_dir: Path) -> None:
                 per_mm, lens.mtf(per_mm, WAVELENGTH_NM, angle_deg=angle_deg, distance_m=DISTANCE_M), label=label
             )
         column[2].set_ylim(0.0, 1.0)
-        column[2].set_xlabel("per mm")
+        column[2].set_xlabel("lp/mm")
     for row in (0, 3):
         axes[row, 0].set_ylabel("y / µm")
         axes[row + 2, 0].set_ylabel("MTF")

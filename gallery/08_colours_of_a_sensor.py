@@ -43,12 +43,12 @@ def fits() -> dict[int, PolynomialCurve]:
     return {degree: PolynomialCurve(wavelength_nm=waves_nm, value=values, degree=degree) for degree in DEGREES}
 
 
-def draw_filters(axes: Axes, filters: fs.FilterSet, waves_nm: np.ndarray, title: str) -> None:
+def draw_filters(axes: Axes, filters: fs.FilterSet, waves_nm: np.ndarray, title: str, y_label: str) -> None:
     """Plot the curves of a filter set in their colours."""
     for name, values in zip(filters.names, filters.transmission(waves_nm), strict=True):
         axes.plot(waves_nm, values, color=COLOURS[name], label=name)
     axes.set_title(title)
-    axes.set_xlabel("wavelength / nm")
+    axes.set(xlabel="wavelength / nm", ylabel=y_label)
     axes.set_ylim(0.0, 1.05)
 
 
@@ -99,11 +99,11 @@ def main(out_dir: Path) -> None:
     figure = Figure(figsize=(8.0, 6.6), layout="constrained")
     (first, second), (third, rest) = figure.subplots(2, 2, sharey=True)
     rest.set_axis_off()
-    draw_filters(first, fs.rgb_filters(), visible_nm, "filters")
-    draw_filters(second, combined, visible_nm, "filters × QE × infrared cut")
+    draw_filters(first, fs.rgb_filters(), visible_nm, "filters", "transmission")
+    draw_filters(second, combined, visible_nm, "filters × QE × infrared cut", "efficiency")
     second.plot(visible_nm, qe(visible_nm), "k--", linewidth=1, label="quantum efficiency")
     second.plot(visible_nm, cut(visible_nm), "k:", linewidth=1, label="infrared cut")
-    draw_filters(third, camera_filters(), visible_nm, "measured product (Nikon D5100)")
+    draw_filters(third, camera_filters(), visible_nm, "measured product (Nikon D5100)", "relative efficiency")
     rest.legend(handles=second.get_lines(), loc="center", frameon=False)
     save_figure(figure, out_dir / "08_filters.png", dpi=140)
 

@@ -123,8 +123,8 @@ def main(out_dir: Path) -> None:
             )
         read_dn = result.gain_dn_per_e[c] * result.dark_noise_e[c]
         curves.axhline(read_dn, color=colour, linestyle=":", label=f"{size:.0f} µm, read noise")
-    curves.set(xscale="log", yscale="log", xlabel="mean minus dark mean (DN)", ylabel="temporal noise (DN)")
-    variances.set(xlabel="mean minus dark mean (DN)", ylabel="temporal variance (DN²)", ylim=(0.0, None))
+    curves.set(xscale="log", yscale="log", xlabel="mean minus dark mean / DN", ylabel="temporal noise / DN")
+    variances.set(xlabel="mean minus dark mean / DN", ylabel="temporal variance / DN²", ylim=(0.0, None))
     curves.set_title("photon transfer: slopes 0 and 1/2, drop at full well")
     variances.set_title("slope of the variance: system gain")
     curves.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)

@@ -68,7 +68,7 @@ def main(out_dir: Path) -> None:
         x_min, y_min, x_max, y_max = picture.grid.bounds_um
         ax.imshow(image[..., 0], cmap="gray", vmin=0, vmax=255, extent=(x_min, x_max, y_min, y_max))
         ax.set_title(title, fontsize=10)
-        ax.set_xlabel("x / µm")
+        ax.set(xlabel="x / µm", ylabel="y / µm")
     save_figure(figure, out_dir / "16_four_zones.png", dpi=140)
 
     # %% Additivity: the charge of every pixel is the sum over the small pixels in the same area.

@@ -66,6 +66,9 @@ def main(out_dir: Path) -> None:
         inner = fs.layout.clip(layout, shapely.box(*INNER_BOUNDS_UM), cut="drop")
         inner.plot(ax=axes[1, k])
         axes[1, k].set(xlim=INNER_BOUNDS_UM[::2], ylim=INNER_BOUNDS_UM[1::2], ylabel="")
+        if k == 0:
+            axes[0, k].set_ylabel("y / µm")
+            axes[1, k].set_ylabel("y / µm")
 
         # %% Area without data.
         x_um, y_um = np.meshgrid(CENTRE.x_um, CENTRE.y_um)

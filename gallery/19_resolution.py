@@ -106,7 +106,9 @@ def main(out_dir: Path) -> None:
         axes[0].plot(per_mm[::4], measured[::4], ".", color=colour, label=f"{name}, slanted edge")
         axes[0].axvline(nyquist, color=colour, linewidth=0.6)
         print(f"{name}: largest error {100.0 * worst[name]:.2f} % up to the Nyquist frequency, {nyquist:.1f} per mm")
-    axes[0].set(xlabel="line pairs per mm", ylabel="MTF", xlim=(0, 1e3 / PITCH_UM), ylim=(0, 1.02))
+    axes[0].set(
+        xlabel="spatial frequency / (line pairs per mm)", ylabel="MTF", xlim=(0, 1e3 / PITCH_UM), ylim=(0, 1.02)
+    )
     axes[0].set_title(f"pitch {PITCH_UM:g} µm; vertical lines: Nyquist frequencies")
     axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
 
@@ -127,7 +129,7 @@ def main(out_dir: Path) -> None:
     for part, title in zip(
         axes[1:], ("foveal: median and range of sites and filters", "uniform: median of filters"), strict=True
     ):
-        part.set(xlabel="eccentricity (µm)", ylabel="Nyquist frequency (per mm)", xscale="log", yscale="log")
+        part.set(xlabel="eccentricity / µm", ylabel="Nyquist frequency / (lp/mm)", xscale="log", yscale="log")
         part.set_title(title)
         part.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
     save_figure(figure, out_dir / "19_mtf_and_nyquist.png", dpi=140)

@@ -77,7 +77,7 @@ def plot_sites(axes: Axes, layout: fs.Layout, values: np.ndarray, colours: str, 
     shapes.set_clim(low, limit)
     axes.add_collection(shapes)
     axes.autoscale_view()
-    axes.set(aspect="equal", title=title, xlabel="x (µm)", ylabel="y (µm)")
+    axes.set(aspect="equal", title=title, xlabel="x / µm", ylabel="y / µm")
 
 
 def main(out_dir: Path) -> None:
@@ -147,7 +147,7 @@ def main(out_dir: Path) -> None:
     for polarity, colour in ((1, "tab:blue"), (-1, "tab:red")):
         is_shown = events.polarity == polarity
         axes[1, 1].plot(1e3 * events.t_s[is_shown], np.degrees(angle[events.site[is_shown]]), ",", color=colour)
-    axes[1, 1].set(xlabel="time (ms)", ylabel="angle of the site (degrees)", ylim=(-180, 180))
+    axes[1, 1].set(xlabel="time / ms", ylabel="angle of the site / degrees", ylim=(-180, 180))
     axes[1, 1].set_title(f"{len(events):,} events: {turns_per_s:.3f} turns per second")
     early = spikes.between(0.0, 4e-3)
     per_s = early.counts() / 4e-3

@@ -335,7 +335,7 @@ def show_task(axes: Axes, results: dict[str, list[MotionErrors]], task: Task) ->
             axes.plot([m, m], [lowest_um, task.allowed_um], color=colour, linewidth=1)
             axes.text(m, 1.08 * lowest_um, f" M = {m:,.0f} ", color=colour, ha=at, va="bottom")
     axes.set(xscale="log", yscale="log", xlim=(60, 20_000), ylim=(lowest_um, 6.0), title=task.title)
-    axes.set(xlabel="photosites M", ylabel="rms error of the motion (µm)")
+    axes.set(xlabel="photosites M", ylabel="rms error of the motion / µm")
     axes.grid(color="0.93", which="both", linewidth=0.6)
     axes.set_axisbelow(True)
 

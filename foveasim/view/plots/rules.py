@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,6 +28,8 @@ MAX_SHOWN, MAX_ANNOTATIONS = 2000, 40
 CIRCLE_PT, CIRCLE_STEP_PT = 9.0, 4.0
 #: Distance of the legend below the axes, clear of their tick labels and axis label.
 LEGEND_BELOW_PT = 36.0
+#: Length of the lines of the legend, so that they fit in the figure.
+LEGEND_CHARACTERS_PER_INCH = 10
 #: Margin around the markers if no layout is given, as a fraction of their extent.
 MARGIN_FRACTION = 0.1
 
@@ -118,9 +121,10 @@ def _draw_result(ax: Axes, result: RuleResult, markers: NDArray[Any], k: int) ->
     ax.add_collection(LineCollection(outlines + lines, colors=colour, linewidths=1.0, linestyles=style, zorder=4))
     x_um, y_um = _centres_um(markers).T
     shown = "" if len(result) == len(markers) else f" (the worst {len(markers):,} are drawn)"
+    width = max(40, round(ax.figure.get_figure(root=True).get_size_inches()[0] * LEGEND_CHARACTERS_PER_INCH))
     ax.scatter(
         x_um, y_um, s=(CIRCLE_PT + k * CIRCLE_STEP_PT) ** 2, facecolors="none", edgecolors=colour, linewidths=1.4,
-        linestyles=style, label=f"{result}{shown}", zorder=5,
+        linestyles=style, label=textwrap.fill(f"{result}{shown}", width), zorder=5,
     )  # fmt: skip
 
 

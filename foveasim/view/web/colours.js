@@ -147,7 +147,7 @@ export function shown(value) {
   if (!Number.isFinite(value)) return value > 0 ? "infinite" : "minus infinite";
   if (Number.isSafeInteger(value)) return value.toLocaleString("en-US");
   const size = Math.abs(value);
-  return size >= 1e-3 && size < 1e7 ? String(Number(value.toPrecision(6))) : value.toExponential(4);
+  return size >= 1e-3 && size < 1e7 ? value.toLocaleString("en-US", { maximumSignificantDigits: 6 }) : value.toExponential(4);
 }
 
 // Formats a site's value of a column with its unit, using the site areas in µm²; "…" while the column is not loaded.

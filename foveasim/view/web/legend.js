@@ -70,12 +70,12 @@ export function summaryOf(scale) {
     (column.note ? " (" + column.note + ")" : "");
 }
 
-// Returns a picture of layers on top of each other, above a foot with the scale bar { text, width }, the title and the
-// colours of a scale, and items { colours, text }. Lengths are CSS pixels.
-export function pictureOf(layers, { width, height, bar, scale, items }) {
-  const picture = document.createElement("canvas"), context = picture.getContext("2d"), ratio = layers[0].width / width;
+// Returns a picture of views side by side, each of layers on top of each other, above a foot with the scale bar
+// { text, width }, the titles and colours of scales, and items { colours, text }. Lengths are CSS pixels.
+export function pictureOf(views, { width, height, bar, scales, items }) {
+  const picture = document.createElement("canvas"), context = picture.getContext("2d"), ratio = views[0][0].height / height;
   context.font = FONT;
-  const boxes = footOf(context, width - 2 * MARGIN, bar, scale, items);
+  const boxes = footOf(context, width - 2 * MARGIN, bar, scales, items);
   let x = MARGIN, y = height, row = 0;
   for (const box of boxes) {
     if (x > MARGIN && x + box.width > width - MARGIN) {
@@ -87,11 +87,15 @@ export function pictureOf(layers, { width, height, bar, scale, items }) {
     x += box.width + (box.tall === TALL_ROW ? 40 : 16);
     row = Math.max(row, box.tall);
   }
-  picture.width = layers[0].width;
+  picture.width = views.reduce((sum, [base]) => sum + base.width, 0);
   picture.height = Math.round((y + row + (row === LOW_ROW ? 6 : 0)) * ratio);
   context.fillStyle = inkOf("--raised");
   context.fillRect(0, 0, picture.width, picture.height);
-  for (const layer of layers) context.drawImage(layer, 0, 0, layers[0].width, layers[0].height);
+  let left = 0;
+  for (const layers of views) {
+    for (const layer of layers) context.drawImage(layer, left, 0, layers[0].width, layers[0].height);
+    left += layers[0].width;
+  }
   context.font = FONT;
   for (const box of boxes) {
     context.setTransform(ratio, 0, 0, ratio, ratio * box.x, ratio * box.y);
@@ -102,13 +106,28 @@ export function pictureOf(layers, { width, height, bar, scale, items }) {
 }
 
 // Boxes of the foot of a picture that is at most so wide: width, height, and a function that draws the box at the origin.
-function footOf(context, most, bar, scale, items) {
-  const widthOf = (text) => context.measureText(text).width, isRamp = scale && scale.column.kind !== "kinds";
+function footOf(context, most, bar, scales, items) {
+  const widthOf = (text) => context.measureText(text).width;
   const boxes = [{
     width: Math.max(bar.width, widthOf(bar.text)), tall: TALL_ROW,
     draw: () => { context.fillText(bar.text, 0, 18); context.fillRect(0, 26, bar.width, 3); },
   }];
-  if (isRamp) {
+  const add = ({ colours, text }) => {
+    const before = (SWATCH + 2) * colours.length + (colours.length ? 4 : 0);
+    boxes.push({
+      width: before + widthOf(text), tall: LOW_ROW,
+      draw: () => {
+        context.fillText(text, before, 18);
+        colours.forEach((colour, k) => { context.fillStyle = colour; context.fillRect((SWATCH + 2) * k, 7, SWATCH, SWATCH); });
+      },
+    });
+  };
+  for (const scale of scales) {
+    if (scale.column.kind === "kinds") {
+      const kinds = kindsOf(scale);
+      [{ colours: [], text: titleOf(scale.column) }, ...kinds.items, ...(kinds.rest ? [{ colours: [], text: kinds.rest }] : [])].forEach(add);
+      continue;
+    }
     const ends = brief(scale.from) + " to " + brief(scale.to) + (scale.isLog ? ", log" : "");
     const ramp = Math.max(40, Math.min(RAMP, most - 10 - widthOf(ends)));
     boxes.push({
@@ -120,19 +139,7 @@ function footOf(context, most, bar, scale, items) {
         drawRamp(context, scale, ramp, 10);
       },
     });
-  } else if (scale) {
-    boxes.push({ width: widthOf(titleOf(scale.column)), tall: LOW_ROW, draw: () => context.fillText(titleOf(scale.column), 0, 18) });
   }
-  const { items: listed, rest } = isRamp ? { items: [], rest: "" } : scale ? kindsOf(scale) : { items, rest: "" };
-  for (const { colours, text } of rest ? [...listed, { colours: [], text: rest }] : listed) {
-    const before = (SWATCH + 2) * colours.length + (colours.length ? 4 : 0);
-    boxes.push({
-      width: before + widthOf(text), tall: LOW_ROW,
-      draw: () => {
-        context.fillText(text, before, 18);
-        colours.forEach((colour, k) => { context.fillStyle = colour; context.fillRect((SWATCH + 2) * k, 7, SWATCH, SWATCH); });
-      },
-    });
-  }
+  items.forEach(add);
   return boxes;
 }

@@ -455,7 +455,7 @@ function tellSite() {
     rows.push([column.label, site < 0 ? "–" : textOf(column, site, state.sites.area), column === state.column || (column.array && column.array === state.column.array)]);
   }
   const centre = site < 0 ? null : state.sites.centre(site);
-  rows.push(["centre / µm", centre ? centre.map((v) => String(Number(v.toPrecision(6)))).join(", ") : "–"]);
+  rows.push(["centre / µm", centre ? centre.map((v) => shown(Math.round(1e6 * v) / 1e6 + 0)).join(", ") : "–"]);
   if (site >= 0 && site === state.hovered && state.others.length) rows.push(["overlaps", state.others.join(", ")]);
   const cells = [];
   for (const [label, text, isShown] of rows) {
@@ -814,14 +814,17 @@ async function copyLink() {
   }
 }
 
-// Returns the displayed map with its scale bar and legend.
+// Returns the displayed maps with their scale bar and legends.
 function viewAsPicture() {
-  const { map, scale, scaleBar } = state, cells = $("cells");
+  const { map, scale, second, scaleBar } = state, visible = (names) => names.map($).filter((layer) => !layer.hidden);
   map.draw(groundColour());
   if (state.overview.isNeeded(map)) state.overview.draw(map, scale, state.range);
-  const layers = [cells, ...["overview", "lines", "marks"].map($).filter((layer) => !layer.hidden)];
+  if (second) drawSecond();
+  // The second map may be below the first, and of another height.
+  const views = [visible(["cells", "overview", "lines", "marks"]), ...(second ? [visible(["second-cells", "second-overview", "second-marks"])] : [])];
   const bar = { text: $("scale-bar").querySelector("span").textContent, width: scaleBar.width };
-  return pictureOf(layers, { width: map.width, height: map.height, bar, scale });
+  const hasOwnScale = second && second.column.key.replace(/^second-/, "") !== state.column.key;
+  return pictureOf(views, { width: map.width + (second ? second.map.width : 0), height: map.height, bar, scales: [scale, ...(hasOwnScale ? [second.scale] : [])], items: [] });
 }
 
 function listenToTools() {

@@ -272,8 +272,8 @@ function viewAsPicture() {
   const { view, scale } = state, { width, tall } = view.orbit, bar = $("scale-bar");
   const items = view.parts.filter((part) => part.isVisible).map((part) => ({ colours: coloursOf(part), text: part.name }));
   view.draw();
-  return pictureOf([$("solid")], {
-    width, height: tall, scale, items,
+  return pictureOf([[$("solid")]], {
+    width, height: tall, scales: scale ? [scale] : [], items: scale ? [] : items,
     bar: { text: bar.querySelector("span").textContent, width: bar.querySelector("i").getBoundingClientRect().width },
   });
 }
