@@ -246,6 +246,18 @@ def test_panned_parts_have_the_same_pitch():
         pan_camera(scene_of(fit="cover"), path, OPTICS, shape=(50, 60))
 
 
+def test_panned_parts_of_fitted_scene_cover_layout():
+    camera, path = camera_of(), GazePath([0.0, 1.0], [[0.0, 0.0], [5.0, 0.0]])
+    for fit, side in (("width", 0), ("cover", slice(None))):
+        frames = list(pan_camera(scene_of(fit=fit), path, camera, shape=(45, 60)))
+        for part, _ in frames:
+            x0, y0, x1, y1 = camera.image_grid(part).bounds_um
+            assert part.basis.shape[1:] == (45, 60)
+            # The layout of 40 x 30 µm has the aspect ratio of the part.
+            assert np.array([x1 - x0, y1 - y0])[side] == pytest.approx(np.array([40.0, 30.0])[side], rel=1e-9)
+        assert frames[1][0].pitch_um == frames[0][0].pitch_um
+
+
 def test_small_layout_on_picture_warns():
     camera = camera_of()
     # 300 pixels of 1000 µm are 300 mm, 12.3 mm in the image; the layout of 40 µm is 0.3 % of it.

@@ -27,6 +27,7 @@ from foveasim.layout.files import check_no_options, layout_path
 from foveasim.layout.files import read_layout as read_sites
 from foveasim.optics import Optics
 from foveasim.scene import Scene
+from foveasim.scene._scene import FRAMINGS
 from foveasim.sensor import Sensor
 from foveasim.sensor.limits import check_plausible
 
@@ -503,6 +504,8 @@ def put_setting(source: Source | str | Path | None, data: dict[str, Any], key: s
     """
     Set a value by its path, such as ``"sensor.bits"``, in place.
 
+    It replaces alternatives: a pixel pitch of the scene replaces its ``fit`` and field of view.
+
     Raises
     ------
     ConfigError
@@ -520,6 +523,10 @@ def put_setting(source: Source | str | Path | None, data: dict[str, Any], key: s
                 f"'{key}={value}' cannot be set: {'.'.join(names[: i + 1])} must be a section, got {section!r}",
             )
     section[names[-1]] = value
+    if names[:-1] == ["scene"] and names[-1] in FRAMINGS and value is not None:
+        for name in FRAMINGS:
+            if name != names[-1]:
+                section.pop(name, None)
 
 
 def resolve_files(directory: Path, value: Any, key: str = "", found: list[Path] | None = None) -> Any:

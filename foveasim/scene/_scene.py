@@ -36,10 +36,12 @@ from foveasim.units import m_from_um, um_from_m
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Fit", "Scene"]
+__all__ = ["FRAMINGS", "Fit", "Scene"]
 
 #: Framing of a picture on a layout.
 Fit: TypeAlias = Literal["cover", "contain", "width"]
+#: Parameters of which one determines the size of a scene.
+FRAMINGS = ("pitch_um", "fit", "field_of_view_deg")
 
 #: Default wavelengths of the channels of colour pictures (red, green, blue) and of grey pictures.
 RGB_NM = (620.0, 550.0, 450.0)

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from foveasim._core.random_streams import Streams
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, check_number, check_shape, finite_array, read_only
+from foveasim.camera import Camera
 from foveasim.errors import ParameterError, type_name, with_article
 from foveasim.fields import PowerMap
 from foveasim.optics import Optics
@@ -176,7 +177,7 @@ def shift_sensor(source: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Sce
 
 
 def pan_camera(
-    scene: Scene, path: GazePath, optics: Optics, *, shape: tuple[int, int]
+    scene: Scene, path: GazePath, optics: Optics | Camera, *, shape: tuple[int, int]
 ) -> Iterator[tuple[Scene, tuple[float, float]]]:
     """
     Yield frames of a large scene for a camera that moves in front of it.
@@ -188,11 +189,11 @@ def pan_camera(
     Parameters
     ----------
     scene : Scene
-        The complete scene, with a pixel pitch; frame a scene with ``fit`` by :meth:`foveasim.Camera.frame`.
+        The complete scene. With ``fit`` and a camera, the cropped part is framed on its layout.
     path : GazePath
         Gaze positions in the sensor plane, in the image of the complete scene.
-    optics : Optics
-        Lens of the camera.
+    optics : Optics or Camera
+        Lens of the camera, or the camera.
     shape : (n_y, n_x)
         Shape of the cropped part in pixels.
 
@@ -203,14 +204,27 @@ def pan_camera(
     Raises
     ------
     ParameterError
-        Immediately when an argument is of another class or the part is larger than the scene; during iteration when the part
-        extends beyond the scene.
+        Immediately when an argument is of another class, the part is larger than the scene, or a scene with ``fit`` is given
+        without a camera; during iteration when the part extends beyond the scene.
     """
-    _check_types(("scene", scene, (Scene,)), ("path", path, (GazePath,)), ("optics", optics, (Optics,)))
+    _check_types(("scene", scene, (Scene,)), ("path", path, (GazePath,)), ("optics", optics, (Optics, Camera)))
     n_y, n_x = check_shape("shape", shape)
     if n_y > scene.basis.shape[1] or n_x > scene.basis.shape[2]:
         raise ParameterError("shape", f"must not exceed the shape of the scene, {scene.basis.shape[1:]}", (n_y, n_x))
+    if isinstance(optics, Camera):
+        camera, optics = optics, optics.optics
+        if scene.pitch_um is None:
+            scene = scene.with_pitch(camera.frame(_crop(scene, 0, 0, n_y, n_x)).pitch_um or 0.0)
+    elif scene.pitch_um is None:
+        raise ParameterError(
+            "scene", "must have a pixel pitch", hint="pass the camera instead of its optics, or camera.frame(scene)"
+        )
     return _parts(scene, path, optics.grid(scene).pitch_x_um, n_y, n_x)
+
+
+def _crop(scene: Scene, left: int, bottom: int, n_y: int, n_x: int) -> Scene:
+    """Return a part of a scene, with its pitch or its framing."""
+    return replace(scene, basis=scene.basis[:, bottom : bottom + n_y, left : left + n_x], field_of_view_deg=None)
 
 
 def _parts(
@@ -235,9 +249,7 @@ def _parts(
                 "µm",
             )
         if (left, bottom) != previous:
-            part = replace(
-                scene, basis=scene.basis[:, bottom : bottom + n_y, left : left + n_x], field_of_view_deg=None
-            )
+            part = _crop(scene, left, bottom, n_y, n_x)
             previous = left, bottom
         shift_um = [
             float(at_um) - (at - 0.5 * free) * cell_um

@@ -449,7 +449,7 @@ def test_invalid_gaze_arguments_are_rejected():
     for change, message in (
         ({"scene": None}, "'scene' must be a Scene"),
         ({"path": 3}, "'path' must be a GazePath"),
-        ({"optics": None}, "'optics' must be a Optics"),
+        ({"optics": None}, "'optics' must be an Optics or a Camera"),
         ({"shape": 5}, "'shape' must be two integers"),
         ({"shape": (121, 160)}, r"'shape' must not exceed the shape of the scene, \(120, 160\)"),
     ):
