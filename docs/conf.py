@@ -36,7 +36,8 @@ extensions = [
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = "foveasim"
-html_static_path: list[str] = []
+html_static_path = ["_static"]
+html_css_files = ["code.css"]
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 # Notebooks are executed, and again only after changes.

@@ -334,13 +334,26 @@ def test_framing_follows_settings(shot_file):
     assert read_shot(shot_file, ["scene.fit=null", "scene.pitch_um=70"]).scene.pitch_um == 70.0
 
 
+def test_last_framing_replaces_others(shot_file):
+    shot_file.write_text(PICTURE + SHOT.split("\n", 2)[2])
+    pitch, angle = "scene.pitch_um=70", "scene.field_of_view_deg=30"
+    assert read_shot(shot_file, [pitch]).scene.pitch_um == 70.0
+    assert read_shot(shot_file, [angle, pitch]).scene.field_of_view_deg is None
+    assert read_shot(shot_file, [pitch, angle]).scene.field_of_view_deg == 30.0
+    assert read_shot(shot_file, [pitch, "scene.fit=width"]).scene.fit == "width"
+    assert read_shot(shot_file, ["scene.pitch_um=null"]).scene.fit == "cover"
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ("scene.fit=crop", r"shot\.yaml: --set scene\.fit: must be one of 'cover', 'contain', 'width', got \"crop\"$"),
         (
-            "scene.pitch_um=70",
-            r"shot\.yaml:2:\d+: scene\.fit: must not be given together with 'pitch_um', got 'cover'; choose one of .* to null$",
+            (
+                "scene={kind: picture, picture: 'skimage:camera', fit: cover, pitch_um: 70, distance_m: 1.0, "
+                "peak_radiance_w_m2_sr_nm: 0.1, band_width_nm: 100}"
+            ),
+            r"shot\.yaml: --set scene\.fit: must not be given together with 'pitch_um', got 'cover'; choose one of .* to null$",
         ),
         (
             "layout.move_um=[900, 0]; scene.fit=contain",

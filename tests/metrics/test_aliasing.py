@@ -168,3 +168,19 @@ def test_lattice_peak_height_matches_window_sums():
 def test_invalid_radial_bin_count_raises(n_bins):
     with pytest.raises(ParameterError, match="'n_bins' must be"):
         sampling_spectrum(SQUARES).radial(n_bins)
+
+
+def test_alias_plot_marks_wave_and_alias():
+    # The wave at 1.5 Nyquist folds to -0.5 Nyquist: 187.5 - 250 line pairs per mm.
+    ax = aliasing_spectrum(SQUARES, (187.5, 0.0)).plot()
+    marks = {line.get_label(): line.get_xydata()[0] for line in ax.lines}
+
+    assert marks["wave"] == pytest.approx([187.5, 0.0])
+    assert marks["alias"] == pytest.approx([-62.5, 0.0], abs=0.1)
+    (circle,) = ax.patches
+    assert circle.radius == pytest.approx(125.0)
+    shown = np.asarray(ax.images[0].get_array())
+    x0, x1, y0, y1 = ax.images[0].get_extent()
+    for x, y in marks.values():
+        row, column = int((y1 - y) / (y1 - y0) * shown.shape[0]), int((x - x0) / (x1 - x0) * shown.shape[1])
+        assert shown[row, column] > shown.max() - 3.0

@@ -150,3 +150,43 @@ def test_results_are_drawn_as_curves():
 def test_curves_need_known_scale():
     with pytest.raises(ParameterError, match="'logarithmic' must be one of '', 'x', 'y', 'xy', got 'z'"):
         plot_curves({"": ([1], [2])}, "x", "y", logarithmic="z")
+
+
+@pytest.mark.parametrize("stagger", [False, True])
+def test_log_polar_plot_is_unrolled_exactly(stagger):
+    layout = fs.layout.log_polar(n_sectors=12, r_min_um=10.0, r_max_um=40.0, n_rings=5, stagger=stagger)
+    degrees = np.degrees(np.arctan2(*layout.centroid_um.T[::-1])) % 360.0
+    image = fs.reconstruct.cortical(layout, degrees)
+    ax = image.plot()
+    (shown,) = (np.asarray(each.get_array()) for each in ax.images)
+
+    assert ax.images[0].get_extent() == [0.0, 360.0, 0.0, 5.0]
+    assert ax.get_xlabel() == "angle / degrees"
+    assert [label.get_text() for label in ax.get_yticklabels()][::5] == ["10", "40"]
+    # Each of the 24 columns shows the site at its angle: the angle of its centroid is at most half a sector away.
+    off = (shown - np.arange(7.5, 360.0, 15.0) + 180.0) % 360.0 - 180.0
+    assert np.abs(off) == pytest.approx(7.5, abs=1e-9)
+
+
+def test_log_polar_image_in_colours_is_white_balanced():
+    plane = np.full((40, 40), 0.25, np.float32)
+    grey = np.stack((plane, 2.0 * plane, 0.5 * plane))
+    picture = fs.Picture(grey, np.ones((40, 40), np.float32), fs.Grid((40, 40), 1.0), np.array([1.0, 2.0, 0.5]))
+    image = fs.reconstruct.to_cortical(picture, n_rings=4, n_sectors=16, r_max_um=15.0, centre_um=(20.0, 20.0))
+    back = fs.reconstruct.from_cortical(image, picture.grid)
+    for ax in (image.plot(), picture.plot(), back.plot()):
+        pixels = np.asarray(ax.images[0].get_array())
+        assert np.all(pixels[pixels[..., 3] == 255][:, :3] == 255)
+    with pytest.raises(ParameterError, match="'channel' must be given for an image of 2 channels"):
+        fs.reconstruct.CorticalImage(data=image.data[:2], radius_um=image.radius_um, start_rad=image.start_rad).plot()
+
+
+def test_colours_without_white_are_balanced_and_scaled():
+    data = np.array([[[4.0, 2.0]], [[8.0, 8.0]], [[2.0, 1.0]]], np.float32)
+    picture = fs.Picture(data, np.ones((1, 2), np.float32), fs.Grid((1, 2), 1.0), np.array([8.0, 16.0, 4.0]))
+
+    assert picture.to_image()[0].tolist() == [[255, 255, 255, 255], [128, 255, 128, 255]]
+    assert picture.to_image(8.0)[0].tolist() == [[128, 255, 64, 255], [64, 255, 32, 255]]
+    for white in ([1.0, 2.0], [1.0, 0.0, 1.0]):
+        with pytest.raises(ParameterError, match="'white' must be"):
+            fs.Picture(data, np.ones((1, 2), np.float32), picture.grid, np.array(white))

@@ -787,6 +787,38 @@ def test_mouse_picks_prisms_in_3d(visit):
 
 
 @pytest.mark.needs("chromium")
+def test_solid_picture_contains_scale_bar_and_legend(visit, tmp_path):
+    layout = fs.layout.mosaic(fs.layout.grid(n_x=6, n_y=4, pitch_um=3.0), ("RG", "GB"))
+    for page, colours in (
+        (visit(solid_page(layout)), [FILTER_COLOURS[name] for name in "RGB"]),
+        (visit(solid_page(CAPTURE)), [(0, 0, 0)]),
+    ):
+        with page.expect_download() as download:
+            page.click("#save")
+        download.value.save_as(tmp_path / "view.png")
+        picture = read_picture(tmp_path / "view.png")[..., :3].astype(int)
+        height = round(page.evaluate("document.getElementById('solid').getBoundingClientRect().height"))
+        foot = picture[height:]
+
+        assert foot.shape[0] >= 46
+        bar = foot[26:29, 14 : 14 + 20].reshape(-1, 3)  # the scale bar in the colour of texts
+        assert np.all(bar == bar[0])
+        assert np.abs(bar[0] - foot[-1, -1]).sum() > 300
+        for colour in colours:
+            assert (np.abs(foot - colour).max(axis=2) <= 2).sum() >= 20
+
+
+@pytest.mark.needs("chromium")
+def test_capture_in_3d_has_every_colouring(visit):
+    page = visit(solid_page(CAPTURE))
+    keys = page.evaluate("[...document.getElementById('colouring').options].map((one) => one.value)")
+    assert page.input_value("#colouring") == keys[1] == "picture"
+    for key in [*keys, "picture"]:
+        page.select_option("#colouring", key)
+        until(page, "key => Boolean(foveasim.colour(0)) === Boolean(key)", key)
+
+
+@pytest.mark.needs("chromium")
 def test_hidden_parts_expose_parts_below(visit):
     layout = fs.layout.mosaic(fs.layout.grid(n_x=6, n_y=4, pitch_um=3.0), ("RG", "GB"))
     stack = solids(layout, SensorStack(well_depth_um=4.0, trench_width_um=0.4))
