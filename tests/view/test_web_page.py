@@ -789,10 +789,8 @@ def test_mouse_picks_prisms_in_3d(visit):
 @pytest.mark.needs("chromium")
 def test_solid_picture_contains_scale_bar_and_legend(visit, tmp_path):
     layout = fs.layout.mosaic(fs.layout.grid(n_x=6, n_y=4, pitch_um=3.0), ("RG", "GB"))
-    for page, colours in (
-        (visit(solid_page(layout)), [FILTER_COLOURS[name] for name in "RGB"]),
-        (visit(solid_page(CAPTURE)), [(0, 0, 0)]),
-    ):
+    # Swatches of the filters of the parts, and the ends of the scales of a mosaic.
+    for page in (visit(solid_page(layout)), visit(solid_page(CAPTURE))):
         with page.expect_download() as download:
             page.click("#save")
         download.value.save_as(tmp_path / "view.png")
@@ -804,8 +802,8 @@ def test_solid_picture_contains_scale_bar_and_legend(visit, tmp_path):
         bar = foot[26:29, 14 : 14 + 20].reshape(-1, 3)  # the scale bar in the colour of texts
         assert np.all(bar == bar[0])
         assert np.abs(bar[0] - foot[-1, -1]).sum() > 300
-        for colour in colours:
-            assert (np.abs(foot - colour).max(axis=2) <= 2).sum() >= 20
+        for name in "RGB":
+            assert (np.abs(foot - FILTER_COLOURS[name]).max(axis=2) <= 8).sum() >= 4
 
 
 @pytest.mark.needs("chromium")
@@ -1671,6 +1669,8 @@ def test_overview_appears_for_small_sites_only(visit):
 @pytest.mark.needs("chromium")
 def test_solid_page_colours_have_legend(visit):
     page = visit(solid_page(CAPTURE), **SMALL)
+    assert page.locator("#legend").is_visible()  # of the codes
+    page.select_option("#colouring", "")
     assert page.locator("#legend").is_hidden()
     page.select_option("#colouring", "expected_e")
     until(page, "foveasim.colour(3) !== null")
