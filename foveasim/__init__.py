@@ -105,7 +105,7 @@ if not TYPE_CHECKING:  # type checkers would take any name for an attribute
         if name not in _LAZY:
             from foveasim._core.names import did_you_mean
 
-            hint = did_you_mean(name, __all__)
+            hint = "" if name.startswith("__") else did_you_mean(name, __all__)  # protocols of other libraries
             raise AttributeError(f"module '{__name__}' has no attribute '{name}'{'; ' if hint else ''}{hint}")
         from importlib import import_module
 

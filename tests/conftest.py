@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import sys
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
-# Processes that tests start read the package as bytecode, without compilation of every module.
+# Bytecode is stored next to the sources, as is the machine code of kernels, even where the environment disables it: the tests start
+# hundreds of processes, and each would compile the package.
+sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 

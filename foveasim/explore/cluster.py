@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import signal
+import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import current_process
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from foveasim._core.extras import needs
 from foveasim.errors import ParameterError, SimulationError
@@ -32,6 +36,9 @@ MEMORY_SETTINGS = {
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": 0.95,
 }
+#: On Linux, local workers are forked from a process that has imported their modules: a new interpreter takes seconds. Libraries
+#: of macOS start threads on import, after which a process must not be forked.
+START_METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 #: Local clusters do not serve HTTP, which requires no certificate.
 NO_HTTP: dict[str, list[str]] = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
 
@@ -92,9 +99,12 @@ def open_client(scheduler: str | None, n_workers: int) -> Iterator[Client]:
             {"distributed.scheduler.allowed-failures": 0, "distributed.admin.large-graph-warning-threshold": "1 TB"}
             | MEMORY_SETTINGS
             | NO_HTTP
+            | {"distributed.worker.multiprocessing-method": START_METHOD}
         ),
         ExitStack() as stack,
     ):
+        if START_METHOD == "forkserver":
+            _start_fork_server()
         try:
             cluster = stack.enter_context(
                 LocalCluster(
@@ -106,6 +116,8 @@ def open_client(scheduler: str | None, n_workers: int) -> Iterator[Client]:
                     dashboard_address="127.0.0.1:0",
                     scheduler_kwargs={"dashboard": False},
                     preload=[__name__],
+                    # The present environment; empty strings are equivalent to absent variables of the interpreter.
+                    env={"PYTHONPATH": "", "PYTHONSAFEPATH": ""} | os.environ,
                     silence_logs=logging.CRITICAL,
                 )
             )
@@ -117,6 +129,28 @@ def open_client(scheduler: str | None, n_workers: int) -> Iterator[Client]:
                 'under if __name__ == "__main__":, because workers import the program'
             ) from None
         yield client
+
+
+def _start_fork_server() -> None:
+    """Start the process from which workers are forked, with the module path of this process, unless it is running."""
+    from multiprocessing import forkserver
+
+    import dask
+    from distributed.utils import get_mp_context
+
+    get_mp_context().set_forkserver_preload(["foveasim.explore._worker_imports"])
+    # Settings of libraries at their import, among them one thread: a process with threads must not be forked.
+    settings = dask.config.get("distributed.nanny.pre-spawn-environ").items()
+    defaults = {name: str(value) for name, value in settings if value is not None} | {"PYTHONHASHSEED": "0"}
+    path = os.pathsep.join(map(os.path.abspath, sys.path))
+    saved = dict(os.environ)
+    os.environ.update(defaults | saved | {"PYTHONPATH": path, "PYTHONSAFEPATH": "1"})
+    try:
+        forkserver.ensure_running()
+    finally:
+        for name in os.environ.keys() - saved.keys():
+            del os.environ[name]
+        os.environ.update(saved)
 
 
 @contextmanager
@@ -159,8 +193,9 @@ def _check_scheduler(scheduler: str, security: Security) -> None:
 
 
 def dask_setup(_worker: Any) -> None:
-    """Ignore Ctrl-C in a local worker: the main program handles it and ends its workers."""
+    """Ignore Ctrl-C in a local worker, which the main program handles, and seed the global generator of numpy."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    np.random.seed()  # noqa: NPY002, TID251 -- forked workers have equal states, and metrics may use them
 
 
 class WorkerStates:

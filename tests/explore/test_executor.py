@@ -187,6 +187,31 @@ def test_item_that_kills_workers_is_reported():
     assert again == {0: 0, 1: 1, 2: 2}
 
 
+def test_local_workers_have_present_environment(monkeypatch):
+    with executor(os.getenv, what="the function", workers=1) as run:  # starts the process that forks workers
+        list(run(["HOME"], ()))
+    before = dict(os.environ)
+    monkeypatch.setenv("FOVEASIM_TEST", "present")
+    names = ["FOVEASIM_TEST", "HOME", "PYTHONPATH", "PYTHONSAFEPATH"]
+    with executor(os.getenv, what="the function", workers=1) as run:
+        found = dict(run(names, ()))
+
+    monkeypatch.undo()
+    assert found == {"FOVEASIM_TEST": "present"} | {name: before.get(name, "") for name in names[1:]}
+    assert dict(os.environ) == before
+
+
+def test_local_workers_have_different_random_states():
+    def draw(_):
+        time.sleep(0.05)
+        return os.getpid(), np.random.get_state()[1].tobytes()  # noqa: NPY002
+
+    with executor(draw, what="the function", workers=2) as run:
+        found = {result for _, result in run(range(8), ())}
+
+    assert len(found) == 2
+
+
 @pytest.fixture(scope="module")
 def scheduler():
     """Start an external scheduler with two workers."""

@@ -182,36 +182,52 @@ def answers(port):
         return one.connect_ex(("127.0.0.1", port)) == 0
 
 
+#: The program ``dask worker``, which forks workers from a process with their modules: several tests end workers.
+WORKER_PROGRAM = """
+from distributed.cli.dask_worker import main
+from distributed.utils import get_mp_context
+
+get_mp_context().set_forkserver_preload(["foveasim.explore._worker_imports"])
+main()
+"""
+
+
 @contextmanager
 def programs(n_workers):
     """Start a scheduler and workers as separate programs; yield the address and the scheduler program."""
     port = free_port()
     address = f"tcp://127.0.0.1:{port}"
+    limits = ["--nworkers", str(n_workers), "--nthreads", "1", "--memory-limit", "2 GB"]
     programs = [
-        ("distributed.cli.dask_scheduler", "--host", address, "--no-dashboard"),
-        *[("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard", "--memory-limit", "2 GB")]
-        * n_workers,
+        ("-m", "distributed.cli.dask_scheduler", "--host", address, "--no-dashboard"),
+        ("-c", WORKER_PROGRAM, address, "--no-dashboard", *limits),
     ]
+    environment = os.environ | {"DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD": "forkserver"}
     running = []
     try:
-        for module, *arguments in programs:
-            command = [sys.executable, "-m", module, *arguments]
-            running.append(subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+        for arguments in programs:
+            command = [sys.executable, *arguments]
+            running.append(
+                subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            )
             if len(running) == 1:
                 wait_for(lambda: answers(port))
         yield address, running[0]
     finally:
-        # Workers first: they sign off at the scheduler.
-        for group in (running[1:], running[:1]):
-            for program in group:
-                program.terminate()
-            for program in group:
-                program.wait(timeout=LIMIT_S)
+        for program in reversed(running):  # workers first: they sign off at the scheduler
+            program.terminate()
+            program.wait(timeout=LIMIT_S)
 
 
 @pytest.fixture(scope="module")
 def scheduler():
     with programs(2) as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def scheduler_of_one_worker():
+    with programs(1) as started:
         yield started
 
 
@@ -227,11 +243,9 @@ def where(request):
     n_workers = int(request.param[0])
     if "process" in request.param:
         yield {"workers": n_workers}
-    elif n_workers == 1:
-        with programs(1) as (address, _):
-            yield {"scheduler": address}
     else:
-        yield {"scheduler": request.getfixturevalue("scheduler")[0]}
+        fixture = {1: "scheduler_of_one_worker", 2: "scheduler"}[n_workers]
+        yield {"scheduler": request.getfixturevalue(fixture)[0]}
 
 
 def test_crashing_metric_fails_only_its_point(where, tmp_path):
