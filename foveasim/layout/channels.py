@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Ints, check_count, finite_array, freeze
@@ -76,7 +76,7 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
     )
 
 
-def _indices(layout: Layout) -> tuple[Ints, Ints]:
+def _indices(layout: Layout) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
     """Return indices of sites in two directions, from columns or positions on a lattice."""
     pair = next((pair for pair in INDEX_COLUMNS if all(name in layout.columns for name in pair)), None)
     if pair is not None:

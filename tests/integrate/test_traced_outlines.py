@@ -35,7 +35,9 @@ def test_traced_outlines_equal_compiled_outlines(name, order, lens):
     scale = compiled(CELLS).max()
     np.testing.assert_allclose(traced(CELLS), compiled(CELLS), rtol=1e-12, atol=1e-13 * scale)
     np.testing.assert_allclose(
-        traced(CELLS.astype(np.float32), where=where), compiled(CELLS.astype(np.float32), where=where), atol=1e-13 * scale
+        traced(CELLS.astype(np.float32), where=where),
+        compiled(CELLS.astype(np.float32), where=where),
+        atol=1e-13 * scale,
     )
     np.testing.assert_allclose(traced.uncovered_um2, compiled.uncovered_um2, atol=1e-12)
     np.testing.assert_array_equal(traced.sites_outside_image_circle, compiled.sites_outside_image_circle)

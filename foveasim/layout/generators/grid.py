@@ -128,7 +128,8 @@ def grid(
         )
         return Layout.from_lattice(RectangleLattice(x_um, y_um), columns)
     shift = 0.5 * (row % 2).astype(np.float64) - 0.25 * (n_y > 1)
-    corners = square_corners_um(column - 0.5 * n_x + shift, row - 0.5 * n_y, pitch_um, pitch_y_um, fractions)
+    x, y = column - 0.5 * n_x + shift, row.astype(np.float64) - 0.5 * n_y
+    corners = square_corners_um(x, y, pitch_um, pitch_y_um, fractions)
     return Layout.from_equal_rings(corners, columns)
 
 
