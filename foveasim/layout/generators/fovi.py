@@ -12,7 +12,7 @@ from foveasim._core.rings import positions_in_runs
 from foveasim._core.validation import Floats, Ints, check_count, check_length_um, check_sites
 from foveasim.errors import ParameterError
 from foveasim.layout._regions import disc
-from foveasim.layout._voronoi import voronoi_cells
+from foveasim.layout.diagrams.voronoi import voronoi_cells
 from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
 from foveasim.layout.site_counts import SolveFor

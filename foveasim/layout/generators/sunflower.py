@@ -8,7 +8,7 @@ import numpy as np
 
 from foveasim._core.validation import Floats, Ints, check_count, check_length_um, check_sites
 from foveasim.layout._regions import disc
-from foveasim.layout._voronoi import voronoi_cells
+from foveasim.layout.diagrams.voronoi import voronoi_cells
 from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
 

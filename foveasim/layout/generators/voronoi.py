@@ -25,7 +25,7 @@ from foveasim._core.validation import (
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid
 from foveasim.layout._regions import parse_region
-from foveasim.layout._voronoi import CellEdges, IncrementalCells, ring_edges
+from foveasim.layout.diagrams.voronoi import CellEdges, IncrementalCells, ring_edges
 from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
 

@@ -15,7 +15,7 @@ from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid
 from foveasim.layout import Layout
 from foveasim.layout._regions import disc
-from foveasim.layout._voronoi import IncrementalCells, ring_edges, voronoi_cells
+from foveasim.layout.diagrams.voronoi import IncrementalCells, ring_edges, voronoi_cells
 from foveasim.layout.generators.fovi import fovi
 from foveasim.layout.generators.penrose import penrose
 from foveasim.layout.generators.quadtree import quadtree

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from foveasim._core.rings import next_vertex, ring_moments
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.errors import GeometryError, ParameterError
-from foveasim.layout._power import N_AUXILIARY, PowerDiagram, auxiliary_points_um
+from foveasim.layout.diagrams.power import N_AUXILIARY, PowerDiagram, auxiliary_points_um
 from foveasim.layout.model import Layout
 
 __all__ = ["CellEdges", "IncrementalCells", "ring_edges", "voronoi_cells"]
