@@ -70,7 +70,11 @@ class PackedRings(Protocol):
 
 
 class Lattice(Protocol):
-    """Rectangles in rows and columns: site ``row * n_column + column`` is ``x_um[column]`` by ``y_um[row]``."""
+    """
+    Rectangles in rows and columns.
+
+    Site ``row * n_column + column`` is ``x_um[column]`` by ``y_um[row]``.
+    """
 
     @property
     def x_um(self) -> Floats:

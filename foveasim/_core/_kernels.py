@@ -1,5 +1,5 @@
 """
-Counter-based random numbers: Philox generators, and uniform and Gaussian numbers from their words.
+Counter-based random numbers: Philox generators, uniform and Gaussian numbers.
 
 A Philox generator maps a counter and a key to random words: J. K. Salmon, M. A. Moraes, R. O. Dror and D. E. Shaw, Parallel
 random numbers: as easy as 1, 2, 3 (SC11), section 3.3. All generators use ten rounds. Words of 32 bits are stored in 64-bit
@@ -159,9 +159,9 @@ def fill_normals(key, batch, words, out):
 @njit(types.void(types.uint64, types.int64, types.float64[::1], types.float64[::1]), error_model="numpy")
 def fill_uniforms(key, batch, first, second):
     """
-    Compute a batch of pairs of uniform numbers in the open interval (0, 1), in multiples of 2**-53.
+    Compute a batch of pairs of uniform numbers in the open interval (0, 1).
 
-    Pair ``i`` of batch ``b`` depends only on the key, ``b`` and ``i``: one counter of Philox 4x32. The arrays have size
+    They are multiples of 2**-53.     Pair ``i`` of batch ``b`` depends only on the key, ``b`` and ``i``: one counter of Philox 4x32. The arrays have size
     ``BATCH``.
     """
     key_0, key_1, zero = key & _LOW, key >> _32, np.uint64(0)
@@ -176,7 +176,7 @@ def fill_uniforms(key, batch, first, second):
     types.void(types.float64[::1], types.Array(types.float64, 1, "C", readonly=True), types.uint64), error_model="numpy"
 )
 def add_normals(values, deviation, key):
-    """Add Gaussian numbers with a standard deviation per value, or of size 1 for all, in place."""
+    """Add Gaussian numbers in place; ``sigma`` has a standard deviation per value, or one."""
     words, normals = np.empty(BATCH, np.uint32), np.empty(BATCH, np.float32)
     for first in range(0, values.size, BATCH):
         fill_normals(key, first // BATCH, words, normals)

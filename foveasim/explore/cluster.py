@@ -132,7 +132,7 @@ def open_client(scheduler: str | None, n_workers: int) -> Iterator[Client]:
 
 
 def _start_fork_server() -> None:
-    """Start the process from which workers are forked, with the module path of this process, unless it is running."""
+    """Start the process from which workers are forked, with the module path of this process."""
     from multiprocessing import forkserver
 
     import dask
@@ -193,7 +193,7 @@ def _check_scheduler(scheduler: str, security: Security) -> None:
 
 
 def dask_setup(_worker: Any) -> None:
-    """Ignore Ctrl-C in a local worker, which the main program handles, and seed the global generator of numpy."""
+    """Ignore Ctrl-C, which the main program handles, and seed numpy's global generator."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     np.random.seed()  # noqa: NPY002, TID251 -- forked workers have equal states, and metrics may use them
 

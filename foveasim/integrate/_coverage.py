@@ -48,7 +48,7 @@ class Coverage:
 
     @classmethod
     def extent_within(cls, grid: Grid, bounds_um: Floats) -> Coverage | None:
-        """Return the coverage of sites with the given bounds, (n_site, 4) µm, or None if one extends beyond the grid."""
+        """Return the coverage of sites with bounds (n_site, 4) µm, or None if one is not inside."""
         return cls.within(grid, _extent_um(bounds_um), bounds_um.shape[0])
 
     @classmethod
@@ -90,7 +90,7 @@ def _extent_um(bounds_um: Floats) -> tuple[float, float, float, float]:
 
 
 def _beyond_um(grid: Grid, bounds_um: Floats) -> Floats:
-    """Return the distance of bounds beyond the grid, more than by rounding, (n,) µm; at most 0 inside."""
+    """Return the distance of bounds beyond the grid, (n,) µm; at most 0 inside it."""
     x0, y0, x1, y1 = grid.bounds_um
     rounding_um = UNCOVERED_ROUNDING * max(map(abs, grid.bounds_um))
     beyond_um = np.maximum(np.array([x0, y0]) - bounds_um[:, :2], bounds_um[:, 2:] - np.array([x1, y1]))

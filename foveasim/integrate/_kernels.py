@@ -108,7 +108,7 @@ def _set_bits(words, offset, first, last):
 
 @njit(inline="always")
 def _touched_columns(touched, row, n_words, columns):
-    """List the columns of a row that edges touch, in ascending order from the left of the box; clear their bits."""
+    """List the columns of a row that edges touch, in ascending order, and clear their bits."""
     n = 0
     for k in range(n_words):
         word = touched[row * n_words + k]
@@ -139,8 +139,9 @@ def _add_moments(moment, ua, ub, va, vb, height):
 @njit(inline="always")
 def _add_edge(ua, va, ub, vb, n_x, bottom, top, left, n_columns, n_words, rows, cover, moment, touched):
     """
-    Add one edge to the cells of a box, the rows ``bottom`` to ``top - 1`` and ``n_columns`` columns from ``left`` on.
+    Add one edge to the cells of a box.
 
+    The box has the rows ``bottom`` to ``top - 1`` and ``n_columns`` columns from ``left`` on.
     ``cover[cell]`` is (height, area): the signed height of the edge pieces in the cell, and the area between them and the left
     boundary of the cell. ``rows[row]`` is (sum of the signed heights, sum of the unsigned heights, number of pieces). At second
     order ``moment[cell]`` is as in :func:`_add_moments`. A bit of ``touched`` is set for each cell.
@@ -387,7 +388,7 @@ def _sum_gradients(columns, n_touched, left, moment, base, rows, i_row, cells, r
 
 @njit(inline="always")
 def _box(uv, start, stop, n_y, n_x):
-    """Return bottom and top row, left column and number of columns of the cells that vertices reach on the map."""
+    """Return bottom and top row, left column and number of columns of the cells in a box."""
     u_low, v_low, u_high, v_high = np.inf, np.inf, -np.inf, -np.inf
     for i in range(start, stop):
         u_low, u_high = min(u_low, uv[i, 0]), max(u_high, uv[i, 0])

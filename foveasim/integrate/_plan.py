@@ -184,7 +184,9 @@ def compile_plan(
     outlines: Callable[[int, int], Outlines], n_sites: int, grid: Grid, n_threads: int, order: int = 1
 ) -> tuple[Plan, Floats]:
     """
-    Trace every outline on the grid and sort the spans by the rows of the grid; also return the signed areas, (n_site,) µm².
+    Trace every outline on the grid and sort the spans by the rows of the grid.
+
+    The signed areas, (n_site,) µm², are also returned.
 
     ``outlines(first, last)`` returns the outlines of the sites ``first`` to ``last - 1``. It is called for one piece of the
     layout at a time, so that undistorted outlines are traced while they are in the cache, and memory use is limited.

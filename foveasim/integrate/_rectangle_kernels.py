@@ -37,9 +37,9 @@ _flags = _input(types.boolean, 1)
 @njit(types.float64[:, ::1](_points, _ints, _ints))
 def find_rectangles(xy, ring_offsets, site_offsets):
     """
-    Return x_min, y_min, x_max, y_max of every site, (n_site, 4), or (0, 4) if a site is not an axis-aligned rectangle.
+    Return x_min, y_min, x_max, y_max of every site, (n_site, 4).
 
-    Clockwise outlines, and rectangles without an area, are not recognised.
+    The result is (0, 4) if a site is not an axis-aligned rectangle. Clockwise outlines, and rectangles without an area, are not recognised.
     """
     n_sites = site_offsets.size - 1
     if ring_offsets.size - 1 != n_sites or xy.shape[0] != 4 * n_sites:
@@ -67,7 +67,11 @@ def find_rectangles(xy, ring_offsets, site_offsets):
 
 @njit(inline="always")
 def _covered_cells(low, high, n):
-    """Return (first, last, w_first, w_last, m_first, m_last) of an interval on ``n`` cells; last < first if it covers none."""
+    """
+    Return (first, last, w_first, w_last, m_first, m_last) of an interval on ``n`` cells.
+
+    ``last < first`` if it covers none.
+    """
     low, high = max(low, 0.0), min(high, float(n))
     if not high > low:
         return 0, -1, 0.0, 0.0, 0.0, 0.0
@@ -107,7 +111,7 @@ def _difference(cells, row, c):
 
 @njit(inline="always")
 def _tilt(cells, row, first, last, w_first, w_last):
-    """Return the integral over an interval of the gradient along v of a row, per cell; 0 along a single cell."""
+    """Return the integral over an interval of a row's gradient along v, per cell."""
     n = cells.shape[0]
     if n == 1:
         return 0.0
@@ -181,9 +185,9 @@ def gather_rectangles(cells, bounds, first_site, last_site, where, scale, order,
 )
 def gather_lattice(cells, u, v, first_row, last_row, where, scale, order, out):
     """
-    Write scale x integral of the sites in the rows ``first_row`` to ``last_row - 1`` of a lattice.
+    Write scale x integral of the sites in some rows of a lattice.
 
-    ``u`` is (n_column, 2) and ``v`` is (n_row, 2), in cells. At first order, without ``where``, a row of the map is integrated
+    The rows are ``first_row`` to ``last_row - 1``.     ``u`` is (n_column, 2) and ``v`` is (n_row, 2), in cells. At first order, without ``where``, a row of the map is integrated
     once over all columns.
     """
     n_y, n_x = cells.shape

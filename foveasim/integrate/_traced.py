@@ -1,4 +1,4 @@
-"""Integration over outlines that are traced at every call, for layouts that change at every call."""
+"""Integration over outlines that are traced at every call, without stored overlaps."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ SITES_PER_PIECE = 1024
 @dataclass(frozen=True, eq=False)
 class TracedOutlines:
     """
-    Outlines without a plan: tracing and summation in one pass, twice to three times the time of a compiled frame.
+    Outlines that are traced and summed in one pass.
+
+    A call takes two to three times as long as with a plan, which must be compiled first.
 
     Attributes
     ----------

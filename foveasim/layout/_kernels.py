@@ -33,7 +33,11 @@ MIN_FACING_COSINE = 0.9
 
 @njit(types.void(_points, _points, types.int64, types.float64[:, ::1]))
 def fill_rectangles(x, y, first, xy):
-    """Write the corners of the sites of a lattice from site ``first`` on, counter-clockwise, four rows of ``xy`` each."""
+    """
+    Write the corners of the sites of a lattice from site ``first`` on.
+
+    Each site has four rows of ``xy``, counter-clockwise.
+    """
     n_x = x.shape[0]
     for k in range(xy.shape[0] // 4):
         row, column = (first + k) // n_x, (first + k) % n_x

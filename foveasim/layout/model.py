@@ -228,7 +228,9 @@ class Layout:
         provenance: Mapping[str, Any] | None = None,
     ) -> Layout:
         """
-        Build a layout of rectangles in rows and columns, whose vertices are computed when they are read.
+        Build a layout of rectangles in rows and columns.
+
+        Vertices are computed when they are read.
 
         Parameters
         ----------

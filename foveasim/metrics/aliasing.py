@@ -176,7 +176,7 @@ class AliasingSpectrum:
     __repr__ = short_repr
 
     def plot(self, *, ax: Axes | None = None) -> Axes:
-        """Draw the contrast in dB, the Nyquist frequency as a circle, and wave and alias, on matplotlib axes."""
+        """Draw the contrast in dB, a circle at the Nyquist frequency, and wave and alias."""
         from matplotlib.patches import Circle
 
         from foveasim.view import plot_image

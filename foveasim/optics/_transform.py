@@ -347,7 +347,7 @@ class Transform:
 
 
 def _interpolation(x: Floats, n_nodes: int) -> Floats:
-    """Return the matrix (n, n_nodes) from values at Chebyshev nodes to those at x within -1 to 1."""
+    """Return the matrix (n, n_nodes) from values at Chebyshev nodes to those at x in [-1, 1]."""
     vandermonde = np.polynomial.chebyshev.chebvander
     nodes = np.polynomial.chebyshev.chebpts1(n_nodes)
     return np.asarray(vandermonde(x, n_nodes - 1) @ np.linalg.inv(vandermonde(nodes, n_nodes - 1)))

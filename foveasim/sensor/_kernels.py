@@ -117,9 +117,9 @@ def count_ray_intersections(xy, ring_offsets, site_offsets, centroid, directions
 @njit(inline="always")
 def _poisson(mean, first, second, tables):
     """
-    Draw a Poisson number from two uniform numbers: the sum of draws of the integral and of the fractional part of the mean.
+    Draw a Poisson number from two uniform numbers.
 
-    Both are inversions of the cumulative distribution, the first one by a table.
+    It is the sum of draws of the integral and of the fractional part of the mean. Both are inversions of the cumulative distribution, the first one by a table.
     """
     row = int(mean)
     n = np.int64(tables.guide[row, int(first * tables.guide.shape[1])])

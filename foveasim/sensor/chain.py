@@ -167,9 +167,9 @@ Step: TypeAlias = Effect | _Deterministic
 
 def merge_steps(steps: Iterable[Step], sites: Sites) -> tuple[Step, ...]:
     """
-    Merge consecutive factors, and consecutive offsets, into single steps, and omit factors of 1 and offsets of 0.
+    Merge consecutive factors, and consecutive offsets, into single steps.
 
-    The result is the same to rounding. Merging avoids passes over the sites and reads of patterns from memory.
+    Factors of 1 and offsets of 0 are omitted.     The result is the same to rounding. Merging avoids passes over the sites and reads of patterns from memory.
     """
     steps_merged: list[Step] = []
     for step in steps:
@@ -288,9 +288,9 @@ def run_steps(
     n_threads: int | None = None,
 ) -> None:
     """
-    Run steps of the chain, which write their results with :class:`Save` and :class:`Conversion`.
+    Run steps of the chain.
 
-    Consecutive local steps process one block of sites after another, which stays in the cache for all of them.
+    Results are written by :class:`Save` and :class:`Conversion`. Consecutive local steps process one block of sites after another, which stays in the cache for all of them.
 
     Parameters
     ----------

@@ -594,7 +594,9 @@ class Sensor:
         self, photo_e_per_s: Floats, exposure_s: float, *, streams: Streams, n_threads: int | None = None
     ) -> tuple[Floats, Ints, NDArray[Any]]:
         """
-        Simulate an exposure: :meth:`expected_electrons`, :meth:`collect` and :meth:`read` in one pass over the sites.
+        Simulate an exposure in one pass over the sites.
+
+        The results are those of :meth:`expected_electrons`, :meth:`collect` and :meth:`read`.
 
         Parameters
         ----------
@@ -651,7 +653,7 @@ class Sensor:
 
     @cached_property
     def _line(self) -> NDArray[np.int32]:
-        """Readout line of each site, (n_site,); 0, (1,), without DNL, which alone differs between lines."""
+        """Readout line of each site, (n_site,), with DNL; otherwise one 0, (1,)."""
         return read_only(self.layout.readout_line.astype(np.int32) if self.dnl_dn else np.zeros(1, np.int32))
 
     @cached_property

@@ -722,7 +722,7 @@ def _add_scalar_bar(plot: Plotter, meshes: list[Mesh]) -> None:
 
 
 def add_picking(plot: Plotter, meshes: list[Mesh]) -> None:
-    """Show the number and the value of a photosite at a right click, and its surface in another colour."""
+    """Show number and value of a photosite at a right click; draw it in another colour."""
     repainted: list[tuple[Any, Any, Any]] = []
 
     def report(_: Any, picker: Any) -> None:

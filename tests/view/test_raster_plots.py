@@ -168,7 +168,7 @@ def test_log_polar_plot_is_unrolled_exactly(stagger):
     assert np.abs(off) == pytest.approx(7.5, abs=1e-9)
 
 
-def test_log_polar_image_in_colours_is_white_balanced():
+def test_colour_log_polar_images_are_white_balanced():
     plane = np.full((40, 40), 0.25, np.float32)
     grey = np.stack((plane, 2.0 * plane, 0.5 * plane))
     picture = fs.Picture(grey, np.ones((40, 40), np.float32), fs.Grid((40, 40), 1.0), np.array([1.0, 2.0, 0.5]))

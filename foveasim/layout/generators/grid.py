@@ -200,7 +200,7 @@ def linear_fill_factor(
 
 
 def cell_interval(fraction: float | None) -> Floats:
-    """Return both ends of a centred fraction of the interval from 0 to 1, or of all of it, (2,)."""
+    """Return both ends of a centred fraction of the interval from 0 to 1, (2,); None for all."""
     margin = 0.0 if fraction is None else 0.5 * (1.0 - fraction)
     return np.array([margin, 1.0 - margin])
 

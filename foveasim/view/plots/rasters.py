@@ -170,7 +170,7 @@ def plot_image(
     figure_inches: float = 8.0,
 ) -> Axes:
     """
-    Draw an array as an image with labelled axes, such as results of :mod:`foveasim.metrics`.
+    Draw an array as an image with labelled axes.
 
     Parameters
     ----------
@@ -296,7 +296,7 @@ def power_map_pixels(power_map: PowerMap, max_pixels: int) -> NDArray[np.uint8]:
 
 def picture_pixels(picture: Picture, max_pixels: int) -> NDArray[np.uint8]:
     """
-    Return a picture as :meth:`foveasim.Picture.to_image`, sRGB-encoded, averaged to a smaller size.
+    Return a picture as sRGB-encoded pixels, averaged to a smaller size.
 
     Pictures of neither 1 nor 3 channels are shown as the mean of their channels. The result is (n_y, n_x, 2 or 4) uint8, with
     alpha.
@@ -310,9 +310,9 @@ def picture_pixels(picture: Picture, max_pixels: int) -> NDArray[np.uint8]:
 
 def cortical_pixels(image: CorticalImage, max_pixels: int) -> NDArray[np.uint8]:
     """
-    Return a log-polar image as pixels with alpha, the outermost ring first, sRGB-encoded; larger ones are averaged.
+    Return a log-polar image as sRGB-encoded pixels with alpha, the outermost ring first.
 
-    Images of neither 1 nor 3 channels are shown as the mean of their channels. There are two pixels per sector, so that
+    Larger ones are averaged.     Images of neither 1 nor 3 channels are shown as the mean of their channels. There are two pixels per sector, so that
     staggered rings are shifted.
     """
     data, white = block_means(_unrolled(image), max_pixels), image.white
