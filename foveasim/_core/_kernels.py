@@ -161,8 +161,8 @@ def fill_uniforms(key, batch, first, second):
     """
     Compute a batch of pairs of uniform numbers in the open interval (0, 1).
 
-    They are multiples of 2**-53.     Pair ``i`` of batch ``b`` depends only on the key, ``b`` and ``i``: one counter of Philox 4x32. The arrays have size
-    ``BATCH``.
+    They are multiples of 2**-53. Pair ``i`` of batch ``b`` depends only on the key, ``b`` and ``i``: one counter of Philox
+    4x32. The arrays have size ``BATCH``.
     """
     key_0, key_1, zero = key & _LOW, key >> _32, np.uint64(0)
     for j in range(BATCH):

@@ -39,7 +39,8 @@ def find_rectangles(xy, ring_offsets, site_offsets):
     """
     Return x_min, y_min, x_max, y_max of every site, (n_site, 4).
 
-    The result is (0, 4) if a site is not an axis-aligned rectangle. Clockwise outlines, and rectangles without an area, are not recognised.
+    The result is (0, 4) if a site is not an axis-aligned rectangle. Clockwise outlines, and rectangles without an area, are not
+    recognised.
     """
     n_sites = site_offsets.size - 1
     if ring_offsets.size - 1 != n_sites or xy.shape[0] != 4 * n_sites:
@@ -187,8 +188,8 @@ def gather_lattice(cells, u, v, first_row, last_row, where, scale, order, out):
     """
     Write scale x integral of the sites in some rows of a lattice.
 
-    The rows are ``first_row`` to ``last_row - 1``.     ``u`` is (n_column, 2) and ``v`` is (n_row, 2), in cells. At first order, without ``where``, a row of the map is integrated
-    once over all columns.
+    The rows are ``first_row`` to ``last_row - 1``. ``u`` is (n_column, 2) and ``v`` is (n_row, 2), in cells. At first order,
+    without ``where``, a row of the map is integrated once over all columns.
     """
     n_y, n_x = cells.shape
     n_columns = u.shape[0]

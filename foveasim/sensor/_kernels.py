@@ -119,7 +119,8 @@ def _poisson(mean, first, second, tables):
     """
     Draw a Poisson number from two uniform numbers.
 
-    It is the sum of draws of the integral and of the fractional part of the mean. Both are inversions of the cumulative distribution, the first one by a table.
+    It is the sum of draws of the integral and of the fractional part of the mean. Both are inversions of the cumulative
+    distribution, the first one by a table.
     """
     row = int(mean)
     n = np.int64(tables.guide[row, int(first * tables.guide.shape[1])])

@@ -169,7 +169,8 @@ def merge_steps(steps: Iterable[Step], sites: Sites) -> tuple[Step, ...]:
     """
     Merge consecutive factors, and consecutive offsets, into single steps.
 
-    Factors of 1 and offsets of 0 are omitted.     The result is the same to rounding. Merging avoids passes over the sites and reads of patterns from memory.
+    Factors of 1 and offsets of 0 are omitted. The result is the same to rounding. Merging avoids passes over the sites and
+    reads of patterns from memory.
     """
     steps_merged: list[Step] = []
     for step in steps:
@@ -290,7 +291,8 @@ def run_steps(
     """
     Run steps of the chain.
 
-    Results are written by :class:`Save` and :class:`Conversion`. Consecutive local steps process one block of sites after another, which stays in the cache for all of them.
+    Results are written by :class:`Save` and :class:`Conversion`. Consecutive local steps process one block of sites after
+    another, which stays in the cache for all of them.
 
     Parameters
     ----------

@@ -58,6 +58,9 @@ class LayoutLayer:
         functools.update_wrapper(self, function)
         self.function = function
 
+    def __repr__(self) -> str:
+        return f"LayoutLayer({getattr(self.function, '__name__', self.function)})"
+
     def __call__(self, layout: Layout, **parameters: Any) -> Any:
         """Return the polygons of a layout."""
         return self.function(layout, **parameters)

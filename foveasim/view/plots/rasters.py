@@ -312,8 +312,8 @@ def cortical_pixels(image: CorticalImage, max_pixels: int) -> NDArray[np.uint8]:
     """
     Return a log-polar image as sRGB-encoded pixels with alpha, the outermost ring first.
 
-    Larger ones are averaged.     Images of neither 1 nor 3 channels are shown as the mean of their channels. There are two pixels per sector, so that
-    staggered rings are shifted.
+    Larger ones are averaged. Images of neither 1 nor 3 channels are shown as the mean of their channels. There are two pixels
+    per sector, so that staggered rings are shifted.
     """
     data, white = block_means(_unrolled(image), max_pixels), image.white
     if data.shape[0] not in (1, 3):
