@@ -12,8 +12,11 @@ from __future__ import annotations
 
 import argparse
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import scipy.fft
@@ -28,6 +31,8 @@ PITCH_UM = 3.0
 DISTANCE_M, N_REPEATS = 1.0, 5
 #: Bounds in pairs: one band, three bands behind a Bayer mosaic, 31 bands behind it.
 MONO_PAIRS, BAYER_PAIRS, BANDS_PAIRS = 2.5, 4.0, 16.0
+#: Bounds of a first capture, which includes layout and compilation, in pairs; and of its memory above the scene.
+FIRST_PAIRS, BYTES_PER_SITE = 15.0, 150.0
 console = Console(width=130)
 
 
@@ -36,6 +41,8 @@ def bench_dense(report: Report, n_side: int) -> None:
     bench_mono(report, n_side)
     bench_bayer(report, n_side)
     bench_bands(report, n_side)
+    bench_first(report, n_side)
+    bench_memory(report, n_side)
 
 
 def bench_mono(report: Report, n_side: int) -> None:
@@ -55,6 +62,51 @@ def bench_bands(report: Report, n_side: int) -> None:
     _report_captures(
         report, "Bayer, 31 bands", dense_camera(n_side, is_colour=True), dense_scene(n_side, 31), BANDS_PAIRS
     )
+
+
+def bench_first(report: Report, n_side: int) -> None:
+    """First captures: layout, sensor, camera and capture."""
+    for name, n_bands in (("mono", 1), ("Bayer, 3 bands", 3)):
+        scene = dense_scene(n_side, n_bands)
+
+        def first(scene: fs.Scene = scene, *, is_colour: bool = n_bands > 1) -> None:
+            dense_camera(n_side, is_colour=is_colour).capture(scene, exposure_s=0.02, seed=0)
+
+        times = medians_s({"pair": pair_of(n_side), "first": first, "again": pair_of(n_side)}, N_REPEATS)
+        report.slower_than(
+            f"layout and first capture, {name}",
+            times["first"],
+            "rfft2 + irfft2",
+            min(times["pair"], times["again"]),
+            FIRST_PAIRS,
+        )
+
+
+MEMORY_PROBE = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import dense
+def status(key):
+    return next(int(l.split()[1]) * 1024 for l in open("/proc/self/status") if l.startswith(key))
+def run(n_side, scene):
+    dense.dense_camera(n_side, is_colour=False).capture(scene, exposure_s=0.02, seed=0)
+run(256, dense.dense_scene(256, 1))
+n_side = int(sys.argv[2])
+scene = dense.dense_scene(n_side, 1)
+before = status("VmRSS")
+open("/proc/self/clear_refs", "w").write("5")
+run(n_side, scene)
+print((status("VmHWM") - before) / n_side**2)
+"""
+
+
+def bench_memory(report: Report, n_side: int) -> None:
+    """Measure the peak memory of a first capture above the scene, in a separate process (Linux)."""
+    if not Path("/proc/self/clear_refs").exists():
+        return
+    arguments = [sys.executable, "-c", MEMORY_PROBE, str(Path(__file__).parent), str(n_side)]
+    n_bytes = float(subprocess.run(arguments, capture_output=True, text=True, check=True).stdout)
+    report.add("peak memory of layout and first capture, mono", "", "bytes per site", "", n_bytes, BYTES_PER_SITE)
 
 
 def dense_optics() -> fs.Optics:

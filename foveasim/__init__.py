@@ -26,6 +26,7 @@ from foveasim import (
     reconstruct,
     scene,
     sensor,
+    tiles,
     units,
     video,
     view,
@@ -81,6 +82,7 @@ __all__ = [
     "rgb_filters",
     "scene",
     "sensor",
+    "tiles",
     "units",
     "video",
     "view",
@@ -90,7 +92,7 @@ __all__ = [
 
 for _module in (
     "distortion", "layout", "maps", "metrics", "modes", "optics", "reconstruct", "scene", "scene.charts", "sensor",
-    "sensor.effects", "units", "video", "view",
+    "sensor.effects", "tiles", "units", "video", "view",
 ):  # fmt: skip
     check_public_calls(f"{__name__}.{_module}")
 check_public_calls(__name__)

@@ -468,19 +468,22 @@ class Camera:
             filter_names=sensor.filter_names,
             bits=sensor.bits,
             white_dn=self._white(light),
-            settings={
-                "light": self._describe_light(light),
-                **self._shared_settings,
-                "oversample": self.oversample(light),
-                "integration_order": self.order(light),
-                "exposure_s": exposure_s,
-                "seed": streams.seed,
-                "frame": streams.frame,
-                "versions": versions(),
-                **settings,
-            },
+            settings=self._describe(light, exposure_s, streams) | settings,
             stage_s=clock.stage_s,
         )
+
+    def _describe(self, light: Scene | PowerMap, exposure_s: float, streams: Streams) -> dict[str, Any]:
+        """Return the settings of a capture, as plain data."""
+        return {
+            "light": self._describe_light(light),
+            **self._shared_settings,
+            "oversample": self.oversample(light),
+            "integration_order": self.order(light),
+            "exposure_s": exposure_s,
+            "seed": streams.seed,
+            "frame": streams.frame,
+            "versions": versions(),
+        }
 
     def _describe_light(self, light: Scene | PowerMap) -> dict[str, object]:
         if isinstance(light, PowerMap):
@@ -814,7 +817,13 @@ class Camera:
                 for grid in grids
             ]
         smallest = min(integrators, key=lambda integrator: integrator.grid.cell_area_um2)
-        self._warn_of_coverage(source, smallest, is_moving=position_um is not None)
+        self._warn_of_coverage(source, Covered.by(smallest), is_moving=position_um is not None)
+        return self._integrate(light, maps, integrators, clock)
+
+    def _integrate(
+        self, light: Scene | PowerMap, maps: Iterable[_WeightedMap], integrators: Sequence[Integrator], clock: _Clock
+    ) -> Floats:
+        """Return the sums of weighted maps over every site, photoelectrons per second."""
         rate_e_per_s = np.zeros(self._layout.n_sites)
         for image, cells, where, weight in maps:
             with clock.stage("integration"):
@@ -903,25 +912,24 @@ class Camera:
             SamplingWarning,
         )
 
-    def _warn_of_coverage(self, source: Scene | PowerMap, integrator: Integrator, *, is_moving: bool) -> None:
+    def _warn_of_coverage(self, source: Scene | PowerMap, covered: Covered, *, is_moving: bool = False) -> None:
         """
         Warn of sites outside the image, and of a layout that measures a small part of it.
 
         Sites outside are dark whatever the scene is.
         """
-        n_outside = integrator.sites_outside_image_circle.size
-        if n_outside:
+        if covered.n_outside:
             warn(
-                f"{n_outside:,} of {self._layout.n_sites:,} photosites lie outside the image circle of the lens and are dark; "
-                "shrink or move the layout, or use a lens model with a larger field",
+                f"{covered.n_outside:,} of {self._layout.n_sites:,} photosites lie outside the image circle of the lens and "
+                "are dark; shrink or move the layout, or use a lens model with a larger field",
                 CoverageWarning,
             )
         is_photograph = isinstance(source, Scene) and source.is_picture
         fit = source.fit if isinstance(source, Scene) else None
         if fit in ("contain", "width"):
             return
-        image_um, layout_um = integrator.grid.bounds_um, integrator.bounds_um
-        n_uncovered = integrator.n_uncovered - n_outside
+        image_um, layout_um = covered.image_um, covered.layout_um
+        n_uncovered = covered.n_uncovered - covered.n_outside
         if n_uncovered:
             remedy = (
                 "use fit='cover', or a larger pitch_um or field_of_view_deg"
@@ -952,6 +960,34 @@ class Camera:
         if max_response == 0.0:
             return np.ones(response.size)
         return np.maximum(response / max_response, MIN_WHITE_FRACTION) * (2**self._sensor.bits - 1)
+
+
+class Covered(NamedTuple):
+    """
+    Numbers of sites beyond an image, among them those outside the image circle.
+
+    ``image_um`` and ``layout_um`` are bounds (x_min, y_min, x_max, y_max), µm.
+    """
+
+    image_um: tuple[float, float, float, float]
+    layout_um: tuple[float, float, float, float]
+    n_uncovered: int
+    n_outside: int
+
+    @classmethod
+    def by(cls, integrator: Integrator) -> Covered:
+        """Return the coverage of an integrator's sites by its grid."""
+        n_outside = integrator.sites_outside_image_circle.size
+        return cls(integrator.grid.bounds_um, integrator.bounds_um, integrator.n_uncovered, n_outside)
+
+    @classmethod
+    def union(cls, image_um: tuple[float, float, float, float], parts: Sequence[Covered]) -> Covered:
+        """Return the coverage of the sites of all parts by an image."""
+        bounds_um = np.array([part.layout_um for part in parts])
+        x0, y0 = np.fmin.reduce(bounds_um[:, :2])
+        x1, y1 = np.fmax.reduce(bounds_um[:, 2:])
+        n_uncovered, n_outside = (sum(part.n_uncovered for part in parts), sum(part.n_outside for part in parts))
+        return cls(image_um, (float(x0), float(y0), float(x1), float(y1)), n_uncovered, n_outside)
 
 
 class _WeightedMap(NamedTuple):

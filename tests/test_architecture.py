@@ -27,7 +27,7 @@ LAYERS = [
     {"modes", "reconstruct"},
     {"capture"},
     {"camera"},
-    {"metrics", "video", "view"},
+    {"metrics", "tiles", "video", "view"},
     {"compare"},
     {"config"},
     {"explore"},

@@ -56,6 +56,8 @@ class Streams:
         Seed of the run, at least 0.
     frame : int
         Index of the frame, at least 0.
+    first_block : int
+        Number of the first block of sites, at least 0: for part of a layout.
 
     Raises
     ------
@@ -75,10 +77,12 @@ class Streams:
 
     seed: int
     frame: int = 0
+    first_block: int = 0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "seed", check_count("seed", self.seed, at_least=0))
         object.__setattr__(self, "frame", check_count("frame", self.frame, at_least=0))
+        object.__setattr__(self, "first_block", check_count("first_block", self.first_block, at_least=0))
 
     def of(self, effect: str, block: int | None = None) -> np.random.Generator:
         """
@@ -87,7 +91,7 @@ class Streams:
         The streams of blocks are parts of the counter range of a Philox generator, which is created in half the time of others.
         """
         if block is not None:
-            counter = np.array([0, 0, 0, block], np.uint64)
+            counter = np.array([0, 0, 0, self.first_block + block], np.uint64)
             return np.random.Generator(np.random.Philox(key=_block_key(self.seed, self.frame, effect), counter=counter))
         key = (self.frame, crc32(effect.encode()))
         return np.random.Generator(np.random.PCG64DXSM(np.random.SeedSequence(self.seed, spawn_key=key)))

@@ -276,16 +276,16 @@ def check_pitch_um(name: str, value: object) -> tuple[float, float]:
     return along_x_um, along_y_um
 
 
-def check_sites(n_sites: int) -> int:
+def check_sites(n_sites: int, *, at_most: int = MAX_SITES) -> int:
     """
     Return the number of sites that a generator is about to create.
 
     Raises
     ------
     ParameterError
-        When the number exceeds ``MAX_SITES``.
+        When the number exceeds the limit.
     """
-    return check_count("n_sites", n_sites, at_most=MAX_SITES, hint="take fewer or larger photosites")
+    return check_count("n_sites", n_sites, at_most=at_most, hint="take fewer or larger photosites")
 
 
 def check_choice(name: str, value: object, choices: Collection[str]) -> str:

@@ -9,18 +9,19 @@ from __future__ import annotations
 
 import codecs
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from io import TextIOWrapper
-from typing import Any
+from typing import Any, TypeVar
 
 from rich.console import Console
 from rich.text import Text
 
 from foveasim.errors import printable
 
-__all__ = ["PlainConsole", "as_plain_text", "plain_streams", "select_spinner"]
+__all__ = ["PlainConsole", "as_plain_text", "plain_streams", "select_spinner", "with_progress"]
 
+T = TypeVar("T")
 #: Name of the encoding error handler of streams.
 HANDLER = "foveasim.plain"
 #: ASCII replacements of characters that this package and rich print, of equal length where possible to align tables.
@@ -104,3 +105,17 @@ def _replace_unencodable(error: UnicodeError) -> tuple[str, int]:
 
 
 codecs.register_error(HANDLER, _replace_unencodable)
+
+
+def with_progress(items: Iterable[T], what: str, n_items: int | None, n_before: int = 0) -> Iterator[T]:
+    """Yield items with a progress bar; the remaining time is estimated from new items only."""
+    from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    console = PlainConsole()
+    spinner = SpinnerColumn(select_spinner(console))
+    columns = (spinner, *Progress.get_default_columns()[:-1], TimeRemainingColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task(what, total=n_items, completed=n_before)
+        for item in items:
+            yield item
+            bar.advance(task)

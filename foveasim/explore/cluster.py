@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
-from multiprocessing import current_process
+from multiprocessing import current_process, get_context
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -99,12 +99,10 @@ def open_client(scheduler: str | None, n_workers: int) -> Iterator[Client]:
             {"distributed.scheduler.allowed-failures": 0, "distributed.admin.large-graph-warning-threshold": "1 TB"}
             | MEMORY_SETTINGS
             | NO_HTTP
-            | {"distributed.worker.multiprocessing-method": START_METHOD}
+            | {"distributed.worker.multiprocessing-method": _start_method()}
         ),
         ExitStack() as stack,
     ):
-        if START_METHOD == "forkserver":
-            _start_fork_server()
         try:
             cluster = stack.enter_context(
                 LocalCluster(
@@ -131,14 +129,23 @@ def open_client(scheduler: str | None, n_workers: int) -> Iterator[Client]:
         yield client
 
 
+def _start_method() -> str:
+    """Return the start method of local workers."""
+    if START_METHOD == "forkserver":
+        try:
+            _start_fork_server()
+        except OSError:  # for example, the path of temporary files is too long for a socket
+            return "spawn"
+    return START_METHOD
+
+
 def _start_fork_server() -> None:
     """Start the process from which workers are forked, with the module path of this process."""
     from multiprocessing import forkserver
 
     import dask
-    from distributed.utils import get_mp_context
 
-    get_mp_context().set_forkserver_preload(["foveasim.explore._worker_imports"])
+    get_context("forkserver").set_forkserver_preload(["foveasim.explore._worker_imports"])
     # Settings of libraries at their import, among them one thread: a process with threads must not be forked.
     settings = dask.config.get("distributed.nanny.pre-spawn-environ").items()
     defaults = {name: str(value) for name, value in settings if value is not None} | {"PYTHONHASHSEED": "0"}

@@ -458,6 +458,8 @@ class Layout:
     def __getitem__(self, selection: Any) -> Layout:
         """Select sites by a mask, a slice, indices, or a function that returns one of these."""
         chosen = unmasked("selection", selection(self) if callable(selection) else selection)
+        if isinstance(chosen, slice) and chosen.step in (None, 1):
+            return self._range(*chosen.indices(self.n_sites)[:2])
         ids = np.atleast_1d(np.arange(self.n_sites)[chosen])
         if ids.ndim != 1:
             raise ParameterError("selection", f"must be a mask, a slice or a list of sites, got {ids.ndim} dimensions")
@@ -469,6 +471,22 @@ class Layout:
             np.concatenate(([0], np.cumsum(np.diff(self.site_offsets)[ids]))),
             {name: column[ids] for name, column in self.columns.items()},
             self._extend_provenance(f"selected {ids.size} of {self.n_sites} sites"),
+        )
+
+    def _range(self, first: int, last: int) -> Layout:
+        """Return the sites ``first`` to ``last - 1``."""
+        last = max(first, last)
+        if self.lattice is not None:
+            rings = self.lattice.rings(first, last)
+        else:
+            site_offsets = self.site_offsets[first : last + 1]
+            ring_offsets = self.ring_offsets[site_offsets[0] : site_offsets[-1] + 1]
+            xy_um = self.xy_um[ring_offsets[0] : ring_offsets[-1]]
+            rings = xy_um.copy(), ring_offsets - ring_offsets[0], site_offsets - site_offsets[0]
+        return Layout._from_checked(
+            *rings,
+            {name: column[first:last].copy() for name, column in self.columns.items()},
+            self._extend_provenance(f"selected {last - first} of {self.n_sites} sites"),
         )
 
     def sort_by(self, *keys: str | ArrayLike, descending: bool = False) -> Layout:

@@ -8,18 +8,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim.layout.lattice import RectangleLattice
 from foveasim.layout.model import Layout
 
 __all__ = ["is_layout_array", "layout_from_arrays", "layout_to_arrays"]
 
 OUTLINES = ("xy_um", "ring_offsets", "site_offsets")
+#: Columns and rows of a lattice of rectangles.
+LATTICE = ("lattice_x_um", "lattice_y_um")
 #: Prefix of the array name of a column.
 COLUMN_PREFIX = "column_"
 
 
-def layout_to_arrays(layout: Layout) -> dict[str, NDArray[Any]]:
-    """Return the outlines and columns of a layout as arrays by name."""
-    arrays = {name: np.asarray(getattr(layout, name)) for name in OUTLINES}
+def layout_to_arrays(layout: Layout, *, is_compact: bool = False) -> dict[str, NDArray[Any]]:
+    """
+    Return the outlines and columns of a layout as arrays by name.
+
+    Compact outlines of lattices are the intervals of columns and rows instead of vertices.
+    """
+    if is_compact and layout.lattice is not None:
+        arrays = {LATTICE[0]: layout.lattice.x_um, LATTICE[1]: layout.lattice.y_um}
+    else:
+        arrays = {name: np.asarray(getattr(layout, name)) for name in OUTLINES}
     return arrays | {COLUMN_PREFIX + name: values for name, values in layout.columns.items()}
 
 
@@ -39,6 +49,9 @@ def layout_from_arrays(arrays: Mapping[str, NDArray[Any]], provenance: Mapping[s
     columns = {
         name.removeprefix(COLUMN_PREFIX): values for name, values in arrays.items() if name.startswith(COLUMN_PREFIX)
     }
+    if LATTICE[0] in arrays:
+        x_um, y_um = (arrays[name] for name in LATTICE)
+        return Layout.from_lattice(RectangleLattice(x_um, y_um), columns, provenance)
     xy_um, ring_offsets, site_offsets = (arrays[name] for name in OUTLINES)
     has_holes = np.diff(site_offsets) > 1
     if has_holes.any():

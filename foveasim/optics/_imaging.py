@@ -17,7 +17,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -30,7 +30,10 @@ from foveasim.optics._aperture import Aperture
 from foveasim.optics._transform import Factor, Transform, source_pixels
 from foveasim.optics.otf import Tables
 
-__all__ = ["Imaging", "isoplanatic_error", "isoplanatic_maps", "reach_cells"]
+__all__ = ["Imaging", "MapRows", "isoplanatic_error", "isoplanatic_maps", "reach_cells", "rows_of"]
+
+#: Function of (first, last) that returns the rows ``first`` to ``last - 1`` of a map.
+MapRows = Callable[[int, int], NDArray[Any]]
 
 #: Callable of (weights of a sum, transform, tables) that returns the transfer function of a sum, cached or not.
 FactorLookup = Callable[[Floats, Transform, Tables], Factor]
@@ -199,8 +202,8 @@ class Imaging:
             n_threads=self.n_threads,
         )
 
-    def maps(self, table_of: Tables) -> Iterator[NDArray[Any]]:
-        """Yield maps with the same PSF over the whole field, computed lazily."""
+    def maps(self, table_of: Tables) -> Iterator[MapRows]:
+        """Yield maps with the same PSF over the whole field; their rows are computed on demand."""
         transform = self.transform(*self.sources(), self.grid.shape)
 
         def write_spectrum(b: int, out: NDArray[Any]) -> None:
@@ -213,7 +216,7 @@ class Imaging:
         transform: Transform,
         write_spectrum: Callable[[int, NDArray[Any]], None],
         factor_of: FactorOf,
-    ) -> Iterator[NDArray[Any]]:
+    ) -> Iterator[MapRows]:
         stored: dict[Group, NDArray[Any]] = {}
 
         def add(spectra: NDArray[Any], step: Step, sums: NDArray[Any], *, is_first: bool, is_last: bool) -> None:
@@ -248,9 +251,13 @@ class Imaging:
                 sums = sum_together(group) if group.is_summed_together else sum_step(group, step)
                 computed |= zip(step.outputs.tolist(), sums, strict=True)
                 del sums
-            yield transform.inverse(computed.pop(c)) if c in computed else np.zeros(transform.map_shape, self.real)
+            yield partial(transform.inverse, computed.pop(c)) if c in computed else partial(self._no_light, transform)
 
-    def patch_maps(self, rows: _PatchExtent, columns: _PatchExtent, table_of: Tables) -> Iterator[NDArray[Any]]:
+    def _no_light(self, transform: Transform, first: int, last: int) -> NDArray[Any]:
+        """Return rows of a map of 0."""
+        return np.zeros((last - first, transform.map_shape[1]), self.real)
+
+    def patch_maps(self, rows: _PatchExtent, columns: _PatchExtent, table_of: Tables) -> Iterator[MapRows]:
         """Yield the contribution of a patch to every map, over the cells that its PSF reaches."""
         shape = rows.cells.size, columns.cells.size
         transform = self.transform(np.arange(shape[0]), np.arange(shape[1]), shape)
@@ -290,7 +297,7 @@ class _PatchExtent:
 
 def isoplanatic_maps(
     imaging: Imaging, n_patches: tuple[int, int], tables_at: Callable[[tuple[float, float]], Tables]
-) -> Iterator[NDArray[Any]]:
+) -> Iterator[MapRows]:
     """
     Yield maps with a PSF that varies over the field; all maps are in memory together.
 
@@ -309,9 +316,15 @@ def isoplanatic_maps(
             fine = [(k * extent.cells[:, np.newaxis] + np.arange(k)).ravel() for extent in (rows, columns)]
             is_inside = [(cells >= 0) & (cells < n) for cells, n in zip(fine, maps.shape[1:], strict=True)]
             to = np.ix_(fine[0][is_inside[0]], fine[1][is_inside[1]])
-            for c, patch_map in enumerate(imaging.patch_maps(rows, columns, tables_at((float(x_um), float(y_um))))):
-                maps[c][to] += patch_map[np.ix_(*is_inside)]
-    yield from maps
+            for c, patch_rows in enumerate(imaging.patch_maps(rows, columns, tables_at((float(x_um), float(y_um))))):
+                maps[c][to] += patch_rows(0, fine[0].size)[np.ix_(*is_inside)]
+    for complete in maps:
+        yield partial(rows_of, complete)
+
+
+def rows_of(cells: NDArray[Any], first: int, last: int) -> NDArray[Any]:
+    """Return the rows ``first`` to ``last - 1`` of a map."""
+    return cells[first:last]
 
 
 def isoplanatic_error(

@@ -6,6 +6,7 @@ import inspect
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -34,6 +35,7 @@ from foveasim.optics.pupils import Pupil
 from foveasim.units import m_from_mm, m_from_um, um_from_m, um_from_nm
 
 if TYPE_CHECKING:
+    from foveasim.optics._imaging import MapRows
     from foveasim.optics._transform import Factor, Transform
 
 __all__ = ["Optics"]
@@ -452,6 +454,34 @@ class Optics(PointImages):
         Memory: the spectra of the outputs or those of the basis images, whichever are fewer, one more spectrum, and one map.
         With more basis images than outputs, the first map is available after all forward transforms.
         """
+        rows_of_maps = self.weighted_rows(scene, weights, grid=grid, n_threads=n_threads)
+        n_y = self._refine(self.grid(scene)).shape[0]
+
+        def complete(rows: MapRows) -> NDArray[Any]:
+            return rows(0, n_y)
+
+        # Unlike a generator, it has no reference to a spectrum while its map is processed.
+        return map(complete, rows_of_maps)
+
+    def weighted_rows(
+        self, scene: SceneLike, weights: Floats, *, grid: Grid | None = None, n_threads: int | None = None
+    ) -> Iterator[MapRows]:
+        """
+        Yield functions that compute rows of the maps of :meth:`weighted_maps`.
+
+        Only their spectra are in memory, for maps that are processed in strips. With aberrations that vary over the field, or
+        lateral chromatic aberration without ``grid``, complete maps are in memory.
+
+        Parameters
+        ----------
+        scene, weights, grid, n_threads
+            As for :meth:`weighted_maps`.
+
+        Yields
+        ------
+        rows : callable
+            ``rows(first, last)`` returns the rows ``first`` to ``last - 1``, (n, k n_x) float32 or float64.
+        """
         common = self._refine(self.grid(scene))
         weights = finite_array("weights", weights, ndim=2)
         if weights.shape[1] != scene.wavelength_nm.size:
@@ -470,7 +500,9 @@ class Optics(PointImages):
             return self._maps(scene, weights, grid or common, thread_count(n_threads))
         return self._maps_on_one_grid(scene, weights, thread_count(n_threads))
 
-    def _maps_on_one_grid(self, scene: SceneLike, weights: Floats, n_threads: int) -> Iterator[NDArray[Any]]:
+    def _maps_on_one_grid(self, scene: SceneLike, weights: Floats, n_threads: int) -> Iterator[MapRows]:
+        from foveasim.optics._imaging import rows_of
+
         to = self._refine(self.grid(scene))
         groups = self.image_grids(scene)
         onto = [[overlaps(n, to.pitch_x_um, n, grid.pitch_x_um) for n in to.shape] for grid, _ in groups]
@@ -478,11 +510,11 @@ class Optics(PointImages):
             total = np.zeros(to.shape)
             for (grid, is_of_it), (along_y, along_x) in zip(groups, onto, strict=True):
                 if np.any(output * is_of_it):
-                    cells = next(self._maps(scene, (output * is_of_it)[np.newaxis], grid, n_threads))
-                    total += (along_x @ (along_y @ cells).T).T
-            yield total.astype(self._real_type())
+                    rows = next(self._maps(scene, (output * is_of_it)[np.newaxis], grid, n_threads))
+                    total += (along_x @ (along_y @ rows(0, grid.shape[0])).T).T
+            yield partial(rows_of, total.astype(self._real_type()))
 
-    def _maps(self, scene: SceneLike, weights: Floats, grid: Grid, n_threads: int) -> Iterator[NDArray[Any]]:
+    def _maps(self, scene: SceneLike, weights: Floats, grid: Grid, n_threads: int) -> Iterator[MapRows]:
         from foveasim.optics._imaging import Imaging, isoplanatic_maps
 
         lambda_n_um = self._lambda_n_um(scene)

@@ -330,19 +330,20 @@ class Transform:
         )
         return x, y
 
-    def inverse(self, lines: NDArray[Any]) -> NDArray[Any]:
-        """Return the picture, without padding, of a sum that is already transformed along y."""
+    def inverse(self, lines: NDArray[Any], first_row: int = 0, last_row: int | None = None) -> NDArray[Any]:
+        """Return rows of the picture without padding, from a sum that is transformed along y."""
         n_y, n_x = self.map_shape
         top, left = (self._oversample * before for before in self._n_before)
-        image = work_array(self.map_shape, self._real)
+        n_rows = (n_y if last_row is None else last_row) - first_row
+        image = work_array((n_rows, n_x), self._real)
 
         def transform_rows(first: int, last: int) -> None:
             rows = np.empty((last - first, lines.shape[0]), lines.dtype)
-            self._kernels.load_rows(lines, top + first, rows)
+            self._kernels.load_rows(lines, top + first_row + first, rows)
             padded = scipy.fft.irfft(rows, n=self._oversample * self._columns.size, axis=1, overwrite_x=True)
             image[first:last] = padded[:, left : left + n_x]
 
-        self._for_each_block(transform_rows, n_y, ROWS_PER_BLOCK)
+        self._for_each_block(transform_rows, n_rows, ROWS_PER_BLOCK)
         return image
 
 

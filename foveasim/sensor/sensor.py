@@ -441,6 +441,26 @@ class Sensor:
         """
         return replace(self, disabled=tuple(dict.fromkeys((*self.disabled, *names))))
 
+    def part(self, first: int, last: int) -> Sensor:
+        """
+        Return the sensor of the sites ``first`` to ``last - 1``, with their fixed patterns.
+
+        Raises
+        ------
+        ParameterError
+            If effects, such as crosstalk, connect sites with others.
+        """
+        connecting = [effect.name for effect in self.chain if not effect.is_local]
+        if connecting:
+            raise ParameterError(
+                "sensor",
+                f"must have no effects between sites to be divided, got {', '.join(map(repr, connecting))}",
+                hint=f"switch them off: sensor.without({', '.join(map(repr, connecting))})",
+            )
+        per_site = {name: np.asarray(getattr(self, name)) for name in _PER_SITE if getattr(self, name) is not None}
+        parts: dict[str, Any] = {name: values[first:last] for name, values in per_site.items() if values.ndim}
+        return replace(self, layout=self.layout[first:last], **parts)
+
     def nominal(self) -> Sensor:
         """Return the sensor without the fixed patterns of its device."""
         return self.without(*(e.name for e in self.chain if e.is_local and not e.is_temporal))

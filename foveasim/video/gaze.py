@@ -214,7 +214,10 @@ def pan_camera(
     if isinstance(optics, Camera):
         camera, optics = optics, optics.optics
         if scene.pitch_um is None:
-            scene = scene.with_pitch(camera.frame(_crop(scene, 0, 0, n_y, n_x)).pitch_um or 0.0)
+            # The remaining shift moves the photosites by up to half a pixel on each side.
+            margin = 1 if scene.fit == "cover" else 0
+            framed = camera.frame(_crop(scene, 0, 0, max(1, n_y - margin), max(1, n_x - margin)))
+            scene = scene.with_pitch(framed.pitch_um or 0.0)
     elif scene.pitch_um is None:
         raise ParameterError(
             "scene", "must have a pixel pitch", hint="pass the camera instead of its optics, or camera.frame(scene)"

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +18,9 @@ from foveasim._core.extras import import_optional
 from foveasim._core.names import missing_path
 from foveasim._core.provenance import differences, to_plain_data
 from foveasim._core.validation import Floats, check_count
-from foveasim._io.atomic import atomic_directory, lock, remove_directory
+from foveasim._io.atomic import atomic_directory
 from foveasim._io.formats import as_file_error
+from foveasim._io.resumable import LOCK, disk_errors, finish, partial_path, resumable_directory
 from foveasim._io.zarr_stores import ZARR, check_codecs
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError, type_name
@@ -51,8 +51,6 @@ LAYOUT_ARRAYS, FRAME_ARRAYS = ("xy_um", "ring_offsets", "site_offsets"), ("code"
 NO_FRAME = -1
 #: Settings that may always differ between captures of one recording.
 FRAME_SETTINGS = frozenset({"exposure_s", "frame", "light.source", "place_um"})
-#: File that is locked while a recording is written, and extension of incomplete files of zarr.
-LOCK, INCOMPLETE = "lock", ".partial"
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -133,16 +131,6 @@ def read_recording(path: str | Path) -> Recording:
             white_dn=np.asarray(about["white_dn"], np.float64),
             settings=about["settings"],
         )
-
-
-def partial_path(path: str | Path) -> Path:
-    """
-    Return the path of the directory in which a resumable recording is written.
-
-    It is in the same directory as the recording, and exists until the last frame is written.
-    """
-    target = Path(path)
-    return target.with_name(target.name + ".partial")
 
 
 def count_recorded_frames(path: str | Path) -> int:
@@ -243,22 +231,21 @@ def resume_recording(captures: Iterable[Capture], target: Path, plan: Mapping[st
     import_optional(target, "zarr")
     if target.exists():
         return _count_finished(captures, target, plan)
-    with _locked_directory(target) as directory:
+    with resumable_directory(target, "recording", is_ours=_is_recording, has_content=_count_complete) as directory:
         n_before = _count_complete(directory)
         if n_before:
             _check_plan(directory, plan)
-        with _disk_errors(target):
+        with disk_errors(target):
             frames = _Frames(directory, plan, n_before)
         try:
             for capture in _check_continuation(check_consistent(captures, n_before=n_before), directory, n_before):
-                with _disk_errors(target):
+                with disk_errors(target):
                     frames.add(capture)
                     if time.monotonic() - frames.written_s > WRITE_S:
                         frames.write()
-            with _disk_errors(target):
+            with disk_errors(target):
                 frames.write()
-                directory.rename(target)
-                (target / LOCK).unlink(missing_ok=True)
+                finish(directory, target)
         except BaseException as error:
             with suppress(Exception):
                 frames.write()
@@ -284,53 +271,6 @@ def _count_finished(captures: Iterable[Capture], target: Path, plan: Mapping[str
             "the recording",
         )
     return n
-
-
-@contextmanager
-def _locked_directory(target: Path) -> Iterator[Path]:
-    """Lock the directory of a recording; delete it after the block if it has no frames."""
-    directory = partial_path(target)
-    if not target.parent.is_dir():
-        raise FileError(target, f"cannot be written: the directory {target.parent} does not exist")
-    if directory.exists() and not (directory.is_dir() and _is_unfinished_recording(directory)):
-        raise FileError(directory, "cannot be written: the path contains other data; choose another path")
-    with _disk_errors(target):
-        directory.mkdir(exist_ok=True)
-        file = (directory / LOCK).open("ab")
-    with file:
-        with _disk_errors(target):
-            # Another process may have finished the recording, or replaced the directory, before it was locked.
-            if not lock(file) or not _is_same_file(file, directory / LOCK):
-                raise FileError(target, "is being written by another process")
-            for incomplete in directory.rglob(f"*{INCOMPLETE}"):
-                incomplete.unlink()
-        try:
-            yield directory
-        finally:
-            if directory.exists() and not _count_complete(directory):
-                remove_directory(directory)
-
-
-@contextmanager
-def _disk_errors(target: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise FileError(target, f"cannot be written: {error.strerror or error}") from None
-
-
-def _is_unfinished_recording(directory: Path) -> bool:
-    """Return whether a directory contains an unfinished recording, possibly without frames."""
-    return all(path.name == LOCK or path.suffix == INCOMPLETE for path in directory.iterdir()) or _is_recording(
-        directory
-    )
-
-
-def _is_same_file(file: IO[bytes], path: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(file.fileno()), path.stat())
-    except OSError:
-        return False
 
 
 def _count_complete(directory: Path) -> int:
@@ -389,7 +329,7 @@ def _check_continuation(captures: Iterable[Capture], directory: Path, n_before: 
             may_differ |= set(different)
             with _open_checked(directory, "r+") as group:
                 pass
-            with _disk_errors(directory):
+            with disk_errors(directory):
                 group.attrs["varied"] = sorted(may_differ - FRAME_SETTINGS)
         next_frame = frame + 1
         yield capture

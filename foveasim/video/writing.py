@@ -108,7 +108,9 @@ def write_video(
             f"is supported for .zarr stores only; {target.name} is written atomically",
         )
     if progress:
-        captures = _with_progress(captures, n_frames, count_recorded_frames(target) if resume else 0)
+        from foveasim._io.terminal import with_progress
+
+        captures = with_progress(captures, "frames", n_frames, count_recorded_frames(target) if resume else 0)
     if extension == ZARR:
         return (resume_recording if resume else record)(captures, target, plan)
     if extension == ".gif":
@@ -121,22 +123,6 @@ def write_video(
             f"must end in .zarr, .gif, {', '.join(VIDEO_EXTENSIONS)}, or have no extension for a directory of pictures",
         )
     return _write_pictures(captures, target, max_pixels)
-
-
-def _with_progress(captures: Iterable[Capture], n_frames: int | None, n_before: int) -> Iterator[Capture]:
-    from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    from foveasim._io.terminal import PlainConsole, select_spinner
-
-    console = PlainConsole()
-    spinner = SpinnerColumn(select_spinner(console))
-    columns = (spinner, *Progress.get_default_columns()[:-1], TimeRemainingColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console) as bar:
-        # The remaining time is estimated from new frames only.
-        task = bar.add_task("frames", total=n_frames, completed=n_before)
-        for capture in captures:
-            yield capture
-            bar.advance(task)
 
 
 # -- pictures ---------------------------------------------------------------------------------------------------------

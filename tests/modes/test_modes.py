@@ -648,7 +648,7 @@ def test_mismatched_or_missing_batches_are_rejected(join, tmp_path, monkeypatch)
     for parts, message in (
         ([one, Events([2.0], [0], [1], other)], "must have the same layout"),
         ([one, Events([0.5], [0], [1], layout)], "must be consecutive in time"),
-        (one, "got a Events; pass a list of batches"),
+        (one, "got an Events; pass a list of batches"),
         (None, "got a NoneType"),
         ([one, 3], "must be Events, got an int"),
         ([], "at least one batch"),

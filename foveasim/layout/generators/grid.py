@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from foveasim._core.validation import (
+    MAX_SITES,
     Floats,
     check_count,
     check_length_um,
@@ -25,6 +26,8 @@ from foveasim.layout.site_counts import SolveFor
 
 __all__ = ["grid"]
 
+#: Maximum number of sites without stored vertices.
+MAX_LATTICE_SITES = 1_000_000_000
 #: Rows that exceed the height of a field by rounding fit in it.
 FIT_ROUNDING = 1.0 + 1e-9
 
@@ -116,7 +119,7 @@ def grid(
             raise ParameterError("width_um", "must be replaced by 'trench_um' if 'pitch_y_um' is given", width_um)
     pitches_um = pitch_um, pitch_um if pitch_y_um is None else pitch_y_um
     fractions = [linear_fill_factor(p_um, width_um, trench_um, fill_factor) for p_um in pitches_um]
-    check_sites(n_x * n_y)
+    check_sites(n_x * n_y, at_most=MAX_SITES if stagger else MAX_LATTICE_SITES)
     # 32 bits: products of an index and the number of columns do not overflow.
     row = freeze(np.repeat(np.arange(n_y, dtype=np.int32), n_x))
     column = freeze(np.tile(np.arange(n_x, dtype=np.int32), n_y))

@@ -71,6 +71,9 @@ class Photosites(PackedRings, Protocol):
     def columns(self) -> Mapping[str, NDArray[Any]]:
         """Data columns per site by name; colour layouts have ``channel``."""
 
+    def __getitem__(self, selection: Any) -> Any:
+        """Return the layout of some of the sites."""
+
     def adjacency(self, *, max_gap_um: float | None = None) -> Any:
         """Return the lengths of shared edges, (n_site, n_site) sparse, µm."""
 
