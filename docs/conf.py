@@ -69,6 +69,7 @@ MODULES = {
     "foveasim.sensor": "Quantum efficiency, colour filters, the electronic chain, noise budget, calibration, HDR merge.",
     "foveasim.sensor.effects": "Noise sources, fixed patterns and crosstalk, and the interface of user effects.",
     "foveasim.reconstruct": "Raster pictures from captures.",
+    "foveasim.tiles": "Captures of sensors that are larger than memory.",
     "foveasim.video": "Frames from files, gaze paths, recordings.",
     "foveasim.modes": "Rolling shutters, event pixels, integrate-and-fire pixels.",
     "foveasim.metrics": "Resolution, aliasing, photon transfer, signal-to-noise ratio, picture quality, optical flow.",

@@ -15,7 +15,7 @@ from foveasim._core.validation import Floats, Images, check_count, finite_array,
 from foveasim._io.encodings import decode, encode_srgb_values
 from foveasim._io.images import picture_format, write_picture
 from foveasim.errors import GeometryError, ParameterError
-from foveasim.fields import Grid, PackedRings, to_file_rows
+from foveasim.fields import Grid, Lattice, PackedRings, to_file_rows
 from foveasim.integrate import Integrator
 
 if TYPE_CHECKING:
@@ -238,9 +238,13 @@ def _channels(colour: Colour, n_channels: int) -> Floats:
 def raster_grid(layout: PackedRings, max_pixels: int) -> Grid:
     """Return a grid of square pixels over the layout, ``max_pixels`` along its longer side."""
     max_pixels = check_count("max_pixels", max_pixels, at_most=2**15)
-    if layout.xy_um.size == 0:
+    lattice: Lattice | None = getattr(layout, "lattice", None)
+    if lattice is None and layout.xy_um.size == 0:
         raise GeometryError("the layout has no sites; a picture needs at least one")
-    low, high = layout.xy_um.min(axis=0), layout.xy_um.max(axis=0)
+    if lattice is not None:  # without its vertices
+        low, high = np.array(lattice.bounds_um).reshape(2, 2)
+    else:
+        low, high = layout.xy_um.min(axis=0), layout.xy_um.max(axis=0)
     pitch_um = float((high - low).max()) / max_pixels
     n_x, n_y = (max(1, math.ceil(length / pitch_um - 1e-6)) for length in high - low)
     centre = 0.5 * (low + high)
