@@ -56,6 +56,8 @@ class FileFormat:
         Keywords of ``read`` and ``write`` that users may set.
     is_sandboxed : bool
         Whether files are read in the sandbox process, because malformed files can crash the library.
+    is_silent : bool
+        Whether output of the library on standard output means that a file is corrupt.
     is_directory : bool
         Whether the format is a directory, which ``write`` itself writes atomically.
     """
@@ -69,6 +71,7 @@ class FileFormat:
     read_options: tuple[str, ...] = ()
     write_options: tuple[str, ...] = ()
     is_sandboxed: bool = False
+    is_silent: bool = False
     is_directory: bool = False
 
     __repr__ = short_repr

@@ -12,27 +12,23 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from foveasim._core.extras import needs
 from foveasim._io.formats import FileFormat, FormatError
-from foveasim.errors import FileError, ParameterError
+from foveasim._io.rasters.exr import MAGIC, import_openexr, read_channels, read_header
+from foveasim.errors import ParameterError
 from foveasim.fields import PowerMap, to_file_rows
-from foveasim.maps._common import MAX_BANDS, Found, check_size
+from foveasim.maps._common import Found
 from foveasim.maps._formats import MAP_FORMATS
 from foveasim.maps._json_metadata import found_in_metadata, map_metadata
 
-__all__ = ["MAGIC", "read", "write"]
+__all__ = ["read", "write"]
 
-MAGIC = b"\x76\x2f\x31\x01"
 ATTRIBUTE = "foveasim"
 #: Channel names of bands; S1 to S3 are polarisation, T is reflectance, and other channels are for display.
 BAND_PATTERN = re.compile(r"(?:S0\.|.*\.)?(?P<number>[0-9]+(?:[.,][0-9]+)?(?:[eE][-+]?[0-9]+)?)nm")
 OTHER_PATTERN = re.compile(r"(?:[RGBAYZ]|S[123]\..*|T\..*)")
-#: Bytes of a 32-bit channel value.
-ITEMSIZE = 4
 
 
 def write(power_map: PowerMap, path: Path) -> None:
@@ -44,7 +40,7 @@ def write(power_map: PowerMap, path: Path) -> None:
     ParameterError
         If the map is not float32, or two bands have the same wavelength.
     """
-    exr = _import_openexr(path)
+    exr = import_openexr(path)
     if power_map.data.dtype != np.float32:
         raise ParameterError(
             "power_map",
@@ -68,40 +64,22 @@ def write(power_map: PowerMap, path: Path) -> None:
 
 def read(path: Path, name: str | None) -> Found:
     """Read the channels of bands, in written order or by increasing wavelength."""
-    exr = _import_openexr(path)
     if name is not None:
         raise FormatError("contains one unnamed map; omit name=")
-    with exr.File(str(path), header_only=True) as file:
-        if len(file.parts) != 1:
-            raise FormatError(f"contains {len(file.parts)} images; provide a file with one")
-        header = file.header()
-        low, high = (np.asarray(corner, dtype=np.int64) for corner in header["dataWindow"])
-        n_x, n_y = (high - low + 1).tolist()
-        channels = {c.name: (c.xSampling, c.ySampling) for c in header["channels"]}
-        if len(channels) > MAX_BANDS or min(n_x, n_y) < 1:
-            raise FormatError(
-                f"must have at most {MAX_BANDS} channels of at least 1 x 1, got {len(channels)} of {n_x} x {n_y}"
-            )
-        check_size((len(channels), n_y, n_x), ITEMSIZE, path.stat().st_size)
-        text, unit = (v if isinstance(v := header.get(key), str) else None for key in (ATTRIBUTE, "emissiveUnits"))
-    bands = _bands(list(channels))
-    if any(channels[channel] != (1, 1) for channel in bands):
-        raise FormatError("has subsampled channels; write all bands at full resolution")
-    with exr.File(str(path), separate_channels=True) as file:
-        pixels = file.channels()
-        stored = found_in_metadata(text or "", np.empty((1, 1)), is_y_descending=True)
-        if stored.wavelength_nm is not None:
-            order = [_channel_name(wavelength) for wavelength in stored.wavelength_nm]
-            if sorted(order) != sorted(bands):
-                raise FormatError("has an attribute 'foveasim' with wavelengths that differ from its channel names")
-            return replace(stored, data=np.stack([pixels[channel].pixels for channel in order]))
-        data = np.stack([pixels[channel].pixels for channel in bands])
+    header = read_header(path)
+    bands = _bands(header.channels)
+    stored = found_in_metadata(header.attributes.get(ATTRIBUTE, ""), np.empty((1, 1)), is_y_descending=True)
+    if stored.wavelength_nm is not None:
+        order = [_channel_name(wavelength) for wavelength in stored.wavelength_nm]
+        if sorted(order) != sorted(bands):
+            raise FormatError("has an attribute 'foveasim' with wavelengths that differ from its channel names")
+        return replace(stored, data=read_channels(path, order))
     waves = [wavelength for wavelength in bands.values() if wavelength is not None]
     return Found(
-        data=data,
+        data=read_channels(path, list(bands)),
         is_y_descending=True,
         wavelength_nm=waves or None,
-        unit=unit,
+        unit=header.attributes.get("emissiveUnits"),
     )
 
 
@@ -123,15 +101,9 @@ def _channel_name(wavelength_nm: float) -> str:
     return f"S0.{wavelength_nm!r}nm".replace(".", ",").replace("S0,", "S0.")
 
 
-def _import_openexr(path: Path) -> Any:
-    try:
-        import OpenEXR
-    except ImportError:
-        raise FileError(path, needs("OpenEXR", "maps")) from None
-    return OpenEXR
-
-
 MAP_FORMATS.register(
     "exr",
-    FileFormat(title="EXR", suffixes=(".exr",), signatures=(MAGIC,), read=read, write=write, is_sandboxed=True),
+    FileFormat(
+        title="EXR", suffixes=(".exr",), signatures=(MAGIC,), read=read, write=write, is_sandboxed=True, is_silent=True
+    ),
 )

@@ -19,12 +19,13 @@ import numpy as np
 
 from foveasim._core.extras import needs
 from foveasim._io.formats import FileFormat, FormatError
+from foveasim._io.rasters import STEP_TOLERANCE, check_size
+from foveasim._io.rasters.units import length_in_um
 from foveasim.errors import FileError
 from foveasim.fields import PowerMap
-from foveasim.maps._common import STEP_TOLERANCE, Found, check_size
+from foveasim.maps._common import Found
 from foveasim.maps._formats import MAP_FORMATS
 from foveasim.maps._json_metadata import found_in_metadata, map_metadata
-from foveasim.maps._units import length_in_um
 
 __all__ = ["MAGIC", "read", "write"]
 

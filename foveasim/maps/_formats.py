@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from foveasim._core.extras import needs
 from foveasim._core.registry import Registry
-from foveasim._io import sandbox
 from foveasim._io.formats import FileFormat, FormatError, as_file_error
+from foveasim._io.rasters import as_images, read_raster
 from foveasim.errors import ParameterError
-from foveasim.maps._common import Found, as_images, max_decompressed_bytes
+from foveasim.maps._common import Found
 
 __all__ = ["MAP_FORMATS", "read_found"]
 
@@ -40,21 +40,7 @@ def read_found(path: Path, kind: str, name: str | None) -> Found:
     FileError
         If the file is corrupt, malformed, too large, or not a map.
     """
-    form = MAP_FORMATS[kind]
-    assert form.read is not None
-    if not form.is_sandboxed:
-        found: Found = form.read(path, name)
-        return found
-    # OpenEXR prints read errors and can return incomplete data: any output counts as an error.
-    metadata, (data,) = sandbox.read_in_sandbox(
-        _read,
-        path,
-        kind=form.title,
-        max_decompressed_bytes=max_decompressed_bytes,
-        is_silent=kind == "exr",
-        format_name=kind,
-        name=name,
-    )
+    metadata, (data,) = read_raster(MAP_FORMATS[kind], _read, path, format_name=kind, name=name)
     about: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in metadata.items()}
     return Found(data=data, **about)
 

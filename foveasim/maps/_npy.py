@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from foveasim._core.names import possible_names
 from foveasim._io.formats import FileFormat, FormatError
 from foveasim._io.npz import read_array, zip_members
+from foveasim._io.rasters import check_size
 from foveasim.fields import PowerMap
-from foveasim.maps._common import Found, check_size
+from foveasim.maps._common import Found
 from foveasim.maps._formats import MAP_FORMATS
 
 __all__ = ["NPY_MAGIC", "ZIP_MAGICS", "read_npy", "read_npz", "write_npz"]

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from foveasim._io.formats import FileFormat, FormatError
 from foveasim._io.images import pixels_of_page
+from foveasim._io.rasters import MAX_BANDS, check_size
 from foveasim.fields import PowerMap, to_file_rows
-from foveasim.maps._common import MAX_BANDS, Found, check_size
+from foveasim.maps._common import Found
 from foveasim.maps._formats import MAP_FORMATS
 from foveasim.maps._json_metadata import found_in_metadata, map_metadata
 

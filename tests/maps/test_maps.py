@@ -21,10 +21,11 @@ import tifffile
 import foveasim as fs
 from foveasim import maps
 from foveasim._io import sandbox
+from foveasim._io.rasters.units import length_in_um
 from foveasim.errors import FileError, ParameterError
 from foveasim.maps import _dataset, from_xarray, read_power_map, to_xarray, write_power_map
 from foveasim.maps._formats import MAP_FORMATS, read_found
-from foveasim.maps._units import irradiance_unit, length_in_um
+from foveasim.maps._units import irradiance_unit
 
 h5py = pytest.importorskip("h5py")
 xr = pytest.importorskip("xarray")
@@ -910,6 +911,7 @@ MAX_S, TIMEOUT_S, MAX_BYTES = 20.0, 60.0, 2 * 2**30
 READ = """
 import json, resource, sys
 from foveasim._io import sandbox
+from foveasim._io.rasters.units import length_in_um
 from foveasim import maps
 from foveasim.errors import FoveasimError
 from foveasim.maps import read_power_map

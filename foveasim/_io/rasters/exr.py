@@ -1,0 +1,89 @@
+"""EXR files: header with size limits, and channels as bands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim._core.extras import needs
+from foveasim._io.formats import FormatError
+from foveasim._io.rasters import MAX_BANDS, check_size
+from foveasim.errors import FileError
+
+__all__ = ["MAGIC", "ExrHeader", "import_openexr", "read_channels", "read_header"]
+
+MAGIC = b"\x76\x2f\x31\x01"
+#: Bytes of a 32-bit channel value.
+ITEMSIZE = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExrHeader:
+    """Names of the channels and text attributes of an EXR file with one image."""
+
+    channels: list[str]
+    attributes: dict[str, str]
+
+
+def read_header(path: Path) -> ExrHeader:
+    """
+    Read the header of a file with one image.
+
+    Raises
+    ------
+    FormatError
+        If the file contains several images, or is too large.
+    """
+    exr = import_openexr(path)
+    with exr.File(str(path), header_only=True) as file:
+        if len(file.parts) != 1:
+            raise FormatError(f"contains {len(file.parts)} images; provide a file with one")
+        header = file.header()
+        low, high = (np.asarray(corner, dtype=np.int64) for corner in header["dataWindow"])
+        n_x, n_y = (high - low + 1).tolist()
+        channels = [channel.name for channel in header["channels"]]
+        attributes = {key: value for key, value in header.items() if isinstance(value, str)}
+    if len(channels) > MAX_BANDS or min(n_x, n_y) < 1:
+        raise FormatError(
+            f"must have at most {MAX_BANDS} channels of at least 1 x 1, got {len(channels)} of {n_x} x {n_y}"
+        )
+    check_size((len(channels), n_y, n_x), ITEMSIZE, path.stat().st_size)
+    return ExrHeader(channels=channels, attributes=attributes)
+
+
+def read_channels(path: Path, names: Sequence[str]) -> NDArray[Any]:
+    """
+    Read channels as bands (n_band, n_y, n_x), top row first; the header must have been read.
+
+    Raises
+    ------
+    FormatError
+        If a channel is subsampled.
+    """
+    exr = import_openexr(path)
+    with exr.File(str(path), separate_channels=True) as file:
+        channels = file.channels()
+        if any((channels[name].xSampling, channels[name].ySampling) != (1, 1) for name in names):
+            raise FormatError("has subsampled channels; write all bands at full resolution")
+        return np.stack([channels[name].pixels for name in names])
+
+
+def import_openexr(path: Path) -> Any:
+    """
+    Import the library OpenEXR.
+
+    Raises
+    ------
+    FileError
+        If it is missing.
+    """
+    try:
+        import OpenEXR
+    except ImportError:
+        raise FileError(path, needs("OpenEXR", "maps")) from None
+    return OpenEXR
