@@ -27,6 +27,7 @@ EXTRAS = {
     "layout": {"klayout", "layout", "parquet"},
     "maps": {"maps"},
     "modes": {"video"},
+    "scene": {"maps"},
     "video": {"video"},
     "view": {"notebook", "view"},
 }

@@ -42,6 +42,8 @@ written = daisy.write("daisy.boxes", digits=2)
 square = fs.layout.grid(n_x=2, n_y=2, pitch_um=2.0)
 capture.save("capture.npz")
 again = fs.Capture.load("capture.npz")
+open("two.lines", "w").write("LINES\\n1 2\\n3 4\\n")
+cube = fs.Scene.from_cube("two.lines", distance_m=1.0)
 print(json.dumps({
     "generator": capture.layout.provenance["generator"],
     "effects": [effect.name for effect in shot.camera.sensor.chain],
@@ -51,6 +53,7 @@ print(json.dumps({
     "boxes": fs.read_layout("daisy.boxes").n_sites,
     "metric": METRICS["darkest_code_dn"](shot, shot.camera, capture) == int(capture.code.min()),
     "chart": type(fs.scene.charts.half_plane(shape=(4, 4), pitch_um=1.0, distance_m=1.0)).__name__,
+    "cube": (cube.basis[0, ::-1] * cube.spectrum_w_m2_sr_nm).tolist(),
     "schema": all(name in json.dumps(schema()) for name in ("daisy", "supply_ripple", "half_moon", "magnifier", "half_plane")),
     "snr": bool(np.allclose(again.signal_to_noise(), capture.signal_to_noise(sensor=shot.camera.sensor), rtol=1e-9)),
 }))
@@ -82,6 +85,7 @@ def test_installed_package_extends_every_kind(extended):
         "boxes": 13,
         "metric": True,
         "chart": "Scene",
+        "cube": [[1.0, 2.0], [3.0, 4.0]],
         "schema": True,
         "snr": True,
     }

@@ -101,6 +101,7 @@ def examples(tmp_path_factory):
         distortion.BrownConrady(focal_um=8000.0, k1=-0.1), distortion.Fisheye(projection="equidistant", focal_um=8000.0),
         distortion.PolynomialFisheye(k=(0.1, 0.0, 0.0, 0.0), focal_um=8000.0), distortion.Scaramuzza(a=(-500.0, 1e-4, 0.0, 0.0), pixel_um=2.0, focal_um=1000.0),
         Found(data=np.ones((3, 100, 100))),
+        fs.scene.Cube(data=np.ones((3, 100, 100))),
         sensor.BandMean(curve=CURVE, band_width_nm=10.0), sensor.ConstantCurve(0.5), sensor.Diffusion(spread_um=0.5),
         sensor.InterPixelCapacitance(neighbour_fraction=0.01), sensor.KernelCrosstalk(kernel=np.full((5, 5), 0.04).tolist()),
         sensor.Diffusion(spread_um=0.5).compile(SITES), sensor.LIMITS["read_noise_e"], CAMERA.noise_budget(SCENE, exposure_s=0.01),

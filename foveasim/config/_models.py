@@ -173,7 +173,10 @@ def _models(_versions: tuple[int, ...]) -> Models:
     power_map = _model("power_map", read_power_map, **(_FILE_TYPES | _WAVELENGTHS))
     scene = _union_of("kind", {**_registered_sections(SCENES, **(_FILE_TYPES | _WAVELENGTHS)), "power_map": power_map})
     fields: dict[str, Any] = {
-        "scene": (scene, Field(description="a photograph, a test chart, or a power map of another program")),
+        "scene": (
+            scene,
+            Field(description="a photograph, a hyperspectral cube, a test chart, or a power map of another program"),
+        ),
         "optics": (optics, Field(description="parameters of the lens")),
         "distortion": (lens | None, Field(None, description="distortion model of the lens")),
         "layout": (str | layout, Field(description="a layout file, the name of a bundled layout, or a generator")),

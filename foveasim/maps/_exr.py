@@ -9,14 +9,13 @@ for spectral images, JCGT 10(3)), with a decimal comma or point, or without pref
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from foveasim._io.formats import FileFormat, FormatError
-from foveasim._io.rasters.exr import MAGIC, import_openexr, read_channels, read_header
+from foveasim._io.rasters.exr import MAGIC, POLARISATION, band_of_channel, import_openexr, read_channels, read_header
 from foveasim.errors import ParameterError
 from foveasim.fields import PowerMap, to_file_rows
 from foveasim.maps._common import Found
@@ -26,9 +25,6 @@ from foveasim.maps._json_metadata import found_in_metadata, map_metadata
 __all__ = ["read", "write"]
 
 ATTRIBUTE = "foveasim"
-#: Channel names of bands; S1 to S3 are polarisation, T is reflectance, and other channels are for display.
-BAND_PATTERN = re.compile(r"(?:S0\.|.*\.)?(?P<number>[0-9]+(?:[.,][0-9]+)?(?:[eE][-+]?[0-9]+)?)nm")
-OTHER_PATTERN = re.compile(r"(?:[RGBAYZ]|S[123]\..*|T\..*)")
 
 
 def write(power_map: PowerMap, path: Path) -> None:
@@ -85,12 +81,9 @@ def read(path: Path, name: str | None) -> Found:
 
 def _bands(names: list[str]) -> dict[str, float | None]:
     """Return the channels of bands by wavelength, or all channels without wavelengths."""
-    waves = {
-        name: match for name in names if not OTHER_PATTERN.fullmatch(name) and (match := BAND_PATTERN.fullmatch(name))
-    }
-    if waves:
-        numbers = {name: float(match["number"].replace(",", ".")) for name, match in waves.items()}
-        return {name: numbers[name] for name in sorted(numbers, key=numbers.__getitem__)}
+    bands = {name: band for name in names if (band := band_of_channel(name)) and band[0] not in (*POLARISATION, "T")}
+    if bands:
+        return {name: bands[name][1] for name in sorted(bands, key=lambda name: bands[name][1])}
     if len(names) > 1 and set(names) <= set("RGBA"):
         raise FormatError("contains RGB colours instead of irradiance per wavelength; read it with Scene.from_picture")
     return dict.fromkeys(names)

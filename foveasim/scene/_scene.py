@@ -27,9 +27,12 @@ from foveasim._core.validation import (
     wavelengths_nm,
 )
 from foveasim._io.encodings import Encoding, decode
+from foveasim._io.formats import as_file_error
 from foveasim._io.images import read_picture
 from foveasim.errors import FileError, ParameterError, printable
 from foveasim.fields import from_file_rows
+from foveasim.scene._illuminants import Illuminant
+from foveasim.scene.cubes import IlluminantTable, Invalid, Quantity, Selection, read_cube, spectral_radiance
 from foveasim.scene.registry import SCENES
 from foveasim.units import m_from_um, um_from_m
 
@@ -65,7 +68,7 @@ class Scene:
     """
     Spectral radiance of a plane at a given distance in front of the lens.
 
-    Usually created by :meth:`from_picture`, :meth:`flat` or :meth:`point_sources`.
+    Usually created by :meth:`from_picture`, :meth:`from_cube`, :meth:`flat` or :meth:`point_sources`.
 
     Parameters
     ----------
@@ -339,6 +342,141 @@ class Scene:
         )
 
     @classmethod
+    def from_cube(
+        cls,
+        path: str | Path,
+        *,
+        distance_m: float | None = None,
+        pitch_um: float | None = None,
+        fit: Fit | None = None,
+        field_of_view_deg: float | None = None,
+        quantity: Quantity | None = None,
+        unit: str | None = None,
+        scale: float | None = None,
+        illuminant: Illuminant | IlluminantTable | None = None,
+        radiance_w_m2_sr_nm: float | None = None,
+        wavelength_nm: Sequence[float] | None = None,
+        band_width_nm: float | Sequence[float] | None = None,
+        bands: Sequence[int] | None = None,
+        range_nm: tuple[float, float] | None = None,
+        resample_nm: Sequence[float] | None = None,
+        rows: tuple[int, int] | None = None,
+        columns: tuple[int, int] | None = None,
+        name: str | None = None,
+        invalid: Invalid = "raise",
+    ) -> Scene:
+        """
+        Create a scene from a hyperspectral cube of radiance or reflectance.
+
+        Parameters
+        ----------
+        path : path
+            ENVI header or data file, MAT file, scene of ISETCam, spectral EXR, netCDF file or zarr directory
+            (:mod:`foveasim.scene.cubes`), detected from its content.
+        distance_m : float, optional, m
+            Distance of the scene from the lens, if the file does not contain it.
+        pitch_um, fit, field_of_view_deg : optional
+            Pixel pitch in the scene, framing on the layout, or horizontal angle of the selected columns, as for
+            :meth:`from_picture`. By default those of the file, or ``fit="cover"``.
+        quantity : {"radiance", "reflectance"}, optional
+            Quantity of the values, if the file does not specify it.
+        unit : str, optional
+            Unit of the values, if the file does not contain it, such as ``"W m-2 sr-1 nm-1"``, ``"uW/(cm^2 sr nm)"``,
+            ``"photons/(s m2 sr nm)"`` or ``"%"``.
+        scale : float, optional
+            Factor from the numbers in the file to the unit, instead of that of the file.
+        illuminant : {"A", "D50", "D55", "D65", "D75", "E"} or mapping, optional
+            Illuminant of a reflectance: a CIE illuminant, or a table ``{"wavelength_nm": [...], "value": [...]}``, which is
+            interpolated linearly. Default: ``"D65"``, which is tabulated from 380 to 780 nm.
+        radiance_w_m2_sr_nm : float, W/(m² sr nm)
+            For a reflectance: spectral radiance at 560 nm of a white with reflectance 1, or factor of the table.
+        wavelength_nm : sequence, optional, nm
+            Wavelengths of all bands of the file, instead of those in the file.
+        band_width_nm : number or sequence, optional, nm
+            Widths of the bands of the scene; by default bands extend halfway to the adjacent wavelengths.
+        bands : sequence of int, optional
+            Indices of the bands, from 0. By default all except those that the file marks as bad.
+        range_nm : (lowest, highest), optional, nm
+            Wavelengths of the bands.
+        resample_nm : sequence, optional, nm
+            Ascending wavelengths of the scene, at which the bands are interpolated linearly.
+        rows, columns : (start, stop), optional
+            Part of the image, in pixels from the top and from the left, without ``stop``.
+        name : str, optional
+            Name of the variable, array or EXR layer, if the file contains several.
+        invalid : {"raise", "zero"}
+            Whether NaN, infinite, negative and missing values are rejected or replaced by 0.
+
+        Raises
+        ------
+        FileError
+            If the file is missing, corrupt, truncated, too large or not a cube, contains invalid values, or lacks metadata that
+            were not passed.
+        ParameterError
+            If an argument is out of range or inconsistent with the file.
+
+        Warns
+        -----
+        FoveasimWarning
+            If a reflectance exceeds 1 by more than 1 %.
+
+        Notes
+        -----
+        Floating-point ENVI data by band or line (bsq, bil) are mapped into memory, not copied; the file must not change while
+        the scene is used. Other data are stored once, as float32 if this represents them exactly. Scale factors, units,
+        illuminant and interpolation change only the spectra of the basis images.
+        """
+        if pitch_um is not None and field_of_view_deg is not None:
+            raise _framing_conflict("field_of_view_deg", field_of_view_deg, "pitch_um")
+        if not isinstance(path, str | Path):
+            raise ParameterError(
+                "path", f"must be a file, got a {type(path).__name__}", hint="pass arrays to Scene, bands first"
+            )
+        path = Path(path)
+        selection = Selection(
+            wavelength_nm=wavelength_nm,
+            bands=bands,
+            range_nm=range_nm,
+            resample_nm=resample_nm,
+            rows=rows,
+            columns=columns,
+            invalid=invalid,
+        )
+        with as_file_error(path, "hyperspectral cube", passes=(ParameterError,)):
+            cube = read_cube(path, name, selection)
+            radiance = spectral_radiance(
+                cube,
+                quantity=quantity,
+                unit=unit,
+                scale=scale,
+                illuminant=illuminant,
+                radiance_w_m2_sr_nm=radiance_w_m2_sr_nm,
+                resample_nm=resample_nm,
+            )
+            distance_m = cube.distance_m if distance_m is None else distance_m
+            if distance_m is None:
+                raise ParameterError("distance_m", "must be given: the file does not contain the distance of the scene")
+            if pitch_um is None and field_of_view_deg is None and fit is None:
+                pitch_um, field_of_view_deg = cube.square_pitch_um(), cube.field_of_view_deg
+                if pitch_um is not None:
+                    field_of_view_deg = None
+                fit = "cover" if pitch_um is None and field_of_view_deg is None else None
+        radiance.warn_above_one()
+        widths_nm = band_width_nm if band_width_nm is not None or resample_nm is not None else cube.band_width_nm
+        return cls(
+            freeze(cube.data),
+            radiance.spectrum_w_m2_sr_nm,
+            radiance.wavelength_nm,
+            band_widths_nm(radiance.wavelength_nm, widths_nm),
+            pitch_um,
+            distance_m,
+            source=str(path),
+            fit=fit,
+            field_of_view_deg=field_of_view_deg,
+            is_picture=True,
+        )
+
+    @classmethod
     def flat(
         cls,
         *,
@@ -511,5 +649,10 @@ def band_widths_nm(wavelength_nm: Floats, band_width_nm: float | Sequence[float]
     return widths
 
 
-for _name, _scene in (("picture", Scene.from_picture), ("flat", Scene.flat), ("point_sources", Scene.point_sources)):
+for _name, _scene in (
+    ("picture", Scene.from_picture),
+    ("flat", Scene.flat),
+    ("point_sources", Scene.point_sources),
+    ("cube", Scene.from_cube),
+):
     SCENES.register(_name, _scene)

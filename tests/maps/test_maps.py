@@ -465,6 +465,16 @@ def test_spectral_exr_bands_are_sorted_by_wavelength(tmp_path):
     assert read.data[:, 0, 0].tolist() == [10.0, 20.0, 0.0]
 
 
+def test_channels_without_layer_have_wavelengths(tmp_path):
+    ones = np.ones((3, 4), np.float32)
+    write_exr(tmp_path / "map.exr", {"550.5nm": ones, "450nm": 2.0 * ones})
+
+    read = read_power_map(tmp_path / "map.exr", pitch_um=1.0, unit="w_m2")
+
+    assert read.wavelength_nm.tolist() == [450.0, 550.5]
+    assert read.data[:, 0, 0].tolist() == [2.0, 1.0]
+
+
 def test_read_rejects_exr_radiance_and_colours(tmp_path):
     ones = np.ones((3, 4), np.float32)
     write_exr(tmp_path / "scene.exr", {"S0.550nm": ones}, emissiveUnits="W.m^-2.sr^-1.nm^-1")

@@ -1,7 +1,8 @@
 """
-Images of spectral bands in files of other programs: size limits, reading in the sandbox process, and parts of formats.
+Images of spectral bands in files of other programs.
 
-Power maps (:mod:`foveasim.maps`) and hyperspectral cubes (:mod:`foveasim.scene`) are read with it.
+Size limits, reading in the sandbox process, and common parts of formats: EXR, MAT, netCDF, zarr, units. Power maps
+(:mod:`foveasim.maps`) and hyperspectral cubes (:mod:`foveasim.scene.cubes`) are read with it.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ MAX_METADATA_BYTES = 2**22
 
 @contextlib.contextmanager
 def open_netcdf(path: Path) -> Iterator[tuple[xr.Dataset, int]]:
-    """Open a netCDF or HDF5 file; yield the dataset, which is read lazily, and the file size in bytes."""
+    """Open a netCDF or HDF5 file; yield the lazy dataset and the file size in bytes."""
     import xarray as xr
 
     with path.open("rb") as file:
@@ -72,7 +72,7 @@ def open_netcdf(path: Path) -> Iterator[tuple[xr.Dataset, int]]:
 
 @contextlib.contextmanager
 def open_zarr(path: Path) -> Iterator[tuple[xr.Dataset, int]]:
-    """Open a zarr directory; yield the dataset, which is read lazily, and the size of the directory in bytes."""
+    """Open a zarr directory; yield the lazy dataset and the total size in bytes."""
     import xarray as xr
 
     n_bytes = _check_zarr(path)
@@ -89,7 +89,7 @@ def select_array(
     dataset: xr.Dataset, name: str | None, n_bytes: int, *, default: str = "", min_ndim: int = 2, what: str = "the map"
 ) -> xr.DataArray:
     """
-    Return the named array, or the one with the default name, or the only one with rows and columns.
+    Return the named array, the one with the default name, or the only possible one.
 
     Parameters
     ----------

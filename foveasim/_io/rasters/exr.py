@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +14,18 @@ from numpy.typing import NDArray
 from foveasim._core.extras import needs
 from foveasim._io.formats import FormatError
 from foveasim._io.rasters import MAX_BANDS, check_size
+from foveasim._io.rasters.units import length_in_um, round_factor
 from foveasim.errors import FileError
 
-__all__ = ["MAGIC", "ExrHeader", "import_openexr", "read_channels", "read_header"]
+__all__ = ["MAGIC", "POLARISATION", "ExrHeader", "band_of_channel", "import_openexr", "read_channels", "read_header"]
 
 MAGIC = b"\x76\x2f\x31\x01"
+#: Channel of a band: optional layer, wavelength and unit. A layer is not a number: ``550.5nm`` has none.
+CHANNEL = re.compile(
+    r"(?:(?P<layer>S[0-3]|T|.*[^0-9.].*)\.)?(?P<number>[0-9]+(?:[.,][0-9]+)?(?:[eE][-+]?[0-9]+)?)(?P<unit>[a-zµ]{1,2})"
+)
+#: Layers of polarisation in spectral EXR.
+POLARISATION = ("S1", "S2", "S3")
 #: Bytes of a 32-bit channel value.
 ITEMSIZE = 4
 
@@ -56,9 +64,26 @@ def read_header(path: Path) -> ExrHeader:
     return ExrHeader(channels=channels, attributes=attributes)
 
 
+def band_of_channel(name: str) -> tuple[str, float] | None:
+    """
+    Return layer and wavelength of a channel, nm; None without wavelength.
+
+    Examples
+    --------
+    >>> band_of_channel("S0.550,5nm"), band_of_channel("550.5nm"), band_of_channel("R")
+    (('S0', 550.5), ('', 550.5), None)
+    """
+    match = CHANNEL.fullmatch(name)
+    size_um = None if match is None else length_in_um(match["unit"])
+    if match is None or size_um is None:
+        return None
+    number = float(match["number"].replace(",", "."))
+    return match["layer"] or "", number if size_um == 1e-3 else round_factor(number * size_um * 1e3)
+
+
 def read_channels(path: Path, names: Sequence[str]) -> NDArray[Any]:
     """
-    Read channels as bands (n_band, n_y, n_x), top row first; the header must have been read.
+    Read channels as bands (n_band, n_y, n_x), top row first.
 
     Raises
     ------

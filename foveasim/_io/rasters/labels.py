@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
+    "BAND",
     "X",
     "Y",
     "coordinate",
@@ -35,18 +36,20 @@ UNNAMED_PREFIXES = ("phony_dim_", "dim_")
 
 
 def squeeze(array: xr.DataArray) -> xr.DataArray:
-    """Return the array without dimensions of size 1 other than rows, columns and bands."""
+    """Drop dimensions of size 1 other than rows, columns and bands."""
     return array.squeeze([d for d in array.dims if array.sizes[d] == 1 and d not in (*X, *Y, *BAND)], drop=True)
 
 
 def is_unnamed(array: xr.DataArray) -> bool:
-    """Return whether an array of rows, columns and possibly bands has dimensions without names."""
+    """Return whether an array has two or three dimensions without names."""
     return array.ndim in (2, 3) and all(str(d).startswith(UNNAMED_PREFIXES) for d in array.dims)
 
 
 def in_order(array: xr.DataArray) -> tuple[xr.DataArray, Hashable | None, tuple[Hashable, Hashable]]:
     """
-    Return the array as ([band,] y, x), the dimension of the bands or None, and those of rows and columns.
+    Return the array as ([band,] y, x), and its dimensions.
+
+    Those are the dimension of the bands or None, and those of rows and columns.
 
     Raises
     ------

@@ -1,7 +1,8 @@
 """
-MAT files of MATLAB: version 5 to 7 with scipy, version 7.3, which is HDF5 with reversed axes, with h5py; structs of ISETCam.
+MAT files of MATLAB, and structs of ISETCam.
 
-Structs are read by the path of a field, ``scene/data/photons``. Sizes are checked before data are decompressed.
+Versions 5 to 7 are read with scipy, version 7.3, which is HDF5 with reversed axes, with h5py. Structs are read by the path of a
+field, ``scene/data/photons``. Sizes are checked before data are decompressed.
 """
 
 from __future__ import annotations
@@ -138,22 +139,30 @@ class IsetStruct:
         Photon rates per nm, top row first.
     wavelength_nm, band_width_nm : list of float, nm
         None if missing. A single wavelength has a band width of 1 nm, as ISETCam's ``bin width``.
-    number : function
-        Function that returns a field as a finite number; None if it is missing or another kind of value.
-    text : function
-        Function that returns a field as text in lower case without spaces.
+    field : function
+        Function that returns a field by its path, as :attr:`MatFile.read`.
     """
 
     photons: NDArray[Any]
     wavelength_nm: list[float] | None
     band_width_nm: list[float] | None
-    number: Callable[[str], float | None]
-    text: Callable[[str], str]
+    field: Callable[[str], NDArray[Any] | None]
+
+    def number(self, path: str) -> float | None:
+        """Return a field as a finite number; None if it is missing or another kind of value."""
+        return _number(self.field(path))
+
+    def text(self, path: str) -> str:
+        """Return a field as text in lower case without spaces."""
+        values = self.field(path)
+        return "" if values is None else "".join(values.ravel().astype(str).tolist()).lower().replace(" ", "")
 
 
 def find_struct(file: MatFile, name: str | None, known: tuple[str, ...], what: str, cure: str) -> IsetStruct:
     """
-    Return the named struct, or the one with a known name, or that of the variables ``data`` and ``photons``.
+    Return the named struct, or one with a known name.
+
+    Without either, the variables ``data`` and ``photons`` are its fields.
 
     Parameters
     ----------
@@ -177,33 +186,28 @@ def find_struct(file: MatFile, name: str | None, known: tuple[str, ...], what: s
     def field(path: str) -> NDArray[Any] | None:
         return file.read(path if struct is None else f"{struct}/{path}")
 
-    def number(path: str) -> float | None:
-        values = field(path)
-        if values is None or values.size != 1 or values.dtype.kind not in "iuf":
-            return None
-        value = float(values.ravel()[0])
-        return value if math.isfinite(value) else None
-
-    def text(path: str) -> str:
-        values = field(path)
-        return "" if values is None else "".join(values.ravel().astype(str).tolist()).lower().replace(" ", "")
-
     photons, waves = (next((v for n in names if (v := field(n)) is not None), None) for names in (PHOTONS, WAVES))
     if photons is None:
         raise FormatError(f"contains no {what} with data.photons; compute it with {cure}")
     if photons.ndim not in (2, 3) or 0 in photons.shape:
         raise FormatError(f"contains photons of shape {photons.shape[:5]}, expected (row, column, wave)")
     return IsetStruct(
-        photons=_photon_rates(photons, number("data/dmin"), number("data/dmax")),
+        photons=_photon_rates(photons, _number(field("data/dmin")), _number(field("data/dmax"))),
         wavelength_nm=None if waves is None else waves.ravel().tolist(),
         band_width_nm=[1.0] if photons.size == math.prod(photons.shape[:2]) else None,
-        number=number,
-        text=text,
+        field=field,
     )
 
 
+def _number(values: NDArray[Any] | None) -> float | None:
+    if values is None or values.size != 1 or values.dtype.kind not in "iuf":
+        return None
+    value = float(values.ravel()[0])
+    return value if math.isfinite(value) else None
+
+
 def _photon_rates(photons: NDArray[Any], low: float | None, high: float | None) -> NDArray[Any]:
-    """Return photon rates, scaled from the integers of versions before 2017 to the range ``dmin`` to ``dmax``."""
+    """Return photon rates; integers of versions before 2017 are scaled to a range."""
     if photons.dtype.kind != "u":
         return photons
     if low is None or high is None or not low <= high:

@@ -1,4 +1,4 @@
-"""Units in files of other programs: products of powers of W, J, m, s, photons and sr with prefixes."""
+"""Units in files: products of powers of W, J, m, s, photons and sr."""
 
 from __future__ import annotations
 

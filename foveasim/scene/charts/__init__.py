@@ -16,7 +16,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from foveasim._core.registry import import_all
-from foveasim.scene.charts._colours import PATCH_NAMES, illuminant, patch_reflectance
+from foveasim.scene._illuminants import illuminant
+from foveasim.scene.charts._colours import PATCH_NAMES, patch_reflectance
 from foveasim.scene.charts._edges import BarElement, bar_elements, bars, checkerboard, letter_f, slanted_edge
 from foveasim.scene.charts._patches import colour_chart, grey_scale
 from foveasim.scene.charts._points import point_grid

@@ -7,15 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from foveasim._core.validation import Floats, check_count, check_number
+from foveasim.scene._illuminants import Illuminant, illuminant_spectrum
 from foveasim.scene._scene import GREY_NM, MAX_RADIANCE, Scene
 from foveasim.scene.charts._canvas import Canvas, Fractions, OneOrMore, add_rectangle
-from foveasim.scene.charts._colours import (
-    PATCH_NAMES,
-    Illuminant,
-    illuminant_spectrum,
-    nonnegative_factors,
-    patch_reflectance,
-)
+from foveasim.scene.charts._colours import PATCH_NAMES, nonnegative_factors, patch_reflectance
 from foveasim.scene.registry import SCENES, chart
 
 __all__ = ["colour_chart", "grey_scale"]

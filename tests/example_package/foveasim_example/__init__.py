@@ -73,6 +73,15 @@ boxes = FileFormat(
 )
 
 
+def read_lines(path: Path, name: str | None) -> fs.scene.Cube:
+    """Read one band: a table of radiance, W/(m² sr nm), top row first, after a header line."""
+    values = np.loadtxt(path, skiprows=1, ndmin=2)[np.newaxis]
+    return fs.scene.Cube(data=values, wavelength=[550.0], band_width_nm=[10.0], unit="W m-2 sr-1 nm-1")
+
+
+lines = FileFormat(title="lines", suffixes=(".lines",), signatures=(b"LINES",), read=read_lines)
+
+
 def half_plane(*, shape: tuple[int, int], pitch_um: float, distance_m: float, wavelength_nm: float = 550.0) -> fs.Scene:
     """A chart: dark on the left, bright on the right."""
     picture = np.zeros(shape)

@@ -1,0 +1,116 @@
+"""
+Cubes in netCDF files and zarr directories.
+
+The dimensions are wavelength, y and x, in any order. The attribute ``units`` of the array is the unit of its values, and that
+of the coordinates is the unit of wavelengths and positions. Rows and columns with positions in a unit of length specify the
+pixel pitch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from contextlib import AbstractContextManager, ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from foveasim._io.formats import FileFormat
+from foveasim._io.rasters import pitch_of_axes
+from foveasim._io.rasters.datasets import HDF5_MAGIC, NETCDF3_MAGICS, is_zarr, open_netcdf, open_zarr, select_array
+from foveasim._io.rasters.labels import BAND, coordinate, in_order, length_of_coordinate, squeeze, unit_of_array
+from foveasim.scene.cubes._cube import Cube
+from foveasim.scene.cubes._formats import CUBE_FORMATS
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["cube_of_array", "read_netcdf", "read_zarr"]
+
+
+def read_netcdf(path: Path, name: str | None) -> Cube:
+    """Read the named variable, or the only one of three dimensions."""
+    return _read(open_netcdf, path, name)
+
+
+def read_zarr(path: Path, name: str | None) -> Cube:
+    """Read the named array, or the only one of three dimensions."""
+    return _read(open_zarr, path, name)
+
+
+def _read(
+    open_dataset: Callable[[Path], AbstractContextManager[tuple[xr.Dataset, int]]], path: Path, name: str | None
+) -> Cube:
+    with ExitStack() as stack:
+        dataset, n_bytes = stack.enter_context(open_dataset(path))
+        array = select_array(dataset, name, n_bytes, min_ndim=3, what="the cube")
+        # Values are read when they are selected, and the file is then closed.
+        return cube_of_array(array, close=stack.pop_all().close)
+
+
+def cube_of_array(array: xr.DataArray, close: Callable[[], None] | None = None) -> Cube:
+    """
+    Return the cube of a labelled array; the values are not read.
+
+    Raises
+    ------
+    FormatError
+        If the dimensions are not those of a cube, or the positions are not uniform.
+    """
+    array, band, (y, x) = in_order(squeeze(array))
+    along_x, along_y = (coordinate(array, d) for d in (x, y))
+    metadata: dict[str, Any] = {}
+    if along_x is not None and along_y is not None:
+        per = [length_of_coordinate(array.coords[d], d) for d in (x, y)]
+        if None not in per:
+            steps = pitch_of_axes(along_x, along_y)
+            pitch = [
+                abs(step) * one for step, one in zip(steps, per, strict=True) if step is not None and one is not None
+            ]
+            metadata["pitch_um"] = (pitch[0], pitch[-1]) if pitch else None
+    wavelength, unit = _wavelengths(array, band)
+    return Cube(
+        data=array,
+        # Rows without positions have the top row first, as in pictures.
+        is_y_descending=along_y is None or bool(along_y[0] > along_y[-1]),
+        is_x_descending=along_x is not None and bool(along_x[0] > along_x[-1]),
+        wavelength=wavelength,
+        wavelength_unit=unit,
+        unit=unit_of_array(array),
+        close=close,
+        **metadata,
+    )
+
+
+def _wavelengths(array: xr.DataArray, band: Hashable | None) -> tuple[list[float] | None, str | None]:
+    """Return wavelengths and their unit from a coordinate of the bands."""
+    for name in (*BAND[:6], band):
+        if name is None or name not in array.coords:
+            continue
+        along = array.coords[name]
+        if along.dims not in ((band,), ()) or along.dtype.kind not in "iuf":
+            continue
+        unit = along.attrs.get("units", "nm" if str(name).endswith("_nm") else None)
+        return along.to_numpy().astype(float).ravel().tolist(), None if unit is None else str(unit)
+    return None, None
+
+
+CUBE_FORMATS.register(
+    "netcdf",
+    FileFormat(
+        title="netCDF",
+        suffixes=(".nc", ".nc4", ".h5"),
+        signatures=(HDF5_MAGIC, *NETCDF3_MAGICS),
+        read=read_netcdf,
+        is_sandboxed=True,
+    ),
+)
+CUBE_FORMATS.register(
+    "zarr",
+    FileFormat(
+        title="zarr",
+        suffixes=(".zarr",),
+        matches=lambda path, _head: is_zarr(path),
+        read=read_zarr,
+        is_sandboxed=True,
+        is_directory=True,
+    ),
+)

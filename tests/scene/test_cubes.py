@@ -1,0 +1,751 @@
+"""Hyperspectral cubes: files written by hand, compared with the numbers in them; electrons of closed-form spectra."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+import sys
+
+import numpy as np
+import pytest
+import scipy.constants
+import scipy.io
+
+import foveasim as fs
+from foveasim.config import read_shot, schema
+from foveasim.errors import ConfigError, FileError, FoveasimWarning, ParameterError
+from foveasim.scene import CUBE_FORMATS, Scene
+from foveasim.scene.charts import illuminant
+from foveasim.scene.cubes import _envi, _formats, _selection
+
+h5py = pytest.importorskip("h5py")
+xr = pytest.importorskip("xarray")
+OpenEXR = pytest.importorskip("OpenEXR")
+pytest.importorskip("zarr")
+pytest.importorskip("h5netcdf")
+
+#: Values [band, row, column] with the top row first; no two are equal.
+VALUES = np.arange(3 * 4 * 5, dtype=np.float64).reshape(3, 4, 5)
+WAVES = [450.0, 550.0, 650.0]
+PER_NM = "W m-2 sr-1 nm-1"
+RADIANCE = {"unit": PER_NM, "distance_m": 1.0}
+
+
+def read_here(form, reader, path, **args):
+    """Read in this process; metadata are transferred as JSON as between processes."""
+    assert form.is_sandboxed
+    metadata, arrays = reader(str(path), **args)
+    return json.loads(json.dumps(metadata)), arrays
+
+
+@pytest.fixture(autouse=True)
+def in_process(monkeypatch):
+    """Read all formats in this process: starting a sandbox process takes about a second per file."""
+    monkeypatch.setattr(_formats, "read_raster", read_here)
+
+
+def radiance(scene):
+    """Return the spectral radiance [wavelength, row, column], top row first, from the definition of a scene."""
+    return np.einsum("byx,bk->kyx", scene.basis.astype(float), scene.spectrum_w_m2_sr_nm)[:, ::-1]
+
+
+def write_envi(path, values=VALUES, *, code="f", number=4, interleave="bsq", order="<", offset=0, lines=(), **entries):
+    """Write a cube number by number, as the definition of the interleaves specifies."""
+    n_bands, n_y, n_x = values.shape
+    loops = {
+        "bsq": [(b, y, x) for b in range(n_bands) for y in range(n_y) for x in range(n_x)],
+        "bil": [(b, y, x) for y in range(n_y) for b in range(n_bands) for x in range(n_x)],
+        "bip": [(b, y, x) for y in range(n_y) for x in range(n_x) for b in range(n_bands)],
+    }[interleave]
+    convert = float if code in "fd" else int
+    path.with_suffix(".img").write_bytes(
+        b"#" * offset + b"".join(struct.pack(order + code, convert(values[at])) for at in loops)
+    )
+    header = {
+        "samples": n_x,
+        "lines": n_y,
+        "bands": n_bands,
+        "header offset": offset,
+        "file type": "ENVI Standard",
+        "data type": number,
+        "interleave": interleave,
+        "byte order": "<>".index(order),
+        "wavelength units": "Nanometers",
+        "wavelength": "{" + ",\n  ".join(map(str, WAVES[:n_bands])) + "}",
+        "map info": "{UTM, 1, 1, 300000, 4000000, 30, 30, 12, North}",
+        **{key.replace("_", " "): value for key, value in entries.items()},
+    }
+    text = "\n".join(["ENVI", "; a comment = {1}", *(f"{k} = {v}" for k, v in header.items() if v is not None), *lines])
+    path.write_text(text + "\n")
+    return path
+
+
+def assert_rejected(path, match, error=FileError, **options):
+    with pytest.raises(error, match=match) as caught:
+        Scene.from_cube(path, **{**RADIANCE, **options})
+    assert "\n" not in str(caught.value)
+    if error is FileError:
+        assert str(caught.value).startswith(f"{path}: ")
+
+
+# -- ENVI -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize("interleave", ["bsq", "bil", "bip"])
+@pytest.mark.parametrize(
+    ("code", "number"),
+    [("B", 1), ("h", 2), ("i", 3), ("f", 4), ("d", 5), ("H", 12), ("I", 13), ("q", 14), ("Q", 15)],
+)
+def test_envi_types_and_interleaves_are_read(tmp_path, code, number, interleave, order):
+    path = write_envi(tmp_path / "cube.hdr", code=code, number=number, interleave=interleave, order=order, offset=7)
+
+    scene = Scene.from_cube(path, **RADIANCE)
+
+    np.testing.assert_array_equal(radiance(scene), VALUES)
+    assert scene.basis.dtype == (np.float32 if code in "BhfH" else np.float64)
+    assert scene.wavelength_nm.tolist() == WAVES
+    assert scene.band_width_nm.tolist() == [100.0] * 3
+    assert scene.source == str(path)
+
+
+@pytest.mark.parametrize("interleave", ["bsq", "bil"])
+def test_floating_point_envi_is_not_copied(tmp_path, interleave):
+    path = write_envi(tmp_path / "cube.hdr", interleave=interleave)
+
+    scene = Scene.from_cube(path, **RADIANCE, rows=(1, 4), columns=(0, 2), range_nm=(500, 700))
+
+    base = scene.basis
+    while isinstance(base.base, np.ndarray):
+        base = base.base
+    assert isinstance(base, np.memmap)
+    assert not scene.basis.flags.writeable
+    np.testing.assert_array_equal(radiance(scene), VALUES[1:, 1:4, :2])
+
+
+def test_envi_data_file_finds_header(tmp_path):
+    path = write_envi(tmp_path / "cube.hdr")
+
+    scene = Scene.from_cube(path.with_suffix(".img"), **RADIANCE)
+    path.rename(tmp_path / "cube.img.hdr")
+    again = Scene.from_cube(tmp_path / "cube.img", **RADIANCE)
+    by_header = Scene.from_cube(tmp_path / "cube.img.hdr", **RADIANCE)
+
+    for one in (scene, again, by_header):
+        np.testing.assert_array_equal(radiance(one), VALUES)
+
+
+def test_envi_scale_factors_are_applied(tmp_path):
+    gains = write_envi(
+        tmp_path / "gains.hdr",
+        data_gain_values="{1, 2, 0.5}",
+        data_offset_values="{0, 0, 3}",
+        data_units="mW/(cm2 sr um)",
+    )
+    scaled = write_envi(tmp_path / "scaled.hdr", code="h", number=2, reflectance_scale_factor=10_000)
+
+    # 1 mW/(cm² sr µm) = 1e-3 W / (1e-4 m² sr 1e3 nm) = 0.01 W/(m² sr nm).
+    expected = 0.01 * (VALUES * np.array([1.0, 2.0, 0.5])[:, None, None] + np.array([0.0, 0.0, 3.0])[:, None, None])
+    np.testing.assert_allclose(radiance(Scene.from_cube(gains, distance_m=1.0)), expected, rtol=1e-6)
+    lit = Scene.from_cube(scaled, distance_m=1.0, illuminant="E", radiance_w_m2_sr_nm=0.2)
+    np.testing.assert_allclose(radiance(lit), VALUES / 10_000 * 0.2, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("units", "per_nm"),
+    [("Nanometers", 1.0), ("Micrometers", 1e-3), ("um", 1e-3), ("Meters", 1e-9), ("Unknown", 1.0), (None, 1.0)],
+)
+def test_envi_wavelengths_become_nm(tmp_path, units, per_nm):
+    waves = "{" + ",".join(repr(w * per_nm) for w in WAVES) + "}"
+    path = write_envi(tmp_path / "cube.hdr", wavelength=waves, wavelength_units=units)
+
+    np.testing.assert_allclose(Scene.from_cube(path, **RADIANCE).wavelength_nm, WAVES, rtol=1e-12)
+
+
+def test_bad_bands_are_skipped(tmp_path):
+    values = VALUES.copy()
+    values[1] = np.nan
+    path = write_envi(tmp_path / "cube.hdr", values, bbl="{1, 0, 1}")
+
+    scene = Scene.from_cube(path, **RADIANCE)
+
+    np.testing.assert_array_equal(radiance(scene), VALUES[[0, 2]])
+    assert scene.wavelength_nm.tolist() == [450.0, 650.0]
+    assert_rejected(path, r"got nan at \[band, row, column\] = \[1, 0, 0\], 20 such values", bands=[0, 1])
+
+
+BAD_ENVI = {
+    "no wavelengths": (
+        {"wavelength": None},
+        r"does not specify the wavelengths of its bands; pass wavelength_nm=\.\.\., 3",
+    ),
+    "wrong count": ({"wavelength": "{450, 550}"}, "contains 2 wavelengths for 3 bands"),
+    "descending": (
+        {"wavelength": "{650, 550, 450}"},
+        "wavelengths must ascend, got 550 nm in band 1 after 650 nm in band 0; select bands in ascending order with bands=",
+    ),
+    "unknown unit": ({"wavelength_units": "Wavenumber"}, "in the unknown unit 'Wavenumber', expected nm, µm or m"),
+    "no unit": ({"wavelength": "{0.4, 0.5, 0.6}", "wavelength_units": None}, "from 0.4 to 0.6 without a unit"),
+    "not a number": ({"wavelength": "{450, x, 650}"}, "'wavelength' must be a list of numbers"),
+    "interleave": (
+        {"interleave": "bsq", "lines": ("interleave = bsx",)},
+        "'interleave' must be bsq, bil or bip, got 'bsx'",
+    ),
+    "data type": ({"lines": ("data type = 6",)}, "'data type' must be one of .*, got 6, which is complex"),
+    "byte order": ({"lines": ("byte order = 2",)}, r"'byte order' must be 0 .* or 1 .*, got 2"),
+    "no samples": ({"samples": None}, "'samples' must be an integer of at least 1, and is missing"),
+    "too many lines": (
+        {"lines": ("lines = 5",)},
+        "300 bytes in all, but 'cube.img' has 240: the data file is truncated",
+    ),
+    "too few lines": (
+        {"lines": ("lines = 3",)},
+        "180 bytes in all, but 'cube.img' has 240: the data file contains more",
+    ),
+    "huge": ({"lines": ("lines = 99999999999999999999",)}, "'lines' must be an integer"),
+    "gains": ({"data_gain_values": "{1, 2}"}, "'data gain values' must have 3 numbers, one per band, got 2"),
+    "zero scale": ({"reflectance_scale_factor": 0}, "'reflectance scale factor' must be > 0, got 0"),
+    "bad bands": ({"bbl": "{0, 0, 0}"}, "marks all its bands as bad"),
+    "short bbl": ({"bbl": "{0, 1}"}, "'bbl' must have 3 numbers, one per band, got 2"),
+    "compressed": ({"file_compression": 1}, "is compressed"),
+    "missing": ({"data_ignore_value": 7}, r"got 7 at \[band, row, column\] = \[0, 1, 2\], 1 such values"),
+}
+
+
+@pytest.mark.parametrize(("entries", "match"), BAD_ENVI.values(), ids=BAD_ENVI)
+def test_bad_envi_gives_one_line(tmp_path, entries, match):
+    assert_rejected(write_envi(tmp_path / "cube.hdr", **entries), match)
+
+
+def test_missing_files_give_one_line(tmp_path):
+    path = write_envi(tmp_path / "cube.hdr")
+    path.with_suffix(".img").rename(tmp_path / "cubes.img")
+
+    assert_rejected(
+        path, "has no data file: expected 'cube' without extension or with one of .*; did you mean 'cubes.img'"
+    )
+    assert_rejected(tmp_path / "cub.hdr", "did you mean 'cube.hdr'")
+    (tmp_path / "text.hdr").write_text("#?RADIANCE\n")
+    assert_rejected(tmp_path / "text.hdr", "not a valid hyperspectral cube: expected ENVI, EXR, MAT, netCDF or zarr")
+    for name in ("cube.dat", "cube.raw"):
+        (tmp_path / name).write_bytes(bytes(240))
+    assert_rejected(path, r"several data files, cube\.dat, cube\.raw; pass the data file instead")
+
+
+# -- selection --------------------------------------------------------------------------------------------------------
+
+
+def test_resampling_interpolates_linearly(tmp_path):
+    scene = Scene.from_cube(write_envi(tmp_path / "cube.hdr"), **RADIANCE, resample_nm=[475.0, 550.0])
+
+    np.testing.assert_allclose(radiance(scene), [0.75 * VALUES[0] + 0.25 * VALUES[1], VALUES[1]], rtol=1e-12)
+    assert scene.basis.shape[0] == 2  # band 650 nm has no weight, and is not read
+    assert scene.wavelength_nm.tolist() == [475.0, 550.0]
+    assert scene.band_width_nm.tolist() == [75.0, 75.0]
+
+
+@pytest.mark.parametrize("interleave", ["bsq", "bip"])
+def test_bands_select_order_of_wavelengths(tmp_path, interleave):
+    path = write_envi(tmp_path / "cube.hdr", wavelength="{650, 550, 450}", interleave=interleave)
+
+    scene = Scene.from_cube(path, **RADIANCE, bands=[2, 0])
+
+    np.testing.assert_array_equal(radiance(scene), VALUES[[2, 0]])
+    assert scene.wavelength_nm.tolist() == [450.0, 650.0]
+
+
+def test_large_pixel_interleaved_cube_is_converted(tmp_path, monkeypatch):
+    monkeypatch.setattr(_selection, "BLOCK_VALUES", 31)
+    path = write_envi(tmp_path / "cube.hdr", interleave="bip")
+
+    scene = Scene.from_cube(path, **RADIANCE, rows=(1, 4), columns=(2, 5), bands=[0, 2])
+
+    np.testing.assert_array_equal(radiance(scene), VALUES[[0, 2], 1:4, 2:5])
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"rows": (0, 5)}, r"'rows' must be \(start, stop\) with 0 <= start < stop <= 4, got \(0, 5\)"),
+        ({"columns": (3, 3)}, r"'columns' must be \(start, stop\)"),
+        ({"columns": (3,)}, r"'columns' must be two integers"),
+        ({"rows": 3}, "'rows' must be a sequence of integers, got 3"),
+        ({"bands": 3}, "'bands' must be a sequence of integers, got 3"),
+        ({"bands": [3]}, "'bands' must be from 0 to 2, the bands of the cube, got 3"),
+        ({"bands": [0, 0]}, "'bands' must be different indices"),
+        ({"bands": [0.5]}, r"'bands\[0\]' must be an integer"),
+        ({"range_nm": (700, 800)}, "'range_nm' must contain a band of the cube, from 450 to 650"),
+        ({"range_nm": (500, 400)}, r"'range_nm' must be two wavelengths \(lowest, highest\)"),
+        ({"resample_nm": [400.0]}, "'resample_nm' must be from 450 to 650, the range of the selected bands"),
+        ({"resample_nm": [500.0, 480.0]}, "'resample_nm' must ascend"),
+        ({"wavelength_nm": [450.0, 550.0]}, "'wavelength_nm' must have 3 values, one per band of the cube, got 2"),
+        ({"invalid": "nan"}, "'invalid' must be one of 'raise', 'zero'"),
+        ({"quantity": "radience"}, "did you mean 'radiance'"),
+        ({"unit": "W m-2"}, "'unit' must be a unit of radiance or reflectance, got 'W m-2'; .* 'W m-2 sr-1 nm-1'"),
+        ({"quantity": "reflectance"}, "'unit' must be a unit of reflectance"),
+        ({"scale": 0.0}, "'scale' must be > 0"),
+        ({"illuminant": "A"}, "'illuminant' must be omitted for a cube of radiance"),
+        ({"distance_m": None}, "'distance_m' must be given: the file does not contain the distance"),
+        ({"pitch_um": 1.0, "field_of_view_deg": 2.0}, "'field_of_view_deg' must not be given together with 'pitch_um'"),
+        ({"bands": [1]}, "'band_width_nm' must be given for a single wavelength"),
+    ],
+)
+def test_wrong_arguments_give_one_line(tmp_path, options, match):
+    assert_rejected(write_envi(tmp_path / "cube.hdr"), match, ParameterError, **options)
+
+
+def test_array_instead_of_file_is_rejected():
+    with pytest.raises(ParameterError, match="'path' must be a file, got a ndarray; pass arrays to Scene, bands first"):
+        Scene.from_cube(VALUES, **RADIANCE)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0])
+def test_invalid_values_are_rejected_or_replaced(tmp_path, value):
+    values = VALUES.copy()
+    values[1, 2, 3] = value
+    path = write_envi(tmp_path / "cube.hdr", values)
+
+    assert_rejected(
+        path, rf"got {value:g} at \[band, row, column\] = \[1, 2, 3\], 1 such values in all; pass invalid='zero'"
+    )
+    assert_rejected(path, r"at \[band, row, column\] = \[1, 2, 3\]", rows=(1, 4), columns=(1, 5), range_nm=(500, 700))
+    replaced = VALUES.copy()
+    replaced[1, 2, 3] = 0.0
+    np.testing.assert_array_equal(radiance(Scene.from_cube(path, **RADIANCE, invalid="zero")), replaced)
+
+
+def test_offset_precedes_check_of_sign(tmp_path):
+    path = write_envi(tmp_path / "cube.hdr", VALUES - 2.0, data_offset_values="{2, 2, 2}")
+
+    np.testing.assert_array_equal(radiance(Scene.from_cube(path, **RADIANCE)), VALUES)
+    assert_rejected(
+        write_envi(tmp_path / "low.hdr", VALUES, data_offset_values="{0, -21.5, 0}"),
+        r"got -1\.5 at .* = \[1, 0, 0\], 2 such",
+    )
+
+
+def test_cube_too_large_for_memory(tmp_path, monkeypatch):
+    path = write_envi(tmp_path / "cube.hdr", code="h", number=2)
+    monkeypatch.setattr(_selection, "memory_bytes", lambda: 100)
+
+    assert_rejected(path, "needs .* GiB of memory, more than .*; select bands=, range_nm=, rows= or columns=")
+    assert Scene.from_cube(path, **RADIANCE, rows=(0, 1)).basis.shape == (3, 1, 5)
+
+
+# -- units and illuminants --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("unit", "per_unit"),
+    [
+        ("W m-2 sr-1 nm-1", 1.0),
+        ("W.m^-2.sr^-1.nm^-1", 1.0),
+        ("W/m²/sr/µm", 1e-3),
+        ("W m-2 sr-1 m-1", 1e-9),
+        ("uW/(cm^2 sr nm)", 1e-2),
+        ("µW*cm-2*nm-1*sr-1", 1e-2),
+    ],
+)
+def test_units_of_power_are_converted(tmp_path, unit, per_unit):
+    scene = Scene.from_cube(write_envi(tmp_path / "cube.hdr"), unit=unit, distance_m=1.0)
+
+    np.testing.assert_allclose(radiance(scene), VALUES * per_unit, rtol=1e-12)
+
+
+def test_photons_become_power(tmp_path):
+    scene = Scene.from_cube(write_envi(tmp_path / "cube.hdr"), unit="photons/(s m2 sr nm)", distance_m=1.0)
+
+    photon_j = scipy.constants.h * scipy.constants.c / (np.array(WAVES) * 1e-9)
+    np.testing.assert_allclose(radiance(scene), VALUES * photon_j[:, None, None], rtol=1e-9)
+
+
+def test_unit_of_file_must_be_known(tmp_path):
+    path = write_envi(tmp_path / "cube.hdr", data_units="DN")
+    assert_rejected(
+        path, "has the unit 'DN', which is neither a spectral radiance nor a reflectance; pass unit=", unit=None
+    )
+    path = write_envi(tmp_path / "cube.hdr", data_units="W m-2 sr-1")
+    assert_rejected(path, "which is not per nm; pass unit=", unit=None)
+    path = write_envi(tmp_path / "cube.hdr")
+    assert_rejected(path, "does not specify the unit of its values; pass unit=.*, or quantity='reflectance'", unit=None)
+
+
+def test_reflectance_is_lit_by_illuminant(tmp_path):
+    path = write_envi(tmp_path / "cube.hdr", VALUES / 100.0, code="d", number=5)
+    options = {"quantity": "reflectance", "distance_m": 1.0, "radiance_w_m2_sr_nm": 0.3}
+
+    daylight = radiance(Scene.from_cube(path, **options))
+    table = {"wavelength_nm": [400.0, 500.0, 700.0], "value": [0.0, 1.0, 3.0]}
+    tabulated = radiance(Scene.from_cube(path, **options, illuminant=table))
+    percent = radiance(Scene.from_cube(path, **(options | {"unit": "%"}), scale=100.0))
+
+    np.testing.assert_allclose(daylight, VALUES / 100 * 0.3 * illuminant("D65", WAVES)[:, None, None], rtol=1e-12)
+    np.testing.assert_allclose(tabulated, VALUES / 100 * 0.3 * np.array([0.5, 1.5, 2.5])[:, None, None], rtol=1e-12)
+    np.testing.assert_allclose(percent, daylight, rtol=1e-12)
+
+
+def test_wrong_illumination_gives_one_line(tmp_path):
+    path = write_envi(tmp_path / "cube.hdr", VALUES / 100.0, wavelength="{450, 550, 850}")
+    lit = {"unit": "1", "radiance_w_m2_sr_nm": 0.3}
+
+    assert_rejected(path, "'radiance_w_m2_sr_nm' must be given for a cube of reflectance", ParameterError, unit="1")
+    assert_rejected(path, "'illuminant' 'D65' must be from 380 to 780.*850.*; select range_nm=", ParameterError, **lit)
+    assert_rejected(path, "did you mean 'D65'", ParameterError, **lit, illuminant="d65")
+    for table, match in (
+        ({"wavelength_nm": [400.0, 800.0], "value": [1.0, 1.0]}, "must be tabulated from 450 to 850"),
+        ({"wavelength_nm": [400.0, 900.0], "value": [1.0]}, "one value for each, got 1"),
+        ({"wavelength_nm": [400.0, 900.0]}, "must have the keys 'wavelength_nm' and 'value'"),
+    ):
+        assert_rejected(path, match, ParameterError, **lit, illuminant=table)
+
+
+def test_reflectance_above_one_warns(tmp_path):
+    path = write_envi(tmp_path / "cube.hdr", code="h", number=2)
+    lit = {"quantity": "reflectance", "distance_m": 1.0, "radiance_w_m2_sr_nm": 0.3}
+
+    with pytest.warns(FoveasimWarning, match=r"the reflectance of the cube is up to 59, above 1; pass scale="):
+        Scene.from_cube(path, **lit)
+    with pytest.raises(FoveasimWarning, match="the reflectance"):  # warnings as errors
+        Scene.from_cube(path, **lit)
+    Scene.from_cube(path, **lit, scale=1 / 59.0)  # no warning
+
+
+# -- other formats ----------------------------------------------------------------------------------------------------
+
+
+def write_exr(path, values=VALUES, names=("S0.450,000000nm", "S0.550,000000nm", "S0.650,000000nm"), **header):
+    channels = {name: np.array(image, np.float32) for name, image in zip(names, values, strict=True)}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
+    with OpenEXR.File(header, channels) as file:
+        file.write(str(path))
+    return path
+
+
+def test_spectral_exr_is_read_by_layer(tmp_path):
+    names = ["S0.550,000000nm", "T.4,5e2nm", "S0.450,000000nm", "T.0.65um", "S1.450nm", "R"]
+    values = np.concatenate([VALUES, VALUES / 100.0])
+    path = write_exr(tmp_path / "cube.exr", values, names, emissiveUnits="W.m^-2.sr^-1.nm^-1")
+
+    emitted = Scene.from_cube(path, distance_m=1.0, name="S0")
+    reflected = Scene.from_cube(path, distance_m=1.0, name="T", radiance_w_m2_sr_nm=1.0, illuminant="E", scale=0.01)
+
+    np.testing.assert_array_equal(radiance(emitted), VALUES[[2, 0]])
+    np.testing.assert_allclose(radiance(reflected), values[[1, 3]].astype(np.float32).astype(float) * 0.01, rtol=1e-12)
+    np.testing.assert_allclose(reflected.wavelength_nm, [450.0, 650.0], rtol=1e-12)
+    assert_rejected(path, "contains several layers; select one with name=, possible: 'S0', 'T'")
+    assert_rejected(path, "has no layer 'S3'; select one with name=", name="S3")
+
+
+def test_bad_exr_gives_one_line(tmp_path):
+    colours = write_exr(tmp_path / "colours.exr", VALUES, "RGB")
+    assert_rejected(
+        colours, "does not contain channels with wavelengths, got B, G, R; read colours with Scene.from_picture"
+    )
+    heat = write_exr(tmp_path / "heat.exr", VALUES, ["S0.1THz", "S0.2THz", "S0.3THz"])
+    assert_rejected(heat, r"got S0\.1THz, S0\.2THz, S0\.3THz; expected names such as 'S0\.550,0nm'")
+    fluorescent = write_exr(tmp_path / "f.exr", VALUES, ["T.400nm", "T.500nm", "T.400nm.500nm"])
+    assert_rejected(fluorescent, "contains fluorescence, channel 'T.400nm.500nm'")
+    paper = write_exr(tmp_path / "paper.exr", emissiveUnits="W.m^-2.sr^-1")
+    assert_rejected(paper, r"has the unit 'W\.m\^-2\.sr\^-1', which is not per nm; pass unit=", unit=None)
+
+
+def test_truncated_exr_gives_one_line(tmp_path, monkeypatch):
+    monkeypatch.undo()  # in the sandbox process
+    path = write_exr(tmp_path / "cube.exr")
+    np.testing.assert_array_equal(radiance(Scene.from_cube(path, **RADIANCE)), VALUES)
+    with pytest.raises(ParameterError, match=r"'rows' must be \(start, stop\) with 0 <= start < stop <= 4"):
+        Scene.from_cube(path, **RADIANCE, rows=(2, 9))
+    path.write_bytes(path.read_bytes()[:-20])
+
+    assert_rejected(path, "is corrupt or truncated")
+
+
+def labelled(**changes):
+    """Return a labelled cube in SI units, with y upwards and another order of dimensions."""
+    coords = {
+        "wavelength": ("wavelength", np.array(WAVES) * 1e-9, {"units": "m"}),
+        "y": ("y", np.arange(4) * 0.01, {"units": "m"}),
+        "x": ("x", np.arange(5) * 0.01, {"units": "m"}),
+    }
+    array = xr.DataArray(
+        VALUES[:, ::-1], dims=("wavelength", "y", "x"), coords=coords, attrs={"units": "W m-2 sr-1 um-1"}
+    )
+    return array.transpose("y", "x", "wavelength").assign_attrs(**changes)
+
+
+@pytest.mark.parametrize("kind", ["nc", "nc3", "zarr"])
+@pytest.mark.filterwarnings("ignore:Consolidated metadata")
+def test_labelled_cubes_are_read(tmp_path, kind):
+    path = tmp_path / f"cube.{kind}"
+    dataset = labelled().to_dataset(name="radiance").assign(mask=(("y", "x"), np.ones((4, 5))))
+    {
+        "nc": lambda: dataset.to_netcdf(path, engine="h5netcdf"),
+        "nc3": lambda: dataset.to_netcdf(path, engine="scipy"),
+        "zarr": lambda: dataset.to_zarr(path, zarr_format=2),
+    }[kind]()
+
+    scene = Scene.from_cube(path, distance_m=2.0)
+    part = Scene.from_cube(path, distance_m=2.0, rows=(0, 2), columns=(3, 5), range_nm=(500, 700), fit="width")
+
+    np.testing.assert_allclose(radiance(scene), VALUES * 1e-3, rtol=1e-12)
+    np.testing.assert_allclose(scene.wavelength_nm, WAVES, rtol=1e-12)
+    assert scene.pitch_um == pytest.approx(1e4)
+    assert (part.fit, part.pitch_um) == ("width", None)
+    np.testing.assert_allclose(radiance(part), VALUES[1:, :2, 3:] * 1e-3, rtol=1e-12)
+    assert_rejected(path, "has no variable 'radianc'; did you mean 'radiance'", name="radianc")
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda a: a.drop_vars("wavelength"), "does not specify the wavelengths of its bands"),
+        (lambda a: a.rename(wavelength="time").drop_vars("time"), r"does not specify the wavelengths"),
+        (lambda a: a.rename(x="longitude"), r"has the dimensions \(y, longitude, wavelength\), expected"),
+        (
+            lambda a: a.assign_coords(wavelength=("wavelength", [1.0, 2.0, 3.0], {"units": "eV"})),
+            "in the unknown unit 'eV'",
+        ),
+        (lambda a: a.assign_coords(y=("y", [0, 1, 2, 4], {"units": "m"})), "has non-uniform steps along y"),
+        (
+            lambda a: a.assign_coords(y=("y", [0, 1, 2, 3], {"units": "m"})),
+            "has pixels of 10000 x 1e.06 µm, expected squares",
+        ),
+        (lambda a: a.where(a != 7.0), r"got nan at \[band, row, column\]"),
+        (lambda a: a.isel(x=0), "contains 0 numeric arrays with rows, columns and bands"),
+    ],
+)
+def test_bad_labelled_cubes_give_one_line(tmp_path, change, match):
+    change(labelled()).to_dataset(name="cube").to_netcdf(tmp_path / "cube.nc", engine="h5netcdf")
+
+    assert_rejected(tmp_path / "cube.nc", match)
+
+
+def save_v73(path, tree):
+    """Write a MAT file of version 7.3 as MATLAB: reversed axes, text as numbers, a header before the HDF5 data."""
+
+    def fill(group, values):
+        for name, value in values.items():
+            if isinstance(value, dict):
+                fill(group.create_group(name), value)
+            elif isinstance(value, str):
+                group[name] = np.array([[ord(c)] for c in value], np.uint16)
+                group[name].attrs["MATLAB_class"] = np.bytes_("char")
+            else:
+                group[name] = np.atleast_2d(value).T
+                group[name].attrs["MATLAB_class"] = np.bytes_("double")
+
+    with h5py.File(path, "w", userblock_size=512) as file:
+        fill(file, tree)
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
+
+
+SAVERS = {
+    "v7": lambda path, tree: scipy.io.savemat(path, tree, do_compression=True),
+    "v6": scipy.io.savemat,
+    "v7.3": save_v73,
+}
+
+
+@pytest.mark.parametrize("save", SAVERS.values(), ids=SAVERS)
+def test_matlab_cubes_are_read(tmp_path, save):
+    path = tmp_path / "cube.mat"
+    by_row = np.moveaxis(VALUES, 0, 2)  # row, column, band
+    save(path, {"rad": by_row, "bands": np.array(WAVES), "rgb": np.ones((4, 5)), "units": "uW/(cm^2 sr nm)"})
+    save(tmp_path / "two.mat", {"a": by_row, "b": 2.0 * by_row.astype(np.int16)})
+    save(tmp_path / "first.mat", {"cube": VALUES, "wave": np.array(WAVES)})
+
+    np.testing.assert_allclose(radiance(Scene.from_cube(path, distance_m=1.0)), VALUES * 0.01, rtol=1e-12)
+    second = Scene.from_cube(tmp_path / "two.mat", **RADIANCE, name="b", wavelength_nm=WAVES)
+    np.testing.assert_array_equal(radiance(second), 2.0 * VALUES)
+    np.testing.assert_array_equal(radiance(Scene.from_cube(tmp_path / "first.mat", **RADIANCE)), VALUES)
+    assert_rejected(tmp_path / "two.mat", "contains 2 arrays of rows, columns and bands: a, b; select one with name=")
+    assert_rejected(path, "has no array 'rat'; did you mean 'rad'", name="rat")
+    assert_rejected(tmp_path / "two.mat", "does not specify the wavelengths", name="a")
+
+
+@pytest.mark.parametrize("save", SAVERS.values(), ids=SAVERS)
+def test_isetcam_scene_yields_absolute_radiance(tmp_path, save):
+    photon_j = scipy.constants.h * scipy.constants.c / (np.array(WAVES) * 1e-9)
+    photons = np.moveaxis(VALUES, 0, 2) / photon_j
+    tree = {
+        "data": {"photons": photons},
+        "spectrum": {"wave": np.reshape(WAVES, (-1, 1))},
+        "wAngular": 10.0,
+        "distance": 2.0,
+    }
+    save(tmp_path / "scene.mat", {"scene": {"type": "scene", **tree}})
+    save(tmp_path / "fields.mat", tree)
+
+    for name in ("scene.mat", "fields.mat"):
+        scene = Scene.from_cube(tmp_path / name)
+        np.testing.assert_allclose(radiance(scene), VALUES, rtol=1e-9)
+        assert scene.distance_m == 2.0
+        # 5 columns at 2 m over 10 degrees: 2 · 2 m · tan(5°) / 5 = 69.991 mm.
+        assert scene.pitch_um == pytest.approx(69_990.9, rel=1e-6)
+    part = Scene.from_cube(tmp_path / "scene.mat", columns=(1, 3))
+    assert part.pitch_um == pytest.approx(69_990.9, rel=1e-6)
+    assert Scene.from_cube(tmp_path / "scene.mat", distance_m=4.0, fit="contain").fit == "contain"
+
+
+# -- a camera, settings and extensions --------------------------------------------------------------------------------
+
+
+def ramp(path, n=41):
+    """Write a cube of uniform radiance that rises linearly from 0 at 400 nm to 0.04 W/(m² sr nm) at 800 nm."""
+    waves = np.linspace(400.0, 800.0, n)
+    values = np.broadcast_to((1e-4 * (waves - 400.0))[:, None, None], (n, 32, 32))
+    write_envi(
+        path, values, code="d", number=5, wavelength="{" + ",".join(map(repr, waves.tolist())) + "}", data_units=PER_NM
+    )
+    return waves
+
+
+@pytest.mark.parametrize("resample_nm", [None, [500.0, 550.0, 600.0]])
+def test_camera_counts_electrons_of_spectrum(tmp_path, resample_nm):
+    ramp(tmp_path / "cube.hdr")
+    layout = fs.layout.grid(n_x=3, n_y=3, pitch_um=50.0)
+    camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=4.0), sensor=fs.Sensor(layout, qe=0.5))
+    scene = Scene.from_cube(
+        tmp_path / "cube.hdr", distance_m=1.0, range_nm=(500, 600), resample_nm=resample_nm, pitch_um=2000.0
+    )
+
+    expected_e = camera.capture(scene, exposure_s=0.01, seed=0).expected_e
+
+    # Thin lens at 1 m: working f-number N = 4 (1 + m), m = f / (1 m - f); irradiance pi L / (1 + 4 N²).
+    n = 4.0 * (1.0 + 0.008 / (1.0 - 0.008))
+    waves, width = (np.linspace(500, 600, 11), 10.0) if resample_nm is None else (np.array(resample_nm), 50.0)
+    photons = 1e-4 * (waves - 400.0) * width * waves * 1e-9 / (scipy.constants.h * scipy.constants.c)
+    electrons = 0.5 * math.pi / (1.0 + 4.0 * n**2) * photons.sum() * 2500e-12 * 0.01
+    # Relative illumination decreases by 2e-5 over 25 µm at a focal length of 8 mm.
+    np.testing.assert_allclose(expected_e[4], electrons, rtol=5e-5)
+
+
+SHOT = """
+scene:
+  kind: cube
+  path: data/cube.hdr
+  distance_m: 1.0
+  pitch_um: 2000.0
+  range_nm: [500, 600]
+  rows: [4, 30]
+optics: {{focal_length_mm: 8.0, f_number: 4.0}}
+layout: {{generator: grid, parameters: {{n_x: 3, n_y: 3, pitch_um: 5.0}}}}
+exposure_s: 0.01
+{more}
+"""
+
+
+def test_settings_file_contains_cube(tmp_path):
+    (tmp_path / "data").mkdir()
+    ramp(tmp_path / "data" / "cube.hdr")
+    (tmp_path / "shot.yaml").write_text(SHOT.format(more=""))
+
+    shot = read_shot(tmp_path / "shot.yaml")
+
+    direct = Scene.from_cube(
+        tmp_path / "data" / "cube.hdr", distance_m=1.0, pitch_um=2000.0, range_nm=(500, 600), rows=(4, 30)
+    )
+    assert shot.scene.basis.shape == direct.basis.shape == (11, 26, 32)
+    np.testing.assert_array_equal(radiance(shot.scene), radiance(direct))
+    table = "scene.illuminant={wavelength_nm: [400, 800], value: [1, 1]}"
+    lit = read_shot(
+        tmp_path / "shot.yaml",
+        [table, "scene.unit='1'", "scene.radiance_w_m2_sr_nm=0.1", "scene.resample_nm=[550]", "scene.band_width_nm=10"],
+    )
+    np.testing.assert_allclose(radiance(lit.scene), 1e-4 * 150.0 * 0.1, rtol=1e-12)
+    cube = next(each for key, each in schema()["$defs"].items() if key == "cube_kind" or each["title"] == "cube kind")
+    assert {"path", "illuminant", "resample_nm", "rows", "kind"} <= set(cube["properties"])
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ("scene.rows=[4, 90]", r"--set scene\.rows: must be \(start, stop\) with 0 <= start < stop <= 32"),
+        ("scene.quantity=radience", "did you mean 'radiance'"),
+        ("scene.path=data/cub.hdr", r"cub\.hdr: no such file"),
+        ("scene.bands=[0.5]", "scene.bands"),
+    ],
+)
+def test_wrong_setting_gives_key_path(tmp_path, change, match, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "data").mkdir()
+    ramp(tmp_path / "data" / "cube.hdr", n=11)
+    (tmp_path / "shot.yaml").write_text(SHOT.format(more=""))
+
+    with pytest.raises(ConfigError, match=match) as caught:
+        read_shot(tmp_path / "shot.yaml", [change])
+    assert "\n" not in str(caught.value)
+
+
+def test_every_format_has_an_entry():
+    assert list(CUBE_FORMATS) == ["envi", "exr", "netcdf", "zarr", "mat73", "mat"]
+    assert set(_envi.TYPES) == {1, 2, 3, 4, 5, 12, 13, 14, 15}
+
+
+# -- malformed files --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore:the reflectance of the cube")
+def test_corrupt_envi_headers_are_handled(tmp_path):
+    """Truncated headers, and headers with changed characters: each yields a scene or an error of one line."""
+    path = write_envi(tmp_path / "cube.hdr", bbl="{1, 1, 1}", data_gain_values="{1, 1, 1}", data_ignore_value=-1)
+    text, rng = path.read_bytes(), np.random.default_rng(5)
+    contents = [text[: len(text) * i // 60] for i in range(1, 60)]
+    for i in range(300):
+        corrupt = bytearray(text)
+        for at in rng.integers(4, len(text), 1 + i % 4):
+            corrupt[at] = rng.choice(list(b"0123456789{}=,-\n e\xff\x00"))
+        contents.append(bytes(corrupt))
+
+    answers = []
+    for content in contents:
+        path.write_bytes(content)
+        try:
+            answers.append(type(Scene.from_cube(path, **RADIANCE, quantity="radiance")).__name__)
+        except (FileError, ParameterError) as error:
+            answers.append(str(error))
+
+    assert not [answer for answer in answers if "\n" in answer]
+    assert not [answer for answer in answers if "is corrupt or not a valid" in answer]  # exceptions of libraries
+    assert 20 < answers.count("Scene") < 340
+
+
+def huge_hdf5(path):
+    with h5py.File(path, "w") as file:
+        file.create_dataset("cube", (2**10, 2**14, 2**14), "f4", chunks=(1, 1024, 1024), compression="gzip")
+
+
+def external_hdf5(path):
+    with h5py.File(path, "w") as file:
+        file.create_dataset("cube", (2, 2, 2), "u1", external="/etc/passwd")
+
+
+def huge_mat(path):
+    scipy.io.savemat(path, {"cube": np.zeros((2, 3, 4))})
+    sizes = struct.pack("<iii", 2, 3, 4)
+    content = path.read_bytes()
+    assert content.count(sizes) == 1
+    path.write_bytes(content.replace(sizes, struct.pack("<iii", 2**10, 2**14, 2**14)))
+
+
+@pytest.mark.parametrize(
+    ("write", "match"),
+    [
+        (huge_hdf5, "contains an array of 1024 x 16384 x 16384 elements, more than the limit"),
+        (external_hdf5, "stores its data in another file, which is not opened"),
+        (huge_mat, "contains an array of 1024 x 16384 x 16384 elements, more than the limit"),
+    ],
+)
+def test_malformed_files_give_one_line(tmp_path, write, match):
+    write(tmp_path / "cube")
+
+    assert_rejected(tmp_path / "cube", match)
+
+
+def test_missing_library_names_extra(tmp_path, monkeypatch):
+    labelled().to_dataset(name="cube").to_netcdf(tmp_path / "cube.nc", engine="h5netcdf")
+    monkeypatch.setitem(sys.modules, "xarray", None)
+
+    assert_rejected(tmp_path / "cube.nc", r"needs xarray; install it with: pip install 'foveasim\[maps\]'")
