@@ -430,7 +430,7 @@ class Scene:
             raise _framing_conflict("field_of_view_deg", field_of_view_deg, "pitch_um")
         if not isinstance(path, str | Path):
             raise ParameterError(
-                "path", f"must be a file, got a {type(path).__name__}", hint="pass arrays to Scene, bands first"
+                "path", f"must be a file, got {type_name(path)}", hint="pass arrays to Scene, bands first"
             )
         path = Path(path)
         selection = Selection(
