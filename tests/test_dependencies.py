@@ -28,6 +28,7 @@ EXTRAS = {
     "maps": {"maps"},
     "modes": {"video"},
     "scene": {"maps"},
+    "tiles": {"video"},
     "video": {"video"},
     "view": {"notebook", "view"},
 }

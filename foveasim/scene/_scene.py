@@ -29,7 +29,7 @@ from foveasim._core.validation import (
 from foveasim._io.encodings import Encoding, decode
 from foveasim._io.formats import as_file_error
 from foveasim._io.images import read_picture
-from foveasim.errors import FileError, ParameterError, printable
+from foveasim.errors import FileError, ParameterError, printable, type_name
 from foveasim.fields import from_file_rows
 from foveasim.scene._illuminants import Illuminant
 from foveasim.scene.cubes import IlluminantTable, Invalid, Quantity, Selection, read_cube, spectral_radiance
