@@ -682,7 +682,7 @@ def test_small_datasets_have_few_shards(tmp_path, name, n, n_shards):
         (3, 1000, 3),
         (100, 1000, 8),
         (256, 1000, 8),
-        (3200, 1000, 100),
+        (3200, 1000, 96),
         (10**6, 1000, 512),
         (10**6, 2**20, 64),
         (100, 2**25, 2),
@@ -702,6 +702,50 @@ def test_zarr_store_contains_layout_and_settings(tmp_path):
 
     np.testing.assert_array_equal(layout.area_um2, data.layout.area_um2)
     np.testing.assert_array_equal(group["settings/exposure_s"][:], [s["settings"]["exposure_s"] for s in data])
+
+
+def test_zarr_arrays_have_dimensions_and_units(tmp_path):
+    xarray = pytest.importorskip("xarray")
+    data = labelled()
+    explore.write_dataset(data, tmp_path / "data.zarr")
+    stored = xarray.open_zarr(tmp_path / "data.zarr", consolidated=False)
+
+    assert stored["code"].dims == ("sample", "site")
+    assert stored["box_covers"].dims == ("sample", "box", "site")
+    assert stored["electrons"].attrs["units"] == "e-"
+    assert stored["flow_um"].attrs["units"] == "µm"
+    np.testing.assert_array_equal(stored["flow_um"][3], data[3]["flow_um"])
+
+
+@pytest.mark.parametrize("per_shard", [4, 7, 16])
+def test_zarr_samples_are_in_one_file(per_shard, tmp_path):
+    explore.write_dataset(explore.Dataset(pictures(2), SHOT, draws=8), tmp_path / "data.zarr", per_shard=per_shard)
+
+    files = [path for path in (tmp_path / "data.zarr" / "electrons" / "c").rglob("*") if path.is_file()]
+
+    assert len(files) == -(-16 // per_shard)
+
+
+def test_former_zarr_layout_is_rejected(tmp_path):
+    data = explore.Dataset(pictures(1), SHOT)
+    explore.write_dataset(data, tmp_path / "data.zarr")
+    metadata = tmp_path / "data.zarr" / "zarr.json"
+    about = json.loads(metadata.read_text())
+    about["attributes"]["version"] = 2
+    metadata.write_text(json.dumps(about))
+
+    for call in (explore.open_dataset, partial(explore.write_dataset, data)):
+        with pytest.raises(FileError, match=r"has the format version 2, expected 3; write the dataset again$"):
+            call(tmp_path / "data.zarr")
+
+
+def test_missing_zarr_shard_is_corrupt_sample(tmp_path):
+    stored = explore.write_dataset(explore.Dataset(pictures(3), SHOT), tmp_path / "data.zarr", per_shard=1)
+    (tmp_path / "data.zarr" / "code" / "c" / "1" / "0").unlink()
+
+    assert stored[0]["code"].shape == (72,)
+    with pytest.raises(FileError, match="has a corrupt sample 1"):
+        stored[1]
 
 
 def test_only_tar_shards_support_varied_layouts(tmp_path):

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from foveasim._core.extras import needs
 from foveasim._core.names import missing_path
@@ -25,22 +24,23 @@ from foveasim._core.validation import check_count
 from foveasim._io.atomic import atomic_directory, atomic_write
 from foveasim.errors import FileError, FoveasimWarning, ParameterError, SimulationError
 from foveasim.explore.datasets.dataset import Dataset
+from foveasim.explore.datasets.items import describe_items, flatten, unflatten
+from foveasim.explore.datasets.zarr_rows import RowReader, create_rows
 from foveasim.explore.executor import KILLED, executor
 
 __all__ = ["StoredSamples", "open_dataset", "write_dataset"]
 
-FORMAT, VERSION = "foveasim dataset", 2
+FORMAT = "foveasim dataset"
 ZARR, ABOUT = ".zarr", "dataset.json"
 #: Default size of a shard: approximate bytes and largest number of samples. One process has a shard in memory.
 SHARD_BYTES, MAX_SHARD_SAMPLES = 1 << 26, 512
 #: Smallest default number of shards: many processes can write, and an interruption loses little.
 MIN_SHARDS = 32
-#: Smallest default number of samples of a shard, which precedes the number of shards: few files for small datasets.
+#: Smallest default number of samples of a shard, which precedes the number of shards: few files for small datasets. Larger
+#: shards have a multiple of it, so that zarr chunks of 2, 4 or 8 samples divide them.
 MIN_SHARD_SAMPLES = 8
-#: Number of shards of a zarr store that a reading process caches, the most recently used.
-MAX_CACHED_SHARDS = 4
-#: Names of the array with the digest of each complete shard, and of the group of random settings.
-DONE, SETTINGS = "done", "settings"
+#: Name of the array with the digest of each complete shard.
+DONE = "done"
 #: First member of a tar file, with the digest of its inputs; WebDataset skips such names.
 INPUT_DIGEST = "__made_of__"
 #: Bytes of a SHA-256.
@@ -69,10 +69,10 @@ def write_dataset(
     ----------
     dataset : Dataset
     path : path
-        ``.zarr``: zarr store with an array for each item of the samples, chunked by shard. Without an extension: directory of
-        tar files ``shard-000000.tar`` ... in the format of WebDataset, with the arrays (``.npz``), the other items (``.json``)
-        and, with labels, the class (``.cls``) of each sample. Zarr is faster for arrays of all samples; tar files are faster
-        for random access to single samples, which are read individually.
+        ``.zarr``: zarr store with a sharded array for each item of the samples, its dimensions and its unit. Without an
+        extension: directory of tar files ``shard-000000.tar`` ... in the format of WebDataset, with the arrays (``.npz``), the
+        other items (``.json``) and, with labels, the class (``.cls``) of each sample. Both read single samples in any order;
+        zarr also reads arrays of all samples.
     per_shard : int, optional
         Number of samples per shard; by default 1/32 of the dataset, from 8 to 512 samples, and at most about 64 MiB.
     workers : int, optional
@@ -127,11 +127,11 @@ def write_dataset(
         n_bytes = max(1, sum(value.nbytes for value in first.values() if isinstance(value, np.ndarray)))
         about = {
             "format": FORMAT,
-            "version": VERSION,
+            "version": kind.version,
             "n_samples": len(dataset),
             "per_shard": per_shard or _default_per_shard(len(dataset), n_bytes),
-            "has_label": "label" in first,
             "class_names": dataset.class_names,
+            "items": describe_items(first),
             "plan": plan,
         }
         kind.create(target, about, dataset, first)
@@ -143,7 +143,7 @@ def write_dataset(
 
 def _default_per_shard(n_samples: int, n_bytes: int) -> int:
     """Return the default number of samples of a shard, for samples of a given size."""
-    n = min(max(n_samples // MIN_SHARDS, MIN_SHARD_SAMPLES), MAX_SHARD_SAMPLES)
+    n = min(max(n_samples // MIN_SHARDS // MIN_SHARD_SAMPLES, 1) * MIN_SHARD_SAMPLES, MAX_SHARD_SAMPLES)
     return max(1, min(n, SHARD_BYTES // n_bytes, n_samples))
 
 
@@ -334,8 +334,11 @@ def _read_about(target: Path) -> dict[str, Any]:
         pass
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise FileError(target, "is not a dataset of foveasim; use another path")
-    if about.get("version") != VERSION:
-        raise FileError(target, f"has the format version {about.get('version')}, expected {VERSION}")
+    expected = _shards_class(target).version
+    if about.get("version") != expected:
+        raise FileError(
+            target, f"has the format version {about.get('version')}, expected {expected}; write the dataset again"
+        )
     return about
 
 
@@ -359,13 +362,21 @@ def _zarr(path: Path) -> Any:
 
 
 class _Shards:
-    """Base class of stored shards with a fixed number of samples each."""
+    """
+    Base class of stored shards with a fixed number of samples each.
+
+    Attributes
+    ----------
+    version : int
+        Version of the format.
+    """
+
+    version: int
 
     def __init__(self, directory: Path, about: Mapping[str, Any]) -> None:
         self.directory = directory
         self.n_samples, self.per_shard = int(about["n_samples"]), int(about["per_shard"])
         self.n_shards = -(-self.n_samples // self.per_shard)
-        self.has_label = bool(about["has_label"])
 
     @staticmethod
     def create(target: Path, about: Mapping[str, Any], dataset: Dataset, first: Mapping[str, Any]) -> None:
@@ -395,6 +406,8 @@ class _Shards:
 
 class _TarShards(_Shards):
     """Shards as tar files, which exist only when complete."""
+
+    version = 2
 
     def __init__(self, directory: Path, about: Mapping[str, Any]) -> None:
         super().__init__(directory, about)
@@ -467,40 +480,47 @@ def _add(tar: tarfile.TarFile, name: str, content: bytes) -> None:
 
 
 class _ZarrShards(_Shards):
-    """Shards as chunks of zarr arrays, with a digest that is written after all chunks."""
+    """Shards of zarr arrays, with a digest that is written after all arrays."""
+
+    version = 3
 
     def __init__(self, directory: Path, about: Mapping[str, Any]) -> None:
         super().__init__(directory, about)
+        self._names = list(about["items"])
         self._opened: tuple[int, dict[str, Any]] | None = None
-        self._read: dict[int, dict[str, NDArray[Any]]] = {}
+        self._readers: dict[str, RowReader] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_opened": None, "_read": {}}
+        return self.__dict__ | {"_opened": None, "_readers": None}
 
     @staticmethod
     def create(target: Path, about: Mapping[str, Any], dataset: Dataset, first: Mapping[str, Any]) -> None:
         zarr = _zarr(target)
         n, per_shard = about["n_samples"], about["per_shard"]
-        n_shards = -(-n // per_shard)
+        values = flatten(first)
 
         with atomic_directory(target, is_ours=lambda _: False) as new:
             group = zarr.open_group(str(new), mode="w", zarr_format=3)
-            for name, value in _flatten(first).items():
-                if isinstance(value, str):
-                    group.create_array(name, shape=(n,), chunks=(per_shard,), dtype=str)
-                    continue
-                array = np.asarray(value)
-                lengths = tuple(max(length, 1) for length in array.shape)
-                group.create_array(
-                    name, shape=(n, *array.shape), chunks=(per_shard, *lengths), dtype=array.dtype, fill_value=0
+            for name, item in about["items"].items():
+                create_rows(
+                    group,
+                    name,
+                    n=n,
+                    per_shard=per_shard,
+                    shape=item["shape"],
+                    dtype=str if isinstance(values[name], str) else np.asarray(values[name]).dtype,
+                    dimensions=("sample", *item["dimensions"]),
+                    attributes={"units": item["units"]},
                 )
             group.create_array(
                 DONE,
-                shape=(n_shards, DIGEST_BYTES),
+                shape=(-(-n // per_shard), DIGEST_BYTES),
                 chunks=(1, DIGEST_BYTES),
                 dtype="u1",
                 fill_value=0,
+                filters=None,
                 compressors=None,
+                dimension_names=("shard", "byte"),
             )
             layout = dataset.layout
             for name in ("xy_um", "ring_offsets", "site_offsets"):
@@ -511,23 +531,30 @@ class _ZarrShards(_Shards):
 
     def _arrays(self) -> dict[str, Any]:
         if self._opened is None or self._opened[0] != os.getpid():
-            group = _zarr(self.directory).open_group(str(self.directory), mode="r+")
-            arrays = {name: array for name, array in group.arrays()}  # noqa: C416 -- a generator of pairs
-            if SETTINGS in group:
-                arrays |= {f"{SETTINGS}/{name}": array for name, array in group[SETTINGS].arrays()}
+            zarr = _zarr(self.directory)
+            # Chunks of zeros are written, so that a missing one is an error.
+            with zarr.config.set({"array.write_empty_chunks": True}):
+                group = zarr.open_group(str(self.directory), mode="r+")
+                arrays = {name: group[name] for name in (*self._names, DONE)}
             self._opened = os.getpid(), arrays
         return self._opened[1]
 
+    def _rows(self) -> dict[str, RowReader]:
+        """Return the reader of each array; they do not depend on the process."""
+        if self._readers is None:
+            self._readers = {name: RowReader(array, self.directory / name) for name, array in self._arrays().items()}
+        return self._readers
+
     def input_digest(self, k: int) -> str:
         try:
-            mark = np.asarray(self._arrays()[DONE][k], np.uint8)
-        except Exception:  # noqa: BLE001 -- a truncated digest counts as missing
+            mark = np.asarray(self._rows()[DONE].read(k))
+        except (OSError, ValueError, KeyError):  # a truncated digest counts as missing
             return ""
         return mark.tobytes().hex() if mark.any() else ""
 
     def write(self, k: int, samples: Sequence[Mapping[str, Any]], input_digest: str) -> None:
         arrays, position = self._arrays(), slice(self.samples(k).start, self.samples(k).stop)
-        flattened = [_flatten(sample) for sample in samples]
+        flattened = [flatten(sample) for sample in samples]
         for name in flattened[0]:
             values: list[Any] = [sample[name] for sample in flattened]
             if isinstance(values[0], str):
@@ -537,29 +564,10 @@ class _ZarrShards(_Shards):
         arrays[DONE][k] = np.frombuffer(bytes.fromhex(input_digest), np.uint8)
 
     def read(self, index: int) -> dict[str, Any]:
-        rows, row = self._rows(index // self.per_shard), index % self.per_shard
-        sample: dict[str, Any] = {SETTINGS: {}}
-        for name, values in rows.items():
-            value = np.array(values[row]) if values.ndim > 1 else values[row]
-            value = value.item() if isinstance(value, np.generic) else value
-            if name.startswith(f"{SETTINGS}/"):
-                sample[SETTINGS][name.removeprefix(f"{SETTINGS}/")] = value
-            else:
-                sample[name] = value
-        return sample
-
-    def _rows(self, k: int) -> dict[str, NDArray[Any]]:
-        """Read all samples of a shard, which are cached: a chunk is decompressed completely."""
-        if k not in self._read:
-            position = slice(self.samples(k).start, self.samples(k).stop)
-            rows = {name: np.asarray(array[position]) for name, array in self._arrays().items() if name != DONE}
-            self._read[k] = rows
-            while len(self._read) > MAX_CACHED_SHARDS:
-                del self._read[next(iter(self._read))]
-        return self._read[k]
-
-
-def _flatten(sample: Mapping[str, Any]) -> dict[str, NDArray[Any] | int | float | str]:
-    """Return a sample with its random settings as separate items."""
-    own = {f"{SETTINGS}/{path}": value for path, value in sample[SETTINGS].items()}
-    return {name: value for name, value in sample.items() if name != SETTINGS} | own
+        found = {name: rows.read(index) for name, rows in self._rows().items() if name != DONE}
+        return unflatten(
+            {
+                name: value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
+                for name, value in found.items()
+            }
+        )
