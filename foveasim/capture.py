@@ -251,6 +251,7 @@ class Capture:
         centre_um: tuple[float, float] | None = None,
         max_pixels: int = 1024,
         sensor: Sensor | None = None,
+        n_threads: int | None = None,
     ) -> CorticalImage:
         """
         Return the values as a log-polar image of rings and sectors.
@@ -269,6 +270,8 @@ class Capture:
             the optical axis, and the outermost ring touches the nearest side of the bounds of the layout.
         max_pixels : int
             Pixels along the longer side of the picture that is resampled.
+        n_threads : int, optional
+            Threads of the reconstruction; all cores by default.
 
         Returns
         -------
@@ -295,7 +298,7 @@ class Capture:
         if r_max_um is None:
             x0, y0, x1, y1 = self.layout.bounds_um
             r_max_um = min(x1 - centre[0], y1 - centre[1], centre[0] - x0, centre[1] - y0)
-        picture = self.picture(max_pixels=max_pixels, of=of, per=per, sensor=sensor)
+        picture = self.picture(max_pixels=max_pixels, of=of, per=per, sensor=sensor, n_threads=n_threads)
         return to_cortical(
             picture, n_rings=n_rings, n_sectors=n_sectors, r_min_um=r_min_um, r_max_um=r_max_um, centre_um=centre
         )

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from foveasim._core.rings import site_moments
 from foveasim._core.validation import Floats, Ints, finite_array, read_only
 from foveasim.fields import Grid, PackedRings
 from foveasim.integrate import Integrator
+from foveasim.layout import Layout
 from foveasim.reconstruct.picture import Picture, coverage_fraction
 
 __all__ = ["cells", "fill_channels"]
 
+#: Number of cached layouts, and the largest number of their sites, about 200 bytes each.
+MAX_CACHED, MAX_CACHED_SITES = 2, 1 << 17
 #: Nearest sites of a channel that are averaged in demosaicing.
 NEIGHBOURS = 4
 
@@ -35,9 +40,9 @@ def cells(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | N
         ``Wᵀ values / Wᵀ 1`` with the exact overlap areas W of sites and pixels: boundaries are anti-aliased, and a uniform
         field stays uniform.
     """
-    integrator = Integrator(layout, grid, n_threads=n_threads)
+    compiled = _compiled_once if _is_cached(layout) else _compiled
+    integrator, coverage = compiled(layout, grid, n_threads)
     channels = np.atleast_2d(finite_array("values", values))
-    coverage = coverage_fraction(integrator)
     covered_um2 = np.where(coverage > 0.0, coverage, np.nan) * grid.cell_area_um2
     data = integrator.spread(channels) / covered_um2
     return Picture(read_only(data.astype(np.float32)), read_only(coverage.astype(np.float32)), grid)
@@ -60,10 +65,36 @@ def fill_channels(layout: PackedRings, values: Floats, channel: Ints, n_channels
         The site's value in its own channel; in other channels the mean of the nearest sites of that channel, weighted by
         inverse distance. NaN for a channel without sites.
     """
+    neighbours = _neighbours_once if _is_cached(layout) else _neighbours
+    filled = np.full((n_channels, values.size), np.nan)
+    for c, (own, nearest, weight) in neighbours(layout, np.asarray(channel, np.int64).tobytes(), n_channels).items():
+        filled[c] = (values[nearest] * weight).sum(axis=1) / weight.sum(axis=1)
+        filled[c, own] = values[own]
+    return filled
+
+
+def _is_cached(layout: PackedRings) -> bool:
+    """Return whether parts of a layout are cached: only of layouts, which are immutable."""
+    return isinstance(layout, Layout) and layout.n_sites <= MAX_CACHED_SITES
+
+
+def _compiled(layout: PackedRings, grid: Grid, n_threads: int | None) -> tuple[Integrator, Floats]:
+    """Return the integrator of a layout on the pixels of a picture, and the fraction of each that is covered."""
+    integrator = Integrator(layout, grid, n_threads=n_threads)
+    return integrator, coverage_fraction(integrator)
+
+
+def _neighbours(layout: PackedRings, channels: bytes, n_channels: int) -> dict[int, tuple[Ints, Ints, Floats]]:
+    """
+    Return the sites of each channel, and for every site the nearest of these and their weights.
+
+    ``channels`` are the bytes of the channels of the sites, int64.
+    """
     from scipy.spatial import cKDTree
 
     _, centroid_um = site_moments(layout.xy_um, layout.ring_offsets, layout.site_offsets)
-    filled = np.full((n_channels, values.size), np.nan)
+    channel = np.frombuffer(channels, np.int64)
+    found = {}
     for c in range(n_channels):
         own = np.flatnonzero(channel == c)
         if own.size == 0:
@@ -71,7 +102,10 @@ def fill_channels(layout: PackedRings, values: Floats, channel: Ints, n_channels
         distance_um, nearest = cKDTree(centroid_um[own]).query(
             centroid_um, k=np.arange(1, min(NEIGHBOURS, own.size) + 1)
         )
-        weight = 1.0 / np.maximum(distance_um, 1e-12)
-        filled[c] = (values[own][nearest] * weight).sum(axis=1) / weight.sum(axis=1)
-        filled[c, own] = values[own]
-    return filled
+        found[c] = own, own[nearest], 1.0 / np.maximum(distance_um, 1e-12)
+    return found
+
+
+# Pictures of one layout share its compiled sites and neighbours, such as the samples of a dataset or the frames of a video.
+_compiled_once = lru_cache(maxsize=MAX_CACHED)(_compiled)
+_neighbours_once = lru_cache(maxsize=MAX_CACHED)(_neighbours)

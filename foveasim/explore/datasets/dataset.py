@@ -34,6 +34,8 @@ from foveasim.errors import (
 )
 from foveasim.explore._files import digests
 from foveasim.explore.datasets.distributions import MAX_INTEGER, MIN_INTEGER, Distribution, parse_distribution
+from foveasim.explore.datasets.images import CORTICAL, RASTER, check_image_options, image_attributes, images_of
+from foveasim.explore.datasets.items import describe_items
 from foveasim.explore.datasets.labels import (
     NO_CLASS,
     boxes_on_sites,
@@ -102,6 +104,12 @@ class Dataset:
         Classes of the pixels of each picture.
     flows : sequence of (n_y, n_x, 2), or of ``.npy`` files, optional, pixels
         Displacement of each pixel, x to the right and y down; NaN where it is unknown.
+    raster : mapping, optional
+        Options of :meth:`foveasim.Capture.picture`, such as ``{"method": "cells", "max_pixels": 96}``; 128 pixels by default.
+        Samples then contain the reconstructed picture.
+    cortical : mapping, optional
+        Options of :meth:`foveasim.Capture.cortical`, such as ``{"n_rings": 32, "n_sectors": 64}``; on layouts of rings ``{}``.
+        Samples then contain the log-polar image.
     fit : {"cover", "contain", "width"}, optional
         Framing of each picture, as the setting ``scene.fit``, which it replaces (:meth:`foveasim.Scene.from_picture`). The
         pitch follows from the layout and lens of each sample. By default the framing or pitch is that of the shot.
@@ -126,6 +134,9 @@ class Dataset:
     path; indices for choices other than numbers) and ``warning``; with labels ``label``; with boxes ``box_um`` (n_box, 4),
     ``box_label`` (n_box,) and ``box_covers`` (n_box, n_site), padded with boxes of class -1 to the same number in all samples;
     with masks ``mask`` (n_site,), -1 outside the picture; with flows ``flow_um`` (n_site, 2) and ``flow_known`` (n_site,).
+    Images are float32 with channels first: ``raster`` (n_channel, n_y, n_x), top row first, and ``cortical`` (n_channel,
+    n_ring, n_sector), innermost ring first; both are 0 where ``raster_known`` (n_y, n_x) and ``cortical_known`` (n_ring,
+    n_sector) are False: outside the photosites.
     :mod:`foveasim.explore.datasets.labels` defines these labels.
 
     Each process caches recent components: layouts, compiled layouts, lenses, scenes and the power on the sites. Arrays in
@@ -163,6 +174,8 @@ class Dataset:
         boxes: Sequence[Any] | None = None,
         masks: Sequence[Any] | None = None,
         flows: Sequence[Any] | None = None,
+        raster: Mapping[str, Any] | None = None,
+        cortical: Mapping[str, Any] | None = None,
         fit: Literal["cover", "contain", "width"] | None = None,
         changes: Mapping[str, Any] | None = None,
         source: Source | str | Path | None = None,
@@ -184,6 +197,8 @@ class Dataset:
             self._boxes = [validate_boxes(f"boxes[{k}]", each[k]) for k in range(n)]
         self._masks = None if masks is None else check_per_picture("masks", masks, n)
         self._flows = None if flows is None else check_per_picture("flows", flows, n)
+        images = {RASTER: check_image_options(RASTER, raster), CORTICAL: check_image_options(CORTICAL, cortical)}
+        self._images = {name: options for name, options in images.items() if options is not None}
         if fit is not None:
             check_choice("fit", fit, get_args(Fit))
         self._fit = fit
@@ -271,6 +286,23 @@ class Dataset:
         """Whether samples have different layouts."""
         return any(path == LAYOUT or path.startswith(LAYOUT + ".") for path in self._distributions)
 
+    def describe_items(self) -> dict[str, dict[str, Any]]:
+        """
+        Return the dimensions, shape, type and unit of each item of the samples, as plain data.
+
+        Shapes are those of the first sample; images also have the position of their pixels and their channels.
+        """
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # reported with the samples
+            items = describe_items(self._evaluate(0, self._sample), self._images)
+            if self._images:
+                shot, capture = self._evaluate(0, self._capture)
+                sensor = shot.camera.sensor
+                attributes = image_attributes(capture, sensor, self._images, n_threads=self._n_threads)
+                for name, found in attributes.items():
+                    items[name] |= found
+        return items
+
     def to_dict(self) -> dict[str, Any]:
         """
         Return everything that determines the samples as plain data.
@@ -292,6 +324,8 @@ class Dataset:
             "seed": self.seed,
             "fields": list(self.fields),
             "fit": self._fit,
+            RASTER: self._images.get(RASTER),
+            CORTICAL: self._images.get(CORTICAL),
             "class_names": self.class_names,
             "labels": hashlib.sha256(json.dumps(labels).encode()).hexdigest(),
             "files": digests(self._files),
@@ -431,6 +465,8 @@ class Dataset:
             sample: dict[str, Any] = {"index": index, "picture": self._picture_of(index)}
             sample |= {field: self._field(field, index, shot, capture) for field in self.fields}
             sample |= self._site_labels(index, shot)
+            if self._images:
+                sample |= images_of(capture, shot.camera.sensor, self._images, n_threads=self._n_threads)
         messages = [*self._messages, *(_as_warning(each.message) for each in caught)]
         if messages and not self._has_warned:
             self._has_warned = True
@@ -489,6 +525,10 @@ class Dataset:
                 for value in distribution.bounds[1:CHECKED_VALUES]:
                     max_bits = max(max_bits, self._check_values(first | {path: value}))
             self._code_type = np.uint8 if max_bits <= 8 else np.uint16
+            if self._images:
+                with _record_warnings():
+                    shot, capture = self._capture(0)
+                    images_of(capture, shot.camera.sensor, self._images, n_threads=self._n_threads)
         finally:
             self._reset()
 

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from foveasim.explore.datasets.images import CORTICAL, RASTER, image_units
+
 __all__ = ["SETTINGS", "Item", "describe_items", "flatten", "unflatten"]
 
 #: Item with the random settings of a sample, and prefix of their names.
@@ -20,7 +22,7 @@ class Item(NamedTuple):
     units: str = "1"
 
 
-#: Items that are not dimensionless numbers or strings.
+#: Items that are not dimensionless numbers or strings; the units of images follow from their options.
 ITEMS = {
     "code": Item(("site",), "DN"),
     "electrons": Item(("site",), "e-"),
@@ -32,6 +34,10 @@ ITEMS = {
     "mask": Item(("site",)),
     "flow_um": Item(("site", "axis"), "µm"),
     "flow_known": Item(("site",)),
+    RASTER: Item(("raster_channel", "raster_y", "raster_x")),
+    f"{RASTER}_known": Item(("raster_y", "raster_x")),
+    CORTICAL: Item(("cortical_channel", "ring", "sector")),
+    f"{CORTICAL}_known": Item(("ring", "sector")),
 }
 
 
@@ -49,8 +55,8 @@ def unflatten(items: Mapping[str, Any]) -> dict[str, Any]:
     return sample | {SETTINGS: settings}
 
 
-def describe_items(sample: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the dimensions, shape, type and unit of each item, as plain data."""
+def describe_items(sample: Mapping[str, Any], images: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return the dimensions, shape, type and unit of each item, as plain data, with the options of images by name."""
     found = {}
     for name, value in flatten(sample).items():
         item = ITEMS.get(name, Item())
@@ -59,6 +65,6 @@ def describe_items(sample: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
             "dimensions": list(item.dimensions),
             "shape": list(np.shape(value)),
             "dtype": "str" if is_string else str(np.asarray(value).dtype),
-            "units": item.units,
+            "units": image_units(images[name]) if name in images else item.units,
         }
     return found

@@ -13,6 +13,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._io.yaml_files import read_yaml
 from foveasim.config import Source, picture_path, resolve_files, validate
 from foveasim.explore.datasets.dataset import Dataset
+from foveasim.explore.datasets.images import CORTICAL, RASTER
 from foveasim.explore.datasets.label_files import (
     FLOW_EXTENSIONS,
     MASK_EXTENSIONS,
@@ -35,6 +36,9 @@ RECIPES: dict[str | None, Callable[..., Dataset]] = {
 }
 #: Parameters of a distribution, in the unit of its setting.
 _Numbers = list[float]
+#: Values of sites, and their normalisation.
+_Values = Literal["code", "electrons", "expected_e", "light_e"]
+_Per = Literal["site", "um2"]
 #: Keys with the same name in :class:`Dataset`.
 DATASET_KEYS = ("cameras", "draws", "seed", "fields", "fit")
 
@@ -69,6 +73,37 @@ class _Distribution(BaseModel):
     weights: _Numbers | None = Field(None, description="relative probabilities of the values of a choice")
 
 
+class _Raster(BaseModel):
+    """Reconstructed picture of each sample."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    method: Literal["cells", "linear", "natural", "least_squares"] | None = Field(
+        None, description="reconstruction, cells by default"
+    )
+    max_pixels: int | None = Field(None, description="pixels along the longer side, 128 by default")
+    of: _Values | None = Field(None, description="values to reconstruct, code by default")
+    per: _Per | None = Field(None, description="values of a site, by default, or per µm²")
+    mu: float | None = Field(None, description="regularisation of least_squares")
+    tolerance: float | None = Field(None, description="relative tolerance of least_squares")
+    max_steps: int | None = Field(None, description="maximum number of steps of least_squares")
+
+
+class _Cortical(BaseModel):
+    """Log-polar image of each sample."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    of: _Values | None = Field(None, description="values of the image, code by default")
+    per: _Per | None = Field(None, description="values of a site, by default, or per µm²")
+    n_rings: int | None = Field(None, description="rings; by default one pixel per site, on layouts of rings")
+    n_sectors: int | None = Field(None, description="sectors, with n_rings")
+    r_min_um: float | None = Field(None, description="inner radius, with n_rings")
+    r_max_um: float | None = Field(None, description="outer radius, with n_rings")
+    centre_um: list[float] | None = Field(None, description="[x, y], with n_rings; the optical axis by default")
+    max_pixels: int | None = Field(
+        None, description="pixels along the longer side of the picture that is resampled, 256 by default"
+    )
+
+
 class DatasetSection(BaseModel):
     """Settings of a dataset: pictures, shot, distributions, labels and shards."""
 
@@ -95,6 +130,8 @@ class DatasetSection(BaseModel):
     boxes: str | None = Field(None, description="JSON file in COCO format")
     masks: str | None = Field(None, description="directory with one .png, .bmp or .tif file per picture name")
     flows: str | None = Field(None, description="directory with one .npy file per picture name")
+    raster: _Raster | None = Field(None, description="options of the reconstructed picture in each sample")
+    cortical: _Cortical | None = Field(None, description="options of the log-polar image in each sample")
     per_shard: int | None = Field(None, ge=1, description="number of samples per shard")
 
 
@@ -107,12 +144,12 @@ def read_dataset(path: str | Path, *, n_threads: int = 1) -> DatasetFile:
     path : path
         File with the keys ``pictures`` (a directory, zip file, array, or list of files), ``shot`` (a settings file, or the
         settings), ``vary`` (distributions by setting path, as for :func:`parse_distribution`), ``recipe``
-        (``classification`` or ``denoising``), ``cameras``, ``draws``, ``seed``, ``fields`` and ``fit`` (as for
-        :class:`Dataset`), ``labels`` (a CSV file with the columns ``picture`` and ``label``, an array, or a list), ``boxes`` (a
-        JSON file in COCO format), ``masks`` and ``flows`` (directories with one file per picture name), ``per_shard``, and
-        ``set`` (settings that are replaced in all samples). Paths are relative to the file; ``skimage:astronaut`` is an example
-        of a picture of scikit-image. Label files identify pictures by their names in the directory, or by their numbers in an
-        array.
+        (``classification`` or ``denoising``), ``cameras``, ``draws``, ``seed``, ``fields``, ``raster``, ``cortical`` and
+        ``fit`` (as for :class:`Dataset`), ``labels`` (a CSV file with the columns ``picture`` and ``label``, an array, or a
+        list), ``boxes`` (a JSON file in COCO format), ``masks`` and ``flows`` (directories with one file per picture name),
+        ``per_shard``, and ``set`` (settings that are replaced in all samples). Paths are relative to the file;
+        ``skimage:astronaut`` is an example of a picture of scikit-image. Label files identify pictures by their names in the
+        directory, or by their numbers in an array.
     n_threads : int
         Number of threads per sample.
 
@@ -132,6 +169,11 @@ def read_dataset(path: str | Path, *, n_threads: int = 1) -> DatasetFile:
     directory = path.parent
     source = _pictures(path, section.pictures)
     options = {name: value for name in DATASET_KEYS if (value := getattr(section, name)) is not None}
+    options |= {
+        name: chosen.model_dump(exclude_none=True)
+        for name in (RASTER, CORTICAL)
+        if (chosen := getattr(section, name)) is not None
+    }
     labels = _labels(directory, section, source)
     with with_file_context(path):
         dataset = RECIPES[section.recipe](

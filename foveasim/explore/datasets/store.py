@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import operator
 import os
 import tarfile
@@ -24,7 +25,7 @@ from foveasim._core.validation import check_count
 from foveasim._io.atomic import atomic_directory, atomic_write
 from foveasim.errors import FileError, FoveasimWarning, ParameterError, SimulationError
 from foveasim.explore.datasets.dataset import Dataset
-from foveasim.explore.datasets.items import describe_items, flatten, unflatten
+from foveasim.explore.datasets.items import flatten, unflatten
 from foveasim.explore.datasets.zarr_rows import RowReader, create_rows
 from foveasim.explore.executor import KILLED, executor
 
@@ -121,20 +122,19 @@ def write_dataset(
     plan = json.loads(json.dumps(dataset.to_dict()))
     about = _read_about(target) if os.path.exists(target) else None  # noqa: PTH110 -- False, not an error, without permission
     if about is None:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # reported with the shard of the first sample
-            first = dataset[0]
-        n_bytes = max(1, sum(value.nbytes for value in first.values() if isinstance(value, np.ndarray)))
+        items = dataset.describe_items()
+        arrays = [item for item in items.values() if item["shape"]]
+        n_bytes = max(1, sum(np.dtype(item["dtype"]).itemsize * math.prod(item["shape"]) for item in arrays))
         about = {
             "format": FORMAT,
             "version": kind.version,
             "n_samples": len(dataset),
             "per_shard": per_shard or _default_per_shard(len(dataset), n_bytes),
             "class_names": dataset.class_names,
-            "items": describe_items(first),
+            "items": items,
             "plan": plan,
         }
-        kind.create(target, about, dataset, first)
+        kind.create(target, about, dataset)
     else:
         _check_same(target, about, plan, per_shard)
     _write_shards(dataset, kind(target, about), scheduler, workers, progress)
@@ -379,8 +379,8 @@ class _Shards:
         self.n_shards = -(-self.n_samples // self.per_shard)
 
     @staticmethod
-    def create(target: Path, about: Mapping[str, Any], dataset: Dataset, first: Mapping[str, Any]) -> None:
-        """Create the store for samples with the items, types and shapes of the first."""
+    def create(target: Path, about: Mapping[str, Any], dataset: Dataset) -> None:
+        """Create the store for samples with the given items."""
         raise NotImplementedError
 
     def samples(self, k: int) -> range:
@@ -417,7 +417,7 @@ class _TarShards(_Shards):
         return self.__dict__ | {"_member_offsets": {}}
 
     @staticmethod
-    def create(target: Path, about: Mapping[str, Any], dataset: Dataset, first: Mapping[str, Any]) -> None:  # noqa: ARG004 -- common signature
+    def create(target: Path, about: Mapping[str, Any], dataset: Dataset) -> None:
         with atomic_directory(target, is_ours=lambda _: False) as new:
             (new / ABOUT).write_text(json.dumps(about, indent=1), encoding="utf-8")
             if not dataset.is_layout_varied:
@@ -494,10 +494,9 @@ class _ZarrShards(_Shards):
         return self.__dict__ | {"_opened": None, "_readers": None}
 
     @staticmethod
-    def create(target: Path, about: Mapping[str, Any], dataset: Dataset, first: Mapping[str, Any]) -> None:
+    def create(target: Path, about: Mapping[str, Any], dataset: Dataset) -> None:
         zarr = _zarr(target)
         n, per_shard = about["n_samples"], about["per_shard"]
-        values = flatten(first)
 
         with atomic_directory(target, is_ours=lambda _: False) as new:
             group = zarr.open_group(str(new), mode="w", zarr_format=3)
@@ -508,9 +507,9 @@ class _ZarrShards(_Shards):
                     n=n,
                     per_shard=per_shard,
                     shape=item["shape"],
-                    dtype=str if isinstance(values[name], str) else np.asarray(values[name]).dtype,
+                    dtype=str if item["dtype"] == "str" else item["dtype"],
                     dimensions=("sample", *item["dimensions"]),
-                    attributes={"units": item["units"]},
+                    attributes={key: item[key] for key in item if key not in ("dimensions", "shape", "dtype")},
                 )
             group.create_array(
                 DONE,
