@@ -144,6 +144,8 @@ class Camera:
         self._n_threads = thread_count(n_threads)
         self._integrators: dict[tuple[Grid, int, Position], Integrator] = {}
         self._bounds_um: list[tuple[float, float, float, float]] = []
+        #: The most recent scene with ``fit``, and the framed scene.
+        self._framed: tuple[Scene, Scene] | None = None
 
     def __repr__(self) -> str:
         return f"Camera({self._optics!r}, {self._sensor!r})"
@@ -213,7 +215,12 @@ class Camera:
         """
         if not isinstance(scene, Scene):
             raise ParameterError("scene", f"must be a Scene, got {type_name(scene)}")
-        return scene if scene.pitch_um is not None else self._fit(scene, scene.fit)
+        if scene.pitch_um is not None:
+            return scene
+        framed = self._framed
+        if framed is None or framed[0] is not scene:
+            self._framed = framed = scene, self._fit(scene, scene.fit)
+        return framed[1]
 
     def _fit(self, scene: Scene, fit: str | None) -> Scene:
         """Return a scene with the pitch of a framing."""

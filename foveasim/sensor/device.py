@@ -21,6 +21,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,8 @@ RAYS = read_only(np.stack((np.cos(_ANGLES_RAD), np.sin(_ANGLES_RAD)), axis=1))
 MIN_RAYS_AROUND = 6
 
 Words = NDArray[np.uint64]
+#: Words of the sites of each layout.
+_words: WeakKeyDictionary[Any, tuple[Words, Words]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,28 +70,13 @@ class Device:
 
     @cached_property
     def _sites(self) -> tuple[Words, Words]:
-        """Two words per site that identify it."""
-        from foveasim.sensor import _kernels
-
-        columns: Any = getattr(self.layout, "columns", {})
-        if SITE_ID in columns:
-            site_ids = columns[SITE_ID]
-            if site_ids.dtype.kind not in "iu":
-                raise ParameterError(SITE_ID, f"must be a layout column of integers, got {site_ids.dtype}")
-            ids = np.ascontiguousarray(site_ids).astype(np.int64)
-            return ids.view(np.uint64), np.full(ids.size, 1 << 63, np.uint64)
-        rings = self.layout.xy_um, self.layout.ring_offsets, self.layout.site_offsets
-        _, centroid_um = site_moments(*rings)
-        position = np.rint(centroid_um / POSITION_UM).astype(np.int64).T
-        x, y = (words.view(np.uint64) for words in np.ascontiguousarray(position))
-        n_intersecting = _kernels.count_ray_intersections(*rings, np.ascontiguousarray(centroid_um), RAYS)
-        is_around = n_intersecting >= MIN_RAYS_AROUND
-        if np.any((n_intersecting > 0) & ~is_around):
-            _, which, n_here = np.unique(position, axis=1, return_inverse=True, return_counts=True)
-            is_around |= (n_intersecting > 0) & (n_here[which.ravel()] > 1)
-        around = np.flatnonzero(is_around)
-        x[around], y[around] = _outline_words(*rings, around)
-        return x, y
+        """Two words per site that identify it, which all devices of a layout share."""
+        if type(self.layout).__hash__ is not object.__hash__:  # not immutable
+            return _site_words(self.layout)
+        words = _words.get(self.layout)
+        if words is None:
+            words = _words[self.layout] = _site_words(self.layout)
+        return words
 
     def key(self, effect: str) -> tuple[np.uint64, np.uint64]:
         """Return the generator key of an effect."""
@@ -152,3 +140,28 @@ def _mix(words: Words) -> Words:
     words = (words ^ (words >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     words = (words ^ (words >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return words ^ (words >> np.uint64(31))
+
+
+def _site_words(layout: PackedRings) -> tuple[Words, Words]:
+    """Return two words per site that identify it."""
+    from foveasim.sensor import _kernels
+
+    columns: Any = getattr(layout, "columns", {})
+    if SITE_ID in columns:
+        site_ids = columns[SITE_ID]
+        if site_ids.dtype.kind not in "iu":
+            raise ParameterError(SITE_ID, f"must be a layout column of integers, got {site_ids.dtype}")
+        ids = np.ascontiguousarray(site_ids).astype(np.int64)
+        return ids.view(np.uint64), np.full(ids.size, 1 << 63, np.uint64)
+    rings = layout.xy_um, layout.ring_offsets, layout.site_offsets
+    _, centroid_um = site_moments(*rings)
+    position = np.rint(centroid_um / POSITION_UM).astype(np.int64).T
+    x, y = (words.view(np.uint64) for words in np.ascontiguousarray(position))
+    n_intersecting = _kernels.count_ray_intersections(*rings, np.ascontiguousarray(centroid_um), RAYS)
+    is_around = n_intersecting >= MIN_RAYS_AROUND
+    if np.any((n_intersecting > 0) & ~is_around):
+        _, which, n_here = np.unique(position, axis=1, return_inverse=True, return_counts=True)
+        is_around |= (n_intersecting > 0) & (n_here[which.ravel()] > 1)
+    around = np.flatnonzero(is_around)
+    x[around], y[around] = _outline_words(*rings, around)
+    return x, y
