@@ -41,6 +41,8 @@ error_console = PlainConsole(stderr=True)
 KINDS = "shot, layout, rules, sweep, study or dataset"
 #: Hint after an interruption that preserves results.
 RESUME = "run the same command again to resume"
+#: Period of the estimate of the remaining time, seconds.
+SPEED_PERIOD_S = 3600.0
 LAYOUT_HELP = "YAML, GDSII, OASIS, GeoJSON, GeoParquet or npz file, or the name of a bundled layout."
 Out = Annotated[Path, typer.Option("--out", "-o", help="Directory for the results; created when missing.")]
 Changes = Annotated[
@@ -533,7 +535,8 @@ def _progress(name: str, note: str) -> Iterator[Callable[[int, int], None]]:
 
     description = TextColumn("{task.description}", markup=False)
     columns = (description, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    progress = Progress(*columns, console=console)
+    # Parts of a long run may take minutes.
+    progress = Progress(*columns, console=console, speed_estimate_period=SPEED_PERIOD_S)
     bar = progress.add_task(printable(name), total=None)
 
     def show(n_done: int, n: int) -> None:

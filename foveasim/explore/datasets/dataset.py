@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from foveasim._core.provenance import versions
 from foveasim._core.random_streams import Streams
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import check_choice, check_count
+from foveasim._core.validation import Ints, check_choice, check_count
 from foveasim.capture import Capture
 from foveasim.config import Shot, Source, build_shot, check_settings, put_setting, resolve_files
 from foveasim.errors import (
@@ -46,6 +46,7 @@ from foveasim.explore.datasets.labels import (
     read_mask,
     validate_boxes,
 )
+from foveasim.explore.datasets.packed import PackedBoxes
 from foveasim.explore.datasets.pictures import digest_of, is_lazy, source_of
 from foveasim.explore.sweeps.plan import VARY, check_disjoint, locate_shot, with_changes
 from foveasim.layout import Layout
@@ -194,7 +195,7 @@ class Dataset:
         self._boxes = None
         if boxes is not None:
             each = check_per_picture("boxes", boxes, n)
-            self._boxes = [validate_boxes(f"boxes[{k}]", each[k]) for k in range(n)]
+            self._boxes = PackedBoxes(validate_boxes(f"boxes[{k}]", each[k]) for k in range(n))
         self._masks = None if masks is None else check_per_picture("masks", masks, n)
         self._flows = None if flows is None else check_per_picture("flows", flows, n)
         images = {RASTER: check_image_options(RASTER, raster), CORTICAL: check_image_options(CORTICAL, cortical)}
@@ -309,12 +310,10 @@ class Dataset:
 
         The contents of pictures, masks and flows are not included; see :meth:`digest`.
         """
-        labels = {
-            "labels": self._labels,
-            "boxes": None if self._boxes is None else [[*map(np.ndarray.tolist, each)] for each in self._boxes],
-            "masks": self._masks is not None,
-            "flows": self._flows is not None,
-        }
+        labels = hashlib.sha256(f"{self._masks is not None} {self._flows is not None}".encode())
+        arrays = () if self._labels is None else (self._labels,)
+        for array in (*arrays, *(() if self._boxes is None else self._boxes.arrays())):
+            labels.update(f"{array.dtype.str} {array.shape}".encode() + np.ascontiguousarray(array).tobytes())
         return {
             "pictures": self._pictures.to_dict(),
             "settings": self._settings,
@@ -327,7 +326,7 @@ class Dataset:
             RASTER: self._images.get(RASTER),
             CORTICAL: self._images.get(CORTICAL),
             "class_names": self.class_names,
-            "labels": hashlib.sha256(json.dumps(labels).encode()).hexdigest(),
+            "labels": labels.hexdigest(),
             "files": digests(self._files),
             "versions": versions(),
         }
@@ -487,7 +486,7 @@ class Dataset:
 
     def _site_labels(self, index: int, shot: Shot) -> dict[str, Any]:
         picture = self._picture_of(index)
-        found: dict[str, Any] = {} if self._labels is None else {"label": self._labels[picture]}
+        found: dict[str, Any] = {} if self._labels is None else {"label": int(self._labels[picture])}
         if self._boxes is None and self._masks is None and self._flows is None:
             return found
         camera = shot.camera
@@ -501,10 +500,9 @@ class Dataset:
         if self._boxes is not None:
             boxes_px, classes = self._boxes[picture]
             on_sites = boxes_on_sites(boxes_px, integrator, lens)
-            max_boxes = max(len(each) for each, _ in self._boxes)
-            found["box_um"] = _pad(on_sites.box_um, max_boxes, 0.0)
-            found["box_label"] = _pad(classes, max_boxes, NO_CLASS)
-            found["box_covers"] = _pad(on_sites.covers, max_boxes, False)
+            found["box_um"] = _pad(on_sites.box_um, self._boxes.most, 0.0)
+            found["box_label"] = _pad(classes, self._boxes.most, NO_CLASS)
+            found["box_covers"] = _pad(on_sites.covers, self._boxes.most, False)
         if self._masks is not None:
             mask = read_mask(self._masks[picture], f"mask {where}", grid.shape)
             found["mask"] = mask_on_sites(mask, integrator)
@@ -602,7 +600,7 @@ def _parse_distributions(
     return distributions
 
 
-def _number_classes(labels: Any, n: int) -> tuple[list[int] | None, list[str] | None]:
+def _number_classes(labels: Any, n: int) -> tuple[Ints | None, list[str] | None]:
     """Return the classes of the pictures as numbers, and the names of string classes."""
     if labels is None:
         return None, None
@@ -611,11 +609,11 @@ def _number_classes(labels: Any, n: int) -> tuple[list[int] | None, list[str] | 
     if all(isinstance(value, int) for value in values):
         for value in values:
             check_count("labels", int(value), at_least=MIN_INTEGER, at_most=MAX_INTEGER)
-        return [int(value) for value in values], None
+        return np.array(values, np.int64), None
     if all(isinstance(value, str) for value in values):
         names = sorted(set(values))
         numbers = {name: k for k, name in enumerate(names)}
-        return [numbers[value] for value in values], names
+        return np.array([numbers[value] for value in values], np.int64), names
     raise ParameterError("labels", "must all be integers, or all be strings", values)
 
 

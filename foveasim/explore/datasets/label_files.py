@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from foveasim._core.names import missing_path
 from foveasim._core.validation import Floats
 from foveasim.errors import FileError
+from foveasim.explore.datasets.packed import PackedFiles
 
 __all__ = ["FLOW_EXTENSIONS", "MASK_EXTENSIONS", "match_label_files", "read_boxes", "read_labels"]
 
@@ -148,7 +149,7 @@ def read_boxes(path: Path, pictures: Sequence[str]) -> list[Floats]:
     return [np.array(boxes[numbers[name]], np.float64).reshape(-1, 5) for name in pictures]
 
 
-def match_label_files(directory: Path, pictures: Sequence[str], extensions: Sequence[str]) -> list[Path]:
+def match_label_files(directory: Path, pictures: Sequence[str], extensions: Sequence[str]) -> PackedFiles:
     """
     Return the file for each picture, with the same name and another extension.
 
@@ -182,7 +183,7 @@ def match_label_files(directory: Path, pictures: Sequence[str], extensions: Sequ
     if repeated is not None:
         raise FileError(directory, f"must have one file per picture, but two pictures have the name '{repeated}'")
     _check_complete(directory, expected, found, f" ({', '.join(extensions)})")
-    return [found[name] for name in expected]
+    return PackedFiles(directory, (found[name].relative_to(directory).as_posix() for name in expected))
 
 
 def _check_complete(path: Path, pictures: Sequence[str], found: Iterable[str], of: str = "") -> None:

@@ -18,6 +18,7 @@ from foveasim._core.names import missing_path
 from foveasim._io.images import PICTURE_EXTENSIONS, picture_names, pixels_of_image, read_picture
 from foveasim.errors import FileError, ParameterError, type_name
 from foveasim.explore._files import digests
+from foveasim.explore.datasets.packed import PackedFiles, PackedStrings
 
 __all__ = ["Source", "digest_of", "is_lazy", "source_of"]
 
@@ -92,7 +93,7 @@ def source_of(pictures: Any) -> Source:
 
 def is_lazy(items: Sequence[Any]) -> bool:
     """Return whether items of a sequence may be computed on access."""
-    return not isinstance(items, list | tuple | np.ndarray)
+    return not isinstance(items, list | tuple | np.ndarray | PackedFiles)
 
 
 def digest_of(item: Any) -> str:
@@ -120,7 +121,7 @@ class _Directory:
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         found = (Path(root) / name for root, _, names in os.walk(directory, onerror=_raise_error) for name in names)
-        self._names = picture_names(path.relative_to(directory).as_posix() for path in found)
+        self._names = PackedStrings(picture_names(path.relative_to(directory).as_posix() for path in found))
         if not self._names:
             raise FileError(directory, f"contains no pictures ({', '.join(PICTURE_EXTENSIONS)})")
 
@@ -158,7 +159,7 @@ class _Zip:
                 names = [item.filename for item in archive.infolist() if not item.is_dir()]
         except (OSError, zipfile.BadZipFile) as error:
             raise FileError(path, f"is corrupt ({error})") from None
-        self._names = picture_names(names)
+        self._names = PackedStrings(picture_names(names))
         if not self._names:
             raise FileError(path, f"contains no pictures ({', '.join(PICTURE_EXTENSIONS)})")
         self._opened: tuple[int, zipfile.ZipFile] | None = None
@@ -343,7 +344,7 @@ class _Items:
         return None
 
     def to_dict(self) -> dict[str, Any]:
-        names = {} if self.is_lazy else _names_digest([self.name(k) for k in range(len(self))])
+        names = {} if self.is_lazy else _names_digest(PackedStrings(self.name(k) for k in range(len(self))))
         return {"kind": "items", "n": len(self)} | names
 
     @property
@@ -361,9 +362,9 @@ def _is_image(item: Any) -> bool:
     return pillow is not None and isinstance(item, pillow.Image)
 
 
-def _names_digest(names: Sequence[str]) -> dict[str, Any]:
+def _names_digest(names: PackedStrings) -> dict[str, Any]:
     """Return the number of names and their SHA-256."""
-    return {"n": len(names), "sha256": hashlib.sha256("\n".join(names).encode()).hexdigest()}
+    return {"n": len(names), "sha256": names.digest()}
 
 
 def _read_error(error: OSError, path: Path) -> FileError:

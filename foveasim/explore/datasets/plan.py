@@ -201,8 +201,10 @@ def _pictures(path: Path, pictures: str | list[str]) -> PictureSource:
 
 def _labels(directory: Path, section: DatasetSection, pictures: PictureSource) -> Mapping[str, Any]:
     """Return the label arguments of :class:`Dataset`."""
-    names = [pictures.key(k) for k in range(len(pictures))]
     found: dict[str, Any] = {}
+    if all(given is None for given in (section.labels, section.boxes, section.masks, section.flows)):
+        return found
+    names = [pictures.key(k) for k in range(len(pictures))]
     if isinstance(section.labels, str):
         found["labels"] = read_labels(directory / section.labels, names)
     elif section.labels is not None:

@@ -10,10 +10,11 @@ import os
 import tarfile
 import time
 import warnings
+from array import array
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from foveasim._core.extras import needs
 from foveasim._core.names import missing_path
 from foveasim._core.threads import thread_count
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import check_count
+from foveasim._core.validation import Ints, check_count
 from foveasim._io.atomic import atomic_directory, atomic_write
 from foveasim.errors import FileError, FoveasimWarning, ParameterError, SimulationError
 from foveasim.explore.datasets.dataset import Dataset
@@ -44,6 +45,8 @@ MIN_SHARD_SAMPLES = 8
 DONE = "done"
 #: First member of a tar file, with the digest of its inputs; WebDataset skips such names.
 INPUT_DIGEST = "__made_of__"
+#: Extensions of the members of a sample in a tar file that are read; the class is also in the JSON.
+READ_EXTENSIONS = ("npz", "json")
 #: Bytes of a SHA-256.
 DIGEST_BYTES = 32
 #: Remaining time in one process above which worker processes are started, seconds; their start takes seconds.
@@ -161,7 +164,7 @@ def _write_shards(
     dataset: Dataset, shards: _Shards, scheduler: str | None, workers: int | None, progress: Progress | None
 ) -> None:
     """Write missing shards, after a check that the inputs of complete shards are unchanged."""
-    missing = []
+    missing = array("q")
     for k in range(shards.n_shards):
         input_digest = shards.input_digest(k)
         if not input_digest:
@@ -174,25 +177,22 @@ def _write_shards(
                 "another path, or remove the existing dataset",
             )
     n, n_done = shards.n_samples, shards.n_samples - sum(len(shards.samples(k)) for k in missing)
-    messages: list[str] = []
+    n_warnings, first_warning = 0, ""
     if progress is not None:
         progress(n_done, n)
     with closing(_write_each(dataset, shards, missing, scheduler, workers)) as results:
-        for k, shard_messages in results:
-            messages += shard_messages
+        for k, (n_own, own) in results:
+            n_warnings, first_warning = n_warnings + n_own, min(first_warning or own, own or first_warning)
             n_done += len(shards.samples(k))
             if progress is not None:
                 progress(n_done, n)
-    if messages:
-        warn(
-            f"{len(messages):,} of the samples written have warnings, such as: {min(messages)}",
-            FoveasimWarning,
-        )
+    if n_warnings:
+        warn(f"{n_warnings:,} of the samples written have warnings, such as: {first_warning}", FoveasimWarning)
 
 
 def _write_each(
     dataset: Dataset, shards: _Shards, missing: Sequence[int], scheduler: str | None, workers: int | None
-) -> Generator[tuple[int, list[str]], None, None]:
+) -> Generator[tuple[int, _Warnings], None, None]:
     """Write shards, and yield each with the warnings of its samples."""
     write = _ShardWriter(dataset, shards)
     start_s = time.monotonic()
@@ -209,13 +209,20 @@ def _write_each(
     what = "the pictures or labels"
     n_workers = min(workers or thread_count(), len(missing) - n_done)
     with executor(write, what=what, scheduler=scheduler, workers=n_workers) as run:
-        for k, shard_messages in run(missing[n_done:], ()):
-            if shard_messages is KILLED:
+        for k, found in run(missing[n_done:], ()):
+            if found is KILLED:
                 raise SimulationError(
                     f"the process that wrote shard {k} ended in every attempt: out of memory, or a crash; complete shards "
                     "remain, and the same call resumes"
                 )
-            yield k, shard_messages
+            yield k, found
+
+
+class _Warnings(NamedTuple):
+    """Number of the samples of a shard with warnings, and the first in alphabetical order."""
+
+    n: int
+    first: str
 
 
 class _ShardWriter:
@@ -224,7 +231,7 @@ class _ShardWriter:
     def __init__(self, dataset: Dataset, shards: _Shards) -> None:
         self._dataset, self._shards = dataset, shards
 
-    def __call__(self, k: int) -> list[str]:
+    def __call__(self, k: int) -> _Warnings:
         input_digest = self._dataset.digest(self._shards.samples(k))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # summarised at the end
@@ -236,7 +243,8 @@ class _ShardWriter:
                 self._shards.directory,
                 f"cannot be written: {error.strerror or error}; complete shards remain, and the same call resumes",
             ) from None
-        return [f"sample {sample['index']}: {sample['warning']}" for sample in samples if sample["warning"]]
+        found = [f"sample {sample['index']}: {sample['warning']}" for sample in samples if sample["warning"]]
+        return _Warnings(len(found), min(found, default=""))
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -411,10 +419,10 @@ class _TarShards(_Shards):
 
     def __init__(self, directory: Path, about: Mapping[str, Any]) -> None:
         super().__init__(directory, about)
-        self._member_offsets: dict[int, dict[str, tuple[int, int]]] = {}
+        self._members: dict[int, Ints] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_member_offsets": {}}
+        return self.__dict__ | {"_members": {}}
 
     @staticmethod
     def create(target: Path, about: Mapping[str, Any], dataset: Dataset) -> None:
@@ -456,21 +464,32 @@ class _TarShards(_Shards):
                     _add(tar, f"{sample['index']:09d}.{extension}", content)
 
     def read(self, index: int) -> dict[str, Any]:
-        k = index // self.per_shard
-        if k not in self._member_offsets:
-            with tarfile.open(self._file(k), "r:") as tar:
-                self._member_offsets[k] = {item.name: (item.offset_data, item.size) for item in tar}
-        offsets = self._member_offsets[k]
+        k, position = divmod(index, self.per_shard)
+        if k not in self._members:
+            self._members[k] = self._read_members(k)
         with self._file(k).open("rb") as file:
 
             def content(extension: str) -> bytes:
-                offset, size = offsets[f"{index:09d}.{extension}"]
+                offset, size = self._members[k][position, READ_EXTENSIONS.index(extension)].tolist()
+                if offset == 0:
+                    raise ValueError("missing")
                 file.seek(offset)
                 return file.read(size)
 
             rest = json.loads(content("json"))
             with np.load(io.BytesIO(content("npz")), allow_pickle=False) as arrays:
                 return rest | {name: arrays[name] for name in arrays.files}
+
+    def _read_members(self, k: int) -> Ints:
+        """Return the offset and size of the members of each sample in a shard, (n_sample, n_extension, 2)."""
+        members = np.zeros((len(self.samples(k)), len(READ_EXTENSIONS), 2), np.int64)
+        with tarfile.open(self._file(k), "r:") as tar:
+            for item in tar:
+                number, _, extension = item.name.partition(".")
+                if extension in READ_EXTENSIONS and number.isdecimal() and int(number) in self.samples(k):
+                    position = int(number) - self.samples(k).start
+                    members[position, READ_EXTENSIONS.index(extension)] = item.offset_data, item.size
+        return members
 
 
 def _add(tar: tarfile.TarFile, name: str, content: bytes) -> None:
