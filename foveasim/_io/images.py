@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+import posixpath
 import re
 import struct
 import warnings
@@ -16,7 +17,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -96,8 +97,8 @@ def picture_names(names: Iterable[str]) -> list[str]:
     pictures = (
         name
         for name in names
-        if PurePosixPath(name).suffix.lower() in PICTURE_EXTENSIONS
-        and not any(part.startswith((".", "__MACOSX")) for part in PurePosixPath(name).parts)
+        if posixpath.splitext(name)[1].lower() in PICTURE_EXTENSIONS
+        and not any(part != "." and part.startswith((".", "__MACOSX")) for part in name.split("/"))
     )
 
     def key(name: str) -> tuple[list[tuple[int, str]], str]:

@@ -120,8 +120,13 @@ class _Directory:
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
-        found = (Path(root) / name for root, _, names in os.walk(directory, onerror=_raise_error) for name in names)
-        self._names = PackedStrings(picture_names(path.relative_to(directory).as_posix() for path in found))
+        found = (
+            f"{prefix}{name}"
+            for root, _, names in os.walk(directory, onerror=_raise_error)
+            for prefix in [f"{Path(root).relative_to(directory).as_posix()}/".removeprefix("./")]
+            for name in names
+        )
+        self._names = PackedStrings(picture_names(found))
         if not self._names:
             raise FileError(directory, f"contains no pictures ({', '.join(PICTURE_EXTENSIONS)})")
 
