@@ -1,5 +1,6 @@
 """
-Samples for learning: cameras simulated on demand, compared with a loader that reads and resizes the same pictures.
+Samples for learning: cameras simulated on demand, compared with a loader that reads and resizes the same pictures, and stored
+samples in random order.
 
     python benchmarks/learning.py             1,000 samples of 50 photographs, with 0 and 2 workers where torch is installed
     python benchmarks/learning.py --quick     100 samples
@@ -12,14 +13,14 @@ import hashlib
 import importlib.util
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import skimage.data
 from PIL import Image
-from report import Report
+from report import Report, best_s
 from rich.console import Console
 
 from foveasim import explore
@@ -72,13 +73,14 @@ def bench_learning(report: Report, n_samples: int) -> None:
         has_torch = importlib.util.find_spec("torch") is not None
         digests_of: dict[str, set[str]] = {}
         for n_workers in (0, 2) if has_torch else (0,):
-            took = {}
+            took, cpu_s = {}, 0.0
             for name, samples in (("cameras", data), ("pictures", PlainPictures(paths, len(data)))):
-                begin = time.perf_counter()
+                begin, begin_cpu = time.perf_counter(), time.process_time()
                 digests_of.setdefault(name, set()).add(
                     _digest(_loaded(samples, n_workers) if has_torch else iter(samples))
                 )
                 took[name] = (time.perf_counter() - begin) / len(data)
+                cpu_s = (time.process_time() - begin_cpu) / len(data) if name == "cameras" else cpu_s
             console.print(
                 f"{len(data):,} samples, {n_workers} workers: {1 / took['cameras']:.0f} a second through cameras drawn at "
                 f"random, {1 / took['pictures']:.0f} plain pictures a second"
@@ -89,7 +91,38 @@ def bench_learning(report: Report, n_samples: int) -> None:
                 "a plain picture",
                 took["pictures"],
             )
+            if n_workers == 0:
+                what = "samples through random cameras"
+                report.add(
+                    what, f"{cpu_s:.4g} s", "per second of processor time", "", 1 / cpu_s, 50, is_lower_bound=True
+                )
         assert all(len(digests) == 1 for digests in digests_of.values()), "samples differ with the number of workers"
+
+
+def bench_stored(report: Report, n_samples: int) -> None:
+    """Write a dataset as zarr store, and compare reading in random order with reading in order."""
+    with tempfile.TemporaryDirectory() as folder:
+        paths = _photographs(Path(folder))
+        data = explore.denoising(
+            [str(path) for path in paths],
+            SHOT,
+            draws=n_samples // N_PICTURES,
+            fields=("code", "electrons"),
+            raster={"max_pixels": 64},
+            fit="cover",
+        )
+        stored = explore.write_dataset(data, Path(folder) / "data.zarr")
+        order = list(range(len(stored)))
+        shuffled = np.random.default_rng(0).permutation(order).tolist()
+
+        def read(indices: Sequence[int]) -> Callable[[], object]:
+            # Each reading process opens the store once.
+            return lambda: [samples[k] for samples in [explore.open_dataset(stored.path)] for k in indices]
+
+        times = best_s({"shuffled": read(shuffled), "order": read(order)}, 5)
+        report.slower_than(
+            f"{len(stored):,} stored samples, shuffled", times["shuffled"], "in order", times["order"], 2
+        )
 
 
 def _photographs(folder: Path) -> list[Path]:
@@ -125,7 +158,9 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="100 samples")
     options = parser.parse_args()
     report = Report(is_judged=False)
-    bench_learning(report, 100 if options.quick else 1000)
+    n_samples = 100 if options.quick else 1000
+    bench_learning(report, n_samples)
+    bench_stored(report, n_samples)
     console.print(report.table)
 
 

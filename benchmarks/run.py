@@ -26,7 +26,7 @@ import scipy.fft
 import shapely
 from dense import bench_dense
 from exploring import bench_exploring
-from learning import bench_learning
+from learning import bench_learning, bench_stored
 from looking import bench_looking
 from report import Report, best_s
 from rich.console import Console
@@ -383,6 +383,7 @@ def main() -> int:
         bench_video(report, 100 if is_quick else 1000)
     with console.status("bench learning"):
         bench_learning(report, 100 if is_quick else 1000)
+        bench_stored(report, 100 if is_quick else 1000)
     with console.status("bench exploring"):
         bench_exploring(report, 10 if is_quick else 40)
     with console.status("bench looking"):
