@@ -10,6 +10,7 @@ Arrays that an object of the package stores are passed to :func:`own`: later edi
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
 from collections.abc import Callable, Collection, Sequence
@@ -136,9 +137,10 @@ def check_number(
     ParameterError
         When the value is not a number, not finite, or out of bounds.
     """
-    value = unmasked(name, value)
+    is_plain = type(value) is float or type(value) is int  # most numbers are
+    value = value if is_plain else unmasked(name, value)
     try:
-        if value is None or isinstance(value, bool | str | bytes) or np.ndim(value) != 0:  # type: ignore[arg-type]
+        if not is_plain and (value is None or isinstance(value, bool | str | bytes) or np.ndim(value) != 0):  # type: ignore[arg-type]
             raise TypeError
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
@@ -147,7 +149,7 @@ def check_number(
         raise ParameterError(name, "must fit in a 64-bit float", hint=hint) from None
     unit = unit_of(name)
     got = value if isinstance(value, int) else number
-    if not np.isfinite(number):
+    if not math.isfinite(number):
         raise ParameterError(name, "must be finite", got, unit, hint)
     if above is not None and not number > above:
         raise ParameterError(name, f"must be > {above:g}", got, unit, hint)
