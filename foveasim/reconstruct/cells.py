@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import TypeGuard
 
 import numpy as np
 
@@ -40,8 +41,8 @@ def cells(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | N
         ``Wᵀ values / Wᵀ 1`` with the exact overlap areas W of sites and pixels: boundaries are anti-aliased, and a uniform
         field stays uniform.
     """
-    compiled = _compiled_once if _is_cached(layout) else _compiled
-    integrator, coverage = compiled(layout, grid, n_threads)
+    arguments = grid, n_threads
+    integrator, coverage = _compiled_once(layout, *arguments) if _is_cached(layout) else _compiled(layout, *arguments)
     channels = np.atleast_2d(finite_array("values", values))
     covered_um2 = np.where(coverage > 0.0, coverage, np.nan) * grid.cell_area_um2
     data = integrator.spread(channels) / covered_um2
@@ -65,28 +66,29 @@ def fill_channels(layout: PackedRings, values: Floats, channel: Ints, n_channels
         The site's value in its own channel; in other channels the mean of the nearest sites of that channel, weighted by
         inverse distance. NaN for a channel without sites.
     """
-    neighbours = _neighbours_once if _is_cached(layout) else _neighbours
+    arguments = np.asarray(channel, np.int64).tobytes(), n_channels
+    neighbours = _neighbours_once(layout, *arguments) if _is_cached(layout) else _neighbours(layout, *arguments)
     filled = np.full((n_channels, values.size), np.nan)
-    for c, (own, nearest, weight) in neighbours(layout, np.asarray(channel, np.int64).tobytes(), n_channels).items():
+    for c, (own, nearest, weight) in neighbours.items():
         filled[c] = (values[nearest] * weight).sum(axis=1) / weight.sum(axis=1)
         filled[c, own] = values[own]
     return filled
 
 
-def _is_cached(layout: PackedRings) -> bool:
+def _is_cached(layout: PackedRings) -> TypeGuard[Layout]:
     """Return whether parts of a layout are cached: only of layouts, which are immutable."""
     return isinstance(layout, Layout) and layout.n_sites <= MAX_CACHED_SITES
 
 
 def _compiled(layout: PackedRings, grid: Grid, n_threads: int | None) -> tuple[Integrator, Floats]:
-    """Return the integrator of a layout on the pixels of a picture, and the fraction of each that is covered."""
+    """Return the integrator of a layout on the pixels of a picture, and their coverage."""
     integrator = Integrator(layout, grid, n_threads=n_threads)
     return integrator, coverage_fraction(integrator)
 
 
 def _neighbours(layout: PackedRings, channels: bytes, n_channels: int) -> dict[int, tuple[Ints, Ints, Floats]]:
     """
-    Return the sites of each channel, and for every site the nearest of these and their weights.
+    Return the sites of each channel, and their nearest ones to every site with weights.
 
     ``channels`` are the bytes of the channels of the sites, int64.
     """

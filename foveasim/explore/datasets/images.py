@@ -1,4 +1,4 @@
-"""Images of samples: reconstructed pictures and log-polar images of captures, channels first."""
+"""Images of samples, channels first: reconstructed pictures and log-polar images."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def images_of(
 def image_attributes(
     capture: Capture, sensor: Sensor, options: Mapping[str, Mapping[str, Any]], *, n_threads: int
 ) -> dict[str, dict[str, Any]]:
-    """Return the position of the pixels of each image in the sensor plane, and its channels, as plain data."""
+    """Return the position of each image in the sensor plane and its channels, as plain data."""
     found: dict[str, dict[str, Any]] = {}
     for name, chosen in options.items():
         image = _image(name, capture, sensor, chosen, n_threads)
@@ -122,6 +122,6 @@ def image_units(options: Mapping[str, Any]) -> str:
 def _image(name: str, capture: Capture, sensor: Sensor, options: Mapping[str, Any], n_threads: int) -> Any:
     reconstruct = capture.picture if name == RASTER else capture.cortical
     try:
-        return reconstruct(sensor=sensor, n_threads=n_threads, **options)  # type: ignore[operator]
+        return reconstruct(sensor=sensor, n_threads=n_threads, **options)
     except FoveasimError as error:
         raise ParameterError(name, f"has invalid options: {error}") from None

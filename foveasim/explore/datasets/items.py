@@ -56,7 +56,11 @@ def unflatten(items: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def describe_items(sample: Mapping[str, Any], images: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return the dimensions, shape, type and unit of each item, as plain data, with the options of images by name."""
+    """
+    Return the dimensions, shape, type and unit of each item, as plain data.
+
+    ``images`` are the options of the images by name.
+    """
     found = {}
     for name, value in flatten(sample).items():
         item = ITEMS.get(name, Item())

@@ -95,8 +95,8 @@ class PackedBoxes:
         Largest number of boxes of a picture.
     """
 
-    def __init__(self, boxes: Iterable[tuple[Floats, Ints]]) -> None:
-        each = list(boxes)
+    def __init__(self, of_pictures: Iterable[tuple[Floats, Ints]]) -> None:
+        each = list(of_pictures)
         counts = [len(classes) for _, classes in each]
         self._offsets = np.concatenate(([0], np.cumsum(counts, dtype=np.int64)))
         self._boxes_px = np.concatenate([np.zeros((0, 4)), *(boxes_px for boxes_px, _ in each)])

@@ -481,7 +481,7 @@ class _TarShards(_Shards):
                 return rest | {name: arrays[name] for name in arrays.files}
 
     def _read_members(self, k: int) -> Ints:
-        """Return the offset and size of the members of each sample in a shard, (n_sample, n_extension, 2)."""
+        """Return the offset and size of the members of each sample, (n_sample, n_extension, 2)."""
         members = np.zeros((len(self.samples(k)), len(READ_EXTENSIONS), 2), np.int64)
         with tarfile.open(self._file(k), "r:") as tar:
             for item in tar:
