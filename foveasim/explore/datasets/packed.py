@@ -95,11 +95,11 @@ class PackedBoxes:
         Largest number of boxes of a picture.
     """
 
-    def __init__(self, of_pictures: Iterable[tuple[Floats, Ints]]) -> None:
-        each = list(of_pictures)
+    def __init__(self, boxes_px: Iterable[tuple[Floats, Ints]]) -> None:
+        each = list(boxes_px)
         counts = [len(classes) for _, classes in each]
         self._offsets = np.concatenate(([0], np.cumsum(counts, dtype=np.int64)))
-        self._boxes_px = np.concatenate([np.zeros((0, 4)), *(boxes_px for boxes_px, _ in each)])
+        self._boxes_px = np.concatenate([np.zeros((0, 4)), *(corners for corners, _ in each)])
         self._classes = np.concatenate([np.zeros(0, np.int64), *(classes for _, classes in each)])
         self.most = max(counts, default=0)
 
