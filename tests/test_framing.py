@@ -46,6 +46,16 @@ def test_pitch_follows_from_thin_lens(fit, image_um):
     assert focused_at_infinity.frame(scene_of(fit=fit)).pitch_um == pytest.approx(image_um / magnification, rel=1e-12)
 
 
+def test_alternating_scenes_have_their_own_pitch():
+    camera, wide, high = camera_of(), scene_of(), scene_of(PICTURE.T)
+
+    pitches_um = [camera.frame(scene).pitch_um for scene in (wide, high, wide, high)]
+
+    # 30 µm over 200 rows, and 40 µm over 200 columns.
+    assert pitches_um[:2] == pytest.approx([30 / 200 / MAGNIFICATION, 40 / 200 / MAGNIFICATION], rel=1e-12)
+    assert pitches_um[2:] == pitches_um[:2]
+
+
 def test_picture_without_pitch_covers_layout():
     assert scene_of().fit == "cover"
     assert scene_of().pitch_um is None

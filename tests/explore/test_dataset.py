@@ -704,6 +704,24 @@ def test_zarr_store_contains_layout_and_settings(tmp_path):
     np.testing.assert_array_equal(group["settings/exposure_s"][:], [s["settings"]["exposure_s"] for s in data])
 
 
+@pytest.mark.parametrize("name", ["data", "data.zarr"])
+def test_million_samples_need_little_memory(name, tmp_path):
+    data = explore.Dataset(pictures(4), SHOT, VARY, draws=250_000, labels=[0, 1, 0, 1])
+
+    def stop(n_done, n):
+        assert (n_done, n) == (0, 10**6)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        explore.write_dataset(data, tmp_path / name, progress=stop)
+    with pytest.raises(FileError, match=r"has 0 of 1954 shards"):
+        explore.open_dataset(tmp_path / name)
+
+    assert sum(1 for _ in (tmp_path / name).rglob("*")) < 100
+    assert len(pickle.dumps(data)) < pictures(4).nbytes + 20_000
+    assert data[10**6 - 1]["label"] == 1
+
+
 def test_zarr_arrays_have_dimensions_and_units(tmp_path):
     xarray = pytest.importorskip("xarray")
     data = labelled()
@@ -737,6 +755,30 @@ def test_former_zarr_layout_is_rejected(tmp_path):
     for call in (explore.open_dataset, partial(explore.write_dataset, data)):
         with pytest.raises(FileError, match=r"has the format version 2, expected 3; write the dataset again$"):
             call(tmp_path / "data.zarr")
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        ("code/zarr.json", '"zstd"', '"gzip"', "is corrupt"),
+        ("code/zarr.json", "{", "[", "is corrupt"),
+        ("code/zarr.json", '"index_location": "end"', '"index_location": "start"', "is corrupt .*another chunk layout"),
+        ("zarr.json", '"items"', '"others"', "is corrupt: it does not describe the items"),
+        ("zarr.json", '"electrons": {', '"electrons_": {', "is corrupt .*electrons_"),
+    ],
+)
+def test_corrupt_zarr_metadata_are_one_line(file, old, new, message, tmp_path):
+    data = explore.Dataset(pictures(2), SHOT)
+    explore.write_dataset(data, tmp_path / "data.zarr")
+    path = tmp_path / "data.zarr" / file
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+    for call in (explore.open_dataset, partial(explore.write_dataset, data)):
+        with pytest.raises(FileError, match=message) as caught:
+            call(tmp_path / "data.zarr")
+        assert "\n" not in str(caught.value)
 
 
 def test_missing_zarr_shard_is_corrupt_sample(tmp_path):

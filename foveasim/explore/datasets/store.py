@@ -505,6 +505,8 @@ class _ZarrShards(_Shards):
 
     def __init__(self, directory: Path, about: Mapping[str, Any]) -> None:
         super().__init__(directory, about)
+        if not isinstance(about.get("items"), Mapping):
+            raise FileError(directory, "is corrupt: it does not describe the items of its samples")
         self._names = list(about["items"])
         self._opened: tuple[int, dict[str, Any]] | None = None
         self._readers: dict[str, RowReader] | None = None
@@ -560,13 +562,19 @@ class _ZarrShards(_Shards):
     def _rows(self) -> dict[str, RowReader]:
         """Return the reader of each array; they do not depend on the process."""
         if self._readers is None:
-            self._readers = {name: RowReader(array, self.directory / name) for name, array in self._arrays().items()}
+            try:
+                arrays = self._arrays()
+                self._readers = {name: RowReader(array, self.directory / name) for name, array in arrays.items()}
+            except Exception as error:  # noqa: BLE001 -- corrupt metadata raise many kinds of errors
+                reason = " ".join(str(error).split()) or type(error).__name__
+                raise FileError(self.directory, f"is corrupt ({reason:.200})") from None
         return self._readers
 
     def input_digest(self, k: int) -> str:
+        done = self._rows()[DONE]
         try:
-            mark = np.asarray(self._rows()[DONE].read(k))
-        except (OSError, ValueError, KeyError):  # a truncated digest counts as missing
+            mark = np.asarray(done.read(k))
+        except (OSError, ValueError):  # a truncated digest counts as missing
             return ""
         return mark.tobytes().hex() if mark.any() else ""
 
