@@ -296,7 +296,9 @@ def test_wrong_arguments_give_one_line(tmp_path, options, match):
 
 
 def test_array_instead_of_file_is_rejected():
-    with pytest.raises(ParameterError, match="'path' must be a file, got an ndarray; pass arrays to Scene, bands first"):
+    with pytest.raises(
+        ParameterError, match="'path' must be a file, got an ndarray; pass arrays to Scene, bands first"
+    ):
         Scene.from_cube(VALUES, **RADIANCE)
 
 
