@@ -32,6 +32,7 @@ LAYERS = [
     {"config"},
     {"explore"},
     {"cli"},
+    {"__main__"},
 ]
 #: Packages that are imported on first use.
 HEAVY = {
