@@ -15,7 +15,7 @@ UV := $(LOWEST)/uv/bin/uv
 # PyTorch has a separate environment, since its wheel may install gigabytes of CUDA libraries.
 TORCH_VENV ?= .venv-torch
 
-.PHONY: demo test test-lowest test-torch soak lint bench docs clean
+.PHONY: demo test test-lowest test-torch soak lint bench peers docs clean
 .NOTPARALLEL:
 
 demo: $(VENV)/.installed
@@ -43,6 +43,11 @@ lint: $(VENV)/.installed-dev
 
 bench: $(VENV)/.installed-dev
 	$(BIN)/python benchmarks/run.py
+
+# The same work with other libraries.
+peers: $(VENV)/.installed-dev
+	$(BIN)/python -m pip install --quiet --editable '.[peers]'
+	$(BIN)/python benchmarks/peers.py
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet --builder html docs docs/_build/html

@@ -14,6 +14,7 @@ import argparse
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -29,6 +30,8 @@ import foveasim as fs
 PITCH_UM = 3.0
 #: Distance of the scenes, and captures per figure.
 DISTANCE_M, N_REPEATS = 1.0, 5
+#: Bands of a hyperspectral scene.
+N_BANDS = 31
 #: Bounds in pairs: one band, three bands behind a Bayer mosaic, 31 bands behind it.
 MONO_PAIRS, BAYER_PAIRS, BANDS_PAIRS = 2.5, 4.0, 16.0
 #: Bounds of a first capture, which includes layout and compilation, in pairs; and of its memory above the scene.
@@ -43,6 +46,8 @@ def bench_dense(report: Report, n_side: int) -> None:
     bench_bands(report, n_side)
     bench_first(report, n_side)
     bench_memory(report, n_side)
+    bench_cube(report, n_side)
+    bench_tiles(report, 5 * n_side)
 
 
 def bench_mono(report: Report, n_side: int) -> None:
@@ -60,7 +65,7 @@ def bench_bayer(report: Report, n_side: int) -> None:
 def bench_bands(report: Report, n_side: int) -> None:
     """Repeated captures of 31 independent bands behind a Bayer mosaic."""
     _report_captures(
-        report, "Bayer, 31 bands", dense_camera(n_side, is_colour=True), dense_scene(n_side, 31), BANDS_PAIRS
+        report, "Bayer, 31 bands", dense_camera(n_side, is_colour=True), dense_scene(n_side, N_BANDS), BANDS_PAIRS
     )
 
 
@@ -107,6 +112,59 @@ def bench_memory(report: Report, n_side: int) -> None:
     arguments = [sys.executable, "-c", MEMORY_PROBE, str(Path(__file__).parent), str(n_side)]
     n_bytes = float(subprocess.run(arguments, capture_output=True, text=True, check=True).stdout)
     report.add("peak memory of layout and first capture, mono", "", "bytes per site", "", n_bytes, BYTES_PER_SITE)
+
+
+def bench_cube(report: Report, n_side: int) -> None:
+    """Compare a capture of a cube of 31 bands in an ENVI file with one of the cube in memory."""
+    scene, camera = dense_scene(n_side, N_BANDS), dense_camera(n_side, is_colour=True)
+    with tempfile.TemporaryDirectory() as directory:
+        header = Path(directory) / "cube.hdr"
+        scene.basis[:, ::-1].tofile(header.with_suffix(".img"))  # top row first
+        wavelengths = ", ".join(map(str, scene.wavelength_nm))
+        header.write_text(
+            f"ENVI\nsamples = {n_side}\nlines = {n_side}\nbands = {N_BANDS}\ndata type = 4\ninterleave = bsq\n"
+            f"wavelength units = nm\nwavelength = {{{wavelengths}}}\n"
+        )
+
+        def from_file() -> None:
+            cube = fs.Scene.from_cube(header, unit="W/(m^2 sr nm)", pitch_um=scene.pitch_um, distance_m=DISTANCE_M)
+            camera.capture(cube, exposure_s=0.02, seed=0)
+
+        times = medians_s(
+            {"file": from_file, "memory": lambda: camera.capture(scene, exposure_s=0.02, seed=0)}, N_REPEATS
+        )
+    what = f"ENVI cube of {N_BANDS} bands, opened and captured"
+    report.slower_than(what, times["file"], "the cube in memory", times["memory"], 1.5)
+
+
+TILES_PROBE = """
+import sys, tempfile, time
+sys.path.insert(0, sys.argv[1])
+import dense, foveasim as fs
+from pathlib import Path
+n_side = int(sys.argv[2])
+scene, camera = dense.dense_scene(n_side, 1), dense.dense_camera(n_side, is_colour=False)
+with tempfile.TemporaryDirectory() as directory:
+    start = time.perf_counter()
+    fs.tiles.write_tiles(Path(directory) / "capture.zarr", camera, scene, exposure_s=0.02, seed=0)
+    duration_s = time.perf_counter() - start
+peak = next(int(l.split()[1]) * 1024 for l in open("/proc/self/status") if l.startswith("VmHWM"))
+print(duration_s, peak)
+"""
+
+
+def bench_tiles(report: Report, n_side: int) -> None:
+    """Measure a capture in tiles to a zarr store, in a separate process (Linux)."""
+    if not Path("/proc/self/status").exists():
+        return
+    arguments = [sys.executable, "-c", TILES_PROBE, str(Path(__file__).parent), str(n_side)]
+    output = subprocess.run(arguments, capture_output=True, text=True, check=True).stdout
+    duration_s, n_bytes = map(float, output.split())
+    pair = pair_of(n_side)
+    pair_s = medians_s({"pair": pair}, 1)["pair"]
+    what = f"{n_side} x {n_side} photosites in tiles, written to zarr"
+    report.slower_than(what, duration_s, f"rfft2 + irfft2, float64, {n_side} x {n_side}", pair_s)
+    report.add("peak memory of the same, with the scene", "", "GB", "", n_bytes / 1e9, 8.0)
 
 
 def dense_optics() -> fs.Optics:
