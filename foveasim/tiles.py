@@ -34,7 +34,10 @@ from foveasim._core.validation import check_count, read_only
 from foveasim._io.formats import as_file_error
 from foveasim._io.resumable import LOCK, disk_errors, finish, partial_path, resumable_directory
 from foveasim._io.zarr_stores import ZARR, check_codecs
-from foveasim.camera import Camera, Covered, _Clock, _WeightedMap
+from foveasim.camera import Camera
+from foveasim.camera._camera import WeightedMap
+from foveasim.camera._clock import Clock
+from foveasim.camera._coverage import Covered, warn_of_coverage
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError, type_name
 from foveasim.fields import Grid, PowerMap
@@ -141,7 +144,7 @@ def _tiles(
     coverages = []
     for tile in tiles:
         first, last = tile * tile_sites, min((tile + 1) * tile_sites, layout.n_sites)
-        clock = _Clock()
+        clock = Clock()
         with clock.stage("compile layout"):
             part = Camera(
                 optics=camera.optics,
@@ -176,7 +179,7 @@ def _tiles(
         )
     if coverages:
         smallest_image = min((image.grid for image in images), key=lambda grid: grid.cell_area_um2)
-        camera._warn_of_coverage(source, Covered.union(smallest_image.bounds_um, coverages))
+        warn_of_coverage(source, Covered.union(smallest_image.bounds_um, coverages), layout.n_sites)
 
 
 def _images(camera: Camera, light: Scene | PowerMap) -> list[_Image]:
@@ -219,19 +222,19 @@ def _strip(grid: Grid, first: int, last: int) -> Grid:
 
 
 def _maps(
-    part: Camera, light: Scene | PowerMap, images: Iterable[_Image], strips: Iterable[tuple[int, int]], clock: _Clock
-) -> Iterator[_WeightedMap]:
+    part: Camera, light: Scene | PowerMap, images: Iterable[_Image], strips: Iterable[tuple[int, int]], clock: Clock
+) -> Iterator[WeightedMap]:
     """Yield the rows of all maps under a tile, each with its sites and their weights."""
     sensor = part.sensor
     e_per_j = sensor.responsivity_e_per_j(light.wavelength_nm)
     for k, (image, strip) in enumerate(zip(images, strips, strict=True)):
         for c, rows in image.rows.items():
             if isinstance(light, PowerMap):
-                yield _WeightedMap(k, rows(*strip), None, e_per_j[sensor.filter_of_site, c])
+                yield WeightedMap(k, rows(*strip), None, e_per_j[sensor.filter_of_site, c])
             elif c in part._sites_of_filter:
                 with clock.stage("optics"):
                     cells = rows(*strip)
-                yield _WeightedMap(k, cells, part._sites_of_filter[c], None)
+                yield WeightedMap(k, cells, part._sites_of_filter[c], None)
                 del cells
 
 

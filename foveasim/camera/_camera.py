@@ -7,10 +7,9 @@ The only module that knows the order of the stages and creates random streams.
 from __future__ import annotations
 
 import math
-import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import cached_property
 from threading import Lock
@@ -24,10 +23,12 @@ from foveasim._core.random_streams import Streams
 from foveasim._core.threads import in_order, thread_count
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, check_count, finite_array, read_only
+from foveasim.camera._clock import Clock
+from foveasim.camera._coverage import Covered, format_point, size_um, warn_of_coverage
+from foveasim.camera._frames import Frame, ImageCache, Position, Task, check_frames, position_settings, tasks
 from foveasim.capture import Capture
 from foveasim.distortion import Lens
 from foveasim.errors import (
-    CoverageWarning,
     FoveasimWarning,
     ParameterError,
     SamplingWarning,
@@ -45,17 +46,8 @@ from foveasim.sensor import NoiseBudget, Sensor, noise_budget
 from foveasim.sensor.limits import check_plausible, check_plausible_array
 from foveasim.units import um_from_nm, w_from_w_m2_um2
 
-__all__ = ["Camera", "Frame"]
+__all__ = ["Camera"]
 
-#: A position in the image plane, (x, y) in µm.
-Position = tuple[float, float]
-#: One frame: a scene or a power map, or either with the position of the sensor's centre in its image.
-Frame = Scene | PowerMap | tuple[Scene | PowerMap, Sequence[float]]
-#: Power maps behind each colour filter, on each grid.
-ImageCache = dict[tuple[Grid, int], NDArray[Any]]
-
-#: Cameras warn when the layout measures less than this fraction of the width of a photograph.
-MIN_PICTURE_FRACTION = 0.25
 #: Margin of a picture that covers undistorted outlines: their edges are curves of limited accuracy.
 COVER_MARGIN = 1e-5
 #: Fourier transforms in float32 leave negative rates of up to this fraction of the largest one.
@@ -236,7 +228,7 @@ class Camera:
         unit_um = 1.0 / self._optics.magnification(scene.distance_m)
         one = scene.with_pitch(unit_um)
         images = [self._optics.grid(one)] if fit == "width" else [grid for grid, _ in self._optics.image_grids(one)]
-        half_um = 0.5 * np.array([_size_um(self._to_sensor_frame(grid).bounds_um) for grid in images])
+        half_um = 0.5 * np.array([size_um(self._to_sensor_frame(grid).bounds_um) for grid in images])
         if fit == "width":
             scale = 0.5 * (below_um + above_um)[0] / half_um[0, 0]
         elif fit == "cover":
@@ -247,8 +239,8 @@ class Camera:
             if not scale > 0.0:
                 raise ParameterError(
                     "fit",
-                    f"must not be 'contain' with the optical axis, at {_format_point(axis_um)} µm, outside the layout, which "
-                    f"extends from {_format_point(bounds_um[:2])} to {_format_point(bounds_um[2:])} µm; use 'cover' or "
+                    f"must not be 'contain' with the optical axis, at {format_point(axis_um)} µm, outside the layout, which "
+                    f"extends from {format_point(bounds_um[:2])} to {format_point(bounds_um[2:])} µm; use 'cover' or "
                     "'width', or move the layout",
                 )
         return scene.with_pitch(float(scale) * unit_um)
@@ -405,7 +397,7 @@ class Camera:
         SimulationError
             When the power map is not finite within a site.
         """
-        return self._photoelectrons_per_s(light, _Clock(), cached=images)
+        return self._photoelectrons_per_s(light, Clock(), cached=images)
 
     def capture(
         self,
@@ -440,7 +432,7 @@ class Camera:
         """
         streams = Streams(seed, frame)
         exposure_s = check_plausible("exposure_s", exposure_s)
-        clock = _Clock()
+        clock = Clock()
         if photo_e_per_s is None:
             photo_e_per_s = self._photoelectrons_per_s(light, clock)
         else:
@@ -457,7 +449,7 @@ class Camera:
         photo_e_per_s: Floats,
         exposure_s: float,
         streams: Streams,
-        clock: _Clock,
+        clock: Clock,
         **settings: Any,
     ) -> Capture:
         """Simulate the sensor for photoelectron rates."""
@@ -542,9 +534,9 @@ class Camera:
         ParameterError, SimulationError
             On the call, when an argument is out of range; during iteration, as for :meth:`capture`.
         """
-        _check_frames(frames)
+        check_frames(frames)
         ahead = check_count("ahead", ahead, at_least=0)
-        return (rate_e_per_s for *_, rate_e_per_s in self._frame_rates(frames, _Clock(), ahead))
+        return (rate_e_per_s for *_, rate_e_per_s in self._frame_rates(frames, Clock(), ahead))
 
     def video(
         self,
@@ -626,7 +618,7 @@ class Camera:
         if exposures_s.ndim > 1 or exposures_s.size == 0:
             raise ParameterError("exposure_s", "must be one time, or a sequence of times", exposure_s, "s")
         exposures_s = np.atleast_1d(exposures_s)
-        _check_frames(frames)
+        check_frames(frames)
         if frame_s is None and (line_s or between != "hold" or every != 1):
             name = "line_s" if line_s else "between" if between != "hold" else "every"
             raise ParameterError(name, "requires 'frame_s', the frame period")
@@ -647,11 +639,11 @@ class Camera:
         self, frames: Iterable[Frame], exposures_s: Floats, streams: Streams, ahead: int
     ) -> Iterator[Capture]:
         """Yield one capture per frame, each exposed to this frame alone."""
-        clock = _Clock()
+        clock = Clock()
         for k, (light, position_um, rate_e_per_s) in enumerate(self._frame_rates(frames, clock, ahead)):
             number = Streams(streams.seed, streams.frame + k)
             exposure_s = float(exposures_s[number.frame % exposures_s.size])
-            yield self._expose(light, rate_e_per_s, exposure_s, number, clock.take(), **_position_settings(position_um))
+            yield self._expose(light, rate_e_per_s, exposure_s, number, clock.take(), **position_settings(position_um))
 
     def _rolling(
         self, frames: Iterable[Frame], exposures_s: Floats, streams: Streams, shutter: Shutter, every: int, ahead: int
@@ -659,12 +651,12 @@ class Camera:
         """Yield one capture per ``every`` frames, each a sum over its exposure."""
         times = {"frame_s": shutter.frame_s, "line_s": shutter.line_s, "every": every, "between": shutter.between}
         in_progress: deque[tuple[int, Scene | PowerMap, Position, Exposure]] = deque()
-        clock = _Clock()
+        clock = Clock()
 
         def first(last_e_per_s: Floats) -> Capture:
             k, light, position_um, exposure = in_progress.popleft()
             number = Streams(streams.seed, streams.frame + k)
-            mean_e_per_s, settings = exposure.mean_e_per_s(last_e_per_s), times | _position_settings(position_um)
+            mean_e_per_s, settings = exposure.mean_e_per_s(last_e_per_s), times | position_settings(position_um)
             return self._expose(light, mean_e_per_s, exposure.exposure_s, number, clock.take(), **settings)
 
         rate_e_per_s = np.zeros(1)
@@ -682,7 +674,7 @@ class Camera:
             yield first(rate_e_per_s)
 
     def _frame_rates(
-        self, frames: Iterable[Frame], clock: _Clock, ahead: int
+        self, frames: Iterable[Frame], clock: Clock, ahead: int
     ) -> Iterator[tuple[Scene | PowerMap, Position, Floats]]:
         """Yield source, sensor position and photoelectron rates of each frame."""
         single_threaded = self
@@ -693,8 +685,8 @@ class Camera:
             single_threaded._bounds_um = self._bounds_um
         image_lock = Lock()
 
-        def compute(task: _Task) -> tuple[_Task, Floats | None, _Clock]:
-            own = _Clock()
+        def compute(task: Task) -> tuple[Task, Floats | None, Clock]:
+            own = Clock()
             if task.is_repeated:
                 return task, None, own
             # The first frame of a scene computes the images that its next frames share.
@@ -703,7 +695,7 @@ class Camera:
                 return task, single_threaded._photoelectrons_per_s(task.light, own, position_um, task.images), own
 
         rate_e_per_s = np.zeros(self._layout.n_sites)
-        for task, found, own in in_order(compute, _tasks(frames), self._n_threads, ahead):
+        for task, found, own in in_order(compute, tasks(frames), self._n_threads, ahead):
             # Repeated frames share the array.
             rate_e_per_s = rate_e_per_s if found is None else read_only(found)
             clock.add(own)
@@ -728,7 +720,7 @@ class Camera:
         ParameterError, SimulationError
             As for :meth:`capture`.
         """
-        expected_e = self._sensor.expected_electrons(self._photoelectrons_per_s(light, _Clock()), exposure_s)
+        expected_e = self._sensor.expected_electrons(self._photoelectrons_per_s(light, Clock()), exposure_s)
         return self._sensor.predict(expected_e, n_threads=self._n_threads)
 
     def reference(self, light: Scene | PowerMap, grid: Grid, *, exposure_s: float) -> Picture:
@@ -780,12 +772,12 @@ class Camera:
         ParameterError, SimulationError
             As for :meth:`capture`.
         """
-        return noise_budget(self._sensor, self._photoelectrons_per_s(light, _Clock()), exposure_s)
+        return noise_budget(self._sensor, self._photoelectrons_per_s(light, Clock()), exposure_s)
 
     def _photoelectrons_per_s(
         self,
         light: Scene | PowerMap,
-        clock: _Clock,
+        clock: Clock,
         position_um: Position | None = None,
         cached: ImageCache | None = None,
     ) -> Floats:
@@ -824,11 +816,11 @@ class Camera:
                 for grid in grids
             ]
         smallest = min(integrators, key=lambda integrator: integrator.grid.cell_area_um2)
-        self._warn_of_coverage(source, Covered.by(smallest), is_moving=position_um is not None)
+        warn_of_coverage(source, Covered.by(smallest), self._layout.n_sites, is_moving=position_um is not None)
         return self._integrate(light, maps, integrators, clock)
 
     def _integrate(
-        self, light: Scene | PowerMap, maps: Iterable[_WeightedMap], integrators: Sequence[Integrator], clock: _Clock
+        self, light: Scene | PowerMap, maps: Iterable[WeightedMap], integrators: Sequence[Integrator], clock: Clock
     ) -> Floats:
         """Return the sums of weighted maps over every site, photoelectrons per second."""
         rate_e_per_s = np.zeros(self._layout.n_sites)
@@ -852,10 +844,10 @@ class Camera:
         used = self._sensor.filters_used.tolist()
         return dict.fromkeys(used) if len(used) == 1 else {c: read_only(filter_of_site == c) for c in used}
 
-    def _bands(self, power_map: PowerMap, e_per_j: Floats) -> Iterator[_WeightedMap]:
+    def _bands(self, power_map: PowerMap, e_per_j: Floats) -> Iterator[WeightedMap]:
         """Yield each band of a power map, with every site's photoelectrons per joule in it."""
         for band, cells in enumerate(power_map.data):
-            yield _WeightedMap(0, cells, None, e_per_j[self._sensor.filter_of_site, band])
+            yield WeightedMap(0, cells, None, e_per_j[self._sensor.filter_of_site, band])
 
     def _images(
         self,
@@ -863,9 +855,9 @@ class Camera:
         optics: Optics,
         images: Sequence[tuple[Grid, Bools]],
         e_per_j: Floats,
-        clock: _Clock,
+        clock: Clock,
         cached: ImageCache | None,
-    ) -> Iterator[_WeightedMap]:
+    ) -> Iterator[WeightedMap]:
         """
         Yield the photoelectron map of each filter, with its sites.
 
@@ -886,7 +878,7 @@ class Camera:
             new = used if cached is None else np.array([c for c in used if (grid, c) not in cached], np.int64)
             maps = optics.weighted_maps(scene, e_per_j[new] * is_in_image, grid=grid, n_threads=self._n_threads)
             for c in used:
-                yield _WeightedMap(k, image(grid, int(c), maps), self._sites_of_filter[int(c)], None)
+                yield WeightedMap(k, image(grid, int(c), maps), self._sites_of_filter[int(c)], None)
 
     def _check_rates(self, light: Scene | PowerMap, rate_e_per_s: Floats) -> None:
         """Raise or warn when rates are not finite, or negative beyond rounding."""
@@ -919,46 +911,6 @@ class Camera:
             SamplingWarning,
         )
 
-    def _warn_of_coverage(self, source: Scene | PowerMap, covered: Covered, *, is_moving: bool = False) -> None:
-        """
-        Warn of sites outside the image, and of a layout that measures a small part of it.
-
-        Sites outside are dark whatever the scene is.
-        """
-        if covered.n_outside:
-            warn(
-                f"{covered.n_outside:,} of {self._layout.n_sites:,} photosites lie outside the image circle of the lens and "
-                "are dark; shrink or move the layout, or use a lens model with a larger field",
-                CoverageWarning,
-            )
-        is_photograph = isinstance(source, Scene) and source.is_picture
-        fit = source.fit if isinstance(source, Scene) else None
-        if fit in ("contain", "width"):
-            return
-        image_um, layout_um = covered.image_um, covered.layout_um
-        n_uncovered = covered.n_uncovered - covered.n_outside
-        if n_uncovered:
-            remedy = (
-                "use fit='cover', or a larger pitch_um or field_of_view_deg"
-                if is_photograph
-                else "enlarge the scene (pitch_um)"
-            )
-            warn(
-                f"{n_uncovered:,} of {self._layout.n_sites:,} photosites lie partly or completely outside the image, where "
-                f"irradiance is 0: the image measures {_format_extent(image_um)}, the layout {_format_extent(layout_um)}; "
-                f"{remedy}, or shrink or move the layout",
-                CoverageWarning,
-            )
-        elif is_photograph and fit is None and not is_moving:
-            fraction = _size_um(layout_um)[0] / _size_um(image_um)[0]
-            if fraction < MIN_PICTURE_FRACTION:
-                warn(
-                    f"the layout measures only {100.0 * fraction:.2g} % of the width of the picture: the image measures "
-                    f"{_format_extent(image_um)}, the layout {_format_extent(layout_um)}; use fit='cover', or a smaller "
-                    "pitch_um or field_of_view_deg",
-                    CoverageWarning,
-                )
-
     def _white(self, light: Scene | PowerMap) -> Floats:
         """Return each filter's relative response to an equal-energy spectrum, as a code."""
         width_nm = light.band_width_nm if isinstance(light, Scene) else np.ones(light.wavelength_nm.size)
@@ -969,35 +921,7 @@ class Camera:
         return np.maximum(response / max_response, MIN_WHITE_FRACTION) * (2**self._sensor.bits - 1)
 
 
-class Covered(NamedTuple):
-    """
-    Numbers of sites beyond an image, among them those outside the image circle.
-
-    ``image_um`` and ``layout_um`` are bounds (x_min, y_min, x_max, y_max), µm.
-    """
-
-    image_um: tuple[float, float, float, float]
-    layout_um: tuple[float, float, float, float]
-    n_uncovered: int
-    n_outside: int
-
-    @classmethod
-    def by(cls, integrator: Integrator) -> Covered:
-        """Return the coverage of an integrator's sites by its grid."""
-        n_outside = integrator.sites_outside_image_circle.size
-        return cls(integrator.grid.bounds_um, integrator.bounds_um, integrator.n_uncovered, n_outside)
-
-    @classmethod
-    def union(cls, image_um: tuple[float, float, float, float], parts: Sequence[Covered]) -> Covered:
-        """Return the coverage of the sites of all parts by an image."""
-        bounds_um = np.array([part.layout_um for part in parts])
-        x0, y0 = np.fmin.reduce(bounds_um[:, :2])
-        x1, y1 = np.fmax.reduce(bounds_um[:, 2:])
-        n_uncovered, n_outside = (sum(part.n_uncovered for part in parts), sum(part.n_outside for part in parts))
-        return cls(image_um, (float(x0), float(y0), float(x1), float(y1)), n_uncovered, n_outside)
-
-
-class _WeightedMap(NamedTuple):
+class WeightedMap(NamedTuple):
     """
     A power map, and the index of its grid.
 
@@ -1009,96 +933,6 @@ class _WeightedMap(NamedTuple):
     cells: NDArray[Any]
     where: Bools | None
     weight: Floats | None
-
-
-class _Clock:
-    """Elapsed seconds of named stages."""
-
-    def __init__(self) -> None:
-        self.stage_s: dict[str, float] = {}
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        start_s = time.perf_counter()
-        yield
-        self.stage_s[name] = self.stage_s.get(name, 0.0) + time.perf_counter() - start_s
-
-    def add(self, other: _Clock) -> None:
-        """Add the seconds of another clock."""
-        for name, s in other.stage_s.items():
-            self.stage_s[name] = self.stage_s.get(name, 0.0) + s
-
-    def take(self) -> _Clock:
-        """Return the seconds since the last call, and reset."""
-        before = _Clock()
-        before.stage_s, self.stage_s = self.stage_s, {}
-        return before
-
-
-class _Task(NamedTuple):
-    """One frame of a video, with the cache of its images."""
-
-    light: Scene | PowerMap
-    position_um: Position
-    images: ImageCache | None
-    is_repeated: bool
-    is_moving: bool
-
-
-def _tasks(frames: Iterable[Frame]) -> Iterator[_Task]:
-    """Yield the frames as tasks; frames of one scene with positions share their images."""
-    before: _Task | None = None
-    for frame in frames:
-        light, position_um = _split_frame(frame)
-        is_same = before is not None and light is before.light
-        images: ImageCache | None = None
-        if isinstance(frame, tuple) and isinstance(light, Scene):
-            is_cached = before is not None and is_same and before.images is not None
-            images = before.images if before is not None and is_cached else {}
-        is_repeated = before is not None and is_same and position_um == before.position_um
-        before = _Task(light, position_um, images, is_repeated, isinstance(frame, tuple))
-        yield before
-
-
-def _check_frames(frames: object) -> None:
-    if not isinstance(frames, Iterable):
-        hint = "put a single one into a list" if isinstance(frames, Scene | PowerMap) else ""
-        raise ParameterError(
-            "frames", f"must be an iterable of Scenes or PowerMaps, got {type_name(frames)}", hint=hint
-        )
-
-
-def _position_settings(position_um: Position) -> dict[str, Any]:
-    """Return the sensor position as settings of a capture; nothing at the origin."""
-    return {"place_um": list(position_um)} if any(position_um) else {}
-
-
-def _split_frame(frame: Frame) -> tuple[Scene | PowerMap, Position]:
-    """Return the source and the position of the sensor's centre in its image."""
-    if not isinstance(frame, tuple):
-        return frame, (0.0, 0.0)
-    position_um = finite_array("frames", frame[1], ndim=1) if len(frame) == 2 else np.zeros(0)
-    if position_um.size != 2:
-        raise ParameterError("frames", "must be Scenes or PowerMaps, or pairs (light, (x_um, y_um))", frame)
-    return frame[0], (float(position_um[0]), float(position_um[1]))
-
-
-def _size_um(bounds_um: Sequence[float]) -> tuple[float, float]:
-    """Return width and height of a bounding box."""
-    x0_um, y0_um, x1_um, y1_um = bounds_um
-    return x1_um - x0_um, y1_um - y0_um
-
-
-def _format_point(xy_um: Sequence[float] | Floats) -> str:
-    return f"({xy_um[0]:.4g}, {xy_um[1]:.4g})"
-
-
-def _format_extent(bounds_um: Sequence[float]) -> str:
-    """Return size and position of a bounding box, for messages."""
-    width_um, height_um = _size_um(bounds_um)
-    return (
-        f"{width_um:.5g} x {height_um:.5g} µm, from {_format_point(bounds_um[:2])} to {_format_point(bounds_um[2:])} µm"
-    )
 
 
 def _load_kernels(light: Scene | PowerMap) -> None:

@@ -1,0 +1,8 @@
+"""The camera: optics and a sensor, from scenes to captures."""
+
+from __future__ import annotations
+
+from foveasim.camera._camera import Camera
+from foveasim.camera._frames import Frame
+
+__all__ = ["Camera", "Frame"]
