@@ -717,7 +717,7 @@ def test_each_picture_has_one_label_file(tmp_path):
     (tmp_path / "a.png").touch()
     (tmp_path / "b.jpg").touch()
 
-    assert match_label_files(tmp_path, ["a.jpeg"], (".png",)) == [tmp_path / "a.png"]
+    assert list(match_label_files(tmp_path, ["a.jpeg"], (".png",))) == [tmp_path / "a.png"]
     with pytest.raises(FileError, match="one file per picture, but two pictures have the name 'a'"):
         match_label_files(tmp_path, ["a.jpeg", "a.png"], (".png",))
     with pytest.raises(FileError, match=r"first 'b'; it contains 'a' \(\.png\)"):
