@@ -32,12 +32,21 @@ def limit(kind: str, maximum: int) -> None:
     resource.setrlimit(number, (maximum if hard == resource.RLIM_INFINITY else min(maximum, hard), hard))
 
 
+def _import(name: str) -> Any:
+    """Import a module; of this package only what the module needs, not all of its parts."""
+    root = name.partition(".")[0]
+    spec = importlib.util.find_spec(root) if root == "foveasim" else None
+    if spec is not None:
+        sys.modules[root] = importlib.util.module_from_spec(spec)  # not executed: its __init__ imports everything
+    return importlib.import_module(name)
+
+
 def _run_reader(task: dict[str, Any]) -> dict[str, Any]:
     import numpy as np
 
     try:
         if task["file"] is None:
-            module = importlib.import_module(task["module"])
+            module = _import(task["module"])
             metadata, arrays = getattr(module, task["reader"])(task["path"], **task["args"])
         else:
             spec = importlib.util.spec_from_file_location(task["module"], task["file"])
