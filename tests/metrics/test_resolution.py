@@ -301,7 +301,7 @@ def test_edge_mtf_noise_is_below_standard():
 def test_mtf_sigma_matches_scatter():
     values, mtf = squares_at_an_edge()
     f = np.array([0.0, 20.0, 60.0, 100.0, 140.0, 166.0])
-    rng, n_runs = np.random.default_rng(9), 200
+    rng, n_runs = np.random.default_rng(9), 100
     # Noise increases with the signal, as for shot noise.
     noise = 0.02 * np.sqrt(0.3 + values)
     draws = [
