@@ -38,8 +38,18 @@ MARGIN = slice(PSF_CELLS, -PSF_CELLS)
 console = Console(width=130)
 
 
-def compare(title: str, calls: dict[str, Callable[[], np.ndarray]], *, is_noisy: bool = False) -> None:
-    """Print time, ratio and largest relative difference of each call from the first one; of noisy ones of the mean."""
+def compare(
+    title: str,
+    calls: dict[str, Callable[[], np.ndarray]],
+    *,
+    illumination: np.ndarray | float = 1.0,
+    is_noisy: bool = False,
+) -> None:
+    """
+    Print time, ratio and largest relative difference of each call from the first one.
+
+    The first result is divided by its relative illumination before. Of noisy results, the means are compared.
+    """
     found = {name: call() for name, call in calls.items()}
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(N_REPEATS):
@@ -52,6 +62,7 @@ def compare(title: str, calls: dict[str, Callable[[], np.ndarray]], *, is_noisy:
         table.add_column(heading, justify="left" if heading == "library" else "right")
     first = next(iter(found))
     own, own_s = found[first], statistics.median(seconds[first])
+    found[first] = own = own / illumination
     for name, values in found.items():
         s = statistics.median(seconds[name])
         reference, compared = (array[own.ndim * (MARGIN,)].astype(np.float64) for array in (own, values))
@@ -74,7 +85,7 @@ def compare_captures(n_side: int) -> None:
     capacitance_f = FULL_WELL_E * fs.units.ELEMENTARY_CHARGE_C / V_SAT_V
     sensor = fs.Sensor(layout, read_noise_e=READ_NOISE_E, capacitance_f=capacitance_f, v_sat_v=V_SAT_V, bits=BITS)
     camera = fs.Camera(optics=optics, sensor=sensor)
-    # Photoelectrons of a picture of 1, without relative illumination, which the other libraries do not model.
+    # Photoelectrons of a picture of 1, without relative illumination.
     flat = optics.irradiance_per_radiance(DISTANCE_M) * 0.01 * 10.0
     scale_e = flat * PITCH_UM**2 * 1e-12 * EXPOSURE_S / fs.units.photon_energy_j(WAVELENGTH_NM)
     psf = optics.psf(
@@ -95,12 +106,12 @@ def compare_captures(n_side: int) -> None:
         return np.clip(electrons * (2**BITS / FULL_WELL_E), 0, 2**BITS - 1).astype(np.uint16)
 
     def own_image() -> np.ndarray:
-        rate_e_per_s = camera.photoelectrons_per_s(scene).reshape(n_side, n_side)
-        x_um = layout.lattice.x_um.mean(axis=1)
-        distance_um = 1e3 * optics.focal_length_mm * (1.0 + optics.magnification(DISTANCE_M))
-        falloff = (1.0 + (x_um**2 + x_um[:, np.newaxis] ** 2) / distance_um**2) ** -2
-        return EXPOSURE_S * rate_e_per_s / falloff
+        return EXPOSURE_S * camera.photoelectrons_per_s(scene).reshape(n_side, n_side)
 
+    # cos^4, which the other libraries do not model.
+    x_um = layout.lattice.x_um.mean(axis=1)
+    distance_um = 1e3 * optics.focal_length_mm * (1.0 + optics.magnification(DISTANCE_M))
+    illumination = (1.0 + (x_um**2 + x_um[:, np.newaxis] ** 2) / distance_um**2) ** -2
     images = {"scipy.signal.fftconvolve": scipy_image, "cv2.filter2D": opencv_image}
     captures: dict[str, Callable[[], np.ndarray]] = {
         "foveasim": lambda: camera.capture(scene, exposure_s=EXPOSURE_S, seed=0).code.reshape(n_side, n_side)
@@ -128,8 +139,12 @@ def compare_captures(n_side: int) -> None:
 
         images["GalSim"] = lambda: galsim_picture().array
         captures["GalSim"] = galsim_codes
-    compare(f"Optical image of {n_side} x {n_side} pixels, photoelectrons", {"foveasim": own_image} | images)
-    compare(f"Capture with noise, {n_side} x {n_side} photosites", captures, is_noisy=True)
+    compare(
+        f"Optical image of {n_side} x {n_side} pixels, photoelectrons",
+        {"foveasim": own_image} | images,
+        illumination=illumination,
+    )
+    compare(f"Capture with noise, {n_side} x {n_side} photosites", captures, illumination=illumination, is_noisy=True)
 
 
 def compare_integration(shape: tuple[int, int]) -> None:

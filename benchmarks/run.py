@@ -101,7 +101,7 @@ def bench_integrator(report: Report, shape: tuple[int, int]) -> None:
     report.slower_than("frame", ours["frame"], "map.sum(), float32", ours["sum"], 6)
     report.slower_than("frame of second order", ours["second"], "frame", ours["frame"], 2)
     report.slower_than("layout integrated once, not compiled", ours["once"], "frame", ours["frame"], 2)
-    bench_compilation(report, shape[0] // 8)
+    bench_compilation(report, shape[0] // 3)
 
     small = fs.Grid.centred((116, 206), 0.5)
     few = fs.layout.hexagonal(n_columns=16, n_rows=12, pitch_um=3.7)
@@ -119,9 +119,9 @@ def bench_integrator(report: Report, shape: tuple[int, int]) -> None:
 
 
 def bench_compilation(report: Report, n_side: int) -> None:
-    """Measure the processor time and memory of compiling hexagons as large as 16 cells, per site."""
-    layout = fs.layout.hexagonal(n_columns=n_side, n_rows=n_side, pitch_um=4.3)
-    grid = fs.Grid.centred((4 * n_side, 5 * n_side), 1.0)
+    """Measure the processor time and memory of compiling hexagons of the size of a cell, per site."""
+    layout = fs.layout.hexagonal(n_columns=n_side, n_rows=n_side, pitch_um=1.0746)
+    grid = fs.Grid.centred((n_side, 11 * n_side // 10), 1.0)
     s = best_s({"compile": lambda: fs.Integrator(layout, grid)}, 6, time.process_time)["compile"]
     what = f"compiling {layout.n_sites:,} hexagons"
     report.add(what, f"{s:.4g} s", "processor time, µs per site", "", 1e6 * s / layout.n_sites, 0.7)

@@ -106,9 +106,15 @@ class ColourScale:
 
         table = np.rint(255.0 * colormaps[self.colour_map](np.arange(256))[:, :3]).astype(np.uint8)
         table = np.concatenate((table, np.array([NO_DATA], np.uint8)))
-        fraction = np.clip((values - self.low) / (self.high - self.low), 0.0, 1.0) ** self.gamma
-        step = np.where(np.isnan(fraction), 256.0, np.minimum(256.0 * fraction, 255.0))
-        return table[step.astype(np.int64)]
+        step = np.asarray(values - self.low, np.float64)
+        step /= self.high - self.low
+        np.clip(step, 0.0, 1.0, out=step)
+        if self.gamma != 1.0:
+            step **= self.gamma
+        step *= 256.0
+        np.minimum(step, 255.0, out=step)
+        np.copyto(step, 256.0, where=np.isnan(step))
+        return table.take(step.astype(np.intp), axis=0)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -235,8 +235,8 @@ def save_figure(figure: Figure, path: str | Path, dpi: float = 150.0) -> None:
     FileError
         When the format is unknown, or the file cannot be written.
     """
-    # Same size as the default level 6, in two thirds of the time.
-    options: dict[str, Any] = {"pil_kwargs": {"compress_level": 3}} if Path(path).suffix.lower() == ".png" else {}
+    # A few percent larger than at the default level 6, in half the time.
+    options: dict[str, Any] = {"pil_kwargs": {"compress_level": 1}} if Path(path).suffix.lower() == ".png" else {}
     # Encoded in memory: on a full disk some encoders leave a partial file.
     encoded = io.BytesIO()
     with atomic_write(path) as temporary:
