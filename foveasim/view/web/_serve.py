@@ -77,6 +77,8 @@ async def _serve(listener: socket.socket, content: bytes, announce: Callable[[st
         except (OSError, asyncio.IncompleteReadError, asyncio.CancelledError):
             # Disconnected, timed out (TimeoutError is an OSError), or the server stops: no response is possible.
             writer.transport.abort()
+            with contextlib.suppress(OSError, asyncio.CancelledError):
+                await writer.wait_closed()  # retrieves the error of the connection, which asyncio would print
         finally:
             n_open -= 1
 
