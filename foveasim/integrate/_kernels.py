@@ -38,7 +38,6 @@ __all__ = [
     "SITE",
     "count_pieces",
     "gather",
-    "integrate_sites",
     "measure_sites",
     "scatter",
     "sort_cuts",
@@ -61,10 +60,6 @@ MIN_RUN = 12
 NO_COVERAGE = 2e-15
 #: Largest number of cells of a box that are accumulated together; larger boxes are divided into strips of rows.
 BOX_CELLS = 2**16
-#: Cells of float32 in a cache line.
-LINE_CELLS = 16
-#: A sum of cells that does not occur.
-NEVER = 1.2345678e300
 #: Multiplication by this sequence maps a power of 2 to a unique value of 6 bits.
 DE_BRUIJN = np.uint64(0x03F79D71B4CB0A89)
 BIT_POSITIONS = np.zeros(64, np.int64)
@@ -591,64 +586,6 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
                     )
                 _clear_row(columns, n_touched, i_row, n_columns, rows, cover, moment)
     return spans[:n_spans].copy(), weights[:n_weights].copy(), cuts[:n_cuts], moments[:n_cuts], covered
-
-
-@njit(
-    [
-        types.void(_input(cell, 2), _points, _ints, _ints, _flags, _count, types.float64, _float_list)
-        for cell in (types.float32, types.float64)
-    ],
-)
-def integrate_sites(cells, uv, ring_offsets, site_offsets, where, order, scale, out):
-    """
-    Write scale x integral of sites, without spans.
-
-    Sites where ``where`` is False are not computed; an empty array stands for all True. Outlines are traced as by
-    :func:`trace_sites`, and the cells of a row are summed as soon as it has been traced.
-    """
-    n_y, n_x = cells.shape
-    has_moments = order == 2
-    rows = np.zeros((64, 3))
-    cover = np.zeros((1024, 2))
-    moment = np.zeros((1024 if has_moments else 0, 3))
-    touched = np.zeros(64, np.uint64)
-    columns = np.empty(n_x + 1, np.int64)
-    for i_site in range(site_offsets.size - 1):
-        if where.size > 0 and not where[i_site]:
-            continue
-        first_ring, last_ring = site_offsets[i_site], site_offsets[i_site + 1]
-        first_row, last_row, left, n_columns = _box(uv, ring_offsets[first_ring], ring_offsets[last_ring], n_y, n_x)
-        n_words = (n_columns + 63) >> 6
-        step = max(1, BOX_CELLS // max(n_columns, 1))
-        total = 0.0
-        for bottom in range(first_row, last_row, step):
-            top = min(bottom + step, last_row)
-            if rows.shape[0] < top - bottom:
-                rows = np.zeros((2 * (top - bottom), 3))
-            if touched.size < (top - bottom) * n_words:
-                touched = np.zeros(2 * (top - bottom) * n_words, np.uint64)
-            if cover.shape[0] < (top - bottom) * n_columns:
-                cover = np.zeros((2 * (top - bottom) * n_columns, 2))
-                moment = np.zeros((cover.shape[0] if has_moments else 0, 3))
-            # Read one cell of each cache line: these loads overlap, while those of the rows below would be waited for.
-            probe = 0.0
-            for row in range(bottom, top):
-                for c in range(left, min(left + n_columns, n_x), LINE_CELLS):
-                    probe += cells[row, c]
-            if probe == NEVER:  # so that the loop is not optimised away
-                total += 1.0
-            _add_rings(
-                uv, ring_offsets, first_ring, last_ring, n_x, bottom, top, left, n_columns, rows, cover, moment, touched
-            )
-            for row in range(bottom, top):
-                i_row = row - bottom
-                n_touched = _touched_columns(touched, i_row, n_words, columns)
-                base = i_row * n_columns
-                total += _sum_row(columns, n_touched, left, cover, base, rows, i_row, cells, row)
-                if has_moments:
-                    total += _sum_gradients(columns, n_touched, left, moment, base, rows, i_row, cells, row)
-                _clear_row(columns, n_touched, i_row, n_columns, rows, cover, moment)
-        out[i_site] = scale * total
 
 
 @njit(

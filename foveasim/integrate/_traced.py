@@ -27,7 +27,7 @@ class TracedOutlines:
     """
     Outlines that are traced and summed in one pass.
 
-    A call takes two to three times as long as with a plan, which must be compiled first.
+    A call takes up to twice as long as with a plan, which must be compiled first.
 
     Attributes
     ----------
@@ -89,13 +89,13 @@ class TracedOutlines:
 
     def gather(self, cells: NDArray[np.floating], out: Floats, scale: float, where: Bools, n_threads: int) -> None:
         """Write scale x integral in cells of every site; see :meth:`Plan.gather`."""
-        from foveasim.integrate import _kernels
+        from foveasim.integrate import _traced_kernels
 
         def integrate(piece: tuple[int, Outlines]) -> None:
             first, outlines = piece
             sites = slice(first, first + outlines.is_outside.size)
             uv = to_frame(outlines.xy_um, self.grid.origin_um, self.grid.pitch_xy_um)
             rings = outlines.ring_offsets, outlines.site_offsets
-            _kernels.integrate_sites(cells, uv, *rings, where[sites], self.order, scale, out[sites])
+            _traced_kernels.integrate_sites(cells, uv, *rings, where[sites], self.order, scale, out[sites])
 
         parallel_map(integrate, self._pieces, n_threads)

@@ -134,7 +134,9 @@ def test_random_map_equals_clipping_over_zoo(name):
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(polygon=polygons(SHAPE))
 def test_random_map_equals_clipping_over_polygons(polygon):
-    assert second(polygon)(MAP)[0] == pytest.approx(second_order_by_clipping(polygon, MAP), rel=EXACT, abs=1e-15)
+    expected = second_order_by_clipping(polygon, MAP)
+    for compiled in (True, False):
+        assert second(polygon, compiled=compiled)(MAP)[0] == pytest.approx(expected, rel=EXACT, abs=1e-15)
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)

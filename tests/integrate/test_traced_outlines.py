@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 import shapely
 
 import foveasim as fs
 from foveasim.errors import GeometryError
+from foveasim.integrate._outlines import outlines_of
 from foveasim.integrate._traced import TracedOutlines
 
 LAYOUTS = {
@@ -71,6 +74,48 @@ def test_wide_sites_sum_all_cells(compiled):
     power = fs.Integrator(layout, fs.Grid((50, 950), 1.0), compiled=compiled)(np.full((50, 950), 2.0))
 
     assert power[0] == pytest.approx(2.0 * polygon.area, rel=1e-12)
+
+
+def _traced_sum(polygon, cells, order):
+    """Return the sum over the only site, without the recognition of rectangles."""
+    layout, grid = fs.Layout.from_polygons([polygon]), fs.Grid(cells.shape, 1.0)
+    traced = TracedOutlines(partial(outlines_of, layout), 1, grid, order, 1)
+    power = np.empty(1)
+    traced.gather(cells, power, 1.0, np.zeros(0, bool), 1)
+    return power[0]
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_traced_site_ignores_adjacent_nan(order):
+    # At second order the gradients of covered cells are not needed.
+    cells = np.full((5, 6), np.nan)
+    cells[1:3, 2:5] = 2.0
+
+    assert _traced_sum(shapely.box(2, 1, 5, 3), cells, order) == 12.0
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_dark_traced_site_is_precise(order):
+    cells = np.full((8, 400), 1.0)
+    cells[:, :200] = 1e12
+    cells[:, 390:] = 1e12
+
+    total = _traced_sum(shapely.box(300.25, 2.25, 380.5, 6.5), cells, order)
+
+    assert total == pytest.approx(80.25 * 4.25, rel=1e-14)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_left_side_bending_within_row(order):
+    # The lowest vertex and the bend are in one row, and the left side reaches further right above the bend.
+    polygon = shapely.Polygon([(2.2, 0.1), (9.7, 0.4), (9.5, 0.95), (7.6, 0.8), (1.1, 0.3)])
+    x, y = np.meshgrid(np.arange(11) + 0.5, np.arange(3) + 0.5)
+    centroid = polygon.centroid
+
+    total = _traced_sum(polygon, 5.0 + x - 0.4 * y if order == 2 else np.full((3, 11), 5.0), order)
+
+    mean = 5.0 + centroid.x - 0.4 * centroid.y if order == 2 else 5.0
+    assert total == pytest.approx(polygon.area * mean, rel=1e-13)
 
 
 @pytest.mark.parametrize("n_threads", [2, 3])
