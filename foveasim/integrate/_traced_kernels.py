@@ -50,7 +50,7 @@ _flags = _input(types.boolean, 1)
 
 @njit(inline="always")
 def _ends(uv, start, stop):
-    """Return the lowest and the highest vertex of a ring, and whether each side between them never turns back along v."""
+    """Return lowest and highest vertex of a ring, and whether it is monotone along v."""
     low, high = start, start
     for i in range(start + 1, stop):
         if uv[i, 1] < uv[low, 1]:
@@ -80,7 +80,7 @@ def _gradient_u(cells, row, column):
 
 @njit(inline="always")
 def _sum_gradients_v(cells, row, start, stop):
-    """Return the sum of the changes of the map per cell along v over the cells ``start`` to ``stop - 1`` of a row."""
+    """Return the sum of the changes of the map along v, over the cells of a row."""
     n_y = cells.shape[0]
     above, below = (
         _sum_cells(cells, min(row + 1, n_y - 1), start, stop),
@@ -186,7 +186,11 @@ def _integrate_chain(cells, uv, start, stop, first, last, is_right, bottom, orde
 
 @njit(inline="always")
 def _prefetch(cells, bottom, top, left, right):
-    """Read one cell of each cache line of a box: these loads overlap, while those of subsequent rows would be waited for."""
+    """
+    Read one cell of each cache line of a box.
+
+    These loads overlap, while those of the rows would be waited for one after another.
+    """
     probe = 0.0
     for row in range(bottom, top):
         for c in range(left, right, LINE_CELLS):
