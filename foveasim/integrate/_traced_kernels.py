@@ -91,7 +91,7 @@ def _sum_gradients_v(cells, row, start, stop):
 
 @njit(inline="always")
 def _between(sum_of, cells, row, start, stop):
-    """Return a sum from ``start`` to ``stop``, negative if they are in descending order."""
+    """Return a sum from ``start`` to ``stop``, signed."""
     if stop >= start:
         return sum_of(cells, row, start, stop)
     return -sum_of(cells, row, stop, start)
@@ -100,7 +100,7 @@ def _between(sum_of, cells, row, start, stop):
 @njit(inline="always")
 def _integrate_chain(cells, uv, start, stop, first, last, is_right, bottom, order, reference):
     """
-    Return the integral of F dv along a chain of edges, upwards from vertex ``first`` to vertex ``last``.
+    Return the integral of F dv along a chain of edges, upwards from ``first`` to ``last``.
 
     The left chain is called first and writes the reference column of every row, the first one on its right.
     """
