@@ -46,7 +46,7 @@ from foveasim.scene import Scene
 from foveasim.sensor import FilterSet, GaussianCurve, PolynomialCurve, Sensor, SiliconQE, rgb_filters
 
 if TYPE_CHECKING:
-    from foveasim import compare, explore
+    from foveasim import compare, explore, learn
     from foveasim.config import read_layout
 
 __all__ = [
@@ -72,6 +72,7 @@ __all__ = [
     "errors",
     "explore",
     "layout",
+    "learn",
     "maps",
     "metrics",
     "modes",
@@ -98,7 +99,12 @@ for _module in (
 check_public_calls(__name__)
 
 #: Names that are imported when they are used, and the modules that have them.
-_LAZY = {"compare": "foveasim.compare", "explore": "foveasim.explore", "read_layout": "foveasim.config"}
+_LAZY = {
+    "compare": "foveasim.compare",
+    "explore": "foveasim.explore",
+    "learn": "foveasim.learn",
+    "read_layout": "foveasim.config",
+}
 
 if not TYPE_CHECKING:  # type checkers would take any name for an attribute
 

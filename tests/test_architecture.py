@@ -30,7 +30,7 @@ LAYERS = [
     {"metrics", "tiles", "video", "view"},
     {"compare"},
     {"config"},
-    {"explore"},
+    {"explore", "learn"},
     {"cli"},
     {"__main__"},
 ]

@@ -25,6 +25,7 @@ EXTRAS = {
     "compare": {"maps"},
     "explore": {"explore", "learn"},
     "layout": {"klayout", "layout", "parquet"},
+    "learn": {"learn"},
     "maps": {"maps"},
     "modes": {"video"},
     "scene": {"maps"},

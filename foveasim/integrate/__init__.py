@@ -10,5 +10,6 @@ from __future__ import annotations
 
 from foveasim.integrate._integrator import Integrator
 from foveasim.integrate._outlines import outline_bounds_um
+from foveasim.integrate._shape import EdgeMoments, SharedEdges, vertex_gradient
 
-__all__ = ["Integrator", "outline_bounds_um"]
+__all__ = ["EdgeMoments", "Integrator", "SharedEdges", "outline_bounds_um", "vertex_gradient"]

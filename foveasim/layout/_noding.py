@@ -7,7 +7,7 @@ import shapely
 
 from foveasim._core.validation import Floats, Ints
 
-__all__ = ["ON_EDGE_UM", "node_edges", "points_on_edges"]
+__all__ = ["ON_EDGE_UM", "merge_coincident_points", "node_edges", "points_on_edges"]
 
 #: Tolerance within which a point lies on an edge, and two points are the same.
 ON_EDGE_UM = 1e-6
@@ -50,7 +50,7 @@ def node_edges(begin_um: Floats, end_um: Floats) -> tuple[Floats, Floats]:
     -------
     begin_um, end_um : (n, 2) float64, µm
     """
-    points, ends = _merge_coincident_points(np.concatenate((begin_um, end_um)))
+    points, ends = merge_coincident_points(np.concatenate((begin_um, end_um)))
     first, last = np.split(ends, 2)
     is_edge = first != last
     first, last = first[is_edge], last[is_edge]
@@ -65,7 +65,7 @@ def node_edges(begin_um: Floats, end_um: Floats) -> tuple[Floats, Floats]:
     return points[run[:-1][is_step]], points[run[1:][is_step]]
 
 
-def _merge_coincident_points(xy_um: Floats) -> tuple[Floats, Ints]:
+def merge_coincident_points(xy_um: Floats) -> tuple[Floats, Ints]:
     """Return the points without duplicates within rounding, and the index of each in them."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

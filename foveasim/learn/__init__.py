@@ -1,0 +1,20 @@
+"""
+Gradients with respect to photosites, optics and electronics, for PyTorch.
+
+The functions take and return tensors on the CPU; the kernels below them are those of the simulator. Requires the extra ``learn``.
+"""
+
+from __future__ import annotations
+
+from foveasim._core.extras import needs
+
+try:
+    import torch as _torch  # noqa: F401
+except ImportError:
+    raise ImportError(f"foveasim.learn {needs('torch')}") from None
+
+from foveasim.learn.integral import site_power
+from foveasim.learn.mesh import Mesh
+from foveasim.learn.outlines import Outlines
+
+__all__ = ["Mesh", "Outlines", "site_power"]

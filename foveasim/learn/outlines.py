@@ -1,0 +1,230 @@
+"""Outlines of sites as points that several sites share: positions are variables, the topology is fixed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import shapely
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from foveasim._core.rings import positions_in_runs
+from foveasim._core.validation import Floats, Ints, read_only
+from foveasim.errors import ParameterError, type_name
+from foveasim.integrate import SharedEdges
+from foveasim.layout import Layout, node
+from foveasim.layout._noding import merge_coincident_points
+from foveasim.learn._tensors import as_array, check_tensor
+
+__all__ = ["Outlines"]
+
+
+@dataclass(frozen=True, eq=False)
+class Outlines:
+    """
+    Topology of outlines: which points are the vertices of which sites.
+
+    Parameters
+    ----------
+    vertex : (n_vertex,) int64
+        Point at each vertex of the packed rings.
+    ring_offsets, site_offsets : (n_ring + 1,), (n_site + 1,) int64
+        As those of a :class:`foveasim.Layout`.
+    columns : mapping of str to (n_site,) array
+        Data per site.
+    provenance : mapping
+        Origin of the layout.
+    """
+
+    vertex: Ints
+    ring_offsets: Ints
+    site_offsets: Ints
+    columns: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def from_layout(cls, layout: Layout) -> tuple[Outlines, Floats]:
+        """
+        Return the topology of a layout, and the positions of its points.
+
+        Vertices of neighbours at the same position, within 1e-6 µm, become one point. Vertices on an edge of a neighbour are
+        inserted there first (:func:`foveasim.layout.node`), so that displacements open no gaps.
+
+        Parameters
+        ----------
+        layout : Layout
+
+        Returns
+        -------
+        outlines : Outlines
+        points_um : (n_point, 2) float64, µm
+
+        Raises
+        ------
+        ParameterError
+            When the argument is not a Layout, or has no sites.
+        """
+        if not isinstance(layout, Layout):
+            raise ParameterError("layout", f"must be a Layout, got {type_name(layout)}")
+        if not layout.n_sites:
+            raise ParameterError("layout", "must have at least one site", layout)
+        noded = node(layout)
+        points_um, vertex = merge_coincident_points(noded.xy_um)
+        outlines = cls(
+            read_only(vertex.astype(np.int64)),
+            noded.ring_offsets,
+            noded.site_offsets,
+            layout.columns,
+            layout.provenance,
+        )
+        return outlines, points_um
+
+    def __repr__(self) -> str:
+        return f"Outlines({self.n_sites} sites, {self.n_points} points)"
+
+    @property
+    def n_sites(self) -> int:
+        """Number of sites."""
+        return self.site_offsets.size - 1
+
+    @cached_property
+    def n_points(self) -> int:
+        """Number of points."""
+        return int(self.vertex.max()) + 1
+
+    @cached_property
+    def edges(self) -> SharedEdges:
+        """Edges between the points, each shared edge once."""
+        return SharedEdges(self.ring_offsets, self.site_offsets, self.vertex)
+
+    @cached_property
+    def _vertex(self) -> Tensor:
+        return torch.from_numpy(np.array(self.vertex))
+
+    @cached_property
+    def _after(self) -> Tensor:
+        return torch.from_numpy(np.array(self.edges.after))
+
+    @cached_property
+    def _site(self) -> Tensor:
+        return torch.from_numpy(np.array(self.edges.site))
+
+    def vertices(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the positions of all vertices, and of the next one in the ring of each, (n_vertex, 2) tensors."""
+        begin = points[self._vertex]
+        return begin, begin[self._after]
+
+    def area_um2(self, points: Tensor) -> Tensor:
+        """
+        Compute the signed area of each site.
+
+        Parameters
+        ----------
+        points : (n_point, 2) tensor, µm
+
+        Returns
+        -------
+        area : (n_site,) tensor, µm²
+            Shoelace formula; negative for clockwise outlines. Its gradient is exact.
+        """
+        points = self.check_points(points)
+        begin, end = self.vertices(points)
+        twice = begin[:, 0] * end[:, 1] - begin[:, 1] * end[:, 0]
+        return torch.zeros(self.n_sites, dtype=points.dtype).index_add(0, self._site, 0.5 * twice)
+
+    def check_points(self, points: object) -> Tensor:
+        """Return positions, (n_point, 2), if they are a valid tensor."""
+        return check_tensor("points", points, (self.n_points, 2), ", one row per point")
+
+    def layout(self, points: Tensor, step: str = "moved vertices") -> Layout:
+        """
+        Return the layout with the points at given positions.
+
+        Parameters
+        ----------
+        points : (n_point, 2) tensor, µm
+        step : str
+            Entry of the provenance.
+
+        Returns
+        -------
+        Layout
+            With the columns of the original layout.
+
+        Raises
+        ------
+        GeometryError
+            When an outline intersects itself; the message specifies the site.
+        """
+        rings = as_array(self.check_points(points)).astype(np.float64)[self.vertex], self.ring_offsets, self.site_offsets
+        steps = [*self.provenance.get("steps", ()), step]
+        layout = Layout.from_polygons(rings, **dict(self.columns))
+        return layout.with_provenance({**self.provenance, "steps": steps})
+
+    def invalid_sites(self, points: Tensor) -> Ints:
+        """
+        Return the indices of sites whose outlines intersect themselves or are not counter-clockwise.
+
+        If the outlines of a tiling with a fixed boundary are all valid, no two sites overlap.
+        """
+        points = self.check_points(points)
+        xy_um = as_array(points)[self.vertex]
+        rings = shapely.linearrings(xy_um, indices=np.repeat(np.arange(self.ring_offsets.size - 1), np.diff(self.ring_offsets)))
+        sites = np.repeat(np.arange(self.n_sites), np.diff(self.site_offsets))
+        polygons = shapely.polygons(rings, indices=sites)
+        return np.flatnonzero(~shapely.is_valid(polygons) | (as_array(self.area_um2(points)) <= 0.0))
+
+    def subdivide(self, n_pieces: Ints) -> tuple[Outlines, Subdivision]:
+        """
+        Divide edges into equal pieces.
+
+        Parameters
+        ----------
+        n_pieces : (n_edge,) int
+            Number of pieces of each edge of :attr:`edges`.
+
+        Returns
+        -------
+        outlines : Outlines
+        subdivision : Subdivision
+            Map from the points of these outlines to those of the result.
+        """
+        edges = self.edges
+        begin, end = self.vertex[edges.begin], self.vertex[edges.end]
+        n_inner = n_pieces - 1
+        edge = np.repeat(np.arange(edges.n_edges), n_inner)
+        k = positions_in_runs(n_inner) + 1
+        identity = np.arange(self.n_points)
+        subdivision = Subdivision(
+            torch.from_numpy(np.concatenate((identity, begin[edge]))),
+            torch.from_numpy(np.concatenate((identity, end[edge]))),
+            torch.from_numpy(np.concatenate((np.zeros(self.n_points), k / n_pieces[edge]))),
+        )
+        # Every vertex is followed by the inner points of its edge, in the direction of its ring.
+        first_inner = self.n_points + np.cumsum(n_inner) - n_inner
+        length = n_pieces[edges.edge]
+        position = positions_in_runs(length)
+        of_edge, is_reversed = np.repeat(edges.edge, length), np.repeat(edges.is_reversed, length)
+        inner = first_inner[of_edge] + np.where(is_reversed, n_pieces[of_edge] - 1 - position, position - 1)
+        vertex = np.where(position == 0, np.repeat(self.vertex, length), inner)
+        ring_offsets = np.concatenate(([0], np.cumsum(length)))[self.ring_offsets]
+        return Outlines(vertex, ring_offsets, self.site_offsets, self.columns, self.provenance), subdivision
+
+
+@dataclass(frozen=True, eq=False)
+class Subdivision:
+    """Positions of the points of subdivided edges, as linear functions of their end points."""
+
+    begin: Tensor
+    end: Tensor
+    fraction: Tensor
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """Return the positions (n, 2) for positions of the end points."""
+        t = self.fraction.to(points.dtype)[:, None]
+        return (1.0 - t) * points[self.begin] + t * points[self.end]
