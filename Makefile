@@ -30,7 +30,8 @@ test-lowest: $(LOWEST)/.installed
 		-W default::DeprecationWarning -W default::PendingDeprecationWarning -W error::pytest.PytestWarning $(PYTEST_ARGS)
 
 test-torch: $(TORCH_VENV)/.installed
-	FOVEASIM_TESTS_NEED=torch $(TORCH_VENV)/bin/python -m pytest tests/explore/test_dataset_torch.py tests/test_notebooks.py -k torch $(PYTEST_ARGS)
+	FOVEASIM_TESTS_NEED=torch $(TORCH_VENV)/bin/python -m pytest $(PARALLEL) --doctest-modules foveasim/learn tests/learn \
+		tests/explore/test_dataset_torch.py tests/test_gallery.py tests/test_notebooks.py -k "torch or learn" $(PYTEST_ARGS)
 
 # Kills workers at random for some minutes: every item must be computed, at most twice.
 soak: $(VENV)/.installed-dev
@@ -92,5 +93,5 @@ $(LOWEST)/.installed: $(LOWEST)/uv/.made pyproject.toml
 
 $(TORCH_VENV)/.installed: $(TORCH_VENV)/.made pyproject.toml
 	@echo "installing foveasim and PyTorch into $(TORCH_VENV) (minutes with CUDA)"
-	$(TORCH_VENV)/bin/python -m pip install --quiet --editable '.[explore,learn]' ipykernel nbclient pytest
+	$(TORCH_VENV)/bin/python -m pip install --quiet --editable '.[explore,layout,learn]' hypothesis ipykernel nbclient pytest pytest-timeout pytest-xdist
 	touch $@

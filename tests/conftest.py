@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import signal
 import sys
 from importlib import import_module
 from importlib.util import find_spec
@@ -16,6 +17,9 @@ import pytest
 # hundreds of processes, and each would compile the package.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+# Background jobs of shells ignore SIGINT, and so would the programs that the tests start and interrupt.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def renderer_is_missing():

@@ -30,7 +30,7 @@ from foveasim.optics._aperture import Aperture
 from foveasim.optics._transform import Factor, Transform, source_pixels
 from foveasim.optics.otf import Tables
 
-__all__ = ["Imaging", "MapRows", "isoplanatic_error", "isoplanatic_maps", "reach_cells", "rows_of"]
+__all__ = ["Imaging", "MapRows", "PatchExtent", "isoplanatic_error", "isoplanatic_maps", "reach_cells", "rows_of"]
 
 #: Function of (first, last) that returns the rows ``first`` to ``last - 1`` of a map.
 MapRows = Callable[[int, int], NDArray[Any]]
@@ -257,12 +257,36 @@ class Imaging:
         """Return rows of a map of 0."""
         return np.zeros((last - first, transform.map_shape[1]), self.real)
 
-    def patch_maps(self, rows: _PatchExtent, columns: _PatchExtent, table_of: Tables) -> Iterator[MapRows]:
+    def patches(self, n_patches: tuple[int, int]) -> list[tuple[tuple[float, float], PatchExtent, PatchExtent]]:
+        """Return the centre (x, y) in µm, and the extents along y and x, of each isoplanatic patch."""
+        node_y_um, node_x_um = _nodes_um(self.grid, n_patches)
+        row_sources, column_sources = self.sources()
+        all_rows = _patch_extents(self, row_sources, self.grid.shape[0], node_y_um)
+        all_columns = _patch_extents(self, column_sources, self.grid.shape[1], node_x_um)
+        return [
+            ((float(x_um), float(y_um)), rows, columns)
+            for y_um, rows in zip(node_y_um, all_rows, strict=True)
+            for x_um, columns in zip(node_x_um, all_columns, strict=True)
+        ]
+
+    def patch_cells(self, rows: PatchExtent, columns: PatchExtent) -> tuple[Any, Any]:
+        """Return the indices of the cells of a patch in the map, and those among its own cells."""
+        k = self.oversample
+        fine = [(k * extent.cells[:, np.newaxis] + np.arange(k)).ravel() for extent in (rows, columns)]
+        is_inside = [(cells >= 0) & (cells < k * n) for cells, n in zip(fine, self.grid.shape, strict=True)]
+        return np.ix_(fine[0][is_inside[0]], fine[1][is_inside[1]]), np.ix_(*is_inside)
+
+    def patch_window(self, rows: PatchExtent, columns: PatchExtent) -> Floats:
+        """Return the weights of the pixels of a patch, times the relative illumination."""
+        x2, y2 = self.tangent2_x[columns.sources], self.tangent2_y[rows.sources]
+        illumination: Floats = (1.0 + x2 + y2[:, np.newaxis]) ** (-0.5 * self.falloff_power)
+        return np.outer(rows.weight, columns.weight) * illumination
+
+    def patch_maps(self, rows: PatchExtent, columns: PatchExtent, table_of: Tables) -> Iterator[MapRows]:
         """Yield the contribution of a patch to every map, over the cells that its PSF reaches."""
         shape = rows.cells.size, columns.cells.size
         transform = self.transform(np.arange(shape[0]), np.arange(shape[1]), shape)
-        x2, y2 = self.tangent2_x[columns.sources], self.tangent2_y[rows.sources]
-        window = np.outer(rows.weight, columns.weight) * (1.0 + x2 + y2[:, np.newaxis]) ** (-0.5 * self.falloff_power)
+        window = self.patch_window(rows, columns)
         picture = np.zeros(shape, self.real)
         inner = picture[rows.pixels, columns.pixels]
         on_axis = np.zeros(shape[1]), np.zeros(shape[0])
@@ -275,7 +299,7 @@ class Imaging:
 
 
 @dataclass(frozen=True)
-class _PatchExtent:
+class PatchExtent:
     """
     Extent of an isoplanatic patch along one axis.
 
@@ -307,17 +331,11 @@ def isoplanatic_maps(
     k = imaging.oversample
     n_y, n_x = imaging.grid.shape
     maps = np.zeros((len(imaging.weights), k * n_y, k * n_x), imaging.real)
-    node_y_um, node_x_um = _nodes_um(imaging.grid, n_patches)
-    row_sources, column_sources = imaging.sources()
-    all_rows = _patch_extents(imaging, row_sources, imaging.grid.shape[0], node_y_um)
-    all_columns = _patch_extents(imaging, column_sources, imaging.grid.shape[1], node_x_um)
-    for y_um, rows in zip(node_y_um, all_rows, strict=True):
-        for x_um, columns in zip(node_x_um, all_columns, strict=True):
-            fine = [(k * extent.cells[:, np.newaxis] + np.arange(k)).ravel() for extent in (rows, columns)]
-            is_inside = [(cells >= 0) & (cells < n) for cells, n in zip(fine, maps.shape[1:], strict=True)]
-            to = np.ix_(fine[0][is_inside[0]], fine[1][is_inside[1]])
-            for c, patch_rows in enumerate(imaging.patch_maps(rows, columns, tables_at((float(x_um), float(y_um))))):
-                maps[c][to] += patch_rows(0, fine[0].size)[np.ix_(*is_inside)]
+    for field_um, rows, columns in imaging.patches(n_patches):
+        to, inner = imaging.patch_cells(rows, columns)
+        n_fine_rows = k * rows.cells.size
+        for c, patch_rows in enumerate(imaging.patch_maps(rows, columns, tables_at(field_um))):
+            maps[c][to] += patch_rows(0, n_fine_rows)[inner]
     for complete in maps:
         yield partial(rows_of, complete)
 
@@ -366,7 +384,7 @@ def _nodes_um(grid: Grid, n_patches: tuple[int, int]) -> tuple[Floats, Floats]:
     return y, x
 
 
-def _patch_extents(imaging: Imaging, sources: Ints, n: int, node_um: Floats) -> list[_PatchExtent]:
+def _patch_extents(imaging: Imaging, sources: Ints, n: int, node_um: Floats) -> list[PatchExtent]:
     """Return the patch of each node along one axis."""
     first = -((sources.size - n) // 2)
     half_um = 0.5 * n * imaging.grid.pitch_x_um
@@ -385,7 +403,7 @@ def _patch_extents(imaging: Imaging, sources: Ints, n: int, node_um: Floats) -> 
         else:
             begin = low - (size - (high - low)) // 2
         cells = (begin + np.arange(size)) % sources.size + first
-        extents.append(_PatchExtent(np.maximum(sources[low:high], 0), weight, slice(low - begin, high - begin), cells))
+        extents.append(PatchExtent(np.maximum(sources[low:high], 0), weight, slice(low - begin, high - begin), cells))
     return extents
 
 

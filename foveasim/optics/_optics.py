@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
@@ -35,7 +35,7 @@ from foveasim.optics.pupils import Pupil
 from foveasim.units import m_from_mm, m_from_um, um_from_m, um_from_nm
 
 if TYPE_CHECKING:
-    from foveasim.optics._imaging import MapRows
+    from foveasim.optics._imaging import Imaging, MapRows
     from foveasim.optics._transform import Factor, Transform
 
 __all__ = ["Optics"]
@@ -515,8 +515,39 @@ class Optics(PointImages):
             yield partial(rows_of, total.astype(self._real_type()))
 
     def _maps(self, scene: SceneLike, weights: Floats, grid: Grid, n_threads: int) -> Iterator[MapRows]:
-        from foveasim.optics._imaging import Imaging, isoplanatic_maps
+        from foveasim.optics._imaging import isoplanatic_maps
 
+        imaging, tables_at = self.imaging(scene, weights, grid=grid, n_threads=n_threads)
+        if not self._is_varying():
+            return imaging.maps(tables_at((0.0, 0.0)))
+        return isoplanatic_maps(imaging, self.n_patches, tables_at)
+
+    @property
+    def n_patches(self) -> tuple[int, int]:
+        """Numbers of isoplanatic patches along y and x."""
+        return (self.field_patches, self.field_patches) if self._is_varying() else (1, 1)
+
+    def imaging(
+        self, scene: SceneLike, weights: Floats, *, grid: Grid | None = None, n_threads: int = 1
+    ) -> tuple[Imaging, Callable[[tuple[float, float]], Tables]]:
+        """
+        Return the inputs of the computation of maps, for other implementations of the transforms.
+
+        Parameters
+        ----------
+        scene, weights, grid, n_threads
+            As for :meth:`weighted_maps`.
+
+        Returns
+        -------
+        imaging : Imaging
+            Geometry, padding and weights.
+        tables_at : callable
+            OTF tables for the image point (x, y), µm.
+        """
+        from foveasim.optics._imaging import Imaging
+
+        grid = self._refine(self.grid(scene)) if grid is None else grid
         lambda_n_um = self._lambda_n_um(scene)
         aperture = self._aperture(scene.distance_m)
         is_clear_circle = self._is_clear_circle(aperture)
@@ -567,18 +598,17 @@ class Optics(PointImages):
             n_threads=n_threads,
             cached_factor=cached_factor,
         )
-        if is_clear_circle:
-            return imaging.maps(RadialTables(1.0 / lambda_n_um, self._real_type()))
 
         def tables_at(field_um: tuple[float, float]) -> Tables:
+            if is_clear_circle:
+                return RadialTables(1.0 / lambda_n_um, self._real_type())
+
             def create() -> PlaneTables:
                 return PlaneTables(aperture, scene.wavelength_nm, lambda_n_um, field_um, self._real_type())
 
             return self._cache.prepare(spectrum_key[:2], field_um, create, imaging.sums())
 
-        if not self._is_varying():
-            return imaging.maps(tables_at((0.0, 0.0)))
-        return isoplanatic_maps(imaging, (self.field_patches, self.field_patches), tables_at)
+        return imaging, tables_at
 
     def isoplanatic_error(self, scene: SceneLike) -> float:
         """
@@ -633,6 +663,10 @@ class Optics(PointImages):
         if self.pupil is None:
             return ()
         return tuple(self.pupil) if isinstance(self.pupil, Sequence) else (self.pupil,)
+
+    def aperture(self, scene: SceneLike) -> Aperture:
+        """Return the aperture for the distance of a scene."""
+        return self._aperture(scene.distance_m)
 
     def _aperture(self, distance_m: float) -> Aperture:
         wavefronts: list[Wavefront] = [part for part in (self.zernike, self.seidel) if part is not None]

@@ -1,0 +1,420 @@
+"""
+Optics as a differentiable function of the scene, the spectral weights, the aberrations and the pupil.
+
+Maps are those of :meth:`foveasim.Optics.weighted_maps` in float64. The transforms are those of torch, so that derivatives of any
+order exist; only the transfer functions of a lens without variables come from the kernels of the simulator.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import scipy.fft
+import torch
+from torch import Tensor, nn
+
+from foveasim._core.names import possible_names
+from foveasim._core.validation import Floats, Ints
+from foveasim.errors import ParameterError, type_name
+from foveasim.fields import Grid, SceneLike
+from foveasim.learn._tensors import check_tensor, constant
+from foveasim.optics import Optics, PupilImage, Seidel, Zernike, zernike
+from foveasim.optics._aperture import Aperture, overlaps
+from foveasim.optics._imaging import PatchExtent
+from foveasim.units import um_from_nm
+
+__all__ = ["VARIABLES", "Imaging"]
+
+#: Variables of a lens.
+VARIABLES = ("zernike", "seidel", "defocus", "pupil")
+#: Coefficients of Seidel aberrations, in the order of the tensor.
+SEIDEL_NAMES = ("spherical_um", "coma_um", "astigmatism_um", "field_curvature_um")
+#: Largest number of aliases per side of a lens with variables; more would take minutes.
+MAX_DIRECT_ALIASES = 2
+
+
+class Imaging(nn.Module):
+    """
+    Power maps of scenes behind a lens.
+
+    Parameters
+    ----------
+    optics : Optics
+        Initial lens. Lateral chromatic aberration is not supported.
+    scene : Scene
+        Geometry and spectrum: distance, pixel pitch, wavelengths. Its basis images are the default of :meth:`forward`.
+    wrt : iterable of {"zernike", "seidel", "defocus", "pupil"}
+        Variables of the lens.
+
+    Attributes
+    ----------
+    zernike : Parameter (n_coefficient,), µm
+        Coefficients of ``optics.zernike``, in the order of its indices.
+    seidel : Parameter (4,), µm
+        Spherical aberration, coma, astigmatism and field curvature of ``optics.seidel``.
+    defocus : Parameter (), µm
+        Path difference at the edge of the aperture, in addition to that of the focus distance.
+    pupil : Parameter (n, n)
+        Amplitude transmission of uniform squares over the square around the aperture, bottom row first: of ``optics.pupil``,
+        a :class:`foveasim.optics.PupilImage`.
+    grid : Grid
+        Grid of the maps.
+
+    Raises
+    ------
+    ParameterError
+        When a variable is unknown or absent from the initial lens, or the cells are too coarse.
+
+    Notes
+    -----
+    Padding, and the sampling of the aperture, are those of the initial lens: start with aberrations of the size that you expect,
+    or set ``padding_cells``. Variations of a lens whose initial OTF is that of the clear circle use the sampled aperture, whose
+    OTF is accurate to 7e-4.
+    """
+
+    zernike: nn.Parameter
+    seidel: nn.Parameter
+    defocus: nn.Parameter
+    pupil: nn.Parameter
+
+    def __init__(self, optics: Optics, scene: SceneLike, wrt: Iterable[str] = ()) -> None:
+        super().__init__()
+        if not isinstance(optics, Optics):
+            raise ParameterError("optics", f"must be an Optics, got {type_name(optics)}")
+        if optics.lateral_colour is not None:
+            raise ParameterError("optics", "must have no lateral chromatic aberration for gradients", optics)
+        self.wrt = _check_variables("wrt", wrt, VARIABLES)
+        initial = optics.resolve_oversample(scene)
+        self._optics = replace(initial, precision="double")
+        if self.wrt and self._optics.zernike is None and self._optics.seidel is None and not self._optics.pupil:
+            # A sampled aperture without aberrations.
+            self._optics = replace(self._optics, zernike=Zernike(coefficients={4: 0.0}))
+        self._scene = scene
+        self._aperture: Aperture = self._optics.aperture(scene)
+        n_waves = scene.wavelength_nm.size
+        self._imaging, self._tables_at = self._optics.imaging(scene, np.eye(n_waves))
+        self.register_buffer("_irradiance", constant(self._imaging.irradiance_w_m2))
+        self.grid: Grid = self._optics.image_grids(scene)[0][0]
+        self._n_patches = self._optics.n_patches
+        for name in self.wrt:
+            setattr(self, name, nn.Parameter(constant(self._start(name))))
+        self._fixed: dict[int, Tensor] = {}
+
+    def __repr__(self) -> str:
+        return f"Imaging({self._optics!r}, variables: {', '.join(self.wrt) or 'none'})"
+
+    def _start(self, name: str) -> Any:
+        """Return the initial values of a variable."""
+        lens = self._optics
+        if name == "defocus":
+            return 0.0
+        if name == "zernike":
+            if lens.zernike is None:
+                raise ParameterError("wrt", "must not contain 'zernike' without optics.zernike", hint="set Zernike(...)")
+            per_wave = [list(lens.zernike.coefficients_um(float(w)).values()) for w in self._scene.wavelength_nm]
+            if np.ptp(per_wave, axis=0).max() > 0.0:
+                raise ParameterError(
+                    "wrt", "must not contain 'zernike' with coefficients that depend on the wavelength", hint="use unit='um'"
+                )
+            return per_wave[0]
+        if name == "seidel":
+            if lens.seidel is None:
+                raise ParameterError("wrt", "must not contain 'seidel' without optics.seidel", hint="set Seidel(...)")
+            return [getattr(lens.seidel, key) for key in SEIDEL_NAMES]
+        images = lens.pupil if isinstance(lens.pupil, tuple) else (lens.pupil,)
+        if len(images) != 1 or not isinstance(images[0], PupilImage) or images[0].wavefront_um is not None:
+            raise ParameterError(
+                "wrt", "must not contain 'pupil' unless optics.pupil is a PupilImage without wavefront", lens.pupil
+            )
+        return np.asarray(images[0].picture)[::-1]
+
+    def optics(self) -> Optics:
+        """
+        Return the lens with the current values of its variables.
+
+        Raises
+        ------
+        ParameterError
+            When a value is out of range, such as a transmission above 1.
+        """
+        values = {name: getattr(self, name).detach().numpy() for name in self.wrt}
+        lens = self._optics
+        if "zernike" in values or "defocus" in values:
+            start = lens.zernike or Zernike(coefficients={4: 0.0})
+            wave_nm = float(self._scene.wavelength_nm[0])
+            found = start.coefficients_um(wave_nm)
+            if "zernike" in values:
+                found = dict(zip(found, values["zernike"].tolist(), strict=True))
+            # r² is sqrt(3) / 6 times the polynomial of defocus, apart from a constant.
+            found[2, 0] = found.get((2, 0), 0.0) + float(values.get("defocus", 0.0)) / (2.0 * math.sqrt(3.0))
+            lens = replace(lens, zernike=Zernike(coefficients={_osa(n, m): c for (n, m), c in found.items()}, index="osa"))
+        if "seidel" in values:
+            assert lens.seidel is not None
+            lens = replace(lens, seidel=replace(lens.seidel, **dict(zip(SEIDEL_NAMES, values["seidel"].tolist(), strict=True))))
+        if "pupil" in values:
+            lens = replace(lens, pupil=PupilImage(values["pupil"][::-1]))
+        return lens
+
+    def forward(self, weights: Tensor | None = None, basis: Tensor | None = None) -> Tensor:
+        """
+        Compute weighted sums of power maps over wavelength.
+
+        Parameters
+        ----------
+        weights : (n_output, n_wavelength) tensor, optional
+            By default one output per wavelength: W/m² per band.
+        basis : (..., n_basis, n_y, n_x) tensor, optional
+            Basis images of scenes; by default those of the scene.
+
+        Returns
+        -------
+        maps : (..., n_output, k n_y, k n_x) float64 tensor
+            With ``optics.oversample`` k; cell means, bottom row first.
+        """
+        n_waves = self._scene.wavelength_nm.size
+        if weights is None:
+            weights = torch.eye(n_waves, dtype=torch.float64)
+        weights = check_tensor("weights", weights, (None, n_waves), ", one column per wavelength").double()
+        shape = self._scene.basis.shape
+        if basis is None:
+            basis = torch.from_numpy(np.array(self._scene.basis, np.float64))
+        if not isinstance(basis, Tensor) or basis.ndim < 3:
+            check_tensor("basis", basis, shape)
+        flat = check_tensor("basis", basis.reshape(-1, *basis.shape[-3:]), (None, *shape), ", as the scene").double()
+        per_basis = weights[:, None, :] * self._irradiance
+        k, (n_y, n_x) = self._imaging.oversample, shape[1:]
+        maps = torch.zeros(flat.shape[0], weights.shape[0], k * n_y, k * n_x, dtype=torch.float64)
+        for number, (field_um, rows, columns) in enumerate(self._extents()):
+            factors, transmittance = self._factors(number, field_um, rows.cells.size, columns.cells.size)
+            found = self._transform(flat, rows, columns, factors, per_basis * transmittance)
+            (to_y, to_x), (from_y, from_x) = self._imaging.patch_cells(rows, columns)
+            inner = found[..., torch.from_numpy(from_y), torch.from_numpy(from_x)]
+            if self._n_patches == (1, 1):
+                maps = inner
+            else:
+                patch = torch.zeros_like(maps)
+                patch[..., torch.from_numpy(to_y), torch.from_numpy(to_x)] = inner
+                maps = maps + patch
+        return maps.reshape(*basis.shape[:-3], *maps.shape[1:])
+
+    def _extents(self) -> list[tuple[tuple[float, float], PatchExtent, PatchExtent]]:
+        """Return field position and extents of all isoplanatic patches; of the padded picture for a single one."""
+        if self._n_patches != (1, 1):
+            return self._imaging.patches(self._n_patches)
+
+        def complete(sources: Ints, n: int) -> PatchExtent:
+            cells = np.arange(sources.size) - (sources.size - n) // 2
+            return PatchExtent(np.maximum(sources, 0), (sources >= 0).astype(float), slice(0, sources.size), cells)
+
+        rows, columns = (
+            complete(sources, n) for sources, n in zip(self._imaging.sources(), self._imaging.grid.shape, strict=True)
+        )
+        return [((0.0, 0.0), rows, columns)]
+
+    def _transform(
+        self, basis: Tensor, rows: PatchExtent, columns: PatchExtent, factors: Tensor, weights: Tensor
+    ) -> Tensor:
+        """Return maps (n_scene, n_output, k n_row, k n_column) of the cells of a patch."""
+        k, (n_y, n_x) = self._imaging.oversample, (rows.cells.size, columns.cells.size)
+        window = constant(self._imaging.patch_window(rows, columns))
+        picture = basis[..., torch.from_numpy(rows.sources), :][..., torch.from_numpy(columns.sources)] * window
+        before = rows.pixels.start, columns.pixels.start
+        after = n_y - rows.pixels.stop, n_x - columns.pixels.stop
+        padded = nn.functional.pad(picture, (before[1], after[1], before[0], after[0]))
+        if k == 1:
+            spectra = torch.fft.rfft2(padded)
+        else:
+            # Points at the centres of source pixels have a periodic spectrum; see foveasim.optics._transform.
+            spectra = torch.fft.fft2(padded)
+            spectra = spectra[..., torch.arange(k * n_y) % n_y, :][..., torch.arange(k * n_x // 2 + 1) % n_x]
+            cycles_x, cycles_y = self._cycles(n_y, n_x)
+            shift = -math.pi * (k - 1)
+            phase = torch.from_numpy(np.exp(1j * shift * cycles_y)[:, np.newaxis] * np.exp(1j * shift * cycles_x))
+            spectra = spectra * (k * k * phase)
+        filtered = torch.einsum("cbk,kyx,sbyx->scyx", weights.to(factors.dtype), factors, spectra)
+        return torch.fft.irfft2(filtered, s=(k * n_y, k * n_x))
+
+    def _cycles(self, n_y: int, n_x: int) -> tuple[Floats, Floats]:
+        """Return the frequencies along x and y of the fine cells, in cycles per cell."""
+        k = self._imaging.oversample
+        cycles_y = scipy.fft.fftfreq(k * n_y)
+        return scipy.fft.rfftfreq(k * n_x), np.where((cycles_y == -0.5) & (k % 2 == 0), 0.5, cycles_y)
+
+    # -- transfer functions -------------------------------------------------------------------------------------------
+
+    def _factors(self, number: int, field_um: tuple[float, float], n_y: int, n_x: int) -> tuple[Tensor, Tensor]:
+        """
+        Return the transfer function of each wavelength, and the change of its transmittance.
+
+        (n_wavelength, k n_y, k n_x // 2 + 1) and (n_wavelength,).
+        """
+        n_waves = self._scene.wavelength_nm.size
+        if self.wrt:
+            tables, transmittance, per_step = self._otf_tables(field_um)
+            return self._sample_tables(tables, per_step, n_y, n_x), transmittance
+        if number not in self._fixed:
+            k = self._imaging.oversample
+            transform = self._imaging.transform(np.arange(n_y), np.arange(n_x), (n_y, n_x))
+            tables_at, full = self._tables_at(field_um), np.zeros((n_waves, k * n_y, k * n_x // 2 + 1), complex)
+            for wave, weight in enumerate(np.eye(n_waves)):
+                columns = transform.complete(transform.factor(*tables_at(weight)))
+                of_row = np.arange(k * n_y)
+                if columns.shape[1] < k * n_y:  # even along y
+                    of_row = np.minimum(of_row, k * n_y - of_row)
+                full[wave, :, : columns.shape[0]] = columns[:, of_row].T
+            self._fixed[number] = torch.from_numpy(full)
+        return self._fixed[number], torch.ones(n_waves, dtype=torch.float64)
+
+    def _otf_tables(self, field_um: tuple[float, float]) -> tuple[Tensor, Tensor, float]:
+        """Return OTF tables (n_wavelength, n, n) over (f_y, f_x), relative transmittances, and steps per frequency."""
+        waves_nm = self._scene.wavelength_nm
+        near_um = um_from_nm(waves_nm) * self._optics.working_f_number(self._scene.distance_m)
+        n_across = [self._aperture.n_across(float(w), field_um) for w in waves_nm]
+        per_step = float((np.array(n_across) * near_um).max())
+        n_lags = math.ceil(per_step / float(near_um.min()))
+        tables, transmittances = [], []
+        for wave_nm, lambda_n_um in zip(waves_nm, near_um, strict=True):
+            table, transmittance = self._otf(float(wave_nm), per_step / float(lambda_n_um), n_lags, field_um)
+            tables.append(table)
+            transmittances.append(transmittance)
+        return torch.stack(tables), torch.stack(transmittances), per_step
+
+    def _otf(
+        self, wave_nm: float, n_across: float, n_lags: int, field_um: tuple[float, float]
+    ) -> tuple[Tensor, Tensor]:
+        """Return the OTF at integer lags, as :meth:`Aperture.compute_otf`, and the relative transmittance."""
+        samples, at, power = self._aperture.samples(wave_nm, n_across, field_um)
+        amplitude, change = torch.from_numpy(samples), torch.ones((), dtype=torch.float64)
+        if "pupil" in self.wrt:
+            amplitude, change = self._pupil_amplitude(wave_nm, n_across, samples, at, field_um)
+        path_um = self._path_change_um(at, field_um)
+        if path_um is not None:
+            phase = (2.0 * math.pi / float(um_from_nm(wave_nm))) * path_um
+            amplitude = amplitude * torch.complex(torch.cos(phase), torch.sin(phase))
+        n = samples.shape[0]
+        size = scipy.fft.next_fast_len(2 * n)
+        wave = torch.fft.fft2(amplitude, (size, size))
+        otf = torch.fft.fft2(wave.real**2 + wave.imag**2) / (size * size * power * change)
+        k = min(n_lags, n - 1)
+        lags = torch.arange(-k, k + 1) % size
+        inner = otf[lags][:, lags]
+        # OTF(0) = 1 conserves energy exactly.
+        centre = torch.zeros(2 * k + 1, 2 * k + 1, dtype=torch.bool)
+        centre[k, k] = True
+        inner = torch.where(centre, torch.ones((), dtype=inner.dtype), inner)
+        return nn.functional.pad(inner, (n_lags - k,) * 4), change
+
+    def _pupil_amplitude(
+        self, wave_nm: float, n_across: float, samples: Any, at: Floats, field_um: tuple[float, float]
+    ) -> tuple[Tensor, Tensor]:
+        """Return the amplitude of the current pupil, and its transmittance relative to that of the initial one."""
+        n = samples.shape[0]
+        # The shape of the aperture without the picture: the unit disc.
+        n_fine = self._aperture._sample_pupil(wave_nm, max(_pupil_points(), n)).shape[0]  # noqa: SLF001
+        position = (np.arange(n_fine) + 0.5) * (2.0 / n_fine) - 1.0
+        disc = constant(position**2 + position[:, np.newaxis] ** 2 <= 1.0)
+        n_pixels = self.pupil.shape[0]
+        pixel = torch.from_numpy(np.clip(np.floor(0.5 * n_pixels * (1.0 + position)), 0, n_pixels - 1).astype(np.int64))
+        fine = disc * self.pupil[pixel][:, pixel]
+        mean = constant(overlaps(n, 2.0 / n_across, n_fine, 2.0 / n_fine).toarray())
+        path_um = self._aperture.path_um(at[np.newaxis, :], at[:, np.newaxis], wave_nm, field_um)
+        phase = torch.from_numpy(np.exp(2j * np.pi / float(um_from_nm(wave_nm)) * path_um))
+        transmittance = (fine * fine).sum() / disc.sum()
+        return (mean @ fine @ mean.T) * phase, transmittance / self._aperture.transmittance(wave_nm)
+
+    def _path_change_um(self, at: Floats, field_um: tuple[float, float]) -> Tensor | None:
+        """Return the path difference relative to the initial lens at samples of the aperture, (n, n)."""
+        x, y = at[np.newaxis, :], at[:, np.newaxis]
+        total: Tensor | None = None
+        for name in self.wrt:
+            if name == "pupil":
+                continue
+            modes = constant(self._modes(name, x, y, field_um))
+            change = torch.tensordot(getattr(self, name).reshape(-1) - constant(self._start(name)).reshape(-1), modes, dims=1)
+            total = change if total is None else total + change
+        return total
+
+    def _modes(self, name: str, x: Floats, y: Floats, field_um: tuple[float, float]) -> Floats:
+        """Return the path difference for a unit of each coefficient, (n_coefficient, n, n)."""
+        if name == "defocus":
+            return np.asarray(x * x + y * y)[np.newaxis]
+        if name == "zernike":
+            assert self._optics.zernike is not None
+            orders = self._optics.zernike.coefficients_um(float(self._scene.wavelength_nm[0]))
+            return np.stack([zernike(n, m, x, y) for n, m in orders])
+        assert self._optics.seidel is not None
+        radius_um = self._optics.seidel.field_radius_um
+        units = [Seidel(field_radius_um=radius_um, **{key: 1.0}) for key in SEIDEL_NAMES]
+        return np.stack([unit.wavefront_um(x, y, 550.0, field_um) for unit in units])
+
+    def _sample_tables(self, tables: Tensor, per_step: float, n_y: int, n_x: int) -> Tensor:
+        """Return transfer functions of cells: sums over the aliases of each frequency."""
+        pitch_um = self.grid.pitch_x_um
+        n_alias = max(0, math.ceil(self._imaging.f_max_per_um * pitch_um - 0.5))
+        if n_alias > MAX_DIRECT_ALIASES:
+            raise ParameterError(
+                "optics",
+                f"must have map cells of at most {(MAX_DIRECT_ALIASES + 0.5) / self._imaging.f_max_per_um:.3g} µm for gradients of "
+                f"aberrations, got {pitch_um:.3g} µm; set Optics(oversample=...)",
+            )
+        k = self._imaging.oversample
+        source_cells = float(k) if self._imaging.is_square_source else 0.0
+        cycles_x, cycles_y = self._cycles(n_y, n_x)
+        total = torch.zeros(tables.shape[0], cycles_y.size, cycles_x.size, dtype=tables.dtype)
+        for a_y in range(-n_alias, n_alias + 1):
+            y, gain_y = _alias(cycles_y, a_y, source_cells, is_alternating=k % 2 == 0)
+            for a_x in range(-n_alias, n_alias + 1):
+                x, gain_x = _alias(cycles_x, a_x, source_cells, is_alternating=k % 2 == 0)
+                gain = torch.from_numpy(gain_y[:, np.newaxis] * gain_x)
+                total = total + gain * _bilinear(tables, y * per_step / pitch_um, x * per_step / pitch_um)
+        return total
+
+
+def _alias(cycles: Floats, alias: int, source_cells: float, *, is_alternating: bool) -> tuple[Floats, Floats]:
+    """Return the frequencies of an alias in cycles per cell, and its gains."""
+    shifted = cycles + alias
+    sign = -1.0 if is_alternating and alias % 2 else 1.0
+    return shifted, sign * np.sinc(shifted) * np.sinc(source_cells * shifted)
+
+
+def _bilinear(tables: Tensor, v: Floats, u: Floats) -> Tensor:
+    """Interpolate tables (n, 2 h + 1, 2 h + 1) at steps (n_v,) and (n_u,) from the centre; 0 outside."""
+    half = tables.shape[1] // 2
+
+    def split(at: Floats) -> tuple[Tensor, Tensor, Tensor]:
+        is_inside = np.abs(at) < half
+        low = np.clip(np.floor(at).astype(np.int64) + half, 0, 2 * half - 1)
+        weight = np.where(is_inside, at + half - low, 0.0)
+        return torch.from_numpy(low), constant(weight), constant(is_inside)
+
+    (j, wv, in_v), (i, wu, in_u) = split(v), split(u)
+    rows = tables[:, j] * (1.0 - wv)[:, None] + tables[:, j + 1] * wv[:, None]
+    found = rows[..., i] * (1.0 - wu) + rows[..., i + 1] * wu
+    return found * (in_v[:, None] * in_u)
+
+
+def _pupil_points() -> int:
+    from foveasim.optics._aperture import PUPIL_POINTS
+
+    return PUPIL_POINTS
+
+
+def _osa(n: int, m: int) -> int:
+    """Return the OSA/ANSI index of a Zernike polynomial."""
+    return (n * (n + 2) + m) // 2
+
+
+def _check_variables(name: str, wrt: Iterable[str], known: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of variables, in a fixed order."""
+    known = tuple(known)
+    names = (wrt,) if isinstance(wrt, str) else tuple(wrt)
+    for variable in names:
+        if variable not in known:
+            raise ParameterError(
+                name, "must contain names of variables", variable, hint=possible_names(str(variable), list(known))
+            )
+    return tuple(variable for variable in known if variable in names)
