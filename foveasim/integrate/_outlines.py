@@ -80,6 +80,12 @@ class UndistortedOutlines:
         outlines = outlines_of(self._layout, first, last)
         return outlines if self._chord_density is None else _undistort(outlines, self._lens, self._chord_density)
 
+    def count_pieces(self) -> Ints:
+        """Return the number of pieces into which the edge after each vertex is split, (n_vertex,)."""
+        if self._chord_density is None:
+            return np.ones(0, np.int64)
+        return self._chord_density.n_pieces(self._layout.xy_um, self._layout.ring_offsets)
+
 
 def _undistort(outlines: Outlines, lens: PointMap, chord_density: _ChordDensity) -> Outlines:
     """Return undistorted outlines."""

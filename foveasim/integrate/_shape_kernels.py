@@ -221,7 +221,9 @@ def differentiate_moments(cells, i_map, begin, end, weights, first_edge, last_ed
         if t_first > 0.0:  # the edge enters the map
             u, v = ua + t * du, va + t * dv
             jump = -_value(cells, i_map, row, column, u, v, order) * (weight_a * (1.0 - t) + weight_b * t)
-            axis = 0 if -ua * inverse_u == t or (n_x - ua) * inverse_u == t else 1
+            enter_u = min(-ua / du, (n_x - ua) / du) if du != 0.0 else -np.inf
+            enter_v = min(-va / dv, (n_y - va) / dv) if dv != 0.0 else -np.inf
+            axis = 0 if enter_u >= enter_v else 1
             inverse = inverse_u if axis == 0 else inverse_v
             out[edge, 0, axis] -= jump * (1.0 - t) * inverse
             out[edge, 1, axis] -= jump * t * inverse

@@ -13,8 +13,12 @@ try:
 except ImportError:
     raise ImportError(f"foveasim.learn {needs('torch')}") from None
 
+from foveasim.learn.distortion import undistort
+from foveasim.learn.imaging import Imaging
 from foveasim.learn.integral import site_power
 from foveasim.learn.mesh import Mesh
+from foveasim.learn.model import Model, capture
 from foveasim.learn.outlines import Outlines
+from foveasim.learn.readout import Readout
 
-__all__ = ["Mesh", "Outlines", "site_power"]
+__all__ = ["Imaging", "Mesh", "Model", "Outlines", "Readout", "capture", "site_power", "undistort"]

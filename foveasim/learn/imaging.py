@@ -318,8 +318,12 @@ class Imaging(nn.Module):
         position = (np.arange(n_fine) + 0.5) * (2.0 / n_fine) - 1.0
         disc = constant(position**2 + position[:, np.newaxis] ** 2 <= 1.0)
         n_pixels = self.pupil.shape[0]
-        pixel = torch.from_numpy(np.clip(np.floor(0.5 * n_pixels * (1.0 + position)), 0, n_pixels - 1).astype(np.int64))
-        fine = disc * self.pupil[pixel][:, pixel]
+        # As in PupilImage, whose rows count from the top: points on a border belong to the pixel below.
+        row, column = (
+            np.clip(np.floor(0.5 * n_pixels * (1.0 + at_point)), 0, n_pixels - 1).astype(np.int64)
+            for at_point in (-position, position)
+        )
+        fine = disc * self.pupil[torch.from_numpy(n_pixels - 1 - row)][:, torch.from_numpy(column)]
         mean = constant(overlaps(n, 2.0 / n_across, n_fine, 2.0 / n_fine).toarray())
         path_um = self._aperture.path_um(at[np.newaxis, :], at[:, np.newaxis], wave_nm, field_um)
         phase = torch.from_numpy(np.exp(2j * np.pi / float(um_from_nm(wave_nm)) * path_um))

@@ -39,6 +39,8 @@ class Outlines:
         Data per site.
     provenance : mapping
         Origin of the layout.
+    n_points : int
+        Number of points; by default those that are vertices.
     """
 
     vertex: Ints
@@ -46,6 +48,11 @@ class Outlines:
     site_offsets: Ints
     columns: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    n_points: int = -1
+
+    def __post_init__(self) -> None:
+        if self.n_points < 0:
+            object.__setattr__(self, "n_points", int(self.vertex.max(initial=-1)) + 1)
 
     @classmethod
     def from_layout(cls, layout: Layout) -> tuple[Outlines, Floats]:
@@ -91,11 +98,6 @@ class Outlines:
     def n_sites(self) -> int:
         """Number of sites."""
         return self.site_offsets.size - 1
-
-    @cached_property
-    def n_points(self) -> int:
-        """Number of points."""
-        return int(self.vertex.max()) + 1
 
     @cached_property
     def edges(self) -> SharedEdges:
@@ -178,6 +180,21 @@ class Outlines:
         sites = np.repeat(np.arange(self.n_sites), np.diff(self.site_offsets))
         polygons = shapely.polygons(rings, indices=sites)
         return np.flatnonzero(~shapely.is_valid(polygons) | (as_array(self.area_um2(points)) <= 0.0))
+
+    def select(self, sites: Ints) -> Outlines:
+        """Return the outlines of some of the sites, with the same points."""
+        n_rings, n_vertices = np.diff(self.site_offsets), np.diff(self.ring_offsets)
+        ring = np.repeat(self.site_offsets[:-1][sites], n_rings[sites]) + positions_in_runs(n_rings[sites])
+        vertex = np.repeat(self.ring_offsets[:-1][ring], n_vertices[ring]) + positions_in_runs(n_vertices[ring])
+        columns = {name: values[sites] for name, values in self.columns.items()}
+        return Outlines(
+            self.vertex[vertex],
+            np.concatenate(([0], np.cumsum(n_vertices[ring]))),
+            np.concatenate(([0], np.cumsum(n_rings[sites]))),
+            columns,
+            self.provenance,
+            self.n_points,
+        )
 
     def subdivide(self, n_pieces: Ints) -> tuple[Outlines, Subdivision]:
         """

@@ -367,6 +367,17 @@ class Sensor:
                 name = "filters"
             raise ParameterError(name, error.detail) from error.__cause__
 
+    def filter_transmission(self, wavelength_nm: Floats) -> Floats:
+        """
+        Compute the transmission of each filter without quantum efficiency, (n_filter, n_wavelength).
+
+        Raises
+        ------
+        ParameterError
+            If a curve is undefined at a wavelength.
+        """
+        return self._filter_set.transmission(wavelength_nm)
+
     def responsivity_e_per_j(self, wavelength_nm: Floats) -> Floats:
         """
         Compute the responsivity: electrons per joule incident on a site.
