@@ -16,19 +16,61 @@ from foveasim.distortion import Lens
 from foveasim.errors import GeometryError, ParameterError, type_name
 from foveasim.learn._tensors import as_array, check_tensor
 
-__all__ = ["coefficient_names", "undistort", "with_coefficients"]
+__all__ = ["coefficient_names", "coefficient_values", "undistort", "with_coefficients"]
 
-#: Step of the difference quotients, relative to the focal length for positions, and to coefficients or this number.
+#: Step of the difference quotients, relative to the focal length for positions, and to the size of coefficients.
 POSITION_STEP, COEFFICIENT_STEP = 2e-3, 2e-3
+#: Parameters of lens models that are lengths, or a transformation of the sensor.
+GEOMETRY = {"focal_um", "centre_um", "pixel_um", "projection", "stretch"}
 #: Nodes and weights of the central difference of fourth order.
 STENCIL = ((-2.0, 1.0 / 12.0), (-1.0, -8.0 / 12.0), (1.0, 8.0 / 12.0), (2.0, -1.0 / 12.0))
 
 
 def coefficient_names(lens: Lens) -> tuple[str, ...]:
-    """Return the names of the coefficients of a lens model that are numbers, such as k1 and p2."""
-    if not is_dataclass(lens):
-        return ()
-    return tuple(f.name for f in fields(lens) if f.init and isinstance(getattr(lens, f.name), float) and f.name != "focal_um")
+    """Return the names of the dimensionless and polynomial coefficients of a lens model, such as k1, p2 and a[2]."""
+    names = []
+    for field in fields(lens) if is_dataclass(lens) else ():
+        value = getattr(lens, field.name)
+        if not field.init or field.name in GEOMETRY:
+            continue
+        if isinstance(value, float):
+            names.append(field.name)
+        elif isinstance(value, tuple):
+            names.extend(f"{field.name}[{k}]" for k in range(len(value)))
+    return tuple(names)
+
+
+def coefficient_values(lens: Lens, names: Iterable[str]) -> list[float]:
+    """Return the values of some coefficients of a lens model."""
+    return [_get(lens, name) for name in names]
+
+
+def _get(lens: Lens, name: str) -> float:
+    key, _, index = name.rstrip("]").partition("[")
+    value = getattr(lens, key)
+    return float(value[int(index)] if index else value)
+
+
+def with_coefficients(lens: Lens, names: Iterable[str], values: Any) -> Lens:
+    """Return a lens model with other values of some coefficients."""
+    changes: dict[str, Any] = {}
+    for name, value in zip(names, values, strict=True):
+        key, _, index = name.rstrip("]").partition("[")
+        if index:
+            sequence = list(changes.get(key, getattr(lens, key)))
+            sequence[int(index)] = float(value)
+            changes[key] = tuple(sequence)
+        else:
+            changes[key] = float(value)
+    return replace(lens, **changes) if changes else lens  # type: ignore[type-var]
+
+
+def _scale(lens: Lens, name: str) -> float:
+    """Return the size of a coefficient for which the distortion is strong at a distance of one focal length."""
+    if name.startswith("a["):  # of Scaramuzza: a0 + a2 r² + a3 r³ + a4 r⁴, in pixels
+        focal = abs(_get(lens, "a[0]"))
+        return focal ** (1.0 - (0, 2, 3, 4)[int(name[2:-1])])
+    return 1.0
 
 
 def undistort(lens: Lens, points: Tensor, coefficients: Tensor | None = None, names: Iterable[str] = ()) -> Tensor:
@@ -43,7 +85,7 @@ def undistort(lens: Lens, points: Tensor, coefficients: Tensor | None = None, na
     coefficients : (n_coefficient,) tensor, optional
         Values of some coefficients of the lens model, in the order of ``names``.
     names : iterable of str
-        Names of these coefficients, such as ``("k1", "k2")``.
+        Names of these coefficients, such as ``("k1", "k2")`` or, for elements of sequences, ``("a[0]", "a[1]")``.
 
     Returns
     -------
@@ -72,15 +114,10 @@ def undistort(lens: Lens, points: Tensor, coefficients: Tensor | None = None, na
             hint = possible_names(str(name), list(known))
             raise ParameterError("names", f"must be coefficients of {type(lens).__name__}", name, hint=hint)
     if coefficients is None:
-        coefficients = torch.tensor([getattr(lens, name) for name in names], dtype=torch.float64)
+        coefficients = torch.tensor(coefficient_values(lens, names), dtype=torch.float64)
     coefficients = check_tensor("coefficients", coefficients, (len(names),), ", one per name")
     return _Undistort.apply(points, coefficients, lens, names)  # type: ignore[no-any-return, no-untyped-call]
 
-
-def with_coefficients(lens: Lens, names: Iterable[str], values: Any) -> Lens:
-    """Return a lens model with other values of some coefficients."""
-    changes = {name: float(value) for name, value in zip(names, values, strict=True)}
-    return replace(lens, **changes) if changes else lens  # type: ignore[type-var]
 
 
 class _Undistort(torch.autograd.Function):
@@ -118,7 +155,7 @@ class _Undistort(torch.autograd.Function):
                     changed = values + t * (np.arange(values.size) == k)
                     return with_coefficients(lens, ctx.names, changed).undistort(xy_um, outside="mask")
 
-                step = COEFFICIENT_STEP * max(abs(float(value)), 1.0 if ctx.names[k][0] in "kp" else 0.0) or COEFFICIENT_STEP
+                step = COEFFICIENT_STEP * max(abs(float(value)), _scale(ctx.lens, ctx.names[k]))
                 found.append(float((_differentiate(shifted, step) * weights).sum()))
             of_coefficients = torch.tensor(found, dtype=coefficients.dtype)
         return of_points, of_coefficients, None, None

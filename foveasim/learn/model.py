@@ -15,7 +15,7 @@ from foveasim.errors import ParameterError, type_name
 from foveasim.fields import Grid
 from foveasim.integrate import UndistortedOutlines
 from foveasim.learn._tensors import constant
-from foveasim.learn.distortion import coefficient_names, undistort, with_coefficients
+from foveasim.learn.distortion import coefficient_names, coefficient_values, undistort, with_coefficients
 from foveasim.learn.imaging import VARIABLES as LENS_VARIABLES
 from foveasim.learn.imaging import Imaging, _check_variables
 from foveasim.learn.integral import site_power
@@ -121,7 +121,7 @@ class Model(nn.Module):
             ("filters", filters),
             ("qe", qe),
             ("exposure_s", float(exposure_s)),
-            ("distortion", [getattr(camera.distortion, key) for key in self.distortion_names]),
+            ("distortion", coefficient_values(camera.distortion, self.distortion_names) if camera.distortion else []),
         ):
             if name in self.wrt:
                 setattr(self, name, nn.Parameter(constant(value)))
@@ -223,6 +223,10 @@ class Model(nn.Module):
         if "filters" in self.wrt or "qe" in self.wrt:
             wave_nm = self._scene.wavelength_nm
             curves = (self.filters * self.qe).detach().numpy()
+            if not (np.isfinite(curves).all() and curves.min() >= 0.0 and curves.max() <= 1.0):
+                raise ParameterError(
+                    "filters", "times 'qe' must be from 0 to 1", curves, hint="clamp them after each step of the optimiser"
+                )
             changes["filters"] = FilterSet([_curve(wave_nm, row) for row in curves], sensor.filter_names)
             changes["qe"] = 1.0
         if lens is not None:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from foveasim._core.rings import positions_in_runs
 from foveasim._core.validation import Floats, Ints, read_only
-from foveasim.errors import ParameterError, type_name
+from foveasim.errors import GeometryError, ParameterError, type_name
 from foveasim.integrate import SharedEdges
 from foveasim.layout import Layout, node
 from foveasim.layout._noding import merge_coincident_points
@@ -161,9 +161,15 @@ class Outlines:
         Raises
         ------
         GeometryError
-            When an outline intersects itself; the message specifies the site.
+            When an outline intersects itself or is clockwise; ``.site_ids`` and the message specify the sites.
         """
-        rings = as_array(self.check_points(points)).astype(np.float64)[self.vertex], self.ring_offsets, self.site_offsets
+        invalid = self.invalid_sites(points)
+        if invalid.size:
+            raise GeometryError(
+                f"the outline of site {invalid[0]} must be counter-clockwise without intersections; use Mesh.limit_step",
+                tuple(invalid.tolist()),
+            )
+        rings = as_array(points).astype(np.float64)[self.vertex], self.ring_offsets, self.site_offsets
         steps = [*self.provenance.get("steps", ()), step]
         layout = Layout.from_polygons(rings, **dict(self.columns))
         return layout.with_provenance({**self.provenance, "steps": steps})

@@ -156,15 +156,20 @@ class Readout:
         (..., n_site) tensor, V
             Conversion gain, fixed patterns, response nonlinearity and pedestal.
         """
-        charge_e = self._check("charge_e", charge_e)
+        return self._transfer(self._check("charge_e", charge_e))[0]
+
+    def _transfer(self, charge_e: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the voltages of charges, and the derivatives of the voltages."""
         transfer = self._model(charge_e).transfer
         gain, sense, scale, output = (
             constant(np.broadcast_to(part, self._n_sites)).to(charge_e.dtype)
             for part in (transfer.v_per_e, transfer.sense_v, transfer.scale, transfer.output_v)
         )
         volts = charge_e * gain + sense
-        fraction = torch.clamp(volts / transfer.v_sat_v, 0.0, 1.0)
-        return volts * (1.0 - transfer.nonlinearity_fraction * fraction) * scale + output
+        loss = transfer.nonlinearity_fraction * torch.clamp(volts / transfer.v_sat_v, 0.0, 1.0)
+        within = (volts > 0.0) & (volts < transfer.v_sat_v)
+        slope = gain * scale * (1.0 - torch.where(within, 2.0, 1.0) * loss)
+        return volts * (1.0 - loss) * scale + output, slope
 
     def code(self, charge_e: Tensor, *, adc: Literal["straight_through", "linear"] = "straight_through") -> Tensor:
         """
@@ -210,8 +215,7 @@ class Readout:
         """
         expected_e = self._check("expected_e", expected_e)
         mean_e = _mix(expected_e, self._coupling)
-        mean_v = self.voltage(self._limited(mean_e))
-        (slope,) = torch.autograd.grad(self.voltage(c := mean_e.detach().clone().requires_grad_()).sum(), c)
+        mean_v, slope = self._transfer(self._limited(mean_e))
         deviation = slope.abs() * torch.sqrt(self.variance_e2(expected_e).clamp_min(1e-12))
         levels = constant(self.sensor.adc.transition_levels[1:-1] * self.sensor.v_sat_v).to(mean_v.dtype)
         flat, width = mean_v.reshape(-1), (deviation * math.sqrt(2.0)).reshape(-1)
