@@ -19,6 +19,7 @@ from foveasim.learn.integral import site_power
 from foveasim.learn.mesh import Mesh
 from foveasim.learn.model import Model, capture
 from foveasim.learn.outlines import Outlines
+from foveasim.learn.parametric import generated
 from foveasim.learn.power_cells import PowerCells
 from foveasim.learn.readout import Readout
 
@@ -30,6 +31,7 @@ __all__ = [
     "PowerCells",
     "Readout",
     "capture",
+    "generated",
     "site_power",
     "undistort",
 ]
