@@ -20,6 +20,7 @@ from foveasim.learn.mesh import Mesh
 from foveasim.learn.model import Model, capture
 from foveasim.learn.outlines import Outlines
 from foveasim.learn.parametric import generated
+from foveasim.learn.penalties import barrier
 from foveasim.learn.power_cells import PowerCells
 from foveasim.learn.readout import Readout
 
@@ -30,6 +31,7 @@ __all__ = [
     "Outlines",
     "PowerCells",
     "Readout",
+    "barrier",
     "capture",
     "generated",
     "site_power",
