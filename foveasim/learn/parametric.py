@@ -287,7 +287,7 @@ def _difference_of_topology(layout: Layout, other: Layout) -> str:
 
 
 def _align_rings(xy_um: Floats, layout: Layout) -> Floats:
-    """Return the vertices with rings rotated such that they begin at the same vertex as those of a layout."""
+    """Return the vertices with rings rotated to begin at the same vertex as in a layout."""
     offsets = layout.ring_offsets
     size = np.diff(offsets)
     start, length = np.repeat(offsets[:-1], size), np.repeat(size, size)
@@ -315,7 +315,7 @@ def _is_smooth(xy: Floats, around: Sequence[Any], step: Any, scale: float) -> bo
 
 
 def _common_points(layout: Layout, stencils: Sequence[_Stencil]) -> Ints:
-    """Return the point of each vertex: vertices are one point if they are at the same position for all parameters."""
+    """Return the point of each vertex; vertices at the same position are one if they stay so."""
     xy_um = layout.xy_um
     _, group = merge_coincident_points(xy_um)
     _, first = np.unique(group, return_index=True)

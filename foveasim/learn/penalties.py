@@ -45,7 +45,7 @@ def barrier(
     convex: bool = False,
 ) -> Tensor:
     """
-    Compute a penalty that is zero well within design rules, and grows steeply towards their limits.
+    Compute a penalty that is zero within design rules and grows towards their limits.
 
     Each measured value has a clearance g: zero at the limit, positive within the rule, and relative to the limit. The penalty
     is the sum of ``-weight (1 - u)² ln(u)`` over all clearances with u = g / margin below 1: it begins smoothly (C²) at u = 1,
@@ -187,7 +187,7 @@ class _Shape:
     @cached_property
     def ends(self) -> tuple[Ints, Ints]:
         """
-        Last vertex before, and first vertex after each vertex at another position, (n_vertex,) each.
+        Nearest vertices at other positions before and after each vertex, (n_vertex,) each.
 
         Equal to the adjacent vertices where no edge has zero length.
         """
@@ -210,7 +210,7 @@ class _Shape:
         return self.xy[torch.from_numpy(np.array(vertices))]
 
     def turns(self) -> tuple[Tensor, Tensor]:
-        """Return cross and dot products of the unit edges at each corner; vertices at one position count once."""
+        """Return cross and dot products of the unit edges at each distinct corner."""
         corner = np.flatnonzero(self.is_distinct)
         before, after = self.ends
         here = self.at(corner)
@@ -218,7 +218,7 @@ class _Shape:
         return _cross(into, out), (into * out).sum(dim=1)
 
     def turning_sines(self) -> Tensor:
-        """Return the sine of the turning angle at each corner of the outer rings, negative at reflex ones."""
+        """Return the sine of the turning angle at each corner of outer rings, negative if reflex."""
         is_outer = np.zeros(self.outlines.ring_offsets.size - 1, bool)
         is_outer[self.outlines.site_offsets[:-1]] = True
         of_ring = np.repeat(is_outer, np.diff(self.outlines.ring_offsets))[self.is_distinct]
@@ -263,7 +263,7 @@ class _Shape:
 
     def facing_edges(self, reach_um: float) -> tuple[Tensor, Tensor]:
         """
-        Return distances of vertices from edges that face an edge at the vertex, and their factors.
+        Return distances of vertices from edges that face one of theirs, and factors.
 
         Distances above ``reach_um`` may be missing.
         """
@@ -328,7 +328,7 @@ class _Shape:
         return torch.maximum(found, 1.0 / found)
 
     def _hull_pairs(self) -> tuple[Ints, Ints, Ints, Ints]:
-        """Return edges of convex hulls of sites, each with all vertices of its site, and the number of the edge."""
+        """Return begin, end, vertex and number of hull edges, with all vertices of their sites."""
         first = self.outlines.ring_offsets[self.outlines.site_offsets]
         site = np.repeat(np.arange(self.outlines.n_sites), np.diff(first))
         hulls = shapely.convex_hull(shapely.multipoints(self.xy_um, indices=site))
@@ -369,7 +369,7 @@ def _unit(vectors: Tensor) -> Tensor:
 
 
 def _extremes(values: Floats, group: Ints) -> tuple[Ints, Ints]:
-    """Return the rows of the largest and of the smallest value of each group; groups are contiguous."""
+    """Return the rows of the largest and of the smallest value of each contiguous group."""
     order = np.lexsort((values, group))
     ends = np.flatnonzero(np.diff(group, append=-1))
     starts = np.concatenate(([0], ends[:-1] + 1)) if ends.size else ends

@@ -176,10 +176,11 @@ class PowerCells(nn.Module):
     @torch.no_grad()
     def limit_step(self) -> float:
         """
-        Shorten the last step of an optimiser such that no cell is empty and no centre outside: a line search.
+        Shorten the last step of an optimiser such that all cells are valid: a line search.
 
-        The step is the change since the previous call, or since the object was created. The steps of invalid centres and of
-        their weights are halved until all cells are valid, and cancelled after 8 times; then those of all others.
+        No cell is empty then, and no centre outside the region. The step is the change since the previous call, or since the
+        object was created. The steps of invalid centres and of their weights are halved until all cells are valid, and
+        cancelled after 8 times; then those of all others.
 
         Returns
         -------
@@ -346,7 +347,7 @@ def _as_numbers(name: str, value: Any) -> Floats:
 
 
 def _reflections(region_um: Tensor) -> tuple[Tensor, Tensor]:
-    """Return factors and offsets (N_SIDES + 1, 2) of no reflection and of those across the sides."""
+    """Return factors and offsets (N_SIDES + 1, 2) of the identity and of all reflections."""
     one, zero = torch.ones_like(region_um[0]), torch.zeros_like(region_um[0])
     scale = torch.stack((one, one, -one, one, -one, one, one, -one, one, -one)).reshape(-1, 2)
     x0, y0, x1, y1 = 2.0 * region_um
@@ -362,7 +363,7 @@ def _images(centres_um: Floats, region_um: Floats) -> Floats:
 
 
 def _regular_triangles(points_um: Floats, weights_um2: Floats, n_centres: int, region_um: Floats) -> Ints:
-    """Return the triangles (n_triangle, 3), counter-clockwise, of the regular triangulation with a centre."""
+    """Return the triangles (n_triangle, 3) of the regular triangulation with a centre."""
     from scipy.spatial import ConvexHull, QhullError
 
     offset = points_um - 0.5 * (region_um[:2] + region_um[2:])
