@@ -144,7 +144,7 @@ def public_classes():
     """Yield the public classes that users construct or receive: not exceptions, protocols and abstract classes."""
     for name in MODULES:
         module = import_module(name)
-        for item in (getattr(module, public) for public in module.__all__):
+        for item in (getattr(module, public) for public in module.__all__ if public != "learn"):  # needs PyTorch
             is_class = isinstance(item, type) and not issubclass(item, BaseException)
             if is_class and not inspect.isabstract(item) and not getattr(item, "_is_protocol", False):
                 yield item

@@ -19,6 +19,21 @@ from foveasim.learn.integral import site_power
 from foveasim.learn.mesh import Mesh
 from foveasim.learn.model import Model, capture
 from foveasim.learn.outlines import Outlines
+from foveasim.learn.parametric import generated
+from foveasim.learn.penalties import barrier
+from foveasim.learn.power_cells import PowerCells
 from foveasim.learn.readout import Readout
 
-__all__ = ["Imaging", "Mesh", "Model", "Outlines", "Readout", "capture", "site_power", "undistort"]
+__all__ = [
+    "Imaging",
+    "Mesh",
+    "Model",
+    "Outlines",
+    "PowerCells",
+    "Readout",
+    "barrier",
+    "capture",
+    "generated",
+    "site_power",
+    "undistort",
+]
