@@ -8,7 +8,7 @@ order exist; only the transfer functions of a lens without variables come from t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -103,9 +103,17 @@ class Imaging(nn.Module):
         for name in self.wrt:
             setattr(self, name, nn.Parameter(constant(self._start(name))))
         self._fixed: dict[int, Tensor] = {}
+        self._computed: dict[Any, Any] = {}
 
     def __repr__(self) -> str:
         return f"Imaging({self._optics!r}, variables: {', '.join(self.wrt) or 'none'})"
+
+    def _once(self, name: str, size: float, field_um: tuple[float, float], compute: Callable[[], Any]) -> Any:
+        """Return constants of the aperture, computed once per wavelength or sampling and field position."""
+        key = name, size, field_um
+        if key not in self._computed:
+            self._computed[key] = compute()
+        return self._computed[key]
 
     def _start(self, name: str) -> Any:
         """Return the initial values of a variable."""
@@ -287,7 +295,7 @@ class Imaging(nn.Module):
         self, wave_nm: float, n_across: float, n_lags: int, field_um: tuple[float, float]
     ) -> tuple[Tensor, Tensor]:
         """Return the OTF at integer lags, as :meth:`Aperture.compute_otf`, and the relative transmittance."""
-        samples, at, power = self._aperture.samples(wave_nm, n_across, field_um)
+        samples, at, power = self._once("samples", wave_nm, field_um, lambda: self._aperture.samples(wave_nm, n_across, field_um))
         amplitude, change = torch.from_numpy(samples), torch.ones((), dtype=torch.float64)
         if "pupil" in self.wrt:
             amplitude, change = self._pupil_amplitude(wave_nm, n_across, samples, at, field_um)
@@ -337,8 +345,10 @@ class Imaging(nn.Module):
         for name in self.wrt:
             if name == "pupil":
                 continue
-            modes = constant(self._modes(name, x, y, field_um))
-            change = torch.tensordot(getattr(self, name).reshape(-1) - constant(self._start(name)).reshape(-1), modes, dims=1)
+            # The number of samples differs between wavelengths.
+            modes = self._once(name, at.size, field_um, lambda name=name: constant(self._modes(name, x, y, field_um)))
+            start = self._once(f"start of {name}", 0, (0.0, 0.0), lambda name=name: constant(self._start(name)).reshape(-1))
+            change = torch.tensordot(getattr(self, name).reshape(-1) - start, modes, dims=1)
             total = change if total is None else total + change
         return total
 
