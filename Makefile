@@ -15,7 +15,7 @@ UV := $(LOWEST)/uv/bin/uv
 # PyTorch has a separate environment, since its wheel may install gigabytes of CUDA libraries.
 TORCH_VENV ?= .venv-torch
 
-.PHONY: demo test test-lowest test-torch soak lint bench peers docs clean
+.PHONY: demo test test-lowest test-torch soak lint bench bench-torch peers docs clean
 .NOTPARALLEL:
 
 demo: $(VENV)/.installed
@@ -44,6 +44,10 @@ lint: $(VENV)/.installed-dev
 
 bench: $(VENV)/.installed-dev
 	$(BIN)/python benchmarks/run.py
+
+# Training steps of layouts, against soft masks.
+bench-torch: $(TORCH_VENV)/.installed
+	$(TORCH_VENV)/bin/python benchmarks/gradients.py
 
 # The same work with other libraries.
 peers: $(VENV)/.installed-dev

@@ -26,6 +26,7 @@ import scipy.fft
 import shapely
 from dense import bench_dense
 from exploring import bench_exploring
+from gradients import bench_gradients
 from learning import bench_learning, bench_stored
 from looking import bench_looking
 from report import Report, best_s
@@ -370,7 +371,7 @@ def main() -> int:
     is_quick = parser.parse_args().quick
     shape = (FULL_SHAPE[0] // 4, FULL_SHAPE[1] // 4) if is_quick else FULL_SHAPE
     report = Report(is_judged=not is_quick)
-    for bench in (bench_integrator, bench_optics, bench_distortion, bench_wavelengths, bench_memory):
+    for bench in (bench_integrator, bench_gradients, bench_optics, bench_distortion, bench_wavelengths, bench_memory):
         with console.status(bench.__name__.replace("_", " ")):
             bench(report, shape)
     with console.status("bench dense"):
