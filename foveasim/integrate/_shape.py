@@ -238,8 +238,8 @@ def vertex_gradient(
     Returns
     -------
     gradient : (n_vertex, 2) float64, unit of the weights times that of the map times µm
-        Derivative with respect to ``layout.xy_um``, the sum over all maps. A vertex that several sites share has one row per site;
-        their sum is the derivative for a displacement of all of them.
+        Derivative with respect to ``layout.xy_um``, the sum over all maps. A vertex that several sites share has one
+        row per site; their sum is the derivative for a displacement of all of them.
 
     Raises
     ------
@@ -261,7 +261,8 @@ def vertex_gradient(
 
     Examples
     --------
-    Under uniform irradiance the gradient is that of the area; moving the upper right corner of a square outwards adds half a side:
+    Under uniform irradiance the gradient is that of the area; moving the upper right corner of a square outwards adds
+    half a side:
 
     >>> import foveasim as fs
     >>> square = fs.Layout.from_rectangles([[1.5, 1.5]], size_um=2.0)

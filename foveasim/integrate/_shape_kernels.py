@@ -1,8 +1,10 @@
 """
 Numba kernels for the derivatives of integrals with respect to the vertices of outlines.
 
-Coordinates are in cells of the grid, as in ``_kernels``. An edge from a to b has the points ``a + τ (b - a)``. Its **moments** are
-the integrals of ``(1 - τ) P`` and of ``τ P`` over τ from 0 to 1, where P is the map along the edge: the mean of the cell at first
+Coordinates are in cells of the grid, as in ``_kernels``. An edge from a to b has the points ``a + τ (b - a)``. Its
+**moments** are
+the integrals of ``(1 - τ) P`` and of ``τ P`` over τ from 0 to 1, where P is the map along the edge: the mean of the
+cell at first
 order, with its gradient at second order, and 0 outside the map. On an edge along a cell boundary P is the mean of both sides.
 """
 
@@ -201,7 +203,8 @@ def differentiate_moments(cells, i_map, begin, end, weights, first_edge, last_ed
     """
     Add the gradient of ``sum weights * moments`` to ``out[edge]``: derivatives by a (u, v) and by b (u, v), (n_edge, 2, 2).
 
-    Moments change with the position of the crossings of the edge and cell boundaries, where the map jumps, and at second order with
+    Moments change with the position of the crossings of the edge and cell boundaries, where the map jumps, and at
+    second order with
     the gradient in each cell. They have no derivative where an edge passes through a corner of cells or lies on a boundary.
     """
     n_y, n_x = cells.shape[1], cells.shape[2]

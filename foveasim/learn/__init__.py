@@ -1,7 +1,8 @@
 """
 Gradients with respect to photosites, optics and electronics, for PyTorch.
 
-The functions take and return tensors on the CPU; the kernels below them are those of the simulator. Requires the extra ``learn``.
+The functions take and return tensors on the CPU; the kernels below them are those of the simulator. Requires the extra
+``learn``.
 """
 
 from __future__ import annotations

@@ -27,9 +27,10 @@ STENCIL = ((-2.0, 1.0 / 12.0), (-1.0, -8.0 / 12.0), (1.0, 8.0 / 12.0), (2.0, -1.
 
 
 def coefficient_names(lens: Lens) -> tuple[str, ...]:
-    """Return the names of the dimensionless and polynomial coefficients of a lens model, such as k1, p2 and a[2]."""
-    names = []
-    for field in fields(lens) if is_dataclass(lens) else ():
+    """Return the names of a lens model's coefficients, such as k1, p2 and a[2]."""
+    parameters: Any = lens
+    names: list[str] = []
+    for field in fields(parameters) if is_dataclass(parameters) else ():
         value = getattr(lens, field.name)
         if not field.init or field.name in GEOMETRY:
             continue
@@ -101,8 +102,8 @@ def undistort(lens: Lens, points: Tensor, coefficients: Tensor | None = None, na
 
     Notes
     -----
-    Derivatives are central differences of fourth order of the lens model, which is smooth on the scale of its focal length. Their
-    relative error is about 1e-9.
+    Derivatives are central differences of fourth order of the lens model, which is smooth on the scale of its focal
+    length. Their relative error is about 1e-9.
     """
     if not isinstance(lens, Lens):
         raise ParameterError("lens", f"must be a lens model of foveasim.distortion, got {type_name(lens)}")
@@ -117,7 +118,6 @@ def undistort(lens: Lens, points: Tensor, coefficients: Tensor | None = None, na
         coefficients = torch.tensor(coefficient_values(lens, names), dtype=torch.float64)
     coefficients = check_tensor("coefficients", coefficients, (len(names),), ", one per name")
     return _Undistort.apply(points, coefficients, lens, names)  # type: ignore[no-any-return, no-untyped-call]
-
 
 
 class _Undistort(torch.autograd.Function):
@@ -142,10 +142,11 @@ class _Undistort(torch.autograd.Function):
             step_um = POSITION_STEP * float(np.min(np.asarray(lens.focal_um)))
             columns = []
             for axis in range(2):
-                shift = np.zeros(2)
-                shift[axis] = 1.0
-                change = _differentiate(lambda t, shift=shift: lens.undistort(xy_um + t * shift, outside="mask"), step_um)
-                columns.append((change * weights).sum(axis=1))
+
+                def moved(t: float, axis: int = axis) -> Floats:
+                    return lens.undistort(xy_um + t * np.eye(2)[axis], outside="mask")
+
+                columns.append((_differentiate(moved, step_um) * weights).sum(axis=1))
             of_points = torch.from_numpy(np.stack(columns, axis=1)).to(points.dtype)
         if ctx.needs_input_grad[1]:
             found = []

@@ -1,7 +1,8 @@
 """
 Optics as a differentiable function of the scene, the spectral weights, the aberrations and the pupil.
 
-Maps are those of :meth:`foveasim.Optics.weighted_maps` in float64. The transforms are those of torch, so that derivatives of any
+Maps are those of :meth:`foveasim.Optics.weighted_maps` in float64. The transforms are those of torch, so that
+derivatives of any
 order exist; only the transfer functions of a lens without variables come from the kernels of the simulator.
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -71,7 +73,8 @@ class Imaging(nn.Module):
 
     Notes
     -----
-    Padding, and the sampling of the aperture, are those of the initial lens: start with aberrations of the size that you expect,
+    Padding, and the sampling of the aperture, are those of the initial lens: start with aberrations of the size that
+    you expect,
     or set ``padding_cells``. Variations of a lens whose initial OTF is that of the clear circle use the sampled aperture, whose
     OTF is accurate to 7e-4.
     """
@@ -122,11 +125,15 @@ class Imaging(nn.Module):
             return 0.0
         if name == "zernike":
             if lens.zernike is None:
-                raise ParameterError("wrt", "must not contain 'zernike' without optics.zernike", hint="set Zernike(...)")
+                raise ParameterError(
+                    "wrt", "must not contain 'zernike' without optics.zernike", hint="set Zernike(...)"
+                )
             per_wave = [list(lens.zernike.coefficients_um(float(w)).values()) for w in self._scene.wavelength_nm]
             if np.ptp(per_wave, axis=0).max() > 0.0:
                 raise ParameterError(
-                    "wrt", "must not contain 'zernike' with coefficients that depend on the wavelength", hint="use unit='um'"
+                    "wrt",
+                    "must not contain 'zernike' with coefficients that depend on the wavelength",
+                    hint="use unit='um'",
                 )
             return per_wave[0]
         if name == "seidel":
@@ -159,10 +166,14 @@ class Imaging(nn.Module):
                 found = dict(zip(found, values["zernike"].tolist(), strict=True))
             # r² is sqrt(3) / 6 times the polynomial of defocus, apart from a constant.
             found[2, 0] = found.get((2, 0), 0.0) + float(values.get("defocus", 0.0)) / (2.0 * math.sqrt(3.0))
-            lens = replace(lens, zernike=Zernike(coefficients={_osa(n, m): c for (n, m), c in found.items()}, index="osa"))
+            lens = replace(
+                lens, zernike=Zernike(coefficients={_osa(n, m): c for (n, m), c in found.items()}, index="osa")
+            )
         if "seidel" in values:
             assert lens.seidel is not None
-            lens = replace(lens, seidel=replace(lens.seidel, **dict(zip(SEIDEL_NAMES, values["seidel"].tolist(), strict=True))))
+            lens = replace(
+                lens, seidel=replace(lens.seidel, **dict(zip(SEIDEL_NAMES, values["seidel"].tolist(), strict=True)))
+            )
         if "pupil" in values:
             lens = replace(lens, pupil=PupilImage(values["pupil"][::-1]))
         return lens
@@ -295,7 +306,9 @@ class Imaging(nn.Module):
         self, wave_nm: float, n_across: float, n_lags: int, field_um: tuple[float, float]
     ) -> tuple[Tensor, Tensor]:
         """Return the OTF at integer lags, as :meth:`Aperture.compute_otf`, and the relative transmittance."""
-        samples, at, power = self._once("samples", wave_nm, field_um, lambda: self._aperture.samples(wave_nm, n_across, field_um))
+        samples, at, power = self._once(
+            "samples", wave_nm, field_um, lambda: self._aperture.samples(wave_nm, n_across, field_um)
+        )
         amplitude, change = torch.from_numpy(samples), torch.ones((), dtype=torch.float64)
         if "pupil" in self.wrt:
             amplitude, change = self._pupil_amplitude(wave_nm, n_across, samples, at, field_um)
@@ -346,9 +359,9 @@ class Imaging(nn.Module):
             if name == "pupil":
                 continue
             # The number of samples differs between wavelengths.
-            modes = self._once(name, at.size, field_um, lambda name=name: constant(self._modes(name, x, y, field_um)))
-            start = self._once(f"start of {name}", 0, (0.0, 0.0), lambda name=name: constant(self._start(name)).reshape(-1))
-            change = torch.tensordot(getattr(self, name).reshape(-1) - start, modes, dims=1)
+            modes = self._once(name, at.size, field_um, partial(self._modes, name, x, y, field_um))
+            start = self._once(f"start of {name}", 0, (0.0, 0.0), partial(self._start, name))
+            change = torch.tensordot((getattr(self, name) - constant(start)).reshape(-1), constant(modes), dims=1)
             total = change if total is None else total + change
         return total
 
@@ -372,8 +385,8 @@ class Imaging(nn.Module):
         if n_alias > MAX_DIRECT_ALIASES:
             raise ParameterError(
                 "optics",
-                f"must have map cells of at most {(MAX_DIRECT_ALIASES + 0.5) / self._imaging.f_max_per_um:.3g} µm for gradients of "
-                f"aberrations, got {pitch_um:.3g} µm; set Optics(oversample=...)",
+                f"must have map cells of at most {(MAX_DIRECT_ALIASES + 0.5) / self._imaging.f_max_per_um:.3g} µm "
+                f"for gradients of aberrations, got {pitch_um:.3g} µm; set Optics(oversample=...)",
             )
         k = self._imaging.oversample
         source_cells = float(k) if self._imaging.is_square_source else 0.0

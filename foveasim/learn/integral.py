@@ -1,7 +1,8 @@
 """
 Integrals over sites as differentiable functions of the vertices and the maps.
 
-The operations form a closed set: the derivatives of integrals are moments along edges and the adjoint of the integrator, and the
+The operations form a closed set: the derivatives of integrals are moments along edges and the adjoint of the
+integrator, and the
 derivatives of these are again moments and integrals. All but the third derivatives therefore exist as code.
 """
 
@@ -25,7 +26,8 @@ from foveasim.learn.outlines import Outlines
 
 __all__ = ["site_power"]
 
-#: Number of maps from which overlaps are stored as a matrix, which is faster than one call per map; and its largest number of cells.
+#: Number of maps from which overlaps are stored as a matrix, which is faster than one call per map; and its largest
+#: number of cells.
 MATRIX_MAPS, MATRIX_CELLS = 4, 2**20
 
 
@@ -59,8 +61,8 @@ def site_power(
     Returns
     -------
     power : (..., n_site) tensor, unit of the maps times µm²
-        Exact integrals, with the dtype of the maps. First and second derivatives exist for points and maps; where an edge lies along
-        a cell boundary, the first is the mean of both sides.
+        Exact integrals, with the dtype of the maps. First and second derivatives exist for points and maps; where an
+        edge lies along a cell boundary, the first is the mean of both sides.
 
     Raises
     ------
@@ -121,7 +123,9 @@ class Integral:
             outlines, xy_um = self.outlines, as_array(points).astype(np.float64)
             finite = np.isfinite(xy_um).all(axis=1)
             if not finite.all():
-                raise GeometryError(f"point {int(np.argmin(finite))} must have finite coordinates, got {xy_um[~finite][0]}")
+                raise GeometryError(
+                    f"point {int(np.argmin(finite))} must have finite coordinates, got {xy_um[~finite][0]}"
+                )
             rings = _Rings(xy_um[outlines.vertex], outlines.ring_offsets, outlines.site_offsets)
             self._compiled["integrator"] = Integrator(
                 rings, self.grid, order=self.order, compiled=n_maps > 1, n_threads=self.n_threads
@@ -130,7 +134,11 @@ class Integral:
 
     def _matrix(self, points: Tensor, n_maps: int) -> Any:
         """Return the overlaps as a sparse matrix (n_site, n_cell), or None for few or large maps."""
-        if n_maps < MATRIX_MAPS or n_maps * self.grid.shape[0] * self.grid.shape[1] < 1 or _n_cells(self.grid) > MATRIX_CELLS:
+        if (
+            n_maps < MATRIX_MAPS
+            or n_maps * self.grid.shape[0] * self.grid.shape[1] < 1
+            or _n_cells(self.grid) > MATRIX_CELLS
+        ):
             return None
         if "matrix" not in self._compiled:
             self._compiled["matrix"] = self.integrator(points, n_maps).weights()

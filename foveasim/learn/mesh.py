@@ -30,8 +30,8 @@ class Mesh(nn.Module):
     layout : Layout
         Initial positions. Vertices on an edge of a neighbour are inserted there.
     boundary : {"fixed", "sliding", "free"}
-        Vertices on the boundary of the layout (on edges of a single site) do not move, move along straight parts of the boundary, or
-        move as all others. Fixed and sliding boundaries conserve the area of the layout.
+        Vertices on the boundary of the layout (on edges of a single site) do not move, move along straight parts of the
+        boundary, or move as all others. Fixed and sliding boundaries conserve the area of the layout.
 
     Attributes
     ----------
@@ -72,7 +72,9 @@ class Mesh(nn.Module):
         self.register_buffer("_previous_um", torch.zeros(point.size, dtype=torch.float64), persistent=False)
 
     def __repr__(self) -> str:
-        return f"Mesh({self.outlines.n_sites} sites, {self.n_points} points, {self.displacement_um.numel()} coordinates)"
+        return (
+            f"Mesh({self.outlines.n_sites} sites, {self.n_points} points, {self.displacement_um.numel()} coordinates)"
+        )
 
     @property
     def n_points(self) -> int:
@@ -114,7 +116,8 @@ class Mesh(nn.Module):
         """
         Shorten the last step of an optimiser such that no outline intersects itself: a line search.
 
-        The step is the displacement since the previous call, or since the mesh was created. Only vertices of invalid sites and their
+        The step is the displacement since the previous call, or since the mesh was created. Only vertices of invalid
+        sites and their
         coordinates are affected: their steps are halved until the sites are valid, and cancelled after 8 times.
 
         Returns

@@ -43,8 +43,8 @@ class Model(nn.Module):
         Geometry and spectrum of the scenes; the default of :meth:`forward`.
     wrt : iterable of str
         Variables: ``"vertices"`` of the photosites; ``"zernike"``, ``"seidel"``, ``"defocus"`` and ``"pupil"`` as for
-        :class:`Imaging`; ``"distortion"``, coefficients of the lens model; ``"filters"`` and ``"qe"``, transmissions and quantum
-        efficiency at the wavelengths of the scene; ``"exposure_s"``.
+        :class:`Imaging`; ``"distortion"``, coefficients of the lens model; ``"filters"`` and ``"qe"``, transmissions
+        and quantum efficiency at the wavelengths of the scene; ``"exposure_s"``.
     exposure_s : float, s
     boundary : {"fixed", "sliding", "free"}
         As for :class:`Mesh`.
@@ -105,7 +105,8 @@ class Model(nn.Module):
         self.imaging = Imaging(camera.optics, self._scene, [name for name in self.wrt if name in LENS_VARIABLES])
         self.grid = self._sensor_grid()
         self.order = camera.order(self._scene)
-        self.mesh = Mesh(sensor.layout, boundary).requires_grad_("vertices" in self.wrt)
+        layout: Any = sensor.layout
+        self.mesh = Mesh(layout, boundary).requires_grad_("vertices" in self.wrt)
         self.readout = Readout(sensor)
         wave_nm = self._scene.wavelength_nm
         self.register_buffer("_photons_per_j", constant(1.0 / photon_energy_j(wave_nm)))
@@ -225,13 +226,18 @@ class Model(nn.Module):
             curves = (self.filters * self.qe).detach().numpy()
             if not (np.isfinite(curves).all() and curves.min() >= 0.0 and curves.max() <= 1.0):
                 raise ParameterError(
-                    "filters", "times 'qe' must be from 0 to 1", curves, hint="clamp them after each step of the optimiser"
+                    "filters",
+                    "times 'qe' must be from 0 to 1",
+                    curves,
+                    hint="clamp them after each step of the optimiser",
                 )
             changes["filters"] = FilterSet([_curve(wave_nm, row) for row in curves], sensor.filter_names)
             changes["qe"] = 1.0
         if lens is not None:
             lens = with_coefficients(lens, self.distortion_names, self.distortion.detach().numpy())
-        return Camera(optics=self.imaging.optics(), sensor=replace(sensor, **changes), distortion=lens, order=self.order)
+        return Camera(
+            optics=self.imaging.optics(), sensor=replace(sensor, **changes), distortion=lens, order=self.order
+        )
 
 
 def _curve(wavelength_nm: Any, values: Any) -> Any:

@@ -171,7 +171,8 @@ class Outlines:
             )
         rings = as_array(points).astype(np.float64)[self.vertex], self.ring_offsets, self.site_offsets
         steps = [*self.provenance.get("steps", ()), step]
-        layout = Layout.from_polygons(rings, **dict(self.columns))
+        columns: dict[str, Any] = dict(self.columns)
+        layout = Layout.from_polygons(rings, **columns)
         return layout.with_provenance({**self.provenance, "steps": steps})
 
     def invalid_sites(self, points: Tensor) -> Ints:
@@ -182,7 +183,9 @@ class Outlines:
         """
         points = self.check_points(points)
         xy_um = as_array(points)[self.vertex]
-        rings = shapely.linearrings(xy_um, indices=np.repeat(np.arange(self.ring_offsets.size - 1), np.diff(self.ring_offsets)))
+        rings = shapely.linearrings(
+            xy_um, indices=np.repeat(np.arange(self.ring_offsets.size - 1), np.diff(self.ring_offsets))
+        )
         sites = np.repeat(np.arange(self.n_sites), np.diff(self.site_offsets))
         polygons = shapely.polygons(rings, indices=sites)
         return np.flatnonzero(~shapely.is_valid(polygons) | (as_array(self.area_um2(points)) <= 0.0))

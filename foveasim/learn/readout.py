@@ -24,8 +24,8 @@ class Readout:
     """
     Electronics of a sensor for tensors of shape (..., n_site).
 
-    Fixed patterns are those of the device. Quantities per site that depend on the area, such as a capacitance per µm², remain those of
-    the layout of the sensor.
+    Fixed patterns are those of the device. Quantities per site that depend on the area, such as a capacitance per µm²,
+    remain those of the layout of the sensor.
 
     Parameters
     ----------
@@ -49,7 +49,9 @@ class Readout:
         self._n_sites = sensor.layout.n_sites
         self._response = constant(np.broadcast_to(sensor.response, self._n_sites))
         self._dark = constant(np.broadcast_to(sensor.dark_rate_e_per_s, self._n_sites))
-        self._diffusion, self._coupling, names = [], [], []
+        self._diffusion: list[Tensor] = []
+        self._coupling: list[Tensor] = []
+        names: list[str] = []
         for effect in sensor.chain:
             compile_for: Any = getattr(effect, "compile_for", None)
             if compile_for is not None and effect.stage in ("expected", "charge"):
@@ -59,7 +61,9 @@ class Readout:
                 names.append(effect.name)
             elif effect.stage == "expected":
                 raise ParameterError(
-                    "sensor", f"must have no effect '{effect.name}' on expected charges for gradients", hint="disable it"
+                    "sensor",
+                    f"must have no effect '{effect.name}' on expected charges for gradients",
+                    hint="disable it",
                 )
         self._local = sensor.without(*names) if names else sensor
 

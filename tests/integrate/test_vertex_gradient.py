@@ -44,10 +44,12 @@ def random_layout(seed):
     hole = shapely.Point(0.31, -0.23).buffer(0.4, 2)
     polygons.append(outer.difference(hole) if outer.contains(hole) else outer)
     polygons.append(star(rng, (11.0, 8.0), 6, 4.0))
-    corner = rng.uniform(-2.0, 2.0, (4, 2)) + [[-6.1, -3.3], [0.2, -3.7], [6.3, -2.9], [0.1, 3.1]]
-    for triangle in (corner[[0, 1, 3]], corner[[1, 2, 3]]):
-        polygons.append(shapely.Polygon(triangle))
-    return fs.Layout.from_polygons([p if p.geom_type == "Polygon" else max(p.geoms, key=lambda q: q.area) for p in polygons])
+    corner = rng.uniform(-2.0, 2.0, (4, 2))
+    corner += np.array([[-6.1, -3.3], [0.2, -3.7], [6.3, -2.9], [0.1, 3.1]])
+    polygons.extend(shapely.Polygon(triangle) for triangle in (corner[[0, 1, 3]], corner[[1, 2, 3]]))
+    return fs.Layout.from_polygons(
+        [p if p.geom_type == "Polygon" else max(p.geoms, key=lambda q: q.area) for p in polygons]
+    )
 
 
 def check_against_differences(layout, cells, order, rng, n_checks):
@@ -174,7 +176,9 @@ def test_spread_is_adjoint_of_measure(order):
     operator = EdgeMoments(GRID, begin, end, order, 1)
     cells, weights = rng.random((2, *GRID.shape)), rng.random((2, 200, 2))
 
-    assert (operator.spread(weights) * cells).sum() == pytest.approx((operator.measure(cells) * weights).sum(), rel=1e-12)
+    assert (operator.spread(weights) * cells).sum() == pytest.approx(
+        (operator.measure(cells) * weights).sum(), rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("order", [1, 2])

@@ -18,7 +18,9 @@ from foveasim.optics import LateralColour, PupilImage, Seidel, Zernike
 from foveasim.sensor.effects import Diffusion, InterPixelCapacitance
 
 #: The pictures are small, so that every derivative can be compared.
-pytestmark = pytest.mark.filterwarnings("ignore::foveasim.errors.SamplingWarning", "ignore::foveasim.errors.CoverageWarning")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::foveasim.errors.SamplingWarning", "ignore::foveasim.errors.CoverageWarning"
+)
 RNG = np.random.default_rng(0)
 ZERNIKE = Zernike(coefficients={4: 0.1, 7: 0.15})
 SEIDEL = Seidel(spherical_um=0.2, coma_um=0.2, astigmatism_um=0.1, field_curvature_um=0.05, field_radius_um=20.0)
@@ -137,7 +139,11 @@ def test_defocus_is_found_by_descent():
         ({}, ("seidel",), "without optics.seidel"),
         ({}, ("pupil",), "PupilImage"),
         ({"zernike": Zernike(coefficients={4: 0.1}, unit="waves")}, ("zernike",), "depend on the wavelength"),
-        ({"lateral_colour": LateralColour(wavelength_nm=[450, 650], magnification=[1.0, 1.01])}, (), "lateral chromatic"),
+        (
+            {"lateral_colour": LateralColour(wavelength_nm=[450, 650], magnification=[1.0, 1.01])},
+            (),
+            "lateral chromatic",
+        ),
     ],
 )
 def test_impossible_lens_variables_are_rejected(changes, wrt, message):
@@ -188,7 +194,9 @@ def test_distortion_passes_gradcheck(model, names):
         return learn.undistort(model, points, scaled * unit, names) / 100.0
 
     assert gradcheck(ideal, (points, scaled), eps=1e-5, atol=1e-6, rtol=1e-6)
-    np.testing.assert_allclose(ideal(points, scaled).detach() * 100.0, model.undistort(points.detach().numpy()), rtol=1e-14)
+    np.testing.assert_allclose(
+        ideal(points, scaled).detach() * 100.0, model.undistort(points.detach().numpy()), rtol=1e-14
+    )
 
 
 def test_distortion_derivative_inverts_forward_model():
@@ -235,7 +243,13 @@ def sensor(**changes):
 
 SENSORS = {
     "plain": {},
-    "patterns": {"prnu_fraction": 0.02, "dark_e_per_s": 100.0, "dsnu_fraction": 0.2, "line_fpn_fraction": 0.005, "pixel_fpn_fraction": 0.003},
+    "patterns": {
+        "prnu_fraction": 0.02,
+        "dark_e_per_s": 100.0,
+        "dsnu_fraction": 0.2,
+        "line_fpn_fraction": 0.005,
+        "pixel_fpn_fraction": 0.003,
+    },
     "diffusion": {"crosstalk": Diffusion(spread_um=0.5)},
     "capacitance": {"coupling": InterPixelCapacitance(neighbour_fraction=0.02)},
     "nonlinear": {"nonlinearity_fraction": 0.03, "pedestal_v": 0.05},
@@ -261,7 +275,7 @@ def test_expected_charges_agree_with_sensor(name):
 def test_expected_codes_agree_with_prediction(name):
     device = built(name)
     expected_e = RNG.uniform(500.0, 5000.0, device.layout.n_sites)
-    mean_dn, variance_dn2 = device.predict(expected_e)
+    mean_dn, _ = device.predict(expected_e)
     found = learn.Readout(device).expected_code(torch.from_numpy(expected_e))
 
     np.testing.assert_allclose(found.numpy(), mean_dn, rtol=0, atol=0.02 if name == "companding" else 0.005)
@@ -275,7 +289,12 @@ def test_readout_passes_gradcheck(name):
 
     def results(charge, exposure):
         expected_e = readout.expected_e(charge, exposure)
-        return expected_e, readout.voltage(expected_e) * 1e3, readout.expected_code(expected_e), readout.variance_e2(expected_e)
+        return (
+            expected_e,
+            readout.voltage(expected_e) * 1e3,
+            readout.expected_code(expected_e),
+            readout.variance_e2(expected_e),
+        )
 
     assert gradcheck(results, (charge, exposure), atol=1e-5, rtol=1e-6, eps=1e-6)
 
@@ -423,7 +442,9 @@ def test_out_of_range_filters_are_reported():
 
 def test_learned_camera_reproduces_expected_charges():
     light = scene(pitch_um=40.0, n_basis=3)
-    model = learn.Model(camera("aberrated"), light, ("vertices", "zernike", "filters"), exposure_s=0.01, boundary="sliding")
+    model = learn.Model(
+        camera("aberrated"), light, ("vertices", "zernike", "filters"), exposure_s=0.01, boundary="sliding"
+    )
     optimiser = torch.optim.Adam(model.parameters(), lr=0.02)
     for _ in range(3):
         optimiser.zero_grad()

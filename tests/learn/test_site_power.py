@@ -167,7 +167,9 @@ def test_moved_mesh_covers_same_area(boundary):
     layout = fs.layout.grid(6, 5, 1.0)
     mesh = learn.Mesh(layout, boundary)
     with torch.no_grad():
-        mesh.displacement_um += 0.2 * torch.randn(mesh.displacement_um.shape, generator=torch.Generator().manual_seed(2))
+        mesh.displacement_um += 0.2 * torch.randn(
+            mesh.displacement_um.shape, generator=torch.Generator().manual_seed(2)
+        )
     report = mesh.layout().check(fs.DesignRules(max_overlap_um2=1e-9, max_gap_um2=1e-9))
 
     assert float(mesh.area_um2().detach().sum()) == pytest.approx(30.0, rel=1e-12)
