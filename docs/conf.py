@@ -56,6 +56,8 @@ nitpicky = False
 REPOSITORY = Path(__file__).parent.parent
 #: Pages of the gallery; pictures are generated again when a script is newer.
 GALLERY = Path(__file__).parent / "gallery"
+#: Text instead of pictures where a script could not run.
+WITHOUT_TORCH = "This site was built without PyTorch, which the script requires; its pictures are therefore missing."
 
 #: Modules of the reference, with descriptions; their ``__all__`` lists the public names.
 MODULES = {
@@ -130,14 +132,15 @@ def write_gallery(_app: Sphinx, _config: Config) -> None:
     for script in gallery_scripts(REPOSITORY):
         folder = GALLERY / script.stem
         done = folder / "done"
-        if not done.exists() or done.stat().st_mtime < script.stat().st_mtime:
+        is_skipped = "import torch" in script.read_text() and not find_spec("torch")
+        if not is_skipped and (not done.exists() or done.stat().st_mtime < script.stat().st_mtime):
             folder.mkdir(parents=True, exist_ok=True)
             runpy.run_path(str(script))["main"](folder)
             done.touch()
         title = script.stem[3:].replace("_", " ").capitalize()
         description = (ast.get_docstring(ast.parse(script.read_text())) or "").replace("``", "`")
         pictures = [f"{script.stem}/{picture.name}" for picture in sorted(folder.glob("*.png"))]
-        shown = "\n\n".join(f"![{picture}]({picture})" for picture in pictures)
+        shown = "\n\n".join(f"![{picture}]({picture})" for picture in pictures) or WITHOUT_TORCH
         source = (
             f"```{{literalinclude}} ../../gallery/{script.name}\n:language: python\n:start-at: from __future__\n```"
         )

@@ -34,12 +34,18 @@ EXTRAS = {
     "view": {"notebook", "view"},
 }
 #: Extras of what is not part of the package.
-FOLDERS = {"tests": {"dev"}, "benchmarks": {"dev", "learn", "peers"}, "gallery": {"dev"}, "docs": {"docs", "learn"}}
+FOLDERS = {
+    "tests": {"dev"},
+    "benchmarks": {"dev", "learn", "peers"},
+    "gallery": {"dev", "learn"},
+    "docs": {"docs", "learn"},
+}
 #: What may name PyTorch or gdsfactory: the only tests that run where they are installed, and the check whether they are.
 OPTIONAL_TESTS = {
     ROOT / "tests" / "explore" / "test_dataset_torch.py",
     ROOT / "tests" / "layout" / "files" / "test_chip_files_gdsfactory.py",
     ROOT / "tests" / "conftest.py",
+    *(ROOT / "tests" / "learn").rglob("*.py"),
 }
 #: Distributions that no line imports.
 INDIRECT = {

@@ -15,11 +15,18 @@ import foveasim.view
 
 GALLERY = Path(foveasim.__file__).parents[1] / "gallery"
 SCRIPTS = sorted(GALLERY.glob("*.py"))
+#: Scripts with their requirements; -k torch selects those that require PyTorch.
+PARAMETERS = [
+    pytest.param(path, marks=pytest.mark.needs("torch"), id=f"{path.stem}-torch")
+    if "import torch" in path.read_text()
+    else pytest.param(path, id=path.stem)
+    for path in SCRIPTS
+]
 #: Width at which the site shows a figure: 736 pixels of 1/96 inch; and the smallest text there.
 SHOWN_INCHES, MIN_TEXT_PT = 736 / 96, 9.0
 
 
-@pytest.mark.parametrize("path", SCRIPTS, ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", PARAMETERS)
 def test_script_runs_and_writes_its_pictures(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "out").mkdir()
@@ -38,7 +45,7 @@ def test_script_runs_and_writes_its_pictures(path, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, spec.name, module)  # dataclasses look their modules up
     spec.loader.exec_module(module)
 
-    module.main(tmp_path / "out")
+    module.main(tmp_path / "out", **getattr(module, "QUICK", {}))
 
     assert small == []
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
