@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import pkgutil
 import runpy
 import shutil
 import sys
@@ -59,6 +60,8 @@ GALLERY = Path(__file__).parent / "gallery"
 #: Text instead of pictures where a script could not run.
 WITHOUT_TORCH = "This site was built without PyTorch, which the script requires; its pictures are therefore missing."
 
+#: Description of the module that only a build with PyTorch documents.
+LEARN = "Gradients with respect to photosites, optics and electronics, for PyTorch."
 #: Modules of the reference, with descriptions; their ``__all__`` lists the public names.
 MODULES = {
     "foveasim": "The main classes, from scenes to captures: `import foveasim as fs`. The other modules are its attributes.",
@@ -79,6 +82,7 @@ MODULES = {
     "foveasim.view": "Plots, 3D rendering, solids, and interactive pages.",
     "foveasim.explore": "Sweeps, optimisation studies and datasets.",
     "foveasim.config": "Settings files in YAML.",
+    **({"foveasim.learn": LEARN} if find_spec("torch") else {}),
     "foveasim.errors": "Exceptions and warnings.",
     "foveasim.units": "Unit conversions.",
 }
@@ -88,11 +92,17 @@ REFERENCE = Path(__file__).parent / "reference"
 def public_names() -> dict[str, list[str]]:
     """List the public names of every module, which have a page each."""
     modules = {name: importlib.import_module(name) for name in MODULES}
+    parts = {
+        name: {m.name for m in pkgutil.iter_modules(getattr(module, "__path__", []))}
+        for name, module in modules.items()
+    }
     public = {}
     for name, module in modules.items():
         # Names that a package imports from its subpackages are listed there.
         hidden = {"__version__"}.union(*(other.__all__ for at, other in modules.items() if at.startswith(f"{name}.")))
-        public[name] = [n for n in module.__all__ if n not in hidden and not inspect.ismodule(getattr(module, n))]
+        # Modules are not imported for this: foveasim.learn needs PyTorch.
+        names = [n for n in module.__all__ if n not in hidden | parts[name]]
+        public[name] = [n for n in names if not inspect.ismodule(getattr(module, n))]
     return public
 
 

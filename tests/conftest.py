@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import signal
 import sys
@@ -12,6 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from reference.kernels import kernel_modules
 
 # Bytecode is stored next to the sources, as is the machine code of kernels, even where the environment disables it: the tests start
 # hundreds of processes, and each would compile the package.
@@ -37,8 +37,6 @@ def torch_is_missing():
 
 
 MISSING = {"renderer": renderer_is_missing, "chromium": chromium_is_missing, "torch": torch_is_missing}
-PACKAGE = Path(__file__).parents[1] / "foveasim"
-KERNELS = re.compile(r"^from foveasim\._core\.jit import njit$", re.MULTILINE)
 
 
 #: Files with slow tests that share no fixture: each of their tests may run in any process, after all other files, so that the
@@ -49,13 +47,6 @@ INDEPENDENT = {
     "test_cli_explore.py",
     "test_principal_point.py",
 }
-
-
-def kernel_modules():
-    """Yield the names of the modules that compile kernels on import."""
-    for path in sorted(PACKAGE.rglob("*.py")):
-        if KERNELS.search(path.read_text()):
-            yield ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
 
 
 def pytest_configure(config):

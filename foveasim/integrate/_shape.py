@@ -166,7 +166,7 @@ class EdgeMoments:
         return out
 
     def spread(self, weights: Floats) -> Floats:
-        """Return the adjoint of :meth:`measure`: maps (n_map, n_y, n_x) for weights (n_map, n_edge, 2)."""
+        """Return maps (n_map, n_y, n_x): the adjoint of :meth:`measure` for its weights."""
         from foveasim.integrate import _shape_kernels
 
         cells = np.zeros((weights.shape[0], *self.grid.shape))
@@ -179,7 +179,7 @@ class EdgeMoments:
 
     def differentiate(self, cells: NDArray[np.floating[Any]], weights: Floats) -> tuple[Floats, Floats]:
         """
-        Return the gradients of ``sum weights * moments`` with respect to both ends of the edges.
+        Return the gradients of ``sum weights * moments`` by both ends of the edges.
 
         Parameters
         ----------
@@ -292,7 +292,7 @@ def vertex_gradient(
 
 
 def _contract(xy_um: Floats, edges: SharedEdges, moments: Floats, site_weights: Floats) -> Floats:
-    """Return the gradient (n_vertex, 2) from moments (n_map, n_edge, 2) and weights (n_map, n_site)."""
+    """Return the gradient (n_vertex, 2) from moments of edges and weights of sites."""
     if moments.shape[0] == 1:
         of_vertex = moments[0][edges.edge] * site_weights[0][edges.site, np.newaxis]
     else:

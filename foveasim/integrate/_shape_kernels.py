@@ -45,7 +45,7 @@ def _clip(start, step, size, first, last):
 
 @njit(inline="always")
 def _first_cell(start, step, t, size, side):
-    """Return the cell that a line enters at τ = t along one axis; ``side`` is 1 for the cell below a boundary."""
+    """Return the cell that a line enters at τ = t; ``side`` 1 is below a boundary."""
     position = start + t * step
     cell = int(np.floor(position))
     if (step < 0.0 or (step == 0.0 and side == 1)) and cell == position:
@@ -139,7 +139,7 @@ def measure_moments(cells, i_map, begin, end, first_edge, last_edge, order, out)
 
 @njit(types.void(_floats3, _count, _points, _points, _count, _out3))
 def spread_moments(weights, i_map, begin, end, order, cells):
-    """Add the adjoint of :func:`measure_moments`, for weights (n_map, n_edge, 2), to one of the maps."""
+    """Add the adjoint of :func:`measure_moments` for its weights to one of the maps."""
     n_y, n_x = cells.shape[1], cells.shape[2]
     for edge in range(begin.shape[0]):
         ua, va, ub, vb = begin[edge, 0], begin[edge, 1], end[edge, 0], end[edge, 1]
@@ -201,7 +201,7 @@ def _value(cells, i_map, row, column, u, v, order):
 )
 def differentiate_moments(cells, i_map, begin, end, weights, first_edge, last_edge, order, out):
     """
-    Add the gradient of ``sum weights * moments`` to ``out[edge]``: derivatives by a (u, v) and by b (u, v), (n_edge, 2, 2).
+    Add the gradient of ``sum weights * moments`` by both ends to ``out``, (n_edge, 2, 2).
 
     Moments change with the position of the crossings of the edge and cell boundaries, where the map jumps, and at
     second order with

@@ -1,5 +1,5 @@
 """
-Optics as a differentiable function of the scene, the spectral weights, the aberrations and the pupil.
+Optics as a differentiable function of scene, spectral weights and aberrations.
 
 Maps are those of :meth:`foveasim.Optics.weighted_maps` in float64. The transforms are those of torch, so that
 derivatives of any
@@ -111,9 +111,9 @@ class Imaging(nn.Module):
     def __repr__(self) -> str:
         return f"Imaging({self._optics!r}, variables: {', '.join(self.wrt) or 'none'})"
 
-    def _once(self, name: str, size: float, field_um: tuple[float, float], compute: Callable[[], Any]) -> Any:
-        """Return constants of the aperture, computed once per wavelength or sampling and field position."""
-        key = name, size, field_um
+    def _once(self, name: str, sampling: float, field_um: tuple[float, float], compute: Callable[[], Any]) -> Any:
+        """Return constants of the aperture, which are computed once."""
+        key = name, sampling, field_um
         if key not in self._computed:
             self._computed[key] = compute()
         return self._computed[key]
@@ -221,7 +221,7 @@ class Imaging(nn.Module):
         return maps.reshape(*basis.shape[:-3], *maps.shape[1:])
 
     def _extents(self) -> list[tuple[tuple[float, float], PatchExtent, PatchExtent]]:
-        """Return field position and extents of all isoplanatic patches; of the padded picture for a single one."""
+        """Return field position and extents of all patches, or of the padded picture."""
         if self._n_patches != (1, 1):
             return self._imaging.patches(self._n_patches)
 
@@ -289,7 +289,7 @@ class Imaging(nn.Module):
         return self._fixed[number], torch.ones(n_waves, dtype=torch.float64)
 
     def _otf_tables(self, field_um: tuple[float, float]) -> tuple[Tensor, Tensor, float]:
-        """Return OTF tables (n_wavelength, n, n) over (f_y, f_x), relative transmittances, and steps per frequency."""
+        """Return OTF tables over (f_y, f_x), relative transmittances, and their step."""
         waves_nm = self._scene.wavelength_nm
         near_um = um_from_nm(waves_nm) * self._optics.working_f_number(self._scene.distance_m)
         n_across = [self._aperture.n_across(float(w), field_um) for w in waves_nm]
@@ -305,7 +305,7 @@ class Imaging(nn.Module):
     def _otf(
         self, wave_nm: float, n_across: float, n_lags: int, field_um: tuple[float, float]
     ) -> tuple[Tensor, Tensor]:
-        """Return the OTF at integer lags, as :meth:`Aperture.compute_otf`, and the relative transmittance."""
+        """Return the OTF at integer lags, and the relative transmittance."""
         samples, at, power = self._once(
             "samples", wave_nm, field_um, lambda: self._aperture.samples(wave_nm, n_across, field_um)
         )
@@ -332,7 +332,7 @@ class Imaging(nn.Module):
     def _pupil_amplitude(
         self, wave_nm: float, n_across: float, samples: Any, at: Floats, field_um: tuple[float, float]
     ) -> tuple[Tensor, Tensor]:
-        """Return the amplitude of the current pupil, and its transmittance relative to that of the initial one."""
+        """Return amplitude and relative transmittance of the current pupil."""
         n = samples.shape[0]
         # The shape of the aperture without the picture: the unit disc.
         n_fine = self._aperture._sample_pupil(wave_nm, max(_pupil_points(), n)).shape[0]  # noqa: SLF001
@@ -352,7 +352,7 @@ class Imaging(nn.Module):
         return (mean @ fine @ mean.T) * phase, transmittance / self._aperture.transmittance(wave_nm)
 
     def _path_change_um(self, at: Floats, field_um: tuple[float, float]) -> Tensor | None:
-        """Return the path difference relative to the initial lens at samples of the aperture, (n, n)."""
+        """Return the change of the path difference at samples of the aperture, (n, n)."""
         x, y = at[np.newaxis, :], at[:, np.newaxis]
         total: Tensor | None = None
         for name in self.wrt:
@@ -389,27 +389,27 @@ class Imaging(nn.Module):
                 f"for gradients of aberrations, got {pitch_um:.3g} µm; set Optics(oversample=...)",
             )
         k = self._imaging.oversample
-        source_cells = float(k) if self._imaging.is_square_source else 0.0
+        n_source_cells = float(k) if self._imaging.is_square_source else 0.0
         cycles_x, cycles_y = self._cycles(n_y, n_x)
         total = torch.zeros(tables.shape[0], cycles_y.size, cycles_x.size, dtype=tables.dtype)
         for a_y in range(-n_alias, n_alias + 1):
-            y, gain_y = _alias(cycles_y, a_y, source_cells, is_alternating=k % 2 == 0)
+            y, gain_y = _alias(cycles_y, a_y, n_source_cells, is_alternating=k % 2 == 0)
             for a_x in range(-n_alias, n_alias + 1):
-                x, gain_x = _alias(cycles_x, a_x, source_cells, is_alternating=k % 2 == 0)
+                x, gain_x = _alias(cycles_x, a_x, n_source_cells, is_alternating=k % 2 == 0)
                 gain = torch.from_numpy(gain_y[:, np.newaxis] * gain_x)
                 total = total + gain * _bilinear(tables, y * per_step / pitch_um, x * per_step / pitch_um)
         return total
 
 
-def _alias(cycles: Floats, alias: int, source_cells: float, *, is_alternating: bool) -> tuple[Floats, Floats]:
+def _alias(cycles: Floats, alias: int, n_source_cells: float, *, is_alternating: bool) -> tuple[Floats, Floats]:
     """Return the frequencies of an alias in cycles per cell, and its gains."""
     shifted = cycles + alias
     sign = -1.0 if is_alternating and alias % 2 else 1.0
-    return shifted, sign * np.sinc(shifted) * np.sinc(source_cells * shifted)
+    return shifted, sign * np.sinc(shifted) * np.sinc(n_source_cells * shifted)
 
 
 def _bilinear(tables: Tensor, v: Floats, u: Floats) -> Tensor:
-    """Interpolate tables (n, 2 h + 1, 2 h + 1) at steps (n_v,) and (n_u,) from the centre; 0 outside."""
+    """Interpolate tables at steps (n_v,) and (n_u,) from the centre; 0 outside."""
     half = tables.shape[1] // 2
 
     def split(at: Floats) -> tuple[Tensor, Tensor, Tensor]:

@@ -109,7 +109,7 @@ class _Rings:
 
 @dataclass(eq=False)
 class Integral:
-    """Integrals over sites at one position of their points, with the operators of the derivatives."""
+    """Integrals over sites at one position of their points, with their derivatives."""
 
     outlines: Outlines
     grid: Grid
@@ -176,7 +176,7 @@ class Integral:
         return torch.from_numpy(vertex[edges.begin]), torch.from_numpy(vertex[edges.end])
 
     def edge_weights(self, weights: Tensor) -> Tensor:
-        """Return the weight (n_map, n_edge) of the integral along each edge: left minus right site."""
+        """Return the weight (n_map, n_edge) of each edge: left minus right site."""
         edges = self.outlines.edges
         sign = torch.from_numpy(np.where(edges.is_reversed, -1.0, 1.0)).to(weights.dtype)
         site, edge = torch.from_numpy(np.array(edges.site)), torch.from_numpy(np.array(edges.edge))

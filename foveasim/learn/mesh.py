@@ -107,14 +107,14 @@ class Mesh(nn.Module):
             return self.outlines.layout(self(), "moved vertices of a mesh")
 
     def invalid_sites(self) -> Ints:
-        """Return the indices of sites whose outlines intersect themselves or are not counter-clockwise."""
+        """Return the indices of sites with self-intersecting or clockwise outlines."""
         with torch.no_grad():
             return self.outlines.invalid_sites(self())
 
     @torch.no_grad()
     def limit_step(self) -> float:
         """
-        Shorten the last step of an optimiser such that no outline intersects itself: a line search.
+        Shorten the last step of an optimiser such that all outlines stay valid.
 
         The step is the displacement since the previous call, or since the mesh was created. Only vertices of invalid
         sites and their
@@ -177,7 +177,7 @@ def _degrees_of_freedom(outlines: Outlines, points_um: Floats, boundary: str) ->
 
 
 def _straight_points(points_um: Floats, begin: Ints, end: Ints) -> tuple[Ints, Floats]:
-    """Return the boundary points between two collinear edges, and the direction of the boundary there."""
+    """Return the boundary points between collinear edges, and their directions."""
     n = points_um.shape[0]
     is_simple = (np.bincount(begin, minlength=n) == 1) & (np.bincount(end, minlength=n) == 1)
     step = points_um[end] - points_um[begin]

@@ -1,4 +1,4 @@
-"""A camera as a PyTorch module: from a scene to expected charges, with gradients to its parts."""
+"""Camera as a PyTorch module, from scenes to expected charges."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Outlines of sites as points that several sites share: positions are variables, the topology is fixed."""
+"""Outlines of sites between shared points, whose positions are variables."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class Outlines:
         return torch.from_numpy(np.array(self.edges.site))
 
     def vertices(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the positions of all vertices, and of the next one in the ring of each, (n_vertex, 2) tensors."""
+        """Return the positions of all vertices, and of the next one in each ring."""
         begin = points[self._vertex]
         return begin, begin[self._after]
 
@@ -177,7 +177,7 @@ class Outlines:
 
     def invalid_sites(self, points: Tensor) -> Ints:
         """
-        Return the indices of sites whose outlines intersect themselves or are not counter-clockwise.
+        Return the indices of sites with self-intersecting or clockwise outlines.
 
         If the outlines of a tiling with a fixed boundary are all valid, no two sites overlap.
         """

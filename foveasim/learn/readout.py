@@ -1,4 +1,4 @@
-"""Sensor chain as differentiable functions: expected charges, noise by reparameterisation, voltages, codes."""
+"""Sensor chain as differentiable functions of charges."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ class Readout:
 
     def expected_code(self, expected_e: Tensor) -> Tensor:
         """
-        Compute the mean code over temporal noise, as :meth:`Sensor.predict`, with Gaussian charges.
+        Compute the mean code over temporal noise, as :meth:`Sensor.predict`.
 
         Parameters
         ----------

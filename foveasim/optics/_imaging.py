@@ -258,7 +258,7 @@ class Imaging:
         return np.zeros((last - first, transform.map_shape[1]), self.real)
 
     def patches(self, n_patches: tuple[int, int]) -> list[tuple[tuple[float, float], PatchExtent, PatchExtent]]:
-        """Return the centre (x, y) in µm, and the extents along y and x, of each isoplanatic patch."""
+        """Return the centre (x, y) in µm, and the extents along y and x, of each patch."""
         node_y_um, node_x_um = _nodes_um(self.grid, n_patches)
         row_sources, column_sources = self.sources()
         all_rows = _patch_extents(self, row_sources, self.grid.shape[0], node_y_um)

@@ -531,7 +531,7 @@ class Optics(PointImages):
         self, scene: SceneLike, weights: Floats, *, grid: Grid | None = None, n_threads: int = 1
     ) -> tuple[Imaging, Callable[[tuple[float, float]], Tables]]:
         """
-        Return the inputs of the computation of maps, for other implementations of the transforms.
+        Return the inputs of the computation of maps, for other transforms.
 
         Parameters
         ----------

@@ -369,7 +369,7 @@ class Sensor:
 
     def filter_transmission(self, wavelength_nm: Floats) -> Floats:
         """
-        Compute the transmission of each filter without quantum efficiency, (n_filter, n_wavelength).
+        Compute filter transmissions without quantum efficiency, (n_filter, n_wavelength).
 
         Raises
         ------

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numba
 import pytest
-from conftest import kernel_modules
+from reference.kernels import kernel_modules
 
 import foveasim
 from foveasim._core.jit import njit
