@@ -49,7 +49,7 @@ DIMENSIONLESS = {
 #: Names in private functions, in cells, pitches or steps as their docstrings specify.
 INTERNAL = {
     "at", "axes", "blur_cells", "blur_lambda_n", "bound", "bounds", "corners", "curve", "cycles", "diagonal", "edge", "extent", "fraction", "fractions", "from_step", "function", "gradient", "half_width", "height", "inl", "mean", "measure",
-    "n_across", "moments", "new_radius", "off_diagonal", "per_step", "pixel", "plane", "points", "quantiles", "r2", "radius", "right", "rows", "s_x", "s_y", "scale", "screen", "side", "slope", "spread", "start", "tables_at",
+    "n_across", "n_source_cells", "moments", "new_radius", "off_diagonal", "per_step", "pixel", "plane", "points", "quantiles", "r2", "radius", "right", "rows", "s_x", "s_y", "scale", "screen", "side", "slope", "spread", "start", "tables_at",
     "tangent2_x", "tangent2_y", "threshold", "to_step", "transform", "u", "upper", "v", "x", "x2", "xy", "y", "y2", "sampling", "step", "t",
 }  # fmt: skip
 FLOATING = re.compile(r"\b(float|Floats|PerSite)\b")

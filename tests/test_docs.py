@@ -51,7 +51,7 @@ PAGES = [page for page in [ROOT / "README.md", *pages_of(ROOT)] if BLOCK.search(
 
 
 #: Requirements of the code of pages.
-NEEDS = {"viewing": [pytest.mark.needs("renderer")]}
+NEEDS = {"learning": [pytest.mark.needs("torch")], "viewing": [pytest.mark.needs("renderer")]}
 
 
 @pytest.fixture

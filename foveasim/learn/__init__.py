@@ -7,6 +7,7 @@ The functions take and return tensors on the CPU; the kernels below them are tho
 
 from __future__ import annotations
 
+from foveasim._core.calls import check_public_calls
 from foveasim._core.extras import needs
 
 try:
@@ -38,3 +39,5 @@ __all__ = [
     "site_power",
     "undistort",
 ]
+
+check_public_calls(__name__)

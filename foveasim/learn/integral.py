@@ -75,6 +75,9 @@ def site_power(
     -----
     The derivative by a vertex is an integral of the map along the two edges at it: :func:`foveasim.integrate.vertex_gradient`.
 
+    With constant cells, minima of a smooth loss can lie on the boundaries of cells, where the first derivative jumps;
+    the second order is smoother.
+
     Examples
     --------
     >>> import foveasim as fs
