@@ -57,7 +57,7 @@ NEEDS = {"learning": [pytest.mark.needs("torch")], "viewing": [pytest.mark.needs
 @pytest.fixture
 def _registries_stay():
     """Restore the registries after a page."""
-    registries = [found for found in gc.get_objects() if isinstance(found, Registry)]
+    registries = [found for found in gc.get_objects() if issubclass(type(found), Registry)]
     before = [dict(registry) for registry in registries]
     yield
     for registry, objects in zip(registries, before, strict=True):
