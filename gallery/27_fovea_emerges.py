@@ -30,7 +30,7 @@ from torch.nn import functional
 
 import foveasim as fs
 from foveasim.errors import FileError
-from foveasim.learn import Mesh, site_power
+from foveasim.learn import Mesh, barrier, site_power
 from foveasim.view import plot_layout, save_figure
 
 #: Pictures of 64 x 64 cells of 1 µm on 10 x 10 photosites.
@@ -44,8 +44,9 @@ BITMAP_HEIGHT, HEIGHT_UM = 20.0, (12.0, 16.0)
 POSITION_SD_UM = 3.0
 #: Photoelectrons per area at the irradiance of a digit, irradiance of the background, and read noise per site.
 ELECTRONS_PER_UM2, BACKGROUND, READ_NOISE_E = 100.0, 0.1, 5.0
-#: Weight of the barrier that keeps corners convex, and learning rates of the layout and of the network.
-BARRIER, LAYOUT_RATE_UM, NETWORK_RATE = 3e-4, 0.2, 5e-3
+#: Design rules, weight of their barrier, and learning rates of the layout and of the network.
+RULES = fs.DesignRules(min_size_um=2.0, min_width_um=0.8, min_angle_deg=15.0)
+BARRIER, LAYOUT_RATE_UM, NETWORK_RATE = 0.03, 0.2, 5e-3
 N_BATCH, N_HIDDEN, N_TEST = 128, 128, 4096
 #: Linear magnification in the centre of the warp by hand, and exponent of its growth: the best of seven pairs.
 WARP_CENTRE, WARP_EXPONENT = 0.4, 4.0
@@ -186,14 +187,6 @@ class Reader(nn.Module):
         area_um2 = self.mesh.outlines.area_um2(points).float()
         return self.network(4.0 * electrons / (ELECTRONS_PER_UM2 * area_um2) - 1.0)  # type: ignore[no-any-return]
 
-    def barrier(self) -> Tensor:
-        """Return minus the sum of logarithms of corner areas, so that sites remain convex."""
-        begin, end = self.mesh.outlines.vertices(self.mesh())
-        after = end - begin
-        before = after[torch.from_numpy(np.array(self.mesh.outlines.edges.before))]
-        area = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
-        return -(area / PITCH_UM**2).clamp(min=1e-6).log().sum()
-
 
 def train(reader: Reader, digits: Digits, is_central: bool, n_steps: int, seed: int) -> list[fs.Layout]:
     """Train network and layout; return layouts at the start, after an eighth, at the end."""
@@ -211,7 +204,7 @@ def train(reader: Reader, digits: Digits, is_central: bool, n_steps: int, seed: 
         pictures, labels = digits.pictures(N_BATCH, is_central, random)
         loss = functional.cross_entropy(reader(pictures, random), labels)
         if is_learned:
-            loss = loss + BARRIER * reader.barrier()
+            loss = loss + barrier(reader.mesh(), reader.mesh, RULES, weight=BARRIER, convex=True)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -326,6 +319,9 @@ def main(out_dir: Path, *, n_steps: int = 2000, seeds: Sequence[int] = (1,), mni
 
     # %% Checks, weaker after short training.
     is_short = n_steps < 1000
+    violations = [report for all_layouts in snapshots.values() for layouts in all_layouts
+                  for report in [layouts[-1].check(RULES)] if not report.ok]  # fmt: skip
+    assert violations == []
     for layouts in snapshots["learned"]:
         assert n_central(layouts[-1]) > (1.1 if is_short else 2.0) * n_central(uniform)
     for layouts in snapshots["learned, anywhere"]:

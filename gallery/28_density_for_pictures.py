@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import foveasim as fs
-from foveasim.learn import Mesh, Outlines, site_power
+from foveasim.learn import Mesh, Outlines, barrier, site_power
 from foveasim.view import plot_layout, save_figure
 
 #: Cells of 1 µm per photosite of the uniform grid, along one axis.
@@ -39,6 +39,8 @@ ELECTRONS_PER_UM2, READ_NOISE_E = 100.0, 5.0
 EXPONENTS = (0.25, 0.5, 0.75, 1.0)
 #: Initial displacements, and learning rate of the coordinates.
 JITTER_UM, LEARNING_RATE_UM = 0.3, 0.05
+#: Design rules of learned layouts, and weight of their barrier relative to the error.
+RULES, BARRIER = fs.DesignRules(min_size_um=1.5, min_width_um=0.8, min_angle_deg=20.0), 1e-5
 #: Arguments of a short version.
 QUICK = {"n_cells": 32, "n_steps": 40}
 
@@ -129,7 +131,8 @@ def learn(pictures: Pictures, layout: fs.Layout, n_steps: int, seed: int) -> fs.
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, n_steps)
     for _ in range(n_steps):
         optimiser.zero_grad()
-        pictures.error(mesh(), mesh.outlines).backward()
+        points = mesh()
+        (pictures.error(points, mesh.outlines) + barrier(points, mesh, RULES, weight=BARRIER, convex=True)).backward()
         optimiser.step()
         mesh.limit_step()
         schedule.step()
@@ -241,6 +244,7 @@ def main(out_dir: Path, *, n_cells: int = 48, n_steps: int = 200, seeds: Sequenc
     difference = pictures.reconstruct(layouts[best][0], weights, seed=1) - weights
     measured = ((difference @ pictures.products) * difference).sum(dim=1).mean() / pictures.products.trace()
     assert abs(100.0 * float(measured) / errors[best][0] - 1.0) < 0.03
+    assert all(one.check(RULES).ok for name, some in layouts.items() if name.startswith("learned") for one in some)
     learned = errors["learned from the best density"]
     assert (learned < errors[best]).all()
     assert (errors["learned from the grid"] < uniform).all()
