@@ -187,3 +187,15 @@ def test_bounds_of_a_distribution_agree():
     assert {
         name: found for name, found in bounds.items() if len(found) > 1 or ("" in found and PROJECT["name"] not in name)
     } == {}
+
+
+def test_missing_pytorch_gives_install_command(monkeypatch):
+    for name in [name for name in sys.modules if name == "torch" or name.startswith("foveasim.learn")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.delattr(foveasim, "learn", raising=False)
+
+    with pytest.raises(
+        ImportError, match=r"^foveasim.learn needs torch; install it with: pip install 'foveasim\[learn\]'$"
+    ):
+        _ = foveasim.learn
