@@ -193,7 +193,7 @@ def test_missing_pytorch_gives_install_command(monkeypatch):
     for name in [name for name in sys.modules if name == "torch" or name.startswith("foveasim.learn")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "torch", None)
-    monkeypatch.delattr(foveasim, "learn", raising=False)
+    monkeypatch.delitem(vars(foveasim), "learn", raising=False)
 
     with pytest.raises(
         ImportError, match=r"^foveasim.learn needs torch; install it with: pip install 'foveasim\[learn\]'$"
