@@ -192,7 +192,7 @@ class Imaging(nn.Module):
         Returns
         -------
         maps : (..., n_output, k n_y, k n_x) float64 tensor
-            With ``optics.oversample`` k; cell means, bottom row first.
+            Sums over the basis images, with ``optics.oversample`` k; cell means, bottom row first.
         """
         n_waves = self._scene.wavelength_nm.size
         if weights is None:

@@ -54,7 +54,8 @@ def site_power(
     grid : Grid
         Grid of the maps.
     order : {1, 2}
-        Order of integration, as for :class:`foveasim.Integrator`.
+        Order of integration, as for :class:`foveasim.Integrator`. A :class:`foveasim.Camera` selects 2 for fine cells, and
+        :class:`Model` uses the order of its camera.
     n_threads : int, optional
         Number of threads, by default all cores. Results are bit-identical for any number.
 

@@ -17,6 +17,8 @@ __all__ = ["Mesh"]
 
 #: Turning angle (rad) up to which a vertex of the boundary is not a corner.
 STRAIGHT_RAD = 1e-6
+#: Edges below this length are points.
+MIN_EDGE_UM = 1e-9
 #: Number of times that a displacement is halved before it is cancelled.
 MAX_HALVINGS = 8
 
@@ -181,7 +183,7 @@ def _straight_points(points_um: Floats, begin: Ints, end: Ints) -> tuple[Ints, F
     n = points_um.shape[0]
     is_simple = (np.bincount(begin, minlength=n) == 1) & (np.bincount(end, minlength=n) == 1)
     step = points_um[end] - points_um[begin]
-    unit = step / np.hypot(*step.T)[:, np.newaxis]
+    unit = step / np.maximum(np.hypot(*step.T), MIN_EDGE_UM)[:, np.newaxis]
     leaving, arriving = np.zeros((n, 2)), np.zeros((n, 2))
     leaving[begin], arriving[end] = unit, unit
     turn = arriving[:, 0] * leaving[:, 1] - arriving[:, 1] * leaving[:, 0]
