@@ -29,6 +29,7 @@ EXTRAS = {
     "maps": {"maps"},
     "modes": {"video"},
     "scene": {"maps"},
+    "studio": {"studio"},
     "tiles": {"video"},
     "video": {"video"},
     "view": {"notebook", "view"},
