@@ -268,7 +268,8 @@ def studio(
         Path | None, typer.Option("--out", "-o", help="Directory for saved files; without it none are written.")
     ] = None,
     host: Annotated[
-        str, typer.Option("--host", help="Address to serve at; others than 127.0.0.1 are accessible from other computers.")
+        str,
+        typer.Option("--host", help="Address to serve at; others than 127.0.0.1 are accessible from other computers."),
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", help="Port; 0 for any free one.")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open a browser.")] = True,

@@ -6,15 +6,16 @@ import copy
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
 from foveasim._core.validation import UNIT_SUFFIXES
 from foveasim.config import bundled_layouts, schema
 from foveasim.sensor.limits import LIMITS
+from foveasim.studio._templates import INITIAL, PER_AREA, WITHOUT_MOSAIC, templates
 
-__all__ = ["controls_of", "value_at"]
+__all__ = ["chosen_value", "controls_of", "structure_of", "value_at"]
 
 #: Ranges of sliders by parameter: lowest and highest value; logarithmic if the lowest is positive and far below the highest.
 RANGES: dict[str, tuple[float, float]] = {
@@ -55,15 +56,17 @@ RANGES: dict[str, tuple[float, float]] = {
 LOG_RATIO = 50.0
 #: Range of a slider around a value without a known range.
 BELOW, ABOVE = 0.25, 4.0
-#: Initial values of required parameters, where an alternative is chosen.
-INITIAL: dict[str, Any] = {
-    "bits": 10, "centre_nm": 550.0, "diameter_um": 5.0, "distance_m": 1.0, "field_of_view_deg": 40.0, "focal_length_mm": 8.0, "fwhm_nm": 100.0, "n_columns": 120, "n_fovea": 20, "n_rho": 76,
-    "n_rings": 64, "n_rows": 120, "n_sectors": 128, "n_sites": 5000, "n_theta": 128, "n_x": 120, "n_y": 120, "peak_radiance_w_m2_sr_nm": 0.02, "picture": "skimage:astronaut",
-    "pitch_um": 5.0, "r_max_um": 500.0, "r_min_um": 20.0, "radiance_w_m2_sr_nm": 0.02, "side_um": [256.0, 512.0], "size_um": [500.0, 500.0], "wavelength_nm": 550.0,
-    "frames_per_s": 30.0, "width_um": 0.2, "space_um": 0.2, "importance": "skimage:astronaut", "n_across": 600, "unit_um": 6.45, "fit": "cover",
-}  # fmt: skip
+#: Parameters with a list of valid numbers.
+ENUMERATED = ("integration_order",)
 #: Keys that select an alternative of a section.
 TAGS = ("kind", "generator")
+#: Scenes whose single band requires a width.
+ONE_BAND = (
+    "bars", "checkerboard", "colour_chart", "flat", "grey_scale", "letter_f", "picture", "point_grid", "point_sources",
+    "siemens_star", "sine", "slanted_edge", "zone_plate",
+)  # fmt: skip
+#: Required parameters that are files without a bundled one.
+FROM_FILES = {"path", "file"}
 #: Depth of nested sections.
 MAX_DEPTH = 6
 
@@ -103,6 +106,45 @@ def value_at(settings: Any, key: str) -> Any:
             return None
         settings = settings[name]
     return settings
+
+
+def structure_of(settings: Any, key: str = "") -> Any:
+    """Return what determines the list of controls: names, kinds and strings of settings, without numbers."""
+    if isinstance(settings, Mapping):
+        return {name: structure_of(value, name) for name, value in settings.items()}
+    if isinstance(settings, bool) or key in ENUMERATED:
+        return settings
+    return type(settings).__name__ if isinstance(settings, int | float | list) else settings
+
+
+def chosen_value(
+    key: str, value: Any, shown: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], start: Mapping[str, Any]
+) -> Any:
+    """
+    Return the value of an alternative for the current settings.
+
+    The list on the page may be older than the settings: parameters that alternatives share have their current values.
+
+    Parameters
+    ----------
+    key : str
+    value : plain data
+        One of the choices of the page, or any other value, which is returned.
+    shown : sequence of controls
+        The controls of the page.
+    settings, start : mapping
+        As for :func:`controls_of`.
+    """
+    labels = [c["label"] for each in _choices(shown, key) for c in each["choices"] if c["value"] == value]
+    if not labels or not isinstance(value, dict):
+        return value
+    new = [c["value"] for each in _choices(controls_of(settings, start), key) for c in each["choices"]
+           if c["label"] == labels[0]]  # fmt: skip
+    return copy.deepcopy(new[0]) if new else value
+
+
+def _choices(controls: Sequence[Mapping[str, Any]], key: str) -> list[Mapping[str, Any]]:
+    return [control for control in controls if control["key"] == key and control["kind"] == "choice"]
 
 
 @lru_cache(maxsize=1)
@@ -235,11 +277,18 @@ def _label(option: dict[str, Any]) -> str:
         return {"PerArea": "per µm²"}.get(option.get("title", ""), option.get("title", "section"))
     if "const" in option:
         return str(option["const"])
-    return {"array": "list", "string": "name", "number": "number", "integer": "number"}.get(option.get("type", ""), "value")
+    return {"array": "list", "string": "name", "number": "number", "integer": "number"}.get(
+        option.get("type", ""), "value"
+    )
 
 
 def _alternatives(
-    root: dict[str, Any], key: str, options: list[dict[str, Any]], value: Any, is_optional: bool, start: Mapping[str, Any]
+    root: dict[str, Any],
+    key: str,
+    options: list[dict[str, Any]],
+    value: Any,
+    is_optional: bool,
+    start: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Return the choices among sections and values of a parameter, each with its initial value."""
     choices: list[dict[str, Any]] = []
@@ -252,18 +301,22 @@ def _alternatives(
     default = None
     for option in options:
         is_selected = selected is None and _is_of(option, value)
+        if not is_selected and (option.get("type") == "array" or set(option.get("required", ())) & FROM_FILES):
+            continue  # lists of values per site, and files, which are uploaded
         if option.get("type") == "object" and "properties" in option:
             if value is not None and is_selected:
                 initial = value
             else:
                 initial = started if _matches(option, started) else _initial(root, option, value)
+                if option.get("title") == "PerArea" and not _matches(option, started):
+                    initial = {"per_um2": PER_AREA.get(name, 1.0)}
         else:
             initial = _initial_value(name, option, value)
         if is_selected:
             selected = len(choices)
         choices.append({"label": _label(option), "value": copy.deepcopy(initial)})
     if key == "layout":
-        choices += [{"label": f"bundled: {name.replace('_', ' ')}", "value": name} for name in bundled_layouts()]
+        choices += [{"label": f"bundled: {each.replace('_', ' ')}", "value": each} for each in bundled_layouts()]
     return {"choices": choices, "selected": selected, "default": default}
 
 
@@ -287,30 +340,37 @@ def _is_of(option: dict[str, Any], value: Any) -> bool:
 
 
 def _initial(root: dict[str, Any], option: dict[str, Any], value: Any) -> dict[str, Any]:
-    """Return a section with the required parameters, and those that the current value has too."""
+    """Return a valid section: its template, and the parameters that the current value has too."""
     found: dict[str, Any] = {}
     tag = _tag(option)
     if tag is not None:
         found[tag[0]] = tag[1]
+    template = templates(option.get("title", ""))
     old = value if isinstance(value, Mapping) else {}
     for name, node in option["properties"].items():
+        options = list(_options(root, node))
         if name in found:
             continue
         if name == "parameters":
-            found[name] = _initial(root, _resolved(root, node), old.get(name))
-            continue
-        inner = list(_options(root, node))
-        if name in old and any(_is_of(each, old[name]) for each in inner):
+            found[name] = _initial(root, options[0], None)
+        elif name in template:
+            found[name] = copy.deepcopy(template[name])
+        elif name in old and any(_is_of(each, old[name]) for each in options):
             found[name] = copy.deepcopy(old[name])
         elif name in option.get("required", ()) or name == "fit":
-            found[name] = _initial_value(name, inner[0], None, root)
+            found[name] = _initial_value(name, options[0], None)
     # Framings of a scene exclude each other.
     if "fit" in found and any(found.get(name) is not None for name in ("pitch_um", "field_of_view_deg")):
         del found["fit"]
+    wavelength_nm = found.get("wavelength_nm", INITIAL["wavelength_nm"])
+    if found.get("kind") in ONE_BAND and not (isinstance(wavelength_nm, list) and len(wavelength_nm) > 1):
+        found.setdefault("band_width_nm", INITIAL["band_width_nm"])
+    if found.get("generator") in WITHOUT_MOSAIC:
+        found.pop("mosaic", None)
     return found
 
 
-def _initial_value(name: str, option: dict[str, Any], value: Any, root: dict[str, Any] | None = None) -> Any:
+def _initial_value(name: str, option: dict[str, Any], value: Any) -> Any:
     """Return a valid value of an alternative."""
     if _is_of(option, value):
         return value
@@ -319,11 +379,11 @@ def _initial_value(name: str, option: dict[str, Any], value: Any, root: dict[str
     if "enum" in option:
         return option["enum"][0]
     if name in INITIAL and _is_of(option, INITIAL[name]):
-        return INITIAL[name]
+        return copy.deepcopy(INITIAL[name])
     limits = LIMITS.get(name)
     match option.get("type"):
         case "object" if "properties" in option:
-            return _initial(root or _schema(), option, None)
+            return _initial(_schema(), option, None)
         case "object":
             return {}
         case "array":
@@ -340,15 +400,13 @@ def _initial_value(name: str, option: dict[str, Any], value: Any, root: dict[str
             return 1.0 if limits is None else min(max(1.0, limits.low), limits.high)
 
 
-def _simple(
-    name: str, options: list[dict[str, Any]], value: Any, default: Any, started: Any
-) -> dict[str, Any]:
+def _simple(name: str, options: list[dict[str, Any]], value: Any, default: Any, started: Any) -> dict[str, Any]:
     """Return the kind, range and choices of a control without a section."""
     shown = value if value is not None else default
     option = next((each for each in options if _is_of(each, shown)), options[0] if options else {})
     enum = option.get("enum")
     if enum is not None or (len(options) == 1 and "const" in option):
-        values = [each for each in (enum or [option["const"]])]
+        values = enum or [option["const"]]
         names = [{"label": "none" if each is None else str(each).replace("_", " "), "value": each} for each in values]
         return {"kind": "choice", "choices": names, "selected": values.index(shown) if shown in values else None}
     match option.get("type"):

@@ -90,4 +90,6 @@ class Engine:
             finally:
                 found = cache.finish_point()
         messages = dict.fromkeys([*found, *(" ".join(str(warning.message).split()) for warning in caught)])
-        return Simulated(dict(settings), shot, capture, photo_e_per_s, images, list(messages), time.perf_counter() - start_s)
+        return Simulated(
+            dict(settings), shot, capture, photo_e_per_s, images, list(messages), time.perf_counter() - start_s
+        )

@@ -22,8 +22,10 @@ from foveasim.errors import FileError, ParameterError, printable
 
 __all__ = ["Files", "apply_preset", "file_name", "presets", "start_settings"]
 
-#: Longest name of an uploaded file.
-MAX_NAME_LENGTH = 80
+#: Longest name and extension of an uploaded file.
+MAX_NAME_LENGTH, MAX_EXTENSION_LENGTH = 80, 8
+#: Characters that names of stored files do not contain.
+UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 
 
 def start_settings(shot: str | Path | None) -> tuple[dict[str, Any], str]:
@@ -44,7 +46,9 @@ def start_settings(shot: str | Path | None) -> tuple[dict[str, Any], str]:
 
 def presets() -> list[dict[str, str]]:
     """Return the bundled shots and layouts by name."""
-    shots = [{"name": f"shot:{path.stem}", "label": path.stem.replace("_", " "), "kind": "shot"} for path in demo_settings()]
+    shots = [
+        {"name": f"shot:{path.stem}", "label": path.stem.replace("_", " "), "kind": "shot"} for path in demo_settings()
+    ]
     layouts = [
         {"name": f"layout:{name}", "label": name.replace("_", " "), "kind": "layout"} for name in bundled_layouts()
     ]
@@ -189,6 +193,7 @@ class Files:
 def file_name(name: str) -> str:
     """Return a safe name for an uploaded file, with its extension."""
     stem, dot, extension = Path(name.replace("\\", "/")).name.rpartition(".")
-    stem, extension = (re.sub(r"[^\w-]+", "_", part, flags=re.ASCII).strip("_") for part in (stem or extension, extension if dot else ""))
-    short = (stem or "file")[: MAX_NAME_LENGTH - len(extension[:8]) - 1]
-    return f"{short}.{extension[:8].lower()}" if dot and extension else short
+    stem, extension = (UNSAFE.sub("_", part).strip("_") for part in ((stem, extension) if dot else (extension, "")))
+    extension = extension[:MAX_EXTENSION_LENGTH].lower()
+    short = (stem or "file")[:MAX_NAME_LENGTH]
+    return f"{short}.{extension}" if extension else short

@@ -83,6 +83,6 @@ class History:
     def copy(self) -> History:
         """Return an independent history with the same states, which are not copied."""
         other = History({})
-        other._past, other._future = self._past, self._future  # noqa: SLF001 -- lists are replaced, not edited
-        other._present, other._draft = self._present, self._draft  # noqa: SLF001
+        other._past, other._future = self._past, self._future
+        other._present, other._draft = self._present, self._draft
         return other

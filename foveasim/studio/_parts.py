@@ -19,9 +19,9 @@ from foveasim._core.short_repr import short_repr
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PowerMap
 from foveasim.metrics import polygon_mtf
-from foveasim.studio._engine import Simulated
 from foveasim.scene import Scene
 from foveasim.sensor import noise_budget
+from foveasim.studio._engine import Simulated
 from foveasim.units import per_mm_from_per_um, photon_energy_j
 from foveasim.view.site_colours import encode_light
 from foveasim.view.web._content import describe_sites, outlines_of, rules_of
@@ -149,9 +149,7 @@ def mtf(result: Simulated) -> PartData:
     chosen = {"smallest site": order[0], "median site": order[order.size // 2], "largest site": order[-1]}
     last_per_mm = float(per_mm_from_per_um(1.0 / np.sqrt(layout.area_um2[order[0]])))
     frequency_per_mm = np.linspace(0.0, last_per_mm, N_FREQUENCIES)
-    values = {
-        name: polygon_mtf(layout[np.array([site])], frequency_per_mm)[0] for name, site in chosen.items()
-    }
+    values = {name: polygon_mtf(layout[np.array([site])], frequency_per_mm)[0] for name, site in chosen.items()}
     if isinstance(scene, Scene):
         wavelength_nm = float(np.median(scene.wavelength_nm))
         lens = result.shot.camera.optics.mtf(frequency_per_mm, wavelength_nm=wavelength_nm, distance_m=scene.distance_m)
@@ -189,7 +187,7 @@ def scene(result: Simulated) -> PartData:
     return about, arrays
 
 
-@part("Design rules", lambda result: (result.capture.layout, result.settings["layout"]))
+@part("Design rules", lambda result: (result.capture.layout, result.shot.rules))
 def rules(result: Simulated) -> PartData:
     """Return the results of the design-rule check."""
     if result.shot.rules is None:
@@ -224,11 +222,11 @@ def summary_of(result: Simulated) -> dict[str, Any]:
     return found
 
 
-def _curves(
-    curves: list[dict[str, Any]], x: list[NDArray[Any]], y: list[NDArray[Any]]
-) -> PartData:
+def _curves(curves: list[dict[str, Any]], x: list[NDArray[Any]], y: list[NDArray[Any]]) -> PartData:
     """Return curves with their arrays."""
-    arrays = {f"{axis}-{k}": np.asarray(v, np.float32) for axis, each in (("x", x), ("y", y)) for k, v in enumerate(each)}
+    arrays = {
+        f"{axis}-{k}": np.asarray(v, np.float32) for axis, each in (("x", x), ("y", y)) for k, v in enumerate(each)
+    }
     return {"curves": curves}, arrays
 
 

@@ -146,7 +146,13 @@ class Studio:
                 await socket.close(TOO_MANY, "too many sessions")
                 return
             outgoing = _Outbox(asyncio.get_running_loop())
-            hello = {"kind": "hello", "session": session.name, "version": __version__, "is_new": is_new, "presets": presets()}
+            hello = {
+                "kind": "hello",
+                "session": session.name,
+                "version": __version__,
+                "is_new": is_new,
+                "presets": presets(),
+            }
             await socket.send_text(json.dumps({**hello, **session.hello()}))
             sender = asyncio.create_task(outgoing.send_to(socket))
             session.attach(outgoing.put)
@@ -182,7 +188,9 @@ class Studio:
         if isinstance(session, Response):
             return session
         limit = min(MAX_FILE_BYTES, MAX_SESSION_BYTES - session.n_uploaded_bytes)
-        message = f"files may have at most {MAX_FILE_BYTES >> 20} MiB, and those of a session {MAX_SESSION_BYTES >> 20} MiB"
+        message = (
+            f"files may have at most {MAX_FILE_BYTES >> 20} MiB, and those of a session {MAX_SESSION_BYTES >> 20} MiB"
+        )
         length = request.headers.get("content-length", "0")
         if not length.isdecimal() or int(length) > limit:
             return _error(message, 413)

@@ -20,12 +20,13 @@ import yaml
 from foveasim._io.atomic import atomic_write
 from foveasim.config import check_settings, put_setting
 from foveasim.errors import FoveasimError, ParameterError, SimulationError, printable
-from foveasim.studio._controls import controls_of, value_at
+from foveasim.studio._controls import chosen_value, controls_of, structure_of, value_at
 from foveasim.studio._engine import Engine, Simulated
 from foveasim.studio._files import Files, apply_preset, file_name, with_layout
 from foveasim.studio._history import History
 from foveasim.studio._messages import encode_part, from_json, to_json
 from foveasim.studio._parts import PARTS, summary_of
+from foveasim.studio._templates import WITHOUT_MOSAIC
 
 __all__ = ["Session", "Start", "settings_yaml"]
 
@@ -90,7 +91,8 @@ class Session:
         self._last_id: Any = None
         self._sent: dict[str, tuple[Any, ...]] = {}
         self._sent_version: dict[str, int] = {}
-        self._sent_controls = ""
+        self._structure: Any = None
+        self._controls: list[dict[str, Any]] = []
         self._frozen: dict[str, Any] | None = None
         self._errors: dict[str, str] = {}
         self._listeners: set[Listener] = set()
@@ -242,7 +244,10 @@ class Session:
                 if key == "layout" and isinstance(value, str):
                     settings = apply_preset(f"layout:{value}", settings)
                 else:
+                    value = chosen_value(key, value, self._controls, settings, self.start.settings)
                     put_setting(None, settings, key, value)
+                if key == "layout":
+                    _match_filters(settings)
             case "reset":
                 settings = _reset(settings, self.start.settings, _key(message))
             case "delete":
@@ -292,7 +297,7 @@ class Session:
             raise ParameterError("message", "must be a JSON object")
         match message.get("do"):
             case "refresh":
-                self._sent, self._sent_version, self._sent_controls = {}, {}, ""
+                self._sent, self._sent_version, self._structure = {}, {}, None
                 if self.result is None:
                     self._send({"kind": "busy"})
                     try:
@@ -361,10 +366,10 @@ class Session:
 
     def _send_state(self) -> None:
         settings, result = self.history.settings, self.result
-        controls = json.dumps(to_json(controls_of(settings, self.start.settings)), allow_nan=False)
-        if controls != self._sent_controls:
-            self._sent_controls = controls
-            self._send_text(f'{{"kind":"controls","controls":{controls}}}')
+        structure = structure_of(settings)
+        if structure != self._structure:
+            self._structure, self._controls = structure, controls_of(settings, self.start.settings)
+            self._send({"kind": "controls", "controls": self._controls})
         self._send({
             "kind": "state",
             "id": self._last_id,
@@ -398,7 +403,9 @@ class Session:
                 message: bytes | None = encode_part(name, self._version, *part.make(result))
             except Exception as error:  # noqa: BLE001 -- one view fails, the others are shown
                 message = None
-                self._send({"kind": "error", "id": self._last_id, "part": name, "text": f"{part.label}: {_line(error)}"})
+                self._send(
+                    {"kind": "error", "id": self._last_id, "part": name, "text": f"{part.label}: {_line(error)}"}
+                )
             self._sent[name], self._sent_version[name] = depends, self._version
             if message is not None:
                 self._broadcast(message)
@@ -429,8 +436,14 @@ def settings_yaml(settings: Mapping[str, Any]) -> str:
 
 def to_plain(value: Any) -> Any:
     """Return plain data without objects that are used twice, which YAML would write as anchors."""
-    return copy.deepcopy(value) if not isinstance(value, dict | list) else (
-        {name: to_plain(item) for name, item in value.items()} if isinstance(value, dict) else [to_plain(i) for i in value]
+    return (
+        copy.deepcopy(value)
+        if not isinstance(value, dict | list)
+        else (
+            {name: to_plain(item) for name, item in value.items()}
+            if isinstance(value, dict)
+            else [to_plain(i) for i in value]
+        )
     )
 
 
@@ -501,6 +514,17 @@ def _changed(settings: Any, start: Any, key: str = "") -> list[str]:
             for found in _changed(settings.get(name), start.get(name), f"{key}.{name}" if key else name)
         ]
     return [] if settings == start else [key]
+
+
+def _match_filters(settings: dict[str, Any]) -> None:
+    """Remove colour filters from settings whose layout cannot have a mosaic; add a mosaic to others."""
+    layout, sensor = settings.get("layout"), settings.get("sensor")
+    if not isinstance(layout, dict) or not isinstance(sensor, dict) or sensor.get("filters") is None:
+        return
+    if layout.get("generator") in WITHOUT_MOSAIC:
+        sensor.pop("filters")
+    elif "generator" in layout and layout.get("mosaic") is None:
+        layout["mosaic"] = ["RG", "GB"]
 
 
 def _with_copies(value: Any, uploads: Path, out: Path) -> Any:
