@@ -71,7 +71,7 @@ def run_studio(
         _require(module)
     from foveasim.config import check_settings
     from foveasim.studio._files import start_settings
-    from foveasim.studio._server import Studio, host_names, serve
+    from foveasim.studio._server import UNSPECIFIED, Studio, host_names, serve
     from foveasim.studio._session import Start
 
     port = check_count("port", port, at_least=0, at_most=2**16 - 1)
@@ -95,7 +95,7 @@ def run_studio(
     with listener:
         found = int(listener.getsockname()[1])
         studio = Studio(start, hosts=host_names(host, found))
-        shown = "127.0.0.1" if host in {"0.0.0.0", "::"} else f"[{host}]" if ":" in host else host  # noqa: S104
+        shown = "127.0.0.1" if host in UNSPECIFIED else f"[{host}]" if ":" in host else host
         address = f"http://{shown}:{found}/#{studio.token}"
 
         def ready() -> None:

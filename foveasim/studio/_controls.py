@@ -187,7 +187,9 @@ def _controls(
         if selected is None and value is None and not isinstance(default, dict):
             value = default
         if selected is None and others and value is not None:
-            yield {**control, **_simple(name, others, value, default, value_at(start, key))}
+            simple = _simple(name, others, value, default, value_at(start, key))
+            if simple["kind"] != "choice":  # names are alternatives of the control above
+                yield {**control, **simple}
     if selected is None and len(sections) == 1 and len(options) == 1 and not control["is_optional"]:
         selected = sections[0]
     if selected is None or depth == MAX_DEPTH:

@@ -12,10 +12,13 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats
 from foveasim.capture import Capture
 from foveasim.config import Shot
+from foveasim.errors import GeometryError
 from foveasim.explore.worker_cache import ShotRunner
 
 __all__ = ["Engine", "Simulated"]
 
+#: Largest number of photosites that are shown.
+MAX_SITES = 2_000_000
 #: Size limit of the arrays in the cache of a session.
 MAX_BYTES = 1 << 29
 
@@ -85,6 +88,10 @@ class Engine:
             warnings.simplefilter("always")
             try:
                 shot, capture = self._runner.simulate_capture(settings)
+                if not 0 < capture.layout.n_sites <= MAX_SITES:
+                    raise GeometryError(
+                        f"the studio shows layouts of 1 to {MAX_SITES:,} photosites, got {capture.layout.n_sites:,}"
+                    )
                 photo_e_per_s = self._runner.photoelectrons_per_s(shot, settings)
                 images = self._runner.images(shot, settings)
             finally:

@@ -24,11 +24,12 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from foveasim import __version__
-from foveasim.errors import FoveasimError, printable
+from foveasim.errors import FoveasimError, ParameterError, SimulationError, printable
+from foveasim.layout import write_layout
 from foveasim.studio._files import file_name, presets
 from foveasim.studio._session import Session, Start
 
-__all__ = ["Studio", "serve"]
+__all__ = ["UNSPECIFIED", "Studio", "host_names", "serve"]
 
 #: Largest uploaded file, and all files of a session.
 MAX_FILE_BYTES, MAX_SESSION_BYTES = 64 << 20, 512 << 20
@@ -38,11 +39,16 @@ MAX_MESSAGE_BYTES = 1 << 20
 IDLE_S, MAX_SESSIONS = 1800.0, 8
 #: Time limit for the first message of a connection, and for closing all connections.
 HELLO_S = 10.0
+#: Simultaneous connections; further ones receive 503.
+MAX_CONNECTIONS = 128
 #: Largest number of messages that wait for a slow connection.
 MAX_OUTGOING = 1000
 #: Close code for a wrong token.
 WRONG_TOKEN = 4403
 TOO_MANY = 4429
+#: Addresses that stand for all addresses of this computer.
+UNSPECIFIED = ("0.0.0.0", "::")  # noqa: S104 -- compared, not bound
+HTTP_PORT = 80
 TYPES = {
     ".html": "text/html; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
@@ -115,6 +121,12 @@ class Studio:
         for name, session in list(self.sessions.items()):
             if session.is_idle and now_s - session.last_used_s > idle_s:
                 self.sessions.pop(name).close()
+
+    async def free_idle_sessions(self) -> None:
+        """Close sessions without a page, from time to time, until cancelled."""
+        while True:
+            await asyncio.sleep(IDLE_S / 10.0)
+            self.free_idle()
 
     # -- pages ------------------------------------------------------------------------------------------------------
 
@@ -316,9 +328,6 @@ def _package_file(package: str, directory: str, name: str) -> Response:
 
 def _exported(session: Session, what: str) -> tuple[bytes, str]:
     """Return the content and the name of a file of the current state."""
-    from foveasim.errors import ParameterError, SimulationError
-    from foveasim.layout import write_layout
-
     stem = file_name(session.start.name)
     if what in ("yaml", "python"):
         return session.text(what).encode(), f"{stem}.{'yaml' if what == 'yaml' else 'py'}"
@@ -338,8 +347,17 @@ def _exported(session: Session, what: str) -> tuple[bytes, str]:
 
 def host_names(host: str, port: int) -> set[str]:
     """Return the accepted values of the header ``Host``."""
-    names = {"127.0.0.1", "localhost", "[::1]", f"[{host}]" if ":" in host else host}
-    return {f"{name}:{port}".lower() for name in names} | (names if port == 80 else set())
+    names = {"127.0.0.1", "localhost", "[::1]", _in_address(host)}
+    if host in UNSPECIFIED:
+        names.add(socket.gethostname())
+        with contextlib.suppress(OSError):
+            names |= {_in_address(str(found[4][0])) for found in socket.getaddrinfo(socket.gethostname(), None)}
+    return {f"{name}:{port}".lower() for name in names} | (names if port == HTTP_PORT else set())
+
+
+def _in_address(host: str) -> str:
+    """Return a host as in a URL."""
+    return f"[{host}]" if ":" in host else host
 
 
 def serve(studio: Studio, listener: socket.socket, announce: Callable[[], None]) -> None:
@@ -359,7 +377,12 @@ def serve(studio: Studio, listener: socket.socket, announce: Callable[[], None])
     class Server(uvicorn.Server):
         async def startup(self, sockets: list[socket.socket] | None = None) -> None:
             await super().startup(sockets=sockets)
+            self.idle = asyncio.create_task(studio.free_idle_sessions())
             announce()
+
+        async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+            self.idle.cancel()
+            await super().shutdown(sockets=sockets)
 
     config = uvicorn.Config(
         studio.app,
@@ -369,6 +392,7 @@ def serve(studio: Studio, listener: socket.socket, announce: Callable[[], None])
         ws="websockets-sansio",
         ws_max_size=MAX_MESSAGE_BYTES,
         timeout_graceful_shutdown=0,
+        limit_concurrency=MAX_CONNECTIONS,
         server_header=False,
         date_header=False,
     )

@@ -15,9 +15,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from foveasim._io.atomic import atomic_write
+from foveasim._io.yaml_files import format_yaml
 from foveasim.config import check_settings, put_setting
 from foveasim.errors import FoveasimError, ParameterError, SimulationError, printable
 from foveasim.studio._controls import chosen_value, controls_of, structure_of, value_at
@@ -28,7 +27,7 @@ from foveasim.studio._messages import encode_part, from_json, to_json
 from foveasim.studio._parts import PARTS, summary_of
 from foveasim.studio._templates import WITHOUT_MOSAIC
 
-__all__ = ["Session", "Start", "settings_yaml"]
+__all__ = ["Session", "Start"]
 
 #: Largest number of messages that wait.
 MAX_WAITING = 1000
@@ -175,7 +174,7 @@ class Session:
                 self._waiting.clear()
             try:
                 self._handle(messages)
-            except Exception as error:  # noqa: BLE001 -- the session continues with its last valid state
+            except BaseException as error:  # noqa: BLE001 -- the session continues with its last valid state
                 self._send_error(self._last_id, error)
 
     def _handle(self, messages: list[Any]) -> None:
@@ -337,16 +336,18 @@ class Session:
         ParameterError
             When the format is unknown.
         """
-        settings = self.history.settings
+        uploaded: list[str] = []
+        settings = _relative(self.history.settings, self.uploads, uploaded)
+        note = f"# Uploaded files, next to this file: {', '.join(uploaded)}\n" if uploaded else ""
         match what:
             case "yaml":
-                return settings_yaml(settings)
+                return note + format_yaml(settings)
             case "python":
                 from foveasim.config import to_python
 
-                return to_python(settings)
+                return note + to_python(settings)
             case "diff":
-                old, new = (settings_yaml(each).splitlines(keepends=True) for each in (self.start.settings, settings))
+                old, new = (format_yaml(each).splitlines(keepends=True) for each in (self.start.settings, settings))
                 return "".join(difflib.unified_diff(old, new, f"{self.start.name}.yaml", "studio"))
             case _:
                 raise ParameterError("what", "must be yaml, python or diff", printable(what)[:40])
@@ -359,9 +360,13 @@ class Session:
         safe = file_name(name)
         path = out / (safe if safe.endswith((".yaml", ".yml")) else f"{safe}.yaml")
         out.mkdir(parents=True, exist_ok=True)
-        settings = _with_copies(self.history.settings, self.uploads, out)
+        uploaded: list[str] = []
+        settings = _relative(self.history.settings, self.uploads, uploaded)
+        for copied in dict.fromkeys(uploaded):
+            with atomic_write(out / copied) as temporary:
+                shutil.copyfile(self.uploads / copied, temporary)
         with atomic_write(path) as temporary:
-            temporary.write_text(settings_yaml(settings), encoding="utf-8")
+            temporary.write_text(format_yaml(settings), encoding="utf-8")
         return path
 
     def _send_state(self) -> None:
@@ -427,24 +432,6 @@ class Session:
         for listener in list(self._listeners):
             with suppress(Exception):
                 listener(message)
-
-
-def settings_yaml(settings: Mapping[str, Any]) -> str:
-    """Return settings as YAML, with which ``foveasim run`` gives the same codes."""
-    return yaml.safe_dump(to_plain(settings), sort_keys=False, allow_unicode=True, default_flow_style=None, width=110)
-
-
-def to_plain(value: Any) -> Any:
-    """Return plain data without objects that are used twice, which YAML would write as anchors."""
-    return (
-        copy.deepcopy(value)
-        if not isinstance(value, dict | list)
-        else (
-            {name: to_plain(item) for name, item in value.items()}
-            if isinstance(value, dict)
-            else [to_plain(i) for i in value]
-        )
-    )
 
 
 def _is_same(old: tuple[Any, ...], new: tuple[Any, ...]) -> bool:
@@ -527,15 +514,13 @@ def _match_filters(settings: dict[str, Any]) -> None:
         layout["mosaic"] = ["RG", "GB"]
 
 
-def _with_copies(value: Any, uploads: Path, out: Path) -> Any:
-    """Return settings with uploaded files replaced by copies in the directory for saved files."""
+def _relative(value: Any, uploads: Path, found: list[str]) -> Any:
+    """Return settings with the names of uploaded files instead of their paths, and append these to a list."""
     if isinstance(value, dict):
-        return {name: _with_copies(item, uploads, out) for name, item in value.items()}
+        return {name: _relative(item, uploads, found) for name, item in value.items()}
     if isinstance(value, list):
-        return [_with_copies(item, uploads, out) for item in value]
-    if isinstance(value, str) and value.startswith(f"{uploads}/"):
-        target = out / Path(value).name
-        with atomic_write(target) as temporary:
-            shutil.copyfile(value, temporary)
-        return target.name
+        return [_relative(item, uploads, found) for item in value]
+    if isinstance(value, str) and Path(value).parent == uploads:
+        found.append(Path(value).name)
+        return found[-1]
     return value
