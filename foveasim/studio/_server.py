@@ -360,7 +360,12 @@ def _in_address(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-def serve(studio: Studio, listener: socket.socket, announce: Callable[[], None]) -> None:
+def serve(
+    studio: Studio,
+    listener: socket.socket,
+    announce: Callable[[], None],
+    started: Callable[[Any], object] | None = None,
+) -> None:
     """
     Serve the studio until Ctrl-C.
 
@@ -371,6 +376,8 @@ def serve(studio: Studio, listener: socket.socket, announce: Callable[[], None])
         Bound to the address.
     announce : function
         Called when the server accepts requests.
+    started : function, optional
+        Called with the server, whose ``should_exit`` stops it, before it runs.
     """
     import uvicorn
 
@@ -398,6 +405,9 @@ def serve(studio: Studio, listener: socket.socket, announce: Callable[[], None])
     )
     try:
         with contextlib.suppress(KeyboardInterrupt):
-            Server(config).run(sockets=[listener])
+            server = Server(config)
+            if started is not None:
+                started(server)
+            server.run(sockets=[listener])
     finally:
         studio.close()

@@ -276,6 +276,8 @@ class Session:
                     control = next(c for c in controls_of(settings, self.start.settings) if c["key"] == "scene")
                     settings["scene"] = next(c["value"] for c in control["choices"] if c["label"] == "picture")
                 settings["scene"]["picture"] = path
+                if settings["scene"].get("fit") is None:
+                    put_setting(None, settings, "scene.fit", "cover")  # pictures differ in their number of pixels
                 return settings
             case "layout":
                 return with_layout(settings, self.files.layout_of(path))
@@ -449,7 +451,7 @@ def _line(error: BaseException) -> str:
     if isinstance(error, MemoryError):
         return "not enough memory; use a smaller picture or fewer photosites"
     text = str(error) if isinstance(error, FoveasimError) else f"{type(error).__name__}: {error}".removesuffix(": ")
-    text = " ".join(printable(text).split())
+    text = printable(" ".join(text.split()))
     return text if len(text) <= MAX_MESSAGE_LENGTH else text[: MAX_MESSAGE_LENGTH - 3] + "..."
 
 

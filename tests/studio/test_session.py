@@ -78,7 +78,7 @@ def test_only_selected_views_are_computed(recorder):
         ("sensor.bits", 99, "bits"),
         ("layout.generator", "grrid", "must be one of"),
         ("exposure_s", None, "exposure_s"),
-        ("layout.parameters.n_x", 10**9, "n_x"),
+        ("layout.parameters.n_x", 10**9, "must be <="),
         ("exposure_s.value", 1, "must be a section"),
         ("scene.kind", "flat", "square_mm"),
         ("nothing", 1, "unknown key"),
@@ -286,20 +286,22 @@ def test_drag_is_one_step(recorder, settings):
 
 def test_waiting_previews_are_simulated_once(recorder):
     built = recorder.session.engine.n_built["optics"]
-    state = recorder.handle([
-        {"do": "set", "key": "optics.f_number", "value": 3.0 + k / 10, "final": k == 9, "id": k} for k in range(10)
-    ])
+    state = recorder.handle(
+        [{"do": "set", "key": "optics.f_number", "value": 3.0 + k / 10, "final": k == 9, "id": k} for k in range(10)]
+    )
 
     assert recorder.session.engine.n_built["optics"] == built + 1
     assert (state["id"], state["settings"]["optics"]["f_number"]) == (9, 3.9)
 
 
 def test_invalid_change_leaves_others_of_batch(recorder):
-    recorder.handle([
-        {"do": "set", "key": "exposure_s", "value": 0.02, "final": True, "id": 1},
-        {"do": "set", "key": "optics.f_number", "value": -2, "final": True, "id": 2},
-        {"do": "set", "key": "sensor.bits", "value": 8, "final": True, "id": 3},
-    ])
+    recorder.handle(
+        [
+            {"do": "set", "key": "exposure_s", "value": 0.02, "final": True, "id": 1},
+            {"do": "set", "key": "optics.f_number", "value": -2, "final": True, "id": 2},
+            {"do": "set", "key": "sensor.bits", "value": 8, "final": True, "id": 3},
+        ]
+    )
     states = [message for message in recorder.messages if message["kind"] == "state"]
 
     assert [list(state["errors"]) for state in states] == [[], ["optics.f_number"], []]
@@ -333,8 +335,8 @@ def test_presets_give_valid_states(recorder, name):
 
 
 def test_restored_settings_give_same_codes(recorder, make_session):
+    recorder.do(do="set", key="optics.f_number", value=22.5, final=True)
     recorder.do(do="set", key="optics.focus_distance_m", value=".inf", final=True)
-    recorder.do(do="set", key="optics.f_number", value=3.3, final=True)
     state = recorder.do(do="set", key="seed", value=5, final=True)
     expected = code_part(recorder)
     other = make_session()
