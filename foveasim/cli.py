@@ -274,7 +274,7 @@ def studio(
     port: Annotated[int, typer.Option("--port", help="Port; 0 for any free one.")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open a browser.")] = True,
 ) -> None:
-    """Change the settings of a shot in the browser, with all views updated at once, until Ctrl-C."""
+    """Change the settings of a shot in the browser, with views that follow at once."""
     from foveasim.studio import run_studio
 
     def announce(address: str, is_opened: bool) -> None:

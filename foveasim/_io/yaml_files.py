@@ -73,7 +73,7 @@ _Dumper.yaml_implicit_resolvers = _SafeLoader.yaml_implicit_resolvers
 
 
 def format_yaml(data: Any) -> str:
-    """Return plain data as YAML that :func:`parse_yaml` reads as the same data, with short lists on one line."""
+    """Return plain data as YAML, which :func:`parse_yaml` reads as the same data."""
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=110)
 
 

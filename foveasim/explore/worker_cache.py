@@ -166,7 +166,7 @@ class ShotRunner:
         return shot, capture
 
     def photoelectrons_per_s(self, shot: Shot, settings: Mapping[str, Any]) -> Floats:
-        """Return the photoelectron rates of the sites of a shot, (n_site,), from the cache or newly computed."""
+        """Return the photoelectron rates of a shot's sites, (n_site,) e-/s."""
         camera, cache = shot.camera, self.cache
         image_settings = _image_settings(shot, settings)
         filters = hashlib.sha256(camera.sensor.filter_of_site.tobytes()).hexdigest()
@@ -180,7 +180,7 @@ class ShotRunner:
         return rates
 
     def images(self, shot: Shot, settings: Mapping[str, Any]) -> dict[Any, Any]:
-        """Return the optical images of a shot by grid and filter, as far as its capture computed them."""
+        """Return the optical images that a shot's capture computed, by grid and filter."""
         found: dict[Any, Any] = self.cache.part("images", _image_settings(shot, settings), dict)
         return found
 

@@ -109,7 +109,7 @@ def value_at(settings: Any, key: str) -> Any:
 
 
 def structure_of(settings: Any, key: str = "") -> Any:
-    """Return what determines the list of controls: names, kinds and strings of settings, without numbers."""
+    """Return names, kinds and strings of settings, which determine the list of controls."""
     if isinstance(settings, Mapping):
         return {name: structure_of(value, name) for name, value in settings.items()}
     if isinstance(settings, bool) or key in ENUMERATED:
@@ -292,7 +292,7 @@ def _alternatives(
     is_optional: bool,
     start: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return the choices among sections and values of a parameter, each with its initial value."""
+    """Return the choices of a parameter, each with its initial value."""
     choices: list[dict[str, Any]] = []
     selected = None
     if is_optional:

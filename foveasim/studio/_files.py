@@ -30,7 +30,7 @@ UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 
 def start_settings(shot: str | Path | None) -> tuple[dict[str, Any], str]:
     """
-    Return the settings of a file with absolute paths, and its name; by default those of the demo.
+    Return the settings of a file or the demo with absolute paths, and the name.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def with_layout(settings: Mapping[str, Any], layout: Any) -> dict[str, Any]:
 
 
 def _inlined(layout: str, directory: Path) -> Any:
-    """Return the section of a layout that is given by the name of a bundled one, or by a YAML file."""
+    """Return the section of a layout that is given by its name or file."""
     path = directory / layout
     if not path.is_file() and layout in bundled_layouts():
         path = bundled_layouts()[layout]

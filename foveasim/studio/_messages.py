@@ -1,4 +1,4 @@
-"""Binary messages of the studio: a header in JSON, and arrays for typed arrays of JavaScript."""
+"""Binary messages of the studio: a JSON header and arrays for JavaScript."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ def _responsivity(result: Simulated) -> tuple[NDArray[Any], NDArray[Any]]:
 
 @part("MTF", lambda result: (result.capture.layout, result.shot.camera.optics, result.shot.scene))
 def mtf(result: Simulated) -> PartData:
-    """Return MTF curves of the lens on the axis, and of the smallest, median and largest photosite."""
+    """Return MTF curves of the lens on the axis and of three photosites."""
     layout, scene = result.capture.layout, result.shot.scene
     order = np.argsort(layout.area_um2, kind="stable")
     chosen = {"smallest site": order[0], "median site": order[order.size // 2], "largest site": order[-1]}
@@ -231,7 +231,7 @@ def _curves(curves: list[dict[str, Any]], x: list[NDArray[Any]], y: list[NDArray
 
 
 def _reduced(bands: NDArray[Any], grid: Grid) -> tuple[NDArray[np.float32], Grid]:
-    """Return means of blocks of cells, for a screen; incomplete blocks at the upper and right end are cropped."""
+    """Return means of blocks of cells; incomplete upper and right blocks are cropped."""
     n_y, n_x = bands.shape[1:]
     block = max(1, -(-max(n_y, n_x) // PICTURE_PIXELS))
     rows, n_columns = n_y // block, n_x // block
@@ -242,7 +242,7 @@ def _reduced(bands: NDArray[Any], grid: Grid) -> tuple[NDArray[np.float32], Grid
 
 
 def _picture(light: NDArray[Any], coverage: NDArray[Any], bounds_um: tuple[float, ...]) -> PartData:
-    """Return bytes of a picture, top row first, from linear light (n_channel, n_y, n_x) and its coverage."""
+    """Return bytes of a picture, top row first, from linear (n_channel, n_y, n_x)."""
     if light.shape[0] not in (1, 3):
         light = light.mean(axis=0, keepdims=True)
     level = np.clip(np.nan_to_num(light) * np.float32(N_LEVELS - 1), 0, N_LEVELS - 1).astype(np.uint16)

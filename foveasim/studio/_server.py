@@ -100,7 +100,7 @@ class Studio:
         self.sessions.clear()
 
     def session(self, name: object) -> tuple[Session | None, bool]:
-        """Return the session of a name, or a new one; None when there are too many. The flag is true for new sessions."""
+        """Return the session of a name or a new one, if possible, and whether it is new."""
         if isinstance(name, str) and name in self.sessions:
             return self.sessions[name], False
         self.free_idle()
@@ -271,7 +271,7 @@ def _part_name(message: bytes) -> str:
 
 
 class _Guard:
-    """Check of the headers ``Host`` and ``Origin`` of all requests, and headers of all responses."""
+    """Check of the headers ``Host`` and ``Origin``, and headers of all responses."""
 
     def __init__(self, app: ASGIApp, hosts: set[str]) -> None:
         self.app, self.hosts = app, hosts

@@ -1,4 +1,4 @@
-"""Session of a page: settings with history, simulation in one thread, and messages to all connections."""
+"""Session of a page: settings with history, simulation in a thread, and messages."""
 
 from __future__ import annotations
 
@@ -331,7 +331,7 @@ class Session:
 
     def text(self, what: str) -> str:
         """
-        Return the current settings as YAML, Python, or their difference to the initial settings.
+        Return the current settings as YAML or Python, or their changes as a difference.
 
         Raises
         ------
@@ -392,7 +392,7 @@ class Session:
         })  # fmt: skip
 
     def _send_parts(self) -> None:
-        """Compute and send the parts that changed; newer messages interrupt, after at least one slow part."""
+        """Compute and send the parts that changed; newer messages interrupt."""
         result = self.result
         if result is None:
             return
@@ -506,7 +506,7 @@ def _changed(settings: Any, start: Any, key: str = "") -> list[str]:
 
 
 def _match_filters(settings: dict[str, Any]) -> None:
-    """Remove colour filters from settings whose layout cannot have a mosaic; add a mosaic to others."""
+    """Remove colour filters from layouts that cannot have a mosaic; add one to others."""
     layout, sensor = settings.get("layout"), settings.get("sensor")
     if not isinstance(layout, dict) or not isinstance(sensor, dict) or sensor.get("filters") is None:
         return
@@ -517,7 +517,7 @@ def _match_filters(settings: dict[str, Any]) -> None:
 
 
 def _relative(value: Any, uploads: Path, found: list[str]) -> Any:
-    """Return settings with the names of uploaded files instead of their paths, and append these to a list."""
+    """Return settings with names of uploaded files for paths, and collect the names."""
     if isinstance(value, dict):
         return {name: _relative(item, uploads, found) for name, item in value.items()}
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""Initial values of sections and parameters that are chosen on the page: valid, and of the size of the demo."""
+"""Valid initial values of sections and parameters that are chosen on the page."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ def test_step_after_undo_discards_later_states():
     assert history.settings == {"n": 0}
 
 
-def test_previews_are_no_steps():
+def test_previews_add_no_steps():
     history = History({"n": 0})
     for n in (1, 2, 3):
         history.preview({"n": n})
@@ -41,7 +41,7 @@ def test_previews_are_no_steps():
     assert not history.can_undo
 
 
-def test_equal_settings_are_no_step():
+def test_equal_settings_add_no_step():
     history = History({"n": 0})
     history.commit({"n": 0})
 
