@@ -78,7 +78,14 @@ async def bench(report: Report, address: str, n: int) -> None:
 
         async def measure(label: str, key: str, value: Callable[[int], Any], bound_ms: float) -> None:
             first_ms, all_ms = await changes_ms(connection, key, value, n)
-            report.add(label, f"{all_ms:.0f} ms", f"bound; values {first_ms:.0f} ms", f"{bound_ms:g} ms", all_ms / bound_ms, 1.0)
+            report.add(
+                label,
+                f"{all_ms:.0f} ms",
+                f"bound; values {first_ms:.0f} ms",
+                f"{bound_ms:g} ms",
+                all_ms / bound_ms,
+                1.0,
+            )
 
         await done()
         for name, (key, value, bound_ms) in CHANGES.items():
