@@ -82,6 +82,7 @@ MODULES = {
     "foveasim.view": "Plots, 3D rendering, solids, and interactive pages.",
     "foveasim.explore": "Sweeps, optimisation studies and datasets.",
     "foveasim.config": "Settings files in YAML.",
+    "foveasim.studio": "Interactive design in the browser.",
     **({"foveasim.learn": LEARN} if find_spec("torch") else {}),
     "foveasim.errors": "Exceptions and warnings.",
     "foveasim.units": "Unit conversions.",

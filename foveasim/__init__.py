@@ -46,7 +46,7 @@ from foveasim.scene import Scene
 from foveasim.sensor import FilterSet, GaussianCurve, PolynomialCurve, Sensor, SiliconQE, rgb_filters
 
 if TYPE_CHECKING:
-    from foveasim import compare, explore, learn
+    from foveasim import compare, explore, learn, studio
     from foveasim.config import read_layout
 
 __all__ = [
@@ -83,6 +83,7 @@ __all__ = [
     "rgb_filters",
     "scene",
     "sensor",
+    "studio",
     "tiles",
     "units",
     "video",
@@ -104,6 +105,7 @@ _LAZY = {
     "explore": "foveasim.explore",
     "learn": "foveasim.learn",
     "read_layout": "foveasim.config",
+    "studio": "foveasim.studio",
 }
 
 if not TYPE_CHECKING:  # type checkers would take any name for an attribute

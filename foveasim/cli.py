@@ -262,6 +262,30 @@ def view(
 
 
 @app.command()
+def studio(
+    shot: Annotated[Path | None, typer.Argument(help="YAML file of the shot; by default that of the demo.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Directory for saved files; without it none are written.")
+    ] = None,
+    host: Annotated[
+        str,
+        typer.Option("--host", help="Address to serve at; others than 127.0.0.1 are accessible from other computers."),
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", help="Port; 0 for any free one.")] = 0,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open a browser.")] = True,
+) -> None:
+    """Change the settings of a shot in the browser, with views that follow at once."""
+    from foveasim.studio import run_studio
+
+    def announce(address: str, is_opened: bool) -> None:
+        _print(f"studio at {address}; press Ctrl-C to stop")
+        if browser and not is_opened:
+            _print("no browser found; open the address in one")
+
+    run_studio(shot, out=out, host=host, port=port, open_browser=browser, announce=announce)
+
+
+@app.command()
 def compare(
     files: Annotated[
         list[Path], typer.Argument(help="Two or more layouts, or settings files of shots. " + LAYOUT_HELP)

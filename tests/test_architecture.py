@@ -31,13 +31,14 @@ LAYERS = [
     {"compare"},
     {"config"},
     {"explore", "learn"},
+    {"studio"},
     {"cli"},
     {"__main__"},
 ]
 #: Packages that are imported on first use.
 HEAVY = {
-    "OpenEXR", "PIL", "astropy", "av", "cv2", "dask", "distributed", "exactextract", "gdstk", "h5netcdf", "h5py", "imagecodecs", "klayout", "manifold3d", "matplotlib", "pyarrow", "numba", "optuna", "pydantic", "pyvista", "rich", "skimage", "tifffile",
-    "torch", "trimesh", "typer", "vtk", "xarray", "yaml", "zarr",
+    "OpenEXR", "PIL", "astropy", "av", "cv2", "dask", "distributed", "exactextract", "gdstk", "h5netcdf", "h5py", "imagecodecs", "klayout", "manifold3d", "matplotlib", "pyarrow", "numba", "optuna", "pydantic", "pyvista", "rich", "skimage", "starlette", "tifffile",
+    "torch", "trimesh", "typer", "uvicorn", "vtk", "websockets", "xarray", "yaml", "zarr",
 }  # fmt: skip
 #: Names of dimensionless numbers, or of numbers in the unit of other arguments.
 DIMENSIONLESS = {

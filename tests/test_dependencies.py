@@ -29,6 +29,7 @@ EXTRAS = {
     "maps": {"maps"},
     "modes": {"video"},
     "scene": {"maps"},
+    "studio": {"studio"},
     "tiles": {"video"},
     "video": {"video"},
     "view": {"notebook", "view"},
@@ -53,6 +54,7 @@ INDIRECT = {
     "h5netcdf": "xarray's engine for NetCDF files",
     "lxml": "trimesh writes 3MF with it",
     "networkx": "trimesh writes 3MF with it",
+    "websockets": "uvicorn serves sockets with it",
 }
 #: Functions that take the name of a module.
 IMPORTING = {"__import__", "_imported", "find_spec", "import_module", "import_optional", "importorskip"}

@@ -29,8 +29,11 @@ EXTRA_OF = {
     "pandas": "maps",
     "pyarrow": "parquet",
     "pyvista": "view",
+    "starlette": "studio",
     "torch": "learn",
+    "uvicorn": "studio",
     "vtkmodules": "view",
+    "websockets": "studio",
     "xarray": "explore",
     "zarr": "video",
 }

@@ -12,7 +12,7 @@ import yaml
 from foveasim._core.names import missing_path
 from foveasim.errors import ConfigError
 
-__all__ = ["MAX_FILE_BYTES", "parse_yaml", "position_of", "read_text", "read_yaml"]
+__all__ = ["MAX_FILE_BYTES", "format_yaml", "parse_yaml", "position_of", "read_text", "read_yaml"]
 
 #: Size limit: settings files are written by hand.
 MAX_FILE_BYTES = 1 << 20
@@ -60,6 +60,21 @@ _SafeLoader.add_implicit_resolver(
     re.compile(r"^[-+]?(\d+\.\d*|\.\d+|\d+(?=[eE]))([eE][-+]?\d+)?$|^[-+]?\.(inf|Inf|INF)$|^\.(nan|NaN|NAN)$"),
     list("-+0123456789."),
 )
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writer of YAML that :func:`parse_yaml` reads as the same data, without anchors."""
+
+    def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002 -- the signature is that of yaml
+        return True
+
+
+_Dumper.yaml_implicit_resolvers = _SafeLoader.yaml_implicit_resolvers
+
+
+def format_yaml(data: Any) -> str:
+    """Return plain data as YAML, which :func:`parse_yaml` reads as the same data."""
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=110)
 
 
 def parse_yaml(path: Path, text: str) -> Any:

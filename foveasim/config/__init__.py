@@ -26,6 +26,7 @@ from foveasim.config._objects import (
     schema,
 )
 from foveasim.config._problems import validate
+from foveasim.config._python import to_python
 from foveasim.config._shots import (
     Result,
     check_directory,
@@ -71,6 +72,7 @@ __all__ = [
     "schema",
     "starting_command",
     "starting_file",
+    "to_python",
     "validate",
     "write_3d_picture",
     "write_results",

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from foveasim._core.threads import thread_count
+from foveasim._core.validation import Floats
 from foveasim.capture import Capture
 from foveasim.config import Shot, Source, build_shot
 from foveasim.errors import FoveasimError
@@ -157,18 +158,31 @@ class ShotRunner:
 
     def simulate_capture(self, settings: Mapping[str, Any]) -> tuple[Shot, Capture]:
         """Build the shot of the given settings and simulate its capture."""
-        cache = self.cache
-        shot = build_shot(self.source, settings, n_threads=self.n_threads, cache=cache.part)
-        camera, sensor, scene = shot.camera, shot.camera.sensor, shot.scene
+        shot = build_shot(self.source, settings, n_threads=self.n_threads, cache=self.cache.part)
+        photo_e_per_s = self.photoelectrons_per_s(shot, settings)
+        capture = shot.camera.capture(
+            shot.scene, exposure_s=shot.exposure_s, seed=shot.seed, photo_e_per_s=photo_e_per_s
+        )
+        return shot, capture
+
+    def photoelectrons_per_s(self, shot: Shot, settings: Mapping[str, Any]) -> Floats:
+        """Return the photoelectron rates of a shot's sites, (n_site,) e-/s."""
+        camera, cache = shot.camera, self.cache
         image_settings = _image_settings(shot, settings)
-        filters = hashlib.sha256(sensor.filter_of_site.tobytes()).hexdigest()
+        filters = hashlib.sha256(camera.sensor.filter_of_site.tobytes()).hexdigest()
         sites = [settings["layout"], settings.get("distortion"), settings.get("integration_order"), filters]
         images = cache.part("images", image_settings, dict) if self.is_geometry_varied else None
-        photo_e_per_s = cache.part(
-            "power on sites", [image_settings, sites], lambda: camera.photoelectrons_per_s(scene, images=images)
+        rates: Floats = cache.part(
+            "power on sites",
+            [image_settings, sites],
+            lambda: camera.photoelectrons_per_s(shot.scene, images=images),
         )
-        capture = camera.capture(scene, exposure_s=shot.exposure_s, seed=shot.seed, photo_e_per_s=photo_e_per_s)
-        return shot, capture
+        return rates
+
+    def images(self, shot: Shot, settings: Mapping[str, Any]) -> dict[Any, Any]:
+        """Return the optical images that a shot's capture computed, by grid and filter."""
+        found: dict[Any, Any] = self.cache.part("images", _image_settings(shot, settings), dict)
+        return found
 
     def _measure(self, metric: Metric, shot: Shot, capture: Capture, settings: Mapping[str, Any]) -> Any:
         """Compute a metric, with a cached reference where the metric takes one."""

@@ -17,7 +17,7 @@ from foveasim.reconstruct.picture import Picture, coverage_fraction
 __all__ = ["cells", "fill_channels"]
 
 #: Number of cached layouts, and the largest number of their sites, about 200 bytes each.
-MAX_CACHED, MAX_CACHED_SITES = 2, 1 << 17
+MAX_CACHED, MAX_CACHED_SITES = 2, 1 << 18
 #: Nearest sites of a channel that are averaged in demosaicing.
 NEIGHBOURS = 4
 

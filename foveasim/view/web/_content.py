@@ -17,6 +17,7 @@ from foveasim.capture import Capture
 from foveasim.errors import GeometryError, ParameterError, SimulationError, type_name
 from foveasim.fields import PowerMap
 from foveasim.layout import Layout, Report
+from foveasim.sensor import Sensor
 from foveasim.view.site_colours import (
     CATEGORY_COLOURS,
     DISPLAY_GAMMA,
@@ -30,7 +31,7 @@ from foveasim.view.site_pictures import site_picture
 from foveasim.view.web._pack import back_references, to_smallest_type
 from foveasim.view.web._shapes import shapes_of
 
-__all__ = ["Content", "content_of", "describe_sites"]
+__all__ = ["Content", "content_of", "describe_sites", "outlines_of", "rules_of"]
 
 #: Columns of a second capture.
 SECOND = ("picture", "code", "electrons", "expected_e", "snr")
@@ -110,7 +111,7 @@ def content_of(
         )
     if second is not None:
         about["columns"] += _second_columns(layout, second, arrays)
-    arrays |= _outlines(layout)
+    arrays |= outlines_of(layout)
     alt = "Picture of the capture" if isinstance(data, Capture) else "Photosites of the layout"
     if optical_image is None:
         pixels, bounds_um = _picture(layout, data if isinstance(data, Capture) else None)
@@ -120,13 +121,23 @@ def content_of(
     file = BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(file, "PNG")
     position = {"bounds_um": bounds_um, "width": pixels.shape[1], "height": pixels.shape[0]}
-    rules = [] if report is None else _rules(report, arrays)
+    rules = [] if report is None else rules_of(report, arrays)
     return Content({**about, "picture": position, "rules": rules}, arrays, file.getvalue(), alt)
 
 
-def describe_sites(data: Layout | Capture, *, name: str = "") -> tuple[dict[str, Any], dict[str, NDArray[Any]], Layout]:
+def describe_sites(
+    data: Layout | Capture, *, name: str = "", sensor: Sensor | None = None
+) -> tuple[dict[str, Any], dict[str, NDArray[Any]], Layout]:
     """
     Return the data of photosites for all kinds of pages.
+
+    Parameters
+    ----------
+    data : Layout or Capture
+    name : str
+        Heading; by default the generator of the layout.
+    sensor : Sensor, optional
+        The sensor of the capture, as for :meth:`foveasim.Capture.signal_to_noise`.
 
     Returns
     -------
@@ -148,7 +159,7 @@ def describe_sites(data: Layout | Capture, *, name: str = "") -> tuple[dict[str,
     if layout.n_sites == 0:
         raise GeometryError("the layout has no sites; a page needs at least one")
     arrays: dict[str, NDArray[Any]] = {}
-    columns = _columns(layout, capture, arrays)
+    columns = _columns(layout, capture, arrays, sensor)
     provenance = layout.provenance
     origin = str(provenance.get("generator", provenance.get("made_by", "polygons"))).replace("_", " ")
     about = {
@@ -171,7 +182,8 @@ def describe_sites(data: Layout | Capture, *, name: str = "") -> tuple[dict[str,
 # -- outlines -----------------------------------------------------------------------------------------------------------
 
 
-def _outlines(layout: Layout) -> dict[str, NDArray[Any]]:
+def outlines_of(layout: Layout) -> dict[str, NDArray[Any]]:
+    """Return the arrays of the outlines and triangles of photosites."""
     shapes = shapes_of(layout)
     arrays = {
         "xy_um": shapes.xy_um,
@@ -190,7 +202,9 @@ def _outlines(layout: Layout) -> dict[str, NDArray[Any]]:
 # -- columns ------------------------------------------------------------------------------------------------------------
 
 
-def _columns(layout: Layout, capture: Capture | None, arrays: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:
+def _columns(
+    layout: Layout, capture: Capture | None, arrays: dict[str, NDArray[Any]], sensor: Sensor | None = None
+) -> list[dict[str, Any]]:
     """Return the columns of a page in list order: label, unit, and type of colour scale."""
     columns: list[dict[str, Any]] = []
 
@@ -211,7 +225,7 @@ def _columns(layout: Layout, capture: Capture | None, arrays: dict[str, NDArray[
             columns.insert(0, {**lit, "array": code, "is_repeat": True})
         add("electrons", "electrons", "e⁻", capture.electrons)
         add("expected_e", "expected electrons", "e⁻", capture.expected_e)
-        ratio = _signal_to_noise(capture)
+        ratio = _signal_to_noise(capture, sensor)
         if ratio is not None:
             add(
                 "snr",
@@ -262,10 +276,10 @@ def _second_columns(layout: Layout, second: Capture, arrays: dict[str, NDArray[A
     ]
 
 
-def _signal_to_noise(capture: Capture) -> Floats | None:
+def _signal_to_noise(capture: Capture, sensor: Sensor | None) -> Floats | None:
     """Return the ratio of every site, (n_site,); None if settings lack the electronics."""
     try:
-        return capture.signal_to_noise()
+        return capture.signal_to_noise(sensor=sensor)
     except (ParameterError, SimulationError):
         return None
 
@@ -362,7 +376,7 @@ def _optical_picture(power_map: PowerMap) -> tuple[NDArray[np.uint8], tuple[floa
     return pixels, (x_min, y_min, x_min + width_um, y_min + height_um)
 
 
-def _rules(report: Report, arrays: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:
+def rules_of(report: Report, arrays: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:
     """Return rules and results; add the worst violations to arrays, rule by rule."""
     rules = []
     values: list[float] = []

@@ -1,0 +1,229 @@
+"""Python source of settings: the calls that a settings file stands for."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import re
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from foveasim.config._models import PerArea, call_of, models
+from foveasim.config._objects import FILE_SETTINGS, resolve_files
+from foveasim.config._problems import validate
+from foveasim.config._sources import Source
+from foveasim.layout import LAYOUTS
+
+__all__ = ["to_python"]
+
+#: Modules with public names, in the order of preference, and their names in the source.
+MODULES = {
+    "foveasim": "fs",
+    "foveasim.layout": "fs.layout",
+    "foveasim.scene": "fs.scene",
+    "foveasim.scene.charts": "fs.scene.charts",
+    "foveasim.optics": "fs.optics",
+    "foveasim.distortion": "fs.distortion",
+    "foveasim.sensor": "fs.sensor",
+    "foveasim.sensor.effects": "fs.sensor.effects",
+    "foveasim.maps": "fs.maps",
+}
+#: Longest call on one line.
+LINE_LENGTH = 100
+#: Names of pictures of scikit-image.
+BUNDLED = re.compile(r"skimage:[\w-]+")
+INDENT = "    "
+HEADER = '"""Simulation of a shot; written by foveasim."""\n'
+
+
+def to_python(settings: Mapping[str, Any], *, source: Source | str | Path | None = None) -> str:
+    """
+    Return Python source that simulates the shot of settings, with bit-identical codes.
+
+    Parameters
+    ----------
+    settings : mapping
+        As :func:`read_settings` returns them.
+    source : Source, path or None
+        Origin of the settings; paths in them are relative to its directory. None for settings from Python, whose paths are
+        relative to the working directory.
+
+    Returns
+    -------
+    text : str
+        Source that defines ``camera``, ``scene`` and ``capture``.
+
+    Raises
+    ------
+    ConfigError
+        When a setting is invalid.
+
+    Examples
+    --------
+    >>> from foveasim.config import demo_settings, read_settings, to_python
+    >>> path = demo_settings()[0]
+    >>> "optics = fs.Optics(focal_length_mm=8.0, f_number=2.8)" in to_python(read_settings(path), source=path)
+    True
+    """
+    source = Source.of(source)
+    data = dict(settings) if source.file is None else resolve_files(source.directory.absolute(), dict(settings))
+    shot = validate(source, models().shot, data)
+    writer = _Writer()
+    try:
+        lines = _shot_lines(writer, shot)
+    except _NotPublicError:
+        writer = _Writer()
+        lines = [
+            f"settings = {writer.expression(data)}",
+            "",
+            "shot = fs.config.build_shot(None, settings)",
+            "camera, scene = shot.camera, shot.scene",
+            "capture = camera.capture(scene, exposure_s=shot.exposure_s, seed=shot.seed)",
+        ]
+    imports = ["import foveasim as fs", *sorted(writer.imports)]
+    return "\n".join([HEADER, *imports, "", *lines, ""])
+
+
+class _NotPublicError(Exception):
+    """A section without a public call of the same meaning."""
+
+
+def _shot_lines(writer: _Writer, shot: Any) -> list[str]:
+    camera = {"optics": _Name("optics"), "sensor": _Name("sensor")}
+    lines = [*_layout_lines(writer, shot.layout), writer.assignment("optics", shot.optics)]
+    if shot.distortion is not None:
+        lines.append(writer.assignment("distortion", shot.distortion))
+        camera["distortion"] = _Name("distortion")
+    if shot.integration_order is not None:
+        camera["order"] = shot.integration_order
+    sensor = {"layout": _Name("layout"), **writer.arguments(shot.sensor)}
+    capture = {"scene": _Name("scene"), "exposure_s": shot.exposure_s, "seed": shot.seed}
+    return [
+        *lines,
+        f"sensor = {writer.call('fs.Sensor', sensor)}",
+        f"camera = {writer.call('fs.Camera', camera)}",
+        writer.assignment("scene", shot.scene),
+        f"capture = {writer.call('camera.capture', capture, positional=('scene',))}",
+    ]
+
+
+def _layout_lines(writer: _Writer, section: Any) -> list[str]:
+    """Return the lines that define the layout, with its edits in their order."""
+    if isinstance(section, str):
+        return [f"layout = {writer.call('fs.read_layout', {'path': section}, positional=('path',))}"]
+    if hasattr(section, "generator"):
+        picture = getattr(LAYOUTS[section.generator], "picture", None)
+        if picture is not None and getattr(section.parameters, picture) is not None:
+            raise _NotPublicError  # a picture is read and placed on a grid
+        lines = [writer.assignment("layout", section.parameters)]
+    else:
+        given = section.model_fields_set - {"mosaic", "move_um", "inset_um", "snap_um", "rules", "source"}
+        options = {name: getattr(section, name) for name in type(section).model_fields if name in given}
+        lines = [f"layout = {writer.call('fs.layout.read_layout', options, positional=('file',))}"]
+    layout = _Name("layout")
+    edits: list[tuple[bool, str, dict[str, Any]]] = [
+        (section.mosaic is not None, "fs.layout.mosaic", {"layout": layout, "block": section.mosaic}),
+        (any(section.move_um), "layout.translate", {"dx_um": section.move_um[0], "dy_um": section.move_um[1]}),
+        (bool(section.inset_um), "fs.layout.inset", {"layout": layout, "margin_um": section.inset_um}),
+        (section.snap_um is not None, "fs.layout.snap", {"layout": layout, "grid_um": section.snap_um}),
+    ]
+    return [
+        *lines,
+        *(
+            f"layout = {writer.call(name, values, positional=('layout',))}"
+            for is_made, name, values in edits
+            if is_made
+        ),
+    ]
+
+
+class _Name(str):
+    """A name or expression of the source, not a string."""
+
+    __slots__ = ()
+
+
+class _Writer:
+    """Writer of expressions, which collects the imports that they need."""
+
+    def __init__(self) -> None:
+        self.imports: set[str] = set()
+
+    def assignment(self, name: str, section: BaseModel) -> str:
+        """Return the line that assigns the object of a section."""
+        return f"{name} = {self.expression(section)}"
+
+    def arguments(self, section: BaseModel) -> dict[str, Any]:
+        """Return the values of a section that the settings contain."""
+        return {
+            name: self._file(name, getattr(section, name))
+            for name in type(section).model_fields
+            if name in section.model_fields_set and name not in {"kind", "generator"}
+        }
+
+    def _file(self, name: str, value: Any) -> Any:
+        """Return the expression of a picture of scikit-image, or the value."""
+        if name in FILE_SETTINGS and isinstance(value, str) and BUNDLED.fullmatch(value):
+            return _Name(f'fs.config.picture_path(fs.config.Source(), "{value}", "{name}")')
+        return value
+
+    def expression(self, value: Any, depth: int = 0) -> str:
+        """Return the source of a value."""
+        if isinstance(value, _Name):
+            return str(value)
+        if isinstance(value, PerArea):
+            return f"{self.expression(value.per_um2)} * layout.area_um2"
+        if isinstance(value, BaseModel):
+            call = call_of(value)
+            if call is None:
+                raise _NotPublicError
+            return self.call(self.name_of(call), self.arguments(value), depth=depth)
+        if isinstance(value, float) and not math.isfinite(value):
+            return f'float("{value}")'
+        if isinstance(value, Mapping):
+            items = [f"{self.expression(k)}: {self.expression(v, depth + 1)}" for k, v in value.items()]
+            return _joined("{", items, "}", depth)
+        if isinstance(value, list | tuple):
+            return _joined("[", [self.expression(item, depth + 1) for item in value], "]", depth)
+        if isinstance(value, str) and '"' not in value and value.isprintable() and "\\" not in value:
+            return f'"{value}"'
+        return repr(value)
+
+    def call(self, name: str, arguments: Mapping[str, Any], *, positional: tuple[str, ...] = (), depth: int = 0) -> str:
+        """Return the source of a call."""
+        items = [
+            self.expression(value, depth + 1) if key in positional else f"{key}={self.expression(value, depth + 1)}"
+            for key, value in arguments.items()
+        ]
+        return _joined(f"{name}(", items, ")", depth)
+
+    def name_of(self, call: Callable[..., Any]) -> str:
+        """Return the public name of a function, class or class method."""
+        owner = getattr(call, "__self__", None)
+        if isinstance(owner, type):
+            return f"{self.name_of(owner)}.{call.__name__}"
+        wanted = inspect.unwrap(call)
+        for module, shown in MODULES.items():
+            found = import_module(module)
+            for name in found.__all__:
+                if name == getattr(wanted, "__name__", "") and inspect.unwrap(getattr(found, name)) is wanted:
+                    if shown.count(".") > 1:
+                        self.imports.add(f"import {module}")
+                    return f"{module if shown.count('.') > 1 else shown}.{name}"
+        if "<" in wanted.__qualname__ or "." in wanted.__qualname__:
+            raise _NotPublicError
+        self.imports.add(f"import {wanted.__module__}")
+        return f"{wanted.__module__}.{wanted.__qualname__}"
+
+
+def _joined(opening: str, items: list[str], closing: str, depth: int) -> str:
+    """Return items on one line, or one per line if they are too long."""
+    line = opening + ", ".join(items) + closing
+    if len(line) + len(INDENT) * depth <= LINE_LENGTH and "\n" not in line:
+        return line
+    inner = INDENT * (depth + 1)
+    return "\n".join([opening, *(f"{inner}{item}," for item in items), INDENT * depth + closing])

@@ -1,0 +1,128 @@
+"""
+Studio: an interactive design table in the browser.
+
+Every setting of a shot is a control; scene, photosites, picture, noise and design rules are updated while it changes.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+import sys
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+
+from foveasim._core.calls import check_public_calls
+from foveasim._core.extras import needs
+from foveasim._core.user_warnings import warn
+from foveasim._core.validation import check_count
+from foveasim.config import check_directory
+from foveasim.errors import FoveasimWarning, ParameterError, SimulationError
+
+__all__ = ["run_studio"]
+
+#: Modules of the extra.
+MODULES = ("starlette", "uvicorn", "websockets")
+
+
+def run_studio(
+    shot: str | Path | None = None,
+    *,
+    out: str | Path | None = None,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    open_browser: bool = True,
+    announce: Callable[[str, bool], None] | None = None,
+) -> None:
+    """
+    Open the studio in a browser until Ctrl-C.
+
+    Parameters
+    ----------
+    shot : path, optional
+        Settings file to start from; by default that of the demo.
+    out : path, optional
+        Directory for saved files. Without it, the studio writes no files.
+    host : str
+        Address of this computer. Others than ``127.0.0.1`` make the studio accessible from other computers.
+    port : int
+        0 for any free port.
+    open_browser : bool
+        Whether to open a browser.
+    announce : function of (address, whether a browser was opened), optional
+        Called when the server accepts requests; by default the address is printed.
+
+    Raises
+    ------
+    SimulationError
+        When the extra ``studio`` is not installed.
+    ConfigError
+        When the settings file cannot be read, or is invalid.
+    ParameterError
+        When the port is out of range or in use, or the host is not an address of this computer.
+
+    Warns
+    -----
+    FoveasimWarning
+        When the host is not a loopback address.
+    """
+    for module in MODULES:
+        _require(module)
+    from foveasim.config import check_settings
+    from foveasim.studio._files import start_settings
+    from foveasim.studio._server import UNSPECIFIED, Studio, host_names, serve
+    from foveasim.studio._session import Start
+
+    port = check_count("port", port, at_least=0, at_most=2**16 - 1)
+    directory = None if out is None else check_directory(out)
+    settings, name = start_settings(shot)
+    check_settings(None if shot is None else Path(shot), settings)
+    start = Start(settings, name, None if shot is None else Path(shot).absolute().parent, directory)
+    if not _is_loopback(host):
+        warn(
+            f"the studio is accessible from other computers at {host}: everyone with the address and its token can use it; "
+            "the connection is not encrypted",
+            FoveasimWarning,
+        )
+    try:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        listener = socket.create_server((host, port), family=family)
+    except OSError as error:
+        raise ParameterError(
+            "port", f"must be a free port of an address of this computer ({error.strerror or error})", port
+        ) from None
+    with listener:
+        found = int(listener.getsockname()[1])
+        studio = Studio(start, hosts=host_names(host, found))
+        shown = "127.0.0.1" if host in UNSPECIFIED else f"[{host}]" if ":" in host else host
+        address = f"http://{shown}:{found}/#{studio.token}"
+
+        def ready() -> None:
+            is_opened = open_browser and webbrowser.open(address)
+            if announce is not None:
+                announce(address, is_opened)
+            else:
+                sys.stdout.write(f"{address}\n")
+                sys.stdout.flush()
+
+        serve(studio, listener, ready)
+
+
+def _require(module: str) -> None:
+    from importlib import import_module
+
+    try:
+        import_module(module)
+    except ImportError:
+        raise SimulationError(f"the studio {needs(module)}") from None
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+check_public_calls(__name__)

@@ -1,0 +1,462 @@
+"""Controls of the settings, generated from their JSON schema."""
+
+from __future__ import annotations
+
+import copy
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+from foveasim._core.validation import UNIT_SUFFIXES
+from foveasim.config import bundled_layouts, schema
+from foveasim.sensor.limits import LIMITS
+from foveasim.studio._templates import INITIAL, PER_AREA, WITHOUT_MOSAIC, templates
+
+__all__ = ["chosen_value", "controls_of", "structure_of", "value_at"]
+
+#: Ranges of sliders by parameter: lowest and highest value; logarithmic if the lowest is positive and far below the highest.
+RANGES: dict[str, tuple[float, float]] = {
+    "bits": (1.0, 16.0),
+    "dark_doubling_k": (4.0, 12.0),
+    "dark_reference_k": (230.0, 350.0),
+    "depth_um": (0.5, 10.0),
+    "distance_m": (0.05, 100.0),
+    "exposure_s": (1e-5, 1.0),
+    "f_number": (1.0, 32.0),
+    "field_of_view_deg": (1.0, 120.0),
+    "field_patches": (1.0, 15.0),
+    "focal_length_mm": (1.0, 200.0),
+    "focus_distance_m": (0.05, 100.0),
+    "fwhm_nm": (10.0, 300.0),
+    "peak_radiance_w_m2_sr_nm": (1e-5, 1.0),
+    "qe": (0.0, 1.0),
+    "radiance_w_m2_sr_nm": (1e-5, 1.0),
+    "read_noise_e": (0.0, 50.0),
+    "rotation_deg": (-180.0, 180.0),
+    "seed": (0.0, 100.0),
+    "sensitivity": (0.0, 1.0),
+    "temperature_k": (230.0, 350.0),
+    "transmission": (0.0, 1.0),
+    "v_sat_v": (0.1, 5.0),
+    "wavelength_nm": (350.0, 1000.0),
+    "prnu_fraction": (0.0, 0.3),
+    "gain_fpn_fraction": (0.0, 0.3),
+    "dsnu_fraction": (0.0, 2.0),
+    "pixel_fpn_fraction": (0.0, 0.1),
+    "line_fpn_fraction": (0.0, 0.1),
+    "hot_fraction": (0.0, 0.1),
+    "dead_fraction": (0.0, 0.1),
+    "rts_fraction": (0.0, 0.1),
+    "nonlinearity_fraction": (0.0, 0.5),
+}
+#: Ratio of the ends of a logarithmic slider.
+LOG_RATIO = 50.0
+#: Range of a slider around a value without a known range.
+BELOW, ABOVE = 0.25, 4.0
+#: Parameters with a list of valid numbers.
+ENUMERATED = ("integration_order",)
+#: Keys that select an alternative of a section.
+TAGS = ("kind", "generator")
+#: Scenes whose single band requires a width.
+ONE_BAND = (
+    "bars", "checkerboard", "colour_chart", "flat", "grey_scale", "letter_f", "picture", "point_grid", "point_sources",
+    "siemens_star", "sine", "slanted_edge", "zone_plate",
+)  # fmt: skip
+#: Required parameters that are files without a bundled one.
+FROM_FILES = {"path", "file"}
+#: Depth of nested sections.
+MAX_DEPTH = 6
+
+
+def controls_of(settings: Mapping[str, Any], start: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
+    """
+    Return the controls of settings, in the order of their sections.
+
+    Parameters
+    ----------
+    settings : mapping
+        Determines the alternatives whose parameters have controls, such as the layout generator.
+    start : mapping, optional
+        Initial settings, from which the ranges of sliders follow; by default the same settings.
+
+    Returns
+    -------
+    controls : list of dict
+        Plain data: key, label, kind, unit, default, help, section, and according to the kind range and choices.
+    """
+    root = _schema()
+    start = settings if start is None else start
+    found: list[dict[str, Any]] = []
+    for name, node in root["properties"].items():
+        found += _controls(root, name, name, node, settings.get(name), start, is_required=name in root["required"])
+    n_of_key = Counter(control["key"] for control in found)
+    for control in found:
+        is_form = control["kind"] == "choice" and n_of_key[control["key"]] > 1
+        control["id"] = f"{control['key']}:form" if is_form else control["key"]
+    return found
+
+
+def value_at(settings: Any, key: str) -> Any:
+    """Return the value of a key such as ``"sensor.bits"``, None if it is missing."""
+    for name in key.split("."):
+        if not isinstance(settings, Mapping) or name not in settings:
+            return None
+        settings = settings[name]
+    return settings
+
+
+def structure_of(settings: Any, key: str = "") -> Any:
+    """Return names, kinds and strings of settings, which determine the list of controls."""
+    if isinstance(settings, Mapping):
+        return {name: structure_of(value, name) for name, value in settings.items()}
+    if isinstance(settings, bool) or key in ENUMERATED:
+        return settings
+    return type(settings).__name__ if isinstance(settings, int | float | list) else settings
+
+
+def chosen_value(
+    key: str, value: Any, shown: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], start: Mapping[str, Any]
+) -> Any:
+    """
+    Return the value of an alternative for the current settings.
+
+    The list on the page may be older than the settings: parameters that alternatives share have their current values.
+
+    Parameters
+    ----------
+    key : str
+    value : plain data
+        One of the choices of the page, or any other value, which is returned.
+    shown : sequence of controls
+        The controls of the page.
+    settings, start : mapping
+        As for :func:`controls_of`.
+    """
+    labels = [c["label"] for each in _choices(shown, key) for c in each["choices"] if c["value"] == value]
+    if not labels or not isinstance(value, dict):
+        return value
+    new = [c["value"] for each in _choices(controls_of(settings, start), key) for c in each["choices"]
+           if c["label"] == labels[0]]  # fmt: skip
+    return copy.deepcopy(new[0]) if new else value
+
+
+def _choices(controls: Sequence[Mapping[str, Any]], key: str) -> list[Mapping[str, Any]]:
+    return [control for control in controls if control["key"] == key and control["kind"] == "choice"]
+
+
+@lru_cache(maxsize=1)
+def _schema() -> dict[str, Any]:
+    return schema()
+
+
+def _controls(
+    root: dict[str, Any],
+    key: str,
+    section: str,
+    node: dict[str, Any],
+    value: Any,
+    start: Mapping[str, Any],
+    *,
+    is_required: bool = False,
+    depth: int = 0,
+) -> Iterator[dict[str, Any]]:
+    """Yield the control of a parameter, and those of its section."""
+    name = key.rpartition(".")[2]
+    control = _described(key, section, node)
+    if is_required:
+        control["is_required"] = True
+    options = list(_options(root, node))
+    if key == "layout":
+        options = [option for option in options if option.get("type") != "string"]
+    control["is_optional"] = any(option.get("type") == "null" for option in options)
+    options = [option for option in options if option.get("type") != "null"]
+    sections = [option for option in options if option.get("type") == "object" and "properties" in option]
+    default = node.get("default")
+    selected = next((option for option in sections if _matches(option, value)), None)
+    if not sections:
+        yield {**control, **_simple(name, options, value, default, value_at(start, key))}
+        return
+    if len(sections) == 1 and len(options) == 1 and not control["is_optional"]:
+        yield {**control, "kind": "group"}
+    else:
+        yield {**control, "kind": "choice", **_alternatives(root, key, options, value, control["is_optional"], start)}
+        others = [option for option in options if option not in sections]
+        if selected is None and value is None and not isinstance(default, dict):
+            value = default
+        if selected is None and others and value is not None:
+            simple = _simple(name, others, value, default, value_at(start, key))
+            if simple["kind"] != "choice":  # names are alternatives of the control above
+                yield {**control, **simple}
+    if selected is None and len(sections) == 1 and len(options) == 1 and not control["is_optional"]:
+        selected = sections[0]
+    if selected is None or depth == MAX_DEPTH:
+        return
+    values = value if isinstance(value, Mapping) else {}
+    required = selected.get("required", ())
+    for inner, below in selected["properties"].items():
+        if inner in TAGS and ("const" in below or len(below.get("enum", ())) == 1):
+            continue
+        inner_key = f"{key}.{inner}"
+        yield from _controls(
+            root,
+            inner_key,
+            section if depth or "." in key else key,
+            below,
+            values.get(inner),
+            start,
+            is_required=inner in required,
+            depth=depth + 1,
+        )
+
+
+def _described(key: str, section: str, node: dict[str, Any]) -> dict[str, Any]:
+    """Return the name, unit and help of a control."""
+    name = key.rpartition(".")[2]
+    suffix = next((s for s in UNIT_SUFFIXES if name.endswith(s) and len(s) < len(name)), "")
+    label = name.removesuffix(suffix).replace("_", " ") if UNIT_SUFFIXES.get(suffix) else name.replace("_", " ")
+    return {
+        "key": key,
+        "label": label,
+        "unit": UNIT_SUFFIXES.get(suffix, ""),
+        "section": section,
+        "help": _plain(node.get("description", "")),
+        "default": node.get("default"),
+    }
+
+
+def _plain(text: str) -> str:
+    """Return a docstring without markup."""
+    text = re.sub(r":\w+:`~?([^`]+)`", r"\1", text)
+    return text.replace("``", "").replace("\\", "")
+
+
+def _resolved(root: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
+    """Return the definition that a node refers to."""
+    while "$ref" in node:
+        node = root["$defs"][node["$ref"].rpartition("/")[2]]
+    return node
+
+
+def _options(root: dict[str, Any], node: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield the alternatives of a node, without nested unions."""
+    node = _resolved(root, node)
+    for union in ("anyOf", "oneOf"):
+        if union in node:
+            for option in node[union]:
+                yield from _options(root, option)
+            return
+    yield node
+
+
+def _tag(option: dict[str, Any]) -> tuple[str, str] | None:
+    """Return the key that selects a section, and its value."""
+    for name in TAGS:
+        below = option["properties"].get(name, {})
+        if "const" in below:
+            return name, below["const"]
+    return None
+
+
+def _matches(option: dict[str, Any], value: Any) -> bool:
+    """Return whether a section is the one that a value belongs to."""
+    if not isinstance(value, Mapping):
+        return False
+    tag = _tag(option)
+    if tag is not None:
+        return value.get(tag[0]) == tag[1]
+    return set(value) <= set(option["properties"]) and set(option.get("required", ())) <= set(value)
+
+
+def _label(option: dict[str, Any]) -> str:
+    """Return the name of an alternative."""
+    if option.get("type") == "object":
+        tag = _tag(option) if "properties" in option else None
+        if tag is not None:
+            return tag[1].replace("_", " ")
+        return {"PerArea": "per µm²"}.get(option.get("title", ""), option.get("title", "section"))
+    if "const" in option:
+        return str(option["const"])
+    return {"array": "list", "string": "name", "number": "number", "integer": "number"}.get(
+        option.get("type", ""), "value"
+    )
+
+
+def _alternatives(
+    root: dict[str, Any],
+    key: str,
+    options: list[dict[str, Any]],
+    value: Any,
+    is_optional: bool,
+    start: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return the choices of a parameter, each with its initial value."""
+    choices: list[dict[str, Any]] = []
+    selected = None
+    if is_optional:
+        choices.append({"label": "none", "value": None})
+        selected = 0 if value is None else None
+    name = key.rpartition(".")[2]
+    started = value_at(start, key)
+    default = None
+    for option in options:
+        is_selected = selected is None and _is_of(option, value)
+        if not is_selected and (option.get("type") == "array" or set(option.get("required", ())) & FROM_FILES):
+            continue  # lists of values per site, and files, which are uploaded
+        if option.get("type") == "object" and "properties" in option:
+            if value is not None and is_selected:
+                initial = value
+            else:
+                initial = started if _matches(option, started) else _initial(root, option, value)
+                if option.get("title") == "PerArea" and not _matches(option, started):
+                    initial = {"per_um2": PER_AREA.get(name, 1.0)}
+        else:
+            initial = _initial_value(name, option, value)
+        if is_selected:
+            selected = len(choices)
+        choices.append({"label": _label(option), "value": copy.deepcopy(initial)})
+    if key == "layout":
+        choices += [{"label": f"bundled: {each.replace('_', ' ')}", "value": each} for each in bundled_layouts()]
+    return {"choices": choices, "selected": selected, "default": default}
+
+
+def _is_of(option: dict[str, Any], value: Any) -> bool:
+    """Return whether a value is of an alternative."""
+    match option.get("type"):
+        case "object":
+            return _matches(option, value) if "properties" in option else isinstance(value, Mapping)
+        case "number":
+            return isinstance(value, int | float) and not isinstance(value, bool)
+        case "integer":
+            return isinstance(value, int) and not isinstance(value, bool)
+        case "string":
+            return isinstance(value, str) and value == option.get("const", value)
+        case "boolean":
+            return isinstance(value, bool)
+        case "array":
+            return isinstance(value, list)
+        case _:
+            return False
+
+
+def _initial(root: dict[str, Any], option: dict[str, Any], value: Any) -> dict[str, Any]:
+    """Return a valid section: its template, and the parameters that the current value has too."""
+    found: dict[str, Any] = {}
+    tag = _tag(option)
+    if tag is not None:
+        found[tag[0]] = tag[1]
+    template = templates(option.get("title", ""))
+    old = value if isinstance(value, Mapping) else {}
+    for name, node in option["properties"].items():
+        options = list(_options(root, node))
+        if name in found:
+            continue
+        if name == "parameters":
+            found[name] = _initial(root, options[0], None)
+        elif name in template:
+            found[name] = copy.deepcopy(template[name])
+        elif name in old and any(_is_of(each, old[name]) for each in options):
+            found[name] = copy.deepcopy(old[name])
+        elif name in option.get("required", ()) or name == "fit":
+            found[name] = _initial_value(name, options[0], None)
+    # Framings of a scene exclude each other.
+    if "fit" in found and any(found.get(name) is not None for name in ("pitch_um", "field_of_view_deg")):
+        del found["fit"]
+    wavelength_nm = found.get("wavelength_nm", INITIAL["wavelength_nm"])
+    if found.get("kind") in ONE_BAND and not (isinstance(wavelength_nm, list) and len(wavelength_nm) > 1):
+        found.setdefault("band_width_nm", INITIAL["band_width_nm"])
+    if found.get("generator") in WITHOUT_MOSAIC:
+        found.pop("mosaic", None)
+    return found
+
+
+def _initial_value(name: str, option: dict[str, Any], value: Any) -> Any:
+    """Return a valid value of an alternative."""
+    if _is_of(option, value):
+        return value
+    if "const" in option:
+        return option["const"]
+    if "enum" in option:
+        return option["enum"][0]
+    if name in INITIAL and _is_of(option, INITIAL[name]):
+        return copy.deepcopy(INITIAL[name])
+    limits = LIMITS.get(name)
+    match option.get("type"):
+        case "object" if "properties" in option:
+            return _initial(_schema(), option, None)
+        case "object":
+            return {}
+        case "array":
+            if "prefixItems" in option:
+                return [_initial_value(name, _resolved(_schema(), item), None) for item in option["prefixItems"]]
+            return [INITIAL[name]] if isinstance(INITIAL.get(name), int | float) else []
+        case "integer":
+            return 1
+        case "boolean":
+            return False
+        case "string":
+            return ""
+        case _:
+            return 1.0 if limits is None else min(max(1.0, limits.low), limits.high)
+
+
+def _simple(name: str, options: list[dict[str, Any]], value: Any, default: Any, started: Any) -> dict[str, Any]:
+    """Return the kind, range and choices of a control without a section."""
+    shown = value if value is not None else default
+    option = next((each for each in options if _is_of(each, shown)), options[0] if options else {})
+    enum = option.get("enum")
+    if enum is not None or (len(options) == 1 and "const" in option):
+        values = enum or [option["const"]]
+        names = [{"label": "none" if each is None else str(each).replace("_", " "), "value": each} for each in values]
+        return {"kind": "choice", "choices": names, "selected": values.index(shown) if shown in values else None}
+    match option.get("type"):
+        case "number" | "integer":
+            return {"kind": option["type"], **_range(name, option, shown, started)}
+        case "boolean":
+            return {"kind": "boolean"}
+        case "string":
+            return {"kind": "text"}
+        case _:
+            length = len(option.get("prefixItems", ())) or None
+            return {"kind": "list", "length": length}
+
+
+def _range(name: str, option: dict[str, Any], value: Any, started: Any) -> dict[str, Any]:
+    """Return the valid and the suggested range of a number, and the scale of its slider."""
+    limits = LIMITS.get(name)
+    minimum = option.get("minimum", limits.low if limits is not None else None)
+    if limits is not None and limits.low > 0.0 and not limits.is_positive:
+        minimum = 0.0  # 0 is valid for any lower end
+    maximum = option.get("maximum", limits.high if limits is not None else None)
+    low, high = RANGES.get(name, (None, None))
+    around = next((x for x in (started, value) if isinstance(x, int | float) and math.isfinite(x)), None)
+    if low is None or high is None:
+        size = abs(around) if around else 1.0
+        if name.endswith("_fraction"):
+            low, high = 0.0, 1.0
+        elif around is not None and around > 0.0:
+            low, high = size * BELOW, size * ABOVE
+        elif around is not None and around < 0.0:
+            low, high = -2.0 * size, 2.0 * size
+        else:
+            low, high = 0.0, 10.0 if option["type"] == "integer" else 1.0
+        if name.startswith(("dx", "dy", "x_", "y_")):
+            low, high = -max(abs(low), high), max(abs(low), high)
+    for x in (around, value):
+        if isinstance(x, int | float) and math.isfinite(x):
+            low, high = min(low, float(x)), max(high, float(x))
+    if minimum is not None:
+        low = max(low, minimum)
+    if maximum is not None:
+        high = min(high, maximum)
+    if option["type"] == "integer":
+        low, high = math.floor(low), max(math.ceil(high), math.floor(low) + 1)
+    is_log = low > 0.0 and high / low >= LOG_RATIO and option["type"] == "number"
+    return {
+        "minimum": minimum,
+        "maximum": maximum,
+        "suggested": [low, high],
+        "scale": "log" if is_log else "linear",
+    }

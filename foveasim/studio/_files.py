@@ -1,0 +1,199 @@
+"""Files that settings from the page may contain, and the presets."""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from foveasim._io.yaml_files import read_yaml
+from foveasim.config import (
+    YAML_EXTENSIONS,
+    bundled_layouts,
+    demo_settings,
+    put_setting,
+    read_settings,
+    resolve_files,
+)
+from foveasim.config._objects import BUNDLED_PICTURE, FILE_SETTINGS
+from foveasim.errors import FileError, ParameterError, printable
+
+__all__ = ["Files", "apply_preset", "file_name", "presets", "start_settings"]
+
+#: Longest name and extension of an uploaded file.
+MAX_NAME_LENGTH, MAX_EXTENSION_LENGTH = 80, 8
+#: Characters that names of stored files do not contain.
+UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
+
+
+def start_settings(shot: str | Path | None) -> tuple[dict[str, Any], str]:
+    """
+    Return the settings of a file or the demo with absolute paths, and the name.
+
+    Raises
+    ------
+    ConfigError
+        When the file cannot be read, or is not YAML.
+    """
+    path = demo_settings()[0] if shot is None else Path(shot)
+    settings = read_settings(path)
+    if isinstance(settings.get("layout"), str):
+        settings["layout"] = _inlined(settings["layout"], path.parent)
+    return resolve_files(path.parent.absolute(), settings), path.stem
+
+
+def presets() -> list[dict[str, str]]:
+    """Return the bundled shots and layouts by name."""
+    shots = [
+        {"name": f"shot:{path.stem}", "label": path.stem.replace("_", " "), "kind": "shot"} for path in demo_settings()
+    ]
+    layouts = [
+        {"name": f"layout:{name}", "label": name.replace("_", " "), "kind": "layout"} for name in bundled_layouts()
+    ]
+    return [*shots, *layouts]
+
+
+def apply_preset(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Return the settings of a preset; a layout replaces that of the given settings.
+
+    Raises
+    ------
+    ParameterError
+        When the preset does not exist.
+    """
+    kind, _, stem = name.partition(":")
+    shots = {path.stem: path for path in demo_settings()}
+    if kind == "shot" and stem in shots:
+        return start_settings(shots[stem])[0]
+    if kind == "layout" and stem in bundled_layouts():
+        return with_layout(settings, resolve_files(bundled_layouts()[stem].parent, read_yaml(bundled_layouts()[stem])))
+    raise ParameterError("name", "must be the name of a preset", printable(name))
+
+
+def with_layout(settings: Mapping[str, Any], layout: Any) -> dict[str, Any]:
+    """Return settings with another layout: the picture covers it, and filters have a mosaic."""
+    found = copy.deepcopy(dict(settings))
+    old = found.get("layout")
+    found["layout"] = copy.deepcopy(layout)
+    if found.get("scene", {}).get("kind") == "picture":
+        put_setting(None, found, "scene.fit", "cover")
+    if isinstance(layout, dict) and "generator" in layout and found.get("sensor", {}).get("filters") is not None:
+        mosaic = old.get("mosaic") if isinstance(old, dict) else None
+        found["layout"].setdefault("mosaic", mosaic or ["RG", "GB"])
+    return found
+
+
+def _inlined(layout: str, directory: Path) -> Any:
+    """Return the section of a layout that is given by its name or file."""
+    path = directory / layout
+    if not path.is_file() and layout in bundled_layouts():
+        path = bundled_layouts()[layout]
+    if path.suffix.lower() not in YAML_EXTENSIONS:
+        return {"file": str(path)}
+    return resolve_files(path.parent.absolute(), read_yaml(path))
+
+
+class Files:
+    """
+    Files that the settings of a session may contain.
+
+    These are pictures of scikit-image, uploaded files, files of the initial settings, and files in their directory.
+
+    Parameters
+    ----------
+    start : mapping
+        The initial settings, with absolute paths.
+    directory : Path, optional
+        Directory of the settings file.
+    uploads : Path
+        Directory of the uploaded files.
+    """
+
+    def __init__(self, start: Mapping[str, Any], directory: Path | None, uploads: Path) -> None:
+        named: list[Path] = []
+        resolve_files(Path(), dict(start), found=named)
+        self._named = {path.resolve() for path in named}
+        self._directories = [path.resolve() for path in (uploads, directory) if path is not None]
+
+    def allows(self, path: str | Path) -> bool:
+        """Return whether settings may contain a file."""
+        try:
+            found = Path(path).resolve()
+        except (OSError, ValueError, RuntimeError):
+            return False
+        if found in self._named:
+            return True
+        return found.parent in self._directories and not found.name.startswith(".")
+
+    def check(self, settings: Any, key: str = "") -> None:
+        """
+        Check the files of settings.
+
+        Raises
+        ------
+        FileError
+            For a file that the settings may not contain.
+        """
+        if isinstance(settings, Mapping):
+            for name, value in settings.items():
+                self.check(value, f"{key}.{name}" if key else str(name))
+        elif isinstance(settings, list):
+            for value in settings:
+                self.check(value, key)
+        elif isinstance(settings, str) and key.rpartition(".")[2] in FILE_SETTINGS:
+            if settings.startswith(BUNDLED_PICTURE) or (key == "layout" and settings in bundled_layouts()):
+                return
+            if not self.allows(settings):
+                raise FileError(
+                    None,
+                    f"{key}: {printable(settings)[:100]!r} is not available here; upload the file, or use a picture of "
+                    "scikit-image such as skimage:astronaut",
+                )
+
+    def resolve(self, settings: Any) -> Any:
+        """Return settings with YAML layouts replaced by their content, after a check of all files."""
+        self.check(settings)
+        if isinstance(settings, dict) and isinstance(settings.get("layout"), str):
+            settings = {**settings, "layout": _inlined(settings["layout"], Path())}
+            self.check(settings)
+        return settings
+
+    def settings_of(self, path: str) -> dict[str, Any]:
+        """
+        Return the settings of a YAML file.
+
+        Raises
+        ------
+        FileError
+            When the file is not available, or not valid YAML.
+        """
+        self._require(path)
+        return resolve_files(Path(path).parent, read_settings(path))
+
+    def layout_of(self, path: str) -> Any:
+        """
+        Return the section of a layout file.
+
+        Raises
+        ------
+        FileError
+            When the file is not available, or not valid YAML.
+        """
+        self._require(path)
+        return _inlined(path, Path())
+
+    def _require(self, path: str) -> None:
+        if not self.allows(path):
+            raise FileError(None, f"{printable(path)[:100]!r} is not available here; upload the file")
+
+
+def file_name(name: str) -> str:
+    """Return a safe name for an uploaded file, with its extension."""
+    stem, dot, extension = Path(name.replace("\\", "/")).name.rpartition(".")
+    stem, extension = (UNSAFE.sub("_", part).strip("_") for part in ((stem, extension) if dot else (extension, "")))
+    extension = extension[:MAX_EXTENSION_LENGTH].lower()
+    short = (stem or "file")[:MAX_NAME_LENGTH]
+    return f"{short}.{extension}" if extension else short

@@ -1,0 +1,413 @@
+"""Web server of the studio: page, socket, uploads and downloads, for this computer."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import json
+import secrets
+import socket
+import tempfile
+import time
+from collections import deque
+from collections.abc import Callable
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+
+from foveasim import __version__
+from foveasim.errors import FoveasimError, ParameterError, SimulationError, printable
+from foveasim.layout import write_layout
+from foveasim.studio._files import file_name, presets
+from foveasim.studio._session import Session, Start
+
+__all__ = ["UNSPECIFIED", "Studio", "host_names", "serve"]
+
+#: Largest uploaded file, and all files of a session.
+MAX_FILE_BYTES, MAX_SESSION_BYTES = 64 << 20, 512 << 20
+#: Largest message of a page.
+MAX_MESSAGE_BYTES = 1 << 20
+#: Time after which sessions without a page are closed, and their number.
+IDLE_S, MAX_SESSIONS = 1800.0, 8
+#: Time limit for the first message of a connection, and for closing all connections.
+HELLO_S = 10.0
+#: Simultaneous connections; further ones receive 503.
+MAX_CONNECTIONS = 128
+#: Largest number of messages that wait for a slow connection.
+MAX_OUTGOING = 1000
+#: Close code for a wrong token.
+WRONG_TOKEN = 4403
+TOO_MANY = 4429
+#: Addresses that stand for all addresses of this computer.
+UNSPECIFIED = ("0.0.0.0", "::")  # noqa: S104 -- compared, not bound
+HTTP_PORT = 80
+TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".svg": "image/svg+xml",
+    ".png": "image/png",
+}
+HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+class Studio:
+    """
+    Sessions and their web application.
+
+    Parameters
+    ----------
+    start : Start
+    token : str, optional
+        Secret of the address; random by default.
+    hosts : set of str
+        Values of the header ``Host`` that are accepted.
+    """
+
+    def __init__(self, start: Start, *, token: str | None = None, hosts: set[str]) -> None:
+        self.start, self.hosts = start, hosts
+        self.token = token or secrets.token_urlsafe(24)
+        self.sessions: dict[str, Session] = {}
+        routes = [
+            Route("/", self._index),
+            Route("/static/{name}", self._static),
+            Route("/web/{name}", self._web),
+            Route("/file", self._file, methods=["POST"]),
+            Route("/download", self._download),
+            WebSocketRoute("/socket", self._socket),
+        ]
+        self.app: ASGIApp = _Guard(Starlette(routes=routes), hosts)
+
+    def close(self) -> None:
+        """Close all sessions."""
+        for session in self.sessions.values():
+            session.close()
+        self.sessions.clear()
+
+    def session(self, name: object) -> tuple[Session | None, bool]:
+        """Return the session of a name or a new one, if possible, and whether it is new."""
+        if isinstance(name, str) and name in self.sessions:
+            return self.sessions[name], False
+        self.free_idle()
+        if len(self.sessions) >= MAX_SESSIONS:
+            # A page that was closed leaves its session; the oldest one makes space.
+            idle = [each for each in self.sessions.values() if each.is_idle]
+            if not idle:
+                return None, True
+            oldest = min(idle, key=lambda each: each.last_used_s)
+            self.sessions.pop(oldest.name).close()
+        session = Session(secrets.token_urlsafe(12), self.start)
+        self.sessions[session.name] = session
+        return session, True
+
+    def free_idle(self, idle_s: float = IDLE_S) -> None:
+        """Close sessions without a page."""
+        now_s = time.monotonic()
+        for name, session in list(self.sessions.items()):
+            if session.is_idle and now_s - session.last_used_s > idle_s:
+                self.sessions.pop(name).close()
+
+    async def free_idle_sessions(self) -> None:
+        """Close sessions without a page, from time to time, until cancelled."""
+        while True:
+            await asyncio.sleep(IDLE_S / 10.0)
+            self.free_idle()
+
+    # -- pages ------------------------------------------------------------------------------------------------------
+
+    async def _index(self, _request: Request) -> Response:
+        return _package_file("foveasim.studio", "static", "index.html")
+
+    async def _static(self, request: Request) -> Response:
+        return _package_file("foveasim.studio", "static", request.path_params["name"])
+
+    async def _web(self, request: Request) -> Response:
+        name = request.path_params["name"]
+        return _package_file("foveasim.view", "web", name if name.endswith(".js") else "")
+
+    # -- socket -----------------------------------------------------------------------------------------------------
+
+    async def _socket(self, socket: WebSocket) -> None:
+        await socket.accept()
+        outgoing: _Outbox | None = None
+        session: Session | None = None
+        sender: asyncio.Task[None] | None = None
+        try:
+            async with asyncio.timeout(HELLO_S):
+                first = _parse(await socket.receive_text())
+            if not isinstance(first, dict) or not self._is_token(first.get("token")):
+                await socket.close(WRONG_TOKEN, "wrong token")
+                return
+            session, is_new = self.session(first.get("session"))
+            if session is None:
+                await socket.close(TOO_MANY, "too many sessions")
+                return
+            outgoing = _Outbox(asyncio.get_running_loop())
+            hello = {
+                "kind": "hello",
+                "session": session.name,
+                "version": __version__,
+                "is_new": is_new,
+                "presets": presets(),
+            }
+            await socket.send_text(json.dumps({**hello, **session.hello()}))
+            sender = asyncio.create_task(outgoing.send_to(socket))
+            session.attach(outgoing.put)
+            while True:
+                session.post(_parse(await socket.receive_text()))
+        except (WebSocketDisconnect, TimeoutError, KeyError, RuntimeError):
+            pass  # disconnected, silent, or a binary message
+        finally:
+            if session is not None and outgoing is not None:
+                session.detach(outgoing.put)
+            if sender is not None:
+                sender.cancel()
+                with contextlib.suppress(asyncio.CancelledError, Exception):
+                    await sender
+            if socket.client_state is WebSocketState.CONNECTED and socket.application_state is WebSocketState.CONNECTED:
+                with contextlib.suppress(RuntimeError):
+                    await socket.close()
+
+    def _is_token(self, token: object) -> bool:
+        return isinstance(token, str) and hmac.compare_digest(token.encode(), self.token.encode())
+
+    # -- files ------------------------------------------------------------------------------------------------------
+
+    def _authorised(self, request: Request) -> Session | Response:
+        scheme, _, token = request.headers.get("authorization", "").partition(" ")
+        if scheme.lower() != "bearer" or not self._is_token(token.strip()):
+            return _error("wrong token", 403)
+        session = self.sessions.get(request.headers.get("x-session", ""))
+        return _error("unknown session; reload the page", 404) if session is None else session
+
+    async def _file(self, request: Request) -> Response:
+        session = self._authorised(request)
+        if isinstance(session, Response):
+            return session
+        limit = min(MAX_FILE_BYTES, MAX_SESSION_BYTES - session.n_uploaded_bytes)
+        message = (
+            f"files may have at most {MAX_FILE_BYTES >> 20} MiB, and those of a session {MAX_SESSION_BYTES >> 20} MiB"
+        )
+        length = request.headers.get("content-length", "0")
+        if not length.isdecimal() or int(length) > limit:
+            return _error(message, 413)
+        content = bytearray()
+        async for piece in request.stream():
+            content += piece
+            if len(content) > limit:
+                return _error(message, 413)
+        if not content:
+            return _error("the file is empty", 400)
+        try:
+            path = await asyncio.to_thread(session.add_file, request.query_params.get("name", "file"), bytes(content))
+        except OSError as error:
+            return _error(f"the file cannot be stored: {error.strerror or error}", 400)
+        return JSONResponse({"path": str(path), "name": path.name})
+
+    async def _download(self, request: Request) -> Response:
+        session = self._authorised(request)
+        if isinstance(session, Response):
+            return session
+        what = request.query_params.get("what", "")
+        try:
+            content, name = await asyncio.to_thread(_exported, session, what)
+        except FoveasimError as error:
+            return _error(" ".join(printable(str(error)).split()), 400)
+        disposition = f'attachment; filename="{name}"'
+        return Response(content, media_type="application/octet-stream", headers={"Content-Disposition": disposition})
+
+
+class _Outbox:
+    """Messages that wait for a connection; newer parts replace older ones of the same view."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._messages: deque[tuple[str | None, str | bytes]] = deque()
+        self._is_ready = asyncio.Event()
+
+    def put(self, message: str | bytes) -> None:
+        """Add a message; called from any thread."""
+        self._loop.call_soon_threadsafe(self._put, message)
+
+    def _put(self, message: str | bytes) -> None:
+        name = _part_name(message) if isinstance(message, bytes) else None
+        if name is not None:
+            self._messages = deque(item for item in self._messages if item[0] != name)
+        if len(self._messages) < MAX_OUTGOING:
+            self._messages.append((name, message))
+        self._is_ready.set()
+
+    async def send_to(self, connection: WebSocket) -> None:
+        """Send messages until the connection is closed."""
+        while True:
+            await self._is_ready.wait()
+            while self._messages:
+                _, message = self._messages.popleft()
+                if isinstance(message, bytes):
+                    await connection.send_bytes(message)
+                else:
+                    await connection.send_text(message)
+            self._is_ready.clear()
+
+
+def _part_name(message: bytes) -> str:
+    start = message.index(b'"part":"') + 8
+    return message[start : message.index(b'"', start)].decode()
+
+
+class _Guard:
+    """Check of the headers ``Host`` and ``Origin``, and headers of all responses."""
+
+    def __init__(self, app: ASGIApp, hosts: set[str]) -> None:
+        self.app, self.hosts = app, hosts
+        self.origins = {f"http://{host}" for host in hosts}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self.app(scope, receive, send)
+            return
+        hosts = [value.decode("latin-1").lower() for name, value in scope["headers"] if name == b"host"]
+        origins = [value.decode("latin-1").lower() for name, value in scope["headers"] if name == b"origin"]
+        if len(hosts) != 1 or hosts[0] not in self.hosts or any(origin not in self.origins for origin in origins):
+            if scope["type"] == "websocket":
+                await receive()
+                await send({"type": "websocket.close", "code": WRONG_TOKEN})
+            else:
+                await _error("wrong host or origin", 403)(scope, receive, send)
+            return
+
+        async def send_with_headers(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                present = {name.lower() for name, _ in message["headers"]}
+                added = [(name.lower().encode(), value.encode()) for name, value in HEADERS.items()]
+                message["headers"] = [*message["headers"], *(item for item in added if item[0] not in present)]
+            await send(message)
+
+        await self.app(scope, receive, send_with_headers)
+
+
+def _error(text: str, status: int) -> Response:
+    return JSONResponse({"error": text}, status, headers=HEADERS)
+
+
+def _parse(text: str) -> Any:
+    """Return the JSON value of a message; None if it is invalid."""
+    try:
+        return json.loads(text, parse_constant=_reject_constant)
+    except (ValueError, RecursionError):
+        return None
+
+
+def _reject_constant(name: str) -> None:
+    raise ValueError(name)
+
+
+def _package_file(package: str, directory: str, name: str) -> Response:
+    """Return a file of the package; names contain no directories."""
+    path = files(package) / directory / name
+    kind = TYPES.get(Path(name).suffix)
+    if not name or kind is None or "/" in name or "\\" in name or name.startswith(".") or not path.is_file():
+        return PlainTextResponse("not found\n", 404)
+    return Response(path.read_bytes(), media_type=kind)
+
+
+def _exported(session: Session, what: str) -> tuple[bytes, str]:
+    """Return the content and the name of a file of the current state."""
+    stem = file_name(session.start.name)
+    if what in ("yaml", "python"):
+        return session.text(what).encode(), f"{stem}.{'yaml' if what == 'yaml' else 'py'}"
+    if what not in ("gds", "oas", "geojson", "npz", "svg", "png"):
+        raise ParameterError("what", "must be yaml, python, gds, oas, geojson, npz, svg or png", printable(what)[:40])
+    if session.result is None:
+        raise SimulationError("there is no result")
+    capture = session.result.capture
+    with tempfile.TemporaryDirectory(prefix="foveasim-studio-") as directory:
+        path = Path(directory) / f"{stem}.{what}"
+        if what == "png":
+            capture.picture(max_pixels=1024).save(path, capture.white_dn, encode_srgb=True)
+        else:
+            write_layout(capture.layout, path)
+        return path.read_bytes(), path.name
+
+
+def host_names(host: str, port: int) -> set[str]:
+    """Return the accepted values of the header ``Host``."""
+    names = {"127.0.0.1", "localhost", "[::1]", _in_address(host)}
+    if host in UNSPECIFIED:
+        names.add(socket.gethostname())
+        with contextlib.suppress(OSError):
+            names |= {_in_address(str(found[4][0])) for found in socket.getaddrinfo(socket.gethostname(), None)}
+    return {f"{name}:{port}".lower() for name in names} | (names if port == HTTP_PORT else set())
+
+
+def _in_address(host: str) -> str:
+    """Return a host as in a URL."""
+    return f"[{host}]" if ":" in host else host
+
+
+def serve(
+    studio: Studio,
+    listener: socket.socket,
+    announce: Callable[[], None],
+    started: Callable[[Any], object] | None = None,
+) -> None:
+    """
+    Serve the studio until Ctrl-C.
+
+    Parameters
+    ----------
+    studio : Studio
+    listener : socket
+        Bound to the address.
+    announce : function
+        Called when the server accepts requests.
+    started : function, optional
+        Called with the server, whose ``should_exit`` stops it, before it runs.
+    """
+    import uvicorn
+
+    class Server(uvicorn.Server):
+        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+            await super().startup(sockets=sockets)
+            self.idle = asyncio.create_task(studio.free_idle_sessions())
+            announce()
+
+        async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+            self.idle.cancel()
+            await super().shutdown(sockets=sockets)
+
+    config = uvicorn.Config(
+        studio.app,
+        log_level="critical",
+        access_log=False,
+        lifespan="off",
+        ws="websockets-sansio",
+        ws_max_size=MAX_MESSAGE_BYTES,
+        timeout_graceful_shutdown=0,
+        limit_concurrency=MAX_CONNECTIONS,
+        server_header=False,
+        date_header=False,
+    )
+    try:
+        with contextlib.suppress(KeyboardInterrupt):
+            server = Server(config)
+            if started is not None:
+                started(server)
+            server.run(sockets=[listener])
+    finally:
+        studio.close()

@@ -1,0 +1,528 @@
+"""Session of a page: settings with history, simulation in a thread, and messages."""
+
+from __future__ import annotations
+
+import copy
+import difflib
+import json
+import shutil
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from foveasim._io.atomic import atomic_write
+from foveasim._io.yaml_files import format_yaml
+from foveasim.config import check_settings, put_setting
+from foveasim.errors import FoveasimError, ParameterError, SimulationError, printable
+from foveasim.studio._controls import chosen_value, controls_of, structure_of, value_at
+from foveasim.studio._engine import Engine, Simulated
+from foveasim.studio._files import Files, apply_preset, file_name, with_layout
+from foveasim.studio._history import History
+from foveasim.studio._messages import encode_part, from_json, to_json
+from foveasim.studio._parts import PARTS, summary_of
+from foveasim.studio._templates import WITHOUT_MOSAIC
+
+__all__ = ["Session", "Start"]
+
+#: Largest number of messages that wait.
+MAX_WAITING = 1000
+#: Longest message text.
+MAX_MESSAGE_LENGTH = 500
+#: Largest depth of settings from the page.
+MAX_DEPTH = 20
+#: Messages that change the settings.
+CHANGES = ("set", "reset", "delete", "undo", "redo", "preset", "restore", "file")
+
+#: Receives messages for a page: strings of JSON, and bytes of parts.
+Listener = Callable[[str | bytes], None]
+
+
+class Start:
+    """
+    Initial state of sessions.
+
+    Parameters
+    ----------
+    settings : dict
+    name : str
+        Name of the shot.
+    directory : Path, optional
+        Directory of the settings file.
+    out : Path, optional
+        Directory for saved files.
+    """
+
+    def __init__(
+        self, settings: dict[str, Any], name: str = "shot", directory: Path | None = None, out: Path | None = None
+    ) -> None:
+        self.settings, self.name, self.directory, self.out = settings, name, directory, out
+
+
+class Session:
+    """
+    Settings of a page with history, and a thread that simulates them.
+
+    Parameters
+    ----------
+    name : str
+        Identifier.
+    start : Start
+    n_threads : int, optional
+        Number of threads of the simulation.
+    """
+
+    def __init__(self, name: str, start: Start, *, n_threads: int | None = None) -> None:
+        self.name, self.start = name, start
+        self.uploads = Path(tempfile.mkdtemp(prefix="foveasim-studio-"))
+        self.files = Files(start.settings, start.directory, self.uploads)
+        self.engine = Engine(n_threads=n_threads)
+        self.history = History(start.settings)
+        self.result: Simulated | None = None
+        self.last_used_s = time.monotonic()
+        self.n_uploaded_bytes = 0
+        self._views = list(PARTS)
+        self._version = 0
+        self._last_id: Any = None
+        self._sent: dict[str, tuple[Any, ...]] = {}
+        self._sent_version: dict[str, int] = {}
+        self._structure: Any = None
+        self._controls: list[dict[str, Any]] = []
+        self._frozen: dict[str, Any] | None = None
+        self._errors: dict[str, str] = {}
+        self._listeners: set[Listener] = set()
+        self._waiting: deque[dict[str, Any]] = deque()
+        self._wake = threading.Condition()
+        self._is_closed = False
+        self._thread = threading.Thread(target=self._run, name=f"studio {name[:8]}", daemon=True)
+        self._thread.start()
+
+    # -- interface of the server ------------------------------------------------------------------------------------
+
+    def hello(self) -> dict[str, Any]:
+        """Return the controls, and the names of views."""
+        settings = self.history.settings
+        return {
+            "controls": controls_of(settings, self.start.settings),
+            "views": [{"name": part.name, "label": part.label} for part in PARTS.values()],
+            "can_save": self.start.out is not None,
+            "settings": to_json(settings),
+            "name": self.start.name,
+        }
+
+    def attach(self, listener: Listener) -> None:
+        """Add a connection, which receives all parts."""
+        with self._wake:
+            self._listeners.add(listener)
+            self.last_used_s = time.monotonic()
+        self.post({"do": "refresh", "id": None})
+
+    def detach(self, listener: Listener) -> None:
+        """Remove a connection."""
+        with self._wake:
+            self._listeners.discard(listener)
+            self.last_used_s = time.monotonic()
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether no page is connected."""
+        return not self._listeners
+
+    def post(self, message: Any) -> None:
+        """Add a message of the page; it is handled in the thread of the session."""
+        with self._wake:
+            self.last_used_s = time.monotonic()
+            if len(self._waiting) >= MAX_WAITING:
+                message = None
+            else:
+                self._waiting.append(message)
+            self._wake.notify()
+        if message is None:
+            self._send({"kind": "error", "id": None, "text": "too many messages wait; the newest were discarded"})
+
+    def close(self) -> None:
+        """Stop the thread, and delete uploaded files."""
+        with self._wake:
+            self._is_closed = True
+            self._wake.notify()
+        shutil.rmtree(self.uploads, ignore_errors=True)
+
+    def add_file(self, name: str, content: bytes) -> Path:
+        """Store an uploaded file, and return its path."""
+        k, path = 0, self.uploads / file_name(name)
+        while path.exists():
+            k += 1
+            path = self.uploads / f"{k}_{file_name(name)}"
+        path.write_bytes(content)
+        self.n_uploaded_bytes += len(content)
+        return path
+
+    # -- thread -----------------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while True:
+            with self._wake:
+                while not self._waiting and not self._is_closed:
+                    self._wake.wait()
+                if self._is_closed:
+                    return
+                messages = list(self._waiting)
+                self._waiting.clear()
+            try:
+                self._handle(messages)
+            except BaseException as error:  # noqa: BLE001 -- the session continues with its last valid state
+                self._send_error(self._last_id, error)
+
+    def _handle(self, messages: list[Any]) -> None:
+        """Handle messages in order; consecutive changes are simulated once."""
+        changes: list[dict[str, Any]] = []
+        for message in messages:
+            if isinstance(message, dict) and message.get("do") in CHANGES:
+                changes.append(message)
+                continue
+            self._change(changes)
+            changes = []
+            try:
+                self._other(message)
+            except Exception as error:  # noqa: BLE001 -- messages of the page may cause any exception
+                self._send_error(message.get("id") if isinstance(message, dict) else None, error)
+        self._change(changes)
+        self._send_parts()
+
+    def _change(self, messages: list[dict[str, Any]]) -> None:
+        """Apply changes and simulate the result; after an error each change is applied separately."""
+        if not messages:
+            return
+        kept = [
+            message
+            for message, following in zip(messages, [*messages[1:], None], strict=True)
+            if not (_is_preview(message) and following is not None and _is_preview(following, message.get("key")))
+        ]
+        before = self.history.copy()
+        self._send({"kind": "busy"})
+        try:
+            for message in kept:
+                self._apply(message)
+            self._simulate(self.history.settings)
+        except Exception as error:  # noqa: BLE001 -- settings may cause any exception of the package or a library
+            self.history = before
+            if len(kept) > 1:
+                for message in kept:
+                    self._change([message])
+                return
+            message = kept[0]
+            if message.get("do") == "set" and message.get("final", True):
+                self.history.commit(self.history.settings)  # a valid preview is the step
+            key = message.get("key")
+            self._errors = {key if isinstance(key, str) else str(message.get("do")): _line(error)}
+        else:
+            self._errors = {}
+        self._last_id = messages[-1].get("id")
+        self._send_state()
+
+    def _apply(self, message: dict[str, Any]) -> None:
+        """Apply one change to the history."""
+        settings = self.history.settings
+        match message["do"]:
+            case "undo":
+                if not self.history.undo():
+                    raise SimulationError("there is no step to undo")
+                return
+            case "redo":
+                if not self.history.redo():
+                    raise SimulationError("there is no step to redo")
+                return
+            case "set":
+                settings = copy.deepcopy(settings)
+                value = from_json(_plain(message.get("value")))
+                key = _key(message)
+                if key == "layout" and isinstance(value, str):
+                    settings = apply_preset(f"layout:{value}", settings)
+                else:
+                    value = chosen_value(key, value, self._controls, settings, self.start.settings)
+                    put_setting(None, settings, key, value)
+                if key == "layout":
+                    _match_filters(settings)
+            case "reset":
+                settings = _reset(settings, self.start.settings, _key(message))
+            case "delete":
+                settings = _reset(settings, {}, _key(message))
+            case "preset":
+                settings = apply_preset(_string(message, "name"), settings)
+            case "restore":
+                restored = from_json(_plain(message.get("settings")))
+                if not isinstance(restored, dict):
+                    raise ParameterError("settings", "must be a mapping")
+                settings = restored
+            case "file":
+                settings = self._with_file(_string(message, "path"), message.get("as"))
+        settings = self.files.resolve(settings)
+        check_settings(None, settings)
+        if message["do"] == "set" and message.get("final", True) is False:
+            self.history.preview(settings)
+        else:
+            self.history.commit(settings)
+
+    def _with_file(self, path: str, use: Any) -> dict[str, Any]:
+        """Return settings with an uploaded file."""
+        settings = copy.deepcopy(self.history.settings)
+        match use:
+            case "scene":
+                if settings["scene"].get("kind") != "picture":
+                    control = next(c for c in controls_of(settings, self.start.settings) if c["key"] == "scene")
+                    settings["scene"] = next(c["value"] for c in control["choices"] if c["label"] == "picture")
+                settings["scene"]["picture"] = path
+                if settings["scene"].get("fit") is None:
+                    put_setting(None, settings, "scene.fit", "cover")  # pictures differ in their number of pixels
+                return settings
+            case "layout":
+                return with_layout(settings, self.files.layout_of(path))
+            case "settings":
+                return self.files.settings_of(path)
+            case _:
+                raise ParameterError("as", "must be scene, layout or settings", printable(str(use))[:40])
+
+    def _simulate(self, settings: dict[str, Any]) -> None:
+        if self.result is not None and self.result.settings == settings:
+            return
+        self.result = self.engine.simulate(settings)
+        self._version += 1
+
+    def _other(self, message: Any) -> None:
+        """Handle a message that does not change the settings."""
+        if not isinstance(message, dict):
+            raise ParameterError("message", "must be a JSON object")
+        match message.get("do"):
+            case "refresh":
+                self._sent, self._sent_version, self._structure = {}, {}, None
+                if self.result is None:
+                    self._send({"kind": "busy"})
+                    try:
+                        self._simulate(self.history.settings)
+                    except Exception as error:  # noqa: BLE001 -- shown at the settings
+                        self._errors = {"": _line(error)}
+            case "views":
+                names = message.get("names")
+                if not isinstance(names, list) or not all(isinstance(name, str) and name in PARTS for name in names):
+                    raise ParameterError("names", f"must be a list of names of views: {', '.join(PARTS)}")
+                self._views = [name for name in PARTS if name in names]
+            case "freeze":
+                if self.result is None:
+                    raise SimulationError("there is no result to freeze")
+                self._frozen = {"summary": summary_of(self.result), "settings": self.result.settings}
+            case "unfreeze":
+                self._frozen = None
+            case "text":
+                text = self.text(_string(message, "what"))
+                self._send({"kind": "text", "id": message.get("id"), "what": message["what"], "text": text})
+            case "save":
+                path = self._save(_string(message, "name"))
+                self._send({"kind": "saved", "id": message.get("id"), "path": str(path)})
+            case unknown:
+                raise ParameterError("do", "must be the name of a message", printable(str(unknown))[:40])
+        self._last_id = message.get("id")
+        self._send_state()
+
+    # -- answers ----------------------------------------------------------------------------------------------------
+
+    def text(self, what: str) -> str:
+        """
+        Return the current settings as YAML or Python, or their changes as a difference.
+
+        Raises
+        ------
+        ParameterError
+            When the format is unknown.
+        """
+        uploaded: list[str] = []
+        settings = _relative(self.history.settings, self.uploads, uploaded)
+        note = f"# Uploaded files, next to this file: {', '.join(uploaded)}\n" if uploaded else ""
+        match what:
+            case "yaml":
+                return note + format_yaml(settings)
+            case "python":
+                from foveasim.config import to_python
+
+                return note + to_python(settings)
+            case "diff":
+                old, new = (format_yaml(each).splitlines(keepends=True) for each in (self.start.settings, settings))
+                return "".join(difflib.unified_diff(old, new, f"{self.start.name}.yaml", "studio"))
+            case _:
+                raise ParameterError("what", "must be yaml, python or diff", printable(what)[:40])
+
+    def _save(self, name: str) -> Path:
+        """Write the settings to the directory for saved files, with copies of uploaded files."""
+        out = self.start.out
+        if out is None:
+            raise SimulationError("files are written only with --out; use the download instead")
+        safe = file_name(name)
+        path = out / (safe if safe.endswith((".yaml", ".yml")) else f"{safe}.yaml")
+        out.mkdir(parents=True, exist_ok=True)
+        uploaded: list[str] = []
+        settings = _relative(self.history.settings, self.uploads, uploaded)
+        for copied in dict.fromkeys(uploaded):
+            with atomic_write(out / copied) as temporary:
+                shutil.copyfile(self.uploads / copied, temporary)
+        with atomic_write(path) as temporary:
+            temporary.write_text(format_yaml(settings), encoding="utf-8")
+        return path
+
+    def _send_state(self) -> None:
+        settings, result = self.history.settings, self.result
+        structure = structure_of(settings)
+        if structure != self._structure:
+            self._structure, self._controls = structure, controls_of(settings, self.start.settings)
+            self._send({"kind": "controls", "controls": self._controls})
+        self._send({
+            "kind": "state",
+            "id": self._last_id,
+            "version": self._version,
+            "settings": settings,
+            "changed": _changed(settings, self.start.settings),
+            "can_undo": self.history.can_undo,
+            "can_redo": self.history.can_redo,
+            "errors": self._errors,
+            "warnings": [] if result is None else result.warnings,
+            "summary": {} if result is None else summary_of(result),
+            "frozen": self._frozen,
+        })  # fmt: skip
+
+    def _send_parts(self) -> None:
+        """Compute and send the parts that changed; newer messages interrupt."""
+        result = self.result
+        if result is None:
+            return
+        times_ms = {"simulation": 1e3 * result.seconds_s}
+        # Sites and their values belong together; the others in the order of their age.
+        names = sorted(self._views, key=lambda n: (n not in ("sites", "columns"), self._sent_version.get(n, -1)))
+        for k, name in enumerate(names):
+            part = PARTS[name]
+            depends = part.depends(result)
+            if name in self._sent and _is_same(self._sent[name], depends):
+                self._sent_version[name] = self._version
+                continue
+            start_s = time.perf_counter()
+            try:
+                message: bytes | None = encode_part(name, self._version, *part.make(result))
+            except Exception as error:  # noqa: BLE001 -- one view fails, the others are shown
+                message = None
+                self._send(
+                    {"kind": "error", "id": self._last_id, "part": name, "text": f"{part.label}: {_line(error)}"}
+                )
+            self._sent[name], self._sent_version[name] = depends, self._version
+            if message is not None:
+                self._broadcast(message)
+            times_ms[name] = 1e3 * (time.perf_counter() - start_s)
+            if self._waiting and k > 1:
+                return
+        self._send({"kind": "done", "id": self._last_id, "version": self._version, "ms": times_ms})
+
+    def _send_error(self, number: Any, error: BaseException) -> None:
+        self._send({"kind": "error", "id": number, "text": _line(error)})
+
+    def _send(self, message: dict[str, Any]) -> None:
+        self._send_text(json.dumps(to_json(message), allow_nan=False))
+
+    def _send_text(self, text: str) -> None:
+        self._broadcast(text)
+
+    def _broadcast(self, message: str | bytes) -> None:
+        for listener in list(self._listeners):
+            with suppress(Exception):
+                listener(message)
+
+
+def _is_same(old: tuple[Any, ...], new: tuple[Any, ...]) -> bool:
+    """Return whether the objects that a part depends on are the same."""
+    return len(old) == len(new) and all(a is b for a, b in zip(old, new, strict=True))
+
+
+def _is_preview(message: dict[str, Any], key: Any = None) -> bool:
+    """Return whether a message sets a value during a drag, of a given key."""
+    return message.get("do") == "set" and message.get("final") is False and (key is None or message.get("key") == key)
+
+
+def _line(error: BaseException) -> str:
+    """Return an error in one line."""
+    if isinstance(error, MemoryError):
+        return "not enough memory; use a smaller picture or fewer photosites"
+    text = str(error) if isinstance(error, FoveasimError) else f"{type(error).__name__}: {error}".removesuffix(": ")
+    text = printable(" ".join(text.split()))
+    return text if len(text) <= MAX_MESSAGE_LENGTH else text[: MAX_MESSAGE_LENGTH - 3] + "..."
+
+
+def _string(message: dict[str, Any], name: str) -> str:
+    value = message.get(name)
+    if not isinstance(value, str):
+        raise ParameterError(name, "must be a string")
+    return value
+
+
+def _key(message: dict[str, Any]) -> str:
+    key = _string(message, "key")
+    if not key or len(key) > MAX_MESSAGE_LENGTH or not all(key.split(".")):
+        raise ParameterError("key", "must be the path of a setting, such as sensor.bits", printable(key)[:40])
+    return key
+
+
+def _plain(value: Any, depth: int = 0) -> Any:
+    """Return a value from the page, after a check of its depth."""
+    if depth > MAX_DEPTH:
+        raise ParameterError("value", f"must have at most {MAX_DEPTH} levels")
+    for item in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        _plain(item, depth + 1)
+    return value
+
+
+def _reset(settings: dict[str, Any], start: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """Return settings with the initial value of a key, or without it."""
+    found = copy.deepcopy(settings)
+    value = value_at(start, key)
+    if value is not None:
+        put_setting(None, found, key, copy.deepcopy(value))
+        return found
+    *above, last = key.split(".")
+    section: Any = found
+    for name in above:
+        section = section.get(name) if isinstance(section, dict) else None
+    if isinstance(section, dict):
+        section.pop(last, None)
+    return found
+
+
+def _changed(settings: Any, start: Any, key: str = "") -> list[str]:
+    """Return the keys of values that differ from the initial ones."""
+    if isinstance(settings, dict) and isinstance(start, dict):
+        return [
+            found
+            for name in dict.fromkeys((*start, *settings))
+            for found in _changed(settings.get(name), start.get(name), f"{key}.{name}" if key else name)
+        ]
+    return [] if settings == start else [key]
+
+
+def _match_filters(settings: dict[str, Any]) -> None:
+    """Remove colour filters from layouts that cannot have a mosaic; add one to others."""
+    layout, sensor = settings.get("layout"), settings.get("sensor")
+    if not isinstance(layout, dict) or not isinstance(sensor, dict) or sensor.get("filters") is None:
+        return
+    if layout.get("generator") in WITHOUT_MOSAIC:
+        sensor.pop("filters")
+    elif "generator" in layout and layout.get("mosaic") is None:
+        layout["mosaic"] = ["RG", "GB"]
+
+
+def _relative(value: Any, uploads: Path, found: list[str]) -> Any:
+    """Return settings with names of uploaded files for paths, and collect the names."""
+    if isinstance(value, dict):
+        return {name: _relative(item, uploads, found) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_relative(item, uploads, found) for item in value]
+    if isinstance(value, str) and Path(value).parent == uploads:
+        found.append(Path(value).name)
+        return found[-1]
+    return value

@@ -1,0 +1,94 @@
+"""Valid initial values of sections and parameters that are chosen on the page."""
+
+from __future__ import annotations
+
+from typing import Any
+
+__all__ = ["INITIAL", "PER_AREA", "WITHOUT_MOSAIC", "templates"]
+
+#: Initial values of required parameters by name.
+INITIAL: dict[str, Any] = {
+    "band_width_nm": 100.0,
+    "bits": 10,
+    "distance_m": 1.0,
+    "f_number": 2.8,
+    "fit": "cover",
+    "focal_length_mm": 8.0,
+    "focal_um": 8000.0,
+    "full_well_e": 10000.0,
+    "intensity_w_sr_nm": 1e-6,
+    "peak_radiance_w_m2_sr_nm": 0.02,
+    "picture": "skimage:astronaut",
+    "pitch_um": 500.0,
+    "radiance_w_m2_sr_nm": 0.02,
+    "shape": [512, 512],
+    "wavelength_nm": 550.0,
+}
+#: Initial values of sections by their title in the schema.
+SECTIONS: dict[str, dict[str, Any]] = {
+    "annulus kind": {"obscuration": 0.3},
+    "bars kind": {"groups": [-3, -2, -1]},
+    "blades kind": {"n_blades": 6},
+    "checkerboard kind": {"square_mm": 16.0},
+    "colour_chart kind": {"patch_mm": 35.0},
+    "constant kind": {"value": 0.6},
+    "coupling": {"neighbour_fraction": 0.01},
+    "diffusion kind": {"spread_um": 1.0},
+    "filter set": {
+        "curves": [{"kind": "gaussian", "centre_nm": centre_nm, "fwhm_nm": 80.0} for centre_nm in (610.0, 540.0, 460.0)],
+        "names": ["R", "G", "B"],
+    },
+    "fisheye kind": {"projection": "equidistant"},
+    "foveal_cartesian parameters": {"n_rings": 30, "ring_ratio": 1.1, "pitch_um": 4.0},
+    "fovi parameters": {"fov_um": 1000.0, "a_um": 20.0, "n_sites": 6000},
+    "gaussian kind": {"centre_nm": 550.0, "fwhm_nm": 150.0},
+    "giotto parameters": {"n_rho": 76, "n_theta": 128, "n_fovea": 20, "n_across": 600, "unit_um": 2.0},
+    "grey_scale kind": {"patch_mm": 20.0},
+    "grid parameters": {"n_x": 120, "n_y": 120, "pitch_um": 8.0},
+    "hexagonal parameters": {"n_columns": 120, "n_rows": 138, "pitch_um": 8.0},
+    "kernel kind": {"kernel": [[0.0, 0.01, 0.0], [0.01, 0.96, 0.01], [0.0, 0.01, 0.0]]},
+    "lateral colour": {"wavelength_nm": [450.0, 550.0, 650.0], "magnification": [0.999, 1.0, 1.001]},
+    "letter_f kind": {"height_mm": 150.0},
+    "log_polar parameters": {"n_sectors": 128, "min_size_um": 3.0, "r_max_um": 600.0},
+    "octagonal parameters": {"n_x": 100, "n_y": 100, "pitch_um": 10.0},
+    "pass_band kind": {"from_nm": 420.0, "to_nm": 680.0},
+    "penrose parameters": {"size_um": 800.0, "side_um": 12.0},
+    "point_grid kind": {"spacing_mm": 16.0},
+    "point_sources kind": {"pixels": [[256, 256]]},
+    "polynomial kind": {"wavelength_nm": [400.0, 500.0, 600.0, 700.0], "value": [0.3, 0.6, 0.6, 0.4], "degree": 3},
+    "polynomial_fisheye kind": {"k": [0.0, 0.0, 0.0, 0.0]},
+    "product kind": {"curves": [0.8, {"kind": "silicon", "depth_um": 3.0}]},
+    "quadtree parameters": {"importance": "skimage:camera", "pitch_um": 4.0, "n_levels": 5, "n_sites": 5000},
+    "readout": {"frames_per_s": 30.0, "bits": 10},
+    "routing": {"width_um": 0.2, "space_um": 0.2},
+    "scaramuzza kind": {"a": [1.57e3, -2.75e-4, 3.76e-8, -3.64e-11], "pixel_um": 2.2, "focal_um": 3454.0},
+    "siemens_star kind": {"n_spokes": 36, "radius_mm": 110.0},
+    "silicon kind": {"depth_um": 3.0},
+    "sine kind": {"line_pairs_per_mm": 0.05},
+    "slit kind": {"width_fraction": 0.5},
+    "spider kind": {"n_vanes": 4, "width_fraction": 0.05},
+    "spline kind": {"wavelength_nm": [400.0, 500.0, 600.0, 700.0], "value": [0.3, 0.6, 0.6, 0.4]},
+    "step kind": {"edge_nm": [400.0, 500.0, 600.0, 700.0], "value": [0.3, 0.6, 0.4]},
+    "sunflower parameters": {"n_sites": 6000, "spacing_um": 8.0},
+    "table kind": {"wavelength_nm": [400.0, 500.0, 600.0, 700.0], "value": [0.3, 0.6, 0.6, 0.4]},
+    "tiling parameters": {"pitch_um": 8.0, "radius_um": 450.0},
+    "voronoi parameters": {"n_sites": 3000, "size_um": [600.0, 600.0]},
+    "zernike": {"coefficients": {"4": 0.1}},
+    "zone_plate kind": {"line_pairs_per_mm": 0.5},
+    "zones parameters": {"side_um": [256.0, 512.0, 1024.0], "pitch_um": [4.0, 8.0, 16.0]},
+}  # fmt: skip
+#: Initial values per µm² by parameter.
+PER_AREA: dict[str, float] = {
+    "capacitance_f": 1e-15,
+    "dark_e_per_s": 10.0,
+    "full_well_e": 2000.0,
+    "read_noise_e": 0.05,
+    "sensitivity": 0.001,
+}
+#: Generators whose sites are not in rows and columns, or rings and sectors, which a mosaic needs.
+WITHOUT_MOSAIC = ("penrose", "quadtree", "sunflower", "voronoi")
+
+
+def templates(title: str) -> dict[str, Any]:
+    """Return the initial values of a section by its title in the schema."""
+    return SECTIONS.get(title, {})

@@ -1,0 +1,89 @@
+"""Small settings, and sessions without a thread."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from foveasim.studio._messages import decode_part
+from foveasim.studio._session import Session, Start
+
+SETTINGS = {
+    "scene": {
+        "kind": "checkerboard", "square_mm": 4.0, "shape": [64, 64], "pitch_um": 500.0, "distance_m": 1.0, "radiance_w_m2_sr_nm": 0.02,
+        "wavelength_nm": [620.0, 550.0, 450.0], "band_width_nm": 80.0,
+    },
+    "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    "layout": {
+        "generator": "grid", "parameters": {"n_x": 16, "n_y": 14, "pitch_um": 12.0}, "mosaic": ["RG", "GB"],
+        "rules": {"min_size_um": 10.0},
+    },
+    "sensor": {"qe": 0.6, "filters": "rgb", "bits": 10, "read_noise_e": 2.0, "capacitance_f": {"per_um2": 1e-15}},
+    "exposure_s": 0.01,
+    "seed": 3,
+}  # fmt: skip
+
+
+class Recorder:
+    """A session whose messages are handled at once, and its answers."""
+
+    def __init__(self, session):
+        self.session = session
+        self.messages, self.parts = [], []
+        session._listeners.add(self._receive)
+        self.do(do="refresh")
+
+    def _receive(self, message):
+        if isinstance(message, bytes):
+            self.parts.append(decode_part(message))
+        else:
+            self.messages.append(json.loads(message))
+
+    def do(self, **message):
+        return self.handle([message])
+
+    def handle(self, messages):
+        self.messages.clear()
+        self.parts.clear()
+        self.session._handle(messages)
+        states = [message for message in self.messages if message["kind"] == "state"]
+        return states[-1] if states else None
+
+    @property
+    def part_names(self):
+        return [header["part"] for header, _ in self.parts]
+
+
+class WithoutThread(Session):
+    def _run(self):
+        pass
+
+
+@pytest.fixture
+def settings():
+    return json.loads(json.dumps(SETTINGS))
+
+
+@pytest.fixture
+def make_session(settings):
+    made = []
+
+    def make(out=None, directory=None, start=None):
+        made.append(WithoutThread("test", Start(start or settings, "small", directory, out), n_threads=1))
+        return Recorder(made[-1])
+
+    yield make
+    for session in made:
+        session.close()
+
+
+@pytest.fixture
+def recorder(make_session):
+    return make_session()
+
+
+@pytest.fixture
+def data_directory():
+    return Path(__file__).parents[1]

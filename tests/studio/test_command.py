@@ -1,0 +1,136 @@
+"""The command: its messages, without the extra, without a browser, and for other hosts."""
+
+from __future__ import annotations
+
+import socket
+
+import pytest
+from typer.testing import CliRunner
+
+from foveasim import studio
+from foveasim.cli import app
+from foveasim.config import demo_settings
+from foveasim.errors import ConfigError, FileError, FoveasimWarning, ParameterError, SimulationError
+from foveasim.studio import _server, run_studio
+from foveasim.studio._files import file_name, start_settings
+from foveasim.studio._server import host_names
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """Record the studio instead of serving it."""
+    found = []
+
+    def record(served, _listener, announce):
+        found.append(served)
+        announce()
+        served.close()
+
+    monkeypatch.setattr(_server, "serve", record)
+    return found
+
+
+def test_address_is_printed_without_browser(started, monkeypatch):
+    monkeypatch.setattr("webbrowser.open", lambda _: False)
+    result = CliRunner().invoke(app, ["studio"])
+
+    assert result.exit_code == 0
+    first, second = result.output.splitlines()
+    assert first.startswith("studio at http://127.0.0.1:")
+    assert first.endswith(f"/#{started[0].token}; press Ctrl-C to stop")
+    assert second == "no browser found; open the address in one"
+
+
+def test_browser_opens_address(started, monkeypatch):
+    opened = []
+    monkeypatch.setattr("webbrowser.open", lambda address: not opened.append(address))
+    result = CliRunner().invoke(app, ["studio", str(demo_settings()[1])])
+
+    assert opened[0] in result.output
+    assert "no browser" not in result.output
+    assert started[0].start.name == "four_zones"
+
+
+def test_no_browser_opens_none(started, monkeypatch):
+    monkeypatch.setattr("webbrowser.open", lambda _: pytest.fail("opened"))
+
+    assert len(CliRunner().invoke(app, ["studio", "--no-browser"]).output.splitlines()) == 1
+
+
+def test_tokens_are_random(started):
+    for _ in range(2):
+        run_studio(open_browser=False, announce=lambda *_: None)
+
+    assert started[0].token != started[1].token
+    assert len(started[0].token) == 32
+
+
+def test_python_call_prints_address(started, capsys):
+    run_studio(open_browser=False)
+
+    assert capsys.readouterr().out.startswith("http://127.0.0.1:")
+
+
+def test_missing_extra_gives_one_line(monkeypatch):
+    monkeypatch.setattr(studio, "MODULES", ("foveasim_missing",))
+    monkeypatch.setattr(
+        studio, "needs", lambda module: f"needs {module}; install it with: pip install 'foveasim[studio]'"
+    )
+
+    with pytest.raises(SimulationError, match=r"pip install 'foveasim\[studio\]'$"):
+        run_studio()
+
+
+def test_other_hosts_give_warning(started):
+    with pytest.warns(FoveasimWarning, match="accessible from other computers"):
+        run_studio(host="0.0.0.0", open_browser=False, announce=lambda *_: None)
+
+    assert any(name.startswith(f"{socket.gethostname().lower()}:") for name in started[0].hosts)
+
+
+def test_host_names_have_the_port():
+    assert host_names("127.0.0.1", 5000) == {"127.0.0.1:5000", "localhost:5000", "[::1]:5000"}
+    assert "localhost" in host_names("127.0.0.1", 80)
+
+
+def test_used_port_gives_one_line():
+    with socket.create_server(("127.0.0.1", 0)) as listener, pytest.raises(ParameterError, match="must be a free port"):
+        run_studio(port=listener.getsockname()[1], open_browser=False)
+
+
+def test_invalid_arguments_give_one_line(tmp_path):
+    (tmp_path / "bad.yaml").write_text("scene: 5\n")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"bad\.yaml:1:1: scene"):
+        run_studio(tmp_path / "bad.yaml", open_browser=False)
+    with pytest.raises(FileError, match="missing"):
+        run_studio(tmp_path / "missing.yaml", open_browser=False)
+    with pytest.raises(FileError, match="cannot contain results"):
+        run_studio(out=tmp_path / "file", open_browser=False)
+    with pytest.raises(ParameterError, match="port"):
+        run_studio(port=70000, open_browser=False)
+
+
+def test_start_settings_have_absolute_paths(tmp_path):
+    path = tmp_path / "shot.yaml"
+    path.write_text(demo_settings()[0].read_text().replace("skimage:astronaut", "own.png"))
+
+    settings, name = start_settings(path)
+
+    assert settings["scene"]["picture"] == str(tmp_path / "own.png")
+    assert name == "shot"
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ("../../etc/passwd", "passwd"),
+        ("C:\\pictures\\My photo.JPG", "My_photo.jpg"),
+        (".hidden", "file.hidden"),
+        ("", "file"),
+        ("..", "file"),
+        ("a" * 300 + ".png", "a" * 80 + ".png"),
+    ],
+)
+def test_names_of_uploads_are_safe(given, expected):
+    assert file_name(given) == expected

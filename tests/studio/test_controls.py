@@ -1,0 +1,141 @@
+"""Controls of settings: one for each key of the schema, with valid ranges and alternatives."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from foveasim.config import check_settings, demo_settings, read_settings, schema
+from foveasim.studio._controls import chosen_value, controls_of, structure_of, value_at
+
+KINDS = {"number", "integer", "choice", "boolean", "text", "list", "group"}
+
+
+@pytest.fixture(scope="module")
+def demo():
+    return read_settings(demo_settings()[0])
+
+
+@pytest.fixture(scope="module")
+def controls(demo):
+    return controls_of(demo)
+
+
+def by_id(controls, name):
+    return next(control for control in controls if control["id"] == name)
+
+
+def keys_of(definition):
+    root = schema()
+    return set(root["$defs"][definition]["properties"])
+
+
+@pytest.mark.parametrize(
+    ("section", "definition"),
+    [
+        ("optics", "optics"),
+        ("sensor", "sensor"),
+        ("scene", "picture_kind"),
+        ("layout", "log_polar_generator"),
+        ("layout.parameters", "log_polar_parameters"),
+        ("layout.rules", "design_rules"),
+        ("sensor.qe", "silicon_kind"),
+    ],
+)
+def test_every_parameter_has_a_control(controls, section, definition):
+    keys = {control["key"] for control in controls}
+
+    assert {f"{section}.{name}" for name in keys_of(definition) - {"kind", "generator"}} <= keys
+
+
+def test_every_section_has_a_control(controls):
+    assert {control["key"] for control in controls if "." not in control["key"]} == set(schema()["properties"])
+
+
+def test_controls_have_all_attributes(controls):
+    ids = [control["id"] for control in controls]
+
+    assert len(set(ids)) == len(ids)
+    json.dumps(controls, allow_nan=False)
+    for control in controls:
+        assert control["kind"] in KINDS
+        assert {"key", "label", "unit", "section", "help", "default", "is_optional"} <= set(control)
+        assert "``" not in control["help"]
+
+
+def test_ranges_contain_values(demo, controls):
+    numbers = [control for control in controls if control["kind"] in ("number", "integer")]
+    assert len(numbers) > 40
+    for control in numbers:
+        low, high = control["suggested"]
+        value = value_at(demo, control["key"])
+        assert low < high, control
+        assert control["scale"] == "linear" or low > 0.0
+        assert value is None or low <= value <= high, control
+        assert control["minimum"] is None or low >= control["minimum"]
+        assert control["maximum"] is None or high <= control["maximum"]
+
+
+def test_units_are_not_in_labels(controls):
+    control = by_id(controls, "optics.focal_length_mm")
+
+    assert (control["label"], control["unit"], control["section"]) == ("focal length", "mm", "optics")
+
+
+def test_generators_select_their_parameters(demo, controls):
+    choices = by_id(controls, "layout")["choices"]
+    assert by_id(controls, "layout")["choices"][by_id(controls, "layout")["selected"]]["label"] == "log polar"
+    settings = {**demo, "layout": next(c["value"] for c in choices if c["label"] == "grid")}
+
+    found = {control["key"] for control in controls_of(settings)}
+
+    assert "layout.parameters.n_x" in found
+    assert "layout.parameters.n_sectors" not in found
+
+
+def test_values_per_area_have_two_controls(controls):
+    form, value = by_id(controls, "sensor.read_noise_e:form"), by_id(controls, "sensor.read_noise_e")
+
+    assert [choice["label"] for choice in form["choices"]] == ["number", "per µm²"]
+    assert value["kind"] == "number"
+    assert by_id(controls, "sensor.capacitance_f.per_um2")["kind"] == "number"
+
+
+def test_choices_are_valid_settings(demo, controls):
+    n_checked = 0
+    for control in controls:
+        for choice in control.get("choices", ()):
+            settings = json.loads(json.dumps(demo))
+            if choice["value"] is None or control["key"] == "integration_order":
+                continue
+            *above, last = control["key"].split(".")
+            section = settings
+            for name in above:
+                section = section.setdefault(name, {})
+            section[last] = choice["value"]
+            if control["key"].startswith("scene."):
+                settings["scene"].pop("pitch_um", None)
+            check_settings(None, settings)
+            n_checked += 1
+
+    assert n_checked > 80
+
+
+def test_numbers_do_not_change_structure(demo):
+    changed = json.loads(json.dumps(demo))
+    changed["optics"]["f_number"] = 4.5
+    changed["layout"]["move_um"] = [1.0, 2.0]
+    assert structure_of(changed) == structure_of(demo)
+    changed["optics"]["lens"] = "aplanatic"
+    assert structure_of(changed) != structure_of(demo)
+
+
+def test_choices_of_older_lists_have_current_values(demo, controls):
+    grid = next(choice["value"] for choice in by_id(controls, "layout")["choices"] if choice["label"] == "grid")
+    moved = json.loads(json.dumps(demo))
+    moved["layout"]["move_um"] = [7.0, 8.0]
+
+    assert grid["move_um"] == demo["layout"]["move_um"]
+    assert chosen_value("layout", grid, controls, moved, demo)["move_um"] == [7.0, 8.0]
+    assert chosen_value("layout", {"generator": "own"}, controls, moved, demo) == {"generator": "own"}

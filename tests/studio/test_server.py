@@ -1,0 +1,432 @@
+"""The server: token, headers, limits, files, several pages, and a restart."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+import websockets
+import yaml
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+import foveasim as fs
+from foveasim._io.images import write_picture
+from foveasim.config import build_shot
+from foveasim.studio import _server
+from foveasim.studio._messages import decode_part
+from foveasim.studio._server import HEADERS, Studio, host_names, serve
+from foveasim.studio._session import Start
+
+TIMEOUT_S = 60.0
+#: Open connections of a test.
+CONNECTIONS = []
+
+
+class Served:
+    """A studio in a thread of this process."""
+
+    def __init__(self, start):
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self.listener.getsockname()[1]
+        self.studio = Studio(start, hosts=host_names("127.0.0.1", self.port))
+        self.host = f"127.0.0.1:{self.port}"
+        self.is_ready = threading.Event()
+        self.servers = []
+        self.thread = threading.Thread(target=self._serve, daemon=True)
+        self.thread.start()
+        assert self.is_ready.wait(TIMEOUT_S)
+
+    def _serve(self):
+        serve(self.studio, self.listener, self.is_ready.set, self.servers.append)
+
+    def stop(self):
+        self.servers[0].should_exit = True
+        self.thread.join(TIMEOUT_S)
+        self.listener.close()
+
+    def get(self, path, data=None, **headers):
+        request = urllib.request.Request(f"http://{self.host}{path}", data, headers)
+        try:
+            with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer:
+                return answer.status, lower(answer.headers), answer.read()
+        except urllib.error.HTTPError as error:
+            return error.code, lower(error.headers), error.read()
+
+    def authorised(self, session, path, data=None, **headers):
+        return self.get(path, data, **{"Authorization": f"Bearer {self.studio.token}", "X-Session": session, **headers})
+
+
+def lower(headers):
+    return {name.lower(): value for name, value in headers.items()}
+
+
+class Page:
+    """A connection as of a browser."""
+
+    def __init__(self, connection):
+        self.connection = connection
+        self.hello, self.state, self.parts, self.messages = None, None, {}, []
+
+    async def until(self, kind):
+        while True:
+            message = await asyncio.wait_for(self.connection.recv(), TIMEOUT_S)
+            if isinstance(message, bytes):
+                header, arrays = decode_part(message)
+                self.parts[header["part"]] = header, arrays
+                continue
+            found = json.loads(message)
+            self.messages.append(found)
+            if found["kind"] == "state":
+                self.state = found
+            if found["kind"] == kind:
+                return found
+
+    async def do(self, kind="done", **message):
+        await self.connection.send(json.dumps(message))
+        return await self.until(kind)
+
+    @property
+    def code(self):
+        header, arrays = self.parts["columns"]
+        return arrays[next(column["array"] for column in header["about"]["columns"] if column["key"] == "code")]
+
+
+async def opened(served, session=None, token=None):
+    connection = await websockets.connect(f"ws://{served.host}/socket", max_size=None)
+    CONNECTIONS.append(connection)
+    await connection.send(json.dumps({"token": token or served.studio.token, "session": session}))
+    page = Page(connection)
+    page.hello = await page.until("hello")
+    await page.until("done")
+    return page
+
+
+async def bounded(coroutine):
+    try:
+        return await asyncio.wait_for(coroutine, TIMEOUT_S)
+    finally:
+        while CONNECTIONS:
+            await CONNECTIONS.pop().close()
+
+
+def run(coroutine):
+    return asyncio.run(bounded(coroutine))
+
+
+@pytest.fixture
+def start(settings):
+    return Start(settings, "small")
+
+
+@pytest.fixture
+def served(start):
+    found = Served(start)
+    yield found
+    found.stop()
+
+
+def codes_of(settings):
+    shot = build_shot(None, settings)
+    return shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed).code
+
+
+def test_pages_have_security_headers(served):
+    for path in ("/", "/static/index.html", "/web/map.js", "/static/missing.js"):
+        status, headers, content = served.get(path)
+        assert status == (404 if "missing" in path else 200)
+        assert {headers[name.lower()] for name in HEADERS} == set(HEADERS.values())
+        assert content
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/static/..%2f__init__.py", "/static/%2e%2e/_server.py", "/web/_serve.py", "/web/..%2f..%2fcli.py", "/web/template.html", "/static/", "/file", "/static/.js", "/x"],
+)  # fmt: skip
+def test_other_files_are_not_served(served, path):
+    assert served.get(path)[0] in (404, 405)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "status"),
+    [
+        ("Host", "example.org", 403),
+        ("Host", "127.0.0.1", 403),
+        ("Host", "127.0.0.1:1", 403),
+        ("Origin", "http://example.org", 403),
+        ("Origin", "null", 403),
+        ("Origin", "https://HOST", 403),
+        ("Origin", "http://HOST", 200),
+    ],
+)
+def test_other_hosts_and_origins_are_rejected(served, name, value, status):
+    headers = {name: value.replace("HOST", served.host)}
+    assert served.get("/", **headers)[0] == status
+
+    async def connect():
+        address = f"ws://{served.host}/socket"
+        async with websockets.connect(address, additional_headers=headers if name == "Origin" else {}):
+            pass
+
+    if name == "Origin":
+        if status == 200:
+            run(connect())
+        else:
+            with pytest.raises(InvalidStatus, match="403"):
+                run(connect())
+
+
+@pytest.mark.parametrize("first", ['{"token": "wrong"}', "{}", "[]", "x", '{"token": 5}', '{"token": "é"}'])
+def test_wrong_tokens_close_the_socket(served, first):
+    async def attempt():
+        async with websockets.connect(f"ws://{served.host}/socket") as connection:
+            await connection.send(first)
+            await connection.recv()
+
+    with pytest.raises(ConnectionClosed) as caught:
+        run(attempt())
+
+    assert caught.value.rcvd.code == 4403
+    assert served.studio.sessions == {}
+
+
+def test_page_receives_state_and_parts(served, settings):
+    async def visit():
+        page = await opened(served)
+        await page.do(do="set", key="exposure_s", value=0.02, final=True, id=1)
+        await page.connection.close()
+        return page
+
+    page = run(visit())
+
+    assert {"session", "version", "controls", "presets", "views", "can_save", "is_new"} <= set(page.hello)
+    assert page.hello["is_new"]
+    assert page.state["id"] == 1
+    assert np.array_equal(page.code, codes_of({**settings, "exposure_s": 0.02}))
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "null", "[1]", "NaN", '"x"', "1" * 5000, "[" * 5000, '{"do": "set", "value": Infinity}']
+)
+def test_malformed_messages_give_errors(served, text):
+    async def visit():
+        page = await opened(served)
+        await page.connection.send(text)
+        error = await page.until("error")
+        await page.until("done")
+        await page.do(do="set", key="seed", value=5, final=True)
+        await page.connection.close()
+        return error, page.state
+
+    error, state = run(visit())
+    assert "\n" not in error["text"]
+    assert state["settings"]["seed"] == 5
+
+
+def test_large_messages_close_the_connection(served):
+    async def visit():
+        page = await opened(served)
+        await page.connection.send("x" * (_server.MAX_MESSAGE_BYTES + 1))
+        with pytest.raises(ConnectionClosed):
+            await page.until("nothing")
+        again = await opened(served, page.hello["session"])
+        await again.connection.close()
+        return again.hello["is_new"]
+
+    assert run(visit()) is False
+
+
+def test_second_connection_restores_session(served):
+    async def visit():
+        first = await opened(served)
+        await first.do(do="set", key="exposure_s", value=0.03, final=True)
+        await first.connection.close()
+        second = await opened(served, first.hello["session"])
+        await second.connection.close()
+        return first, second
+
+    first, second = run(visit())
+    assert not second.hello["is_new"]
+    assert second.state["settings"]["exposure_s"] == 0.03
+    assert np.array_equal(first.code, second.code)
+
+
+def test_tabs_have_separate_sessions(served, settings):
+    async def visit():
+        one, two = await opened(served), await opened(served)
+        await one.do(do="set", key="exposure_s", value=0.03, final=True)
+        await two.do(do="set", key="seed", value=8, final=True)
+        for page in (one, two):
+            await page.connection.close()
+        return one, two
+
+    one, two = run(visit())
+    assert one.hello["session"] != two.hello["session"]
+    assert np.array_equal(one.code, codes_of({**settings, "exposure_s": 0.03}))
+    assert np.array_equal(two.code, codes_of({**settings, "seed": 8}))
+
+
+def test_sessions_are_limited_and_freed(served, monkeypatch):
+    monkeypatch.setattr(_server, "MAX_SESSIONS", 2)
+
+    async def visit():
+        pages = [await opened(served), await opened(served)]
+        with pytest.raises(ConnectionClosed) as caught:
+            await opened(served)
+        await pages[0].connection.close()
+        await asyncio.sleep(0.3)
+        third = await opened(served)
+        names = set(served.studio.sessions)
+        for page in (*pages, third):
+            await page.connection.close()
+        return caught.value.rcvd.code, names, pages, third
+
+    code, names, pages, third = run(visit())
+    assert code == 4429
+    assert names == {pages[1].hello["session"], third.hello["session"]}
+    time.sleep(0.3)
+    served.studio.free_idle(0.0)
+    assert served.studio.sessions == {}
+
+
+def test_uploaded_picture_is_simulated(served, tmp_path):
+    write_picture(tmp_path / "photo.png", np.full((20, 20, 3), 100, np.uint8))
+
+    async def visit():
+        page = await opened(served)
+        session = page.hello["session"]
+        status, _, body = await asyncio.to_thread(
+            served.authorised, session, "/file?name=photo.png", (tmp_path / "photo.png").read_bytes()
+        )
+        await page.do(do="file", path=json.loads(body)["path"], **{"as": "scene"})
+        _, headers, text = await asyncio.to_thread(served.authorised, session, "/download?what=yaml")
+        await page.connection.close()
+        return status, page, headers, text
+
+    status, page, headers, text = run(visit())
+    assert status == 200
+    assert page.state["errors"] == {}
+    assert yaml.safe_load(text)["scene"]["picture"] == "photo.png"
+    assert headers["content-disposition"] == 'attachment; filename="small.yaml"'
+
+
+def test_uploads_have_limits(served, monkeypatch):
+    async def visit():
+        page = await opened(served)
+        await page.connection.close()
+        return page.hello["session"]
+
+    session = run(visit())
+    monkeypatch.setattr(_server, "MAX_FILE_BYTES", 1000)
+    assert served.authorised(session, "/file?name=a.png", b"x" * 1001)[0] == 413
+    assert served.authorised(session, "/file?name=a.png", b"x" * 1000)[0] == 200
+    monkeypatch.setattr(_server, "MAX_SESSION_BYTES", 1500)
+    assert served.authorised(session, "/file?name=a.png", b"x" * 600)[0] == 413
+    assert served.authorised(session, "/file?name=a.png", b"")[0] == 400
+    assert served.authorised("other", "/file?name=a.png", b"x")[0] == 404
+    assert served.get("/file?name=a.png", b"x")[0] == 403
+    assert served.get("/download?what=yaml", Authorization="Bearer wrong")[0] == 403
+    assert len(list(served.studio.sessions[session].uploads.iterdir())) == 1
+
+
+@pytest.mark.parametrize("what", ["yaml", "python", "gds", "oas", "geojson", "npz", "svg", "png"])
+def test_downloads_contain_current_state(served, what, tmp_path):
+    async def visit():
+        page = await opened(served)
+        await page.do(do="set", key="layout.parameters.n_x", value=18, final=True)
+        answer = await asyncio.to_thread(served.authorised, page.hello["session"], f"/download?what={what}")
+        await page.connection.close()
+        return answer
+
+    status, headers, content = run(visit())
+    path = tmp_path / headers["content-disposition"].split('"')[1]
+    path.write_bytes(content)
+
+    assert status == 200
+    if what in ("gds", "oas", "geojson", "npz"):
+        assert fs.read_layout(path).n_sites == 18 * 14
+    else:
+        assert len(content) > 200
+
+
+def test_unknown_downloads_give_one_line(served):
+    async def visit():
+        page = await opened(served)
+        await page.connection.close()
+        return page.hello["session"]
+
+    status, _, content = served.authorised(run(visit()), "/download?what=../x")
+    assert status == 400
+    assert "must be yaml, python" in json.loads(content)["error"]
+
+
+def test_slow_connections_receive_newest_parts():
+    async def fill():
+        outbox = _server._Outbox(asyncio.get_running_loop())
+        for k in range(5):
+            outbox._put(b'\0\0\0\0{"part":"picture","version":%d}' % k)
+            outbox._put(f"state {k}")
+        return [message for _, message in outbox._messages]
+
+    messages = asyncio.run(fill())
+    assert [message for message in messages if isinstance(message, str)] == [f"state {k}" for k in range(5)]
+    assert [message[-2:-1] for message in messages if isinstance(message, bytes)] == [b"4"]
+
+
+class Program:
+    """The command in a process of its own."""
+
+    def __init__(self, *arguments):
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "foveasim", "studio", "--no-browser", *arguments],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=Path(fs.__file__).parents[1],
+        )  # fmt: skip
+        line = self.process.stdout.readline()
+        address = line.split("studio at ")[1].split(";")[0]
+        self.host, _, token = address.removeprefix("http://").partition("/#")
+        self.studio = type("Address", (), {"token": token})
+
+    def stop(self, number):
+        start_s = time.monotonic()
+        self.process.send_signal(number)
+        _, errors = self.process.communicate(timeout=TIMEOUT_S)
+        return self.process.returncode, time.monotonic() - start_s, errors
+
+
+def test_restarted_server_restores_settings(tmp_path, settings):
+    shot = tmp_path / "shot.yaml"
+    shot.write_text(yaml.safe_dump(settings))
+
+    async def before(program):
+        page = await opened(program)
+        await page.do(do="set", key="exposure_s", value=0.02, final=True)
+        return page
+
+    async def after(program, page):
+        again = await opened(program, page.hello["session"])
+        assert again.hello["is_new"]
+        await again.do(do="restore", settings=page.state["settings"])
+        start_s = time.monotonic()
+        code, elapsed_s, errors = await asyncio.to_thread(program.stop, signal.SIGINT)
+        assert time.monotonic() - start_s < 10.0
+        return again, code, elapsed_s, errors
+
+    first = Program(str(shot))
+    page = run(before(first))
+    first.stop(signal.SIGKILL)
+    again, code, elapsed_s, errors = run(after(Program(str(shot)), page))
+
+    assert again.state["settings"] == page.state["settings"]
+    assert np.array_equal(again.code, page.code)
+    assert (code, errors) == (0, "")
+    assert elapsed_s < 3.0  # with an open page, on a busy machine

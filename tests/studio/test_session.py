@@ -1,0 +1,461 @@
+"""Messages of a page: each changes the state as specified, and invalid ones give one line."""
+
+from __future__ import annotations
+
+import copy
+import json
+import threading
+import time
+
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+import foveasim as fs
+from foveasim._io.images import write_picture
+from foveasim.cli import app
+from foveasim.config import build_shot, read_settings
+from foveasim.studio import _session
+from foveasim.studio._files import start_settings
+from foveasim.studio._session import Session, Start
+
+LINE = 600
+
+
+def codes_of(settings):
+    shot = build_shot(None, settings)
+    return shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed).code
+
+
+def code_part(recorder):
+    header, arrays = next(part for part in recorder.parts if part[0]["part"] == "columns")
+    column = next(column for column in header["about"]["columns"] if column["key"] == "code")
+    return arrays[column["array"]]
+
+
+def test_first_connection_receives_all_parts(recorder):
+    assert recorder.part_names == ["sites", "columns", "noise", "spectrum", "mtf", "picture", "scene", "rules"]
+    assert [message["kind"] for message in recorder.messages] == ["busy", "controls", "state", "done"]
+    assert {header["version"] for header, _ in recorder.parts} == {1}
+
+
+def test_set_simulates_new_value(recorder, settings):
+    state = recorder.do(do="set", key="exposure_s", value=0.02, final=True, id=7)
+
+    assert (state["id"], state["changed"], state["can_undo"], state["errors"]) == (7, ["exposure_s"], True, {})
+    assert state["summary"]["exposure_s"] == 0.02
+    assert np.array_equal(code_part(recorder), codes_of({**settings, "exposure_s": 0.02}))
+
+
+def test_only_changed_parts_are_sent(recorder):
+    recorder.do(do="set", key="exposure_s", value=0.02, final=True)
+    assert recorder.part_names == ["columns", "noise", "picture"]
+    recorder.do(do="set", key="optics.f_number", value=4.0, final=True)
+    assert set(recorder.part_names) == {"columns", "noise", "mtf", "picture", "scene"}
+    recorder.do(do="set", key="layout.parameters.pitch_um", value=13.0, final=True)
+    assert {"sites", "rules"} <= set(recorder.part_names)
+    recorder.do(do="set", key="layout.parameters.pitch_um", value=13.0, final=True)
+    assert recorder.part_names == []
+
+
+def test_only_selected_views_are_computed(recorder):
+    recorder.do(do="views", names=["picture"])
+    recorder.do(do="set", key="exposure_s", value=0.02, final=True)
+    assert recorder.part_names == ["picture"]
+    recorder.do(do="views", names=["columns", "picture"])
+    assert recorder.part_names == ["columns"]
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "text"),
+    [
+        ("optics.f_number", -1.0, "must be > 0"),
+        ("optics.f_number", "wide", "must be a valid number"),
+        ("optics.f_number", 10**400, "f_number"),
+        ("optics.f_number", [1, 2], "must be a valid number"),
+        ("optics.f_nmber", 2.8, "unknown parameter"),
+        ("sensor.bits", 99, "bits"),
+        ("layout.generator", "grrid", "must be one of"),
+        ("exposure_s", None, "exposure_s"),
+        ("layout.parameters.n_x", 10**9, "must be <="),
+        ("exposure_s.value", 1, "must be a section"),
+        ("scene.kind", "flat", "square_mm"),
+        ("nothing", 1, "unknown key"),
+        ("", 1, "path of a setting"),
+        ("a..b", 1, "path of a setting"),
+        ("optics", 5, "optics"),
+    ],
+)
+def test_invalid_values_keep_last_state(recorder, settings, key, value, text):
+    state = recorder.do(do="set", key=key, value=value, final=True, id=3)
+
+    line = state["errors"][key]
+    assert text in line
+    assert "\n" not in line
+    assert len(line) < LINE
+    assert (state["id"], state["settings"], state["can_undo"], recorder.parts) == (3, settings, False, [])
+
+
+def test_errors_disappear_with_valid_change(recorder):
+    recorder.do(do="set", key="optics.f_number", value=-1.0, final=True)
+
+    assert recorder.do(do="set", key="optics.f_number", value=4.0, final=True)["errors"] == {}
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        None,
+        5,
+        [],
+        {},
+        {"do": None},
+        {"do": ["set"]},
+        {"do": "explode"},
+        {"do": "text", "what": "word"},
+        {"do": "text"},
+        {"do": "views", "names": ["nothing"]},
+        {"do": "views", "names": 3},
+        {"do": "views", "names": [["sites"]]},
+        {"do": "save", "name": "a.yaml"},
+    ],
+)
+def test_malformed_messages_give_one_line(recorder, message):
+    recorder.handle([message])
+    errors = [message for message in recorder.messages if message["kind"] == "error"]
+
+    assert len(errors) == 1
+    assert "\n" not in errors[0]["text"]
+    assert recorder.do(do="set", key="seed", value=9, final=True)["errors"] == {}
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        {"do": "set"},
+        {"do": "set", "key": 5, "value": 1},
+        {"do": "set", "key": "optics.f_number"},
+        {"do": "reset", "key": {}},
+        {"do": "delete"},
+        {"do": "delete", "key": "optics"},
+        {"do": "undo"},
+        {"do": "redo"},
+        {"do": "preset", "name": "shot:other"},
+        {"do": "preset", "name": 5},
+        {"do": "restore"},
+        {"do": "restore", "settings": []},
+        {"do": "restore", "settings": {}},
+        {"do": "restore", "settings": {"scene": 1}},
+        {"do": "file", "path": "/etc/passwd", "as": "settings"},
+        {"do": "file", "path": "/etc/passwd", "as": "layout"},
+        {"do": "file", "path": "/etc/passwd", "as": "scene"},
+        {"do": "file", "path": "x", "as": "program"},
+        {"do": "file"},
+    ],
+)
+def test_malformed_changes_give_one_line(recorder, settings, message):
+    state = recorder.do(**message)
+
+    assert len(state["errors"]) == 1
+    assert "\n" not in next(iter(state["errors"].values()))
+    assert state["settings"] == settings
+
+
+def test_deep_values_are_rejected(recorder, settings):
+    value = 1
+    for _ in range(50):
+        value = [value]
+
+    state = recorder.do(do="set", key="sensor.qe", value=value, final=True)
+
+    assert "levels" in state["errors"]["sensor.qe"]
+    assert state["settings"] == settings
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("scene", {"kind": "picture", "picture": "/etc/passwd", "fit": "cover", "distance_m": 1.0, "peak_radiance_w_m2_sr_nm": 0.02}),
+        ("scene", {"kind": "cube", "path": "../../cube.hdr"}),
+        ("layout", {"file": "/etc/passwd"}),
+        ("layout", "/etc/passwd"),
+        ("layout", "../layouts/x_trans.yaml"),
+        ("layout.parameters", {"density": "/etc/passwd"}),
+        ("sensor.qe", {"kind": "file", "path": "/etc/passwd"}),
+        ("sensor.filters", {"path": "/proc/self/environ"}),
+        ("optics.pupil", [{"kind": "image", "picture": "/etc/passwd"}]),
+    ],
+)  # fmt: skip
+def test_other_files_are_rejected(recorder, settings, key, value):
+    state = recorder.do(do="set", key=key, value=value, final=True)
+
+    assert state["errors"]
+    assert "not available" in state["errors"][key] or "preset" in state["errors"][key]
+    assert state["settings"] == settings
+
+
+def test_files_next_to_settings_are_accepted(tmp_path, settings, make_session):
+    picture = tmp_path / "own.png"
+    write_picture(picture, np.full((40, 40, 3), 128, np.uint8))
+    outside = tmp_path.parent / f"{tmp_path.name}.png"
+    outside.write_bytes(picture.read_bytes())
+    (tmp_path / "link.png").symlink_to(outside)
+    shot = tmp_path / "shot.yaml"
+    scene = {"kind": "picture", "picture": "own.png", "fit": "cover", "distance_m": 1.0, "peak_radiance_w_m2_sr_nm": 0.02, "wavelength_nm": [620.0, 550.0, 450.0]}  # fmt: skip
+    shot.write_text(yaml.safe_dump({**settings, "scene": scene}))
+    start, name = start_settings(shot)
+    recorder = make_session(start=start, directory=tmp_path)
+
+    assert name == "shot"
+    assert recorder.part_names[0] == "sites"
+    assert recorder.do(do="set", key="scene.picture", value=str(picture), final=True)["errors"] == {}
+    for path in (outside, tmp_path / "link.png"):
+        assert "not available" in recorder.do(do="set", key="scene.picture", value=str(path))["errors"]["scene.picture"]
+
+
+def test_layout_files_cannot_name_other_files(recorder):
+    content = "generator: voronoi\nparameters: {n_sites: 10, size_um: [9.0, 9.0], density: /etc/passwd}\n"
+    path = recorder.session.add_file("layout.yaml", content.encode())
+
+    state = recorder.do(do="file", path=str(path), **{"as": "layout"})
+
+    assert "'/etc/passwd' is not available" in state["errors"]["file"]
+
+
+def test_uploaded_picture_becomes_scene(recorder, tmp_path):
+    write_picture(tmp_path / "photo.png", np.full((30, 30, 3), 90, np.uint8))
+    path = recorder.session.add_file("My photo.PNG", (tmp_path / "photo.png").read_bytes())
+
+    state = recorder.do(do="file", path=str(path), **{"as": "scene"})
+
+    assert path.name == "My_photo.png"
+    assert state["errors"] == {}
+    assert state["settings"]["scene"]["picture"] == str(path)
+    assert "picture" in recorder.part_names
+
+
+def test_corrupt_picture_keeps_last_scene(recorder, settings):
+    path = recorder.session.add_file("photo.png", b"\x89PNG\r\n\x1a\n broken")
+
+    state = recorder.do(do="file", path=str(path), **{"as": "scene"})
+
+    assert len(state["errors"]) == 1
+    assert state["settings"] == settings
+
+
+def test_uploaded_layout_replaces_layout(recorder, tmp_path):
+    fs.layout.mosaic(fs.layout.grid(9, 8, 10.0), ["RG", "GB"]).write(tmp_path / "sites.npz")
+    path = recorder.session.add_file("sites.npz", (tmp_path / "sites.npz").read_bytes())
+
+    state = recorder.do(do="file", path=str(path), **{"as": "layout"})
+
+    assert state["errors"] == {}
+    assert state["summary"]["n_sites"] == 72
+
+
+def test_uploaded_settings_replace_all(recorder, settings):
+    changed = {**settings, "exposure_s": 0.5}
+    path = recorder.session.add_file("own.yaml", yaml.safe_dump(changed).encode())
+
+    state = recorder.do(do="file", path=str(path), **{"as": "settings"})
+
+    assert state["settings"] == changed
+
+
+def test_undo_and_redo_restore_codes(recorder):
+    codes = [recorder.session.result.capture.code]
+    for k in range(5):
+        recorder.do(do="set", key="seed", value=10 + k, final=True)
+        codes.append(code_part(recorder))
+    for k in range(4, -1, -1):
+        recorder.do(do="undo")
+        assert np.array_equal(code_part(recorder), codes[k])
+    for k in range(1, 6):
+        recorder.do(do="redo")
+        assert np.array_equal(code_part(recorder), codes[k])
+
+
+def test_drag_is_one_step(recorder, settings):
+    for k in range(5):
+        recorder.do(do="set", key="optics.f_number", value=3.0 + k / 10, final=False)
+    recorder.do(do="set", key="optics.f_number", value=3.6, final=True)
+
+    assert recorder.do(do="undo")["settings"] == settings
+
+
+def test_waiting_previews_are_simulated_once(recorder):
+    built = recorder.session.engine.n_built["optics"]
+    state = recorder.handle(
+        [{"do": "set", "key": "optics.f_number", "value": 3.0 + k / 10, "final": k == 9, "id": k} for k in range(10)]
+    )
+
+    assert recorder.session.engine.n_built["optics"] == built + 1
+    assert (state["id"], state["settings"]["optics"]["f_number"]) == (9, 3.9)
+
+
+def test_invalid_change_leaves_others_of_batch(recorder):
+    recorder.handle(
+        [
+            {"do": "set", "key": "exposure_s", "value": 0.02, "final": True, "id": 1},
+            {"do": "set", "key": "optics.f_number", "value": -2, "final": True, "id": 2},
+            {"do": "set", "key": "sensor.bits", "value": 8, "final": True, "id": 3},
+        ]
+    )
+    states = [message for message in recorder.messages if message["kind"] == "state"]
+
+    assert [list(state["errors"]) for state in states] == [[], ["optics.f_number"], []]
+    assert states[-1]["settings"]["exposure_s"] == 0.02
+    assert states[-1]["settings"]["sensor"]["bits"] == 8
+
+
+def test_reset_restores_start_value(recorder, settings):
+    recorder.do(do="set", key="optics.f_number", value=4.0, final=True)
+    recorder.do(do="set", key="sensor.prnu_fraction", value=0.01, final=True)
+    recorder.do(do="reset", key="optics.f_number")
+    state = recorder.do(do="reset", key="sensor.prnu_fraction")
+
+    assert state["settings"] == settings
+    assert state["changed"] == []
+
+
+def test_delete_removes_optional_value(recorder):
+    state = recorder.do(do="delete", key="layout.rules")
+
+    assert "rules" not in state["settings"]["layout"]
+    assert state["errors"] == {}
+
+
+@pytest.mark.parametrize("name", ["layout:prima_75", "layout:giotto_1", "layout:x_trans", "shot:four_zones"])
+def test_presets_give_valid_states(recorder, name):
+    state = recorder.do(do="preset", name=name)
+
+    assert state["errors"] == {}
+    assert state["summary"]["n_sites"] > 100
+
+
+def test_restored_settings_give_same_codes(recorder, make_session):
+    recorder.do(do="set", key="optics.f_number", value=22.5, final=True)
+    recorder.do(do="set", key="optics.focus_distance_m", value=".inf", final=True)
+    state = recorder.do(do="set", key="seed", value=5, final=True)
+    expected = code_part(recorder)
+    other = make_session()
+
+    restored = other.do(do="restore", settings=json.loads(json.dumps(state["settings"])))
+
+    assert restored["settings"] == state["settings"]
+    assert np.array_equal(code_part(other), expected)
+
+
+def test_alternatives_from_page_are_valid(recorder):
+    controls = next(message for message in recorder.messages if message["kind"] == "controls")["controls"]
+    control = next(control for control in controls if control["id"] == "layout")
+    for label in ("hexagonal", "sunflower", "log polar", "zones", "bundled: prima 75"):
+        value = next(choice["value"] for choice in control["choices"] if choice["label"] == label)
+        state = recorder.do(do="set", key="layout", value=value, final=True)
+
+        assert state["errors"] == {}, label
+
+
+def test_failing_view_leaves_others(recorder, monkeypatch):
+    part = _session.PARTS["noise"]
+
+    def fail(_):
+        raise RuntimeError("two\nlines")
+
+    monkeypatch.setitem(_session.PARTS, "noise", type(part)(part.name, part.label, fail, part.depends))
+    recorder.do(do="set", key="exposure_s", value=0.02, final=True)
+
+    assert recorder.part_names == ["columns", "picture"]
+    errors = [message for message in recorder.messages if message["kind"] == "error"]
+    assert [(error["part"], error["text"]) for error in errors] == [("noise", "Noise: RuntimeError: two lines")]
+
+
+def test_freeze_keeps_summary(recorder):
+    frozen = recorder.do(do="freeze")["frozen"]
+    state = recorder.do(do="set", key="exposure_s", value=0.02, final=True)
+
+    assert state["frozen"] == frozen
+    assert (frozen["summary"]["exposure_s"], state["summary"]["exposure_s"]) == (0.01, 0.02)
+    assert recorder.do(do="unfreeze")["frozen"] is None
+
+
+def text_of(recorder, what):
+    recorder.do(do="text", what=what, id=1)
+    return next(message["text"] for message in recorder.messages if message["kind"] == "text")
+
+
+def test_texts_describe_current_settings(recorder, settings):
+    recorder.do(do="set", key="optics.f_number", value=4.0, final=True)
+    names = {}
+    exec(text_of(recorder, "python"), names)
+
+    assert yaml.safe_load(text_of(recorder, "yaml"))["optics"]["f_number"] == 4.0
+    assert "-optics: {focal_length_mm: 8.0, f_number: 2.8}" in text_of(recorder, "diff")
+    assert np.array_equal(names["capture"].code, recorder.session.result.capture.code)
+
+
+def test_saved_settings_give_same_codes(make_session, tmp_path):
+    out = tmp_path / "out"
+    recorder = make_session(out=out)
+    write_picture(tmp_path / "photo.png", np.random.default_rng(1).integers(0, 255, (40, 40, 3)).astype(np.uint8))
+    path = recorder.session.add_file("photo.png", (tmp_path / "photo.png").read_bytes())
+    recorder.do(do="file", path=str(path), **{"as": "scene"})
+    recorder.do(do="set", key="optics.f_number", value=3.7, final=True)
+    recorder.do(do="save", name="../../my shot", id=1)
+    saved = out / "my_shot.yaml"
+
+    assert sorted(each.name for each in out.iterdir()) == ["my_shot.yaml", "photo.png"]
+    assert read_settings(saved)["scene"]["picture"] == "photo.png"
+    result = CliRunner().invoke(app, ["run", str(saved), "--out", str(tmp_path / "run")])
+    assert result.exit_code == 0
+    codes = fs.Capture.load(tmp_path / "run" / "my_shot_capture.npz").code
+    assert np.array_equal(codes, recorder.session.result.capture.code)
+
+
+def wait_until(condition, timeout_s=20.0):
+    end_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+
+
+def test_thread_survives_unexpected_exceptions(settings, monkeypatch):
+    session = Session("threaded", Start(settings), n_threads=1)
+    messages = []
+    session.attach(messages.append)
+
+    def kinds():
+        return [json.loads(message)["kind"] for message in messages if isinstance(message, str)]
+
+    try:
+        wait_until(lambda: "done" in kinds())
+        monkeypatch.setattr(_session, "summary_of", lambda _: 1 / 0)
+        session.post({"do": "set", "key": "seed", "value": 2, "final": True})
+        wait_until(lambda: "error" in kinds())
+        monkeypatch.undo()
+        messages.clear()
+        session.post({"do": "set", "key": "seed", "value": 3, "final": True})
+        wait_until(lambda: "done" in kinds())
+        assert session.history.settings["seed"] == 3
+    finally:
+        session.close()
+    wait_until(lambda: not session._thread.is_alive())
+    assert not session.uploads.exists()
+    assert threading.active_count() < 50
+
+
+def test_failing_listener_leaves_others(recorder):
+    def fail(_message):
+        raise OSError
+
+    recorder.session._listeners.add(fail)
+    assert recorder.do(do="set", key="seed", value=2, final=True)["errors"] == {}
+
+
+def test_settings_are_not_shared(recorder, settings):
+    before = copy.deepcopy(recorder.session.history.settings)
+    recorder.do(do="set", key="layout.mosaic", value=["GR", "BG"], final=True)
+    recorder.do(do="undo")
+
+    assert recorder.session.history.settings == before == settings
