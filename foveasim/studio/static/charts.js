@@ -33,7 +33,6 @@ export class CurveChart {
     this.canvas = make("canvas");
     this.canvas.setAttribute("role", "img");
     this.legend = make("ul", undefined, "chart-legend");
-    this.readout = make("p", "", "readout");
     root.append(this.canvas, this.legend);
     this.curves = [];
     this.at = null;
@@ -51,17 +50,21 @@ export class CurveChart {
 
   draw() {
     if (!this.root.clientWidth) return;
-    const { context, width, height } = fitted(this.canvas), { curves } = this;
-    const own = curves.filter((curve) => !curve.isDashed);
+    const { curves } = this, own = curves.filter((curve) => !curve.isDashed), left = 46, right = 10, top = 8, bottom = 32;
+    const inks = curves.map((curve) => inkOfCurve(curve, own.findIndex((one) => one.label === curve.label)));
+    const [x0, x1] = limitsOf(curves.map((curve) => curve.x)), wide = this.canvas.clientWidth - left - right;
+    const here = this.at === null || !own.length ? null : clamp(x0 + ((this.at - left) / wide) * (x1 - x0), x0, x1);
+    // The legend first: the rest of the height is for the canvas.
+    this._listCurves(curves, inks, here, own);
+    const { context, width, height } = fitted(this.canvas);
     context.font = FONT;
     if (!own.length) {
       context.fillStyle = inkOf("--quiet");
       context.fillText("no data", 8, 20);
-      this.legend.replaceChildren();
       return;
     }
-    const [x0, x1] = limitsOf(curves.map((curve) => curve.x)), y1 = limitsOf(curves.map((curve) => curve.y))[1] * 1.04, y0 = Math.min(0, limitsOf(curves.map((curve) => curve.y))[0]);
-    const left = 40, right = 10, top = 8, bottom = 32, w = width - left - right, h = height - top - bottom;
+    const y1 = limitsOf(curves.map((curve) => curve.y))[1] * 1.04, y0 = Math.min(0, limitsOf(curves.map((curve) => curve.y))[0]);
+    const w = width - left - right, h = height - top - bottom;
     const toX = (v) => left + ((v - x0) / (x1 - x0)) * w, toY = (v) => top + h - ((v - y0) / (y1 - y0)) * h;
     context.strokeStyle = inkOf("--line");
     context.fillStyle = inkOf("--quiet");
@@ -89,12 +92,8 @@ export class CurveChart {
     context.fillText(axisTitle(this.nameY, own[0].unit_y), 0, 0);
     context.restore();
     context.textAlign = "left";
-    const colours = [];
-    let k = 0;
-    for (const curve of curves) {
-      const ink = inkOfCurve(curve, curve.isDashed ? own.findIndex((one) => one.label === curve.label) : k++);
-      colours.push(ink);
-      context.strokeStyle = ink;
+    curves.forEach((curve, k) => {
+      context.strokeStyle = inks[k];
       context.lineWidth = curve.isDashed ? 1.25 : 1.75;
       context.setLineDash(curve.isDashed ? [4, 3] : []);
       context.beginPath();
@@ -106,16 +105,18 @@ export class CurveChart {
         isDown = true;
       }
       context.stroke();
-    }
+    });
     context.setLineDash([]);
-    const here = this.at === null ? null : clamp(x0 + ((this.at - left) / w) * (x1 - x0), x0, x1);
     if (here !== null) {
       context.fillStyle = inkOf("--quiet");
       context.fillRect(toX(here), top, 1, h);
     }
-    const items = curves.map((curve, i) => {
+  }
+
+  _listCurves(curves, inks, here, own) {
+    const items = curves.map((curve, k) => {
       const item = make("li"), swatch = make("i");
-      swatch.style.background = colours[i];
+      swatch.style.background = inks[k];
       const value = here === null ? "" : " " + brief(Number(valueAt(curve, here).toPrecision(3)));
       item.append(swatch, make("span", (curve.isDashed ? "A: " : "") + curve.label + value));
       return item;
@@ -164,7 +165,7 @@ export class Histogram {
   draw(range, value) {
     const { scale, counts, others } = this;
     if (!scale || !this.root.clientWidth) return;
-    const { context, width, height } = fitted(this.canvas), left = 40, right = 10, top = 8, bottom = 32, w = width - left - right, h = height - top - bottom;
+    const { context, width, height } = fitted(this.canvas), left = 46, right = 10, top = 8, bottom = 32, w = width - left - right, h = height - top - bottom;
     this.left = left;
     this.wide = w;
     const most = Math.max(1, ...counts, ...(others || [])), tall = (count) => (count ? Math.max(1.5, Math.sqrt(count / most) * h) : 0);

@@ -5,6 +5,8 @@ import { make } from "/web/page_parts.js";
 
 // Sections that are open at first; settings outside all sections are in the first of them.
 const OPEN = ["exposure", "layout", "optics", "sensor"];
+// Keys that select one of several sections.
+const TAGS = ["kind", "generator"];
 // A step of a logarithmic slider is at least this factor.
 const LOG_STEP = 1.02;
 const LINEAR_STEPS = 200;
@@ -348,13 +350,14 @@ export class Controls {
   update(state) {
     this.state = state;
     const changed = new Set(state.changed);
-    // A change of "sensor" marks its parts, and a change of a part marks "sensor".
-    const isChanged = (key) => changed.has(key) || [...changed].some((one) => one.startsWith(key + ".") || key.startsWith(one + "."));
+    // A change of "sensor" marks its parts; a change of a part marks a choice among sections only if it is the one that is chosen.
+    const isChanged = ({ key, kind }) => changed.has(key) || [...changed].some((one) => key.startsWith(one + ".") ||
+      (one.startsWith(key + ".") && (kind !== "choice" || TAGS.includes(one.slice(key.length + 1)))));
     const errors = { ...(state.errors || {}) }, rest = [];
     // A value of its own after a choice shows the error.
     for (const row of [...this.rows.values()].reverse()) {
       const { key } = row.control;
-      row.update(valueAt(state.settings, key), isChanged(key), errors[key], state.id ?? null);
+      row.update(valueAt(state.settings, key), row.control.kind !== "group" && isChanged(row.control), errors[key], state.id ?? null);
       delete errors[key];
     }
     for (const [key, text] of Object.entries(errors)) rest.push(key && !text.includes(key) ? key + ": " + text : text);

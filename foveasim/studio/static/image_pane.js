@@ -81,7 +81,7 @@ export class ImagePane {
     this.frame = frame || null;
     this.pixels.width = width;
     this.pixels.height = height;
-    this.pixels.getContext("2d").putImageData(new ImageData(new Uint8ClampedArray(rgba.buffer, rgba.byteOffset, rgba.length), width, height), 0, 0);
+    this.pixels.getContext("2d", { willReadFrequently: true }).putImageData(new ImageData(new Uint8ClampedArray(rgba.buffer, rgba.byteOffset, rgba.length), width, height), 0, 0);
   }
 
   // Conversions between µm on the sensor and CSS pixels: the complete picture, or the view of a map.

@@ -15,11 +15,16 @@ const MOST_SELECTED = 4000;
 
 export const groundColour = () => bytesOfHex(inkOf("--map"));
 
+let isSlow = false;
+
+// With software rendering, canvases in main memory are faster.
+export function useSoftware(isSoftware) { isSlow = isSoftware; }
+
 // A 2D context of a canvas, whose unit is the CSS pixel.
 export function fitted(canvas, width = canvas.clientWidth, height = canvas.clientHeight) {
   const ratio = pixelRatio();
   fitCanvas(canvas, width, height);
-  const context = canvas.getContext("2d");
+  const context = canvas.getContext("2d", { willReadFrequently: isSlow });
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   context.clearRect(0, 0, width, height);
   return { context, width, height };
@@ -78,7 +83,8 @@ export class SitePane {
     this.palette = palette;
     if (isNew) this._createMap(sites);
     else this.map.use(sites);
-    this.overview = new Overview(this.overviewCanvas, sites);
+    // The raster map averages small sites itself.
+    this.overview = this.map.gl ? new Overview(this.overviewCanvas, sites) : null;
     this.resize();
     if (isWhole) this.fit();
     else this.map.set(this.map.x, this.map.y, this.map.scale);
@@ -165,7 +171,7 @@ export class SitePane {
     if (!this.isShown) return;
     const { map } = this;
     map.draw(groundColour());
-    this.overview.update(map, this.scale, this.range);
+    this.overview?.update(map, this.scale, this.range);
     const { context, width, height } = fitted(this.lines);
     drawOutlines(context, map, width, height);
     this.drawViolations?.(context, map);

@@ -15,7 +15,7 @@ import { Controls, valueAt } from "./controls.js";
 import { ImagePane } from "./image_pane.js";
 import { copyText, listenToDialogs, listenToMenu, showText } from "./menus.js";
 import { RulesList } from "./rules_list.js";
-import { SitePane } from "./site_pane.js";
+import { SitePane, useSoftware } from "./site_pane.js";
 
 // Views in tiles, with the parts that they need; those that are shown at first on narrow and on wide screens.
 const TILES = [
@@ -41,19 +41,24 @@ let connection, controls, panes, charts, rules;
 
 // -- drawing ------------------------------------------------------------------------------------------------------------
 
-// Draws "map" (and all marks) or only "marks" in the next frame.
+const MAPS = ["b", "a"], IMAGES = ["picture", "pictureA", "scene"];
+// Panes to draw after a part arrived; all marks are drawn in every frame.
+const DRAWN = { sites: [...MAPS, ...IMAGES], columns: MAPS, picture: ["picture"], scene: ["scene"], rules: ["b"] };
+
+// Draws panes in the next frame: "map" for all, "marks" for none, or the names of some.
 function ask(what) {
   const isAsked = page.asked !== null;
-  page.asked = page.asked === "map" ? "map" : what;
+  page.asked = page.asked || new Set();
+  for (const name of what === "map" ? [...MAPS, ...IMAGES] : what === "marks" ? [] : what) page.asked.add(name);
   if (!isAsked) requestAnimationFrame(drawAsked);
 }
 
 function drawAsked() {
-  const isMap = page.asked === "map";
+  const { asked } = page;
   page.asked = null;
-  if (isMap) {
-    if (page.frozen) panes.a.follow(panes.b);
-    for (const pane of [panes.b, panes.a, panes.picture, panes.pictureA, panes.scene]) pane.draw();
+  if (page.frozen) panes.a.follow(panes.b);
+  for (const name of asked) panes[name].draw();
+  if (asked.has("b")) {
     drawScaleBar();
     page.drawn++;
   }
@@ -142,17 +147,22 @@ function recolour() {
 }
 
 function statisticsOf({ column, sites }) {
-  const every = Uint32Array.from({ length: sites.n }, (_, i) => i), found = statistics(column.values, every), figure = (v) => (Number.isNaN(v) ? "–" : shown(Number(v.toPrecision(4))));
   if (column.names) return { n: shown(sites.n) };
-  const sorted = Float64Array.from(column.values).filter(Number.isFinite).sort();
-  return { n: shown(found.n), mean: figure(found.mean), median: figure(sorted.length ? sorted[sorted.length >> 1] : NaN), std: figure(found.std), min: figure(found.min), max: figure(found.max) };
+  const sorted = Float64Array.from(column.values).sort(), figure = (v) => (Number.isNaN(v) ? "–" : shown(Number(v.toPrecision(4))));
+  // NaN is last.
+  const found = statistics(sorted, sorted.keys()), first = sorted.findIndex((v) => v > -Infinity);
+  return { n: shown(found.n), mean: figure(found.mean), median: figure(found.n ? sorted[first + (found.n >> 1)] : NaN), std: figure(found.std), min: figure(found.min), max: figure(found.max) };
 }
 
 const curvesOf = ({ about, arrays }, isDashed = false) => about.curves.map((curve, k) => ({ ...curve, x: arrays["x-" + k], y: arrays["y-" + k], isDashed }));
 
 function showCurves(name) {
   const part = page.parts[name], before = page.frozen?.parts[name];
-  if (part) charts[name].use([...curvesOf(part), ...(before && before !== part ? curvesOf(before, true) : [])]);
+  if (!part) return;
+  const curves = curvesOf(part), isSame = (one, other) => one.label === other.label && one.y.length === other.y.length && one.y.every((v, i) => v === other.y[i]);
+  // Curves of A that are equal in B would be hidden.
+  const others = before && before !== part ? curvesOf(before, true).filter((one) => !curves.some((other) => isSame(one, other))) : [];
+  charts[name].use([...curves, ...others]);
 }
 
 function showNoise() {
@@ -168,7 +178,7 @@ const USE = {
   sites: useSites,
   columns: useColumns,
   picture: ({ about, arrays }) => panes.picture.use(about, arrays.rgba),
-  scene: ({ about, arrays }) => { panes.scene.use(about, arrays.rgba); page.gazeAt = null; },
+  scene: ({ about, arrays }) => { panes.scene.use({ ...about, frame_um: panes.b.sites?.bounds }, arrays.rgba); },
   noise: showNoise,
   spectrum: () => showCurves("spectrum"),
   mtf: () => showCurves("mtf"),
@@ -182,7 +192,7 @@ function receivePart(part) {
   USE[part.part](part);
   // Frames of the layout move with it.
   if (part.part === "sites" && panes.scene.bounds) panes.scene.frame = part.about.bounds_um;
-  ask("map");
+  ask(DRAWN[part.part] || "marks");
 }
 
 // -- state --------------------------------------------------------------------------------------------------------------
@@ -223,7 +233,7 @@ function finish({ id, ms }) {
     showStatus(Number.isFinite(page.lastMs) ? Math.round(page.lastMs) + " ms" : "ready");
   };
   if (document.hidden) showTime();
-  else requestAnimationFrame(() => requestAnimationFrame(showTime));
+  else requestAnimationFrame(showTime);
 }
 
 function showState(state) {
@@ -353,6 +363,7 @@ function showTile(name, isShown) {
   markTiles();
   sendViews();
   resize();
+  if (isShown) $("tile-" + name).scrollIntoView({ block: "nearest", inline: "nearest" });
 }
 
 function markTiles() {
@@ -681,6 +692,7 @@ function chosenRenderer() {
 
 function start() {
   const renderer = chosenRenderer();
+  useSoftware(!renderer || renderer.isSlow);
   const onMap = {
     isSelecting: () => page.isSelecting,
     select,
