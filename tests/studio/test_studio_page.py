@@ -372,6 +372,7 @@ def test_alternative_brings_its_parameters(visit):
     settle(page)
 
     assert "per_um2" in setting(page, "sensor.read_noise_e")
+    page.locator(".control[data-key='layout'] select").focus()
     page.locator(".control[data-key='layout'] select").select_option(label="hexagonal")
     page.wait_for_selector(".control[data-key='layout.parameters.pitch_um']", state="attached")
     settle(page)

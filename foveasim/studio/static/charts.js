@@ -1,6 +1,7 @@
 // Charts on canvases, with axes and units: curves with a readout, a histogram with a range, and bars of noise sources.
 
 import { brief, clamp, roundStep, shown } from "/web/colours.js";
+import { watchSize } from "/web/gl.js";
 import { inkOf, make } from "/web/page_parts.js";
 import { fitted } from "./site_pane.js";
 
@@ -36,6 +37,7 @@ export class CurveChart {
     root.append(this.canvas, this.legend);
     this.curves = [];
     this.at = null;
+    watchSize(this.canvas, () => this.draw());
     this.canvas.addEventListener("pointermove", (event) => { this.at = event.clientX - this.canvas.getBoundingClientRect().left; this.draw(); });
     this.canvas.addEventListener("pointerleave", () => { this.at = null; this.draw(); });
   }
@@ -142,6 +144,7 @@ export class Histogram {
     this.canvas.setAttribute("role", "img");
     this.root = root;
     root.append(this.canvas);
+    watchSize(this.canvas, () => this.draw(...(this.drawn || [])));
     let start = null;
     const valueAtEvent = (event) => {
       const box = this.canvas.getBoundingClientRect(), { scale } = this, value = scale.value(clamp((event.clientX - box.left - this.left) / this.wide, 0, 1));
@@ -164,6 +167,7 @@ export class Histogram {
 
   draw(range, value) {
     const { scale, counts, others } = this;
+    this.drawn = [range, value];
     if (!scale || !this.root.clientWidth) return;
     const { context, width, height } = fitted(this.canvas), left = 46, right = 10, top = 8, bottom = 32, w = width - left - right, h = height - top - bottom;
     this.left = left;
@@ -198,7 +202,7 @@ export class Histogram {
     context.fillStyle = inkOf("--quiet");
     context.textAlign = "center";
     const { column } = scale, isKinds = column.kind === "kinds";
-    const ticks = isKinds && column.names && column.names.length <= 12 ? column.names.map((_, k) => k) : scale.ticks(Math.max(2, w / 70));
+    const ticks = isKinds && column.names && column.names.length <= 12 ? column.names.map((_, k) => k) : scale.ticks(Math.max(2, w / 48));
     for (const tick of ticks) {
       const at = isKinds ? (tick - scale.from + 0.5) * step : scale.fraction(tick) * w;
       if (at >= -0.5 && at <= w + 0.5) context.fillText(isKinds && column.names ? column.names[tick] : brief(tick), clamp(left + at, left, width - 14), top + h + 15);

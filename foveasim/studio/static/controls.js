@@ -76,6 +76,22 @@ function chosenOf({ choices, selected }, value) {
   return found >= 0 ? found : selected ?? -1;
 }
 
+// Abbreviations that names of settings have in lower case.
+const SHORT = { qe: "QE", prnu: "PRNU", dsnu: "DSNU", fpn: "FPN", rts: "RTS", ktc: "kTC", cds: "CDS", inl: "INL", dnl: "DNL", mtf: "MTF" };
+
+function labelOf({ key, label }) {
+  if (/\.per_um2$/.test(key)) return "per µm²";
+  return label.split(" ").map((word) => SHORT[word] || word).join(" ");
+}
+
+const choicesOf = (control) => (control.choices || []).map((choice) => (choice !== null && typeof choice === "object" && "value" in choice ? choice : { label: fieldText(choice), value: choice }));
+
+// What the elements of a control depend on, without its values and ranges.
+function shapeOf(control) {
+  const { key, kind, label, unit, help, section, is_value: isValue, default: initial } = control;
+  return JSON.stringify([key, kind, label, unit, help, section, isValue, initial, choicesOf(control).map((choice) => choice.label), Boolean(sliderOf(control, NaN))]);
+}
+
 let made = 0;
 
 // A row with one control. send(value, isFinal), reset() and remove() are called by the user.
@@ -118,7 +134,7 @@ class Row {
     const { control } = this, { kind } = control;
     if (kind === "choice") {
       this.field = make("select");
-      this.choices = (control.choices || []).map((choice) => (choice !== null && typeof choice === "object" && "value" in choice ? choice : { label: fieldText(choice), value: choice }));
+      this.choices = choicesOf(control);
       this.choices.forEach(({ label, value }, i) => {
         const option = make("option", String(label ?? fieldText(value)).replaceAll("_", " "));
         option.value = i;
@@ -165,6 +181,12 @@ class Row {
     this.slider.addEventListener("change", () => { this.isHeld = false; this._send(value(), true); });
     this._place(NaN);
     this.root.append(this.slider);
+  }
+
+  // Takes over a description with other values and ranges; the elements stay, with their focus.
+  refresh(control) {
+    this.control = control;
+    if (control.kind === "choice") this.choices = choicesOf(control);
   }
 
   // Moves the slider to a value.
@@ -268,18 +290,22 @@ export class Controls {
     this.rows = new Map();
     const groups = new Map();
     const forms = new Set(list.filter((one) => one.id === one.key + ":form").map((one) => one.key));
+    const defaults = new Map(list.filter((one) => forms.has(one.key) && one.id === one.key).map((one) => [one.key, one.default]));
     for (const described of list) {
-      // The value after the choice of its form.
-      const control = { ...described, is_value: forms.has(described.key) && described.id === described.key };
-      const id = control.id || control.key, known = before.get(id), text = JSON.stringify(control);
+      // The value after the choice of its form, which has the same default.
+      const control = { ...described, label: labelOf(described), is_value: forms.has(described.key) && described.id === described.key };
+      if (control.id === control.key + ":form") control.default ??= defaults.get(control.key);
+      if (/\.per_um2$/.test(control.key)) control.unit = "";
+      const id = control.id || control.key, known = before.get(id), shape = shapeOf(control);
       // The heading of a section is enough.
       if (control.kind === "group" && !control.key.includes(".")) continue;
-      const row = known && known.text === text ? known : new Row(control, {
+      const row = known && known.shape === shape ? known : new Row(control, {
         send: (value, isFinal) => this.on.send(control.key, value, isFinal),
         reset: () => this.on.reset(control.key),
         remove: () => this.on.remove(control.key),
       });
-      row.text = text;
+      row.shape = shape;
+      row.refresh(control);
       this.rows.set(id, row);
       const isAlone = control.section === control.key && !list.some((one) => one.key.startsWith(control.key + ".")) && control.kind !== "choice";
       const section = isAlone || control.key === "integration_order" ? OPEN[0] : control.section || control.key.split(".")[0];
