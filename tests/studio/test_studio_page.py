@@ -24,7 +24,7 @@ pytestmark = pytest.mark.needs("chromium")
 #: WebGL by the processor, which every machine has.
 SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 TOKEN = "the-token-of-these-tests-0123456"
-TIMEOUT_MS = 15_000
+TIMEOUT_MS = 60_000
 #: A foveal colour sensor of 1,152 photosites with design rules.
 SHOT = yaml.safe_load("""
 scene:

@@ -27,14 +27,13 @@ export function readPart(buffer) {
 }
 
 export class Connection {
-  // Callbacks: hello(message, isAgain), message(message), part(part), status("open" | "lost" | "denied").
+  // Callbacks: hello(message, { isSame: whether the token is that of an earlier connection }), message(message), part(part), status("open" | "lost" | "denied").
   constructor(on) {
     this.on = on;
     this.token = location.hash.slice(1) || memory.get("token") || "";
     this.id = 0;
     this.delay = FIRST_DELAY_MS;
     this.isOpen = false;
-    this.wasOpen = false;
     this.waiting = null;
     this.preview = null;
     this.unsent = new Map();
@@ -76,8 +75,7 @@ export class Connection {
       this.delay = FIRST_DELAY_MS;
       memory.set("token", this.token);
       memory.set("session", message.session);
-      this.on.hello(message, { isSame, isAgain: this.wasOpen });
-      this.wasOpen = true;
+      this.on.hello(message, { isSame });
       this.on.status("open");
       for (const [key, value] of this.unsent) this.set(key, value, true);
       this.unsent.clear();

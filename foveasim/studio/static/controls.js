@@ -109,7 +109,7 @@ class Row {
     this.root.style.setProperty("--depth", Math.max(0, control.key.split(".").length - 2 + (control.is_value ? 1 : 0)));
     this.label = make("label", control.is_value ? "value" : control.label);
     this.label.htmlFor = this.id;
-    if (control.help) this.label.title = control.help;
+    this.label.title = control.key + (control.help ? ": " + control.help : "");
     this.reset = make("button", "↺", "reset");
     this.reset.type = "button";
     this.reset.title = "Reset to the value at the start";
@@ -296,6 +296,7 @@ export class Controls {
       const control = { ...described, label: labelOf(described), is_value: forms.has(described.key) && described.id === described.key };
       if (control.id === control.key + ":form") control.default ??= defaults.get(control.key);
       if (/\.per_um2$/.test(control.key)) control.unit = "";
+      if (!control.unit && / fraction$/.test(control.label)) Object.assign(control, { label: control.label.slice(0, -9), unit: "fraction" });
       const id = control.id || control.key, known = before.get(id), shape = shapeOf(control);
       // The heading of a section is enough.
       if (control.kind === "group" && !control.key.includes(".")) continue;

@@ -114,7 +114,13 @@ export class ImagePane {
   // Marks: cursor, the map whose view is a rectangle, the boundary of the layout.
   drawMarks({ cursor, map, boundary }) {
     if (!this.isShown) return;
-    const { context, width, height } = fitted(this.marks), view = this.view();
+    const view = this.view(), isAt = cursor && cursor.from !== this;
+    const state = JSON.stringify([view.width, view.height, view.toX(0), view.toY(0), view.perUm, this.frame, this.offset, isAt && [cursor.x, cursor.y], map && !this.follows && [map.x, map.y, map.scale, map.width, map.height]]);
+    // Drawn again only when the marks change: each layer costs time to compose the page.
+    if (state === this.shown && boundary === this.shownBoundary) return;
+    this.shown = state;
+    this.shownBoundary = boundary;
+    const { context, width, height } = fitted(this.marks);
     if (boundary && this.frame) {
       const [dx, dy] = this.offset;
       outline(context, () => boundary(context, (x) => view.toX(x + dx), (y) => view.toY(y + dy)), [3.5, 1.5], ["rgb(0 0 0 / 60%)", "#ffd34d"]);
@@ -126,6 +132,6 @@ export class ImagePane {
         outline(context, () => context.rect(0.5 * (x0 + x1 - w), 0.5 * (y0 + y1 - h), w, h), [3.5, 1.75], ["rgb(0 0 0 / 55%)", "#ffffff"]);
       }
     }
-    if (cursor && cursor.from !== this) outline(context, () => traceCross(context, view.toX(cursor.x), view.toY(cursor.y), 3, 10), [3.5, 1.5], ["rgb(0 0 0 / 65%)", "#ffffff"]);
+    if (isAt) outline(context, () => traceCross(context, view.toX(cursor.x), view.toY(cursor.y), 3, 10), [3.5, 1.5], ["rgb(0 0 0 / 65%)", "#ffffff"]);
   }
 }

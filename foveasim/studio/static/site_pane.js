@@ -81,6 +81,7 @@ export class SitePane {
     const isNew = !this.map, isWhole = isNew || this.isWhole;
     this.sites = sites;
     this.palette = palette;
+    this.generation = (this.generation || 0) + 1;
     if (isNew) this._createMap(sites);
     else this.map.use(sites);
     // The raster map averages small sites itself.
@@ -172,14 +173,32 @@ export class SitePane {
     const { map } = this;
     map.draw(groundColour());
     this.overview?.update(map, this.scale, this.range);
+    // Layers are drawn again only when they change: each costs time to compose the page.
+    if (!this._isNew("lines", [this.viewState, this.violations?.()])) return;
     const { context, width, height } = fitted(this.lines);
     drawOutlines(context, map, width, height);
     this.drawViolations?.(context, map);
   }
 
+  get viewState() {
+    const { x, y, scale, width, height } = this.map;
+    return [x, y, scale, width, height, pixelRatio(), this.generation].join();
+  }
+
+  _isNew(layer, state) {
+    const text = JSON.stringify(state);
+    this.shown = this.shown || {};
+    if (this.shown[layer] === text) return false;
+    this.shown[layer] = text;
+    return true;
+  }
+
   // Marks: { cursor, isOwn, hovered, pinned, rectangle, selected, chosen }.
   drawMarks({ cursor, hovered, pinned, rectangle, selected, trace }) {
     if (!this.isShown) return;
+    const isAt = cursor && cursor.from !== this, state = [hovered, pinned, rectangle, selected.length, selected[0], trace && [...trace.box], isAt && [cursor.x, cursor.y]];
+    const isEmpty = hovered < 0 && pinned < 0 && !rectangle && !selected.length && !trace && !isAt;
+    if (!this._isNew("marks", isEmpty ? [this.map.width, this.map.height] : [this.viewState, state])) return;
     const { map, sites } = this, { context } = fitted(this.marks);
     if (trace) {
       outline(context, () => trace.path(context, map), [8, 4], ["#ffffff", "#d3261b"]);
@@ -196,7 +215,7 @@ export class SitePane {
     }
     if (pinned >= 0 && pinned < sites.n) ringSite(context, map, pinned, ["#ffffff", "#1f5fbf"]);
     if (hovered >= 0 && hovered < sites.n && hovered !== pinned) ringSite(context, map, hovered, ["#ffffff", "#10151f"]);
-    if (cursor && cursor.from !== this) outline(context, () => traceCross(context, map.toX(cursor.x), map.toY(cursor.y), 4, 13), [4, 2], ["#ffffff", "#10151f"]);
+    if (isAt) outline(context, () => traceCross(context, map.toX(cursor.x), map.toY(cursor.y), 4, 13), [4, 2], ["#ffffff", "#10151f"]);
   }
 
   pick(x, y) {

@@ -61,6 +61,7 @@ function drawAsked() {
   if (asked.has("b")) {
     drawScaleBar();
     page.drawn++;
+    page.drawnAt = performance.now();
   }
   drawMarks();
 }
@@ -142,7 +143,6 @@ function recolour() {
     return item;
   }));
   charts.histogram.use(b.scale, page.frozen && other ? a.scale : null);
-  drawHistogram();
   tellSite();
 }
 
@@ -236,7 +236,11 @@ function finish({ id, ms }) {
   else requestAnimationFrame(showTime);
 }
 
-function showState(state) {
+function showState(message) {
+  const errors = { ...message.errors }, state = { ...message, errors };
+  // The buttons show where the history ends.
+  delete errors.undo;
+  delete errors.redo;
   page.state = state;
   memory.set("settings", JSON.stringify(state.settings));
   const rest = controls.update(state);
@@ -278,8 +282,8 @@ function showSummary() {
   $("warnings").replaceChildren(...(warnings || []).map((warning) => make("li", warning)));
 }
 
-function hello(message, { isSame, isAgain }) {
-  page.parts = page.frozen && isAgain ? {} : page.parts;
+function hello(message, { isSame }) {
+  // A server that was started again counts from the beginning.
   for (const name of Object.keys(page.parts)) page.parts[name].version = -1;
   document.title = (message.name ? message.name + " – " : "") + "foveasim studio";
   controls.describe(message.controls);
@@ -606,8 +610,7 @@ function receiveText({ what, text }) {
 // -- keys and buttons -------------------------------------------------------------------------------------------------------
 
 function listenToButtons() {
-  $("undo").addEventListener("click", () => connection.send({ do: "undo" }));
-  $("redo").addEventListener("click", () => connection.send({ do: "redo" }));
+  for (const name of ["undo", "redo"]) $(name).addEventListener("click", () => connection.send({ do: name }));
   $("preset").addEventListener("change", () => {
     if ($("preset").value) connection.send({ do: "preset", name: $("preset").value });
     $("preset").value = "";
@@ -650,7 +653,7 @@ function listenToKeys() {
       const isTyped = event.target.matches?.("input[type='text']") && (event.target.id === "search" || [...controls.rows.values()].some((row) => row.field === event.target && row.isDirty));
       if ((key.toLowerCase() !== "z" && !isRedo) || isTyped) return;
       event.preventDefault();
-      connection.send({ do: isRedo ? "redo" : "undo" });
+      if (!$(isRedo ? "redo" : "undo").disabled) connection.send({ do: isRedo ? "redo" : "undo" });
       return;
     }
     if (event.ctrlKey || event.metaKey || event.altKey) return;
@@ -717,6 +720,7 @@ function start() {
   };
   rules = new RulesList($("rules"), flyToViolation);
   panes.b.drawViolations = (context, map) => rules.draw(context, map);
+  panes.b.violations = () => [page.parts.rules?.version, rules.rule, rules.chosen];
   rules.select.addEventListener("change", () => ask("map"));
   controls = new Controls($("sections"), $("search"), $("only-changed"), {
     send: (key, value, isFinal) => connection.set(key, value, isFinal),
