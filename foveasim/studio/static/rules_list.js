@@ -63,15 +63,12 @@ export class RulesList {
   }
 
   _item(i) {
-    const { violations } = this, rule = this.rules[violations.rule[i]], ids = [...violations.sitesOf(i)];
-    const sites = ids.length ? (ids.length > 1 ? "sites " : "site ") + ids.slice(0, 4).join(", ") + (ids.length > 4 ? ", …" : "") : "position";
-    const unit = rule.unit ? " " + rule.unit : "", limit = rule.limit === null ? "" : ", limit " + shown(rule.limit) + unit;
-    const value = Number.isNaN(violations.value[i]) ? "" : shown(Number(violations.value[i].toPrecision(4))) + unit + limit;
+    const { rule, sites, value } = this.violations.describe(i);
     const item = make("li"), button = make("button");
     button.type = "button";
     button.dataset.violation = i;
     button.append(make("span", this.rule < 0 ? rule.name + ": " + sites : sites), make("span", value));
-    button.addEventListener("click", () => { this.choose(i); this.onChoose(i, ids); });
+    button.addEventListener("click", () => { this.choose(i); this.onChoose(i); });
     item.append(button);
     return item;
   }
@@ -93,24 +90,6 @@ export class RulesList {
 
   // Draws markers of the listed violations in view.
   draw(context, map) {
-    const { violations, rule } = this;
-    if (!violations) return;
-    const x0 = map.fromX(0), y0 = map.fromY(map.height), x1 = map.fromX(map.width), y1 = map.fromY(0);
-    context.beginPath();
-    for (let i = 0, drawn = 0; i < violations.n && drawn < 2000; i++) {
-      const [a, b, c, d] = violations.boxes.subarray(4 * i, 4 * i + 4);
-      if ((rule >= 0 && violations.rule[i] !== rule) || a > x1 || c < x0 || b > y1 || d < y0) continue;
-      drawn++;
-      if ((c - a) * map.scale < 3 && (d - b) * map.scale < 3) {
-        const x = map.toX(0.5 * (a + c)), y = map.toY(0.5 * (b + d));
-        context.moveTo(x + 2.5, y);
-        context.arc(x, y, 2.5, 0, 7);
-      } else violations.trace(context, i, map);
-    }
-    for (const [width, ink] of [[4, "rgb(255 255 255 / 70%)"], [2, "#d3261b"]]) {
-      context.lineWidth = width;
-      context.strokeStyle = ink;
-      context.stroke();
-    }
+    this.violations?.drawMarkers(context, map, this.rule);
   }
 }

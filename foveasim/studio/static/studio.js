@@ -457,16 +457,10 @@ function fly(x, y, scale) {
 
 function fit() { fly(...panes.b.map.middle, panes.b.map.fitScale()); }
 
-function flyToViolation(i, ids) {
-  const { map, sites } = panes.b, [a, b, c, d] = rules.violations.boxes.subarray(4 * i, 4 * i + 4);
-  let width = Math.max(c - a, d - b);
-  for (const site of ids) {
-    if (site >= sites.n) continue;
-    const box = sites.box.subarray(4 * site, 4 * site + 4);
-    width = Math.max(width, Math.min(Math.max(box[2] - box[0], box[3] - box[1]), 20 * width || Infinity));
-  }
+function flyToViolation(i) {
+  const { map, sites } = panes.b, { violations } = rules, [a, b, c, d] = violations.boxes.subarray(4 * i, 4 * i + 4);
   if (!Number.isFinite(a)) { notice("This violation has no position"); return; }
-  fly(0.5 * (a + c), 0.5 * (b + d), (0.3 * Math.min(map.width, map.height)) / (width || 1));
+  fly(0.5 * (a + c), 0.5 * (b + d), (0.3 * Math.min(map.width, map.height)) / (violations.widthOf(i, sites) || 1));
 }
 
 // -- selection --------------------------------------------------------------------------------------------------------------

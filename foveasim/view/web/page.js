@@ -256,29 +256,7 @@ function drawLines() {
   const { map } = state, { context, width, height } = state.lines;
   context.clearRect(0, 0, width, height);
   drawOutlines(context, map, width, height);
-  if (state.violations) drawMarkers(context, [map.fromX(0), map.fromY(height), map.fromX(width), map.fromY(0)]);
-}
-
-function drawMarkers(context, [x0, y0, x1, y1]) {
-  const { violations, map } = state, rule = Number($("rule").value);
-  context.beginPath();
-  let drawn = 0;
-  for (let i = 0; i < violations.n && drawn < MOST_OUTLINES; i++) {
-    const [a, b, c, d] = violations.boxes.subarray(4 * i, 4 * i + 4);
-    if ((rule >= 0 && violations.rule[i] !== rule) || a > x1 || c < x0 || b > y1 || d < y0) continue;
-    drawn++;
-    if ((c - a) * map.scale < 3 && (d - b) * map.scale < 3) {
-      const x = map.toX(0.5 * (a + c)), y = map.toY(0.5 * (b + d));
-      context.moveTo(x + 2.5, y);
-      context.arc(x, y, 2.5, 0, 7);
-    } else violations.trace(context, i, map);
-  }
-  context.lineWidth = 4;
-  context.strokeStyle = "rgb(255 255 255 / 70%)";
-  context.stroke();
-  context.lineWidth = 2;
-  context.strokeStyle = "#d3261b";
-  context.stroke();
+  if (state.violations) state.violations.drawMarkers(context, map, Number($("rule").value));
 }
 
 // Outlines the pinned and the hovered site on a map.
@@ -685,10 +663,7 @@ function listViolations() {
 }
 
 function violationItem(i) {
-  const { violations } = state, rule = about.rules[violations.rule[i]], ids = [...violations.sitesOf(i)];
-  const sites = ids.length ? (ids.length > 1 ? "sites " : "site ") + ids.slice(0, 4).join(", ") + (ids.length > 4 ? ", …" : "") : "position";
-  const unit = rule.unit ? " " + rule.unit : "", limit = rule.limit === null ? "" : ", limit " + shown(rule.limit) + unit;
-  const value = Number.isNaN(violations.value[i]) ? "" : shown(Number(violations.value[i].toPrecision(4))) + unit + limit;
+  const { rule, sites, value } = state.violations.describe(i);
   const item = make("li"), button = make("button");
   button.type = "button";
   button.dataset.violation = i;
@@ -709,15 +684,9 @@ function choose(i) {
 
 function flyToViolation(i) {
   const { violations, map, sites } = state, box = [...violations.boxes.subarray(4 * i, 4 * i + 4)];
-  let width = Math.max(box[2] - box[0], box[3] - box[1]);
-  for (const site of violations.sitesOf(i)) {
-    if (site >= sites.n) continue;
-    const [a, b, c, d] = sites.box.subarray(4 * site, 4 * site + 4);
-    width = Math.max(width, Math.min(Math.max(c - a, d - b), 20 * width || Infinity));
-  }
   choose(i);
   if (!Number.isFinite(box[0])) { notice("The report has no position for this violation"); return; }
-  fly(0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3]), (0.3 * Math.min(map.width, map.height)) / (width || 1));
+  fly(0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3]), (0.3 * Math.min(map.width, map.height)) / (violations.widthOf(i, sites) || 1));
 }
 
 // -- links, pictures, themes -----------------------------------------------------------------------------------------------------------------
