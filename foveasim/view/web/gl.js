@@ -58,12 +58,14 @@ export function buildProgram(gl, vertexSource, fragmentSource, attributes = []) 
   return { program, at };
 }
 
-// Sets an integer attribute by its number, for the bound vertex array.
+// Sets an integer attribute by its number, for the bound vertex array; returns its buffer.
 export function bindIntegers(gl, location, data, size, type) {
-  gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+  const buffer = gl.createBuffer();
+  gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
   gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
   gl.enableVertexAttribArray(location);
   gl.vertexAttribIPointer(location, size, type, 0, 0);
+  return buffer;
 }
 
 // Texture with one colour per site, in rows, which shaders read with texelFetch.

@@ -1,4 +1,4 @@
-// The map: draws all sites by WebGL2 and stores the visible part of the sensor.
+// The map: stores the visible part of the sensor, and draws all sites by WebGL2.
 
 import { clamp } from "./colours.js";
 import { TEXTURE_WIDTH, bindIntegers, buildProgram, createLookup, fitCanvas, sendLookup, textureSize } from "./gl.js";
@@ -26,52 +26,22 @@ const LATTICE = 2 ** 30;
 // Largest zoom: ratio of the width of the layout to that of the view.
 const DEEPEST = 1e7;
 
-export class SensorMap {
-  constructor(canvas, sites, renderer) {
+// The visible part of a sensor on a canvas: its centre in µm, and the scale in CSS pixels per µm.
+export class MapView {
+  constructor(canvas) {
     this.canvas = canvas;
-    this.sites = sites;
-    const [x0, y0, x1, y1] = sites.bounds;
-    this.middle = [0.5 * (x0 + x1), 0.5 * (y0 + y1)];
-    this.extent = Math.max(x1 - x0, y1 - y0);
-    this.perUm = LATTICE / this.extent;
-    this.x = this.middle[0];
-    this.y = this.middle[1];
     this.scale = 1;
     this.width = this.height = 1;
+  }
+
+  // Shows sites, at first with their centre in the middle.
+  use(sites) {
+    const [x0, y0, x1, y1] = sites.bounds;
+    this.sites = sites;
+    this.middle = [0.5 * (x0 + x1), 0.5 * (y0 + y1)];
+    this.extent = Math.max(x1 - x0, y1 - y0);
+    if (this.x === undefined) [this.x, this.y] = this.middle;
     this.colours = new Uint32Array(textureSize(sites.n));
-    this.gl = canvas.getContext("webgl2", { antialias: !renderer.isSlow, alpha: false, depth: false, powerPreference: "high-performance" });
-    if (this.gl) this._load();
-  }
-
-  _load() {
-    const { gl, sites } = this;
-    const { program, at } = buildProgram(gl, VERTEX_SHADER, FRAGMENT_SHADER, ["position", "site"]);
-    gl.useProgram(program);
-    this.at = at;
-
-    const n = sites.position.length, positions = new Int32Array(2 * n), owners = new Uint32Array(n);
-    for (let v = 0; v < n; v++) {
-      const p = 2 * sites.position[v];
-      positions[2 * v] = Math.round((sites.xy[p] - this.middle[0]) * this.perUm);
-      positions[2 * v + 1] = Math.round((sites.xy[p + 1] - this.middle[1]) * this.perUm);
-    }
-    for (let site = 0; site < sites.n; site++) owners.fill(site, sites.firstVertex(site), sites.firstVertex(site + 1));
-    gl.bindVertexArray(gl.createVertexArray());
-    bindIntegers(gl, 0, positions, 2, gl.INT);
-    bindIntegers(gl, 1, owners, 1, gl.UNSIGNED_INT);
-    const { corners, tiles } = sites.triangles();
-    this.tiles = tiles;
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
-    createLookup(gl);
-  }
-
-  sendColours() { sendLookup(this.gl, new Uint8Array(this.colours.buffer)); }
-
-  // Restores all GPU resources after the graphics context was lost.
-  restore() {
-    this._load();
-    this.sendColours();
   }
 
   // Conversion from µm on the sensor to CSS pixels of the map, and back; y points up on the sensor.
@@ -104,6 +74,64 @@ export class SensorMap {
     const x = this.fromX(px), y = this.fromY(py), fit = this.fitScale();
     const scale = clamp(this.scale * factor, 0.5 * fit, DEEPEST * fit);
     this.set(x - (px - 0.5 * this.width) / scale, y + (py - 0.5 * this.height) / scale, scale);
+  }
+}
+
+export class SensorMap extends MapView {
+  constructor(canvas, sites, renderer) {
+    super(canvas);
+    this.gl = canvas.getContext("webgl2", { antialias: !renderer.isSlow, alpha: false, depth: false, powerPreference: "high-performance" });
+    this.use(sites);
+  }
+
+  use(sites) {
+    super.use(sites);
+    this.perUm = LATTICE / this.extent;
+    if (!this.gl) return;
+    this._free();
+    this._load();
+  }
+
+  _load() {
+    const { gl, sites } = this;
+    this.built = this.built || buildProgram(gl, VERTEX_SHADER, FRAGMENT_SHADER, ["position", "site"]);
+    gl.useProgram(this.built.program);
+    this.at = this.built.at;
+
+    const n = sites.position.length, positions = new Int32Array(2 * n), owners = new Uint32Array(n);
+    for (let v = 0; v < n; v++) {
+      const p = 2 * sites.position[v];
+      positions[2 * v] = Math.round((sites.xy[p] - this.middle[0]) * this.perUm);
+      positions[2 * v + 1] = Math.round((sites.xy[p + 1] - this.middle[1]) * this.perUm);
+    }
+    for (let site = 0; site < sites.n; site++) owners.fill(site, sites.firstVertex(site), sites.firstVertex(site + 1));
+    const outlines = gl.createVertexArray(), indices = gl.createBuffer();
+    gl.bindVertexArray(outlines);
+    const buffers = [bindIntegers(gl, 0, positions, 2, gl.INT), bindIntegers(gl, 1, owners, 1, gl.UNSIGNED_INT), indices];
+    const { corners, tiles } = sites.triangles();
+    this.tiles = tiles;
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, indices);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+    this.loaded = { outlines, buffers, lookup: createLookup(gl) };
+  }
+
+  // Frees the GPU resources of the sites before.
+  _free() {
+    if (!this.loaded) return;
+    const { gl } = this, { outlines, buffers, lookup } = this.loaded;
+    gl.deleteVertexArray(outlines);
+    for (const buffer of buffers) gl.deleteBuffer(buffer);
+    gl.deleteTexture(lookup);
+    this.loaded = null;
+  }
+
+  sendColours() { sendLookup(this.gl, new Uint8Array(this.colours.buffer)); }
+
+  // Restores all GPU resources after the graphics context was lost.
+  restore() {
+    this.built = null;
+    this._load();
+    this.sendColours();
   }
 
   draw(ground) {

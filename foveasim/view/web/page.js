@@ -7,6 +7,7 @@ import { listenToPointers } from "./gestures.js";
 import { findRenderer, fitCanvas, pixelRatio, watchSize } from "./gl.js";
 import { drawRamp, kindsOf, pictureOf, summaryOf, swatchItem, tickLabels, titleOf } from "./legend.js";
 import { SensorMap } from "./map.js";
+import { MOST_OUTLINES, drawOutlines, outline, pathBetween, positionText, ringSite, traceCross } from "./marks.js";
 import { downloadTable, lengthText, sitesIn, statisticsRows, tableOf } from "./measure.js";
 import { Overview } from "./overview.js";
 import { $, downloadPicture, inkOf, isForPage, listenToHelp, make, notice, speak, startTheme, stayingNotice, useTheme } from "./page_parts.js";
@@ -16,8 +17,6 @@ import { Violations } from "./violations.js";
 
 const about = JSON.parse($("about").textContent);
 const reducesMotion = matchMedia("(prefers-reduced-motion: reduce)");
-// More outlines than this are not drawn, because they would not be distinguishable.
-const MOST_OUTLINES = 4000;
 const VIOLATIONS_AT_A_TIME = 200;
 const STEPS = 72;
 
@@ -254,81 +253,21 @@ function drawMap() {
 
 // Draws outlines of sufficiently large sites, and markers of violations.
 function drawLines() {
-  const { map, sites } = state, { context, width, height } = state.lines;
+  const { map } = state, { context, width, height } = state.lines;
   context.clearRect(0, 0, width, height);
-  const view = [map.fromX(0), map.fromY(height), map.fromX(width), map.fromY(0)];
-  const found = sites.within(...view, MOST_OUTLINES);
-  if (found && found.size) {
-    const side = Math.sqrt((width * height) / found.size), ink = clamp((side - 7) / 25, 0, 0.5);
-    if (ink > 0) {
-      context.lineWidth = 1;
-      // A grey between those of dark and bright sites, visible on both.
-      context.strokeStyle = "rgb(112 120 134 / " + 1.6 * ink + ")";
-      // In groups: the time per path grows faster than its length.
-      let traced = 0;
-      context.beginPath();
-      for (const site of found) {
-        sites.trace(context, site, map);
-        if (++traced % 20 === 0) { context.stroke(); context.beginPath(); }
-      }
-      context.stroke();
-    }
-  }
-  if (state.violations) drawMarkers(context, view);
-}
-
-function drawMarkers(context, [x0, y0, x1, y1]) {
-  const { violations, map } = state, rule = Number($("rule").value);
-  context.beginPath();
-  let drawn = 0;
-  for (let i = 0; i < violations.n && drawn < MOST_OUTLINES; i++) {
-    const [a, b, c, d] = violations.boxes.subarray(4 * i, 4 * i + 4);
-    if ((rule >= 0 && violations.rule[i] !== rule) || a > x1 || c < x0 || b > y1 || d < y0) continue;
-    drawn++;
-    if ((c - a) * map.scale < 3 && (d - b) * map.scale < 3) {
-      const x = map.toX(0.5 * (a + c)), y = map.toY(0.5 * (b + d));
-      context.moveTo(x + 2.5, y);
-      context.arc(x, y, 2.5, 0, 7);
-    } else violations.trace(context, i, map);
-  }
-  context.lineWidth = 4;
-  context.strokeStyle = "rgb(255 255 255 / 70%)";
-  context.stroke();
-  context.lineWidth = 2;
-  context.strokeStyle = "#d3261b";
-  context.stroke();
-}
-
-function outline(context, trace, widths, inks) {
-  context.beginPath();
-  trace();
-  context.lineJoin = "round";
-  widths.forEach((width, i) => {
-    context.lineWidth = width;
-    context.strokeStyle = inks[i];
-    context.stroke();
-  });
+  drawOutlines(context, map, width, height);
+  if (state.violations) state.violations.drawMarkers(context, map, Number($("rule").value));
 }
 
 // Outlines the pinned and the hovered site on a map.
 function drawSites(context, map) {
-  const { sites } = state;
-  const ring = (site, inks) => {
-    const [a, b, c, d] = sites.box.subarray(4 * site, 4 * site + 4);
-    outline(context, () => sites.trace(context, site, map), [5, 2.5], inks);
-    // A circle around sites of a few pixels, which could be missed.
-    if ((c - a) * map.scale < 10 && (d - b) * map.scale < 10) {
-      outline(context, () => context.arc(map.toX(0.5 * (a + c)), map.toY(0.5 * (b + d)), 9, 0, 7), [4, 2], inks);
-    }
-  };
-  if (state.pinned >= 0) ring(state.pinned, ["#ffffff", "#1f5fbf"]);
-  if (state.hovered >= 0 && state.hovered !== state.pinned) ring(state.hovered, ["#ffffff", "#10151f"]);
+  if (state.pinned >= 0) ringSite(context, map, state.pinned, ["#ffffff", "#1f5fbf"]);
+  if (state.hovered >= 0 && state.hovered !== state.pinned) ringSite(context, map, state.hovered, ["#ffffff", "#10151f"]);
 }
 
 function drawCursor(context, map) {
   const x = map.toX(state.cursor.x), y = map.toY(state.cursor.y);
-  const cross = () => { for (const [u, v] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) { context.moveTo(x + 4 * u, y + 4 * v); context.lineTo(x + 13 * u, y + 13 * v); } };
-  outline(context, cross, [4, 2], ["#ffffff", "#10151f"]);
+  outline(context, () => traceCross(context, x, y, 4, 13), [4, 2], ["#ffffff", "#10151f"]);
 }
 
 function drawMarks() {
@@ -383,8 +322,7 @@ function drawPictureMarks() {
   }
   if (cursor) {
     const x = box.toX(cursor.x), y = box.toY(cursor.y);
-    const cross = () => { for (const [u, v] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) { context.moveTo(x + 3 * u, y + 3 * v); context.lineTo(x + 9 * u, y + 9 * v); } };
-    outline(context, cross, [3.5, 1.5], ["rgb(0 0 0 / 65%)", "#ffffff"]);
+    outline(context, () => traceCross(context, x, y, 3, 9), [3.5, 1.5], ["rgb(0 0 0 / 65%)", "#ffffff"]);
   }
 }
 
@@ -418,7 +356,7 @@ function hover(x, y, from) {
   state.cursor = { x, y, from };
   state.hovered = all.length ? all[all.length - 1] : -1;
   state.others = all.slice(0, -1);
-  $("cursor").textContent = rulerText() || "x " + positionText(x) + "  y " + positionText(y) + " µm";
+  $("cursor").textContent = rulerText() || "x " + positionText(x, state.map.scale) + "  y " + positionText(y, state.map.scale) + " µm";
   tellSite();
   ask("marks");
 }
@@ -430,11 +368,6 @@ function leave() {
   $("cursor").textContent = "";
   tellSite();
   ask("marks");
-}
-
-// Formats a position with the digits that the view resolves.
-function positionText(value) {
-  return value.toFixed(clamp(Math.ceil(Math.log10(state.map.scale)) + 1, 0, 6));
 }
 
 let announcedSite = null;
@@ -504,12 +437,10 @@ function fly(x, y, scale) {
   cancelAnimationFrame(flight);
   if (reducesMotion.matches) { moved(); return; }
   map.set(from.x, from.y, from.scale);
-  const start = performance.now(), ratio = to.scale / from.scale;
+  const start = performance.now(), path = pathBetween(from, to);
   const step = () => {
-    const t = clamp((performance.now() - start) / 450, 0, 1), eased = t * t * (3 - 2 * t);
-    // The path follows the width of the view, which gives the impression of falling towards the target.
-    const way = Math.abs(ratio - 1) < 1e-3 ? eased : (1 - ratio ** -eased) / (1 - 1 / ratio);
-    map.set(from.x + way * (to.x - from.x), from.y + way * (to.y - from.y), from.scale * ratio ** eased);
+    const t = clamp((performance.now() - start) / 450, 0, 1), at = path(t);
+    map.set(at.x, at.y, at.scale);
     if (t < 1) { ask("map"); flight = requestAnimationFrame(step); } else { map.set(to.x, to.y, to.scale); moved(); }
   };
   step();
@@ -732,10 +663,7 @@ function listViolations() {
 }
 
 function violationItem(i) {
-  const { violations } = state, rule = about.rules[violations.rule[i]], ids = [...violations.sitesOf(i)];
-  const sites = ids.length ? (ids.length > 1 ? "sites " : "site ") + ids.slice(0, 4).join(", ") + (ids.length > 4 ? ", …" : "") : "position";
-  const unit = rule.unit ? " " + rule.unit : "", limit = rule.limit === null ? "" : ", limit " + shown(rule.limit) + unit;
-  const value = Number.isNaN(violations.value[i]) ? "" : shown(Number(violations.value[i].toPrecision(4))) + unit + limit;
+  const { rule, sites, value } = state.violations.describe(i);
   const item = make("li"), button = make("button");
   button.type = "button";
   button.dataset.violation = i;
@@ -756,15 +684,9 @@ function choose(i) {
 
 function flyToViolation(i) {
   const { violations, map, sites } = state, box = [...violations.boxes.subarray(4 * i, 4 * i + 4)];
-  let width = Math.max(box[2] - box[0], box[3] - box[1]);
-  for (const site of violations.sitesOf(i)) {
-    if (site >= sites.n) continue;
-    const [a, b, c, d] = sites.box.subarray(4 * site, 4 * site + 4);
-    width = Math.max(width, Math.min(Math.max(c - a, d - b), 20 * width || Infinity));
-  }
   choose(i);
   if (!Number.isFinite(box[0])) { notice("The report has no position for this violation"); return; }
-  fly(0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3]), (0.3 * Math.min(map.width, map.height)) / (width || 1));
+  fly(0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3]), (0.3 * Math.min(map.width, map.height)) / (violations.widthOf(i, sites) || 1));
 }
 
 // -- links, pictures, themes -----------------------------------------------------------------------------------------------------------------

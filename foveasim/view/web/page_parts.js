@@ -65,7 +65,7 @@ export function speak(textOrNull) {
 
 // -- files ------------------------------------------------------------------------------------------------------------------
 
-function download(blob, name, extension) {
+export function download(blob, name, extension) {
   const link = document.createElement("a");
   link.href = URL.createObjectURL(blob);
   link.download = name.replace(/[^\p{L}\p{N}_-]+/gu, "_").slice(0, 60) + "." + extension;

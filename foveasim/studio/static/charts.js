@@ -1,0 +1,242 @@
+// Charts on canvases, with axes and units: curves with a readout, a histogram with a range, and bars of noise sources.
+
+import { brief, clamp, roundStep, shown } from "/web/colours.js";
+import { watchSize } from "/web/gl.js";
+import { inkOf, make } from "/web/page_parts.js";
+import { fitted } from "./site_pane.js";
+
+const FONT = "11px system-ui, sans-serif";
+// Names of curves with a colour of their own; other curves have the next of the list, by theme.
+const NAMED = { R: ["#c62828", "#ff7b72"], G: ["#1b7f3b", "#5fd37f"], B: ["#1f5fbf", "#7db3ff"], W: ["#566073", "#c3cad6"] };
+const INKS = [["#1f5fbf", "#7db3ff"], ["#c2571a", "#ffa657"], ["#1b7f3b", "#5fd37f"], ["#8338a8", "#d2a8ff"], ["#a02c5a", "#ff8cc0"], ["#566073", "#c3cad6"]];
+const STEPS = 72;
+
+const theme = () => (document.documentElement.dataset.theme === "dark" ? 1 : 0);
+const inkOfCurve = (curve, k) => (NAMED[curve.name] || INKS[k % INKS.length])[theme()];
+const axisTitle = (name, unit) => (unit ? name + " / " + unit : name);
+
+function ticksOf(low, high, most) {
+  const step = roundStep((high - low) / most), ticks = [];
+  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k++) ticks.push(Number((k * step).toPrecision(12)));
+  return ticks;
+}
+
+function limitsOf(arrays) {
+  let low = Infinity, high = -Infinity;
+  for (const values of arrays) for (const v of values) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); }
+  return low === Infinity ? [0, 1] : [low, high > low ? high : low + 1];
+}
+
+// Curves y of x with their legend; dashed curves are those of variant A.
+export class CurveChart {
+  constructor(root, { nameX, nameY, label }) {
+    Object.assign(this, { root, nameX, nameY, label });
+    this.canvas = make("canvas");
+    this.canvas.setAttribute("role", "img");
+    this.legend = make("ul", undefined, "chart-legend");
+    root.append(this.canvas, this.legend);
+    this.curves = [];
+    this.at = null;
+    watchSize(this.canvas, () => this.draw());
+    this.canvas.addEventListener("pointermove", (event) => { this.at = event.clientX - this.canvas.getBoundingClientRect().left; this.draw(); });
+    this.canvas.addEventListener("pointerleave", () => { this.at = null; this.draw(); });
+  }
+
+  // Curves: [{ label, name, unit_x, unit_y, x, y, isDashed }].
+  use(curves) {
+    this.curves = curves;
+    const own = curves.filter((curve) => !curve.isDashed);
+    this.canvas.setAttribute("aria-label", this.label + ": " + (own.length ? own.map((curve) => curve.label + ", largest value " + shown(Number(limitsOf([curve.y])[1].toPrecision(3)))).join("; ") : "no data"));
+    this.draw();
+  }
+
+  draw() {
+    if (!this.root.clientWidth) return;
+    const { curves } = this, own = curves.filter((curve) => !curve.isDashed), left = 46, right = 10, top = 8, bottom = 32;
+    const inks = curves.map((curve) => inkOfCurve(curve, own.findIndex((one) => one.label === curve.label)));
+    const [x0, x1] = limitsOf(curves.map((curve) => curve.x)), wide = this.canvas.clientWidth - left - right;
+    const here = this.at === null || !own.length ? null : clamp(x0 + ((this.at - left) / wide) * (x1 - x0), x0, x1);
+    // The legend first: the rest of the height is for the canvas.
+    this._listCurves(curves, inks, here, own);
+    const { context, width, height } = fitted(this.canvas);
+    context.font = FONT;
+    if (!own.length) {
+      context.fillStyle = inkOf("--quiet");
+      context.fillText("no data", 8, 20);
+      return;
+    }
+    const y1 = limitsOf(curves.map((curve) => curve.y))[1] * 1.04, y0 = Math.min(0, limitsOf(curves.map((curve) => curve.y))[0]);
+    const w = width - left - right, h = height - top - bottom;
+    const toX = (v) => left + ((v - x0) / (x1 - x0)) * w, toY = (v) => top + h - ((v - y0) / (y1 - y0)) * h;
+    context.strokeStyle = inkOf("--line");
+    context.fillStyle = inkOf("--quiet");
+    context.lineWidth = 1;
+    context.beginPath();
+    context.textAlign = "right";
+    for (const tick of ticksOf(y0, y1, Math.max(2, h / 34))) {
+      const y = Math.round(toY(tick)) + 0.5;
+      context.moveTo(left, y);
+      context.lineTo(left + w, y);
+      context.fillText(brief(tick), left - 5, y + 3.5);
+    }
+    context.textAlign = "center";
+    for (const tick of ticksOf(x0, x1, Math.max(2, w / 60))) {
+      const x = Math.round(toX(tick)) + 0.5;
+      context.moveTo(x, top + h);
+      context.lineTo(x, top + h + 4);
+      context.fillText(brief(tick), clamp(x, left + 4, width - 14), top + h + 15);
+    }
+    context.stroke();
+    context.fillText(axisTitle(this.nameX, own[0].unit_x), left + 0.5 * w, height - 4);
+    context.save();
+    context.translate(9, top + 0.5 * h);
+    context.rotate(-Math.PI / 2);
+    context.fillText(axisTitle(this.nameY, own[0].unit_y), 0, 0);
+    context.restore();
+    context.textAlign = "left";
+    curves.forEach((curve, k) => {
+      context.strokeStyle = inks[k];
+      context.lineWidth = curve.isDashed ? 1.25 : 1.75;
+      context.setLineDash(curve.isDashed ? [4, 3] : []);
+      context.beginPath();
+      let isDown = false;
+      for (let i = 0; i < curve.x.length; i++) {
+        if (!Number.isFinite(curve.y[i])) { isDown = false; continue; }
+        if (isDown) context.lineTo(toX(curve.x[i]), toY(curve.y[i]));
+        else context.moveTo(toX(curve.x[i]), toY(curve.y[i]));
+        isDown = true;
+      }
+      context.stroke();
+    });
+    context.setLineDash([]);
+    if (here !== null) {
+      context.fillStyle = inkOf("--quiet");
+      context.fillRect(toX(here), top, 1, h);
+    }
+  }
+
+  _listCurves(curves, inks, here, own) {
+    const items = curves.map((curve, k) => {
+      const item = make("li"), swatch = make("i");
+      swatch.style.background = inks[k];
+      const value = here === null ? "" : " " + brief(Number(valueAt(curve, here).toPrecision(3)));
+      item.append(swatch, make("span", (curve.isDashed ? "A: " : "") + curve.label + value));
+      return item;
+    });
+    if (here !== null) items.unshift(make("li", brief(Number(here.toPrecision(4))) + " " + own[0].unit_x));
+    this.legend.replaceChildren(...items);
+  }
+}
+
+// Linear interpolation on increasing x.
+function valueAt({ x, y }, at) {
+  let i = 1;
+  while (i < x.length - 1 && x[i] < at) i++;
+  const t = clamp((at - x[i - 1]) / (x[i] - x[i - 1] || 1), 0, 1);
+  return y[i - 1] + t * (y[i] - y[i - 1]);
+}
+
+// Histogram of a column along its scale; dragging selects a range of values. Heights are square roots of counts, so that
+// a few sites among many are visible.
+export class Histogram {
+  constructor(root, onRange) {
+    this.canvas = make("canvas");
+    this.canvas.setAttribute("role", "img");
+    this.root = root;
+    root.append(this.canvas);
+    watchSize(this.canvas, () => this.draw(...(this.drawn || [])));
+    let start = null;
+    const valueAtEvent = (event) => {
+      const box = this.canvas.getBoundingClientRect(), { scale } = this, value = scale.value(clamp((event.clientX - box.left - this.left) / this.wide, 0, 1));
+      return scale.column.is_integer && !scale.isLog ? Math.round(value) : value;
+    };
+    this.canvas.addEventListener("pointerdown", (event) => { if (this.scale) { start = valueAtEvent(event); this.canvas.setPointerCapture(event.pointerId); } });
+    this.canvas.addEventListener("pointermove", (event) => {
+      if (start === null || !event.buttons) return;
+      const now = valueAtEvent(event);
+      onRange(start === now ? null : [Math.min(start, now), Math.max(start, now)]);
+    });
+    this.canvas.addEventListener("pointerup", (event) => { if (start !== null && valueAtEvent(event) === start) onRange(null); start = null; });
+  }
+
+  use(scale, other) {
+    this.scale = scale;
+    this.counts = scale.histogram(STEPS);
+    this.others = other ? other.histogram(STEPS) : null;
+  }
+
+  draw(range, value) {
+    const { scale, counts, others } = this;
+    this.drawn = [range, value];
+    if (!scale || !this.root.clientWidth) return;
+    const { context, width, height } = fitted(this.canvas), left = 46, right = 10, top = 8, bottom = 32, w = width - left - right, h = height - top - bottom;
+    this.left = left;
+    this.wide = w;
+    const most = Math.max(1, ...counts, ...(others || [])), tall = (count) => (count ? Math.max(1.5, Math.sqrt(count / most) * h) : 0);
+    const step = w / counts.length, inside = inkOf("--accent"), outside = inkOf("--line");
+    const [from, to] = range ? range.map((v) => left + scale.fraction(v) * w) : [-1, width + 1];
+    context.font = FONT;
+    context.fillStyle = inkOf("--quiet");
+    context.textAlign = "right";
+    for (const fraction of [0.25, 0.5, 1]) {
+      const count = fraction ** 2 * most, y = Math.round(top + h - fraction * h) + 0.5;
+      context.fillText(brief(Math.round(count)), left - 5, y + 3.5);
+      context.fillStyle = inkOf("--line");
+      context.fillRect(left, y - 0.5, w, 1);
+      context.fillStyle = inkOf("--quiet");
+    }
+    counts.forEach((count, i) => {
+      const x = left + i * step;
+      context.fillStyle = x + step > from && x < to ? inside : outside;
+      context.fillRect(x, top + h - tall(count), Math.max(step - (step > 3 ? 0.75 : 0), 0.5), tall(count));
+    });
+    if (others && others.length === counts.length) {
+      context.strokeStyle = inkOf("--text");
+      context.lineWidth = 1;
+      context.beginPath();
+      others.forEach((count, i) => { const y = top + h - tall(count); context.lineTo(left + i * step, y); context.lineTo(left + (i + 1) * step, y); });
+      context.stroke();
+    }
+    context.fillStyle = inkOf("--line");
+    context.fillRect(left, top + h, w, 1);
+    context.fillStyle = inkOf("--quiet");
+    context.textAlign = "center";
+    const { column } = scale, isKinds = column.kind === "kinds";
+    const ticks = isKinds && column.names && column.names.length <= 12 ? column.names.map((_, k) => k) : scale.ticks(Math.max(2, w / 48));
+    for (const tick of ticks) {
+      const at = isKinds ? (tick - scale.from + 0.5) * step : scale.fraction(tick) * w;
+      if (at >= -0.5 && at <= w + 0.5) context.fillText(isKinds && column.names ? column.names[tick] : brief(tick), clamp(left + at, left, width - 14), top + h + 15);
+    }
+    context.fillText(axisTitle(column.label, column.unit), left + 0.5 * w, height - 4);
+    if (Number.isFinite(value)) {
+      context.fillStyle = inkOf("--text");
+      context.fillRect(clamp(left + scale.fraction(value) * w - 1, left, left + w - 2), top, 2, h);
+    }
+    context.save();
+    context.translate(9, top + 0.5 * h);
+    context.rotate(-Math.PI / 2);
+    context.fillStyle = inkOf("--quiet");
+    context.fillText("photosites", 0, 0);
+    context.restore();
+    this.canvas.setAttribute("aria-label", "Histogram of " + column.label + " from " + shown(scale.lowest) + " to " + shown(scale.highest));
+  }
+}
+
+// Rows of horizontal bars: sources of noise by size, with those of variant A as a line.
+export function barRows(sources, others, unit) {
+  const before = new Map((others || []).map((source) => [source.name, source.values])), most = Math.max(1e-12, ...sources.map((source) => source.values), ...before.values());
+  return [...sources].sort((a, b) => b.values - a.values).map((source) => {
+    const row = make("li"), bar = make("i"), was = before.get(source.name), track = make("span", undefined, "track");
+    bar.style.width = (100 * source.values) / most + "%";
+    bar.classList.toggle("fixed", source.is_temporal === false);
+    track.append(bar);
+    if (was !== undefined) {
+      const mark = make("b");
+      mark.style.left = (100 * was) / most + "%";
+      mark.title = "A: " + brief(was) + " " + unit;
+      track.append(mark);
+    }
+    row.append(make("span", source.label || source.name.replaceAll("_", " ")), track, make("span", brief(source.values)));
+    return row;
+  });
+}

@@ -1,0 +1,157 @@
+// Connection to the server: one WebSocket that reconnects, messages with numbers, and parts with arrays.
+
+const TYPES = {
+  uint8: Uint8Array, int8: Int8Array, uint16: Uint16Array, int16: Int16Array,
+  uint32: Uint32Array, int32: Int32Array, float32: Float32Array, float64: Float64Array,
+};
+const FIRST_DELAY_MS = 250;
+const LONGEST_DELAY_MS = 4000;
+// The server closes with this code when the token is wrong.
+const WRONG_TOKEN = 4403;
+// A preview that is not answered in this time no longer delays the next one.
+const PATIENCE_MS = 4000;
+
+// What the page remembers in this tab, such as its session.
+export const memory = {
+  get(name) { try { return sessionStorage.getItem("foveasim-studio-" + name); } catch { return null; } },
+  set(name, text) { try { sessionStorage.setItem("foveasim-studio-" + name, text); } catch { /* not kept */ } },
+};
+
+// Returns the header and the arrays of a part; arrays are views of its buffer.
+export function readPart(buffer) {
+  const length = new DataView(buffer).getUint32(0, true);
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
+  const arrays = {};
+  for (const { name, type, size, offset } of header.arrays) arrays[name] = new TYPES[type](buffer, 4 + length + offset, size);
+  return { part: header.part, version: header.version, about: header.about, arrays };
+}
+
+export class Connection {
+  // Callbacks: hello(message, { isSame: whether the token is that of an earlier connection }), message(message), part(part), status("open" | "lost" | "denied").
+  constructor(on) {
+    this.on = on;
+    this.token = location.hash.slice(1) || memory.get("token") || "";
+    this.id = 0;
+    this.delay = FIRST_DELAY_MS;
+    this.isOpen = false;
+    this.waiting = null;
+    this.preview = null;
+    this.unsent = new Map();
+    this.sentAt = new Map();
+    const now = () => { if (!this.socket && !this.isDenied) this.open(); };
+    addEventListener("online", now);
+    addEventListener("focus", now);
+  }
+
+  open() {
+    clearTimeout(this.retry);
+    const socket = new WebSocket((location.protocol === "https:" ? "wss://" : "ws://") + location.host + "/socket");
+    this.socket = socket;
+    socket.binaryType = "arraybuffer";
+    socket.addEventListener("open", () => socket.send(JSON.stringify({ token: this.token, session: memory.get("session") })));
+    socket.addEventListener("message", ({ data }) => {
+      if (typeof data === "string") this._receive(JSON.parse(data));
+      else this.on.part(readPart(data));
+    });
+    socket.addEventListener("close", ({ code }) => this._close(socket, code));
+  }
+
+  _close(socket, code) {
+    if (socket !== this.socket) return;
+    this.socket = null;
+    this.isOpen = false;
+    this._settle(Infinity);
+    this.isDenied = code === WRONG_TOKEN;
+    this.on.status(this.isDenied ? "denied" : "lost");
+    if (this.isDenied) return;
+    this.retry = setTimeout(() => this.open(), this.delay);
+    this.delay = Math.min(LONGEST_DELAY_MS, 2 * this.delay);
+  }
+
+  _receive(message) {
+    if (message.kind === "hello") {
+      const isSame = memory.get("token") === this.token;
+      this.isOpen = true;
+      this.delay = FIRST_DELAY_MS;
+      memory.set("token", this.token);
+      memory.set("session", message.session);
+      this.on.hello(message, { isSame });
+      this.on.status("open");
+      for (const [key, value] of this.unsent) this.set(key, value, true);
+      this.unsent.clear();
+      return;
+    }
+    this.on.message(message);
+    const isAnswer = message.kind === "done" || (message.kind === "error" && !message.part) || (message.kind === "state" && Object.keys(message.errors || {}).length > 0);
+    if (isAnswer) this._settle(message.id);
+  }
+
+  // The message with this number, and all before it, are answered: the newest waiting preview follows.
+  _settle(id) {
+    if (this.waiting === null || !(id >= this.waiting)) return;
+    clearTimeout(this.patience);
+    this.waiting = null;
+    const next = this.preview;
+    this.preview = null;
+    if (next && this.isOpen) this.set(next.key, next.value, false);
+  }
+
+  // Returns the number of the message, or null without a connection.
+  send(message) {
+    if (!this.isOpen) return null;
+    const id = ++this.id;
+    this.sentAt.set(id, performance.now());
+    this.socket.send(JSON.stringify({ ...message, id }));
+    return id;
+  }
+
+  // Sets a value. Previews wait until the one before is answered, and the newest wins; final values are sent at once.
+  set(key, value, isFinal) {
+    if (!this.isOpen) {
+      if (isFinal) this.unsent.set(key, value);
+      return null;
+    }
+    if (!isFinal && this.waiting !== null) {
+      this.preview = { key, value };
+      return null;
+    }
+    if (isFinal) this.preview = null;
+    const id = this.send({ do: "set", key, value, final: isFinal });
+    this.waiting = id;
+    clearTimeout(this.patience);
+    this.patience = setTimeout(() => this._settle(Infinity), PATIENCE_MS);
+    return id;
+  }
+
+  // Time in ms since a message was sent.
+  since(id) {
+    const start = this.sentAt.get(id);
+    for (const old of this.sentAt.keys()) if (old <= id) this.sentAt.delete(old);
+    return start === undefined ? NaN : performance.now() - start;
+  }
+
+  get headers() { return { Authorization: "Bearer " + this.token, "X-Session": memory.get("session") || "" }; }
+
+  // Sends a file to the server; returns { path } or { error }.
+  async upload(file) {
+    try {
+      const answer = await fetch("/file?name=" + encodeURIComponent(file.name), { method: "POST", headers: this.headers, body: file });
+      const found = await answer.json().catch(() => ({}));
+      return answer.ok || found.error ? found : { error: "The server does not accept " + file.name + " (status " + answer.status + ")" };
+    } catch {
+      return { error: "The server does not answer" };
+    }
+  }
+
+  // Returns the file of the current state as { blob } or { error }.
+  async fetchFile(what) {
+    try {
+      const answer = await fetch("/download?what=" + what, { headers: this.headers });
+      if (answer.ok && !(answer.headers.get("Content-Type") || "").startsWith("application/problem")) return { blob: await answer.blob() };
+      const found = await answer.json().catch(() => ({}));
+      return { error: found.error || "The file is not available (status " + answer.status + ")" };
+    } catch {
+      return { error: "The server does not answer" };
+    }
+  }
+}

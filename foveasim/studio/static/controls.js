@@ -1,0 +1,410 @@
+// Controls of all settings, generated from the list of the server: sliders, fields, choices, with errors and resets.
+
+import { clamp, roundStep, shown } from "/web/colours.js";
+import { make } from "/web/page_parts.js";
+
+// Sections that are open at first; settings outside all sections are in the first of them.
+const OPEN = ["exposure", "layout", "optics", "sensor"];
+// Keys that select one of several sections.
+const TAGS = ["kind", "generator"];
+// A step of a logarithmic slider is at least this factor.
+const LOG_STEP = 1.02;
+const LINEAR_STEPS = 200;
+
+export const valueAt = (settings, key) => key.split(".").reduce((part, name) => (part === null || part === undefined ? undefined : part[name]), settings);
+
+// Formats a value of a setting for its field.
+export function fieldText(value) {
+  if (value === null || value === undefined) return "";
+  if (typeof value === "number") return String(Number(value.toPrecision(12)));
+  if (Array.isArray(value) && value.every((item) => item === null || typeof item !== "object")) return value.map(fieldText).join(", ");
+  return typeof value === "object" ? JSON.stringify(value) : String(value);
+}
+
+const asNumber = (text) => (text.trim() !== "" && Number.isFinite(Number(text)) ? Number(text) : text.trim());
+
+// Parses the text of a list: JSON, or numbers and words with commas.
+export function listOf(text) {
+  const trimmed = text.trim();
+  if (/^[[{]/.test(trimmed)) {
+    try { return JSON.parse(trimmed); } catch { return trimmed; }
+  }
+  return trimmed.split(/[\s,;]+/).filter(Boolean).map(asNumber);
+}
+
+// Positions of a slider for a range of values, linear or logarithmic.
+function sliderOf({ minimum, maximum, suggested, scale, kind }, value) {
+  let [low, high] = suggested || [minimum, maximum];
+  if (!Number.isFinite(low) || !Number.isFinite(high) || !(high > low)) return null;
+  if (Number.isFinite(value)) { low = Math.min(low, value); high = Math.max(high, value); }
+  const isLog = scale === "log" && low > 0, isInteger = kind === "integer";
+  if (isLog) {
+    const span = Math.log(high / low), steps = clamp(Math.round(span / Math.log(LOG_STEP)), 20, 400);
+    return {
+      steps,
+      toStep: (v) => (steps * Math.log(clamp(v, low, high) / low)) / span,
+      toValue: (step) => {
+        const found = step <= 0 ? low : step >= steps ? high : Number((low * Math.exp((span * step) / steps)).toPrecision(3));
+        return isInteger ? Math.round(found) : found;
+      },
+    };
+  }
+  const unit = isInteger ? Math.max(1, roundStep((high - low) / 1000, true)) : roundStep((high - low) / LINEAR_STEPS), steps = Math.ceil((high - low) / unit - 1e-9);
+  return {
+    steps, unit,
+    toStep: (v) => (clamp(v, low, high) - low) / unit,
+    toValue: (step) => {
+      const found = step >= steps ? high : step <= 0 ? low : Math.round((low + step * unit) / unit) * unit;
+      return isInteger ? Math.round(found) : Number(clamp(found, low, high).toPrecision(12));
+    },
+  };
+}
+
+// Index of the choice that a value belongs to: an equal one, a section of the same kind, or a value of the same type.
+function chosenOf({ choices, selected }, value) {
+  const isSection = (item) => item !== null && typeof item === "object" && !Array.isArray(item), text = JSON.stringify(value ?? null);
+  const equal = choices.findIndex((choice) => JSON.stringify(choice.value) === text);
+  if (equal >= 0) return equal;
+  if (isSection(value)) {
+    const tag = value.kind !== undefined ? "kind" : "generator";
+    const found = value[tag] === undefined ? -1 : choices.findIndex((choice) => isSection(choice.value) && choice.value[tag] === value[tag]);
+    return found >= 0 ? found : selected ?? -1;
+  }
+  if (value === null || value === undefined) return selected ?? -1;
+  const kind = Array.isArray(value) ? Array.isArray : (item) => typeof item === typeof value;
+  const found = choices.findIndex((choice) => !isSection(choice.value) && kind(choice.value));
+  return found >= 0 ? found : selected ?? -1;
+}
+
+// Abbreviations that names of settings have in lower case.
+const SHORT = { qe: "QE", prnu: "PRNU", dsnu: "DSNU", fpn: "FPN", rts: "RTS", ktc: "kTC", cds: "CDS", inl: "INL", dnl: "DNL", mtf: "MTF" };
+
+function labelOf({ key, label }) {
+  if (/\.per_um2$/.test(key)) return "per µm²";
+  return label.split(" ").map((word) => SHORT[word] || word).join(" ");
+}
+
+const choicesOf = (control) => (control.choices || []).map((choice) => (choice !== null && typeof choice === "object" && "value" in choice ? choice : { label: fieldText(choice), value: choice }));
+
+// What the elements of a control depend on, without its values and ranges.
+function shapeOf(control) {
+  const { key, kind, label, unit, help, section, is_value: isValue, default: initial } = control;
+  return JSON.stringify([key, kind, label, unit, help, section, isValue, initial, choicesOf(control).map((choice) => choice.label), Boolean(sliderOf(control, NaN))]);
+}
+
+let made = 0;
+
+// A row with one control. send(value, isFinal), reset() and remove() are called by the user.
+class Row {
+  constructor(control, on) {
+    this.control = control;
+    this.on = on;
+    this.id = "control-" + ++made;
+    this.isDirty = false;
+    this.sent = 0;
+    this.value = undefined;
+    this.root = make("div", undefined, "control kind-" + control.kind);
+    this.root.dataset.key = control.key;
+    this.root.dataset.id = control.id || control.key;
+    this.root.style.setProperty("--depth", Math.max(0, control.key.split(".").length - 2 + (control.is_value ? 1 : 0)));
+    this.label = make("label", control.is_value ? "value" : control.label);
+    this.label.htmlFor = this.id;
+    this.label.title = control.key + (control.help ? ": " + control.help : "");
+    this.reset = make("button", "↺", "reset");
+    this.reset.type = "button";
+    this.reset.title = "Reset to the value at the start";
+    this.reset.setAttribute("aria-label", "Reset " + control.label);
+    this.reset.hidden = true;
+    this.reset.addEventListener("click", () => { this.field?.focus(); on.reset(); });
+    this.error = make("p", undefined, "error");
+    this.error.id = this.id + "-error";
+    this.error.hidden = true;
+    this.unit = make("span", control.unit || "", "unit");
+    if (control.kind === "group") this.root.append(make("h3", control.label));
+    else this._build();
+    for (const input of [this.field, this.slider].filter(Boolean)) {
+      input.setAttribute("aria-describedby", this.error.id);
+      if (control.help) input.title = control.help;
+    }
+    this.root.append(this.error);
+    this.words = [control.label, control.key, control.help, control.section].join(" ").toLowerCase().replaceAll("_", " ");
+  }
+
+  _build() {
+    const { control } = this, { kind } = control;
+    if (kind === "choice") {
+      this.field = make("select");
+      this.choices = choicesOf(control);
+      this.choices.forEach(({ label, value }, i) => {
+        const option = make("option", String(label ?? fieldText(value)).replaceAll("_", " "));
+        option.value = i;
+        this.field.append(option);
+      });
+      this.field.addEventListener("change", () => { const choice = this.choices[this.field.value]; if (choice) this._send(choice.value, true); });
+    } else if (kind === "boolean") {
+      this.field = make("input");
+      this.field.type = "checkbox";
+      this.field.addEventListener("change", () => this._send(this.field.checked, true));
+    } else {
+      this.field = make("input");
+      this.field.type = "text";
+      this.field.autocomplete = "off";
+      this.field.spellcheck = false;
+      if (kind === "number" || kind === "integer") this.field.inputMode = "decimal";
+      if (control.default !== undefined && control.default !== null) this.field.placeholder = fieldText(control.default);
+      this.field.addEventListener("input", () => { this.isDirty = true; });
+      this.field.addEventListener("change", () => this._commit());
+      this.field.addEventListener("keydown", (event) => this._key(event));
+    }
+    this.field.id = this.id;
+    const line = make("div", undefined, "line");
+    line.append(this.label, this.reset, this.field, this.unit);
+    this.root.append(line);
+    if (kind === "number" || kind === "integer") this._buildSlider();
+  }
+
+  _buildSlider() {
+    const range = sliderOf(this.control, NaN);
+    if (!range) return;
+    this.slider = make("input");
+    this.slider.type = "range";
+    this.slider.min = 0;
+    this.slider.step = 1;
+    this.slider.setAttribute("aria-label", this.control.label + " slider");
+    const value = () => this.range.toValue(Number(this.slider.value));
+    this.slider.addEventListener("input", () => {
+      this.isHeld = true;
+      this.field.value = fieldText(value());
+      this._fill();
+      this._send(value(), false);
+    });
+    this.slider.addEventListener("change", () => { this.isHeld = false; this._send(value(), true); });
+    this._place(NaN);
+    this.root.append(this.slider);
+  }
+
+  // Takes over a description with other values and ranges; the elements stay, with their focus.
+  refresh(control) {
+    this.control = control;
+    if (control.kind === "choice") this.choices = choicesOf(control);
+  }
+
+  // Moves the slider to a value.
+  _place(value) {
+    this.range = sliderOf(this.control, value);
+    this.slider.max = this.range.steps;
+    const base = Number.isFinite(value) ? value : typeof this.control.default === "number" ? this.control.default : this.range.toValue(0);
+    this.slider.value = this.range.toStep(base);
+    this.slider.setAttribute("aria-valuetext", fieldText(base) + " " + (this.control.unit || ""));
+    this._fill();
+  }
+
+  _fill() { this.slider.style.setProperty("--filled", (100 * this.slider.value) / Math.max(1, this.slider.max) + "%"); }
+
+  _key(event) {
+    const { kind } = this.control;
+    if (event.key === "Escape" && this.isDirty) {
+      this._show();
+      event.stopPropagation();
+    }
+    const sign = { ArrowUp: 1, ArrowDown: -1 }[event.key], value = Number(this.field.value);
+    if (!sign || (kind !== "number" && kind !== "integer") || this.field.value.trim() === "" || !Number.isFinite(value)) return;
+    event.preventDefault();
+    // A step of the second digit, or ten times that with Shift.
+    const step = kind === "integer" ? 1 : this.range?.unit || 10 ** (Math.floor(Math.log10(Math.abs(value) || 1)) - 1);
+    const { minimum, maximum } = this.control;
+    const next = clamp(value + sign * step * (event.shiftKey ? 10 : 1), minimum ?? -Infinity, maximum ?? Infinity);
+    this.field.value = fieldText(Number(next.toPrecision(9)));
+    this.isDirty = true;
+    this._commit();
+  }
+
+  _commit() {
+    if (!this.isDirty) return;
+    this.isDirty = false;
+    const { kind } = this.control, text = this.field.value;
+    if (text === fieldText(this.value) && this.error.hidden) return;
+    if (text.trim() === "" && kind !== "text") this.on.remove();
+    else this._send(kind === "list" ? listOf(text) : kind === "text" ? text : asNumber(text), true);
+  }
+
+  _send(value, isFinal) { this.sent = this.on.send(value, isFinal) ?? this.sent; }
+
+  // Shows the value of a state, unless the user is changing it or it has an error.
+  update(value, isChanged, error, id) {
+    this.root.classList.toggle("changed", isChanged);
+    this.reset.hidden = !isChanged;
+    this.error.hidden = !error;
+    this.error.textContent = error || "";
+    if (error) this.field?.setAttribute("aria-invalid", "true");
+    else this.field?.removeAttribute("aria-invalid");
+    this.value = value;
+    // Settings that are absent and may be are behind a button.
+    this.isExtra = Boolean(this.control.is_optional) && !this.control.is_value && this.control.kind !== "group" && (value === null || value === undefined) && !isChanged && !error;
+    if (!this.field || error || this.isDirty || this.isHeld || (id !== null && id < this.sent)) return;
+    this._show();
+  }
+
+  _show() {
+    const { control, value } = this;
+    this.isDirty = false;
+    if (control.kind === "choice") {
+      const chosen = chosenOf({ ...control, choices: this.choices }, value ?? control.default);
+      let other = this.field.querySelector("option[value='-1']");
+      if (chosen < 0 && !other) {
+        other = make("option", "–");
+        other.value = -1;
+        this.field.prepend(other);
+      } else if (chosen >= 0) other?.remove();
+      this.field.value = chosen;
+    } else if (control.kind === "boolean") this.field.checked = Boolean(value ?? control.default);
+    else if (this.field.value !== fieldText(value)) this.field.value = fieldText(value);
+    if (this.slider) this._place(typeof value === "number" ? value : NaN);
+  }
+}
+
+export class Controls {
+  // Callbacks: send(key, value, isFinal) returns the number of the message; reset(key), remove(key).
+  constructor(root, search, onlyChanged, on) {
+    Object.assign(this, { root, search, onlyChanged, on });
+    this.rows = new Map();
+    this.sections = new Map();
+    this.state = null;
+    search.addEventListener("input", () => this._filter());
+    search.addEventListener("keydown", (event) => {
+      if (event.key !== "Escape" || !search.value) return;
+      search.value = "";
+      this._filter();
+      event.stopPropagation();
+    });
+    onlyChanged.addEventListener("click", () => {
+      onlyChanged.setAttribute("aria-pressed", onlyChanged.getAttribute("aria-pressed") !== "true");
+      this._filter();
+    });
+  }
+
+  // Shows a list of controls; rows that are the same keep their state and focus.
+  describe(list) {
+    const focused = document.activeElement, focusedKey = focused?.closest?.(".control")?.dataset.id, wasSlider = focused?.type === "range";
+    const before = this.rows;
+    this.rows = new Map();
+    const groups = new Map();
+    const forms = new Set(list.filter((one) => one.id === one.key + ":form").map((one) => one.key));
+    const defaults = new Map(list.filter((one) => forms.has(one.key) && one.id === one.key).map((one) => [one.key, one.default]));
+    for (const described of list) {
+      // The value after the choice of its form, which has the same default.
+      const control = { ...described, label: labelOf(described), is_value: forms.has(described.key) && described.id === described.key };
+      if (control.id === control.key + ":form") control.default ??= defaults.get(control.key);
+      if (/\.per_um2$/.test(control.key)) control.unit = "";
+      if (!control.unit && / fraction$/.test(control.label)) Object.assign(control, { label: control.label.slice(0, -9), unit: "fraction" });
+      const id = control.id || control.key, known = before.get(id), shape = shapeOf(control);
+      // The heading of a section is enough.
+      if (control.kind === "group" && !control.key.includes(".")) continue;
+      const row = known && known.shape === shape ? known : new Row(control, {
+        send: (value, isFinal) => this.on.send(control.key, value, isFinal),
+        reset: () => this.on.reset(control.key),
+        remove: () => this.on.remove(control.key),
+      });
+      row.shape = shape;
+      row.refresh(control);
+      this.rows.set(id, row);
+      const isAlone = control.section === control.key && !list.some((one) => one.key.startsWith(control.key + ".")) && control.kind !== "choice";
+      const section = isAlone || control.key === "integration_order" ? OPEN[0] : control.section || control.key.split(".")[0];
+      if (!groups.has(section)) groups.set(section, []);
+      groups.get(section).push(row);
+    }
+    if (groups.has(OPEN[0])) {
+      const first = groups.get(OPEN[0]);
+      groups.delete(OPEN[0]);
+      const rest = [...groups];
+      groups.clear();
+      for (const [name, rows] of [[OPEN[0], first], ...rest]) groups.set(name, rows);
+    }
+    for (const [name, section] of this.sections) if (!groups.has(name)) { section.root.remove(); this.sections.delete(name); }
+    for (const [name, rows] of groups) this._fillSection(name, rows);
+    if (focusedKey && document.activeElement !== focused) {
+      const row = this.rows.get(focusedKey);
+      (wasSlider && row?.slider ? row.slider : row?.field)?.focus({ preventScroll: true });
+    }
+    if (this.state) this.update(this.state);
+    this._filter();
+  }
+
+  _fillSection(name, rows) {
+    let section = this.sections.get(name);
+    if (!section) {
+      const root = make("details", undefined, "section"), heading = make("summary"), count = make("span", "", "count"), body = make("div", undefined, "body");
+      heading.append(make("span", name.replaceAll("_", " ")), count);
+      const more = make("button", "", "more");
+      more.type = "button";
+      more.addEventListener("click", () => { section.isFull = !section.isFull; this._filter(); });
+      root.append(heading, body, more);
+      root.open = OPEN.includes(name);
+      root.dataset.section = name;
+      section = { root, body, count, more, wasOpen: null, isFull: false };
+      this.sections.set(name, section);
+    }
+    section.rows = rows;
+    this.root.append(section.root);
+    const nodes = rows.map((row) => row.root);
+    if (nodes.length !== section.body.children.length || nodes.some((node, i) => section.body.children[i] !== node)) section.body.replaceChildren(...nodes);
+  }
+
+  _filter() {
+    const words = this.search.value.toLowerCase().split(/\s+/).filter(Boolean), isOnly = this.onlyChanged.getAttribute("aria-pressed") === "true";
+    const isFiltered = words.length > 0 || isOnly;
+    let found = 0;
+    for (const section of this.sections.values()) {
+      let visible = 0, extra = 0;
+      for (const row of section.rows) {
+        if (!isFiltered && row.isExtra) extra++;
+        const isFound = (isFiltered || section.isFull || !row.isExtra || row.root.contains(document.activeElement)) && words.every((word) => row.words.includes(word)) && (!isOnly || row.root.classList.contains("changed"));
+        row.root.hidden = !isFound;
+        visible += isFound;
+      }
+      found += visible;
+      section.root.hidden = visible === 0 && extra === 0;
+      section.more.hidden = extra === 0;
+      section.more.textContent = section.isFull ? "Hide settings that are not set" : "Show " + shown(extra) + " more";
+      section.more.setAttribute("aria-expanded", section.isFull);
+      if (isFiltered && section.wasOpen === null) section.wasOpen = section.root.open;
+      if (isFiltered) section.root.open = true;
+      else if (section.wasOpen !== null) { section.root.open = section.wasOpen; section.wasOpen = null; }
+    }
+    this.root.classList.toggle("nothing", found === 0);
+  }
+
+  update(state) {
+    this.state = state;
+    const changed = new Set(state.changed);
+    // A change of "sensor" marks its parts; a change of a part marks a choice among sections only if it is the one that is chosen.
+    const isChanged = ({ key, kind }) => changed.has(key) || [...changed].some((one) => key.startsWith(one + ".") ||
+      (one.startsWith(key + ".") && (kind !== "choice" || TAGS.includes(one.slice(key.length + 1)))));
+    const errors = { ...(state.errors || {}) }, rest = [];
+    // A value of its own after a choice shows the error.
+    for (const row of [...this.rows.values()].reverse()) {
+      const { key } = row.control;
+      row.update(valueAt(state.settings, key), row.control.kind !== "group" && isChanged(row.control), errors[key], state.id ?? null);
+      delete errors[key];
+    }
+    for (const [key, text] of Object.entries(errors)) rest.push(key && !text.includes(key) ? key + ": " + text : text);
+    for (const section of this.sections.values()) {
+      const n = section.rows.filter((row) => row.root.classList.contains("changed")).length;
+      const hasError = section.rows.some((row) => !row.error.hidden);
+      section.count.textContent = n ? shown(n) : "";
+      section.count.title = n ? shown(n) + " changed" : "";
+      section.root.classList.toggle("wrong", hasError);
+    }
+    this._filter();
+    return rest;
+  }
+
+  // Opens the section of a control and moves the focus to it.
+  show(key) {
+    const row = this.rows.get(key);
+    if (!row) return;
+    row.root.closest("details").open = true;
+    row.field.focus();
+    row.root.scrollIntoView({ block: "nearest" });
+  }
+}

@@ -1,0 +1,137 @@
+// A picture on the sensor: the reconstructed picture or the optical image, with the cursor and the view of the map.
+
+import { outline, traceCross } from "/web/marks.js";
+import { make } from "/web/page_parts.js";
+import { fitted } from "./site_pane.js";
+
+// Distance in µm of one step of the gaze by an arrow key, as a fraction of the frame.
+const GAZE_STEP = 0.02;
+
+export class ImagePane {
+  // Callbacks: hover(x, y, pane), leave(), click(x, y), gaze(dx, dy, isFinal). canMove() is whether the gaze can be dragged.
+  constructor(root, on, { label, canMove = () => false }) {
+    this.root = root;
+    this.on = on;
+    this.canMove = canMove;
+    this.image = make("canvas", undefined, "image");
+    this.marks = make("canvas", undefined, "marks");
+    this.marks.tabIndex = 0;
+    this.marks.setAttribute("role", "application");
+    this.marks.setAttribute("aria-label", label);
+    this.image.setAttribute("aria-hidden", "true");
+    root.append(this.image, this.marks);
+    this.pixels = make("canvas");
+    this.bounds = null;
+    this.follows = false;
+    this.offset = [0, 0];
+    this._listen();
+  }
+
+  _listen() {
+    const { marks, on } = this;
+    const at = (event) => { const box = marks.getBoundingClientRect(), view = this.view(); return [view.fromX(event.clientX - box.left), view.fromY(event.clientY - box.top)]; };
+    let start = null, isMoving = false;
+    marks.addEventListener("pointerdown", (event) => {
+      if (!this.bounds || event.button !== 0) return;
+      start = at(event);
+      isMoving = false;
+      marks.setPointerCapture(event.pointerId);
+    });
+    marks.addEventListener("pointermove", (event) => {
+      if (!this.bounds) return;
+      const [x, y] = at(event);
+      if (start && this.canMove() && this.frame && this._isInFrame(start)) {
+        if (!isMoving && Math.hypot(x - start[0], y - start[1]) * this.view().perUm < 4) return;
+        isMoving = true;
+        marks.classList.add("held");
+        this.offset = [x - start[0], y - start[1]];
+        on.gaze(...this.offset, false);
+      } else on.hover(x, y, this);
+    });
+    const end = (event) => {
+      if (isMoving) {
+        const moved = this.offset;
+        this.offset = [0, 0];
+        if (event.type === "pointerup") on.gaze(...moved, true);
+        else on.gaze(0, 0, true);
+      } else if (start && event.type === "pointerup") on.click(...at(event));
+      start = null;
+      isMoving = false;
+      marks.classList.remove("held");
+    };
+    marks.addEventListener("pointerup", end);
+    marks.addEventListener("pointercancel", end);
+    marks.addEventListener("pointerleave", () => { if (!start) on.leave(); });
+    marks.addEventListener("keydown", (event) => {
+      const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+      if (!step || !this.frame || !this.canMove() || event.ctrlKey || event.metaKey || event.altKey) return;
+      event.preventDefault();
+      const [a, , c] = this.frame, length = GAZE_STEP * (c - a) * (event.shiftKey ? 5 : 1);
+      on.gaze(step[0] * length, step[1] * length, true);
+    });
+  }
+
+  _isInFrame([x, y]) {
+    const [a, b, c, d] = this.frame;
+    return x >= a && x <= c && y >= b && y <= d;
+  }
+
+  use({ width, height, bounds_um: bounds, frame_um: frame }, rgba) {
+    this.bounds = bounds;
+    this.frame = frame || null;
+    this.pixels.width = width;
+    this.pixels.height = height;
+    this.pixels.getContext("2d", { willReadFrequently: true }).putImageData(new ImageData(new Uint8ClampedArray(rgba.buffer, rgba.byteOffset, rgba.length), width, height), 0, 0);
+  }
+
+  // Conversions between µm on the sensor and CSS pixels: the complete picture, or the view of a map.
+  view() {
+    const { clientWidth: width, clientHeight: height } = this.root, [x0, y0, x1, y1] = this.bounds || [0, 0, 1, 1];
+    let x = 0.5 * (x0 + x1), y = 0.5 * (y0 + y1), perUm = Math.min(width / (x1 - x0), height / (y1 - y0));
+    if (this.follows && this.map) {
+      ({ x, y } = this.map);
+      perUm = this.map.scale * Math.min(width / this.map.width, height / this.map.height);
+    }
+    return {
+      perUm, width, height,
+      toX: (u) => 0.5 * width + (u - x) * perUm, toY: (v) => 0.5 * height - (v - y) * perUm,
+      fromX: (px) => x + (px - 0.5 * width) / perUm, fromY: (py) => y - (py - 0.5 * height) / perUm,
+    };
+  }
+
+  get isShown() { return Boolean(this.bounds) && this.root.clientWidth > 0; }
+
+  draw() {
+    if (!this.isShown) return;
+    const { context } = fitted(this.image), view = this.view(), [x0, y0, x1, y1] = this.bounds;
+    const wide = (x1 - x0) * view.perUm, tall = (y1 - y0) * view.perUm;
+    // Pixels of several screen pixels have sharp edges.
+    context.imageSmoothingEnabled = wide / this.pixels.width < 4;
+    context.imageSmoothingQuality = "high";
+    context.drawImage(this.pixels, view.toX(x0), view.toY(y1), wide, tall);
+  }
+
+  // Marks: cursor, the map whose view is a rectangle, the boundary of the layout.
+  drawMarks({ cursor, map, boundary }) {
+    if (!this.isShown) return;
+    const view = this.view(), isAt = cursor && cursor.from !== this;
+    const state = JSON.stringify([view.width, view.height, view.toX(0), view.toY(0), view.perUm, this.frame, this.offset, isAt && [cursor.x, cursor.y], map && !this.follows && [map.x, map.y, map.scale, map.width, map.height]]);
+    // Drawn again only when the marks change: each layer costs time to compose the page.
+    if (state === this.shown && boundary === this.shownBoundary) return;
+    this.shown = state;
+    this.shownBoundary = boundary;
+    const { context, width, height } = fitted(this.marks);
+    if (boundary && this.frame) {
+      const [dx, dy] = this.offset;
+      outline(context, () => boundary(context, (x) => view.toX(x + dx), (y) => view.toY(y + dy)), [3.5, 1.5], ["rgb(0 0 0 / 60%)", "#ffd34d"]);
+    }
+    if (map && !this.follows) {
+      const x0 = view.toX(map.fromX(0)), y0 = view.toY(map.fromY(0)), x1 = view.toX(map.fromX(map.width)), y1 = view.toY(map.fromY(map.height));
+      if (x0 > 1 || y0 > 1 || x1 < width - 1 || y1 < height - 1) {
+        const w = Math.max(5, x1 - x0), h = Math.max(5, y1 - y0);
+        outline(context, () => context.rect(0.5 * (x0 + x1 - w), 0.5 * (y0 + y1 - h), w, h), [3.5, 1.75], ["rgb(0 0 0 / 55%)", "#ffffff"]);
+      }
+    }
+    if (isAt) outline(context, () => traceCross(context, view.toX(cursor.x), view.toY(cursor.y), 3, 10), [3.5, 1.5], ["rgb(0 0 0 / 65%)", "#ffffff"]);
+  }
+}

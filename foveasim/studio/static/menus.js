@@ -1,0 +1,60 @@
+// Menus that open from a button, and dialogs with a text.
+
+import { $, make, notice } from "/web/page_parts.js";
+
+// A menu of buttons: arrows move, Escape and clicks outside close it.
+export function listenToMenu(button, menu) {
+  const items = () => [...menu.querySelectorAll("button:not(:disabled)")].filter((item) => item.offsetParent);
+  const show = (isOpen) => {
+    menu.hidden = !isOpen;
+    button.setAttribute("aria-expanded", isOpen);
+    if (isOpen) items()[0]?.focus();
+  };
+  button.setAttribute("aria-haspopup", "true");
+  button.setAttribute("aria-expanded", "false");
+  button.addEventListener("click", () => show(menu.hidden));
+  menu.addEventListener("click", (event) => { if (event.target.closest("button")) { show(false); button.focus(); } });
+  menu.addEventListener("keydown", (event) => {
+    const all = items(), at = all.indexOf(document.activeElement);
+    const next = { ArrowDown: at + 1, ArrowUp: at - 1, Home: 0, End: all.length - 1 }[event.key];
+    if (event.key === "Escape") { show(false); button.focus(); event.stopPropagation(); }
+    else if (next !== undefined) { all[(next + all.length) % all.length]?.focus(); event.preventDefault(); }
+  });
+  document.addEventListener("pointerdown", (event) => { if (!menu.hidden && !menu.contains(event.target) && !button.contains(event.target)) show(false); });
+  menu.addEventListener("focusout", (event) => { if (event.relatedTarget && !menu.contains(event.relatedTarget) && event.relatedTarget !== button) show(false); });
+}
+
+export async function copyText(text, what) {
+  try {
+    await navigator.clipboard.writeText(text);
+    notice(what + " copied");
+  } catch {
+    showText(what, text);
+  }
+}
+
+// Shows a text in a dialog, with a button to copy it.
+export function showText(title, text) {
+  $("text-title").textContent = title;
+  const lines = text.split("\n").map((line) => make("span", line + "\n", /^\+(?!\+\+)/.test(line) ? "added" : /^-(?!--)/.test(line) ? "removed" : undefined));
+  $("text").replaceChildren(...(title === "Differences" ? lines : [text]));
+  if (!$("text-dialog").open) $("text-dialog").showModal();
+}
+
+export function listenToDialogs() {
+  $("text-copy").addEventListener("click", async () => {
+    try {
+      await navigator.clipboard.writeText($("text").textContent);
+      $("text-copy").textContent = "Copied";
+    } catch {
+      getSelection().selectAllChildren($("text"));
+    }
+    setTimeout(() => { $("text-copy").textContent = "Copy"; }, 1500);
+  });
+  for (const dialog of document.querySelectorAll("dialog")) {
+    dialog.addEventListener("click", (event) => {
+      const box = dialog.getBoundingClientRect(), { clientX: x, clientY: y } = event;
+      if (event.target === dialog && (x < box.left || x > box.right || y < box.top || y > box.bottom)) dialog.close();
+    });
+  }
+}

@@ -1,0 +1,229 @@
+// A map of photosites: colours, outlines, marks, legend; two of them show two variants with the same view.
+
+import { Scale, brief, bytesOfHex } from "/web/colours.js";
+import { listenToPointers } from "/web/gestures.js";
+import { fitCanvas, pixelRatio } from "/web/gl.js";
+import { drawRamp, kindsOf, swatchItem, tickLabels, titleOf } from "/web/legend.js";
+import { SensorMap } from "/web/map.js";
+import { drawOutlines, outline, ringSite, traceCross } from "/web/marks.js";
+import { Overview } from "/web/overview.js";
+import { inkOf, make } from "/web/page_parts.js";
+import { sitesIn } from "/web/measure.js";
+import { RasterMap } from "./raster_map.js";
+
+const MOST_SELECTED = 4000;
+
+export const groundColour = () => bytesOfHex(inkOf("--map"));
+
+let isSlow = false;
+
+// With software rendering, canvases in main memory are faster.
+export function useSoftware(isSoftware) { isSlow = isSoftware; }
+
+// A 2D context of a canvas, whose unit is the CSS pixel.
+export function fitted(canvas, width = canvas.clientWidth, height = canvas.clientHeight) {
+  const ratio = pixelRatio();
+  fitCanvas(canvas, width, height);
+  const context = canvas.getContext("2d", { willReadFrequently: isSlow });
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.clearRect(0, 0, width, height);
+  return { context, width, height };
+}
+
+export class SitePane {
+  // Callbacks of listenToPointers, without conversions: moved(), hover(x, y), leave(), click(), select(rectangle).
+  constructor(root, on, { renderer, label }) {
+    this.root = root;
+    this.renderer = renderer;
+    const layer = (name) => { const canvas = make("canvas", undefined, name); canvas.setAttribute("aria-hidden", "true"); root.append(canvas); return canvas; };
+    this.cells = layer("cells");
+    this.overviewCanvas = layer("overview");
+    this.lines = layer("lines");
+    this.marks = layer("marks");
+    this.marks.removeAttribute("aria-hidden");
+    this.marks.tabIndex = 0;
+    this.marks.setAttribute("role", "application");
+    this.marks.setAttribute("aria-label", label);
+    this.legend = make("div", undefined, "legend");
+    this.title = make("p", "", "legend-title");
+    this.ramp = make("canvas");
+    this.ticks = make("div", undefined, "ticks");
+    this.kinds = make("ul");
+    this.legend.append(this.title, this.ramp, this.ticks, this.kinds);
+    root.append(this.legend);
+    this.sites = null;
+    this.map = null;
+    this.columns = [];
+    let held = null;
+    listenToPointers(this.marks, {
+      press: (px, py) => { if (this.map) held = [this.map.fromX(px), this.map.fromY(py)]; },
+      drag: (dx, dy, { px, py, isSecond }) => {
+        if (!this.map) return;
+        if (on.isSelecting() !== isSecond) { on.select([held, [this.map.fromX(px), this.map.fromY(py)]]); return; }
+        this.map.set(this.map.x - dx / this.map.scale, this.map.y + dy / this.map.scale, this.map.scale);
+        on.moved(this);
+      },
+      pinch: (factor, px, py) => { this.map?.zoom(factor, px, py); on.moved(this); },
+      wheel: (factor, px, py) => {
+        if (!this.map) return;
+        this.map.zoom(factor, px, py);
+        on.hover(this.map.fromX(px), this.map.fromY(py), this);
+        on.moved(this);
+      },
+      click: () => on.click(this),
+      move: (px, py) => { if (this.map) on.hover(this.map.fromX(px), this.map.fromY(py), this); },
+      leave: () => on.leave(),
+    });
+  }
+
+  // Shows sites; the view stays, or shows all sites again if it did.
+  useSites(sites, palette) {
+    const isNew = !this.map, isWhole = isNew || this.isWhole;
+    this.sites = sites;
+    this.palette = palette;
+    this.generation = (this.generation || 0) + 1;
+    if (isNew) this._createMap(sites);
+    else this.map.use(sites);
+    // The raster map averages small sites itself.
+    this.overview = this.map.gl ? new Overview(this.overviewCanvas, sites) : null;
+    this.resize();
+    if (isWhole) this.fit();
+    else this.map.set(this.map.x, this.map.y, this.map.scale);
+    this.scale = null;
+  }
+
+  _createMap(sites) {
+    // By the processor, a table of the sites of all pixels is faster than WebGL.
+    if (this.renderer && !this.renderer.isSlow) {
+      this.map = new SensorMap(this.cells, sites, this.renderer);
+      if (this.map.gl) {
+        this.cells.addEventListener("webglcontextlost", (event) => event.preventDefault());
+        this.cells.addEventListener("webglcontextrestored", () => { this.map.restore(); this.draw(); });
+        return;
+      }
+      const fresh = make("canvas", undefined, "cells");
+      this.cells.replaceWith(fresh);
+      this.cells = fresh;
+    }
+    this.map = new RasterMap(this.cells, sites);
+  }
+
+  useColumns(columns, filterOf) {
+    this.columns = columns;
+    this.filterOf = filterOf;
+  }
+
+  get isWhole() {
+    const { map } = this;
+    return Boolean(map) && Math.abs(map.scale / map.fitScale() - 1) < 1e-6 && map.x === map.middle[0] && map.y === map.middle[1];
+  }
+
+  fit() { this.map.set(this.map.middle[0], this.map.middle[1], this.map.fitScale()); }
+
+  // Takes the view of another pane, also beyond the limits of these sites.
+  follow(other) {
+    if (!this.map) return;
+    Object.assign(this.map, { x: other.map.x, y: other.map.y, scale: other.map.scale });
+  }
+
+  columnOf(key) { return this.columns.find((column) => column.key === key) || this.columns[0]; }
+
+  // Colours the sites by a column; with values of another pane, so that colours are comparable.
+  colourBy(key, options) {
+    if (!this.columns.length || !this.map) return;
+    this.column = this.columnOf(key);
+    this.scale = new Scale(this.column, this.column.values, this.column.kind === "lit" ? this.filterOf : null, this.palette, options);
+  }
+
+  paint(range) {
+    if (!this.scale) return;
+    this.range = range;
+    this.scale.paint(this.map.colours, range, groundColour());
+    this.map.sendColours();
+    this._drawLegend();
+  }
+
+  _drawLegend() {
+    const { scale, column } = this, isKinds = column.kind === "kinds";
+    this.title.textContent = titleOf(column) + (scale.isLog ? ", log" : "");
+    this.ramp.hidden = this.ticks.hidden = isKinds;
+    this.kinds.hidden = !isKinds;
+    if (isKinds) {
+      const { items, rest } = kindsOf(scale);
+      this.kinds.replaceChildren(...items.slice(0, 8).map(swatchItem), ...(rest || items.length > 8 ? [make("li", "…")] : []));
+      return;
+    }
+    const { context, width, height } = fitted(this.ramp);
+    drawRamp(context, scale, width, height);
+    this.ticks.replaceChildren(...tickLabels(scale));
+  }
+
+  resize() {
+    if (!this.map) return;
+    const { clientWidth: width, clientHeight: height } = this.root, isWhole = this.isWhole;
+    if (width === this.map.width && height === this.map.height && this.cells.width > 1) return;
+    this.map.resize(width, height);
+    if (isWhole) this.fit();
+  }
+
+  get isShown() { return Boolean(this.map && this.scale) && this.root.clientWidth > 0; }
+
+  draw() {
+    if (!this.isShown) return;
+    const { map } = this;
+    map.draw(groundColour());
+    this.overview?.update(map, this.scale, this.range);
+    // Layers are drawn again only when they change: each costs time to compose the page.
+    if (!this._isNew("lines", [this.viewState, this.violations?.()])) return;
+    const { context, width, height } = fitted(this.lines);
+    drawOutlines(context, map, width, height);
+    this.drawViolations?.(context, map);
+  }
+
+  get viewState() {
+    const { x, y, scale, width, height } = this.map;
+    return [x, y, scale, width, height, pixelRatio(), this.generation].join();
+  }
+
+  _isNew(layer, state) {
+    const text = JSON.stringify(state);
+    this.shown = this.shown || {};
+    if (this.shown[layer] === text) return false;
+    this.shown[layer] = text;
+    return true;
+  }
+
+  // Marks: { cursor, isOwn, hovered, pinned, rectangle, selected, chosen }.
+  drawMarks({ cursor, hovered, pinned, rectangle, selected, trace }) {
+    if (!this.isShown) return;
+    const isAt = cursor && cursor.from !== this, state = [hovered, pinned, rectangle, selected.length, selected[0], trace && [...trace.box], isAt && [cursor.x, cursor.y]];
+    const isEmpty = hovered < 0 && pinned < 0 && !rectangle && !selected.length && !trace && !isAt;
+    if (!this._isNew("marks", isEmpty ? [this.map.width, this.map.height] : [this.viewState, state])) return;
+    const { map, sites } = this, { context } = fitted(this.marks);
+    if (trace) {
+      outline(context, () => trace.path(context, map), [8, 4], ["#ffffff", "#d3261b"]);
+      const [a, b, c, d] = trace.box;
+      outline(context, () => context.arc(map.toX(0.5 * (a + c)), map.toY(0.5 * (b + d)), Math.max(16, 0.75 * map.scale * Math.hypot(c - a, d - b)), 0, 7), [4, 2], ["#ffffff", "#d3261b"]);
+    }
+    if (selected.length) outline(context, () => { for (const site of selected.slice(0, MOST_SELECTED)) if (site < sites.n) sites.trace(context, site, map); }, [3, 1.5], ["#ffffff", "#1f5fbf"]);
+    if (rectangle) {
+      const [[x0, y0], [x1, y1]] = rectangle;
+      const box = [map.toX(Math.min(x0, x1)), map.toY(Math.max(y0, y1)), Math.abs(x1 - x0) * map.scale, Math.abs(y1 - y0) * map.scale];
+      context.fillStyle = "rgb(31 95 191 / 14%)";
+      context.fillRect(...box);
+      outline(context, () => context.rect(...box), [4, 2], ["#ffffff", "#1f5fbf"]);
+    }
+    if (pinned >= 0 && pinned < sites.n) ringSite(context, map, pinned, ["#ffffff", "#1f5fbf"]);
+    if (hovered >= 0 && hovered < sites.n && hovered !== pinned) ringSite(context, map, hovered, ["#ffffff", "#10151f"]);
+    if (isAt) outline(context, () => traceCross(context, map.toX(cursor.x), map.toY(cursor.y), 4, 13), [4, 2], ["#ffffff", "#10151f"]);
+  }
+
+  pick(x, y) {
+    const all = this.sites ? this.sites.pickAll(x, y) : [];
+    return all.length ? all[all.length - 1] : -1;
+  }
+
+  sitesIn(rectangle) { return this.sites ? sitesIn(this.sites, rectangle) : []; }
+}
+
+export const countText = (n) => (n >= 1e5 ? brief(n) : n.toLocaleString("en-US"));
