@@ -13,6 +13,7 @@ from torch.func import functional_call
 import foveasim as fs
 from foveasim import learn
 from foveasim.distortion import BrownConrady, Fisheye, PolynomialFisheye, Scaramuzza
+from foveasim.integrate import UndistortedOutlines
 from foveasim.learn.distortion import coefficient_values
 from foveasim.optics import LateralColour, PupilImage, Seidel, Zernike
 from foveasim.sensor.effects import Diffusion, InterPixelCapacitance
@@ -462,3 +463,44 @@ def test_learned_camera_reproduces_expected_charges():
 def replace_precision(camera):
     optics = replace(camera.optics, precision="double")
     return fs.Camera(optics=optics, sensor=camera.sensor, distortion=camera.distortion)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_distorted_outlines_agree_with_differences(order):
+    """Displacements of vertices before the distortion, through the plain integrator."""
+    distortion = BrownConrady(focal_um=60.0, k1=-0.08, p1=0.003, centre_um=(0.7, -0.4))
+    grid, h, n_compared = fs.Grid((40, 40), 0.8, (-16.0, -16.0)), 1e-4, 0
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        mesh = learn.Mesh(fs.layout.hexagonal(n_columns=4, n_rows=3, pitch_um=5.0).rotate(7.0), "free")
+        points = mesh().detach() + torch.from_numpy(rng.uniform(-0.5, 0.5, (mesh.n_points, 2)))
+        layout = mesh.outlines.layout(points)
+        pieces = np.ones(mesh.outlines.edges.n_edges, np.int64)
+        chords = UndistortedOutlines(layout, distortion, 0.8).count_pieces()
+        np.maximum.at(pieces, mesh.outlines.edges.edge, chords)
+        outlines, subdivision = mesh.outlines.subdivide(pieces)
+        cells, weights = rng.random(grid.shape), rng.uniform(-1.0, 1.0, layout.n_sites)
+        points.requires_grad_()
+        ideal = learn.undistort(distortion, subdivision(points))
+        power = learn.site_power(ideal, torch.from_numpy(cells), outlines, grid, order=order)
+        np.testing.assert_allclose(
+            power.detach().numpy(), fs.Integrator(layout, grid, distortion=distortion, order=order)(cells), rtol=1e-12
+        )
+        (power * torch.from_numpy(weights)).sum().backward()
+
+        def total(points, outlines=mesh.outlines, cells=cells, weights=weights):
+            moved = outlines.layout(points)
+            return float(fs.Integrator(moved, grid, distortion=distortion, order=order)(cells) @ weights)
+
+        scale = float(points.grad.abs().max())
+        for point, axis in zip(rng.integers(0, mesh.n_points, 20), rng.integers(0, 2, 20), strict=True):
+            slopes = []
+            for size in (h, 0.5 * h):
+                step = torch.zeros_like(points)
+                step[point, axis] = size
+                slopes.append((total(points.detach() + step) - total(points.detach() - step)) / (2.0 * size))
+            if abs(slopes[0] - slopes[1]) < 1e-8 * scale:  # else an edge passes a corner of cells
+                n_compared += 1
+                assert abs(slopes[1] - float(points.grad[point, axis])) < 2e-8 * scale
+
+    assert n_compared > 100
