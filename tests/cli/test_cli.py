@@ -328,4 +328,4 @@ def test_shell_completion_suggests_commands(tmp_path):
     environment = {**os.environ, "_FOVEASIM_COMPLETE": "complete_bash", "COMP_WORDS": "foveasim s", "COMP_CWORD": "1"}
     program = Path(sys.executable).with_name("foveasim")
     result = subprocess.run([program], env=environment, capture_output=True, text=True, check=True, cwd=tmp_path)
-    assert result.stdout.split() == ["sweep", "study", "schema"]
+    assert result.stdout.split() == ["studio", "sweep", "study", "schema"]
