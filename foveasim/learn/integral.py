@@ -138,11 +138,8 @@ class Integral:
 
     def _matrix(self, points: Tensor, n_maps: int) -> Any:
         """Return the overlaps as a sparse matrix (n_site, n_cell), or None for few or large maps."""
-        if (
-            n_maps < MATRIX_MAPS
-            or n_maps * self.grid.shape[0] * self.grid.shape[1] < 1
-            or _n_cells(self.grid) > MATRIX_CELLS
-        ):
+        n_y, n_x = self.grid.shape
+        if n_maps < MATRIX_MAPS or n_y * n_x > MATRIX_CELLS:
             return None
         if "matrix" not in self._compiled:
             self._compiled["matrix"] = self.integrator(points, n_maps).weights()
@@ -198,8 +195,12 @@ class Integral:
         return gradient.index_add(0, end, normal * sums[:, 1:2].to(points.dtype))
 
 
-def _n_cells(grid: Grid) -> int:
-    return grid.shape[0] * grid.shape[1]
+def _point_gradient(ctx: Any, points: Tensor, maps: Tensor, weights: Tensor) -> Tensor | None:
+    """Return the gradient of ``sum weights * power`` by the points, if it is needed."""
+    if not ctx.needs_input_grad[0]:
+        return None
+    moments = _Moments.apply(points, maps, ctx.integral)
+    return ctx.integral.contract(points, moments, weights)  # type: ignore[no-any-return]
 
 
 class _SitePower(torch.autograd.Function):
@@ -215,12 +216,8 @@ class _SitePower(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
         (weights,) = gradients
         points, maps = ctx.saved_tensors
-        of_points = of_maps = None
-        if ctx.needs_input_grad[0]:
-            of_points = ctx.integral.contract(points, _Moments.apply(points, maps, ctx.integral), weights)
-        if ctx.needs_input_grad[1]:
-            of_maps = _Spread.apply(points, weights, ctx.integral).to(maps.dtype)
-        return of_points, of_maps, None
+        of_maps = _Spread.apply(points, weights, ctx.integral).to(maps.dtype) if ctx.needs_input_grad[1] else None
+        return _point_gradient(ctx, points, maps, weights), of_maps, None
 
 
 class _Spread(torch.autograd.Function):
@@ -236,12 +233,8 @@ class _Spread(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
         (maps,) = gradients
         points, weights = ctx.saved_tensors
-        of_points = of_weights = None
-        if ctx.needs_input_grad[0]:
-            of_points = ctx.integral.contract(points, _Moments.apply(points, maps, ctx.integral), weights)
-        if ctx.needs_input_grad[1]:
-            of_weights = _SitePower.apply(points, maps, ctx.integral).to(weights.dtype)
-        return of_points, of_weights, None
+        of_weights = _SitePower.apply(points, maps, ctx.integral).to(weights.dtype) if ctx.needs_input_grad[1] else None
+        return _point_gradient(ctx, points, maps, weights), of_weights, None
 
 
 class _Moments(torch.autograd.Function):
