@@ -68,6 +68,7 @@ __all__ = [
     "SiliconQE",
     "__version__",
     "compare",
+    "config",
     "distortion",
     "errors",
     "explore",
@@ -102,6 +103,7 @@ check_public_calls(__name__)
 #: Names that are imported when they are used, and the modules that have them.
 _LAZY = {
     "compare": "foveasim.compare",
+    "config": "foveasim.config",
     "explore": "foveasim.explore",
     "learn": "foveasim.learn",
     "read_layout": "foveasim.config",

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, create_mo
 
 from foveasim._core.registry import Registry
 from foveasim.distortion import LENSES
-from foveasim.layout import LAYOUTS, PRESETS, RULES, DesignRules, Readout, Routing, read_layout
+from foveasim.layout import EDITS, LAYOUTS, PRESETS, RULES, DesignRules, Readout, Routing, read_layout
 from foveasim.maps import read_power_map
 from foveasim.optics import PUPILS, LateralColour, Optics, Seidel, Zernike
 from foveasim.scene import SCENES
@@ -33,12 +33,12 @@ from foveasim.sensor import (
 from foveasim.sensor.effects import EFFECTS
 from foveasim.sensor.spectral import CURVES
 
-__all__ = ["FILE_OPTIONS", "Models", "PerArea", "call_of", "models"]
+__all__ = ["FILE_OPTIONS", "LayerSection", "Models", "PerArea", "call_of", "models"]
 
 #: The function or class of each section.
 _CALLS: dict[type[BaseModel], Callable[..., Any]] = {}
 #: Registries whose members are sections: the models are rebuilt when one of these changes.
-_REGISTRIES: tuple[Registry[Any], ...] = (LAYOUTS, RULES, SCENES, LENSES, PUPILS, CURVES, EFFECTS)
+_REGISTRIES: tuple[Registry[Any], ...] = (LAYOUTS, EDITS, RULES, SCENES, LENSES, PUPILS, CURVES, EFFECTS)
 
 _log = logging.getLogger("foveasim")
 
@@ -87,7 +87,10 @@ def _documentation(call: Callable[..., Any]) -> tuple[str, dict[str, str]]:
 
 def _union_of(tag: str, models: Mapping[str, type[_Section]]) -> Any:
     """Return a union of sections with a discriminating key."""
-    tagged = [create_model(f"{name} {tag}", __base__=m, **{tag: (Literal[name], ...)}) for name, m in models.items()]  # type: ignore[call-overload]
+    tagged = []
+    for name, model in models.items():
+        title = f"{model.__name__} {tag}"
+        tagged.append(create_model(title, __base__=model, **{tag: (Literal[name], ...)}))  # type: ignore[call-overload]
     return Annotated[Union[tuple(tagged)], Field(discriminator=tag)]  # noqa: UP007 -- a union of a list
 
 
@@ -95,6 +98,10 @@ class PerArea(_Section):
     """A value per site that is proportional to its area."""
 
     per_um2: float
+
+
+class LayerSection(_Section):
+    """Base of the sections of layouts, and of layouts that are layers of another one."""
 
 
 _Outline = Annotated[list[list[float]] | str, Field(description="vertices [x, y] in µm, or WKT")]
@@ -111,6 +118,18 @@ _FILE_TYPES: dict[str, Any] = {
 _Numbers: Any = float | list[float] | None
 #: Bands of scenes: one wavelength or several.
 _WAVELENGTHS: dict[str, Any] = {"wavelength_nm": _Numbers, "band_width_nm": _Numbers}
+_Point = tuple[float, float]
+#: Parameters of layout edits with other types in files than in Python.
+_EDIT_TYPES: dict[str, Any] = {
+    "by_um": _Point,
+    "from_um": list[_Point],
+    "line_um": list[_Point],
+    "margin_um": float,
+    "outlines_um": list[_Outline],
+    "points_um": list[_Point] | None,
+    "region": _Outline,
+    "to_um": list[_Point],
+}
 #: Options of layout files in settings, with their types: a layer is ``77`` or ``77/3``.
 _Layer: Any = int | str
 FILE_OPTIONS: dict[str, Any] = {
@@ -259,10 +278,21 @@ def _layout(rules: type[_Section]) -> Any:
         "move_um": (tuple[float, float], Field((0.0, 0.0), description="displacement along x and y, µm")),
         "inset_um": (float, Field(0.0, description="margin that is removed from each photosite, µm")),
         "snap_um": (float | None, Field(None, description="manufacturing grid of the vertices, µm")),
-        "rules": (rules | None, Field(None, description="design rules of the layout")),
         "source": (str, Field("", description="source of the parameters")),
     }
-    base = create_model("_LayoutSection", __base__=_Section, **fields)
+    parameters = _registered_sections(LAYOUTS, _EXCLUDED, "{} parameters", **_FILE_TYPES)
+    layer = _layout_union("layer", create_model("_Layer", __base__=LayerSection, **fields), parameters)
+    edits = _registered_sections(EDITS, ("layout", "self"), **_EDIT_TYPES, layer=layer, rules=rules | None)
+    fields["edits"] = (
+        list[_union_of("kind", edits)],  # type: ignore[misc]
+        Field([], description="edits of the layout in their order, before its displacement"),
+    )
+    fields["rules"] = (rules | None, Field(None, description="design rules of the layout"))
+    return _layout_union("layout", create_model("_LayoutSection", __base__=LayerSection, **fields), parameters)
+
+
+def _layout_union(title: str, base: type[LayerSection], parameters: Mapping[str, type[_Section]]) -> Any:
+    """Return the union of the sections of a layout, a generator or a file, over a base."""
     base.__doc__ = (
         "A layout: a generator and its parameters, colour filters, edits in the order of the keys, design rules."
     )
@@ -270,14 +300,17 @@ def _layout(rules: type[_Section]) -> Any:
     options: dict[str, Any] = {
         name: (kind, Field(None, description=descriptions[name])) for name, kind in FILE_OPTIONS.items()
     }
-    file = create_model("layout file", __base__=base, file=(str, ...), **options)
+    file = create_model(f"{title} file", __base__=base, file=(str, ...), **options)
     file.__doc__ = (
         "A layout: a file and options of its format, colour filters, edits in the order of the keys, design rules."
     )
-    parameters = _registered_sections(LAYOUTS, _EXCLUDED, "{} parameters", **_FILE_TYPES)
+    suffix = "" if title == "layout" else f" {title}"
     generated = _union_of(
         "generator",
-        {name: create_model(name, __base__=base, parameters=(part, ...)) for name, part in parameters.items()},
+        {
+            name: create_model(f"{name}{suffix}", __base__=base, parameters=(part, ...))
+            for name, part in parameters.items()
+        },
     )
     return Annotated[
         Annotated[file, Tag("layout file")] | Annotated[generated, Tag("layout generator")],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -17,7 +18,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._io.images import read_picture
 from foveasim._io.yaml_files import parse_yaml, read_yaml
 from foveasim.camera import Camera
-from foveasim.config._models import FILE_OPTIONS, PerArea, call_of, models
+from foveasim.config._models import FILE_OPTIONS, LayerSection, PerArea, call_of, models
 from foveasim.config._problems import validate
 from foveasim.config._sources import Source
 from foveasim.errors import ConfigError, FoveasimError, ParameterError
@@ -57,6 +58,8 @@ YAML_EXTENSIONS = (".yaml", ".yml")
 FILE_SETTINGS = ("density", "file", "importance", "layers", "layout", "path", "picture")
 #: Option of the command line that replaces settings.
 CHANGE = "--set"
+#: Keys of a layout that do not change its photosites before the edits.
+AFTER_EDITS = ("edits", "move_um", "inset_um", "snap_um", "rules", "source")
 #: Tolerance of the aspect ratio of a picture and the rectangle that it covers.
 SHAPE_ROUNDING = 1e-6
 
@@ -211,7 +214,7 @@ def build_shot(
 
     def layout_file() -> LayoutFile:
         if not isinstance(settings.layout, str):
-            return _build_layout(source, "layout.", settings.layout)
+            return _build_layout(source, "layout.", settings.layout, data["layout"], cache)
         read: LayoutFile = _call(
             source, "layout", read_any_layout, {"path": settings.layout, "directory": source.directory}
         )
@@ -386,10 +389,44 @@ def _read_sites(source: Source, prefix: str, section: Any) -> Layout:
     return layout
 
 
-def _build_layout(source: Source, prefix: str, section: Any) -> LayoutFile:
-    layout = (_generate if hasattr(section, "generator") else _read_sites)(source, prefix, section)
-    if section.mosaic is not None:
-        layout = _call(source, prefix + "mosaic", mosaic, {"layout": layout, "block": section.mosaic})
+def _build_layout(
+    source: Source,
+    prefix: str,
+    section: Any,
+    data: Mapping[str, Any] | None = None,
+    cache: Callable[[str, Any, Callable[[], Any]], Any] = _make_uncached,
+) -> LayoutFile:
+    """Return the layout of a section; with its plain data, layouts of last edits are cached."""
+    rules = None
+    if getattr(section, "rules", None) is not None:
+        rules = _build(source, prefix + "rules", section.rules)
+    edits = getattr(section, "edits", [])
+    if data is None:
+        cache = _make_uncached
+    unedited = {name: value for name, value in (data or {}).items() if name not in AFTER_EDITS}
+
+    def generated() -> Layout:
+        layout = (_generate if hasattr(section, "generator") else _read_sites)(source, prefix, section)
+        if section.mosaic is not None:
+            layout = _call(source, prefix + "mosaic", mosaic, {"layout": layout, "block": section.mosaic})
+        return layout
+
+    def edited(n: int) -> Layout:
+        """Return the layout after n edits, from the cache for the last two."""
+        layout = cache("generated layout", unedited, generated)
+        for i in range(n):
+            layout = _edit(source, f"{prefix}edits[{i}]", edits[i], layout, rules)
+        return layout
+
+    def cached(n: int) -> Layout:
+        settings = [unedited, data["edits"][:n] if data else None, data.get("rules") if data else None]
+        return cache("edited layout", settings, lambda: with_last(n))
+
+    def with_last(n: int) -> Layout:
+        before = cached(n - 1) if n == len(edits) and n > 1 else edited(n - 1)
+        return _edit(source, f"{prefix}edits[{n - 1}]", edits[n - 1], before, rules)
+
+    layout = cached(len(edits)) if edits else edited(0)
     if any(section.move_um):
         layout = _call(
             source, prefix + "move_um", layout.translate, dict(zip(("dx_um", "dy_um"), section.move_um, strict=True))
@@ -398,8 +435,19 @@ def _build_layout(source: Source, prefix: str, section: Any) -> LayoutFile:
         layout = _call(source, prefix + "inset_um", inset, {"layout": layout, "margin_um": section.inset_um})
     if section.snap_um is not None:
         layout = _call(source, prefix + "snap_um", snap, {"layout": layout, "grid_um": section.snap_um})
-    rules = None if section.rules is None else _build(source, prefix + "rules", section.rules)
     return LayoutFile(layout=layout, rules=rules, source=section.source)
+
+
+def _edit(source: Source, key_path: str, section: Any, layout: Layout, rules: DesignRules | None) -> Layout:
+    """Return a layout after an edit, which has the rules of the layout by default."""
+    call = _callable(section)
+    values = _values(source, key_path + ".", section)
+    if "rules" in values and values["rules"] is None:
+        values["rules"] = rules
+    edited: Layout = _call(source, key_path, functools.partial(call, layout), values)
+    if edited.n_sites == 0:
+        raise source.error(key_path, "must leave at least one photosite")
+    return edited
 
 
 def _picture_values(source: Source, key_path: str, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -439,6 +487,8 @@ def _build(source: Source, key_path: str, value: Any) -> Any:
         return picture_path(source, value, key_path)
     if not isinstance(value, BaseModel) or isinstance(value, PerArea):
         return value
+    if isinstance(value, LayerSection):
+        return _build_layout(source, key_path + ".", value).layout
     return _call(source, key_path, _callable(value), _values(source, key_path + ".", value))
 
 
@@ -515,14 +565,25 @@ def put_setting(source: Source | str | Path | None, data: dict[str, Any], key: s
     if not all(names):
         raise ConfigError(Source.of(source).file, f"'{key}' must be the path of a setting, such as sensor.bits")
     section: Any = data
-    for i, name in enumerate(names[:-1]):
-        section = section.setdefault(name, {})
-        if not isinstance(section, dict):
+    for i, name in enumerate(names):
+        if isinstance(section, list):
+            if not name.isdecimal() or int(name) >= len(section):
+                raise ConfigError(
+                    Source.of(source).file,
+                    f"'{key}={value}' cannot be set: {'.'.join(names[:i])} is a list of {len(section)} items, and the next "
+                    f"part of the path must be the index of one of them, from 0",
+                )
+        elif not isinstance(section, dict):
             raise ConfigError(
                 Source.of(source).file,
-                f"'{key}={value}' cannot be set: {'.'.join(names[: i + 1])} must be a section, got {section!r}",
+                f"'{key}={value}' cannot be set: {'.'.join(names[:i])} must be a section, got {section!r}",
             )
-    section[names[-1]] = value
+        step: Any = int(name) if isinstance(section, list) else name
+        if i == len(names) - 1:
+            section[step] = value
+        else:
+            section = section[step] if isinstance(section, list) else section.setdefault(name, {})
+    section = data.get("scene", {})
     if names[:-1] == ["scene"] and names[-1] in FRAMINGS and value is not None:
         for name in FRAMINGS:
             if name != names[-1]:

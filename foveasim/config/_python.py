@@ -12,11 +12,11 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from foveasim.config._models import PerArea, call_of, models
+from foveasim.config._models import FILE_OPTIONS, PerArea, call_of, models
 from foveasim.config._objects import FILE_SETTINGS, resolve_files
 from foveasim.config._problems import validate
 from foveasim.config._sources import Source
-from foveasim.layout import LAYOUTS
+from foveasim.layout import LAYOUTS, Layout
 
 __all__ = ["to_python"]
 
@@ -111,34 +111,44 @@ def _shot_lines(writer: _Writer, shot: Any) -> list[str]:
     ]
 
 
-def _layout_lines(writer: _Writer, section: Any) -> list[str]:
-    """Return the lines that define the layout, with its edits in their order."""
+def _layout_lines(writer: _Writer, section: Any, variable: str = "layout") -> list[str]:
+    """Return the lines that define a layout, with its edits in their order."""
+    layout = _Name(variable)
     if isinstance(section, str):
-        return [f"layout = {writer.call('fs.read_layout', {'path': section}, positional=('path',))}"]
+        return [f"{layout} = {writer.call('fs.read_layout', {'path': section}, positional=('path',))}"]
     if hasattr(section, "generator"):
         picture = getattr(LAYOUTS[section.generator], "picture", None)
         if picture is not None and getattr(section.parameters, picture) is not None:
             raise _NotPublicError  # a picture is read and placed on a grid
-        lines = [writer.assignment("layout", section.parameters)]
+        lines = [writer.assignment(variable, section.parameters)]
     else:
-        given = section.model_fields_set - {"mosaic", "move_um", "inset_um", "snap_um", "rules", "source"}
-        options = {name: getattr(section, name) for name in type(section).model_fields if name in given}
-        lines = [f"layout = {writer.call('fs.layout.read_layout', options, positional=('file',))}"]
-    layout = _Name("layout")
-    edits: list[tuple[bool, str, dict[str, Any]]] = [
-        (section.mosaic is not None, "fs.layout.mosaic", {"layout": layout, "block": section.mosaic}),
-        (any(section.move_um), "layout.translate", {"dx_um": section.move_um[0], "dy_um": section.move_um[1]}),
-        (bool(section.inset_um), "fs.layout.inset", {"layout": layout, "margin_um": section.inset_um}),
-        (section.snap_um is not None, "fs.layout.snap", {"layout": layout, "grid_um": section.snap_um}),
-    ]
-    return [
-        *lines,
-        *(
-            f"layout = {writer.call(name, values, positional=('layout',))}"
-            for is_made, name, values in edits
-            if is_made
-        ),
-    ]
+        options = {name: getattr(section, name) for name in ("file", *FILE_OPTIONS) if name in section.model_fields_set}
+        lines = [f"{layout} = {writer.call('fs.layout.read_layout', options, positional=('file',))}"]
+
+    def step(call: str, values: dict[str, Any]) -> str:
+        first = {} if call.startswith(f"{variable}.") else {"layout": layout}
+        return f"{layout} = {writer.call(call, {**first, **values}, positional=('layout',))}"
+
+    if section.mosaic is not None:
+        lines.append(step("fs.layout.mosaic", {"block": section.mosaic}))
+    for edit in getattr(section, "edits", []):
+        values = writer.arguments(edit)
+        if "layer" in values:
+            lines += _layout_lines(writer, values["layer"], "layer")
+            values["layer"] = _Name("layer")
+        call = call_of(edit)
+        if values.get("rules") is None and "rules" in type(edit).model_fields and section.rules is not None:
+            values["rules"] = section.rules
+        assert call is not None
+        is_method = inspect.unwrap(getattr(Layout, call.__name__, len)) is inspect.unwrap(call)
+        lines.append(step(f"{variable}.{call.__name__}" if is_method else writer.name_of(call), values))
+    if any(section.move_um):
+        lines.append(step(f"{variable}.translate", {"dx_um": section.move_um[0], "dy_um": section.move_um[1]}))
+    if section.inset_um:
+        lines.append(step("fs.layout.inset", {"margin_um": section.inset_um}))
+    if section.snap_um is not None:
+        lines.append(step("fs.layout.snap", {"grid_um": section.snap_um}))
+    return lines
 
 
 class _Name(str):

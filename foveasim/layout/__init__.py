@@ -8,10 +8,33 @@ from foveasim.layout.adjacency import adjacency
 from foveasim.layout.channels import MOSAICS, graph_colouring, mosaic, random_channels
 from foveasim.layout.drc.measurements import RULES, Rule
 from foveasim.layout.drc.presets import PRESETS, Preset
-from foveasim.layout.drc.repair import Change, enforce
+from foveasim.layout.drc.repair import Change, enforce, repair
 from foveasim.layout.drc.routing import Readout, Routing, track_demand
 from foveasim.layout.drc.rules import DesignRules, Report, RuleResult, Violation, min_width_um
-from foveasim.layout.edits import clip, cut_out, inset, merge, merge_small, node, snap, split, union
+from foveasim.layout.edits import (
+    EDITS,
+    clip,
+    cut_along,
+    cut_out,
+    draw,
+    inset,
+    layout_edit,
+    merge,
+    merge_at,
+    merge_small,
+    move_sites,
+    move_vertices,
+    node,
+    overlay,
+    remove_at,
+    remove_vertices,
+    set_channel,
+    sites_at,
+    snap,
+    split,
+    split_at,
+    union,
+)
 from foveasim.layout.families import LAYOUTS, layout_family
 from foveasim.layout.files import (
     DERIVED_LAYERS,
@@ -44,6 +67,7 @@ from foveasim.layout.summary import Summary, describe
 
 __all__ = [
     "DERIVED_LAYERS",
+    "EDITS",
     "FORMATS",
     "LAYOUTS",
     "MOSAICS",
@@ -67,8 +91,10 @@ __all__ = [
     "adjacency",
     "bundled_layouts",
     "clip",
+    "cut_along",
     "cut_out",
     "describe",
+    "draw",
     "enforce",
     "fill",
     "foveal_cartesian",
@@ -79,15 +105,20 @@ __all__ = [
     "grid",
     "hexagonal",
     "inset",
+    "layout_edit",
     "layout_family",
     "log_polar",
     "merge",
+    "merge_at",
     "merge_small",
     "min_width_um",
     "mosaic",
+    "move_sites",
+    "move_vertices",
     "nearest_bus",
     "node",
     "octagonal",
+    "overlay",
     "penrose",
     "quadtree",
     "random_channels",
@@ -95,8 +126,14 @@ __all__ = [
     "read_layout",
     "readout_by",
     "readout_order",
+    "remove_at",
+    "remove_vertices",
+    "repair",
+    "set_channel",
+    "sites_at",
     "snap",
     "split",
+    "split_at",
     "square_ring_ratio",
     "sunflower",
     "tiling",

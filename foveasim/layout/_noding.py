@@ -13,7 +13,9 @@ __all__ = ["ON_EDGE_UM", "merge_coincident_points", "node_edges", "points_on_edg
 ON_EDGE_UM = 1e-6
 
 
-def points_on_edges(points_um: Floats, begin_um: Floats, end_um: Floats) -> tuple[Ints, Ints, Floats]:
+def points_on_edges(
+    points_um: Floats, begin_um: Floats, end_um: Floats, tolerance_um: float = ON_EDGE_UM
+) -> tuple[Ints, Ints, Floats]:
     """
     Return the points that lie on edges, end points excluded.
 
@@ -21,6 +23,8 @@ def points_on_edges(points_um: Floats, begin_um: Floats, end_um: Floats) -> tupl
     ----------
     points_um : (n_point, 2) float64, µm
     begin_um, end_um : (n_edge, 2) float64, µm
+    tolerance_um : float, µm
+        Distance within which a point lies on an edge.
 
     Returns
     -------
@@ -29,11 +33,11 @@ def points_on_edges(points_um: Floats, begin_um: Floats, end_um: Floats) -> tupl
         Position along the edge, from 0 to 1.
     """
     edges = shapely.linestrings(np.stack((begin_um, end_um), axis=1))
-    edge, point = shapely.STRtree(shapely.points(points_um)).query(edges, predicate="dwithin", distance=ON_EDGE_UM)
+    edge, point = shapely.STRtree(shapely.points(points_um)).query(edges, predicate="dwithin", distance=tolerance_um)
     along = end_um[edge] - begin_um[edge]
     length2 = np.einsum("ij,ij->i", along, along)
     fraction = np.einsum("ij,ij->i", points_um[point] - begin_um[edge], along) / length2
-    margin = ON_EDGE_UM / np.sqrt(length2)
+    margin = tolerance_um / np.sqrt(length2)
     is_inside = (fraction > margin) & (fraction < 1.0 - margin)
     return edge[is_inside], point[is_inside], fraction[is_inside]
 

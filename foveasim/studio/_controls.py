@@ -68,7 +68,9 @@ ONE_BAND = (
 #: Required parameters that are files without a bundled one.
 FROM_FILES = {"path", "file"}
 #: Depth of nested sections.
-MAX_DEPTH = 6
+MAX_DEPTH = 8
+#: Largest number of sections of a list that have controls.
+MAX_ITEMS = 100
 
 
 def controls_of(settings: Mapping[str, Any], start: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
@@ -100,11 +102,14 @@ def controls_of(settings: Mapping[str, Any], start: Mapping[str, Any] | None = N
 
 
 def value_at(settings: Any, key: str) -> Any:
-    """Return the value of a key such as ``"sensor.bits"``, None if it is missing."""
+    """Return the value of a key such as ``"layout.edits.0.kind"``, None if it is missing."""
     for name in key.split("."):
-        if not isinstance(settings, Mapping) or name not in settings:
+        if isinstance(settings, list) and name.isdecimal() and int(name) < len(settings):
+            settings = settings[int(name)]
+        elif isinstance(settings, Mapping) and name in settings:
+            settings = settings[name]
+        else:
             return None
-        settings = settings[name]
     return settings
 
 
@@ -112,6 +117,8 @@ def structure_of(settings: Any, key: str = "") -> Any:
     """Return names, kinds and strings of settings, which determine the list of controls."""
     if isinstance(settings, Mapping):
         return {name: structure_of(value, name) for name, value in settings.items()}
+    if isinstance(settings, list) and settings and all(isinstance(item, Mapping) for item in settings):
+        return [structure_of(item) for item in settings[:MAX_ITEMS]]
     if isinstance(settings, bool) or key in ENUMERATED:
         return settings
     return type(settings).__name__ if isinstance(settings, int | float | list) else settings
@@ -176,6 +183,17 @@ def _controls(
     sections = [option for option in options if option.get("type") == "object" and "properties" in option]
     default = node.get("default")
     selected = next((option for option in sections if _matches(option, value)), None)
+    items = _items(root, options)
+    if items:
+        yield {**control, "kind": "sections", "choices": _templates_of(root, items)}
+        for i, item in enumerate(value[:MAX_ITEMS] if isinstance(value, list) else ()):
+            found = next((each for each in items if _matches(each, item)), None)
+            if found is not None:
+                item_key = f"{key}.{i}"
+                heading = f"{i + 1}. {_label(found)}"
+                yield {**_described(item_key, section, {}), "label": heading, "kind": "group", "is_item": True}
+                yield from _parameters(root, item_key, section, found, item, start, depth)
+        return
     if not sections:
         yield {**control, **_simple(name, options, value, default, value_at(start, key))}
         return
@@ -192,24 +210,52 @@ def _controls(
                 yield {**control, **simple}
     if selected is None and len(sections) == 1 and len(options) == 1 and not control["is_optional"]:
         selected = sections[0]
-    if selected is None or depth == MAX_DEPTH:
+    if selected is not None:
+        inner_section = section if depth or "." in key else key
+        yield from _parameters(root, key, inner_section, selected, value, start, depth)
+
+
+def _parameters(
+    root: dict[str, Any],
+    key: str,
+    section: str,
+    selected: dict[str, Any],
+    value: Any,
+    start: Mapping[str, Any],
+    depth: int,
+) -> Iterator[dict[str, Any]]:
+    """Yield the controls of the parameters of a section."""
+    if depth == MAX_DEPTH:
         return
     values = value if isinstance(value, Mapping) else {}
     required = selected.get("required", ())
     for inner, below in selected["properties"].items():
         if inner in TAGS and ("const" in below or len(below.get("enum", ())) == 1):
             continue
-        inner_key = f"{key}.{inner}"
         yield from _controls(
             root,
-            inner_key,
-            section if depth or "." in key else key,
+            f"{key}.{inner}",
+            section,
             below,
             values.get(inner),
             start,
             is_required=inner in required,
             depth=depth + 1,
         )
+
+
+def _items(root: dict[str, Any], options: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the sections that a list may contain; none for lists of values."""
+    found = [item for option in options if option.get("type") == "array" and "items" in option
+             for item in _options(root, option["items"])]  # fmt: skip
+    is_list = len(options) == 1 and all(item.get("type") == "object" and "properties" in item for item in found)
+    return found if is_list else []
+
+
+def _templates_of(root: dict[str, Any], items: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the sections that a list may contain and that have valid initial values."""
+    initial = [(_label(item), _initial(root, item, None)) for item in items]
+    return [{"label": label, "value": value} for label, value in initial if [] not in value.values()]
 
 
 def _described(key: str, section: str, node: dict[str, Any]) -> dict[str, Any]:

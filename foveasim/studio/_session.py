@@ -485,12 +485,12 @@ def _reset(settings: dict[str, Any], start: Mapping[str, Any], key: str) -> dict
     if value is not None:
         put_setting(None, found, key, copy.deepcopy(value))
         return found
-    *above, last = key.split(".")
-    section: Any = found
-    for name in above:
-        section = section.get(name) if isinstance(section, dict) else None
+    above, _, last = key.rpartition(".")
+    section: Any = value_at(found, above) if above else found
     if isinstance(section, dict):
         section.pop(last, None)
+    elif isinstance(section, list) and last.isdecimal() and int(last) < len(section):
+        section.pop(int(last))
     return found
 
 

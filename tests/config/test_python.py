@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -87,10 +89,21 @@ def test_source_of_bundled_layouts_gives_same_codes(name):
     assert np.array_equal(codes_of_python(to_python(settings)), codes_of_settings(settings))
 
 
+EDITS = [
+    {"kind": "remove_at", "points_um": [[2.0, 2.0]]},
+    {"kind": "draw", "outlines_um": [[[-9.0, -9.0], [9.0, -9.0], [0.0, 9.0]]], "channel": 1},
+    {"kind": "overlay", "layer": {"generator": "hexagonal", "parameters": {"n_columns": 3, "n_rows": 3, "pitch_um": 2.0}, "move_um": [12.0, 8.0]}},
+    {"kind": "rotate", "angle_deg": 10.0},
+    {"kind": "merge_at", "points_um": [[-14.0, -14.0], [-17.0, -14.0]]},
+    {"kind": "repair"},
+]  # fmt: skip
+
+
 @pytest.mark.filterwarnings("ignore::foveasim.errors.FoveasimWarning")
 @pytest.mark.parametrize(
     "settings",
     [
+        changed(layout__edits=EDITS, layout__rules={"min_size_um": 1.5}, layout__move_um=[3.0, -2.5], layout__inset_um=0.2),
         changed(layout__move_um=[3.0, -2.5], layout__inset_um=0.2, layout__snap_um=0.01, layout__mosaic=["RG", "GB"], sensor__filters="rgb", scene__wavelength_nm=[620.0, 550.0, 450.0], scene__band_width_nm=80.0),
         changed(sensor__capacitance_f={"per_um2": 1e-15}, sensor__dark_e_per_s={"per_um2": 3.7}, sensor__read_noise_e=1.5),
         changed(sensor__qe={"kind": "product", "curves": [0.5, {"kind": "silicon", "depth_um": 3.0}]}),
@@ -100,13 +113,21 @@ def test_source_of_bundled_layouts_gives_same_codes(name):
         changed(distortion={"kind": "brown_conrady", "focal_um": 8000.0, "k1": 0.1}, integration_order=1),
         changed(scene={"kind": "siemens_star", "n_spokes": 12, "radius_mm": 8.0, "shape": [60, 60], "pitch_um": 400.0, "distance_m": 1.0, "radiance_w_m2_sr_nm": 0.02, "band_width_nm": 100.0}),
     ],
-    ids=["edits", "per area", "curves", "crosstalk", "pupil", "focus", "distortion", "chart"],
+    ids=["edits", "steps", "per area", "curves", "crosstalk", "pupil", "focus", "distortion", "chart"],
 )  # fmt: skip
 def test_source_of_sections_gives_same_codes(settings):
     text = to_python(settings)
 
     assert "build_shot" not in text
     assert np.array_equal(codes_of_python(text), codes_of_settings(settings))
+
+
+def test_source_runs_in_new_process():
+    settings = changed(scene=read_settings(demo_settings()[0])["scene"], scene__pitch_um=20.0)
+    script = to_python(settings) + "\nprint(capture.code.sum())"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+
+    assert int(done.stdout) == codes_of_settings(settings).sum()
 
 
 def test_source_of_density_picture_gives_same_codes(tmp_path):

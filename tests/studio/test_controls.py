@@ -6,10 +6,10 @@ import json
 
 import pytest
 
-from foveasim.config import check_settings, demo_settings, read_settings, schema
+from foveasim.config import build_shot, check_settings, demo_settings, read_settings, schema
 from foveasim.studio._controls import chosen_value, controls_of, structure_of, value_at
 
-KINDS = {"number", "integer", "choice", "boolean", "text", "list", "group"}
+KINDS = {"number", "integer", "choice", "boolean", "text", "list", "group", "sections"}
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +113,7 @@ def test_choices_are_valid_settings(demo, controls):
             section = settings
             for name in above:
                 section = section.setdefault(name, {})
-            section[last] = choice["value"]
+            section[last] = [choice["value"]] if control["kind"] == "sections" else choice["value"]
             if control["key"].startswith("scene."):
                 settings["scene"].pop("pitch_um", None)
             check_settings(None, settings)
@@ -139,3 +139,30 @@ def test_choices_of_older_lists_have_current_values(demo, controls):
     assert grid["move_um"] == demo["layout"]["move_um"]
     assert chosen_value("layout", grid, controls, moved, demo)["move_um"] == [7.0, 8.0]
     assert chosen_value("layout", {"generator": "own"}, controls, moved, demo) == {"generator": "own"}
+
+
+def test_sections_of_lists_have_controls(demo):
+    edits = [
+        {"kind": "inset", "margin_um": 0.2},
+        {"kind": "draw", "outlines_um": [[[0.0, 0.0], [9.0, 0.0], [0.0, 9.0]]]},
+    ]
+    settings = {
+        **demo,
+        "layout": {"generator": "grid", "parameters": {"n_x": 4, "n_y": 4, "pitch_um": 9.0}, "edits": edits},
+    }
+    controls = controls_of(settings)
+
+    assert by_id(controls, "layout.edits.0.margin_um")["kind"] == "number"
+    assert by_id(controls, "layout.edits.1.overlap")["kind"] == "choice"
+    assert [control["label"] for control in controls if control.get("is_item")] == ["1. inset", "2. draw"]
+    assert value_at(settings, "layout.edits.0.margin_um") == 0.2
+    assert structure_of(settings) != structure_of({**settings, "layout": {**settings["layout"], "edits": edits[:1]}})
+
+
+@pytest.mark.filterwarnings("ignore::foveasim.errors.FoveasimWarning")
+def test_initial_values_of_edits_are_valid(demo):
+    layout = {"generator": "grid", "parameters": {"n_x": 40, "n_y": 40, "pitch_um": 9.0}}
+    for choice in by_id(controls_of({**demo, "layout": layout}), "layout.edits")["choices"]:
+        settings = {**demo, "layout": {**layout, "mosaic": ["RG", "GB"], "edits": [choice["value"]]}}
+
+        assert build_shot(None, settings).camera.sensor.layout.n_sites > 0

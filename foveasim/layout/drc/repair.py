@@ -11,13 +11,13 @@ import shapely
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Ints, check_choice
-from foveasim.errors import GeometryError
+from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout.drc.rules import RULES, DesignRules, Report, RuleResult
-from foveasim.layout.edits import joining_groups, merge, union
+from foveasim.layout.edits import joining_groups, layout_edit, merge, union
 from foveasim.layout.generators.tiling import fill
 from foveasim.layout.model import Layout
 
-__all__ = ["Change", "enforce"]
+__all__ = ["Change", "enforce", "repair"]
 
 Repair: TypeAlias = Literal["drop", "merge", "refill"]
 
@@ -96,6 +96,35 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> t
     if not rest.ok:
         raise GeometryError(f"the layout violates rules that removing sites cannot repair: {_format_violations(rest)}")
     return layout, tuple(changes)
+
+
+@layout_edit(example={"rules": DesignRules(min_size_um=5.0)})
+def repair(layout: Layout, *, rules: DesignRules | None = None, method: Repair = "drop") -> Layout:
+    """
+    Return a layout repaired to satisfy the rules.
+
+    Parameters
+    ----------
+    layout : Layout
+    rules : DesignRules
+        Required in Python. In settings files, those of the layout by default.
+    method : {"drop", "merge", "refill"}
+        As ``repair`` of :func:`enforce`.
+
+    Returns
+    -------
+    Layout
+
+    Raises
+    ------
+    GeometryError
+        As for :func:`enforce`.
+    ParameterError
+        When there are no rules.
+    """
+    if rules is None:
+        raise ParameterError("rules", "must be given", hint="in settings files, the layout may have them")
+    return enforce(layout, rules, repair=method)[0]
 
 
 def _drop_violating_sites(

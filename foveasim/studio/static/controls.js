@@ -120,7 +120,8 @@ class Row {
     this.error.id = this.id + "-error";
     this.error.hidden = true;
     this.unit = make("span", control.unit || "", "unit");
-    if (control.kind === "group") this.root.append(make("h3", control.label));
+    if (control.kind === "group") this._buildHeading();
+    else if (control.kind === "sections") this._buildAdder();
     else this._build();
     for (const input of [this.field, this.slider].filter(Boolean)) {
       input.setAttribute("aria-describedby", this.error.id);
@@ -183,10 +184,44 @@ class Row {
     this.root.append(this.slider);
   }
 
+  // Heading of a section; one of a list can be removed.
+  _buildHeading() {
+    const { control } = this, heading = make("h3", control.label);
+    this.root.append(heading);
+    if (!control.is_item) return;
+    const remove = make("button", "✕", "remove");
+    remove.type = "button";
+    remove.title = "Remove";
+    remove.setAttribute("aria-label", "Remove " + control.label);
+    remove.addEventListener("click", () => this.on.remove());
+    heading.append(remove);
+  }
+
+  // A list of sections, to which the user adds one.
+  _buildAdder() {
+    const adder = make("select");
+    adder.id = this.id;
+    this.choices = choicesOf(this.control);
+    ["Add…", ...this.choices.map(({ label }) => label)].forEach((text, i) => {
+      const option = make("option", text);
+      option.value = i - 1;
+      adder.append(option);
+    });
+    adder.addEventListener("change", () => {
+      const choice = this.choices[adder.value];
+      adder.value = -1;
+      if (choice) this._send([...(this.value || []), choice.value], true);
+    });
+    const line = make("div", undefined, "line");
+    line.append(this.label, this.reset, adder, this.unit);
+    this.root.append(line);
+    this.adder = adder;
+  }
+
   // Takes over a description with other values and ranges; the elements stay, with their focus.
   refresh(control) {
     this.control = control;
-    if (control.kind === "choice") this.choices = choicesOf(control);
+    if (control.kind === "choice" || control.kind === "sections") this.choices = choicesOf(control);
   }
 
   // Moves the slider to a value.
@@ -404,7 +439,7 @@ export class Controls {
     const row = this.rows.get(key);
     if (!row) return;
     row.root.closest("details").open = true;
-    row.field.focus();
+    (row.field ?? row.adder)?.focus();
     row.root.scrollIntoView({ block: "nearest" });
   }
 }

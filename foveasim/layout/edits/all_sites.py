@@ -1,5 +1,5 @@
 """
-Edits of layouts: union, clip, cut out, inset, merge, split, node, snap.
+Edits of all sites of layouts: union, clip, cut out, inset, merge, split, node, snap.
 
 Each function returns a new layout: sites retain their columns, and the provenance records the step. Regions are shapely
 polygons in µm.
@@ -30,12 +30,11 @@ from foveasim.layout._noding import points_on_edges
 from foveasim.layout._regions import as_region
 from foveasim.layout.adjacency import TOUCHING_UM, adjacency
 from foveasim.layout.drc.measurements import is_below_size
+from foveasim.layout.edits._parts import concatenate_layouts, replace_sites, separate_parts
+from foveasim.layout.edits.registry import layout_edit
 from foveasim.layout.model import INTEGER_RANGES, Layout
 
 __all__ = ["clip", "cut_out", "inset", "joining_groups", "merge", "merge_small", "node", "snap", "split", "union"]
-
-#: Area of a piece, relative to its site, below which it is a rounding artefact of the cut.
-SLIVER = 1e-9
 
 
 def union(layouts: Sequence[Layout]) -> Layout:
@@ -62,14 +61,13 @@ def union(layouts: Sequence[Layout]) -> Layout:
     check_sites(sum(layout.n_sites for layout in layouts) or 1)
     names = set.intersection(*(set(layout.columns) for layout in layouts))
     return Layout._from_checked(  # noqa: SLF001 -- of the same subpackage
-        np.concatenate([layout.xy_um for layout in layouts]),
-        _concatenate_offsets([layout.ring_offsets for layout in layouts]),
-        _concatenate_offsets([layout.site_offsets for layout in layouts]),
+        *concatenate_layouts(layouts),
         {name: _concatenate_columns(name, [layout.columns[name] for layout in layouts]) for name in sorted(names)},
         {"made_by": "union", "parts": [dict(layout.provenance) for layout in layouts]},
     )
 
 
+@layout_edit(example={"region": [[-10.0, -10.0], [15.0, -10.0], [0.0, 15.0]]})
 def clip(layout: Layout, region: Any, *, cut: Literal["pieces", "drop"] = "pieces") -> Layout:
     """
     Return the part of a layout inside a region.
@@ -96,6 +94,7 @@ def clip(layout: Layout, region: Any, *, cut: Literal["pieces", "drop"] = "piece
     )
 
 
+@layout_edit(example={"region": [[-10.0, -10.0], [15.0, -10.0], [0.0, 15.0]]})
 def cut_out(layout: Layout, region: Any, *, cut: Literal["pieces", "drop"] = "pieces") -> Layout:
     """
     Return the part of a layout outside a region; parameters and errors as for :func:`clip`.
@@ -111,6 +110,7 @@ def cut_out(layout: Layout, region: Any, *, cut: Literal["pieces", "drop"] = "pi
     return _clip_sites(layout, as_region("region", region), shapely.difference, shapely.disjoint, cut, "region cut out")
 
 
+@layout_edit(example={"margin_um": 1.0})
 def inset(layout: Layout, margin_um: ArrayLike) -> Layout:
     """
     Offset the boundary of each site inwards, for trenches of twice the margin.
@@ -189,6 +189,7 @@ def merge(layout: Layout, groups: ArrayLike) -> Layout:
     return _rebuild(layout, joined, first, "merged by groups")
 
 
+@layout_edit(example={"min_size_um": 12.0})
 def merge_small(layout: Layout, *, min_size_um: float) -> Layout:
     """
     Merge each site below a size with the neighbour of the longest shared edge, repeatedly.
@@ -243,6 +244,7 @@ def joining_groups(layout: Layout, small: Ints) -> Ints:
     return groups
 
 
+@layout_edit(example={"n_x": 2})
 def split(layout: Layout, *, n_x: int = 2, n_y: int = 1) -> Layout:
     """
     Split each site into ``n_x`` by ``n_y`` parts, for dual pixels and quad pixels.
@@ -276,11 +278,12 @@ def split(layout: Layout, *, n_x: int = 2, n_y: int = 1) -> Layout:
     frames = shapely.box(x[:, 0, ix], y[:, 0, iy], x[:, 0, ix + 1], y[:, 0, iy + 1])
     parts = shapely.intersection(layout.polygons()[:, np.newaxis], frames)
     parent, part = (index.ravel() for index in np.indices(parts.shape))
-    return _separate_parts(
-        layout.with_columns(parent=np.arange(layout.n_sites)), parts.ravel(), parent, "split", part=part
-    )
+    pieces, shape = separate_parts(layout, parts.ravel(), parent)
+    marked = layout.with_columns(parent=np.arange(layout.n_sites), part=np.zeros(layout.n_sites, np.int64))
+    return replace_sites(marked, np.arange(layout.n_sites), pieces, parent[shape], "split", {"part": part[shape]})
 
 
+@layout_edit(example={})
 def node(layout: Layout) -> Layout:
     """
     Insert each vertex that lies on the edge of a neighbour into that edge.
@@ -312,6 +315,7 @@ def node(layout: Layout) -> Layout:
     )
 
 
+@layout_edit(example={"grid_um": 0.5})
 def snap(layout: Layout, grid_um: float) -> Layout:
     """
     Snap each vertex to a manufacturing grid.
@@ -351,11 +355,6 @@ def snap(layout: Layout, grid_um: float) -> Layout:
 # -- parts ---------------------------------------------------------------------------------------------------------------
 
 
-def _concatenate_offsets(offsets: Sequence[Ints]) -> Ints:
-    steps = np.concatenate([np.diff(part) for part in offsets])
-    return np.concatenate(([0], np.cumsum(steps)))
-
-
 def _concatenate_columns(name: str, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """Concatenate parts of a column; signed and unsigned integers remain exact."""
     if {part.dtype.kind for part in parts} == {"i", "u"} and np.result_type(*parts).kind == "f":
@@ -371,25 +370,11 @@ def _clip_sites(layout: Layout, region: Any, operation: Any, predicate: Any, cut
     check_choice("cut", cut, ("pieces", "drop"))
     shapely.prepare(region)
     polygons = layout.polygons()
-    is_complete = predicate(region, polygons)
+    changed = np.flatnonzero(~predicate(region, polygons))
     if cut == "drop":
-        return layout[is_complete]
-    pieces = polygons.copy()
-    pieces[~is_complete] = operation(polygons[~is_complete], region)
-    return _separate_parts(layout, pieces, np.arange(layout.n_sites), step)
-
-
-def _separate_parts(layout: Layout, shapes: NDArray[Any], parent: Ints, step: str, **columns: NDArray[Any]) -> Layout:
-    """Return the layout of all polygons of the shapes, each with the columns of its parent."""
-    parts, shape = shapely.get_parts(shapes, return_index=True)
-    is_real = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (
-        shapely.area(parts) > SLIVER * layout.area_um2[parent[shape]]
-    )
-    own = {name: values[shape[is_real]] for name, values in columns.items()}
-    rebuilt = _rebuild(layout, parts[is_real], parent[shape[is_real]], step)
-    return Layout._from_checked(  # noqa: SLF001
-        rebuilt.xy_um, rebuilt.ring_offsets, rebuilt.site_offsets, {**rebuilt.columns, **own}, rebuilt.provenance
-    )
+        return layout[np.delete(np.arange(layout.n_sites), changed)]
+    parts, shape = separate_parts(layout, operation(polygons[changed], region), changed)
+    return replace_sites(layout, changed, parts, changed[shape], step)
 
 
 def _rebuild(layout: Layout, polygons: NDArray[Any], parent: Ints, step: str) -> Layout:

@@ -1,0 +1,43 @@
+"""Registry of layout edits: functions of a layout and parameters that return a new layout."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+from foveasim._core.registry import Registry
+from foveasim.layout.model import Layout
+
+__all__ = ["EDITS", "layout_edit"]
+
+E = TypeVar("E", bound=Callable[..., Layout])
+
+#: Edits of layouts by their name in settings files. The first parameter of an edit is the layout. Installed packages register
+#: more as entry points of the group ``foveasim.edits``.
+EDITS: Registry[Callable[..., Layout]] = Registry("layout edit", "foveasim.edits")
+
+
+def layout_edit(*, example: Mapping[str, Any], name: str | None = None) -> Callable[[E], E]:
+    """
+    Register a function as an edit of settings files.
+
+    Parameters
+    ----------
+    example : mapping
+        Parameters that are valid for a grid of 4 x 4 squares of 10 µm around the optical axis; used by the tests of all edits.
+    name : str, optional
+        Name of the edit; by default that of the function.
+
+    Examples
+    --------
+    >>> @layout_edit(example={"margin_um": 1.0})  # doctest: +SKIP
+    ... def grow(layout, *, margin_um: float) -> Layout:
+    ...     return fs.Layout.from_polygons(shapely.buffer(layout.polygons(), margin_um))
+    """
+
+    def register(edit: E) -> E:
+        edit.example = dict(example)  # type: ignore[attr-defined]
+        EDITS.register(name or edit.__name__, edit)
+        return edit
+
+    return register
