@@ -1,0 +1,269 @@
+"""
+The studio in Chromium: latency from a control to the drawn views, and a soak test with random changes.
+
+    python benchmarks/studio_browser.py                 medians of 50 changes; the demo, and 200,000 photosites
+    python benchmarks/studio_browser.py --quick         5 changes, without bounds
+    python benchmarks/studio_browser.py --soak 30       random changes for 30 minutes: memory, console, stale views, codes
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from playwright.sync_api import Page, sync_playwright
+from report import Report
+from rich.console import Console
+from studio import CHANGES, LARGE, LARGE_MS, N_CHANGES, N_QUICK
+
+from foveasim.config import build_shot
+
+#: WebGL by the processor, which every machine has.
+SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+TIMEOUT_MS = 120_000
+WARM_UP_S = 180.0
+LEAK_MIB = 200.0
+#: Sends a change, and resolves to the times until the photosites and until all views are drawn.
+CHANGE = """([key, value]) => new Promise((resolve) => {
+  const { page, connection } = studio, start = performance.now(), id = connection.set(key, value, true);
+  let values = NaN;
+  const step = () => {
+    const { state, parts } = page, isNew = state.id >= id && parts.columns.version >= state.version;
+    if (Number.isNaN(values) && isNew && page.asked === null && page.drawnAt > start) values = performance.now() - start;
+    if (page.doneId >= id && page.asked === null) { resolve([values, performance.now() - start]); return; }
+    requestAnimationFrame(step);
+  };
+  requestAnimationFrame(step);
+})"""
+#: Sends messages, and resolves when the last one is done and drawn.
+SEND = """(messages) => new Promise((resolve) => {
+  const { page, connection } = studio;
+  let id = 0;
+  for (const message of messages) id = connection.send(message);
+  const start = performance.now(), step = () => {
+    if ((page.doneId >= id || performance.now() - start > 60000) && studio.isReady) resolve(page.doneId >= id);
+    else requestAnimationFrame(step);
+  };
+  step();
+})"""
+#: The arrays of all shown parts as text, for their comparison after a refresh.
+PARTS = """() => Object.fromEntries(Object.entries(studio.page.parts).map(([name, { about, arrays }]) => [name, JSON.stringify(about) +
+  Object.entries(arrays).map(([key, array]) => key + new Uint8Array(array.buffer, array.byteOffset, array.byteLength).reduce((sum, byte) => (31 * sum + byte) | 0, 7)).join()]))"""
+CODES = """() => { const column = studio.panes.b.columns.find(({ key }) => key === "code"); return Array.from(column.values); }"""
+console = Console(width=130)
+
+
+class Studio:
+    """The server, and its page in Chromium."""
+
+    def __init__(self, out: Path) -> None:
+        command = [sys.executable, "-m", "foveasim", "studio", "--no-browser", "--out", str(out)]
+        self.server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert self.server.stdout is not None
+        address = self.server.stdout.readline().partition("studio at ")[2].partition(";")[0]
+        self.playwright = sync_playwright().start()
+        browser = self.playwright.chromium.launch(executable_path=shutil.which("chromium"), args=list(SOFTWARE))
+        context = browser.new_context(viewport={"width": 1440, "height": 900}, bypass_csp=True)
+        self.page: Page = context.new_page()
+        self.messages: list[str] = []
+        self.page.on("console", lambda message: self.messages.append(message.text))
+        self.page.on("pageerror", lambda error: self.messages.append(str(error)))
+        self.page.goto(address)
+        self.page.wait_for_function("window.studio && studio.isReady && studio.page.doneId !== undefined", timeout=TIMEOUT_MS)
+        self.devtools = context.new_cdp_session(self.page)
+
+    def close(self) -> None:
+        """End browser and server."""
+        self.playwright.stop()
+        self.server.terminate()
+        self.server.wait()
+
+    def memory_mib(self) -> tuple[float, float]:
+        """Return the resident memory of the server, and the heap of the page after garbage collection."""
+        self.devtools.send("HeapProfiler.collectGarbage")
+        heap = self.devtools.send("Runtime.getHeapUsage")
+        pages = int(Path(f"/proc/{self.server.pid}/statm").read_text().split()[1])
+        return pages * 4096 / 2**20, (heap["usedSize"] + heap.get("backingStorageSize", 0)) / 2**20
+
+
+def measure_latency(studio: Studio, report: Report, n: int) -> None:
+    """Add the latency of changes to the report."""
+
+    def measure(label: str, key: str, value: Callable[[int], Any], bound_ms: float) -> None:
+        times = [studio.page.evaluate(CHANGE, [key, value(k)]) for k in range(n + 2)][2:]
+        drawn_ms, all_ms = np.median(times, axis=0)
+        shown = f"bound; all views {all_ms:.0f} ms"
+        report.add(label, f"{drawn_ms:.0f} ms", shown, f"{bound_ms:g} ms", drawn_ms / bound_ms, 1.0)
+
+    for name, (key, value, bound_ms) in CHANGES.items():
+        measure(f"14,208 photosites: {name}", key, value, bound_ms)
+    large = [
+        {"do": "set", "key": key, "value": value, "final": True} for key, value in (("scene.fit", "cover"), ("layout", LARGE))
+    ]
+    studio.page.evaluate(SEND, large)
+    for name in ("exposure", "f-number"):
+        measure(f"200,000 photosites: {name}", *CHANGES[name][:2], LARGE_MS)
+    for line in studio.messages:
+        console.print(f"console: {line}")
+
+
+def random_messages(rng: random.Random, studio: Studio) -> list[dict[str, Any]]:
+    """Return one to five random messages of a user."""
+    controls = studio.page.evaluate(
+        "() => [...studio.controls.rows.values()].map(({ control, value }) => ({ ...control, value: value ?? null }))"
+    )
+    numbers = [c for c in controls if c["kind"] in ("number", "integer") and c["value"] is not None and "layout" not in c["key"]]
+    presets = studio.page.evaluate("() => [...document.querySelectorAll('#preset option')].map((o) => o.value).filter(Boolean)")
+
+    def number() -> dict[str, Any]:
+        control = rng.choice(numbers)
+        low, high = control["suggested"]
+        value = low + (high - low) * rng.random()
+        value = round(value) if control["kind"] == "integer" else float(f"{value:.4g}")
+        return {"do": "set", "key": control["key"], "value": value, "final": rng.random() < 0.5}
+
+    def choice() -> dict[str, Any]:
+        control = rng.choice([c for c in controls if c["kind"] == "choice" and c["key"].startswith(("optics", "sensor", "distortion"))])
+        return {"do": "set", "key": control["key"], "value": rng.choice(control["choices"])["value"], "final": True}
+
+    def edit() -> dict[str, Any]:
+        state = studio.page.evaluate("() => studio.page.state")
+        x0, y0, x1, y1 = state["summary"]["bounds_um"]
+        x, y = rng.uniform(x0, x1), rng.uniform(y0, y1)
+        outline = [[x, y], [x + 20.0, y], [x + 10.0, y + 15.0]]
+        edits = [*state["settings"]["layout"].get("edits", []), {"kind": "draw", "outlines_um": [outline]}][-8:]
+        return {"do": "set", "key": "layout.edits", "value": edits, "final": True}
+
+    def gaze() -> dict[str, Any]:
+        return {"do": "set", "key": "layout.move_um", "value": [rng.uniform(-200, 200), rng.uniform(-200, 200)], "final": True}
+
+    others = [{"do": "undo"}, {"do": "redo"}, {"do": "freeze"}, {"do": "unfreeze"}, {"do": "reset", "key": "sensor"}]
+    made = []
+    for _ in range(rng.randint(1, 5)):
+        kind = rng.random()
+        if kind < 0.5:
+            made.append(number())
+        elif kind < 0.6:
+            made.append(choice())
+        elif kind < 0.7:
+            made.append(edit())
+        elif kind < 0.85:
+            made.append(gaze())
+        elif kind < 0.97:
+            made.append(rng.choice(others))
+        else:
+            small = [name for name in presets if "pixirad" not in name and "wave" not in name]
+            made.append({"do": "preset", "name": rng.choice(small)})
+    return made
+
+
+def soak(studio: Studio, report: Report, minutes: float, seed: int, out: Path) -> None:
+    """Make random changes, and add memory, console messages, stale views and differences of codes to the report."""
+    rng = random.Random(seed)
+    start_s = time.monotonic()
+    n_steps = n_refreshed = n_stale = n_compared = n_different = n_late = 0
+    first: tuple[float, float] | None = None
+    while time.monotonic() - start_s < 60.0 * minutes:
+        n_late += not studio.page.evaluate(SEND, random_messages(rng, studio))
+        n_steps += 1
+        if n_steps % 3 == 0:
+            tile = rng.choice(studio.page.evaluate("() => [...document.querySelectorAll('#tabs button')].map((b) => b.dataset.tile)"))
+            studio.page.click(f"#tabs button[data-tile='{tile}']")
+        if first is None and time.monotonic() - start_s > min(WARM_UP_S, 20.0 * minutes):
+            first = studio.memory_mib()
+            console.print(f"{n_steps} steps: server {first[0]:.0f} MiB, page {first[1]:.0f} MiB")
+        if n_steps % 10 == 0:
+            studio.page.wait_for_function("studio.isReady", timeout=TIMEOUT_MS)
+            before = studio.page.evaluate(PARTS)
+            studio.page.evaluate(SEND, [{"do": "refresh"}])
+            after = studio.page.evaluate(PARTS)
+            shown = [name for name in before if name in after]
+            stale = [name for name in shown if _digest(before[name]) != _digest(after[name])]
+            n_refreshed, n_stale = n_refreshed + 1, n_stale + len(stale)
+            if stale:
+                console.print(f"step {n_steps}: stale {stale}")
+        if n_steps % 20 == 0:
+            n_compared += 1
+            n_different += not _is_equal(studio)
+    studio.page.evaluate(SEND, [{"do": "save", "name": "soak.yaml"}, {"do": "refresh"}])
+    codes = np.array(studio.page.evaluate(CODES))
+    run = [sys.executable, "-m", "foveasim", "run", str(out / "soak.yaml"), "--out", str(out / "results")]
+    subprocess.run(run, check=True, stdout=subprocess.DEVNULL)
+    is_same = np.array_equal(codes, _codes_of_run(out / "results"))
+    last = studio.memory_mib()
+    first = first or last
+    grown_mib = last[0] - first[0] + last[1] - first[1]
+    console.print(f"{n_steps} steps; server {last[0]:.0f} MiB, page {last[1]:.0f} MiB; seed {seed}")
+    report.add("soak: memory growth", f"{grown_mib:.0f} MiB", "bound", f"{LEAK_MIB:g} MiB", grown_mib / LEAK_MIB, 1.0)
+    for name, n_found, n_of in (
+        ("console messages", len(studio.messages), n_steps),
+        ("answers later than a minute", n_late, n_steps),
+        ("stale views", n_stale, n_refreshed),
+        ("codes other than those of the settings", n_different, n_compared),
+        ("codes other than those of foveasim run", int(not is_same), 1),
+    ):
+        report.add(f"soak: {name}", f"{n_found} of {n_of}", "none", "0", float(n_found > 0) * 2.0, 1.0)
+    for line in studio.messages[:20]:
+        console.print(f"console: {line}")
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _is_equal(studio: Studio) -> bool:
+    """Return whether the codes of the page are those of its settings in this process."""
+    settings = json.loads(studio.page.evaluate("() => JSON.stringify(studio.page.state.settings)"), parse_float=float)
+    settings = _with_infinities(settings)
+    shot = build_shot(None, settings)
+    codes = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed).code
+    return np.array_equal(np.array(studio.page.evaluate(CODES)), codes)
+
+
+def _with_infinities(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _with_infinities(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_with_infinities(item) for item in value]
+    return {".inf": float("inf"), "-.inf": -float("inf")}.get(value, value) if isinstance(value, str) else value
+
+
+def _codes_of_run(directory: Path) -> Any:
+    with np.load(next(directory.glob("*.npz")), allow_pickle=False) as results:
+        return results["code"]
+
+
+def main() -> int:
+    """Print the table; exit with 1 when a bound is missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--soak", type=float, metavar="MINUTES")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    report = Report(is_judged=not options.quick)
+    with tempfile.TemporaryDirectory() as directory:
+        studio = Studio(Path(directory))
+        try:
+            if options.soak:
+                soak(studio, report, options.soak, options.seed, Path(directory))
+            else:
+                measure_latency(studio, report, N_QUICK if options.quick else N_CHANGES)
+        finally:
+            studio.close()
+    console.print(report.table)
+    return min(report.missed, 1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
