@@ -58,9 +58,19 @@ SEND = """(messages) => new Promise((resolve) => {
   step();
 })"""
 #: The arrays of all shown parts as text, for their comparison after a refresh.
-PARTS = """() => Object.fromEntries(Object.entries(studio.page.parts).map(([name, { about, arrays }]) => [name, JSON.stringify(about) +
-  Object.entries(arrays).map(([key, array]) => key + new Uint8Array(array.buffer, array.byteOffset, array.byteLength).reduce((sum, byte) => (31 * sum + byte) | 0, 7)).join()]))"""
-CODES = """() => { const column = studio.panes.b.columns.find(({ key }) => key === "code"); return Array.from(column.values); }"""
+PARTS = """() => {
+  const bytes = (array) => new Uint8Array(array.buffer, array.byteOffset, array.byteLength);
+  const sum = (array) => bytes(array).reduce((total, byte) => (31 * total + byte) | 0, 7);
+  const sums = (arrays) => Object.entries(arrays).map(([key, array]) => key + sum(array)).join();
+  const text = ({ about, arrays }) => JSON.stringify(about) + sums(arrays);
+  return Object.fromEntries(Object.entries(studio.page.parts).map(([name, part]) => [name, text(part)]));
+}"""
+CODES = """() => Array.from(studio.panes.b.columns.find(({ key }) => key === "code").values)"""
+CONTROLS = (
+    "() => [...studio.controls.rows.values()].map(({ control, value }) => ({ ...control, value: value ?? null }))"
+)
+PRESETS = "() => [...document.querySelectorAll('#preset option')].map((option) => option.value).filter(Boolean)"
+TILES = "() => [...document.querySelectorAll('#tabs button')].map((button) => button.dataset.tile)"
 console = Console(width=130)
 
 
@@ -80,7 +90,10 @@ class Studio:
         self.page.on("console", lambda message: self.messages.append(message.text))
         self.page.on("pageerror", lambda error: self.messages.append(str(error)))
         self.page.goto(address)
-        self.page.wait_for_function("window.studio && studio.isReady && studio.page.doneId !== undefined", timeout=TIMEOUT_MS)
+        self.page.wait_for_function(
+            "window.studio && studio.isReady && studio.page.doneId !== undefined", timeout=TIMEOUT_MS
+        )
+        self.start = self.page.evaluate("() => studio.page.state.settings")
         self.devtools = context.new_cdp_session(self.page)
 
     def close(self) -> None:
@@ -90,7 +103,8 @@ class Studio:
         self.server.wait()
 
     def memory_mib(self) -> tuple[float, float]:
-        """Return the resident memory of the server, and the heap of the page after garbage collection."""
+        """Return the memory of the server and the heap of the page, MiB, with the initial settings."""
+        self.page.evaluate(SEND, [{"do": "unfreeze"}, {"do": "restore", "settings": self.start}])
         self.devtools.send("HeapProfiler.collectGarbage")
         heap = self.devtools.send("Runtime.getHeapUsage")
         pages = int(Path(f"/proc/{self.server.pid}/statm").read_text().split()[1])
@@ -109,7 +123,8 @@ def measure_latency(studio: Studio, report: Report, n: int) -> None:
     for name, (key, value, bound_ms) in CHANGES.items():
         measure(f"14,208 photosites: {name}", key, value, bound_ms)
     large = [
-        {"do": "set", "key": key, "value": value, "final": True} for key, value in (("scene.fit", "cover"), ("layout", LARGE))
+        {"do": "set", "key": key, "value": value, "final": True}
+        for key, value in (("scene.fit", "cover"), ("layout", LARGE))
     ]
     studio.page.evaluate(SEND, large)
     for name in ("exposure", "f-number"):
@@ -120,11 +135,10 @@ def measure_latency(studio: Studio, report: Report, n: int) -> None:
 
 def random_messages(rng: random.Random, studio: Studio) -> list[dict[str, Any]]:
     """Return one to five random messages of a user."""
-    controls = studio.page.evaluate(
-        "() => [...studio.controls.rows.values()].map(({ control, value }) => ({ ...control, value: value ?? null }))"
-    )
-    numbers = [c for c in controls if c["kind"] in ("number", "integer") and c["value"] is not None and "layout" not in c["key"]]
-    presets = studio.page.evaluate("() => [...document.querySelectorAll('#preset option')].map((o) => o.value).filter(Boolean)")
+    controls = [c for c in studio.page.evaluate(CONTROLS) if not c["key"].startswith("layout")]
+    numbers = [c for c in controls if c["kind"] in ("number", "integer") and c["value"] is not None]
+    choices = [c for c in controls if c["kind"] == "choice" and not c["key"].startswith("scene")]
+    presets = studio.page.evaluate(PRESETS)
 
     def number() -> dict[str, Any]:
         control = rng.choice(numbers)
@@ -134,7 +148,7 @@ def random_messages(rng: random.Random, studio: Studio) -> list[dict[str, Any]]:
         return {"do": "set", "key": control["key"], "value": value, "final": rng.random() < 0.5}
 
     def choice() -> dict[str, Any]:
-        control = rng.choice([c for c in controls if c["kind"] == "choice" and c["key"].startswith(("optics", "sensor", "distortion"))])
+        control = rng.choice(choices)
         return {"do": "set", "key": control["key"], "value": rng.choice(control["choices"])["value"], "final": True}
 
     def edit() -> dict[str, Any]:
@@ -146,7 +160,12 @@ def random_messages(rng: random.Random, studio: Studio) -> list[dict[str, Any]]:
         return {"do": "set", "key": "layout.edits", "value": edits, "final": True}
 
     def gaze() -> dict[str, Any]:
-        return {"do": "set", "key": "layout.move_um", "value": [rng.uniform(-200, 200), rng.uniform(-200, 200)], "final": True}
+        return {
+            "do": "set",
+            "key": "layout.move_um",
+            "value": [rng.uniform(-200, 200), rng.uniform(-200, 200)],
+            "final": True,
+        }
 
     others = [{"do": "undo"}, {"do": "redo"}, {"do": "freeze"}, {"do": "unfreeze"}, {"do": "reset", "key": "sensor"}]
     made = []
@@ -178,7 +197,7 @@ def soak(studio: Studio, report: Report, minutes: float, seed: int, out: Path) -
         n_late += not studio.page.evaluate(SEND, random_messages(rng, studio))
         n_steps += 1
         if n_steps % 3 == 0:
-            tile = rng.choice(studio.page.evaluate("() => [...document.querySelectorAll('#tabs button')].map((b) => b.dataset.tile)"))
+            tile = rng.choice(studio.page.evaluate(TILES))
             studio.page.click(f"#tabs button[data-tile='{tile}']")
         if first is None and time.monotonic() - start_s > min(WARM_UP_S, 20.0 * minutes):
             first = studio.memory_mib()

@@ -122,6 +122,7 @@ _Point = tuple[float, float]
 #: Parameters of layout edits with other types in files than in Python.
 _EDIT_TYPES: dict[str, Any] = {
     "by_um": _Point,
+    "fractions": list[float],
     "from_um": list[_Point],
     "line_um": list[_Point],
     "margin_um": float,

@@ -11,6 +11,7 @@ from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Ints, check_count, finite_array, freeze
 from foveasim.errors import ParameterError
 from foveasim.layout.adjacency import adjacency
+from foveasim.layout.edit_registry import layout_edit
 from foveasim.layout.model import Layout
 
 __all__ = ["MOSAICS", "graph_colouring", "mosaic", "random_channels"]
@@ -31,6 +32,7 @@ MOSAICS = {
 }
 
 
+@layout_edit(example={"block": ["RG", "GB"]})
 def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None) -> Layout:
     """
     Return the layout with a repeating block of colour filters.
@@ -108,6 +110,7 @@ def _lattice_index(layout: Layout, axis: int) -> Ints | None:
     return index if is_regular.all() else None
 
 
+@layout_edit(example={"fractions": [1.0, 2.0, 1.0], "seed": 0})
 def random_channels(layout: Layout, fractions: ArrayLike, *, seed: int) -> Layout:
     """
     Return the layout with randomly placed colour filters in exact proportions.
@@ -137,6 +140,7 @@ def random_channels(layout: Layout, fractions: ArrayLike, *, seed: int) -> Layou
     return layout.with_columns(channel=Streams(seed).of("layout channels").permutation(ordered))
 
 
+@layout_edit(example={"n_channels": 3})
 def graph_colouring(layout: Layout, n_channels: int, *, max_gap_um: float | None = None) -> Layout:
     """
     Return the layout with colour filters that differ between neighbours where possible.

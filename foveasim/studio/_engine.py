@@ -20,7 +20,7 @@ __all__ = ["Engine", "Simulated"]
 #: Largest number of photosites that are shown.
 MAX_SITES = 2_000_000
 #: Size limit of the arrays in the cache of a session.
-MAX_BYTES = 1 << 29
+MAX_BYTES = 1 << 27
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,6 +35,8 @@ MAX_WAITING = 1000
 MAX_MESSAGE_LENGTH = 500
 #: Largest depth of settings from the page.
 MAX_DEPTH = 20
+#: Number of colour filters that a layout without mosaic receives.
+N_FILTERS = 3
 #: Messages that change the settings.
 CHANGES = ("set", "reset", "delete", "undo", "redo", "preset", "restore", "file")
 
@@ -506,12 +508,12 @@ def _changed(settings: Any, start: Any, key: str = "") -> list[str]:
 
 
 def _match_filters(settings: dict[str, Any]) -> None:
-    """Remove colour filters from layouts that cannot have a mosaic; add one to others."""
+    """Add a mosaic to a layout, or filters that differ between neighbours."""
     layout, sensor = settings.get("layout"), settings.get("sensor")
     if not isinstance(layout, dict) or not isinstance(sensor, dict) or sensor.get("filters") is None:
         return
     if layout.get("generator") in WITHOUT_MOSAIC:
-        sensor.pop("filters")
+        layout.setdefault("edits", [{"kind": "graph_colouring", "n_channels": N_FILTERS}])
     elif "generator" in layout and layout.get("mosaic") is None:
         layout["mosaic"] = ["RG", "GB"]
 

@@ -45,6 +45,7 @@ SECTIONS: dict[str, dict[str, Any]] = {
     "fovi parameters": {"fov_um": 1000.0, "a_um": 20.0, "n_sites": 6000},
     "gaussian kind": {"centre_nm": 550.0, "fwhm_nm": 150.0},
     "giotto parameters": {"n_rho": 76, "n_theta": 128, "n_fovea": 20, "n_across": 600, "unit_um": 2.0},
+    "graph_colouring kind": {"n_channels": 3},
     "grey_scale kind": {"patch_mm": 20.0},
     "grid parameters": {"n_x": 120, "n_y": 120, "pitch_um": 8.0},
     "hexagonal parameters": {"n_columns": 120, "n_rows": 138, "pitch_um": 8.0},
@@ -54,6 +55,7 @@ SECTIONS: dict[str, dict[str, Any]] = {
     "letter_f kind": {"height_mm": 150.0},
     "log_polar parameters": {"n_sectors": 128, "min_size_um": 3.0, "r_max_um": 600.0},
     "merge_small kind": {"min_size_um": 2.0},
+    "mosaic kind": {"block": ["RG", "GB"]},
     "octagonal parameters": {"n_x": 100, "n_y": 100, "pitch_um": 10.0},
     "overlay kind": {
         "layer": {"generator": "grid", "parameters": {"n_x": 20, "n_y": 20, "pitch_um": 4.0}}, "operation": "replace",
@@ -67,6 +69,7 @@ SECTIONS: dict[str, dict[str, Any]] = {
     "product kind": {"curves": [0.8, {"kind": "silicon", "depth_um": 3.0}]},
     "quadtree parameters": {"importance": "skimage:camera", "pitch_um": 4.0, "n_levels": 5, "n_sites": 5000},
     "readout": {"frames_per_s": 30.0, "bits": 10},
+    "random_channels kind": {"fractions": [1.0, 2.0, 1.0], "seed": 0},
     "repair kind": {"rules": {"min_size_um": 2.0}},
     "rotate kind": {"angle_deg": 15.0},
     "routing": {"width_um": 0.2, "space_um": 0.2},

@@ -13,7 +13,8 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Ints, check_choice
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout.drc.rules import RULES, DesignRules, Report, RuleResult
-from foveasim.layout.edits import joining_groups, layout_edit, merge, union
+from foveasim.layout.edit_registry import layout_edit
+from foveasim.layout.edits import joining_groups, merge, union
 from foveasim.layout.generators.tiling import fill
 from foveasim.layout.model import Layout
 

@@ -7,6 +7,7 @@ shapely polygons or vertices in µm. Edits are registered in :data:`EDITS`; sett
 
 from __future__ import annotations
 
+from foveasim.layout.edit_registry import EDITS, layout_edit
 from foveasim.layout.edits.all_sites import (
     clip,
     cut_out,
@@ -31,7 +32,6 @@ from foveasim.layout.edits.at_points import (
     split_at,
 )
 from foveasim.layout.edits.layers import draw, overlay
-from foveasim.layout.edits.registry import EDITS, layout_edit
 from foveasim.layout.model import Layout
 
 __all__ = [

@@ -30,8 +30,8 @@ from foveasim.layout._noding import points_on_edges
 from foveasim.layout._regions import as_region
 from foveasim.layout.adjacency import TOUCHING_UM, adjacency
 from foveasim.layout.drc.measurements import is_below_size
+from foveasim.layout.edit_registry import layout_edit
 from foveasim.layout.edits._parts import concatenate_layouts, replace_sites, separate_parts
-from foveasim.layout.edits.registry import layout_edit
 from foveasim.layout.model import INTEGER_RANGES, Layout
 
 __all__ = ["clip", "cut_out", "inset", "joining_groups", "merge", "merge_small", "node", "snap", "split", "union"]

@@ -24,9 +24,9 @@ from foveasim._core.validation import (
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout._noding import points_on_edges
 from foveasim.layout.adjacency import TOUCHING_UM
+from foveasim.layout.edit_registry import layout_edit
 from foveasim.layout.edits._parts import replace_sites, separate_parts
 from foveasim.layout.edits.all_sites import split
-from foveasim.layout.edits.registry import layout_edit
 from foveasim.layout.model import Layout
 
 __all__ = [

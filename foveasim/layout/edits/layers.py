@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from foveasim._core.validation import MAX_LENGTH_UM, Ints, check_choice, check_count, check_number, check_sites
 from foveasim.errors import ParameterError
 from foveasim.layout._regions import as_region
+from foveasim.layout.edit_registry import layout_edit
 from foveasim.layout.edits._parts import replace_sites, separate_parts
 from foveasim.layout.edits.all_sites import clip, cut_out
-from foveasim.layout.edits.registry import layout_edit
 from foveasim.layout.model import Layout
 
 __all__ = ["draw", "overlay"]
