@@ -123,6 +123,12 @@ export class Connection {
     return id;
   }
 
+  // Removes a value, with its default after that.
+  remove(key) {
+    this.preview = null;
+    return this.send({ do: "delete", key });
+  }
+
   // Time in ms since a message was sent.
   since(id) {
     const start = this.sentAt.get(id);

@@ -76,9 +76,9 @@ export class SitePane {
     });
   }
 
-  // Shows sites; the view stays, or shows all sites again if it did.
+  // Shows sites; the view stays, or shows all sites again if it did, unless they are edited.
   useSites(sites, palette) {
-    const isNew = !this.map, isWhole = isNew || this.isWhole;
+    const isNew = !this.map, isWhole = isNew || (this.isWhole && !this.isEdited);
     this.sites = sites;
     this.palette = palette;
     this.generation = (this.generation || 0) + 1;

@@ -8,6 +8,7 @@ import { downloadTable, statistics, statisticsRows } from "/web/measure.js";
 import { $, download, inkOf, make, notice, speak, startTheme } from "/web/page_parts.js";
 import { Sites } from "/web/sites.js";
 import { offsetsOf } from "/web/unpack.js";
+import { Editor } from "./authoring.js";
 import { boundaryOf } from "./boundary.js";
 import { CurveChart, Histogram, barRows } from "./charts.js";
 import { Connection, memory } from "./connection.js";
@@ -16,11 +17,12 @@ import { ImagePane } from "./image_pane.js";
 import { copyText, listenToDialogs, listenToMenu, showText } from "./menus.js";
 import { RulesList } from "./rules_list.js";
 import { SitePane, useSoftware } from "./site_pane.js";
+import { Steps } from "./steps.js";
 
 // Views in tiles, with the parts that they need; those that are shown at first on narrow and on wide screens.
 const TILES = [
   ["histogram", "Histogram", null], ["site", "Photosite", null], ["noise", "Noise", "noise"], ["spectrum", "Spectrum", "spectrum"],
-  ["mtf", "MTF", "mtf"], ["rules", "Design rules", "rules"], ["summary", "Summary", null], ["selection", "Selection", null],
+  ["mtf", "MTF", "mtf"], ["rules", "Design rules", "rules"], ["steps", "Steps", null], ["summary", "Summary", null], ["selection", "Selection", null],
 ];
 const FIRST_TILES = ["histogram", "noise", "mtf", "summary"];
 const WIDE = 1800;
@@ -37,7 +39,7 @@ const page = {
   state: null, parts: {}, frozen: null, cursor: null, hovered: -1, pinned: -1, rectangle: null, selected: [], range: null, key: null, wantsLog: undefined,
   isSelecting: false, tiles: new Set(), asked: null, gazeAt: null, lastMs: NaN, nDone: 0, drawn: 0, boundary: null, isBusy: false,
 };
-let connection, controls, panes, charts, rules;
+let connection, controls, panes, charts, rules, editor, steps;
 
 // -- drawing ------------------------------------------------------------------------------------------------------------
 
@@ -64,6 +66,7 @@ function drawAsked() {
     page.drawnAt = performance.now();
   }
   drawMarks();
+  editor.draw();
 }
 
 function drawMarks() {
@@ -97,7 +100,7 @@ function useSites({ about, arrays, version }) {
   page.boundary = boundaryOf(sites);
   page.hovered = -1;
   if (page.pinned >= sites.n) page.pinned = -1;
-  page.selected = page.rectangle ? panes.b.sitesIn(page.rectangle) : [];
+  page.selected = page.rectangle && !editor.isOn ? panes.b.sitesIn(page.rectangle) : editor.useSites(sites);
   if (isNew) $("views").classList.add("loaded");
 }
 
@@ -109,6 +112,7 @@ function useColumns({ about, arrays }) {
   if (columns.some((column) => column.values.length !== sites.n)) return;
   panes.b.useColumns(columns, about.filter ? arrays[about.filter] : null);
   fillColumns(columns);
+  editor.useColumns();
   recolour();
   if (page.selected.length) showSelection();
 }
@@ -223,6 +227,7 @@ function showStatus(text) { $("status").lastElementChild.textContent = text; }
 
 function finish({ id, ms }) {
   setBusy(false);
+  editor.finish();
   page.nDone++;
   page.serverMs = ms;
   // The time to the frame that shows the result.
@@ -253,6 +258,8 @@ function showState(message) {
   $("scene").classList.toggle("can-move", canMove);
   $("gaze-note").hidden = !canMove;
   showSummary();
+  editor.update(state);
+  steps.update();
   // Frozen by an earlier connection: its arrays are lost.
   if (!state.frozen && page.frozen && page.frozen.isAnswered) unfreeze();
   if (state.frozen && page.frozen) page.frozen.isAnswered = true;
@@ -339,7 +346,7 @@ function showConnection(status) {
 }
 
 function sendViews() {
-  connection.send({ do: "views", names: [...ALWAYS, ...TILES.filter(([name, , part]) => part && page.tiles.has(name)).map(([, , part]) => part)] });
+  connection.send({ do: "views", names: [...ALWAYS, ...TILES.filter(([name, , part]) => part && (page.tiles.has(name) || (part === "rules" && editor.isOn))).map(([, , part]) => part)] });
 }
 
 // -- tiles --------------------------------------------------------------------------------------------------------------
@@ -475,12 +482,21 @@ function select(rectangle) {
   page.rectangle = rectangle;
   page.selected = rectangle ? panes.b.sitesIn(rectangle) : [];
   if (rectangle) showTile("selection", true);
+  editor.follow(page.selected);
+  showSelection();
+  ask("marks");
+}
+
+function selectSites(sites) {
+  page.rectangle = null;
+  page.selected = sites;
+  editor.follow(sites);
   showSelection();
   ask("marks");
 }
 
 function showSelection() {
-  const { selected, rectangle } = page;
+  const { selected } = page, rectangle = page.rectangle || selected.length > 0;
   $("selection-heading").textContent = rectangle ? "Selection: " + shown(selected.length) + " photosites" : "Selection";
   $("selection-note").hidden = Boolean(rectangle);
   $("export").disabled = !selected.length;
@@ -641,6 +657,7 @@ function listenToButtons() {
 function listenToKeys() {
   document.addEventListener("keydown", (event) => {
     const isOpen = document.querySelector("dialog[open]"), { key } = event;
+    if (!isOpen && !event.target.closest?.("input[type='text'], select, .menu") && editor.key(event)) { event.preventDefault(); return; }
     if ((event.ctrlKey || event.metaKey) && !event.altKey && !isOpen) {
       const isRedo = (key.toLowerCase() === "z" && event.shiftKey) || key.toLowerCase() === "y";
       // A text that is being typed has its own undo.
@@ -669,6 +686,36 @@ function listenToKeys() {
   });
 }
 
+// -- editor -------------------------------------------------------------------------------------------------------------------
+
+function createEditor() {
+  editor = new Editor(panes.b, $("pane-sites"), $("edit"), {
+    settings: () => page.state?.settings, summary: () => page.state?.summary, selected: () => page.selected, select: selectSites,
+    send: (key, value, isFinal) => connection.set(key, value, isFinal),
+    remove: (key) => connection.remove(key),
+    undo: () => connection.send({ do: "undo" }),
+    redraw: (what = "marks") => ask(what),
+    hover: (x, y) => hover(x, y, panes.b),
+    generators: () => (controls.rows.get("layout")?.choices || []).filter(({ value }) => value?.generator),
+    violations: () => rules.violations,
+    nViolations: () => rules.rules.reduce((sum, { count }) => sum + count, 0),
+    opened: (isOn) => { if (isOn) showTile("steps", true); sendViews(); resize(); },
+    showRules: () => showTile("rules", true),
+    showSteps: (index) => { showTile("steps", true); steps.open(index); },
+  });
+  steps = new Steps($("steps"), editor, flyToStep);
+}
+
+function flyToStep(index) {
+  const { map } = panes.b, box = index === null ? null : editor.boxOf(editor.edits[index]);
+  editor.toggle(true);
+  editor.highlight(index);
+  if (index === null || !map) return;
+  if (!box) { fit(); return; }
+  const [a, b, c, d] = box, size = Math.max(c - a, d - b);
+  fly(0.5 * (a + c), 0.5 * (b + d), size > 0 ? (0.4 * Math.min(map.width, map.height)) / size : map.scale);
+}
+
 // -- start --------------------------------------------------------------------------------------------------------------------
 
 // Redraws everything in the colours of the theme.
@@ -695,7 +742,7 @@ function start() {
     select,
     moved: (pane) => { cancelAnimationFrame(flight); if (pane === panes.a) panes.b.follow(panes.a); ask("map"); },
     hover, leave,
-    click: (pane) => { if (pane === panes.b && !page.isSelecting) pin(page.hovered); },
+    click: (pane) => { if (pane === panes.b && !page.isSelecting && !editor.isOn) pin(page.hovered); },
   };
   const onImage = { hover, leave, click: (x, y) => { if (panes.b.map) fly(x, y, Math.max(panes.b.map.scale, 4 * panes.b.map.fitScale())); }, gaze };
   panes = {
@@ -721,6 +768,7 @@ function start() {
     reset: (key) => connection.send({ do: "reset", key }),
     remove: (key) => connection.send({ do: "delete", key }),
   });
+  createEditor();
   connection = new Connection({ hello, message: receive, part: receivePart, status: showConnection });
   createTiles();
   startTheme(showTheme);
@@ -736,7 +784,7 @@ start();
 
 // For tests and scripts.
 window.studio = {
-  page, panes, controls, connection, charts, rules,
+  page, panes, controls, connection, charts, rules, editor, steps,
   get state() { return page.state; },
   get isReady() { return Boolean(page.state && panes.b.scale && !page.isBusy && connection.isOpen && connection.waiting === null && page.asked === null); },
   toWindow: (x, y, pane = "b") => {
