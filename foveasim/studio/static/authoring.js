@@ -139,11 +139,15 @@ export class Editor {
 
   select(sites) { this.studio.select(sites); }
 
-  // Stores positions in the selected sites, so that these are found again in other layouts.
+  // Positions in the selected sites, by which these are found again in other layouts.
+  get points() { return (this._points ??= this.followed()); }
+  set points(points) { this._points = points; }
+
   follow(selected) {
     const [mx, my] = this.move, { sites } = this;
     this.shift = [0, 0];
-    this.points = selected.length > MOST_FOLLOWED ? [] : selected.map((site) => { const [x, y] = pointIn(sites, site); return this.rounded([x - mx, y - my], 6); });
+    this.followed = () => selected.map((site) => { const [x, y] = pointIn(sites, site); return this.rounded([x - mx, y - my], 6); });
+    this._points = selected.length && selected.length <= MOST_FOLLOWED ? null : [];
   }
 
   // -- edits ----------------------------------------------------------------------------------------------------------------
@@ -221,10 +225,11 @@ export class Editor {
     if (name === "repair") { this.commit({ kind: "repair" }); return; }
     if (!selected.length || !points.length) { notice("Select photosites first"); return; }
     if (name === "merge" && selected.length < 2) { notice("Select two or more photosites that touch"); return; }
+    if (name === "channel" && this.bar.number("channel") === null) { notice("Choose a filter first"); return; }
     const edit = {
       merge: () => ({ kind: "merge_at", points_um: points }),
       split: () => ({ kind: "split_at", points_um: points, n_x: this.bar.number("n_x") ?? 2, n_y: this.bar.number("n_y") ?? 1 }),
-      channel: () => ({ kind: "set_channel", points_um: points, channel: this.bar.number("channel") ?? 0 }),
+      channel: () => ({ kind: "set_channel", points_um: points, channel: this.bar.number("channel") }),
       remove: () => ({ kind: "remove_at", points_um: points }),
     }[name]();
     this.commit(edit);

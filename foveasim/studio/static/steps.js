@@ -69,7 +69,8 @@ export class Steps {
       this.choose(this.opened === i ? i : null);
       this.update();
     });
-    line.append(head, ...BUTTONS.map(([action, sign, title]) => {
+    const actions = make("div", undefined, "step-actions");
+    actions.append(...BUTTONS.map(([action, sign, title]) => {
       const button = make("button", sign, "step-" + action);
       button.title = title;
       button.setAttribute("aria-label", title + ": step " + (i + 1));
@@ -78,6 +79,7 @@ export class Steps {
       button.addEventListener("click", () => this._act(action, i));
       return button;
     }));
+    line.append(head, actions);
     head.dataset.at = "name" + i;
     for (const button of line.querySelectorAll("button")) button.type = "button";
     item.append(line);

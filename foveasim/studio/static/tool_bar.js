@@ -119,12 +119,13 @@ export class ToolBar {
     this.problem.setAttribute("role", "alert");
     const part = (tools, label, ...nodes) => { const span = make("label", label); span.append(...nodes); this.parts.push([tools, span]); return span; };
     this.parts = [];
-    const { fields } = this;
+    const { fields } = this, note = make("div", undefined, "tool-note");
+    note.append(this.hint, this.problem, this.rulesButton);
     this.row.append(
       part(["polygon", "rectangle"], "", fields.overlap), part(["polygon", "rectangle", "channel"], "", fields.channel),
       part(["split"], "x", fields.n_x), part(["split"], "y", fields.n_y),
       part(["layer"], "", fields.generator), part(["layer"], "", fields.operation), part(["layer"], "margin", fields.margin_um),
-      part(PLACING, "at", fields.at), this.applyButton, part(PLACING, "grid", fields.grid, make("span", "µm")), make("span", undefined, "space"), this.rulesButton, this.hint, this.problem,
+      part(PLACING, "at", fields.at), this.applyButton, part(PLACING, "grid", fields.grid, make("span", "µm")), note,
     );
     fields.at.addEventListener("input", () => { this.isTyping = true; });
     fields.at.addEventListener("blur", () => { this.isTyping = false; });
