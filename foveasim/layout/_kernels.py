@@ -100,6 +100,8 @@ def min_widths(xy, after, before, ring_offsets, site_offsets):
             ax, ay = xy[i, 0], xy[i, 1]
             bx, by = xy[after[i], 0], xy[after[i], 1]
             length = np.hypot(bx - ax, by - ay)
+            if length == 0.0:  # vertices that rounding has made equal
+                continue
             ex, ey = (bx - ax) / length, (by - ay) / length
             low, high = np.inf, -np.inf
             for k in range(first, last):
@@ -112,6 +114,8 @@ def min_widths(xy, after, before, ring_offsets, site_offsets):
                 cx, cy = xy[k, 0], xy[k, 1]
                 dx, dy = xy[after[k], 0], xy[after[k], 1]
                 other = np.hypot(dx - cx, dy - cy)
+                if other == 0.0:
+                    continue
                 fx, fy = (dx - cx) / other, (dy - cy) / other
                 if ex * fx + ey * fy > -MIN_FACING_COSINE:
                     continue

@@ -187,6 +187,21 @@ def test_drawn_site_replaces_covered_area():
     assert overlap_um2(edited) == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.parametrize("rounding_um", [-1e-13, 1e-13])
+def test_drawn_vertices_on_outlines_leave_no_repeats(rounding_um):
+    # A vertex of four sites, and points of two edges, up to rounding.
+    outline = [[rounding_um, 10.0 + rounding_um], [15.0, 0.0 + rounding_um], [10.0 + rounding_um, 15.0]]
+    drawn = fs.layout.draw(GRID, [outline]).translate(1000.0, 1000.0)
+    end = np.concatenate(
+        [np.roll(np.arange(a, b), -1) for a, b in zip(drawn.ring_offsets[:-1], drawn.ring_offsets[1:], strict=True)]
+    )
+    edge_um = np.hypot(*(drawn.xy_um[end] - drawn.xy_um).T)
+
+    assert edge_um.min() > 0.1
+    assert drawn.area_um2.sum() == pytest.approx(1600.0)
+    assert fs.layout.min_width_um(drawn).min() > 0.1
+
+
 def test_drawn_site_fills_only_gaps():
     holed = fs.layout.remove_at(GRID, [[5.0, 5.0]])
     edited = fs.layout.draw(holed, [[[-5.0, -5.0], [15.0, -5.0], [15.0, 15.0], [-5.0, 15.0]]], overlap="fill")

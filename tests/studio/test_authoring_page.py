@@ -470,8 +470,8 @@ def test_positions_snap_to_vertices_and_grid(edit):
     kind, at = position(30, 20, 4, 4)
     assert (kind, at) == ("midpoint", pytest.approx([30, 20], abs=1e-9))
     assert page.evaluate("studio.editor.step") == 1
-    kind, at = position(35, 20, 1, 3)
-    assert (kind, at) == ("edge", pytest.approx([35, 20], abs=1e-9))
+    kind, at = position(27, 20, 1, 3)
+    assert (kind, at) == ("edge", pytest.approx([27, 20], abs=1e-9))
     page.get_by_label("Grid in µm").fill("2.5")
     page.get_by_label("Grid in µm").press("Enter")
     kind, at = position(32.5, 12.5, 1, 1)

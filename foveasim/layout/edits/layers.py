@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from foveasim._core.validation import MAX_LENGTH_UM, Ints, check_choice, check_count, check_number, check_sites
 from foveasim.errors import ParameterError
 from foveasim.layout._regions import as_region
+from foveasim.layout.adjacency import TOUCHING_UM
 from foveasim.layout.edit_registry import layout_edit
 from foveasim.layout.edits._parts import replace_sites, separate_parts
 from foveasim.layout.edits.all_sites import clip, cut_out
@@ -148,6 +149,9 @@ def _without(layout: Layout, area: Any) -> Layout:
     shapely.prepare(area)
     is_cut = shapely.intersects(area, polygons) & ~shapely.touches(area, polygons)
     near, polygons = near[is_cut], polygons[is_cut]
+    # Vertices of the area that lie on an outline up to rounding would leave necks of this width.
+    is_crossed = ~shapely.contains_properly(area, polygons)
+    polygons[is_crossed] = shapely.snap(polygons[is_crossed], area, TOUCHING_UM)
     parts, shape = separate_parts(layout, shapely.difference(polygons, area), near)
     return replace_sites(layout, near, parts, near[shape], f"area of {near.size} sites cut out")
 

@@ -125,7 +125,7 @@ export class ToolBar {
       part(["polygon", "rectangle"], "", fields.overlap), part(["polygon", "rectangle", "channel"], "", fields.channel),
       part(["split"], "x", fields.n_x), part(["split"], "y", fields.n_y),
       part(["layer"], "", fields.generator), part(["layer"], "", fields.operation), part(["layer"], "margin", fields.margin_um),
-      part(PLACING, "at", fields.at), this.applyButton, part(PLACING, "grid", fields.grid, make("span", "µm")), note,
+      part(PLACING, "at", fields.at), this.applyButton, part(PLACING.filter((tool) => tool !== "layer"), "grid", fields.grid, make("span", "µm")), note,
     );
     fields.at.addEventListener("input", () => { this.isTyping = true; });
     fields.at.addEventListener("blur", () => { this.isTyping = false; });

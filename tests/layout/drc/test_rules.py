@@ -212,6 +212,14 @@ def test_width_matches_known_shapes(shape, width_um):
     assert min_width_um(Layout.from_polygons([shape]))[0] == pytest.approx(width_um, rel=1e-9)
 
 
+def test_width_ignores_coincident_vertices():
+    corners = [(0.0, 0.0), (4.0, 0.0), (4.0, 1e-14), (4.0, 3.0), (0.0, 3.0)]
+    shifted = Layout.from_polygons([shapely.Polygon(corners)]).translate(1000.0, 1000.0)
+
+    assert np.array_equal(shifted.xy_um[1], shifted.xy_um[2])
+    assert min_width_um(shifted)[0] == pytest.approx(3.0)
+
+
 @pytest.mark.parametrize("shape", [shape for shape, _ in WIDTHS.values()], ids=WIDTHS)
 @given(angle_deg=st.floats(0, 360), factor=st.floats(0.1, 10), shift_um=st.integers(-1000, 1000))
 @settings(relaxed, max_examples=15)
