@@ -420,7 +420,9 @@ def test_steps_are_listed_and_changed(edit):
     assert page.evaluate(names) == ["1. Split 1 site into 2 × 2", "2. Delete 1 site"]
     page.locator(".step-name").first.click()
     until(page, "() => studio.page.asked === null")
-    view = page.evaluate("(({ x, y, scale, width, height }) => [x, y, Math.min(width, height) / scale])(studio.panes.b.map)")
+    view = page.evaluate(
+        "(({ x, y, scale, width, height }) => [x, y, Math.min(width, height) / scale])(studio.panes.b.map)"
+    )
     # The site at the point is now a part of 10 µm.
     assert view[:2] == pytest.approx((np.array([15, 15]) + MOVE_UM).tolist())
     assert view[2] == pytest.approx(10 / 0.4)
