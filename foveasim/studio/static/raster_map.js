@@ -43,38 +43,50 @@ export class RasterMap extends MapView {
     if (this.drawn !== view) {
       if (!this.owner || this.owner.length !== n * n * width * height) this.owner = new Uint32Array(n * n * width * height);
       ownersOf(this, n * width, n * height, this.owner);
+      this.mixed = n === 1 ? null : mixedPixels(this.owner, width, height, n);
       if (!this.picture || this.picture.width !== width || this.picture.height !== height) this.picture = this.context.createImageData(width, height);
+      if (this.table?.length !== this.sites.n + 1) this.table = new Uint32Array(this.sites.n + 1);
       this.drawn = view;
     }
-    const pixels = new Uint32Array(this.picture.data.buffer), table = new Uint32Array(this.sites.n + 1);
+    const pixels = new Uint32Array(this.picture.data.buffer), { table, owner, mixed } = this;
     table[0] = (255 << 24 | ground[2] << 16 | ground[1] << 8 | ground[0]) >>> 0;
     table.set(this.colours.subarray(0, this.sites.n), 1);
-    if (n === 1) for (let p = 0; p < pixels.length; p++) pixels[p] = table[this.owner[p]];
-    else averageSamples(pixels, this.owner, table, width, height, n);
+    const first = mixed ? mixed.first : owner;
+    for (let p = 0; p < pixels.length; p++) pixels[p] = table[first[p]];
+    if (mixed) averageSamples(pixels, mixed, table, n * n);
     this.context.putImageData(this.picture, 0, 0);
   }
 }
 
-// Sets every pixel to the mean of its samples in linear light.
-function averageSamples(pixels, owner, table, width, height, n) {
-  const row = n * width, scale = (LEVELS - 1) / (n * n);
+// Returns the site of the first sample of every pixel, and the samples of the pixels with several sites.
+function mixedPixels(owner, width, height, n) {
+  const row = n * width, first = new Uint32Array(width * height), pixels = [], samples = [];
   for (let y = 0, p = 0; y < height; y++) {
-    for (let x = 0, first = y * n * row; x < width; x++, p++, first += n) {
-      const one = owner[first];
+    for (let x = 0, at = y * n * row; x < width; x++, p++, at += n) {
+      const one = owner[at];
+      first[p] = one;
       let isOne = true;
-      for (let v = 0; isOne && v < n; v++) for (let u = 0; u < n; u++) if (owner[first + v * row + u] !== one) { isOne = false; break; }
-      if (isOne) { pixels[p] = table[one]; continue; }
-      let red = 0, green = 0, blue = 0;
-      for (let v = 0; v < n; v++) {
-        for (let u = 0; u < n; u++) {
-          const colour = table[owner[first + v * row + u]];
-          red += LINEAR[colour & 255];
-          green += LINEAR[(colour >>> 8) & 255];
-          blue += LINEAR[(colour >>> 16) & 255];
-        }
-      }
-      pixels[p] = (255 << 24 | ENCODED[(blue * scale + 0.5) | 0] << 16 | ENCODED[(green * scale + 0.5) | 0] << 8 | ENCODED[(red * scale + 0.5) | 0]) >>> 0;
+      for (let v = 0; isOne && v < n; v++) for (let u = 0; u < n; u++) if (owner[at + v * row + u] !== one) { isOne = false; break; }
+      if (isOne) continue;
+      pixels.push(p);
+      for (let v = 0; v < n; v++) for (let u = 0; u < n; u++) samples.push(owner[at + v * row + u]);
     }
+  }
+  return { first, pixels: Uint32Array.from(pixels), samples: Uint32Array.from(samples) };
+}
+
+// Sets pixels with several sites to the mean of their samples in linear light.
+function averageSamples(pixels, mixed, table, n) {
+  const scale = (LEVELS - 1) / n, { samples } = mixed;
+  for (let i = 0, k = 0; i < mixed.pixels.length; i++) {
+    let red = 0, green = 0, blue = 0;
+    for (const end = k + n; k < end; k++) {
+      const colour = table[samples[k]];
+      red += LINEAR[colour & 255];
+      green += LINEAR[(colour >>> 8) & 255];
+      blue += LINEAR[(colour >>> 16) & 255];
+    }
+    pixels[mixed.pixels[i]] = (255 << 24 | ENCODED[(blue * scale + 0.5) | 0] << 16 | ENCODED[(green * scale + 0.5) | 0] << 8 | ENCODED[(red * scale + 0.5) | 0]) >>> 0;
   }
 }
 

@@ -13,13 +13,14 @@ export const titleOf = (column) => (column.unit ? column.label + " / " + column.
 
 // Draws the colours of a scale, one row per filter on a mosaic.
 export function drawRamp(context, scale, width, height) {
-  const rows = scale.tables.length;
-  scale.tables.forEach((shades, row) => {
-    for (let px = 0; px < width; px++) {
-      context.fillStyle = "rgb(" + shades[Math.round((255 * px) / Math.max(1, width - 1))] + ")";
-      context.fillRect(px, (row * height) / rows, 1.5, height / rows);
-    }
-  });
+  const rows = scale.tables.length, strip = make("canvas");
+  strip.width = 256;
+  strip.height = rows;
+  const stripContext = strip.getContext("2d", { willReadFrequently: true }), image = stripContext.createImageData(256, rows);
+  scale.tables.forEach((shades, row) => shades.forEach((shade, i) => image.data.set([...shade, 255], 4 * (256 * row + i))));
+  stripContext.putImageData(image, 0, 0);
+  context.imageSmoothingEnabled = false;
+  context.drawImage(strip, 0, 0, width, height);
 }
 
 export function tickLabels(scale) {
