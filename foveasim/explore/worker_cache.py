@@ -81,6 +81,12 @@ class WorkerCache:
         self._warnings += self._parts[key].warnings
         return self._parts[key].value
 
+    def forget(self, text: str) -> None:
+        """Remove components whose settings contain a string, such as the path of a file."""
+        quoted = json.dumps(text)
+        for key in [key for key in self._parts if quoted in key[1]]:
+            del self._parts[key]
+
     def finish_point(self) -> list[str]:
         """
         Remove the least recently used components, except those of the last point.

@@ -40,6 +40,8 @@ class Simulated:
     warnings : list of str
     seconds_s : float, s
         Time of the simulation.
+    frozen : Simulated, optional
+        Variant to compare with.
     """
 
     settings: dict[str, Any]
@@ -49,6 +51,7 @@ class Simulated:
     images: dict[Any, Any]
     warnings: list[str] = field(default_factory=list)
     seconds_s: float = 0.0
+    frozen: Simulated | None = None
 
     __repr__ = short_repr
 
@@ -72,6 +75,10 @@ class Engine:
     def n_built(self) -> dict[str, int]:
         """Number of times that each stage was computed."""
         return self._runner.cache.n_built
+
+    def forget(self, text: str) -> None:
+        """Remove cached stages whose settings contain a string, such as the path of a frame."""
+        self._runner.cache.forget(text)
 
     def simulate(self, settings: Mapping[str, Any]) -> Simulated:
         """

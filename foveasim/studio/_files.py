@@ -117,6 +117,7 @@ class Files:
         resolve_files(Path(), dict(start), found=named)
         self._named = {path.resolve() for path in named}
         self._directories = [path.resolve() for path in (uploads, directory) if path is not None]
+        self._uploads = uploads
 
     def allows(self, path: str | Path) -> bool:
         """Return whether settings may contain a file."""
@@ -153,6 +154,17 @@ class Files:
                     "scikit-image such as skimage:astronaut",
                 )
 
+    def with_uploads(self, settings: Any, key: str = "") -> Any:
+        """Return settings with the paths of uploaded files for their names."""
+        if isinstance(settings, dict):
+            return {name: self.with_uploads(value, str(name)) for name, value in settings.items()}
+        if isinstance(settings, list):
+            return [self.with_uploads(value, key) for value in settings]
+        if isinstance(settings, str) and key in FILE_SETTINGS and settings == file_name(settings):
+            path = self._uploads / settings
+            return str(path) if path.is_file() else settings
+        return settings
+
     def resolve(self, settings: Any) -> Any:
         """Return settings with YAML layouts replaced by their content, after a check of all files."""
         self.check(settings)
@@ -170,7 +182,7 @@ class Files:
         FileError
             When the file is not available, or not valid YAML.
         """
-        self._require(path)
+        self.available(path)
         return resolve_files(Path(path).parent, read_settings(path))
 
     def layout_of(self, path: str) -> Any:
@@ -182,12 +194,20 @@ class Files:
         FileError
             When the file is not available, or not valid YAML.
         """
-        self._require(path)
-        return _inlined(path, Path())
+        return _inlined(self.available(path), Path())
 
-    def _require(self, path: str) -> None:
+    def available(self, path: str) -> str:
+        """
+        Return the path of a file after a check that settings may contain it.
+
+        Raises
+        ------
+        FileError
+            When the file is not available.
+        """
         if not self.allows(path):
             raise FileError(None, f"{printable(path)[:100]!r} is not available here; upload the file")
+        return path
 
 
 def file_name(name: str) -> str:

@@ -22,6 +22,7 @@ from foveasim.metrics import polygon_mtf
 from foveasim.scene import Scene
 from foveasim.sensor import noise_budget
 from foveasim.studio._engine import Simulated
+from foveasim.studio._variants import compare
 from foveasim.units import per_mm_from_per_um, photon_energy_j
 from foveasim.view.site_colours import encode_light
 from foveasim.view.web._content import describe_sites, outlines_of, rules_of
@@ -195,6 +196,12 @@ def rules(result: Simulated) -> PartData:
     arrays: dict[str, NDArray[Any]] = {}
     report = result.capture.layout.check(result.shot.rules)
     return {"rules": rules_of(report, arrays), "is_satisfied": bool(report.ok)}, arrays
+
+
+@part("A and B", lambda result: (result.capture, result.frozen and result.frozen.capture))
+def comparison(result: Simulated) -> PartData:
+    """Return budgets and picture quality of the frozen variant and the current one."""
+    return ({"rows": []} if result.frozen is None else compare(result.frozen, result)), {}
 
 
 def summary_of(result: Simulated) -> dict[str, Any]:

@@ -26,7 +26,9 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 from foveasim import __version__
 from foveasim.errors import FoveasimError, ParameterError, SimulationError, printable
 from foveasim.layout import write_layout
+from foveasim.studio._exports import archive
 from foveasim.studio._files import file_name, presets
+from foveasim.studio._frames import camera_frame
 from foveasim.studio._session import Session, Start
 
 __all__ = ["UNSPECIFIED", "Studio", "host_names", "serve"]
@@ -49,6 +51,8 @@ TOO_MANY = 4429
 #: Addresses that stand for all addresses of this computer.
 UNSPECIFIED = ("0.0.0.0", "::")  # noqa: S104 -- compared, not bound
 HTTP_PORT = 80
+#: Texts that can be downloaded, and their extensions.
+TEXTS = {"yaml": "yaml", "python": "py", "notebook": "ipynb"}
 TYPES = {
     ".html": "text/html; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
@@ -61,6 +65,7 @@ HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(self), display-capture=(), geolocation=(), microphone=(), payment=(), usb=()",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
@@ -169,9 +174,9 @@ class Studio:
             sender = asyncio.create_task(outgoing.send_to(socket))
             session.attach(outgoing.put)
             while True:
-                session.post(_parse(await socket.receive_text()))
+                session.post(_message(await socket.receive()))
         except (WebSocketDisconnect, TimeoutError, KeyError, RuntimeError):
-            pass  # disconnected, silent, or a binary message
+            pass  # disconnected, silent, or a first message in binary
         finally:
             if session is not None and outgoing is not None:
                 session.detach(outgoing.put)
@@ -305,6 +310,25 @@ def _error(text: str, status: int) -> Response:
     return JSONResponse({"error": text}, status, headers=HEADERS)
 
 
+def _message(received: Any) -> Any:
+    """
+    Return a message of a page: JSON, or a camera frame in binary; None if it is invalid.
+
+    Raises
+    ------
+    WebSocketDisconnect
+        When the page has closed the connection.
+    """
+    if received["type"] == "websocket.disconnect":
+        raise WebSocketDisconnect(received.get("code", 1000))
+    if received.get("text") is not None:
+        return _parse(received["text"])
+    try:
+        return camera_frame(received["bytes"])
+    except ParameterError:
+        return None
+
+
 def _parse(text: str) -> Any:
     """Return the JSON value of a message; None if it is invalid."""
     try:
@@ -329,10 +353,15 @@ def _package_file(package: str, directory: str, name: str) -> Response:
 def _exported(session: Session, what: str) -> tuple[bytes, str]:
     """Return the content and the name of a file of the current state."""
     stem = file_name(session.start.name)
-    if what in ("yaml", "python"):
-        return session.text(what).encode(), f"{stem}.{'yaml' if what == 'yaml' else 'py'}"
+    if what in TEXTS:
+        return session.text(what).encode(), f"{stem}.{TEXTS[what]}"
+    if what == "zip":
+        exported, result = session.exported(), session.result
+        texts = {f"{stem}.{extension}": session.text(text, exported) for text, extension in TEXTS.items()}
+        return archive(stem, texts, exported[1], None if result is None else result.capture.layout), f"{stem}.zip"
     if what not in ("gds", "oas", "geojson", "npz", "svg", "png"):
-        raise ParameterError("what", "must be yaml, python, gds, oas, geojson, npz, svg or png", printable(what)[:40])
+        names = f"{', '.join(TEXTS)}, zip, gds, oas, geojson, npz, svg or png"
+        raise ParameterError("what", f"must be {names}", printable(what)[:40])
     if session.result is None:
         raise SimulationError("there is no result")
     capture = session.result.capture

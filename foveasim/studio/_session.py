@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,14 @@ from foveasim.config import check_settings, put_setting
 from foveasim.errors import FoveasimError, ParameterError, SimulationError, printable
 from foveasim.studio._controls import chosen_value, controls_of, structure_of, value_at
 from foveasim.studio._engine import Engine, Simulated
+from foveasim.studio._exports import notebook
 from foveasim.studio._files import Files, apply_preset, file_name, with_layout
+from foveasim.studio._frames import Frames
 from foveasim.studio._history import History
 from foveasim.studio._messages import encode_part, from_json, to_json
 from foveasim.studio._parts import PARTS, summary_of
 from foveasim.studio._templates import WITHOUT_MOSAIC
+from foveasim.studio._variants import with_n_sites
 
 __all__ = ["Session", "Start"]
 
@@ -38,7 +42,7 @@ MAX_DEPTH = 20
 #: Number of colour filters that a layout without mosaic receives.
 N_FILTERS = 3
 #: Messages that change the settings.
-CHANGES = ("set", "reset", "delete", "undo", "redo", "preset", "restore", "file")
+CHANGES = ("set", "reset", "delete", "undo", "redo", "preset", "restore", "file", "video", "frame", "match")
 
 #: Receives messages for a page: strings of JSON, and bytes of parts.
 Listener = Callable[[str | bytes], None]
@@ -87,6 +91,7 @@ class Session:
         self.result: Simulated | None = None
         self.last_used_s = time.monotonic()
         self.n_uploaded_bytes = 0
+        self.frames = Frames(self.uploads, self._new_path)
         self._views = list(PARTS)
         self._version = 0
         self._last_id: Any = None
@@ -95,7 +100,9 @@ class Session:
         self._structure: Any = None
         self._controls: list[dict[str, Any]] = []
         self._frozen: dict[str, Any] | None = None
+        self._frozen_result: Simulated | None = None
         self._errors: dict[str, str] = {}
+        self._simulated_frame: str | None = None
         self._listeners: set[Listener] = set()
         self._waiting: deque[dict[str, Any]] = deque()
         self._wake = threading.Condition()
@@ -138,6 +145,8 @@ class Session:
         """Add a message of the page; it is handled in the thread of the session."""
         with self._wake:
             self.last_used_s = time.monotonic()
+            if _is_frame(message) and self._waiting and _is_frame(self._waiting[-1]) and not message.get("is_first"):
+                message["is_first"] = self._waiting.pop().get("is_first")
             if len(self._waiting) >= MAX_WAITING:
                 message = None
             else:
@@ -155,12 +164,17 @@ class Session:
 
     def add_file(self, name: str, content: bytes) -> Path:
         """Store an uploaded file, and return its path."""
-        k, path = 0, self.uploads / file_name(name)
-        while path.exists():
-            k += 1
-            path = self.uploads / f"{k}_{file_name(name)}"
+        path = self._new_path(file_name(name))
         path.write_bytes(content)
         self.n_uploaded_bytes += len(content)
+        return path
+
+    def _new_path(self, name: str) -> Path:
+        """Return an unused path for an uploaded file or for the frames of a source."""
+        k, path = 0, self.uploads / name
+        while path.exists() or path == self.frames.path:
+            k += 1
+            path = self.uploads / f"{k}_{name}"
         return path
 
     # -- thread -----------------------------------------------------------------------------------------------------
@@ -202,7 +216,11 @@ class Session:
         kept = [
             message
             for message, following in zip(messages, [*messages[1:], None], strict=True)
-            if not (_is_preview(message) and following is not None and _is_preview(following, message.get("key")))
+            if following is None
+            or not (
+                (_is_preview(message) and _is_preview(following, message.get("key")))
+                or (_is_frame(message) and _is_frame(following) and not message.get("is_first"))
+            )
         ]
         before = self.history.copy()
         self._send({"kind": "busy"})
@@ -259,9 +277,25 @@ class Session:
                 restored = from_json(_plain(message.get("settings")))
                 if not isinstance(restored, dict):
                     raise ParameterError("settings", "must be a mapping")
-                settings = restored
+                settings = self.files.with_uploads(restored)
             case "file":
                 settings = self._with_file(_string(message, "path"), message.get("as"))
+            case "match":
+                if self._frozen_result is None or self.result is None:
+                    raise SimulationError("there is no variant A to compare with")
+                n_sites = self._frozen_result.capture.layout.n_sites
+                settings = with_n_sites(settings, n_sites, self.result.capture.layout)
+            case "video":
+                path = Path(self.files.available(_string(message, "path")))
+                settings = self._with_file(str(self.frames.path if self.frames.open_video(path) else path), "scene")
+            case "frame":
+                if "pixels" not in message:
+                    self.frames.show(message.get("n"))
+                    return
+                is_first = bool(message.get("is_first"))
+                if not self.frames.receive(message["pixels"], is_first=is_first) or not is_first:
+                    return
+                settings = self._with_file(str(self.frames.path), "scene")
         settings = self.files.resolve(settings)
         check_settings(None, settings)
         if message["do"] == "set" and message.get("final", True) is False:
@@ -289,10 +323,14 @@ class Session:
                 raise ParameterError("as", "must be scene, layout or settings", printable(str(use))[:40])
 
     def _simulate(self, settings: dict[str, Any]) -> None:
+        settings, before = self.frames.with_current(settings), self._simulated_frame
         if self.result is not None and self.result.settings == settings:
             return
         self.result = self.engine.simulate(settings)
         self._version += 1
+        self._simulated_frame = self.frames.stored_name
+        if before is not None and before != self._simulated_frame:
+            self.engine.forget(before)
 
     def _other(self, message: Any) -> None:
         """Handle a message that does not change the settings."""
@@ -315,9 +353,10 @@ class Session:
             case "freeze":
                 if self.result is None:
                     raise SimulationError("there is no result to freeze")
-                self._frozen = {"summary": summary_of(self.result), "settings": self.result.settings}
+                self._frozen_result = self.result
+                self._frozen = {"summary": summary_of(self.result), "settings": self.history.settings}
             case "unfreeze":
-                self._frozen = None
+                self._frozen = self._frozen_result = None
             case "text":
                 text = self.text(_string(message, "what"))
                 self._send({"kind": "text", "id": message.get("id"), "what": message["what"], "text": text})
@@ -331,21 +370,30 @@ class Session:
 
     # -- answers ----------------------------------------------------------------------------------------------------
 
-    def text(self, what: str) -> str:
+    def text(self, what: str, exported: tuple[dict[str, Any], dict[str, Path]] | None = None) -> str:
         """
-        Return the current settings as YAML or Python, or their changes as a difference.
+        Return the current settings as YAML, Python, notebook or JSON of a link, or their changes as a difference.
+
+        Parameters
+        ----------
+        what : {"yaml", "python", "notebook", "link", "diff"}
+        exported : tuple, optional
+            As :meth:`exported` returns it, for several texts of the same state.
 
         Raises
         ------
         ParameterError
             When the format is unknown.
         """
-        uploaded: list[str] = []
-        settings = _relative(self.history.settings, self.uploads, uploaded)
-        note = f"# Uploaded files, next to this file: {', '.join(uploaded)}\n" if uploaded else ""
+        settings, files = self.exported() if exported is None else exported
+        note = f"# Uploaded files, next to this file: {', '.join(files)}\n" if files else ""
         match what:
             case "yaml":
                 return note + format_yaml(settings)
+            case "notebook":
+                return notebook(settings, self.start.name, list(files))
+            case "link":
+                return json.dumps(to_json(settings), separators=(",", ":"))
             case "python":
                 from foveasim.config import to_python
 
@@ -354,7 +402,20 @@ class Session:
                 old, new = (format_yaml(each).splitlines(keepends=True) for each in (self.start.settings, settings))
                 return "".join(difflib.unified_diff(old, new, f"{self.start.name}.yaml", "studio"))
             case _:
-                raise ParameterError("what", "must be yaml, python or diff", printable(what)[:40])
+                raise ParameterError("what", "must be yaml, python, notebook, link or diff", printable(what)[:40])
+
+    def exported(self) -> tuple[dict[str, Any], dict[str, Path]]:
+        """
+        Return the current settings with names of uploaded files for their paths, and the files.
+
+        Returns
+        -------
+        settings : dict
+        files : dict of str to Path
+            Uploaded files by name, and the current frame of a source.
+        """
+        settings, files = self.history.settings, dict[str, Path]()
+        return _relative(settings, self.uploads, self.frames.export(settings), files), files
 
     def _save(self, name: str) -> Path:
         """Write the settings to the directory for saved files, with copies of uploaded files."""
@@ -364,11 +425,10 @@ class Session:
         safe = file_name(name)
         path = out / (safe if safe.endswith((".yaml", ".yml")) else f"{safe}.yaml")
         out.mkdir(parents=True, exist_ok=True)
-        uploaded: list[str] = []
-        settings = _relative(self.history.settings, self.uploads, uploaded)
-        for copied in dict.fromkeys(uploaded):
+        settings, files = self.exported()
+        for copied, original in files.items():
             with atomic_write(out / copied) as temporary:
-                shutil.copyfile(self.uploads / copied, temporary)
+                shutil.copyfile(original, temporary)
         with atomic_write(path) as temporary:
             temporary.write_text(format_yaml(settings), encoding="utf-8")
         return path
@@ -391,6 +451,7 @@ class Session:
             "warnings": [] if result is None else result.warnings,
             "summary": {} if result is None else summary_of(result),
             "frozen": self._frozen,
+            "film": self.frames.about(settings),
         })  # fmt: skip
 
     def _send_parts(self) -> None:
@@ -398,6 +459,7 @@ class Session:
         result = self.result
         if result is None:
             return
+        result = replace(result, frozen=self._frozen_result)
         times_ms = {"simulation": 1e3 * result.seconds_s}
         # Sites and their values belong together; the others in the order of their age.
         names = sorted(self._views, key=lambda n: (n not in ("sites", "columns"), self._sent_version.get(n, -1)))
@@ -446,6 +508,11 @@ def _is_same(old: tuple[Any, ...], new: tuple[Any, ...]) -> bool:
 def _is_preview(message: dict[str, Any], key: Any = None) -> bool:
     """Return whether a message sets a value during a drag, of a given key."""
     return message.get("do") == "set" and message.get("final") is False and (key is None or message.get("key") == key)
+
+
+def _is_frame(message: Any) -> bool:
+    """Return whether a message changes only the frame of a video or camera."""
+    return isinstance(message, dict) and message.get("do") == "frame"
 
 
 def _line(error: BaseException) -> str:
@@ -518,13 +585,14 @@ def _match_filters(settings: dict[str, Any]) -> None:
         layout["mosaic"] = ["RG", "GB"]
 
 
-def _relative(value: Any, uploads: Path, found: list[str]) -> Any:
-    """Return settings with names of uploaded files for paths, and collect the names."""
+def _relative(value: Any, uploads: Path, frames: Mapping[str, Path], found: dict[str, Path]) -> Any:
+    """Return settings with names of uploaded files for paths, and collect the files by name."""
     if isinstance(value, dict):
-        return {name: _relative(item, uploads, found) for name, item in value.items()}
+        return {name: _relative(item, uploads, frames, found) for name, item in value.items()}
     if isinstance(value, list):
-        return [_relative(item, uploads, found) for item in value]
+        return [_relative(item, uploads, frames, found) for item in value]
     if isinstance(value, str) and Path(value).parent == uploads:
-        found.append(Path(value).name)
-        return found[-1]
+        file = frames.get(value, Path(value))
+        found[file.name] = file
+        return file.name
     return value

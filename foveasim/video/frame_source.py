@@ -21,7 +21,7 @@ from foveasim._io.images import PICTURE_EXTENSIONS, check_picture_size, picture_
 from foveasim.errors import FileError, ParameterError, printable, type_name
 from foveasim.scene import Scene
 
-__all__ = ["FrameSource", "list_pictures"]
+__all__ = ["FrameSource", "VideoFile", "list_pictures"]
 
 #: Placeholder wavelengths, which the spectra of the template replace.
 GREY_NM, COLOUR_NM = (550.0,), (620.0, 550.0, 450.0)
@@ -105,7 +105,7 @@ class FrameSource:
                 self._source = list_pictures(path)
                 self._n_source = len(self._source)
             elif path.is_file():
-                self._source = _VideoFile(path)
+                self._source = VideoFile(path)
                 self._n_source, period_s = self._source.n_frames, self._source.frame_s
             else:
                 raise FileError(path, missing_path(path, "file or directory"))
@@ -119,7 +119,7 @@ class FrameSource:
         self._frame_s = None if period_s is None else period_s * (self._step if frame_s is None else 1)
         self._may_be_empty = False
         # The frame count of video files is an estimate.
-        if self._n_source is not None and not isinstance(self._source, _VideoFile):
+        if self._n_source is not None and not isinstance(self._source, VideoFile):
             self._check_not_empty(self.n_frames)
 
     def __repr__(self) -> str:
@@ -174,7 +174,7 @@ class FrameSource:
         """Iterate over the scenes."""
         shape: tuple[int, ...] | None = None
         pictures: Iterator[Any] = islice(iter(self._source), self._start, self._stop, self._step)
-        if isinstance(self._source, _VideoFile):  # skipped frames are decoded but not converted to pixels
+        if isinstance(self._source, VideoFile):  # skipped frames are decoded but not converted to pixels
             pictures = _pixels(self._source.path, pictures)
         for k, picture in enumerate(pictures):
             scene = (
@@ -246,8 +246,26 @@ class _SinglePass:
         return pictures
 
 
-class _VideoFile:
-    """Decoded frames of a video file, before conversion to pixels."""
+class VideoFile:
+    """
+    Decoded frames of a video file, before conversion to pixels.
+
+    Parameters
+    ----------
+    path : Path
+
+    Attributes
+    ----------
+    frame_s : float or None, s
+        Frame period.
+    n_frames : int or None
+        Number of frames according to the file, which may be wrong.
+
+    Raises
+    ------
+    FileError
+        When the file is not a readable video, or the extra ``video`` is not installed.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -273,6 +291,34 @@ class _VideoFile:
                 n_read += 1
             if n_read == 0:
                 raise FileError(self.path, "contains no frames")
+
+    def pixels(self, start: int = 0) -> Iterator[NDArray[np.uint8]]:
+        """
+        Iterate over the pixels of frames, (n_y, n_x, 3) uint8, top row first.
+
+        Parameters
+        ----------
+        start : int
+            First frame; earlier ones are decoded but not converted.
+
+        Raises
+        ------
+        FileError
+            When a frame is corrupt or too large.
+        """
+        return _pixels(self.path, islice(iter(self), start, None))
+
+    def count_frames(self) -> int:
+        """
+        Return the number of encoded frames, without decoding them.
+
+        Raises
+        ------
+        FileError
+            When the file is corrupt.
+        """
+        with _open_video(self.path) as container, _as_video_error(self.path, "is corrupt"):
+            return sum(packet.size > 0 for packet in container.demux(container.streams.video[0]))
 
 
 def _pixels(path: Path, frames: Iterator[Any]) -> Iterator[NDArray[np.uint8]]:

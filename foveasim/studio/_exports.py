@@ -1,0 +1,114 @@
+"""Files of a state for other programs and other people: notebook and archive."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import tempfile
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from foveasim import __version__
+from foveasim.config import to_python
+from foveasim.errors import FoveasimError
+from foveasim.layout import Layout, write_layout
+
+__all__ = ["archive", "notebook"]
+
+#: Date of the files in archives, so that equal states have equal archives; the earliest that the format can represent.
+DATE = (1980, 1, 1, 0, 0, 0)
+#: Layout formats of the archive: the first one that can be written.
+LAYOUT_FORMATS = ("gds", "geojson")
+#: Permissions of the files in archives: read by all, written by the owner.
+PERMISSIONS = 0o644 << 16
+
+
+def notebook(settings: Mapping[str, Any], name: str, files: Sequence[str]) -> str:
+    """
+    Return a notebook that simulates the shot of settings and shows its picture and photosites.
+
+    Parameters
+    ----------
+    settings : mapping
+    name : str
+        Heading.
+    files : sequence of str
+        Files that the settings contain, which must be next to the notebook.
+
+    Returns
+    -------
+    text : str
+        JSON of notebook format 4.
+    """
+    needed = [f"Required next to this notebook: {', '.join(f'`{file}`' for file in files)}."] if files else []
+    source = re.sub(r'\A""".*?"""\n', "", to_python(settings), flags=re.DOTALL).strip()
+    cells = [
+        _markdown(
+            [f"# {name}", "", f"Simulation of a shot; written by the studio of foveasim {__version__}.", *needed]
+        ),
+        _code("%matplotlib inline"),
+        _code(source),
+        _markdown(["The reconstructed picture:"]),
+        _code("capture.picture(max_pixels=1024)"),
+        _markdown(["The photosites, coloured by their codes:"]),
+        _code("fs.view.plot_capture(capture);"),
+    ]
+    content = {
+        "cells": [{**cell, "id": f"cell-{k}"} for k, cell in enumerate(cells)],
+        "metadata": {
+            "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
+            "language_info": {"name": "python"},
+        },
+        "nbformat": 4,
+        "nbformat_minor": 5,
+    }
+    return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+
+
+def _markdown(lines: Sequence[str]) -> dict[str, Any]:
+    return {"cell_type": "markdown", "metadata": {}, "source": "\n".join(lines)}
+
+
+def _code(source: str) -> dict[str, Any]:
+    return {"cell_type": "code", "execution_count": None, "metadata": {}, "outputs": [], "source": source}
+
+
+def archive(name: str, texts: Mapping[str, str], files: Mapping[str, Path], layout: Layout | None) -> bytes:
+    """
+    Return a zip archive with all files of a state.
+
+    Parameters
+    ----------
+    name : str
+        Stem of the file of the layout.
+    texts : mapping of str to str
+        Text files by name.
+    files : mapping of str to Path
+        Copied files by name.
+    layout : Layout, optional
+        Written as GDSII, or as GeoJSON without the extra ``layout``.
+    """
+    content = io.BytesIO()
+    with tempfile.TemporaryDirectory(prefix="foveasim-studio-") as directory, zipfile.ZipFile(content, "w") as file:
+        for file_name, text in texts.items():
+            _add(file, file_name, text.encode())
+        for file_name, path in files.items():
+            _add(file, file_name, path.read_bytes())
+        for extension in LAYOUT_FORMATS if layout is not None else ():
+            path = Path(directory) / f"{name}_layout.{extension}"
+            try:
+                write_layout(layout, path)
+            except FoveasimError:
+                continue
+            _add(file, path.name, path.read_bytes())
+            break
+    return content.getvalue()
+
+
+def _add(file: zipfile.ZipFile, name: str, content: bytes) -> None:
+    entry = zipfile.ZipInfo(name, DATE)
+    entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, PERMISSIONS
+    file.writestr(entry, content)

@@ -1,0 +1,252 @@
+"""Frames of a video file or a camera: the current one is the picture of the scene."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim._io.images import write_picture
+from foveasim.errors import FileError, ParameterError
+from foveasim.video.frame_source import VideoFile
+
+__all__ = ["Frames", "camera_frame"]
+
+#: Largest size of the decoded frames that are stored for steps back.
+MAX_DECODED_BYTES = 64 << 20
+#: Largest number of pixels of a camera frame: three bytes per pixel and a header are one message of a page.
+MAX_CAMERA_PIXELS = (1 << 20) // 3 - 1024
+#: Length of the digest in names of camera frames.
+DIGEST_LENGTH = 8
+#: Directory of the current frame, in the directory of uploaded files; settings cannot contain its files.
+HIDDEN = ".frames"
+
+
+def camera_frame(message: bytes) -> dict[str, Any]:
+    """
+    Decode a camera frame: the length of the header as little-endian uint32, the header in JSON, the pixels.
+
+    Parameters
+    ----------
+    message : bytes
+        The header contains ``id``, ``width`` and ``height``; the pixels are RGB, uint8, top row first.
+
+    Returns
+    -------
+    message : dict
+        With ``pixels``, (n_y, n_x, 3) uint8.
+
+    Raises
+    ------
+    ParameterError
+        When the message is invalid.
+    """
+    start = 4 + int.from_bytes(message[:4], "little")
+    try:
+        header = json.loads(message[4:start])
+        width, height = header["width"], header["height"]
+        if not (type(width) is int and type(height) is int and 0 < width * height <= MAX_CAMERA_PIXELS and width > 0):
+            raise ValueError
+        pixels = np.frombuffer(message, np.uint8, offset=start).reshape(height, width, 3)
+    except (ValueError, TypeError, KeyError, RecursionError):
+        raise ParameterError("frame", "must be a header and the pixels that it specifies") from None
+    return {"do": "frame", "id": header.get("id"), "is_first": header.get("is_first") is True, "pixels": pixels}
+
+
+class Frames:
+    """
+    Current frame of a video file or a camera.
+
+    The settings contain a fixed path, :attr:`path`. Its file is written when it is required; simulations read the current frame
+    from another file, whose name differs for each frame.
+
+    Parameters
+    ----------
+    uploads : Path
+        Directory of uploaded files.
+    new_path : function of a name
+        Returns an unused path there.
+    """
+
+    def __init__(self, uploads: Path, new_path: Callable[[str], Path]) -> None:
+        self.path: Path | None = None
+        self._lock = threading.Lock()  # frames are exported in other threads
+        self._directory, self._new_path = uploads / HIDDEN, new_path
+        self._video: VideoFile | None = None
+        self._name = ""
+        self._n_frames = 0
+        self._number = 0
+        self._pixels: NDArray[np.uint8] | None = None
+        self._stored: Path | None = None
+        self._n_stored = 0
+        self._reader: Iterator[NDArray[np.uint8]] | None = None
+        self._next = 0
+        self._decoded: OrderedDict[int, NDArray[np.uint8]] = OrderedDict()
+
+    # -- sources ----------------------------------------------------------------------------------------------------
+
+    def open_video(self, path: Path) -> bool:
+        """
+        Open a video file at its first frame.
+
+        Returns
+        -------
+        is_video : bool
+            False for a single frame, which is a picture.
+
+        Raises
+        ------
+        FileError
+            When the file is not a video, is corrupt, or the extra ``video`` is not installed.
+        """
+        video = VideoFile(path)
+        n_frames = video.count_frames()
+        if n_frames <= 1 and path.suffix.lower() == ".gif":
+            return False
+        reader = video.pixels()
+        first = next(reader)
+        self.close()
+        self._video, self._name, self._n_frames = video, path.name, n_frames
+        self._reader, self._next = reader, 1
+        self.path = self._new_path(f"{path.stem}.png")
+        self._use(0, first)
+        return True
+
+    def receive(self, pixels: NDArray[np.uint8], *, is_first: bool) -> bool:
+        """Use a frame of the camera; return False for a late frame of a camera that is not in use."""
+        if is_first:
+            self.close()
+            self._name, self.path = "camera", self._new_path("camera.png")
+        elif self.path is None or self._video is not None:
+            return False
+        self._use(0 if is_first else self._number + 1, pixels)
+        return True
+
+    def show(self, number: object) -> None:
+        """
+        Decode a frame of the video.
+
+        Raises
+        ------
+        FileError
+            When the frame is corrupt.
+        ParameterError
+            When there is no video, or it has no such frame.
+        """
+        if self._video is None:
+            raise ParameterError("n", "must be the number of a frame of an open video")
+        if type(number) is not int or not 0 <= number < self._n_frames:
+            raise ParameterError("n", f"must be 0 to {self._n_frames - 1}")
+        if number not in self._decoded:
+            self._decode(number)
+        self._decoded.move_to_end(number)
+        self._use(number, self._decoded[number])
+
+    def _decode(self, number: int) -> None:
+        """Decode frames up to a number, from the last one or the beginning."""
+        assert self._video is not None
+        if self._reader is None or number < self._next:
+            self._reader, self._next = self._video.pixels(number), number
+        while self._next <= number:
+            try:
+                pixels = next(self._reader, None)
+            except FileError:
+                self._reader = None
+                raise
+            if pixels is None:
+                self._reader, self._n_frames = None, max(1, self._next)
+                raise FileError(self._video.path, f"ends after {self._n_frames} frames")
+            self._decoded[self._next] = pixels
+            self._next += 1
+            while len(self._decoded) > 1 and sum(each.nbytes for each in self._decoded.values()) > MAX_DECODED_BYTES:
+                self._decoded.popitem(last=False)
+
+    def _use(self, number: int, pixels: NDArray[np.uint8]) -> None:
+        """Store the current frame for the next simulation."""
+        if self._pixels is not None and pixels is self._pixels:
+            return
+        self._directory.mkdir(exist_ok=True)
+        stored = self._directory / f"{self._n_stored}.ppm"
+        height, width = pixels.shape[:2]
+        stored.write_bytes(b"P6 %d %d 255\n" % (width, height) + np.ascontiguousarray(pixels).tobytes())
+        self._remove_stored()
+        self._n_stored += 1
+        with self._lock:
+            self._stored, self._number, self._pixels = stored, number, pixels
+
+    def _remove_stored(self) -> None:
+        if self._stored is not None:
+            self._stored.unlink(missing_ok=True)
+            self._stored = None
+
+    def close(self) -> None:
+        """Close the source; its last frame remains available at its path."""
+        if self.path is not None and self._pixels is not None:
+            write_picture(self.path, self._pixels)
+        self._remove_stored()
+        with self._lock:
+            self.path = self._video = self._reader = self._pixels = None
+        self._decoded.clear()
+
+    # -- the current frame ------------------------------------------------------------------------------------------
+
+    def about(self, settings: Mapping[str, Any]) -> dict[str, Any] | None:
+        """Return a description of the source if it is the scene of settings, otherwise None."""
+        if self._pixels is None or not self._is_used(settings):
+            return None
+        height, width = self._pixels.shape[:2]
+        frame_s = None if self._video is None else self._video.frame_s
+        return {
+            "kind": "camera" if self._video is None else "video",
+            "name": self._name,
+            "n": self._number,
+            "n_frames": self._n_frames if self._video is not None else None,
+            "frame_s": frame_s,
+            "width": width,
+            "height": height,
+        }
+
+    def _is_used(self, settings: Mapping[str, Any]) -> bool:
+        scene = settings.get("scene")
+        return self.path is not None and isinstance(scene, Mapping) and scene.get("picture") == str(self.path)
+
+    def with_current(self, settings: dict[str, Any]) -> dict[str, Any]:
+        """Return settings whose scene is the file of the current frame, or the same object."""
+        if self._stored is None or not self._is_used(settings):
+            return settings
+        found = copy.copy(settings)
+        found["scene"] = {**settings["scene"], "picture": str(self._stored)}
+        return found
+
+    @property
+    def stored_name(self) -> str | None:
+        """Path of the current frame in the settings of simulations."""
+        return None if self._stored is None else str(self._stored)
+
+    def export(self, settings: Mapping[str, Any]) -> dict[str, Path]:
+        """
+        Write the current frame to a file with its own name, if it is the scene of settings.
+
+        Returns
+        -------
+        files : dict of str to Path
+            The file by the path in the settings; empty if the scene is another one.
+        """
+        with self._lock:
+            if self.path is None or self._pixels is None or not self._is_used(settings):
+                return {}
+            key, pixels, suffix = str(self.path), self._pixels, f"frame_{self._number}"
+        if self._video is None:
+            suffix = hashlib.sha256(pixels.tobytes()).hexdigest()[:DIGEST_LENGTH]
+        file = Path(key).with_name(f"{Path(key).stem}_{suffix}.png")
+        if not file.exists():
+            write_picture(file, pixels)
+        return {key: file}
