@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.short_repr import short_repr
-from foveasim.errors import ParameterError
+from foveasim.errors import ParameterError, SimulationError
 from foveasim.fields import Grid, PowerMap
 from foveasim.metrics import polygon_mtf
 from foveasim.scene import Scene
@@ -201,7 +201,9 @@ def rules(result: Simulated) -> PartData:
 @part("A and B", lambda result: (result.capture, result.frozen and result.frozen.capture))
 def comparison(result: Simulated) -> PartData:
     """Return budgets and picture quality of the frozen variant and the current one."""
-    return ({"rows": []} if result.frozen is None else compare(result.frozen, result)), {}
+    if result.frozen is None:
+        raise SimulationError("there is no variant A to compare with")
+    return compare(result.frozen, result), {}
 
 
 def summary_of(result: Simulated) -> dict[str, Any]:

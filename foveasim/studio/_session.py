@@ -238,7 +238,7 @@ class Session:
             if message.get("do") == "set" and message.get("final", True):
                 self.history.commit(self.history.settings)  # a valid preview is the step
             key = message.get("key")
-            self._errors = {key if isinstance(key, str) else str(message.get("do")): _line(error)}
+            self._errors = {key if isinstance(key, str) else str(message.get("do")): _line(error).replace(f"{self.uploads}/", "")}
         else:
             self._errors = {}
         self._last_id = messages[-1].get("id")
@@ -357,9 +357,16 @@ class Session:
                 self._frozen = {"summary": summary_of(self.result), "settings": self.history.settings}
             case "unfreeze":
                 self._frozen = self._frozen_result = None
+                self._sent.pop("comparison", None)
             case "text":
-                text = self.text(_string(message, "what"))
-                self._send({"kind": "text", "id": message.get("id"), "what": message["what"], "text": text})
+                exported = self.exported()
+                self._send({
+                    "kind": "text",
+                    "id": message.get("id"),
+                    "what": message["what"],
+                    "text": self.text(_string(message, "what"), exported),
+                    "files": list(exported[1]),
+                })  # fmt: skip
             case "save":
                 path = self._save(_string(message, "name"))
                 self._send({"kind": "saved", "id": message.get("id"), "path": str(path)})
@@ -462,7 +469,8 @@ class Session:
         result = replace(result, frozen=self._frozen_result)
         times_ms = {"simulation": 1e3 * result.seconds_s}
         # Sites and their values belong together; the others in the order of their age.
-        names = sorted(self._views, key=lambda n: (n not in ("sites", "columns"), self._sent_version.get(n, -1)))
+        shown = [name for name in self._views if name != "comparison" or self._frozen_result is not None]
+        names = sorted(shown, key=lambda n: (n not in ("sites", "columns"), self._sent_version.get(n, -1)))
         for k, name in enumerate(names):
             part = PARTS[name]
             depends = part.depends(result)
@@ -486,7 +494,7 @@ class Session:
         self._send({"kind": "done", "id": self._last_id, "version": self._version, "ms": times_ms})
 
     def _send_error(self, number: Any, error: BaseException) -> None:
-        self._send({"kind": "error", "id": number, "text": _line(error)})
+        self._send({"kind": "error", "id": number, "text": _line(error).replace(f"{self.uploads}/", "")})
 
     def _send(self, message: dict[str, Any]) -> None:
         self._send_text(json.dumps(to_json(message), allow_nan=False))

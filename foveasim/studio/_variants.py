@@ -26,6 +26,8 @@ FOVEA_AREA_RATIO, SLIVER_QUANTILE = 2.0, 0.01
 #: Parameters of raster generators that the number of sites in a field of given size replaces.
 RASTER = ("grid", "hexagonal", "octagonal")
 RASTER_PARAMETERS = ("n_x", "n_y", "n_columns", "n_rows", "pitch_um", "pitch_y_um")
+#: Largest difference of the number of sites, in percent, where generators have no nearer possible number.
+MAX_PERCENT = 8
 #: Rows of the comparison: label and unit by name.
 ROWS = {
     "n_sites": ("photosites", ""),
@@ -147,21 +149,25 @@ def with_n_sites(settings: dict[str, Any], n_sites: int, layout: Layout) -> dict
         x0_um, y0_um, x1_um, y1_um = layout.bounds_um
         if parameters.get("size_um") is None:
             parameters["size_um"] = [round(x1_um - x0_um, 6), round(y1_um - y0_um, 6)]
-        for parameter in RASTER_PARAMETERS:
-            parameters.pop(parameter, None)
+        candidates = [{key: value for key, value in parameters.items() if key not in RASTER_PARAMETERS}]
     elif solvable and parameters.get("n_sites") is None:
         if not given:
             raise ParameterError("layout", f"of {name} must contain {' or '.join(each.name for each in solvable)}")
-        parameters.pop(_solvable(name, given, parameters, n_sites))
-    parameters["n_sites"] = n_sites
+        candidates = [{key: value for key, value in parameters.items() if key != other} for other in given]
+    else:
+        candidates = [parameters]
+    chosen = candidates[0] | {"n_sites": n_sites}
+    if solvable and LAYOUTS[name].picture is None:  # type: ignore[attr-defined]
+        chosen = _nearest(name, candidates, n_sites) or chosen  # without any, the generator reports the reason
+    found["layout"]["parameters"] = chosen
     return found
 
 
-def _solvable(generator: str, given: list[str], parameters: dict[str, Any], n_sites: int) -> str:
-    """Return the first parameter that the generator can solve for; the first one if none can be."""
-    for name in given if len(given) > 1 else ():
-        others = {key: value for key, value in parameters.items() if key != name}
-        with suppress(FoveasimError):
-            LAYOUTS[generator](**others, n_sites=n_sites)
-            return name
-    return given[0]
+def _nearest(generator: str, candidates: list[dict[str, Any]], n_sites: int) -> dict[str, Any] | None:
+    """Return the first parameters with a possible number of sites near the given one; None without any."""
+    for percent in sorted(range(-MAX_PERCENT, MAX_PERCENT + 1), key=abs):
+        for parameters in candidates:
+            with suppress(FoveasimError):
+                layout = LAYOUTS[generator](**{**parameters, "n_sites": round(n_sites * (1.0 + 0.01 * percent))})
+                return parameters | {"n_sites": layout.n_sites if percent else n_sites}
+    return None

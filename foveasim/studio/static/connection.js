@@ -30,7 +30,8 @@ export class Connection {
   // Callbacks: hello(message, { isSame: whether the token is that of an earlier connection }), message(message), part(part), status("open" | "lost" | "denied").
   constructor(on) {
     this.on = on;
-    this.token = location.hash.slice(1) || memory.get("token") || "";
+    // Settings of a link may follow.
+    this.token = location.hash.slice(1).split("&").find((part) => !part.includes("=")) || memory.get("token") || "";
     this.id = 0;
     this.delay = FIRST_DELAY_MS;
     this.isOpen = false;
@@ -102,6 +103,18 @@ export class Connection {
     const id = ++this.id;
     this.sentAt.set(id, performance.now());
     this.socket.send(JSON.stringify({ ...message, id }));
+    return id;
+  }
+
+  // Sends a frame of the camera: its header with the number of the message, and its pixels. Returns the number, or null.
+  sendFrame(header, pixels) {
+    if (!this.isOpen) return null;
+    const id = ++this.id, text = new TextEncoder().encode(JSON.stringify({ ...header, id })), message = new Uint8Array(4 + text.length + pixels.length);
+    this.sentAt.set(id, performance.now());
+    new DataView(message.buffer).setUint32(0, text.length, true);
+    message.set(text, 4);
+    message.set(pixels, 4 + text.length);
+    this.socket.send(message);
     return id;
   }
 

@@ -11,18 +11,22 @@ import { offsetsOf } from "/web/unpack.js";
 import { Editor } from "./authoring.js";
 import { boundaryOf } from "./boundary.js";
 import { CurveChart, Histogram, barRows } from "./charts.js";
+import { showComparison } from "./comparison.js";
 import { Connection, memory } from "./connection.js";
 import { Controls, valueAt } from "./controls.js";
 import { ImagePane } from "./image_pane.js";
+import { fragmentOf, settingsOf, stateOf } from "./links.js";
 import { copyText, listenToDialogs, listenToMenu, showText } from "./menus.js";
 import { RulesList } from "./rules_list.js";
 import { SitePane, useSoftware } from "./site_pane.js";
+import { Sources, isVideo } from "./sources.js";
 import { Steps } from "./steps.js";
 
 // Views in tiles, with the parts that they need; those that are shown at first on narrow and on wide screens.
 const TILES = [
   ["histogram", "Histogram", null], ["site", "Photosite", null], ["noise", "Noise", "noise"], ["spectrum", "Spectrum", "spectrum"],
   ["mtf", "MTF", "mtf"], ["rules", "Design rules", "rules"], ["steps", "Steps", null], ["summary", "Summary", null], ["selection", "Selection", null],
+  ["comparison", "A and B", "comparison"],
 ];
 const FIRST_TILES = ["histogram", "noise", "mtf", "summary"];
 const WIDE = 1800;
@@ -39,7 +43,7 @@ const page = {
   state: null, parts: {}, frozen: null, cursor: null, hovered: -1, pinned: -1, rectangle: null, selected: [], range: null, key: null, wantsLog: undefined,
   isSelecting: false, tiles: new Set(), asked: null, gazeAt: null, lastMs: NaN, nDone: 0, drawn: 0, boundary: null, isBusy: false,
 };
-let connection, controls, panes, charts, rules, editor, steps;
+let connection, controls, panes, charts, rules, editor, steps, sources;
 
 // -- drawing ------------------------------------------------------------------------------------------------------------
 
@@ -186,6 +190,7 @@ const USE = {
   noise: showNoise,
   spectrum: () => showCurves("spectrum"),
   mtf: () => showCurves("mtf"),
+  comparison: ({ about }) => { if (page.frozen) showTable(about); },
   rules: ({ about, arrays }) => { if (panes.b.sites) rules.use(about.rules, arrays, panes.b.sites); },
 };
 
@@ -215,6 +220,7 @@ function receive(message) {
     case "saved": notice("Saved as " + message.path); break;
     default:
   }
+  sources.receive(message);
 }
 
 function setBusy(isBusy) {
@@ -307,6 +313,7 @@ function hello(message, { isSame }) {
     page.offered = JSON.parse(stored);
     $("offer").hidden = false;
   }
+  openLink(location.hash);
 }
 
 function fillPresets(presets) {
@@ -331,6 +338,7 @@ function fillPresets(presets) {
 }
 
 function showConnection(status) {
+  if (status !== "open") sources.lost();
   document.body.classList.toggle("offline", status !== "open");
   if (status === "open") {
     if (!page.isBusy) showStatus("ready");
@@ -537,11 +545,13 @@ function freeze() {
   const { picture } = page.parts;
   if (picture) panes.pictureA.use(picture.about, picture.arrays.rgba);
   connection.send({ do: "freeze" });
+  showTile("comparison", true);
   showVariants();
 }
 
 function unfreeze() {
   page.frozen = null;
+  showTable(null);
   $("map-a").hidden = $("picture-a").hidden = true;
   document.body.classList.remove("compares");
   $("freeze").setAttribute("aria-pressed", "false");
@@ -561,6 +571,7 @@ function showVariants() {
 // -- files ------------------------------------------------------------------------------------------------------------------
 
 function useOf(name) {
+  if (isVideo(name)) return "video";
   if (/\.ya?ml$/i.test(name)) return "settings";
   return /\.(gds|gds2|gdsii|oas|oasis|geojson|json|npz|svg)(\.gz)?$/i.test(name) ? "layout" : "scene";
 }
@@ -575,7 +586,8 @@ async function uploadFile(file) {
     notice(file.name + ": " + answer.error);
     return;
   }
-  page.fileId = connection.send({ do: "file", path: answer.path, as: answer.as || useOf(file.name) });
+  const use = answer.as || useOf(file.name);
+  page.fileId = connection.send(use === "video" ? { do: "video", path: answer.path } : { do: "file", path: answer.path, as: use });
 }
 
 function listenToFiles() {
@@ -589,7 +601,7 @@ function listenToFiles() {
     $("drop").hidden = true;
     if (!hasFile(event)) return;
     event.preventDefault();
-    if (event.dataTransfer.files[0]) uploadFile(event.dataTransfer.files[0]);
+    if (!sources.dropped(event.dataTransfer) && event.dataTransfer.files[0]) uploadFile(event.dataTransfer.files[0]);
   });
   $("chosen-file").addEventListener("change", () => { if ($("chosen-file").files[0]) uploadFile($("chosen-file").files[0]); $("chosen-file").value = ""; });
   listenToMenu($("file"), $("file-menu"));
@@ -598,6 +610,8 @@ function listenToFiles() {
     if (!button) return;
     const { do: action, copy, file, extension } = button.dataset;
     if (action === "open") $("chosen-file").click();
+    else if (action === "open-link") $("link-dialog").showModal();
+    else if (action === "link" || action === "share") { page.wantsToken = action === "link"; connection.send({ do: "text", what: "link" }); }
     else if (action === "save") $("save-dialog").showModal();
     else if (action === "diff") connection.send({ do: "text", what: "diff" });
     else if (copy) connection.send({ do: "text", what: copy });
@@ -612,10 +626,26 @@ function listenToFiles() {
   });
 }
 
-function receiveText({ what, text }) {
-  if (what === "diff") showText("Differences", text || "The settings are those at the start.");
+async function receiveText({ what, text, files }) {
+  if (what === "link") {
+    await copyText(location.origin + location.pathname + "#" + (await fragmentOf(text, page.wantsToken ? connection.token : "")), "Link");
+    if (files.length) notice("The link contains only the names of uploaded files: " + files.join(", "));
+  } else if (what === "diff") showText("Differences", text || "The settings are those at the start.");
   else copyText(text, what === "yaml" ? "YAML" : "Python");
 }
+
+// Restores the settings of a link, which is then removed from the address; the server checks them.
+async function openLink(link) {
+  const compressed = stateOf(link);
+  if (compressed === null) return false;
+  if (link === location.hash) history.replaceState(null, "", "#" + connection.token);
+  const { settings, error } = await settingsOf(compressed);
+  if (error) notice(error);
+  else connection.send({ do: "restore", settings });
+  return true;
+}
+
+const showTable = (about) => showComparison({ table: $("comparison"), note: $("comparison-note"), button: $("match") }, about);
 
 // -- keys and buttons -------------------------------------------------------------------------------------------------------
 
@@ -652,6 +682,13 @@ function listenToButtons() {
     });
   }
   $("help").addEventListener("click", () => $("keys").showModal());
+  $("match").addEventListener("click", () => connection.send({ do: "match" }));
+  $("link-form").addEventListener("submit", async (event) => {
+    const text = $("link-text").value;
+    $("link-text").value = "";
+    if (event.submitter?.value === "open" && !(await openLink(text))) notice("The text is not a link of the studio");
+  });
+  addEventListener("hashchange", () => { if (connection.isOpen) openLink(location.hash); });
 }
 
 function listenToKeys() {
@@ -769,6 +806,10 @@ function start() {
     remove: (key) => connection.send({ do: "delete", key }),
   });
   createEditor();
+  sources = new Sources($("pane-scene"), {
+    connection: () => connection, state: () => page.state, choose: () => $("chosen-file").click(),
+    charts: () => [...controls.rows.values()].find((row) => row.control.key === "scene" && row.control.kind === "choice")?.control.choices || [],
+  });
   connection = new Connection({ hello, message: receive, part: receivePart, status: showConnection });
   createTiles();
   startTheme(showTheme);
@@ -784,7 +825,7 @@ start();
 
 // For tests and scripts.
 window.studio = {
-  page, panes, controls, connection, charts, rules, editor, steps,
+  page, panes, controls, connection, charts, rules, editor, steps, sources,
   get state() { return page.state; },
   get isReady() { return Boolean(page.state && panes.b.scale && !page.isBusy && connection.isOpen && connection.waiting === null && page.asked === null); },
   toWindow: (x, y, pane = "b") => {

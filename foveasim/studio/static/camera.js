@@ -1,0 +1,56 @@
+// Frames of a camera of this computer.
+
+// Longer sides of frames, pixels: three bytes per pixel of the largest are below the limit of a message.
+export const SIZES = [240, 320, 480, 640];
+export const FIRST_SIZE = 480;
+const PROBLEMS = {
+  NotAllowedError: "The browser does not permit the camera for this page",
+  NotFoundError: "There is no camera",
+  NotReadableError: "The camera is in use by another program",
+  OverconstrainedError: "There is no suitable camera",
+};
+
+export class Camera {
+  constructor() { this.size = FIRST_SIZE; this.canvas = document.createElement("canvas"); }
+
+  // Starts; returns null, or the reason in one line. ended() is called when the camera is disconnected.
+  async start(ended) {
+    if (!navigator.mediaDevices?.getUserMedia) return "Browsers permit cameras only at 127.0.0.1 or with https";
+    try {
+      this.stream = await navigator.mediaDevices.getUserMedia({ video: { width: { ideal: 640 }, height: { ideal: 480 } }, audio: false });
+      this.video = document.createElement("video");
+      this.video.muted = this.video.playsInline = true;
+      this.video.srcObject = this.stream;
+      await this.video.play();
+    } catch (error) {
+      this.stop();
+      return PROBLEMS[error.name] || "The camera does not start (" + error.name + ")";
+    }
+    for (const track of this.stream.getTracks()) track.addEventListener("ended", ended);
+    return null;
+  }
+
+  stop() {
+    for (const track of this.stream?.getTracks() || []) track.stop();
+    if (this.video) this.video.srcObject = null;
+    this.stream = this.video = null;
+  }
+
+  get isOn() { return Boolean(this.stream); }
+
+  // Returns the present frame: { width, height, pixels: RGB, top row first }.
+  frame() {
+    const { videoWidth, videoHeight } = this.video, scale = Math.min(1, this.size / Math.max(videoWidth, videoHeight));
+    const width = Math.max(1, Math.round(scale * videoWidth)), height = Math.max(1, Math.round(scale * videoHeight)), { canvas } = this;
+    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+    const context = canvas.getContext("2d", { willReadFrequently: true, alpha: false });
+    context.drawImage(this.video, 0, 0, width, height);
+    const { data } = context.getImageData(0, 0, width, height), pixels = new Uint8Array(3 * width * height);
+    for (let i = 0, k = 0; k < pixels.length; i += 4) {
+      pixels[k++] = data[i];
+      pixels[k++] = data[i + 1];
+      pixels[k++] = data[i + 2];
+    }
+    return { width, height, pixels };
+  }
+}

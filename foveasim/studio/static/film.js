@@ -1,0 +1,85 @@
+// Frames of a video file or a folder, one at a time: play, step, scrub.
+
+// Time of a picture of a folder in s.
+const PICTURE_S = 0.5;
+
+export class Film {
+  // show(n, isFinal) shows a frame, and resolves to false when it failed; changed() is called when the state changes.
+  constructor({ count, frameS, isSkipping, show, changed, n = 0 }) {
+    Object.assign(this, { count, n, frameS: frameS || PICTURE_S, isSkipping, show, changed });
+    this.isPlaying = false;
+    this.isBusy = false;
+    this.wanted = null;
+    this.rate = new Rate();
+  }
+
+  // Shows a frame; while another is computed, only the newest is shown next.
+  async go(n, isFinal = true) {
+    const to = Math.max(0, Math.min(this.count - 1, n));
+    if (this.isBusy) {
+      this.wanted = [to, isFinal];
+      return true;
+    }
+    this.isBusy = true;
+    const isShown = await this.show(to, isFinal).catch(() => false);
+    this.isBusy = false;
+    if (isShown) {
+      this.n = to;
+      this.rate.count();
+    } else this.isPlaying = false;
+    this.changed();
+    const next = this.wanted;
+    this.wanted = null;
+    return next ? this.go(...next) : isShown;
+  }
+
+  step(by) {
+    this.pause();
+    return this.go((this.wanted ? this.wanted[0] : this.n) + by);
+  }
+
+  // Plays at the rate of the file; frames are skipped when they take longer to compute.
+  async play() {
+    if (this.isPlaying || this.count < 2) return;
+    this.isPlaying = true;
+    this.rate = new Rate();
+    this.changed();
+    if (this.n >= this.count - 1) await this.go(0, false);
+    let start = performance.now() - 1000 * this.frameS * this.n;
+    while (this.isPlaying && this.n < this.count - 1) {
+      const due = Math.floor((performance.now() - start) / (1000 * this.frameS)), next = this.isSkipping ? Math.max(due, this.n + 1) : this.n + 1;
+      const wait = start + 1000 * this.frameS * next - performance.now();
+      if (wait > 0) await new Promise((resolve) => { setTimeout(resolve, wait); });
+      if (!this.isPlaying) break;
+      const before = this.n;
+      await this.go(next, false);
+      // A step of the slider or a late picture: time continues from there.
+      if (this.n !== next || (!this.isSkipping && wait < 0)) start = performance.now() - 1000 * this.frameS * this.n;
+      if (this.n === before && !this.isBusy) break;
+    }
+    const wasPlaying = this.isPlaying;
+    this.isPlaying = false;
+    this.changed();
+    if (wasPlaying) await this.go(this.n, true);
+  }
+
+  pause() {
+    this.isPlaying = false;
+    this.changed();
+  }
+}
+
+// Frames per second over the last second or two.
+export class Rate {
+  constructor() { this.times = []; }
+
+  count() {
+    const now = performance.now();
+    this.times = [...this.times.filter((time) => now - time < 2000), now];
+  }
+
+  get perS() {
+    const { times } = this;
+    return times.length > 2 ? ((times.length - 1) * 1000) / (times.at(-1) - times[0]) : NaN;
+  }
+}

@@ -1,0 +1,321 @@
+// Sources of the scene: photographs, videos, folders of pictures, the camera, test charts.
+
+import { $, make, notice } from "/web/page_parts.js";
+import { Camera, FIRST_SIZE, SIZES } from "./camera.js";
+import { Film, Rate } from "./film.js";
+import { listenToMenu } from "./menus.js";
+
+const VIDEO = /\.(mp4|m4v|mov|avi|mkv|webm|mpe?g|ogv|wmv|gif)$/i;
+const PICTURE = /\.(bmp|exr|hdr|jp2|jpe?g|png|ppm|tga|tiff?|webp)$/i;
+// Pictures that browsers can show.
+const SHOWN = /\.(bmp|jpe?g|png|webp)$/i;
+const MAX_PICTURES = 500;
+
+export const isVideo = (name) => VIDEO.test(name);
+
+export class Sources {
+  // Callbacks: connection(), state(), charts() (choices of the scene), choose() (a file), uploadAs(file).
+  constructor(pane, on) {
+    this.pane = pane;
+    this.on = on;
+    this.waiting = [];
+    this.film = null;
+    this.folder = null;
+    this.camera = new Camera();
+    this._build();
+  }
+
+  // -- elements -------------------------------------------------------------------------------------------------------------
+
+  _build() {
+    const bar = this.pane.querySelector(".bar"), frame = make("div", undefined, "menu-frame"), button = make("button", "Source "), arrow = make("span", "▾");
+    button.type = "button";
+    button.id = "source";
+    button.title = "Photograph, video, folder, camera or test chart as the scene";
+    arrow.setAttribute("aria-hidden", "true");
+    button.append(arrow);
+    this.menu = make("div", undefined, "menu right");
+    this.menu.id = "source-menu";
+    this.menu.hidden = true;
+    this.directory = make("input");
+    Object.assign(this.directory, { type: "file", webkitdirectory: true, multiple: true, className: "unseen", tabIndex: -1, id: "chosen-folder" });
+    this.directory.setAttribute("aria-label", "Folder of pictures");
+    frame.append(button, this.menu, this.directory);
+    bar.insertBefore(frame, $("follow-scene"));
+    this.row = make("div", undefined, "film");
+    this.row.id = "film";
+    this.row.hidden = true;
+    this.strip = make("div", undefined, "strip");
+    this.strip.id = "strip";
+    this.strip.hidden = true;
+    this.strip.setAttribute("role", "group");
+    this.strip.setAttribute("aria-label", "Pictures of the folder");
+    bar.after(this.row, this.strip);
+    const item = (name, title, act) => {
+      const found = make("button", name);
+      found.type = "button";
+      if (title) found.title = title;
+      found.setAttribute("aria-label", title || name);
+      found.addEventListener("click", act);
+      return found;
+    };
+    this.buttons = {
+      back: item("◂", "One frame back", () => this.film?.step(-1)),
+      play: item("▶", "Play", () => this._play()),
+      forward: item("▸", "One frame forward", () => this.film?.step(1)),
+      close: item("✕", "Close", () => this._close()),
+      camera: item("Stop", "Stop the camera; its last frame stays the scene", () => (this.camera.isOn ? this.stopCamera() : this.startCamera())),
+    };
+    this.slider = make("input");
+    Object.assign(this.slider, { type: "range", min: 0, step: 1, value: 0 });
+    this.slider.setAttribute("aria-label", "Frame");
+    this.slider.addEventListener("input", () => { this.film?.go(Number(this.slider.value), false); this.film?.pause(); });
+    this.slider.addEventListener("change", () => this.film?.go(Number(this.slider.value), true));
+    this.size = make("select");
+    this.size.setAttribute("aria-label", "Longer side of camera frames");
+    this.size.append(...SIZES.map((size) => { const option = make("option", size + " px"); option.value = size; return option; }));
+    this.size.value = FIRST_SIZE;
+    this.size.addEventListener("change", () => { this.camera.size = Number(this.size.value); });
+    this.label = make("span", undefined, "quiet");
+    const { back, play, forward, camera, close } = this.buttons;
+    this.row.append(back, play, forward, this.slider, camera, this.size, this.label, close);
+    button.addEventListener("click", () => this._fillMenu());
+    listenToMenu(button, this.menu);
+    this.menu.addEventListener("click", (event) => {
+      const chosen = event.target.closest("button");
+      if (chosen) this._choose(chosen.dataset);
+    });
+    this.directory.addEventListener("change", () => { this.openFolder([...this.directory.files].filter((file) => file.webkitRelativePath.split("/").length <= 2)); this.directory.value = ""; });
+  }
+
+  _fillMenu() {
+    const entry = (text, data) => { const button = make("button", text); button.type = "button"; Object.assign(button.dataset, data); return button; };
+    const charts = this.on.charts().filter(({ label }) => label !== "picture");
+    this.menu.replaceChildren(
+      entry("Photograph or video…", { source: "file" }), entry("Folder of pictures…", { source: "folder" }), entry(this.camera.isOn ? "Stop the camera" : "Camera", { source: "camera" }),
+      make("hr"), make("h3", "Test charts"), ...charts.map(({ label }) => entry(label[0].toUpperCase() + label.slice(1), { source: "chart", label })),
+    );
+  }
+
+  _choose({ source, label }) {
+    if (source === "file") this.on.choose();
+    else if (source === "folder") this.directory.click();
+    else if (source === "camera") { if (this.camera.isOn) this.stopCamera(); else this.startCamera(); }
+    else if (source === "chart") {
+      const chart = this.on.charts().find((choice) => choice.label === label);
+      if (chart) this.on.connection().send({ do: "set", key: "scene", value: chart.value, final: true });
+    }
+  }
+
+  // -- answers of the server --------------------------------------------------------------------------------------------------
+
+  // Resolves to whether the message succeeded, after its result is shown.
+  _answered(id) { return id === null ? Promise.resolve(false) : new Promise((resolve) => { this.waiting.push({ id, resolve }); }); }
+
+  receive(message) {
+    const { kind, id } = message, isFailed = (kind === "error" && !message.part) || (kind === "state" && Object.keys(message.errors || {}).length > 0);
+    if (kind === "state") this._useState(message);
+    if (kind !== "done" && !isFailed) return;
+    for (const one of this.waiting.filter((each) => id >= each.id)) one.resolve(!isFailed || one.id !== id);
+    if (isFailed && this.waiting.some((each) => each.id === id)) notice(message.text || Object.values(message.errors)[0]);
+    this.waiting = this.waiting.filter((each) => !(id >= each.id));
+  }
+
+  lost() {
+    for (const { resolve } of this.waiting) resolve(false);
+    this.waiting = [];
+    this.film?.pause();
+    if (this.camera.isOn) this.stopCamera();
+  }
+
+  _useState({ film, settings }) {
+    const picture = settings.scene?.picture, k = this.folder ? this.folder.findIndex(({ path }) => path && path === picture) : -1;
+    if (film?.kind === "video") {
+      if (this.kind !== "video" || this.shownName !== film.name || this.film.count !== film.n_frames) {
+        this.film?.pause();
+        this.film = new Film({ count: film.n_frames, n: film.n, frameS: film.frame_s, isSkipping: true, show: (n) => this._answered(this.on.connection().send({ do: "frame", n })), changed: () => this._show() });
+      } else if (!this.film.isBusy) this.film.n = film.n;
+      this.shownName = film.name;
+    } else if (film?.kind === "camera") {
+      this.film?.pause();
+      this.film = null;
+    } else if (k >= 0) {
+      if (this.kind !== "folder") this.film = this._folderFilm(k);
+      else if (!this.film.isBusy) this.film.n = k;
+    } else if (this.film && !(this.kind === "folder" && this.film.isBusy)) {
+      this.film.pause();
+      this.film = null;
+    }
+    this.kind = film?.kind || (this.film && this.folder ? "folder" : null);
+    this.about = film;
+    if (this.camera.isOn && this.isLive && film?.kind !== "camera") this.stopCamera();
+    this._show();
+  }
+
+  // -- display ------------------------------------------------------------------------------------------------------------------
+
+  _show() {
+    const { film, kind, camera } = this, isCamera = kind === "camera" || camera.isOn, rate = (isCamera ? this.rate : film?.rate)?.perS;
+    const { back, play, forward, camera: stop } = this.buttons;
+    this.row.hidden = !film && !isCamera;
+    this.strip.hidden = !(this.folder && (kind === "folder"));
+    if (this.row.hidden) return;
+    for (const each of [back, play, forward, this.slider]) each.hidden = isCamera;
+    for (const each of [stop, this.size]) each.hidden = !isCamera;
+    this.row.classList.toggle("live", camera.isOn);
+    const perS = Number.isFinite(rate) && (film?.isPlaying || camera.isOn) ? rate.toFixed(rate < 10 ? 1 : 0) + " frames/s" : "";
+    if (isCamera) {
+      stop.textContent = camera.isOn ? "Stop" : "Start";
+      stop.title = camera.isOn ? "Stop the camera; its last frame stays the scene" : "Start the camera again";
+      stop.setAttribute("aria-label", stop.title);
+      const size = this.about?.kind === "camera" ? this.about.width + " × " + this.about.height : "";
+      this.label.textContent = camera.isOn ? ["live", size, perS].filter(Boolean).join(" · ") : "camera stopped, last frame";
+      return;
+    }
+    const total = String(film.count);
+    this.slider.max = film.count - 1;
+    if (film.isPlaying || !film.isBusy) this.slider.value = film.n;
+    this.slider.setAttribute("aria-valuetext", "Frame " + (film.n + 1) + " of " + total);
+    play.textContent = film.isPlaying ? "❚❚" : "▶";
+    play.title = film.isPlaying ? "Pause" : "Play";
+    play.setAttribute("aria-label", play.title);
+    play.disabled = film.count < 2;
+    back.disabled = film.n <= 0;
+    forward.disabled = film.n >= film.count - 1;
+    const name = kind === "folder" ? this.folder[film.n]?.file.name : this.about?.name;
+    this.label.textContent = String(film.n + 1).padStart(total.length, "\u2007") + " / " + total + (perS ? " · " + perS : "");
+    this.label.title = name || "";
+    if (kind === "folder") [...this.strip.children].forEach((cell, k) => {
+      const isCurrent = k === film.n;
+      if (isCurrent && cell.getAttribute("aria-current") !== "true") cell.scrollIntoView({ block: "nearest", inline: "nearest" });
+      cell.setAttribute("aria-current", isCurrent);
+    });
+  }
+
+  _play() {
+    if (!this.film) return;
+    if (this.film.isPlaying) this.film.pause();
+    else this.film.play();
+  }
+
+  // Closes the row; the current frame stays the scene.
+  _close() {
+    this.stopCamera();
+    this.film?.pause();
+    this.film = this.kind = null;
+    if (this.folder) this._forgetFolder();
+    this.row.hidden = this.strip.hidden = true;
+    $("source").focus();
+  }
+
+  // -- folders --------------------------------------------------------------------------------------------------------------------
+
+  // Uses files of a drop that are more than one, or in a folder; returns whether it does.
+  dropped(transfer) {
+    const entries = [...transfer.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean), directory = entries.find((entry) => entry.isDirectory);
+    if (directory) {
+      filesOf(directory).then((files) => this.openFolder(files), () => notice("The folder cannot be read"));
+      return true;
+    }
+    const files = [...transfer.files];
+    if (files.length < 2 || !files.every(({ name }) => PICTURE.test(name))) return false;
+    this.openFolder(files);
+    return true;
+  }
+
+  openFolder(files) {
+    const pictures = files.filter(({ name }) => PICTURE.test(name) && !name.startsWith(".")).sort((a, b) => a.name.localeCompare(b.name, "en", { numeric: true }));
+    if (!pictures.length) { notice("The folder contains no pictures"); return; }
+    if (pictures.length > MAX_PICTURES) notice("The first " + MAX_PICTURES + " of " + pictures.length + " pictures are used");
+    this._forgetFolder();
+    this.film?.pause();
+    this.folder = pictures.slice(0, MAX_PICTURES).map((file) => ({ file, path: null, address: null }));
+    this.strip.replaceChildren(...this.folder.map((item, k) => {
+      const cell = make("button");
+      cell.type = "button";
+      cell.title = item.file.name;
+      cell.setAttribute("aria-label", item.file.name);
+      if (SHOWN.test(item.file.name)) {
+        const image = make("img");
+        item.address = URL.createObjectURL(item.file);
+        Object.assign(image, { loading: "lazy", decoding: "async", alt: "", src: item.address });
+        cell.append(image);
+      } else cell.append(make("span", item.file.name.split(".").at(-1)));
+      cell.addEventListener("click", () => { this.film?.pause(); this.film?.go(k); });
+      return cell;
+    }));
+    this.film = this._folderFilm(0);
+    this.kind = "folder";
+    this.film.go(0);
+  }
+
+  _folderFilm(n) {
+    return new Film({ count: this.folder.length, n, isSkipping: false, show: (k, isFinal) => this._showPicture(k, isFinal), changed: () => this._show() });
+  }
+
+  async _showPicture(k, isFinal) {
+    const item = this.folder?.[k], connection = this.on.connection();
+    if (!item) return false;
+    if (!item.path) {
+      const answer = await connection.upload(item.file);
+      if (answer.error) { notice(item.file.name + ": " + answer.error); return false; }
+      item.path = answer.path;
+    }
+    // The first picture makes the scene a photograph; the next ones replace it.
+    const { scene } = this.on.state().settings, isOfFolder = this.folder?.some(({ path }) => path && path === scene.picture);
+    return this._answered(connection.send(isOfFolder ? { do: "set", key: "scene.picture", value: item.path, final: isFinal } : { do: "file", path: item.path, as: "scene" }));
+  }
+
+  _forgetFolder() {
+    for (const { address } of this.folder || []) if (address) URL.revokeObjectURL(address);
+    this.folder = null;
+    this.strip.replaceChildren();
+  }
+
+  // -- camera ---------------------------------------------------------------------------------------------------------------------
+
+  async startCamera() {
+    if (this.camera.isOn || this.isStarting) return;
+    this.isStarting = true;
+    const problem = await this.camera.start(() => { this.stopCamera(); notice("The camera was disconnected"); });
+    this.isStarting = false;
+    if (problem) { notice(problem); return; }
+    this.film?.pause();
+    this.rate = new Rate();
+    this.isLive = false;
+    this._show();
+    let isFirst = true;
+    while (this.camera.isOn) {
+      if (document.hidden) {
+        await new Promise((resolve) => { document.addEventListener("visibilitychange", resolve, { once: true }); });
+        continue;
+      }
+      const { width, height, pixels } = this.camera.frame();
+      const isShown = await this._answered(this.on.connection().sendFrame({ width, height, is_first: isFirst }, pixels));
+      if (!isShown) break;
+      this.isLive = true;
+      isFirst = false;
+      this.rate.count();
+      this._show();
+    }
+    this.stopCamera();
+  }
+
+  stopCamera() {
+    if (!this.camera.isOn) return;
+    this.camera.stop();
+    this.isLive = false;
+    this._show();
+  }
+}
+
+// Returns the files of a dropped directory, without those of directories in it.
+async function filesOf(directory) {
+  const reader = directory.createReader(), found = [];
+  for (;;) {
+    const entries = await new Promise((resolve, reject) => { reader.readEntries(resolve, reject); });
+    if (!entries.length) break;
+    found.push(...entries.filter((entry) => entry.isFile));
+  }
+  return Promise.all(found.map((entry) => new Promise((resolve, reject) => { entry.file(resolve, reject); })));
+}

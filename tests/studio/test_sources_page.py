@@ -1,0 +1,468 @@
+"""Sources, comparison and links on the page of the studio, in a browser."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import zipfile
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+pytest.importorskip("starlette")
+pytest.importorskip("uvicorn")
+
+from PIL import Image
+from studio.test_studio_page import (
+    SOFTWARE,
+    browser,  # noqa: F401 -- fixture
+    change,
+    codes,
+    drop,
+    server,  # noqa: F401 -- fixture
+    set_value,
+    setting,
+    settle,
+    until,
+    visit,  # noqa: F401 -- fixture
+)
+
+from foveasim.config import read_shot
+
+pytestmark = pytest.mark.needs("chromium")
+
+#: A camera that shows a moving picture.
+FAKE_CAMERA = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
+SIZE = (48, 32)
+
+
+def photograph(k):
+    return np.random.default_rng(k).integers(0, 255, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
+
+
+def png(k):
+    buffer = io.BytesIO()
+    Image.fromarray(photograph(k)).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def video(tmp_path, name="clip.mp4", n_frames=12):
+    """Return a video whose frames differ in their brightness."""
+    av = pytest.importorskip("av")
+    path = tmp_path / name
+    codec, pixels = {"mp4": ("mpeg4", "yuv420p"), "avi": ("mpeg4", "yuv420p"), "gif": ("gif", "rgb8")}[name[-3:]]
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=Fraction(10))
+        stream.width, stream.height, stream.pix_fmt = *SIZE, pixels
+        for k in range(n_frames):
+            frame = np.full((SIZE[1], SIZE[0], 3), 40 + 15 * k, np.uint8)
+            frame[: SIZE[1] // 2] //= 2
+            for packet in stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")):
+                container.mux(packet)
+        for packet in stream.encode():
+            container.mux(packet)
+    return path.read_bytes()
+
+
+def ready(page):
+    until(page, "() => studio.isReady && !studio.sources.film?.isBusy && studio.sources.waiting.length === 0")
+
+
+def film(page):
+    until(page, "() => studio.state.film && !document.getElementById('film').hidden")
+    ready(page)
+    return page.evaluate("studio.state.film")
+
+
+def unzipped(page, directory):
+    page.click("#file")
+    with page.expect_download() as download:
+        page.click("[data-file=zip]")
+    with zipfile.ZipFile(download.value.path()) as archive:
+        archive.extractall(directory)
+        return sorted(archive.namelist())
+
+
+def codes_of(path):
+    shot = read_shot(path)
+    return shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed).code
+
+
+def drop_all(page, files):
+    page.evaluate(
+        """(files) => { const data = new DataTransfer(); for (const [name, bytes] of files) data.items.add(new File([new Uint8Array(bytes)], name));
+        for (const type of ["dragenter", "dragover", "drop"]) document.body.dispatchEvent(new DragEvent(type, { dataTransfer: data, bubbles: true, cancelable: true })); }""",
+        [[name, list(content)] for name, content in files],
+    )
+
+
+def message(page, pattern):
+    until(
+        page,
+        "pattern => [document.getElementById('problem'), document.getElementById('notice')].some((e) => !e.hidden && new RegExp(pattern).test(e.textContent))",
+        pattern,
+    )
+
+
+# -- videos -----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["clip.mp4", "clip.avi", "clip.gif"])
+def test_dropped_video_shows_its_frames(visit, tmp_path, name):
+    page = visit()
+    drop(page, name, video(tmp_path, name))
+    about = film(page)
+
+    assert (about["kind"], about["n"], about["n_frames"]) == ("video", 0, 12)
+    first = codes(page)
+    page.click("[aria-label='One frame forward']")
+    until(page, "() => studio.state.film.n === 1")
+    ready(page)
+    second = codes(page)
+    assert second.mean() > first.mean()
+    page.locator("#film input").fill("11")
+    until(page, "() => studio.state.film.n === 11")
+    ready(page)
+    assert codes(page).mean() > second.mean()
+    page.click("[aria-label='One frame back']")
+    until(page, "() => studio.state.film.n === 10")
+    ready(page)
+    assert "11 / 12" in page.inner_text("#film .quiet")
+    change(page, "() => { studio.connection.send({ do: 'undo' }); }")
+    assert setting(page, "scene.picture") == "skimage:astronaut"
+    assert page.is_hidden("#film")
+
+
+def test_video_plays_while_gaze_moves(visit, tmp_path):
+    page = visit()
+    drop(page, "clip.mp4", video(tmp_path))
+    film(page)
+    page.click("[aria-label='Play']")
+    until(page, "() => studio.state.film.n >= 3")
+    page.evaluate("() => { studio.connection.set('layout.move_um', [-100, 250], true); }")
+    until(page, "() => studio.state.film.n === 11 && !studio.sources.film.isPlaying")
+    ready(page)
+
+    assert setting(page, "layout.move_um") == [-100, 250]
+    change(page, "() => { studio.connection.send({ do: 'undo' }); }")
+    assert setting(page, "layout.move_um") == [-140.0, 320.0]
+    assert page.evaluate("studio.state.film.n") == 11
+    change(page, "() => { studio.connection.send({ do: 'undo' }); }")
+    assert setting(page, "scene.picture") == "skimage:astronaut"
+
+
+def test_archive_of_frame_has_same_codes(visit, tmp_path):
+    page = visit()
+    drop(page, "clip.mp4", video(tmp_path))
+    film(page)
+    page.evaluate("() => { studio.sources.film.go(7); }")
+    until(page, "() => studio.state.film.n === 7")
+    ready(page)
+    names = unzipped(page, tmp_path / "all")
+
+    assert {"clip_frame_7.png", "test.yaml", "test.py", "test.ipynb"} <= set(names)
+    assert np.array_equal(codes(page), codes_of(tmp_path / "all" / "test.yaml"))
+
+
+def test_corrupt_videos_give_one_line(visit, tmp_path):
+    page = visit()
+    before = codes(page)
+    drop(page, "notes.mp4", b"This is a text.\n" * 50)
+    message(page, r"notes\.mp4.*not a readable video")
+    drop(page, "cut.mp4", video(tmp_path)[:300])
+    message(page, r"cut\.mp4")
+
+    assert page.is_hidden("#film")
+    assert np.array_equal(codes(page), before)
+    assert not page.is_disabled("#freeze")
+
+
+def test_empty_and_large_files_give_one_line(visit):
+    page = visit(is_checked=False)
+    before = codes(page)
+    drop(page, "empty.png", b"")
+    message(page, r"empty\.png: the file is empty")
+    page.evaluate(
+        """() => { const data = new DataTransfer(); data.items.add(new File([new Uint8Array(65 * 2 ** 20)], "large.png"));
+        document.body.dispatchEvent(new DragEvent("drop", { dataTransfer: data, bubbles: true, cancelable: true })); }"""
+    )
+    message(page, r"large\.png: (files may have at most 64 MiB|The server)")
+
+    assert np.array_equal(codes(page), before)
+
+
+# -- folders and charts ---------------------------------------------------------------------------------------------------------
+
+
+def test_folder_becomes_a_film_strip(visit, tmp_path):
+    page = visit()
+    drop_all(page, [(f"picture {k}.png", png(k)) for k in (10, 2, 1)])
+    until(page, "() => !document.getElementById('strip').hidden")
+    ready(page)
+
+    assert page.locator("#strip button").evaluate_all("all => all.map((b) => b.title)") == [
+        "picture 1.png",
+        "picture 2.png",
+        "picture 10.png",
+    ]
+    assert "picture_1" in setting(page, "scene.picture")
+    page.locator("#strip button").nth(2).click()
+    until(page, "() => /picture_10/.test(studio.state.settings.scene.picture)")
+    ready(page)
+    assert page.locator("#strip [aria-current=true]").get_attribute("title") == "picture 10.png"
+    page.click("[aria-label='Play']")
+    until(page, "() => studio.sources.film.n === 2 && !studio.sources.film.isPlaying", None)
+    ready(page)
+    names = unzipped(page, tmp_path / "all")
+    assert "picture_10.png" in names
+    assert np.array_equal(codes(page), codes_of(tmp_path / "all" / "test.yaml"))
+    page.click("#film [aria-label='Close']")
+    assert page.is_hidden("#strip")
+
+
+def test_corrupt_picture_of_folder_is_named(visit):
+    page = visit()
+    drop_all(page, [("a.png", png(1)), ("b.png", b"no picture")])
+    until(page, "() => !document.getElementById('strip').hidden")
+    ready(page)
+    page.locator("#strip button").nth(1).click()
+    message(page, r"b\.png")
+    ready(page)
+
+    assert "a.png" in setting(page, "scene.picture")
+
+
+def test_source_menu_selects_test_chart(visit):
+    page = visit()
+    page.focus("#source")
+    page.keyboard.press("Enter")
+    page.locator("#source-menu button", has_text="Siemens star").click()
+    until(page, "() => studio.state.settings.scene.kind === 'siemens_star' && studio.isReady")
+
+    assert page.evaluate("Object.keys(studio.state.errors).length") == 0
+    assert len(np.unique(codes(page))) > 2
+
+
+# -- camera -------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def camera_browser(browser):  # noqa: F811
+    chromium = browser.browser_type.launch(executable_path=shutil.which("chromium"), args=[*SOFTWARE, *FAKE_CAMERA])
+    yield chromium
+    chromium.close()
+
+
+@pytest.fixture
+def visit_camera(server, camera_browser):  # noqa: F811
+    """Open a page of a browser with a camera."""
+    contexts = []
+
+    def open_page(**options):
+        context = camera_browser.new_context(viewport={"width": 1280, "height": 800}, **{"bypass_csp": True, **options})
+        contexts.append(context)
+        page = context.new_page()
+        page.set_default_timeout(60_000)
+        page.goto(server.address)
+        settle(page)
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+
+
+def start_camera(page):
+    page.click("#source")
+    page.locator("#source-menu button", has_text="Camera").click()
+
+
+def test_camera_frames_follow_live(visit_camera, tmp_path):
+    page = visit_camera()
+    start_camera(page)
+    until(page, "() => studio.state.film && studio.state.film.n >= 4")
+    first = page.evaluate("studio.state.film")
+    assert (first["kind"], first["width"], first["height"]) == ("camera", 480, 360)
+    before = codes(page)
+    until(page, "n => studio.state.film.n >= n + 8", first["n"])
+    assert not np.array_equal(codes(page), before)
+    page.evaluate("() => { studio.connection.set('exposure_s', 0.01, true); }")
+    until(page, "() => studio.state.settings.exposure_s === 0.01")
+    page.click("#film button:has-text('Stop')")
+    ready(page)
+    n = page.evaluate("studio.state.film.n")
+    page.wait_for_timeout(300)
+    assert page.evaluate("studio.state.film.n") == n
+    names = unzipped(page, tmp_path / "all")
+    assert sum(name.startswith("camera_") for name in names) == 1
+    assert np.array_equal(codes(page), codes_of(tmp_path / "all" / "test.yaml"))
+    # One step for the camera and one for the exposure, however many frames there were.
+    change(page, "() => { studio.connection.send({ do: 'undo' }); studio.connection.send({ do: 'undo' }); }")
+    assert setting(page, "scene.picture") == "skimage:astronaut"
+    assert page.is_disabled("#undo")
+
+
+def test_undo_stops_the_camera(visit_camera):
+    page = visit_camera()
+    start_camera(page)
+    until(page, "() => studio.state.film && studio.state.film.n >= 2")
+    page.click("#undo")
+    until(page, "() => !studio.sources.camera.isOn && studio.state.film === null")
+
+    assert setting(page, "scene.picture") == "skimage:astronaut"
+    assert page.is_hidden("#film")
+
+
+def test_missing_camera_gives_one_line(visit):
+    page = visit()
+    start_camera(page)
+    message(page, "There is no camera|does not permit")
+
+    assert page.is_hidden("#film")
+    assert setting(page, "scene.picture") == "skimage:astronaut"
+
+
+# -- comparison ---------------------------------------------------------------------------------------------------------------
+
+
+def rows(page):
+    until(page, "() => document.querySelectorAll('#comparison tr').length > 5")
+    ready(page)
+    found = page.locator("#comparison tr[data-name]").evaluate_all(
+        "all => all.map((row) => [row.dataset.name, [...row.querySelectorAll('td')].map((cell) => cell.textContent)])"
+    )
+    return dict(found)
+
+
+def test_match_gives_the_same_number_of_sites(visit):
+    page = visit()
+    page.click("#freeze")
+    form = page.locator(".control[data-key='layout'] select")
+    form.evaluate("select => { select.closest('details').open = true; }")
+    form.select_option(label="grid")
+    until(page, "() => studio.isReady && studio.state.settings.layout.generator === 'grid'")
+    until(page, "() => document.querySelectorAll('#comparison tr.differs').length > 5")
+    before = rows(page)
+    assert before["n_sites"] == ["912", "14,400"]
+    page.click("#match")
+    until(page, "() => studio.isReady && studio.panes.b.sites.n < 2000")
+    after = rows(page)
+
+    assert after["n_sites"] == ["912", "900"]
+    assert page.evaluate("studio.state.summary.width_um") == pytest.approx(960.0, rel=1e-6)
+    assert all(float(value) > 5 for value in after["fovea_psnr_db"] + after["field_psnr_db"])
+    page.click("#freeze")
+    assert page.is_hidden("#comparison")
+
+
+def test_equal_variants_have_equal_rows(visit):
+    page = visit()
+    page.click("#freeze")
+    found = rows(page)
+
+    assert all(a == b for a, b in found.values())
+    assert found["bits_per_frame"] == ["9,120", "9,120"]
+    assert found["frames_per_s"] == ["50", "50"]
+    assert page.is_disabled("#match")
+
+
+# -- notebook, archive, links ---------------------------------------------------------------------------------------------------
+
+
+def test_notebook_of_page_names_its_files(visit, tmp_path):
+    page = visit()
+    drop(page, "photo.png", png(3))
+    until(page, "() => /photo/.test(studio.state.settings.scene.picture) && studio.isReady")
+    page.click("#file")
+    with page.expect_download() as download:
+        page.click("[data-file=notebook]")
+    cells = json.loads(download.value.path().read_text("utf-8"))["cells"]
+
+    assert "`photo.png`" in cells[0]["source"]
+    assert '"photo.png"' in "".join(cell["source"] for cell in cells)
+
+
+def copied_link(page, name):
+    page.evaluate("() => { window.copied = null; navigator.clipboard.writeText = async (text) => { copied = text; }; }")
+    page.click("#file")
+    page.click(f"[data-do={name}]")
+    until(page, "() => copied !== null")
+    return page.evaluate("copied")
+
+
+def test_link_restores_the_state(visit, server):  # noqa: F811
+    page = visit()
+    set_value(page, "optics.f_number", 4.0)
+    wanted = codes(page)
+    shared, own = copied_link(page, "share"), copied_link(page, "link")
+    token = server.address.split("#")[1]
+    assert token not in shared
+    assert own.startswith(server.address + "&state=")
+
+    other = visit()
+    other.click("#file")
+    other.click("[data-do=open-link]")
+    other.fill("#link-text", shared)
+    other.click("#link-form button[value=open]")
+    until(other, "() => studio.state.settings.optics.f_number === 4 && studio.isReady")
+    assert np.array_equal(codes(other), wanted)
+    third = visit(address=own)
+    until(third, "() => window.studio && studio.isReady && studio.state.settings.optics.f_number === 4")
+    assert np.array_equal(codes(third), wanted)
+    assert third.evaluate("location.hash") == "#" + token
+    assert third.is_enabled("#undo")
+
+
+@pytest.mark.parametrize("text", ["hello", "http://127.0.0.1/#state=AAAA", "#state=!!!"])
+def test_invalid_links_give_one_line(visit, text):
+    page = visit()
+    page.click("#file")
+    page.click("[data-do=open-link]")
+    page.fill("#link-text", text)
+    page.click("#link-form button[value=open]")
+
+    message(page, "not a link of the studio|not one of the studio")
+
+
+def test_large_links_give_one_line(visit):
+    page = visit()
+    link = page.evaluate("""async () => {
+      const stream = new Blob([new Uint8Array(5e7)]).stream().pipeThrough(new CompressionStream("deflate-raw"));
+      const bytes = new Uint8Array(await new Response(stream).arrayBuffer());
+      return "#state=" + btoa(Array.from(bytes, (b) => String.fromCharCode(b)).join("")).replaceAll("+", "-").replaceAll("/", "_");
+    }""")
+    page.click("#file")
+    page.click("[data-do=open-link]")
+    page.fill("#link-text", link)
+    page.click("#link-form button[value=open]")
+
+    message(page, "not one of the studio")
+
+
+def test_links_cannot_name_other_files(visit):
+    page = visit()
+    link = page.evaluate("""async () => {
+      const settings = structuredClone(studio.state.settings);
+      settings.scene.picture = "/etc/passwd";
+      const { fragmentOf } = await import("/static/links.js");
+      return "#" + await fragmentOf(JSON.stringify(settings));
+    }""")
+    page.click("#file")
+    page.click("[data-do=open-link]")
+    page.fill("#link-text", link)
+    page.click("#link-form button[value=open]")
+    message(page, "'/etc/passwd' is not available here; upload the file")
+
+    assert setting(page, "scene.picture") == "skimage:astronaut"
+
+
+def test_link_lists_uploaded_files(visit):
+    page, other = visit(), visit()
+    drop(page, "photo.png", png(3))
+    until(page, "() => /photo/.test(studio.state.settings.scene.picture) && studio.isReady")
+    link = copied_link(page, "share")
+    message(page, r"only the names of uploaded files: photo\.png")
+    other.evaluate("link => { location.hash = link.slice(link.indexOf('#')); }", link)
+    message(other, r"'photo\.png' is not available here; upload the file")
