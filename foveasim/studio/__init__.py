@@ -7,8 +7,11 @@ Every setting of a shot is a control; scene, photosites, picture, noise and desi
 from __future__ import annotations
 
 import ipaddress
+import os
+import re
 import socket
 import sys
+import tempfile
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
@@ -18,12 +21,14 @@ from foveasim._core.extras import needs
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import check_count
 from foveasim.config import check_directory
-from foveasim.errors import FoveasimWarning, ParameterError, SimulationError
+from foveasim.errors import FileError, FoveasimWarning, ParameterError, SimulationError
 
 __all__ = ["run_studio"]
 
 #: Modules of the extra.
 MODULES = ("starlette", "uvicorn", "websockets")
+#: Environment variable with the token of the address, and its minimum length.
+TOKEN_VARIABLE, MIN_TOKEN_LENGTH = "FOVEASIM_STUDIO_TOKEN", 24
 
 
 def run_studio(
@@ -60,12 +65,20 @@ def run_studio(
     ConfigError
         When the settings file cannot be read, or is invalid.
     ParameterError
-        When the port is out of range or in use, or the host is not an address of this computer.
+        When the port is out of range or in use, the host is not an address of this computer, or the token of the environment is
+        too short.
+    FileError
+        When the directory for saved files cannot be created or written.
 
     Warns
     -----
     FoveasimWarning
         When the host is not a loopback address.
+
+    Notes
+    -----
+    The address contains a random token. The environment variable ``FOVEASIM_STUDIO_TOKEN`` specifies another one, so that the
+    address is the same after a restart.
     """
     for module in MODULES:
         _require(module)
@@ -75,7 +88,8 @@ def run_studio(
     from foveasim.studio._session import Start
 
     port = check_count("port", port, at_least=0, at_most=2**16 - 1)
-    directory = None if out is None else check_directory(out)
+    token = _own_token()
+    directory = None if out is None else _writable(out)
     settings, name = start_settings(shot)
     check_settings(None if shot is None else Path(shot), settings)
     start = Start(settings, name, None if shot is None else Path(shot).absolute().parent, directory)
@@ -94,7 +108,7 @@ def run_studio(
         ) from None
     with listener:
         found = int(listener.getsockname()[1])
-        studio = Studio(start, hosts=host_names(host, found))
+        studio = Studio(start, token=token, hosts=host_names(host, found))
         shown = "127.0.0.1" if host in UNSPECIFIED else f"[{host}]" if ":" in host else host
         address = f"http://{shown}:{found}/#{studio.token}"
 
@@ -116,6 +130,26 @@ def _require(module: str) -> None:
         import_module(module)
     except ImportError:
         raise SimulationError(f"the studio {needs(module)}") from None
+
+
+def _own_token() -> str | None:
+    """Return the token of the environment, None without one; it is not repeated in messages."""
+    token = os.environ.get(TOKEN_VARIABLE)
+    if token is not None and not re.fullmatch(rf"[A-Za-z0-9_-]{{{MIN_TOKEN_LENGTH},}}", token):
+        raise ParameterError(TOKEN_VARIABLE, f"must have at least {MIN_TOKEN_LENGTH} characters of A-Z, a-z, 0-9, '-', '_'")
+    return token
+
+
+def _writable(out: str | Path) -> Path:
+    """Return the directory for saved files, which is created and written once, before the first page opens."""
+    directory = check_directory(out)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=directory):
+            pass
+    except OSError as error:
+        raise FileError(directory, f"cannot be written: {error.strerror or error}") from None
+    return directory
 
 
 def _is_loopback(host: str) -> bool:

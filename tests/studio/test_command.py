@@ -65,6 +65,40 @@ def test_tokens_are_random(started):
     assert len(started[0].token) == 32
 
 
+def test_token_of_environment_is_used(started, monkeypatch):
+    monkeypatch.setenv("FOVEASIM_STUDIO_TOKEN", "a-token_that_is_long_enough_1")
+    run_studio(open_browser=False, announce=lambda *_: None)
+
+    assert started[0].token == "a-token_that_is_long_enough_1"
+
+
+@pytest.mark.parametrize("token", ["", "a" * 23, "a" * 24 + "&state=x", "ä" * 30])
+def test_invalid_tokens_are_not_printed(monkeypatch, token):
+    monkeypatch.setenv("FOVEASIM_STUDIO_TOKEN", token)
+    result = CliRunner().invoke(app, ["studio", "--no-browser"])
+
+    assert result.exit_code == 1
+    assert "must have at least 24 characters" in str(result.exception)
+    assert not token or token not in str(result.exception)
+
+
+def test_directory_for_files_is_created_first(started, tmp_path):
+    run_studio(out=tmp_path / "new" / "shots", open_browser=False, announce=lambda *_: None)
+
+    assert list((tmp_path / "new").rglob("*")) == [tmp_path / "new" / "shots"]
+    assert started[0].start.out == tmp_path / "new" / "shots"
+
+
+def test_unwritable_directory_gives_one_line(tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr(studio.tempfile, "TemporaryFile", fail)
+
+    with pytest.raises(FileError, match="cannot be written: Read-only file system$"):
+        run_studio(out=tmp_path / "shots", open_browser=False)
+
+
 def test_python_call_prints_address(started, capsys):
     run_studio(open_browser=False)
 

@@ -1,0 +1,383 @@
+"""Frames of videos and cameras, comparison, notebook and archive, in sessions without a thread."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+import zipfile
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from foveasim.capture import Capture
+from foveasim.errors import ParameterError
+from foveasim.studio._engine import Engine
+from foveasim.studio._exports import notebook
+from foveasim.studio._frames import camera_frame
+from foveasim.studio._server import _exported, _message
+from foveasim.studio._variants import compare, fovea_um, with_n_sites
+
+WIDTH, HEIGHT = 40, 24
+
+
+def pixels(k):
+    return np.random.default_rng(k).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+
+
+def message(k, **header):
+    head = json.dumps({"id": k, "width": WIDTH, "height": HEIGHT, **header}).encode()
+    return len(head).to_bytes(4, "little") + head + pixels(k).tobytes()
+
+
+def png(array):
+    buffer = io.BytesIO()
+    Image.fromarray(array).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+@pytest.fixture
+def clip(tmp_path):
+    """Write a video of 10 frames without losses."""
+    av = pytest.importorskip("av")
+    path = tmp_path / "clip.avi"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=Fraction(25))
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "bgr0"
+        for k in range(10):
+            for packet in stream.encode(av.VideoFrame.from_ndarray(pixels(k), format="rgb24")):
+                container.mux(packet)
+        for packet in stream.encode():
+            container.mux(packet)
+    return path
+
+
+def opened(recorder, clip):
+    path = recorder.session.add_file(clip.name, clip.read_bytes())
+    return recorder.do(do="video", path=str(path), id=1)
+
+
+def codes(recorder):
+    return recorder.session.result.capture.code
+
+
+def run_settings(path, out):
+    """Return the codes of ``foveasim run``."""
+    command = [sys.executable, "-m", "foveasim", "run", str(path), "--out", str(out)]
+    subprocess.run(command, check=True, capture_output=True, cwd=path.parent)
+    return Capture.load(out / f"{path.stem}_capture.npz").code
+
+
+# -- videos -----------------------------------------------------------------------------------------------------------------
+
+
+def test_video_frames_are_exact(recorder, clip):
+    state = opened(recorder, clip)
+    assert state["film"] == {
+        "kind": "video", "name": "clip.avi", "n": 0, "n_frames": 10, "frame_s": 0.04, "width": WIDTH, "height": HEIGHT,
+    }  # fmt: skip
+    session = recorder.session
+    for n in (3, 9, 2, 3, 0):
+        state = recorder.do(do="frame", n=n, id=n)
+        uploaded = session.add_file("frame.png", png(pixels(n)))
+        picture = {**session.history.settings, "scene": {**session.history.settings["scene"], "picture": str(uploaded)}}
+
+        assert state["film"]["n"] == n
+        assert np.array_equal(codes(recorder), Engine(n_threads=1).simulate(picture).capture.code)
+
+
+def test_frames_are_no_undo_steps(recorder, clip):
+    first = recorder.session.history.settings
+    opened(recorder, clip)
+    for n in range(1, 10):
+        recorder.do(do="frame", n=n, id=n)
+    recorder.do(do="set", key="exposure_s", value=0.02, id=20)
+    recorder.do(do="undo", id=21)
+    state = recorder.do(do="undo", id=22)
+
+    assert recorder.session.history.settings == first
+    assert not state["can_undo"]
+    assert state["film"] is None
+    assert recorder.do(do="redo", id=23)["film"]["n"] == 9
+
+
+def test_frames_use_constant_disk_and_cache(recorder, clip):
+    opened(recorder, clip)
+    sizes = []
+    for n in (1, 5, 9, 4, 7):
+        recorder.do(do="frame", n=n, id=n)
+        cache = recorder.session.engine._runner.cache
+        sizes.append((len(list((recorder.session.uploads / ".frames").iterdir())), len(cache._parts)))
+
+    assert set(sizes) == {(1, sizes[0][1])}
+
+
+@pytest.mark.parametrize("n", [10, -1, 1.0, True, None, "1"])
+def test_missing_frames_give_one_line(recorder, clip, n):
+    opened(recorder, clip)
+    before = codes(recorder)
+    state = recorder.do(do="frame", n=n, id=5)
+
+    assert state["errors"] == {"frame": "'n' must be 0 to 9"}
+    assert np.array_equal(codes(recorder), before)
+
+
+def test_only_newest_waiting_frame_is_decoded(recorder, clip):
+    opened(recorder, clip)
+    version = recorder.session._version
+    state = recorder.handle([{"do": "frame", "n": n, "id": n} for n in range(1, 9)])
+
+    assert state["film"]["n"] == 8
+    assert recorder.session._version == version + 1
+
+
+def test_saved_settings_name_the_frame(make_session, tmp_path, clip):
+    recorder = make_session(out=tmp_path / "out")
+    opened(recorder, clip)
+    for n in (4, 6):
+        recorder.do(do="frame", n=n, id=n)
+        recorder.do(do="save", name=f"shot_{n}", id=n + 10)
+        found = run_settings(tmp_path / "out" / f"shot_{n}.yaml", tmp_path / "results")
+
+        assert np.array_equal(found, codes(recorder))
+    assert {path.name for path in (tmp_path / "out").glob("*.png")} == {"clip_frame_4.png", "clip_frame_6.png"}
+
+
+@pytest.mark.parametrize(
+    ("name", "content"), [("a.mp4", b"text " * 99), ("b.avi", b"RIFF" + bytes(99)), ("c.gif", b"")]
+)
+def test_corrupt_videos_keep_the_scene(recorder, name, content):
+    pytest.importorskip("av")
+    path = recorder.session.add_file(name, content)
+    before = recorder.session.history.settings
+    state = recorder.do(do="video", path=str(path), id=1)
+
+    assert len(state["errors"]["video"].splitlines()) == 1
+    assert state["errors"]["video"].startswith(f"{name}: ")
+    assert recorder.session.history.settings == before
+
+
+def test_other_files_are_no_videos(recorder):
+    state = recorder.do(do="video", path="/etc/passwd", id=1)
+
+    assert "is not available here" in state["errors"]["video"]
+
+
+def test_single_gif_is_a_picture(recorder):
+    pytest.importorskip("av")
+    buffer = io.BytesIO()
+    Image.fromarray(pixels(1)).save(buffer, "GIF")
+    path = recorder.session.add_file("one.gif", buffer.getvalue())
+    state = recorder.do(do="video", path=str(path), id=1)
+
+    assert state["errors"] == {}
+    assert state["film"] is None
+    assert state["settings"]["scene"]["picture"] == str(path)
+
+
+# -- camera -----------------------------------------------------------------------------------------------------------------
+
+
+def test_camera_frames_replace_the_scene(recorder):
+    recorder.handle([camera_frame(message(1, is_first=True))])
+    state = recorder.handle([camera_frame(message(k)) for k in (2, 3, 4)])
+    uploaded = recorder.session.add_file("frame.png", png(pixels(4)))
+    settings = recorder.session.history.settings
+    picture = {**settings, "scene": {**settings["scene"], "picture": str(uploaded)}}
+
+    assert (state["film"]["kind"], state["film"]["n"]) == ("camera", 1)
+    assert np.array_equal(codes(recorder), Engine(n_threads=1).simulate(picture).capture.code)
+    recorder.do(do="undo", id=9)
+    assert recorder.session.history.settings["scene"]["kind"] == "checkerboard"
+    state = recorder.handle([camera_frame(message(5))])
+    assert state["settings"]["scene"]["kind"] == "checkerboard"
+
+
+def test_camera_frames_that_wait_are_replaced(recorder):
+    for k in range(5):
+        recorder.session.post(camera_frame(message(k, is_first=k == 0)))
+    (waiting,) = recorder.session._waiting
+
+    assert (waiting["id"], waiting["is_first"]) == (4, True)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\xff\xff\xff\xff",
+        message(1)[:-1],
+        message(1, width=-40, height=-24),
+        message(1, width=2**20, height=2**20),
+        message(1, width=40.0),
+        message(1, width=True, height=40 * 24),
+        (2).to_bytes(4, "little") + b"[]",
+        (2).to_bytes(4, "little") + b"\xff\xff",
+    ],
+)
+def test_invalid_camera_frames_are_rejected(recorder, content):
+    with pytest.raises(ParameterError, match="'frame' must be a header and the pixels that it specifies"):
+        camera_frame(content)
+    assert _message({"type": "websocket.receive", "bytes": content}) is None
+    recorder.handle([None])
+    assert recorder.messages[0]["kind"] == "error"
+
+
+def test_pixels_in_json_are_rejected(recorder):
+    state = recorder.do(do="frame", pixels=[[1]], is_first=True, id=1)
+
+    assert "frame" in state["errors"]
+    assert state["film"] is None
+
+
+# -- comparison -------------------------------------------------------------------------------------------------------------
+
+
+def table(recorder):
+    for header, _ in recorder.parts:
+        if header["part"] == "comparison":
+            return {row["name"]: row["values"] for row in header["about"]["rows"]}
+    return None
+
+
+def test_comparison_has_closed_form_budgets(recorder):
+    recorder.do(do="freeze", id=1)
+    recorder.do(do="set", key="sensor.bits", value=8, id=2)
+    recorder.do(do="set", key="layout.parameters.n_x", value=32, id=3)
+    found = table(recorder)
+
+    assert found["n_sites"] == [224, 448]
+    assert found["bits_per_frame"] == [2240, 3584]
+    # One frame per exposure of 10 ms; B has the same data rate of 224,000 bit/s.
+    assert found["frames_per_s"] == pytest.approx([100.0, 62.5])
+    assert found["area_um2"] == pytest.approx([224 * 144.0, 448 * 144.0])
+    assert found["readout_steps"] == [14, 14]
+    assert found["read_noise_e"] == pytest.approx([2.0 * 224**0.5, 2.0 * 448**0.5])
+
+
+def test_match_solves_for_the_budget_of_a(recorder):
+    recorder.do(do="freeze", id=1)
+    recorder.do(do="set", key="layout.parameters", value={"n_x": 30, "n_y": 30, "pitch_um": 6.0}, id=2)
+    state = recorder.do(do="match", id=3)
+    found = table(recorder)
+
+    assert state["errors"] == {}
+    assert found["n_sites"] == [224, 225]
+    assert state["summary"]["width_um"] == pytest.approx(180.0)
+    recorder.do(do="undo", id=4)
+    assert table(recorder)["n_sites"] == [224, 900]
+    recorder.do(do="unfreeze", id=5)
+    assert table(recorder) is None
+    assert "no variant A" in recorder.do(do="match", id=6)["errors"]["match"]
+
+
+@pytest.mark.parametrize(
+    ("generator", "parameters"),
+    [
+        ("hexagonal", {"n_columns": 20, "n_rows": 20, "pitch_um": 8.0}),
+        ("octagonal", {"n_x": 20, "n_y": 20, "pitch_um": 8.0}),
+        ("penrose", {"size_um": 200.0, "side_um": 12.0}),
+        ("sunflower", {"n_sites": 500, "spacing_um": 8.0}),
+        ("tiling", {"pitch_um": 8.0, "radius_um": 100.0}),
+        ("log_polar", {"n_sectors": 20, "min_size_um": 4.0, "r_max_um": 150.0}),
+    ],
+)
+def test_every_generator_can_match(settings, generator, parameters):
+    engine = Engine(n_threads=1)
+    settings["layout"] = {"generator": generator, "parameters": parameters}
+    settings["sensor"].pop("filters")
+    settings["scene"]["wavelength_nm"] = 550.0
+    layout = engine.simulate(settings).capture.layout
+    matched = with_n_sites(settings, 1000, layout)
+
+    assert engine.simulate(matched).capture.layout.n_sites == pytest.approx(1000, rel=0.05)
+
+
+def test_layout_files_cannot_match(settings):
+    with pytest.raises(ParameterError, match="'layout' must have a generator"):
+        with_n_sites({**settings, "layout": {"file": "chip.gds"}}, 100, None)
+
+
+def test_finer_sites_have_better_pictures(settings):
+    engine = Engine(n_threads=1)
+    settings["scene"]["square_mm"] = 8.0
+    coarse = engine.simulate(settings)
+    settings["layout"]["parameters"] = {"n_x": 64, "n_y": 56, "pitch_um": 3.0}
+    fine = engine.simulate(settings)
+    found = {row["name"]: row["values"] for row in compare(coarse, fine)["rows"]}
+
+    for name in ("fovea_psnr_db", "field_psnr_db", "field_ssim"):
+        assert found[name][1] > found[name][0]
+    assert fovea_um(fine.capture.layout) == pytest.approx([0.0, 0.0], abs=1e-9)
+
+
+# -- notebook, archive, links -----------------------------------------------------------------------------------------------------
+
+
+def test_notebook_gives_identical_codes(recorder, clip, tmp_path, monkeypatch):
+    import matplotlib
+
+    nbformat = pytest.importorskip("nbformat")
+    matplotlib.use("Agg")
+    opened(recorder, clip)
+    recorder.do(do="frame", n=5, id=5)
+    settings, files = recorder.session.exported()
+    content = nbformat.reads(recorder.session.text("notebook"), as_version=4)
+    nbformat.validate(content)
+    monkeypatch.chdir(tmp_path)
+    for name, path in files.items():
+        (tmp_path / name).write_bytes(path.read_bytes())
+    names = {}
+    for cell in content.cells:
+        if cell.cell_type == "code" and not cell.source.startswith("%"):
+            exec(cell.source, names)
+
+    assert settings["scene"]["picture"] == "clip_frame_5.png"
+    assert "`clip_frame_5.png`" in content.cells[0].source
+    assert np.array_equal(names["capture"].code, codes(recorder))
+
+
+def test_notebook_without_files_names_none(settings):
+    first = json.loads(notebook(settings, "small", []))["cells"][0]
+
+    assert "Required" not in first["source"]
+
+
+def test_archive_runs_unchanged(recorder, tmp_path):
+    path = recorder.session.add_file("photo.png", png(pixels(8)))
+    recorder.do(do="file", path=str(path), **{"as": "scene"}, id=1)
+    content, name = _exported(recorder.session, "zip")
+    assert name == "small.zip"
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        assert set(archive.namelist()) >= {"small.yaml", "small.py", "small.ipynb", "photo.png"}
+        assert any(each.startswith("small_layout.") for each in archive.namelist())
+        archive.extractall(tmp_path / "all")
+    script = "import runpy, sys, numpy as np; np.save(sys.argv[2], runpy.run_path(sys.argv[1])['capture'].code)"
+    subprocess.run([sys.executable, "-c", script, "small.py", "codes.npy"], check=True, cwd=tmp_path / "all")
+
+    assert np.array_equal(run_settings(tmp_path / "all" / "small.yaml", tmp_path / "out"), codes(recorder))
+    assert np.array_equal(np.load(tmp_path / "all" / "codes.npy"), codes(recorder))
+
+
+def test_link_has_names_of_uploads(recorder, make_session):
+    path = recorder.session.add_file("photo.png", png(pixels(8)))
+    recorder.do(do="file", path=str(path), **{"as": "scene"}, id=1)
+    recorder.do(do="text", what="link", id=2)
+    answer = next(each for each in recorder.messages if each["kind"] == "text")
+    restored = json.loads(answer["text"])
+
+    assert answer["files"] == ["photo.png"]
+    assert str(recorder.session.uploads) not in answer["text"]
+    other = make_session()
+    state = other.do(do="restore", settings=restored, id=1)
+    assert "'photo.png' is not available here; upload the file" in state["errors"]["restore"]
+    assert state["settings"] == yaml.safe_load(yaml.safe_dump(other.session.start.settings))
+    other.session.add_file("photo.png", png(pixels(8)))
+    assert other.do(do="restore", settings=restored, id=2)["errors"] == {}
+    assert np.array_equal(codes(other), codes(recorder))
+
+
