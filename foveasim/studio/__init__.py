@@ -136,12 +136,14 @@ def _own_token() -> str | None:
     """Return the token of the environment, None without one; it is not repeated in messages."""
     token = os.environ.get(TOKEN_VARIABLE)
     if token is not None and not re.fullmatch(rf"[A-Za-z0-9_-]{{{MIN_TOKEN_LENGTH},}}", token):
-        raise ParameterError(TOKEN_VARIABLE, f"must have at least {MIN_TOKEN_LENGTH} characters of A-Z, a-z, 0-9, '-', '_'")
+        raise ParameterError(
+            TOKEN_VARIABLE, f"must have at least {MIN_TOKEN_LENGTH} characters of A-Z, a-z, 0-9, '-', '_'"
+        )
     return token
 
 
 def _writable(out: str | Path) -> Path:
-    """Return the directory for saved files, which is created and written once, before the first page opens."""
+    """Create the directory for saved files, check that it can be written, and return it."""
     directory = check_directory(out)
     try:
         directory.mkdir(parents=True, exist_ok=True)

@@ -20,15 +20,13 @@ __all__ = ["archive", "notebook"]
 
 #: Date of the files in archives, so that equal states have equal archives; the earliest that the format can represent.
 DATE = (1980, 1, 1, 0, 0, 0)
-#: Layout formats of the archive: the first one that can be written.
-LAYOUT_FORMATS = ("gds", "geojson")
 #: Permissions of the files in archives: read by all, written by the owner.
 PERMISSIONS = 0o644 << 16
 
 
 def notebook(settings: Mapping[str, Any], name: str, files: Sequence[str]) -> str:
     """
-    Return a notebook that simulates the shot of settings and shows its picture and photosites.
+    Return a notebook that simulates a shot and shows its picture and photosites.
 
     Parameters
     ----------
@@ -97,15 +95,19 @@ def archive(name: str, texts: Mapping[str, str], files: Mapping[str, Path], layo
             _add(file, file_name, text.encode())
         for file_name, path in files.items():
             _add(file, file_name, path.read_bytes())
-        for extension in LAYOUT_FORMATS if layout is not None else ():
-            path = Path(directory) / f"{name}_layout.{extension}"
-            try:
-                write_layout(layout, path)
-            except FoveasimError:
-                continue
+        if layout is not None:
+            path = _write_layout(layout, Path(directory) / f"{name}_layout")
             _add(file, path.name, path.read_bytes())
-            break
     return content.getvalue()
+
+
+def _write_layout(layout: Layout, stem: Path) -> Path:
+    """Write a layout as GDSII, or as GeoJSON without the extra, and return the path."""
+    try:
+        write_layout(layout, path := stem.with_name(f"{stem.name}.gds"))
+    except FoveasimError:
+        write_layout(layout, path := stem.with_name(f"{stem.name}.geojson"))
+    return path
 
 
 def _add(file: zipfile.ZipFile, name: str, content: bytes) -> None:

@@ -32,12 +32,13 @@ HIDDEN = ".frames"
 
 def camera_frame(message: bytes) -> dict[str, Any]:
     """
-    Decode a camera frame: the length of the header as little-endian uint32, the header in JSON, the pixels.
+    Decode a camera frame.
 
     Parameters
     ----------
     message : bytes
-        The header contains ``id``, ``width`` and ``height``; the pixels are RGB, uint8, top row first.
+        Length of the header as little-endian uint32; header in JSON with ``id``, ``width``, ``height`` and ``is_first``;
+        pixels, RGB, uint8, top row first.
 
     Returns
     -------

@@ -238,7 +238,9 @@ class Session:
             if message.get("do") == "set" and message.get("final", True):
                 self.history.commit(self.history.settings)  # a valid preview is the step
             key = message.get("key")
-            self._errors = {key if isinstance(key, str) else str(message.get("do")): _line(error).replace(f"{self.uploads}/", "")}
+            self._errors = {
+                key if isinstance(key, str) else str(message.get("do")): _line(error).replace(f"{self.uploads}/", "")
+            }
         else:
             self._errors = {}
         self._last_id = messages[-1].get("id")
@@ -379,7 +381,7 @@ class Session:
 
     def text(self, what: str, exported: tuple[dict[str, Any], dict[str, Path]] | None = None) -> str:
         """
-        Return the current settings as YAML, Python, notebook or JSON of a link, or their changes as a difference.
+        Return the current settings in a text format, or their changes as a difference.
 
         Parameters
         ----------

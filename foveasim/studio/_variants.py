@@ -28,15 +28,16 @@ RASTER = ("grid", "hexagonal", "octagonal")
 RASTER_PARAMETERS = ("n_x", "n_y", "n_columns", "n_rows", "pitch_um", "pitch_y_um")
 #: Largest difference of the number of sites, in percent, where generators have no nearer possible number.
 MAX_PERCENT = 8
+MM2_PER_UM2 = 1e-6
 #: Rows of the comparison: label and unit by name.
 ROWS = {
     "n_sites": ("photosites", ""),
-    "bits_per_frame": ("bits per frame", "bit"),
-    "frames_per_s": ("frames at the same data rate", "1/s"),
-    "readout_steps": ("sites on the longest line", ""),
-    "area_um2": ("light-collecting area", "µm²"),
-    "total_e": ("electrons per frame", "e⁻"),
-    "read_noise_e": ("read noise of all sites", "e⁻"),
+    "bits_per_frame": ("bits per frame", ""),
+    "frames_per_s": ("frame rate", "1/s"),
+    "readout_steps": ("longest line", "sites"),
+    "area_mm2": ("area", "mm²"),
+    "total_e": ("electrons", "e⁻"),
+    "read_noise_e": ("read noise", "e⁻"),
     "fovea_psnr_db": ("PSNR, fovea", "dB"),
     "field_psnr_db": ("PSNR, field", "dB"),
     "fovea_ssim": ("SSIM, fovea", ""),
@@ -80,7 +81,7 @@ def _measures(result: Simulated, rate_bit_per_s: float, half_um: float) -> dict[
         "bits_per_frame": budget.data_rate_bit_per_s,
         "frames_per_s": rate_bit_per_s / budget.data_rate_bit_per_s,
         "readout_steps": budget.readout_steps,
-        "area_um2": budget.area_um2,
+        "area_mm2": budget.area_um2 * MM2_PER_UM2,
         "total_e": float(result.capture.electrons.sum(dtype=np.float64)),
         "read_noise_e": float(np.sqrt(budget.read_noise_e2)),
     }
@@ -98,7 +99,7 @@ def _measures(result: Simulated, rate_bit_per_s: float, half_um: float) -> dict[
 
 
 def fovea_um(layout: Layout) -> Floats:
-    """Return the centre of the smallest photosites, (x, y) µm; that of the layout if all sites have the same size."""
+    """Return the mean centroid of the smallest photosites, (x, y) µm."""
     limit_um2 = FOVEA_AREA_RATIO * np.quantile(layout.area_um2, SLIVER_QUANTILE)
     centre_um: Floats = layout.centroid_um[layout.area_um2 <= limit_um2].mean(axis=0)
     return centre_um
@@ -112,7 +113,9 @@ def _half_side_um(layout: Layout) -> float:
 
 def _square(centre_um: Floats, half_um: float) -> Grid:
     pitch_um = 2.0 * half_um / N_PIXELS
-    return Grid((N_PIXELS, N_PIXELS), (pitch_um, pitch_um), (float(centre_um[0] - half_um), float(centre_um[1] - half_um)))
+    return Grid(
+        (N_PIXELS, N_PIXELS), (pitch_um, pitch_um), (float(centre_um[0] - half_um), float(centre_um[1] - half_um))
+    )
 
 
 def _is_generated(settings: dict[str, Any]) -> bool:
@@ -164,7 +167,7 @@ def with_n_sites(settings: dict[str, Any], n_sites: int, layout: Layout) -> dict
 
 
 def _nearest(generator: str, candidates: list[dict[str, Any]], n_sites: int) -> dict[str, Any] | None:
-    """Return the first parameters with a possible number of sites near the given one; None without any."""
+    """Return the first parameters with a possible number of sites near the given one."""
     for percent in sorted(range(-MAX_PERCENT, MAX_PERCENT + 1), key=abs):
         for parameters in candidates:
             with suppress(FoveasimError):

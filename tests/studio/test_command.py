@@ -95,7 +95,7 @@ def test_unwritable_directory_gives_one_line(tmp_path, monkeypatch):
 
     monkeypatch.setattr(studio.tempfile, "TemporaryFile", fail)
 
-    with pytest.raises(FileError, match="cannot be written: Read-only file system$"):
+    with pytest.raises(FileError, match=r"cannot be written: Read-only file system$"):
         run_studio(out=tmp_path / "shots", open_browser=False)
 
 

@@ -90,7 +90,7 @@ def test_video_frames_are_exact(recorder, clip):
         assert np.array_equal(codes(recorder), Engine(n_threads=1).simulate(picture).capture.code)
 
 
-def test_frames_are_no_undo_steps(recorder, clip):
+def test_frames_leave_the_undo_steps(recorder, clip):
     first = recorder.session.history.settings
     opened(recorder, clip)
     for n in range(1, 10):
@@ -161,7 +161,7 @@ def test_corrupt_videos_keep_the_scene(recorder, name, content):
     assert recorder.session.history.settings == before
 
 
-def test_other_files_are_no_videos(recorder):
+def test_other_files_are_not_available(recorder):
     state = recorder.do(do="video", path="/etc/passwd", id=1)
 
     assert "is not available here" in state["errors"]["video"]
@@ -254,7 +254,7 @@ def test_comparison_has_closed_form_budgets(recorder):
     assert found["bits_per_frame"] == [2240, 3584]
     # One frame per exposure of 10 ms; B has the same data rate of 224,000 bit/s.
     assert found["frames_per_s"] == pytest.approx([100.0, 62.5])
-    assert found["area_um2"] == pytest.approx([224 * 144.0, 448 * 144.0])
+    assert found["area_mm2"] == pytest.approx([224 * 144e-6, 448 * 144e-6])
     assert found["readout_steps"] == [14, 14]
     assert found["read_noise_e"] == pytest.approx([2.0 * 224**0.5, 2.0 * 448**0.5])
 
@@ -319,10 +319,10 @@ def test_finer_sites_have_better_pictures(settings):
 
 
 def test_notebook_gives_identical_codes(recorder, clip, tmp_path, monkeypatch):
-    import matplotlib
+    import matplotlib as mpl
 
     nbformat = pytest.importorskip("nbformat")
-    matplotlib.use("Agg")
+    mpl.use("Agg")
     opened(recorder, clip)
     recorder.do(do="frame", n=5, id=5)
     settings, files = recorder.session.exported()
@@ -379,5 +379,3 @@ def test_link_has_names_of_uploads(recorder, make_session):
     other.session.add_file("photo.png", png(pixels(8)))
     assert other.do(do="restore", settings=restored, id=2)["errors"] == {}
     assert np.array_equal(codes(other), codes(recorder))
-
-

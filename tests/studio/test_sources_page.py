@@ -15,23 +15,22 @@ pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
 from PIL import Image
+from studio import test_studio_page
 from studio.test_studio_page import (
     SOFTWARE,
-    browser,  # noqa: F401 -- fixture
     change,
     codes,
     drop,
-    server,  # noqa: F401 -- fixture
     set_value,
     setting,
     settle,
     until,
-    visit,  # noqa: F401 -- fixture
 )
 
 from foveasim.config import read_shot
 
 pytestmark = pytest.mark.needs("chromium")
+server, browser, visit = test_studio_page.server, test_studio_page.browser, test_studio_page.visit
 
 #: A camera that shows a moving picture.
 FAKE_CAMERA = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
@@ -249,14 +248,14 @@ def test_source_menu_selects_test_chart(visit):
 
 
 @pytest.fixture(scope="module")
-def camera_browser(browser):  # noqa: F811
+def camera_browser(browser):
     chromium = browser.browser_type.launch(executable_path=shutil.which("chromium"), args=[*SOFTWARE, *FAKE_CAMERA])
     yield chromium
     chromium.close()
 
 
 @pytest.fixture
-def visit_camera(server, camera_browser):  # noqa: F811
+def visit_camera(server, camera_browser):
     """Open a page of a browser with a camera."""
     contexts = []
 
@@ -392,7 +391,7 @@ def copied_link(page, name):
     return page.evaluate("copied")
 
 
-def test_link_restores_the_state(visit, server):  # noqa: F811
+def test_link_restores_the_state(visit, server):
     page = visit()
     set_value(page, "optics.f_number", 4.0)
     wanted = codes(page)

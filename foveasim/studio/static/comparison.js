@@ -3,7 +3,18 @@
 import { shown } from "/web/colours.js";
 import { make } from "/web/page_parts.js";
 
-const figure = (value, unit) => (value === null || value === undefined ? "–" : typeof value !== "number" ? "∞" : shown(Number(value.toPrecision(unit === "dB" || Math.abs(value) < 1000 ? 3 : 4))));
+// Largest relative difference of equal numbers of photosites: generators solve for a number within this tolerance.
+const MATCHED = 0.01;
+// Notes on rows, by name.
+const NOTES = { frames_per_s: "At the data rate of A", total_e: "Signal of all photosites in a frame", read_noise_e: "Root sum of squares over all photosites", readout_steps: "Photosites on the longest readout line; lines are read in parallel", area_mm2: "Total area of the photosites" };
+const PREFIXES = [[1e9, " G"], [1e6, " M"], [1e5, " k"]];
+
+// Four digits; large numbers with a prefix.
+function figure(value) {
+  if (typeof value !== "number") return value ? "∞" : "–";
+  const [limit, prefix] = PREFIXES.find(([from]) => Math.abs(value) >= from) || [1, ""], scale = prefix === " k" ? 1e3 : limit;
+  return shown(Number((value / scale).toPrecision(4))) + prefix;
+}
 
 // Shows rows of { name, label, unit, values: [a, b] }; null without variants.
 export function showComparison({ table, note, button }, about) {
@@ -13,15 +24,17 @@ export function showComparison({ table, note, button }, about) {
   const head = make("tr"), sizes = [about.fovea_um, about.field_um].map((side) => shown(Math.round(side)));
   head.append(make("td"), ...["A", "B"].map((name) => { const cell = make("th", name); cell.scope = "col"; return cell; }));
   const rows = about.rows.map(({ name, label, unit, values }) => {
-    const row = make("tr"), title = make("th", label + (unit ? " / " + unit : ""));
+    const row = make("tr"), title = make("th", label + (unit ? ", " + unit : ""));
     title.scope = "row";
     row.dataset.name = name;
+    title.title = NOTES[name] || "";
     if (/^(fovea|field)_/.test(name)) title.title = "Against the optical image, after a fit of one gain, on a square of " + sizes[name.startsWith("fovea") ? 0 : 1] + " µm";
-    row.append(title, ...values.map((value) => make("td", name === "n_sites" ? shown(value) : figure(value, unit))));
+    row.append(title, ...values.map((value) => make("td", name === "n_sites" ? shown(value) : figure(value))));
     row.classList.toggle("differs", values[0] !== values[1]);
     return row;
   });
   table.replaceChildren(head, ...rows);
-  button.disabled = !about.can_match || about.rows[0].values[0] === about.rows[0].values[1];
+  const [a, b] = about.rows[0].values;
+  button.disabled = !about.can_match || Math.abs(a - b) <= MATCHED * a;
   button.title = about.can_match ? "Same number of photosites as A, in the same field" : "The layout of B has no generator";
 }
