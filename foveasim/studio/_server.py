@@ -427,6 +427,7 @@ def serve(
         lifespan="off",
         ws="websockets-sansio",
         ws_max_size=MAX_MESSAGE_BYTES,
+        ws_per_message_deflate=False,  # costs more time than the transfer on this computer
         timeout_graceful_shutdown=0,
         limit_concurrency=MAX_CONNECTIONS,
         server_header=False,

@@ -147,6 +147,9 @@ def test_pages_have_security_headers(served):
         assert status == (404 if "missing" in path else 200)
         assert {headers[name.lower()] for name in HEADERS} == set(HEADERS.values())
         assert content
+    permitted = dict(item.split("=") for item in headers["permissions-policy"].split(", "))
+    assert {name for name, origins in permitted.items() if origins != "()"} == {"camera"}
+    assert permitted["camera"] == "(self)"
 
 
 @pytest.mark.parametrize(
