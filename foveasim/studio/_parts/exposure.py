@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.validation import Floats
 from foveasim.sensor import NoiseBudget, Sensor, noise_budget
-from foveasim.sensor.signal_to_noise import local_step_e, signal_to_noise
+from foveasim.sensor.signal_to_noise import signal_to_noise
 from foveasim.studio._engine import Simulated
 from foveasim.studio._parts.registry import PartData, capture_of, curves_of, part
 
@@ -22,54 +22,43 @@ N_LEVELS = 129
 LOWEST_E, HIGHEST = 0.1, 4.0
 #: Lowest ratio in the chart, dB.
 LOWEST_DB = -10.0
-#: Lowest temporal noise in the chart, relative to that below saturation.
-FLOOR = 0.3
-#: Temporal entry of the noise budget with its own curve.
-PHOTON_SHOT = "photon_shot"
+#: Temporal entries of the noise budget with their own curves.
+SEPARATE = PHOTON_SHOT, QUANTISATION = "photon_shot", "quantisation"
 
 
 @part("Photon transfer", capture_of)
 def photon_transfer(result: Simulated) -> PartData:
-    """Return noise against mean signal of the photosite of median charge, for the exposure time of the capture."""
+    """Return noise against signal of the photosite of median charge, for the exposure time of the capture."""
     sensor, capture, exposure_s = result.shot.camera.sensor, result.capture, result.shot.exposure_s
     if exposure_s == 0.0:
         return curves_of([], [], [])
     site = _median_site(capture.expected_e)
     copies = _copies(sensor, site, N_LEVELS)
-    level_e = np.geomspace(LOWEST_E, HIGHEST * _range_e(copies), N_LEVELS)
+    range_e = _range_e(copies)
     sensitivity = float(np.broadcast_to(copies.sensitivity, N_LEVELS)[0]) or 1.0
-    photo_e_per_s = level_e / (exposure_s * sensitivity)
-    charge_e = copies.expected_electrons(photo_e_per_s, exposure_s)
+    photo_e_per_s = np.geomspace(LOWEST_E, HIGHEST * range_e, N_LEVELS) / (exposure_s * sensitivity)
     dark_e = copies.expected_electrons(np.zeros(N_LEVELS), exposure_s)
-    mean_dn, variance_dn2 = copies.predict(charge_e)
-    dark_dn = copies.predict(dark_e)[0]
-    is_saturated = signal_to_noise(copies, charge_e, dark_e).is_saturated
+    found = signal_to_noise(copies, copies.expected_electrons(photo_e_per_s, exposure_s), dark_e)
     budget = noise_budget(copies, photo_e_per_s, exposure_s)
-    dn_per_e = 1.0 / local_step_e(copies, charge_e, copies.v_per_e, np.full(1, copies.pedestal_v))
-    others = [name for name in budget.temporal if name != PHOTON_SHOT]
     fixed = [name for name in budget if name not in budget.temporal]
-    noise_dn = np.sqrt(variance_dn2)
-    # Clipped noise approaches 0: lower values than the noise floor are not shown.
-    floor_dn = FLOOR * float(noise_dn[~is_saturated].min(initial=np.inf))
     shown = {
-        "temporal noise": np.where(noise_dn >= min(floor_dn, float(noise_dn.max())), noise_dn, np.nan),
-        "photon shot": np.where(is_saturated, np.nan, budget[PHOTON_SHOT] * dn_per_e),
-        "dark and read": np.where(is_saturated, np.nan, _root_sum_of_squares(budget, others) * dn_per_e),
-        "fixed pattern": np.where(is_saturated, np.nan, _root_sum_of_squares(budget, fixed) * dn_per_e),
+        "temporal noise": found.noise_e,
+        "photon shot": budget[PHOTON_SHOT],
+        "dark and read": _root_sum_of_squares(budget, [name for name in budget.temporal if name not in SEPARATE]),
+        "quantisation": budget[QUANTISATION],
+        "fixed pattern": _root_sum_of_squares(budget, fixed),
     }
-    signal_dn = mean_dn - dark_dn
-    is_positive = signal_dn > 0.0
-    shown = {name: _positive(values)[is_positive] for name, values in shown.items() if np.nanmax(values) > 0.0}
-    curves = [{"label": name, "unit_x": "DN", "unit_y": "DN"} for name in shown]
-    about, arrays = curves_of(curves, [signal_dn[is_positive]] * len(curves), list(shown.values()))
-    now = _copies(sensor, site, 1)
-    now_dn, now_dn2 = now.predict(capture.expected_e[[site]])
-    at = float(now_dn[0] - dark_dn[0]), float(np.sqrt(now_dn2[0]))
-    about["marks"] = [{"x": at[0], "y": at[1]}] if min(at) > 0.0 else []
-    gain, is_over = float(dn_per_e[0]), at[1] <= 0.0 < at[0]
+    # Above saturation, signal and noise are those at saturation.
+    is_shown = ~found.is_saturated & (found.signal_e > 0.0)
+    shown = {name: values[is_shown] for name, values in shown.items() if (values[is_shown] > 0.0).all()}
+    curves = [{"label": name, "unit_x": "e⁻", "unit_y": "e⁻"} for name in shown]
+    about, arrays = curves_of(curves, [found.signal_e[is_shown]] * len(curves), list(shown.values()))
+    now = signal_to_noise(_copies(sensor, site, 1), capture.expected_e[[site]], dark_e[:1])
+    x, y = float(now.signal_e[0]), float(now.noise_e[0])
+    about["marks"] = [{"x": x, "y": y}] if min(x, y) > 0.0 and curves else []
     about["note"] = (
-        f"Photosite {site:,} (median signal), {gain:.3g} DN/e⁻, full range {_range_e(copies):,.0f} e⁻"
-        f"{'; now saturated' if is_over else ''}"
+        f"Photosite {site:,}, {float(now.gain_dn_per_e.flat[0]):.3g} DN/e⁻, full range {range_e:,.0f} e⁻"
+        f"{'; now saturated' if now.is_saturated[0] else ''}"
     )
     return about, arrays
 
@@ -103,10 +92,8 @@ def snr(result: Simulated) -> PartData:
         ranges.append((name, curve.dynamic_range_db))
     about, arrays = curves_of(curves, x, y)
     about["marks"] = [mark for mark in marks if mark["y"] >= LOWEST_DB]
-    shown = ", ".join(
-        f"{name} {range_db:.1f} dB" if len(ranges) > 1 else f"{range_db:.1f} dB" for name, range_db in ranges
-    )
-    about["note"] = f"Dynamic range {shown}; bars: saturation" if ranges else "No photoelectrons"
+    shown = ", ".join(f"{name} {range_db:.1f}" if len(ranges) > 1 else f"{range_db:.1f}" for name, range_db in ranges)
+    about["note"] = f"Dynamic range / dB: {shown}" if ranges else "No photoelectrons"
     about["dynamic_range_db"] = dict(ranges)
     return about, arrays
 
@@ -182,11 +169,6 @@ def _range_e(sensor: Sensor) -> float:
 
 def _root_sum_of_squares(budget: NoiseBudget, names: list[str]) -> Floats:
     return np.sqrt(sum((np.square(budget[name]) for name in names), np.zeros(N_LEVELS)))
-
-
-def _positive(values: Floats) -> Floats:
-    """Return values with NaN for those that a logarithmic axis cannot show."""
-    return np.where(values > 0.0, values, np.nan)
 
 
 def _decibels(ratio: Floats) -> Floats:

@@ -27,14 +27,44 @@ function limitsOf(arrays) {
   return low === Infinity ? [0, 1] : [low, high > low ? high : low + 1];
 }
 
-// Curves y of x with their legend; dashed curves are those of variant A.
+// Powers of ten in a range; with few of them also 2 and 5 times.
+function decadesOf(low, high, most) {
+  const first = Math.floor(Math.log10(low)), last = Math.ceil(Math.log10(high)), skip = Math.ceil((last - first) / Math.max(1, most)), ticks = [];
+  for (let e = first; e <= last; e++) {
+    for (const step of 3 * (last - first) <= most ? [1, 2, 5] : [1]) {
+      const tick = Number((step * 10 ** e).toPrecision(3));
+      if ((e - first) % skip === 0 && tick >= 0.999 * low && tick <= 1.001 * high) ticks.push(tick);
+    }
+  }
+  return ticks;
+}
+
+const decadeText = (value) => (value >= 1e-3 && value < 1e4 ? String(value) : value.toExponential(0).replace("e+", "e"));
+
+// Conversion of numbers to fractions of an axis, and its ticks.
+function axisOf(low, high, isLog) {
+  if (!isLog) return { low, high, at: (v) => (v - low) / (high - low), value: (t) => low + t * (high - low), ticks: (most) => ticksOf(low, high, most), text: brief };
+  const span = Math.log(high / low);
+  return { low, high, at: (v) => Math.log(v / low) / span, value: (t) => low * Math.exp(t * span), ticks: (most) => decadesOf(low, high, most), text: decadeText };
+}
+
+// Limits of positive numbers for a logarithmic axis.
+function decadeLimits(arrays) {
+  let low = Infinity, high = 0;
+  for (const values of arrays) for (const v of values) if (v > 0 && v < Infinity) { low = Math.min(low, v); high = Math.max(high, v); }
+  return low === Infinity ? [1, 10] : [low, Math.max(high, 1.01 * low)];
+}
+
+// Curves y of x with their legend; dashed curves are those of variant A. Axes in "log" (such as "xy") are logarithmic.
 export class CurveChart {
-  constructor(root, { nameX, nameY, label }) {
-    Object.assign(this, { root, nameX, nameY, label });
+  constructor(root, { nameX, nameY, label, log = "" }) {
+    Object.assign(this, { root, nameX, nameY, label, log, marks: [], lines: [] });
     this.canvas = make("canvas");
     this.canvas.setAttribute("role", "img");
     this.legend = make("ul", undefined, "chart-legend");
-    root.append(this.canvas, this.legend);
+    this.note = make("p", "", "chart-note quiet");
+    this.note.hidden = true;
+    root.append(this.canvas, this.legend, this.note);
     this.curves = [];
     this.at = null;
     watchSize(this.canvas, () => this.draw());
@@ -42,9 +72,12 @@ export class CurveChart {
     this.canvas.addEventListener("pointerleave", () => { this.at = null; this.draw(); });
   }
 
-  // Curves: [{ label, name, unit_x, unit_y, x, y, isDashed }].
-  use(curves) {
-    this.curves = curves;
+  // Curves: [{ label, name, unit_x, unit_y, x, y, isDashed }]; marks on them: [{ x, y, name, kind }], "end" for a bar, else
+  // a dot; vertical lines: [{ x, label, of }].
+  use(curves, { marks = [], lines = [], note = "" } = {}) {
+    Object.assign(this, { curves, marks, lines });
+    this.note.textContent = note;
+    this.note.hidden = !note;
     const own = curves.filter((curve) => !curve.isDashed);
     this.canvas.setAttribute("aria-label", this.label + ": " + (own.length ? own.map((curve) => curve.label + ", largest value " + shown(Number(limitsOf([curve.y])[1].toPrecision(3)))).join("; ") : "no data"));
     this.draw();
@@ -54,8 +87,9 @@ export class CurveChart {
     if (!this.root.clientWidth) return;
     const { curves } = this, own = curves.filter((curve) => !curve.isDashed), left = 46, right = 10, top = 8, bottom = 32;
     const inks = curves.map((curve) => inkOfCurve(curve, own.findIndex((one) => one.label === curve.label)));
-    const [x0, x1] = limitsOf(curves.map((curve) => curve.x)), wide = this.canvas.clientWidth - left - right;
-    const here = this.at === null || !own.length ? null : clamp(x0 + ((this.at - left) / wide) * (x1 - x0), x0, x1);
+    const isLogX = this.log.includes("x"), isLogY = this.log.includes("y"), allX = [...curves.map((curve) => curve.x), this.marks.map((mark) => mark.x)];
+    const axisX = axisOf(...(isLogX ? decadeLimits(allX) : limitsOf(allX)), isLogX), wide = this.canvas.clientWidth - left - right;
+    const here = this.at === null || !own.length ? null : axisX.value(clamp((this.at - left) / wide, 0, 1));
     // The legend first: the rest of the height is for the canvas.
     this._listCurves(curves, inks, here, own);
     const { context, width, height } = fitted(this.canvas);
@@ -65,28 +99,32 @@ export class CurveChart {
       context.fillText("no data", 8, 20);
       return;
     }
-    const y1 = limitsOf(curves.map((curve) => curve.y))[1] * 1.04, y0 = Math.min(0, limitsOf(curves.map((curve) => curve.y))[0]);
+    const allY = curves.map((curve) => curve.y), [low, high] = limitsOf(allY), [lowest, highest] = decadeLimits(allY);
+    const axisY = isLogY ? axisOf(0.9 * lowest, 1.3 * highest, true) : axisOf(Math.min(0, low), high * 1.04, false);
     const w = width - left - right, h = height - top - bottom;
-    const toX = (v) => left + ((v - x0) / (x1 - x0)) * w, toY = (v) => top + h - ((v - y0) / (y1 - y0)) * h;
+    const toX = (v) => left + axisX.at(v) * w, toY = (v) => top + h - axisY.at(v) * h;
     context.strokeStyle = inkOf("--line");
     context.fillStyle = inkOf("--quiet");
     context.lineWidth = 1;
     context.beginPath();
     context.textAlign = "right";
-    for (const tick of ticksOf(y0, y1, Math.max(2, h / 34))) {
+    for (const tick of axisY.ticks(Math.max(2, h / (isLogY ? 20 : 34)))) {
       const y = Math.round(toY(tick)) + 0.5;
       context.moveTo(left, y);
       context.lineTo(left + w, y);
-      context.fillText(brief(tick), left - 5, y + 3.5);
+      context.fillText(axisY.text(tick), left - 5, y + 3.5);
     }
     context.textAlign = "center";
-    for (const tick of ticksOf(x0, x1, Math.max(2, w / 60))) {
+    for (const tick of axisX.ticks(Math.max(2, w / (isLogX ? 40 : 60)))) {
       const x = Math.round(toX(tick)) + 0.5;
       context.moveTo(x, top + h);
       context.lineTo(x, top + h + 4);
-      context.fillText(brief(tick), clamp(x, left + 4, width - 14), top + h + 15);
+      context.fillText(axisX.text(tick), clamp(x, left + 4, width - 14), top + h + 15);
     }
     context.stroke();
+    context.save();
+    this._drawLines(context, curves, inks, { toX, top, h, right: left + w });
+    context.restore();
     context.fillText(axisTitle(this.nameX, own[0].unit_x), left + 0.5 * w, height - 4);
     context.save();
     context.translate(9, top + 0.5 * h);
@@ -109,10 +147,44 @@ export class CurveChart {
       context.stroke();
     });
     context.setLineDash([]);
+    for (const mark of this.marks) this._drawMark(context, mark, toX(mark.x), toY(Math.max(mark.y, axisY.low)), own, inks);
     if (here !== null) {
       context.fillStyle = inkOf("--quiet");
       context.fillRect(toX(here), top, 1, h);
     }
+  }
+
+  // Vertical lines in the colours of the curves of the same label, with a triangle on the axis.
+  _drawLines(context, curves, inks, { toX, top, h, right }) {
+    for (const line of this.lines) {
+      const k = curves.findIndex((curve) => curve.label === line.label && !curve.isDashed), x = Math.round(toX(line.x)) + 0.5;
+      if (!(x <= right + 1)) continue;
+      context.strokeStyle = context.fillStyle = k < 0 ? inkOf("--quiet") : inks[k];
+      context.lineWidth = 1;
+      context.setLineDash([2, 3]);
+      context.beginPath();
+      context.moveTo(x, top);
+      context.lineTo(x, top + h);
+      context.stroke();
+      context.setLineDash([]);
+      context.beginPath();
+      context.moveTo(x, top + h - 6);
+      context.lineTo(x - 4, top + h);
+      context.lineTo(x + 4, top + h);
+      context.fill();
+    }
+  }
+
+  _drawMark(context, mark, x, y, own, inks) {
+    const k = own.findIndex((curve) => curve.name === mark.name);
+    context.fillStyle = mark.name && k >= 0 ? inks[this.curves.indexOf(own[k])] : inkOf("--text");
+    context.strokeStyle = inkOf("--raised");
+    context.lineWidth = 1.5;
+    context.beginPath();
+    if (mark.kind === "end") context.rect(x - 1.25, y - 6, 2.5, 12);
+    else context.arc(x, y, 4.5, 0, 7);
+    context.stroke();
+    context.fill();
   }
 
   _listCurves(curves, inks, here, own) {
@@ -120,7 +192,9 @@ export class CurveChart {
       const item = make("li"), swatch = make("i");
       swatch.style.background = inks[k];
       const value = here === null ? "" : " " + brief(Number(valueAt(curve, here).toPrecision(3)));
-      item.append(swatch, make("span", (curve.isDashed ? "A: " : "") + curve.label + value));
+      const line = curve.isDashed ? null : this.lines.find((one) => one.label === curve.label);
+      const text = (curve.isDashed ? "A: " : "") + curve.label + value + (line && here === null ? ", " + line.of + " " + brief(Number(line.x.toPrecision(3))) : "");
+      item.append(swatch, make("span", text));
       return item;
     });
     if (here !== null) items.unshift(make("li", brief(Number(here.toPrecision(4))) + " " + own[0].unit_x));

@@ -25,10 +25,11 @@ import { Steps } from "./steps.js";
 // Views in tiles, with the parts that they need; those that are shown at first on narrow and on wide screens.
 const TILES = [
   ["histogram", "Histogram", null], ["site", "Photosite", null], ["noise", "Noise", "noise"], ["spectrum", "Spectrum", "spectrum"],
-  ["mtf", "MTF", "mtf"], ["rules", "Design rules", "rules"], ["steps", "Steps", null], ["summary", "Summary", null], ["selection", "Selection", null],
-  ["comparison", "A and B", "comparison"],
+  ["photon_transfer", "Photon transfer", "photon_transfer"], ["snr", "SNR", "snr"], ["mtf", "MTF", "mtf"], ["rules", "Design rules", "rules"],
+  ["steps", "Steps", null], ["summary", "Summary", null], ["selection", "Selection", null], ["comparison", "A and B", "comparison"],
 ];
 const FIRST_TILES = ["histogram", "noise", "mtf", "summary"];
+const CURVES = ["spectrum", "mtf", "photon_transfer", "snr"];
 const WIDE = 1800;
 const ALWAYS = ["sites", "columns", "picture", "scene"];
 // Words of the summary that have another form than the key.
@@ -170,7 +171,7 @@ function showCurves(name) {
   const curves = curvesOf(part), isSame = (one, other) => one.label === other.label && one.y.length === other.y.length && one.y.every((v, i) => v === other.y[i]);
   // Curves of A that are equal in B would be hidden.
   const others = before && before !== part ? curvesOf(before, true).filter((one) => !curves.some((other) => isSame(one, other))) : [];
-  charts[name].use([...curves, ...others]);
+  charts[name].use([...curves, ...others], part.about);
 }
 
 function showNoise() {
@@ -188,8 +189,7 @@ const USE = {
   picture: ({ about, arrays }) => panes.picture.use(about, arrays.rgba),
   scene: ({ about, arrays }) => { panes.scene.use({ ...about, frame_um: panes.b.sites?.bounds }, arrays.rgba); },
   noise: showNoise,
-  spectrum: () => showCurves("spectrum"),
-  mtf: () => showCurves("mtf"),
+  ...Object.fromEntries(CURVES.map((name) => [name, () => showCurves(name)])),
   comparison: ({ about }) => { if (page.frozen) showTable(about); },
   rules: ({ about, arrays }) => { if (panes.b.sites) rules.use(about.rules, arrays, panes.b.sites); },
 };
@@ -399,7 +399,7 @@ function drawHistogram() {
 
 function drawCharts() {
   drawHistogram();
-  for (const name of ["spectrum", "mtf"]) if (page.tiles.has(name)) charts[name].draw();
+  for (const name of CURVES) if (page.tiles.has(name)) charts[name].draw();
 }
 
 // -- the photosite ------------------------------------------------------------------------------------------------------
@@ -563,8 +563,7 @@ function showVariants() {
   recolour();
   showSummary();
   showNoise();
-  showCurves("spectrum");
-  showCurves("mtf");
+  for (const name of CURVES) showCurves(name);
   ask("map");
 }
 
@@ -795,6 +794,8 @@ function start() {
     histogram: new Histogram($("histogram"), setRange),
     spectrum: new CurveChart($("spectrum"), { nameX: "wavelength", nameY: "response", label: "Spectral response" }),
     mtf: new CurveChart($("mtf"), { nameX: "spatial frequency", nameY: "MTF", label: "Modulation transfer" }),
+    photon_transfer: new CurveChart($("photon_transfer"), { nameX: "mean signal", nameY: "noise", label: "Photon transfer", log: "xy" }),
+    snr: new CurveChart($("snr"), { nameX: "exposure", nameY: "SNR", label: "Signal-to-noise ratio", log: "x" }),
   };
   rules = new RulesList($("rules"), flyToViolation);
   panes.b.drawViolations = (context, map) => rules.draw(context, map);
