@@ -92,7 +92,7 @@ class Session:
         self.last_used_s = time.monotonic()
         self.n_uploaded_bytes = 0
         self.frames = Frames(self.uploads, self._new_path)
-        self._views = list(PARTS)
+        self._views = [part.name for part in PARTS.values() if not part.is_costly]
         self._version = 0
         self._last_id: Any = None
         self._sent: dict[str, tuple[Any, ...]] = {}

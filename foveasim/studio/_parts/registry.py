@@ -32,12 +32,15 @@ class Part:
         Returns the data.
     depends : function of Simulated
         Returns objects that determine the data: the part is computed again when one of them is another object.
+    is_costly : bool
+        Whether the part is computed only when a page asks for it, and not for previews.
     """
 
     name: str
     label: str
     make: Callable[[Simulated], PartData]
     depends: Callable[[Simulated], tuple[Any, ...]]
+    is_costly: bool = False
 
     __repr__ = short_repr
 
@@ -47,13 +50,13 @@ PARTS: dict[str, Part] = {}
 
 
 def part(
-    label: str, depends: Callable[[Simulated], tuple[Any, ...]]
+    label: str, depends: Callable[[Simulated], tuple[Any, ...]], *, is_costly: bool = False
 ) -> Callable[[Callable[[Simulated], PartData]], Callable[[Simulated], PartData]]:
     """Register a function as the view with its name."""
 
     def register(make: Callable[[Simulated], PartData]) -> Callable[[Simulated], PartData]:
         name = make.__name__
-        PARTS[name] = Part(name, label, make, depends)
+        PARTS[name] = Part(name, label, make, depends, is_costly)
         return make
 
     return register

@@ -19,11 +19,13 @@ import { fragmentOf, settingsOf, stateOf } from "./links.js";
 import { copyText, listenToDialogs, listenToMenu, showText } from "./menus.js";
 import { RulesList } from "./rules_list.js";
 import { SitePane, useSoftware } from "./site_pane.js";
+import { SolidPane } from "./solid_pane.js";
 import { Sources, isVideo } from "./sources.js";
 import { Steps } from "./steps.js";
 
 // Views in tiles, with the parts that they need; those that are shown at first on narrow and on wide screens.
 const TILES = [
+  ["solid", "3D", null],
   ["histogram", "Histogram", null], ["site", "Photosite", null], ["noise", "Noise", "noise"], ["spectrum", "Spectrum", "spectrum"],
   ["photon_transfer", "Photon transfer", "photon_transfer"], ["snr", "SNR", "snr"], ["mtf", "MTF", "mtf"], ["rules", "Design rules", "rules"],
   ["steps", "Steps", null], ["summary", "Summary", null], ["selection", "Selection", null], ["comparison", "A and B", "comparison"],
@@ -44,7 +46,7 @@ const page = {
   state: null, parts: {}, frozen: null, cursor: null, hovered: -1, pinned: -1, rectangle: null, selected: [], range: null, key: null, wantsLog: undefined,
   isSelecting: false, tiles: new Set(), asked: null, gazeAt: null, lastMs: NaN, nDone: 0, drawn: 0, boundary: null, isBusy: false,
 };
-let connection, controls, panes, charts, rules, editor, steps, sources;
+let connection, controls, panes, charts, rules, editor, steps, sources, solid;
 
 // -- drawing ------------------------------------------------------------------------------------------------------------
 
@@ -66,6 +68,7 @@ function drawAsked() {
   if (page.frozen) panes.a.follow(panes.b);
   for (const name of asked) panes[name].draw();
   if (asked.has("b")) {
+    solid.follow(panes.b);
     drawScaleBar();
     page.drawn++;
     page.drawnAt = performance.now();
@@ -79,6 +82,7 @@ function drawMarks() {
   if (b.isShown) b.drawMarks({ cursor, hovered: page.hovered, pinned, rectangle, selected, trace: rules.trace });
   if (page.frozen && a.isShown) a.drawMarks({ cursor, hovered: cursor ? a.pick(cursor.x, cursor.y) : -1, pinned: page.frozen.sites === b.sites ? pinned : -1, rectangle, selected: [], trace: null });
   for (const pane of [panes.picture, panes.pictureA, panes.scene]) pane.drawMarks({ cursor, map: b.map, boundary: page.boundary });
+  solid.mark({ cursor, hovered: page.hovered, pinned });
 }
 
 function drawScaleBar() {
@@ -191,6 +195,7 @@ const USE = {
   noise: showNoise,
   ...Object.fromEntries(CURVES.map((name) => [name, () => showCurves(name)])),
   comparison: ({ about }) => { if (page.frozen) showTable(about); },
+  stack: (part) => solid.useStack(part),
   rules: ({ about, arrays }) => { if (panes.b.sites) rules.use(about.rules, arrays, panes.b.sites); },
 };
 
@@ -354,7 +359,8 @@ function showConnection(status) {
 }
 
 function sendViews() {
-  connection.send({ do: "views", names: [...ALWAYS, ...TILES.filter(([name, , part]) => part && (page.tiles.has(name) || (part === "rules" && editor.isOn))).map(([, , part]) => part)] });
+  const isWanted = ([name, , part]) => part && (page.tiles.has(name) || (part === "rules" && editor.isOn));
+  connection.send({ do: "views", names: [...ALWAYS, ...TILES.filter(isWanted).map(([, , part]) => part), ...solid.parts] });
 }
 
 // -- tiles --------------------------------------------------------------------------------------------------------------
@@ -362,7 +368,7 @@ function sendViews() {
 function createTiles() {
   let chosen = null;
   try { chosen = JSON.parse(localStorage.getItem("foveasim-studio-tiles")); } catch { /* the first ones */ }
-  const known = TILES.map(([name]) => name), first = innerWidth >= WIDE ? known : FIRST_TILES;
+  const known = TILES.map(([name]) => name), first = innerWidth >= WIDE ? known.filter((name) => name !== "solid") : FIRST_TILES;
   page.tiles = new Set(Array.isArray(chosen) ? chosen.filter((name) => known.includes(name)) : first);
   $("tabs").append(...TILES.map(([name, label]) => {
     const button = make("button", label);
@@ -380,6 +386,7 @@ function showTile(name, isShown) {
   else page.tiles.delete(name);
   try { localStorage.setItem("foveasim-studio-tiles", JSON.stringify([...page.tiles])); } catch { /* not kept */ }
   markTiles();
+  solid.follow(panes.b);
   sendViews();
   resize();
   if (isShown) $("tile-" + name).scrollIntoView({ block: "nearest", inline: "nearest" });
@@ -404,9 +411,9 @@ function drawCharts() {
 
 // -- the photosite ------------------------------------------------------------------------------------------------------
 
-function hover(x, y, from) {
+function hover(x, y, from, site = panes.b.pick(x, y)) {
   page.cursor = { x, y, from };
-  page.hovered = panes.b.pick(x, y);
+  page.hovered = site;
   const { map } = panes.b;
   $("cursor").textContent = map ? "x " + positionText(x, map.scale) + "  y " + positionText(y, map.scale) + " µm" : "";
   tellSite();
@@ -797,6 +804,7 @@ function start() {
     photon_transfer: new CurveChart($("photon_transfer"), { nameX: "mean signal", nameY: "noise", label: "Photon transfer", log: "xy" }),
     snr: new CurveChart($("snr"), { nameX: "exposure", nameY: "SNR", label: "Signal-to-noise ratio", log: "x" }),
   };
+  solid = new SolidPane({ hover, leave, click: (site) => { if (site >= 0) pin(site); }, changed: () => sendViews() });
   rules = new RulesList($("rules"), flyToViolation);
   panes.b.drawViolations = (context, map) => rules.draw(context, map);
   panes.b.violations = () => [page.parts.rules?.version, rules.rule, rules.chosen];
@@ -826,7 +834,7 @@ start();
 
 // For tests and scripts.
 window.studio = {
-  page, panes, controls, connection, charts, rules, editor, steps, sources,
+  page, panes, controls, connection, charts, rules, editor, steps, sources, solid,
   get state() { return page.state; },
   get isReady() { return Boolean(page.state && panes.b.scale && !page.isBusy && connection.isOpen && connection.waiting === null && page.asked === null); },
   toWindow: (x, y, pane = "b") => {

@@ -11,15 +11,21 @@ uniform ivec3 centre;
 uniform vec3 rest;
 uniform vec3 unit;
 uniform mat4 toClip;
+uniform float tallest;
 uniform highp sampler2D colours;
+uniform highp sampler2D heights;
 out vec3 at;
 flat out vec3 colour;
 flat out uint owner;
 void main() {
+  ivec2 entry = ivec2(int(site) % ${TEXTURE_WIDTH}, int(site) / ${TEXTURE_WIDTH});
   // Integers subtract exactly, so that surfaces are sharp at any zoom.
-  at = (vec3(position - centre) - rest) * unit;
+  vec3 steps = vec3(position - centre);
+  // With a height per site, z is 0 at the bottom and 1 at the top.
+  if (tallest > 0.0) steps.z = float(position.z) * tallest * texelFetch(heights, entry, 0).r - float(centre.z);
+  at = (steps - rest) * unit;
   gl_Position = toClip * vec4(at, 1.0);
-  colour = texelFetch(colours, ivec2(int(site) % ${TEXTURE_WIDTH}, int(site) / ${TEXTURE_WIDTH}), 0).rgb;
+  colour = texelFetch(colours, entry, 0).rgb;
   owner = site;
 }`;
 const SRGB = `
@@ -89,13 +95,10 @@ const CUT_INSET = 1e-4;
 export class SolidView {
   // Takes the canvas, Bodies, an Orbit around them, the number of sites, and findRenderer().
   constructor(canvas, bodies, orbit, nSites, renderer) {
-    if (bodies.list.length > MAX_PARTS) throw new Error("more than " + MAX_PARTS + " parts");
     this.canvas = canvas;
-    this.bodies = bodies;
     this.orbit = orbit;
-    this.nSites = nSites;
     this.wantedSamples = renderer.isSlow ? 0 : SAMPLES;
-    this.parts = bodies.list.map((body) => ({ name: body.name, nTriangles: body.nTriangles, isVisible: true, painted: null, body }));
+    this._take(bodies, nSites);
     this.ground = [0, 0, 0];
     this.hovered = -1;
     this.pinned = -1;
@@ -111,30 +114,58 @@ export class SolidView {
     this.load();
   }
 
+  _take(bodies, nSites) {
+    if (bodies.list.length > MAX_PARTS) throw new Error("more than " + MAX_PARTS + " parts");
+    this.bodies = bodies;
+    this.nSites = nSites;
+    // Heights of the sites as fractions of the tallest, at index site + 1, for bodies with "tallest" lattice steps.
+    this.heights = null;
+    this.parts = bodies.list.map((body) => ({ name: body.name, nTriangles: body.nTriangles, isVisible: true, painted: null, cutShift: 0, body }));
+  }
+
+  // Shows other bodies; the GPU resources of those before are freed.
+  use(bodies, nSites) {
+    const { gl } = this;
+    for (const part of this.parts) {
+      gl.deleteVertexArray(part.vertices);
+      for (const buffer of part.buffers) gl.deleteBuffer(buffer);
+      gl.deleteTexture(part.colours);
+    }
+    gl.deleteTexture(this.heightTable);
+    this._take(bodies, nSites);
+    this._loadParts();
+  }
+
   // Creates all GPU resources; again after the context was lost.
   load() {
-    const { gl, bodies } = this;
+    const { gl } = this;
     // The same attribute numbers, so that one vertex array serves both programs.
     this.image = buildProgram(gl, VERTEX_SHADER, IMAGE_SHADER, ATTRIBUTES);
     this.id = buildProgram(gl, VERTEX_SHADER, ID_SHADER, ATTRIBUTES);
     this.screen = buildProgram(gl, SCREEN_SHADER, COMPOSE_SHADER);
+    this.nothing = gl.createVertexArray();
+    this.targets = null;
+    this._loadParts();
+  }
+
+  _loadParts() {
+    const { gl, bodies } = this;
     gl.activeTexture(gl.TEXTURE0);
+    this.heightTable = createLookup(gl);
+    this._sendHeights();
     for (const part of this.parts) {
       const { positions, sites, indices, tiles } = bodies.build(part.body);
       part.tiles = tiles;
       part.vertices = gl.createVertexArray();
       gl.bindVertexArray(part.vertices);
-      bindIntegers(gl, 0, positions, 3, gl.INT);
-      bindIntegers(gl, 1, sites, 1, gl.UNSIGNED_INT);
-      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+      part.buffers = [bindIntegers(gl, 0, positions, 3, gl.INT), bindIntegers(gl, 1, sites, 1, gl.UNSIGNED_INT), gl.createBuffer()];
+      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, part.buffers[2]);
       gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
       part.colours = createLookup(gl);
       sendLookup(gl, part.painted || this._ownColours(part));
     }
-    this.nothing = gl.createVertexArray();
     gl.bindVertexArray(null);
-    this.targets = null;
-    this.isImageStale = this.areIdsStale = true;
+    this.change();
   }
 
   // Buffers of the canvas's size: samples and depths, the image, ids and their depths.
@@ -216,6 +247,21 @@ export class SolidView {
     return bytes;
   }
 
+  // Changes the heights of the sites: fractions of the tallest, at index site + 1.
+  setHeights(heights) {
+    const { gl } = this;
+    this.heights = heights;
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, this.heightTable);
+    this._sendHeights();
+    this.change();
+  }
+
+  _sendHeights() {
+    const { gl } = this, table = this.heights || new Float32Array(TEXTURE_WIDTH);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32F, TEXTURE_WIDTH, table.length / TEXTURE_WIDTH, 0, gl.RED, gl.FLOAT, table);
+  }
+
   setHeight(factor) { this.orbit.setHeight(factor); this.change(); }
 
   // Draws outdated buffers, and the screen.
@@ -281,7 +327,11 @@ export class SolidView {
     gl.uniform3f(at.rest, cx - wx, cy - wy, cz - wz);
     gl.uniform3f(at.unit, unit, unit, unit * orbit.height);
     gl.uniformMatrix4fv(at.toClip, false, orbit.toClip);
-    gl.uniform4f(at.cut, ...this._cutPlane());
+    gl.uniform1f(at.tallest, this.bodies.tallest || 0);
+    gl.uniform1i(at.colours, 0);
+    gl.uniform1i(at.heights, 2);
+    gl.activeTexture(gl.TEXTURE2);
+    gl.bindTexture(gl.TEXTURE_2D, this.heightTable);
     this._findPlanes(cx, cy, cz, unit);
     // Back faces are visible through a cut only.
     if (this.cut) gl.disable(gl.CULL_FACE);
@@ -291,6 +341,7 @@ export class SolidView {
       const part = this.parts[k], { tiles } = part;
       if (!part.isVisible) continue;
       if (at.part !== undefined) gl.uniform1ui(at.part, k + 1);
+      gl.uniform4f(at.cut, ...this._cutPlane(part.cutShift));
       gl.bindTexture(gl.TEXTURE_2D, part.colours);
       gl.bindVertexArray(part.vertices);
       let from = -1, to = -1;
@@ -309,13 +360,14 @@ export class SolidView {
   }
 
   // The cut relative to the target in units of its distance: a normal and a distance; a zero normal cuts nothing.
-  _cutPlane() {
+  // A shift in µm moves it for a part, which removes more of that part.
+  _cutPlane(shift = 0) {
     const { cut, orbit: { target, distance, height } } = this, plane = [0, 0, 0, 1];
     if (cut) {
       plane[cut.axis] = cut.sign;
       // Slightly inside, so that walls exactly at the position are removed.
       const inset = CUT_INSET * (this.bodies.high[cut.axis] - this.bodies.low[cut.axis]) * (cut.axis === 2 ? height : 1);
-      plane[3] = (cut.sign * (cut.position * (cut.axis === 2 ? height : 1) - target[cut.axis]) - inset) / distance;
+      plane[3] = (-shift + cut.sign * (cut.position * (cut.axis === 2 ? height : 1) - target[cut.axis]) - inset) / distance;
     }
     return plane;
   }
@@ -341,14 +393,21 @@ export class SolidView {
     return true;
   }
 
+  // Draws the ids if they are outdated, so that the hovered site is highlighted.
+  updateIds() {
+    const { gl, canvas } = this;
+    if (gl.isContextLost() || !this.areIdsStale) return;
+    if (!this.targets || this.targets.width !== canvas.width || this.targets.height !== canvas.height) this._resizeTargets();
+    this._drawIds();
+  }
+
   // Returns the visible site and part at a pixel, -1 for none, and the depth for Orbit.pointAt.
   pick(px, py) {
     const { gl, found, word, canvas, orbit } = this;
     found.site = found.part = -1;
     found.depth = 1;
     if (gl.isContextLost() || !(px >= 0 && py >= 0 && px < orbit.width && py < orbit.tall)) return found;
-    if (!this.targets || this.targets.width !== canvas.width || this.targets.height !== canvas.height) this._resizeTargets();
-    if (this.areIdsStale) this._drawIds();
+    this.updateIds();
     const x = Math.floor((px * canvas.width) / orbit.width), y = canvas.height - 1 - Math.floor((py * canvas.height) / orbit.tall);
     gl.bindFramebuffer(gl.READ_FRAMEBUFFER, this.targets.frames[2]);
     gl.readPixels(x, y, 1, 1, gl.RGBA_INTEGER, gl.UNSIGNED_INT, word);

@@ -1,0 +1,274 @@
+"""Views of the studio in a browser: charts over signal and exposure, columns and layers in three dimensions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("starlette")
+pytest.importorskip("uvicorn")
+
+from studio.test_studio_page import browser, change, has_picture, server, set_value, settle, until, visit
+
+pytestmark = pytest.mark.needs("chromium")
+__all__ = ["browser", "server", "visit"]
+
+#: Browsers without WebGL.
+WITHOUT_WEBGL = """{ const own = HTMLCanvasElement.prototype.getContext;
+  HTMLCanvasElement.prototype.getContext = function (kind, ...rest) { return /webgl/.test(kind) ? null : own.call(this, kind, ...rest); }; }"""
+
+
+def show(page, *names):
+    """Show only the tiles with these names."""
+    page.evaluate(
+        "names => { for (const b of document.querySelectorAll('#tabs button'))"
+        " if ((b.getAttribute('aria-pressed') === 'true') !== names.includes(b.dataset.tile)) b.click(); }",
+        list(names),
+    )
+    settle(page)
+
+
+def show_solid(page, mode="columns"):
+    show(page, "solid")
+    if mode == "stack":
+        page.click("[data-solid=stack]")
+        until(page, "() => studio.page.parts.stack")
+    until(
+        page,
+        "mode => studio.solid.shown.mode === mode && studio.solid.view.counts.screen > 0 && !studio.solid.isAsked",
+        mode,
+    )
+
+
+def pixels(page):
+    """Return the drawn pixels of the 3D view, (n_y, n_x, 3)."""
+    values = page.evaluate("""() => { const { view } = studio.solid, { gl, canvas: { width, height } } = view, data = new Uint8Array(4 * width * height);
+      view.draw(); gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, data);
+      let text = ""; for (let i = 0; i < data.length; i += 8192) text += String.fromCharCode(...data.subarray(i, i + 8192)); return [width, height, btoa(text)]; }""")
+    import base64
+
+    width, height, text = values
+    return np.frombuffer(base64.b64decode(text), np.uint8).reshape(height, width, 4)[::-1, :, :3].astype(int)
+
+
+# -- charts -----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_charts_have_curves_marks_and_notes(visit, scheme):
+    page = visit(color_scheme=scheme)
+    show(page, "photon_transfer", "snr", "mtf")
+    until(page, "() => ['photon_transfer', 'snr', 'mtf'].every((name) => studio.page.parts[name])")
+
+    for name in ("photon_transfer", "snr", "mtf"):
+        assert has_picture(page, f"#{name} canvas"), name
+    assert page.locator("#photon_transfer li").all_inner_texts()[:2] == ["temporal noise", "photon shot"]
+    assert page.locator("#snr li").all_inner_texts() == ["R", "G", "B"]
+    assert "full range" in page.inner_text("#photon_transfer .chart-note")
+    assert "Dynamic range / dB: R" in page.inner_text("#snr .chart-note")
+    assert "Nyquist" in page.inner_text("#mtf")
+    assert page.evaluate("studio.charts.snr.marks.length") == 6
+
+
+def test_signal_mark_follows_exposure(visit):
+    page = visit()
+    show(page, "photon_transfer")
+    until(page, "() => studio.charts.photon_transfer.marks.length")
+    before = page.evaluate("studio.charts.photon_transfer.marks[0].x")
+    set_value(page, "exposure_s", 0.01)
+
+    assert page.evaluate("studio.charts.photon_transfer.marks[0].x") == pytest.approx(before / 2, rel=1e-3)
+
+
+def test_logarithmic_chart_reads_values_at_mouse(visit):
+    page = visit()
+    show(page, "snr")
+    until(page, "() => studio.page.parts.snr")
+    box = page.locator("#snr canvas").bounding_box()
+    page.mouse.move(box["x"] + 46 + 0.5 * (box["width"] - 56), box["y"] + 40)
+    first, *values = page.locator("#snr li").all_inner_texts()
+    low, high = page.evaluate(
+        "() => { const all = studio.charts.snr.curves.flatMap((c) => [...c.x]); return [Math.min(...all), Math.max(...all)]; }"
+    )
+
+    assert float(first.split()[0]) == pytest.approx(np.sqrt(low * high), rel=0.03)
+    assert len(values) == 3
+
+
+# -- three dimensions -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_columns_have_colours_of_the_map(visit, scheme):
+    page = visit(color_scheme=scheme)
+    show_solid(page)
+    page.click("#solid-above")
+    until(page, "() => !studio.solid.isAsked")
+    seen = {tuple(v) for v in pixels(page).reshape(-1, 3)}
+    ground = page.evaluate("studio.solid.view.ground")
+    expected = page.evaluate("""() => { const { sites, scale } = studio.panes.b, areas = [...sites.area.keys()].sort((a, b) => sites.area[b] - sites.area[a]);
+      return areas.slice(0, 40).map((site) => scale.colour(site)); }""")
+
+    assert tuple(ground) in seen
+    # Tops face the lens; the light is inclined by 31 degrees.
+    lit = 0.42 + 0.60 * 0.856
+    linear = [
+        np.where(np.array(c) / 255 <= 0.04045, np.array(c) / 255 / 12.92, ((np.array(c) / 255 + 0.055) / 1.055) ** 2.4)
+        for c in expected
+    ]
+    near = []
+    for colour in linear:
+        value = colour * lit
+        wanted = np.rint(255 * np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055))
+        near.append(any(np.abs(wanted - v).max() <= 3 for v in seen))
+    assert np.mean(near) > 0.9
+
+
+def test_columns_follow_values_without_outlines(visit):
+    page = visit()
+    show_solid(page)
+    before = page.evaluate(
+        "() => { window.bodies = studio.solid.view.bodies; return [...studio.solid.view.heights.subarray(1, studio.panes.b.sites.n + 1)]; }"
+    )
+    set_value(page, "exposure_s", 0.004)
+    until(page, "() => !studio.solid.isAsked")
+    after, codes, top = page.evaluate(
+        "() => [[...studio.solid.view.heights.subarray(1, studio.panes.b.sites.n + 1)], [...studio.panes.b.column.values], studio.panes.b.scale.to]"
+    )
+
+    assert page.evaluate("window.bodies === studio.solid.view.bodies")
+    assert after == pytest.approx(np.array(codes) / top, abs=1e-6)
+    assert before != after
+    page.select_option("#colouring", "size_um")
+    until(page, "() => !studio.solid.isAsked && studio.solid.shown.scale === studio.panes.b.scale")
+    assert "size" in page.inner_text("#solid-text")
+    set_value(page, "layout.parameters.n_sectors", 36)
+    until(page, "() => !studio.solid.isAsked && studio.solid.view.bodies.sites === studio.panes.b.sites")
+
+
+def test_cursor_is_common_with_columns(visit):
+    page = visit()
+    show_solid(page)
+    page.click("#solid-above")
+    until(page, "() => !studio.solid.isAsked")
+    site = 200
+    x, y = page.evaluate("site => studio.panes.b.sites.centre(site)", site)
+    at = page.evaluate(
+        """([x, y, site]) => { const { view, half } = studio.solid, box = half.getBoundingClientRect(), [px, py] = view.orbit.project(x, y, view.heights[site + 1] * view.bodies.high[2], [0, 0]);
+      return [box.left + px, box.top + py]; }""",
+        [x, y, site],
+    )
+    page.mouse.move(*at)
+    until(page, "site => studio.page.hovered === site", site)
+    assert page.evaluate("[studio.page.cursor.x, studio.page.cursor.y]") == pytest.approx([x, y], abs=4.0)
+    page.mouse.click(*at)
+    until(page, "site => studio.page.pinned === site", site)
+    page.mouse.move(*page.evaluate("([x, y]) => studio.toWindow(x, y)", [x, y]))
+    until(
+        page, "site => studio.solid.hovered === site && !studio.solid.isAsked && !studio.solid.view.areIdsStale", site
+    )
+    lit = pixels(page)
+    page.mouse.move(2, 2)
+    until(page, "() => studio.solid.hovered === -1 && !studio.solid.isAsked")
+    assert (lit != pixels(page)).any()
+
+
+def test_view_rotates_by_mouse_and_keys(visit):
+    page = visit()
+    show_solid(page)
+    orbit = "[studio.solid.view.orbit.azimuth, studio.solid.view.orbit.elevation, studio.solid.view.orbit.distance]"
+    start = page.evaluate(orbit)
+    box = page.locator("#solid").bounding_box()
+    page.mouse.move(box["x"] + 100, box["y"] + 100)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 160, box["y"] + 120, steps=4)
+    page.mouse.up()
+    turned = page.evaluate(orbit)
+    assert turned[0] < start[0]
+    assert turned[1] > start[1]
+    map_scale = page.evaluate("studio.panes.b.map.scale")
+    page.focus("#solid .marks")
+    for key in ("ArrowRight", "ArrowUp", "+", "Enter"):
+        page.keyboard.press(key)
+    moved = page.evaluate(orbit)
+    assert moved[0] > turned[0]
+    assert moved[2] < turned[2]
+    assert page.evaluate("studio.panes.b.map.scale") == map_scale
+    assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") != "none"
+    page.keyboard.press("t")
+    assert page.evaluate("studio.solid.view.orbit.elevation") == pytest.approx(np.pi / 2)
+    page.keyboard.press("0")
+    assert page.evaluate(orbit)[:2] == pytest.approx(start[:2])
+
+
+def test_height_slider_scales_columns(visit):
+    page = visit()
+    show_solid(page)
+    page.evaluate(
+        "() => { const s = document.getElementById('solid-height'); s.value = 1; s.dispatchEvent(new Event('input')); }"
+    )
+
+    assert page.evaluate("studio.solid.view.orbit.height") == 2
+    assert page.inner_text("#solid-factor") == "× 2"
+    page.click("[data-solid=stack]")
+    until(page, "() => studio.solid.shown.mode === 'stack'")
+    page.click("[data-solid=columns]")
+    until(page, "() => studio.solid.shown.mode === 'columns'")
+    assert page.inner_text("#solid-factor") == "× 2"
+
+
+def test_layers_are_stacked_and_cut(visit):
+    page = visit()
+    show_solid(page, "stack")
+    assert page.evaluate("studio.solid.view.parts.map((part) => part.name)") == [
+        "wells",
+        "trenches",
+        "filters",
+        "lenses",
+    ]
+    assert "Silicon 3 µm" in page.inner_text("#solid-text")
+    found = page.evaluate("""() => { const { view } = studio.solid, seen = new Set(); view.updateIds();
+      for (let x = 0; x < view.orbit.width; x += 2) for (let y = 0; y < view.orbit.tall; y += 2) { const { part } = view.pick(x, y); if (part >= 0) seen.add(view.parts[part].name); } return [...seen]; }""")
+    assert {"wells", "filters", "lenses"} <= set(found)
+    page.evaluate(
+        "() => { const s = document.getElementById('solid-cut'); s.value = 0; s.dispatchEvent(new Event('input')); }"
+    )
+    assert page.evaluate("studio.solid.view.cut") is None
+
+
+def test_hidden_view_computes_nothing(visit):
+    page = visit()
+    show(page, "histogram")
+    set_value(page, "exposure_s", 0.01)
+
+    assert page.evaluate("studio.solid.view") is None
+    show_solid(page, "stack")
+    show(page, "histogram")
+    page.evaluate("() => { delete studio.page.parts.stack; window.drawn = studio.solid.view.counts.image; }")
+    set_value(page, "layout.parameters.n_sectors", 40)
+    assert page.evaluate("[studio.page.parts.stack === undefined, studio.solid.view.counts.image - window.drawn]") == [
+        True,
+        0,
+    ]
+
+
+def test_line_explains_missing_webgl(visit):
+    page = visit(script=WITHOUT_WEBGL)
+    show(page, "solid")
+    until(page, "() => !document.getElementById('solid-note').hidden")
+
+    assert "WebGL2" in page.inner_text("#solid-note")
+    set_value(page, "exposure_s", 0.01)
+
+
+@pytest.mark.parametrize("width", [390, 1280, 2560])
+def test_new_views_fit_width(visit, width):
+    page = visit(width=width, height=844 if width < 500 else width * 9 // 16)
+    show(page, "solid", "photon_transfer", "snr", "mtf")
+    change(page, "() => { studio.connection.set('exposure_s', 0.015, true); }")
+
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    for name in ("#solid", "#map", "#photon_transfer canvas", "#snr canvas"):
+        box = page.locator(name).bounding_box()
+        assert box["width"] > 100, name
+        assert box["height"] > 60, name
