@@ -125,6 +125,8 @@ class ShotRunner:
         Threads of a capture; by default those of the worker, or of this process.
     max_bytes : int
         Size limit of the arrays in the cache. On a worker the limit is at most a quarter of its memory.
+    check : callable, optional
+        Called before each stage; it may raise an exception to stop the simulation. Stages until then remain in the cache.
 
     Notes
     -----
@@ -139,8 +141,10 @@ class ShotRunner:
         is_geometry_varied: bool = True,
         n_threads: int | None = None,
         max_bytes: int = MAX_BYTES,
+        check: Callable[[], None] | None = None,
     ) -> None:
         self.source, self.metrics = source, metrics
+        self.check = check
         self.is_geometry_varied, self.n_threads, self.max_bytes = is_geometry_varied, n_threads, max_bytes
         self._cache: WorkerCache | None = None
 
@@ -164,12 +168,31 @@ class ShotRunner:
 
     def simulate_capture(self, settings: Mapping[str, Any]) -> tuple[Shot, Capture]:
         """Build the shot of the given settings and simulate its capture."""
-        shot = build_shot(self.source, settings, n_threads=self.n_threads, cache=self.cache.part)
+        shot = self.build_shot(settings)
+        return shot, self.capture(shot, settings)
+
+    def build_shot(self, settings: Mapping[str, Any]) -> Shot:
+        """Build the shot of the given settings."""
+        return build_shot(self.source, settings, n_threads=self.n_threads, cache=self.part)
+
+    def capture(self, shot: Shot, settings: Mapping[str, Any]) -> Capture:
+        """Simulate the capture of a shot with the given settings."""
         photo_e_per_s = self.photoelectrons_per_s(shot, settings)
-        capture = shot.camera.capture(
-            shot.scene, exposure_s=shot.exposure_s, seed=shot.seed, photo_e_per_s=photo_e_per_s
-        )
-        return shot, capture
+        self._before_stage()
+        return shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed, photo_e_per_s=photo_e_per_s)
+
+    def part(self, kind: str, settings: Any, make: Callable[[], Any]) -> Any:
+        """Return a component as :meth:`WorkerCache.part`, with a check before it is built."""
+
+        def checked() -> Any:
+            self._before_stage()
+            return make()
+
+        return self.cache.part(kind, settings, checked)
+
+    def _before_stage(self) -> None:
+        if self.check is not None:
+            self.check()
 
     def photoelectrons_per_s(self, shot: Shot, settings: Mapping[str, Any]) -> Floats:
         """Return the photoelectron rates of a shot's sites, (n_site,) e-/s."""
@@ -177,8 +200,8 @@ class ShotRunner:
         image_settings = _image_settings(shot, settings)
         filters = hashlib.sha256(camera.sensor.filter_of_site.tobytes()).hexdigest()
         sites = [settings["layout"], settings.get("distortion"), settings.get("integration_order"), filters]
-        images = cache.part("images", image_settings, dict) if self.is_geometry_varied else None
-        rates: Floats = cache.part(
+        images = cache.part("images", image_settings, self._make_images) if self.is_geometry_varied else None
+        rates: Floats = self.part(
             "power on sites",
             [image_settings, sites],
             lambda: camera.photoelectrons_per_s(shot.scene, images=images),
@@ -187,8 +210,12 @@ class ShotRunner:
 
     def images(self, shot: Shot, settings: Mapping[str, Any]) -> dict[Any, Any]:
         """Return the optical images that a shot's capture computed, by grid and filter."""
-        found: dict[Any, Any] = self.cache.part("images", _image_settings(shot, settings), dict)
+        found: dict[Any, Any] = self.cache.part("images", _image_settings(shot, settings), self._make_images)
         return found
+
+    def _make_images(self) -> dict[Any, Any]:
+        """Return an empty cache of images, with a check after each."""
+        return {} if self.check is None else _CheckedImages(self._before_stage)
 
     def _measure(self, metric: Metric, shot: Shot, capture: Capture, settings: Mapping[str, Any]) -> Any:
         """Compute a metric, with a cached reference where the metric takes one."""
@@ -228,6 +255,18 @@ class ShotRunner:
                         errors.append(text if text.startswith(f"'{name}") else f"{name}: {text}")
         messages = dict.fromkeys([*self.cache.finish_point(), *(str(warning.message) for warning in caught)])
         return Record(point, values, "; ".join(errors), "; ".join(_truncate(text) for text in messages))
+
+
+class _CheckedImages(dict[Any, Any]):
+    """Optical images that call a function after each new one."""
+
+    def __init__(self, check: Callable[[], None]) -> None:
+        super().__init__()
+        self._check = check
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        super().__setitem__(key, value)
+        self._check()
 
 
 def _worker() -> Any:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats
@@ -14,11 +18,14 @@ from foveasim.capture import Capture
 from foveasim.config import Shot
 from foveasim.errors import GeometryError
 from foveasim.explore.worker_cache import ShotRunner
+from foveasim.scene import Scene
 
-__all__ = ["Engine", "Simulated"]
+__all__ = ["Engine", "Simulated", "block_means"]
 
 #: Largest number of photosites that are shown.
 MAX_SITES = 2_000_000
+#: Largest number of cells of the optical image of a preview.
+PREVIEW_CELLS = 1 << 18
 #: Size limit of the arrays in the cache of a session.
 MAX_BYTES = 1 << 27
 
@@ -42,6 +49,8 @@ class Simulated:
         Time of the simulation.
     frozen : Simulated, optional
         Variant to compare with.
+    is_preview : bool
+        Whether the scene was reduced.
     """
 
     settings: dict[str, Any]
@@ -52,6 +61,7 @@ class Simulated:
     warnings: list[str] = field(default_factory=list)
     seconds_s: float = 0.0
     frozen: Simulated | None = None
+    is_preview: bool = False
 
     __repr__ = short_repr
 
@@ -66,10 +76,12 @@ class Engine:
     ----------
     n_threads : int, optional
         Number of threads; one per core by default.
+    check : callable, optional
+        Called before each stage; it may raise an exception to stop the simulation.
     """
 
-    def __init__(self, *, n_threads: int | None = None) -> None:
-        self._runner = ShotRunner(None, {}, n_threads=n_threads, max_bytes=MAX_BYTES)
+    def __init__(self, *, n_threads: int | None = None, check: Callable[[], None] | None = None) -> None:
+        self._runner = ShotRunner(None, {}, n_threads=n_threads, max_bytes=MAX_BYTES, check=check)
 
     @property
     def n_built(self) -> dict[str, int]:
@@ -80,9 +92,15 @@ class Engine:
         """Remove cached stages whose settings contain a string, such as the path of a frame."""
         self._runner.cache.forget(text)
 
-    def simulate(self, settings: Mapping[str, Any]) -> Simulated:
+    def simulate(self, settings: Mapping[str, Any], *, is_preview: bool = False) -> Simulated:
         """
         Simulate the shot of settings.
+
+        Parameters
+        ----------
+        settings : mapping
+        is_preview : bool
+            Whether a large scene may be reduced: means of blocks of its pixels, and no finer cells of the optical image.
 
         Raises
         ------
@@ -94,16 +112,62 @@ class Engine:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:
-                shot, capture = self._runner.simulate_capture(settings)
+                shot, used, is_reduced = self._shot(settings, is_preview)
+                capture = self._runner.capture(shot, used)
                 if not 0 < capture.layout.n_sites <= MAX_SITES:
                     raise GeometryError(
                         f"the studio shows layouts of 1 to {MAX_SITES:,} photosites, got {capture.layout.n_sites:,}"
                     )
-                photo_e_per_s = self._runner.photoelectrons_per_s(shot, settings)
-                images = self._runner.images(shot, settings)
+                photo_e_per_s = self._runner.photoelectrons_per_s(shot, used)
+                images = self._runner.images(shot, used)
             finally:
                 found = cache.finish_point()
         messages = dict.fromkeys([*found, *(" ".join(str(warning.message).split()) for warning in caught)])
         return Simulated(
-            dict(settings), shot, capture, photo_e_per_s, images, list(messages), time.perf_counter() - start_s
+            dict(settings),
+            shot,
+            capture,
+            photo_e_per_s,
+            images,
+            list(messages),
+            time.perf_counter() - start_s,
+            is_reduced,
         )
+
+    def _shot(self, settings: Mapping[str, Any], is_preview: bool) -> tuple[Shot, Mapping[str, Any], bool]:
+        """Return a shot, the settings that identify its components in the cache, and whether its scene was reduced."""
+        shot = self._runner.build_shot(settings)
+        scene, camera = shot.scene, shot.camera
+        if not (is_preview and isinstance(scene, Scene)):
+            return shot, settings, False
+        oversample = camera.oversample(scene)
+        n_cells = math.prod(scene.basis.shape[1:])
+        if n_cells * oversample**2 <= PREVIEW_CELLS:
+            return shot, settings, False
+        block = math.ceil(math.sqrt(n_cells / PREVIEW_CELLS))
+        key = [settings["scene"], block]
+        reduced = self._runner.part("preview", key, lambda: _reduced(scene, block))
+        used = {**settings, "scene": {"preview": key}, "optics": {**settings["optics"], "oversample": 1}}
+        optics = self._runner.part("optics", used["optics"], lambda: replace(camera.optics, oversample=1))
+        return replace(shot, scene=reduced, camera=camera.replace(optics=optics)), used, True
+
+
+def block_means(cells: NDArray[Any], block: int) -> NDArray[Any]:
+    """Return means of square blocks of cells, (n_y // block, n_x // block); incomplete upper and right blocks are cropped."""
+    if block == 1:
+        return cells
+    n_y, n_x = (n // block for n in cells.shape)
+    # Sums of complete rows first: much faster than sums over both axes at once.
+    rows = cells[: n_y * block, : n_x * block].reshape(n_y, block, -1).sum(axis=1)
+    return np.asarray(rows.reshape(n_y, n_x, block).sum(axis=2) / cells.dtype.type(block * block))
+
+
+def _reduced(scene: Scene, block: int) -> Scene:
+    """Return a scene with means of blocks of its pixels; the outermost pixels may be cropped."""
+    if block == 1:
+        return scene
+    n_y, n_x = (block * (n // block) for n in scene.basis.shape[1:])
+    y0, x0 = ((n - used) // 2 for n, used in zip(scene.basis.shape[1:], (n_y, n_x), strict=True))
+    basis = np.stack([block_means(image[y0 : y0 + n_y, x0 : x0 + n_x], block) for image in scene.basis])
+    pitch_um = None if scene.pitch_um is None or scene.field_of_view_deg is not None else scene.pitch_um * block
+    return replace(scene, basis=basis, pitch_um=pitch_um)

@@ -22,7 +22,9 @@ TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float32", "floa
 NOT_FINITE = {".inf": math.inf, "-.inf": -math.inf}
 
 
-def encode_part(name: str, version: int, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> bytes:
+def encode_part(
+    name: str, version: int, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], *, is_preview: bool = False
+) -> bytes:
     """
     Encode a part: the length of the header as little-endian uint32, the header, the arrays.
 
@@ -35,6 +37,8 @@ def encode_part(name: str, version: int, about: Mapping[str, Any], arrays: Mappi
         Plain data.
     arrays : mapping of str to array
         Of the types in :data:`TYPES`, any shape; each begins at a multiple of 8 bytes.
+    is_preview : bool
+        Whether the data are those of a preview.
     """
     described, pieces, offset = [], [], 0
     for key, array in arrays.items():
@@ -46,7 +50,13 @@ def encode_part(name: str, version: int, about: Mapping[str, Any], arrays: Mappi
         pieces += [content, bytes(-len(content) % ALIGNMENT)]
         offset += len(content) + -len(content) % ALIGNMENT
     header = json.dumps(
-        {"part": name, "version": version, "about": to_json(dict(about)), "arrays": described},
+        {
+            "part": name,
+            "version": version,
+            "about": to_json(dict(about)),
+            "arrays": described,
+            **({"is_preview": True} if is_preview else {}),
+        },
         allow_nan=False,
         separators=(",", ":"),
     ).encode()

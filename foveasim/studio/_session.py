@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import difflib
 import json
+import math
 import shutil
 import tempfile
 import threading
@@ -21,6 +22,7 @@ from foveasim._io.yaml_files import format_yaml
 from foveasim.config import check_settings, put_setting
 from foveasim.errors import FoveasimError, ParameterError, SimulationError, printable
 from foveasim.studio._controls import chosen_value, controls_of, structure_of, value_at
+from foveasim.studio._costs import REST_S, Costs, SupersededError
 from foveasim.studio._engine import Engine, Simulated
 from foveasim.studio._exports import notebook
 from foveasim.studio._files import Files, apply_preset, file_name, with_layout
@@ -41,6 +43,8 @@ MAX_MESSAGE_LENGTH = 500
 MAX_DEPTH = 20
 #: Number of colour filters that a layout without mosaic receives.
 N_FILTERS = 3
+#: Newer changes stop simulations for at most this time in succession, so that some are shown.
+MAX_STOPPED_S = 3.0
 #: Messages that change the settings.
 CHANGES = ("set", "reset", "delete", "undo", "redo", "preset", "restore", "file", "video", "frame", "match")
 
@@ -86,7 +90,7 @@ class Session:
         self.name, self.start = name, start
         self.uploads = Path(tempfile.mkdtemp(prefix="foveasim-studio-"))
         self.files = Files(start.settings, start.directory, self.uploads)
-        self.engine = Engine(n_threads=n_threads)
+        self.engine = Engine(n_threads=n_threads, check=self._check)
         self.history = History(start.settings)
         self.result: Simulated | None = None
         self.last_used_s = time.monotonic()
@@ -103,6 +107,14 @@ class Session:
         self._frozen_result: Simulated | None = None
         self._errors: dict[str, str] = {}
         self._simulated_frame: str | None = None
+        self._costs = Costs()
+        # Setting that changed last, and whether this was during a drag.
+        self._key: str | None = None
+        self._is_dragging = False
+        self._left_out: list[str] = []
+        self._wants_rest = False
+        self._can_stop = False
+        self._stopped_s = -math.inf
         self._listeners: set[Listener] = set()
         self._waiting: deque[dict[str, Any]] = deque()
         self._wake = threading.Condition()
@@ -182,34 +194,74 @@ class Session:
     def _run(self) -> None:
         while True:
             with self._wake:
-                while not self._waiting and not self._is_closed:
-                    self._wake.wait()
+                is_at_rest = False
+                while not self._waiting and not self._is_closed and not is_at_rest:
+                    is_at_rest = not self._wake.wait(REST_S if self._wants_rest else None)
                 if self._is_closed:
                     return
                 messages = list(self._waiting)
                 self._waiting.clear()
             try:
-                self._handle(messages)
+                if messages:
+                    self._handle(messages)
+                else:
+                    self._complete()
             except BaseException as error:  # noqa: BLE001 -- the session continues with its last valid state
                 self._send_error(self._last_id, error)
 
     def _handle(self, messages: list[Any]) -> None:
         """Handle messages in order; consecutive changes are simulated once."""
         changes: list[dict[str, Any]] = []
-        for message in messages:
-            if isinstance(message, dict) and message.get("do") in CHANGES:
-                changes.append(message)
-                continue
+        done = 0
+        try:
+            for k, message in enumerate(messages):
+                if _is_change(message):
+                    changes.append(message)
+                    continue
+                self._change(changes)
+                changes, done = [], k + 1
+                try:
+                    self._other(message)
+                except Exception as error:  # noqa: BLE001 -- messages of the page may cause any exception
+                    self._send_error(message.get("id") if isinstance(message, dict) else None, error)
             self._change(changes)
-            changes = []
-            try:
-                self._other(message)
-            except Exception as error:  # noqa: BLE001 -- messages of the page may cause any exception
-                self._send_error(message.get("id") if isinstance(message, dict) else None, error)
-        self._change(changes)
+        except SupersededError:
+            # Applied again together with the newer ones.
+            with self._wake:
+                self._waiting.extendleft(reversed(messages[done:]))
+            return
+        self._send_parts()
+        self._wants_rest = self.is_preview
+
+    def _check(self) -> None:
+        """Stop a simulation when a newer change waits."""
+        if not self._can_stop or not any(_is_change(message) for message in list(self._waiting)):
+            return
+        now_s = time.monotonic()
+        if self._stopped_s == -math.inf:
+            self._stopped_s = now_s
+        if now_s - self._stopped_s < MAX_STOPPED_S:
+            raise SupersededError
+
+    @property
+    def is_preview(self) -> bool:
+        """Whether the views show a preview, or were left out for one."""
+        return bool(self._left_out) or (self.result is not None and self.result.is_preview)
+
+    def _complete(self) -> None:
+        """Replace a preview by the complete result."""
+        self._is_dragging = self._wants_rest = False
+        self._send({"kind": "busy"})
+        try:
+            self._simulate(self.history.settings)
+        except SupersededError:
+            return
+        except Exception as error:  # noqa: BLE001 -- the preview stays, with the reason
+            self._errors = {"": _line(error)}
+        self._send_state()
         self._send_parts()
 
-    def _change(self, messages: list[dict[str, Any]]) -> None:
+    def _change(self, messages: list[dict[str, Any]], *, can_stop: bool = True) -> None:
         """Apply changes and simulate the result; after an error each change is applied separately."""
         if not messages:
             return
@@ -227,12 +279,17 @@ class Session:
         try:
             for message in kept:
                 self._apply(message)
-            self._simulate(self.history.settings)
+            self._key = kept[-1]["key"] if len(kept) == 1 and isinstance(kept[0].get("key"), str) else None
+            self._is_dragging = _is_preview(kept[-1])
+            self._simulate(self.history.settings, can_stop=can_stop)
+        except SupersededError:
+            self.history = before
+            raise
         except Exception as error:  # noqa: BLE001 -- settings may cause any exception of the package or a library
             self.history = before
             if len(kept) > 1:
                 for message in kept:
-                    self._change([message])
+                    self._change([message], can_stop=False)
                 return
             message = kept[0]
             if message.get("do") == "set" and message.get("final", True):
@@ -324,11 +381,20 @@ class Session:
             case _:
                 raise ParameterError("as", "must be scene, layout or settings", printable(str(use))[:40])
 
-    def _simulate(self, settings: dict[str, Any]) -> None:
+    def _simulate(self, settings: dict[str, Any], *, can_stop: bool = True) -> None:
         settings, before = self.frames.with_current(settings), self._simulated_frame
-        if self.result is not None and self.result.settings == settings:
+        is_preview = self._is_dragging and self._costs.is_slow(self._key)
+        result = self.result
+        if result is not None and result.settings == settings and (is_preview or not result.is_preview):
             return
-        self.result = self.engine.simulate(settings)
+        self._can_stop = can_stop
+        try:
+            self.result = self.engine.simulate(settings, is_preview=is_preview)
+        finally:
+            self._can_stop = False
+        self._stopped_s = -math.inf
+        if not self.result.is_preview:
+            self._costs.add_simulation(self._key, 1e3 * self.result.seconds_s)
         self._version += 1
         self._simulated_frame = self.frames.stored_name
         if before is not None and before != self._simulated_frame:
@@ -344,7 +410,7 @@ class Session:
                 if self.result is None:
                     self._send({"kind": "busy"})
                     try:
-                        self._simulate(self.history.settings)
+                        self._simulate(self.history.settings, can_stop=False)
                     except Exception as error:  # noqa: BLE001 -- shown at the settings
                         self._errors = {"": _line(error)}
             case "views":
@@ -355,6 +421,9 @@ class Session:
             case "freeze":
                 if self.result is None:
                     raise SimulationError("there is no result to freeze")
+                if self.result.is_preview:
+                    self._is_dragging = False
+                    self._simulate(self.history.settings, can_stop=False)
                 self._frozen_result = self.result
                 self._frozen = {"summary": summary_of(self.result), "settings": self.history.settings}
             case "unfreeze":
@@ -461,6 +530,7 @@ class Session:
             "summary": {} if result is None else summary_of(result),
             "frozen": self._frozen,
             "film": self.frames.about(settings),
+            "is_preview": result is not None and result.is_preview,
         })  # fmt: skip
 
     def _send_parts(self) -> None:
@@ -470,6 +540,7 @@ class Session:
             return
         result = replace(result, frozen=self._frozen_result)
         times_ms = {"simulation": 1e3 * result.seconds_s}
+        self._left_out = []
         # Sites and their values belong together; the others in the order of their age.
         shown = [name for name in self._views if name != "comparison" or self._frozen_result is not None]
         names = sorted(shown, key=lambda n: (n not in ("sites", "columns"), self._sent_version.get(n, -1)))
@@ -479,9 +550,14 @@ class Session:
             if name in self._sent and _is_same(self._sent[name], depends):
                 self._sent_version[name] = self._version
                 continue
+            if self._is_dragging and (part.is_costly or self._costs.is_slow_part(self._key, name)):
+                self._left_out.append(name)
+                continue
             start_s = time.perf_counter()
             try:
-                message: bytes | None = encode_part(name, self._version, *part.make(result))
+                message: bytes | None = encode_part(
+                    name, self._version, *part.make(result), is_preview=result.is_preview
+                )
             except Exception as error:  # noqa: BLE001 -- one view fails, the others are shown
                 message = None
                 self._send(
@@ -491,9 +567,18 @@ class Session:
             if message is not None:
                 self._broadcast(message)
             times_ms[name] = 1e3 * (time.perf_counter() - start_s)
+            self._costs.add_part(self._key, name, times_ms[name])
             if self._waiting and k > 1:
                 return
-        self._send({"kind": "done", "id": self._last_id, "version": self._version, "ms": times_ms})
+        self._send(
+            {
+                "kind": "done",
+                "id": self._last_id,
+                "version": self._version,
+                "ms": times_ms,
+                "is_preview": self.is_preview,
+            }
+        )
 
     def _send_error(self, number: Any, error: BaseException) -> None:
         self._send({"kind": "error", "id": number, "text": _line(error).replace(f"{self.uploads}/", "")})
@@ -513,6 +598,11 @@ class Session:
 def _is_same(old: tuple[Any, ...], new: tuple[Any, ...]) -> bool:
     """Return whether the objects that a part depends on are the same."""
     return len(old) == len(new) and all(a is b for a, b in zip(old, new, strict=True))
+
+
+def _is_change(message: Any) -> bool:
+    """Return whether a message changes the settings."""
+    return isinstance(message, dict) and message.get("do") in CHANGES
 
 
 def _is_preview(message: dict[str, Any], key: Any = None) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim.fields import Grid, PowerMap
-from foveasim.studio._engine import Simulated
+from foveasim.studio._engine import Simulated, block_means
 from foveasim.studio._parts.registry import PartData, capture_of, part
 from foveasim.view.site_colours import encode_light
 
@@ -37,28 +38,32 @@ def scene(result: Simulated) -> PartData:
     """Return the optical image through each colour filter."""
     camera, source = result.shot.camera, result.shot.scene
     if isinstance(source, PowerMap):
-        bands, grid = source.data[np.argsort(-source.wavelength_nm)], source.grid
+        bands, grid = list(source.data[np.argsort(-source.wavelength_nm)]), source.grid
+        white = np.ones(len(bands))
     else:
         # With lateral chromatic aberration, each wavelength has its own grid: the largest is shown.
         widest = max((key[0] for key in result.images), key=lambda each: each.pitch_x_um)
         found = {key[1]: image for key, image in result.images.items() if key[0] == widest}
-        bands = np.stack([found[c] / np.float32(result.capture.white_dn[c]) for c in sorted(found)])
         bounds_um = np.array(camera.image_grid(source).bounds_um)
-        pitch_um = (bounds_um[2:] - bounds_um[:2]) / bands.shape[:0:-1]
+        pitch_um = (bounds_um[2:] - bounds_um[:2]) / widest.shape[::-1]
         grid = Grid(widest.shape, (float(pitch_um[0]), float(pitch_um[1])), tuple(bounds_um[:2].tolist()))
+        bands = [found[c] for c in sorted(found)]
+        white = result.capture.white_dn[sorted(found)]
     data, grid = _reduced(bands, grid)
+    data /= np.asarray(white, np.float32).reshape(-1, 1, 1)
     scale = float(np.quantile(data, WHITE_QUANTILE)) or 1.0
     about, arrays = _picture(data / scale, np.ones(data.shape[1:], np.float32), grid.bounds_um)
     return about, arrays
 
 
-def _reduced(bands: NDArray[Any], grid: Grid) -> tuple[NDArray[np.float32], Grid]:
+def _reduced(bands: Sequence[NDArray[Any]], grid: Grid) -> tuple[NDArray[np.float32], Grid]:
     """Return means of blocks of cells; incomplete upper and right blocks are cropped."""
-    n_y, n_x = bands.shape[1:]
+    n_y, n_x = bands[0].shape
     block = max(1, -(-max(n_y, n_x) // PICTURE_PIXELS))
     rows, n_columns = n_y // block, n_x // block
-    cells = bands[:, : rows * block, : n_columns * block].reshape(-1, rows, block, n_columns, block)
-    data = cells.mean(axis=(2, 4), dtype=np.float32)
+    data = np.empty((len(bands), rows, n_columns), np.float32)
+    for band, cells in enumerate(bands):
+        data[band] = block_means(cells, block)
     pitch_x_um, pitch_y_um = grid.pitch_x_um * block, grid.pitch_y_um * block
     return data, Grid((rows, n_columns), (pitch_x_um, pitch_y_um), grid.origin_um)
 

@@ -236,17 +236,18 @@ function setBusy(isBusy) {
 
 function showStatus(text) { $("status").lastElementChild.textContent = text; }
 
-function finish({ id, ms }) {
+function finish({ id, ms, is_preview: isPreview }) {
   setBusy(false);
   editor.finish();
   page.nDone++;
   page.serverMs = ms;
+  page.isPreview = Boolean(isPreview);
   // The time to the frame that shows the result.
   const showTime = () => {
     const time = connection.since(id);
     page.doneId = id;
     if (Number.isFinite(time)) page.lastMs = time;
-    showStatus(Number.isFinite(page.lastMs) ? Math.round(page.lastMs) + " ms" : "ready");
+    showStatus((isPreview ? "preview, " : "") + (Number.isFinite(page.lastMs) ? Math.round(page.lastMs) + " ms" : "ready"));
   };
   if (document.hidden) showTime();
   else requestAnimationFrame(showTime);
