@@ -46,7 +46,7 @@ def test_codes_equal_those_of_files(engine, settings):
         ("sensor.read_noise_e", 5.0, {"sensor"}),
         ("sensor.qe", 0.5, {"sensor", "images", "power on sites"}),
         ("optics.f_number", 4.0, {"optics", "images", "power on sites"}),
-        ("layout.parameters.pitch_um", 13.0, {"layout", "sensor", "camera", "power on sites"}),
+        ("layout.parameters.pitch_um", 13.0, {"generated layout", "layout", "sensor", "camera", "power on sites"}),
         ("scene.square_mm", 5.0, {"scene", "images", "power on sites"}),
     ],
 )

@@ -1,0 +1,279 @@
+"""Previews with a reduced scene, the complete result after them, and simulations that stop early."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from foveasim.config import build_shot
+from foveasim.studio import _engine, _session
+from foveasim.studio._costs import Costs, SupersededError
+from foveasim.studio._engine import Engine, block_means
+from foveasim.studio._messages import decode_part
+from foveasim.studio._session import Session, Start
+
+
+@pytest.fixture
+def large(settings, monkeypatch):
+    """Settings whose scene of 64 x 64 pixels is too large for previews."""
+    monkeypatch.setattr(_engine, "PREVIEW_CELLS", 32 * 32)
+    return settings
+
+
+def codes_of(settings):
+    shot = build_shot(None, settings)
+    return shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed).code
+
+
+def drag(recorder, *values, key="optics.f_number"):
+    return [recorder.do(do="set", key=key, value=value, final=False) for value in values]
+
+
+def done_of(recorder):
+    return [message for message in recorder.messages if message["kind"] == "done"]
+
+
+# -- reduced scenes ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("block", [1, 2, 3])
+def test_blocks_have_mean_of_cells(block):
+    cells = np.arange(7 * 8, dtype=np.float64).reshape(7, 8)
+    found = block_means(cells, block)
+
+    assert found.shape == (7 // block, 8 // block)
+    assert found[0, 0] == cells[:block, :block].mean()
+    assert found[-1, -1] == cells[: 7 // block * block, : 8 // block * block][-block:, -block:].mean()
+
+
+def test_preview_conserves_flux_and_position(large):
+    engine = Engine(n_threads=1)
+    full, reduced = engine.simulate(large), engine.simulate(large, is_preview=True)
+    images = [list(result.images.values()) for result in (full, reduced)]
+
+    assert (full.is_preview, reduced.is_preview) == (False, True)
+    assert reduced.shot.scene.basis.shape == (full.shot.scene.basis.shape[0], 32, 32)
+    assert reduced.shot.camera.image_grid(reduced.shot.scene).bounds_um == pytest.approx(
+        full.shot.camera.image_grid(full.shot.scene).bounds_um
+    )
+    assert [image.mean() for image in images[1]] == pytest.approx([image.mean() for image in images[0]], rel=1e-3)
+
+
+def test_small_scenes_are_not_reduced(settings):
+    result = Engine(n_threads=1).simulate(settings, is_preview=True)
+
+    assert not result.is_preview
+    assert np.array_equal(result.capture.code, codes_of(settings))
+
+
+def test_scenes_with_fit_are_reduced(large, tmp_path):
+    pixels = np.random.default_rng(1).integers(0, 255, (64, 64, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "photo.png")
+    large["scene"] = {
+        "kind": "picture", "picture": str(tmp_path / "photo.png"), "fit": "cover", "distance_m": 1.0,
+        "peak_radiance_w_m2_sr_nm": 0.02, "wavelength_nm": [620, 550, 450],
+    }  # fmt: skip
+    engine = Engine(n_threads=1)
+    full, reduced = engine.simulate(large), engine.simulate(large, is_preview=True)
+
+    assert reduced.is_preview
+    pitches_um = [result.shot.camera.frame(result.shot.scene).pitch_um for result in (full, reduced)]
+    assert pitches_um[1] == pytest.approx(2.0 * pitches_um[0])
+
+
+# -- sessions ---------------------------------------------------------------------------------------------------------------
+
+
+def test_drags_show_previews_and_final_codes_are_exact(large, make_session):
+    recorder = make_session(start=large)
+    for state in drag(recorder, 3.0, 3.5, 4.0):
+        assert state["is_preview"]
+    assert done_of(recorder)[0]["is_preview"]
+    assert all(header.get("is_preview") for header, _ in recorder.parts)
+    state = recorder.do(do="set", key="optics.f_number", value=4.0, final=True)
+
+    assert not state["is_preview"]
+    assert not done_of(recorder)[0]["is_preview"]
+    assert not any(header.get("is_preview") for header, _ in recorder.parts)
+    assert {"columns", "picture", "scene"} <= set(recorder.part_names)
+    assert np.array_equal(
+        recorder.session.result.capture.code, codes_of({**large, "optics": {**large["optics"], "f_number": 4.0}})
+    )
+
+
+@pytest.mark.parametrize("following", [{"do": "undo"}, {"do": "reset", "key": "optics.f_number"}, {"do": "freeze"}])
+def test_messages_after_drags_have_complete_results(large, make_session, following):
+    recorder = make_session(start=large)
+    drag(recorder, 3.0, 4.0)
+    state = recorder.do(**following)
+
+    assert not state["is_preview"]
+    assert np.array_equal(recorder.session.result.capture.code, codes_of(state["settings"]))
+
+
+def test_invalid_value_after_drag_completes_the_draft(large, make_session):
+    recorder = make_session(start=large)
+    drag(recorder, 4.0)
+    state = recorder.do(do="set", key="optics.f_number", value=-1.0, final=True)
+
+    assert "optics.f_number" in state["errors"]
+    recorder.messages.clear()
+    recorder.session._complete()
+    assert not recorder.session.is_preview
+    assert np.array_equal(recorder.session.result.capture.code, codes_of(state["settings"]))
+
+
+def test_fast_settings_have_no_previews(large, make_session):
+    recorder = make_session(start=large)
+    state = drag(recorder, 0.02, key="exposure_s")[-1]
+    assert not state["is_preview"]
+    # The time of a complete simulation is known after the first step.
+    recorder.do(do="set", key="optics.f_number", value=4.0, final=True)
+    recorder.session._costs._simulation_ms["optics.f_number"] = 20.0
+    assert not drag(recorder, 5.0)[-1]["is_preview"]
+
+
+def test_slow_views_wait_for_the_end_of_drags(recorder):
+    recorder.session._costs.add_part("layout.parameters.pitch_um", "picture", 500.0)
+    drag(recorder, 13.0, key="layout.parameters.pitch_um")
+    assert "picture" not in recorder.part_names
+    assert "columns" in recorder.part_names
+    assert done_of(recorder)[0]["is_preview"]
+    recorder.do(do="set", key="layout.parameters.pitch_um", value=13.0, final=True)
+
+    assert recorder.part_names == ["picture"]
+    assert not done_of(recorder)[0]["is_preview"]
+
+
+def test_layers_are_not_computed_while_dragging(recorder):
+    recorder.do(do="views", names=["sites", "columns", "stack"])
+    assert "stack" in recorder.part_names
+    drag(recorder, 13.0, key="layout.parameters.pitch_um")
+    assert "stack" not in recorder.part_names
+    recorder.parts.clear()
+    recorder.session._complete()
+    assert recorder.part_names == ["stack"]
+
+
+def test_costs_remember_slow_changes():
+    costs = Costs()
+    assert costs.is_slow("optics.f_number")
+    assert not costs.is_slow("seed")
+    costs.add_simulation("optics.f_number", 1000.0)
+    costs.add_simulation("optics.f_number", 1.0)  # from the cache
+    assert costs.is_slow("optics.f_number")
+    for _ in range(3):
+        costs.add_simulation("optics.f_number", 1.0)
+    assert not costs.is_slow("optics.f_number")
+
+
+class Listener:
+    """Messages of a session with its thread."""
+
+    def __init__(self, session):
+        self.messages = []
+        self.event = threading.Condition()
+        session.attach(self)
+
+    def __call__(self, message):
+        with self.event:
+            self.messages.append(decode_part(message)[0] if isinstance(message, bytes) else json.loads(message))
+            self.event.notify_all()
+
+    def wait(self, condition, timeout_s=60.0):
+        with self.event:
+            assert self.event.wait_for(lambda: any(map(condition, self.messages)), timeout_s)
+
+
+@pytest.fixture
+def make_threaded():
+    made = []
+
+    def make(settings):
+        made.append(Session("test", Start(settings, "small"), n_threads=1))
+        return made[-1]
+
+    yield make
+    for session in made:
+        session.close()
+
+
+def test_rest_completes_a_preview(large, make_threaded):
+    session = make_threaded(large)
+    listener = Listener(session)
+    session.post({"do": "set", "key": "optics.f_number", "value": 4.0, "final": False, "id": 5})
+    listener.wait(lambda m: m.get("kind") == "done" and m["id"] == 5 and m["is_preview"])
+    listener.wait(lambda m: m.get("kind") == "done" and m["id"] == 5 and not m["is_preview"])
+
+    assert np.array_equal(
+        session.result.capture.code, codes_of({**large, "optics": {**large["optics"], "f_number": 4.0}})
+    )
+
+
+# -- interruption -----------------------------------------------------------------------------------------------------------
+
+
+def test_check_stops_before_the_next_stage(settings):
+    built = []
+
+    def check():
+        built.append(dict(engine.n_built))
+        if engine.n_built.get("scene"):
+            raise SupersededError
+
+    engine = Engine(n_threads=1, check=check)
+    with pytest.raises(SupersededError):
+        engine.simulate(settings)
+
+    assert "power on sites" not in engine.n_built
+    assert engine.n_built["layout"] == 1
+
+
+def test_newer_change_stops_a_simulation(settings, make_threaded, monkeypatch):
+    session = make_threaded(settings)
+    listener = Listener(session)
+    listener.wait(lambda m: m.get("kind") == "done")
+    started = threading.Event()
+    stages = []
+    make = session.engine._runner.check
+
+    def slow_check():
+        stages.append(time.monotonic())
+        started.set()
+        time.sleep(0.2)
+        make()
+
+    session.engine._runner.check = slow_check
+    session.post({"do": "set", "key": "optics.f_number", "value": 4.0, "final": True, "id": 1})
+    assert started.wait(30.0)
+    n_before = len(stages)
+    session.post({"do": "set", "key": "sensor.bits", "value": 8, "final": True, "id": 2})
+    listener.wait(lambda m: m.get("kind") == "done" and m["id"] == 2)
+
+    states = [m for m in listener.messages if m.get("kind") == "state" and m["id"] in (1, 2)]
+    assert [state["id"] for state in states] == [2]
+    assert n_before == 1
+    assert (states[0]["settings"]["optics"]["f_number"], states[0]["settings"]["sensor"]["bits"]) == (4.0, 8)
+    assert np.array_equal(session.result.capture.code, codes_of(states[0]["settings"]))
+    # Both are steps of their own.
+    session.post({"do": "undo", "id": 3})
+    listener.wait(lambda m: m.get("kind") == "done" and m["id"] == 3)
+    assert session.history.settings["optics"]["f_number"] == 4.0
+    assert session.history.settings["sensor"]["bits"] == 10
+
+
+def test_endless_changes_are_not_stopped_forever(recorder, monkeypatch):
+    session = recorder.session
+    session._can_stop = True
+    session._waiting.append({"do": "set", "key": "seed", "value": 1, "final": True})
+    with pytest.raises(SupersededError):
+        session._check()
+    monkeypatch.setattr(_session, "MAX_STOPPED_S", 0.0)
+    session._check()
+    session._waiting.clear()
+    session._check()
