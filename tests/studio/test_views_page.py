@@ -272,3 +272,27 @@ def test_new_views_fit_width(visit, width):
         box = page.locator(name).bounding_box()
         assert box["width"] > 100, name
         assert box["height"] > 60, name
+
+
+# -- previews ---------------------------------------------------------------------------------------------------------------
+
+
+def test_drag_shows_previews_and_then_everything(visit, monkeypatch):
+    from foveasim.config import build_shot
+    from foveasim.studio import _engine
+
+    monkeypatch.setattr(_engine, "PREVIEW_CELLS", 1 << 14)
+    page = visit()
+    page.evaluate("() => { studio.connection.set('optics.f_number', 4, false); }")
+    until(page, "() => /^preview, /.test(document.getElementById('status').textContent.trim())")
+    assert page.evaluate("studio.page.parts.columns.is_preview && studio.state.is_preview")
+    # Without further changes the complete result follows.
+    until(page, "() => studio.isReady && !studio.page.isPreview && !studio.state.is_preview")
+    assert "preview" not in page.inner_text("#status")
+    set_value(page, "optics.f_number", 5.6)
+    shot = build_shot(None, page.evaluate("studio.state.settings"))
+    expected = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed).code
+    found = page.evaluate("() => [...studio.panes.b.columns.find((c) => c.key === 'code').values]")
+
+    assert found == expected.tolist()
+    assert page.is_enabled("#undo")
