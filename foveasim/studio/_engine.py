@@ -131,7 +131,7 @@ class Engine:
             images,
             list(messages),
             time.perf_counter() - start_s,
-            is_reduced,
+            is_preview=is_reduced,
         )
 
     def _shot(self, settings: Mapping[str, Any], is_preview: bool) -> tuple[Shot, Mapping[str, Any], bool]:

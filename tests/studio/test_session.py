@@ -36,7 +36,7 @@ def code_part(recorder):
 
 def test_first_connection_receives_all_parts(recorder):
     assert recorder.part_names[:2] == ["sites", "columns"]
-    assert set(recorder.part_names) == set(_session.PARTS) - {"stack"}
+    assert set(recorder.part_names) == set(_session.PARTS) - {"stack", "comparison"}
     assert [message["kind"] for message in recorder.messages] == ["busy", "controls", "state", "done"]
     assert {header["version"] for header, _ in recorder.parts} == {1}
 

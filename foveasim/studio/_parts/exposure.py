@@ -157,7 +157,7 @@ def _copies(sensor: Sensor, site: int, n: int) -> Sensor:
     connecting = [effect.name for effect in sensor.chain if not effect.is_local]
     one = (sensor.without(*connecting) if connecting else sensor).part(site, site + 1)
     values = {each.name: getattr(one, each.name) for each in fields(one)}
-    single = {name: float(v[0]) for name, v in values.items() if isinstance(v, np.ndarray) and v.shape == (1,)}
+    single: dict[str, Any] = {name: float(v[0]) for name, v in values.items() if isinstance(v, np.ndarray) and v.shape == (1,)}
     return replace(one, layout=one.layout[np.zeros(n, np.int64)], **single)
 
 
