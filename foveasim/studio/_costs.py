@@ -5,7 +5,7 @@ from __future__ import annotations
 __all__ = ["REST_S", "Costs", "SupersededError"]
 
 #: Simulations and views that take longer are reduced or left out while a control is dragged.
-SLOW_MS = 150.0
+SLOW_S = 0.15
 #: Rest after which a preview is replaced by the complete result.
 REST_S = 0.3
 #: Settings that no stage with a scene depends on.
@@ -22,21 +22,21 @@ class Costs:
     """Times of complete simulations and of views, by the setting that changed."""
 
     def __init__(self) -> None:
-        self._simulation_ms: dict[str | None, float] = {}
-        self._part_ms: dict[tuple[str | None, str], float] = {}
+        self._simulation_s: dict[str | None, float] = {}
+        self._part_s: dict[tuple[str | None, str], float] = {}
 
-    def add_simulation(self, key: str | None, time_ms: float) -> None:
+    def add_simulation(self, key: str | None, time_s: float) -> None:
         """Store the time of a complete simulation after a change of a setting."""
-        self._simulation_ms[key] = max(time_ms, DECAY * self._simulation_ms.get(key, 0.0))
+        self._simulation_s[key] = max(time_s, DECAY * self._simulation_s.get(key, 0.0))
 
-    def add_part(self, key: str | None, name: str, time_ms: float) -> None:
+    def add_part(self, key: str | None, name: str, time_s: float) -> None:
         """Store the time of a view after a change of a setting."""
-        self._part_ms[key, name] = max(time_ms, DECAY * self._part_ms.get((key, name), 0.0))
+        self._part_s[key, name] = max(time_s, DECAY * self._part_s.get((key, name), 0.0))
 
     def is_slow(self, key: str | None) -> bool:
         """Return whether a change of a setting may take long; unknown ones may."""
-        return key not in FAST_KEYS and self._simulation_ms.get(key, 2.0 * SLOW_MS) > SLOW_MS
+        return key not in FAST_KEYS and self._simulation_s.get(key, 2.0 * SLOW_S) > SLOW_S
 
     def is_slow_part(self, key: str | None, name: str) -> bool:
         """Return whether a view took long after a change of a setting."""
-        return self._part_ms.get((key, name), 0.0) > SLOW_MS
+        return self._part_s.get((key, name), 0.0) > SLOW_S

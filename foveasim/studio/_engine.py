@@ -135,7 +135,7 @@ class Engine:
         )
 
     def _shot(self, settings: Mapping[str, Any], is_preview: bool) -> tuple[Shot, Mapping[str, Any], bool]:
-        """Return a shot, the settings that identify its components in the cache, and whether its scene was reduced."""
+        """Return a shot, its settings for the cache, and whether its scene was reduced."""
         shot = self._runner.build_shot(settings)
         scene, camera = shot.scene, shot.camera
         if not (is_preview and isinstance(scene, Scene)):
@@ -153,7 +153,7 @@ class Engine:
 
 
 def block_means(cells: NDArray[Any], block: int) -> NDArray[Any]:
-    """Return means of square blocks of cells, (n_y // block, n_x // block); incomplete upper and right blocks are cropped."""
+    """Return means of square blocks of cells; incomplete upper and right blocks are cropped."""
     if block == 1:
         return cells
     n_y, n_x = (n // block for n in cells.shape)

@@ -394,7 +394,7 @@ class Session:
             self._can_stop = False
         self._stopped_s = -math.inf
         if not self.result.is_preview:
-            self._costs.add_simulation(self._key, 1e3 * self.result.seconds_s)
+            self._costs.add_simulation(self._key, self.result.seconds_s)
         self._version += 1
         self._simulated_frame = self.frames.stored_name
         if before is not None and before != self._simulated_frame:
@@ -567,7 +567,7 @@ class Session:
             if message is not None:
                 self._broadcast(message)
             times_ms[name] = 1e3 * (time.perf_counter() - start_s)
-            self._costs.add_part(self._key, name, times_ms[name])
+            self._costs.add_part(self._key, name, 1e-3 * times_ms[name])
             if self._waiting and k > 1:
                 return
         self._send(

@@ -1,4 +1,4 @@
-"""Charts over signal and exposure: photon transfer and signal-to-noise ratio of photosites, analytically."""
+"""Charts over signal and exposure: photon transfer and SNR of photosites."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SEPARATE = PHOTON_SHOT, QUANTISATION = "photon_shot", "quantisation"
 
 @part("Photon transfer", capture_of)
 def photon_transfer(result: Simulated) -> PartData:
-    """Return noise against signal of the photosite of median charge, for the exposure time of the capture."""
+    """Return noise against signal of the photosite of median charge."""
     sensor, capture, exposure_s = result.shot.camera.sensor, result.capture, result.shot.exposure_s
     if exposure_s == 0.0:
         return curves_of([], [], [])
@@ -65,7 +65,7 @@ def photon_transfer(result: Simulated) -> PartData:
 
 @part("SNR", capture_of)
 def snr(result: Simulated) -> PartData:
-    """Return the signal-to-noise ratio against exposure of the photosite of median charge of each filter."""
+    """Return the SNR against exposure of the median photosite of each filter."""
     sensor, capture, exposure_s = result.shot.camera.sensor, result.capture, result.shot.exposure_s
     curves: list[dict[str, Any]] = []
     x: list[NDArray[Any]] = []
@@ -153,11 +153,13 @@ def _median_site(values: Floats) -> int:
 
 
 def _copies(sensor: Sensor, site: int, n: int) -> Sensor:
-    """Return a sensor of n copies of a photosite, without exchange of charge: each level of a curve is a site."""
+    """Return a sensor of n copies of a photosite, without exchange of charge."""
     connecting = [effect.name for effect in sensor.chain if not effect.is_local]
     one = (sensor.without(*connecting) if connecting else sensor).part(site, site + 1)
     values = {each.name: getattr(one, each.name) for each in fields(one)}
-    single: dict[str, Any] = {name: float(v[0]) for name, v in values.items() if isinstance(v, np.ndarray) and v.shape == (1,)}
+    single: dict[str, Any] = {
+        name: float(v[0]) for name, v in values.items() if isinstance(v, np.ndarray) and v.shape == (1,)
+    }
     return replace(one, layout=one.layout[np.zeros(n, np.int64)], **single)
 
 

@@ -41,7 +41,7 @@ def stack(result: Simulated) -> PartData:
 
 
 def _central(layout: Layout) -> np.ndarray:
-    """Return the photosites nearest to the centre of the layout, as a square, in ascending order."""
+    """Return the photosites nearest to the centre of the layout, in ascending order."""
     if layout.n_sites <= MAX_STACK_SITES:
         return np.arange(layout.n_sites)
     x0, y0, x1, y1 = layout.bounds_um
