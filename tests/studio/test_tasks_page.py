@@ -13,8 +13,9 @@ import pytest
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
-import foveasim as fs
 from studio.test_studio_page import browser, codes, server, setting, visit  # noqa: F401 -- fixtures
+
+import foveasim as fs
 
 pytestmark = pytest.mark.needs("chromium")
 
