@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from foveasim._core.validation import Ints
 from foveasim.errors import GeometryError
-from foveasim.layout.adjacency import TOUCHING_UM
 from foveasim.layout.model import Layout
 
 __all__ = ["concatenate_layouts", "replace_sites", "separate_parts"]
@@ -22,7 +21,7 @@ SLIVER = 1e-9
 
 def separate_parts(layout: Layout, shapes: NDArray[Any], parent: Ints) -> tuple[NDArray[Any], Ints]:
     """
-    Return all polygons of shapes, without slivers and edges of the size of rounding errors.
+    Return all polygons of shapes, without slivers.
 
     Parameters
     ----------
@@ -41,7 +40,7 @@ def separate_parts(layout: Layout, shapes: NDArray[Any], parent: Ints) -> tuple[
     is_real = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (
         shapely.area(parts) > SLIVER * layout.area_um2[parent[shape]]
     )
-    return shapely.remove_repeated_points(parts[is_real], TOUCHING_UM), shape[is_real]
+    return parts[is_real], shape[is_real]
 
 
 def replace_sites(

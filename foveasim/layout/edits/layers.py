@@ -153,6 +153,7 @@ def _without(layout: Layout, area: Any) -> Layout:
     is_crossed = ~shapely.contains_properly(area, polygons)
     polygons[is_crossed] = shapely.snap(polygons[is_crossed], area, TOUCHING_UM)
     parts, shape = separate_parts(layout, shapely.difference(polygons, area), near)
+    parts = shapely.remove_repeated_points(parts, TOUCHING_UM)
     return replace_sites(layout, near, parts, near[shape], f"area of {near.size} sites cut out")
 
 
@@ -169,7 +170,8 @@ def _parts_outside(polygons: NDArray[Any], layout: Layout, margin_um: float) -> 
     shapes = polygons.copy()
     is_cut = shapely.intersects(area, polygons)
     shapes[is_cut] = shapely.difference(polygons[is_cut], area)
-    return separate_parts(Layout.from_polygons(polygons), shapes, np.arange(polygons.size))
+    parts, shape = separate_parts(Layout.from_polygons(polygons), shapes, np.arange(polygons.size))
+    return shapely.remove_repeated_points(parts, TOUCHING_UM), shape
 
 
 def _append(layout: Layout, added: Layout, step: str) -> Layout:
