@@ -48,6 +48,9 @@ MAX_STOPPED_S = 3.0
 #: Messages that change the settings.
 CHANGES = ("set", "reset", "delete", "undo", "redo", "preset", "restore", "file", "video", "frame", "match")
 
+#: Changes that cannot be applied twice, as they advance a source of frames: their simulations are complete.
+ONCE = ("video", "frame")
+
 #: Receives messages for a page: strings of JSON, and bytes of parts.
 Listener = Callable[[str | bytes], None]
 
@@ -235,7 +238,7 @@ class Session:
 
     def _check(self) -> None:
         """Stop a simulation when a newer change waits."""
-        if not self._can_stop or not any(_is_change(message) for message in list(self._waiting)):
+        if not self._can_stop or not any(_is_change(m) and m["do"] not in ONCE for m in list(self._waiting)):
             return
         now_s = time.monotonic()
         if self._stopped_s == -math.inf:
@@ -281,6 +284,7 @@ class Session:
                 self._apply(message)
             self._key = kept[-1]["key"] if len(kept) == 1 and isinstance(kept[0].get("key"), str) else None
             self._is_dragging = _is_preview(kept[-1])
+            can_stop = can_stop and not any(message["do"] in ONCE for message in kept)
             self._simulate(self.history.settings, can_stop=can_stop)
         except SupersededError:
             self.history = before

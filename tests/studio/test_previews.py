@@ -277,3 +277,10 @@ def test_endless_changes_are_not_stopped_forever(recorder, monkeypatch):
     session._check()
     session._waiting.clear()
     session._check()
+
+
+def test_frames_stop_no_simulation(recorder):
+    session = recorder.session
+    session._can_stop = True
+    session._waiting.append({"do": "frame", "n": 3})
+    session._check()
