@@ -121,7 +121,8 @@ def structure_of(settings: Any, key: str = "") -> Any:
         return [structure_of(item) for item in settings[:MAX_ITEMS]]
     if isinstance(settings, bool) or key in ENUMERATED:
         return settings
-    return type(settings).__name__ if isinstance(settings, int | float | list) else settings
+    # 4 and 3.9 have the same control: another list would end the drag of a slider.
+    return "number" if isinstance(settings, int | float) else "list" if isinstance(settings, list) else settings
 
 
 def chosen_value(

@@ -49,6 +49,13 @@ def test_set_simulates_new_value(recorder, settings):
     assert np.array_equal(code_part(recorder), codes_of({**settings, "exposure_s": 0.02}))
 
 
+def test_integers_keep_the_controls(recorder):
+    for value in (3.9, 4, 4.1):
+        recorder.do(do="set", key="optics.f_number", value=value, final=False)
+
+        assert "controls" not in [message["kind"] for message in recorder.messages], value
+
+
 def test_only_changed_parts_are_sent(recorder):
     recorder.do(do="set", key="exposure_s", value=0.02, final=True)
     assert set(recorder.part_names) == {"columns", "noise", "photon_transfer", "picture", "snr"}
