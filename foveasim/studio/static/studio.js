@@ -33,6 +33,7 @@ const TILES = [
 const FIRST_TILES = ["histogram", "noise", "mtf", "summary"];
 const CURVES = ["spectrum", "mtf", "photon_transfer", "snr"];
 const WIDE = 1800;
+const BUSY_DELAY_MS = 150;
 const ALWAYS = ["sites", "columns", "picture", "scene"];
 // Words of the summary that have another form than the key.
 const SUMMARY = {
@@ -64,6 +65,7 @@ function ask(what) {
 
 function drawAsked() {
   const { asked } = page;
+  if (!asked) return;
   page.asked = null;
   if (page.frozen) panes.a.follow(panes.b);
   for (const name of asked) panes[name].draw();
@@ -207,6 +209,8 @@ function receivePart(part) {
   // Frames of the layout move with it.
   if (part.part === "sites" && panes.scene.bounds) panes.scene.frame = part.about.bounds_um;
   ask(DRAWN[part.part] || "marks");
+  // Photosites are drawn at once: they are in the next frame together with the controls.
+  if (part.part === "columns") drawAsked();
 }
 
 // -- state --------------------------------------------------------------------------------------------------------------
@@ -230,8 +234,10 @@ function receive(message) {
 
 function setBusy(isBusy) {
   page.isBusy = isBusy;
-  document.body.classList.toggle("busy", isBusy);
-  if (isBusy) showStatus("computing…");
+  clearTimeout(page.busyTimer);
+  // Short work is not announced: each change of the page costs a frame.
+  if (isBusy) page.busyTimer = setTimeout(() => { document.body.classList.add("busy"); showStatus("computing…"); }, BUSY_DELAY_MS);
+  else document.body.classList.remove("busy");
 }
 
 function showStatus(text) { $("status").lastElementChild.textContent = text; }
