@@ -204,7 +204,8 @@ def soak(studio: Studio, report: Report, minutes: float, seed: int, out: Path) -
             first = studio.memory_mib()
             console.print(f"{n_steps} steps: server {first[0]:.0f} MiB, page {first[1]:.0f} MiB")
         if n_steps % 10 == 0:
-            studio.page.wait_for_function("studio.isReady", timeout=TIMEOUT_MS)
+            # A preview is shown as such until the complete result replaces it.
+            studio.page.wait_for_function("studio.isReady && !studio.page.isPreview", timeout=TIMEOUT_MS)
             before = studio.page.evaluate(PARTS)
             studio.page.evaluate(SEND, [{"do": "refresh"}])
             after = studio.page.evaluate(PARTS)
