@@ -12,6 +12,7 @@ import argparse
 import hashlib
 import json
 import random
+import resource
 import shutil
 import subprocess
 import sys
@@ -33,6 +34,10 @@ from foveasim.config import build_shot
 SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 TIMEOUT_MS = 120_000
 WARM_UP_S = 180.0
+#: The server returns unused memory after a rest that is a little shorter.
+REST_S = 7.0
+#: Interval at which the memory of the server is printed.
+PRINT_S = 120.0
 LEAK_MIB = 200.0
 #: Sends a change, and resolves to the times until the photosites and until all views are drawn. Timers, not frames, poll: a
 #: page that asks for each frame would be slower.
@@ -47,14 +52,18 @@ CHANGE = """([key, value]) => new Promise((resolve) => {
   };
   step();
 })"""
-#: Sends messages, and resolves when the last one is done and drawn.
+#: Sends messages, and resolves when the last one is done and drawn, or to the state of the page after a minute.
 SEND = """(messages) => new Promise((resolve) => {
   const { page, connection } = studio;
   let id = 0;
   for (const message of messages) id = connection.send(message);
   const start = performance.now(), step = () => {
-    if ((page.doneId >= id || performance.now() - start > 60000) && studio.isReady) resolve(page.doneId >= id);
-    else requestAnimationFrame(step);
+    if (page.doneId >= id && studio.isReady) resolve(null);
+    else if (performance.now() - start < 60000) setTimeout(step, 5);
+    else {
+      const { isBusy, doneId, asked } = page, { isOpen, waiting } = connection;
+      resolve(JSON.stringify({ messages, id, doneId, isBusy, isDrawn: asked === null, isOpen, waiting }));
+    }
   };
   step();
 })"""
@@ -88,8 +97,8 @@ class Studio:
         context = browser.new_context(viewport={"width": 1440, "height": 900}, bypass_csp=True)
         self.page: Page = context.new_page()
         self.messages: list[str] = []
-        self.page.on("console", lambda message: self.messages.append(message.text))
-        self.page.on("pageerror", lambda error: self.messages.append(str(error)))
+        self.page.on("console", lambda message: self._log(message.text))
+        self.page.on("pageerror", lambda error: self._log(str(error)))
         self.page.goto(address)
         self.page.wait_for_function(
             "window.studio && studio.isReady && studio.page.doneId !== undefined", timeout=TIMEOUT_MS
@@ -97,19 +106,28 @@ class Studio:
         self.start = self.page.evaluate("() => studio.page.state.settings")
         self.devtools = context.new_cdp_session(self.page)
 
+    def _log(self, text: str) -> None:
+        self.messages.append(text)
+        console.print(f"console: {text}")
+
     def close(self) -> None:
         """End browser and server."""
         self.playwright.stop()
         self.server.terminate()
         self.server.wait()
 
+    def server_mib(self) -> float:
+        """Return the resident memory of the server, MiB."""
+        n_pages = int(Path(f"/proc/{self.server.pid}/statm").read_text().split()[1])
+        return n_pages * resource.getpagesize() / 2**20
+
     def memory_mib(self) -> tuple[float, float]:
-        """Return the memory of the server and the heap of the page, MiB, with the initial settings."""
+        """Return the memory of the server and the heap of the page, MiB, at rest with the initial settings."""
         self.page.evaluate(SEND, [{"do": "unfreeze"}, {"do": "restore", "settings": self.start}])
+        time.sleep(REST_S)
         self.devtools.send("HeapProfiler.collectGarbage")
         heap = self.devtools.send("Runtime.getHeapUsage")
-        pages = int(Path(f"/proc/{self.server.pid}/statm").read_text().split()[1])
-        return pages * 4096 / 2**20, (heap["usedSize"] + heap.get("backingStorageSize", 0)) / 2**20
+        return self.server_mib(), (heap["usedSize"] + heap.get("backingStorageSize", 0)) / 2**20
 
 
 def measure_latency(studio: Studio, report: Report, n: int) -> None:
@@ -130,8 +148,6 @@ def measure_latency(studio: Studio, report: Report, n: int) -> None:
     studio.page.evaluate(SEND, large)
     for name in ("exposure", "f-number"):
         measure(f"200,000 photosites: {name}", *CHANGES[name][:2], LARGE_MS)
-    for line in studio.messages:
-        console.print(f"console: {line}")
 
 
 def random_messages(rng: random.Random, studio: Studio) -> list[dict[str, Any]]:
@@ -194,15 +210,22 @@ def soak(studio: Studio, report: Report, minutes: float, seed: int, out: Path) -
     start_s = time.monotonic()
     n_steps = n_refreshed = n_stale = n_compared = n_different = n_late = 0
     first: tuple[float, float] | None = None
+    printed_s = 0.0
     while time.monotonic() - start_s < 60.0 * minutes:
-        n_late += not studio.page.evaluate(SEND, random_messages(rng, studio))
+        late = studio.page.evaluate(SEND, random_messages(rng, studio))
         n_steps += 1
+        if late:
+            n_late += 1
+            console.print(f"step {n_steps}: {late}")
         if n_steps % 3 == 0:
             tile = rng.choice(studio.page.evaluate(TILES))
             studio.page.click(f"#tabs button[data-tile='{tile}']")
         if first is None and time.monotonic() - start_s > min(WARM_UP_S, 20.0 * minutes):
             first = studio.memory_mib()
             console.print(f"{n_steps} steps: server {first[0]:.0f} MiB, page {first[1]:.0f} MiB")
+        if time.monotonic() - printed_s > PRINT_S:
+            printed_s = time.monotonic()
+            console.print(f"{printed_s - start_s:.0f} s, {n_steps} steps: server {studio.server_mib():.0f} MiB")
         if n_steps % 10 == 0:
             # A preview is shown as such until the complete result replaces it.
             studio.page.wait_for_function("studio.isReady && !studio.page.isPreview", timeout=TIMEOUT_MS)
@@ -235,8 +258,6 @@ def soak(studio: Studio, report: Report, minutes: float, seed: int, out: Path) -
         ("codes other than those of foveasim run", int(not is_same), 1),
     ):
         report.add(f"soak: {name}", f"{n_found} of {n_of}", "none", "0", float(n_found > 0) * 2.0, 1.0)
-    for line in studio.messages[:20]:
-        console.print(f"console: {line}")
 
 
 def _digest(text: str) -> str:

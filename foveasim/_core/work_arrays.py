@@ -7,14 +7,18 @@ that no object refers to any more, so that repeated captures of one size need no
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import math
+import sys
+from contextlib import suppress
 from threading import RLock
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-__all__ = ["work_array"]
+__all__ = ["release_memory", "work_array"]
 
 #: Smaller arrays are allocated as usual: the allocator reuses their memory.
 MIN_BYTES = 1 << 20
@@ -54,6 +58,10 @@ class _Pool:
             while sum(unused.size for unused in self._unused) > MAX_UNUSED_BYTES:
                 del self._unused[0]
 
+    def clear(self) -> None:
+        with self._lock:
+            self._unused.clear()
+
 
 _POOL = _Pool()
 
@@ -69,3 +77,17 @@ def work_array(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
     if n_bytes < MIN_BYTES:
         return np.empty(shape, dtype)
     return np.asarray(_Memory(_POOL, _POOL.get(n_bytes))).view(dtype).reshape(shape)
+
+
+def release_memory() -> None:
+    """
+    Return unused memory to the operating system.
+
+    This is the memory that work arrays retain, and with the C library of GNU also that of the allocator, which else keeps what
+    small arrays between used ones have freed. The next arrays need fresh memory: for a process that waits.
+    """
+    gc.collect()
+    _POOL.clear()
+    if sys.platform.startswith("linux"):
+        with suppress(AttributeError, OSError):  # other C libraries
+            ctypes.CDLL(None).malloc_trim(0)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-__all__ = ["REST_S", "Costs", "SupersededError"]
+__all__ = ["RELEASE_S", "REST_S", "Costs", "SupersededError"]
 
 #: Simulations and views that take longer are reduced or left out while a control is dragged.
 SLOW_S = 0.15
 #: Rest after which a preview is replaced by the complete result.
 REST_S = 0.3
+#: Rest after which unused memory is returned to the operating system.
+RELEASE_S = 5.0
 #: Settings that no stage with a scene depends on.
 FAST_KEYS = ("exposure_s", "seed")
 #: An earlier time counts with this factor: stages may come from the cache once.

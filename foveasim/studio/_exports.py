@@ -1,7 +1,8 @@
-"""Files of a state for other programs and other people: notebook and archive."""
+"""Files of a state for other programs and other people: texts, notebook and archive."""
 
 from __future__ import annotations
 
+import difflib
 import io
 import json
 import re
@@ -12,16 +13,84 @@ from pathlib import Path
 from typing import Any
 
 from foveasim import __version__
+from foveasim._io.yaml_files import format_yaml
 from foveasim.config import to_python
-from foveasim.errors import FoveasimError
+from foveasim.errors import FoveasimError, ParameterError, printable
 from foveasim.layout import Layout, write_layout
+from foveasim.studio._messages import to_json
 
-__all__ = ["archive", "notebook"]
+__all__ = ["archive", "notebook", "text_of", "without_directories"]
 
 #: Date of the files in archives, so that equal states have equal archives; the earliest that the format can represent.
 DATE = (1980, 1, 1, 0, 0, 0)
 #: Permissions of the files in archives: read by all, written by the owner.
 PERMISSIONS = 0o644 << 16
+
+
+def text_of(what: str, settings: Mapping[str, Any], start: Mapping[str, Any], name: str, files: Sequence[str]) -> str:
+    """
+    Return settings in a text format, or their changes as a difference.
+
+    Parameters
+    ----------
+    what : {"yaml", "python", "notebook", "link", "diff"}
+    settings, start : mapping
+        Current and initial settings.
+    name : str
+        Name of the shot.
+    files : sequence of str
+        Files that the settings contain, which must be next to the text.
+
+    Raises
+    ------
+    ParameterError
+        When the format is unknown.
+    """
+    note = f"# Uploaded files, next to this file: {', '.join(files)}\n" if files else ""
+    match what:
+        case "yaml":
+            return note + format_yaml(settings)
+        case "notebook":
+            return notebook(settings, name, files)
+        case "link":
+            return json.dumps(to_json(settings), separators=(",", ":"))
+        case "python":
+            return note + to_python(settings)
+        case "diff":
+            old, new = (format_yaml(each).splitlines(keepends=True) for each in (start, settings))
+            return "".join(difflib.unified_diff(old, new, f"{name}.yaml", "studio"))
+        case _:
+            raise ParameterError("what", "must be yaml, python, notebook, link or diff", printable(what)[:40])
+
+
+def without_directories(
+    settings: dict[str, Any], uploads: Path, frames: Mapping[str, Path]
+) -> tuple[dict[str, Any], dict[str, Path]]:
+    """
+    Return settings with names for the paths of uploaded files, and the files by name.
+
+    Parameters
+    ----------
+    settings : dict
+    uploads : Path
+        Directory of uploaded files.
+    frames : mapping of str to Path
+        Files that replace others, by the path in the settings.
+    """
+    files: dict[str, Path] = {}
+
+    def renamed(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {name: renamed(item) for name, item in value.items()}
+        if isinstance(value, list):
+            return [renamed(item) for item in value]
+        if isinstance(value, str) and Path(value).parent == uploads:
+            file = frames.get(value, Path(value))
+            files[file.name] = file
+            return file.name
+        return value
+
+    return renamed(settings), files
 
 
 def notebook(settings: Mapping[str, Any], name: str, files: Sequence[str]) -> str:

@@ -56,7 +56,11 @@ class History:
             return
         self._past = [*self._past, self._present][-MAX_STEPS:]
         self._future = []
-        self._present = settings
+        # States share their equal sections.
+        self._present = {
+            name: before if (before := self._present.get(name)) == section else section
+            for name, section in settings.items()
+        }
 
     def undo(self) -> bool:
         """Return to the state before the last step; a draft is discarded first."""

@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.errors import FileError, ParameterError
+from foveasim.errors import FileError, FoveasimError, ParameterError, printable
 
-__all__ = ["decode_part", "encode_part", "from_json", "to_json"]
+__all__ = ["decode_part", "encode_part", "from_json", "one_line", "to_json"]
 
 #: Alignment of arrays in bytes: typed arrays of JavaScript require offsets that are multiples of their item size.
 ALIGNMENT = 8
+#: Longest message of an error.
+MAX_MESSAGE_LENGTH = 500
 #: Types of arrays; JavaScript has a typed array for each.
 TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float32", "float64")
 #: Non-finite numbers in JSON, as YAML writes them.
@@ -112,3 +114,12 @@ def from_json(value: Any) -> Any:
     if isinstance(value, list):
         return [from_json(item) for item in value]
     return NOT_FINITE.get(value, value) if isinstance(value, str) else value
+
+
+def one_line(error: BaseException) -> str:
+    """Return the message of an exception in one line."""
+    if isinstance(error, MemoryError):
+        return "not enough memory; use a smaller picture or fewer photosites"
+    text = str(error) if isinstance(error, FoveasimError) else f"{type(error).__name__}: {error}".removesuffix(": ")
+    text = printable(" ".join(text.split()))
+    return text if len(text) <= MAX_MESSAGE_LENGTH else text[: MAX_MESSAGE_LENGTH - 3] + "..."

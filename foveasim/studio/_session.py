@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import difflib
 import json
 import math
 import shutil
@@ -11,46 +10,48 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from foveasim._core.work_arrays import release_memory
 from foveasim._io.atomic import atomic_write
 from foveasim._io.yaml_files import format_yaml
 from foveasim.config import check_settings, put_setting
-from foveasim.errors import FoveasimError, ParameterError, SimulationError, printable
-from foveasim.studio._controls import chosen_value, controls_of, structure_of, value_at
-from foveasim.studio._costs import REST_S, Costs, SupersededError
+from foveasim.errors import ParameterError, SimulationError, printable
+from foveasim.studio._changes import (
+    ONCE,
+    changed_keys,
+    check_depth,
+    is_change,
+    is_draft,
+    is_frame,
+    key_of,
+    match_filters,
+    reset,
+    string_of,
+    with_file,
+)
+from foveasim.studio._controls import chosen_value, controls_of, structure_of
+from foveasim.studio._costs import RELEASE_S, REST_S, Costs, SupersededError
 from foveasim.studio._engine import Engine, Simulated
-from foveasim.studio._exports import notebook
-from foveasim.studio._files import Files, apply_preset, file_name, with_layout
+from foveasim.studio._exports import text_of, without_directories
+from foveasim.studio._files import Files, apply_preset, file_name
 from foveasim.studio._frames import Frames
 from foveasim.studio._history import History
-from foveasim.studio._messages import encode_part, from_json, to_json
+from foveasim.studio._messages import from_json, one_line, to_json
 from foveasim.studio._parts import PARTS, summary_of
-from foveasim.studio._templates import WITHOUT_MOSAIC
 from foveasim.studio._variants import with_n_sites
+from foveasim.studio._views import Views
 
 __all__ = ["Session", "Start"]
 
 #: Largest number of messages that wait.
 MAX_WAITING = 1000
-#: Longest message text.
-MAX_MESSAGE_LENGTH = 500
-#: Largest depth of settings from the page.
-MAX_DEPTH = 20
-#: Number of colour filters that a layout without mosaic receives.
-N_FILTERS = 3
 #: Newer changes stop simulations for at most this time in succession, so that some are shown.
 MAX_STOPPED_S = 3.0
-#: Messages that change the settings.
-CHANGES = ("set", "reset", "delete", "undo", "redo", "preset", "restore", "file", "video", "frame", "match")
-
-#: Changes that cannot be applied twice, as they advance a source of frames: their simulations are complete.
-ONCE = ("video", "frame")
-
 #: Receives messages for a page: strings of JSON, and bytes of parts.
 Listener = Callable[[str | bytes], None]
 
@@ -99,23 +100,21 @@ class Session:
         self.last_used_s = time.monotonic()
         self.n_uploaded_bytes = 0
         self.frames = Frames(self.uploads, self._new_path)
-        self._views = [part.name for part in PARTS.values() if not part.is_costly]
+        self._costs = Costs()
+        self._views = Views(self._send, self._line, self._costs)
         self._version = 0
         self._last_id: Any = None
-        self._sent: dict[str, tuple[Any, ...]] = {}
-        self._sent_version: dict[str, int] = {}
         self._structure: Any = None
         self._controls: list[dict[str, Any]] = []
         self._frozen: dict[str, Any] | None = None
         self._frozen_result: Simulated | None = None
         self._errors: dict[str, str] = {}
         self._simulated_frame: str | None = None
-        self._costs = Costs()
         # Setting that changed last, and whether this was during a drag.
         self._key: str | None = None
         self._is_dragging = False
-        self._left_out: list[str] = []
         self._wants_rest = False
+        self._has_unused_memory = False
         self._can_stop = False
         self._stopped_s = -math.inf
         self._listeners: set[Listener] = set()
@@ -160,7 +159,7 @@ class Session:
         """Add a message of the page; it is handled in the thread of the session."""
         with self._wake:
             self.last_used_s = time.monotonic()
-            if _is_frame(message) and self._waiting and _is_frame(self._waiting[-1]) and not message.get("is_first"):
+            if is_frame(message) and self._waiting and is_frame(self._waiting[-1]) and not message.get("is_first"):
                 message["is_first"] = self._waiting.pop().get("is_first")
             if len(self._waiting) >= MAX_WAITING:
                 message = None
@@ -198,8 +197,9 @@ class Session:
         while True:
             with self._wake:
                 is_at_rest = False
+                rest_s = REST_S if self._wants_rest else RELEASE_S if self._has_unused_memory else None
                 while not self._waiting and not self._is_closed and not is_at_rest:
-                    is_at_rest = not self._wake.wait(REST_S if self._wants_rest else None)
+                    is_at_rest = not self._wake.wait(rest_s)
                 if self._is_closed:
                     return
                 messages = list(self._waiting)
@@ -207,8 +207,11 @@ class Session:
             try:
                 if messages:
                     self._handle(messages)
-                else:
+                elif self._wants_rest:
                     self._complete()
+                else:
+                    release_memory()
+                self._has_unused_memory = bool(messages) or self._wants_rest
             except BaseException as error:  # noqa: BLE001 -- the session continues with its last valid state
                 self._send_error(self._last_id, error)
 
@@ -218,7 +221,7 @@ class Session:
         done = 0
         try:
             for k, message in enumerate(messages):
-                if _is_change(message):
+                if is_change(message):
                     changes.append(message)
                     continue
                 self._change(changes)
@@ -226,7 +229,8 @@ class Session:
                 try:
                     self._other(message)
                 except Exception as error:  # noqa: BLE001 -- messages of the page may cause any exception
-                    self._send_error(message.get("id") if isinstance(message, dict) else None, error)
+                    self._last_id = message.get("id") if isinstance(message, dict) else None
+                    self._send_error(self._last_id, error)
             self._change(changes)
         except SupersededError:
             # Applied again together with the newer ones.
@@ -238,7 +242,7 @@ class Session:
 
     def _check(self) -> None:
         """Stop a simulation when a newer change waits."""
-        if not self._can_stop or not any(_is_change(m) and m["do"] not in ONCE for m in list(self._waiting)):
+        if not self._can_stop or not any(is_change(m) and m["do"] not in ONCE for m in list(self._waiting)):
             return
         now_s = time.monotonic()
         if self._stopped_s == -math.inf:
@@ -249,7 +253,7 @@ class Session:
     @property
     def is_preview(self) -> bool:
         """Whether the views show a preview, or were left out for one."""
-        return bool(self._left_out) or (self.result is not None and self.result.is_preview)
+        return bool(self._views.left_out) or (self.result is not None and self.result.is_preview)
 
     def _complete(self) -> None:
         """Replace a preview by the complete result."""
@@ -260,7 +264,7 @@ class Session:
         except SupersededError:
             return
         except Exception as error:  # noqa: BLE001 -- the preview stays, with the reason
-            self._errors = {"": _line(error)}
+            self._errors = {"": self._line(error)}
         self._send_state()
         self._send_parts()
 
@@ -273,8 +277,8 @@ class Session:
             for message, following in zip(messages, [*messages[1:], None], strict=True)
             if following is None
             or not (
-                (_is_preview(message) and _is_preview(following, message.get("key")))
-                or (_is_frame(message) and _is_frame(following) and not message.get("is_first"))
+                (is_draft(message) and is_draft(following, message.get("key")))
+                or (is_frame(message) and is_frame(following) and not message.get("is_first"))
             )
         ]
         before = self.history.copy()
@@ -283,7 +287,7 @@ class Session:
             for message in kept:
                 self._apply(message)
             self._key = kept[-1]["key"] if len(kept) == 1 and isinstance(kept[0].get("key"), str) else None
-            self._is_dragging = _is_preview(kept[-1])
+            self._is_dragging = is_draft(kept[-1])
             can_stop = can_stop and not any(message["do"] in ONCE for message in kept)
             self._simulate(self.history.settings, can_stop=can_stop)
         except SupersededError:
@@ -299,9 +303,7 @@ class Session:
             if message.get("do") == "set" and message.get("final", True):
                 self.history.commit(self.history.settings)  # a valid preview is the step
             key = message.get("key")
-            self._errors = {
-                key if isinstance(key, str) else str(message.get("do")): _line(error).replace(f"{self.uploads}/", "")
-            }
+            self._errors = {key if isinstance(key, str) else str(message.get("do")): self._line(error)}
         else:
             self._errors = {}
         self._last_id = messages[-1].get("id")
@@ -321,36 +323,39 @@ class Session:
                 return
             case "set":
                 settings = copy.deepcopy(settings)
-                value = from_json(_plain(message.get("value")))
-                key = _key(message)
+                value = from_json(check_depth(message.get("value")))
+                key = key_of(message)
                 if key == "layout" and isinstance(value, str):
                     settings = apply_preset(f"layout:{value}", settings)
                 else:
                     value = chosen_value(key, value, self._controls, settings, self.start.settings)
                     put_setting(None, settings, key, value)
                 if key == "layout":
-                    _match_filters(settings)
+                    match_filters(settings)
             case "reset":
-                settings = _reset(settings, self.start.settings, _key(message))
+                settings = reset(settings, self.start.settings, key_of(message))
             case "delete":
-                settings = _reset(settings, {}, _key(message))
+                settings = reset(settings, {}, key_of(message))
             case "preset":
-                settings = apply_preset(_string(message, "name"), settings)
+                settings = apply_preset(string_of(message, "name"), settings)
             case "restore":
-                restored = from_json(_plain(message.get("settings")))
+                restored = from_json(check_depth(message.get("settings")))
                 if not isinstance(restored, dict):
                     raise ParameterError("settings", "must be a mapping")
                 settings = self.files.with_uploads(restored)
             case "file":
-                settings = self._with_file(_string(message, "path"), message.get("as"))
+                settings = with_file(
+                    settings, self.start.settings, self.files, string_of(message, "path"), message.get("as")
+                )
             case "match":
                 if self._frozen_result is None or self.result is None:
                     raise SimulationError("there is no variant A to compare with")
                 n_sites = self._frozen_result.capture.layout.n_sites
                 settings = with_n_sites(settings, n_sites, self.result.capture.layout)
             case "video":
-                path = Path(self.files.available(_string(message, "path")))
-                settings = self._with_file(str(self.frames.path if self.frames.open_video(path) else path), "scene")
+                path = Path(self.files.available(string_of(message, "path")))
+                shown = self.frames.path if self.frames.open_video(path) else path
+                settings = with_file(settings, self.start.settings, self.files, str(shown), "scene")
             case "frame":
                 if "pixels" not in message:
                     self.frames.show(message.get("n"))
@@ -358,32 +363,13 @@ class Session:
                 is_first = bool(message.get("is_first"))
                 if not self.frames.receive(message["pixels"], is_first=is_first) or not is_first:
                     return
-                settings = self._with_file(str(self.frames.path), "scene")
+                settings = with_file(settings, self.start.settings, self.files, str(self.frames.path), "scene")
         settings = self.files.resolve(settings)
         check_settings(None, settings)
         if message["do"] == "set" and message.get("final", True) is False:
             self.history.preview(settings)
         else:
             self.history.commit(settings)
-
-    def _with_file(self, path: str, use: Any) -> dict[str, Any]:
-        """Return settings with an uploaded file."""
-        settings = copy.deepcopy(self.history.settings)
-        match use:
-            case "scene":
-                if settings["scene"].get("kind") != "picture":
-                    control = next(c for c in controls_of(settings, self.start.settings) if c["key"] == "scene")
-                    settings["scene"] = next(c["value"] for c in control["choices"] if c["label"] == "picture")
-                settings["scene"]["picture"] = path
-                if settings["scene"].get("fit") is None:
-                    put_setting(None, settings, "scene.fit", "cover")  # pictures differ in their number of pixels
-                return settings
-            case "layout":
-                return with_layout(settings, self.files.layout_of(path))
-            case "settings":
-                return self.files.settings_of(path)
-            case _:
-                raise ParameterError("as", "must be scene, layout or settings", printable(str(use))[:40])
 
     def _simulate(self, settings: dict[str, Any], *, can_stop: bool = True) -> None:
         settings, before = self.frames.with_current(settings), self._simulated_frame
@@ -410,18 +396,16 @@ class Session:
             raise ParameterError("message", "must be a JSON object")
         match message.get("do"):
             case "refresh":
-                self._sent, self._sent_version, self._structure = {}, {}, None
+                self._views.forget()
+                self._structure = None
                 if self.result is None:
                     self._send({"kind": "busy"})
                     try:
                         self._simulate(self.history.settings, can_stop=False)
                     except Exception as error:  # noqa: BLE001 -- shown at the settings
-                        self._errors = {"": _line(error)}
+                        self._errors = {"": self._line(error)}
             case "views":
-                names = message.get("names")
-                if not isinstance(names, list) or not all(isinstance(name, str) and name in PARTS for name in names):
-                    raise ParameterError("names", f"must be a list of names of views: {', '.join(PARTS)}")
-                self._views = [name for name in PARTS if name in names]
+                self._views.select(message.get("names"))
             case "freeze":
                 if self.result is None:
                     raise SimulationError("there is no result to freeze")
@@ -432,18 +416,18 @@ class Session:
                 self._frozen = {"summary": summary_of(self.result), "settings": self.history.settings}
             case "unfreeze":
                 self._frozen = self._frozen_result = None
-                self._sent.pop("comparison", None)
+                self._views.forget("comparison")
             case "text":
                 exported = self.exported()
                 self._send({
                     "kind": "text",
                     "id": message.get("id"),
                     "what": message["what"],
-                    "text": self.text(_string(message, "what"), exported),
+                    "text": self.text(string_of(message, "what"), exported),
                     "files": list(exported[1]),
                 })  # fmt: skip
             case "save":
-                path = self._save(_string(message, "name"))
+                path = self._save(string_of(message, "name"))
                 self._send({"kind": "saved", "id": message.get("id"), "path": str(path)})
             case unknown:
                 raise ParameterError("do", "must be the name of a message", printable(str(unknown))[:40])
@@ -468,23 +452,7 @@ class Session:
             When the format is unknown.
         """
         settings, files = self.exported() if exported is None else exported
-        note = f"# Uploaded files, next to this file: {', '.join(files)}\n" if files else ""
-        match what:
-            case "yaml":
-                return note + format_yaml(settings)
-            case "notebook":
-                return notebook(settings, self.start.name, list(files))
-            case "link":
-                return json.dumps(to_json(settings), separators=(",", ":"))
-            case "python":
-                from foveasim.config import to_python
-
-                return note + to_python(settings)
-            case "diff":
-                old, new = (format_yaml(each).splitlines(keepends=True) for each in (self.start.settings, settings))
-                return "".join(difflib.unified_diff(old, new, f"{self.start.name}.yaml", "studio"))
-            case _:
-                raise ParameterError("what", "must be yaml, python, notebook, link or diff", printable(what)[:40])
+        return text_of(what, settings, self.start.settings, self.start.name, list(files))
 
     def exported(self) -> tuple[dict[str, Any], dict[str, Path]]:
         """
@@ -496,8 +464,8 @@ class Session:
         files : dict of str to Path
             Uploaded files by name, and the current frame of a source.
         """
-        settings, files = self.history.settings, dict[str, Path]()
-        return _relative(settings, self.uploads, self.frames.export(settings), files), files
+        settings = self.history.settings
+        return without_directories(settings, self.uploads, self.frames.export(settings))
 
     def _save(self, name: str) -> Path:
         """Write the settings to the directory for saved files, with copies of uploaded files."""
@@ -526,7 +494,7 @@ class Session:
             "id": self._last_id,
             "version": self._version,
             "settings": settings,
-            "changed": _changed(settings, self.start.settings),
+            "changed": changed_keys(settings, self.start.settings),
             "can_undo": self.history.can_undo,
             "can_redo": self.history.can_redo,
             "errors": self._errors,
@@ -539,164 +507,35 @@ class Session:
 
     def _send_parts(self) -> None:
         """Compute and send the parts that changed; newer messages interrupt."""
-        result = self.result
-        if result is None:
+        if self.result is None:
             return
-        result = replace(result, frozen=self._frozen_result)
-        times_ms = {"simulation": 1e3 * result.seconds_s}
-        self._left_out = []
-        # Sites and their values belong together; the others in the order of their age.
-        shown = [name for name in self._views if name != "comparison" or self._frozen_result is not None]
-        names = sorted(shown, key=lambda n: (n not in ("sites", "columns"), self._sent_version.get(n, -1)))
-        for k, name in enumerate(names):
-            part = PARTS[name]
-            depends = part.depends(result)
-            if name in self._sent and _is_same(self._sent[name], depends):
-                self._sent_version[name] = self._version
-                continue
-            if self._is_dragging and (part.is_costly or self._costs.is_slow_part(self._key, name)):
-                self._left_out.append(name)
-                continue
-            start_s = time.perf_counter()
-            try:
-                message: bytes | None = encode_part(
-                    name, self._version, *part.make(result), is_preview=result.is_preview
-                )
-            except Exception as error:  # noqa: BLE001 -- one view fails, the others are shown
-                message = None
-                self._send(
-                    {"kind": "error", "id": self._last_id, "part": name, "text": f"{part.label}: {_line(error)}"}
-                )
-            self._sent[name], self._sent_version[name] = depends, self._version
-            if message is not None:
-                self._broadcast(message)
-            times_ms[name] = 1e3 * (time.perf_counter() - start_s)
-            self._costs.add_part(self._key, name, 1e-3 * times_ms[name])
-            if self._waiting and k > 1:
-                return
-        self._send(
-            {
+        times_ms = self._views.send_changed(
+            replace(self.result, frozen=self._frozen_result),
+            self._version,
+            self._last_id,
+            key=self._key,
+            is_dragging=self._is_dragging,
+            is_interrupted=lambda: bool(self._waiting),
+        )
+        if times_ms is not None:
+            times_ms["simulation"] = 1e3 * self.result.seconds_s
+            self._send({
                 "kind": "done",
                 "id": self._last_id,
                 "version": self._version,
                 "ms": times_ms,
                 "is_preview": self.is_preview,
-            }
-        )
+            })  # fmt: skip
+
+    def _line(self, error: BaseException) -> str:
+        """Return an error in one line, without the directory of uploads."""
+        return one_line(error).replace(f"{self.uploads}/", "")
 
     def _send_error(self, number: Any, error: BaseException) -> None:
-        self._send({"kind": "error", "id": number, "text": _line(error).replace(f"{self.uploads}/", "")})
+        self._send({"kind": "error", "id": number, "text": self._line(error)})
 
-    def _send(self, message: dict[str, Any]) -> None:
-        self._send_text(json.dumps(to_json(message), allow_nan=False))
-
-    def _send_text(self, text: str) -> None:
-        self._broadcast(text)
-
-    def _broadcast(self, message: str | bytes) -> None:
+    def _send(self, message: dict[str, Any] | bytes) -> None:
+        sent = message if isinstance(message, bytes) else json.dumps(to_json(message), allow_nan=False)
         for listener in list(self._listeners):
             with suppress(Exception):
-                listener(message)
-
-
-def _is_same(old: tuple[Any, ...], new: tuple[Any, ...]) -> bool:
-    """Return whether the objects that a part depends on are the same."""
-    return len(old) == len(new) and all(a is b for a, b in zip(old, new, strict=True))
-
-
-def _is_change(message: Any) -> bool:
-    """Return whether a message changes the settings."""
-    return isinstance(message, dict) and message.get("do") in CHANGES
-
-
-def _is_preview(message: dict[str, Any], key: Any = None) -> bool:
-    """Return whether a message sets a value during a drag, of a given key."""
-    return message.get("do") == "set" and message.get("final") is False and (key is None or message.get("key") == key)
-
-
-def _is_frame(message: Any) -> bool:
-    """Return whether a message changes only the frame of a video or camera."""
-    return isinstance(message, dict) and message.get("do") == "frame"
-
-
-def _line(error: BaseException) -> str:
-    """Return an error in one line."""
-    if isinstance(error, MemoryError):
-        return "not enough memory; use a smaller picture or fewer photosites"
-    text = str(error) if isinstance(error, FoveasimError) else f"{type(error).__name__}: {error}".removesuffix(": ")
-    text = printable(" ".join(text.split()))
-    return text if len(text) <= MAX_MESSAGE_LENGTH else text[: MAX_MESSAGE_LENGTH - 3] + "..."
-
-
-def _string(message: dict[str, Any], name: str) -> str:
-    value = message.get(name)
-    if not isinstance(value, str):
-        raise ParameterError(name, "must be a string")
-    return value
-
-
-def _key(message: dict[str, Any]) -> str:
-    key = _string(message, "key")
-    if not key or len(key) > MAX_MESSAGE_LENGTH or not all(key.split(".")):
-        raise ParameterError("key", "must be the path of a setting, such as sensor.bits", printable(key)[:40])
-    return key
-
-
-def _plain(value: Any, depth: int = 0) -> Any:
-    """Return a value from the page, after a check of its depth."""
-    if depth > MAX_DEPTH:
-        raise ParameterError("value", f"must have at most {MAX_DEPTH} levels")
-    for item in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
-        _plain(item, depth + 1)
-    return value
-
-
-def _reset(settings: dict[str, Any], start: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """Return settings with the initial value of a key, or without it."""
-    found = copy.deepcopy(settings)
-    value = value_at(start, key)
-    if value is not None:
-        put_setting(None, found, key, copy.deepcopy(value))
-        return found
-    above, _, last = key.rpartition(".")
-    section: Any = value_at(found, above) if above else found
-    if isinstance(section, dict):
-        section.pop(last, None)
-    elif isinstance(section, list) and last.isdecimal() and int(last) < len(section):
-        section.pop(int(last))
-    return found
-
-
-def _changed(settings: Any, start: Any, key: str = "") -> list[str]:
-    """Return the keys of values that differ from the initial ones."""
-    if isinstance(settings, dict) and isinstance(start, dict):
-        return [
-            found
-            for name in dict.fromkeys((*start, *settings))
-            for found in _changed(settings.get(name), start.get(name), f"{key}.{name}" if key else name)
-        ]
-    return [] if settings == start else [key]
-
-
-def _match_filters(settings: dict[str, Any]) -> None:
-    """Add a mosaic to a layout, or filters that differ between neighbours."""
-    layout, sensor = settings.get("layout"), settings.get("sensor")
-    if not isinstance(layout, dict) or not isinstance(sensor, dict) or sensor.get("filters") is None:
-        return
-    if layout.get("generator") in WITHOUT_MOSAIC:
-        layout.setdefault("edits", [{"kind": "graph_colouring", "n_channels": N_FILTERS}])
-    elif "generator" in layout and layout.get("mosaic") is None:
-        layout["mosaic"] = ["RG", "GB"]
-
-
-def _relative(value: Any, uploads: Path, frames: Mapping[str, Path], found: dict[str, Path]) -> Any:
-    """Return settings with names of uploaded files for paths, and collect the files by name."""
-    if isinstance(value, dict):
-        return {name: _relative(item, uploads, frames, found) for name, item in value.items()}
-    if isinstance(value, list):
-        return [_relative(item, uploads, frames, found) for item in value]
-    if isinstance(value, str) and Path(value).parent == uploads:
-        file = frames.get(value, Path(value))
-        found[file.name] = file
-        return file.name
-    return value
+                listener(sent)

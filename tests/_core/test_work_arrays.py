@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from foveasim._core import work_arrays
-from foveasim._core.work_arrays import work_array
+from foveasim._core.work_arrays import release_memory, work_array
 
 SHAPE = (512, 1024)
 
@@ -53,6 +53,18 @@ def test_unused_memory_is_limited(monkeypatch):
     del arrays
 
     assert sum(unused.size for unused in work_arrays._POOL._unused) == 2 * n_bytes
+
+
+def test_release_keeps_used_memory():
+    used, unused = (work_array(SHAPE, np.float32) for _ in range(2))
+    used[...] = 3.0
+    del unused
+    assert len(work_arrays._POOL._unused) == 1
+
+    release_memory()
+
+    assert work_arrays._POOL._unused == []
+    assert (used == 3.0).all()
 
 
 def test_threads_never_share_memory():

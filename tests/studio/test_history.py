@@ -57,3 +57,14 @@ def test_copies_are_independent():
     assert copied.settings == {"n": 1}
     assert copied.can_undo
     assert not copied.can_redo
+
+
+def test_states_share_equal_sections():
+    history = History({"scene": {"kind": "flat"}, "seed": 1})
+    first = history.settings
+    history.commit({"scene": {"kind": "flat"}, "seed": 2})
+
+    assert history.settings == {"scene": {"kind": "flat"}, "seed": 2}
+    assert history.settings["scene"] is first["scene"]
+    assert history.undo()
+    assert history.settings == {"scene": {"kind": "flat"}, "seed": 1}

@@ -215,6 +215,19 @@ def test_rest_completes_a_preview(large, make_threaded):
     )
 
 
+def test_rest_releases_unused_memory(settings, make_threaded, monkeypatch):
+    released = threading.Event()
+    monkeypatch.setattr(_session, "RELEASE_S", 0.05)
+    monkeypatch.setattr(_session, "release_memory", released.set)
+    session = make_threaded(settings)
+    for number in (1, 2):
+        session.post({"do": "set", "key": "seed", "value": number, "final": True})
+        assert released.wait(60.0), number
+        released.clear()
+
+    assert not released.wait(0.3)  # only once in each rest
+
+
 # -- interruption -----------------------------------------------------------------------------------------------------------
 
 

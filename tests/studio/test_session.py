@@ -467,3 +467,54 @@ def test_settings_are_not_shared(recorder, settings):
     recorder.do(do="undo")
 
     assert recorder.session.history.settings == before == settings
+
+
+def other_values(control):
+    """Return values of a control that differ from the current one."""
+    match control["kind"]:
+        case "number" | "integer":
+            low, high = control["suggested"]
+            value = low + 0.3 * (high - low)
+            return [round(value) if control["kind"] == "integer" else value]
+        case "choice":
+            return [choice["value"] for choice in control["choices"]][-2:]
+        case "boolean":
+            return [not control.get("default", False)]
+        case "list" if control.get("default"):
+            return [[number + 2.5 for number in control["default"]]]
+        case _:
+            return []
+
+
+def test_no_setting_leaves_stale_views(make_session, settings):
+    lens = {"kind": "brown_conrady", "focal_um": 8000.0, "radial": [-0.1], "centre_um": [1.0, 0.5]}
+    settings = {**settings, "distortion": lens}
+    recorder = make_session(start=settings)
+    recorder.do(do="views", names=[name for name, part in _session.PARTS.items() if not part.is_costly])
+    shown, stale, n_changes = {}, [], 0
+
+    def receive():
+        shown.update({header["part"]: (header["about"], arrays) for header, arrays in recorder.parts})
+
+    def is_same(one, other):
+        return one[0] == other[0] and all(np.array_equal(one[1][k], other[1][k], equal_nan=True) for k in other[1])
+
+    recorder.do(do="refresh")
+    receive()
+    controls = [control for control in recorder.session._controls if other_values(control)]
+    for control in controls:
+        for value in other_values(control):
+            state = recorder.do(do="set", key=control["key"], value=value, final=True)
+            receive()
+            if state["errors"]:
+                continue
+            n_changes += 1
+            before = dict(shown)
+            recorder.do(do="refresh")
+            receive()
+            stale += [(control["key"], name) for name in shown if not is_same(before[name], shown[name])]
+        recorder.do(do="restore", settings=settings)
+        receive()
+
+    assert stale == []
+    assert n_changes > len(controls) // 2, (n_changes, len(controls))

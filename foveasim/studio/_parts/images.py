@@ -33,7 +33,16 @@ def picture(result: Simulated) -> PartData:
     return _picture(levels, found.coverage, found.grid.bounds_um)
 
 
-@part("Optical image", lambda result: (*result.images.values(), result.shot.scene))
+def _light_of(result: Simulated) -> tuple[Any, ...]:
+    """Return the images, with their position and the white that scales them: both depend on other settings too."""
+    source, camera = result.shot.scene, result.shot.camera
+    if isinstance(source, PowerMap):
+        return (source,)
+    white_dn = tuple(result.capture.white_dn.tolist())
+    return (*result.images.values(), white_dn, camera.image_grid(source).bounds_um, tuple(result.images))
+
+
+@part("Optical image", _light_of)
 def scene(result: Simulated) -> PartData:
     """Return the optical image through each colour filter."""
     camera, source = result.shot.camera, result.shot.scene

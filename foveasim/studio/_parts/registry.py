@@ -31,7 +31,8 @@ class Part:
     make : function of Simulated
         Returns the data.
     depends : function of Simulated
-        Returns objects that determine the data: the part is computed again when one of them is another object.
+        Returns objects that determine the data: the part is computed again when one of them is another object, or a tuple
+        that is not equal.
     is_costly : bool
         Whether the part is computed only when a page asks for it, and not for previews.
     """

@@ -1,0 +1,146 @@
+"""Changes of the settings that a page requests: fields of its messages, and new settings."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+from foveasim.config import put_setting
+from foveasim.errors import ParameterError, printable
+from foveasim.studio._controls import controls_of, value_at
+from foveasim.studio._files import Files, with_layout
+from foveasim.studio._templates import WITHOUT_MOSAIC
+
+__all__ = [
+    "ONCE", "changed_keys", "check_depth", "is_change", "is_draft", "is_frame", "key_of", "match_filters", "reset",
+    "string_of", "with_file",
+]  # fmt: skip
+
+#: Messages that change the settings.
+CHANGES = ("set", "reset", "delete", "undo", "redo", "preset", "restore", "file", "video", "frame", "match")
+#: Changes that cannot be applied twice, as they advance a source of frames: their simulations are complete.
+ONCE = ("video", "frame")
+#: Longest path of a setting.
+MAX_KEY_LENGTH = 500
+#: Largest depth of settings from the page.
+MAX_DEPTH = 20
+#: Number of colour filters that a layout without mosaic receives.
+N_FILTERS = 3
+
+
+def is_change(message: Any) -> bool:
+    """Return whether a message changes the settings."""
+    return isinstance(message, dict) and message.get("do") in CHANGES
+
+
+def is_draft(message: dict[str, Any], key: Any = None) -> bool:
+    """Return whether a message sets a value during a drag, of a given key."""
+    return message.get("do") == "set" and message.get("final") is False and (key is None or message.get("key") == key)
+
+
+def is_frame(message: Any) -> bool:
+    """Return whether a message changes only the frame of a video or camera."""
+    return isinstance(message, dict) and message.get("do") == "frame"
+
+
+def string_of(message: dict[str, Any], name: str) -> str:
+    """Return a text of a message."""
+    value = message.get(name)
+    if not isinstance(value, str):
+        raise ParameterError(name, "must be a string")
+    return value
+
+
+def key_of(message: dict[str, Any]) -> str:
+    """Return the path of the setting of a message."""
+    key = string_of(message, "key")
+    if not key or len(key) > MAX_KEY_LENGTH or not all(key.split(".")):
+        raise ParameterError("key", "must be the path of a setting, such as sensor.bits", printable(key)[:40])
+    return key
+
+
+def check_depth(value: Any, depth: int = 0) -> Any:
+    """Return a value from the page, after a check of its depth."""
+    if depth > MAX_DEPTH:
+        raise ParameterError("value", f"must have at most {MAX_DEPTH} levels")
+    for item in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        check_depth(item, depth + 1)
+    return value
+
+
+def reset(settings: dict[str, Any], start: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """Return settings with the initial value of a key, or without it."""
+    found = copy.deepcopy(settings)
+    value = value_at(start, key)
+    if value is not None:
+        put_setting(None, found, key, copy.deepcopy(value))
+        return found
+    above, _, last = key.rpartition(".")
+    section: Any = value_at(found, above) if above else found
+    if isinstance(section, dict):
+        section.pop(last, None)
+    elif isinstance(section, list) and last.isdecimal() and int(last) < len(section):
+        section.pop(int(last))
+    return found
+
+
+def changed_keys(settings: Any, start: Any, key: str = "") -> list[str]:
+    """Return the keys of values that differ from the initial ones."""
+    if isinstance(settings, dict) and isinstance(start, dict):
+        return [
+            found
+            for name in dict.fromkeys((*start, *settings))
+            for found in changed_keys(settings.get(name), start.get(name), f"{key}.{name}" if key else name)
+        ]
+    return [] if settings == start else [key]
+
+
+def match_filters(settings: dict[str, Any]) -> None:
+    """Add a mosaic to a layout, or filters that differ between neighbours."""
+    layout, sensor = settings.get("layout"), settings.get("sensor")
+    if not isinstance(layout, dict) or not isinstance(sensor, dict) or sensor.get("filters") is None:
+        return
+    if layout.get("generator") in WITHOUT_MOSAIC:
+        layout.setdefault("edits", [{"kind": "graph_colouring", "n_channels": N_FILTERS}])
+    elif "generator" in layout and layout.get("mosaic") is None:
+        layout["mosaic"] = ["RG", "GB"]
+
+
+def with_file(
+    settings: Mapping[str, Any], start: Mapping[str, Any], files: Files, path: str, use: Any
+) -> dict[str, Any]:
+    """
+    Return settings with an uploaded file.
+
+    Parameters
+    ----------
+    settings, start : mapping
+        Current and initial settings.
+    files : Files
+    path : str
+    use : {"scene", "layout", "settings"}
+
+    Raises
+    ------
+    FileError
+        When the file is not available, or invalid.
+    ParameterError
+        When the use is unknown.
+    """
+    match use:
+        case "scene":
+            found = copy.deepcopy(dict(settings))
+            if found["scene"].get("kind") != "picture":
+                control = next(control for control in controls_of(found, start) if control["key"] == "scene")
+                found["scene"] = next(each["value"] for each in control["choices"] if each["label"] == "picture")
+            found["scene"]["picture"] = path
+            if found["scene"].get("fit") is None:
+                put_setting(None, found, "scene.fit", "cover")  # pictures differ in their number of pixels
+            return found
+        case "layout":
+            return with_layout(settings, files.layout_of(path))
+        case "settings":
+            return files.settings_of(path)
+        case _:
+            raise ParameterError("as", "must be scene, layout or settings", printable(str(use))[:40])

@@ -1,0 +1,134 @@
+"""Views that a page shows: each is computed and sent when what it depends on changed."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+from foveasim.errors import ParameterError
+from foveasim.studio._costs import Costs
+from foveasim.studio._engine import Simulated
+from foveasim.studio._messages import encode_part
+from foveasim.studio._parts import PARTS
+
+__all__ = ["Views"]
+
+#: Parts that are sent first and together: sites, and their values.
+FIRST = ("sites", "columns")
+
+
+class Views:
+    """
+    Selected views, and what was sent of them.
+
+    Parameters
+    ----------
+    send : function of a message
+        Receives parts as bytes, and errors as dicts.
+    line : function of an exception
+        Returns its message in one line.
+    costs : Costs
+        Receives the times of views; slow ones are left out during drags.
+    """
+
+    def __init__(
+        self,
+        send: Callable[[dict[str, Any] | bytes], None],
+        line: Callable[[BaseException], str],
+        costs: Costs,
+    ) -> None:
+        self._send, self._line, self._costs = send, line, costs
+        self.left_out: list[str] = []
+        self._names = [part.name for part in PARTS.values() if not part.is_costly]
+        self._sent: dict[str, tuple[Any, ...]] = {}
+        self._version: dict[str, int] = {}
+
+    def select(self, names: Any) -> None:
+        """
+        Set the views that are sent.
+
+        Raises
+        ------
+        ParameterError
+            When a name is unknown.
+        """
+        if not isinstance(names, list) or not all(isinstance(name, str) and name in PARTS for name in names):
+            raise ParameterError("names", f"must be a list of names of views: {', '.join(PARTS)}")
+        self._names = [name for name in PARTS if name in names]
+
+    def forget(self, name: str | None = None) -> None:
+        """Send a view again, or all."""
+        for each in list(self._sent) if name is None else [name]:
+            self._sent.pop(each, None)
+            self._version.pop(each, None)
+
+    def send_changed(
+        self,
+        result: Simulated,
+        version: int,
+        number: Any,
+        *,
+        key: str | None,
+        is_dragging: bool,
+        is_interrupted: Callable[[], bool],
+    ) -> dict[str, float] | None:
+        """
+        Compute and send the views that changed.
+
+        Parameters
+        ----------
+        result : Simulated
+        version : int
+            Number of the result.
+        number : object
+            Number of the message that is answered.
+        key : str, optional
+            Setting that changed.
+        is_dragging : bool
+            Whether slow views are left out.
+        is_interrupted : function
+            Whether newer messages wait: later views are then left to the next call.
+
+        Returns
+        -------
+        times_ms : dict of str to float, ms, or None
+            Times by view; None after an interruption.
+        """
+        times_ms: dict[str, float] = {}
+        self.left_out = []
+        shown = [name for name in self._names if name != "comparison" or result.frozen is not None]
+        # Sites and their values belong together; the others in the order of their age.
+        names = sorted(shown, key=lambda name: (name not in FIRST, self._version.get(name, -1)))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # those of the simulation are in the state
+            for k, name in enumerate(names):
+                part = PARTS[name]
+                depends = part.depends(result)
+                if name in self._sent and _is_same(self._sent[name], depends):
+                    self._version[name] = version
+                    continue
+                if is_dragging and (part.is_costly or self._costs.is_slow_part(key, name)):
+                    self.left_out.append(name)
+                    continue
+                start_s = time.perf_counter()
+                try:
+                    self._send(encode_part(name, version, *part.make(result), is_preview=result.is_preview))
+                except Exception as error:  # noqa: BLE001 -- one view fails, the others are shown
+                    text = f"{part.label}: {self._line(error)}"
+                    self._send({"kind": "error", "id": number, "part": name, "text": text})
+                self._sent[name], self._version[name] = depends, version
+                time_s = time.perf_counter() - start_s
+                times_ms[name] = 1e3 * time_s
+                self._costs.add_part(key, name, time_s)
+                if is_interrupted() and k >= len(FIRST):
+                    return None
+        return times_ms
+
+
+def _is_same(old: tuple[Any, ...], new: tuple[Any, ...]) -> bool:
+    """Return whether the objects that a part depends on are the same, or equal tuples of numbers."""
+    return len(old) == len(new) and all(
+        a is b or (isinstance(a, tuple) and isinstance(b, tuple) and a == b) for a, b in zip(old, new, strict=True)
+    )
