@@ -411,22 +411,26 @@ def _build_layout(
             layout = _call(source, prefix + "mosaic", mosaic, {"layout": layout, "block": section.mosaic})
         return layout
 
-    def edited(n: int) -> Layout:
-        """Return the layout after n edits, from the cache for the last two."""
-        layout = cache("generated layout", unedited, generated)
-        for i in range(n):
+    def edited(layout: Layout, start: int, stop: int) -> Layout:
+        for i in range(start, stop):
             layout = _edit(source, f"{prefix}edits[{i}]", edits[i], layout, rules)
         return layout
 
-    def cached(n: int) -> Layout:
-        settings = [unedited, data["edits"][:n] if data else None, data.get("rules") if data else None]
-        return cache("edited layout", settings, lambda: with_last(n))
+    # The generated layout, and those after the last two edits, are cached: the last edit is the one that changes.
+    n = len(edits)
+    plain = data or {}
 
-    def with_last(n: int) -> Layout:
-        before = cached(n - 1) if n == len(edits) and n > 1 else edited(n - 1)
-        return _edit(source, f"{prefix}edits[{n - 1}]", edits[n - 1], before, rules)
+    def first() -> Layout:
+        return cache("generated layout", unedited, generated)
 
-    layout = cached(len(edits)) if edits else edited(0)
+    def cached(n_edits: int, make: Callable[[], Layout]) -> Layout:
+        return cache("edited layout", [unedited, plain.get("edits", [])[:n_edits], plain.get("rules")], make)
+
+    def last() -> Layout:
+        before = cached(n - 1, lambda: edited(first(), 0, n - 1)) if n > 1 else first()
+        return edited(before, n - 1, n)
+
+    layout = cached(n, last) if n else first()
     if any(section.move_um):
         layout = _call(
             source, prefix + "move_um", layout.translate, dict(zip(("dx_um", "dy_um"), section.move_um, strict=True))
@@ -565,7 +569,9 @@ def put_setting(source: Source | str | Path | None, data: dict[str, Any], key: s
     if not all(names):
         raise ConfigError(Source.of(source).file, f"'{key}' must be the path of a setting, such as sensor.bits")
     section: Any = data
+    step: Any = names[0]
     for i, name in enumerate(names):
+        step = name
         if isinstance(section, list):
             if not name.isdecimal() or int(name) >= len(section):
                 raise ConfigError(
@@ -573,20 +579,20 @@ def put_setting(source: Source | str | Path | None, data: dict[str, Any], key: s
                     f"'{key}={value}' cannot be set: {'.'.join(names[:i])} is a list of {len(section)} items, and the next "
                     f"part of the path must be the index of one of them, from 0",
                 )
+            step = int(name)
         elif not isinstance(section, dict):
             raise ConfigError(
                 Source.of(source).file,
                 f"'{key}={value}' cannot be set: {'.'.join(names[:i])} must be a section, got {section!r}",
             )
-        step: Any = int(name) if isinstance(section, list) else name
-        if i == len(names) - 1:
-            section[step] = value
-        else:
-            section = section[step] if isinstance(section, list) else section.setdefault(name, {})
-    section = data.get("scene", {})
-    if names[:-1] == ["scene"] and names[-1] in FRAMINGS and value is not None:
+        elif i < len(names) - 1:
+            section.setdefault(name, {})
+        if i < len(names) - 1:
+            section = section[step]
+    section[step] = value
+    if names[:-1] == ["scene"] and step in FRAMINGS and value is not None:
         for name in FRAMINGS:
-            if name != names[-1]:
+            if name != step:
                 section.pop(name, None)
 
 

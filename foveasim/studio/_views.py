@@ -17,6 +17,8 @@ __all__ = ["Views"]
 
 #: Parts that are sent first and together: sites, and their values.
 FIRST = ("sites", "columns")
+#: Other parts are sent together unless this time has passed: each transfer costs the page a frame.
+TOGETHER_S = 0.1
 
 
 class Views:
@@ -98,9 +100,12 @@ class Views:
         """
         times_ms: dict[str, float] = {}
         self.left_out = []
+        encoded: list[bytes] = []
+        sent_s = time.perf_counter()
         shown = [name for name in self._names if name != "comparison" or result.frozen is not None]
         # Sites and their values belong together; the others in the order of their age.
         names = sorted(shown, key=lambda name: (name not in FIRST, self._version.get(name, -1)))
+        n_first = sum(name in FIRST for name in names)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # those of the simulation are in the state
             for k, name in enumerate(names):
@@ -114,7 +119,7 @@ class Views:
                     continue
                 start_s = time.perf_counter()
                 try:
-                    self._send(encode_part(name, version, *part.make(result), is_preview=result.is_preview))
+                    encoded.append(encode_part(name, version, *part.make(result), is_preview=result.is_preview))
                 except Exception as error:  # noqa: BLE001 -- one view fails, the others are shown
                     text = f"{part.label}: {self._line(error)}"
                     self._send({"kind": "error", "id": number, "part": name, "text": text})
@@ -122,9 +127,19 @@ class Views:
                 time_s = time.perf_counter() - start_s
                 times_ms[name] = 1e3 * time_s
                 self._costs.add_part(key, name, time_s)
-                if is_interrupted() and k >= len(FIRST):
+                is_stopped = k >= len(FIRST) and is_interrupted()
+                if k + 1 == n_first or is_stopped or time.perf_counter() - sent_s > TOGETHER_S:
+                    self._send_all(encoded)
+                    sent_s = time.perf_counter()
+                if is_stopped:
                     return None
+        self._send_all(encoded)
         return times_ms
+
+    def _send_all(self, encoded: list[bytes]) -> None:
+        for message in encoded:
+            self._send(message)
+        encoded.clear()
 
 
 def _is_same(old: tuple[Any, ...], new: tuple[Any, ...]) -> bool:

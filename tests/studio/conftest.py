@@ -1,4 +1,4 @@
-"""Small settings, and sessions without a thread."""
+"""Small settings, sessions without a thread, and pages in a browser."""
 
 from __future__ import annotations
 
@@ -87,3 +87,56 @@ def recorder(make_session):
 @pytest.fixture
 def data_directory():
     return Path(__file__).parents[1]
+
+
+# -- pages in a browser -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    from studio.page_tools import Server
+
+    running = Server(tmp_path_factory.mktemp("out"))
+    yield running
+    running.stop()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from playwright.sync_api import sync_playwright
+    from studio.page_tools import open_chromium
+
+    with sync_playwright() as playwright:
+        chromium = open_chromium(playwright)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def visit(server, browser):
+    """Open pages; at the end check that they wrote nothing to the console."""
+    from studio.page_tools import TIMEOUT_MS, settle
+
+    contexts, problems = [], []
+
+    def open_page(*, width=1280, height=800, script=None, is_checked=True, address=None, **options):
+        context = browser.new_context(
+            viewport={"width": width, "height": height}, **{"bypass_csp": True, "reduced_motion": "reduce", **options}
+        )
+        contexts.append(context)
+        if script:
+            context.add_init_script(script)
+        page = context.new_page()
+        page.set_default_timeout(TIMEOUT_MS)
+        if is_checked:
+            page.on("console", lambda message: problems.append(message.text))
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        page.goto(address or server.address)
+        if options.get("bypass_csp", True) and address is None:
+            settle(page)
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert problems == []

@@ -11,17 +11,7 @@ import pytest
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
-from studio.test_studio_page import (  # noqa: F401 -- fixtures
-    SHOT,
-    browser,
-    change,
-    server,
-    set_value,
-    setting,
-    settle,
-    until,
-    visit,
-)
+from studio.page_tools import SHOT, change, set_value, setting, settle, until
 
 pytestmark = pytest.mark.needs("chromium")
 
@@ -41,7 +31,7 @@ GRID = {
 
 
 @pytest.fixture
-def edit(visit):  # noqa: F811
+def edit(visit):
     """Open the editor on a grid, with other keys of the layout."""
 
     def start(tool="select", *, layout=None, **options):

@@ -15,8 +15,7 @@ pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
 from PIL import Image
-from studio import test_studio_page
-from studio.test_studio_page import (
+from studio.page_tools import (
     SOFTWARE,
     change,
     codes,
@@ -30,7 +29,6 @@ from studio.test_studio_page import (
 from foveasim.config import read_shot
 
 pytestmark = pytest.mark.needs("chromium")
-server, browser, visit = test_studio_page.server, test_studio_page.browser, test_studio_page.visit
 
 #: A camera that shows a moving picture.
 FAKE_CAMERA = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
@@ -414,13 +412,17 @@ def test_link_restores_the_state(visit, server):
     assert third.is_enabled("#undo")
 
 
+def open_link(page, link):
+    page.click("#file")
+    page.click("[data-do=open-link]")
+    page.fill("#link-text", link)
+    page.click("#link-form button[value=open]")
+
+
 @pytest.mark.parametrize("text", ["hello", "http://127.0.0.1/#state=AAAA", "#state=!!!"])
 def test_invalid_links_give_one_line(visit, text):
     page = visit()
-    page.click("#file")
-    page.click("[data-do=open-link]")
-    page.fill("#link-text", text)
-    page.click("#link-form button[value=open]")
+    open_link(page, text)
 
     message(page, "not a link of the studio|not one of the studio")
 
@@ -432,10 +434,7 @@ def test_large_links_give_one_line(visit):
       const bytes = new Uint8Array(await new Response(stream).arrayBuffer());
       return "#state=" + btoa(Array.from(bytes, (b) => String.fromCharCode(b)).join("")).replaceAll("+", "-").replaceAll("/", "_");
     }""")
-    page.click("#file")
-    page.click("[data-do=open-link]")
-    page.fill("#link-text", link)
-    page.click("#link-form button[value=open]")
+    open_link(page, link)
 
     message(page, "not one of the studio")
 
@@ -448,10 +447,7 @@ def test_links_cannot_name_other_files(visit):
       const { fragmentOf } = await import("/static/links.js");
       return "#" + await fragmentOf(JSON.stringify(settings));
     }""")
-    page.click("#file")
-    page.click("[data-do=open-link]")
-    page.fill("#link-text", link)
-    page.click("#link-form button[value=open]")
+    open_link(page, link)
     message(page, "'/etc/passwd' is not available here; upload the file")
 
     assert setting(page, "scene.picture") == "skimage:astronaut"

@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
-from studio.test_studio_page import browser, codes, server, setting, visit  # noqa: F401 -- fixtures
+from studio.page_tools import codes, setting
 
 import foveasim as fs
 
@@ -31,7 +31,7 @@ def tasks():
 
 
 @pytest.fixture
-def page(visit, tasks):  # noqa: F811
+def page(visit, tasks):
     found = visit(width=1440, height=900, bypass_csp=True, accept_downloads=True)
     tasks.wait_for_views(found)
     return found

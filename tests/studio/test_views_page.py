@@ -8,10 +8,9 @@ import pytest
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
-from studio.test_studio_page import browser, change, has_picture, server, set_value, settle, until, visit
+from studio.page_tools import change, has_picture, set_value, settle, until
 
 pytestmark = pytest.mark.needs("chromium")
-__all__ = ["browser", "server", "visit"]
 
 #: Browsers without WebGL.
 WITHOUT_WEBGL = """{ const own = HTMLCanvasElement.prototype.getContext;

@@ -23,10 +23,9 @@ from foveasim._core.validation import (
 )
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout._noding import points_on_edges
-from foveasim.layout.adjacency import TOUCHING_UM
 from foveasim.layout.edit_registry import layout_edit
 from foveasim.layout.edits._parts import replace_sites, separate_parts
-from foveasim.layout.edits.all_sites import split
+from foveasim.layout.edits.all_sites import merge, split
 from foveasim.layout.model import Layout
 
 __all__ = [
@@ -125,15 +124,13 @@ def merge_at(layout: Layout, points_um: ArrayLike) -> Layout:
         When a point lies outside all sites.
     """
     sites = np.unique(sites_at(layout, points_um))
-    polygons = layout[sites].polygons()
-    joined = shapely.union_all(polygons)
-    if not isinstance(joined, shapely.Polygon):
-        joined = shapely.union_all(polygons, grid_size=TOUCHING_UM)
-    if not isinstance(joined, shapely.Polygon):
+    try:
+        joined = merge(layout[sites], np.zeros(sites.size, int)).polygons()
+    except GeometryError:
         raise GeometryError(
             "the sites at the points must be connected by shared edges; merge fewer sites", tuple(sites.tolist())
-        )
-    return replace_sites(layout, sites, np.array([joined]), sites[:1], f"{sites.size} sites merged")
+        ) from None
+    return replace_sites(layout, sites, joined, sites[:1], f"{sites.size} sites merged")
 
 
 @layout_edit(example={"points_um": [[-5.0, 5.0]], "n_x": 2})

@@ -1,0 +1,136 @@
+"""The studio in a browser, for tests: a server in a thread, and steps on its page."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import threading
+
+import numpy as np
+import yaml
+
+from foveasim.studio._server import Studio, host_names
+from foveasim.studio._session import Start
+
+#: WebGL by the processor, which every machine has.
+SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+TOKEN = "the-token-of-these-tests-0123456"
+TIMEOUT_MS = 60_000
+#: A foveal colour sensor of 1,152 photosites with design rules.
+SHOT = yaml.safe_load("""
+scene:
+  kind: picture
+  picture: skimage:astronaut
+  pitch_um: 1000.0
+  distance_m: 1.0
+  peak_radiance_w_m2_sr_nm: 0.02
+  wavelength_nm: [620, 550, 450]
+optics: {focal_length_mm: 8.0, f_number: 2.8}
+layout:
+  generator: log_polar
+  parameters: {n_sectors: 48, min_size_um: 8.0, r_max_um: 690.0, stagger: true, chords_per_arc: 2}
+  mosaic: [RG, GB]
+  move_um: [-140.0, 320.0]
+  rules: {min_size_um: 8.0, min_width_um: 7.0}
+sensor:
+  qe: {kind: silicon, depth_um: 3.0}
+  filters: rgb
+  capacitance_f: {per_um2: 1.0e-15}
+  read_noise_e: 1.0
+  v_sat_v: 3.0
+  bits: 10
+exposure_s: 0.02
+seed: 1
+""")
+
+
+class Server:
+    """The web server in a thread, which can be stopped and started again at the same address."""
+
+    def __init__(self, out):
+        self.start_of = Start(SHOT, "test", None, out)
+        self.port = 0
+        self.start()
+
+    def start(self):
+        import uvicorn
+
+        listener = socket.create_server(("127.0.0.1", self.port), reuse_port=False)
+        self.port = listener.getsockname()[1]
+        self.studio = Studio(self.start_of, token=TOKEN, hosts=host_names("127.0.0.1", self.port))
+        self.server = uvicorn.Server(
+            uvicorn.Config(
+                self.studio.app,
+                log_level="critical",
+                lifespan="off",
+                ws="websockets-sansio",
+                timeout_graceful_shutdown=0,
+            )
+        )
+        self.thread = threading.Thread(target=self.server.run, kwargs={"sockets": [listener]}, daemon=True)
+        self.thread.start()
+
+    def stop(self):
+        self.server.should_exit = self.server.force_exit = True
+        self.thread.join(20)
+        self.studio.close()
+
+    @property
+    def address(self):
+        return f"http://127.0.0.1:{self.port}/#{TOKEN}"
+
+
+def open_chromium(playwright, *more):
+    """Start the browser, with further arguments."""
+    return playwright.chromium.launch(executable_path=shutil.which("chromium"), args=[*SOFTWARE, *more])
+
+
+def until(page, condition, argument=None):
+    page.wait_for_function(condition, arg=argument, timeout=TIMEOUT_MS, polling=20)
+
+
+def settle(page):
+    """Wait until all parts that the page asked for are drawn."""
+    until(page, "() => window.studio && studio.isReady && studio.page.parts.picture && studio.page.nDone > 0")
+
+
+def change(page, script, argument=None):
+    """Run a script that sends messages, and wait for the answer to the last one."""
+    page.evaluate(script, argument)
+    until(page, "() => studio.isReady && studio.page.doneId >= studio.connection.id")
+
+
+def set_value(page, key, value):
+    change(page, "([key, value]) => { studio.connection.set(key, value, true); }", [key, value])
+
+
+def setting(page, key):
+    return page.evaluate("key => key.split('.').reduce((part, name) => part[name] ?? null, studio.state.settings)", key)
+
+
+def codes(page):
+    return np.array(page.evaluate("() => [...studio.panes.b.columns.find((c) => c.key === 'code').values]"))
+
+
+def control(page, key, part="input[type=text]"):
+    """Return an element of the last control of a key, after its section was opened."""
+    row = page.locator(f".control[data-key='{key}']").last
+    row.evaluate("row => { row.closest('details').open = true; }")
+    return row.locator(part)
+
+
+def has_picture(page, selector):
+    """Whether the pixels of a canvas differ."""
+    return page.evaluate(
+        "selector => { const canvas = document.querySelector(selector), data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;"
+        " const first = data.slice(0, 4).join(); for (let i = 0; i < data.length; i += 4) if (data.slice(i, i + 4).join() !== first) return true; return false; }",
+        selector,
+    )
+
+
+def drop(page, name, content):
+    page.evaluate(
+        """([name, bytes]) => { const data = new DataTransfer(); data.items.add(new File([new Uint8Array(bytes)], name));
+        for (const type of ["dragenter", "dragover", "drop"]) document.body.dispatchEvent(new DragEvent(type, { dataTransfer: data, bubbles: true, cancelable: true })); }""",
+        [name, list(content)],
+    )
