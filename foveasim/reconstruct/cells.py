@@ -69,9 +69,9 @@ def fill_channels(layout: PackedRings, values: Floats, channel: Ints, n_channels
     arguments = np.asarray(channel, np.int64).tobytes(), n_channels
     neighbours = _neighbours_once(layout, *arguments) if _is_cached(layout) else _neighbours(layout, *arguments)
     filled = np.full((n_channels, values.size), np.nan)
-    for c, (own, nearest, weight) in neighbours.items():
-        filled[c] = (values[nearest] * weight).sum(axis=1) / weight.sum(axis=1)
+    for c, (own, others, nearest, weight) in neighbours.items():
         filled[c, own] = values[own]
+        filled[c, others] = (values[nearest] * weight).sum(axis=1) / weight.sum(axis=1)
     return filled
 
 
@@ -86,9 +86,9 @@ def _compiled(layout: PackedRings, grid: Grid, n_threads: int | None) -> tuple[I
     return integrator, coverage_fraction(integrator)
 
 
-def _neighbours(layout: PackedRings, channels: bytes, n_channels: int) -> dict[int, tuple[Ints, Ints, Floats]]:
+def _neighbours(layout: PackedRings, channels: bytes, n_channels: int) -> dict[int, tuple[Ints, Ints, Ints, Floats]]:
     """
-    Return the sites of each channel, and their nearest ones to every site with weights.
+    Return the sites of each channel, the others, and for each of these the nearest sites of the channel with weights.
 
     ``channels`` are the bytes of the channels of the sites, int64.
     """
@@ -98,13 +98,13 @@ def _neighbours(layout: PackedRings, channels: bytes, n_channels: int) -> dict[i
     channel = np.frombuffer(channels, np.int64)
     found = {}
     for c in range(n_channels):
-        own = np.flatnonzero(channel == c)
+        own, others = np.flatnonzero(channel == c), np.flatnonzero(channel != c)
         if own.size == 0:
             continue
         distance_um, nearest = cKDTree(centroid_um[own]).query(
-            centroid_um, k=np.arange(1, min(NEIGHBOURS, own.size) + 1)
+            centroid_um[others], k=np.arange(1, min(NEIGHBOURS, own.size) + 1)
         )
-        found[c] = own, own[nearest], 1.0 / np.maximum(distance_um, 1e-12)
+        found[c] = own, others, own[nearest], 1.0 / np.maximum(distance_um, 1e-12)
     return found
 
 

@@ -6,6 +6,7 @@ Every setting of a shot is a control; scene, photosites, picture, noise and desi
 
 from __future__ import annotations
 
+import errno
 import ipaddress
 import os
 import re
@@ -103,9 +104,9 @@ def run_studio(
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         listener = socket.create_server((host, port), family=family)
     except OSError as error:
-        raise ParameterError(
-            "port", f"must be a free port of an address of this computer ({error.strerror or error})", port
-        ) from None
+        if error.errno in (errno.EADDRNOTAVAIL, socket.EAI_NONAME, socket.EAI_AGAIN):
+            raise ParameterError("host", "must be an address of this computer", host) from None
+        raise ParameterError("port", f"must be a free port ({error.strerror or error})", port) from None
     with listener:
         found = int(listener.getsockname()[1])
         studio = Studio(start, token=token, hosts=host_names(host, found))

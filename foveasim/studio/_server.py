@@ -8,6 +8,7 @@ import hmac
 import json
 import secrets
 import socket
+import sys
 import tempfile
 import time
 from collections import deque
@@ -45,6 +46,8 @@ HELLO_S = 10.0
 MAX_CONNECTIONS = 128
 #: Largest number of messages that wait for a slow connection.
 MAX_OUTGOING = 1000
+#: Longest time that a simulation delays the thread that sends messages.
+SWITCH_INTERVAL_S = 5e-4
 #: Close code for a wrong token.
 WRONG_TOKEN = 4403
 TOO_MANY = 4429
@@ -433,6 +436,8 @@ def serve(
         server_header=False,
         date_header=False,
     )
+    interval_s = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
     try:
         with contextlib.suppress(KeyboardInterrupt):
             server = Server(config)
@@ -440,4 +445,5 @@ def serve(
                 started(server)
             server.run(sockets=[listener])
     finally:
+        sys.setswitchinterval(interval_s)
         studio.close()

@@ -405,7 +405,7 @@ class Session:
                     except Exception as error:  # noqa: BLE001 -- shown at the settings
                         self._errors = {"": self._line(error)}
             case "views":
-                self._views.select(message.get("names"))
+                self._views.select(message.get("names"), message.get("pixels"))
             case "freeze":
                 if self.result is None:
                     raise SimulationError("there is no result to freeze")

@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from foveasim.errors import ParameterError
 from foveasim.studio._costs import Costs
-from foveasim.studio._engine import Simulated
+from foveasim.studio._engine import PICTURE_PIXELS, Simulated
 from foveasim.studio._messages import encode_part
 from foveasim.studio._parts import PARTS
 
@@ -17,6 +18,8 @@ __all__ = ["Views"]
 
 #: Parts that are sent first and together: sites, and their values.
 FIRST = ("sites", "columns")
+#: Limit of the longer side of pictures.
+MAX_PIXELS = 2048
 #: Other parts are sent together unless this time has passed: each transfer costs the page a frame.
 TOGETHER_S = 0.1
 
@@ -44,21 +47,31 @@ class Views:
         self._send, self._line, self._costs = send, line, costs
         self.left_out: list[str] = []
         self._names = [part.name for part in PARTS.values() if not part.is_costly]
+        self._pixels = PICTURE_PIXELS
         self._sent: dict[str, tuple[Any, ...]] = {}
         self._version: dict[str, int] = {}
 
-    def select(self, names: Any) -> None:
+    def select(self, names: Any, pixels: Any = None) -> None:
         """
         Set the views that are sent.
+
+        Parameters
+        ----------
+        names : list of str
+        pixels : int, optional
+            Longer side of pictures.
 
         Raises
         ------
         ParameterError
-            When a name is unknown.
+            When a name is unknown, or the number of pixels out of range.
         """
+        if pixels is not None and (type(pixels) is not int or not 1 <= pixels <= MAX_PIXELS):
+            raise ParameterError("pixels", f"must be an integer from 1 to {MAX_PIXELS}")
         if not isinstance(names, list) or not all(isinstance(name, str) and name in PARTS for name in names):
             raise ParameterError("names", f"must be a list of names of views: {', '.join(PARTS)}")
         self._names = [name for name in PARTS if name in names]
+        self._pixels = self._pixels if pixels is None else pixels
 
     def forget(self, name: str | None = None) -> None:
         """Send a view again, or all."""
@@ -98,6 +111,7 @@ class Views:
         times_ms : dict of str to float, ms, or None
             Times by view; None after an interruption.
         """
+        result = replace(result, picture_pixels=self._pixels)
         times_ms: dict[str, float] = {}
         self.left_out = []
         encoded: list[bytes] = []

@@ -132,6 +132,15 @@ def test_used_port_gives_one_line():
         run_studio(port=listener.getsockname()[1], open_browser=False)
 
 
+@pytest.mark.parametrize("host", ["300.1.1.1", "192.0.2.1"])
+def test_foreign_hosts_give_one_line(host):
+    with (
+        pytest.warns(FoveasimWarning),
+        pytest.raises(ParameterError, match="'host' must be an address of this computer"),
+    ):
+        run_studio(host=host, open_browser=False)
+
+
 def test_invalid_arguments_give_one_line(tmp_path):
     (tmp_path / "bad.yaml").write_text("scene: 5\n")
     (tmp_path / "file").write_text("")

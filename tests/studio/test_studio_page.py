@@ -414,7 +414,7 @@ def test_dropped_photograph_becomes_the_scene(visit):
     drop(page, "photo.png", buffer.getvalue())
     until(
         page,
-        "() => /photo/.test(studio.state.settings.scene.picture) && studio.isReady && studio.page.doneId >= studio.page.fileId",
+        "() => /photo/.test(studio.state.settings.scene.picture) && studio.isReady && studio.page.doneId >= studio.connection.id",
     )
 
     assert not np.array_equal(codes(page), before)

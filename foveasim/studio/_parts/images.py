@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -11,35 +12,36 @@ from numpy.typing import NDArray
 
 from foveasim.fields import Grid, PowerMap
 from foveasim.studio._engine import Simulated, block_means
-from foveasim.studio._parts.registry import PartData, capture_of, part
+from foveasim.studio._parts.registry import PartData, part
 from foveasim.view.site_colours import encode_light
 
 __all__ = ["picture", "scene"]
 
-#: Longer side of the reconstructed picture and of the optical image.
-PICTURE_PIXELS = 512
 #: Fraction of the cells of an optical image that are not brighter than white.
 WHITE_QUANTILE = 0.995
 #: Levels of linear light in the table of sRGB bytes.
 N_LEVELS = 1 << 14
 
 
-@part("Picture", capture_of)
+@part("Picture", lambda result: (result.capture, (result.picture_pixels,)))
 def picture(result: Simulated) -> PartData:
     """Return the picture that is reconstructed from the codes."""
     capture = result.capture
-    found = capture.picture(max_pixels=PICTURE_PIXELS)
+    # A picture of a layout that has only moved moves with it: its compiled outlines and its neighbours are known.
+    unmoved = capture if result.unmoved is None else replace(capture, layout=result.unmoved)
+    found = unmoved.picture(max_pixels=result.picture_pixels)
     levels = found.data / capture.white_dn.reshape(-1, 1, 1).astype(np.float32)
-    return _picture(levels, found.coverage, found.grid.bounds_um)
+    bounds_um = tuple(side + move for side, move in zip(found.grid.bounds_um, 2 * result.move_um, strict=True))
+    return _picture(levels, found.coverage, bounds_um)
 
 
 def _light_of(result: Simulated) -> tuple[Any, ...]:
     """Return the images, with their position and the white that scales them: both depend on other settings too."""
     source, camera = result.shot.scene, result.shot.camera
     if isinstance(source, PowerMap):
-        return (source,)
-    white_dn = tuple(result.capture.white_dn.tolist())
-    return (*result.images.values(), white_dn, camera.image_grid(source).bounds_um, tuple(result.images))
+        return source, (result.picture_pixels,)
+    numbers = result.picture_pixels, *result.capture.white_dn.tolist(), *camera.image_grid(source).bounds_um
+    return (*result.images.values(), tuple(result.images), numbers)
 
 
 @part("Optical image", _light_of)
@@ -58,17 +60,17 @@ def scene(result: Simulated) -> PartData:
         grid = Grid(widest.shape, (float(pitch_um[0]), float(pitch_um[1])), tuple(bounds_um[:2].tolist()))
         bands = [found[c] for c in sorted(found)]
         white = result.capture.white_dn[sorted(found)]
-    data, grid = _reduced(bands, grid)
+    data, grid = _reduced(bands, grid, result.picture_pixels)
     data /= np.asarray(white, np.float32).reshape(-1, 1, 1)
     scale = float(np.quantile(data, WHITE_QUANTILE)) or 1.0
     about, arrays = _picture(data / scale, np.ones(data.shape[1:], np.float32), grid.bounds_um)
     return about, arrays
 
 
-def _reduced(bands: Sequence[NDArray[Any]], grid: Grid) -> tuple[NDArray[np.float32], Grid]:
+def _reduced(bands: Sequence[NDArray[Any]], grid: Grid, n_pixels: int) -> tuple[NDArray[np.float32], Grid]:
     """Return means of blocks of cells; incomplete upper and right blocks are cropped."""
     n_y, n_x = bands[0].shape
-    block = max(1, -(-max(n_y, n_x) // PICTURE_PIXELS))
+    block = max(1, -(-max(n_y, n_x) // n_pixels))
     rows, n_columns = n_y // block, n_x // block
     data = np.empty((len(bands), rows, n_columns), np.float32)
     for band, cells in enumerate(bands):

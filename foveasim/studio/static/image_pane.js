@@ -1,5 +1,6 @@
 // A picture on the sensor: the reconstructed picture or the optical image, with the cursor and the view of the map.
 
+import { pixelRatio } from "/web/gl.js";
 import { outline, traceCross } from "/web/marks.js";
 import { make } from "/web/page_parts.js";
 import { fitted } from "./site_pane.js";
@@ -99,6 +100,14 @@ export class ImagePane {
     };
   }
 
+  // Longer side of the complete picture in pixels of the screen.
+  neededPixels() {
+    const { clientWidth, clientHeight } = this.root, ratio = pixelRatio();
+    if (!this.bounds || !clientWidth) return Math.min(clientWidth, clientHeight) * ratio;
+    const [x0, y0, x1, y1] = this.bounds;
+    return Math.max(x1 - x0, y1 - y0) * this.view().perUm * ratio;
+  }
+
   get isShown() { return Boolean(this.bounds) && this.root.clientWidth > 0; }
 
   draw() {
@@ -107,7 +116,7 @@ export class ImagePane {
     const wide = (x1 - x0) * view.perUm, tall = (y1 - y0) * view.perUm;
     // Pixels of several screen pixels have sharp edges.
     context.imageSmoothingEnabled = wide / this.pixels.width < 4;
-    context.imageSmoothingQuality = "high";
+    context.imageSmoothingQuality = wide > 0.7 * this.pixels.width ? "low" : "high";
     context.drawImage(this.pixels, view.toX(x0), view.toY(y1), wide, tall);
   }
 

@@ -4,8 +4,8 @@ import { clamp, formatLength, roundStep, shown, textOf } from "/web/colours.js";
 import { findRenderer, watchSize } from "/web/gl.js";
 import { titleOf } from "/web/legend.js";
 import { pathBetween, positionText } from "/web/marks.js";
-import { downloadTable, statistics, statisticsRows } from "/web/measure.js";
-import { $, download, inkOf, make, notice, speak, startTheme } from "/web/page_parts.js";
+import { downloadTable, statisticsRows } from "/web/measure.js";
+import { $, inkOf, make, notice, speak, startTheme } from "/web/page_parts.js";
 import { Sites } from "/web/sites.js";
 import { offsetsOf } from "/web/unpack.js";
 import { Editor } from "./authoring.js";
@@ -14,14 +14,15 @@ import { CurveChart, Histogram, barRows } from "./charts.js";
 import { showComparison } from "./comparison.js";
 import { Connection, memory } from "./connection.js";
 import { Controls, valueAt } from "./controls.js";
+import { Files } from "./files.js";
 import { ImagePane } from "./image_pane.js";
-import { fragmentOf, settingsOf, stateOf } from "./links.js";
-import { copyText, listenToDialogs, listenToMenu, showText } from "./menus.js";
+import { listenToDialogs } from "./menus.js";
 import { RulesList } from "./rules_list.js";
 import { SitePane, useSoftware } from "./site_pane.js";
 import { SolidPane } from "./solid_pane.js";
-import { Sources, isVideo } from "./sources.js";
+import { Sources } from "./sources.js";
 import { Steps } from "./steps.js";
+import { statisticsOf, summaryRows } from "./summary.js";
 
 // Views in tiles, with the parts that they need; those that are shown at first on narrow and on wide screens.
 const TILES = [
@@ -34,20 +35,16 @@ const FIRST_TILES = ["histogram", "noise", "mtf", "summary"];
 const CURVES = ["spectrum", "mtf", "photon_transfer", "snr"];
 const WIDE = 1800;
 const BUSY_DELAY_MS = 150;
+const SIZE_DELAY_MS = 250;
+const PICTURE_SIZES = [256, 320, 384, 512, 768, 1024], SMALLER = 0.85;
 const ALWAYS = ["sites", "columns", "picture", "scene"];
-// Words of the summary that have another form than the key.
-const SUMMARY = {
-  n_sites: ["photosites", ""], width_um: ["width", "µm"], height_um: ["height", "µm"], min_size_um: ["smallest site", "µm"], max_size_um: ["largest site", "µm"],
-  exposure_s: ["exposure", "s"], bits: ["bits", ""], mean_dn: ["mean code", "DN"], median_e: ["median signal", "e⁻"], saturated_fraction: ["saturated", "%"],
-  dark_fraction: ["code 0", "%"], f_number: ["f-number", ""], magnification: ["magnification", ""],
-};
 const reducesMotion = matchMedia("(prefers-reduced-motion: reduce)");
 
 const page = {
-  state: null, parts: {}, frozen: null, cursor: null, hovered: -1, pinned: -1, rectangle: null, selected: [], range: null, key: null, wantsLog: undefined,
+  state: null, parts: {}, frozen: null, cursor: null, hovered: -1, pinned: -1, rectangle: null, selected: [], range: null, key: null, wantsLog: undefined, sizeTimer: 0,
   isSelecting: false, tiles: new Set(), asked: null, gazeAt: null, lastMs: NaN, nDone: 0, drawn: 0, boundary: null, isBusy: false,
 };
-let connection, controls, panes, charts, rules, editor, steps, sources, solid;
+let connection, controls, panes, charts, rules, editor, steps, sources, solid, files;
 
 // -- drawing ------------------------------------------------------------------------------------------------------------
 
@@ -77,6 +74,7 @@ function drawAsked() {
   }
   drawMarks();
   editor.draw();
+  followSize();
 }
 
 function drawMarks() {
@@ -161,14 +159,6 @@ function recolour() {
   tellSite();
 }
 
-function statisticsOf({ column, sites }) {
-  if (column.names) return { n: shown(sites.n) };
-  const sorted = Float64Array.from(column.values).sort(), figure = (v) => (Number.isNaN(v) ? "–" : shown(Number(v.toPrecision(4))));
-  // NaN is last.
-  const found = statistics(sorted, sorted.keys()), first = sorted.findIndex((v) => v > -Infinity);
-  return { n: shown(found.n), mean: figure(found.mean), median: figure(found.n ? sorted[first + (found.n >> 1)] : NaN), std: figure(found.std), min: figure(found.min), max: figure(found.max) };
-}
-
 const curvesOf = ({ about, arrays }, isDashed = false) => about.curves.map((curve, k) => ({ ...curve, x: arrays["x-" + k], y: arrays["y-" + k], isDashed }));
 
 function showCurves(name) {
@@ -225,7 +215,7 @@ function receive(message) {
       setBusy(false);
       notice(message.text);
       break;
-    case "text": receiveText(message); break;
+    case "text": files.receiveText(message); break;
     case "saved": notice("Saved as " + message.path); break;
     default:
   }
@@ -284,26 +274,8 @@ function showState(message) {
 }
 
 function showSummary() {
-  const { summary, warnings } = page.state, before = page.frozen?.summary;
-  const text = (key, value) => {
-    if (value === undefined) return "–";
-    if (key.endsWith("_fraction")) return shown(Number((100 * value).toPrecision(3))) + " %";
-    const unit = SUMMARY[key]?.[1];
-    return shown(Number.isInteger(value) ? value : Number(value.toPrecision(5))) + (unit ? " " + unit : "");
-  };
-  const rows = Object.entries(summary).filter(([, value]) => typeof value === "number").map(([key, value]) => {
-    const row = make("tr"), name = make("th", SUMMARY[key]?.[0] || key.replaceAll("_", " "));
-    name.scope = "row";
-    row.append(name, ...(before ? [make("td", text(key, before[key]))] : []), make("td", text(key, value)));
-    row.classList.toggle("differs", Boolean(before) && before[key] !== value);
-    return row;
-  });
-  if (before) {
-    const head = make("tr");
-    head.append(make("td"), ...["A", "B"].map((name) => { const cell = make("th", name); cell.scope = "col"; return cell; }));
-    rows.unshift(head);
-  }
-  $("summary").replaceChildren(...rows);
+  const { summary, warnings } = page.state;
+  $("summary").replaceChildren(...summaryRows(summary, page.frozen?.summary));
   $("warnings").replaceChildren(...(warnings || []).map((warning) => make("li", warning)));
 }
 
@@ -325,7 +297,7 @@ function hello(message, { isSame }) {
     page.offered = JSON.parse(stored);
     $("offer").hidden = false;
   }
-  openLink(location.hash);
+  files.openLink(location.hash);
 }
 
 function fillPresets(presets) {
@@ -365,9 +337,22 @@ function showConnection(status) {
   }
 }
 
+// Longer side of pictures in pixels of the screen, in a few steps, a little smaller at most; more when they are enlarged.
+function pictureSize() {
+  const needed = Math.max(...IMAGES.map((name) => panes[name].neededPixels()));
+  return PICTURE_SIZES.find((size) => size >= SMALLER * needed) || PICTURE_SIZES[PICTURE_SIZES.length - 1];
+}
+
+// Asks for pictures of another size, not for each step of a zoom.
+function followSize() {
+  if (!connection.isOpen || page.sizeTimer || pictureSize() === page.pixels) return;
+  page.sizeTimer = setTimeout(() => { page.sizeTimer = 0; if (pictureSize() !== page.pixels) sendViews(); }, SIZE_DELAY_MS);
+}
+
 function sendViews() {
+  page.pixels = pictureSize();
   const isWanted = ([name, , part]) => part && (page.tiles.has(name) || (part === "rules" && editor.isOn));
-  connection.send({ do: "views", names: [...ALWAYS, ...TILES.filter(isWanted).map(([, , part]) => part), ...solid.parts] });
+  connection.send({ do: "views", names: [...ALWAYS, ...TILES.filter(isWanted).map(([, , part]) => part), ...solid.parts], pixels: page.pixels });
 }
 
 // -- tiles --------------------------------------------------------------------------------------------------------------
@@ -581,83 +566,6 @@ function showVariants() {
   ask("map");
 }
 
-// -- files ------------------------------------------------------------------------------------------------------------------
-
-function useOf(name) {
-  if (isVideo(name)) return "video";
-  if (/\.ya?ml$/i.test(name)) return "settings";
-  return /\.(gds|gds2|gdsii|oas|oasis|geojson|json|npz|svg)(\.gz)?$/i.test(name) ? "layout" : "scene";
-}
-
-async function uploadFile(file) {
-  setBusy(true);
-  showStatus("sending " + file.name + "…");
-  const answer = await connection.upload(file);
-  if (answer.error) {
-    setBusy(false);
-    showStatus("ready");
-    notice(file.name + ": " + answer.error);
-    return;
-  }
-  const use = answer.as || useOf(file.name);
-  page.fileId = connection.send(use === "video" ? { do: "video", path: answer.path } : { do: "file", path: answer.path, as: use });
-}
-
-function listenToFiles() {
-  const hasFile = (event) => [...(event.dataTransfer?.types || [])].includes("Files");
-  let depth = 0;
-  document.addEventListener("dragenter", (event) => { if (hasFile(event)) { depth++; $("drop").hidden = false; event.preventDefault(); } });
-  document.addEventListener("dragleave", (event) => { if (hasFile(event) && --depth <= 0) { depth = 0; $("drop").hidden = true; } });
-  document.addEventListener("dragover", (event) => { if (hasFile(event)) event.preventDefault(); });
-  document.addEventListener("drop", (event) => {
-    depth = 0;
-    $("drop").hidden = true;
-    if (!hasFile(event)) return;
-    event.preventDefault();
-    if (!sources.dropped(event.dataTransfer) && event.dataTransfer.files[0]) uploadFile(event.dataTransfer.files[0]);
-  });
-  $("chosen-file").addEventListener("change", () => { if ($("chosen-file").files[0]) uploadFile($("chosen-file").files[0]); $("chosen-file").value = ""; });
-  listenToMenu($("file"), $("file-menu"));
-  $("file-menu").addEventListener("click", async (event) => {
-    const button = event.target.closest("button");
-    if (!button) return;
-    const { do: action, copy, file, extension } = button.dataset;
-    if (action === "open") $("chosen-file").click();
-    else if (action === "open-link") $("link-dialog").showModal();
-    else if (action === "link" || action === "share") { page.wantsToken = action === "link"; connection.send({ do: "text", what: "link" }); }
-    else if (action === "save") $("save-dialog").showModal();
-    else if (action === "diff") connection.send({ do: "text", what: "diff" });
-    else if (copy) connection.send({ do: "text", what: copy });
-    else if (file) {
-      const { blob, error } = await connection.fetchFile(file);
-      if (error) notice(error);
-      else download(blob, document.title.split(" – ")[0], extension);
-    }
-  });
-  $("save-form").addEventListener("submit", (event) => {
-    if (event.submitter?.value === "save") connection.send({ do: "save", name: $("save-name").value });
-  });
-}
-
-async function receiveText({ what, text, files }) {
-  if (what === "link") {
-    await copyText(location.origin + location.pathname + "#" + (await fragmentOf(text, page.wantsToken ? connection.token : "")), "Link");
-    if (files.length) notice("The link contains only the names of uploaded files: " + files.join(", "));
-  } else if (what === "diff") showText("Differences", text || "The settings are those at the start.");
-  else copyText(text, what === "yaml" ? "YAML" : "Python");
-}
-
-// Restores the settings of a link, which is then removed from the address; the server checks them.
-async function openLink(link) {
-  const compressed = stateOf(link);
-  if (compressed === null) return false;
-  if (link === location.hash) history.replaceState(null, "", "#" + connection.token);
-  const { settings, error } = await settingsOf(compressed);
-  if (error) notice(error);
-  else connection.send({ do: "restore", settings });
-  return true;
-}
-
 const showTable = (about) => showComparison({ table: $("comparison"), note: $("comparison-note"), button: $("match") }, about);
 
 // -- keys and buttons -------------------------------------------------------------------------------------------------------
@@ -696,12 +604,6 @@ function listenToButtons() {
   }
   $("help").addEventListener("click", () => $("keys").showModal());
   $("match").addEventListener("click", () => connection.send({ do: "match" }));
-  $("link-form").addEventListener("submit", async (event) => {
-    const text = $("link-text").value;
-    $("link-text").value = "";
-    if (event.submitter?.value === "open" && !(await openLink(text))) notice("The text is not a link of the studio");
-  });
-  addEventListener("hashchange", () => { if (connection.isOpen) openLink(location.hash); });
 }
 
 function listenToKeys() {
@@ -827,11 +729,14 @@ function start() {
     charts: () => [...controls.rows.values()].find((row) => row.control.key === "scene" && row.control.kind === "choice")?.control.choices || [],
   });
   connection = new Connection({ hello, message: receive, part: receivePart, status: showConnection });
+  files = new Files(connection, {
+    busy: (text) => { setBusy(text !== null); showStatus(text ?? "ready"); },
+    dropped: (transfer) => sources.dropped(transfer),
+  });
   createTiles();
   startTheme(showTheme);
   listenToButtons();
   listenToKeys();
-  listenToFiles();
   listenToDialogs();
   for (const element of [$("map"), $("map-a"), $("picture"), $("scene"), $("tiles")]) watchSize(element, resize);
   connection.open();

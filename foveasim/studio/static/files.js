@@ -1,0 +1,95 @@
+// Files and links: dropped and chosen files, the menu, texts of the state, and links that restore it.
+
+import { $, download, notice } from "/web/page_parts.js";
+import { fragmentOf, settingsOf, stateOf } from "./links.js";
+import { copyText, listenToMenu, showText } from "./menus.js";
+import { isVideo } from "./sources.js";
+
+// How the server uses a file: by its name.
+function useOf(name) {
+  if (isVideo(name)) return "video";
+  if (/\.ya?ml$/i.test(name)) return "settings";
+  return /\.(gds|gds2|gdsii|oas|oasis|geojson|json|npz|svg)(\.gz)?$/i.test(name) ? "layout" : "scene";
+}
+
+export class Files {
+  // Callbacks: busy(text) while a file is sent, with null at its end; dropped(transfer) returns whether it takes the files.
+  constructor(connection, on) {
+    Object.assign(this, { connection, on, wantsToken: false });
+    this._listenToDrops();
+    $("chosen-file").addEventListener("change", () => { if ($("chosen-file").files[0]) this.upload($("chosen-file").files[0]); $("chosen-file").value = ""; });
+    listenToMenu($("file"), $("file-menu"));
+    $("file-menu").addEventListener("click", (event) => { const button = event.target.closest("button"); if (button) this._choose(button.dataset); });
+    $("save-form").addEventListener("submit", (event) => {
+      if (event.submitter?.value === "save") connection.send({ do: "save", name: $("save-name").value });
+    });
+    $("link-form").addEventListener("submit", async (event) => {
+      const text = $("link-text").value;
+      $("link-text").value = "";
+      if (event.submitter?.value === "open" && !(await this.openLink(text))) notice("The text is not a link of the studio");
+    });
+    addEventListener("hashchange", () => { if (connection.isOpen) this.openLink(location.hash); });
+  }
+
+  _listenToDrops() {
+    const hasFile = (event) => [...(event.dataTransfer?.types || [])].includes("Files");
+    let depth = 0;
+    document.addEventListener("dragenter", (event) => { if (hasFile(event)) { depth++; $("drop").hidden = false; event.preventDefault(); } });
+    document.addEventListener("dragleave", (event) => { if (hasFile(event) && --depth <= 0) { depth = 0; $("drop").hidden = true; } });
+    document.addEventListener("dragover", (event) => { if (hasFile(event)) event.preventDefault(); });
+    document.addEventListener("drop", (event) => {
+      depth = 0;
+      $("drop").hidden = true;
+      if (!hasFile(event)) return;
+      event.preventDefault();
+      const [file] = event.dataTransfer.files;
+      if (!this.on.dropped(event.dataTransfer) && file) this.upload(file);
+    });
+  }
+
+  async _choose({ do: action, copy, file, extension }) {
+    const { connection } = this;
+    if (action === "open") $("chosen-file").click();
+    else if (action === "open-link") $("link-dialog").showModal();
+    else if (action === "link" || action === "share") { this.wantsToken = action === "link"; connection.send({ do: "text", what: "link" }); }
+    else if (action === "save") $("save-dialog").showModal();
+    else if (action === "diff") connection.send({ do: "text", what: "diff" });
+    else if (copy) connection.send({ do: "text", what: copy });
+    else if (file) {
+      const { blob, error } = await connection.fetchFile(file);
+      if (error) notice(error);
+      else download(blob, document.title.split(" – ")[0], extension);
+    }
+  }
+
+  async upload(file) {
+    this.on.busy("sending " + file.name + "…");
+    const answer = await this.connection.upload(file);
+    if (answer.error) {
+      this.on.busy(null);
+      notice(file.name + ": " + answer.error);
+      return;
+    }
+    const use = answer.as || useOf(file.name);
+    this.connection.send(use === "video" ? { do: "video", path: answer.path } : { do: "file", path: answer.path, as: use });
+  }
+
+  async receiveText({ what, text, files }) {
+    if (what === "link") {
+      await copyText(location.origin + location.pathname + "#" + (await fragmentOf(text, this.wantsToken ? this.connection.token : "")), "Link");
+      if (files.length) notice("The link contains only the names of uploaded files: " + files.join(", "));
+    } else if (what === "diff") showText("Differences", text || "The settings are those at the start.");
+    else copyText(text, what === "yaml" ? "YAML" : "Python");
+  }
+
+  // Restores the settings of a link, which is then removed from the address; the server checks them. Returns whether it is one.
+  async openLink(link) {
+    const compressed = stateOf(link);
+    if (compressed === null) return false;
+    if (link === location.hash) history.replaceState(null, "", "#" + this.connection.token);
+    const { settings, error } = await settingsOf(compressed);
+    if (error) notice(error);
+    else this.connection.send({ do: "restore", settings });
+    return true;
+  }
+}
