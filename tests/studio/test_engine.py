@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -162,3 +163,29 @@ def test_summary_contains_numbers_of_capture(engine, settings):
     assert summary["width_um"] == pytest.approx(16 * 12.0)
     assert summary["max_size_um"] == pytest.approx(12.0)
     assert summary["mean_dn"] == result.capture.code.mean()
+
+
+def test_moved_layout_has_moved_picture(engine, settings):
+    first = engine.simulate(settings)
+    moved = engine.simulate(with_value(settings, "layout.move_um", [3.25, -7.5]))
+    about, arrays = PARTS["picture"].make(moved)
+    picture = moved.capture.picture(max_pixels=moved.picture_pixels)
+
+    assert moved.unmoved is first.capture.layout
+    assert moved.move_um == pytest.approx((3.25, -7.5), abs=1e-12)
+    assert about["bounds_um"] == pytest.approx(picture.grid.bounds_um, abs=1e-9)
+    # As without the earlier layout, up to the rounding of levels.
+    own_about, own = PARTS["picture"].make(replace(moved, unmoved=None, move_um=(0.0, 0.0)))
+    assert (about["width"], about["height"]) == (own_about["width"], own_about["height"])
+    assert np.abs(arrays["rgba"].astype(int) - own["rgba"]).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("layout.parameters.pitch_um", 12.5), ("layout.parameters.n_x", 15), ("layout.inset_um", 0.5)]
+)
+def test_other_layouts_are_no_translations(engine, settings, key, value):
+    engine.simulate(settings)
+    changed = engine.simulate(with_value(settings, key, value))
+
+    assert changed.unmoved is changed.capture.layout
+    assert changed.move_um == (0.0, 0.0)

@@ -75,6 +75,20 @@ def test_only_selected_views_are_computed(recorder):
     assert recorder.part_names == ["columns"]
 
 
+def test_pictures_have_the_requested_size(recorder):
+    for pixels in (64, 200):
+        recorder.do(do="views", names=["picture", "scene"], pixels=pixels)
+
+        assert set(recorder.part_names) <= {"picture", "scene"}
+        about = next(header["about"] for header, _ in recorder.parts if header["part"] == "picture")
+        assert max(about["width"], about["height"]) == pixels
+    recorder.do(do="views", names=["picture", "scene"], pixels=200)
+    assert recorder.part_names == []
+    for pixels in (0, 10**9, 1.5, "many", True):
+        recorder.do(do="views", names=["picture"], pixels=pixels)
+        assert "pixels" in recorder.messages[0]["text"]
+
+
 @pytest.mark.parametrize(
     ("key", "value", "text"),
     [

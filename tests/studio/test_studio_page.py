@@ -86,6 +86,16 @@ def test_cursor_is_common_to_views(visit):
     assert page.evaluate("studio.page.hovered") == site
 
 
+def test_enlarged_pictures_have_more_pixels(visit):
+    page = visit()
+    until(page, "() => studio.page.pixels === studio.page.parts.picture.about.width")
+    before = page.evaluate("studio.page.pixels")
+    for _ in range(4):
+        page.keyboard.press("+")
+    until(page, "before => studio.page.pixels > before", before)
+    until(page, "() => studio.page.pixels === studio.page.parts.picture.about.width")
+
+
 def test_selection_matches_its_sites(visit):
     page = visit()
     page.keyboard.press("s")
