@@ -174,7 +174,7 @@ class Engine:
 
 
 def _translation_um(before: Layout, after: Layout) -> tuple[float, float] | None:
-    """Return the translation between two layouts in µm, or None if they differ in anything else."""
+    """Return the translation between two layouts; None if they differ otherwise."""
     if before is after:
         return 0.0, 0.0
     if before.xy_um.shape != after.xy_um.shape or not (

@@ -20,7 +20,7 @@ __all__ = ["Views"]
 FIRST = ("sites", "columns")
 #: Limit of the longer side of pictures.
 MAX_PIXELS = 2048
-#: Other parts are sent together unless this time has passed: each transfer costs the page a frame.
+#: Other parts are sent together unless this time has passed: the page then draws them in one frame.
 TOGETHER_S = 0.1
 
 
@@ -157,7 +157,7 @@ class Views:
 
 
 def _is_same(old: tuple[Any, ...], new: tuple[Any, ...]) -> bool:
-    """Return whether the objects that a part depends on are the same, or equal tuples of numbers."""
+    """Return whether all objects are the same, or equal tuples."""
     return len(old) == len(new) and all(
         a is b or (isinstance(a, tuple) and isinstance(b, tuple) and a == b) for a, b in zip(old, new, strict=True)
     )

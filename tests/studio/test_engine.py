@@ -183,7 +183,7 @@ def test_moved_layout_has_moved_picture(engine, settings):
 @pytest.mark.parametrize(
     ("key", "value"), [("layout.parameters.pitch_um", 12.5), ("layout.parameters.n_x", 15), ("layout.inset_um", 0.5)]
 )
-def test_other_layouts_are_no_translations(engine, settings, key, value):
+def test_changed_outlines_are_not_translations(engine, settings, key, value):
     engine.simulate(settings)
     changed = engine.simulate(with_value(settings, key, value))
 

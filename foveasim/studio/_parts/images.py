@@ -27,7 +27,7 @@ N_LEVELS = 1 << 14
 def picture(result: Simulated) -> PartData:
     """Return the picture that is reconstructed from the codes."""
     capture = result.capture
-    # A picture of a layout that has only moved moves with it: its compiled outlines and its neighbours are known.
+    # The picture of a layout that only moved is that of the earlier one, whose compiled outlines are cached.
     unmoved = capture if result.unmoved is None else replace(capture, layout=result.unmoved)
     found = unmoved.picture(max_pixels=result.picture_pixels)
     levels = found.data / capture.white_dn.reshape(-1, 1, 1).astype(np.float32)
@@ -36,7 +36,7 @@ def picture(result: Simulated) -> PartData:
 
 
 def _light_of(result: Simulated) -> tuple[Any, ...]:
-    """Return the images, with their position and the white that scales them: both depend on other settings too."""
+    """Return the images, their position and the white level that scales them."""
     source, camera = result.shot.scene, result.shot.camera
     if isinstance(source, PowerMap):
         return source, (result.picture_pixels,)
