@@ -39,6 +39,14 @@ LARGE = {"generator": "grid", "parameters": {"n_x": 500, "n_y": 400, "pitch_um":
 console = Console(width=130)
 
 
+def start_server(*options: str) -> tuple[subprocess.Popen[str], str]:
+    """Start the studio with options of its command, and return its process and address."""
+    command = [sys.executable, "-m", "foveasim", "studio", "--no-browser", *options]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    return process, process.stdout.readline().partition("studio at ")[2].partition(";")[0]
+
+
 async def changes_ms(connection: Any, key: str, value: Callable[[int], Any], n: int) -> tuple[float, float]:
     """Return the median time of changes until the values of the photosites, and until all views."""
     first_ms, all_ms = [], []
@@ -105,10 +113,8 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true")
     is_quick = parser.parse_args().quick
     report = Report(is_judged=not is_quick)
-    command = [sys.executable, "-m", "foveasim", "studio", "--no-browser"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        address = process.stdout.readline().partition("studio at ")[2].partition(";")[0]
+    process, address = start_server()
+    with process:
         try:
             asyncio.run(bench(report, address, N_QUICK if is_quick else N_CHANGES))
         finally:

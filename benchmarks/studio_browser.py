@@ -26,7 +26,7 @@ import numpy as np
 from playwright.sync_api import Page, sync_playwright
 from report import Report
 from rich.console import Console
-from studio import CHANGES, LARGE, LARGE_MS, N_CHANGES, N_QUICK
+from studio import CHANGES, LARGE, LARGE_MS, N_CHANGES, N_QUICK, start_server
 
 from foveasim.config import build_shot
 
@@ -93,10 +93,7 @@ class Studio:
     """The server, and its page in Chromium."""
 
     def __init__(self, out: Path, arguments: tuple[str, ...]) -> None:
-        command = [sys.executable, "-m", "foveasim", "studio", "--no-browser", "--out", str(out)]
-        self.server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        assert self.server.stdout is not None
-        address = self.server.stdout.readline().partition("studio at ")[2].partition(";")[0]
+        self.server, address = start_server("--out", str(out))
         self.playwright = sync_playwright().start()
         browser = self.playwright.chromium.launch(executable_path=shutil.which("chromium"), args=list(arguments))
         context = browser.new_context(viewport={"width": 1440, "height": 900}, bypass_csp=True)
