@@ -58,15 +58,16 @@ CHANGE = """([key, value]) => new Promise((resolve) => {
 #: are complete. After a minute it resolves to the state of the page, with the number of frames that it draws in a second.
 SEND = """([messages, isComplete]) => new Promise((resolve) => {
   const { page, connection } = studio;
-  let id = -1, nFrames = 0;
-  for (const message of messages) id = connection.send(message);
+  let nFrames = 0;
+  for (const message of messages) connection.send(message);
+  const { id } = connection;  // also of messages that the page has sent, such as the choice of views
   const count = () => { nFrames++; requestAnimationFrame(count); };
   const describe = () => {
     const { isBusy, doneId, asked, isPreview } = page, { isOpen, waiting } = connection;
     return JSON.stringify({ messages, id, doneId, isBusy, isPreview, isDrawn: asked === null, isOpen, waiting, nFrames });
   };
   const start = performance.now(), step = () => {
-    if ((page.doneId ?? -1) >= id && studio.isReady && !(isComplete && page.isPreview)) resolve(null);
+    if (page.doneId >= id && studio.isReady && !(isComplete && page.isPreview)) resolve(null);
     else if (performance.now() - start < 60000) setTimeout(step, 5);
     else { count(); setTimeout(() => resolve(describe()), 1000); }
   };
