@@ -7,13 +7,14 @@ the package before the reader, so that it starts quickly and its limits apply to
 
 from __future__ import annotations
 
+import functools
 import importlib
 import importlib.util
 import json
 import os
 import sys
 import warnings
-from typing import Any
+from typing import Any, BinaryIO
 
 __all__ = ["limit"]
 
@@ -41,23 +42,42 @@ def _import(name: str) -> Any:
     return importlib.import_module(name)
 
 
-def _run_reader(task: dict[str, Any]) -> dict[str, Any]:
+def _load(task: dict[str, Any]) -> Any:
+    """Return the reader of a task, with its keywords."""
+    if task.get("file") is None:
+        return functools.partial(getattr(_import(task["module"]), task["reader"]), task["path"], **task["args"])
+    spec = importlib.util.spec_from_file_location(task["module"], task["file"])
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return functools.partial(getattr(module, task["reader"]), task["path"], limit=limit, **task["args"])
+
+
+def _run_reader(task: dict[str, Any], answer: BinaryIO) -> dict[str, Any]:
+    """Write the arrays of a reader, and return its other data."""
     import numpy as np
 
+    if task.get("is_iterator"):
+        for array in _load(task)():
+            about = {} if array is None else {"shape": array.shape, "type": array.dtype.str}
+            content = b"" if array is None else array.tobytes()
+            answer.write(json.dumps({**about, "n_bytes": len(content)}).encode() + b"\n" + content)
+            answer.flush()
+        return {"is_last": True}
+    metadata, arrays = _load(task)()
+    with open(task["arrays"], "wb") as file:  # noqa: PTH123 -- a string from the task
+        for array in arrays:
+            np.save(file, np.ascontiguousarray(array), allow_pickle=False)
+    return {"metadata": metadata, "n_arrays": len(arrays)}
+
+
+def _answer(task: dict[str, Any], answer: BinaryIO) -> dict[str, Any]:
+    """Return the answer of a reader, or the reason why it rejects the file."""
     try:
-        if task["file"] is None:
-            module = _import(task["module"])
-            metadata, arrays = getattr(module, task["reader"])(task["path"], **task["args"])
-        else:
-            spec = importlib.util.spec_from_file_location(task["module"], task["file"])
-            assert spec is not None
-            assert spec.loader is not None
-            module = importlib.util.module_from_spec(spec)
-            spec.loader.exec_module(module)
-            metadata, arrays = getattr(module, task["reader"])(task["path"], limit=limit, **task["args"])
-        with open(task["arrays"], "wb") as file:  # noqa: PTH123 -- a string from the task
-            for array in arrays:
-                np.save(file, np.ascontiguousarray(array), allow_pickle=False)
+        return _run_reader(task, answer)
+    except BrokenPipeError:
+        raise
     except MemoryError:
         return {"rejected": "is malformed: reading it needs more memory than a valid file of its size"}
     except Exception as error:  # noqa: BLE001 -- readers raise arbitrary exceptions on malformed files
@@ -65,19 +85,19 @@ def _run_reader(task: dict[str, Any]) -> dict[str, Any]:
             return {"rejected": str(error).removeprefix(f"{task['path']}: ")}
         reason = " ".join(str(error).split()) or type(error).__name__
         return {"rejected": f"is corrupt or truncated ({reason:.200})"}
-    return {"metadata": metadata, "n_arrays": len(arrays)}
 
 
 def _main() -> None:
     task = json.load(sys.stdin)
     for kind, maximum in (("RLIMIT_CORE", 0), ("RLIMIT_CPU", task["max_cpu_s"]), ("RLIMIT_AS", task["max_bytes"])):
-        limit(kind, maximum)
+        if maximum is not None:
+            limit(kind, maximum)
     sys.path[:] = task["sys_path"]
     warnings.simplefilter("ignore")
     # Libraries print problems of a file on standard output.
-    with os.fdopen(os.dup(1), "w") as answer, open(task["printed"], "w") as printed:  # noqa: PTH123
+    with os.fdopen(os.dup(1), "wb") as answer, open(task["printed"], "w") as printed:  # noqa: PTH123
         os.dup2(printed.fileno(), 1)
-        answer.write(json.dumps(_run_reader(task)))
+        answer.write(json.dumps(_answer(task, answer)).encode())
 
 
 if __name__ == "__main__":

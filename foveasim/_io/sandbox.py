@@ -8,23 +8,26 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foveasim.errors import FileError
 
-__all__ = ["WALL_TIME_FACTOR", "read_in_sandbox", "run_in_sandbox"]
+__all__ = ["WALL_TIME_FACTOR", "iterate_in_sandbox", "read_in_sandbox", "run_in_sandbox"]
 
 #: Memory of the process and its libraries, and number of copies of the data in memory.
 BASE_BYTES, DATA_COPIES = 2**31, 3
 MAX_CPU_S, BYTES_PER_S = 10, 2**22
 #: Ratio of the wall time limit to the processor time limit, for busy machines.
 WALL_TIME_FACTOR = 5
-SCRIPT = Path(__file__).with_name("_sandboxed.py")
+COMMAND = (sys.executable, "-P", str(Path(__file__).with_name("_sandboxed.py")))
+#: Environment of the process: each thread of a library reserves memory.
+ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "HDF5_PLUGIN_PRELOAD": "::"}
 
 #: Result of a reader: plain data, and arrays.
 ReaderResult = tuple[dict[str, Any], list[NDArray[Any]]]
@@ -123,14 +126,13 @@ def run_in_sandbox(
         }
         try:
             process = subprocess.run(  # noqa: S603 -- a script of this package
-                [sys.executable, "-P", str(SCRIPT)],
+                COMMAND,
                 input=json.dumps(task).encode(),
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
                 timeout=WALL_TIME_FACTOR * max_cpu_s,
                 check=False,
-                # Each thread of a library reserves memory.
-                env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "HDF5_PLUGIN_PRELOAD": "::"},
+                env={**os.environ, **ENVIRONMENT},
             )
             is_timed_out = process.returncode == -getattr(signal, "SIGXCPU", 0)
         except subprocess.TimeoutExpired:
@@ -146,6 +148,101 @@ def run_in_sandbox(
             raise FileError(path, answer["rejected"])
         with arrays.open("rb") as file:
             return answer["metadata"], [np.load(file, allow_pickle=False) for _ in range(answer["n_arrays"])]
+
+
+def iterate_in_sandbox(
+    reader: Callable[..., Iterator[NDArray[Any] | None]],
+    path: Path,
+    args: Mapping[str, Any],
+    *,
+    kind: str,
+    max_bytes: int,
+    max_item_s: float = WALL_TIME_FACTOR * MAX_CPU_S,
+) -> Iterator[NDArray[Any]]:
+    """
+    Iterate over the arrays that a reader of the package yields in the sandbox process.
+
+    The process ends with the iterator. It waits while no array is requested.
+
+    Parameters
+    ----------
+    reader : function
+        Module-level function of the path as a string and ``args``; yields arrays, and None for skipped ones.
+    path, kind
+        As in :func:`read_in_sandbox`.
+    args : mapping
+        Keywords of the reader, plain data.
+    max_bytes : int
+        Limit of the address space.
+    max_item_s : float, s
+        Limit of the time for each array.
+
+    Raises
+    ------
+    FileError
+        When the reader rejects the file, fails, crashes or exceeds a limit.
+    """
+    task = {
+        "module": reader.__module__,
+        "reader": reader.__name__,
+        "path": str(path.resolve()),
+        "args": dict(args),
+        "is_iterator": True,
+        "printed": os.devnull,
+        "sys_path": sys.path,
+        "max_cpu_s": None,
+        "max_bytes": max_bytes,
+    }
+    process = subprocess.Popen(  # noqa: S603 -- a script of this package
+        COMMAND,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, **ENVIRONMENT},
+    )
+    assert process.stdin is not None
+    assert process.stdout is not None
+    with process:
+        try:
+            with process.stdin as task_file:
+                task_file.write(json.dumps(task).encode())
+            while True:
+                is_late = threading.Event()
+                timer = threading.Timer(max_item_s, _end, (process, is_late))
+                timer.start()
+                try:
+                    header, content = _read_item(process.stdout, max_bytes)
+                finally:
+                    timer.cancel()
+                if is_late.is_set():
+                    raise FileError(path, f"is malformed: reading it took more than {max_item_s:g} s")
+                if "rejected" in header:
+                    raise FileError(path, header["rejected"])
+                if header.get("is_last"):
+                    return
+                if not header:
+                    raise FileError(path, f"is malformed: reading it as {kind} crashed")
+                if "shape" in header:
+                    yield np.frombuffer(content, header["type"]).reshape(header["shape"])
+        finally:
+            process.kill()
+
+
+def _read_item(file: IO[bytes], max_bytes: int) -> tuple[dict[str, Any], bytes]:
+    """Return the header and the content of an item; an empty header if the process has ended."""
+    try:
+        header = json.loads(file.readline())
+    except ValueError:
+        return {}, b""
+    n_bytes = min(int(header.get("n_bytes", 0)), max_bytes)
+    content = file.read(n_bytes)
+    return (header, content) if len(content) == n_bytes else ({}, b"")
+
+
+def _end(process: subprocess.Popen[bytes], is_late: threading.Event) -> None:
+    """End a process that takes too long."""
+    is_late.set()
+    process.kill()
 
 
 def _directory_bytes(path: Path) -> int:

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._io.images import write_picture
+from foveasim._io.videos import SandboxedVideo
 from foveasim.errors import FileError, ParameterError
-from foveasim.video.frame_source import VideoFile
 
 __all__ = ["Frames", "camera_frame"]
 
@@ -81,7 +81,7 @@ class Frames:
         self.path: Path | None = None
         self._lock = threading.Lock()  # frames are exported in other threads
         self._directory, self._new_path = uploads / HIDDEN, new_path
-        self._video: VideoFile | None = None
+        self._video: SandboxedVideo | None = None
         self._name = ""
         self._n_frames = 0
         self._number = 0
@@ -108,8 +108,8 @@ class Frames:
         FileError
             When the file is not a video, is corrupt, or the extra ``video`` is not installed.
         """
-        video = VideoFile(path)
-        n_frames = video.count_frames()
+        video = SandboxedVideo(path)
+        n_frames = video.n_frames
         if n_frames <= 1 and path.suffix.lower() == ".gif":
             return False
         reader = video.pixels()
@@ -193,8 +193,9 @@ class Frames:
         if self.path is not None and self._pixels is not None:
             write_picture(self.path, self._pixels)
         self._remove_stored()
+        self._reader = None  # ends its process
         with self._lock:
-            self.path = self._video = self._reader = self._pixels = None
+            self.path = self._video = self._pixels = None
         self._decoded.clear()
 
     # -- the current frame ------------------------------------------------------------------------------------------

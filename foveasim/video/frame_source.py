@@ -5,29 +5,27 @@ from __future__ import annotations
 import copy
 import inspect
 from collections.abc import Iterable, Iterator, Sized
-from contextlib import contextmanager
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from foveasim._core.extras import needs
 from foveasim._core.names import missing_path, possible_names
 from foveasim._core.validation import check_count, check_number
-from foveasim._io.images import PICTURE_EXTENSIONS, check_picture_size, picture_names
-from foveasim.errors import FileError, ParameterError, printable, type_name
+from foveasim._io.images import PICTURE_EXTENSIONS, picture_names
+from foveasim._io.videos import VideoFile, to_pixels
+from foveasim.errors import FileError, ParameterError, type_name
 from foveasim.scene import Scene
 
-__all__ = ["FrameSource", "VideoFile", "list_pictures"]
+__all__ = ["FrameSource", "list_pictures"]
 
 #: Placeholder wavelengths, which the spectra of the template replace.
 GREY_NM, COLOUR_NM = (550.0,), (620.0, 550.0, 450.0)
 #: Upper limit of frame indices.
 MAX_FRAMES = 2**31
-NEEDS_PYAV = needs("av")
 
 
 class FrameSource:
@@ -175,7 +173,7 @@ class FrameSource:
         shape: tuple[int, ...] | None = None
         pictures: Iterator[Any] = islice(iter(self._source), self._start, self._stop, self._step)
         if isinstance(self._source, VideoFile):  # skipped frames are decoded but not converted to pixels
-            pictures = _pixels(self._source.path, pictures)
+            pictures = to_pixels(self._source.path, pictures)
         for k, picture in enumerate(pictures):
             scene = (
                 Scene.from_picture(picture, **self._scene) if self._template is None else self._from_template(picture)
@@ -244,120 +242,3 @@ class _SinglePass:
             )
         pictures, self._pictures = self._pictures, None
         return pictures
-
-
-class VideoFile:
-    """
-    Decoded frames of a video file, before conversion to pixels.
-
-    Parameters
-    ----------
-    path : Path
-
-    Attributes
-    ----------
-    frame_s : float or None, s
-        Frame period.
-    n_frames : int or None
-        Number of frames according to the file, which may be wrong.
-
-    Raises
-    ------
-    FileError
-        When the file is not a readable video, or the extra ``video`` is not installed.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        with _open_video(path) as container, _as_video_error(path, "is corrupt"):
-            stream = container.streams.video[0]
-            rate = stream.average_rate or stream.base_rate
-            self.frame_s = float(1 / rate) if rate and rate > 0 else None
-            self.n_frames: int | None = int(stream.frames) if stream.frames > 0 else None
-
-    def __iter__(self) -> Iterator[Any]:
-        with _open_video(self.path) as container:
-            n_read = 0
-            with _as_video_error(self.path, "is corrupt"):
-                stream = container.streams.video[0]
-                stream.thread_type = "AUTO"
-                frames = iter(container.decode(stream))
-            while True:
-                with _as_video_error(self.path, f"is corrupt after frame {n_read}"):
-                    frame = next(frames, None)
-                if frame is None:
-                    break
-                yield frame
-                n_read += 1
-            if n_read == 0:
-                raise FileError(self.path, "contains no frames")
-
-    def pixels(self, start: int = 0) -> Iterator[NDArray[np.uint8]]:
-        """
-        Iterate over the pixels of frames, (n_y, n_x, 3) uint8, top row first.
-
-        Parameters
-        ----------
-        start : int
-            First frame; earlier ones are decoded but not converted.
-
-        Raises
-        ------
-        FileError
-            When a frame is corrupt or too large.
-        """
-        return _pixels(self.path, islice(iter(self), start, None))
-
-    def count_frames(self) -> int:
-        """
-        Return the number of encoded frames, without decoding them.
-
-        Raises
-        ------
-        FileError
-            When the file is corrupt.
-        """
-        with _open_video(self.path) as container, _as_video_error(self.path, "is corrupt"):
-            return sum(packet.size > 0 for packet in container.demux(container.streams.video[0]))
-
-
-def _pixels(path: Path, frames: Iterator[Any]) -> Iterator[NDArray[np.uint8]]:
-    """
-    Convert frames to pixels, (n_y, n_x, 3) uint8, top row first.
-
-    The size is checked before memory is allocated, because corrupt files may claim any size.
-    """
-    for frame in frames:
-        check_picture_size(path, frame.width, frame.height)
-        with _as_video_error(path, "is corrupt"):
-            pixels = frame.to_ndarray(format="rgb24")
-        yield pixels
-
-
-def _open_video(path: Path) -> Any:
-    try:
-        import av
-    except ImportError:
-        raise FileError(path, NEEDS_PYAV) from None
-    with _as_video_error(path, "is not a readable video file"):
-        # Metadata such as titles are not used and may be corrupt.
-        container = av.open(str(path), metadata_errors="replace")
-    if not container.streams.video:
-        container.close()
-        raise FileError(path, "contains no video stream")
-    if container.streams.video[0].codec_context is None:  # some versions of PyAV crash on decoding
-        container.close()
-        raise FileError(path, "has a video stream with an unsupported codec")
-    return container
-
-
-@contextmanager
-def _as_video_error(path: Path, problem: str) -> Iterator[None]:
-    """Convert exceptions of the video library, which may be of any type, to FileErrors."""
-    try:
-        yield
-    except FileError:
-        raise
-    except Exception as error:  # noqa: BLE001
-        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
-        raise FileError(path, f"{problem} ({printable(reason):.160})") from None

@@ -161,6 +161,14 @@ def test_corrupt_videos_keep_the_scene(recorder, name, content):
     assert recorder.session.history.settings == before
 
 
+def test_videos_are_decoded_outside(recorder, clip, monkeypatch):
+    av = pytest.importorskip("av")
+    monkeypatch.setattr(av, "open", None)
+    opened(recorder, clip)
+
+    assert recorder.do(do="frame", n=3, id=1)["film"]["n"] == 3
+
+
 def test_other_files_are_not_available(recorder):
     state = recorder.do(do="video", path="/etc/passwd", id=1)
 

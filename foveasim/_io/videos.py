@@ -1,0 +1,192 @@
+"""Video files: frames by PyAV, in this process or in the sandbox process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim._core.extras import needs
+from foveasim._io.images import check_picture_size
+from foveasim._io.sandbox import iterate_in_sandbox, read_in_sandbox
+from foveasim.errors import FileError, printable
+
+__all__ = ["SandboxedVideo", "VideoFile", "to_pixels"]
+
+NEEDS_PYAV = needs("av")
+KIND = "a video"
+#: Limit of the memory of the sandbox process: threads of the decoder and its reference frames.
+MAX_BYTES = 2**32
+
+
+class VideoFile:
+    """
+    Decoded frames of a video file, before conversion to pixels.
+
+    Parameters
+    ----------
+    path : Path
+
+    Attributes
+    ----------
+    frame_s : float or None, s
+        Frame period.
+    n_frames : int or None
+        Number of frames according to the file, which may be wrong.
+
+    Raises
+    ------
+    FileError
+        When the file is not a readable video, or the extra ``video`` is not installed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with _open_video(path) as container, _as_video_error(path, "is corrupt"):
+            stream = container.streams.video[0]
+            rate = stream.average_rate or stream.base_rate
+            self.frame_s = float(1 / rate) if rate and rate > 0 else None
+            self.n_frames: int | None = int(stream.frames) if stream.frames > 0 else None
+
+    def __iter__(self) -> Iterator[Any]:
+        with _open_video(self.path) as container:
+            n_read = 0
+            with _as_video_error(self.path, "is corrupt"):
+                stream = container.streams.video[0]
+                stream.thread_type = "AUTO"
+                frames = iter(container.decode(stream))
+            while True:
+                with _as_video_error(self.path, f"is corrupt after frame {n_read}"):
+                    frame = next(frames, None)
+                if frame is None:
+                    break
+                yield frame
+                n_read += 1
+            if n_read == 0:
+                raise FileError(self.path, "contains no frames")
+
+    def pixels(self, start: int = 0) -> Iterator[NDArray[np.uint8]]:
+        """
+        Iterate over the pixels of frames, (n_y, n_x, 3) uint8, top row first.
+
+        Parameters
+        ----------
+        start : int
+            First frame; earlier ones are decoded but not converted.
+
+        Raises
+        ------
+        FileError
+            When a frame is corrupt or too large.
+        """
+        return to_pixels(self.path, islice(iter(self), start, None))
+
+    def count_frames(self) -> int:
+        """
+        Return the number of encoded frames, without decoding them.
+
+        Raises
+        ------
+        FileError
+            When the file is corrupt.
+        """
+        with _open_video(self.path) as container, _as_video_error(self.path, "is corrupt"):
+            return sum(packet.size > 0 for packet in container.demux(container.streams.video[0]))
+
+
+def to_pixels(path: Path, frames: Iterator[Any]) -> Iterator[NDArray[np.uint8]]:
+    """
+    Convert frames to pixels, (n_y, n_x, 3) uint8, top row first.
+
+    The size is checked before memory is allocated, because corrupt files may claim any size.
+    """
+    for frame in frames:
+        check_picture_size(path, frame.width, frame.height)
+        with _as_video_error(path, "is corrupt"):
+            pixels = frame.to_ndarray(format="rgb24")
+        yield pixels
+
+
+def _open_video(path: Path) -> Any:
+    try:
+        import av
+    except ImportError:
+        raise FileError(path, NEEDS_PYAV) from None
+    with _as_video_error(path, "is not a readable video file"):
+        # Metadata such as titles are not used and may be corrupt.
+        container = av.open(str(path), metadata_errors="replace")
+    if not container.streams.video:
+        container.close()
+        raise FileError(path, "contains no video stream")
+    if container.streams.video[0].codec_context is None:  # some versions of PyAV crash on decoding
+        container.close()
+        raise FileError(path, "has a video stream with an unsupported codec")
+    return container
+
+
+@contextmanager
+def _as_video_error(path: Path, problem: str) -> Iterator[None]:
+    """Convert exceptions of the video library, which may be of any type, to FileErrors."""
+    try:
+        yield
+    except FileError:
+        raise
+    except Exception as error:  # noqa: BLE001
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
+        raise FileError(path, f"{problem} ({printable(reason):.160})") from None
+
+
+class SandboxedVideo:
+    """
+    Video file of unknown origin, read in the sandbox process.
+
+    Parameters
+    ----------
+    path : Path
+
+    Attributes
+    ----------
+    frame_s : float or None, s
+        Frame period.
+    n_frames : int
+        Number of encoded frames.
+
+    Raises
+    ------
+    FileError
+        When the file is not a readable video, or the extra ``video`` is not installed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        about, _ = read_in_sandbox(_describe, path, kind=KIND, max_decompressed_bytes=lambda _: MAX_BYTES)
+        self.frame_s: float | None = about["frame_s"]
+        self.n_frames: int = about["n_frames"]
+
+    def pixels(self, start: int = 0) -> Iterator[NDArray[np.uint8]]:
+        """
+        Iterate over the pixels of frames, as :meth:`VideoFile.pixels`.
+
+        Raises
+        ------
+        FileError
+            When a frame is corrupt or too large, or takes too long.
+        """
+        return iterate_in_sandbox(_decode, self.path, {"start": start}, kind=KIND, max_bytes=MAX_BYTES)
+
+
+def _describe(path: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+    """Return the frame period and the number of frames, in the sandbox process."""
+    video = VideoFile(Path(path))
+    return {"frame_s": video.frame_s, "n_frames": video.count_frames()}, []
+
+
+def _decode(path: str, start: int) -> Iterator[NDArray[np.uint8] | None]:
+    """Yield None for each frame before the first one, and the pixels of the others, in the sandbox process."""
+    for number, frame in enumerate(VideoFile(Path(path))):
+        yield None if number < start else next(to_pixels(Path(path), iter([frame])))
