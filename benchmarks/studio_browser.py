@@ -55,7 +55,8 @@ CHANGE = """([key, value]) => new Promise((resolve) => {
   step();
 })"""
 #: Sends messages, and resolves to null when the last one is done and drawn, and with a second argument also all previews
-#: are complete. After a minute it resolves to the state of the page, with the number of frames that it draws in a second.
+#: are complete. After a minute it resolves to the state of the page, with the longest time without a timer, and the number
+#: of frames that it draws in a second.
 SEND = """([messages, isComplete]) => new Promise((resolve) => {
   const { page, connection } = studio;
   let nFrames = 0;
@@ -64,12 +65,21 @@ SEND = """([messages, isComplete]) => new Promise((resolve) => {
   const count = () => { nFrames++; requestAnimationFrame(count); };
   const describe = () => {
     const { isBusy, doneId, asked, isPreview } = page, { isOpen, waiting } = connection;
-    return JSON.stringify({ messages, id, doneId, isBusy, isPreview, isDrawn: asked === null, isOpen, waiting, nFrames });
+    return { messages, id, doneId, isBusy, isPreview, isDrawn: asked === null, isOpen, waiting, longestGapMs };
   };
-  const start = performance.now(), step = () => {
+  const start = performance.now();
+  let last = start, longestGapMs = 0;
+  const step = () => {
+    const now = performance.now();
+    longestGapMs = Math.max(longestGapMs, now - last);
+    last = now;
     if (page.doneId >= id && studio.isReady && !(isComplete && page.isPreview)) resolve(null);
     else if (performance.now() - start < 60000) setTimeout(step, 5);
-    else { count(); setTimeout(() => resolve(describe()), 1000); }
+    else {
+      const before = describe();
+      count();
+      setTimeout(() => resolve(JSON.stringify([before, describe(), nFrames])), 1000);
+    }
   };
   step();
 })"""

@@ -10,6 +10,7 @@ import { Orbit } from "/web/orbit.js";
 import { $, inkOf } from "/web/page_parts.js";
 import { SolidView } from "/web/solid_view.js";
 import { Columns } from "./columns.js";
+import { inNextFrame } from "./frames.js";
 import { fitted } from "./site_pane.js";
 
 const NO_WEBGL = "This browser has no WebGL2, which three dimensions need; enable graphics acceleration, or use another browser.";
@@ -66,7 +67,7 @@ export class SolidPane {
   ask() {
     if (this.isAsked || this.root.hidden) return;
     this.isAsked = true;
-    requestAnimationFrame(() => { this.isAsked = false; this._draw(); });
+    inNextFrame(() => { this.isAsked = false; this._draw(); });
   }
 
   // -- content ----------------------------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ import { showComparison } from "./comparison.js";
 import { Connection, memory } from "./connection.js";
 import { Controls, valueAt } from "./controls.js";
 import { Files } from "./files.js";
+import { inNextFrame } from "./frames.js";
 import { ImagePane } from "./image_pane.js";
 import { listenToDialogs } from "./menus.js";
 import { RulesList } from "./rules_list.js";
@@ -57,7 +58,7 @@ function ask(what) {
   const isAsked = page.asked !== null;
   page.asked = page.asked || new Set();
   for (const name of what === "map" ? [...MAPS, ...IMAGES] : what === "marks" ? [] : what) page.asked.add(name);
-  if (!isAsked) requestAnimationFrame(drawAsked);
+  if (!isAsked) inNextFrame(drawAsked);
 }
 
 function drawAsked() {
@@ -246,7 +247,7 @@ function finish({ id, ms, is_preview: isPreview }) {
     showStatus((isPreview ? "preview, " : "") + (Number.isFinite(page.lastMs) ? Math.round(page.lastMs) + " ms" : "ready"));
   };
   if (document.hidden) showTime();
-  else requestAnimationFrame(showTime);
+  else inNextFrame(showTime);
 }
 
 function showState(message) {
