@@ -146,8 +146,9 @@ class Imaging:
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import connected_components
 
+        n_outputs, n_basis = len(self.weights), len(self.irradiance_w_m2)
         is_needed = np.array([[bool(np.any(w * e)) for e in self.irradiance_w_m2] for w in self.weights], bool)
-        n_outputs, n_basis = is_needed.shape
+        is_needed = is_needed.reshape(n_outputs, n_basis)  # without maps too
         edges = np.zeros((n_outputs + n_basis,) * 2, bool)
         edges[:n_outputs, n_outputs:] = is_needed
         _, label = connected_components(csr_array(edges), directed=False)

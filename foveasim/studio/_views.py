@@ -118,8 +118,10 @@ class Views:
         sent_s = time.perf_counter()
         shown = [name for name in self._names if name != "comparison" or result.frozen is not None]
         # Sites and their values belong together; the others in the order of their age.
-        names = sorted(shown, key=lambda name: (name not in FIRST, self._version.get(name, -1)))
-        n_first = sum(name in FIRST for name in names)
+        first = [name for name in FIRST if name in shown]
+        names = first + sorted(
+            set(shown) - set(first), key=lambda name: (self._version.get(name, -1), shown.index(name))
+        )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # those of the simulation are in the state
             for k, name in enumerate(names):
@@ -128,7 +130,9 @@ class Views:
                 if name in self._sent and _is_same(self._sent[name], depends):
                     self._version[name] = version
                     continue
-                if is_dragging and (part.is_costly or self._costs.is_slow_part(key, name)):
+                together = first if name in first else [name]
+                is_slow = any(self._costs.is_slow_part(key, each) for each in together)
+                if is_dragging and (part.is_costly or is_slow):
                     self.left_out.append(name)
                     continue
                 start_s = time.perf_counter()
@@ -142,7 +146,7 @@ class Views:
                 times_ms[name] = 1e3 * time_s
                 self._costs.add_part(key, name, time_s)
                 is_stopped = k >= len(FIRST) and is_interrupted()
-                if k + 1 == n_first or is_stopped or time.perf_counter() - sent_s > TOGETHER_S:
+                if k + 1 == len(first) or is_stopped or time.perf_counter() - sent_s > TOGETHER_S:
                     self._send_all(encoded)
                     sent_s = time.perf_counter()
                 if is_stopped:

@@ -857,6 +857,18 @@ def test_points_are_grouped_by_shared_components():
         assert all(len(set(kinds[a:b])) == 1 for a, b in zip(begins, [*begins[1:], None], strict=True))
 
 
+@pytest.mark.parametrize("pupil", [None, {"kind": "slit", "width_fraction": 0.3}])
+def test_known_images_need_no_transform(pupil):
+    optics = SHOT["optics"] if pupil is None else {**SHOT["optics"], "pupil": pupil}
+    shot = build_shot("reference", {**SHOT, "optics": optics})
+    images = {}
+    shot.camera.photoelectrons_per_s(shot.scene, images=images)
+    moved = build_shot("reference", {**SHOT, "optics": optics, "layout": {**SHOT["layout"], "move_um": [3.0, -2.0]}})
+    found = moved.camera.photoelectrons_per_s(shot.scene, images=images)
+
+    np.testing.assert_array_equal(found, moved.camera.photoelectrons_per_s(shot.scene))
+
+
 def test_camera_reuses_images_and_compiled_layout():
     shot = build_shot("reference", SHOT)
     camera, images = shot.camera, {}

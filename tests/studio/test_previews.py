@@ -150,6 +150,19 @@ def test_slow_views_wait_while_dragging(recorder):
     assert not done_of(recorder)[0]["is_preview"]
 
 
+@pytest.mark.parametrize("slow", ["sites", "columns"])
+def test_sites_arrive_before_their_values(recorder, slow):
+    costs = recorder.session._costs
+    for key in ("layout.parameters.pitch_um", None):
+        costs.add_part(key, slow, 1.0)
+    recorder.do(do="set", key="layout.parameters.pitch_um", value=12.5, final=False)
+    assert not {"sites", "columns"} & set(recorder.part_names)  # both wait for the rest
+    recorder.do(do="set", key="seed", value=9, final=False)
+    recorder.do(do="set", key="layout.parameters.pitch_um", value=11.5, final=True)
+
+    assert recorder.part_names[:2] == ["sites", "columns"]
+
+
 def test_layers_are_not_computed_while_dragging(recorder):
     recorder.do(do="views", names=["sites", "columns", "stack"])
     assert "stack" in recorder.part_names
