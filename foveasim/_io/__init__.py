@@ -1,1 +1,1 @@
-"""Input and output: atomic files, npz, YAML, zarr, images, videos, reader sandbox, terminal."""
+"""Input and output: atomic files, npz, YAML, zarr, images, videos, sandbox, terminal."""

@@ -187,6 +187,6 @@ def _describe(path: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
 
 
 def _decode(path: str, start: int) -> Iterator[NDArray[np.uint8] | None]:
-    """Yield None for each frame before the first one, and the pixels of the others, in the sandbox process."""
+    """Yield the pixels of frames from the first one, and None for each before."""
     for number, frame in enumerate(VideoFile(Path(path))):
         yield None if number < start else next(to_pixels(Path(path), iter([frame])))
