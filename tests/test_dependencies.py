@@ -20,7 +20,7 @@ ROOT = PACKAGE.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 #: Extras of each part of the package, beyond what is always installed.
 EXTRAS = {
-    "_io": {"maps", "pictures"},
+    "_io": {"maps", "pictures", "video"},
     "capture": {"maps"},
     "compare": {"maps"},
     "explore": {"explore", "learn"},

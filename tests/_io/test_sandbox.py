@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import sys
 import time
 from pathlib import Path
 
@@ -47,9 +48,10 @@ MAX_BYTES = 2**32
 @pytest.fixture
 def iterate(tmp_path, monkeypatch):
     """Iterate over a reader of a module that only the test has."""
-    (tmp_path / "readers_of_test.py").write_text(READERS)
+    source = tmp_path / "readers_of_test.py"
+    source.write_text(READERS)
     monkeypatch.syspath_prepend(str(tmp_path))
-    module = importlib.import_module("readers_of_test")
+    module = importlib.import_module(source.stem)
     path = tmp_path / "film"
     path.write_text("")
 
@@ -59,7 +61,7 @@ def iterate(tmp_path, monkeypatch):
         )
 
     yield start
-    monkeypatch.delitem(importlib.sys.modules, "readers_of_test")
+    monkeypatch.delitem(sys.modules, source.stem)
 
 
 def test_arrays_arrive_in_order(iterate):
