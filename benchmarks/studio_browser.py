@@ -35,7 +35,6 @@ from foveasim.config import build_shot
 INSTALLED = ("--no-sandbox",)
 WEBGL = (*INSTALLED, "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu-rasterization")
 TIMEOUT_MS = 120_000
-WARM_UP_S = 180.0
 #: The server returns unused memory after a rest that is a little shorter.
 REST_S = 7.0
 #: Interval at which the memory of the server is printed.
@@ -172,10 +171,10 @@ def measure_latency(studio: Studio, report: Report, n: int) -> None:
 
 def random_messages(rng: random.Random, studio: Studio) -> list[dict[str, Any]]:
     """Return one to five random messages of a user."""
-    controls = [c for c in studio.page.evaluate(CONTROLS) if not c["key"].startswith("layout")]
+    controls = studio.page.evaluate(CONTROLS)
     numbers = [c for c in controls if c["kind"] in ("number", "integer") and c["value"] is not None]
-    choices = [c for c in controls if c["kind"] == "choice" and not c["key"].startswith("scene")]
-    presets = studio.page.evaluate(PRESETS)
+    numbers = [c for c in numbers if not c["key"].startswith("layout")]
+    choices, presets = _choices(controls), _presets(studio)
 
     def number() -> dict[str, Any]:
         control = rng.choice(numbers)
@@ -219,27 +218,48 @@ def random_messages(rng: random.Random, studio: Studio) -> list[dict[str, Any]]:
         elif kind < 0.97:
             made.append(rng.choice(others))
         else:
-            small = [name for name in presets if "pixirad" not in name and "wave" not in name]
-            made.append({"do": "preset", "name": rng.choice(small)})
+            made.append({"do": "preset", "name": rng.choice(presets)})
     return made
+
+
+def _choices(controls: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the controls with choices, without those of layout and scene, which presets change."""
+    return [c for c in controls if c["kind"] == "choice" and not c["key"].startswith(("layout", "scene"))]
+
+
+def _presets(studio: Studio) -> list[str]:
+    """Return the names of the presets, without layouts that take some seconds each."""
+    return [name for name in studio.page.evaluate(PRESETS) if "pixirad" not in name and "wave" not in name]
+
+
+def warm_up(studio: Studio) -> None:
+    """Show each view, preset and choice once: modules and kernels are then loaded, which is not growth."""
+    for tile in studio.page.evaluate(TILES):
+        studio.page.click(f"#tabs button[data-tile='{tile}']")
+        studio.send([])
+    for name in _presets(studio):
+        studio.send([{"do": "preset", "name": name}])
+    studio.send([{"do": "restore", "settings": studio.start}])
+    for control in _choices(studio.page.evaluate(CONTROLS)):
+        for choice in control["choices"]:
+            studio.send([{"do": "set", "key": control["key"], "value": choice["value"], "final": True}])
+        studio.send([{"do": "restore", "settings": studio.start}])
 
 
 def soak(studio: Studio, report: Report, minutes: float, seed: int, out: Path) -> None:
     """Make random changes, and add memory, console messages, stale views and differences of codes to the report."""
     rng = random.Random(seed)
-    start_s = time.monotonic()
+    warm_up(studio)
+    first = studio.memory_mib()
+    console.print(f"after every view, preset and choice: server {first[0]:.0f} MiB, page {first[1]:.0f} MiB")
+    start_s = printed_s = time.monotonic()
     n_steps = n_refreshed = n_stale = n_compared = n_different = n_late = 0
-    first: tuple[float, float] | None = None
-    printed_s = 0.0
     while time.monotonic() - start_s < 60.0 * minutes:
         n_late += studio.send(random_messages(rng, studio))
         n_steps += 1
         if n_steps % 3 == 0:
             tile = rng.choice(studio.page.evaluate(TILES))
             studio.page.click(f"#tabs button[data-tile='{tile}']")
-        if first is None and time.monotonic() - start_s > min(WARM_UP_S, 20.0 * minutes):
-            first = studio.memory_mib()
-            console.print(f"{n_steps} steps: server {first[0]:.0f} MiB, page {first[1]:.0f} MiB")
         if time.monotonic() - printed_s > PRINT_S:
             printed_s = time.monotonic()
             console.print(f"{printed_s - start_s:.0f} s, {n_steps} steps: server {studio.server_mib():.0f} MiB")
@@ -263,7 +283,6 @@ def soak(studio: Studio, report: Report, minutes: float, seed: int, out: Path) -
     subprocess.run(run, check=True, stdout=subprocess.DEVNULL)
     is_same = np.array_equal(codes, _codes_of_run(out / "results"))
     last = studio.memory_mib()
-    first = first or last
     grown_mib = last[0] - first[0] + last[1] - first[1]
     console.print(f"{n_steps} steps; server {last[0]:.0f} MiB, page {last[1]:.0f} MiB; seed {seed}")
     report.add("soak: memory growth", f"{grown_mib:.0f} MiB", "bound", f"{LEAK_MIB:g} MiB", grown_mib / LEAK_MIB, 1.0)

@@ -44,7 +44,7 @@ def _import(name: str) -> Any:
 
 def _load(task: dict[str, Any]) -> Any:
     """Return the reader of a task, with its keywords."""
-    if task.get("file") is None:
+    if task["file"] is None:
         return functools.partial(getattr(_import(task["module"]), task["reader"]), task["path"], **task["args"])
     spec = importlib.util.spec_from_file_location(task["module"], task["file"])
     assert spec is not None

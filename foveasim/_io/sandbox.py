@@ -112,22 +112,16 @@ def run_in_sandbox(
     """
     with tempfile.TemporaryDirectory(prefix="foveasim-") as directory:
         arrays, printed = Path(directory) / "arrays.npy", Path(directory) / "printed.txt"
-        task = {
-            "module": reader.__module__,
+        files = {
             "file": sys.modules[reader.__module__].__file__ if is_standalone else None,
-            "reader": reader.__name__,
-            "path": str(path.resolve()),
-            "args": dict(args),
             "arrays": str(arrays),
             "printed": str(printed),
-            "sys_path": sys.path,
-            "max_cpu_s": max_cpu_s,
-            "max_bytes": max_bytes,
         }
+        task = _task(reader, path, args, **files, max_cpu_s=max_cpu_s, max_bytes=max_bytes)
         try:
             process = subprocess.run(  # noqa: S603 -- a script of this package
                 COMMAND,
-                input=json.dumps(task).encode(),
+                input=task,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
                 timeout=WALL_TIME_FACTOR * max_cpu_s,
@@ -182,17 +176,9 @@ def iterate_in_sandbox(
     FileError
         When the reader rejects the file, fails, crashes or exceeds a limit.
     """
-    task = {
-        "module": reader.__module__,
-        "reader": reader.__name__,
-        "path": str(path.resolve()),
-        "args": dict(args),
-        "is_iterator": True,
-        "printed": os.devnull,
-        "sys_path": sys.path,
-        "max_cpu_s": None,
-        "max_bytes": max_bytes,
-    }
+    task = _task(
+        reader, path, args, file=None, is_iterator=True, printed=os.devnull, max_cpu_s=None, max_bytes=max_bytes
+    )
     process = subprocess.Popen(  # noqa: S603 -- a script of this package
         COMMAND,
         stdin=subprocess.PIPE,
@@ -205,7 +191,7 @@ def iterate_in_sandbox(
     with process:
         try:
             with process.stdin as task_file:
-                task_file.write(json.dumps(task).encode())
+                task_file.write(task)
             while True:
                 is_late = threading.Event()
                 timer = threading.Timer(max_item_s, _end, (process, is_late))
@@ -226,6 +212,12 @@ def iterate_in_sandbox(
                     yield np.frombuffer(content, header["type"]).reshape(header["shape"])
         finally:
             process.kill()
+
+
+def _task(reader: Callable[..., Any], path: Path, args: Mapping[str, Any], **options: Any) -> bytes:
+    """Return the task of the sandbox process, as :mod:`foveasim._io._sandboxed` reads it."""
+    about = {"module": reader.__module__, "reader": reader.__name__, "path": str(path.resolve()), "args": dict(args)}
+    return json.dumps(about | {"sys_path": sys.path} | options).encode()
 
 
 def _read_item(file: IO[bytes], max_bytes: int) -> tuple[dict[str, Any], bytes]:

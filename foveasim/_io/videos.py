@@ -16,7 +16,7 @@ from foveasim._io.images import check_picture_size
 from foveasim._io.sandbox import iterate_in_sandbox, read_in_sandbox
 from foveasim.errors import FileError, printable
 
-__all__ = ["SandboxedVideo", "VideoFile", "to_pixels"]
+__all__ = ["SandboxedVideo", "VideoFile", "frame_pixels"]
 
 NEEDS_PYAV = needs("av")
 KIND = "a video"
@@ -84,7 +84,7 @@ class VideoFile:
         FileError
             When a frame is corrupt or too large.
         """
-        return to_pixels(self.path, islice(iter(self), start, None))
+        return (frame_pixels(self.path, frame) for frame in islice(self, start, None))
 
     def count_frames(self) -> int:
         """
@@ -99,17 +99,15 @@ class VideoFile:
             return sum(packet.size > 0 for packet in container.demux(container.streams.video[0]))
 
 
-def to_pixels(path: Path, frames: Iterator[Any]) -> Iterator[NDArray[np.uint8]]:
+def frame_pixels(path: Path, frame: Any) -> NDArray[np.uint8]:
     """
-    Convert frames to pixels, (n_y, n_x, 3) uint8, top row first.
+    Return the pixels of a decoded frame, (n_y, n_x, 3) uint8, top row first.
 
     The size is checked before memory is allocated, because corrupt files may claim any size.
     """
-    for frame in frames:
-        check_picture_size(path, frame.width, frame.height)
-        with _as_video_error(path, "is corrupt"):
-            pixels = frame.to_ndarray(format="rgb24")
-        yield pixels
+    check_picture_size(path, frame.width, frame.height)
+    with _as_video_error(path, "is corrupt"):
+        return np.asarray(frame.to_ndarray(format="rgb24"))
 
 
 def _open_video(path: Path) -> Any:
@@ -143,23 +141,14 @@ def _as_video_error(path: Path, problem: str) -> Iterator[None]:
 
 class SandboxedVideo:
     """
-    Video file of unknown origin, read in the sandbox process.
+    Video file of unknown origin, read in the sandbox process: as :class:`VideoFile`.
 
-    Parameters
-    ----------
-    path : Path
-
-    Attributes
-    ----------
-    frame_s : float or None, s
-        Frame period.
-    n_frames : int
-        Number of encoded frames.
+    The number of frames is that of the encoded ones.
 
     Raises
     ------
     FileError
-        When the file is not a readable video, or the extra ``video`` is not installed.
+        When the file is not a readable video, or exceeds a limit.
     """
 
     def __init__(self, path: Path) -> None:
@@ -188,5 +177,6 @@ def _describe(path: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
 
 def _decode(path: str, start: int) -> Iterator[NDArray[np.uint8] | None]:
     """Yield the pixels of frames from the first one, and None for each before."""
-    for number, frame in enumerate(VideoFile(Path(path))):
-        yield None if number < start else next(to_pixels(Path(path), iter([frame])))
+    video = VideoFile(Path(path))
+    for number, frame in enumerate(video):
+        yield None if number < start else frame_pixels(video.path, frame)

@@ -88,9 +88,9 @@ def _compiled(layout: PackedRings, grid: Grid, n_threads: int | None) -> tuple[I
 
 def _neighbours(layout: PackedRings, channels: bytes, n_channels: int) -> dict[int, tuple[Ints, Ints, Ints, Floats]]:
     """
-    Return the sites of each channel, the other sites, and for these the nearest of it.
+    Return the sites of each channel, the other sites, and their nearest neighbours in the channel.
 
-    ``channels`` are the bytes of the channels of the sites, int64. Weights are inverse distances.
+    ``channels`` are the bytes of the channels of the sites, int64. The last array of each channel has the inverse distances.
     """
     from scipy.spatial import cKDTree
 

@@ -25,6 +25,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from foveasim import __version__
+from foveasim._core.work_arrays import share_heap
 from foveasim.errors import FoveasimError, ParameterError, SimulationError, printable
 from foveasim.layout import write_layout
 from foveasim.studio._exports import archive
@@ -436,6 +437,7 @@ def serve(
         server_header=False,
         date_header=False,
     )
+    share_heap()
     interval_s = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     try:

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
+from weakref import ref
 
 from foveasim.errors import ParameterError
 from foveasim.studio._costs import Costs
@@ -48,7 +49,8 @@ class Views:
         self.left_out: list[str] = []
         self._names = [part.name for part in PARTS.values() if not part.is_costly]
         self._pixels = PICTURE_PIXELS
-        self._sent: dict[str, tuple[Any, ...]] = {}
+        # Weak references to what each view was computed from: a view that is not shown retains no earlier result.
+        self._sent: dict[str, list[Any]] = {}
         self._version: dict[str, int] = {}
 
     def select(self, names: Any, pixels: Any = None) -> None:
@@ -141,7 +143,7 @@ class Views:
                 except Exception as error:  # noqa: BLE001 -- one view fails, the others are shown
                     text = f"{part.label}: {self._line(error)}"
                     self._send({"kind": "error", "id": number, "part": name, "text": text})
-                self._sent[name], self._version[name] = depends, version
+                self._sent[name], self._version[name] = [_weak(each) for each in depends], version
                 time_s = time.perf_counter() - start_s
                 times_ms[name] = 1e3 * time_s
                 self._costs.add_part(key, name, time_s)
@@ -160,8 +162,14 @@ class Views:
         encoded.clear()
 
 
-def _is_same(old: tuple[Any, ...], new: tuple[Any, ...]) -> bool:
-    """Return whether all objects are the same, or equal tuples."""
+def _weak(value: Any) -> Any:
+    """Return a weak reference to an object; tuples and small objects with slots, which have none, themselves."""
+    return ref(value) if type(value).__weakrefoffset__ else value
+
+
+def _is_same(old: list[Any], new: tuple[Any, ...]) -> bool:
+    """Return whether the references are to the same objects, and tuples are equal."""
     return len(old) == len(new) and all(
-        a is b or (isinstance(a, tuple) and isinstance(b, tuple) and a == b) for a, b in zip(old, new, strict=True)
+        a() is b if isinstance(a, ref) else a is b or (isinstance(b, tuple) and a == b)
+        for a, b in zip(old, new, strict=True)
     )

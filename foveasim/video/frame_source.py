@@ -6,6 +6,7 @@ import copy
 import inspect
 from collections.abc import Iterable, Iterator, Sized
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from numpy.typing import ArrayLike
 from foveasim._core.names import missing_path, possible_names
 from foveasim._core.validation import check_count, check_number
 from foveasim._io.images import PICTURE_EXTENSIONS, picture_names
-from foveasim._io.videos import VideoFile, to_pixels
+from foveasim._io.videos import VideoFile, frame_pixels
 from foveasim.errors import FileError, ParameterError, type_name
 from foveasim.scene import Scene
 
@@ -173,7 +174,7 @@ class FrameSource:
         shape: tuple[int, ...] | None = None
         pictures: Iterator[Any] = islice(iter(self._source), self._start, self._stop, self._step)
         if isinstance(self._source, VideoFile):  # skipped frames are decoded but not converted to pixels
-            pictures = to_pixels(self._source.path, pictures)
+            pictures = map(partial(frame_pixels, self._source.path), pictures)
         for k, picture in enumerate(pictures):
             scene = (
                 Scene.from_picture(picture, **self._scene) if self._template is None else self._from_template(picture)

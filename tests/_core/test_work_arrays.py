@@ -1,5 +1,8 @@
 """Tests of the reuse of the memory of large arrays."""
 
+import platform
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -65,6 +68,35 @@ def test_release_keeps_used_memory():
 
     assert work_arrays._POOL._unused == []
     assert (used == 3.0).all()
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="needs the C library of GNU")
+def test_threads_share_one_heap(tmp_path):
+    code = """
+import ctypes, sys, threading
+if sys.argv[1] == "shared":
+    from foveasim._core.work_arrays import share_heap
+    share_heap()
+barrier, blocks = threading.Barrier(3), []
+def allocate():
+    blocks.append(bytearray(100_000))
+    barrier.wait()
+threads = [threading.Thread(target=allocate) for _ in range(3)]
+[thread.start() for thread in threads]
+[thread.join() for thread in threads]
+libc = ctypes.CDLL(None)
+libc.fopen.restype = ctypes.c_void_p
+file = ctypes.c_void_p(libc.fopen(sys.argv[2].encode(), b"w"))
+libc.malloc_info(0, file)
+libc.fclose(file)
+"""
+    n_heaps = {}
+    for name in ("shared", "separate"):
+        path = tmp_path / f"{name}.xml"
+        subprocess.run([sys.executable, "-c", code, name, str(path)], check=True)
+        n_heaps[name] = path.read_text().count("<heap nr=")
+
+    assert n_heaps["shared"] == 1 < n_heaps["separate"]
 
 
 def test_threads_never_share_memory():

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
+import gc
 import json
 import threading
 import time
+import weakref
 
 import numpy as np
 import pytest
@@ -73,6 +75,17 @@ def test_only_selected_views_are_computed(recorder):
     assert recorder.part_names == ["picture"]
     recorder.do(do="views", names=["columns", "picture"])
     assert recorder.part_names == ["columns"]
+
+
+def test_hidden_views_retain_no_results(recorder):
+    recorder.do(do="views", names=["picture"])
+    earlier = weakref.ref(recorder.session.result.capture)
+    recorder.do(do="set", key="optics.f_number", value=4.0, final=True)
+    gc.collect()
+
+    assert earlier() is None
+    recorder.do(do="views", names=list(_session.PARTS))
+    assert {"columns", "noise", "scene"} <= set(recorder.part_names)
 
 
 def test_pictures_have_the_requested_size(recorder):
