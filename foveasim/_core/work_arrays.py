@@ -83,10 +83,10 @@ def work_array(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
 
 def share_heap() -> None:
     """
-    Let all threads allocate from one heap, with the C library of GNU: for servers that run for a long time.
+    Let all threads of the process allocate from one heap.
 
-    By default, threads have heaps of their own (arenas), and each retains parts of pages between used blocks: hundreds of
-    megabytes after some thousand different captures. Other libraries are unchanged.
+    By default, the C library of GNU gives threads separate heaps (arenas), each of which retains parts of pages between used
+    blocks: hundreds of megabytes after some thousand different captures. For servers; no effect with other C libraries.
     """
     if sys.platform.startswith("linux"):
         with suppress(AttributeError, OSError):

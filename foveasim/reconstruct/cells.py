@@ -88,9 +88,10 @@ def _compiled(layout: PackedRings, grid: Grid, n_threads: int | None) -> tuple[I
 
 def _neighbours(layout: PackedRings, channels: bytes, n_channels: int) -> dict[int, tuple[Ints, Ints, Ints, Floats]]:
     """
-    Return the sites of each channel, the other sites, and their nearest neighbours in the channel.
+    Find the nearest sites of each channel for the sites of the others.
 
-    ``channels`` are the bytes of the channels of the sites, int64. The last array of each channel has the inverse distances.
+    Returns by channel: its sites, the other sites, their nearest sites of the channel, and the inverse distances to these.
+    ``channels`` are the bytes of the channels of the sites, int64.
     """
     from scipy.spatial import cKDTree
 

@@ -163,7 +163,7 @@ class Views:
 
 
 def _weak(value: Any) -> Any:
-    """Return a weak reference to an object; tuples and small objects with slots, which have none, themselves."""
+    """Return a weak reference to an object; tuples and small objects without one themselves."""
     return ref(value) if type(value).__weakrefoffset__ else value
 
 
