@@ -10,6 +10,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -190,7 +191,7 @@ def iterate_in_sandbox(
     assert process.stdout is not None
     with process:
         try:
-            with process.stdin as task_file:
+            with suppress(BrokenPipeError), process.stdin as task_file:  # it may have ended already
                 task_file.write(task)
             while True:
                 is_late = threading.Event()

@@ -153,7 +153,7 @@ class SandboxedVideo:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        about, _ = read_in_sandbox(_describe, path, kind=KIND, max_decompressed_bytes=lambda _: MAX_BYTES)
+        about, _ = read_in_sandbox(_describe, path, kind=KIND, max_decompressed_bytes=lambda _: 0)  # decodes no frames
         self.frame_s: float | None = about["frame_s"]
         self.n_frames: int = about["n_frames"]
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import shapely
 
+from foveasim._core.rings import next_vertex
 from foveasim._core.validation import Floats, Ints
 
-__all__ = ["ON_EDGE_UM", "merge_coincident_points", "node_edges", "points_on_edges"]
+__all__ = ["ON_EDGE_UM", "insert_points", "merge_coincident_points", "node_edges", "points_on_edges"]
 
 #: Tolerance within which a point lies on an edge, and two points are the same.
 ON_EDGE_UM = 1e-6
@@ -40,6 +41,36 @@ def points_on_edges(
     margin = tolerance_um / np.sqrt(length2)
     is_inside = (fraction > margin) & (fraction < 1.0 - margin)
     return edge[is_inside], point[is_inside], fraction[is_inside]
+
+
+def insert_points(
+    xy_um: Floats, ring_offsets: Ints, points_um: Floats, tolerance_um: float = ON_EDGE_UM
+) -> tuple[Floats, Ints, Ints]:
+    """
+    Insert points as vertices into the edges on which they lie.
+
+    Parameters
+    ----------
+    xy_um : (n_vertex, 2) float64, µm
+    ring_offsets : (n_ring + 1,) int64
+    points_um : (n_point, 2) float64, µm
+    tolerance_um : float, µm
+        Distance within which a point lies on an edge.
+
+    Returns
+    -------
+    xy_um : (n, 2) float64, µm
+    ring_offsets : (n_ring + 1,) int64
+    point : (n - n_vertex,) int64
+        Inserted points, those of several edges repeatedly.
+    """
+    n_vertices = xy_um.shape[0]
+    edge, point, fraction = points_on_edges(points_um, xy_um, xy_um[next_vertex(ring_offsets)], tolerance_um)
+    # The new vertices follow the first one of the edge, in order along it.
+    owner = np.concatenate((np.arange(n_vertices), edge))
+    order = np.lexsort((np.concatenate((np.zeros(n_vertices), fraction)), owner))
+    starts = np.concatenate(([0], np.cumsum(np.bincount(edge, minlength=n_vertices) + 1)))
+    return np.concatenate((xy_um, points_um[point]))[order], starts[ring_offsets], point
 
 
 def node_edges(begin_um: Floats, end_um: Floats) -> tuple[Floats, Floats]:

@@ -13,6 +13,7 @@ import re
 import socket
 import sys
 import tempfile
+import threading
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
@@ -28,6 +29,8 @@ __all__ = ["run_studio"]
 
 #: Modules of the extra.
 MODULES = ("starlette", "uvicorn", "websockets")
+#: Commands of browsers that show text in the terminal.
+TEXT_BROWSERS = ("www-browser", "links", "elinks", "lynx", "w3m")
 #: Environment variable with the token of the address, and its minimum length.
 TOKEN_VARIABLE, MIN_TOKEN_LENGTH = "FOVEASIM_STUDIO_TOKEN", 24
 
@@ -56,7 +59,7 @@ def run_studio(
         0 for any free port.
     open_browser : bool
         Whether to open a browser.
-    announce : function of (address, whether a browser was opened), optional
+    announce : function of (address, whether a browser opens it), optional
         Called when the server accepts requests; by default the address is printed.
 
     Raises
@@ -102,7 +105,8 @@ def run_studio(
         )
     try:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        listener = socket.create_server((host, port), family=family)
+        has_both = host == "::" and socket.has_dualstack_ipv6()
+        listener = socket.create_server((host, port), family=family, dualstack_ipv6=has_both)
     except OSError as error:
         if error.errno in (errno.EADDRNOTAVAIL, socket.EAI_NONAME, socket.EAI_AGAIN):
             raise ParameterError("host", "must be an address of this computer", host) from None
@@ -110,18 +114,30 @@ def run_studio(
     with listener:
         found = int(listener.getsockname()[1])
         studio = Studio(start, token=token, hosts=host_names(host, found))
-        shown = "127.0.0.1" if host in UNSPECIFIED else f"[{host}]" if ":" in host else host
-        address = f"http://{shown}:{found}/#{studio.token}"
+        shown = host if host not in UNSPECIFIED else "127.0.0.1" if has_both or ":" not in host else "::1"
+        address = f"http://{f'[{shown}]' if ':' in shown else shown}:{found}/#{studio.token}"
+        browser = _graphical_browser() if open_browser else None
 
         def ready() -> None:
-            is_opened = open_browser and webbrowser.open(address)
             if announce is not None:
-                announce(address, is_opened)
+                announce(address, browser is not None)
             else:
                 sys.stdout.write(f"{address}\n")
                 sys.stdout.flush()
+            if browser is not None:
+                # In a thread: some commands return only when the browser is closed.
+                threading.Thread(target=browser.open, args=(address,), daemon=True).start()
 
         serve(studio, listener, ready)
+
+
+def _graphical_browser() -> webbrowser.BaseBrowser | None:
+    """Return the browser of the user, None without one that shows pages with scripts."""
+    try:
+        browser = webbrowser.get()
+    except webbrowser.Error:
+        return None
+    return None if browser.name in TEXT_BROWSERS else browser
 
 
 def _require(module: str) -> None:

@@ -19,7 +19,7 @@ __all__ = [
 
 #: Messages that change the settings.
 CHANGES = ("set", "reset", "delete", "undo", "redo", "preset", "restore", "file", "video", "frame", "match")
-#: Changes that cannot be applied twice, as they advance a source of frames: their simulations are complete.
+#: Changes that advance a source of frames: newer ones do not stop their simulations.
 ONCE = ("video", "frame")
 #: Longest path of a setting.
 MAX_KEY_LENGTH = 500

@@ -347,7 +347,6 @@ def _alternatives(
         selected = 0 if value is None else None
     name = key.rpartition(".")[2]
     started = value_at(start, key)
-    default = None
     for option in options:
         is_selected = selected is None and _is_of(option, value)
         if not is_selected and (option.get("type") == "array" or set(option.get("required", ())) & FROM_FILES):
@@ -366,7 +365,7 @@ def _alternatives(
         choices.append({"label": _label(option), "value": copy.deepcopy(initial)})
     if key == "layout":
         choices += [{"label": f"bundled: {each.replace('_', ' ')}", "value": each} for each in bundled_layouts()]
-    return {"choices": choices, "selected": selected, "default": default}
+    return {"choices": choices, "selected": selected}
 
 
 def _is_of(option: dict[str, Any], value: Any) -> bool:

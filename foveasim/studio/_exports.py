@@ -8,7 +8,7 @@ import json
 import re
 import tempfile
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +64,7 @@ def text_of(what: str, settings: Mapping[str, Any], start: Mapping[str, Any], na
 
 
 def without_directories(
-    settings: dict[str, Any], uploads: Path, frames: Mapping[str, Path]
+    settings: dict[str, Any], uploads: Path, frames: Mapping[str, Path], name_of: Callable[[Path], str]
 ) -> tuple[dict[str, Any], dict[str, Path]]:
     """
     Return settings with names for the paths of uploaded files, and the files by name.
@@ -76,6 +76,8 @@ def without_directories(
         Directory of uploaded files.
     frames : mapping of str to Path
         Files that replace others, by the path in the settings.
+    name_of : function of a path
+        Returns the name of a file.
     """
     files: dict[str, Path] = {}
 
@@ -86,8 +88,9 @@ def without_directories(
             return [renamed(item) for item in value]
         if isinstance(value, str) and Path(value).parent == uploads:
             file = frames.get(value, Path(value))
-            files[file.name] = file
-            return file.name
+            name = name_of(file)
+            files[name] = file
+            return name
         return value
 
     return renamed(settings), files

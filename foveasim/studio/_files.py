@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
+import filecmp
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from foveasim.config import (
 from foveasim.config._objects import BUNDLED_PICTURE, FILE_SETTINGS
 from foveasim.errors import FileError, ParameterError, printable
 
-__all__ = ["Files", "apply_preset", "file_name", "presets", "start_settings"]
+__all__ = ["Files", "apply_preset", "file_name", "is_copy", "presets", "start_settings", "unused_path"]
 
 #: Longest name and extension of an uploaded file.
 MAX_NAME_LENGTH, MAX_EXTENSION_LENGTH = 80, 8
@@ -217,3 +218,17 @@ def file_name(name: str) -> str:
     extension = extension[:MAX_EXTENSION_LENGTH].lower()
     short = (stem or "file")[:MAX_NAME_LENGTH]
     return f"{short}.{extension}" if extension else short
+
+
+def unused_path(path: Path, is_usable: Callable[[Path], bool]) -> Path:
+    """Return a path, or with a number after its name the first one that is usable."""
+    k, found = 1, path
+    while not is_usable(found):
+        k += 1
+        found = path.with_name(f"{path.stem}_{k}{path.suffix}")
+    return found
+
+
+def is_copy(original: Path, path: Path) -> bool:
+    """Return whether a path is unused, or that of a file with the content of the original."""
+    return not path.exists() or (path.is_file() and filecmp.cmp(original, path, shallow=False))

@@ -193,10 +193,14 @@ class Frames:
         if self.path is not None and self._pixels is not None:
             write_picture(self.path, self._pixels)
         self._remove_stored()
-        self._reader = None  # ends its process
+        self.stop()
         with self._lock:
             self.path = self._video = self._pixels = None
         self._decoded.clear()
+
+    def stop(self) -> None:
+        """End the process that decodes a video."""
+        self._reader = None
 
     # -- the current frame ------------------------------------------------------------------------------------------
 

@@ -31,17 +31,18 @@ from foveasim.layout import write_layout
 from foveasim.studio._exports import archive
 from foveasim.studio._files import file_name, presets
 from foveasim.studio._frames import camera_frame
-from foveasim.studio._session import Session, Start
+from foveasim.studio._messages import one_line
+from foveasim.studio._session import MAX_SESSION_BYTES, Session, Start
 
 __all__ = ["UNSPECIFIED", "Studio", "host_names", "serve"]
 
-#: Largest uploaded file, and all files of a session.
-MAX_FILE_BYTES, MAX_SESSION_BYTES = 64 << 20, 512 << 20
+#: Largest uploaded file.
+MAX_FILE_BYTES = 64 << 20
 #: Largest message of a page.
 MAX_MESSAGE_BYTES = 1 << 20
 #: Time after which sessions without a page are closed, and their number.
 IDLE_S, MAX_SESSIONS = 1800.0, 8
-#: Time limit for the first message of a connection, and for closing all connections.
+#: Time limit for the first message of a connection.
 HELLO_S = 10.0
 #: Simultaneous connections; further ones receive 503.
 MAX_CONNECTIONS = 128
@@ -167,6 +168,7 @@ class Studio:
                 await socket.close(TOO_MANY, "too many sessions")
                 return
             outgoing = _Outbox(asyncio.get_running_loop())
+            session.attach(outgoing.put)  # at once: a session without a page may be closed
             hello = {
                 "kind": "hello",
                 "session": session.name,
@@ -176,7 +178,6 @@ class Studio:
             }
             await socket.send_text(json.dumps({**hello, **session.hello()}))
             sender = asyncio.create_task(outgoing.send_to(socket))
-            session.attach(outgoing.put)
             while True:
                 session.post(_message(await socket.receive()))
         except (WebSocketDisconnect, TimeoutError, KeyError, RuntimeError):
@@ -193,7 +194,7 @@ class Studio:
                     await socket.close()
 
     def _is_token(self, token: object) -> bool:
-        return isinstance(token, str) and hmac.compare_digest(token.encode(), self.token.encode())
+        return isinstance(token, str) and hmac.compare_digest(token.encode(errors="replace"), self.token.encode())
 
     # -- files ------------------------------------------------------------------------------------------------------
 
@@ -208,7 +209,7 @@ class Studio:
         session = self._authorised(request)
         if isinstance(session, Response):
             return session
-        limit = min(MAX_FILE_BYTES, MAX_SESSION_BYTES - session.n_uploaded_bytes)
+        limit = min(MAX_FILE_BYTES, session.n_free_bytes)
         message = (
             f"files may have at most {MAX_FILE_BYTES >> 20} MiB, and those of a session {MAX_SESSION_BYTES >> 20} MiB"
         )
@@ -226,6 +227,8 @@ class Studio:
             path = await asyncio.to_thread(session.add_file, request.query_params.get("name", "file"), bytes(content))
         except OSError as error:
             return _error(f"the file cannot be stored: {error.strerror or error}", 400)
+        if path is None:
+            return _error(message, 413)
         return JSONResponse({"path": str(path), "name": path.name})
 
     async def _download(self, request: Request) -> Response:
@@ -237,6 +240,8 @@ class Studio:
             content, name = await asyncio.to_thread(_exported, session, what)
         except FoveasimError as error:
             return _error(" ".join(printable(str(error)).split()), 400)
+        except (OSError, MemoryError) as error:
+            return _error(f"the file cannot be written: {one_line(error)}", 400)
         disposition = f'attachment; filename="{name}"'
         return Response(content, media_type="application/octet-stream", headers={"Content-Disposition": disposition})
 

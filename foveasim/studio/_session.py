@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ from foveasim.studio._controls import chosen_value, controls_of, structure_of
 from foveasim.studio._costs import RELEASE_S, REST_S, Costs, SupersededError
 from foveasim.studio._engine import Engine, Simulated
 from foveasim.studio._exports import text_of, without_directories
-from foveasim.studio._files import Files, apply_preset, file_name
+from foveasim.studio._files import Files, apply_preset, file_name, is_copy, unused_path
 from foveasim.studio._frames import Frames
 from foveasim.studio._history import History
 from foveasim.studio._messages import from_json, one_line, to_json
@@ -46,8 +47,10 @@ from foveasim.studio._parts import PARTS, summary_of
 from foveasim.studio._variants import with_n_sites
 from foveasim.studio._views import Views
 
-__all__ = ["Session", "Start"]
+__all__ = ["MAX_SESSION_BYTES", "Session", "Start"]
 
+#: Size limit of all uploaded files.
+MAX_SESSION_BYTES = 512 << 20
 #: Largest number of messages that wait.
 MAX_WAITING = 1000
 #: Newer changes stop simulations for at most this time in succession, so that some are shown.
@@ -98,7 +101,8 @@ class Session:
         self.history = History(start.settings)
         self.result: Simulated | None = None
         self.last_used_s = time.monotonic()
-        self.n_uploaded_bytes = 0
+        self.n_free_bytes = MAX_SESSION_BYTES
+        self._uploading = threading.Lock()  # in threads of the server
         self.frames = Frames(self.uploads, self._new_path)
         self._costs = Costs()
         self._views = Views(self._send, self._line, self._costs)
@@ -176,24 +180,33 @@ class Session:
             self._wake.notify()
         shutil.rmtree(self.uploads, ignore_errors=True)
 
-    def add_file(self, name: str, content: bytes) -> Path:
-        """Store an uploaded file, and return its path."""
+    def add_file(self, name: str, content: bytes) -> Path | None:
+        """Store an uploaded file and return its path; None beyond the limit of the session."""
+        with self._uploading:
+            if len(content) > self.n_free_bytes:
+                return None
+            self.n_free_bytes -= len(content)
         path = self._new_path(file_name(name))
         path.write_bytes(content)
-        self.n_uploaded_bytes += len(content)
         return path
 
     def _new_path(self, name: str) -> Path:
-        """Return an unused path for an uploaded file or for the frames of a source."""
-        k, path = 0, self.uploads / name
-        while path.exists() or path == self.frames.path:
-            k += 1
-            path = self.uploads / f"{k}_{name}"
+        """Return the path of a new, empty file for an uploaded file or for the frames of a source."""
+        with self._uploading:
+            path = unused_path(self.uploads / name, lambda path: not path.exists())
+            path.touch()
         return path
 
     # -- thread -----------------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
+        try:
+            self._handle_until_closed()
+        finally:
+            self.frames.stop()
+            shutil.rmtree(self.uploads, ignore_errors=True)
+
+    def _handle_until_closed(self) -> None:
         while True:
             with self._wake:
                 is_at_rest = False
@@ -205,13 +218,12 @@ class Session:
                 messages = list(self._waiting)
                 self._waiting.clear()
             try:
-                if messages:
-                    self._handle(messages)
-                elif self._wants_rest:
-                    self._complete()
+                if messages or self._wants_rest:
+                    self._has_unused_memory = True
+                    self._handle(messages) if messages else self._complete()
                 else:
+                    self._has_unused_memory = False
                     release_memory()
-                self._has_unused_memory = bool(messages) or self._wants_rest
             except BaseException as error:  # noqa: BLE001 -- the session continues with its last valid state
                 self._send_error(self._last_id, error)
 
@@ -241,7 +253,9 @@ class Session:
         self._wants_rest = self.is_preview
 
     def _check(self) -> None:
-        """Stop a simulation when a newer change waits."""
+        """Stop a simulation when the session is closed or a newer change waits."""
+        if self._is_closed:
+            raise SupersededError
         if not self._can_stop or not any(is_change(m) and m["do"] not in ONCE for m in list(self._waiting)):
             return
         now_s = time.monotonic()
@@ -394,6 +408,7 @@ class Session:
         """Handle a message that does not change the settings."""
         if not isinstance(message, dict):
             raise ParameterError("message", "must be a JSON object")
+        self._last_id = message.get("id")
         match message.get("do"):
             case "refresh":
                 self._views.forget()
@@ -414,16 +429,17 @@ class Session:
                     self._simulate(self.history.settings, can_stop=False)
                 self._frozen_result = self.result
                 self._frozen = {"summary": summary_of(self.result), "settings": self.history.settings}
+                self._send_parts(can_interrupt=False)  # before later changes: the page keeps those of the variant
             case "unfreeze":
                 self._frozen = self._frozen_result = None
                 self._views.forget("comparison")
             case "text":
-                exported = self.exported()
+                what, exported = string_of(message, "what"), self.exported()
                 self._send({
                     "kind": "text",
                     "id": message.get("id"),
-                    "what": message["what"],
-                    "text": self.text(string_of(message, "what"), exported),
+                    "what": what,
+                    "text": self.text(what, exported),
                     "files": list(exported[1]),
                 })  # fmt: skip
             case "save":
@@ -431,7 +447,6 @@ class Session:
                 self._send({"kind": "saved", "id": message.get("id"), "path": str(path)})
             case unknown:
                 raise ParameterError("do", "must be the name of a message", printable(str(unknown))[:40])
-        self._last_id = message.get("id")
         self._send_state()
 
     # -- answers ----------------------------------------------------------------------------------------------------
@@ -454,9 +469,16 @@ class Session:
         settings, files = self.exported() if exported is None else exported
         return text_of(what, settings, self.start.settings, self.start.name, list(files))
 
-    def exported(self) -> tuple[dict[str, Any], dict[str, Path]]:
+    def exported(
+        self, name_of: Callable[[Path], str] = lambda file: file.name
+    ) -> tuple[dict[str, Any], dict[str, Path]]:
         """
         Return the current settings with names of uploaded files for their paths, and the files.
+
+        Parameters
+        ----------
+        name_of : function of a path
+            Returns the name of a file.
 
         Returns
         -------
@@ -465,7 +487,7 @@ class Session:
             Uploaded files by name, and the current frame of a source.
         """
         settings = self.history.settings
-        return without_directories(settings, self.uploads, self.frames.export(settings))
+        return without_directories(settings, self.uploads, self.frames.export(settings), name_of)
 
     def _save(self, name: str) -> Path:
         """Write the settings to the directory for saved files, with copies of uploaded files."""
@@ -475,7 +497,8 @@ class Session:
         safe = file_name(name)
         path = out / (safe if safe.endswith((".yaml", ".yml")) else f"{safe}.yaml")
         out.mkdir(parents=True, exist_ok=True)
-        settings, files = self.exported()
+        # Settings that were saved before keep their pictures.
+        settings, files = self.exported(lambda file: unused_path(out / file.name, partial(is_copy, file)).name)
         for copied, original in files.items():
             with atomic_write(out / copied) as temporary:
                 shutil.copyfile(original, temporary)
@@ -505,8 +528,8 @@ class Session:
             "is_preview": result is not None and result.is_preview,
         })  # fmt: skip
 
-    def _send_parts(self) -> None:
-        """Compute and send the parts that changed; newer messages interrupt."""
+    def _send_parts(self, *, can_interrupt: bool = True) -> None:
+        """Compute and send the parts that changed, until newer messages interrupt."""
         if self.result is None:
             return
         times_ms = self._views.send_changed(
@@ -515,7 +538,7 @@ class Session:
             self._last_id,
             key=self._key,
             is_dragging=self._is_dragging,
-            is_interrupted=lambda: bool(self._waiting),
+            is_interrupted=lambda: can_interrupt and bool(self._waiting),
         )
         if times_ms is not None:
             times_ms["simulation"] = 1e3 * self.result.seconds_s

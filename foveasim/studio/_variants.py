@@ -59,8 +59,9 @@ def compare(a: Simulated, b: Simulated) -> dict[str, Any]:
     """
     half_um = min(_half_side_um(result.capture.layout) for result in (a, b))
     readout = None if a.shot.rules is None else a.shot.rules.readout
-    frames_per_s = 1.0 / a.shot.exposure_s if readout is None else readout.frames_per_s
-    rate_bit_per_s = budget_of(a.shot.camera, frames_per_s).data_rate_bit_per_s
+    exposure_s = a.shot.exposure_s
+    frames_per_s = readout.frames_per_s if readout is not None else 1.0 / exposure_s if exposure_s > 0 else None
+    rate_bit_per_s = frames_per_s and budget_of(a.shot.camera, frames_per_s).data_rate_bit_per_s
     found = [_measures(result, rate_bit_per_s, half_um) for result in (a, b)]
     rows = [
         {"name": name, "label": label, "unit": unit, "values": [each[name] for each in found]}
@@ -74,12 +75,12 @@ def compare(a: Simulated, b: Simulated) -> dict[str, Any]:
     }
 
 
-def _measures(result: Simulated, rate_bit_per_s: float, half_um: float) -> dict[str, float | None]:
+def _measures(result: Simulated, rate_bit_per_s: float | None, half_um: float) -> dict[str, float | None]:
     budget = budget_of(result.shot.camera, 1.0)
     found: dict[str, float | None] = {
         "n_sites": budget.n_sites,
         "bits_per_frame": budget.data_rate_bit_per_s,
-        "frames_per_s": rate_bit_per_s / budget.data_rate_bit_per_s,
+        "frames_per_s": rate_bit_per_s and rate_bit_per_s / budget.data_rate_bit_per_s,
         "readout_steps": budget.readout_steps,
         "area_mm2": budget.area_um2 * MM2_PER_UM2,
         "total_e": float(result.capture.electrons.sum(dtype=np.float64)),
@@ -91,7 +92,7 @@ def _measures(result: Simulated, rate_bit_per_s: float, half_um: float) -> dict[
         try:
             picture = result.capture.picture(of="light_e", per="um2", grid=grid, sensor=camera.sensor)
             reference = camera.reference(scene, grid, exposure_s=result.shot.exposure_s)
-            quality = quality_by_eccentricity(picture, reference, edges_um=np.array([0.0, 1.0]))
+            quality = quality_by_eccentricity(picture, reference, edges_um=np.array([0.0, side_um]))
             found |= {f"{name}_psnr_db": quality.psnr_db, f"{name}_ssim": quality.ssim}
         except FoveasimError:  # such as a uniform image, or one outside the image circle
             found |= {f"{name}_psnr_db": None, f"{name}_ssim": None}

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from foveasim._io import sandbox
 from foveasim._io.sandbox import iterate_in_sandbox
 from foveasim.errors import FileError
 
@@ -113,3 +114,10 @@ def test_process_ends_with_iterator(iterate):
             return
         time.sleep(0.05)
     pytest.fail("the process continues")
+
+
+def test_process_that_ends_early_is_reported(iterate, monkeypatch):
+    monkeypatch.setattr(sandbox, "COMMAND", (sys.executable, "-c", ""))
+
+    with pytest.raises(FileError, match="reading it as a film crashed"):
+        next(iterate("count", n="x" * 2**20))  # more than a pipe contains

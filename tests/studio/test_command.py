@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import queue
 import socket
+import threading
+import webbrowser
 
 import pytest
 from typer.testing import CliRunner
@@ -30,8 +33,22 @@ def started(monkeypatch):
     return found
 
 
+class Browser:
+    """Records the addresses that it opens."""
+
+    def __init__(self, name, opened):
+        self.name, self.opened = name, opened
+
+    def open(self, address):
+        self.opened.put(address)
+
+
+def no_browser():
+    raise webbrowser.Error
+
+
 def test_address_is_printed_without_browser(started, monkeypatch):
-    monkeypatch.setattr("webbrowser.open", lambda _: False)
+    monkeypatch.setattr("webbrowser.get", no_browser)
     result = CliRunner().invoke(app, ["studio"])
 
     assert result.exit_code == 0
@@ -42,17 +59,34 @@ def test_address_is_printed_without_browser(started, monkeypatch):
 
 
 def test_browser_opens_address(started, monkeypatch):
-    opened = []
-    monkeypatch.setattr("webbrowser.open", lambda address: not opened.append(address))
+    opened = queue.Queue()
+    monkeypatch.setattr("webbrowser.get", lambda: Browser("firefox", opened))
     result = CliRunner().invoke(app, ["studio", str(demo_settings()[1])])
 
-    assert opened[0] in result.output
+    assert opened.get(timeout=60.0) in result.output
     assert "no browser" not in result.output
     assert started[0].start.name == "four_zones"
 
 
+def test_text_browsers_are_not_opened(started, monkeypatch):
+    monkeypatch.setattr("webbrowser.get", lambda: Browser("w3m", None))
+
+    assert "no browser found" in CliRunner().invoke(app, ["studio"]).output
+
+
+def test_waiting_browser_delays_nothing(started, monkeypatch):
+    is_closed = threading.Event()
+    browser = Browser("kiosk", queue.Queue())
+    browser.open = lambda _: is_closed.wait(60.0)
+    monkeypatch.setattr("webbrowser.get", lambda: browser)
+    result = CliRunner().invoke(app, ["studio"])
+    is_closed.set()
+
+    assert "studio at" in result.output
+
+
 def test_no_browser_opens_none(started, monkeypatch):
-    monkeypatch.setattr("webbrowser.open", lambda _: pytest.fail("opened"))
+    monkeypatch.setattr("webbrowser.get", lambda: pytest.fail("opened"))
 
     assert len(CliRunner().invoke(app, ["studio", "--no-browser"]).output.splitlines()) == 1
 
@@ -120,6 +154,28 @@ def test_other_hosts_give_warning(started):
         run_studio(host="0.0.0.0", open_browser=False, announce=lambda *_: None)
 
     assert any(name.startswith(f"{socket.gethostname().lower()}:") for name in started[0].hosts)
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
+def test_printed_address_is_reachable(monkeypatch, host):
+    if host == "::" and not socket.has_ipv6:
+        pytest.skip("this computer has no IPv6")
+    connected = []
+
+    def connect(served, _listener, announce):
+        announce()
+        served.close()
+
+    def announce(address, _):
+        name, _, port = address.removeprefix("http://").partition("/")[0].rpartition(":")
+        with socket.create_connection((name.strip("[]"), int(port)), timeout=10.0):
+            connected.append(address)
+
+    monkeypatch.setattr(_server, "serve", connect)
+    with pytest.warns(FoveasimWarning):
+        run_studio(host=host, open_browser=False, announce=announce)
+
+    assert len(connected) == 1
 
 
 def test_host_names_have_the_port():

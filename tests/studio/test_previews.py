@@ -241,7 +241,46 @@ def test_rest_releases_unused_memory(settings, make_threaded, monkeypatch):
     assert not released.wait(0.3)  # only once in each rest
 
 
+def test_complete_result_releases_memory(large, make_threaded, monkeypatch):
+    released = threading.Event()
+    monkeypatch.setattr(_session, "RELEASE_S", 0.05)
+    monkeypatch.setattr(_session, "release_memory", released.set)
+    session = make_threaded(large)
+    listener = Listener(session)
+    session.post({"do": "set", "key": "optics.f_number", "value": 4.0, "final": False, "id": 5})
+    listener.wait(lambda m: m.get("kind") == "done" and m["id"] == 5 and not m["is_preview"])
+
+    assert released.wait(60.0)
+
+
 # -- interruption -----------------------------------------------------------------------------------------------------------
+
+
+def test_closing_stops_the_simulation(settings, make_threaded, monkeypatch):
+    is_started = threading.Event()
+    monkeypatch.setattr(Session, "_check", slowly(Session._check, is_started))
+    session = make_threaded(settings)
+    session.post({"do": "refresh"})
+    assert is_started.wait(60.0)
+    session.close()
+    session._thread.join(60.0)
+
+    assert session.result is None
+    assert not session.uploads.exists()
+
+
+def slowly(check, is_started):
+    """Return a check that waits until the session is closed."""
+
+    def wait(session):
+        is_started.set()
+        for _ in range(6000):
+            if session._is_closed:
+                break
+            time.sleep(0.01)
+        check(session)
+
+    return wait
 
 
 def test_check_stops_before_the_next_stage(settings):

@@ -189,7 +189,9 @@ def test_other_hosts_and_origins_are_rejected(served, name, value, status):
                 run(connect())
 
 
-@pytest.mark.parametrize("first", ['{"token": "wrong"}', "{}", "[]", "x", '{"token": 5}', '{"token": "é"}'])
+@pytest.mark.parametrize(
+    "first", ['{"token": "wrong"}', "{}", "[]", "x", '{"token": 5}', '{"token": "é"}', r'{"token": "\ud800"}']
+)
 def test_wrong_tokens_close_the_socket(served, first):
     async def attempt():
         async with websockets.connect(f"ws://{served.host}/socket") as connection:
@@ -333,13 +335,30 @@ def test_uploads_have_limits(served, monkeypatch):
     monkeypatch.setattr(_server, "MAX_FILE_BYTES", 1000)
     assert served.authorised(session, "/file?name=a.png", b"x" * 1001)[0] == 413
     assert served.authorised(session, "/file?name=a.png", b"x" * 1000)[0] == 200
-    monkeypatch.setattr(_server, "MAX_SESSION_BYTES", 1500)
+    served.studio.sessions[session].n_free_bytes = 500
     assert served.authorised(session, "/file?name=a.png", b"x" * 600)[0] == 413
     assert served.authorised(session, "/file?name=a.png", b"")[0] == 400
     assert served.authorised("other", "/file?name=a.png", b"x")[0] == 404
     assert served.get("/file?name=a.png", b"x")[0] == 403
     assert served.get("/download?what=yaml", Authorization="Bearer wrong")[0] == 403
     assert len(list(served.studio.sessions[session].uploads.iterdir())) == 1
+
+
+def test_failed_downloads_give_one_line(served, monkeypatch):
+    async def visit():
+        page = await opened(served)
+        answer = await asyncio.to_thread(served.authorised, page.hello["session"], "/download?what=gds")
+        await page.connection.close()
+        return answer
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(_server, "write_layout", fail)
+    status, _, content = run(visit())
+
+    assert status == 400
+    assert "No space left on device" in json.loads(content)["error"]
 
 
 @pytest.mark.parametrize("what", ["yaml", "python", "gds", "oas", "geojson", "npz", "svg", "png"])

@@ -8,6 +8,7 @@ import json
 import threading
 import time
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -446,6 +447,70 @@ def test_saved_settings_give_same_codes(make_session, tmp_path):
     assert result.exit_code == 0
     codes = fs.Capture.load(tmp_path / "run" / "my_shot_capture.npz").code
     assert np.array_equal(codes, recorder.session.result.capture.code)
+
+
+def test_save_keeps_pictures_of_earlier_saves(make_session, tmp_path):
+    out = tmp_path / "out"
+    codes = {}
+    for n, name in enumerate(("first", "second", "again")):
+        recorder = make_session(out=out)
+        pixels = np.random.default_rng(min(n, 1)).integers(0, 255, (40, 40, 3)).astype(np.uint8)
+        write_picture(tmp_path / "photo.png", pixels)
+        path = recorder.session.add_file("photo.png", (tmp_path / "photo.png").read_bytes())
+        recorder.do(do="file", path=str(path), **{"as": "scene"})
+        recorder.do(do="save", name=name)
+        codes[name] = recorder.session.result.capture.code
+
+    assert {each.name for each in out.glob("*.png")} == {"photo.png", "photo_2.png"}
+    for name, expected in codes.items():
+        assert np.array_equal(codes_of(start_settings(out / f"{name}.yaml")[0]), expected)
+
+
+def test_uploads_never_share_a_path(recorder):
+    with ThreadPoolExecutor(8) as pool:
+        paths = list(pool.map(lambda n: recorder.session.add_file("a.bin", b"%d" % n), range(40)))
+
+    assert sorted(path.read_bytes() for path in paths) == sorted(b"%d" % n for n in range(40))
+
+
+def test_uploads_never_exceed_the_limit(recorder):
+    recorder.session.n_free_bytes = 1000
+    with ThreadPoolExecutor(8) as pool:
+        paths = list(pool.map(lambda _: recorder.session.add_file("a.bin", bytes(300)), range(20)))
+
+    assert sum(path is not None for path in paths) == 3
+
+
+def test_frozen_variant_is_sent_before_changes(recorder):
+    recorder.handle([
+        {"do": "set", "key": "exposure_s", "value": 0.02, "final": True, "id": 1},
+        {"do": "freeze", "id": 2},
+        {"do": "set", "key": "exposure_s", "value": 0.005, "final": True, "id": 3},
+    ])  # fmt: skip
+    done = [message["id"] for message in recorder.messages if message["kind"] == "done"]
+    columns = [arrays for header, arrays in recorder.parts if header["part"] == "columns"]
+    frozen = [message["frozen"] for message in recorder.messages if message["kind"] == "state"][-1]
+
+    assert done == [2, 3]
+    assert len(columns) == 2
+    assert frozen["summary"]["exposure_s"] == 0.02
+
+
+def test_comparison_without_exposure_has_no_rate(recorder):
+    recorder.do(do="set", key="exposure_s", value=0.0, final=True)
+    recorder.do(do="views", names=["comparison"])
+    recorder.do(do="freeze")
+    about = next(header["about"] for header, _ in recorder.parts if header["part"] == "comparison")
+    values = {row["name"]: row["values"] for row in about["rows"]}
+
+    assert values["frames_per_s"] == [None, None]
+    assert values["bits_per_frame"][0] > 0
+
+
+def test_text_without_format_gives_one_line(recorder):
+    recorder.do(do="text", id=4)
+
+    assert [(m["id"], m["text"]) for m in recorder.messages if m["kind"] == "error"] == [(4, "'what' must be a string")]
 
 
 def wait_until(condition, timeout_s=20.0):

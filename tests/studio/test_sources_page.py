@@ -301,6 +301,41 @@ def test_camera_frames_follow_live(visit_camera, tmp_path):
     assert page.is_disabled("#undo")
 
 
+def test_restarted_camera_sends_frames_once(visit_camera):
+    page = visit_camera()
+    start_camera(page)
+    until(page, "() => studio.state.film && studio.state.film.n >= 2")
+    page.evaluate("""() => { const { sources } = studio, answered = sources._answered.bind(sources);
+      window.waiting = window.most = 0;
+      sources._answered = async (id) => { window.most = Math.max(window.most, ++window.waiting); const found = await answered(id); window.waiting--; return found; };
+      sources.stopCamera(); sources.startCamera(); }""")
+    until(page, "() => studio.sources.isLive && studio.state.film.n >= 2")
+    page.evaluate("() => { window.most = 0; }")
+    n = page.evaluate("studio.state.film.n")
+    until(page, "n => studio.state.film.n >= n + 4", n)
+
+    assert page.evaluate("most") == 1
+    assert page.evaluate("studio.sources.camera.isOn")
+
+
+def test_frames_fit_into_messages(visit):
+    page = visit()
+    sizes = page.evaluate("""async () => { const { Camera } = await import("/static/camera.js"), camera = new Camera(), found = [];
+      camera.size = 640;
+      for (const [width, height] of [[640, 480], [480, 640], [1280, 1280], [1920, 1080], [100, 80]]) {
+        const canvas = document.createElement("canvas");
+        canvas.width = width; canvas.height = height;
+        canvas.videoWidth = width; canvas.videoHeight = height;
+        camera.video = canvas;
+        const frame = camera.frame();
+        found.push([frame.width, frame.height, frame.pixels.length]);
+      }
+      return found; }""")
+
+    assert [size[:2] for size in sizes] == [[640, 480], [480, 640], [572, 572], [640, 360], [100, 80]]
+    assert max(size[2] for size in sizes) < 2**20 - 1000
+
+
 def test_undo_stops_the_camera(visit_camera):
     page = visit_camera()
     start_camera(page)

@@ -135,11 +135,30 @@ def test_violation_moves_the_view(visit):
     until(page, "() => document.querySelectorAll('.violations button').length > 0")
     page.locator(".violations button").first.click()
     until(page, "() => studio.page.asked === null")
-    x0, y0, x1, y1 = page.evaluate("[...studio.rules.trace.box]")
+    x0, y0, x1, y1 = page.evaluate("[...studio.rules.traceOn(studio.panes.b.sites).box]")
     view = page.evaluate("(({ x, y, scale, width }) => ({ x, y, span: width / scale }))(studio.panes.b.map)")
 
     assert (view["x"], view["y"]) == pytest.approx((0.5 * (x0 + x1), 0.5 * (y0 + y1)), abs=1e-6)
     assert view["span"] < 400.0
+
+
+def test_violations_of_earlier_layout_vanish(visit):
+    page = visit()
+    page.click("[data-tile=rules]")
+    set_value(page, "layout.rules.min_size_um", 12.0)
+    until(page, "() => document.querySelectorAll('.violations button').length > 0")
+    page.locator(".violations button").first.click()
+    page.click("[data-tile=rules]")
+    page.evaluate("""() => { const { violations } = studio.rules; window.nDrawn = 0;
+      violations.drawMarkers = () => { window.nDrawn++; }; studio.panes.b.shown = {}; studio.panes.b.draw(); }""")
+    assert page.evaluate("nDrawn") == 1
+    set_value(page, "layout.parameters.n_sectors", 36)
+
+    assert page.evaluate("nDrawn") == 1
+    assert page.evaluate("studio.rules.traceOn(studio.panes.b.sites)") is None
+    page.click("[data-tile=rules]")
+    until(page, "() => studio.isReady && studio.page.doneId >= studio.connection.id")
+    assert page.evaluate("studio.rules.sites === studio.panes.b.sites")
 
 
 def test_maps_draw_colours_of_sites(visit):
@@ -270,6 +289,19 @@ def test_slider_drag_is_one_step(visit):
     assert page.is_disabled("#undo")
 
 
+def test_slider_back_at_start_is_released(visit):
+    page = visit()
+    page.evaluate("""() => { const slider = document.querySelector(".control[data-key='optics.f_number'] input[type=range]"), start = slider.value;
+      for (const value of [Number(start) + 50, start]) { slider.value = value; slider.dispatchEvent(new Event("input", { bubbles: true })); }
+      slider.dispatchEvent(new PointerEvent("pointerup", { bubbles: true })); }""")
+    until(page, "() => studio.isReady && studio.page.doneId >= studio.connection.id")
+    assert setting(page, "optics.f_number") == 2.8
+    assert page.is_disabled("#undo")
+    change(page, "() => { studio.connection.set('optics.f_number', 5.6, true); }")
+
+    assert page.input_value(".control[data-key='optics.f_number'] input[type=text]") == "5.6"
+
+
 def test_previews_wait_for_answers(visit):
     page = visit()
     page.evaluate("""() => { window.waits = []; const send = studio.connection.socket.send.bind(studio.connection.socket);
@@ -377,6 +409,24 @@ def test_variants_have_common_view_and_scale(visit):
     page.click("#freeze")
     until(page, "() => !studio.page.frozen")
     assert page.is_hidden("#map-a")
+
+
+def test_variant_is_that_of_the_server(visit):
+    page = visit()
+    set_value(page, "exposure_s", 0.004)
+    expected = codes(page)
+    set_value(page, "exposure_s", 0.02)
+    change(
+        page,
+        """() => { studio.connection.set("exposure_s", 0.004, true); document.getElementById("freeze").click();
+      studio.connection.set("exposure_s", 0.03, true); }""",
+    )
+    a = page.evaluate("[...studio.panes.a.columns.find((c) => c.key === 'code').values]")
+
+    assert a == expected.tolist()
+    assert page.evaluate("studio.page.frozen.summary.exposure_s") == 0.004
+    assert codes(page).mean() > expected.mean()
+    page.click("#freeze")
 
 
 def test_gaze_follows_drag_on_scene(visit):

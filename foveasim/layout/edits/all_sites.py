@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.rings import next_vertex, positions_in_runs
+from foveasim._core.rings import positions_in_runs
 from foveasim._core.validation import (
     MAX_LENGTH_UM,
     Ints,
@@ -26,7 +26,7 @@ from foveasim._core.validation import (
     unmasked,
 )
 from foveasim.errors import GeometryError, ParameterError
-from foveasim.layout._noding import points_on_edges
+from foveasim.layout._noding import insert_points
 from foveasim.layout._regions import as_region
 from foveasim.layout.adjacency import TOUCHING_UM, adjacency
 from foveasim.layout.drc.measurements import is_below_size
@@ -298,17 +298,10 @@ def node(layout: Layout) -> Layout:
         The same sites. T-junctions have a vertex on both sides afterwards, so rotation, snapping and the database unit of
         a GDSII file do not open gaps there.
     """
-    points, _ = np.unique(layout.xy_um, axis=0, return_index=True)
-    after = next_vertex(layout.ring_offsets)
-    begin, end = layout.xy_um, layout.xy_um[after]
-    edge, point, t = points_on_edges(points, begin, end)
-    # The new vertices follow the first one of the edge, in order along it.
-    owner = np.concatenate((np.arange(begin.shape[0]), edge))
-    order = np.lexsort((np.concatenate((np.zeros(begin.shape[0]), t)), owner))
-    n_new = np.bincount(edge, minlength=begin.shape[0])
+    xy_um, ring_offsets, _ = insert_points(layout.xy_um, layout.ring_offsets, np.unique(layout.xy_um, axis=0))
     return Layout._from_checked(  # noqa: SLF001 -- of the same subpackage
-        np.concatenate((begin, points[point]))[order],
-        np.concatenate(([0], np.cumsum(n_new + 1)))[layout.ring_offsets],
+        xy_um,
+        ring_offsets,
         layout.site_offsets,
         layout.columns,
         layout._extend_provenance("noded"),  # noqa: SLF001 -- of the same subpackage

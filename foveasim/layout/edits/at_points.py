@@ -12,7 +12,6 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike
 
-from foveasim._core.rings import next_vertex
 from foveasim._core.validation import (
     MAX_LENGTH_UM,
     Floats,
@@ -22,7 +21,7 @@ from foveasim._core.validation import (
     finite_array,
 )
 from foveasim.errors import GeometryError, ParameterError
-from foveasim.layout._noding import points_on_edges
+from foveasim.layout._noding import insert_points
 from foveasim.layout.edit_registry import layout_edit
 from foveasim.layout.edits._parts import replace_sites, separate_parts
 from foveasim.layout.edits.all_sites import merge, split
@@ -158,7 +157,7 @@ def split_at(layout: Layout, points_um: ArrayLike, *, n_x: int = 2, n_y: int = 1
         When a point lies outside all sites, or a number is below 1.
     """
     sites = np.unique(sites_at(layout, points_um))
-    parts = split(layout[sites], n_x=check_count("n_x", n_x), n_y=check_count("n_y", n_y))
+    parts = split(layout[sites], n_x=n_x, n_y=n_y)
     parent = sites[parts.columns["parent"]]
     return replace_sites(layout, sites, parts.polygons(), parent, f"{sites.size} sites split")
 
@@ -189,9 +188,7 @@ def cut_along(layout: Layout, line_um: ArrayLike, *, points_um: ArrayLike | None
     vertices = _points("line_um", line_um, at_least=2)
     line = shapely.LineString(vertices)
     if points_um is None:
-        low_um, high_um = vertices.min(axis=0), vertices.max(axis=0)
-        box = layout.site_bounds_um
-        sites = np.flatnonzero(((box[:, :2] <= high_um) & (box[:, 2:] >= low_um)).all(axis=1))
+        sites = _in_box(layout, vertices.min(axis=0), vertices.max(axis=0))
     else:
         sites = np.unique(sites_at(layout, points_um))
     polygons = layout[sites].polygons()
@@ -263,7 +260,7 @@ def move_vertices(layout: Layout, from_um: ArrayLike, to_um: ArrayLike, *, toler
     Raises
     ------
     GeometryError
-        When an outline would cross itself or vanish; ``.site_ids`` are its index.
+        When an outline would cross itself or vanish; ``.site_ids`` contains the index of its site.
     ParameterError
         When a point is neither a vertex nor on an edge, or the numbers of points differ.
     """
@@ -298,7 +295,7 @@ def remove_vertices(layout: Layout, points_um: ArrayLike, *, tolerance_um: float
     Raises
     ------
     GeometryError
-        When an outline would cross itself or vanish; ``.site_ids`` are its index.
+        When an outline would cross itself or vanish; ``.site_ids`` contains the index of its site.
     ParameterError
         When there is no vertex at a point.
     """
@@ -356,12 +353,16 @@ def _points(name: str, points_um: Any, at_least: int = 1) -> Floats:
     return points
 
 
+def _in_box(layout: Layout, low_um: Floats, high_um: Floats) -> Ints:
+    """Return the sites whose bounding boxes touch a box."""
+    bounds_um = layout.site_bounds_um
+    return np.flatnonzero(((bounds_um[:, :2] <= high_um) & (bounds_um[:, 2:] >= low_um)).all(axis=1))
+
+
 def _near(layout: Layout, points_um: Floats, distance_um: float) -> Ints:
     """Return the sites whose bounding boxes are near points."""
-    low_um, high_um = points_um.min(axis=0) - distance_um, points_um.max(axis=0) + distance_um
-    box = layout.site_bounds_um
-    sites = np.flatnonzero(((box[:, :2] <= high_um) & (box[:, 2:] >= low_um)).all(axis=1))
-    boxes = shapely.box(*(box[sites].T + distance_um * np.array([[-1.0], [-1.0], [1.0], [1.0]])))
+    sites = _in_box(layout, points_um.min(axis=0) - distance_um, points_um.max(axis=0) + distance_um)
+    boxes = shapely.box(*(layout.site_bounds_um[sites].T + distance_um * np.array([[-1.0], [-1.0], [1.0], [1.0]])))
     found = shapely.STRtree(boxes).query(shapely.points(points_um), predicate="intersects")[1]
     return np.asarray(sites[np.unique(found)], dtype=np.int64)
 
@@ -377,22 +378,14 @@ def _with_vertices_at(layout: Layout, points_um: Floats, tolerance_um: float) ->
     """Return the sites at points, and their layout with a vertex at each point on their edges."""
     sites = _near(layout, points_um, tolerance_um)
     part = layout[sites]
-    begin, end = part.xy_um, part.xy_um[next_vertex(part.ring_offsets)]
     found, vertex = _vertices_at(part, points_um, tolerance_um)
     # An edge through a vertex of a neighbour receives this vertex, which the point is replaced by.
     exact_um = points_um.copy()
     exact_um[found] = part.xy_um[vertex]
-    edge, point, fraction = points_on_edges(exact_um, begin, end, tolerance_um)
+    xy_um, ring_offsets, point = insert_points(part.xy_um, part.ring_offsets, exact_um, tolerance_um)
     _require_all("from_um", points_um, np.concatenate((found, point)), "must be a vertex or a point on an edge")
-    owner = np.concatenate((np.arange(begin.shape[0]), edge))
-    order = np.lexsort((np.concatenate((np.zeros(begin.shape[0]), fraction)), owner))
-    n_new = np.bincount(edge, minlength=begin.shape[0])
     return sites, Layout._from_checked(  # noqa: SLF001 -- of the same subpackage
-        np.concatenate((begin, exact_um[point]))[order],
-        np.concatenate(([0], np.cumsum(n_new + 1)))[part.ring_offsets],
-        part.site_offsets,
-        part.columns,
-        part.provenance,
+        xy_um, ring_offsets, part.site_offsets, part.columns, part.provenance
     )
 
 

@@ -61,7 +61,7 @@ def draw(
     if overlap == "cut":
         layout = _without(layout, shapely.union_all(shapes))
     elif overlap == "fill":
-        shapes = _outside(shapes, layout)
+        shapes, _ = _parts_outside(shapes, layout, 0.0)
         if shapes.size == 0:
             raise ParameterError("outlines_um", "must contain an area outside existing sites", hint="use overlap: cut")
     drawn = Layout.from_polygons(shapes)
@@ -155,10 +155,6 @@ def _without(layout: Layout, area: Any) -> Layout:
     parts, shape = separate_parts(layout, shapely.difference(polygons, area), near)
     parts = shapely.remove_repeated_points(parts, TOUCHING_UM)
     return replace_sites(layout, near, parts, near[shape], f"area of {near.size} sites cut out")
-
-
-def _outside(polygons: NDArray[Any], layout: Layout) -> NDArray[Any]:
-    return _parts_outside(polygons, layout, 0.0)[0]
 
 
 def _parts_outside(polygons: NDArray[Any], layout: Layout, margin_um: float) -> tuple[NDArray[Any], Ints]:

@@ -1,7 +1,8 @@
 // Frames of a camera of this computer.
 
-// Longer sides of frames, pixels: three bytes per pixel of the largest are below the limit of a message.
+// Longer sides of frames, pixels, and largest number of pixels: three bytes each, below the limit of a message.
 export const SIZES = [240, 320, 480, 640];
+const MAX_PIXELS = 327680;
 export const FIRST_SIZE = 480;
 const PROBLEMS = {
   NotAllowedError: "The browser does not permit the camera for this page",
@@ -40,7 +41,8 @@ export class Camera {
 
   // Returns the present frame: { width, height, pixels: RGB, top row first }.
   frame() {
-    const { videoWidth, videoHeight } = this.video, scale = Math.min(1, this.size / Math.max(videoWidth, videoHeight));
+    const { videoWidth, videoHeight } = this.video;
+    const scale = Math.min(1, this.size / Math.max(videoWidth, videoHeight), Math.sqrt(MAX_PIXELS / (videoWidth * videoHeight)));
     const width = Math.max(1, Math.round(scale * videoWidth)), height = Math.max(1, Math.round(scale * videoHeight)), { canvas } = this;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     const context = canvas.getContext("2d", { willReadFrequently: true, alpha: false });

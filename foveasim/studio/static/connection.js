@@ -166,7 +166,7 @@ export class Connection {
   async fetchFile(what) {
     try {
       const answer = await fetch("/download?what=" + what, { headers: this.headers });
-      if (answer.ok && !(answer.headers.get("Content-Type") || "").startsWith("application/problem")) return { blob: await answer.blob() };
+      if (answer.ok) return { blob: await answer.blob() };
       const found = await answer.json().catch(() => ({}));
       return { error: found.error || "The file is not available (status " + answer.status + ")" };
     } catch {

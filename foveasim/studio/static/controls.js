@@ -173,13 +173,20 @@ class Row {
     this.slider.step = 1;
     this.slider.setAttribute("aria-label", this.control.label + " slider");
     const value = () => this.range.toValue(Number(this.slider.value));
+    const release = () => {
+      if (!this.isHeld) return;
+      this.isHeld = false;
+      this._send(value(), true);
+    };
     this.slider.addEventListener("input", () => {
       this.isHeld = true;
+      // No change is reported when the slider returns to its start.
+      for (const type of ["pointerup", "pointercancel"]) addEventListener(type, release, { once: true });
       this.field.value = fieldText(value());
       this._fill();
       this._send(value(), false);
     });
-    this.slider.addEventListener("change", () => { this.isHeld = false; this._send(value(), true); });
+    for (const type of ["change", "blur"]) this.slider.addEventListener(type, release);
     this._place(NaN);
     this.root.append(this.slider);
   }
@@ -325,11 +332,9 @@ export class Controls {
     this.rows = new Map();
     const groups = new Map();
     const forms = new Set(list.filter((one) => one.id === one.key + ":form").map((one) => one.key));
-    const defaults = new Map(list.filter((one) => forms.has(one.key) && one.id === one.key).map((one) => [one.key, one.default]));
     for (const described of list) {
-      // The value after the choice of its form, which has the same default.
+      // The value after the choice of its form.
       const control = { ...described, label: labelOf(described), is_value: forms.has(described.key) && described.id === described.key };
-      if (control.id === control.key + ":form") control.default ??= defaults.get(control.key);
       if (/\.per_um2$/.test(control.key)) control.unit = "";
       if (!control.unit && / fraction$/.test(control.label)) Object.assign(control, { label: control.label.slice(0, -9), unit: "fraction" });
       const id = control.id || control.key, known = before.get(id), shape = shapeOf(control);
@@ -432,14 +437,5 @@ export class Controls {
     }
     this._filter();
     return rest;
-  }
-
-  // Opens the section of a control and moves the focus to it.
-  show(key) {
-    const row = this.rows.get(key);
-    if (!row) return;
-    row.root.closest("details").open = true;
-    (row.field ?? row.adder)?.focus();
-    row.root.scrollIntoView({ block: "nearest" });
   }
 }

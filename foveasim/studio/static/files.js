@@ -70,7 +70,7 @@ export class Files {
       notice(file.name + ": " + answer.error);
       return;
     }
-    const use = answer.as || useOf(file.name);
+    const use = useOf(file.name);
     this.connection.send(use === "video" ? { do: "video", path: answer.path } : { do: "file", path: answer.path, as: use });
   }
 

@@ -34,6 +34,7 @@ export class RulesList {
   use(rules, arrays, sites) {
     const before = this.rules[this.rule]?.name;
     this.rules = rules;
+    this.sites = sites;
     this.violations = rules.length && ARRAYS.every((name) => arrays[name]) ? new Violations(arrays, rules, sites) : null;
     this.chosen = null;
     const option = (value, text) => { const element = make("option", text); element.value = value; return element; };
@@ -81,15 +82,15 @@ export class RulesList {
     }
   }
 
-  // The chosen violation as a path with its box, or null.
-  get trace() {
+  // Returns the chosen violation as a path with its box, or null; also for sites other than those of the violations.
+  traceOn(sites) {
     const { violations, chosen } = this;
-    if (!violations || chosen === null) return null;
+    if (!violations || chosen === null || sites !== this.sites) return null;
     return { path: (context, map) => violations.trace(context, chosen, map), box: violations.boxes.subarray(4 * chosen, 4 * chosen + 4) };
   }
 
-  // Draws markers of the listed violations in view.
-  draw(context, map) {
-    this.violations?.drawMarkers(context, map, this.rule);
+  // Draws markers of the listed violations in view; none on sites other than those of the violations.
+  draw(context, map, sites) {
+    if (sites === this.sites) this.violations?.drawMarkers(context, map, this.rule);
   }
 }

@@ -1,6 +1,6 @@
 // A map of photosites: colours, outlines, marks, legend; two of them show two variants with the same view.
 
-import { Scale, brief, bytesOfHex } from "/web/colours.js";
+import { Scale, bytesOfHex } from "/web/colours.js";
 import { listenToPointers } from "/web/gestures.js";
 import { fitCanvas, pixelRatio } from "/web/gl.js";
 import { drawRamp, kindsOf, swatchItem, tickLabels, titleOf } from "/web/legend.js";
@@ -85,6 +85,7 @@ export class SitePane {
     if (isNew) this._createMap(sites);
     else this.map.use(sites);
     // The raster map averages small sites itself.
+    clearTimeout(this.overview?.resting);
     this.overview = this.map.gl ? new Overview(this.overviewCanvas, sites) : null;
     this.resize();
     if (isWhole) this.fit();
@@ -193,7 +194,7 @@ export class SitePane {
     return true;
   }
 
-  // Marks: { cursor, isOwn, hovered, pinned, rectangle, selected, chosen }.
+  // Draws marks: { cursor, hovered, pinned, rectangle, selected, trace }.
   drawMarks({ cursor, hovered, pinned, rectangle, selected, trace }) {
     if (!this.isShown) return;
     const isAt = cursor && cursor.from !== this, state = [hovered, pinned, rectangle, selected.length, selected[0], trace && [...trace.box], isAt && [cursor.x, cursor.y]];
@@ -225,5 +226,3 @@ export class SitePane {
 
   sitesIn(rectangle) { return this.sites ? sitesIn(this.sites, rectangle) : []; }
 }
-
-export const countText = (n) => (n >= 1e5 ? brief(n) : n.toLocaleString("en-US"));

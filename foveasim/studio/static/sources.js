@@ -14,7 +14,7 @@ const MAX_PICTURES = 500;
 export const isVideo = (name) => VIDEO.test(name);
 
 export class Sources {
-  // Callbacks: connection(), state(), charts() (choices of the scene), choose() (a file), uploadAs(file).
+  // Callbacks: connection(), state(), charts() (choices of the scene), choose() (a file).
   constructor(pane, on) {
     this.pane = pane;
     this.on = on;
@@ -284,8 +284,10 @@ export class Sources {
     this.rate = new Rate();
     this.isLive = false;
     this._show();
+    // The camera may be stopped and started again while a frame is simulated.
+    const { stream } = this.camera;
     let isFirst = true;
-    while (this.camera.isOn) {
+    while (this.camera.stream === stream) {
       if (document.hidden) {
         await new Promise((resolve) => { document.addEventListener("visibilitychange", resolve, { once: true }); });
         continue;
@@ -298,7 +300,7 @@ export class Sources {
       this.rate.count();
       this._show();
     }
-    this.stopCamera();
+    if (this.camera.stream === stream) this.stopCamera();
   }
 
   stopCamera() {

@@ -43,7 +43,7 @@ const reducesMotion = matchMedia("(prefers-reduced-motion: reduce)");
 
 const page = {
   state: null, parts: {}, frozen: null, cursor: null, hovered: -1, pinned: -1, rectangle: null, selected: [], range: null, key: null, wantsLog: undefined, sizeTimer: 0,
-  isSelecting: false, tiles: new Set(), asked: null, gazeAt: null, lastMs: NaN, nDone: 0, drawn: 0, boundary: null, isBusy: false,
+  isSelecting: false, tiles: new Set(), asked: null, gazeAt: null, lastMs: NaN, nDone: 0, boundary: null, isBusy: false,
 };
 let connection, controls, panes, charts, rules, editor, steps, sources, solid, files;
 
@@ -70,7 +70,6 @@ function drawAsked() {
   if (asked.has("b")) {
     solid.follow(panes.b);
     drawScaleBar();
-    page.drawn++;
     page.drawnAt = performance.now();
   }
   drawMarks();
@@ -80,7 +79,7 @@ function drawAsked() {
 
 function drawMarks() {
   const { cursor, rectangle, selected, pinned } = page, { a, b } = panes;
-  if (b.isShown) b.drawMarks({ cursor, hovered: page.hovered, pinned, rectangle, selected, trace: rules.trace });
+  if (b.isShown) b.drawMarks({ cursor, hovered: page.hovered, pinned, rectangle, selected, trace: rules.traceOn(b.sites) });
   if (page.frozen && a.isShown) a.drawMarks({ cursor, hovered: cursor ? a.pick(cursor.x, cursor.y) : -1, pinned: page.frozen.sites === b.sites ? pinned : -1, rectangle, selected: [], trace: null });
   for (const pane of [panes.picture, panes.pictureA, panes.scene]) pane.drawMarks({ cursor, map: b.map, boundary: page.boundary });
   solid.mark({ cursor, hovered: page.hovered, pinned });
@@ -233,11 +232,15 @@ function setBusy(isBusy) {
 
 function showStatus(text) { $("status").lastElementChild.textContent = text; }
 
-function finish({ id, ms, is_preview: isPreview }) {
+function finish({ id, is_preview: isPreview }) {
   setBusy(false);
   editor.finish();
   page.nDone++;
-  page.serverMs = ms;
+  if (page.frozen && !page.frozen.isKept && id >= page.frozen.id) {
+    page.frozen.isKept = true;
+    keepVariant();
+    recolour();
+  }
   page.isPreview = Boolean(isPreview);
   // The time to the frame that shows the result.
   const showTime = () => {
@@ -266,6 +269,7 @@ function showState(message) {
   const canMove = Boolean(gazeKey());
   $("scene").classList.toggle("can-move", canMove);
   $("gaze-note").hidden = !canMove;
+  if (state.frozen && page.frozen) page.frozen.summary = state.frozen.summary;
   showSummary();
   editor.update(state);
   steps.update();
@@ -304,7 +308,7 @@ function hello(message, { isSame }) {
 function fillPresets(presets) {
   const groups = new Map();
   for (const preset of presets) {
-    const { name, label, kind } = typeof preset === "string" ? { name: preset, label: preset } : preset;
+    const { name, label, kind } = preset;
     const option = make("option", (label || name).replaceAll("_", " "));
     option.value = name;
     if (!groups.has(kind || "")) groups.set(kind || "", []);
@@ -534,19 +538,24 @@ function gaze(dx, dy, isFinal) {
 // -- A and B ----------------------------------------------------------------------------------------------------------------
 
 function freeze() {
-  const { b, a } = panes;
-  if (!b.sites || !page.state) return;
-  page.frozen = { sites: b.sites, columns: b.columns, filterOf: b.filterOf, parts: { ...page.parts }, summary: page.state.summary, isAnswered: false };
+  if (!panes.b.sites || !page.state) return;
+  page.frozen = { isAnswered: false, isKept: false };
   $("map-a").hidden = $("picture-a").hidden = false;
   document.body.classList.add("compares");
   $("freeze").setAttribute("aria-pressed", "true");
-  a.useSites(b.sites, b.palette);
-  a.useColumns(b.columns, b.filterOf);
-  const { picture } = page.parts;
-  if (picture) panes.pictureA.use(picture.about, picture.arrays.rgba);
-  connection.send({ do: "freeze" });
+  keepVariant();
+  page.frozen.id = connection.send({ do: "freeze" });
   showTile("comparison", true);
   showVariants();
+}
+
+// Keeps what is shown as A: at the click, and again when the server has frozen its result, which may be newer.
+function keepVariant() {
+  const { b, a } = panes, { picture } = page.parts;
+  Object.assign(page.frozen, { sites: b.sites, columns: b.columns, filterOf: b.filterOf, parts: { ...page.parts }, summary: page.state.summary });
+  if (a.sites !== b.sites) a.useSites(b.sites, b.palette);
+  a.useColumns(b.columns, b.filterOf);
+  if (picture) panes.pictureA.use(picture.about, picture.arrays.rgba);
 }
 
 function unfreeze() {
@@ -716,7 +725,7 @@ function start() {
   };
   solid = new SolidPane({ hover, leave, click: (site) => { if (site >= 0) pin(site); }, changed: () => sendViews() });
   rules = new RulesList($("rules"), flyToViolation);
-  panes.b.drawViolations = (context, map) => rules.draw(context, map);
+  panes.b.drawViolations = (context, map) => rules.draw(context, map, panes.b.sites);
   panes.b.violations = () => [page.parts.rules?.version, rules.rule, rules.chosen];
   rules.select.addEventListener("change", () => ask("map"));
   controls = new Controls($("sections"), $("search"), $("only-changed"), {
