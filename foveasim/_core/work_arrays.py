@@ -22,8 +22,9 @@ __all__ = ["release_memory", "share_heap", "work_array"]
 
 #: Smaller arrays are allocated as usual: the allocator reuses their memory.
 MIN_BYTES = 1 << 20
-#: Option of mallopt of the C library of GNU: number of heaps of the process.
-M_ARENA_MAX = -8
+#: Options of mallopt of the C library of GNU: M_ARENA_MAX, the number of heaps; M_MMAP_THRESHOLD, the size of blocks outside
+#: the heap, at its maximum; M_TRIM_THRESHOLD, the free memory at the end of the heap that is returned.
+HEAP_OPTIONS = {-8: 1, -3: 1 << 25, -1: (1 << 31) - 1}
 #: Limit of the unused memory that is retained; the memory that has been unused for longest is released first.
 MAX_UNUSED_BYTES = 1 << 28
 
@@ -83,14 +84,17 @@ def work_array(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
 
 def share_heap() -> None:
     """
-    Let all threads of the process allocate from one heap.
+    Let all threads allocate from one heap, which grows until :func:`release_memory`.
 
     By default, the C library of GNU gives threads separate heaps (arenas), each of which retains parts of pages between used
-    blocks: hundreds of megabytes after some thousand different captures. For servers; no effect with other C libraries.
+    blocks: hundreds of megabytes after some thousand different captures. It also returns large blocks and the end of a heap to
+    the system at once, so that the next capture needs fresh memory. For servers; no effect with other C libraries.
     """
     if sys.platform.startswith("linux"):
         with suppress(AttributeError, OSError):
-            ctypes.CDLL(None).mallopt(M_ARENA_MAX, 1)
+            library = ctypes.CDLL(None)
+            for option, value in HEAP_OPTIONS.items():
+                library.mallopt(option, value)
 
 
 def release_memory() -> None:
