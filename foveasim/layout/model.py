@@ -432,7 +432,7 @@ class Layout:
             return read_only(self.lattice.site_bounds_um())
         return read_only(site_bounds_um(self.xy_um, self.ring_offsets, self.site_offsets))
 
-    @property
+    @cached_property
     def bounds_um(self) -> tuple[float, float, float, float]:
         """Bounding box (x_min, y_min, x_max, y_max) of the layout, µm."""
         if self.n_sites == 0:

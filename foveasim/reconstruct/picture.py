@@ -244,7 +244,8 @@ def raster_grid(layout: PackedRings, max_pixels: int) -> Grid:
     if lattice is not None:  # without its vertices
         low, high = np.array(lattice.bounds_um).reshape(2, 2)
     else:
-        low, high = layout.xy_um.min(axis=0), layout.xy_um.max(axis=0)
+        columns_um = layout.xy_um.T  # separately: many times faster than a reduction along axis 0
+        low, high = (np.array([extreme(each) for each in columns_um]) for extreme in (np.min, np.max))
     pitch_um = float((high - low).max()) / max_pixels
     n_x, n_y = (max(1, math.ceil(length / pitch_um - 1e-6)) for length in high - low)
     centre = 0.5 * (low + high)

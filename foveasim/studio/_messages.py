@@ -25,7 +25,13 @@ NOT_FINITE = {".inf": math.inf, "-.inf": -math.inf}
 
 
 def encode_part(
-    name: str, version: int, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], *, is_preview: bool = False
+    name: str,
+    version: int,
+    about: Mapping[str, Any],
+    arrays: Mapping[str, NDArray[Any]],
+    *,
+    is_preview: bool = False,
+    has_more: bool = False,
 ) -> bytes:
     """
     Encode a part: the length of the header as little-endian uint32, the header, the arrays.
@@ -41,6 +47,8 @@ def encode_part(
         Of the types in :data:`TYPES`, any shape; each begins at a multiple of 8 bytes.
     is_preview : bool
         Whether the data are those of a preview.
+    has_more : bool
+        Whether the page waits for the next part, and shows both in one frame.
     """
     described, pieces, offset = [], [], 0
     for key, array in arrays.items():
@@ -58,6 +66,7 @@ def encode_part(
             "about": to_json(dict(about)),
             "arrays": described,
             **({"is_preview": True} if is_preview else {}),
+            **({"has_more": True} if has_more else {}),
         },
         allow_nan=False,
         separators=(",", ":"),

@@ -13,7 +13,7 @@ from foveasim.errors import ParameterError
 from foveasim.studio._costs import Costs
 from foveasim.studio._engine import PICTURE_PIXELS, Simulated
 from foveasim.studio._messages import encode_part
-from foveasim.studio._parts import PARTS
+from foveasim.studio._parts import PARTS, PartData
 
 __all__ = ["Views"]
 
@@ -111,12 +111,19 @@ class Views:
         Returns
         -------
         times_ms : dict of str to float, ms, or None
-            Times by view; None after an interruption.
+            Times by view, for the message that follows the last one; None after an interruption.
         """
         result = replace(result, picture_pixels=self._pixels)
         times_ms: dict[str, float] = {}
         self.left_out = []
-        encoded: list[bytes] = []
+        made: list[tuple[str, PartData]] = []
+
+        def send(*, is_last: bool = False) -> None:
+            for n, (name, data) in enumerate(made, 1):
+                has_more = is_last or n < len(made)
+                self._send(encode_part(name, version, *data, is_preview=result.is_preview, has_more=has_more))
+            made.clear()
+
         sent_s = time.perf_counter()
         shown = [name for name in self._names if name != "comparison" or result.frozen is not None]
         # Sites and their values belong together; the others in the order of their age.
@@ -139,7 +146,7 @@ class Views:
                     continue
                 start_s = time.perf_counter()
                 try:
-                    encoded.append(encode_part(name, version, *part.make(result), is_preview=result.is_preview))
+                    made.append((name, part.make(result)))
                 except Exception as error:  # noqa: BLE001 -- one view fails, the others are shown
                     text = f"{part.label}: {self._line(error)}"
                     self._send({"kind": "error", "id": number, "part": name, "text": text})
@@ -149,17 +156,12 @@ class Views:
                 self._costs.add_part(key, name, time_s)
                 is_stopped = k >= len(FIRST) and is_interrupted()
                 if k + 1 == len(first) or is_stopped or time.perf_counter() - sent_s > TOGETHER_S:
-                    self._send_all(encoded)
+                    send()
                     sent_s = time.perf_counter()
                 if is_stopped:
                     return None
-        self._send_all(encoded)
+        send(is_last=True)
         return times_ms
-
-    def _send_all(self, encoded: list[bytes]) -> None:
-        for message in encoded:
-            self._send(message)
-        encoded.clear()
 
 
 def _weak(value: Any) -> Any:

@@ -19,7 +19,7 @@ import foveasim as fs
 from foveasim._io.images import write_picture
 from foveasim.cli import app
 from foveasim.config import build_shot, read_settings
-from foveasim.studio import _session
+from foveasim.studio import _session, _views
 from foveasim.studio._files import start_settings
 from foveasim.studio._session import Session, Start
 
@@ -464,6 +464,24 @@ def test_save_keeps_pictures_of_earlier_saves(make_session, tmp_path):
     assert {each.name for each in out.glob("*.png")} == {"photo.png", "photo_2.png"}
     for name, expected in codes.items():
         assert np.array_equal(codes_of(start_settings(out / f"{name}.yaml")[0]), expected)
+
+
+def test_parts_are_shown_in_two_frames(recorder, monkeypatch):
+    monkeypatch.setattr(_views, "TOGETHER_S", 60.0)
+    recorder.do(do="set", key="layout.parameters.pitch_um", value=13.0, final=True)
+    groups = [(header["part"], header.get("has_more", False)) for header, _ in recorder.parts]
+
+    assert groups[:2] == [("sites", True), ("columns", False)]
+    # The message "done" ends the second group.
+    assert all(has_more for _, has_more in groups[2:])
+    assert recorder.messages[-1]["kind"] == "done"
+
+
+def test_late_parts_are_shown_at_once(recorder, monkeypatch):
+    monkeypatch.setattr(_views, "TOGETHER_S", 0.0)
+    recorder.do(do="set", key="optics.f_number", value=4.0, final=True)
+
+    assert not any(header.get("has_more", False) for header, _ in recorder.parts)
 
 
 def test_uploads_never_share_a_path(recorder):

@@ -3,6 +3,7 @@
 import { brief, clamp, roundStep, shown } from "/web/colours.js";
 import { watchSize } from "/web/gl.js";
 import { inkOf, make } from "/web/page_parts.js";
+import { sizeOf } from "./frames.js";
 import { fitted } from "./site_pane.js";
 
 const FONT = "11px system-ui, sans-serif";
@@ -84,11 +85,11 @@ export class CurveChart {
   }
 
   draw() {
-    if (!this.root.clientWidth) return;
+    if (!sizeOf(this.root).width) return;
     const { curves } = this, own = curves.filter((curve) => !curve.isDashed), left = 46, right = 10, top = 8, bottom = 32;
     const inks = curves.map((curve) => inkOfCurve(curve, own.findIndex((one) => one.label === curve.label)));
     const isLogX = this.log.includes("x"), isLogY = this.log.includes("y"), allX = [...curves.map((curve) => curve.x), this.marks.map((mark) => mark.x)];
-    const axisX = axisOf(...(isLogX ? decadeLimits(allX) : limitsOf(allX)), isLogX), wide = this.canvas.clientWidth - left - right;
+    const axisX = axisOf(...(isLogX ? decadeLimits(allX) : limitsOf(allX)), isLogX), wide = sizeOf(this.canvas).width - left - right;
     const here = this.at === null || !own.length ? null : axisX.value(clamp((this.at - left) / wide, 0, 1));
     // The legend first: the rest of the height is for the canvas.
     this._listCurves(curves, inks, here, own);
@@ -242,7 +243,7 @@ export class Histogram {
   draw(range, value) {
     const { scale, counts, others } = this;
     this.drawn = [range, value];
-    if (!scale || !this.root.clientWidth) return;
+    if (!scale || !sizeOf(this.root).width) return;
     const { context, width, height } = fitted(this.canvas), left = 46, right = 10, top = 8, bottom = 32, w = width - left - right, h = height - top - bottom;
     this.left = left;
     this.wide = w;

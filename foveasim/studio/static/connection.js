@@ -23,7 +23,7 @@ export function readPart(buffer) {
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
   const arrays = {};
   for (const { name, type, size, offset } of header.arrays) arrays[name] = new TYPES[type](buffer, 4 + length + offset, size);
-  return { part: header.part, version: header.version, is_preview: Boolean(header.is_preview), about: header.about, arrays };
+  return { part: header.part, version: header.version, is_preview: Boolean(header.is_preview), hasMore: Boolean(header.has_more), about: header.about, arrays };
 }
 
 export class Connection {

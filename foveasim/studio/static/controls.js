@@ -1,7 +1,7 @@
 // Controls of all settings, generated from the list of the server: sliders, fields, choices, with errors and resets.
 
 import { clamp, roundStep, shown } from "/web/colours.js";
-import { make } from "/web/page_parts.js";
+import { change, make } from "/web/page_parts.js";
 
 // Sections that are open at first; settings outside all sections are in the first of them.
 const OPEN = ["exposure", "layout", "optics", "sensor"];
@@ -153,7 +153,7 @@ class Row {
       this.field.spellcheck = false;
       if (kind === "number" || kind === "integer") this.field.inputMode = "decimal";
       if (control.default !== undefined && control.default !== null) this.field.placeholder = fieldText(control.default);
-      this.field.addEventListener("input", () => { this.isDirty = true; });
+      this.field.addEventListener("input", () => { this.isDirty = true; this.isCurrent = false; });
       this.field.addEventListener("change", () => this._commit());
       this.field.addEventListener("keydown", (event) => this._key(event));
     }
@@ -180,6 +180,7 @@ class Row {
     };
     this.slider.addEventListener("input", () => {
       this.isHeld = true;
+      this.isCurrent = false;
       // No change is reported when the slider returns to its start.
       for (const type of ["pointerup", "pointercancel"]) addEventListener(type, release, { once: true });
       this.field.value = fieldText(value());
@@ -227,6 +228,7 @@ class Row {
 
   // Takes over a description with other values and ranges; the elements stay, with their focus.
   refresh(control) {
+    this.isCurrent = false;
     this.control = control;
     if (control.kind === "choice" || control.kind === "sections") this.choices = choicesOf(control);
   }
@@ -258,6 +260,7 @@ class Row {
     const next = clamp(value + sign * step * (event.shiftKey ? 10 : 1), minimum ?? -Infinity, maximum ?? Infinity);
     this.field.value = fieldText(Number(next.toPrecision(9)));
     this.isDirty = true;
+    this.isCurrent = false;
     this._commit();
   }
 
@@ -270,10 +273,16 @@ class Row {
     else this._send(kind === "list" ? listOf(text) : kind === "text" ? text : asNumber(text), true);
   }
 
-  _send(value, isFinal) { this.sent = this.on.send(value, isFinal) ?? this.sent; }
+  _send(value, isFinal) {
+    this.isCurrent = false;
+    this.sent = this.on.send(value, isFinal) ?? this.sent;
+  }
 
   // Shows the value of a state, unless the user is changing it or it has an error.
   update(value, isChanged, error, id) {
+    if (this.isCurrent && value === this.value && isChanged === this.isMarked && !error) return;
+    this.isMarked = isChanged;
+    this.isCurrent = !this.field && !error;
     this.root.classList.toggle("changed", isChanged);
     this.reset.hidden = !isChanged;
     this.error.hidden = !error;
@@ -290,6 +299,7 @@ class Row {
   _show() {
     const { control, value } = this;
     this.isDirty = false;
+    this.isCurrent = true;
     if (control.kind === "choice") {
       const chosen = chosenOf({ ...control, choices: this.choices }, value ?? control.default);
       let other = this.field.querySelector("option[value='-1']");
@@ -399,14 +409,14 @@ export class Controls {
       for (const row of section.rows) {
         if (!isFiltered && row.isExtra) extra++;
         const isFound = (isFiltered || section.isFull || !row.isExtra || row.root.contains(document.activeElement)) && words.every((word) => row.words.includes(word)) && (!isOnly || row.root.classList.contains("changed"));
-        row.root.hidden = !isFound;
+        change(row.root, { hidden: !isFound });
         visible += isFound;
       }
       found += visible;
-      section.root.hidden = visible === 0 && extra === 0;
-      section.more.hidden = extra === 0;
-      section.more.textContent = section.isFull ? "Hide settings that are not set" : "Show " + shown(extra) + " more";
-      section.more.setAttribute("aria-expanded", section.isFull);
+      change(section.root, { hidden: visible === 0 && extra === 0 });
+      change(section.more, {
+        hidden: extra === 0, textContent: section.isFull ? "Hide settings that are not set" : "Show " + shown(extra) + " more", ariaExpanded: String(section.isFull),
+      });
       if (isFiltered && section.wasOpen === null) section.wasOpen = section.root.open;
       if (isFiltered) section.root.open = true;
       else if (section.wasOpen !== null) { section.root.open = section.wasOpen; section.wasOpen = null; }
@@ -431,8 +441,7 @@ export class Controls {
     for (const section of this.sections.values()) {
       const n = section.rows.filter((row) => row.root.classList.contains("changed")).length;
       const hasError = section.rows.some((row) => !row.error.hidden);
-      section.count.textContent = n ? shown(n) : "";
-      section.count.title = n ? shown(n) + " changed" : "";
+      change(section.count, { textContent: n ? shown(n) : "", title: n ? shown(n) + " changed" : "" });
       section.root.classList.toggle("wrong", hasError);
     }
     this._filter();

@@ -3,6 +3,7 @@
 import { pixelRatio } from "/web/gl.js";
 import { outline, traceCross } from "/web/marks.js";
 import { make } from "/web/page_parts.js";
+import { sizeOf } from "./frames.js";
 import { fitted } from "./site_pane.js";
 
 // Distance in µm of one step of the gaze by an arrow key, as a fraction of the frame.
@@ -87,7 +88,7 @@ export class ImagePane {
 
   // Conversions between µm on the sensor and CSS pixels: the complete picture, or the view of a map.
   view() {
-    const { clientWidth: width, clientHeight: height } = this.root, [x0, y0, x1, y1] = this.bounds || [0, 0, 1, 1];
+    const { width, height } = sizeOf(this.root), [x0, y0, x1, y1] = this.bounds || [0, 0, 1, 1];
     let x = 0.5 * (x0 + x1), y = 0.5 * (y0 + y1), perUm = Math.min(width / (x1 - x0), height / (y1 - y0));
     if (this.follows && this.map) {
       ({ x, y } = this.map);
@@ -102,13 +103,13 @@ export class ImagePane {
 
   // Longer side of the complete picture in pixels of the screen.
   neededPixels() {
-    const { clientWidth, clientHeight } = this.root, ratio = pixelRatio();
-    if (!this.bounds || !clientWidth) return Math.min(clientWidth, clientHeight) * ratio;
+    const { width, height } = sizeOf(this.root), ratio = pixelRatio();
+    if (!this.bounds || !width) return Math.min(width, height) * ratio;
     const [x0, y0, x1, y1] = this.bounds;
     return Math.max(x1 - x0, y1 - y0) * this.view().perUm * ratio;
   }
 
-  get isShown() { return Boolean(this.bounds) && this.root.clientWidth > 0; }
+  get isShown() { return Boolean(this.bounds) && sizeOf(this.root).width > 0; }
 
   draw() {
     if (!this.isShown) return;

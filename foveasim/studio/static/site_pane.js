@@ -7,8 +7,9 @@ import { drawRamp, kindsOf, swatchItem, tickLabels, titleOf } from "/web/legend.
 import { SensorMap } from "/web/map.js";
 import { drawOutlines, outline, ringSite, traceCross } from "/web/marks.js";
 import { Overview } from "/web/overview.js";
-import { inkOf, make } from "/web/page_parts.js";
+import { change, inkOf, make } from "/web/page_parts.js";
 import { sitesIn } from "/web/measure.js";
+import { sizeOf } from "./frames.js";
 import { RasterMap } from "./raster_map.js";
 
 const MOST_SELECTED = 4000;
@@ -21,8 +22,8 @@ let isSlow = false;
 export function useSoftware(isSoftware) { isSlow = isSoftware; }
 
 // A 2D context of a canvas, whose unit is the CSS pixel.
-export function fitted(canvas, width = canvas.clientWidth, height = canvas.clientHeight) {
-  const ratio = pixelRatio();
+export function fitted(canvas) {
+  const ratio = pixelRatio(), { width, height } = sizeOf(canvas);
   fitCanvas(canvas, width, height);
   const context = canvas.getContext("2d", { willReadFrequently: isSlow });
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
@@ -146,9 +147,9 @@ export class SitePane {
 
   _drawLegend() {
     const { scale, column } = this, isKinds = column.kind === "kinds";
-    this.title.textContent = titleOf(column) + (scale.isLog ? ", log" : "");
-    this.ramp.hidden = this.ticks.hidden = isKinds;
-    this.kinds.hidden = !isKinds;
+    change(this.title, { textContent: titleOf(column) + (scale.isLog ? ", log" : "") });
+    for (const element of [this.ramp, this.ticks]) change(element, { hidden: isKinds });
+    change(this.kinds, { hidden: !isKinds });
     if (isKinds) {
       const { items, rest } = kindsOf(scale);
       this.kinds.replaceChildren(...items.slice(0, 8).map(swatchItem), ...(rest || items.length > 8 ? [make("li", "…")] : []));
@@ -167,7 +168,7 @@ export class SitePane {
     if (isWhole) this.fit();
   }
 
-  get isShown() { return Boolean(this.map && this.scale) && this.root.clientWidth > 0; }
+  get isShown() { return Boolean(this.map && this.scale) && sizeOf(this.root).width > 0; }
 
   draw() {
     if (!this.isShown) return;

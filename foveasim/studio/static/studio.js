@@ -5,7 +5,7 @@ import { findRenderer, watchSize } from "/web/gl.js";
 import { titleOf } from "/web/legend.js";
 import { pathBetween, positionText } from "/web/marks.js";
 import { downloadTable, statisticsRows } from "/web/measure.js";
-import { $, inkOf, make, notice, speak, startTheme } from "/web/page_parts.js";
+import { $, change, inkOf, make, notice, speak, startTheme } from "/web/page_parts.js";
 import { Sites } from "/web/sites.js";
 import { offsetsOf } from "/web/unpack.js";
 import { Editor } from "./authoring.js";
@@ -37,13 +37,14 @@ const CURVES = ["spectrum", "mtf", "photon_transfer", "snr"];
 const WIDE = 1800;
 const BUSY_DELAY_MS = 150;
 const SIZE_DELAY_MS = 250;
+const HOLD_MS = 100;
 const PICTURE_SIZES = [256, 320, 384, 512, 768, 1024], SMALLER = 0.85;
 const ALWAYS = ["sites", "columns", "picture", "scene"];
 const reducesMotion = matchMedia("(prefers-reduced-motion: reduce)");
 
 const page = {
   state: null, parts: {}, frozen: null, cursor: null, hovered: -1, pinned: -1, rectangle: null, selected: [], range: null, key: null, wantsLog: undefined, sizeTimer: 0,
-  isSelecting: false, tiles: new Set(), asked: null, gazeAt: null, lastMs: NaN, nDone: 0, boundary: null, isBusy: false,
+  isSelecting: false, tiles: new Set(), asked: null, held: { states: [], parts: [] }, holdTimer: 0, gazeAt: null, lastMs: NaN, nDone: 0, boundary: null, isBusy: false,
 };
 let connection, controls, panes, charts, rules, editor, steps, sources, solid, files;
 
@@ -191,7 +192,27 @@ const USE = {
   rules: ({ about, arrays }) => { if (panes.b.sites) rules.use(about.rules, arrays, panes.b.sites); },
 };
 
+// A state is shown with the values that follow it, and parts of a group together: each frame takes the browser tens of milliseconds.
 function receivePart(part) {
+  hold("parts", part);
+  if (!part.hasMore) showHeld();
+}
+
+function hold(kind, message) {
+  page.held[kind].push(message);
+  page.holdTimer ||= setTimeout(showHeld, HOLD_MS);
+}
+
+function showHeld() {
+  clearTimeout(page.holdTimer);
+  page.holdTimer = 0;
+  const { states, parts } = page.held;
+  page.held = { states: [], parts: [] };
+  for (const state of states) showState(state);
+  for (const part of parts) usePart(part);
+}
+
+function usePart(part) {
   const { [part.part]: before } = page.parts;
   if (!USE[part.part] || (before && before.version > part.version)) return;
   page.parts[part.part] = part;
@@ -206,8 +227,9 @@ function receivePart(part) {
 // -- state --------------------------------------------------------------------------------------------------------------
 
 function receive(message) {
+  if (message.kind !== "state" && message.kind !== "busy") showHeld();
   switch (message.kind) {
-    case "state": showState(message); break;
+    case "state": hold("states", message); return;
     case "controls": controls.describe(message.controls); break;
     case "busy": setBusy(true); break;
     case "done": finish(message); break;
@@ -230,7 +252,7 @@ function setBusy(isBusy) {
   else document.body.classList.remove("busy");
 }
 
-function showStatus(text) { $("status").lastElementChild.textContent = text; }
+function showStatus(text) { change($("status").lastElementChild, { textContent: text }); }
 
 function finish({ id, is_preview: isPreview }) {
   setBusy(false);
@@ -276,6 +298,7 @@ function showState(message) {
   // Frozen by an earlier connection: its arrays are lost.
   if (!state.frozen && page.frozen && page.frozen.isAnswered) unfreeze();
   if (state.frozen && page.frozen) page.frozen.isAnswered = true;
+  sources.receive(message);
 }
 
 function showSummary() {
@@ -427,7 +450,7 @@ function leave() {
 
 function tellSite() {
   const { sites, columns } = panes.b, site = page.hovered >= 0 ? page.hovered : page.pinned;
-  $("site-heading").textContent = site < 0 || !sites ? "Photosite" : "Photosite " + site.toLocaleString("en-US") + (site === page.pinned ? " (pinned)" : "");
+  change($("site-heading"), { textContent: site < 0 || !sites ? "Photosite" : "Photosite " + site.toLocaleString("en-US") + (site === page.pinned ? " (pinned)" : "") });
   if (page.tiles.has("site") && sites) {
     const cells = columns.filter((column) => !column.is_repeat).flatMap((column) => [make("dt", column.label), make("dd", site < 0 ? "–" : textOf(column, site, sites.area))]);
     cells.push(make("dt", "centre / µm"), make("dd", site < 0 ? "–" : sites.centre(site).map((v) => shown(Math.round(1e4 * v) / 1e4 + 0)).join(", ")));

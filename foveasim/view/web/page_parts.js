@@ -9,7 +9,18 @@ export function make(tag, text, className) {
   return element;
 }
 
-export const inkOf = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+// Sets properties of an element that differ: the page is laid out again after each change.
+export function change(element, properties) {
+  for (const [name, value] of Object.entries(properties)) if (element[name] !== value) element[name] = value;
+}
+
+const inks = new Map();
+
+// Colour of the theme by the name of its variable.
+export function inkOf(name) {
+  if (!inks.has(name)) inks.set(name, getComputedStyle(document.documentElement).getPropertyValue(name).trim());
+  return inks.get(name);
+}
 
 // -- themes ---------------------------------------------------------------------------------------------------------------
 
@@ -19,6 +30,7 @@ let chosenTheme = null, themeChanged = () => {};
 export function useTheme(theme) {
   if (chosenTheme || document.documentElement.dataset.theme === theme) return;
   document.documentElement.dataset.theme = theme;
+  inks.clear();
   themeChanged();
 }
 
@@ -28,7 +40,7 @@ export function startTheme(onChange) {
   themeChanged = onChange;
   try { chosenTheme = localStorage.getItem("foveasim-theme"); } catch { /* not kept */ }
   if (chosenTheme !== "dark" && chosenTheme !== "light") chosenTheme = null;
-  const show = () => { root.dataset.theme = chosenTheme || (system.matches ? "dark" : "light"); };
+  const show = () => { root.dataset.theme = chosenTheme || (system.matches ? "dark" : "light"); inks.clear(); };
   show();
   system.addEventListener("change", () => { if (!chosenTheme) { show(); onChange(); } });
   $("theme").addEventListener("click", () => {
