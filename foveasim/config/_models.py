@@ -128,7 +128,7 @@ _EDIT_TYPES: dict[str, Any] = {
     "margin_um": float,
     "outlines_um": list[_Outline],
     "points_um": list[_Point] | None,
-    "region": _Outline,
+    "region": _Outline | None,
     "to_um": list[_Point],
 }
 #: Options of layout files in settings, with their types: a layer is ``77`` or ``77/3``.

@@ -169,6 +169,7 @@ def test_removed_vertex_is_removed_from_neighbours():
         ("overlay", {"layer": "grid"}, "'layer' must be a layout"),
         ("overlay", {"layer": GRID, "operation": "cut_out"}, "must leave at least one site"),
         ("overlay", {"layer": GRID, "operation": "cut"}, "'operation' must be"),
+        ("overlay", {"layer": GRID, "region": [[90, 90], [99, 90], [99, 99]]}, "'region' must contain a part of the layer"),
         ("repair", {}, "'rules' must be given"),
     ],
 )  # fmt: skip
@@ -229,6 +230,16 @@ def test_layer_fills_around_sites():
     assert edited.n_sites == 16 + 8
     assert edited.area_um2.sum() == pytest.approx(120.0**2)
     assert np.array_equal(edited[:16].xy_um, GRID.xy_um)
+
+
+@pytest.mark.parametrize(
+    ("operation", "sum_um2"), [("replace", 1600.0), ("union", 1750.0), ("clip", 150.0), ("cut_out", 1450.0)]
+)
+def test_region_limits_the_layer(operation, sum_um2):
+    layer = fs.layout.grid(n_x=40, n_y=40, pitch_um=3.0)
+    edited = fs.layout.overlay(GRID, layer, operation=operation, region=[[0, 0], [15, 0], [15, 10], [0, 10]])
+
+    assert edited.area_um2.sum() == pytest.approx(sum_um2)
 
 
 def test_layers_clip_and_cut_complementary():

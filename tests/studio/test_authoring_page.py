@@ -560,3 +560,22 @@ def test_drawn_settings_match_command(edit, tmp_path):
     shot = read_shot(path)
     capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed)
     assert np.array_equal(capture.code, codes)
+
+
+def test_layer_in_rectangle_keeps_the_rest(edit):
+    page = edit("layer")
+    page.get_by_label("Generator").select_option(label="grid")
+    drag(page, (10.0, 10.0), (50.0, 30.0))
+    wait(page)
+    (added,) = edits(page)
+
+    assert added["region"] == [[10, 10], [50, 10], [50, 30], [10, 30]]
+    assert areas(page).sum() == pytest.approx(N_SITES * 400)
+    assert count(page) > N_SITES
+    undo(page)
+    page.evaluate("() => studio.editor.use('layer')")
+    click(page, (30.0, 20.0))
+    wait(page)
+    (added,) = edits(page)
+    assert "region" not in added
+    assert added["layer"]["move_um"] == [30, 20]

@@ -80,6 +80,7 @@ def overlay(
     *,
     operation: Literal["replace", "fill", "union", "clip", "cut_out"] = "replace",
     margin_um: float = 0.0,
+    region: Any = None,
 ) -> Layout:
     """
     Combine a layout with another one as layer.
@@ -96,6 +97,8 @@ def overlay(
     margin_um : float, µm
         Distance by which the area of the layer, or for ``"fill"`` that of the sites, is enlarged: a trench, or for ``"clip"``
         a larger area.
+    region : shapely Polygon or MultiPolygon, or (n, 2) vertices, µm, optional
+        The part of the layer inside it is used, with the pieces of sites that its boundary cuts; by default the whole layer.
 
     Returns
     -------
@@ -105,12 +108,16 @@ def overlay(
     Raises
     ------
     ParameterError
-        When the layer has no sites, or no site remains.
+        When the layer has no sites, also in the region, or no site remains.
     """
     check_choice("operation", operation, ("replace", "fill", "union", "clip", "cut_out"))
     margin_um = check_number("margin_um", margin_um, at_least=0.0, at_most=MAX_LENGTH_UM)
     if not isinstance(layer, Layout) or layer.n_sites == 0:
         raise ParameterError("layer", "must be a layout with sites", layer)
+    if region is not None:
+        layer = clip(layer, region)
+        if layer.n_sites == 0:
+            raise ParameterError("region", "must contain a part of the layer")
     check_sites(layout.n_sites + layer.n_sites)
     if operation == "fill":
         polygons = layer.polygons()

@@ -245,13 +245,15 @@ export class Editor {
     this.nudged = JSON.stringify(edit);
   }
 
-  // Adds a layer of the chosen generator at a position, by default in the centre of the view.
-  addLayer(at) {
+  // Adds a layer of the chosen generator at a position, by default in the centre of the view, or in a rectangle.
+  addLayer(at, corners) {
     const found = this.studio.generators().find(({ label }) => label === this.bar.value("generator"));
     if (!found || !this.map) return;
-    const { generator, parameters, mosaic } = found.value, centre = at || { x: onGrid(this.map.x, this.step), y: onGrid(this.map.y, this.step) };
+    const { generator, parameters, mosaic } = found.value, middle = corners ? { x: 0.5 * (corners[0].x + corners[2].x), y: 0.5 * (corners[0].y + corners[2].y) } : this.map;
+    const centre = at || { x: onGrid(middle.x, this.step), y: onGrid(middle.y, this.step) };
     const layer = { generator, parameters, ...(mosaic ? { mosaic } : {}), move_um: this.toLayout(centre) }, margin = this.bar.number("margin_um");
-    this.commit({ kind: "overlay", layer, operation: this.bar.value("operation"), ...(margin ? { margin_um: margin } : {}) });
+    const region = corners ? { region: corners.map(this.toLayout) } : {};
+    this.commit({ kind: "overlay", layer, operation: this.bar.value("operation"), ...(margin ? { margin_um: margin } : {}), ...region });
     this.studio.showSteps(this.edits.length - 1);
   }
 
@@ -303,7 +305,7 @@ export class Editor {
         consume(event);
         if (event.type === "pointercancel") this.tool.cancel();
         else if (this.tool.isHeld && this.isDragged) this.tool.release(this.at);
-        else if (this.tool.isHeld && this.name !== "rectangle") this.tool.cancel();
+        else if (this.tool.isHeld) this.tool.tap(this.at);
       } else if (isClick && event.type === "pointerup") this.tool.click(this.raw, { isSecond: event.shiftKey || event.ctrlKey || event.metaKey });
       start = null;
       this.isDragged = isUsed = false;
@@ -445,7 +447,7 @@ export class Editor {
 
   // Outlines of an edit on the map; edits at sites have those of the sites that are there.
   outlinesOf(edit) {
-    const [mx, my] = this.move, { sites } = this, layer = edit.layer?.move_um;
+    const [mx, my] = this.move, { sites } = this, layer = edit.region ? null : edit.layer?.move_um;
     const paths = layer ? [{ points: [layer] }] : pathsOf(edit);
     return paths.map(({ points, isClosed }) => ({ points: points.map(([x, y]) => [x + mx, y + my]), isClosed })).flatMap((path) => {
       if (path.points.length > 1 || !sites) return [path];

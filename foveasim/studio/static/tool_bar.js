@@ -13,7 +13,7 @@ export const TOOLS = [
   ["merge", "j", "Merge", "M1.5 8H6M4 5.5L6.5 8 4 10.5M14.5 8H10M12 5.5L9.5 8l2.5 2.5M8 2.5v11", "Click adjacent sites, then Enter."],
   ["split", "d", "Split", "M2.5 3h11v10h-11zM8 3v10M2.5 8h11", "Click sites, then Enter."],
   ["channel", "f", "Set filter", "M8 1.8C5.5 5.2 3.8 7.5 3.8 9.8a4.2 4.2 0 0 0 8.4 0C12.2 7.5 10.5 5.2 8 1.8z", "Click sites, then Enter."],
-  ["layer", "l", "Add layer…", "M8 2l6.5 3.5L8 9 1.5 5.5zM1.5 9L8 12.5 14.5 9", "Click its centre, or Enter for the centre of the view."],
+  ["layer", "l", "Add layer…", "M8 2l6.5 3.5L8 9 1.5 5.5zM1.5 9L8 12.5 14.5 9", "Drag a rectangle for it, or click its centre; Enter for the centre of the view."],
 ];
 const ACTIONS = [
   ["remove", "Delete", "Delete selected sites (Delete)", "M3 4.5h10M6.5 4.5v-2h3v2M4.5 4.5l.7 9h5.6l.7-9M6.8 7v4.5M9.2 7v4.5"],

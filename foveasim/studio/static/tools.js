@@ -34,6 +34,8 @@ class Tool {
   press() { return false; }
   drag() {}
   release() {}
+  // tap() ends a press without a drag.
+  tap() { this.cancel(); }
   click() {}
   // enter() ends or applies; back() undoes a part and cancel() all: these return whether there was something to undo.
   enter() {}
@@ -179,13 +181,14 @@ export class RectangleTool extends Tool {
   drag(at) { if (!this._isEmpty(at)) this.editor.preview(this.editor.drawing(this._corners(at))); }
 
   release(at) {
-    // A click without a drag: the next one is the opposite corner.
     if (!this.isHeld || this._isEmpty(at)) return;
     const { paths } = this, corners = this._corners(at);
     this.isHeld = false;
     this.editor.commit(this.editor.drawing(corners), paths);
   }
 
+  // The next press is the opposite corner.
+  tap() {}
   back() { return this.cancel(); }
 }
 
@@ -302,9 +305,23 @@ export class VertexTool extends Tool {
   }
 }
 
-// Places a layer of sites of a generator.
-export class LayerTool extends Tool {
-  get isReady() { return true; }
-  press(at) { this.editor.addLayer(at); return true; }
+// Places a layer of sites of a generator with its centre at a click, or in a rectangle.
+export class LayerTool extends RectangleTool {
+  get isReady() { return !this.isHeld; }
+
+  press(at, event) {
+    if (event) return super.press(at);
+    this.editor.addLayer(at);  // at a position of the keys
+    return true;
+  }
+
+  drag() {}
+  tap(at) { this.isHeld = false; this.editor.addLayer(at); }
   enter() { this.editor.addLayer(); }
+
+  release(at) {
+    if (!this.isHeld || this._isEmpty(at)) return;
+    this.isHeld = false;
+    this.editor.addLayer(null, this._corners(at));
+  }
 }
