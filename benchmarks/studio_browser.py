@@ -54,7 +54,7 @@ CHANGE = """([key, value]) => new Promise((resolve) => {
   step();
 })"""
 #: Sends messages, and resolves to null when the last one is done and drawn, and with a second argument also all previews
-#: are complete. After a minute it resolves to the state of the page, with the longest time without a timer, and the number
+#: are complete and pictures have the size of their panes. After a minute it resolves to the state of the page, with the longest time without a timer, and the number
 #: of frames that it draws in a second.
 SEND = """([messages, isComplete]) => new Promise((resolve) => {
   const { page, connection } = studio;
@@ -72,7 +72,8 @@ SEND = """([messages, isComplete]) => new Promise((resolve) => {
     const now = performance.now();
     longestGapMs = Math.max(longestGapMs, now - last);
     last = now;
-    if (page.doneId >= id && studio.isReady && !(isComplete && page.isPreview)) resolve(null);
+    const isFinal = !page.isPreview && !page.sizeTimer && page.doneId >= connection.id;
+    if (page.doneId >= id && studio.isReady && (isFinal || !isComplete)) resolve(null);
     else if (performance.now() - start < 60000) setTimeout(step, 5);
     else {
       const before = describe();
