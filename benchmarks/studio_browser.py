@@ -54,8 +54,8 @@ CHANGE = """([key, value]) => new Promise((resolve) => {
   step();
 })"""
 #: Sends messages, and resolves to null when the last one is done and drawn, and with a second argument also all previews
-#: are complete and pictures have the size of their panes. After a minute it resolves to the state of the page, with the longest time without a timer, and the number
-#: of frames that it draws in a second.
+#: are complete and pictures have the size of their panes. After a minute it resolves to the state of the page, with the
+#: longest time without a timer, and the number of frames that it draws in a second.
 SEND = """([messages, isComplete]) => new Promise((resolve) => {
   const { page, connection } = studio;
   let nFrames = 0;
