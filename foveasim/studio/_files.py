@@ -21,7 +21,7 @@ from foveasim.config import (
 from foveasim.config._objects import BUNDLED_PICTURE, FILE_SETTINGS
 from foveasim.errors import FileError, ParameterError, printable
 
-__all__ = ["Files", "apply_preset", "file_name", "is_copy", "presets", "start_settings", "unused_path"]
+__all__ = ["Files", "apply_preset", "file_name", "is_unused_or_copy", "presets", "start_settings", "unused_path"]
 
 #: Longest name and extension of an uploaded file.
 MAX_NAME_LENGTH, MAX_EXTENSION_LENGTH = 80, 8
@@ -229,6 +229,6 @@ def unused_path(path: Path, is_usable: Callable[[Path], bool]) -> Path:
     return found
 
 
-def is_copy(original: Path, path: Path) -> bool:
+def is_unused_or_copy(path: Path, original: Path) -> bool:
     """Return whether a path is unused, or that of a file with the content of the original."""
     return not path.exists() or (path.is_file() and filecmp.cmp(original, path, shallow=False))

@@ -13,7 +13,6 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +38,7 @@ from foveasim.studio._controls import chosen_value, controls_of, structure_of
 from foveasim.studio._costs import RELEASE_S, REST_S, Costs, SupersededError
 from foveasim.studio._engine import Engine, Simulated
 from foveasim.studio._exports import text_of, without_directories
-from foveasim.studio._files import Files, apply_preset, file_name, is_copy, unused_path
+from foveasim.studio._files import Files, apply_preset, file_name, is_unused_or_copy, unused_path
 from foveasim.studio._frames import Frames
 from foveasim.studio._history import History
 from foveasim.studio._messages import from_json, one_line, to_json
@@ -186,8 +185,16 @@ class Session:
             if len(content) > self.n_free_bytes:
                 return None
             self.n_free_bytes -= len(content)
-        path = self._new_path(file_name(name))
-        path.write_bytes(content)
+        path = None
+        try:
+            path = self._new_path(file_name(name))
+            path.write_bytes(content)
+        except OSError:
+            if path is not None:
+                path.unlink(missing_ok=True)
+            with self._uploading:
+                self.n_free_bytes += len(content)
+            raise
         return path
 
     def _new_path(self, name: str) -> Path:
@@ -497,8 +504,19 @@ class Session:
         safe = file_name(name)
         path = out / (safe if safe.endswith((".yaml", ".yml")) else f"{safe}.yaml")
         out.mkdir(parents=True, exist_ok=True)
-        # Settings that were saved before keep their pictures.
-        settings, files = self.exported(lambda file: unused_path(out / file.name, partial(is_copy, file)).name)
+        originals: dict[Path, Path] = {}
+
+        def name_of(original: Path) -> str:
+            """Return a name that no other file of these settings has, nor a picture of settings that were saved before."""
+
+            def is_usable(copied: Path) -> bool:
+                return originals.get(copied, original) == original and is_unused_or_copy(copied, original)
+
+            copied = unused_path(out / original.name, is_usable)
+            originals[copied] = original
+            return copied.name
+
+        settings, files = self.exported(name_of)
         for copied, original in files.items():
             with atomic_write(out / copied) as temporary:
                 shutil.copyfile(original, temporary)

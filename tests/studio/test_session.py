@@ -9,6 +9,7 @@ import threading
 import time
 import weakref
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -464,6 +465,42 @@ def test_save_keeps_pictures_of_earlier_saves(make_session, tmp_path):
     assert {each.name for each in out.glob("*.png")} == {"photo.png", "photo_2.png"}
     for name, expected in codes.items():
         assert np.array_equal(codes_of(start_settings(out / f"{name}.yaml")[0]), expected)
+
+
+def test_saved_pictures_never_share_a_name(make_session, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    recorder = make_session(out=out)
+    pixels = np.random.default_rng(1).integers(0, 255, (3, 40, 40, 3)).astype(np.uint8)
+    write_picture(out / "photo.png", pixels[0])
+    files = {}
+    for name, each in zip(("photo.png", "photo_2.png"), pixels[1:], strict=True):
+        write_picture(tmp_path / name, each)
+        files[name] = recorder.session.add_file(name, (tmp_path / name).read_bytes())
+    # The picture of the scene becomes photo_2.png, which is the name of the other.
+    recorder.do(do="file", path=str(files["photo.png"]), **{"as": "scene"})
+    settings = recorder.session.history.settings
+    layout = {"generator": "voronoi", "parameters": {"density": str(files["photo_2.png"])}}
+    recorder.session.history.commit({**settings, "layout": layout})
+    recorder.session._save("both")
+    saved = read_settings(out / "both.yaml")
+
+    assert (out / saved["scene"]["picture"]).read_bytes() == files["photo.png"].read_bytes()
+    assert (out / saved["layout"]["parameters"]["density"]).read_bytes() == files["photo_2.png"].read_bytes()
+    assert (out / "photo.png").read_bytes() not in {path.read_bytes() for path in files.values()}
+
+
+def test_failed_upload_returns_its_bytes(recorder, monkeypatch):
+    def fail(path, content):
+        raise OSError(28, "No space left on device")
+
+    n_free_bytes = recorder.session.n_free_bytes
+    monkeypatch.setattr(Path, "write_bytes", fail)
+    with pytest.raises(OSError, match="No space left"):
+        recorder.session.add_file("a.bin", bytes(300))
+
+    assert recorder.session.n_free_bytes == n_free_bytes
+    assert not list(recorder.session.uploads.iterdir())
 
 
 def test_parts_are_shown_in_two_frames(recorder, monkeypatch):

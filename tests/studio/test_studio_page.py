@@ -128,12 +128,16 @@ def test_selection_matches_its_sites(visit):
     assert page.evaluate("studio.page.selected") == []
 
 
-def test_violation_moves_the_view(visit):
-    page = visit()
+def show_first_violation(page):
     page.click("[data-tile=rules]")
     set_value(page, "layout.rules.min_size_um", 12.0)
     until(page, "() => document.querySelectorAll('.violations button').length > 0")
     page.locator(".violations button").first.click()
+
+
+def test_violation_moves_the_view(visit):
+    page = visit()
+    show_first_violation(page)
     until(page, "() => studio.page.asked === null")
     x0, y0, x1, y1 = page.evaluate("[...studio.rules.traceOn(studio.panes.b.sites).box]")
     view = page.evaluate("(({ x, y, scale, width }) => ({ x, y, span: width / scale }))(studio.panes.b.map)")
@@ -144,10 +148,7 @@ def test_violation_moves_the_view(visit):
 
 def test_violations_of_earlier_layout_vanish(visit):
     page = visit()
-    page.click("[data-tile=rules]")
-    set_value(page, "layout.rules.min_size_um", 12.0)
-    until(page, "() => document.querySelectorAll('.violations button').length > 0")
-    page.locator(".violations button").first.click()
+    show_first_violation(page)
     page.click("[data-tile=rules]")
     page.evaluate("""() => { const { violations } = studio.rules; window.nDrawn = 0;
       violations.drawMarkers = () => { window.nDrawn++; }; studio.panes.b.shown = {}; studio.panes.b.draw(); }""")
