@@ -389,7 +389,7 @@ class Sensor:
         Returns
         -------
         responsivity : (n_filter, n_wavelength) float64, e-/J
-            ``qe * filter * wavelength / (h c)``.
+            ``qe * filter * wavelength / (h c)``, read-only.
 
         Raises
         ------
@@ -397,10 +397,16 @@ class Sensor:
             If a quantum efficiency or a filter is outside 0 to 1, or undefined at a wavelength; if a user-defined curve fails,
             or does not return one number per wavelength (the message names the curve, its exception is the cause).
         """
+        # Captures of the same scene compute it several times each.
+        known: tuple[Floats, Floats] | None = self.__dict__.get("_responsivity")
+        if known is not None and np.array_equal(known[0], wavelength_nm):
+            return known[1]
         curves = self._transmission(wavelength_nm)
         if not (np.isfinite(curves).all() and curves.min() >= 0.0 and curves.max() <= 1.0):
             raise ParameterError("qe", "and 'filters' must have values from 0 to 1 at every wavelength", curves)
-        return curves / photon_energy_j(wavelength_nm)
+        found = read_only(curves / photon_energy_j(wavelength_nm))
+        self.__dict__["_responsivity"] = np.array(wavelength_nm), found
+        return found
 
     # -- ADC and device ------------------------------------------------------------------------------------------------
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 __all__ = ["RELEASE_S", "REST_S", "Costs", "SupersededError"]
 
 #: Simulations and views that take longer are reduced or left out while a control is dragged.
@@ -38,6 +40,10 @@ class Costs:
     def is_slow(self, key: str | None) -> bool:
         """Return whether a change of a setting may take long; unknown ones may."""
         return key not in FAST_KEYS and self._simulation_s.get(key, 2.0 * SLOW_S) > SLOW_S
+
+    def parts_s(self, key: str | None, names: Iterable[str]) -> float:
+        """Return the expected time of views after a change of a setting; 0 for those that it did not change yet."""
+        return sum(self._part_s.get((key, name), 0.0) for name in names)
 
     def is_slow_part(self, key: str | None, name: str) -> bool:
         """Return whether a view took long after a change of a setting."""

@@ -13,7 +13,7 @@ from foveasim.errors import ParameterError
 from foveasim.studio._costs import Costs
 from foveasim.studio._engine import PICTURE_PIXELS, Simulated
 from foveasim.studio._messages import encode_part
-from foveasim.studio._parts import PARTS, PartData
+from foveasim.studio._parts import PARTS
 
 __all__ = ["Views"]
 
@@ -21,8 +21,9 @@ __all__ = ["Views"]
 FIRST = ("sites", "columns")
 #: Limit of the longer side of pictures.
 MAX_PIXELS = 2048
-#: Other parts are sent together unless this time has passed: the page then draws them in one frame.
-TOGETHER_S = 0.1
+#: The page draws the parts of a change in one frame if those after the photosites are expected within the first time, and
+#: otherwise those of the second: each frame takes a browser tens of milliseconds.
+SOON_S, TOGETHER_S = 0.04, 0.1
 
 
 class Views:
@@ -116,15 +117,7 @@ class Views:
         result = replace(result, picture_pixels=self._pixels)
         times_ms: dict[str, float] = {}
         self.left_out = []
-        made: list[tuple[str, PartData]] = []
-
-        def send(*, is_last: bool = False) -> None:
-            for n, (name, data) in enumerate(made, 1):
-                has_more = is_last or n < len(made)
-                self._send(encode_part(name, version, *data, is_preview=result.is_preview, has_more=has_more))
-            made.clear()
-
-        sent_s = time.perf_counter()
+        drawn_s = time.perf_counter()
         shown = [name for name in self._names if name != "comparison" or result.frozen is not None]
         # Sites and their values belong together; the others in the order of their age.
         first = [name for name in FIRST if name in shown]
@@ -146,8 +139,9 @@ class Views:
                     continue
                 start_s = time.perf_counter()
                 try:
-                    made.append((name, part.make(result)))
+                    data = part.make(result)
                 except Exception as error:  # noqa: BLE001 -- one view fails, the others are shown
+                    data = None
                     text = f"{part.label}: {self._line(error)}"
                     self._send({"kind": "error", "id": number, "part": name, "text": text})
                 self._sent[name], self._version[name] = [_weak(each) for each in depends], version
@@ -155,12 +149,16 @@ class Views:
                 times_ms[name] = 1e3 * time_s
                 self._costs.add_part(key, name, time_s)
                 is_stopped = k >= len(FIRST) and is_interrupted()
-                if k + 1 == len(first) or is_stopped or time.perf_counter() - sent_s > TOGETHER_S:
-                    send()
-                    sent_s = time.perf_counter()
+                is_late = k + 1 >= len(first) and time.perf_counter() - drawn_s > TOGETHER_S
+                has_slow = k + 1 == len(first) and self._costs.parts_s(key, names[k + 1 :]) > SOON_S
+                is_drawn = is_stopped or is_late or has_slow
+                if data is not None:
+                    is_preview = result.is_preview
+                    self._send(encode_part(name, version, *data, is_preview=is_preview, has_more=not is_drawn))
+                if is_drawn:
+                    drawn_s = time.perf_counter()
                 if is_stopped:
                     return None
-        send(is_last=True)
         return times_ms
 
 

@@ -503,22 +503,40 @@ def test_failed_upload_returns_its_bytes(recorder, monkeypatch):
     assert not list(recorder.session.uploads.iterdir())
 
 
-def test_parts_are_shown_in_two_frames(recorder, monkeypatch):
+def groups_of(recorder):
+    return [(header["part"], header.get("has_more", False)) for header, _ in recorder.parts]
+
+
+def test_fast_parts_are_shown_in_one_frame(recorder, monkeypatch):
     monkeypatch.setattr(_views, "TOGETHER_S", 60.0)
+    monkeypatch.setattr(_views, "SOON_S", 60.0)
     recorder.do(do="set", key="layout.parameters.pitch_um", value=13.0, final=True)
-    groups = [(header["part"], header.get("has_more", False)) for header, _ in recorder.parts]
+    groups = groups_of(recorder)
+
+    # The message "done" ends the group.
+    assert [name for name, _ in groups[:2]] == ["sites", "columns"]
+    assert len(groups) > 4
+    assert all(has_more for _, has_more in groups)
+    assert recorder.messages[-1]["kind"] == "done"
+
+
+def test_sites_are_shown_before_slow_parts(recorder, monkeypatch):
+    monkeypatch.setattr(_views, "TOGETHER_S", 60.0)
+    key = "layout.parameters.pitch_um"
+    recorder.do(do="set", key=key, value=13.0, final=True)
+    recorder.session._costs.add_part(key, "picture", 0.5)
+    recorder.do(do="set", key=key, value=14.0, final=True)
+    groups = groups_of(recorder)
 
     assert groups[:2] == [("sites", True), ("columns", False)]
-    # The message "done" ends the second group.
     assert all(has_more for _, has_more in groups[2:])
-    assert recorder.messages[-1]["kind"] == "done"
 
 
 def test_late_parts_are_shown_at_once(recorder, monkeypatch):
     monkeypatch.setattr(_views, "TOGETHER_S", 0.0)
     recorder.do(do="set", key="optics.f_number", value=4.0, final=True)
 
-    assert not any(header.get("has_more", False) for header, _ in recorder.parts)
+    assert not any(has_more for _, has_more in groups_of(recorder))
 
 
 def test_uploads_never_share_a_path(recorder):

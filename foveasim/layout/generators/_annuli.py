@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from foveasim._core.validation import Floats, Ints
+from foveasim._core.validation import Floats, Ints, read_only
 
 __all__ = ["MIN_SITES_PER_RHO", "Annuli", "Fovea", "Ring", "annuli", "fovea_rings", "ring_outlines"]
 
 #: Minimum number of sites of a ring of the fovea, per unit of its radius.
 MIN_SITES_PER_RHO = 3
+#: Number of circles that are cached: those between rings of equal sectors are of at most two kinds, in alternation.
+MAX_CIRCLES = 4
 #: Filling of the centre: none, rings with sites in proportion to the radius, linear-polar rings of the same sectors, hexagons.
 Fovea: TypeAlias = Literal["none", "rings", "linear", "hexagons"]
 
@@ -156,6 +159,13 @@ def _circle(radius_um: float, rings: Sequence[Ring]) -> _Circle:
     adjacent = [ring for ring in rings if ring.n_sites > 1]
     if radius_um <= 0.0 or not adjacent:
         return _Circle(np.zeros((1, 2)), np.zeros(1, np.int64), 1)
+    unit, step, n_steps = _unit_circle(tuple(adjacent))
+    return _Circle(radius_um * unit, step, n_steps)
+
+
+@lru_cache(maxsize=MAX_CIRCLES)
+def _unit_circle(adjacent: tuple[Ring, ...]) -> _Circle:
+    """Return the points of a circle of radius 1; many circles of a layout differ only in their radius."""
     n_steps = math.lcm(*(2 * ring.n_sites * ring.n_chords for ring in adjacent))
     steps = []
     for n_sites, rotation, n_chords in adjacent:
@@ -163,7 +173,7 @@ def _circle(radius_um: float, rings: Sequence[Ring]) -> _Circle:
         steps.append(half_chords * (n_steps // (2 * n_sites * n_chords)) % n_steps)
     step = np.unique(np.concatenate(steps))
     angle_rad = (2.0 * math.pi) * (step / n_steps)
-    return _Circle(radius_um * np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1), step, n_steps)
+    return _Circle(np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1), read_only(step), n_steps)
 
 
 def _corner_positions(circle: _Circle, ring: Ring) -> tuple[Ints, Ints]:

@@ -9,7 +9,7 @@ const FEW_SAMPLES = 2, MANY_SAMPLES = 3;
 const MOST_SAMPLES = 1.2e7;
 // Levels of linear light in the table of bytes.
 const LEVELS = 4096;
-const LINEAR = Float32Array.from({ length: 256 }, (_, i) => (i / 255 <= 0.04045 ? i / 255 / 12.92 : ((i / 255 + 0.055) / 1.055) ** 2.4));
+const LINEAR = Uint16Array.from({ length: 256 }, (_, i) => Math.round((LEVELS - 1) * (i / 255 <= 0.04045 ? i / 255 / 12.92 : ((i / 255 + 0.055) / 1.055) ** 2.4)));
 const ENCODED = Uint8Array.from({ length: LEVELS }, (_, i) => {
   const light = i / (LEVELS - 1);
   return Math.round(255 * (light <= 0.0031308 ? 12.92 * light : 1.055 * light ** (1 / 2.4) - 0.055));
@@ -41,8 +41,9 @@ export class RasterMap extends MapView {
   draw(ground) {
     const { canvas } = this, { width, height } = canvas, n = this.samples, view = [this.x, this.y, this.scale, width, height, n].join();
     if (this.drawn !== view) {
-      if (!this.owner || this.owner.length !== n * n * width * height) this.owner = new Uint32Array(n * n * width * height);
-      ownersOf(this, n * width, n * height, this.owner);
+      const Numbers = this.sites.n < 2 ** 16 ? Uint16Array : Uint32Array, size = n * n * width * height;
+      if (this.owner?.constructor !== Numbers || this.owner.length !== size) this.owner = new Numbers(size);
+      findOwners(this, n * width, n * height, this.owner);
       this.mixed = n === 1 ? null : mixedPixels(this.owner, width, height, n);
       if (!this.picture || this.picture.width !== width || this.picture.height !== height) this.picture = this.context.createImageData(width, height);
       if (this.table?.length !== this.sites.n + 1) this.table = new Uint32Array(this.sites.n + 1);
@@ -53,75 +54,96 @@ export class RasterMap extends MapView {
     table.set(this.colours.subarray(0, this.sites.n), 1);
     const first = mixed ? mixed.first : owner;
     for (let p = 0; p < pixels.length; p++) pixels[p] = table[first[p]];
-    if (mixed) averageSamples(pixels, mixed, table, n * n);
+    if (mixed) averageSamples(pixels, mixed.pixels, owner, width, n, lightOf(table));
     this.context.putImageData(this.picture, 0, 0);
   }
 }
 
-// Returns the site of the first sample of every pixel, and the samples of the pixels with several sites.
+// Returns the site of the first sample of every pixel, and the pixels that have several sites.
 function mixedPixels(owner, width, height, n) {
-  const row = n * width, first = new Uint32Array(width * height), pixels = [], samples = [];
+  const row = n * width, first = new owner.constructor(width * height), pixels = new Uint32Array(width * height), corner = (n - 1) * (row + 1);
+  let nMixed = 0;
   for (let y = 0, p = 0; y < height; y++) {
     for (let x = 0, at = y * n * row; x < width; x++, p++, at += n) {
       const one = owner[at];
       first[p] = one;
-      let isOne = true;
-      for (let v = 0; isOne && v < n; v++) for (let u = 0; u < n; u++) if (owner[at + v * row + u] !== one) { isOne = false; break; }
-      if (isOne) continue;
-      pixels.push(p);
-      for (let v = 0; v < n; v++) for (let u = 0; u < n; u++) samples.push(owner[at + v * row + u]);
+      // Opposite corners differ in most of them.
+      let isOne = owner[at + corner] === one;
+      for (let start = at; isOne && start <= at + corner; start += row) {
+        for (let k = start; k < start + n; k++) if (owner[k] !== one) { isOne = false; break; }
+      }
+      if (!isOne) pixels[nMixed++] = p;
     }
   }
-  return { first, pixels: Uint32Array.from(pixels), samples: Uint32Array.from(samples) };
+  return { first, pixels: pixels.slice(0, nMixed) };
 }
 
-// Sets pixels with several sites to the mean of their samples in linear light.
-function averageSamples(pixels, mixed, table, n) {
-  const scale = (LEVELS - 1) / n, { samples } = mixed;
-  for (let i = 0, k = 0; i < mixed.pixels.length; i++) {
-    let red = 0, green = 0, blue = 0;
-    for (const end = k + n; k < end; k++) {
-      const colour = table[samples[k]];
-      red += LINEAR[colour & 255];
-      green += LINEAR[(colour >>> 8) & 255];
-      blue += LINEAR[(colour >>> 16) & 255];
+// Linear light of colours: red and green in 16 bits each, which hold sums of MANY_SAMPLES squared, and blue.
+function lightOf(table) {
+  const redGreen = new Uint32Array(table.length), blue = new Uint16Array(table.length);
+  for (let i = 0; i < table.length; i++) {
+    const colour = table[i];
+    redGreen[i] = LINEAR[colour & 255] | LINEAR[(colour >>> 8) & 255] << 16;
+    blue[i] = LINEAR[(colour >>> 16) & 255];
+  }
+  return { redGreen, blue };
+}
+
+// Sets pixels with several sites to the mean of their samples, n per side, in linear light.
+function averageSamples(pixels, mixed, owner, width, n, { redGreen, blue }) {
+  const half = (n * n) >> 1, row = n * width;
+  for (let i = 0; i < mixed.length; i++) {
+    const p = mixed[i], x = p % width, at = (p - x) * n * n + n * x;
+    let both = 0, rest = half;
+    for (let v = 0, start = at; v < n; v++, start += row) {
+      for (let k = start; k < start + n; k++) {
+        both = (both + redGreen[owner[k]]) | 0;
+        rest += blue[owner[k]];
+      }
     }
-    pixels[mixed.pixels[i]] = (255 << 24 | ENCODED[(blue * scale + 0.5) | 0] << 16 | ENCODED[(green * scale + 0.5) | 0] << 8 | ENCODED[(red * scale + 0.5) | 0]) >>> 0;
+    const red = ((both & 65535) + half) / (n * n), green = ((both >>> 16) + half) / (n * n);
+    pixels[p] = (255 << 24 | ENCODED[(rest / (n * n)) | 0] << 16 | ENCODED[green | 0] << 8 | ENCODED[red | 0]) >>> 0;
   }
 }
 
-// Finds the number of the site at every pixel centre plus 1, top row first; 0 for none. Later sites cover earlier ones.
-export function ownersOf(view, width, height, owner = new Uint32Array(width * height)) {
+// Sets the numbers of the sites at all pixel centres plus 1, top row first; 0 for none. Later sites cover earlier ones.
+function findOwners(view, width, height, owner) {
   const { sites } = view, { xy, position, ringOffsets, box } = sites, step = (view.scale * width) / view.width;
   const left = view.fromX(0), top = view.fromY(0), right = view.fromX(view.width), bottom = view.fromY(view.height);
-  const crossings = [];
+  // Crossings of outlines and rows of pixel centres: in each row up to one per vertex.
+  const counts = new Uint32Array(height);
+  let crossings = new Float64Array(4096);
   owner.fill(0);
   for (let site = 0; site < sites.n; site++) {
     const at = 4 * site;
     if (box[at] > right || box[at + 2] < left || box[at + 1] > top || box[at + 3] < bottom) continue;
     const first = Math.max(0, Math.ceil((top - box[at + 3]) * step - 0.5)), last = Math.min(height - 1, Math.floor((top - box[at + 1]) * step - 0.5));
-    const firstRing = sites.firstRing(site), endRing = sites.firstRing(site + 1);
-    for (let row = first; row <= last; row++) {
-      const y = top - (row + 0.5) / step;
-      let n = 0;
-      for (let ring = firstRing; ring < endRing; ring++) {
-        const to = ringOffsets[ring + 1];
-        let p = 2 * position[to - 1];
-        for (let v = ringOffsets[ring]; v < to; v++) {
-          const q = 2 * position[v], ay = xy[p + 1], by = xy[q + 1];
-          if (ay > y !== by > y) crossings[n++] = (xy[p] + ((y - ay) / (by - ay)) * (xy[q] - xy[p]) - left) * step;
-          p = q;
+    if (last < first) continue;
+    const firstRing = sites.firstRing(site), endRing = sites.firstRing(site + 1), most = ringOffsets[endRing] - ringOffsets[firstRing];
+    if ((last - first + 1) * most > crossings.length) crossings = new Float64Array(2 * (last - first + 1) * most);
+    for (let ring = firstRing; ring < endRing; ring++) {
+      const to = ringOffsets[ring + 1];
+      let p = 2 * position[to - 1];
+      for (let v = ringOffsets[ring]; v < to; v++) {
+        const q = 2 * position[v], ay = xy[p + 1], by = xy[q + 1];
+        // One row more at both ends: the comparison below decides, which both sites of an edge make with equal numbers.
+        const from = Math.max(first, Math.floor((top - Math.max(ay, by)) * step - 0.5)), end = Math.min(last, Math.ceil((top - Math.min(ay, by)) * step - 0.5));
+        for (let row = from; row <= end; row++) {
+          const y = top - (row + 0.5) / step;
+          if (ay > y !== by > y) crossings[(row - first) * most + counts[row]++] = (xy[p] + ((y - ay) / (by - ay)) * (xy[q] - xy[p]) - left) * step;
         }
+        p = q;
       }
-      if (n > 2) {
-        crossings.length = n;
-        crossings.sort((a, b) => a - b);
-      } else if (crossings[0] > crossings[1]) [crossings[0], crossings[1]] = [crossings[1], crossings[0]];
-      for (let k = 0; k + 1 < n; k += 2) {
+    }
+    for (let row = first; row <= last; row++) {
+      const start = (row - first) * most, n = counts[row];
+      counts[row] = 0;
+      if (n > 2) crossings.subarray(start, start + n).sort();
+      else if (n === 2 && crossings[start] > crossings[start + 1]) [crossings[start], crossings[start + 1]] = [crossings[start + 1], crossings[start]];
+      for (let k = start; k + 1 < start + n; k += 2) {
         const from = Math.max(0, Math.ceil(crossings[k] - 0.5)), to = Math.min(width, Math.ceil(crossings[k + 1] - 0.5));
         for (let x = from, base = row * width; x < to; x++) owner[base + x] = site + 1;
       }
     }
   }
-  return owner;
 }

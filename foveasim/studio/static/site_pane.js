@@ -88,7 +88,7 @@ export class SitePane {
     // The raster map averages small sites itself.
     clearTimeout(this.overview?.resting);
     this.overview = this.map.gl ? new Overview(this.overviewCanvas, sites) : null;
-    this.resize();
+    if (isNew) this.resize();
     if (isWhole) this.fit();
     else this.map.set(this.map.x, this.map.y, this.map.scale);
     this.scale = null;

@@ -103,11 +103,10 @@ function resize() {
 
 // -- parts of the server ------------------------------------------------------------------------------------------------
 
-function useSites({ about, arrays, version }) {
-  const sites = new Sites(arrays, about), isNew = !panes.b.map;
-  sites.version = version;
+function useSites({ about, sites, boundary }) {
+  const isNew = !panes.b.map;
   panes.b.useSites(sites, about.palette);
-  page.boundary = boundaryOf(sites);
+  page.boundary = boundary;
   page.hovered = -1;
   if (page.pinned >= sites.n) page.pinned = -1;
   page.selected = page.rectangle && !editor.isOn ? panes.b.sitesIn(page.rectangle) : editor.useSites(sites);
@@ -117,7 +116,7 @@ function useSites({ about, arrays, version }) {
 function useColumns({ about, arrays }) {
   const { sites } = panes.b;
   if (!sites) return;
-  const columns = about.columns.map((column) => ({ ...column, values: column.of === "area" ? sites.area : column.of === "size" ? Float64Array.from(sites.area, Math.sqrt) : arrays[column.array] }));
+  const columns = about.columns.map((column) => ({ ...column, values: column.of === "area" ? sites.area : column.of === "size" ? sites.sizes : arrays[column.array] }));
   // Values of another layout: its outlines follow.
   if (columns.some((column) => column.values.length !== sites.n)) return;
   panes.b.useColumns(columns, about.filter ? arrays[about.filter] : null);
@@ -194,6 +193,11 @@ const USE = {
 
 // A state is shown with the values that follow it, and parts of a group together: each frame takes the browser tens of milliseconds.
 function receivePart(part) {
+  // While the server computes the values.
+  if (part.part === "sites") {
+    part.sites = new Sites(part.arrays, part.about);
+    part.boundary = boundaryOf(part.sites);
+  }
   hold("parts", part);
   if (!part.hasMore) showHeld();
 }

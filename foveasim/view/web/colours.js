@@ -141,13 +141,16 @@ export function formatLength(length) {
   return length >= 1000 ? length / 1000 + " mm" : length >= 0.1 ? Number(length.toPrecision(3)) + " µm" : Number((1000 * length).toPrecision(3)) + " nm";
 }
 
+// Made once: numbers are formatted many times faster than by toLocaleString.
+const WHOLE = new Intl.NumberFormat("en-US"), SIX_DIGITS = new Intl.NumberFormat("en-US", { maximumSignificantDigits: 6 });
+
 // Formats integers exactly, other numbers with six significant digits.
 export function shown(value) {
   if (Number.isNaN(value)) return "no value";
   if (!Number.isFinite(value)) return value > 0 ? "infinite" : "minus infinite";
-  if (Number.isSafeInteger(value)) return value.toLocaleString("en-US");
+  if (Number.isSafeInteger(value)) return WHOLE.format(value);
   const size = Math.abs(value);
-  return size >= 1e-3 && size < 1e7 ? value.toLocaleString("en-US", { maximumSignificantDigits: 6 }) : value.toExponential(4);
+  return size >= 1e-3 && size < 1e7 ? SIX_DIGITS.format(value) : value.toExponential(4);
 }
 
 // Formats a site's value of a column with its unit, using the site areas in µm²; "…" while the column is not loaded.

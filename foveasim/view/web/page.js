@@ -34,7 +34,7 @@ const array = (name) => unpack(name, about.arrays[name]);
 async function valuesOf(column) {
   if (!column.values) {
     if (column.of === "area") column.values = state.sites.area;
-    else if (column.of === "size") column.values = Float64Array.from(state.sites.area, Math.sqrt);
+    else if (column.of === "size") column.values = state.sites.sizes;
     else column.values = await array(column.array);
   }
   return column.values;

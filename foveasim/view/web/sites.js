@@ -15,6 +15,12 @@ export class Sites {
     this._sortIntoBins();
   }
 
+  // Square roots of the areas.
+  get sizes() {
+    this._sizes ||= this.area.map(Math.sqrt);
+    return this._sizes;
+  }
+
   firstRing(site) { return this.siteOffsets ? this.siteOffsets[site] : site; }
   firstVertex(site) { return this.ringOffsets[this.firstRing(site)]; }
 
@@ -40,7 +46,10 @@ export class Sites {
           px = qx; py = qy;
         }
       }
-      this.box.set([x0, y0, x1, y1], 4 * site);
+      this.box[4 * site] = x0;
+      this.box[4 * site + 1] = y0;
+      this.box[4 * site + 2] = x1;
+      this.box[4 * site + 3] = y1;
       this.area[site] = twice / 2;
     }
   }
@@ -49,6 +58,8 @@ export class Sites {
   _sortIntoBins() {
     const [x0, y0, x1, y1] = this.bounds, { n, box } = this;
     const width = Math.max(x1 - x0, 1e-12), height = Math.max(y1 - y0, 1e-12);
+    // Columns and rows of the first and last bin of each site.
+    const spans = new Uint16Array(4 * n);
     for (let wanted = Math.max(n, 1); ; wanted /= 4) {
       const side = Math.sqrt((width * height) / wanted);
       this.nx = Math.min(4096, Math.max(1, Math.round(width / side)));
@@ -56,32 +67,33 @@ export class Sites {
       this.perX = this.nx / width;
       this.perY = this.ny / height;
       let total = 0;
-      for (let site = 0; site < n; site++) {
-        const [a, b, c, d] = this._span(4 * site);
-        total += (c - a + 1) * (d - b + 1);
+      for (let at = 0; at < 4 * n; at += 4) {
+        for (let k = 0; k < 4; k += 2) {
+          spans[at + k] = this._column(box[at + k]);
+          spans[at + k + 1] = this._row(box[at + k + 1]);
+        }
+        total += (spans[at + 2] - spans[at] + 1) * (spans[at + 3] - spans[at + 1] + 1);
       }
       if (total <= 16 * n + 4096 || wanted < 1) break;
     }
+    const eachBin = (visit) => {
+      for (let site = 0; site < n; site++) {
+        const last = spans[4 * site + 2], top = spans[4 * site + 3];
+        for (let row = spans[4 * site + 1]; row <= top; row++) {
+          for (let column = spans[4 * site]; column <= last; column++) visit(row * this.nx + column, site);
+        }
+      }
+    };
     const counts = new Uint32Array(this.nx * this.ny);
-    this._eachBin((bin) => { counts[bin]++; });
+    eachBin((bin) => { counts[bin]++; });
     this.binOffsets = offsetsOf(counts);
     this.inBin = new Uint32Array(this.binOffsets[counts.length]);
     const next = this.binOffsets.slice();
-    this._eachBin((bin, site) => { this.inBin[next[bin]++] = site; });
+    eachBin((bin, site) => { this.inBin[next[bin]++] = site; });
   }
 
   _column(x) { return Math.min(this.nx - 1, Math.max(0, Math.floor((x - this.bounds[0]) * this.perX))); }
   _row(y) { return Math.min(this.ny - 1, Math.max(0, Math.floor((y - this.bounds[1]) * this.perY))); }
-  _span(at) {
-    const { box } = this;
-    return [this._column(box[at]), this._row(box[at + 1]), this._column(box[at + 2]), this._row(box[at + 3])];
-  }
-  _eachBin(visit) {
-    for (let site = 0; site < this.n; site++) {
-      const [a, b, c, d] = this._span(4 * site);
-      for (let row = b; row <= d; row++) for (let column = a; column <= c; column++) visit(row * this.nx + column, site);
-    }
-  }
 
   // All sites that contain a point, in ascending order. A point on a boundary belongs to the site on its +x side,
   // on a horizontal boundary to the site on its +y side.
