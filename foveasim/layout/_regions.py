@@ -9,12 +9,14 @@ import numpy as np
 import shapely
 
 from foveasim._core.validation import MAX_LENGTH_UM, as_numbers, check_length_um, finite_array
-from foveasim.errors import ParameterError, type_name
+from foveasim.errors import ParameterError, printable, type_name
 
 __all__ = ["as_region", "disc", "parse_region", "region_as_plain_data"]
 
 #: Vertices of a polygonal disc, by default: its area is that of the circle within 7 ppm.
 DISC_CORNERS = 960
+#: Characters of an invalid text that messages show.
+MAX_SHOWN = 60
 
 
 def parse_region(*, size_um: Any = None, radius_um: float | None = None, region: Any = None) -> Any:
@@ -60,6 +62,8 @@ def as_region(name: str, region: Any) -> Any:
     outline = region
     if isinstance(region, str):
         outline = shapely.from_wkt(region, on_invalid="ignore")
+        if outline is None:
+            raise ParameterError(name, "must be a polygon as well-known text (WKT)", printable(region)[:MAX_SHOWN])
     elif not isinstance(region, shapely.Geometry):
         vertices = finite_array(name, region, ndim=2)
         if vertices.shape[1] != 2 or vertices.shape[0] < 3:

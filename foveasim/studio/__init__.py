@@ -96,6 +96,8 @@ def run_studio(
     directory = None if out is None else _writable(out)
     settings, name = start_settings(shot)
     check_settings(None if shot is None else Path(shot), settings)
+    if not host:  # which would be all addresses
+        raise ParameterError("host", "must be an address of this computer", host)
     start = Start(settings, name, None if shot is None else Path(shot).absolute().parent, directory)
     if not _is_loopback(host):
         warn(

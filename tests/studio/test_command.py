@@ -208,6 +208,8 @@ def test_invalid_arguments_give_one_line(tmp_path):
         run_studio(out=tmp_path / "file", open_browser=False)
     with pytest.raises(ParameterError, match="port"):
         run_studio(port=70000, open_browser=False)
+    with pytest.raises(ParameterError, match="'host' must be an address of this computer, got ''"):
+        run_studio(host="", open_browser=False)
 
 
 def test_start_settings_have_absolute_paths(tmp_path):

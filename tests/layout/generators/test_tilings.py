@@ -117,7 +117,7 @@ def test_tiling_accepts_mosaic():
         ({"origin_um": (1, 2, 3)}, ParameterError, "'origin_um' must be two numbers"),
         ({"min_size_um": -1.0}, ParameterError, "'min_size_um' must be > 0"),
         ({"radius_um": 0.5, "min_size_um": 3.0}, GeometryError, "the region is too small for a single site"),
-        ({"radius_um": None, "region": "nowhere"}, ParameterError, "'region' must be a shapely Polygon"),
+        ({"radius_um": None, "region": "nowhere"}, ParameterError, "'region' must be a polygon as well-known text .WKT., got 'nowhere'"),
         ({"radius_um": None, "region": [(0, 0), (1, 1)]}, ParameterError, r"'region' must have the shape \(n, 2\)"),
     ],
 )  # fmt: skip
