@@ -42,7 +42,7 @@ class Costs:
         return key not in FAST_KEYS and self._simulation_s.get(key, 2.0 * SLOW_S) > SLOW_S
 
     def parts_s(self, key: str | None, names: Iterable[str]) -> float:
-        """Return the expected time of views after a change of a setting; 0 for those that it did not change yet."""
+        """Return the expected time of views after a change of a setting, s."""
         return sum(self._part_s.get((key, name), 0.0) for name in names)
 
     def is_slow_part(self, key: str | None, name: str) -> bool:

@@ -507,7 +507,7 @@ class Session:
         originals: dict[Path, Path] = {}
 
         def name_of(original: Path) -> str:
-            """Return a name that no other file of these settings has, nor a picture of settings that were saved before."""
+            """Return a name that no other file has, of these settings or of those saved before."""
 
             def is_usable(copied: Path) -> bool:
                 return originals.get(copied, original) == original and is_unused_or_copy(copied, original)

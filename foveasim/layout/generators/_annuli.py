@@ -165,7 +165,7 @@ def _circle(radius_um: float, rings: Sequence[Ring]) -> _Circle:
 
 @lru_cache(maxsize=MAX_CIRCLES)
 def _unit_circle(adjacent: tuple[Ring, ...]) -> _Circle:
-    """Return the points of a circle of radius 1; many circles of a layout differ only in their radius."""
+    """Return the points of a circle of radius 1, the same for many circles of a layout."""
     n_steps = math.lcm(*(2 * ring.n_sites * ring.n_chords for ring in adjacent))
     steps = []
     for n_sites, rotation, n_chords in adjacent:
