@@ -504,7 +504,7 @@ class Session:
         safe = file_name(name)
         path = out / (safe if safe.endswith((".yaml", ".yml")) else f"{safe}.yaml")
         out.mkdir(parents=True, exist_ok=True)
-        originals: dict[Path, Path] = {}
+        originals = {path: path}
 
         def name_of(original: Path) -> str:
             """Return a name that no other file has, of these settings or of those saved before."""

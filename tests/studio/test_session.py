@@ -490,6 +490,15 @@ def test_saved_pictures_never_share_a_name(make_session, tmp_path):
     assert (out / "photo.png").read_bytes() not in {path.read_bytes() for path in files.values()}
 
 
+def test_saved_settings_replace_no_upload(make_session, tmp_path):
+    recorder = make_session(out=tmp_path / "out")
+    path = recorder.session.add_file("shot.yaml", b"generator: grid\n")
+    recorder.session.history.commit({**recorder.session.history.settings, "layout": {"file": str(path)}})
+    saved = read_settings(recorder.session._save("shot.yaml"))
+
+    assert (tmp_path / "out" / saved["layout"]["file"]).read_bytes() == path.read_bytes()
+
+
 def test_failed_upload_returns_its_bytes(recorder, monkeypatch):
     def fail(path, content):
         raise OSError(28, "No space left on device")
