@@ -282,9 +282,12 @@ def _plain(text: str) -> str:
 
 def _resolved(root: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
     """Return the definition that a node refers to."""
-    while "$ref" in node:
+    while True:
+        # Before version 2.9, pydantic wrote references with a description into ``allOf``.
+        (node,) = node.get("allOf", (node,))
+        if "$ref" not in node:
+            return node
         node = root["$defs"][node["$ref"].rpartition("/")[2]]
-    return node
 
 
 def _options(root: dict[str, Any], node: dict[str, Any]) -> Iterator[dict[str, Any]]:
