@@ -7,6 +7,7 @@ import json
 import pytest
 
 from foveasim.config import build_shot, check_settings, demo_settings, read_settings, schema
+from foveasim.studio import _controls
 from foveasim.studio._controls import chosen_value, controls_of, structure_of, value_at
 
 KINDS = {"number", "integer", "choice", "boolean", "text", "list", "group", "sections"}
@@ -75,6 +76,12 @@ def test_ranges_contain_values(demo, controls):
         assert value is None or low <= value <= high, control
         assert control["minimum"] is None or low >= control["minimum"]
         assert control["maximum"] is None or high <= control["maximum"]
+
+
+def test_references_in_all_of_are_resolved():
+    root = {"$defs": {"lens": {"type": "object"}, "optics": {"allOf": [{"$ref": "#/$defs/lens"}]}}}
+    node = {"allOf": [{"$ref": "#/$defs/optics"}], "description": "as pydantic before version 2.9 writes it"}
+    assert _controls._resolved(root, node) == {"type": "object"}
 
 
 def test_units_are_not_in_labels(controls):
