@@ -40,18 +40,23 @@ REST_S = 7.0
 #: Interval at which the memory of the server is printed.
 PRINT_S = 120.0
 LEAK_MIB = 200.0
-#: Sends a change, and resolves to the times until the photosites and until all views are drawn. Timers, not frames, poll: a
-#: page that asks for each frame would be slower.
+#: Sends a change, and resolves to the times until the photosites are drawn and until the frame with all views is painted. The
+#: page tells when it is done: timers or frames that poll would take time from it.
 CHANGE = """([key, value]) => new Promise((resolve) => {
-  const { page, connection } = studio, start = performance.now(), id = connection.set(key, value, true);
-  let values = NaN;
-  const step = () => {
-    const { state, parts } = page, isNew = state.id >= id && parts.columns.version >= state.version;
-    if (Number.isNaN(values) && isNew && page.asked === null && page.drawnAt > start) values = page.drawnAt - start;
-    if (page.doneId >= id && page.asked === null) resolve([values, performance.now() - start]);
-    else setTimeout(step, 2);
+  const { page, connection } = studio, start = performance.now(), property = { configurable: true, enumerable: true };
+  let { doneId } = page, id = Infinity;
+  const finish = () => {
+    if (page.asked === null) resolve([page.drawnAt > start ? page.drawnAt - start : NaN, performance.now() - start]);
+    else setTimeout(finish, 2);
   };
-  step();
+  const set = (value) => {
+    doneId = value;
+    if (doneId < id) return;
+    Object.defineProperty(page, "doneId", { ...property, value, writable: true });
+    setTimeout(finish);  // set at the beginning of a frame: after it
+  };
+  Object.defineProperty(page, "doneId", { ...property, get: () => doneId, set });
+  id = connection.set(key, value, true);
 })"""
 #: Sends messages, and resolves to null when the last one is done and drawn, and with a second argument also all previews
 #: are complete and pictures have the size of their panes. After a minute it resolves to the state of the page, with the
