@@ -91,13 +91,13 @@ def run_studio(
     from foveasim.studio._server import UNSPECIFIED, Studio, host_names, serve
     from foveasim.studio._session import Start
 
+    if not host:  # a socket would listen at all addresses
+        raise ParameterError("host", "must be an address of this computer", host)
     port = check_count("port", port, at_least=0, at_most=2**16 - 1)
     token = _own_token()
     directory = None if out is None else _writable(out)
     settings, name = start_settings(shot)
     check_settings(None if shot is None else Path(shot), settings)
-    if not host:  # which would be all addresses
-        raise ParameterError("host", "must be an address of this computer", host)
     start = Start(settings, name, None if shot is None else Path(shot).absolute().parent, directory)
     if not _is_loopback(host):
         warn(

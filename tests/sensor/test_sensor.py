@@ -63,6 +63,18 @@ def test_photon_rate_matches_si_conversion():
     assert math.isclose(sensor.expected_electrons(rate_e_per_s, 1.0)[0], 2.76876e6, rel_tol=2e-6)
 
 
+def test_responsivity_follows_changed_wavelengths():
+    sensor, wavelength_nm = Sensor(FOUR), np.array([400.0])
+    first = sensor.responsivity_e_per_j(wavelength_nm).copy()
+    wavelength_nm[0] = 800.0
+
+    # At equal quantum efficiency it is proportional to the wavelength.
+    np.testing.assert_allclose(sensor.responsivity_e_per_j(wavelength_nm), 2.0 * first, rtol=1e-15)
+    np.testing.assert_allclose(
+        sensor.responsivity_e_per_j(np.array([400.0, 800.0])), [[first[0, 0], 2.0 * first[0, 0]]]
+    )
+
+
 def test_responsivity_is_proportional_to_wavelength():
     responsivity = Sensor(FOUR).responsivity_e_per_j(np.array([400.0, 800.0]))[0]
     assert math.isclose(responsivity[1] / responsivity[0], 2.0, rel_tol=1e-15)
