@@ -179,6 +179,16 @@ def test_invalid_argument_raises_with_name(call, message):
         call()
 
 
+@pytest.mark.parametrize("min_size_um", [1.5, 2.0, 6.0])
+def test_merge_small_closes_gaps_of_rounding(min_size_um):
+    layout = fs.layout.log_polar(n_sectors=36, min_size_um=1.0, r_max_um=18.0, fovea="hexagons")
+    merged = fs.layout.merge_small(layout, min_size_um=min_size_um)
+
+    assert merged.area_um2.min() >= min_size_um**2 * (1.0 - 1e-9)
+    assert merged.area_um2.sum() == pytest.approx(layout.area_um2.sum(), abs=1e-4)
+    assert shapely.area(shapely.make_valid(merged.polygons())).sum() == pytest.approx(layout.area_um2.sum(), abs=1e-4)
+
+
 def test_merge_small_joins_slivers_across_cut():
     """Both sides of a cut are computed separately, so their boundaries agree only within rounding."""
     disc = shapely.Point(0.0, 0.0).buffer(50.0)

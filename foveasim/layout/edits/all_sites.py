@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.rings import positions_in_runs
 from foveasim._core.validation import (
     MAX_LENGTH_UM,
+    Bools,
     Ints,
     check_choice,
     check_count,
@@ -31,7 +32,7 @@ from foveasim.layout._regions import as_region
 from foveasim.layout.adjacency import TOUCHING_UM, adjacency
 from foveasim.layout.drc.measurements import is_below_size
 from foveasim.layout.edit_registry import layout_edit
-from foveasim.layout.edits._parts import concatenate_layouts, replace_sites, separate_parts
+from foveasim.layout.edits._parts import SLIVER, concatenate_layouts, replace_sites, separate_parts
 from foveasim.layout.model import INTEGER_RANGES, Layout
 
 __all__ = ["clip", "cut_out", "inset", "joining_groups", "merge", "merge_small", "node", "snap", "split", "union"]
@@ -177,9 +178,9 @@ def merge(layout: Layout, groups: ArrayLike) -> Layout:
     rows = np.full((count.size, int(count.max(initial=1))), None, dtype=object)
     rows[group[order], positions_in_runs(count)] = layout.polygons()[order]
     joined = shapely.union_all(rows, axis=1) if count.size else np.zeros(0, dtype=object)
-    is_disconnected = shapely.get_type_id(joined) != shapely.GeometryType.POLYGON
-    # Edges separated by a cut coincide only within rounding: on a fine grid they are equal.
-    joined[is_disconnected] = shapely.union_all(rows[is_disconnected], axis=1, grid_size=TOUCHING_UM)
+    # Shared edges that coincide only within rounding leave gaps, which are closed on a fine grid.
+    has_gaps = (shapely.get_type_id(joined) != shapely.GeometryType.POLYGON) | _has_slivers(joined)
+    joined[has_gaps] = shapely.union_all(rows[has_gaps], axis=1, grid_size=TOUCHING_UM)
     is_disconnected = shapely.get_type_id(joined) != shapely.GeometryType.POLYGON
     if is_disconnected.any():
         bad = np.flatnonzero(is_disconnected[group])
@@ -187,6 +188,18 @@ def merge(layout: Layout, groups: ArrayLike) -> Layout:
             f"site {bad[0]} must be connected to the other sites of its group", tuple(int(i) for i in bad)
         )
     return _rebuild(layout, joined, first, "merged by groups")
+
+
+def _has_slivers(shapes: NDArray[Any]) -> Bools:
+    """Whether polygons have holes without area, within rounding, (n,)."""
+    has_slivers = np.zeros(shapes.size, bool)
+    rings, index = shapely.get_rings(shapes, return_index=True)
+    is_hole = np.zeros(index.size, bool)
+    is_hole[1:] = index[1:] == index[:-1]
+    shape = index[is_hole]
+    area_um2 = shapely.area(shapely.polygons(rings[is_hole]))
+    has_slivers[shape[area_um2 <= SLIVER * shapely.area(shapes)[shape]]] = True
+    return has_slivers
 
 
 @layout_edit(example={"min_size_um": 12.0})
