@@ -17,6 +17,7 @@ from foveasim._core.validation import Bools, Floats, Ints
 
 __all__ = [
     "are_convex",
+    "collapse_short_edges",
     "from_frame",
     "next_vertex",
     "positions_in_runs",
@@ -38,6 +39,28 @@ def next_vertex(ring_offsets: Ints) -> Ints:
     after = np.arange(1, ring_offsets[-1] + 1)
     after[ring_offsets[1:] - 1] = ring_offsets[:-1]
     return after
+
+
+def collapse_short_edges(xy: Floats, ring_offsets: Ints, shortest: float) -> tuple[Floats, Ints]:
+    """
+    Return packed rings without edges up to a length, whose ends become one vertex in all rings.
+
+    Vertices that rings share are equal before and after.
+    """
+    while True:
+        after = next_vertex(ring_offsets)
+        is_short = np.hypot(*(xy[after] - xy).T) <= shortest
+        if not is_short.any():
+            return xy, ring_offsets
+        # Of the two ends of an edge, all rings keep the smaller one in the order of x, then y.
+        points = np.ascontiguousarray(xy).view(np.complex128)[:, 0]
+        ends = np.sort(np.stack((points[is_short], points[after[is_short]])), axis=0)
+        larger, index = np.unique(ends[1], return_index=True)
+        at = np.minimum(np.searchsorted(larger, points), larger.size - 1)
+        points = np.where(larger[at] == points, ends[0][index][at], points)
+        is_kept = points != points[after]
+        ring_offsets = np.concatenate(([0], np.cumsum(is_kept)))[ring_offsets]
+        xy = points[is_kept].view(np.float64).reshape(-1, 2)
 
 
 def to_frame(xy: Floats, origin: ArrayLike, unit: ArrayLike) -> Floats:

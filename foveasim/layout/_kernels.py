@@ -29,6 +29,8 @@ _flags = types.Array(types.boolean, 1, "C")
 #: corners of octagons and the almost right angles between a chord and a side would count as widths. No two edges of a regular
 #: polygon enclose an angle with this cosine.
 MIN_FACING_COSINE = 0.9
+#: Length, in µm, up to which edges are those of vertices that differ by rounding, and common edges touch in a corner only.
+MIN_EDGE_UM = 1e-6
 
 
 @njit(types.void(_points, _points, types.int64, types.float64[:, ::1]))
@@ -52,8 +54,10 @@ def fill_rectangles(x, y, first, xy):
 def _point_to_edge(px, py, ax, ay, bx, by):
     """Return the distance of a point from a segment."""
     dx, dy = bx - ax, by - ay
-    t = ((px - ax) * dx + (py - ay) * dy) / (dx * dx + dy * dy)
-    t = min(max(t, 0.0), 1.0)
+    length2 = dx * dx + dy * dy
+    t = 0.0
+    if length2 > 0.0:
+        t = min(max(((px - ax) * dx + (py - ay) * dy) / length2, 0.0), 1.0)
     return np.hypot(px - ax - t * dx, py - ay - t * dy)
 
 
@@ -100,7 +104,7 @@ def min_widths(xy, after, before, ring_offsets, site_offsets):
             ax, ay = xy[i, 0], xy[i, 1]
             bx, by = xy[after[i], 0], xy[after[i], 1]
             length = np.hypot(bx - ax, by - ay)
-            if length == 0.0:  # vertices that rounding has made equal
+            if length <= MIN_EDGE_UM:  # vertices that differ by rounding
                 continue
             ex, ey = (bx - ax) / length, (by - ay) / length
             low, high = np.inf, -np.inf
@@ -114,7 +118,7 @@ def min_widths(xy, after, before, ring_offsets, site_offsets):
                 cx, cy = xy[k, 0], xy[k, 1]
                 dx, dy = xy[after[k], 0], xy[after[k], 1]
                 other = np.hypot(dx - cx, dy - cy)
-                if other == 0.0:
+                if other <= MIN_EDGE_UM:
                     continue
                 fx, fy = (dx - cx) / other, (dy - cy) / other
                 if ex * fx + ey * fy > -MIN_FACING_COSINE:
@@ -342,7 +346,8 @@ def _is_separated(xy, after, overhang, depth, i_first, i_last, j_first, j_last):
         lowest = 0.0
         for c in range(j_first, j_last):
             lowest = min(lowest, ey * (xy[c, 0] - xy[a, 0]) - ex * (xy[c, 1] - xy[a, 1]))
-        if overhang[a] - lowest / np.hypot(ex, ey) <= depth:
+        length = np.hypot(ex, ey)
+        if length > MIN_EDGE_UM and overhang[a] - lowest / length <= depth:
             return True
     return False
 
@@ -436,10 +441,6 @@ def contacts(xy, after, first_vertex, box, overhang, depth, first, second, reach
     return distances, is_non_overlapping
 
 
-#: Common length, in µm, up to which edges count as touching in a corner only: the rounding of coordinates.
-MIN_SHARED_LENGTH_UM = 1e-6
-
-
 @njit(types.float64[::1](_points, _ints, _ints, _ints, _ints, types.float64))
 def shared_lengths(xy, after, first_vertex, first, second, max_gap):
     """
@@ -455,6 +456,8 @@ def shared_lengths(xy, after, first_vertex, first, second, max_gap):
             ax, ay = xy[a, 0], xy[a, 1]
             ex, ey = xy[after[a], 0] - ax, xy[after[a], 1] - ay
             length = np.hypot(ex, ey)
+            if length <= MIN_EDGE_UM:  # vertices that differ by rounding
+                continue
             ex, ey = ex / length, ey / length
             for c in range(first_vertex[j], first_vertex[j + 1]):
                 cx, cy = xy[c, 0] - ax, xy[c, 1] - ay
@@ -462,7 +465,7 @@ def shared_lengths(xy, after, first_vertex, first, second, max_gap):
                 high = cx * ex + cy * ey  # the other edge has the opposite direction
                 low = dx * ex + dy * ey
                 begin, end = max(low, 0.0), min(high, length)
-                if end - begin <= MIN_SHARED_LENGTH_UM:
+                if end - begin <= MIN_EDGE_UM:
                     continue
                 slope = ((cy - dy) * ex - (cx - dx) * ey) / (high - low)
                 away = dy * ex - dx * ey - slope * low  # distance of the line of the other edge at (ax, ay)

@@ -11,7 +11,15 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from foveasim._core.rings import are_convex, next_vertex, positions_in_runs, ring_moments, site_bounds_um, site_moments
+from foveasim._core.rings import (
+    are_convex,
+    collapse_short_edges,
+    next_vertex,
+    positions_in_runs,
+    ring_moments,
+    site_bounds_um,
+    site_moments,
+)
 
 relaxed = settings(deadline=None, derandomize=True, max_examples=60)
 
@@ -215,3 +223,15 @@ def test_pentagram_is_not_convex():
     angle = 2.0 * np.pi * 2.0 * np.arange(5) / 5
 
     assert not are_convex(np.stack((np.cos(angle), np.sin(angle)), axis=1), np.array([0, 5])).any()
+
+
+def test_short_edges_collapse_alike_in_all_rings():
+    tiny = 1e-12
+    xy = np.array(
+        [[0, 0], [1, 0], [1, 1], [1 - tiny, 1 + tiny], [0, 1], [1, 0], [2, 0], [2, 1], [1 - tiny, 1 + tiny], [1, 1]]
+    )
+    found, offsets = collapse_short_edges(xy.astype(float), np.array([0, 5, 10]), 1e-9)
+
+    corner = [1 - tiny, 1 + tiny]
+    assert offsets.tolist() == [0, 4, 8]
+    assert found.tolist() == [[0, 0], [1, 0], corner, [0, 1], [1, 0], [2, 0], [2, 1], corner]

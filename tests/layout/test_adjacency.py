@@ -106,3 +106,18 @@ def test_corners_overlapping_by_rounding_share_nothing():
     layout = fs.Layout.from_polygons([shapely.box(0, 0, 2, 2), shapely.box(2 + 1e-8, 2 - 1e-8, 4, 4)])
 
     assert layout.adjacency().nnz == 0
+
+
+def test_edges_without_length_share_nothing():
+    square = np.array([[0, 0], [2, 0], [2, 2], [0, 2]], float)
+    xy_um = np.concatenate((square[[0, 1, 1, 2, 3]], square + np.array([2.0, 0.0])))
+    layout = fs.Layout._from_checked(xy_um, np.array([0, 5, 9]), np.arange(3), {}, {})
+
+    assert layout.adjacency().toarray().tolist() == [[0.0, 2.0], [2.0, 0.0]]
+
+
+def test_rotated_voronoi_cells_share_same_edges():
+    layout = fs.layout.fovi(fov_um=36.0, a_um=3.0, n_rings=12)
+
+    assert abs(layout.rotate(30.0).adjacency() - layout.adjacency()).max() < 1e-9
+    assert layout.check(fs.DesignRules(min_width_um=0.4)).ok

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
@@ -10,7 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from foveasim._core.rings import next_vertex, ring_moments
+from foveasim._core.rings import collapse_short_edges, next_vertex, ring_moments
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout.diagrams.power import N_AUXILIARY, PowerDiagram, auxiliary_points_um
@@ -365,7 +366,10 @@ def _clip(
                 f"centre {parts.missing[0]} is too close to another centre for float64", tuple(parts.missing.tolist())
             )
         rings_um, ring_offsets = _rings(parts.join(boundary), boundary)
-    return _merge_rings(unclipped_um, offsets, rings_um, ring_offsets, boundary, float(region.area))
+    area_um2 = float(region.area)
+    merged = _merge_rings(unclipped_um, offsets, rings_um, ring_offsets, boundary, area_um2)
+    # Cuts through a vertex of the region, within rounding.
+    return collapse_short_edges(*merged, SHORT_EDGE * math.sqrt(area_um2 / is_inside.size))
 
 
 @dataclass(frozen=True)
