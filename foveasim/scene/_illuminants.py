@@ -16,8 +16,13 @@ __all__ = ["Illuminant", "illuminant", "illuminant_spectrum", "interpolate_table
 
 Illuminant = Literal["A", "D50", "D55", "D65", "D75", "E"]
 
-#: Correlated colour temperatures of the CIE daylight illuminants; their names precede the revision of Planck's second constant.
-DAYLIGHTS_K = {"D50": 5003.0, "D55": 5503.0, "D65": 6504.0, "D75": 7504.0}
+#: Revision of Planck's second constant since the definition of the daylight illuminants, from 1.438 to 1.4388 cm K: their
+#: correlated colour temperatures are the nominal ones times this ratio, not rounded (CIE 15:2004, section 3.1).
+PLANCK_REVISION = 1.4388 / 1.4380
+DAYLIGHTS_K = {
+    name: nominal_k * PLANCK_REVISION
+    for name, nominal_k in {"D50": 5000.0, "D55": 5500.0, "D65": 6500.0, "D75": 7500.0}.items()
+}
 #: Normalisation wavelength of relative spectra.
 REFERENCE_NM = 560.0
 #: Planck's second constant and the temperature that define illuminant A (CIE 15).
@@ -47,7 +52,8 @@ def illuminant(name: Illuminant, wavelength_nm: ArrayLike) -> Floats:
     Notes
     -----
     Daylight according to CIE 15:2004: S0 + M1 S1 + M2 S2 with M1 and M2 rounded to three decimals; the components are
-    interpolated linearly between steps of 10 nm.
+    interpolated linearly between steps of 10 nm. The published tables of D50, D55, D65 and D75 in steps of 5 nm agree to
+    1e-5 of the value at 560 nm.
     """
     check_choice("illuminant", name, (*DAYLIGHTS_K, "A", "E"))
     waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)

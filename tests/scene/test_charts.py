@@ -484,15 +484,18 @@ def test_illuminants_have_standard_chromaticities(name, x, y):
 
 
 @pytest.mark.parametrize(
-    ("name", "table"),  # CIE 15:2004, Table T.1
+    ("name", "table"),  # CIE 15:2004, Table T.1, also at 5 nm between the steps of the components
     [
-        ("D65", {380: 49.9755, 400: 82.7549, 450: 117.008, 500: 109.354, 560: 100.0, 600: 90.0062, 700: 71.6091}),
-        ("A", {380: 9.7951, 400: 14.708, 500: 59.8611, 560: 100.0, 700: 198.261, 780: 241.675}),
+        ("A", {380: 9.7951, 405: 16.148, 500: 59.8611, 560: 100.0, 700: 198.261, 780: 241.675}),
+        ("D50", {380: 24.488, 405: 52.91, 450: 87.247, 560: 100.0, 680: 99.133, 780: 78.274}),
+        ("D55", {380: 32.584, 405: 64.751, 450: 97.993, 560: 100.0, 680: 89.956, 780: 71.818}),
+        ("D65", {380: 49.9755, 405: 87.1204, 410: 91.486, 545: 104.225, 560: 100.0, 680: 78.2842, 780: 63.3828}),
+        ("D75", {380: 66.703, 405: 106.911, 450: 133.01, 560: 100.0, 680: 71.576, 780: 58.324}),
     ],
 )
 def test_illuminants_have_published_spectra(name, table):
     found = charts.illuminant(name, [float(w) for w in table])
-    np.testing.assert_allclose(100.0 * found, list(table.values()), rtol=1e-3)
+    np.testing.assert_allclose(found, np.array(list(table.values())) / 100.0, rtol=0.0, atol=1e-5)
 
 
 # -- aliasing -------------------------------------------------------------------------------------------------------
