@@ -33,8 +33,8 @@ _W0, _W1 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBB67AE8584CAA73B)
 _M0_32, _M1_32 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
 _W0_32, _W1_32 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
 _M_32 = np.uint64(0xD256D193)
-_LOW, _32, _11 = np.uint64(0xFFFFFFFF), np.uint64(32), np.uint64(11)
-_12, _ONE_IN_2_53, _ONE_IN_2_52 = np.uint64(12), 2.0**-53, 2.0**-52
+_LOW, _32 = np.uint64(0xFFFFFFFF), np.uint64(32)
+_12, _ONE_IN_2_52 = np.uint64(12), 2.0**-52
 #: Number of random numbers that are computed at a time: their buffers fit in the L1 cache.
 BATCH = 1024
 _QUARTER, _HALF = BATCH // 4, BATCH // 2
@@ -106,8 +106,13 @@ def philox_2x32(key, c0, c1):
 
 @njit(inline="always")
 def uniform(word):
-    """Convert a word of 64 bits to a number in the open interval (0, 1)."""
-    return (np.float64(word >> _11) + 0.5) * _ONE_IN_2_53
+    """
+    Convert a word of 64 bits to a number in the open interval (0, 1).
+
+    Numbers are odd multiples of 2**-53, from 2**-53 to 1 - 2**-53, and symmetric: words that are complements give ``u`` and
+    ``1 - u``. Of 53 bits, float64 would round the half away: the largest word would give 1.
+    """
+    return (np.float64(word >> _12) + 0.5) * _ONE_IN_2_52
 
 
 @njit(types.void(types.uint64, types.int64, types.uint32[::1], types.float32[::1]), error_model="numpy")
@@ -161,15 +166,14 @@ def fill_uniforms(key, batch, first, second):
     """
     Compute a batch of pairs of uniform numbers in the open interval (0, 1).
 
-    They are multiples of 2**-53. Pair ``i`` of batch ``b`` depends only on the key, ``b`` and ``i``: one counter of Philox
-    4x32. The arrays have size ``BATCH``.
+    See :func:`uniform`. Pair ``i`` of batch ``b`` depends only on the key, ``b`` and ``i``: one counter of Philox 4x32. The
+    arrays have size ``BATCH``.
     """
     key_0, key_1, zero = key & _LOW, key >> _32, np.uint64(0)
     for j in range(BATCH):
         counter = np.uint64(batch * BATCH + j)
         a, b, c, d = philox_4x32(key_0, key_1, counter & _LOW, counter >> _32, zero, _UNIFORMS)
-        first[j] = (np.float64(((a << _32) | b) >> _12) + 0.5) * _ONE_IN_2_52
-        second[j] = (np.float64(((c << _32) | d) >> _12) + 0.5) * _ONE_IN_2_52
+        first[j], second[j] = uniform((a << _32) | b), uniform((c << _32) | d)
 
 
 @njit(

@@ -9,7 +9,8 @@ only counted, so that the caller can repeat the call with longer arrays; countin
 An event whose time would be rounded to another frame is moved to the nearest time in its own frame: change events are in
 ``(begin, end]`` of a frame, spikes in ``[begin, end)``. The order of events therefore does not depend on the batches.
 
-Random numbers depend on the key, the site and the number of previous draws of the site, not on the batches.
+Random numbers, in the open interval (0, 1), depend on the key, the site and the number of previous draws of the site, not on
+the batches.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ import sys
 
 import numpy as np
 import pytest
+import scipy.special
 import scipy.stats
 
 from foveasim._core import _kernels
@@ -194,6 +195,16 @@ def reference_normal(key, i):
     theta = math.pi / 4.0 * (1.0 + angle / 2**31)
     sign = -1.0 if word >> (30 if is_second else 31) & 1 else 1.0
     return sign * radius * (math.cos(theta) if is_second else math.sin(theta))
+
+
+@pytest.mark.parametrize("word", [0, 1, 2**12 - 1, 2**63 - 1, 2**63, 2**64 - 2**12, 2**64 - 1])
+def test_uniform_numbers_exclude_zero_and_one(word):
+    number, opposite = _kernels.uniform(np.uint64(word)), _kernels.uniform(np.uint64(2**64 - 1 - word))
+
+    # Differences below 1 of multiples of 2**-53 are exact.
+    assert number == 1.0 - opposite
+    assert 0.0 < number < 1.0
+    assert scipy.special.ndtri(number) == pytest.approx(scipy.stats.norm.ppf((word // 2**12 + 0.5) / 2**52))
 
 
 @pytest.mark.parametrize("key", [0, 1, 2**63, 2**64 - 1])

@@ -59,7 +59,7 @@ def test_device_uniforms_match_philox_reference():
 
     for number, (first, second) in zip(ours, ((5, 1), (2**63, 0)), strict=True):
         word = np.random.Philox(key=[int(k) for k in key], counter=[first - 1, second, 0, 0]).random_raw()
-        assert number == ((int(word) >> 11) + 0.5) / 2.0**53
+        assert number == ((int(word) >> 12) + 0.5) / 2.0**52
 
 
 EFFECTS = ("prnu", "dsnu", "hot", "gain_fpn", "pixel_fpn", "rts")
@@ -326,6 +326,31 @@ def test_exact_draws_follow_mean_of_each_site():
         assert abs(values.mean() - wanted) < SIGMAS * values.std() / math.sqrt(z.size)
     for lag in (1, 2, 1024):
         assert abs(np.corrcoef(z[:-lag], z[lag:])[0, 1]) < SIGMAS / math.sqrt(z.size)
+
+
+@pytest.mark.parametrize(("mean_e", "distance"), [(100.0, 2.0e-4), (700.0, 2.8e-5)])
+def test_draws_above_limit_approximate_poisson(mean_e, distance):
+    """Draws have the probabilities of the documented quadratic function, with its distance and kurtosis."""
+    c = 1 / 6 + 11 / (648 * mean_e)
+    s = math.sqrt(mean_e - 1 / 12 - 2 * c * c)
+    edges = np.arange(int(mean_e - 9 * s), int(mean_e + 10 * s)) + 0.5
+    # mean + s z + c (z² - 1) < edge between the two roots.
+    root = np.sqrt(s * s - 4 * c * (mean_e - c - edges))
+    probability = np.diff(scipy.stats.norm.cdf((root - s) / (2 * c)) - scipy.stats.norm.cdf((-root - s) / (2 * c)))
+    charges = edges[1:] - 0.5
+    n = 4_000_000
+
+    electrons = fs.sensor.draw_shot_noise(np.full(n, np.nextafter(mean_e, np.inf)), "auto", mean_e, Streams(23))
+
+    is_frequent = probability * n > 20
+    counts = np.histogram(electrons, edges)[0][is_frequent]
+    wanted = probability[is_frequent] * n
+    rest = n - counts.sum(), n - wanted.sum()
+    assert scipy.stats.chisquare([*counts, rest[0]], [*wanted, rest[1]]).pvalue > 1e-6
+    poisson = scipy.stats.poisson.pmf(charges, mean_e)
+    assert 0.5 * np.abs(probability - poisson).sum() == pytest.approx(distance, rel=0.02)
+    kurtosis = ((charges - mean_e) ** 4 @ probability) / mean_e**2 - 3.0
+    assert kurtosis == pytest.approx(4 / (3 * mean_e), rel=2e-3)
 
 
 @pytest.mark.parametrize("gaussian_above_e", [5.0, 1e9, math.nan])

@@ -88,6 +88,11 @@ class ShotNoise(Effect):
     to the variance. Hence ``s² = λ - 1/12 - 2 c²``, and c solves ``6 c (λ - 1/12) - 4 c³ = λ``: to order 1/λ it is
     ``1/6 + 11 / (648 λ)``. This is the second-order Cornish-Fisher expansion (Abramowitz and Stegun, 26.2.49), corrected for
     rounding.
+
+    Remaining error above the limit: the fourth cumulant is ``48 c² (s² + c²)``, so that the excess kurtosis is 4/(3 λ), four
+    thirds of that of the Poisson distribution: 0.0133 instead of 0.0100 at 100 e-. The total variation distance from the
+    Poisson distribution, the largest difference in probability of any event, is 0.02/λ: 2e-3 at 10 e-, 2e-4 at the default
+    limit of 100 e-, 3e-5 at 700 e-.
     """
 
     name: ClassVar[str] = "shot"
