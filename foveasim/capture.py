@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.extras import import_optional, needs
+from foveasim._core.extras import import_optional
 from foveasim._core.names import possible_names
 from foveasim._core.provenance import copy_plain_data, to_plain_data
 from foveasim._core.rings import same_rings
@@ -416,10 +416,7 @@ class Capture:
         ``_``; its attribute ``long_name`` is the original name. Outlines are not included: ``layout.write`` and
         :meth:`save` write them.
         """
-        try:
-            import xarray as xr
-        except ImportError:
-            raise ParameterError("to_xarray", needs("xarray", "maps")) from None
+        xr = import_optional("to_xarray", "xarray", "maps")
         variables, coordinates, _ = self._variables()
 
         def parts(chosen: Mapping[str, Variable]) -> dict[str, Any]:
@@ -449,10 +446,7 @@ class Capture:
 
             capture.to_pandas().groupby("filter_name")["code"].mean()
         """
-        try:
-            import pandas as pd
-        except ImportError:
-            raise ParameterError("to_pandas", needs("pandas")) from None
+        pd = import_optional("to_pandas", "pandas")
         variables, coordinates, _ = self._variables()
         columns = {
             **{name: coordinates[name] for name in ("x_um", "y_um", "area_um2")},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import re
 import sys
 import tomllib
@@ -13,7 +14,8 @@ from pathlib import Path
 import pytest
 
 import foveasim
-from foveasim._core.extras import EXTRA_OF
+from foveasim._core.extras import EXTRA_OF, import_optional
+from foveasim.errors import FileError, ParameterError
 
 PACKAGE = Path(foveasim.__file__).parent
 ROOT = PACKAGE.parent
@@ -51,7 +53,6 @@ OPTIONAL_TESTS = {
 #: Distributions that no line imports.
 INDIRECT = {
     "cryptography": "distributed makes the keys of a sweep's own scheduler with it",
-    "h5netcdf": "xarray's engine for NetCDF files",
     "lxml": "trimesh writes 3MF with it",
     "networkx": "trimesh writes 3MF with it",
     "websockets": "uvicorn serves sockets with it",
@@ -106,8 +107,9 @@ def imported_modules(path):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.level == 0:
             yield node.module
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in IMPORTING:
-            yield from (a.value for a in node.args if isinstance(a, ast.Constant) and isinstance(a.value, str))
+        elif isinstance(node, ast.Call) and (name := ast.unparse(node.func).rpartition(".")[2]) in IMPORTING:
+            args = node.args[1:2] if name == "import_optional" else node.args  # after its subject, before the extra
+            yield from (a.value for a in args if isinstance(a, ast.Constant) and isinstance(a.value, str))
 
 
 def imported_distributions(path):
@@ -191,13 +193,87 @@ def test_bounds_of_a_distribution_agree():
     } == {}
 
 
-def test_missing_pytorch_gives_install_command(monkeypatch):
+#: Modules of the package that import optional modules directly, and the functions that have imported them before.
+GUARDED = {
+    "explore/_worker_imports.py": "check_installed of explore/cluster.py, before workers start",
+    "explore/cluster.py": "check_installed",
+    "explore/datasets/zarr_rows.py": "zarr is imported by explore/datasets/store.py",
+    "explore/executor.py": "check_installed",
+    "explore/studies/study.py": "optuna requires sqlalchemy",
+    "explore/worker_cache.py": "only in a worker, where distributed is imported",
+    "layout/files/_gdstk.py": "import_optional in layout/files/gds.py",
+    "modes/_hdf5.py": "import_optional in modes/events.py",
+    "studio/_server.py": "import_optional in run_studio",
+    "view/meshes.py": "PyVista requires VTK",
+    "view/web/_widget.py": "import_optional in view/notebook/_widget.py",
+}
+
+
+def test_optional_modules_are_imported_with_install_hint():
+    found = set()
+    for path in PACKAGE.rglob("*.py"):
+        tree = ast.parse(path.read_text())
+        skipped = set(only_for_types(tree))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Import):
+                modules = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                modules = [node.module]
+            else:
+                continue
+            if node not in skipped and {name.partition(".")[0] for name in modules} & set(EXTRA_OF):
+                found.add(str(path.relative_to(PACKAGE)))
+
+    assert {path for path in found if not path.startswith("learn/")} == set(GUARDED)
+
+
+def without_pytorch(monkeypatch):
     for name in [name for name in sys.modules if name == "torch" or name.startswith("foveasim.learn")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "torch", None)
     monkeypatch.delitem(vars(foveasim), "learn", raising=False)
 
+
+def test_missing_pytorch_gives_install_command(monkeypatch):
+    without_pytorch(monkeypatch)
+
     with pytest.raises(
-        ImportError, match=r"^foveasim.learn needs torch; install it with: pip install 'foveasim\[learn\]'$"
+        ImportError, match=r"^foveasim.learn.Mesh needs torch; install it with: pip install 'foveasim\[learn\]'$"
     ):
-        _ = foveasim.learn
+        _ = foveasim.learn.Mesh
+    with pytest.raises(ImportError, match=r"pip install 'foveasim\[learn\]'$"):
+        from foveasim.learn import site_power  # noqa: F401
+    assert not hasattr(foveasim.learn, "not_a_name")
+
+
+def test_members_are_listed_without_pytorch(monkeypatch):
+    without_pytorch(monkeypatch)
+
+    members = dict(inspect.getmembers(foveasim))
+
+    assert set(members) == set(foveasim.__all__)
+    assert inspect.getmembers(members["learn"]) == []
+
+
+@pytest.mark.parametrize(
+    "error", [ModuleNotFoundError("No module named 'h5py'", name="h5py"), ImportError("libhdf5.so: no\n")]
+)
+def test_missing_and_unusable_modules_are_distinguished(monkeypatch, error):
+    def fail(name):
+        raise error
+
+    monkeypatch.setattr("foveasim._core.extras.import_module", fail)
+
+    with pytest.raises(FileError) as of_file:
+        import_optional(Path("a.h5"), "h5py", "maps")
+    with pytest.raises(ParameterError) as of_other:
+        import_optional("to_table", "h5py", "maps")
+
+    is_missing = isinstance(error, ModuleNotFoundError)
+    reason = (
+        "; install it with: pip install 'foveasim[maps]'"
+        if is_missing
+        else ", which cannot be imported (libhdf5.so: no)"
+    )
+    assert str(of_file.value) == f"a.h5: needs h5py{reason}"
+    assert str(of_other.value) == f"'to_table' needs h5py{reason}"

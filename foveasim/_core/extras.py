@@ -6,9 +6,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from foveasim.errors import FileError
+from foveasim.errors import FileError, ParameterError
 
-__all__ = ["EXTRA_OF", "import_optional", "install_hint", "needs"]
+__all__ = ["EXTRA_OF", "import_optional", "needs"]
 
 #: Smallest extra that installs each optional module.
 EXTRA_OF = {
@@ -16,7 +16,9 @@ EXTRA_OF = {
     "anywidget": "notebook",
     "astropy": "maps",
     "av": "video",
+    "cloudpickle": "explore",
     "cryptography": "explore",
+    "dask": "explore",
     "distributed": "explore",
     "gdstk": "layout",
     "h5netcdf": "maps",
@@ -25,12 +27,15 @@ EXTRA_OF = {
     "klayout": "klayout",
     "lxml": "view",
     "networkx": "view",
+    "numcodecs": "explore",
     "optuna": "explore",
     "pandas": "maps",
     "pyarrow": "parquet",
     "pyvista": "view",
+    "sqlalchemy": "explore",
     "starlette": "studio",
     "torch": "learn",
+    "traitlets": "notebook",
     "uvicorn": "studio",
     "vtkmodules": "view",
     "websockets": "studio",
@@ -39,26 +44,43 @@ EXTRA_OF = {
 }
 
 
-def install_hint(module: str, extra: str | None = None) -> str:
-    """Return the command that installs a module, by default with its smallest extra."""
-    return f"install it with: pip install 'foveasim[{extra or EXTRA_OF[module]}]'"
-
-
 def needs(module: str, extra: str | None = None) -> str:
-    """Return the message for a missing module."""
-    return f"needs {module}; {install_hint(module, extra)}"
+    """Return the message for a missing module, by default with its smallest extra."""
+    return f"needs {module}; install it with: pip install 'foveasim[{extra or EXTRA_OF[module]}]'"
 
 
-def import_optional(path: Path, module: str) -> Any:
+def import_optional(subject: Path | str, module: str, extra: str | None = None) -> Any:
     """
-    Import an optional module that a file requires.
+    Import an optional module, with the command that installs it as error message.
+
+    Other imports of optional modules are of those that this function has imported before.
+
+    Parameters
+    ----------
+    subject : Path or str
+        What requires the module, for the message: the path of a file, or the name of a function or an argument.
+    module : str
+        Name of the module, such as ``"h5py"`` or ``"astropy.io.fits"``.
+    extra : str, optional
+        Extra that installs everything that the subject requires; by default the smallest one with the module.
+
+    Returns
+    -------
+    module
 
     Raises
     ------
     FileError
-        When the module is not installed; the message contains the path of the file.
+        When the module is not installed or cannot be imported, and the subject is a path.
+    ParameterError
+        The same for other subjects.
     """
+    name = module.partition(".")[0]
     try:
+        import_module(name)
         return import_module(module)
-    except ImportError:
-        raise FileError(path, needs(module)) from None
+    except ImportError as error:
+        detail = needs(name, extra)
+        if not isinstance(error, ModuleNotFoundError):  # installed, but for example without a library of the system
+            detail = f"needs {name}, which cannot be imported ({' '.join(str(error).split()):.160})"
+    raise FileError(subject, detail) if isinstance(subject, Path) else ParameterError(subject, detail)

@@ -497,8 +497,7 @@ def _write_tiff(path: Path, picture: NDArray[Any]) -> None:
 
 
 def _write_exr(path: Path, picture: NDArray[Any]) -> None:
-    import OpenEXR
-
+    OpenEXR = import_optional(path, "OpenEXR")
     layers = picture.reshape(*picture.shape[:2], -1)
     names = ("Y", "YA", "RGB", "RGBA")[layers.shape[2] - 1]
     channels = {name: np.ascontiguousarray(layers[..., k]) for k, name in enumerate(names)}
@@ -575,8 +574,6 @@ def write_picture(path: str | Path, picture: NDArray[Any]) -> None:
             chosen.write(temporary, picture)
         except FileError as error:
             raise FileError(target, error.detail) from None
-        except ImportError as error:
-            raise FileError(target, needs(error.name or "OpenEXR", "pictures")) from None
         except (OSError, ValueError, RuntimeError) as error:
             if disk_problem(error):
                 raise

@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.extras import needs
+from foveasim._core.extras import import_optional
 from foveasim._io.images import check_picture_size
 from foveasim._io.sandbox import iterate_in_sandbox, read_in_sandbox
 from foveasim.errors import FileError, printable
 
 __all__ = ["SandboxedVideo", "VideoFile", "frame_pixels"]
 
-NEEDS_PYAV = needs("av")
 KIND = "a video"
 #: Limit of the memory of the sandbox process: threads of the decoder and its reference frames.
 MAX_BYTES = 2**32
@@ -111,10 +110,7 @@ def frame_pixels(path: Path, frame: Any) -> NDArray[np.uint8]:
 
 
 def _open_video(path: Path) -> Any:
-    try:
-        import av
-    except ImportError:
-        raise FileError(path, NEEDS_PYAV) from None
+    av = import_optional(path, "av")
     with _as_video_error(path, "is not a readable video file"):
         # Metadata such as titles are not used and may be corrupt.
         container = av.open(str(path), metadata_errors="replace")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.extras import needs
+from foveasim._core.extras import import_optional
 from foveasim._core.provenance import copy_plain_data, to_plain_data, versions
 from foveasim._core.validation import Floats, check_count, check_number, finite_array, read_only
 from foveasim.camera import Camera
@@ -173,10 +173,7 @@ class Comparison:
         ParameterError
             When xarray is missing.
         """
-        try:
-            import xarray as xr
-        except ImportError:
-            raise ParameterError("to_xarray", needs("xarray", "maps")) from None
+        xr = import_optional("to_xarray", "xarray", "maps")
         variables = {}
         for name, measure in MEASURES.items():
             dims = ("camera", "scene") if measure.has_scenes else ("camera",)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from foveasim._core.calls import check_public_calls
-from foveasim._core.registry import import_all
 from foveasim.explore._metrics import METRICS, Metric, import_metric
 from foveasim.explore._schemas import schema_of
 from foveasim.explore.datasets.dataset import Dataset
@@ -50,7 +49,5 @@ __all__ = [
     "trials_table",
     "write_dataset",
 ]
-
-import_all(__name__, __path__)
 
 check_public_calls(__name__)

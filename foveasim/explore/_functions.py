@@ -10,8 +10,7 @@ from pathlib import Path
 from types import CellType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
-from foveasim._core.extras import needs
-from foveasim.errors import ParameterError
+from foveasim._core.extras import import_optional
 
 __all__ = ["find_user_module", "identify_function"]
 
@@ -48,10 +47,7 @@ def identify_function(function: Callable[..., Any]) -> str:
     name = f"{getattr(function, '__module__', '')}:{getattr(function, '__qualname__', type(function).__qualname__)}"
     if isinstance(function, FunctionType) and find_user_module(function) is None and function.__closure__ is None:
         return name
-    try:
-        from dask.base import tokenize
-    except ImportError:
-        raise ParameterError("metrics", needs("dask")) from None
+    tokenize = import_optional("metrics", "dask.base").tokenize
     return f"{name} {tokenize(_parts_of(function, {}))}"
 
 

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from foveasim._core.extras import needs
+from foveasim._core.extras import import_optional
 from foveasim.errors import ParameterError, SimulationError
 
 if TYPE_CHECKING:
     from distributed import Client, Security
 
-__all__ = ["WorkerStates", "dask_setup", "open_client"]
+__all__ = ["WorkerStates", "check_installed", "dask_setup", "open_client"]
 
 #: Timeout of a scheduler, seconds.
 SCHEDULER_S = 10.0
@@ -41,6 +41,19 @@ MEMORY_SETTINGS = {
 START_METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 #: Local clusters do not serve HTTP, which requires no certificate.
 NO_HTTP: dict[str, list[str]] = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
+
+
+def check_installed() -> None:
+    """
+    Check that the libraries for worker processes are installed.
+
+    Raises
+    ------
+    ParameterError
+        When one is missing.
+    """
+    for module in ("distributed", "dask", "cloudpickle", "cryptography"):
+        import_optional("workers", module)
 
 
 @contextmanager
@@ -62,7 +75,7 @@ def open_client(scheduler: str | None, n_workers: int) -> Iterator[Client]:
     Raises
     ------
     ParameterError
-        When dask or cryptography is not installed, or no scheduler answers.
+        When no scheduler answers.
     SimulationError
         When local workers do not start.
 
@@ -72,14 +85,11 @@ def open_client(scheduler: str | None, n_workers: int) -> Iterator[Client]:
     TLS with a key of this run, which stays in the memory of its processes, and reject connections without it. The
     configuration of dask (``distributed.comm.tls``) determines the connection to an external scheduler.
     """
-    try:
-        import dask
-        from distributed import Client, LocalCluster, Security
-        from distributed.system import MEMORY_LIMIT
+    import dask
+    from distributed import Client, LocalCluster, Security
+    from distributed.system import MEMORY_LIMIT
 
-        security = Security() if scheduler is not None else Security.temporary()
-    except ImportError:
-        raise ParameterError("sweep", needs("distributed")) from None
+    security = Security() if scheduler is not None else Security.temporary()
     if scheduler is not None:
         _check_scheduler(scheduler, security)
         with _suppress_logs():

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from foveasim._core.provenance import versions
 from foveasim.errors import FoveasimError, SimulationError
 from foveasim.explore._functions import find_user_module
-from foveasim.explore.cluster import WorkerStates, open_client
+from foveasim.explore.cluster import WorkerStates, check_installed, open_client
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -96,6 +96,7 @@ def executor(
     if scheduler is None and workers is None:
         yield lambda items, _cuts: ((item, function(item)) for item in items)
         return
+    check_installed()
     payload = _pickle(function, what, users)
     with open_client(scheduler, workers or 1) as client:
         shared = client.submit(_Shared, payload, versions(), pure=False)

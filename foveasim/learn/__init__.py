@@ -2,29 +2,16 @@
 Gradients with respect to photosites, optics and electronics, for PyTorch.
 
 The functions take and return tensors on the CPU; the kernels below them are those of the simulator. Requires the extra
-``learn``.
+``learn``: without PyTorch the module has no names, and their use raises an ImportError.
 """
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
 from foveasim._core.calls import check_public_calls
 from foveasim._core.extras import needs
-
-try:
-    import torch as _torch  # noqa: F401
-except ImportError:
-    raise ImportError(f"foveasim.learn {needs('torch')}") from None
-
-from foveasim.learn.distortion import undistort
-from foveasim.learn.imaging import Imaging
-from foveasim.learn.integral import site_power
-from foveasim.learn.mesh import Mesh
-from foveasim.learn.model import Model, capture
-from foveasim.learn.outlines import Outlines
-from foveasim.learn.parametric import generated
-from foveasim.learn.penalties import barrier
-from foveasim.learn.power_cells import PowerCells
-from foveasim.learn.readout import Readout
 
 __all__ = [
     "Imaging",
@@ -40,4 +27,25 @@ __all__ = [
     "undistort",
 ]
 
-check_public_calls(__name__)
+if TYPE_CHECKING or find_spec("torch") is not None:
+    from foveasim.learn.distortion import undistort
+    from foveasim.learn.imaging import Imaging
+    from foveasim.learn.integral import site_power
+    from foveasim.learn.mesh import Mesh
+    from foveasim.learn.model import Model, capture
+    from foveasim.learn.outlines import Outlines
+    from foveasim.learn.parametric import generated
+    from foveasim.learn.penalties import barrier
+    from foveasim.learn.power_cells import PowerCells
+    from foveasim.learn.readout import Readout
+
+    check_public_calls(__name__)
+else:
+
+    def __getattr__(name: str) -> Any:
+        if name in __all__:
+            raise ImportError(f"{__name__}.{name} {needs('torch')}", name=__name__)
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+
+    def __dir__() -> list[str]:
+        return []

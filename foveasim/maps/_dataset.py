@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from foveasim._core.extras import needs
+from foveasim._core.extras import import_optional
 from foveasim._io.atomic import atomic_directory, check_free_space
 from foveasim._io.formats import FileFormat
 from foveasim._io.rasters.datasets import HDF5_MAGIC, NETCDF3_MAGICS, is_zarr, open_netcdf, open_zarr, select_array
-from foveasim.errors import FileError
 from foveasim.fields import PowerMap
 from foveasim.maps._common import Found
 from foveasim.maps._formats import MAP_FORMATS
@@ -26,7 +25,8 @@ NETCDF_BYTES = 2**16
 
 def write_netcdf(power_map: PowerMap, path: Path) -> None:
     """Write an uncompressed netCDF 4 file."""
-    _require(path, "h5netcdf")
+    for module in ("h5netcdf", "xarray"):
+        import_optional(path, module, "maps")
     # HDF5 crashes if the disk is full.
     check_free_space(path, power_map.data.nbytes + 8 * sum(power_map.data.shape) + NETCDF_BYTES)
     to_xarray(power_map).to_dataset().to_netcdf(path, engine="h5netcdf", encoding={NAME: {"_FillValue": None}})
@@ -41,7 +41,8 @@ def write_zarr(power_map: PowerMap, path: Path) -> None:
     FileError
         If zarr is missing, the path exists and is not a zarr directory, or it cannot be written.
     """
-    _require(path, "zarr")
+    for module in ("zarr", "xarray"):
+        import_optional(path, module, "maps")
     with atomic_directory(path, is_ours=is_zarr) as directory:
         dataset = to_xarray(power_map).to_dataset()
         encoding: dict[str, dict[str, Any]] = {str(name): {"compressors": None} for name in dataset.variables}
@@ -61,14 +62,6 @@ def read_zarr(path: Path, name: str | None) -> Found:
     """Read the named array, or ``irradiance``, or the only array that is a map."""
     with open_zarr(path) as (dataset, n_bytes):
         return found_in_array(select_array(dataset, name, n_bytes, default=NAME))
-
-
-def _require(path: Path, engine: str) -> None:
-    try:
-        __import__(engine)
-        __import__("xarray")
-    except ImportError:
-        raise FileError(path, needs(engine, "maps")) from None
 
 
 MAP_FORMATS.register(

@@ -14,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from foveasim._core.extras import import_optional
 from foveasim._io.formats import FileFormat, FormatError
-from foveasim._io.rasters.exr import MAGIC, POLARISATION, band_of_channel, import_openexr, read_channels, read_header
+from foveasim._io.rasters.exr import MAGIC, POLARISATION, band_of_channel, read_channels, read_header
 from foveasim.errors import ParameterError
 from foveasim.fields import PowerMap, to_file_rows
 from foveasim.maps._common import Found
@@ -36,7 +37,7 @@ def write(power_map: PowerMap, path: Path) -> None:
     ParameterError
         If the map is not float32, or two bands have the same wavelength.
     """
-    exr = import_openexr(path)
+    exr = import_optional(path, "OpenEXR", "maps")
     if power_map.data.dtype != np.float32:
         raise ParameterError(
             "power_map",

@@ -17,11 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from foveasim._core.extras import needs
+from foveasim._core.extras import import_optional
 from foveasim._io.formats import FileFormat, FormatError
 from foveasim._io.rasters import STEP_TOLERANCE, check_size
 from foveasim._io.rasters.units import length_in_um
-from foveasim.errors import FileError
 from foveasim.fields import PowerMap
 from foveasim.maps._common import Found
 from foveasim.maps._formats import MAP_FORMATS
@@ -39,7 +38,7 @@ WAVES = ("WAVE", "AWAV", "WAVELENGTH", "LAMBDA")
 
 def write(power_map: PowerMap, path: Path) -> None:
     """Write one image (n_band, n_y, n_x)."""
-    fits = _import_astropy(path)
+    fits = import_optional(path, "astropy.io.fits")
     grid, waves_nm = power_map.grid, power_map.wavelength_nm
     hdu = fits.PrimaryHDU(power_map.data.astype(power_map.data.dtype.newbyteorder(">")))
     header = hdu.header
@@ -62,7 +61,7 @@ def write(power_map: PowerMap, path: Path) -> None:
 
 def read(path: Path, name: str | None) -> Found:
     """Read the image with a name or number, or the first image."""
-    fits = _import_astropy(path)
+    fits = import_optional(path, "astropy.io.fits")
     n_bytes = path.stat().st_size
     with (
         warnings.catch_warnings(),
@@ -156,14 +155,6 @@ def _number(header: Any, keyword: str, default: int) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise FormatError(f"has the invalid value {keyword} = {value!r:.20}, expected a finite number")
     return float(value)
-
-
-def _import_astropy(path: Path) -> Any:
-    try:
-        from astropy.io import fits
-    except ImportError:
-        raise FileError(path, needs("astropy")) from None
-    return fits
 
 
 MAP_FORMATS.register(

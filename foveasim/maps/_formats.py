@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.extras import needs
 from foveasim._core.registry import Registry
-from foveasim._io.formats import FileFormat, FormatError, as_file_error
+from foveasim._io.formats import FileFormat, as_file_error
 from foveasim._io.rasters import as_images, read_raster
 from foveasim.errors import ParameterError
 from foveasim.maps._common import Found
@@ -50,10 +49,7 @@ def _read(path: str, format_name: str, name: str | None) -> tuple[dict[str, Any]
     form = MAP_FORMATS[format_name]
     assert form.read is not None
     with as_file_error(Path(path), "power map", passes=(ParameterError,)):
-        try:
-            found: Found = form.read(Path(path), name)
-        except ModuleNotFoundError as error:
-            raise FormatError(needs(error.name or "a library", "maps")) from None
+        found: Found = form.read(Path(path), name)
         metadata = asdict(replace(found, data=np.empty(0)))
         del metadata["data"]
         return metadata, [as_images(found.data)]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from foveasim._core.extras import install_hint
+from foveasim._core.extras import import_optional
 from foveasim._core.validation import Floats
 from foveasim._io.formats import FormatError
 from foveasim._io.rasters import pitch_of_axes
@@ -58,7 +58,7 @@ def to_xarray(power_map: PowerMap) -> xr.DataArray:
     """
     if not isinstance(power_map, PowerMap):
         raise ParameterError("power_map", f"must be a PowerMap, got {type_name(power_map)}")
-    xr = _import_xarray()
+    xr = import_optional("xarray", "xarray", "maps")
     grid = power_map.grid
     return xr.DataArray(
         power_map.data,
@@ -106,7 +106,7 @@ def from_xarray(
     ParameterError
         If the array has other dimensions or invalid values, or metadata are missing.
     """
-    xr = _import_xarray()
+    xr = import_optional("xarray", "xarray", "maps")
     if not isinstance(data_array, xr.DataArray):
         raise ParameterError("data_array", f"must be an xarray.DataArray, got {type_name(data_array)}")
     given = Given(
@@ -182,11 +182,3 @@ def _exact_grid(array: xr.DataArray, x_um: Floats, y_um: Floats) -> Grid | None:
     far_x = np.abs(np.sort(x_um) - grid.x_um).max() / grid.pitch_x_um
     far_y = np.abs(np.sort(y_um) - grid.y_um).max() / grid.pitch_y_um
     return grid if max(far_x, far_y) <= ROUNDING else None
-
-
-def _import_xarray() -> Any:
-    try:
-        import xarray as xr
-    except ImportError:
-        raise ParameterError("xarray", f"must be installed; {install_hint('xarray', 'maps')}") from None
-    return xr

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.extras import needs
+from foveasim._core.extras import import_optional
 from foveasim._core.provenance import to_plain_data
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Floats, Ints, as_numbers, check_number, finite_array, own, read_only
@@ -341,7 +341,7 @@ class Events:
         """
         source = Path(path)
         if source.suffix.lower() in HDF5_EXTENSIONS:
-            _needs_h5py(source)
+            import_optional(source, "h5py")
             if not source.is_file():
                 raise FileError(source, "is not a file" if source.exists() else "no such file")
             with as_file_error(source, "event file"):
@@ -388,9 +388,7 @@ def write_events(batches: Iterable[Events], path: str | Path, *, pitch_um: float
     target = Path(path)
     if target.suffix.lower() not in HDF5_EXTENSIONS:
         raise FileError(target, "must end in .h5 or .hdf5")
-    _needs_h5py(target)
-    import h5py
-
+    h5py = import_optional(target, "h5py")
     file: _hdf5.EventFile | None = None
     with atomic_write(target) as temporary, ExitStack() as stack:
         for batch in _check_consecutive("batches", batches):
@@ -499,10 +497,3 @@ def _to_us(t_s: Floats) -> Ints:
     t_us += (t_us + 1.0) / 1e6 <= t_s
     t_us -= t_us / 1e6 > t_s
     return t_us.astype(np.int64)
-
-
-def _needs_h5py(path: Path) -> None:
-    try:
-        import h5py  # noqa: F401
-    except ImportError:
-        raise FileError(path, needs("h5py")) from None

@@ -19,11 +19,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from foveasim._core.calls import check_public_calls
-from foveasim._core.extras import needs
+from foveasim._core.extras import import_optional
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import check_count
 from foveasim.config import check_directory
-from foveasim.errors import FileError, FoveasimWarning, ParameterError, SimulationError
+from foveasim.errors import FileError, FoveasimWarning, ParameterError
 
 __all__ = ["run_studio"]
 
@@ -64,13 +64,11 @@ def run_studio(
 
     Raises
     ------
-    SimulationError
-        When the extra ``studio`` is not installed.
     ConfigError
         When the settings file cannot be read, or is invalid.
     ParameterError
-        When the port is out of range or in use, the host is not an address of this computer, or the token of the environment is
-        too short.
+        When the extra ``studio`` is not installed, the port is out of range or in use, the host is not an address of this
+        computer, or the token of the environment is too short.
     FileError
         When the directory for saved files cannot be created or written.
 
@@ -85,7 +83,7 @@ def run_studio(
     address is the same after a restart.
     """
     for module in MODULES:
-        _require(module)
+        import_optional("studio", module)
     from foveasim.config import check_settings
     from foveasim.studio._files import start_settings
     from foveasim.studio._server import UNSPECIFIED, Studio, host_names, serve
@@ -140,15 +138,6 @@ def _graphical_browser() -> webbrowser.BaseBrowser | None:
     except webbrowser.Error:
         return None
     return None if browser.name in TEXT_BROWSERS else browser
-
-
-def _require(module: str) -> None:
-    from importlib import import_module
-
-    try:
-        import_module(module)
-    except ImportError:
-        raise SimulationError(f"the studio {needs(module)}") from None
 
 
 def _own_token() -> str | None:

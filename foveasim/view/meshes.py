@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.extras import install_hint
+from foveasim._core.extras import import_optional
 from foveasim._core.provenance import to_plain_data
 from foveasim._core.rings import next_vertex, positions_in_runs
 from foveasim._core.threads import parallel_map, thread_count
@@ -498,8 +498,4 @@ def import_pyvista() -> Any:
     ParameterError
         When PyVista is not installed.
     """
-    try:
-        import pyvista
-    except ImportError:
-        raise ParameterError("pyvista", f"is missing; {install_hint('pyvista')}") from None
-    return pyvista
+    return import_optional("view in 3D", "pyvista")

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from functools import cache
 from importlib.util import find_spec
 
-from foveasim._core.extras import install_hint
+from foveasim._core.extras import needs
 
 __all__ = ["ON_SCREEN", "begin_rendering", "find_renderer", "missing_software"]
 
@@ -83,7 +83,7 @@ def begin_rendering() -> None:
 def missing_software() -> str:
     """Return a message on the software that PyVista rendering lacks; empty if it is complete."""
     if any(find_spec(module) is None for module in ("pyvista", "vtkmodules")):
-        return f"PyVista is not installed; {install_hint('pyvista')}"
+        return f"rendering {needs('pyvista')}"
     if find_renderer() is None:
         return "this machine has no OpenGL; install it, on Debian and Ubuntu with: apt install libegl1 libgl1"
     return ""

@@ -80,8 +80,6 @@ def public_functions():
     for name in MODULES:
         module = import_module(name)
         for public in module.__all__:
-            if (name, public) == ("foveasim", "learn"):  # needs PyTorch; a module of its own where it is installed
-                continue
             item = getattr(module, public)
             if isinstance(item, FunctionType):
                 yield f"{name}.{public}", item

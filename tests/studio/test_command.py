@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import socket
+import sys
 import threading
 import webbrowser
 
@@ -13,7 +14,7 @@ from typer.testing import CliRunner
 from foveasim import studio
 from foveasim.cli import app
 from foveasim.config import demo_settings
-from foveasim.errors import ConfigError, FileError, FoveasimWarning, ParameterError, SimulationError
+from foveasim.errors import ConfigError, FileError, FoveasimWarning, ParameterError
 from foveasim.studio import _server, run_studio
 from foveasim.studio._files import file_name, start_settings
 from foveasim.studio._server import host_names
@@ -140,12 +141,9 @@ def test_python_call_prints_address(started, capsys):
 
 
 def test_missing_extra_gives_one_line(monkeypatch):
-    monkeypatch.setattr(studio, "MODULES", ("foveasim_missing",))
-    monkeypatch.setattr(
-        studio, "needs", lambda module: f"needs {module}; install it with: pip install 'foveasim[studio]'"
-    )
+    monkeypatch.setitem(sys.modules, "websockets", None)
 
-    with pytest.raises(SimulationError, match=r"pip install 'foveasim\[studio\]'$"):
+    with pytest.raises(ParameterError, match=r"pip install 'foveasim\[studio\]'$"):
         run_studio()
 
 

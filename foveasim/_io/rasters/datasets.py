@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from foveasim._core.extras import import_optional
 from foveasim._core.names import possible_names
 from foveasim._io.formats import FormatError
 from foveasim._io.rasters import check_size
@@ -57,8 +58,7 @@ MAX_METADATA_BYTES = 2**22
 @contextlib.contextmanager
 def open_netcdf(path: Path) -> Iterator[tuple[xr.Dataset, int]]:
     """Open a netCDF or HDF5 file; yield the lazy dataset and the file size in bytes."""
-    import xarray as xr
-
+    xr = import_optional(path, "xarray", "maps")
     with path.open("rb") as file:
         is_hdf5 = not file.read(4).startswith(b"CDF")
     if is_hdf5:
@@ -73,8 +73,8 @@ def open_netcdf(path: Path) -> Iterator[tuple[xr.Dataset, int]]:
 @contextlib.contextmanager
 def open_zarr(path: Path) -> Iterator[tuple[xr.Dataset, int]]:
     """Open a zarr directory; yield the lazy dataset and the total size in bytes."""
-    import xarray as xr
-
+    xr = import_optional(path, "xarray", "maps")
+    import_optional(path, "zarr", "maps")
     n_bytes = _check_zarr(path)
     with xr.open_zarr(path, consolidated=False, chunks=None, decode_times=False) as dataset:
         yield dataset, n_bytes
@@ -140,8 +140,8 @@ def _select_name(dataset: xr.Dataset, name: str | None, default: str, min_ndim: 
 
 def _check_hdf5(path: Path) -> None:
     """Reject files with external references or too many objects."""
-    import h5py
-
+    h5py = import_optional(path, "h5py", "maps")
+    import_optional(path, "h5netcdf", "maps")
     with h5py.File(path, "r") as file:
         groups, n_objects = [file["/"]], 0
         visited = set()

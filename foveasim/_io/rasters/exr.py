@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.extras import needs
+from foveasim._core.extras import import_optional
 from foveasim._io.formats import FormatError
 from foveasim._io.rasters import MAX_BANDS, check_size
 from foveasim._io.rasters.units import length_in_um, round_factor
-from foveasim.errors import FileError
 
-__all__ = ["MAGIC", "POLARISATION", "ExrHeader", "band_of_channel", "import_openexr", "read_channels", "read_header"]
+__all__ = ["MAGIC", "POLARISATION", "ExrHeader", "band_of_channel", "read_channels", "read_header"]
 
 MAGIC = b"\x76\x2f\x31\x01"
 #: Channel of a band: optional layer, wavelength and unit. A layer is not a number: ``550.5nm`` has none.
@@ -47,7 +46,7 @@ def read_header(path: Path) -> ExrHeader:
     FormatError
         If the file contains several images, or is too large.
     """
-    exr = import_openexr(path)
+    exr = import_optional(path, "OpenEXR", "maps")
     with exr.File(str(path), header_only=True) as file:
         if len(file.parts) != 1:
             raise FormatError(f"contains {len(file.parts)} images; provide a file with one")
@@ -90,25 +89,9 @@ def read_channels(path: Path, names: Sequence[str]) -> NDArray[Any]:
     FormatError
         If a channel is subsampled.
     """
-    exr = import_openexr(path)
+    exr = import_optional(path, "OpenEXR", "maps")
     with exr.File(str(path), separate_channels=True) as file:
         channels = file.channels()
         if any((channels[name].xSampling, channels[name].ySampling) != (1, 1) for name in names):
             raise FormatError("has subsampled channels; write all bands at full resolution")
         return np.stack([channels[name].pixels for name in names])
-
-
-def import_openexr(path: Path) -> Any:
-    """
-    Import the library OpenEXR.
-
-    Raises
-    ------
-    FileError
-        If it is missing.
-    """
-    try:
-        import OpenEXR
-    except ImportError:
-        raise FileError(path, needs("OpenEXR", "maps")) from None
-    return OpenEXR

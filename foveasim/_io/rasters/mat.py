@@ -19,6 +19,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.extras import import_optional
 from foveasim._core.names import possible_names
 from foveasim._io.formats import FormatError
 from foveasim._io.rasters import check_size, max_decompressed_bytes
@@ -95,8 +96,7 @@ def open_mat5(path: Path) -> Iterator[MatFile]:
 @contextmanager
 def open_mat73(path: Path) -> Iterator[MatFile]:
     """Open a MAT file of version 7.3."""
-    import h5py
-
+    h5py = import_optional(path, "h5py", "maps")
     n_bytes = path.stat().st_size
     with h5py.File(path, "r") as file:
 

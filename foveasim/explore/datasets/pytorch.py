@@ -8,8 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from foveasim._core.extras import needs
-from foveasim.errors import ParameterError
+from foveasim._core.extras import import_optional
 
 __all__ = ["torch_dataset"]
 
@@ -55,17 +54,14 @@ def torch_dataset(dataset: Samples, transform: Callable[[dict[str, Any]], Any] |
 @cache
 def _dataset_class() -> Any:
     """Return the dataset class, which is defined on first use."""
-    try:
-        import torch  # type: ignore[import-not-found,unused-ignore]
-    except ImportError:
-        raise ParameterError("torch_dataset", needs("torch")) from None
+    torch = import_optional("torch_dataset", "torch")
 
     def tensor(value: Any) -> Any:
         if not isinstance(value, np.ndarray):
             return value
         return torch.from_numpy(value.astype(np.int32) if value.dtype == np.uint16 else value)
 
-    class TorchDataset(torch.utils.data.Dataset):  # type: ignore[misc,unused-ignore]
+    class TorchDataset(import_optional("torch_dataset", "torch.utils.data").Dataset):  # type: ignore[misc]
         """Dataset with tensors instead of the arrays of another dataset."""
 
         def __init__(self, dataset: Samples, transform: Callable[[dict[str, Any]], Any] | None) -> None:

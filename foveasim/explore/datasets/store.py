@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from foveasim._core.extras import needs
+from foveasim._core.extras import import_optional
 from foveasim._core.names import missing_path
 from foveasim._core.threads import thread_count
 from foveasim._core.user_warnings import warn
@@ -51,7 +51,6 @@ READ_EXTENSIONS = ("npz", "json")
 DIGEST_BYTES = 32
 #: Remaining time in one process above which worker processes are started, seconds; their start takes seconds.
 SINGLE_PROCESS_S = 10.0
-NEEDS_ZARR = needs("zarr", "explore")
 
 #: Function of the number of written samples and the total number.
 Progress = Callable[[int, int], None]
@@ -121,7 +120,7 @@ def write_dataset(
             raise ParameterError(
                 "layout", "must not vary in a zarr store, whose arrays have one length; use a directory of tar files"
             )
-        _zarr(target)
+        import_optional(target, "zarr", "explore")
     plan = json.loads(json.dumps(dataset.to_dict()))
     about = _read_about(target) if os.path.exists(target) else None  # noqa: PTH110 -- False, not an error, without permission
     if about is None:
@@ -321,7 +320,7 @@ def open_dataset(path: str | Path) -> StoredSamples:
     except OSError as error:
         raise FileError(source, f"cannot be read: {error.strerror or error}") from None
     if source.suffix.lower() == ZARR:
-        _zarr(source)
+        import_optional(source, "zarr", "explore")
     stored = StoredSamples(source, _read_about(source))
     shards = stored._shards  # noqa: SLF001 -- same module
     n_done = sum(shards.is_complete(k) for k in range(shards.n_shards))
@@ -356,14 +355,6 @@ def _shards_class(target: Path) -> type[_Shards]:
     if target.suffix:
         raise FileError(target, "must have the extension .zarr, or none for a directory of tar files")
     return _TarShards
-
-
-def _zarr(path: Path) -> Any:
-    try:
-        import zarr
-    except ImportError:
-        raise FileError(path, NEEDS_ZARR) from None
-    return zarr
 
 
 # -- shards -----------------------------------------------------------------------------------------------------------
@@ -516,7 +507,7 @@ class _ZarrShards(_Shards):
 
     @staticmethod
     def create(target: Path, about: Mapping[str, Any], dataset: Dataset) -> None:
-        zarr = _zarr(target)
+        zarr = import_optional(target, "zarr", "explore")
         n, per_shard = about["n_samples"], about["per_shard"]
 
         with atomic_directory(target, is_ours=lambda _: False) as new:
@@ -551,7 +542,7 @@ class _ZarrShards(_Shards):
 
     def _arrays(self) -> dict[str, Any]:
         if self._opened is None or self._opened[0] != os.getpid():
-            zarr = _zarr(self.directory)
+            zarr = import_optional(self.directory, "zarr", "explore")
             # Chunks of zeros are written, so that a missing one is an error.
             with zarr.config.set({"array.write_empty_chunks": True}):
                 group = zarr.open_group(str(self.directory), mode="r+")

@@ -14,12 +14,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from foveasim._core.extras import needs
+from foveasim._core.extras import import_optional
 from foveasim._core.names import possible_names
 from foveasim._core.random_streams import derive_seed
 from foveasim._core.validation import check_count
 from foveasim._io.atomic import lock
-from foveasim.errors import FileError, FoveasimError, ParameterError, printable
+from foveasim.errors import FileError, FoveasimError, printable
 from foveasim.explore._metrics import Metric
 from foveasim.explore._records import WORKER_LOST, Record, Value, check_same_plan
 from foveasim.explore.executor import KILLED, executor
@@ -157,7 +157,7 @@ def run_study(
     """
     if workers is not None:
         workers = min(check_count("workers", workers, at_most=1024), plan.batch)
-    optuna = _optuna()
+    optuna = import_optional("study", "optuna")
     url = _url(storage)
     with _file_lock(storage, url):
         token = secrets.token_hex(8)
@@ -446,11 +446,3 @@ def _suppress_logs(optuna: Any) -> Iterator[None]:
         yield
     finally:
         optuna.logging.set_verbosity(verbosity)
-
-
-def _optuna() -> Any:
-    try:
-        import optuna
-    except ImportError:
-        raise ParameterError("study", needs("optuna")) from None
-    return optuna

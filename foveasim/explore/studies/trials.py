@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from copy import copy
 from typing import TYPE_CHECKING, Any
 
-from foveasim._core.extras import needs
-from foveasim.errors import ParameterError
+from foveasim._core.extras import import_optional
 from foveasim.explore.studies.plan import typed_choice
 
 if TYPE_CHECKING:
@@ -82,10 +81,7 @@ def trials_table(optuna_study: optuna.Study) -> pd.DataFrame:
         table = explore.trials_table(found)
         table[table.is_best].sort_values("snr_mean")
     """
-    try:
-        import pandas as pd
-    except ImportError:
-        raise ParameterError("trials_table", needs("pandas", "explore")) from None
+    pd = import_optional("trials_table", "pandas", "explore")
     best = {trial.number for trial in optuna_study.best_trials}
     rows = []
     for trial in finished_trials(optuna_study):

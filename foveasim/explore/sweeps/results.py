@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.extras import needs
+from foveasim._core.extras import import_optional
 from foveasim._core.names import missing_path
 from foveasim._core.validation import unit_of
 from foveasim._io.atomic import atomic_directory
-from foveasim.errors import FileError, ParameterError
+from foveasim.errors import FileError
 from foveasim.explore._records import FORMAT, VERSION, Record, Value
 from foveasim.explore.sweeps.plan import POINT, REPEAT, Plan, coordinate
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["check_store", "open_results", "stored_plan", "to_dataset", "write_store"]
+__all__ = ["check_store", "import_xarray", "open_results", "stored_plan", "to_dataset", "write_store"]
 
 #: Variables of every sweep.
 SEED, ERROR, WARNING = "seed", "error", "warning"
@@ -48,7 +48,7 @@ def to_dataset(plan: Plan, records: Mapping[int, Record]) -> xr.Dataset:
         Dimensions are the varied settings, or ``point``, and ``repeat``. Variables are the metrics, ``seed``, ``error`` (empty
         without errors) and ``warning``. Unlabelled dimensions are padded with NaN to the longest array.
     """
-    xr = _xarray()
+    xr = import_xarray("sweep")
     shape, dims = plan.shape, plan.dims
     errors = {k: records[k].error if k in records else "not done" for k in range(plan.n_points)}
     reserved = {*plan.values, POINT, REPEAT, SEED, ERROR, WARNING}
@@ -223,7 +223,6 @@ def check_store(path: Path) -> None:
     FileError
         When the directory does not exist, or the path contains other data.
     """
-    _xarray()
     if not path.absolute().parent.is_dir():
         raise FileError(path, f"cannot be written: the directory {path.absolute().parent} does not exist")
     if path.exists() and not (path / "zarr.json").is_file():
@@ -263,8 +262,9 @@ def open_results(path: str | Path) -> xr.Dataset:
     path = Path(path)
     if stored_plan(path) is None:
         raise FileError(path, missing_path(path, "store"))
+    xarray = import_xarray(path)
     try:
-        with _xarray().open_zarr(path, consolidated=False, chunks=None) as dataset:
+        with xarray.open_zarr(path, consolidated=False, chunks=None) as dataset:
             loaded: xr.Dataset = dataset.load()
             return loaded
     except Exception as error:  # noqa: BLE001 -- corrupt stores raise many kinds of errors
@@ -293,10 +293,14 @@ def write_store(dataset: xr.Dataset, path: Path) -> None:
                 os.fsync(opened.fileno())
 
 
-def _xarray() -> Any:
-    try:
-        import xarray
-        import zarr  # noqa: F401 -- format of the results
-    except ImportError:
-        raise ParameterError("sweep", needs("xarray")) from None
-    return xarray
+def import_xarray(subject: Path | str) -> Any:
+    """
+    Import xarray, and zarr, the format of the results.
+
+    Raises
+    ------
+    ParameterError, FileError
+        When one of them is not installed.
+    """
+    import_optional(subject, "zarr", "explore")
+    return import_optional(subject, "xarray", "explore")

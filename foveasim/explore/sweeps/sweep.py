@@ -16,7 +16,14 @@ from foveasim.explore._metrics import Metric
 from foveasim.explore._records import WORKER_LOST, Journal, Record, check_same_plan, journal_path
 from foveasim.explore.executor import KILLED, executor
 from foveasim.explore.sweeps.plan import Plan, plan_sweep
-from foveasim.explore.sweeps.results import check_store, open_results, stored_plan, to_dataset, write_store
+from foveasim.explore.sweeps.results import (
+    check_store,
+    import_xarray,
+    open_results,
+    stored_plan,
+    to_dataset,
+    write_store,
+)
 from foveasim.explore.worker_cache import ShotRunner
 
 if TYPE_CHECKING:
@@ -129,6 +136,7 @@ def run_sweep(
     """
     if workers is not None:
         workers = check_count("workers", workers, at_most=1024)
+    import_xarray("sweep")  # before hours of work
     if out is None:
         records: dict[int, Record] = {}
         _run(plan, records, lambda record: records.update({record.point: record}), scheduler, workers, progress)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import shapely
 
-from foveasim._core.extras import needs
+from foveasim._core.extras import import_optional
 from foveasim._core.names import missing_path
 from foveasim._io.atomic import atomic_write
 from foveasim.errors import FileError
@@ -58,10 +58,7 @@ def write_lyrdb(report: Report, path: str | Path) -> None:
     target = Path(path)
     if target.suffix != ".lyrdb":
         raise FileError(target, "must end in .lyrdb")
-    try:
-        from klayout import db, rdb
-    except ImportError:
-        raise FileError(target, needs("klayout")) from None
+    db, rdb = import_optional(target, "klayout.db"), import_optional(target, "klayout.rdb")
     database = rdb.ReportDatabase("foveasim design rules")
     database.generator = "foveasim"
     database.top_cell_name = CELL_NAME

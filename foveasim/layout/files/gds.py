@@ -37,7 +37,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from foveasim._core.extras import needs
+from foveasim._core.extras import import_optional
 from foveasim._core.rings import positions_in_runs, ring_moments
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import MAX_SITES, Floats, Ints, check_number
@@ -149,7 +149,7 @@ def write(
     FileError
         When gdstk is not installed, or the file cannot be written.
     """
-    gdstk = _gdstk(path)
+    gdstk = import_optional(path, "gdstk")
     all_drawn = _drawn_layers(layout, layer, layers, filter_names)
     drawn = [d for d in all_drawn if not d.is_of_layout]
     dbu_um = check_number("dbu_um", dbu_um, at_least=1e-9, at_most=1e3)
@@ -544,14 +544,6 @@ def _number_text(number: tuple[int, ...]) -> str:
     return f"photosite {number[0]} part {number[1]} of {number[2]}"
 
 
-def _gdstk(path: Path) -> Any:
-    try:
-        import gdstk
-    except ImportError:
-        raise FileError(path, needs("gdstk")) from None
-    return gdstk
-
-
 def _to_um(xy_dbu: NDArray[Any], dbu_um: float) -> Floats:
     """Convert to µm; correctly rounded where 1 µm is an integer number of database units."""
     per_um = round(1.0 / dbu_um)
@@ -632,7 +624,7 @@ def read(
     ParameterError
         When a layer or a channel is invalid.
     """
-    _gdstk(path)
+    import_optional(path, "gdstk")
     kind = "GDSII or OASIS"
     wanted, filters = _selection(layer, layers, channels, filter_names)
     with as_file_error(path, f"{kind} layout"):

@@ -15,7 +15,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from foveasim._core.extras import needs
+from foveasim._core.extras import import_optional
 from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import FileFormat, as_file_error
 from foveasim.errors import FileError, ParameterError
@@ -155,12 +155,7 @@ def read(path: Path) -> Layout:
 
 
 def _pyarrow(path: Path) -> tuple[Any, Any]:
-    try:
-        import pyarrow as pa
-        from pyarrow import parquet
-    except ImportError:
-        raise FileError(path, needs("pyarrow")) from None
-    return pa, parquet
+    return import_optional(path, "pyarrow"), import_optional(path, "pyarrow.parquet")
 
 
 def _table(path: Path, pa: Any, file: Any) -> Any:

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from foveasim._core.extras import needs
 from foveasim._core.registry import Registry
-from foveasim._io.formats import FileFormat, FormatError, as_file_error, detect_format
+from foveasim._io.formats import FileFormat, as_file_error, detect_format
 from foveasim._io.rasters import read_raster
 from foveasim._io.sandbox import ReaderResult
 from foveasim.errors import ParameterError
@@ -73,8 +72,6 @@ def _read_plain(path: str, format_name: str, name: str | None, selection: dict[s
     with as_file_error(Path(path), "hyperspectral cube", passes=(ParameterError,)):
         try:
             cube = _read_selected(CUBE_FORMATS[format_name], Path(path), name, Selection(**selection))
-        except ModuleNotFoundError as error:
-            raise FormatError(needs(error.name or "a library", "maps")) from None
         except ParameterError as error:
             return {INVALID: [error.name, error.detail]}, []
         data, plain = cube.data, replace(cube, data=None, close=None)

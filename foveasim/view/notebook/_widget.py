@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from foveasim._core.extras import needs
+from foveasim._core.extras import import_optional
 from foveasim.capture import Capture
-from foveasim.errors import ParameterError
 from foveasim.layout import Layout, Report
 
 if TYPE_CHECKING:
@@ -56,12 +55,9 @@ def widget(
         view.by = "electrons"
         capture.electrons[view.selected].mean()
     """
-    try:
-        from foveasim.view.web._widget import SitesWidget
-    except ModuleNotFoundError as error:
-        if error.name not in ("anywidget", "traitlets"):
-            raise
-        raise ParameterError("widget", needs("anywidget")) from None
+    for module in ("anywidget", "traitlets"):
+        import_optional("widget", module)
     from foveasim.view.web._content import content_of
+    from foveasim.view.web._widget import SitesWidget
 
     return SitesWidget(content_of(data, report, name=name), height_px)
