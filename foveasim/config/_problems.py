@@ -57,11 +57,8 @@ def _problems(kind: Any, data: dict[str, Any], error: ValidationError) -> list[t
     problems: list[tuple[tuple[str, ...], str]] = []
     # Unknown keys first: a misspelt key is also missing.
     for key_path, item in sorted(found, key=lambda each: each[1]["type"] != "extra_forbidden"):
-        is_type = item["type"].endswith("_type") or (
-            item["type"] == "literal_error" and isinstance(item["input"], dict | list)
-        )
-        is_shadowed = is_type and any(
-            other[: len(key_path)] == key_path and (len(other) > len(key_path) or not o["type"].endswith("_type"))
+        is_shadowed = _is_of_type(item) and any(
+            other[: len(key_path)] == key_path and (len(other) > len(key_path) or not _is_of_type(o))
             for other, o in found
         )
         if not is_shadowed:
@@ -69,6 +66,12 @@ def _problems(kind: Any, data: dict[str, Any], error: ValidationError) -> list[t
             tag = [item["ctx"]["discriminator"].strip("'")] if item["type"] == "union_tag_invalid" else []
             problems.append(((*key_path, *tag), _describe(kind, item, is_first=not problems)))
     return list(dict.fromkeys(problems))
+
+
+def _is_of_type(error: Any) -> bool:
+    """Return whether a problem is the type of the value: a list or section is not one of the names of a choice."""
+    is_choice = error["type"] == "literal_error"
+    return error["type"].endswith("_type") or (is_choice and isinstance(error["input"], dict | list))
 
 
 def _key_path(data: Any, error: Any) -> tuple[str, ...]:
@@ -116,8 +119,9 @@ def _describe(kind: Any, error: Any, *, is_first: bool) -> str:
             closest = next((name for key in _quoted(rule) if (name := closest_name(key, given))), None)
             return f"{rule}, got '{closest}'" if closest else f"{rule};{others}" if others else rule
         case "union_tag_invalid":
-            known, tag = _quoted(error["ctx"]["expected_tags"]), error["ctx"]["tag"]
-            return _not_one_of(known, tag, f"'{tag}'")
+            tag = error["input"].get(error["ctx"]["discriminator"].strip("'"))
+            shown = f"'{tag}'" if isinstance(tag, str) else json.dumps(tag)
+            return _not_one_of(_quoted(error["ctx"]["expected_tags"]), tag, shown)
         case "literal_error":
             value = error["input"]
             return _not_one_of(_quoted(error["ctx"]["expected"]), value, json.dumps(value))
