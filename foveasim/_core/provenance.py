@@ -15,7 +15,7 @@ import numpy as np
 from foveasim._core.validation import own
 from foveasim._version import __version__
 
-__all__ = ["copy_plain_data", "differences", "to_plain_data", "versions"]
+__all__ = ["copy_plain_data", "differences", "is_digest", "to_plain_data", "versions"]
 
 #: Arrays up to this size are stored as lists; larger arrays as shape, dtype and checksum.
 MAX_LISTED_VALUES = 64
@@ -52,6 +52,11 @@ def to_plain_data(value: Any, *, without: Collection[str] = ()) -> Any:
             },
         }
     return repr(value)
+
+
+def is_digest(value: Any) -> bool:
+    """Return whether plain data are the shape, dtype and SHA-256 of an array."""
+    return isinstance(value, Mapping) and value.keys() == {"shape", "dtype", "sha256"}
 
 
 def copy_plain_data(value: Any) -> Any:

@@ -25,7 +25,7 @@ from foveasim.config._objects import (
     resolve_files,
     schema,
 )
-from foveasim.config._problems import validate
+from foveasim.config._problems import plain_settings, validate
 from foveasim.config._python import to_python
 from foveasim.config._shots import (
     Result,
@@ -57,6 +57,7 @@ __all__ = [
     "compare_files",
     "demo_settings",
     "picture_path",
+    "plain_settings",
     "put_setting",
     "read_any_layout",
     "read_layout",

@@ -19,7 +19,7 @@ from foveasim._io.images import read_picture
 from foveasim._io.yaml_files import parse_yaml, read_yaml
 from foveasim.camera import Camera
 from foveasim.config._models import FILE_OPTIONS, LayerSection, PerArea, call_of, models
-from foveasim.config._problems import validate
+from foveasim.config._problems import plain_settings, validate
 from foveasim.config._sources import Source
 from foveasim.errors import ConfigError, FoveasimError, ParameterError
 from foveasim.fields import Grid, PowerMap
@@ -175,7 +175,7 @@ def check_settings(source: Source | str | Path | None, settings: Mapping[str, An
     ConfigError
         When a setting is invalid.
     """
-    validate(source, models().shot, dict(settings))
+    validate(source, models().shot, settings)
 
 
 def _make_uncached(_part: str, _settings: Any, make: Callable[[], Any]) -> Any:
@@ -210,7 +210,8 @@ def build_shot(
         As for :func:`read_shot`.
     """
     source = Source.of(source)
-    settings = validate(source, models().shot, dict(data))
+    settings = validate(source, models().shot, data)
+    data = plain_settings(source, data)
 
     def layout_file() -> LayoutFile:
         if not isinstance(settings.layout, str):

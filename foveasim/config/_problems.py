@@ -4,25 +4,70 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
+import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from foveasim._core.names import closest_name, did_you_mean, list_names, possible_names
 from foveasim.config._models import call_of
 from foveasim.config._sources import Source
-from foveasim.errors import ConfigError, type_name
+from foveasim.errors import ConfigError, format_value
 
-__all__ = ["validate"]
+__all__ = ["plain_settings", "validate"]
 
 #: Maximum number of problems in one message.
 MAX_PROBLEMS = 3
 
 
-def validate(source: Source | str | Path | None, kind: Any, data: dict[str, Any]) -> Any:
+def plain_settings(source: Source | str | Path | None, value: Any, key_path: tuple[str, ...] = ()) -> Any:
+    """
+    Return settings from Python as a settings file contains them.
+
+    Keys become strings, as in JSON; tuples and arrays become lists, paths strings, numbers of numpy numbers.
+
+    Parameters
+    ----------
+    source : Source, path or None
+        Origin of the settings, for messages.
+    value : mapping, list or single value
+    key_path : tuple of str
+        Path of the value in the settings, for messages.
+
+    Raises
+    ------
+    ConfigError
+        When the settings contain other objects, other keys than strings and integers, or a key twice.
+    """
+    if value is None or type(value) in (str, bool, int, float):
+        return value
+    if isinstance(value, Mapping):
+        found: dict[str, Any] = {}
+        for key, item in value.items():
+            name = str(key)
+            if not isinstance(key, str | int | np.integer) or isinstance(key, bool):
+                problem = f"must have strings or integers as keys, got {format_value(key)}"
+                raise Source.of(source).error(key_path, problem)
+            if name in found:
+                raise Source.of(source).error((*key_path, name), "must be given once, not as a string and an integer")
+            found[name] = plain_settings(source, item, (*key_path, name))
+        return found
+    if isinstance(value, list | tuple):
+        return [plain_settings(source, item, (*key_path, str(k))) for k, item in enumerate(value)]
+    if isinstance(value, np.ndarray | np.generic):
+        return plain_settings(source, value.tolist(), key_path)
+    if isinstance(value, Path):
+        return str(value)
+    for kind in (str, int, float):
+        if isinstance(value, kind):  # subclasses, such as enumerations
+            return kind(value)
+    raise Source.of(source).error(key_path, f"must be a number, string, list or section, got {format_value(value)}")
+
+
+def validate(source: Source | str | Path | None, kind: Any, data: Mapping[str, Any]) -> Any:
     """
     Return settings as an instance of a model.
 
@@ -33,21 +78,18 @@ def validate(source: Source | str | Path | None, kind: Any, data: dict[str, Any]
     """
     source = Source.of(source)
     try:
-        return TypeAdapter(kind).validate_json(json.dumps(data, default=_reject), strict=True)
+        plain = plain_settings(source, data)
+        return TypeAdapter(kind).validate_json(json.dumps(plain), strict=True)
     except ValidationError as error:
-        (key_path, first), *others = _problems(kind, data, error)
+        (key_path, first), *others = _problems(kind, plain, error)
         more = len(others) + 1 - MAX_PROBLEMS
         others_listed = [
             f"{'.'.join(key)}: {problem}" if key else problem for key, problem in others[: MAX_PROBLEMS - 1]
         ]
         message = "; ".join([first, *others_listed, *([f"and {more} more"] if more > 0 else [])])
         raise source.error(key_path, message) from None
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(source.file, f"contains an unreadable value ({error})") from None
-
-
-def _reject(value: object) -> None:
-    raise ValueError(f"{type_name(value)} is not a number, string, list or section")
+    except RecursionError:
+        raise ConfigError(source.file, "is nested too deeply") from None
 
 
 def _problems(kind: Any, data: dict[str, Any], error: ValidationError) -> list[tuple[tuple[str, ...], str]]:
@@ -69,7 +111,7 @@ def _problems(kind: Any, data: dict[str, Any], error: ValidationError) -> list[t
 
 
 def _is_of_type(error: Any) -> bool:
-    """Return whether a problem is the type of the value: a list or section is not one of the names of a choice."""
+    """Return whether a problem is the type of a value, such as a list instead of a choice."""
     is_choice = error["type"] == "literal_error"
     return error["type"].endswith("_type") or (is_choice and isinstance(error["input"], dict | list))
 

@@ -14,7 +14,7 @@ from pydantic import BaseModel
 
 from foveasim.config._models import FILE_OPTIONS, PerArea, call_of, models
 from foveasim.config._objects import FILE_SETTINGS, resolve_files
-from foveasim.config._problems import validate
+from foveasim.config._problems import plain_settings, validate
 from foveasim.config._sources import Source
 from foveasim.layout import LAYOUTS, Layout
 
@@ -70,7 +70,9 @@ def to_python(settings: Mapping[str, Any], *, source: Source | str | Path | None
     True
     """
     source = Source.of(source)
-    data = dict(settings) if source.file is None else resolve_files(source.directory.absolute(), dict(settings))
+    data = plain_settings(source, settings)
+    if source.file is not None:
+        data = resolve_files(source.directory.absolute(), data)
     shot = validate(source, models().shot, data)
     writer = _Writer()
     try:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.names import possible_names
+from foveasim._core.provenance import is_digest
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Floats, Ints, check_count, check_number, read_only, unmasked
 from foveasim.errors import ParameterError, SimulationError, type_name
@@ -279,8 +280,8 @@ class Sensor:
         Raises
         ------
         ParameterError
-            If a parameter whose default is not 0 or None is missing, per-site arrays were too long to be stored, or an effect
-            is not registered.
+            If a parameter whose default is not 0 or None is missing, arrays were too long to be stored, or an effect is not
+            registered.
         """
         kinds: tuple[Any, ...] = (Diffusion, KernelCrosstalk, InterPixelCapacitance, *EFFECTS.values())
         classes = {kind.__name__: kind for kind in kinds}
@@ -289,15 +290,10 @@ class Sensor:
             name = parameter.name
             if name in ("layout", "qe", "filters"):
                 continue
-            value = settings.get(name)
-            is_array = isinstance(value, Mapping) and "sha256" in value
-            if is_array or (name not in settings and parameter.default):
-                of_sites = " per site" if is_array else ""
-                raise ParameterError(
-                    "sensor", f"must be given: the settings of the capture do not contain {name!r}{of_sites}"
-                )
+            if name not in settings and parameter.default:
+                raise ParameterError("sensor", f"must be given: the settings of the capture do not contain {name!r}")
             if name in settings:
-                values[name] = _object(classes, value)
+                values[name] = _object(classes, name, settings[name])
         return cls(layout, **values)
 
     def __repr__(self) -> str:
@@ -834,13 +830,24 @@ class Sensor:
         return mean_dn, variance_dn2
 
 
-def _object(classes: Mapping[str, Any], data: Any) -> Any:
+def _object(classes: Mapping[str, Any], name: str, data: Any) -> Any:
     """Create the effect objects that plain data describe; return other data unchanged."""
+    if is_digest(data):
+        raise ParameterError(
+            "sensor", f"must be given: the settings of the capture do not contain all values of {name!r}"
+        )
     if isinstance(data, list):
-        return [_object(classes, item) for item in data]
+        return [_object(classes, f"{name}[{k}]", item) for k, item in enumerate(data)]
     if not isinstance(data, Mapping):
         return data
-    kind = data.get("kind")
-    if str(kind) not in classes:
+    values = {key: _object(classes, f"{name}.{key}", item) for key, item in data.items() if key != "kind"}
+    if "kind" not in data:
+        return values  # a parameter of an effect
+    kind = str(data["kind"])
+    if kind not in classes:
         raise ParameterError("sensor", f"must be given: its effect {kind!r} is not registered")
-    return classes[str(kind)](**{name: value for name, value in data.items() if name != "kind"})
+    parameters = {each.name: each.init for each in fields(classes[kind])}
+    unknown = next((key for key in values if key not in parameters), None)
+    if unknown is not None:
+        raise ParameterError("sensor", f"must be given: its effect {kind!r} has no parameter {unknown!r} any more")
+    return classes[kind](**{key: value for key, value in values.items() if parameters[key]})

@@ -139,6 +139,19 @@ def test_sample_equals_capture_of_its_shot():
     )
 
 
+def test_integer_keys_equal_string_keys():
+    def settings(*keys):
+        return {"coefficients": dict.fromkeys(keys, 0.1), "unit": "waves", "wavelength_nm": [550]}
+
+    vary = {"optics.zernike.coefficients.7": {"uniform": [0.1, 0.2]}}
+    by_shot = explore.Dataset(pictures(1), SHOT | {"optics": SHOT["optics"] | {"zernike": settings(4, 7)}}, vary)
+    by_change = explore.Dataset(pictures(1), SHOT, vary, changes={"optics.zernike": settings(4, 7)})
+    expected = explore.Dataset(pictures(1), SHOT, vary, changes={"optics.zernike": settings("4", "7")})
+
+    assert by_shot.settings_of(0) == by_change.settings_of(0) == expected.settings_of(0)
+    assert_same(by_shot[0], expected[0])
+
+
 def test_draws_of_camera_differ_in_noise():
     data = labelled()
 

@@ -148,6 +148,24 @@ def assert_identical(one, other):
 # -- results on different workers -------------------------------------------------------------------------------------
 
 
+def test_integer_keys_equal_string_keys():
+    """Settings from Python may have the keys that a YAML file converts to strings, as may their changes."""
+    zernike = {"coefficients": {4: 0.1, np.int64(7): np.float64(0.2)}, "unit": "waves", "wavelength_nm": (550,)}
+    shot = SHOT | {"optics": SHOT["optics"] | {"zernike": zernike}}
+    vary = {"sensor.bits": [8, 10]}
+    as_in_file = json.loads(json.dumps(shot | {"optics": SHOT["optics"] | {"zernike": None}}))
+    as_in_file["optics"]["zernike"] = {"coefficients": {"4": 0.1, "7": 0.2}, "unit": "waves", "wavelength_nm": [550]}
+    expected = explore.plan_sweep(as_in_file, vary)
+    by_change = explore.plan_sweep(SHOT, vary, changes={"optics.zernike": zernike})
+    study = explore.plan_study(shot, {"sensor.bits": [8, 10]}, {"snr_mean": "maximize"}, n_trials=1)
+
+    assert explore.plan_sweep(shot, vary).to_dict() == by_change.to_dict() == expected.to_dict()
+    assert study.base.settings == expected.settings
+    assert in_process(explore.plan_sweep(shot, vary)).equals(in_process(expected))
+    coefficients = explore.plan_sweep(shot, {"optics.zernike.coefficients.4": [0.1, 0.3]}).settings_of(1)["optics"]
+    assert coefficients["zernike"]["coefficients"] == {"4": 0.3, "7": 0.2}
+
+
 @pytest.mark.parametrize("workers", [1, 2, 4])
 def test_results_do_not_depend_on_workers(workers, reference_results, tmp_path):
     found = explore.run_sweep(plan_200(), out=tmp_path / "r.zarr", workers=workers)

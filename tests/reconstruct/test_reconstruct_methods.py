@@ -615,7 +615,7 @@ def test_loaded_capture_gives_same_picture(tmp_path):
         (lambda c, _: c.picture(per="magic"), "'per' must be one of"),
         (
             lambda c, _: c.picture("least_squares"),
-            "'sensor' must be given: the settings of the capture do not contain 'capacitance_f' per site",
+            "'sensor' must be given: the settings of the capture do not contain all values of 'capacitance_f'",
         ),
         (lambda c, _: c.picture(per="um2", sensor="magic"), "'sensor' must be the Sensor of the capture's layout"),
         (

@@ -381,6 +381,49 @@ class Registered(AdditiveNoise):
         return self.sigma_e
 
 
+@effects.EFFECTS.register("shading of test_effects")
+@dataclass(frozen=True, eq=False)
+class Shading(FixedFactor):
+    name: ClassVar[str] = "shading"
+    stage: ClassVar[str] = "photo"
+
+    factor: np.ndarray
+
+    def pattern(self, sites):
+        return sites.select(np.asarray(self.factor))
+
+
+@pytest.mark.parametrize("extension", ["npz", "zarr"])
+@pytest.mark.parametrize(("n", "is_stored"), [(64, True), (65, False)])
+def test_loaded_capture_needs_long_arrays(tmp_path, extension, n, is_stored):
+    row = grid(n_x=n, n_y=1, pitch_um=2.0)
+    sensor = Sensor(row, **FINE, read_noise_e=2.0, effects=[Shading(np.linspace(0.5, 1.0, n))])
+    light = fs.PowerMap(np.full((1, 10, 200), 1e-3), fs.Grid.centred((10, 200), 1.0), [550.0])
+    camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=4.0), sensor=sensor)
+    capture = camera.capture(light, exposure_s=0.01, seed=1)
+    capture.save(tmp_path / f"capture.{extension}")
+    loaded = fs.Capture.load(tmp_path / f"capture.{extension}")
+
+    expected = capture.signal_to_noise(sensor=sensor)
+    assert np.array_equal(loaded.signal_to_noise(sensor=sensor), expected)
+    if is_stored:
+        assert np.array_equal(loaded.signal_to_noise(), expected)
+    else:
+        message = r"^'sensor' must be given: .* do not contain all values of 'effects\[0\]\.factor'$"
+        with pytest.raises(ParameterError, match=message):
+            loaded.signal_to_noise()
+
+
+def test_settings_of_changed_effects_are_rejected():
+    from foveasim._core.provenance import to_plain_data
+
+    settings = to_plain_data(Sensor(ROW[:10], **FINE, effects=[Registered(2.5)]))
+    settings["effects"][0]["former_e"] = 1.0
+
+    with pytest.raises(ParameterError, match="its effect 'Registered' has no parameter 'former_e' any more"):
+        Sensor.from_settings(ROW[:10], settings)
+
+
 def test_public_effects_have_no_long_signatures():
     for name in effects.__all__:
         parts = getattr(effects, name)

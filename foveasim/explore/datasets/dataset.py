@@ -48,7 +48,7 @@ from foveasim.explore.datasets.labels import (
 )
 from foveasim.explore.datasets.packed import PackedBoxes
 from foveasim.explore.datasets.pictures import digest_of, is_lazy, source_of
-from foveasim.explore.sweeps.plan import VARY, check_disjoint, locate_shot, with_changes
+from foveasim.explore.sweeps.plan import VARY, check_disjoint, locate_shot, put_changes, with_changes
 from foveasim.layout import Layout
 from foveasim.scene import Scene
 from foveasim.scene._scene import Fit
@@ -205,7 +205,7 @@ class Dataset:
         self._fit = fit
         self._files: list[Path] = []
         own = Source.of(source)
-        base_source, self._settings = _base_settings(shot, own, changes or {}, self._files, fit)
+        base_source, self._settings = _base_settings(shot, own, changes, self._files, fit)
         self._distributions = _parse_distributions(own, vary or {}, self._files, is_fitted=fit is not None)
         written = own.absolute().at(VARY)
         self._source = base_source.absolute().with_replaced({path: written.at(path) for path in self._distributions})
@@ -540,7 +540,7 @@ class Dataset:
 def _base_settings(
     shot: str | Path | Mapping[str, Any],
     own: Source,
-    changes: Mapping[str, Any],
+    changes: Mapping[str, Any] | None,
     found: list[Path],
     fit: str | None,
 ) -> tuple[Source, Any]:
@@ -552,7 +552,6 @@ def _base_settings(
     if not isinstance(shot, str | Path | Mapping):
         raise ParameterError("shot", f"must be a settings file or a mapping of settings, got {type_name(shot)}")
     source, data = locate_shot(own, shot)
-    data = _copy(data)
     scene = data.get("scene")
     if not isinstance(scene, Mapping) or scene.get("kind") != "picture":
         raise source.error("scene.kind", "must be 'picture' for a dataset, which supplies the pictures")
@@ -563,22 +562,9 @@ def _base_settings(
     if fit is not None:
         data["scene"] |= {"fit": fit, "pitch_um": None, "field_of_view_deg": None}
     source = with_changes(own, source, changes)
-    for path, value in changes.items():
-        put_setting(source, data, path, resolve_files(own.directory, value, path, found))
+    put_changes(own, source, data, changes, found)
     data.pop("seed", None)
-    try:
-        return source, json.loads(json.dumps(data, default=_to_plain_data))
-    except (TypeError, ValueError, RecursionError) as error:
-        raise source.error("", f"must contain only numbers, strings, lists and mappings ({error})") from None
-
-
-def _to_plain_data(value: Any) -> Any:
-    """Convert numpy and path objects in settings to plain data."""
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    if isinstance(value, Path):
-        return str(value)
-    raise TypeError(f"got {type_name(value)}")
+    return source, data
 
 
 def _parse_distributions(

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 from foveasim._core.validation import check_number
-from foveasim.config import Source, put_setting
+from foveasim.config import Source
 from foveasim.explore.datasets.dataset import Dataset
-from foveasim.explore.sweeps.plan import locate_shot, with_changes
+from foveasim.explore.sweeps.plan import locate_shot, put_changes, with_changes
 
 __all__ = ["classification", "denoising"]
 
@@ -116,10 +115,8 @@ def _read_numbers(shot: str | Path | Mapping[str, Any], options: Mapping[str, An
     """Return numbers of the shot settings, after the ``changes`` of the dataset options."""
     own = Source.of(options.get("source"))
     source, data = locate_shot(own, shot)
-    data = deepcopy(data)
     source = with_changes(own, source, options.get("changes"))
-    for path, value in (options.get("changes") or {}).items():
-        put_setting(source, data, path, value)
+    put_changes(own, source, data, options.get("changes"), [])
     found = []
     for path in paths:
         setting: Any = data

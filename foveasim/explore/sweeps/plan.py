@@ -21,7 +21,15 @@ from foveasim._core.random_streams import derive_seed
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Ints, check_choice, check_count
 from foveasim._io.yaml_files import position_of, read_yaml
-from foveasim.config import Source, check_settings, put_setting, read_settings, resolve_files, validate
+from foveasim.config import (
+    Source,
+    check_settings,
+    plain_settings,
+    put_setting,
+    read_settings,
+    resolve_files,
+    validate,
+)
 from foveasim.errors import ConfigError, ParameterError
 from foveasim.explore._files import digests
 from foveasim.explore._functions import identify_function
@@ -35,6 +43,7 @@ __all__ = [
     "coordinate",
     "locate_shot",
     "plan_sweep",
+    "put_changes",
     "read_sweep",
     "with_changes",
     "with_file_context",
@@ -365,8 +374,7 @@ def plan_sweep(
     found: list[Path] = []
     settings = resolve_files(shot_source.directory, data, found=found)
     shot_source = with_changes(own, shot_source, changes)
-    for path, value in (changes or {}).items():
-        put_setting(shot_source, settings, path, resolve_files(own.directory, value, path, found))
+    put_changes(own, shot_source, settings, changes, found)
     settings.pop("seed", None)
     plan = Plan(
         source=shot_source.absolute(),
@@ -402,7 +410,7 @@ def locate_shot(own: Source, shot: str | Path | Mapping[str, Any]) -> tuple[Sour
         When the file does not exist, or is not valid YAML.
     """
     if isinstance(shot, Mapping):
-        return own.at("shot"), dict(shot)
+        return own.at("shot"), plain_settings(own.at("shot"), shot)
     return Source.of(shot), read_settings(shot)
 
 
@@ -410,6 +418,23 @@ def with_changes(own: Source, shot_source: Source, changes: Mapping[str, Any] | 
     """Return the origin of settings of which a sweep, study or dataset replaces some."""
     key = "changes" if own.file is None else "set"
     return shot_source.with_replaced({path: own.absolute().at(key, path) for path in changes or {}})
+
+
+def put_changes(
+    own: Source, shot_source: Source, settings: dict[str, Any], changes: Mapping[str, Any] | None, found: list[Path]
+) -> None:
+    """
+    Replace settings of a shot in place.
+
+    The referenced files are appended to ``found``.
+
+    Raises
+    ------
+    ConfigError
+        When a path or a value is not one of settings.
+    """
+    for path, value in plain_settings(shot_source, changes or {}).items():
+        put_setting(shot_source, settings, path, resolve_files(own.directory, value, path, found))
 
 
 def coordinate(values: Iterable[Any]) -> NDArray[Any]:
