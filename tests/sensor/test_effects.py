@@ -276,6 +276,90 @@ def test_shared_draws_span_site_blocks():
     assert noise_budget(sensor, np.full(layout.n_sites, 1e3), 1.0)["row_noise"] == pytest.approx(5.0)
 
 
+@dataclass(frozen=True)
+class ChannelGain(Effect):
+    """Test effect: a factor per channel, cached under computed names."""
+
+    name: ClassVar[str] = "channel_gain"
+    stage: ClassVar[str] = "charge"
+    is_temporal: ClassVar[bool] = False
+
+    def apply(self, values, *, sites, rng):
+        channel = sites.select(sites.layout.channel)
+        for c in range(3):
+            gain = sites.cached((self, "gain of " + str(c)), lambda all_sites, c=c: np.full(all_sites.n_sites, 1.0 + c))
+            values[channel == c] *= sites.select(gain)[channel == c]
+        return values
+
+    def moments(self, mean, variance, *, sites):
+        return mean, variance
+
+
+def test_cached_names_compare_by_value():
+    layout = ROW[:300].with_columns(channel=np.arange(300) % 3)
+    sensor = Sensor(layout, effects=[ChannelGain()], **FINE | {"pedestal_v": 0.0})
+    expected = 350 * (1 + layout.channel)
+
+    for frame in range(100):
+        code = sensor.read(np.full(300, 350), streams=Streams(0, frame))
+        assert np.abs(code - expected).max() <= 1.0
+    assert len(sensor.sites._cache) == 3
+
+
+def test_cached_names_compare_by_type():
+    sites, effect = make_sensor().sites, Hum()
+
+    assert [sites.cached((effect, name), lambda _, name=name: repr(name)) for name in (1, True, 1.0)] == [
+        "1",
+        "True",
+        "1.0",
+    ]
+
+
+def test_cached_effects_compare_by_identity():
+    """New objects may have the address, and may have the value, of a deleted one."""
+    sites = make_sensor().sites
+
+    assert [sites.cached(Hum(sigma=0.0), lambda _, k=k: k) for k in range(500)] == list(range(500))
+    assert len(sites._cache) < 100
+
+
+def test_functions_of_effect_have_separate_patterns():
+    sites, effect = make_sensor().sites, LampFlicker()
+
+    one, other = (sites.pattern(effect, function) for function in (effect.deviation, lambda _: 7.0))
+
+    assert np.array_equal(one, effect.deviation(sites))
+    assert other.tolist() == [7.0]
+
+
+@pytest.mark.parametrize("is_known_first", [True, False])
+def test_cached_patterns_are_separate_without_device(is_known_first):
+    sites, effect = make_sensor().sites, LampFlicker()
+
+    def numbers(sites):
+        return sites.cached(effect, lambda all_sites: all_sites.device.normals("numbers"))
+
+    if is_known_first:
+        assert numbers(sites).shape == (N,)
+    with pytest.raises(SimulationError, match="differs between devices"):
+        numbers(sites.without_device())
+    assert numbers(sites).shape == (N,)
+
+
+@pytest.mark.parametrize(
+    ("key", "message"),
+    [
+        ("gain", "'key' must be the effect, or a tuple of the effect and hashable values, got 'gain'"),
+        ((), "'key' must be the effect, or a tuple of the effect and hashable values, got"),
+        ((Hum(), [1]), r"'key' must contain only hashable values after the effect, got \(\[1\],\)"),
+    ],
+)
+def test_invalid_cache_keys_are_rejected(key, message):
+    with pytest.raises(ParameterError, match=message):
+        make_sensor().sites.cached(key, lambda _: 1.0)
+
+
 @pytest.mark.parametrize("deviation", [np.ones(3), np.nan])
 def test_wrong_deviation_is_rejected(deviation):
     class Wrong(LampFlicker):

@@ -8,11 +8,10 @@ weights of reconstructions and HDR merges) use only :meth:`Effect.apply` and :me
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
-from threading import RLock
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, Protocol, TypeVar
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,13 +20,16 @@ from foveasim._core.random_streams import random_key
 from foveasim._core.registry import Registry
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, Ints, read_only
-from foveasim.errors import SimulationError
+from foveasim.errors import ParameterError, SimulationError
 from foveasim.fields import PackedRings
+from foveasim.sensor.bounded_cache import BoundedCache
 from foveasim.sensor.device import Device
 
 __all__ = ["EFFECTS", "STAGES", "AdditiveNoise", "Effect", "FixedFactor", "FixedOffset", "Photosites", "Sites", "Stage"]
 
 T = TypeVar("T")
+#: Cached values of a sensor: several times those of all standard effects.
+MAX_CACHED = 64
 #: Stage of the chain at which an effect acts.
 Stage = Literal["photo", "dark", "expected", "collection", "charge", "sense_node", "output"]
 #: Unit of the values at each stage, in the order of the chain.
@@ -78,6 +80,28 @@ class Photosites(PackedRings, Protocol):
         """Return the lengths of shared edges, (n_site, n_site) sparse, µm."""
 
 
+class CompleteSites(NamedTuple):
+    """
+    All sites of the sensor that a part belongs to.
+
+    ``selection`` contains the indices of the part's sites among them, a slice of step 1 or (n,).
+    """
+
+    sites: Sites
+    selection: slice | Ints
+
+
+def _compose(selection: slice | Ints, index: slice | Ints, n: int) -> slice | Ints:
+    """Return the indices of some of the selected elements among all ``n``; slices have step 1."""
+    if not isinstance(selection, slice):
+        return selection[index]
+    chosen = range(n)[selection]
+    if not isinstance(index, slice):
+        return np.asarray(chosen.start + index)
+    chosen = chosen[index]
+    return slice(chosen.start, chosen.stop)
+
+
 @dataclass(frozen=True, eq=False)
 class Sites:
     """
@@ -86,13 +110,13 @@ class Sites:
     Attributes
     ----------
     layout : Layout
-        All photosites.
+        All photosites: of the complete layout, also in tiles, for effects that need it (:attr:`Effect.needs_layout`).
     known_device : Device or None
         Device with its fixed patterns. With None, moments are over all devices of the kind.
     capacitance_f : (n_site,) or (1,) float64, F
-        Capacitance of the sense nodes.
-    index : slice
-        Indices of these sites in the layout.
+        Capacitance of the sense nodes of all photosites.
+    index : slice or (n,) int64
+        Indices of these sites in the layout; an array for part of a sensor that is not a range of sites.
     n_threads : int or None
         Number of threads for effects on all sites; None for all cores.
     """
@@ -100,21 +124,35 @@ class Sites:
     layout: Photosites
     known_device: Device | None
     capacitance_f: Floats
-    index: slice = field(default_factory=lambda: slice(None))
+    index: slice | Ints = field(default_factory=lambda: slice(None))
     n_threads: int | None = None
-    _cache: dict[Any, Any] = field(default_factory=dict, repr=False)
-    _lock: Any = field(default_factory=RLock, repr=False)
+    _complete: CompleteSites | None = field(default=None, repr=False)
+    _cache: BoundedCache = field(default_factory=lambda: BoundedCache(MAX_CACHED), repr=False)
 
     __repr__ = short_repr
 
     @property
     def n_sites(self) -> int:
         """Number of these sites."""
-        return len(range(*self.index.indices(self.layout.n_sites)))
+        if isinstance(self.index, slice):
+            return len(range(*self.index.indices(self.layout.n_sites)))
+        return self.index.size
 
-    def block(self, index: slice, *, n_threads: int | None = 1) -> Sites:
-        """Return a block of the layout's sites."""
+    def block(self, index: slice | Ints, *, n_threads: int | None = 1) -> Sites:
+        """Return some of the layout's sites."""
         return replace(self, index=index, n_threads=n_threads)
+
+    def of(self, effect: Any) -> Sites:
+        """
+        Return these sites in the layout that an effect needs.
+
+        For part of a sensor, such as a tile, this is the complete layout, unless ``effect.needs_layout`` is False.
+        """
+        if self._complete is None or not effect.needs_layout:
+            return self
+        sites, selection = self._complete
+        found = sites.block(_compose(selection, self.index, sites.layout.n_sites), n_threads=self.n_threads).of(effect)
+        return found if self.known_device is not None else found.without_device()
 
     def without_device(self) -> Sites:
         """Return the same sites without a device, for moments over all devices of the kind."""
@@ -149,43 +187,77 @@ class Sites:
         """
         Return the cached result of a function of all sites, computed at the first call.
 
+        Results that have not been used recently are discarded, and computed again.
+
         Parameters
         ----------
-        key : object
-            Key of the cache: the effect, or a tuple of the effect and a name.
+        key : Effect, or tuple of an Effect and hashable values
+            Key of the cache, such as ``(self, "gain", channel)``. Effects are compared by identity, other values by type and
+            value.
         compute : callable
             Called with all sites of the layout.
-        """
-        key = tuple(map(id, key)) if isinstance(key, tuple) else id(key)
-        if key not in self._cache:
-            with self._lock:
-                if key not in self._cache:
-                    self._cache[key] = compute(replace(self, index=slice(None)))
-        return self._cache[key]
 
-    def pattern(self, effect: Any, compute: Callable[[Sites], ArrayLike]) -> Floats:
+        Raises
+        ------
+        ParameterError
+            If the key does not start with an effect, or a value is not hashable.
+        """
+        parts = key if isinstance(key, tuple) else (key,)
+        if not parts or not isinstance(parts[0], Effect):
+            raise ParameterError("key", "must be the effect, or a tuple of the effect and hashable values", key)
+        # A known device is part of the key: functions of all sites may use its numbers.
+        owner = (self.known_device, *parts)
+        found: T = self._cache.get(_cache_key(owner), lambda: compute(replace(self, index=slice(None))), owner=owner)
+        return found
+
+    def pattern(self, key: Any, compute: Callable[[Sites], ArrayLike]) -> Floats:
         """
         Return the elements for these sites of a cached array (n_site,) or number.
 
         The array is computed for all sites at the first call.
 
+        Parameters
+        ----------
+        key : Effect, or tuple of an Effect and hashable values
+            As for :meth:`cached`; different functions of an effect have different results.
+        compute : callable
+            Called with all sites of the layout; returns one number, or one for each of them.
+
         Raises
         ------
+        ParameterError
+            If the key does not start with an effect, or a value is not hashable.
         SimulationError
             If the array has another shape, or a number is not finite.
         """
+        parts = key if isinstance(key, tuple) else (key,)
 
         def compute_array(sites: Sites) -> Floats:
             array = np.atleast_1d(np.asarray(compute(sites), np.float64))
-            if array.shape not in ((1,), (sites.n_sites,)) or not np.isfinite(array).all():
-                name = getattr(effect, "name", type(effect).__name__)
+            if array.shape not in ((1,), (sites.n_sites,)):
                 raise SimulationError(
-                    f"the effect '{name}' must return one finite number, or one for each of the {sites.n_sites} sites, "
-                    f"got an array of shape {array.shape}"
+                    f"the effect '{parts[0].name}' must return one finite number, or one for each of the {sites.n_sites} "
+                    f"sites, got an array of shape {array.shape}"
+                )
+            if not (is_finite := np.isfinite(array)).all():
+                site = int(np.argmin(is_finite))
+                raise SimulationError(
+                    f"the effect '{parts[0].name}' must return one finite number, or one for each of the {sites.n_sites} "
+                    f"sites, got {array[site]} at site {site}"
                 )
             return read_only(array.copy())
 
-        return self.select(self.cached(effect, compute_array))
+        return self.select(self.cached((*parts, "pattern", getattr(compute, "__qualname__", "")), compute_array))
+
+
+def _cache_key(parts: tuple[Any, ...]) -> Hashable:
+    """Return a key of effects and devices by identity, and of other values by type and value."""
+    key = tuple((type(part), id(part) if isinstance(part, Effect | Device) else part) for part in parts)
+    try:
+        hash(key)
+    except TypeError:
+        raise ParameterError("key", "must contain only hashable values after the effect", parts[2:]) from None
+    return key
 
 
 class Effect(ABC):
@@ -208,6 +280,9 @@ class Effect(ABC):
         common to a row of sites, :meth:`apply` is called with all sites at once.
     is_drawn_at_reset : bool
         Whether all reads between two resets share one draw.
+    needs_layout : bool
+        Whether the effect on a site depends on its position or index in the layout, on other sites, or on an array per site. If
+        not, the effect on part of a sensor, such as a tile, is computed for its sites alone, which takes less memory.
     """
 
     name: ClassVar[str]
@@ -215,6 +290,7 @@ class Effect(ABC):
     is_temporal: ClassVar[bool]
     is_local: ClassVar[bool] = True
     is_drawn_at_reset: ClassVar[bool] = False
+    needs_layout: ClassVar[bool] = True
 
     @abstractmethod
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
@@ -252,6 +328,7 @@ class Effect(ABC):
         SimulationError
             If the result is not a mean and a variance of the shape of the values.
         """
+        sites = sites.of(self)
         found = self.moments(mean, variance, sites=sites)
         shape = np.broadcast_shapes(np.shape(mean), np.shape(variance), (sites.n_sites,))
         try:

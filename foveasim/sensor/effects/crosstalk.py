@@ -201,14 +201,18 @@ class _Crosstalk(Effect):
         """Return the operator for all sites of the layout."""
         raise NotImplementedError
 
+    def _operator(self, sites: Sites) -> CrosstalkOperator:
+        """Return the operator, which all devices share."""
+        return sites.without_device().cached(self, self.compile_for)
+
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
         """Return the charges after crosstalk, (n_site,)."""
         _ = rng
-        return sites.cached(self, self.compile_for).apply(values, n_threads=sites.n_threads)
+        return self._operator(sites).apply(values, n_threads=sites.n_threads)
 
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
         """Compute the moments of independent charges after crosstalk, (..., n_site)."""
-        operator = sites.cached(self, self.compile_for)
+        operator = self._operator(sites)
         mean, variance = (
             np.broadcast_to(part, np.broadcast_shapes(np.shape(part), (sites.n_sites,))) for part in (mean, variance)
         )
