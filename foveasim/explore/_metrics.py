@@ -114,7 +114,8 @@ def picture_psnr_db(shot: Shot, camera: Camera, capture: Capture, reference: Pic
     return psnr_db(picture, reference)
 
 
-#: Functions that compute the reference of a metric. It depends on scene, layout and exposure only, so captures share it.
+#: Functions that compute the reference of a metric. It depends on the photoelectron rates of an ideal raster, exposure time and
+#: bit depth only, so captures share it.
 REFERENCES: dict[Callable[..., Any], Callable[[Shot, Camera], Any]] = {picture_psnr_db: ideal_picture}
 
 

@@ -7,7 +7,7 @@ import json
 import sys
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import current_thread, main_thread
@@ -24,7 +24,7 @@ from foveasim.explore._metrics import REFERENCES, Metric
 from foveasim.explore._records import Record, check_unique, to_values
 from foveasim.scene import Scene
 
-__all__ = ["ShotRunner", "WorkerCache"]
+__all__ = ["ShotRunner", "WorkerCache", "rate_settings"]
 
 #: Limits of a cache: bytes, and number of components. Nested components count in every component that contains them.
 MAX_BYTES, MAX_PARTS = 1 << 30, 1024
@@ -34,6 +34,9 @@ MEMORY_DIVISOR = 4
 GROWING_KINDS = ("camera", "images")
 #: Depth of nested containers whose arrays count towards the size of a component.
 MAX_DEPTH = 6
+#: Sections of the settings of a shot that do not change the photoelectron rates, and others that do not change the optical
+#: images; the responsivity of the sensor changes both.
+AFTER_LIGHT, AFTER_IMAGE = ("sensor", "exposure_s", "seed"), ("layout", "distortion", "integration_order")
 #: Longest stored message, characters.
 MAX_MESSAGE_LENGTH = 500
 
@@ -196,15 +199,11 @@ class ShotRunner:
 
     def photoelectrons_per_s(self, shot: Shot, settings: Mapping[str, Any]) -> Floats:
         """Return the photoelectron rates of a shot's sites, (n_site,) e-/s."""
-        camera, cache = shot.camera, self.cache
-        image_settings = _image_settings(shot, settings)
-        filters = hashlib.sha256(camera.sensor.filter_of_site.tobytes()).hexdigest()
-        sites = [settings["layout"], settings.get("distortion"), settings.get("integration_order"), filters]
-        images = cache.part("images", image_settings, self._make_images) if self.is_geometry_varied else None
+        images = self.images(shot, settings) if self.is_geometry_varied else None
         rates: Floats = self.part(
             "power on sites",
-            [image_settings, sites],
-            lambda: camera.photoelectrons_per_s(shot.scene, images=images),
+            rate_settings(shot, settings),
+            lambda: shot.camera.photoelectrons_per_s(shot.scene, images=images),
         )
         return rates
 
@@ -223,7 +222,8 @@ class ShotRunner:
         make = next((make for own, make in REFERENCES.items() if own is metric), None)
         if make is None:
             return metric(shot, shot.camera, capture)
-        key = [_image_settings(shot, settings), settings["layout"], shot.exposure_s]
+        # White balance of the reference is in codes.
+        key = [make.__name__, rate_settings(shot, settings), shot.exposure_s, shot.camera.sensor.bits]
         reference = self.cache.part("reference", key, lambda: make(shot, shot.camera))
         return compared(shot, shot.camera, capture, reference)
 
@@ -281,13 +281,33 @@ def _worker() -> Any:
         return None
 
 
+def rate_settings(shot: Shot, settings: Mapping[str, Any]) -> list[Any]:
+    """
+    Return all that determines the photoelectron rates of a shot's sites, as plain data.
+
+    Sections of the settings that do not are excluded by name, so that any other section, also a new one, is contained. Of the
+    sensor, only spectral responsivity and the filter of each site matter.
+    """
+    filters = hashlib.sha256(shot.camera.sensor.filter_of_site.tobytes()).hexdigest()
+    return [_without(settings, AFTER_LIGHT), _responsivity_digest(shot), filters]
+
+
 def _image_settings(shot: Shot, settings: Mapping[str, Any]) -> list[Any]:
-    """Return the settings that determine the images, with spectral responsivity and pitch."""
+    """Return all that determines the optical images of the filters that the photosites have, as plain data."""
     scene = shot.scene
-    response = shot.camera.sensor.responsivity_e_per_j(scene.wavelength_nm)
     # With 'fit' the pitch depends on layout and distortion.
     pitch_um = shot.camera.frame(scene).pitch_um if isinstance(scene, Scene) else None
-    return [settings["scene"], settings["optics"], pitch_um, hashlib.sha256(response.tobytes()).hexdigest()]
+    # Images that are computed together share sums, whose rounding depends on their number.
+    used = shot.camera.sensor.filters_used.tolist()
+    return [_without(settings, (*AFTER_LIGHT, *AFTER_IMAGE)), pitch_um, _responsivity_digest(shot), used]
+
+
+def _without(settings: Mapping[str, Any], sections: Sequence[str]) -> dict[str, Any]:
+    return {name: section for name, section in settings.items() if name not in sections}
+
+
+def _responsivity_digest(shot: Shot) -> str:
+    return hashlib.sha256(shot.camera.sensor.responsivity_e_per_j(shot.scene.wavelength_nm).tobytes()).hexdigest()
 
 
 def _raise_ctrl_c(error: BaseException) -> None:

@@ -49,6 +49,7 @@ from foveasim.explore.datasets.labels import (
 from foveasim.explore.datasets.packed import PackedBoxes
 from foveasim.explore.datasets.pictures import digest_of, is_lazy, source_of
 from foveasim.explore.sweeps.plan import VARY, check_disjoint, locate_shot, put_changes, with_changes
+from foveasim.explore.worker_cache import rate_settings
 from foveasim.layout import Layout
 from foveasim.scene import Scene
 from foveasim.scene._scene import Fit
@@ -443,13 +444,8 @@ class Dataset:
     def _capture(self, index: int) -> tuple[Shot, Capture]:
         settings = self._settings_of(index)
         shot = self._build(index, settings)
-        camera, sensor, scene = shot.camera, shot.camera.sensor, shot.scene
-        sums = [sensor.responsivity_e_per_j(scene.wavelength_nm), sensor.filter_of_site]
-        power_settings = [
-            self._picture_of(index),
-            *(settings.get(part) for part in ("scene", "optics", "distortion", "layout", "integration_order")),
-            *(hashlib.sha256(each.tobytes()).hexdigest() for each in sums),
-        ]
+        camera, scene = shot.camera, shot.scene
+        power_settings = [self._picture_of(index), rate_settings(shot, settings)]
         photo_e_per_s = self._cached("power", power_settings, lambda: camera.photoelectrons_per_s(scene))
         capture = camera.capture(
             scene, exposure_s=shot.exposure_s, seed=self.seed, frame=index, photo_e_per_s=photo_e_per_s
