@@ -65,9 +65,9 @@ def main(out_dir: Path) -> None:
     save_figure(figure, out_dir / "26_foveal_against_square.png", dpi=140)
     print(found)
 
-    (foveal, square), _ = found.summary("psnr_db", by_eccentricity=True)
-    per_mm2, _ = found.summary("information_bit_per_mm2", by_eccentricity=True)
-    total, _ = found.summary("information_bit_per_site")
+    foveal, square = found.summary("psnr_db", by_eccentricity=True).median
+    per_mm2 = found.summary("information_bit_per_mm2", by_eccentricity=True).median
+    total = found.summary("information_bit_per_site").median
     assert foveal[0] > square[0] + 5.0
     assert foveal[3] < square[3] - 2.0
     assert per_mm2[0, 0] > 3.0 * per_mm2[1, 0]

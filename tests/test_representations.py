@@ -131,7 +131,7 @@ def examples(tmp_path_factory):
         config.LayoutFile(layout=SITES, rules=fs.DesignRules(min_size_um=1.0), source="sites.npz"), config.Result(shot, capture, REPORT, 0.1), shot,
         config.Viewable(capture, REPORT, "capture"), drc.Case(SITES, fs.DesignRules(min_size_um=1.0)), drc.Measurement(MANY),
         config.Source(file=Path("sweep.yaml"), keys=("shot",), index="3"), layout.SolveFor(name="n_x", is_integer=True, is_increasing=True, guess=len),
-        compare.budget_of(CAMERA, 30.0), compare.MEASURES["psnr_db"], compare.SceneCovariance(np.ones(50), np.ones(50)),
+        compare.budget_of(CAMERA, 30.0), compare.MEASURES["psnr_db"], compare.median_interval(np.ones((50, 5))), compare.SceneCovariance(np.ones(50), np.ones(50)),
         compare.quality_by_eccentricity(capture.picture(), capture.picture(), edges_um=np.array([0.0, 20.0])),
         compare.cameras({"a": CAMERA, "b": CAMERA}, {"flat": SCENE}, exposure_s=0.01, n_annuli=2),
         reconstruct.CorticalImage(data=np.ones((1, 20, 30)), radius_um=np.arange(21.0), start_rad=np.zeros(20)),

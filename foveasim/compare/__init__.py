@@ -16,6 +16,7 @@ from foveasim.compare.information import (
     scene_covariance,
     site_information_bits,
 )
+from foveasim.compare.intervals import MedianInterval, median_interval
 from foveasim.compare.measure import MEASURES, Measure
 from foveasim.compare.setup import default_sensor, photograph_scenes
 
@@ -25,6 +26,7 @@ __all__ = [
     "Budget",
     "Comparison",
     "Measure",
+    "MedianInterval",
     "PictureQuality",
     "SceneCovariance",
     "budget_of",
@@ -32,6 +34,7 @@ __all__ = [
     "default_sensor",
     "gaussian_information_bits",
     "layouts",
+    "median_interval",
     "photograph_scenes",
     "quality_by_eccentricity",
     "scene_covariance",

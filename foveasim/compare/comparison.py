@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from foveasim.camera import Camera
 from foveasim.compare.annuli import PictureQuality, quality_by_eccentricity
 from foveasim.compare.budgets import BUDGETS, Budget, budget_of, check_equal_budgets
 from foveasim.compare.information import SceneCovariance, scene_covariance
+from foveasim.compare.intervals import MedianInterval, median_interval
 from foveasim.compare.measure import (
     MEASURES,
     SceneMeasures,
@@ -47,8 +49,6 @@ Method = Literal["cells", "linear", "natural", "least_squares"]
 
 #: Coverage from which a pixel belongs to a camera's picture.
 MIN_COVERAGE = 0.5
-#: Confidence of the intervals.
-CONFIDENCE = 0.95
 #: Cells of the images for shifts per picture pixel, and margin in picture pixels.
 FINE_CELLS, MARGIN_PIXELS = 2, 4
 #: Frequency of the waves for aliases, in Nyquist frequencies of a square grid; relative margin of the outermost annulus.
@@ -102,9 +102,9 @@ class Comparison:
     def __repr__(self) -> str:
         return f"Comparison({', '.join(map(format_value, self.names))}; {len(self.scenes)} scenes)"
 
-    def summary(self, name: str, *, by_eccentricity: bool = False) -> tuple[Floats, Floats]:
+    def summary(self, name: str, *, by_eccentricity: bool = False) -> MedianInterval:
         """
-        Return mean and half width of the confidence interval of a measure.
+        Return the median of a measure over the scenes, and its confidence interval.
 
         Parameters
         ----------
@@ -115,16 +115,15 @@ class Comparison:
 
         Returns
         -------
-        mean, half_width : (n_camera,) or (n_camera, n_annulus) float64
-            Half width of the 95 % interval of Student's t over the scenes; NaN for one scene, 0 for measures of layouts.
+        median, low, high : (n_camera,) or (n_camera, n_annulus) float64
+            With a 95 % interval for the median of the population of scenes, for any distribution (:func:`median_interval`).
+            Its bounds are NaN for fewer than five scenes, and the value itself for measures of layouts.
         """
-        measure = _measure(name)
-        values = self.values[name + (BY_ECCENTRICITY if by_eccentricity else "")]
-        return _interval(values) if measure.has_scenes else (values, np.zeros_like(values))
+        return self._interval(name, by_eccentricity, lambda values: values)
 
-    def differences(self, name: str, *, by_eccentricity: bool = False) -> tuple[Floats, Floats]:
+    def differences(self, name: str, *, by_eccentricity: bool = False) -> MedianInterval:
         """
-        Return mean difference from the first camera, and half width of its interval.
+        Return the median difference from the first camera, and its confidence interval.
 
         Parameters
         ----------
@@ -133,14 +132,21 @@ class Comparison:
 
         Returns
         -------
-        mean, half_width : (n_camera,) or (n_camera, n_annulus) float64
+        median, low, high : (n_camera,) or (n_camera, n_annulus) float64
             Differences are paired by scene, so that the interval does not contain the variation between scenes.
         """
-        measure = _measure(name)
-        values = self.values[name + (BY_ECCENTRICITY if by_eccentricity else "")]
-        with np.errstate(invalid="ignore"):  # infinite PSNR of identical pictures
-            difference = np.where(values == values[:1], 0.0, values - values[:1])
-        return _interval(difference) if measure.has_scenes else (difference, np.zeros_like(difference))
+
+        def difference(values: Floats) -> Floats:
+            with np.errstate(invalid="ignore"):  # infinite PSNR of identical pictures
+                return np.where(values == values[:1], 0.0, values - values[:1])
+
+        return self._interval(name, by_eccentricity, difference)
+
+    def _interval(self, name: str, by_eccentricity: bool, function: Callable[[Floats], Floats]) -> MedianInterval:
+        """Return the interval of a function of a measure; a single value for measures of layouts."""
+        has_scenes = _measure(name).has_scenes
+        values = function(self.values[name + (BY_ECCENTRICITY if by_eccentricity else "")])
+        return median_interval(np.moveaxis(values, 1, -1)) if has_scenes else MedianInterval(values, values, values)
 
     def records(self) -> list[dict[str, Any]]:
         """Return one dict per camera, with its budget, its coverage and all measures."""
@@ -152,10 +158,10 @@ class Comparison:
                 "coverage_fraction": float(self.coverage_fraction[k]),
             }
             for measure in MEASURES:
-                mean, half_width = self.summary(measure)
-                row[measure] = float(mean[k])
+                median, low, high = self.summary(measure)
+                row[measure] = float(median[k])
                 if MEASURES[measure].has_scenes:
-                    row[f"{measure}_half_width"] = float(half_width[k])
+                    row[f"{measure}_low"], row[f"{measure}_high"] = float(low[k]), float(high[k])
             rows.append(row)
         return rows
 
@@ -261,9 +267,8 @@ class Comparison:
             rows.append([f"{title} / {unit}" if unit else title, *(format_number(x) for x in numbers)])
         rows.append(["coverage of the field / %", *(f"{100.0 * part:.1f}" for part in self.coverage_fraction)])
         for name, measure in MEASURES.items():
-            mean, half_width = self.summary(name)
             title = f"{measure.title} / {measure.unit}" if measure.unit else measure.title
-            rows.append([title, *(format_interval(*pair) for pair in zip(mean, half_width, strict=True))])
+            rows.append([title, *(format_interval(*one) for one in zip(*self.summary(name), strict=True))])
         return rows
 
 
@@ -569,21 +574,22 @@ def format_number(value: float) -> str:
     return f"{value:.5g}"
 
 
-def format_interval(mean: float, half_width: float) -> str:
+def format_interval(median: float, low: float, high: float) -> str:
     """
-    Format a mean with its confidence interval.
+    Format a median with its confidence interval.
 
     Examples
     --------
-    >>> format_interval(25.123, 0.52), format_interval(25.123, 0.0), format_interval(float("nan"), 0.0)
-    ('25.12 ± 0.52', '25.12', '–')
+    >>> format_interval(25.123, 24.6, 26.31), format_interval(25.123, 25.123, 25.123), format_interval(float("nan"), 0, 1)
+    ('25.12 [24.60, 26.31]', '25.12', '–')
     """
-    if not np.isfinite(mean):
-        return "∞" if mean > 0 else "–"
-    if not np.isfinite(half_width) or half_width == 0.0:
-        return f"{mean:,.4g}" if abs(mean) < 1e4 else f"{mean:,.0f}"
-    digits = min(max(0, 1 - int(np.floor(np.log10(half_width)))), 6)
-    return f"{mean:,.{digits}f} ± {half_width:,.{digits}f}"
+    if not np.isfinite(median):
+        return "∞" if median > 0 else "–"
+    width = high - low
+    if np.isnan(width) or width == 0.0:
+        return f"{median:,.4g}" if abs(median) < 1e4 else f"{median:,.0f}"
+    digits = min(max(0, 1 - math.floor(math.log10(0.5 * width))), 6) if np.isfinite(width) else 2
+    return f"{median:,.{digits}f} [{low:,.{digits}f}, {high:,.{digits}f}]".replace("inf", "∞")
 
 
 def _check_cameras(cameras: Mapping[str, Camera]) -> dict[str, Camera]:
@@ -630,18 +636,3 @@ def _measure(name: str) -> Any:
     if name not in MEASURES:
         raise ParameterError("name", f"must be one of {', '.join(MEASURES)}", name)
     return MEASURES[name]
-
-
-def _interval(values: NDArray[np.float64]) -> tuple[Floats, Floats]:
-    """Return mean and half width of the confidence interval over axis 1, without NaN."""
-    from scipy.stats import t
-
-    is_known = np.isfinite(values)
-    n = is_known.sum(axis=1)
-    # Without any finite value the mean is the value itself: an infinite PSNR, or NaN.
-    mean = np.divide(np.where(is_known, values, 0.0).sum(axis=1), n, out=values[:, 0].copy(), where=n > 0)
-    with np.errstate(invalid="ignore"):
-        deviation = np.where(is_known, values - mean[:, np.newaxis], 0.0)
-    variance = np.divide(np.square(deviation).sum(axis=1), n - 1, out=np.full(mean.shape, np.nan), where=n > 1)
-    factor = t.ppf(0.5 + 0.5 * CONFIDENCE, np.maximum(n - 1, 1))
-    return mean, factor * np.sqrt(variance / np.maximum(n, 1))

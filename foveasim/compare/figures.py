@@ -31,9 +31,9 @@ MAX_NAME = 28
 def draw_measure(comparison: Comparison, name: str, axes: Axes) -> None:
     """Draw one measure of all cameras against eccentricity, with confidence intervals."""
     measure = MEASURES[name]
-    mean, half_width = comparison.summary(name, by_eccentricity=True)
+    medians, lows, highs = comparison.summary(name, by_eccentricity=True)
     r_um = 0.5 * (comparison.edges_um[1:] + comparison.edges_um[:-1])
-    for k, (y, error) in enumerate(zip(mean, half_width, strict=True)):
+    for k, (y, low, high) in enumerate(zip(medians, lows, highs, strict=True)):
         style: dict[str, Any] = {
             "color": COLOURS[k % len(COLOURS)],
             "marker": MARKERS[k % len(MARKERS)],
@@ -41,19 +41,19 @@ def draw_measure(comparison: Comparison, name: str, axes: Axes) -> None:
         }
         is_finite = np.isfinite(y)
         axes.plot(r_um[is_finite], y[is_finite], linewidth=1.6, label=_short(comparison.names[k]), **style)
-        if measure.has_scenes and np.isfinite(error[is_finite]).any():
+        if measure.has_scenes and np.isfinite((high - low)[is_finite]).any():
             axes.fill_between(
                 r_um[is_finite],
-                (y - error)[is_finite],
-                (y + error)[is_finite],
+                low[is_finite],
+                high[is_finite],
                 color=style["color"],
                 alpha=0.16,
                 linewidth=0.0,
             )
-    if name in LOGARITHMIC and (mean[np.isfinite(mean)] > 0.0).all() and np.isfinite(mean).any():
+    finite = medians[np.isfinite(medians)]
+    if name in LOGARITHMIC and finite.size and (finite > 0.0).all():
         axes.set_yscale("log")
-        positive = mean[np.isfinite(mean)]
-        axes.set_ylim(0.6 * positive.min(), 1.6 * positive.max())
+        axes.set_ylim(0.6 * finite.min(), 1.6 * finite.max())
         _label_plainly(axes.yaxis)
     axes.set_xlabel("eccentricity / µm")
     axes.set_ylabel(f"{measure.title} / {measure.unit}" if measure.unit else measure.title)

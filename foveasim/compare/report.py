@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from foveasim.compare.budgets import BUDGETS
 from foveasim.compare.figures import measure_figure, sizes_figure
+from foveasim.compare.intervals import MIN_SCENES
 from foveasim.compare.measure import MEASURES
 from foveasim.reconstruct import Picture
 from foveasim.view.web._report_page import (
@@ -62,7 +63,9 @@ def _summary(comparison: Comparison) -> ReportSection:
         if budget is not None
         else "The budgets are not equal."
     )
-    scenes = f"{n} scenes" if n > 1 else "one scene, without confidence intervals"
+    scenes = f"{n} scenes" if n > 1 else "one scene"
+    if n < MIN_SCENES:
+        scenes += f", without confidence intervals, which require {MIN_SCENES} scenes"
     notes = [
         (
             f"{equal} Same lens, exposure of {1e3 * comparison.settings['exposure_s']:.4g} ms, and picture grid; {scenes}: "
@@ -83,19 +86,19 @@ def _summary(comparison: Comparison) -> ReportSection:
         [f"{title} / {unit}" if unit else title, *(format_number(getattr(b, attribute)) for b in comparison.budgets)]
         for attribute, title, unit in BUDGETS.values()
     ]
-    means, differences = [], []
+    medians, differences = [], []
     for name, measure in MEASURES.items():
         head = f"{measure.title} / {measure.unit}" if measure.unit else measure.title
-        means.append([head, *(format_interval(*p) for p in zip(*comparison.summary(name), strict=True))])
-        pairs = [*zip(*comparison.differences(name), strict=True)][1:]
-        differences.append([head, *(format_interval(*pair) for pair in pairs)])
-    interval = "mean ± half width of the 95 % confidence interval over the scenes (Student's t)"
+        medians.append([head, *(format_interval(*one) for one in zip(*comparison.summary(name), strict=True))])
+        others = [*zip(*comparison.differences(name), strict=True)][1:]
+        differences.append([head, *(format_interval(*one) for one in others)])
+    interval = "median [95 % confidence interval] over the scenes"
     return ReportSection(
         "Summary",
         notes,
         (
             ReportTable(("Budget", *comparison.names), budgets, "Budgets of the cameras."),
-            ReportTable(("Measure", *comparison.names), means, f"Over the complete field: {interval}."),
+            ReportTable(("Measure", *comparison.names), medians, f"Over the complete field: {interval}."),
             ReportTable(
                 ("Difference", *comparison.names[1:]),
                 differences,
@@ -129,7 +132,7 @@ def _pixels(picture: Picture, white: NDArray[np.float64]) -> NDArray[np.uint8]:
 
 def _eccentricity(comparison: Comparison) -> ReportSection:
     x_um, y_um = comparison.centre_um
-    intervals = ", with 95 % confidence intervals over the scenes" if len(comparison.scenes) > 1 else ""
+    intervals = ", with 95 % confidence intervals over the scenes" if len(comparison.scenes) >= MIN_SCENES else ""
     figures = [
         drawn_figure(
             measure_figure(comparison, name, INK, FAINT),
@@ -169,6 +172,10 @@ def _definitions(comparison: Comparison) -> ReportSection:
             "the chain rule over nearest neighbours: an estimate to compare sensors, not a bound for photographs."
         ),
         "The precision of a shift is the Cramér–Rao bound for a known image and the sites of an annulus.",
+        (
+            "Confidence intervals are those of order statistics for the median of the population of scenes. They are valid for "
+            "any distribution."
+        ),
     ]
     versions = comparison.settings["versions"]
     found = ", ".join(f"{name} {version}" for name, version in versions.items())

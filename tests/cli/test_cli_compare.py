@@ -67,7 +67,7 @@ def test_shots_are_compared_on_their_scenes(foveasim, folder):
     assert result.returncode == 0, result.stderr
     page = (folder / "s.html").read_text()
     assert "Comparison of shot, fine and shot (2)" in page
-    assert "one scene, without confidence intervals: scene of shot." in page
+    assert "one scene, without confidence intervals, which require 5 scenes: scene of shot." in page
 
 
 @pytest.mark.parametrize(
