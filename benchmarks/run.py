@@ -198,7 +198,10 @@ def bench_distortion(report: Report, shape: tuple[int, int]) -> None:
     grid = optics.grid(scene)
     layout = paper_layout(grid)
     sensor = fs.Sensor(layout, qe=0.6, dark_e_per_s=20.0, full_well_e=1e6, read_noise_e=1.0, bits=12)
-    lens = fs.distortion.BrownConrady(focal_um=4.0 * layout.bounds_um[2], k1=-0.08, k2=0.01, p1=1e-3)
+    # The coefficients are those of a lens with a focal length of twice the width of the layout.
+    focal_um = 1e6 * scene.distance_m * optics.magnification(scene.distance_m)
+    ratio = focal_um / (4.0 * layout.bounds_um[2])
+    lens = fs.distortion.BrownConrady(focal_um=focal_um, k1=-0.08 * ratio**2, k2=0.01 * ratio**4, p1=1e-3 * ratio)
     plain = fs.Camera(optics=optics, sensor=sensor)
     bent = fs.Camera(optics=optics, sensor=sensor, distortion=lens)
     cells = np.random.default_rng(0).random(grid.shape, dtype=np.float32)

@@ -38,6 +38,7 @@ from foveasim.camera import Camera
 from foveasim.camera._camera import WeightedMap
 from foveasim.camera._clock import Clock
 from foveasim.camera._coverage import Covered, warn_of_coverage
+from foveasim.camera._lens_scale import warn_of_focal_length
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError, type_name
 from foveasim.fields import Grid, PowerMap
@@ -117,6 +118,8 @@ def capture_tiles(
     -----
     CoverageWarning
         After the last tile, as for a capture.
+    FoveasimWarning
+        Before the first tile, when the lens model contradicts the focal length of the optics, as for a capture.
     """
     if not isinstance(camera, Camera):
         raise ParameterError("camera", f"must be a Camera, got {type_name(camera)}")
@@ -140,6 +143,8 @@ def _tiles(
     camera: Camera, source: Scene | PowerMap, exposure_s: float, streams: Streams, tile_sites: int, tiles: range
 ) -> Iterator[Capture]:
     layout, light = camera.sensor.layout, source if isinstance(source, PowerMap) else camera.frame(source)
+    if isinstance(light, Scene):
+        warn_of_focal_length(camera.optics, camera.distortion, light)
     images = _images(camera, light)
     coverages = []
     for tile in tiles:

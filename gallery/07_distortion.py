@@ -13,6 +13,7 @@ corners of a picture that is warped without regard to areas.
 from __future__ import annotations
 
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +48,9 @@ def centroids_um(layout: fs.Layout, values: np.ndarray, guess_um: np.ndarray, sh
 
 def main(out_dir: Path) -> None:
     """Write the run of the paper, points, a letter and the warping error to a directory."""
-    # %% Settings of the paper: a million sites, whose outlines are undistorted once.
+    # %% Settings of the paper: a million sites, whose outlines are undistorted once. The paper combines the distortion of a
+    # lens of 3.5 mm with the image of one of 22 mm, of which captures warn.
+    warnings.filterwarnings("ignore", message="the focal length of the lens model")
     shot = read_shot(SETTINGS)
     lens, layout, optics = shot.camera.distortion, shot.camera.sensor.layout, shot.camera.optics
     size = layout.provenance["parameters"]

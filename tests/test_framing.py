@@ -107,6 +107,7 @@ def undistorted_radius_um(radius_um, k1, focal_um):
     return brentq(lambda r: r * (1.0 + k1 * (r / focal_um) ** 2) - radius_um, 0.0, 4.0 * radius_um, xtol=1e-13)
 
 
+@pytest.mark.filterwarnings("ignore:the focal length of the lens model")  # a short one, for strong distortion
 @pytest.mark.parametrize("is_one_site", [True, False], ids=["one site", "grid"])
 @pytest.mark.parametrize("k1", [-0.1, 0.3], ids=["barrel", "pincushion"])
 def test_cover_contains_undistorted_outlines(k1, is_one_site):
@@ -148,6 +149,7 @@ def test_two_focal_lengths_stretch_the_picture():
     assert pitch_um == pytest.approx(expected_um, rel=2e-5)
 
 
+@pytest.mark.filterwarnings("ignore:the focal length of the lens model")  # a short one, for strong distortion
 def test_sites_outside_image_circle_do_not_count():
     lens = fs.distortion.Fisheye(projection="orthographic", focal_um=60.0)
     layout = fs.Layout.from_rectangles([[0.0, 0.0], [100.0, 0.0]], 20.0)

@@ -1,6 +1,8 @@
 """The optical axis meets the sensor at the principal point: images, relative illumination and fields are centred there."""
 
 import json
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -147,3 +149,34 @@ def test_reference_picture_centres_on_principal_point():
     y_um = cells.sum(axis=1) @ grid.y_um[rows] / cells.sum()
 
     assert (x_um, y_um) == pytest.approx(CENTRE_UM, abs=1e-3)
+
+
+@pytest.mark.parametrize("focus_m", [None, 0.4])
+def test_contradicting_focal_length_warns(focus_m):
+    """The reference is the image distance of a thin lens, 1 / f = 1 / H + 1 / D."""
+    optics = fs.Optics(focal_length_mm=8.0, f_number=4.0, focus_distance_m=focus_m)
+    image_um = 1e6 / (1.0 / 8e-3 - 1.0 / (focus_m or DISTANCE_M))
+    sensor = fs.Sensor(fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0))
+    scene = fs.Scene.flat(
+        shape=(60, 60), pitch_um=1000.0, distance_m=DISTANCE_M, radiance_w_m2_sr_nm=1.0, band_width_nm=10.0
+    )
+
+    def rates(light=scene, lens=optics, **distortion):
+        camera = fs.Camera(optics=lens, sensor=sensor, distortion=BrownConrady(k1=-0.1, **distortion))
+        return camera.photoelectrons_per_s(light), camera
+
+    # Within 2 %, also of the geometric mean of unequal axes; the suite turns warnings into errors.
+    for focal_um in (0.981 * image_um, 1.019 * image_um, (1.5 * image_um, image_um / 1.5)):
+        rates(focal_um=focal_um)
+    for focal_um in (0.979 * image_um, 1.021 * image_um, 0.49 * image_um, (1.03 * image_um, 1.03 * image_um)):
+        with pytest.warns(fs.errors.FoveasimWarning, match="the focal length of the lens model is") as caught:
+            _, camera = rates(focal_um=focal_um)
+        # Both remedies of the message remove the contradiction.
+        message = str(caught[0].message)
+        rates(focal_um=float(re.search(r"focal_um=([\d.]+)", message).group(1)))
+        focal_mm = float(re.search(r"focal_length_mm=([\d.]+)", message).group(1))
+        rates(focal_um=focal_um, lens=replace(optics, focal_length_mm=focal_mm))
+    with pytest.warns(fs.errors.FoveasimWarning, match="the focal length of the lens model is"):
+        next(fs.tiles.capture_tiles(camera, scene, exposure_s=0.01, seed=0))
+    # The optics do not take part in the image of another program.
+    rates(camera.power_map(scene), focal_um=4000.0)

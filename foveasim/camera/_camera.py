@@ -26,6 +26,7 @@ from foveasim._core.validation import Bools, Floats, check_count, finite_array, 
 from foveasim.camera._clock import Clock
 from foveasim.camera._coverage import Covered, format_point, size_um, warn_of_coverage
 from foveasim.camera._frames import Frame, ImageCache, Position, Task, check_frames, position_settings, tasks
+from foveasim.camera._lens_scale import warn_of_focal_length
 from foveasim.capture import Capture
 from foveasim.distortion import Lens
 from foveasim.errors import (
@@ -94,6 +95,9 @@ class Camera:
         quarter of the width of a photograph. Scenes with ``fit`` are framed on the layout, without these warnings.
     SamplingWarning
         On a capture, when second-order integration of a sharp image on coarse cells gives negative photoelectrons.
+    FoveasimWarning
+        On a capture of a scene, when the ``focal_um`` of the lens model differs by more than 2 % from the image distance of the
+        optics, which is their focal length for a distant scene: it would be distorted for wrong field angles.
 
     Examples
     --------
@@ -796,6 +800,7 @@ class Camera:
         if isinstance(light, PowerMap):
             maps, grids = self._bands(light, e_per_j), [light.grid]
         else:
+            warn_of_focal_length(self._optics, self._distortion, light)
             # Lateral chromatic aberration gives images of several sizes, each with its own grid.
             optics = self._optics.resolve_oversample(light)
             images = optics.image_grids(light)

@@ -74,7 +74,7 @@ SECTIONS: dict[str, dict[str, Any]] = {
     "rotate kind": {"angle_deg": 15.0},
     "routing": {"width_um": 0.2, "space_um": 0.2},
     "scale kind": {"factor": 1.2},
-    "scaramuzza kind": {"a": [1.57e3, -2.75e-4, 3.76e-8, -3.64e-11], "pixel_um": 2.2, "focal_um": 3454.0},
+    "scaramuzza kind": {"a": [1.57e3, -2.75e-4, 3.76e-8, -3.64e-11], "pixel_um": 5.1},
     "siemens_star kind": {"n_spokes": 36, "radius_mm": 110.0},
     "silicon kind": {"depth_um": 3.0},
     "sine kind": {"line_pairs_per_mm": 0.05},

@@ -57,7 +57,9 @@ VARY = {
 }
 N_Y, N_X = 80, 96
 FLAT = {"kind": "flat", "shape": [80, 96], "radiance_w_m2_sr_nm": 0.1}
-BARREL = {"kind": "brown_conrady", "focal_um": 100.0, "k1": -0.3}
+#: The image distance of the optics, and the distortion of a focal length of 100 µm with k1 = -0.3.
+FOCAL_UM = 8064.5
+BARREL = {"kind": "brown_conrady", "focal_um": FOCAL_UM, "k1": -0.3 * (FOCAL_UM / 100.0) ** 2}
 
 
 def pictures(n, seed=0):
@@ -435,7 +437,8 @@ def test_labels_match_the_optical_image():
 
 
 def test_samples_are_finite_outside_picture():
-    narrow = {"kind": "fisheye", "projection": "orthographic", "focal_um": 30.0}
+    # The radius r (1 + k1 (r / f)²) is at most 2 r / 3 = 30 µm, at (r / f)² = -1 / (3 k1).
+    narrow = {"kind": "brown_conrady", "focal_um": FOCAL_UM, "k1": -((FOCAL_UM / 45.0) ** 2) / 3.0}
     shot = SHOT | {"scene": SHOT["scene"] | {"pitch_um": 120.0}, "distortion": narrow}
     flows = np.full((1, N_Y, N_X, 2), np.nan)
     with pytest.warns(CoverageWarning, match="sample 0: .*photosites lie"):

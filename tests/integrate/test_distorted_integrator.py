@@ -156,6 +156,7 @@ def test_camera_accepts_any_lens_model():
     assert not np.allclose(captures[0].expected_e, captures[1].expected_e, rtol=1e-6)
 
 
+@pytest.mark.filterwarnings("ignore:the focal length of the lens model")  # a short one, for strong distortion
 def test_camera_warns_of_sites_outside_image_circle():
     layout = fs.layout.hexagonal(n_columns=12, n_rows=12, pitch_um=8.0)
     optics = fs.Optics(focal_length_mm=8.0, f_number=2.8)

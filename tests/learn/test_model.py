@@ -18,9 +18,11 @@ from foveasim.learn.distortion import coefficient_values
 from foveasim.optics import LateralColour, PupilImage, Seidel, Zernike
 from foveasim.sensor.effects import Diffusion, InterPixelCapacitance
 
-#: The pictures are small, so that every derivative can be compared.
+#: The pictures and focal lengths are small, so that every derivative can be compared.
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::foveasim.errors.SamplingWarning", "ignore::foveasim.errors.CoverageWarning"
+    "ignore::foveasim.errors.SamplingWarning",
+    "ignore::foveasim.errors.CoverageWarning",
+    "ignore:the focal length of the lens model",
 )
 RNG = np.random.default_rng(0)
 ZERNIKE = Zernike(coefficients={4: 0.1, 7: 0.15})

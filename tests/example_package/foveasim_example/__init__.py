@@ -111,7 +111,7 @@ class HalfMoon:
 class Magnifier:
     """A lens model that enlarges everything."""
 
-    focal_um = 1.0
+    focal_um = 8000.0
     centre_um = (0.0, 0.0)
 
     factor: float = 1.1
