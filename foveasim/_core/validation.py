@@ -102,6 +102,7 @@ UNIT_SUFFIXES = {
     "_rad": "rad",
     "_deg": "degrees",
     "_dn": "DN",
+    "_ev": "eV",
     "_m": "m",
     "_s": "s",
     "_k": "K",

@@ -94,6 +94,10 @@ LIMITS: Mapping[str, Limits] = MappingProxyType(
         "temperature_k": Limits(low=0.01, high=1000.0, is_positive=True, hint=_KELVIN),
         "dark_reference_k": Limits(low=0.01, high=1000.0, is_positive=True, hint=_KELVIN),
         "dark_doubling_k": Limits(low=0.1, high=1000.0, is_positive=True, hint="dark current doubles every 5 to 10 K"),
+        "dark_activation_ev": Limits(
+            low=0.01, high=10.0, is_positive=True, hint="in silicon, generation has 0.63 eV and diffusion 1.27 eV"
+        ),
+        "dark_diffusion_fraction": _FRACTION,
         "full_well_e": Limits(low=0.0, high=1e15, is_positive=True, hint=_ELECTRONS),
         "read_noise_e": _NOISE_E,
         "rts_e": _NOISE_E,

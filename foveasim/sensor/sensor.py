@@ -34,7 +34,7 @@ from foveasim.sensor.chain import (
     sort_by_stage,
 )
 from foveasim.sensor.device import Device
-from foveasim.sensor.effects import EFFECTS, STANDARD, Effect, Photosites, Sites, dark_current_factor
+from foveasim.sensor.effects import EFFECTS, STANDARD, DarkLaw, Effect, Photosites, Sites, dark_current_factor
 from foveasim.sensor.effects.contract import FixedFactor, FixedOffset
 from foveasim.sensor.effects.crosstalk import Diffusion, InterPixelCapacitance, KernelCrosstalk
 from foveasim.sensor.effects.shot import ShotChoice, ShotNoise
@@ -60,7 +60,8 @@ _PER_SITE = ("sensitivity", "dark_e_per_s", "full_well_e", "read_noise_e", "capa
 _NUMBERS = (
     *("prnu_fraction", "dsnu_fraction", "pixel_fpn_fraction", "line_fpn_fraction", "gain_fpn_fraction"),
     *("hot_fraction", "dead_fraction", "rts_fraction", "nonlinearity_fraction", "hot_e_per_s", "rts_e"),
-    *("temperature_k", "dark_reference_k", "dark_doubling_k", "v_sat_v", "pedestal_v"),
+    *("temperature_k", "dark_reference_k", "dark_doubling_k", "dark_activation_ev", "dark_diffusion_fraction"),
+    *("v_sat_v", "pedestal_v"),
 )
 
 #: One value for all sites, or an array (n_site,).
@@ -93,8 +94,14 @@ class Sensor:
         Photo-response non-uniformity (PRNU): standard deviation over mean of a Gaussian distribution, at most 0.3.
     dark_e_per_s : float or (n_site,), e-/s
         Dark current at ``dark_reference_k``.
-    temperature_k, dark_reference_k, dark_doubling_k : float, K
-        Temperature of the sensor, reference temperature of the dark current, and temperature rise that doubles it.
+    temperature_k, dark_reference_k : float, K
+        Temperature of the sensor, and reference temperature of the dark current.
+    dark_law : {"doubling", "arrhenius", "diffusion_generation"}
+        Temperature dependence of the dark current: see :func:`foveasim.sensor.effects.dark_current_factor`. The default is
+        the rule of EMVA 1288; far below the reference temperature it is too bright.
+    dark_doubling_k, dark_activation_ev, dark_diffusion_fraction : float
+        Parameters of the three laws: temperature rise that doubles the dark current, K; activation energy, eV; fraction of the
+        diffusion current at ``dark_reference_k``.
     dsnu_fraction : float
         Dark-signal non-uniformity (DSNU): standard deviation over mean of the dark current. The distribution is log-normal
         with mean ``dark_e_per_s``, so that values are never negative.
@@ -161,7 +168,10 @@ class Sensor:
     dark_e_per_s: PerSite = 0.0
     temperature_k: float = 300.0
     dark_reference_k: float = 300.0
+    dark_law: DarkLaw = "doubling"
     dark_doubling_k: float = 8.0
+    dark_activation_ev: float = 0.67
+    dark_diffusion_fraction: float = 0.5
     dsnu_fraction: float = 0.0
     hot_fraction: float = 0.0
     hot_e_per_s: float = 0.0
@@ -229,7 +239,7 @@ class Sensor:
                 f"{LIMITS['dark_e_per_s'].rule} at temperature_k = {self.temperature_k:g} K",
                 hottest_e_per_s,
                 "e-/s",
-                "check dark_reference_k and dark_doubling_k",
+                "check dark_reference_k and the parameters of dark_law",
             )
         for name in ("ktc_noise", "cds"):
             if not isinstance(getattr(self, name), bool):
@@ -556,7 +566,14 @@ class Sensor:
     @property
     def dark_current_ratio(self) -> float:
         """Ratio of the dark current at ``temperature_k`` to that at ``dark_reference_k``."""
-        return dark_current_factor(self.temperature_k, self.dark_reference_k, self.dark_doubling_k)
+        return dark_current_factor(
+            self.temperature_k,
+            self.dark_reference_k,
+            self.dark_law,
+            doubling_k=self.dark_doubling_k,
+            activation_ev=self.dark_activation_ev,
+            diffusion_fraction=self.dark_diffusion_fraction,
+        )
 
     @cached_property
     def v_per_e(self) -> Floats:

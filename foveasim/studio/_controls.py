@@ -20,6 +20,7 @@ __all__ = ["chosen_value", "controls_of", "structure_of", "value_at"]
 #: Ranges of sliders by parameter: lowest and highest value; logarithmic if the lowest is positive and far below the highest.
 RANGES: dict[str, tuple[float, float]] = {
     "bits": (1.0, 16.0),
+    "dark_activation_ev": (0.4, 1.3),
     "dark_doubling_k": (4.0, 12.0),
     "dark_reference_k": (230.0, 350.0),
     "depth_um": (0.5, 10.0),

@@ -212,6 +212,58 @@ def test_dark_current_doubles_every_eight_kelvin(temperature_k, factor):
     assert expected(100.0, temperature_k=temperature_k)[0] == 100.0
 
 
+def dark_ratio(temperature_k, law, **options):
+    return fs.sensor.effects.dark_current_factor(temperature_k, 300.0, law, **options)
+
+
+@pytest.mark.parametrize(
+    ("diffusion_fraction", "power", "energies"), [(0.0, 1.5, 0.5), (1.0, 3.0, 1.0)], ids=["generation", "diffusion"]
+)
+@pytest.mark.parametrize("temperature_k", [233.0, 300.0])
+def test_dark_current_doubles_with_band_gap(temperature_k, diffusion_fraction, power, energies):
+    """Doubling temperature k T² ln 2 / (m k T + (E_g - T dE_g/dT) / ν) of T^m exp(-E_g / ν k T), by difference."""
+    t_k, k_ev = temperature_k, scipy.constants.k / scipy.constants.e
+    gap_ev = 1.1557 - 7.021e-4 * t_k**2 / (1108.0 + t_k)
+    slope_ev = -7.021e-4 * t_k * (2.0 * 1108.0 + t_k) / (1108.0 + t_k) ** 2
+    expected_k = k_ev * t_k**2 * math.log(2.0) / (power * k_ev * t_k + (gap_ev - t_k * slope_ev) * energies)
+
+    step_k, options = 0.01, {"diffusion_fraction": diffusion_fraction}
+    above, below = (dark_ratio(t_k + step, "diffusion_generation", **options) for step in (step_k, -step_k))
+    assert math.log(2.0) * 2.0 * step_k / math.log(above / below) == pytest.approx(expected_k, rel=1e-6)
+    assert dark_ratio(300.0, "diffusion_generation", **options) == 1.0
+
+
+def test_dark_laws_differ_when_cooled():
+    """Published figures: doubling in 8 K is 3.2 times too bright at 233 K for generation, 3,400 times for diffusion."""
+    rule = dark_ratio(233.0, "doubling")
+    generation, diffusion, both = (
+        dark_ratio(233.0, "diffusion_generation", diffusion_fraction=share) for share in (0.0, 1.0, 0.2)
+    )
+    assert rule / generation == pytest.approx(3.2, rel=0.01)
+    assert rule / diffusion == pytest.approx(3400.0, rel=0.02)
+    assert both == pytest.approx(0.8 * generation + 0.2 * diffusion)
+    # An Arrhenius plot is a straight line, with the slope -E / k.
+    inverse_per_k = np.array([1 / 233.0, 1 / 266.0, 1 / 300.0, 1 / 350.0])
+    logarithm = np.log([dark_ratio(1.0 / each, "arrhenius", activation_ev=0.9) for each in inverse_per_k])
+    slopes_k = np.diff(logarithm) / np.diff(inverse_per_k)
+    assert slopes_k * scipy.constants.k / scipy.constants.e == pytest.approx(-0.9)
+    assert dark_ratio(300.0, "arrhenius") == 1.0
+    # The default activation energy doubles the current in 8 K at the reference temperature.
+    assert dark_ratio(300.1, "arrhenius") == pytest.approx(dark_ratio(300.1, "doubling"), rel=1e-4)
+    assert (dark_ratio(0.01, "arrhenius"), dark_ratio(0.01, "diffusion_generation")) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("law", ["arrhenius", "diffusion_generation"])
+def test_dark_and_hot_current_follow_law(law):
+    cooled = {"dark_law": law, "temperature_k": 263.0, "dark_activation_ev": 0.5, "dark_diffusion_fraction": 0.3}
+    factor = dark_ratio(263.0, law, activation_ev=0.5, diffusion_fraction=0.3)
+    dark = expected(dark_e_per_s=50.0, hot_fraction=0.1, hot_e_per_s=5000.0, **cooled)
+
+    assert np.unique(dark) == pytest.approx([50.0 * factor, 5050.0 * factor])
+    assert factor < 0.1
+    assert expected(100.0, **cooled)[0] == 100.0
+
+
 def test_hot_sites_have_stated_fraction_and_current():
     dark = expected(hot_fraction=0.01, hot_e_per_s=5000.0, dark_e_per_s=10.0)
 
@@ -679,6 +731,13 @@ def test_sensitivity_affects_only_photoelectrons():
         ("temperature_k", 0.0, "'temperature_k' must be > 0"),
         ("temperature_k", -20.0, "'temperature_k' must be > 0"),
         ("dark_doubling_k", 0.0, "'dark_doubling_k' must be > 0"),
+        (
+            "dark_law",
+            "Arrhenius",
+            "'dark_law' must be one of 'doubling', 'arrhenius', 'diffusion_generation', got 'Arr",
+        ),
+        ("dark_activation_ev", 670.0, r"'dark_activation_ev' must be from 0.01 to 10, got 670.0 eV; in silicon"),
+        ("dark_diffusion_fraction", 2.0, "'dark_diffusion_fraction' must be <= 1"),
         ("ktc_noise", 1, "'ktc_noise' must be True or False"),
         ("cds", "yes", "'cds' must be True or False"),
         ("companding", "gamma", "'companding' must be one of 'linear', 'root', 'log', 'table'"),

@@ -23,7 +23,7 @@ from foveasim.sensor.effects.contract import (
     Stage,
 )
 from foveasim.sensor.effects.crosstalk import CrosstalkOperator, Diffusion, InterPixelCapacitance, KernelCrosstalk
-from foveasim.sensor.effects.dark import DarkSignal, HotSites, dark_current_factor
+from foveasim.sensor.effects.dark import DarkLaw, DarkSignal, HotSites, dark_current_factor
 from foveasim.sensor.effects.fixed_pattern import ColumnOffset, PixelGain, PixelOffset
 from foveasim.sensor.effects.readout import ReadNoise, ResetNoise, TelegraphNoise
 from foveasim.sensor.effects.response import DeadSites, PhotoResponse
@@ -36,6 +36,7 @@ __all__ = [
     "AdditiveNoise",
     "ColumnOffset",
     "CrosstalkOperator",
+    "DarkLaw",
     "DarkSignal",
     "DeadSites",
     "Diffusion",
