@@ -21,7 +21,7 @@ MAX_FOCAL_DIFFERENCE = 0.02
 
 def warn_of_focal_length(optics: Optics, lens: Lens | None, scene: Scene) -> None:
     """
-    Warn when the focal length of a lens model differs from the image distance of the optics.
+    Warn when the focal length of a lens model differs from the image distance.
 
     A lens model maps directions, which are ideal positions over its focal length. Those of the optics are over the image
     distance, which equals their focal length for a distant scene in focus. For unequal axes, the geometric mean is compared,
