@@ -32,6 +32,7 @@ from foveasim._core.provenance import differences, to_plain_data
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import check_count, read_only
 from foveasim._io.formats import as_file_error
+from foveasim._io.mapped_files import in_memory
 from foveasim._io.resumable import LOCK, disk_errors, finish, partial_path, resumable_directory
 from foveasim._io.zarr_stores import ZARR, check_codecs
 from foveasim.camera import Camera
@@ -478,7 +479,7 @@ def _plan(
     for array in arrays:
         for plane in array:
             for first in range(0, plane.shape[0], 256):
-                checksum = crc32(np.ascontiguousarray(plane[first : first + 256]).data, checksum)
+                checksum = crc32(np.ascontiguousarray(in_memory(plane[first : first + 256])).data, checksum)
     n_sites = camera.sensor.layout.n_sites
     plan = {"settings": settings, "light_crc32": checksum, "n_sites": n_sites, "tile_sites": tile_sites}
     found: dict[str, Any] = json.loads(json.dumps(plan))

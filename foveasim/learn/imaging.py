@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from foveasim._core.names import possible_names
 from foveasim._core.validation import Floats, Ints
+from foveasim._io.mapped_files import in_memory
 from foveasim.errors import ParameterError, type_name
 from foveasim.fields import Grid, SceneLike
 from foveasim.learn._tensors import check_tensor, constant
@@ -200,7 +201,7 @@ class Imaging(nn.Module):
         weights = check_tensor("weights", weights, (None, n_waves), ", one column per wavelength").double()
         shape = self._scene.basis.shape
         if basis is None:
-            basis = torch.from_numpy(np.array(self._scene.basis, np.float64))
+            basis = torch.from_numpy(np.array(in_memory(self._scene.basis), np.float64))
         if not isinstance(basis, Tensor) or basis.ndim < 3:
             check_tensor("basis", basis, shape)
         flat = check_tensor("basis", basis.reshape(-1, *basis.shape[-3:]), (None, *shape), ", as the scene").double()

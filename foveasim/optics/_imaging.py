@@ -25,6 +25,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from foveasim._core.validation import Floats, Images, Ints
+from foveasim._io.mapped_files import in_memory
 from foveasim.fields import Grid
 from foveasim.optics._aperture import Aperture
 from foveasim.optics._transform import Factor, Transform, source_pixels
@@ -208,7 +209,7 @@ class Imaging:
         transform = self.transform(*self.sources(), self.grid.shape)
 
         def write_spectrum(b: int, out: NDArray[Any]) -> None:
-            transform.forward(self.basis[b], self.tangent2_x, self.tangent2_y, self.falloff_power, out)
+            transform.forward(in_memory(self.basis[b]), self.tangent2_x, self.tangent2_y, self.falloff_power, out)
 
         return self._maps(transform, write_spectrum, lambda weight: self.cached_factor(weight, transform, table_of))
 
@@ -291,9 +292,11 @@ class Imaging:
         picture = np.zeros(shape, self.real)
         inner = picture[rows.pixels, columns.pixels]
         on_axis = np.zeros(shape[1]), np.zeros(shape[0])
+        y, x = (range(int(sources.min()), int(sources.max()) + 1) for sources in (rows.sources, columns.sources))
 
         def write_spectrum(b: int, out: NDArray[Any]) -> None:
-            inner[:] = self.basis[b][np.ix_(rows.sources, columns.sources)] * window
+            box = self.basis[b, y.start : y.stop, x.start : x.stop]
+            inner[:] = in_memory(box)[np.ix_(rows.sources - y.start, columns.sources - x.start)] * window
             transform.forward(picture, *on_axis, self.falloff_power, out)
 
         return self._maps(transform, write_spectrum, lambda weight: transform.factor(*table_of(weight)))

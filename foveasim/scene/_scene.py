@@ -29,6 +29,7 @@ from foveasim._core.validation import (
 from foveasim._io.encodings import Encoding, decode
 from foveasim._io.formats import as_file_error
 from foveasim._io.images import read_picture
+from foveasim._io.mapped_files import check_unchanged, value_range
 from foveasim.errors import FileError, ParameterError, printable, type_name
 from foveasim.fields import from_file_rows
 from foveasim.scene._illuminants import Illuminant
@@ -63,6 +64,19 @@ MAX_SOURCE = 100
 LUMINANCE_WEIGHTS = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
+class _BasisImages:
+    """Basis images of a scene; each access checks the file of mapped images."""
+
+    def __get__(self, scene: Scene | None, owner: type[Scene]) -> Images:
+        if scene is None:  # dataclasses: the field has no default
+            raise AttributeError("basis")
+        images: Images = vars(scene)["basis"]
+        return check_unchanged(images)
+
+    def __set__(self, scene: Scene, images: Images) -> None:
+        vars(scene)["basis"] = images
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """
@@ -74,7 +88,8 @@ class Scene:
     ----------
     basis : (n_basis, n_y, n_x) float32 or float64
         Basis images, bottom row first, values >= 0. The array is copied, so that later changes do not affect the scene; an
-        array that is read-only, with all its base arrays, is shared.
+        array that is read-only, with all its base arrays, is shared. Images that are mapped from a file (:meth:`from_cube`) are
+        checked at each use: ``FileError`` if the file has changed.
     spectrum_w_m2_sr_nm : (n_basis, n_wavelength) float64, W/(m² sr nm)
         Spectral radiance of the value 1 in each basis image.
     wavelength_nm : (n_wavelength,) float64, nm
@@ -105,7 +120,7 @@ class Scene:
     Spectral radiance of pixel [iy, ix] at wavelength k: ``sum_b basis[b, iy, ix] * spectrum[b, k]``.
     """
 
-    basis: Images
+    basis: Images = _BasisImages()  # type: ignore[assignment]
     spectrum_w_m2_sr_nm: Floats
     wavelength_nm: Floats
     band_width_nm: Floats
@@ -122,7 +137,7 @@ class Scene:
             basis = read_only(basis.astype(np.float64))
         if basis.ndim != 3 or 0 in basis.shape:
             raise ParameterError("basis", f"must have the shape (n_basis, n_y, n_x), got {basis.shape}")
-        lowest, highest = float(basis.min()), float(basis.max())
+        lowest, highest = value_range(basis)
         if not (np.isfinite(lowest) and np.isfinite(highest)):
             raise ParameterError("basis", "must be finite; replace NaN and infinite values")
         if lowest < 0.0:
@@ -155,6 +170,9 @@ class Scene:
         distance_m = check_number("distance_m", self.distance_m, above=0.0, at_most=MAX_DISTANCE_M)
         object.__setattr__(self, "distance_m", distance_m)
         object.__setattr__(self, "pitch_um", self._checked_pitch_um())
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"basis": self.basis}
 
     def _checked_pitch_um(self) -> float | None:
         """Return the given pitch or that of the field of view; None with ``fit``."""
@@ -208,7 +226,7 @@ class Scene:
         return scene
 
     def __repr__(self) -> str:
-        n_basis, n_y, n_x = self.basis.shape
+        n_basis, n_y, n_x = vars(self)["basis"].shape
         size = f", fit='{self.fit}'," if self.pitch_um is None else f" of {self.pitch_um:g} µm"
         return (
             f"Scene({n_x} x {n_y} pixels{size} at {self.distance_m:g} m, {n_basis} basis images, "
@@ -422,9 +440,10 @@ class Scene:
 
         Notes
         -----
-        Floating-point ENVI data by band or line (bsq, bil) are mapped into memory, not copied; the file must not change while
-        the scene is used. Other data are stored once, as float32 if this represents them exactly. Scale factors, units,
-        illuminant and interpolation change only the spectra of the basis images.
+        Data are stored once, as float32 if this represents them exactly. Floating-point ENVI data by band or line (bsq, bil)
+        above 1 GiB are mapped into memory, not copied. Each use of such a scene raises ``FileError`` if the size or the time of
+        modification of the file has changed; replacing it by another file of the same name does not affect the scene. Scale
+        factors, units, illuminant and interpolation change only the spectra of the basis images.
         """
         if pitch_um is not None and field_of_view_deg is not None:
             raise _framing_conflict("field_of_view_deg", field_of_view_deg, "pitch_um")

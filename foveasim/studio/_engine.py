@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats
+from foveasim._io.mapped_files import in_memory
 from foveasim.capture import Capture
 from foveasim.config import Shot
 from foveasim.errors import GeometryError
@@ -204,6 +205,6 @@ def _reduced(scene: Scene, block: int) -> Scene:
         return scene
     n_y, n_x = (block * (n // block) for n in scene.basis.shape[1:])
     y0, x0 = ((n - used) // 2 for n, used in zip(scene.basis.shape[1:], (n_y, n_x), strict=True))
-    basis = np.stack([block_means(image[y0 : y0 + n_y, x0 : x0 + n_x], block) for image in scene.basis])
+    basis = np.stack([block_means(in_memory(image[y0 : y0 + n_y, x0 : x0 + n_x]), block) for image in scene.basis])
     pitch_um = None if scene.pitch_um is None or scene.field_of_view_deg is not None else scene.pitch_um * block
     return replace(scene, basis=basis, pitch_um=pitch_um)

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
+import mmap
+import os
+import pickle
 import struct
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +23,7 @@ from foveasim.errors import ConfigError, FileError, FoveasimWarning, ParameterEr
 from foveasim.scene import CUBE_FORMATS, Scene
 from foveasim.scene.charts import illuminant
 from foveasim.scene.cubes import _envi, _formats, _selection
+from foveasim.view.plots.rasters import scene_pixels
 
 h5py = pytest.importorskip("h5py")
 xr = pytest.importorskip("xarray")
@@ -110,18 +116,116 @@ def test_envi_types_and_interleaves_are_read(tmp_path, code, number, interleave,
     assert scene.source == str(path)
 
 
+@pytest.fixture
+def all_mapped(monkeypatch):
+    """Map floating-point ENVI data of any size."""
+    monkeypatch.setattr(_selection, "MAX_COPIED_BYTES", 0)
+
+
+PART = {"rows": (1, 4), "columns": (0, 2), "range_nm": (500, 700)}
+
+
 @pytest.mark.parametrize("interleave", ["bsq", "bil"])
-def test_floating_point_envi_is_not_copied(tmp_path, interleave):
+def test_large_envi_is_mapped(tmp_path, interleave, all_mapped):
     path = write_envi(tmp_path / "cube.hdr", interleave=interleave)
 
-    scene = Scene.from_cube(path, **RADIANCE, rows=(1, 4), columns=(0, 2), range_nm=(500, 700))
+    scene = Scene.from_cube(path, **RADIANCE, **PART)
 
     base = scene.basis
-    while isinstance(base.base, np.ndarray):
+    while isinstance(base, np.ndarray):
         base = base.base
-    assert isinstance(base, np.memmap)
+    assert isinstance(base, mmap.mmap)
     assert not scene.basis.flags.writeable
     np.testing.assert_array_equal(radiance(scene), VALUES[1:, 1:4, :2])
+
+
+@pytest.mark.parametrize("interleave", ["bsq", "bil", "bip"])
+def test_small_scene_survives_changed_file(tmp_path, interleave):
+    path = write_envi(tmp_path / "cube.hdr", interleave=interleave)
+    scene, part = Scene.from_cube(path, **RADIANCE), Scene.from_cube(path, **RADIANCE, **PART)
+
+    data = path.with_suffix(".img")
+    data.write_bytes(bytes(data.stat().st_size))
+
+    np.testing.assert_array_equal(radiance(scene), VALUES)
+    np.testing.assert_array_equal(radiance(part), VALUES[1:, 1:4, :2])
+    assert not scene.basis.flags.writeable
+    data.write_bytes(b"")
+    np.testing.assert_array_equal(radiance(scene), VALUES)
+
+
+def change(data, how):
+    if how == "overwritten":
+        data.write_bytes(bytes(data.stat().st_size))
+    elif how == "truncated":
+        data.write_bytes(b"")
+    else:
+        with data.open("ab") as file:
+            file.write(b"1234")
+
+
+#: Uses of a scene from a file: each raises after a change.
+USES = {
+    "basis": lambda scene, _: scene.basis,
+    "power map": lambda scene, camera: camera.optics.power_map(scene),
+    "capture": lambda scene, camera: camera.capture(scene, exposure_s=0.1, seed=0),
+    "crop": lambda scene, _: replace(scene, basis=scene.basis[:, 1:]),
+    "pitch": lambda scene, _: scene.with_pitch(5.0).basis,
+    "pixels": lambda scene, _: scene_pixels(scene, 2),
+    "pickle": lambda scene, _: pickle.dumps(scene),
+    "copy": lambda scene, _: copy.deepcopy(scene),
+}
+
+
+@pytest.mark.parametrize("how", ["overwritten", "truncated", "extended"])
+@pytest.mark.parametrize("interleave", ["bsq", "bil"])
+@pytest.mark.parametrize("use", USES)
+def test_changed_mapped_file_raises_at_use(tmp_path, use, interleave, how, all_mapped):
+    path = write_envi(tmp_path / "cube.hdr", interleave=interleave)
+    camera = fs.Camera(
+        optics=fs.Optics(focal_length_mm=20.0, f_number=4.0, oversample=1),
+        sensor=fs.Sensor(fs.layout.grid(n_x=2, n_y=2, pitch_um=40.0), qe=0.5),
+    )
+    scene = Scene.from_cube(path, **RADIANCE, pitch_um=1000.0)
+    crop = replace(scene, basis=scene.basis[:, :, 1:])
+    USES[use](scene, camera)  # the unchanged file
+    data = path.with_suffix(".img")
+    os.utime(data, ns=(0, 0))  # before the resolution of file times
+    scene = Scene.from_cube(path, **RADIANCE, pitch_um=1000.0)
+
+    change(data, how)
+
+    expected = {"overwritten": "was modified", "truncated": "has 0 bytes instead of 240", "extended": "has 244 bytes"}
+    for one in (scene, crop):
+        with pytest.raises(FileError, match=f"{expected[how]}.* since it was opened; open it again") as caught:
+            USES[use](one, camera)
+        assert caught.value.path == data
+    assert "5 x 4 pixels" in repr(scene)
+
+
+def test_replaced_file_leaves_mapped_scene_valid(tmp_path, all_mapped):
+    scene = Scene.from_cube(write_envi(tmp_path / "cube.hdr"), **RADIANCE)
+    (tmp_path / "new.img").write_bytes(b"other")
+    (tmp_path / "new.img").replace(tmp_path / "cube.img")
+
+    np.testing.assert_array_equal(radiance(scene), VALUES)
+
+
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize("interleave", ["bsq", "bil", "bip"])
+def test_mapped_and_copied_captures_are_equal(tmp_path, interleave, order, monkeypatch):
+    values = np.random.default_rng(0).random((3, 24, 32))
+    path = write_envi(tmp_path / "cube.hdr", values, interleave=interleave, order=order)
+    lens = {"focal_length_mm": 20.0, "f_number": 4.0, "oversample": 1}
+    varying = fs.Optics(**lens, seidel=fs.optics.Seidel(coma_um=0.4), field_patches=3)
+    maps = []
+    for limit in (2**30, 0):
+        monkeypatch.setattr(_selection, "MAX_COPIED_BYTES", limit)
+        scene = Scene.from_cube(path, **RADIANCE, pitch_um=1000.0)
+        maps.append([optics.power_map(scene).data for optics in (fs.Optics(**lens), varying)])
+
+    for copied, mapped in zip(*maps, strict=True):
+        np.testing.assert_array_equal(copied, mapped)
 
 
 def test_envi_data_file_finds_header(tmp_path):

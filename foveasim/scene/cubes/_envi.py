@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.names import did_you_mean
 from foveasim._io.formats import FileFormat, FormatError
+from foveasim._io.mapped_files import map_file
 from foveasim.scene.cubes._cube import Cube, Quantity
 from foveasim.scene.cubes._formats import CUBE_FORMATS
 
@@ -132,8 +133,7 @@ def _map(path: Path, entries: dict[str, str]) -> NDArray[Any]:
             f"after {offset} bytes, {expected:,} bytes in all, but {path.name!r:.60} has {actual:,}: {problem} the header is "
             "that of another file"
         )
-    mapped = np.memmap(path, dtype, "r", offset, tuple(sizes[axis] for axis in axes))
-    return np.asarray(mapped).transpose(to_bands)
+    return map_file(path, dtype, tuple(sizes[axis] for axis in axes), offset).transpose(to_bands)
 
 
 def _wavelength_unit(entries: dict[str, str]) -> str | None:

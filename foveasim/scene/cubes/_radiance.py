@@ -10,6 +10,7 @@ import numpy as np
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Floats, check_choice, check_number, finite_array, wavelengths_nm
 from foveasim._io.formats import FormatError
+from foveasim._io.mapped_files import value_range
 from foveasim._io.rasters.units import Powers, parse_unit, round_factor
 from foveasim.errors import FoveasimWarning, ParameterError
 from foveasim.scene._illuminants import Illuminant
@@ -98,7 +99,8 @@ def spectral_radiance(
         weights = interpolation_weights(bands_nm, waves_nm)
     spectrum, max_fraction = factor[:, np.newaxis] * weights, 0.0
     if kind == "reflectance":
-        max_fraction = max(f * float(band.max()) for f, band in zip(factor.tolist(), cube.data, strict=True))
+        bands = (cube.data[k : k + 1] for k in range(factor.size))
+        max_fraction = max(f * value_range(band)[1] for f, band in zip(factor.tolist(), bands, strict=True))
         spectrum = spectrum * _illumination(waves_nm, illuminant, radiance_w_m2_sr_nm)
     else:
         for name, value in (("illuminant", illuminant), ("radiance_w_m2_sr_nm", radiance_w_m2_sr_nm)):

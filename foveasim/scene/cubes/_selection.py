@@ -24,6 +24,7 @@ from foveasim._core.validation import (
     wavelengths_nm,
 )
 from foveasim._io.formats import FormatError
+from foveasim._io.mapped_files import in_memory, value_range
 from foveasim._io.rasters import MAX_BANDS
 from foveasim.errors import ParameterError
 from foveasim.scene.cubes._cube import Cube
@@ -34,6 +35,8 @@ __all__ = ["Invalid", "Selection", "interpolation_weights", "select"]
 Invalid: TypeAlias = Literal["raise", "zero"]
 #: Values that are converted at a time.
 BLOCK_VALUES = 2**22
+#: Floating-point values of a mapped file are copied into memory up to this size.
+MAX_COPIED_BYTES = 2**30
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,8 +105,8 @@ def select(cube: Cube, selection: Selection) -> Cube:
     -------
     cube : Cube
         Bands with ascending wavelengths in nm, bottom row first, float32 if this represents the values exactly, otherwise
-        float64. The data are a view of a memory map of such values, unless they are stored by pixel, have an offset, or contain
-        values that are replaced.
+        float64. The data are a view of a memory map of such values above 1 GiB, unless they are stored by pixel, have an
+        offset, or contain values that are replaced.
 
     Raises
     ------
@@ -257,7 +260,7 @@ def _load(data: Any, index: Ints, y: slice, x: slice) -> Images:
     is_by_pixel = view.shape[0] > 1 and view.strides[0] == view.itemsize
     is_run = bool(np.all(np.diff(index) == 1))
     if is_run and view.dtype == real and not is_by_pixel:
-        return view
+        return in_memory(view) if view.nbytes <= MAX_COPIED_BYTES else view
     _check_fits((index.size, *view.shape[1:]), real)
     images = np.empty((index.size, *view.shape[1:]), real)
     index = index - int(index.min())
@@ -265,8 +268,9 @@ def _load(data: Any, index: Ints, y: slice, x: slice) -> Images:
     step = max(1, BLOCK_VALUES // (view.shape[0] * view.shape[2])) if is_by_pixel else view.shape[1]
     for first in range(0, view.shape[1], step):
         rows = slice(first, first + step)
+        part = in_memory(view[:, rows]) if is_by_pixel else view[:, rows]
         for k, band in enumerate(index):
-            images[k, rows] = view[band, rows]
+            images[k, rows] = in_memory(part[band])
     return images
 
 
@@ -288,8 +292,8 @@ def _checked(
     corner: tuple[int, int],
 ) -> Images:
     """Add the offsets, and reject or replace invalid values; a view is then copied."""
-    if offset.any() and not images.flags.writeable:
-        images = np.array(images)
+    if offset.any():
+        images = _writeable(images)
     n_invalid, first_invalid = 0, ""
     for k in range(images.shape[0]):
         where = _invalid_pixels(images[k], missing, offset[k])
@@ -297,7 +301,7 @@ def _checked(
             continue
         n_invalid += int(np.count_nonzero(where))
         if invalid == "zero":
-            images = images if images.flags.writeable else np.array(images)
+            images = _writeable(images)
             images[k][where] = 0.0
         elif not first_invalid:
             row, column = (int(i) for i in np.argwhere(where[::-1])[0])
@@ -312,9 +316,15 @@ def _checked(
     return freeze(images)
 
 
+def _writeable(images: Images) -> Images:
+    copy = in_memory(images)
+    return copy if copy.flags.writeable else np.array(copy)
+
+
 def _invalid_pixels(band: NDArray[Any], missing: float | None, offset: float) -> Bools | None:
     """Add the offset to a band in place; return its invalid pixels, or None."""
-    low, high = float(band.min()), float(band.max())
+    band = in_memory(band)
+    low, high = value_range(band[np.newaxis])
     may_miss = missing is not None and not (missing < low or missing > high)
     where = band == missing if may_miss else None
     if offset:

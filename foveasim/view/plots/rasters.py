@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.validation import Floats, check_count
 from foveasim._io.encodings import encode_srgb_values
+from foveasim._io.mapped_files import in_memory
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PowerMap, to_file_rows
 from foveasim.reconstruct import CorticalImage, Picture
@@ -285,7 +286,9 @@ def scene_pixels(scene: Scene, max_pixels: int) -> NDArray[np.uint8]:
         sRGB-encoded, top row first; white is the brightest value.
     """
     weights = scene.spectrum_w_m2_sr_nm @ _colour_weights(scene.wavelength_nm)
-    return _encode(np.tensordot(weights, block_means(scene.basis, max_pixels), (0, 0)))
+    basis = scene.basis
+    means = [block_means(in_memory(basis[b : b + 1]), max_pixels)[0] for b in range(basis.shape[0])]
+    return _encode(np.tensordot(weights, means, (0, 0)))
 
 
 def power_map_pixels(power_map: PowerMap, max_pixels: int) -> NDArray[np.uint8]:
