@@ -361,7 +361,18 @@ class Capture:
 
     def _electronics(self, sensor: Sensor | None) -> Sensor:
         """Return the given sensor, or the one in the settings."""
-        return Sensor.from_settings(self.layout, self.settings.get("sensor", {})) if sensor is None else sensor
+        if sensor is not None:
+            return sensor
+        known = Sensor.from_settings(self.layout, self.settings.get("sensor", {}))
+        if "tile" in self.settings:
+            unknown = [effect.name for effect in known.effects if effect.needs_layout]
+            if unknown:
+                raise ParameterError(
+                    "sensor",
+                    f"must be given: the effects {', '.join(map(repr, unknown))} of a tile need the complete layout",
+                    hint="use camera.sensor.part(slice(first, last))",
+                )
+        return known
 
     def _estimates(self, electronics: Sensor, of: str) -> SiteEstimates:
         exposure_s = float(self.settings.get("exposure_s", 0.0))

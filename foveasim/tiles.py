@@ -107,8 +107,9 @@ def capture_tiles(
     Yields
     ------
     Capture
-        Of the layout ``camera.sensor.layout[first:last]``. Its setting ``tile`` contains ``first_site`` and the number of sites
-        of the complete layout. Codes and charges are those of ``camera.capture``, except for rounding of the irradiance.
+        Of the layout ``camera.sensor.layout[first:last]``. Its settings are those of the camera; ``tile`` contains
+        ``first_site`` and the number of sites of the complete layout. Fixed patterns, effects, codes and charges are those of
+        ``camera.capture``, except for rounding of the irradiance.
 
     Raises
     ------
@@ -131,7 +132,7 @@ def capture_tiles(
     tile_sites = _whole_blocks(tile_sites)
     n_tiles = -(-camera.sensor.layout.n_sites // tile_sites)
     first_tile = check_count("first_tile", first_tile, at_least=0, at_most=n_tiles)
-    camera.sensor.part(0, 0)  # raises an error for sensors with crosstalk
+    camera.sensor.part(slice(0, 0))  # raises an error for sensors with crosstalk
     return _tiles(camera, light, exposure_s, streams, tile_sites, range(first_tile, n_tiles))
 
 
@@ -154,11 +155,13 @@ def _tiles(
         with clock.stage("compile layout"):
             part = Camera(
                 optics=camera.optics,
-                sensor=camera.sensor.part(first, last),
+                sensor=camera.sensor.part(slice(first, last)),
                 distortion=camera.distortion,
                 order=camera.order(light),
                 n_threads=camera._n_threads,
             )
+            # Arrays per site are those of all sites, as in a stored capture.
+            part._shared_settings = camera._shared_settings
             bounds_um = outline_bounds_um(part.sensor.layout, camera.distortion)
             strips = [_rows_under(image.grid, bounds_um) for image in images]
             integrators = [

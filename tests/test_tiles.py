@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import itertools
 import shutil
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ import pytest
 import foveasim as fs
 from foveasim import tiles
 from foveasim.errors import CoverageWarning, FileError, ParameterError
+from foveasim.sensor import effects
+from foveasim.sensor.effects import AdditiveNoise, Effect, FixedFactor, FixedOffset
 from foveasim.video import partial_path
 
 zarr = pytest.importorskip("zarr")
@@ -88,6 +91,110 @@ def test_tiles_of_distorted_rings_equal_capture(order):
     scale = whole.expected_e.max()
     np.testing.assert_allclose(joined(parts, "expected_e"), whole.expected_e, rtol=1e-6, atol=1e-9 * scale)
     assert np.mean(joined(parts, "code") != whole.code) < 1e-4
+
+
+@dataclass(frozen=True)
+class Shading(FixedFactor):
+    """Test effect: loss that increases towards the corners of the layout."""
+
+    name = "shading"
+    stage = "photo"
+
+    def pattern(self, sites):
+        low, high = np.reshape(sites.layout.bounds_um, (2, 2))
+        return 1.0 - np.sum(((sites.layout.centroid_um - low) / (high - low) - 0.5) ** 2, axis=1)
+
+
+@effects.EFFECTS.register("shading of test_tiles")
+@dataclass(frozen=True)
+class RegisteredShading(Shading):
+    name = "registered_shading"
+
+    def pattern_moments(self, sites):
+        return self.pattern(sites), 0.0
+
+
+@dataclass(frozen=True)
+class LeakingCharge(Effect):
+    """Test effect: a deterministic loss and noise that increase with the distance from the first row."""
+
+    name = "leak"
+    stage = "charge"
+    is_temporal = True
+
+    def apply(self, values, *, sites, rng):
+        height_um = sites.select(sites.layout.centroid_um[:, 1] - sites.layout.bounds_um[1])
+        return values - height_um + 0.2 * height_um * rng.standard_normal(values.size)
+
+    def moments(self, mean, variance, *, sites):
+        height_um = sites.select(sites.layout.centroid_um[:, 1] - sites.layout.bounds_um[1])
+        return mean - height_um, variance + (0.2 * height_um) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredOffset(FixedOffset):
+    """Test effect: an array per site."""
+
+    name = "measured"
+    stage = "output"
+
+    offset_v: np.ndarray
+
+    def pattern(self, sites):
+        return self.offset_v
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredNoise(AdditiveNoise):
+    """Test effect: noise with an array per site."""
+
+    name = "measured_noise"
+    stage = "sense_node"
+
+    sigma_v: np.ndarray
+
+    def deviation(self, sites):
+        return self.sigma_v
+
+
+@pytest.mark.parametrize("make", [Shading, LeakingCharge, MeasuredOffset, MeasuredNoise])
+def test_tiles_with_user_effect_equal_capture(camera, make):
+    """Effects that depend on the position in the layout, or contain an array per site."""
+    n_sites = camera.sensor.layout.n_sites
+    effect = make(np.linspace(0.01, 0.2, n_sites)) if make in (MeasuredOffset, MeasuredNoise) else make()
+    camera = camera.replace(sensor=replace(camera.sensor, effects=[effect]))
+    cells = np.random.default_rng(1).random((1, 520, 720), dtype=np.float32)
+    light = fs.PowerMap.from_array(cells, pitch_um=PITCH_UM, wavelength_nm=[550.0])
+
+    whole = camera.capture(light, exposure_s=1e-2, seed=0)
+    parts = list(tiles.capture_tiles(camera, light, exposure_s=1e-2, seed=0, tile_sites=BLOCK))
+
+    assert len(parts) == 6
+    for name in ("expected_e", "electrons", "code"):
+        np.testing.assert_array_equal(joined(parts, name), getattr(whole, name))
+    without = camera.replace(sensor=camera.sensor.without(effect.name)).capture(light, exposure_s=1e-2, seed=0)
+    assert np.mean(whole.code != without.code) > 0.3
+
+
+def test_tiles_have_settings_of_camera(camera, scene, complete):
+    part = next(tiles.capture_tiles(camera, scene, exposure_s=0.01, seed=3, frame=2, tile_sites=BLOCK))
+
+    tile = {"first_site": 0, "n_sites": camera.sensor.layout.n_sites}
+    assert part.settings == complete.settings | {"tile": tile}
+
+
+def test_effects_of_tile_need_sensor(camera, scene):
+    sensor = replace(camera.sensor, effects=[RegisteredShading()], dark_e_per_s=1.0)
+    shaded = camera.replace(sensor=sensor)
+    whole = shaded.capture(scene, exposure_s=0.01, seed=0)
+    tile = next(tiles.capture_tiles(shaded, scene, exposure_s=0.01, seed=0, tile_sites=BLOCK))
+
+    with pytest.raises(
+        ParameterError, match="'sensor' must be given: the effects 'registered_shading' of a tile need the"
+    ):
+        tile.signal_to_noise()
+    ratio = tile.signal_to_noise(sensor=sensor.part(slice(0, BLOCK)))
+    np.testing.assert_allclose(ratio, whole.signal_to_noise(sensor=sensor)[:BLOCK], rtol=1e-5)
 
 
 def test_tiles_of_lateral_colour_equal_capture(camera, scene):

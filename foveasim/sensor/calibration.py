@@ -435,7 +435,7 @@ def calibrate(
     signal_e = nominal.expected_electrons(flat / exposure_s, exposure_s) - dark_e
     # RTS noise counts as a defect (noisy site), so the nominal noise excludes it.
     without_rts = nominal.without(
-        *(effect.name for effect in nominal.chain if effect.half_step(nominal.sites) is not None)
+        *(effect.name for effect in nominal.chain if effect.half_step(nominal.sites.of(effect)) is not None)
     )
     dark_e2 = dark_e if sensor.shot.is_drawn else np.zeros(1)
     noise_e2 = dark_e2 + without_rts.readout_model(dark_e).noise_e2

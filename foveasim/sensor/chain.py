@@ -48,6 +48,7 @@ class _Deterministic:
     name = ""
     is_local = True
     is_temporal = False
+    needs_layout = False
 
     def __init__(self, values: Any) -> None:
         self.values = np.asarray(values)
@@ -176,9 +177,9 @@ def merge_steps(steps: Iterable[Step], sites: Sites) -> tuple[Step, ...]:
     for step in steps:
         current: Step = step
         if isinstance(step, FixedFactor):
-            current = Factor(sites.pattern(step, step.pattern))
+            current = Factor(sites.of(step).pattern(step, step.pattern))
         elif isinstance(step, FixedOffset):
-            current = Offset(sites.pattern(step, step.pattern))
+            current = Offset(sites.of(step).pattern(step, step.pattern))
         previous = steps_merged[-1] if steps_merged else None
         if isinstance(current, Factor) and isinstance(previous, Factor):
             steps_merged[-1] = Factor(previous.values * current.values)
@@ -333,7 +334,7 @@ def run_steps(
 
 def _apply_step(step: Step, values: Any, sites: Sites, rng: Any) -> Any:
     """Apply a step and check the shape of its result."""
-    found = step.apply(values, sites=sites, rng=rng)
+    found = step.apply(values, sites=sites.of(step), rng=rng)
     if getattr(found, "shape", None) != values.shape:
         raise SimulationError(
             f"the effect '{step.name}' must return an array of shape {values.shape}, got "

@@ -65,12 +65,31 @@ class Device:
 
     seed: int
     layout: PackedRings
+    _complete: tuple[Device, slice | Ints] | None = None
 
     __repr__ = short_repr
 
+    def part(self, selection: slice | Ints, layout: PackedRings) -> Device:
+        """
+        Return the device of some of its sites, with their numbers.
+
+        Parameters
+        ----------
+        selection : slice or (n,) int64
+        layout : packed rings with ``columns``
+            The layout of these sites.
+        """
+        # Outlines of a lattice are rectangles, each identified by its own centroid, and are not all in memory.
+        is_lattice = getattr(self.layout, "lattice", None) is not None
+        return Device(self.seed, layout, None if is_lattice else (self, selection))
+
     @cached_property
-    def _sites(self) -> tuple[Words, Words]:
+    def words(self) -> tuple[Words, Words]:
         """Two words per site that identify it, which all devices of a layout share."""
+        if self._complete is not None:
+            device, selection = self._complete
+            one, other = device.words
+            return one[selection], other[selection]
         if type(self.layout).__hash__ is not object.__hash__:  # not immutable
             return _site_words(self.layout)
         words = _words.get(self.layout)
@@ -86,7 +105,7 @@ class Device:
         """Return a uniform number in (0, 1) for each site, (n_site,)."""
         from foveasim.sensor import _kernels
 
-        out: Floats = _kernels.device_uniforms(*self.key(effect), *self._sites)
+        out: Floats = _kernels.device_uniforms(*self.key(effect), *self.words)
         return out
 
     def normals(self, effect: str) -> Floats:

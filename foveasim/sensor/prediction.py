@@ -102,11 +102,11 @@ class _LinearModel:
         self.mean, self.variance = mean, variance
         for effect in effects:
             mean, variance = effect.validate_moments(self.mean, self.variance, sites)
-            factor = effect.moments(self.mean + 1.0, self.variance, sites=sites)[0] - mean
+            factor = effect.validate_moments(self.mean + 1.0, self.variance, sites)[0] - mean
             added = np.zeros(1)
             if effect.is_temporal:
                 added = np.maximum(variance - factor**2 * self.variance, 0.0)
-            half_step = effect.half_step(sites) if sites.known_device is not None else None
+            half_step = effect.half_step(sites.of(effect)) if sites.known_device is not None else None
             self.half_step2 = factor**2 * self.half_step2
             if half_step is not None:
                 self.half_step2 = self.half_step2 + half_step**2
@@ -155,7 +155,7 @@ def readout_model(
             local.append(effect)
             continue
         before = _LinearModel(local, mean_e, variance_e2, sites)
-        mean_e, variance_e2 = effect.moments(before.mean, before.variance + before.half_step2, sites=sites)
+        mean_e, variance_e2 = effect.validate_moments(before.mean, before.variance + before.half_step2, sites)
         is_mixed, local = True, []
     charges = _LinearModel(local, mean_e, variance_e2, sites)
     sense = _LinearModel(

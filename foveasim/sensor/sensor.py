@@ -35,7 +35,7 @@ from foveasim.sensor.chain import (
 )
 from foveasim.sensor.device import Device
 from foveasim.sensor.effects import EFFECTS, STANDARD, DarkLaw, Effect, Photosites, Sites, dark_current_factor
-from foveasim.sensor.effects.contract import FixedFactor, FixedOffset
+from foveasim.sensor.effects.contract import CompleteSites, FixedFactor, FixedOffset
 from foveasim.sensor.effects.crosstalk import Diffusion, InterPixelCapacitance, KernelCrosstalk
 from foveasim.sensor.effects.shot import ShotChoice, ShotNoise
 from foveasim.sensor.limits import LIMITS, check_plausible, check_plausible_array
@@ -464,14 +464,19 @@ class Sensor:
         """
         return replace(self, disabled=tuple(dict.fromkeys((*self.disabled, *names))))
 
-    def part(self, first: int, last: int) -> Sensor:
+    def part(self, selection: slice | Ints) -> Sensor:
         """
-        Return the sensor of the sites ``first`` to ``last - 1``, with their fixed patterns.
+        Return the sensor of some of the sites, with their fixed patterns and effects.
+
+        Parameters
+        ----------
+        selection : slice or (n,) int
+            Indices of the sites, in any order, which may be repeated.
 
         Raises
         ------
         ParameterError
-            If effects, such as crosstalk, connect sites with others.
+            If effects, such as crosstalk, connect sites with others, or an index is not that of a site.
         """
         connecting = [effect.name for effect in self.chain if not effect.is_local]
         if connecting:
@@ -480,9 +485,18 @@ class Sensor:
                 f"must have no effects between sites to be divided, got {', '.join(map(repr, connecting))}",
                 hint=f"switch them off: sensor.without({', '.join(map(repr, connecting))})",
             )
-        per_site = {name: np.asarray(getattr(self, name)) for name in _PER_SITE if getattr(self, name) is not None}
-        parts: dict[str, Any] = {name: values[first:last] for name, values in per_site.items() if values.ndim}
-        return replace(self, layout=self.layout[first:last], **parts)
+        chosen = selection
+        if not isinstance(selection, slice) or selection.step not in (None, 1):
+            try:
+                chosen = np.arange(self.layout.n_sites)[selection]
+                if chosen.ndim != 1:
+                    raise IndexError
+            except IndexError:
+                rule = f"must be a slice, or a list of indices of the {self.layout.n_sites} sites"
+                raise ParameterError("selection", rule, selection) from None
+        values: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(Sensor)}
+        values |= {name: values[name][chosen] for name in _PER_SITE if np.ndim(values[name])}
+        return SensorPart(**values | {"layout": self.layout[chosen]}, _complete=self, _selection=chosen)
 
     def nominal(self) -> Sensor:
         """Return the sensor without the fixed patterns of its device."""
@@ -498,7 +512,12 @@ class Sensor:
     def sites(self) -> Sites:
         """Photosites with device and sense-node capacitances, for effects."""
         capacitance_f = read_only(np.atleast_1d(np.asarray(self.capacitance_f, np.float64)).copy())
-        return Sites(self.layout, self.device, capacitance_f)
+        return Sites(self.layout, self.device, capacitance_f, _complete=self._complete_sites)
+
+    @property
+    def _complete_sites(self) -> CompleteSites | None:
+        """Sites of the sensor that this one is a part of."""
+        return None
 
     def _effects_at(self, *stages: str) -> list[Effect]:
         return [effect for effect in self.chain if effect.stage in stages]
@@ -525,8 +544,8 @@ class Sensor:
         patterns: dict[str, Floats] = {}
         for effect in self.chain:
             if isinstance(effect, FixedFactor | FixedOffset):
-                patterns[effect.name] = self.sites.pattern(effect, effect.pattern)
-            elif (half_step := effect.half_step(self.sites)) is not None:
+                patterns[effect.name] = self.sites.of(effect).pattern(effect, effect.pattern)
+            elif (half_step := effect.half_step(self.sites.of(effect))) is not None:
                 patterns[effect.name] = half_step
         if name not in patterns:
             hint = possible_names(name, list(patterns))
@@ -845,6 +864,46 @@ class Sensor:
 
         for_each_block(expected_e.size, block, n_threads)
         return mean_dn, variance_dn2
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class SensorPart(Sensor):
+    """
+    Some of the sites of a sensor, such as a tile.
+
+    Their fixed patterns and effects are those that they have in the complete sensor. Created by :meth:`Sensor.part`.
+
+    Raises
+    ------
+    ParameterError
+        If the device or the number of sites is not that of the part.
+    """
+
+    #: Sensor with all sites, whose layout the effects use, and indices of the sites of the part.
+    _complete: Sensor
+    _selection: slice | Ints
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.device_seed != self._complete.device_seed:
+            raise ParameterError(
+                "device_seed",
+                f"must be {self._complete.device_seed} in part of a sensor",
+                self.device_seed,
+                hint="change it in the complete sensor",
+            )
+        n_sites = self._complete.sites.block(self._selection).n_sites
+        if self.layout.n_sites != n_sites:
+            raise ParameterError("layout", f"must have the {n_sites} sites of the part, got {self.layout.n_sites}")
+
+    @cached_property
+    def device(self) -> Device:
+        """Source of the fixed patterns."""
+        return self._complete.device.part(self._selection, self.layout)
+
+    @property
+    def _complete_sites(self) -> CompleteSites:
+        return CompleteSites(self._complete.sites, self._selection)
 
 
 def _object(classes: Mapping[str, Any], name: str, data: Any) -> Any:

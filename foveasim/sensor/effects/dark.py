@@ -109,6 +109,7 @@ class DarkSignal(FixedFactor):
 
     name: ClassVar[str] = "dsnu"
     stage: ClassVar[Stage] = "dark"
+    needs_layout: ClassVar[bool] = False
 
     dsnu_fraction: float
 
@@ -142,6 +143,7 @@ class HotSites(FixedOffset):
 
     name: ClassVar[str] = "hot"
     stage: ClassVar[Stage] = "dark"
+    needs_layout: ClassVar[bool] = False
 
     hot_fraction: float
     hot_e_per_s: float

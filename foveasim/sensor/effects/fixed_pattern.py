@@ -26,6 +26,7 @@ class PixelGain(FixedFactor):
 
     name: ClassVar[str] = "gain_fpn"
     stage: ClassVar[Stage] = "sense_node"
+    needs_layout: ClassVar[bool] = False
 
     gain_fpn_fraction: float
 
@@ -57,6 +58,7 @@ class PixelOffset(FixedOffset):
 
     name: ClassVar[str] = "pixel_fpn"
     stage: ClassVar[Stage] = "output"
+    needs_layout: ClassVar[bool] = False
 
     offset_v: float
 
@@ -89,6 +91,7 @@ class ColumnOffset(FixedOffset):
 
     name: ClassVar[str] = "column_fpn"
     stage: ClassVar[Stage] = "output"
+    needs_layout: ClassVar[bool] = False
 
     offset_v: float
 

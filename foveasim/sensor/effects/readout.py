@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
@@ -28,6 +28,7 @@ class ResetNoise(AdditiveNoise):
     name: ClassVar[str] = "reset"
     stage: ClassVar[Stage] = "charge"
     is_drawn_at_reset: ClassVar[bool] = True
+    needs_layout: ClassVar[bool] = False
 
     temperature_k: float
 
@@ -54,6 +55,7 @@ class ReadNoise(AdditiveNoise):
 
     name: ClassVar[str] = "read"
     stage: ClassVar[Stage] = "charge"
+    needs_layout: ClassVar[bool] = False
 
     read_noise_e: float | Floats
 
@@ -92,6 +94,7 @@ class TelegraphNoise(Effect):
     name: ClassVar[str] = "rts"
     stage: ClassVar[Stage] = "charge"
     is_temporal: ClassVar[bool] = True
+    needs_layout: ClassVar[bool] = False
 
     rts_fraction: float
     rts_e: float
@@ -111,7 +114,8 @@ class TelegraphNoise(Effect):
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
         """Return the values plus or minus half the difference of the states on RTS sites."""
         rts_sites = sites.cached((self, "sites"), lambda all_sites: np.flatnonzero(self.half_step(all_sites)))
-        first, end, _ = sites.index.indices(sites.layout.n_sites)
+        # Without its layout, the effect has ranges of sites only.
+        first, end, _ = cast("slice", sites.index).indices(sites.layout.n_sites)
         where = rts_sites[slice(*np.searchsorted(rts_sites, (first, end)))] - first
         values[where] += np.copysign(0.5 * self.rts_e, rng.random(where.size) - 0.5)
         return values

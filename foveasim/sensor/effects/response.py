@@ -26,6 +26,7 @@ class PhotoResponse(FixedFactor):
 
     name: ClassVar[str] = "prnu"
     stage: ClassVar[Stage] = "photo"
+    needs_layout: ClassVar[bool] = False
 
     prnu_fraction: float
 
@@ -57,6 +58,7 @@ class DeadSites(FixedFactor):
 
     name: ClassVar[str] = "dead"
     stage: ClassVar[Stage] = "photo"
+    needs_layout: ClassVar[bool] = False
 
     dead_fraction: float
 

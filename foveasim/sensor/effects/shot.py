@@ -98,6 +98,7 @@ class ShotNoise(Effect):
     name: ClassVar[str] = "shot"
     stage: ClassVar[Stage] = "collection"
     is_temporal: ClassVar[bool] = True
+    needs_layout: ClassVar[bool] = False
 
     how: ShotChoice = "auto"
     gaussian_above_e: float = 100.0

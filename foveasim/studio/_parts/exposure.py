@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -155,12 +154,7 @@ def _median_site(values: Floats) -> int:
 def _copies(sensor: Sensor, site: int, n: int) -> Sensor:
     """Return a sensor of n copies of a photosite, without exchange of charge."""
     connecting = [effect.name for effect in sensor.chain if not effect.is_local]
-    one = (sensor.without(*connecting) if connecting else sensor).part(site, site + 1)
-    values = {each.name: getattr(one, each.name) for each in fields(one)}
-    single: dict[str, Any] = {
-        name: float(v[0]) for name, v in values.items() if isinstance(v, np.ndarray) and v.shape == (1,)
-    }
-    return replace(one, layout=one.layout[np.zeros(n, np.int64)], **single)
+    return (sensor.without(*connecting) if connecting else sensor).part(np.full(n, site))
 
 
 def _range_e(sensor: Sensor) -> float:
