@@ -1,13 +1,19 @@
-"""Provenance of results: settings and versions as plain data."""
+"""Provenance of results: settings, versions and identities of functions as plain data."""
 
 from __future__ import annotations
 
+import functools
 import hashlib
+import json
 import platform
+import sys
+import sysconfig
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib.metadata import version
+from pathlib import Path
+from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -15,11 +21,14 @@ import numpy as np
 from foveasim._core.validation import own
 from foveasim._version import __version__
 
-__all__ = ["copy_plain_data", "differences", "is_digest", "to_plain_data", "versions"]
+__all__ = ["copy_plain_data", "differences", "find_user_module", "identify", "is_digest", "to_plain_data", "versions"]
+
 
 #: Arrays up to this size are stored as lists; larger arrays as shape, dtype and checksum.
 MAX_LISTED_VALUES = 64
 _ATOMS = frozenset({str, int, float, bool, type(None)})
+#: Types whose ``repr`` is their value, equal in all processes.
+_REPRESENTED = (bool, int, float, complex, str, bytes, range, slice, type(None), type(...), np.dtype, Path)
 
 
 def to_plain_data(value: Any, *, without: Collection[str] = ()) -> Any:
@@ -27,7 +36,8 @@ def to_plain_data(value: Any, *, without: Collection[str] = ()) -> Any:
     Convert an object to plain data: numbers, strings, lists and dicts.
 
     A dataclass becomes a dict of its class name and public fields, except those in ``without``; a large array becomes its
-    shape, dtype and SHA-256.
+    shape, dtype and SHA-256; a function, or an object without a representation of its own, becomes its identity
+    (:func:`identify`).
     """
     if value is None or isinstance(value, bool | int | float | str):
         return value
@@ -51,7 +61,8 @@ def to_plain_data(value: Any, *, without: Collection[str] = ()) -> Any:
                 if not f.name.startswith("_") and f.name not in without
             },
         }
-    return repr(value)
+    # Default representations contain addresses.
+    return identify(value) if callable(value) or type(value).__repr__ is object.__repr__ else repr(value)
 
 
 def is_digest(value: Any) -> bool:
@@ -95,3 +106,132 @@ def _versions() -> dict[str, str]:
 def versions() -> dict[str, str]:
     """Return the versions of the package, of Python, and of the libraries that affect results."""
     return dict(_versions())
+
+
+# -- functions and objects --------------------------------------------------------------------------------------------
+
+
+def find_user_module(value: Any) -> str | None:
+    """Return the user module (main program or uninstalled file) of an object, or None."""
+    name = getattr(value, "__module__", None)
+    if not isinstance(name, str) or name.partition(".")[0] == "foveasim":
+        return None
+    if name == "__main__":
+        return name
+    file = getattr(sys.modules.get(name), "__file__", None)
+    if file is None:
+        return None
+    installed = {sysconfig.get_path(kind) for kind in ("purelib", "platlib", "stdlib")}
+    return None if any(Path(file).is_relative_to(directory) for directory in installed) else name
+
+
+def identify(value: Any) -> str:
+    """
+    Return the module and name of a function, with a digest for user functions and objects.
+
+    The digest covers code, constants, defaults, captured values (of closures, partial functions and objects), and the functions
+    and variables of user modules that the function uses. It is equal in all processes and runs of one program, changes with
+    any of these, and does not depend on comments, line numbers or hash seeds. Functions of installed packages have no digest:
+    their versions identify them. Of objects that cannot be pickled, such as locks, only the type contributes.
+    """
+    name = f"{getattr(value, '__module__', '')}:{getattr(value, '__qualname__', type(value).__qualname__)}"
+    if isinstance(value, FunctionType) and find_user_module(value) is None and value.__closure__ is None:
+        return name
+    parts = json.dumps(_nested(value, {}))
+    return f"{name} {hashlib.sha256(parts.encode()).hexdigest()[:32]}"
+
+
+def _nested(value: Any, visited: dict[int, tuple[int, Any]]) -> Any:
+    """Return nested lists of strings, with a number in place of a repeated part."""
+    kind = type(value).__qualname__
+    if isinstance(value, np.ndarray | np.generic) and not value.dtype.hasobject:
+        return [kind, value.dtype.str, value.shape, hashlib.sha256(value.tobytes()).hexdigest()]
+    if type(value) in _REPRESENTED or isinstance(value, np.dtype | Path):
+        return [kind, repr(value)]
+    # Whether equal constants are one object depends on how the code was loaded. References keep the ids of other parts valid.
+    if not isinstance(value, tuple | frozenset | CodeType):
+        if id(value) in visited:
+            return ["part", visited[id(value)][0]]
+        visited[id(value)] = len(visited), value
+    return [kind, *(_nested(part, visited) for part in _parts(value))]
+
+
+def _parts(value: Any) -> Iterator[Any]:
+    """Return the parts of a function, class, container or object."""
+    if isinstance(value, list | tuple):
+        return iter(value)
+    if isinstance(value, np.ndarray):
+        return iter((value.shape, value.tolist()))
+    if isinstance(value, set | frozenset):
+        return iter(sorted(value, key=repr))  # the iteration order depends on the hash seed
+    if isinstance(value, Mapping):
+        return (part for item in value.items() for part in item)
+    if isinstance(value, functools.partial):
+        return iter((value.func, value.args, sorted(value.keywords.items())))
+    if isinstance(value, MethodType):
+        return iter((value.__func__, value.__self__))
+    if isinstance(value, BuiltinFunctionType):
+        return iter((value.__name__, value.__self__))
+    if isinstance(value, CodeType):
+        # Names of arguments and variables; line numbers do not change the behaviour.
+        return iter((value.co_code, value.co_names, value.co_consts, value.co_varnames[: value.co_argcount]))
+    if isinstance(value, ModuleType):
+        return iter((value.__name__,))
+    if isinstance(value, FunctionType):
+        return _parts_of_function(value)
+    if isinstance(value, type):
+        own = [] if find_user_module(value) is None else [*value.__bases__, *_members(value)]
+        return iter((value.__qualname__, *own))
+    if is_dataclass(value):
+        return iter((type(value), *(getattr(value, part.name) for part in fields(value))))
+    if find_user_module(type(value)) is not None:
+        return iter((type(value), dict(getattr(value, "__dict__", {}))))
+    if hasattr(value, "__wrapped__"):
+        return iter((value.__wrapped__,))
+    return _parts_of_pickle(value)
+
+
+def _parts_of_pickle(value: Any) -> Iterator[Any]:
+    """Return the parts of an object as pickles contain them, without their byte format."""
+    try:
+        reduced = value.__reduce_ex__(4)
+    except Exception:  # noqa: BLE001 -- objects may raise anything when they are pickled
+        return iter(())
+    if isinstance(reduced, str):
+        return iter((reduced,))
+    function, arguments, state, items, pairs, *_ = (*reduced, None, None, None, None)
+    return iter((getattr(function, "__qualname__", ""), arguments, state, list(items or ()), list(pairs or ())))
+
+
+def _parts_of_function(function: FunctionType) -> Iterator[Any]:
+    yield from (function.__qualname__, function.__defaults__, function.__kwdefaults__)
+    for cell in function.__closure__ or ():
+        try:
+            yield cell.cell_contents
+        except ValueError:  # a variable without a value
+            yield CellType
+    # Package versions identify installed functions.
+    if find_user_module(function) is not None:
+        yield function.__code__
+        names = _global_names(function.__code__)
+        yield from (function.__globals__[name] for name in names if name in function.__globals__)
+
+
+def _members(kind: type) -> Iterator[Any]:
+    """Yield the names, functions and constants of a class."""
+    for name, member in sorted(vars(kind).items()):
+        function = getattr(
+            member, "__func__", getattr(member, "fget", member)
+        )  # of static and class methods, and properties
+        if isinstance(function, bool | int | float | complex | str | bytes | Path | FunctionType | None) and not (
+            name.startswith("__") and isinstance(function, str | int | None)
+        ):
+            yield from (name, function)
+
+
+def _global_names(code: CodeType) -> Iterator[str]:
+    """Yield the names of module variables in a function and its nested functions."""
+    yield from code.co_names
+    for part in code.co_consts:
+        if isinstance(part, CodeType):
+            yield from _global_names(part)

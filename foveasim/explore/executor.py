@@ -17,9 +17,8 @@ from functools import partial
 from threading import Lock
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from foveasim._core.provenance import versions
+from foveasim._core.provenance import find_user_module, versions
 from foveasim.errors import FoveasimError, SimulationError
-from foveasim.explore._functions import find_user_module
 from foveasim.explore.cluster import WorkerStates, check_installed, open_client
 
 if TYPE_CHECKING:

@@ -293,7 +293,7 @@ def rate_settings(shot: Shot, settings: Mapping[str, Any]) -> list[Any]:
 
 
 def _image_settings(shot: Shot, settings: Mapping[str, Any]) -> list[Any]:
-    """Return all that determines the optical images of the filters that the photosites have, as plain data."""
+    """Return all that determines the optical images of the filters in use, as plain data."""
     scene = shot.scene
     # With 'fit' the pitch depends on layout and distortion.
     pitch_um = shot.camera.frame(scene).pitch_um if isinstance(scene, Scene) else None

@@ -1039,6 +1039,54 @@ def test_different_recording_is_not_resumed(tmp_path):
         assert f"got {first_frame}" in message
 
 
+#: Records two more frames, and a capture in tiles, with a function as quantum efficiency.
+FUNCTION_RECORDER = """
+import sys
+import numpy as np
+import foveasim as fs
+from foveasim.errors import FileError
+from foveasim.tiles import write_tiles
+from foveasim.video import count_recorded_frames, write_video
+from own import qe
+
+light = fs.PowerMap(np.ones((1, 8, 8)), fs.Grid.centred((8, 8), 1.0), np.array([550.0]))
+sensor = fs.Sensor(fs.layout.grid(n_x=4, n_y=4, pitch_um=1.0), qe=qe)
+camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=4.0), sensor=sensor)
+n = count_recorded_frames("v.zarr")
+
+def frames():
+    yield from (light, light)
+    raise InterruptedError
+
+for write in (
+    lambda: write_video(camera.video(frames(), exposure_s=0.01, seed=1, first_frame=n), "v.zarr", resume=True),
+    lambda: write_tiles("t.zarr", camera, light, exposure_s=0.01, seed=1),
+):
+    try:
+        write()
+    except (FileError, InterruptedError) as error:
+        print(type(error).__name__, "qe" if "sensor.qe" in str(error) else "")
+print(count_recorded_frames("v.zarr"))
+"""
+
+
+def test_functions_are_equal_in_new_processes(tmp_path):
+    def run(hash_seed):
+        environment = os.environ | {"PYTHONHASHSEED": str(hash_seed), "PYTHONDONTWRITEBYTECODE": "1"}
+        command = [sys.executable, "-c", FUNCTION_RECORDER]
+        found = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        assert found.returncode == 0, found.stderr
+        return found.stdout.split()
+
+    source = "LEVEL = 0.5\n\n\ndef qe(wavelength_nm):\n    return LEVEL + 0.0 * wavelength_nm\n"
+    (tmp_path / "own.py").write_text(source)
+    assert run(1) == ["InterruptedError", "2"]
+    (tmp_path / "own.py").write_text("# a comment\n" + source)
+    assert run(2) == ["InterruptedError", "4"]
+    (tmp_path / "own.py").write_text(source.replace("0.5", "0.6"))
+    assert run(3) == ["FileError", "qe", "FileError", "qe", "4"]
+
+
 def test_recording_with_different_filters_is_rejected(tmp_path):
     layout = rows_layout()
     layout = layout.with_columns(channel=np.arange(layout.n_sites) % 3)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from foveasim._core.provenance import versions
+from foveasim._core.provenance import identify, versions
 from foveasim._core.random_streams import derive_seed
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Ints, check_choice, check_count
@@ -32,7 +32,6 @@ from foveasim.config import (
 )
 from foveasim.errors import ConfigError, ParameterError
 from foveasim.explore._files import digests
-from foveasim.explore._functions import identify_function
 from foveasim.explore._metrics import Metric, add_metrics, resolve_metrics
 
 __all__ = [
@@ -180,7 +179,7 @@ class Plan:
     @cached_property
     def _metric_identities(self) -> dict[str, str]:
         # Computed once: captured values of a function may change while it runs.
-        return {name: identify_function(metric) for name, metric in self.metrics.items()}
+        return {name: identify(metric) for name, metric in self.metrics.items()}
 
     def _first_equal(self) -> Ints:
         """Return ``choices`` with equal values replaced by the index of the first of them."""

@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 
 from foveasim import explore
-from foveasim.explore._functions import identify_function
+from foveasim._core.provenance import identify
 
 OWN = """
 import functools
+import threading
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 LEVEL = 10
 TABLE = np.arange(5.0)
@@ -62,18 +64,20 @@ METRICS = {
     "plain": plain,
     "lambda": lambda *_: [x + LEVEL for x in range(3)],
     "both": lambda *_: [ping(1), pong(1), *[name for name in ("a", "b")]],
+    "interpolation": functools.partial(plain, of=PchipInterpolator([0.0, 1.0, 3.0], [0.0, 2.0, 3.0])),
+    "lock": functools.partial(plain, of=threading.Lock()),
     "recursive": (lambda: (g := lambda n: g(n - 1)))(),
 }
 """
 COMMAND = """
 import importlib, json, sys
-from foveasim.explore._functions import identify_function
+from foveasim._core.provenance import identify
 found = []
 for directory in sys.argv[1:]:
     sys.path.insert(0, directory)
     sys.modules.pop("own", None)
     own = importlib.import_module("own")
-    found.append({name: identify_function(metric) for name, metric in own.METRICS.items()})
+    found.append({name: identify(metric) for name, metric in own.METRICS.items()})
 print(json.dumps(found))
 """
 
@@ -98,12 +102,13 @@ CHANGES = (
     ("Counter(3)", "Counter(4)", {"object"}),
     ("scale = 2", "scale = 3", {"object"}),
     ("self.scale * self.level", "self.scale + self.level", {"object"}),
-    ("LEVEL = 10", "LEVEL = 11", {"plain", "partial", "lambda"}),
-    ("code > LEVEL", "code >= LEVEL", {"plain", "partial"}),
+    ("LEVEL = 10", "LEVEL = 11", {"plain", "partial", "interpolation", "lock", "lambda"}),
+    ("code > LEVEL", "code >= LEVEL", {"plain", "partial", "interpolation", "lock"}),
     ("np.arange(5.0)", "np.arange(6.0)", {"closure"}),
     ('"two", "three"}', '"two", "four"}', {"closure"}),
     ("ping(n) + 2", "ping(n) + 3", {"both"}),
     ("n - 1", "n - 2", {"recursive"}),
+    ("[0.0, 2.0, 3.0]", "[0.0, 2.0, 4.0]", {"interpolation"}),
 )
 
 
@@ -129,14 +134,14 @@ def test_identity_is_constant_during_use():
     def often(n):
         return sum(n + k for k in range(10)) + table[0]
 
-    before = identify_function(often)
+    before = identify(often)
     for k in range(200):
         often(k)
-    assert identify_function(often) == before
+    assert identify(often) == before
 
 
 def test_package_metrics_are_identified_by_name():
-    assert identify_function(explore.METRICS["snr"]) == "foveasim.explore._metrics:snr"
+    assert identify(explore.METRICS["snr"]) == "foveasim.explore._metrics:snr"
 
 
 @pytest.mark.parametrize(
@@ -149,5 +154,5 @@ def test_package_metrics_are_identified_by_name():
     ],
 )
 def test_identity_depends_on_captured_values(pair):
-    assert identify_function(pair[0]) == identify_function(pair[0])
-    assert identify_function(pair[0]) != identify_function(pair[1])
+    assert identify(pair[0]) == identify(pair[0])
+    assert identify(pair[0]) != identify(pair[1])
