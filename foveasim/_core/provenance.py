@@ -62,7 +62,8 @@ def to_plain_data(value: Any, *, without: Collection[str] = ()) -> Any:
             },
         }
     # Default representations contain addresses.
-    return identify(value) if callable(value) or type(value).__repr__ is object.__repr__ else repr(value)
+    has_address = type(value).__repr__ is object.__repr__  # type: ignore[comparison-overlap]
+    return identify(value) if callable(value) or has_address else repr(value)
 
 
 def is_digest(value: Any) -> bool:
@@ -199,8 +200,9 @@ def _parts_of_pickle(value: Any) -> Iterator[Any]:
         return iter(())
     if isinstance(reduced, str):
         return iter((reduced,))
-    function, arguments, state, items, pairs, *_ = (*reduced, None, None, None, None)
-    return iter((getattr(function, "__qualname__", ""), arguments, state, list(items or ()), list(pairs or ())))
+    function, arguments, *rest = reduced
+    state = rest[0] if rest else None
+    return iter((getattr(function, "__qualname__", ""), arguments, state, *(list(part or ()) for part in rest[1:3])))
 
 
 def _parts_of_function(function: FunctionType) -> Iterator[Any]:

@@ -540,7 +540,7 @@ class Camera:
         """
         check_frames(frames)
         ahead = check_count("ahead", ahead, at_least=0)
-        return (rate_e_per_s for *_, rate_e_per_s in self._frame_rates(frames, Clock(), ahead))
+        return (rate_e_per_s for _, rate_e_per_s in self._frame_rates(frames, Clock(), ahead))
 
     def video(
         self,
@@ -644,31 +644,31 @@ class Camera:
     ) -> Iterator[Capture]:
         """Yield one capture per frame, each exposed to this frame alone."""
         clock = Clock()
-        for k, (light, position_um, rate_e_per_s) in enumerate(self._frame_rates(frames, clock, ahead)):
+        for k, (task, rate_e_per_s) in enumerate(self._frame_rates(frames, clock, ahead)):
             number = Streams(streams.seed, streams.frame + k)
             exposure_s = float(exposures_s[number.frame % exposures_s.size])
-            yield self._expose(light, rate_e_per_s, exposure_s, number, clock.take(), **position_settings(position_um))
+            yield self._expose(task.light, rate_e_per_s, exposure_s, number, clock.take(), **position_settings(task))
 
     def _rolling(
         self, frames: Iterable[Frame], exposures_s: Floats, streams: Streams, shutter: Shutter, every: int, ahead: int
     ) -> Iterator[Capture]:
         """Yield one capture per ``every`` frames, each a sum over its exposure."""
         times = {"frame_s": shutter.frame_s, "line_s": shutter.line_s, "every": every, "between": shutter.between}
-        in_progress: deque[tuple[int, Scene | PowerMap, Position, Exposure]] = deque()
+        in_progress: deque[tuple[int, Task, Exposure]] = deque()
         clock = Clock()
 
         def first(last_e_per_s: Floats) -> Capture:
-            k, light, position_um, exposure = in_progress.popleft()
+            k, task, exposure = in_progress.popleft()
             number = Streams(streams.seed, streams.frame + k)
-            mean_e_per_s, settings = exposure.mean_e_per_s(last_e_per_s), times | position_settings(position_um)
-            return self._expose(light, mean_e_per_s, exposure.exposure_s, number, clock.take(), **settings)
+            mean_e_per_s, settings = exposure.mean_e_per_s(last_e_per_s), times | position_settings(task, every)
+            return self._expose(task.light, mean_e_per_s, exposure.exposure_s, number, clock.take(), **settings)
 
         rate_e_per_s = np.zeros(1)
-        for n, (light, position_um, rate_e_per_s) in enumerate(self._frame_rates(frames, clock, ahead)):
+        for n, (task, rate_e_per_s) in enumerate(self._frame_rates(frames, clock, ahead)):
             if n % every == 0:
                 k = n // every
                 exposure_s = float(exposures_s[(streams.frame + k) % exposures_s.size])
-                in_progress.append((k, light, position_um, Exposure(shutter, exposure_s)))
+                in_progress.append((k, task, Exposure(shutter, exposure_s)))
             with clock.stage("shutter"):
                 for *_, exposure in in_progress:
                     exposure.add(rate_e_per_s)
@@ -677,10 +677,8 @@ class Camera:
         while in_progress:
             yield first(rate_e_per_s)
 
-    def _frame_rates(
-        self, frames: Iterable[Frame], clock: Clock, ahead: int
-    ) -> Iterator[tuple[Scene | PowerMap, Position, Floats]]:
-        """Yield source, sensor position and photoelectron rates of each frame."""
+    def _frame_rates(self, frames: Iterable[Frame], clock: Clock, ahead: int) -> Iterator[tuple[Task, Floats]]:
+        """Yield each frame with its photoelectron rates."""
         single_threaded = self
         if ahead:
             single_threaded = Camera(
@@ -703,7 +701,7 @@ class Camera:
             # Repeated frames share the array.
             rate_e_per_s = rate_e_per_s if found is None else read_only(found)
             clock.add(own)
-            yield task.light, task.position_um, rate_e_per_s
+            yield task, rate_e_per_s
 
     def predict(self, light: Scene | PowerMap, *, exposure_s: float) -> tuple[Floats, Floats]:
         """

@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from hashlib import blake2b
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.validation import finite_array
+from foveasim._core.validation import Floats, finite_array
 from foveasim.errors import ParameterError, type_name
 from foveasim.fields import Grid, PowerMap
 from foveasim.scene import Scene
 
-__all__ = ["Frame", "ImageCache", "Position", "Task", "check_frames", "position_settings", "tasks"]
+__all__ = [
+    "DIGEST_BYTES",
+    "Frame",
+    "ImageCache",
+    "PathPosition",
+    "Position",
+    "Task",
+    "check_frames",
+    "path_positions",
+    "position_settings",
+    "tasks",
+]
 
 #: A position in the image plane, (x, y) in µm.
 Position = tuple[float, float]
@@ -21,6 +34,54 @@ Position = tuple[float, float]
 Frame = Scene | PowerMap | tuple[Scene | PowerMap, Sequence[float]]
 #: Power maps behind each colour filter, on each grid.
 ImageCache = dict[tuple[Grid, int], NDArray[Any]]
+
+
+#: Length of the digest of a path.
+DIGEST_BYTES = 16
+
+
+class PathPosition(tuple[float, float]):  # noqa: SLOT001 -- tuples have no slots with values
+    """
+    Sensor position (x, y) in µm that belongs to a gaze path.
+
+    Attributes
+    ----------
+    gaze_um : (x, y), µm
+        Point of the path.
+    digests : sequence of bytes
+        For every point, digest of the path from it to the end; the last is that of no point.
+    number : int
+        Number of the point.
+    """
+
+    gaze_um: Position
+    digests: Sequence[bytes]
+    number: int
+
+    def __new__(
+        cls, position_um: Position, gaze_um: Position = (0.0, 0.0), digests: Sequence[bytes] = (), number: int = 0
+    ) -> Self:
+        """Create the position of a point; pickles set the attributes afterwards."""
+        new = super().__new__(cls, position_um)
+        new.gaze_um, new.digests, new.number = gaze_um, digests, number
+        return new
+
+
+def path_positions(gaze_um: Floats, positions_um: Iterable[Sequence[float]]) -> Iterator[PathPosition]:
+    """
+    Yield sensor positions with the points of a path, (n, 2) µm, that they belong to.
+
+    A digest of the path from each point to its end identifies the rest of the path, also when its beginning is skipped.
+    """
+    digests = [bytes(DIGEST_BYTES)]
+    for x_um, y_um in gaze_um[::-1].tolist():
+        point = struct.pack("<dd", x_um + 0.0, y_um + 0.0)  # + 0.0 removes the sign of zero
+        digests.append(blake2b(point + digests[-1], digest_size=DIGEST_BYTES).digest())
+    digests.reverse()
+    return (
+        PathPosition((float(x_um), float(y_um)), (float(at_um[0]), float(at_um[1])), digests, k)
+        for k, (at_um, (x_um, y_um)) in enumerate(zip(gaze_um, positions_um, strict=True))
+    )
 
 
 class Task(NamedTuple):
@@ -36,7 +97,7 @@ class Task(NamedTuple):
 def tasks(frames: Iterable[Frame]) -> Iterator[Task]:
     """Yield the frames as tasks; frames of one scene with positions share their images."""
     before: Task | None = None
-    for frame in frames:
+    for frame in _with_path(frames):
         light, position_um = _split_frame(frame)
         is_same = before is not None and light is before.light
         images: ImageCache | None = None
@@ -56,9 +117,41 @@ def check_frames(frames: object) -> None:
         )
 
 
-def position_settings(position_um: Position) -> dict[str, Any]:
-    """Return the sensor position as settings of a capture; nothing at the origin."""
-    return {"place_um": list(position_um)} if any(position_um) else {}
+def position_settings(task: Task, every: int = 1) -> dict[str, Any]:
+    """
+    Return the sensor position and the gaze of a frame as settings of a capture.
+
+    ``every`` is the number of frames per capture: the digest of the rest of the path begins at the next capture. Frames without
+    positions have none of these settings.
+    """
+    if not task.is_moving:
+        return {}
+    position_um = task.position_um
+    settings: dict[str, Any] = {"place_um": list(position_um)} if any(position_um) else {}
+    gaze: dict[str, Any] = {"xy_um": list(position_um)}
+    if isinstance(position_um, PathPosition):
+        ahead = min(position_um.number + every, len(position_um.digests) - 1)
+        gaze = {
+            "xy_um": list(position_um.gaze_um),
+            "path": position_um.digests[position_um.number].hex(),
+            "next_path": position_um.digests[ahead].hex(),
+        }
+    return settings | {"gaze": gaze}
+
+
+def _with_path(frames: Iterable[Frame]) -> Iterable[Frame]:
+    """Return frames with a path, if all are in memory: their positions are known in advance."""
+    if not isinstance(frames, Sequence):
+        return frames
+    pairs = [frame for frame in frames if isinstance(frame, tuple) and len(frame) == 2]
+    if len(pairs) < len(frames) or any(isinstance(position_um, PathPosition) for _, position_um in pairs):
+        return frames
+    try:
+        positions_um = np.array([position_um for _, position_um in pairs], np.float64).reshape(-1, 2)
+        along = path_positions(positions_um, positions_um.tolist())
+        return [(light, position_um) for (light, _), position_um in zip(pairs, along, strict=True)]
+    except (TypeError, ValueError):  # reported with the frame
+        return frames
 
 
 def _split_frame(frame: Frame) -> tuple[Scene | PowerMap, Position]:
@@ -68,4 +161,8 @@ def _split_frame(frame: Frame) -> tuple[Scene | PowerMap, Position]:
     position_um = finite_array("frames", frame[1], ndim=1) if len(frame) == 2 else np.zeros(0)
     if position_um.size != 2:
         raise ParameterError("frames", "must be Scenes or PowerMaps, or pairs (light, (x_um, y_um))", frame)
-    return frame[0], (float(position_um[0]), float(position_um[1]))
+    found = float(position_um[0]), float(position_um[1])
+    given = frame[1]
+    if isinstance(given, PathPosition):
+        return frame[0], PathPosition(found, given.gaze_um, given.digests, given.number)
+    return frame[0], found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -13,6 +14,7 @@ from foveasim._core.random_streams import Streams
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, check_number, check_shape, finite_array, read_only
 from foveasim.camera import Camera
+from foveasim.camera._frames import path_positions
 from foveasim.errors import ParameterError, type_name, with_article
 from foveasim.fields import PowerMap
 from foveasim.optics import Optics
@@ -173,7 +175,7 @@ def shift_sensor(source: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Sce
         When an argument is of another class.
     """
     _check_types(("source", source, (Scene, PowerMap)), ("path", path, (GazePath,)))
-    return ((source, (float(x_um), float(y_um))) for x_um, y_um in path.xy_um)
+    return ((source, position_um) for position_um in path_positions(path.xy_um, path.xy_um))
 
 
 def pan_camera(
@@ -237,6 +239,9 @@ def _parts(
     free_y, free_x = scene.basis.shape[1] - n_y, scene.basis.shape[2] - n_x
     previous: tuple[int, int] | None = None
     part = scene
+    # The positions are the remaining shifts, which are known when a part is cropped.
+    shifts_um: deque[tuple[float, float]] = deque()
+    positions = path_positions(path.xy_um, (shifts_um.popleft() for _ in path.t_s))
     for t_s, position_um in zip(path.t_s, path.xy_um, strict=True):
         # The centre of the part is off by half a pixel if the number of free pixels is odd.
         left, bottom = (
@@ -254,11 +259,12 @@ def _parts(
         if (left, bottom) != previous:
             part = _crop(scene, left, bottom, n_y, n_x)
             previous = left, bottom
-        shift_um = [
+        x_um, y_um = (
             float(at_um) - (at - 0.5 * free) * cell_um
             for at_um, at, free in zip(position_um, (left, bottom), (free_x, free_y), strict=True)
-        ]
-        yield part, (shift_um[0], shift_um[1])
+        )
+        shifts_um.append((x_um, y_um))
+        yield part, next(positions)
 
 
 def _check_types(*arguments: tuple[str, object, tuple[type, ...]]) -> None:

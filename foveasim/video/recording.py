@@ -22,6 +22,7 @@ from foveasim._io.atomic import atomic_directory
 from foveasim._io.formats import as_file_error
 from foveasim._io.resumable import LOCK, disk_errors, finish, partial_path, resumable_directory
 from foveasim._io.zarr_stores import ZARR, check_codecs
+from foveasim.camera._frames import DIGEST_BYTES
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError, type_name
 from foveasim.layout import Layout
@@ -37,7 +38,7 @@ __all__ = [
     "resume_recording",
 ]
 
-FORMAT, VERSION = "foveasim video", 1
+FORMAT, VERSION = "foveasim video", 2
 #: Codes per chunk of a zarr store, but at least one frame; one chunk is in memory while writing.
 CHUNK_CODES = 1 << 22
 #: Resumable recordings are written at this interval or earlier: upper limit of the loss after a crash.
@@ -46,11 +47,16 @@ WRITE_S = 10.0
 CODECS = ("bytes", "zstd")
 MAX_DECOMPRESSED_BYTES = 8 * 2**30
 #: Arrays of the layout, and arrays that grow frame by frame: frame numbers are written last and mark complete frames.
-LAYOUT_ARRAYS, FRAME_ARRAYS = ("xy_um", "ring_offsets", "site_offsets"), ("code", "exposure_s", "frame")
+LAYOUT_ARRAYS = ("xy_um", "ring_offsets", "site_offsets")
+FRAME_ARRAYS = ("code", "exposure_s", "gaze_um", "next_path", "frame")
 #: Fill value of frame numbers, for incomplete frames.
 NO_FRAME = -1
+#: Digest of the rest of a gaze path that ends, or of frames without a path.
+NO_PATH = bytes(DIGEST_BYTES).hex()
 #: Settings that may always differ between captures of one recording.
-FRAME_SETTINGS = frozenset({"exposure_s", "frame", "light.source", "place_um"})
+FRAME_SETTINGS = frozenset(
+    {"exposure_s", "frame", "light.source", "place_um", "gaze.xy_um", "gaze.path", "gaze.next_path"}
+)
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -69,6 +75,9 @@ class Recording:
         Exposure times.
     frame : (n_frame,) int64
         Frame numbers, which select the random streams of the noise.
+    gaze_um : (n_frame, 2) float64, µm
+        Gaze position at the first source frame of each capture, in the image of the complete picture; 0 for frames without
+        positions.
     layout : Layout
         Layout of the photosites.
     filter_names : tuple of str
@@ -86,6 +95,7 @@ class Recording:
     code: Any
     exposure_s: Floats
     frame: NDArray[np.int64]
+    gaze_um: Floats
     layout: Layout
     filter_names: tuple[str, ...]
     filter_of_site: NDArray[Any]
@@ -122,6 +132,7 @@ def read_recording(path: str | Path) -> Recording:
             code=group["code"],
             exposure_s=group["exposure_s"][:],
             frame=group["frame"][:],
+            gaze_um=group["gaze_um"][:],
             layout=Layout(
                 group["xy_um"][:], group["ring_offsets"][:], group["site_offsets"][:], columns, about["provenance"]
             ),
@@ -174,7 +185,7 @@ def _open_checked(source: Path, mode: str = "r") -> Iterator[Any]:
             raise FileError(source, "is not a video of captures")
         if group.attrs.get("version") != VERSION:
             raise FileError(source, f"has the format version {group.attrs.get('version')}, expected {VERSION}")
-        names = (*LAYOUT_ARRAYS, "filter_of_site", "exposure_s", "frame")
+        names = (*LAYOUT_ARRAYS, "filter_of_site", *(name for name in FRAME_ARRAYS if name != "code"))
         arrays = [group[name] for name in names if name in group]
         arrays += [array for _, array in group["columns"].arrays()] if "columns" in group else []
         if sum(array.nbytes for array in arrays) > MAX_DECOMPRESSED_BYTES:
@@ -309,6 +320,7 @@ def _check_continuation(captures: Iterable[Capture], directory: Path, n_before: 
     if n_before:
         with _open_checked(directory) as group:
             first, next_frame = group.attrs["settings"], int(group["frame"][n_before - 1]) + 1
+            next_path = group["next_path"][n_before - 1].tobytes().hex()
             may_differ |= set(group.attrs["varied"])
     for k, capture in enumerate(captures, n_before):
         settings = _json_round_trip(capture.settings)
@@ -325,6 +337,8 @@ def _check_continuation(captures: Iterable[Capture], directory: Path, n_before: 
         if n_before and k == n_before:
             _reject(directory, _property_differences(directory, capture))
             _reject(directory, different)
+            if settings.get("gaze", {}).get("path", NO_PATH) != next_path:
+                _reject(directory, ["gaze"])
         elif different:
             may_differ |= set(different)
             with _open_checked(directory, "r+") as group:
@@ -387,7 +401,16 @@ class _Frames:
             self._create_arrays(capture)
         n_before, frames = self._chunk
         settings = capture.settings
-        frames.append((capture.code, settings.get("exposure_s", np.nan), settings.get("frame", n_before + len(frames))))
+        gaze = settings.get("gaze", {})
+        frames.append(
+            (
+                capture.code,
+                settings.get("exposure_s", np.nan),
+                gaze.get("xy_um", (0.0, 0.0)),
+                np.frombuffer(bytes.fromhex(gaze.get("next_path", NO_PATH)), np.uint8),
+                settings.get("frame", n_before + len(frames)),
+            )
+        )
         if len(frames) == self._n_chunk:
             self.write()
             self._chunk = self.n_complete, []
@@ -435,6 +458,8 @@ class _Frames:
         for name, shape, dtype, n_chunk, fill in (
             ("code", (0, n_sites), capture.code.dtype, self._n_chunk, 0),
             ("exposure_s", (0,), np.dtype(np.float64), 4096, 0.0),
+            ("gaze_um", (0, 2), np.dtype(np.float64), 4096, 0.0),
+            ("next_path", (0, DIGEST_BYTES), np.dtype(np.uint8), 4096, 0),
             ("frame", (0,), np.dtype(np.int64), 4096, NO_FRAME),
         ):
             chunks = (n_chunk, *(max(n, 1) for n in shape[1:]))

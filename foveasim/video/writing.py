@@ -88,7 +88,9 @@ def write_video(
 
     With ``resume``, no frame is lost after Ctrl-C, an error in a frame or a full disk; after a crash of the process, the frames
     of the last 10 seconds are lost. A resumed recording must be the same recording: frame numbers continue, and all settings
-    equal those of the first frame, except settings that already differed between frames.
+    equal those of the first frame, except settings that already differed between frames. A gaze path must be the same from the
+    first missing frame to its end: of :func:`foveasim.video.shift_sensor`, :func:`foveasim.video.pan_camera`, or a list of
+    frames with positions. Of other iterators the rest of the path is unknown.
 
     Examples
     --------
@@ -97,6 +99,10 @@ def write_video(
         n = count_recorded_frames("long.zarr")
         captures = camera.video(footage.from_frame(n), exposure_s=0.01, seed=0, first_frame=n)
         write_video(captures, "long.zarr", resume=True)
+
+    With a moving gaze, the first frames are skipped::
+
+        frames = itertools.islice(shift_sensor(scene, path), n, None)
     """
     target = Path(path)
     frame_s = check_number("frame_s", frame_s, above=0.0)

@@ -137,7 +137,7 @@ def test_cached_lens_gives_bit_identical_maps(changes, precision, pitch_um):
 def test_lens_cache_size_is_limited(monkeypatch):
     from foveasim.optics import otf
 
-    small, large = (scene_of(np.ones(shape, np.float32)) for shape in ((120, 160), (240, 320)))
+    small, large = (scene_of(np.ones(shape, np.float32)) for shape in ((120, 160), (180, 240)))
 
     def kept_sizes(*scenes, optics):
         for scene in scenes:
@@ -1085,6 +1085,53 @@ def test_functions_are_equal_in_new_processes(tmp_path):
     assert run(2) == ["InterruptedError", "4"]
     (tmp_path / "own.py").write_text(source.replace("0.5", "0.6"))
     assert run(3) == ["FileError", "qe", "FileError", "qe", "4"]
+
+
+def gaze_path(n, last_um=3.0):
+    xy_um = np.random.default_rng(4).uniform(-4.0, 4.0, (n, 2))
+    xy_um[-1, 0] = last_um
+    return GazePath(0.004 * np.arange(n), xy_um)
+
+
+GAZE_FRAMES = {
+    "shift": lambda scene, path, n: islice(shift_sensor(scene, path), n, None),
+    "rest": lambda scene, path, n: shift_sensor(scene, GazePath(path.t_s[n:], path.xy_um[n:])),
+    "pan": lambda scene, path, n: islice(pan_camera(scene, path, OPTICS, shape=(150, 200)), n, None),
+    "list": lambda scene, path, n: [(scene, tuple(xy_um)) for xy_um in path.xy_um][n:],
+}
+
+
+@pytest.mark.parametrize("kind", GAZE_FRAMES)
+@pytest.mark.parametrize("every", [1, 2])
+def test_recordings_store_and_check_gaze(tmp_path, kind, every):
+    file, scene, path = tmp_path / "v.zarr", scene_of(pictures(1, (180, 240))[0]), gaze_path(8)
+    shutter = {"frame_s": 0.004, "every": every} if every > 1 else {}
+
+    def captures(n, path):
+        frames = GAZE_FRAMES[kind](scene, path, n * every)
+        return camera_of(rows_layout()).video(frames, exposure_s=0.003, seed=1, first_frame=n, **shutter)
+
+    with pytest.raises(InterruptionError):
+        write_video(interrupted(captures(0, path), 2), file, resume=True)
+    # Only the last point of the path differs.
+    for other in (gaze_path(8, last_um=2.0), GazePath(path.t_s[:-1], path.xy_um[:-1])):
+        with pytest.raises(FileError, match="is another recording: 'gaze' differs"):
+            write_video(captures(2, other), file, resume=True)
+    still = camera_of(rows_layout()).video([scene], exposure_s=0.003, seed=1, first_frame=2, **shutter)
+    with pytest.raises(FileError, match="is another recording"):
+        write_video(still, file, resume=True)
+    n = write_video(captures(2, path), file, resume=True)
+    write_video(captures(0, path), tmp_path / "expected.zarr")
+
+    assert n == 8 // every
+    assert np.array_equal(read_recording(file).gaze_um, path.xy_um[::every])
+    assert files_of(file) == files_of(tmp_path / "expected.zarr")
+
+
+def test_recording_without_gaze_is_centred(tmp_path):
+    write_video(captures_of(2), tmp_path / "v.zarr")
+
+    assert read_recording(tmp_path / "v.zarr").gaze_um.tolist() == [[0.0, 0.0], [0.0, 0.0]]
 
 
 def test_recording_with_different_filters_is_rejected(tmp_path):
