@@ -259,8 +259,8 @@ class SpikingPixels:
     Parameters
     ----------
     sensor : Sensor
-        Sensor with the photosites. Areas, sensitivities, PRNU, dark current and crosstalk are used. If its shot noise is off,
-        the charge increases uniformly.
+        Sensor with the photosites. Areas, sensitivities, PRNU, dark current and crosstalk are used. If its shot noise is off
+        or disabled, the charge increases uniformly.
     threshold_e : float or (n_site,), e-
         Charge per spike, at least 1.
     refractory_s : float, s
@@ -377,7 +377,7 @@ class SpikingPixels:
                         first,  # noqa: B023
                         _part(threshold_e, sites),
                         self.refractory_s,
-                        self.sensor.shot_noise != "off",
+                        self.sensor.shot.is_drawn,
                         *key,
                         sites.start,
                         max_events,

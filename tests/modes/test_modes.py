@@ -350,6 +350,13 @@ def test_spike_rate_is_current_per_threshold():
     assert np.allclose(times_s, 250.0 / 12_345.0 * np.arange(1, times_s.size + 1), rtol=1e-12)
 
 
+def test_spikes_without_disabled_shot_noise_are_uniform():
+    sensor = sensor_of(1).without("shot")
+    spikes = SpikingPixels(sensor, threshold_e=400.0).events([[1000.0], [500.0]], frame_s=1.0, seed=0)
+
+    assert np.allclose(spikes.t_s, [0.4, 0.8, 1.4], rtol=1e-12)
+
+
 def test_charge_is_retained_between_frames():
     sensor = sensor_of(1, shot_noise="off")
     spikes = SpikingPixels(sensor, threshold_e=100.0).events(
