@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import groupby
 from typing import Any, TypeAlias
 
@@ -48,6 +48,7 @@ class _Deterministic:
     name = ""
     is_local = True
     is_temporal = False
+    is_drawn_at_reset = False
     needs_layout = False
 
     def __init__(self, values: Any) -> None:
@@ -266,6 +267,7 @@ def apply_steps(
     *,
     sites: Sites,
     streams: Streams | None = None,
+    reset_streams: Streams | None = None,
     n_threads: int | None = None,
 ) -> Floats:
     """
@@ -273,11 +275,11 @@ def apply_steps(
 
     Parameters
     ----------
-    steps, values, sites, streams, n_threads
+    steps, values, sites, streams, reset_streams, n_threads
         As for :func:`run_steps`.
     """
     result = Save()
-    run_steps((*steps, result), values, sites=sites, streams=streams, n_threads=n_threads)
+    run_steps((*steps, result), values, sites=sites, streams=streams, reset_streams=reset_streams, n_threads=n_threads)
     return result.values
 
 
@@ -287,6 +289,7 @@ def run_steps(
     *,
     sites: Sites,
     streams: Streams | None = None,
+    reset_streams: Streams | None = None,
     n_threads: int | None = None,
 ) -> None:
     """
@@ -304,18 +307,24 @@ def run_steps(
         All sites.
     streams : Streams, optional
         Random streams of the frame; required for temporal steps.
+    reset_streams : Streams, optional
+        Random streams of the last reset, for effects that are drawn at the reset; by default those of the frame.
     n_threads : int, optional
         Number of threads; all cores by default. Results do not depend on it.
     """
+
+    def rng_of(step: Step, *block: int) -> Any:
+        own = reset_streams if step.is_drawn_at_reset and reset_streams is not None else streams
+        return own.of(step.name, *block) if step.is_temporal and own is not None else None
+
     is_own = False
     groups = [(is_local, list(group)) for is_local, group in groupby(steps, key=lambda step: step.is_local)]
     for number, (is_local, group) in enumerate(groups):
         if not is_local:
             all_sites = sites.block(slice(None), n_threads=n_threads)
             for step in group:
-                rng: Any = streams.of(step.name) if step.is_temporal and streams is not None else None
                 own_values = values if is_own else np.array(values, np.float64)
-                values, is_own = _apply_step(step, own_values, all_sites, rng), True
+                values, is_own = _apply_step(step, own_values, all_sites, rng_of(step)), True
             continue
         first, before, result = group[0], values, Save()
         if is_own and isinstance(first, Save) and first.values.dtype == values.dtype:
@@ -328,7 +337,7 @@ def run_steps(
             if isinstance(step, Save):
                 step.allocate(sites.n_sites)
         if group:
-            _run_local_steps(group, before, sites, streams, n_threads)
+            _run_local_steps(group, before, sites, rng_of, n_threads)
         values, is_own = result.values, True
 
 
@@ -344,14 +353,13 @@ def _apply_step(step: Step, values: Any, sites: Sites, rng: Any) -> Any:
 
 
 def _run_local_steps(
-    steps: Sequence[Step], values: Any, sites: Sites, streams: Streams | None, n_threads: int | None
+    steps: Sequence[Step], values: Any, sites: Sites, rng_of: Callable[[Step, int], Any], n_threads: int | None
 ) -> None:
     """Run local steps block by block."""
 
     def block(number: int, index: slice) -> None:
         part, part_sites = values[index].astype(np.float64), sites.block(index)
         for step in steps:
-            rng: Any = streams.of(step.name, number) if step.is_temporal and streams is not None else None
-            part = _apply_step(step, part, part_sites, rng)
+            part = _apply_step(step, part, part_sites, rng_of(step, number))
 
     for_each_block(sites.n_sites, block, n_threads)

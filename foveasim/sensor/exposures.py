@@ -16,10 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.random_streams import Streams
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, Ints, as_numbers, own, unmasked
-from foveasim.errors import ParameterError, type_name
+from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.sensor.calibration import Calibration, linearise, nominal_e_per_dn
-from foveasim.sensor.chain import apply_steps
-from foveasim.sensor.effects.shot import MAX_CHARGE_E, ROUNDING_E2, draw_shot_noise
+from foveasim.sensor.effects.shot import MAX_CHARGE_E, ROUNDING_E2
 from foveasim.sensor.limits import check_plausible_array
 from foveasim.sensor.sensor import Sensor
 
@@ -31,6 +30,10 @@ MARGIN_SIGMAS = 5.0
 TAPER_FRACTION = 0.25
 #: Number of iterations of the weights from the merged estimate.
 N_PASSES = 2
+#: Number of iterations that estimate charges before inter-pixel capacitance.
+N_UNMIXING_STEPS = 8
+#: Relative decrease of an expected charge that counts as rounding.
+DECREASE_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +191,8 @@ def merge_exposures(
     rate = (taper * rates * t_s).sum(axis=0) / total
     fraction = taper
     for _ in range(N_PASSES):
-        model = sensor.readout_model(*sensor.shot.moments((np.maximum(rate, 0.0) + dark_e_per_s) * t_s, np.zeros(1)))
+        collected_e = _estimate_collected(sensor, (np.maximum(rate, 0.0) + dark_e_per_s) * t_s)
+        model = sensor.readout_model(*sensor.shot.moments(collected_e, np.zeros(1)))
         information = t_s**2 / (model.variance_e2 + model.noise_e2 + conversion_e2)
         total = np.where(is_known, (taper * information).sum(axis=0), 1.0)
         fraction = taper * information / total
@@ -232,13 +236,18 @@ def non_destructive_reads(
     ------
     ParameterError
         If the times do not increase, or the number of rates is not the number of sites.
+    SimulationError
+        If an effect lets the expected charge decrease with time.
 
     Notes
     -----
-    The charge collected between two reads is drawn independently and added, then clipped at the full well. Later charges
-    include earlier ones, ``cov(N_i, N_j) = E[N_i]`` for ``i <= j``, and increments are uncorrelated. Read noise is drawn for
-    each read; reset noise is drawn once and is the same in all reads. The state of RTS sites is drawn for each read, which
-    assumes fast switching.
+    The expected charge of a read is that of an exposure until the read, with all effects on it. The charge collected between
+    two reads is drawn independently with the increase of the expected charge, added, and clipped at the full well. Later
+    charges include earlier ones, ``cov(N_i, N_j) = E[N_i]`` for ``i <= j``, and increments are uncorrelated.
+
+    Each read passes through the complete chain, as in a capture. Read noise is drawn for each read. Effects that are drawn at
+    the reset, such as reset noise, act at their place in the chain with the same random numbers in all reads. The state of RTS
+    sites is drawn for each read, which assumes fast switching.
 
     Examples
     --------
@@ -256,28 +265,35 @@ def non_destructive_reads(
         raise ParameterError(
             "photo_e_per_s", f"must be one number, or one for each of the {n_sites} sites, got the shape {photo.shape}"
         )
-    per_s = sensor.expected_electrons(np.broadcast_to(photo, n_sites), 1.0)
+    photo = np.broadcast_to(photo, n_sites)
     well_e = np.minimum(sensor.well_e, MAX_CHARGE_E).astype(np.int64)
-    at_reset = [effect for effect in sensor.chain if effect.is_drawn_at_reset]
-    reset_e = apply_steps(at_reset, np.zeros(n_sites), sites=sensor.sites, streams=streams, n_threads=n_threads)
-    # Noise drawn at the reset is already part of the charge.
-    reader = sensor.without(*(effect.name for effect in at_reset)) if at_reset else sensor
     electrons = np.empty((times.size, n_sites), np.int64)
     codes = []
-    collected = np.zeros(n_sites, np.int64)
-    for k, interval_s in enumerate(np.diff(times, prepend=0.0)):
+    expected_e, collected = np.zeros(n_sites), np.zeros(n_sites, np.int64)
+    for k, time_s in enumerate(times):
         own = Streams(int(streams.of("read of a ramp", k).integers(2**63)), streams.frame)
-        if not sensor.shot.is_drawn:
-            collected = draw_shot_noise(per_s * times[k], "off", sensor.gaussian_above_e, own)
+        before_e, expected_e = expected_e, sensor.expected_electrons(photo, float(time_s), n_threads=n_threads)
+        if sensor.shot.is_drawn:
+            added_e = _increase(before_e, expected_e, float(time_s))
+            collected = np.minimum(collected + sensor.collect(added_e, streams=own, n_threads=n_threads), well_e)
         else:
-            collected = collected + draw_shot_noise(
-                per_s * interval_s, sensor.shot.how, sensor.gaussian_above_e, own, n_threads=n_threads
-            )
-        collected = np.minimum(collected, well_e)
+            collected = sensor.collect(expected_e, streams=own, n_threads=n_threads)
         electrons[k] = collected
-        charge: Any = collected if reader is sensor else collected + reset_e
-        codes.append(reader.read(charge, streams=own, n_threads=n_threads))
+        codes.append(sensor.read(collected, streams=own, reset_streams=streams, n_threads=n_threads))
     return Ramp(times_s=times, electrons=electrons, code=np.stack(codes))
+
+
+def _increase(before_e: Floats, expected_e: Floats, time_s: float) -> Floats:
+    """Return the increase of expected charges since the previous read, at least 0."""
+    added_e = expected_e - before_e
+    is_less = added_e < -DECREASE_ROUNDING * np.abs(before_e)
+    if is_less.any():
+        site = int(np.argmax(is_less))
+        raise SimulationError(
+            f"the expected charge of site {site} decreases from {before_e[site]:.6g} to {expected_e[site]:.6g} e- until the "
+            f"read at {time_s:g} s; effects at the stage 'expected' must not decrease with time"
+        )
+    return np.maximum(added_e, 0.0)
 
 
 def fit_ramp(
@@ -295,7 +311,8 @@ def fit_ramp(
     sensor : Sensor
         Its ADC, capacitances, full well, read noise and RTS sites are used.
     weight_rate_e_per_s : number or (n_site,), optional, e-/s
-        Rate for the shot noise in the weights; by default each site's rate from its first and last usable reads.
+        Rate of the collected charge for the shot noise in the weights; by default each site's rate from its first and last
+        usable reads, with an approximate correction of inter-pixel capacitance.
 
     Returns
     -------
@@ -310,9 +327,11 @@ def fit_ramp(
     Notes
     -----
     Differences of consecutive reads contain neither offset nor reset noise. Their covariance matrix is tridiagonal with
-    ``r dt_k + 2 s²`` on the diagonal and ``-s²`` next to it, where s combines read, RTS and conversion noise. The slope is the
-    generalised least-squares solution, computed in time proportional to the number of reads (T. D. Brandt, PASP 136, 045004,
-    2024; arXiv:2309.08753).
+    ``r dt_k + 2 s²`` on the diagonal and ``-s²`` next to it, where s combines read, RTS and conversion noise. Effects that mix
+    the charges of sites after collection, such as inter-pixel capacitance, change the shot noise ``r dt_k`` to
+    ``sum_j K_ij² r_j dt_k``, with the fraction K_ij of the charge of site j at site i. The slope is the generalised
+    least-squares solution, computed in time proportional to the number of reads (T. D. Brandt, PASP 136, 045004, 2024;
+    arXiv:2309.08753).
 
     For a given ``weight_rate_e_per_s`` the slope is a fixed linear combination of the reads, and therefore unbiased; for
     weights from the site's own rate the bias is a fraction of an electron per ramp.
@@ -325,7 +344,8 @@ def fit_ramp(
     codes, linear_dn, e_per_dn = _linearise_reads(code, times.size, sensor, "read")
     n_sites = sensor.layout.n_sites
     charge_e = linear_dn * e_per_dn
-    noise_e2 = _conversion_noise_e2(sensor, codes, e_per_dn) + sensor.readout_model(charge_e, is_reset=False).noise_e2
+    model = sensor.readout_model(charge_e, is_reset=False)
+    noise_e2 = _conversion_noise_e2(sensor, codes, e_per_dn) + model.noise_e2 + model.variance_e2
     if not sensor.shot.is_drawn:
         noise_e2 += ROUNDING_E2
     is_below = (codes < 2.0**sensor.bits - 1.0) & (linear_dn < _saturation_dn(sensor))
@@ -336,6 +356,8 @@ def fit_ramp(
     if weight_rate_e_per_s is None:
         rise_e = charge_e[last, np.arange(n_sites)] - charge_e[0]
         rate = np.divide(rise_e, duration_s, out=np.zeros(n_sites), where=duration_s > 0.0)
+        longest_s = times[-1] - times[0]
+        rate = _estimate_collected(sensor, np.maximum(rate, 0.0) * longest_s) / longest_s
     else:
         rate = check_plausible_array("weight_rate_e_per_s", weight_rate_e_per_s)
         if rate.shape not in ((), (n_sites,)):
@@ -346,7 +368,11 @@ def fit_ramp(
         rate = np.zeros(1)
     dt_s = np.where(is_used[1:], np.diff(times)[:, None], 0.0)
     rise_e = np.where(is_used[1:], np.diff(charge_e, axis=0), 0.0)
-    diagonal = np.where(is_used[1:], np.maximum(rate, 0.0) * dt_s + noise_e2[:-1] + noise_e2[1:], 1.0)
+    shot_e2 = np.broadcast_to(np.maximum(rate, 0.0) * np.diff(times)[:, None], dt_s.shape)
+    if model.is_mixed:
+        with_shot = sensor.readout_model(charge_e[1:], shot_e2, is_reset=False)
+        shot_e2 = with_shot.variance_e2 - np.broadcast_to(model.variance_e2, charge_e.shape)[1:]
+    diagonal = np.where(is_used[1:], shot_e2 + noise_e2[:-1] + noise_e2[1:], 1.0)
     off_diagonal = np.where(is_used[2:], -noise_e2[1:-1], 0.0)
     weights = _solve_tridiagonal(diagonal, off_diagonal, dt_s)
     information = (weights * dt_s).sum(axis=0)
@@ -392,6 +418,23 @@ def _conversion_noise_e2(sensor: Sensor, codes: NDArray[Any], e_per_dn: Floats) 
     """Return the variance of conversion from the width of each code, (n_reading, n_site) e-²."""
     step_e = sensor.adc.width_of_code_dn(codes) * e_per_dn
     return np.asarray(step_e**2 * sensor.adc.noise_dn2)
+
+
+def _estimate_collected(sensor: Sensor, charge_e: Floats) -> Floats:
+    """
+    Estimate collected charges from those after effects that mix sites.
+
+    For inter-pixel capacitance with the fractions K, the iteration ``q <- q + (charge - K q)`` (P. H. van Cittert, Zeitschrift
+    für Physik 69, 298, 1931) is ended early, since its limit amplifies noise. Without mixing, charges are returned unchanged.
+    """
+    at_zero = sensor.readout_model(np.zeros(sensor.layout.n_sites))
+    if not at_zero.is_mixed:
+        return charge_e
+    collected_e = charge_e
+    for _ in range(N_UNMIXING_STEPS):
+        mixed_e = sensor.readout_model(collected_e).mean_e - at_zero.mean_e
+        collected_e = np.maximum(collected_e + charge_e - mixed_e, 0.0)
+    return collected_e
 
 
 def _saturation_dn(sensor: Sensor) -> Floats:

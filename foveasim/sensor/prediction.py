@@ -96,17 +96,21 @@ class ReadoutModel(NamedTuple):
 class _LinearModel:
     """First-order model of a stage: ``factor * value + offset``, Gaussian and RTS noise."""
 
-    def __init__(self, effects: Iterable[Effect], mean: Floats, variance: Floats, sites: Sites) -> None:
+    def __init__(
+        self, effects: Iterable[Effect], mean: Floats, variance: Floats, sites: Sites, *, is_reset: bool
+    ) -> None:
         self.factor, self.offset = np.ones(1), np.zeros(1)
         self.noise, self.half_step2 = np.zeros(1), np.zeros(1)
         self.mean, self.variance = mean, variance
         for effect in effects:
             mean, variance = effect.validate_moments(self.mean, self.variance, sites)
             factor = effect.validate_moments(self.mean + 1.0, self.variance, sites)[0] - mean
-            added = np.zeros(1)
-            if effect.is_temporal:
+            # Draws at the reset are constants in differences of reads.
+            is_drawn = effect.is_temporal and (is_reset or not effect.is_drawn_at_reset)
+            added, half_step = np.zeros(1), None
+            if is_drawn:
                 added = np.maximum(variance - factor**2 * self.variance, 0.0)
-            half_step = effect.half_step(sites.of(effect)) if sites.known_device is not None else None
+                half_step = effect.half_step(sites.of(effect)) if sites.known_device is not None else None
             self.half_step2 = factor**2 * self.half_step2
             if half_step is not None:
                 self.half_step2 = self.half_step2 + half_step**2
@@ -130,6 +134,7 @@ def readout_model(
     nonlinearity_fraction: float,
     v_sat_v: float,
     pedestal_v: float,
+    is_reset: bool = True,
 ) -> ReadoutModel:
     """
     Compute the first-order readout model at the mean collected charges.
@@ -147,6 +152,8 @@ def readout_model(
     nonlinearity_fraction : float
         Response nonlinearity: relative signal loss at full range.
     v_sat_v, pedestal_v : float, V
+    is_reset : bool
+        Whether to include the noise of effects that are drawn at the reset.
     """
     is_mixed = False
     local: list[Effect] = []
@@ -154,17 +161,25 @@ def readout_model(
         if effect.is_local or effect.is_temporal:
             local.append(effect)
             continue
-        before = _LinearModel(local, mean_e, variance_e2, sites)
+        before = _LinearModel(local, mean_e, variance_e2, sites, is_reset=is_reset)
         mean_e, variance_e2 = effect.validate_moments(before.mean, before.variance + before.half_step2, sites)
         is_mixed, local = True, []
-    charges = _LinearModel(local, mean_e, variance_e2, sites)
+    charges = _LinearModel(local, mean_e, variance_e2, sites, is_reset=is_reset)
     sense = _LinearModel(
-        sense_node, charges.mean * v_per_e, (charges.variance + charges.half_step2) * v_per_e**2, sites
+        sense_node,
+        charges.mean * v_per_e,
+        (charges.variance + charges.half_step2) * v_per_e**2,
+        sites,
+        is_reset=is_reset,
     )
     fraction = np.clip(sense.mean / v_sat_v, 0.0, 1.0)
     slope = np.maximum(1.0 - 2.0 * nonlinearity_fraction * fraction, MIN_SLOPE)
     last = _LinearModel(
-        output, sense.mean * (1.0 - nonlinearity_fraction * fraction) + pedestal_v, sense.variance * slope**2, sites
+        output,
+        sense.mean * (1.0 - nonlinearity_fraction * fraction) + pedestal_v,
+        sense.variance * slope**2,
+        sites,
+        is_reset=is_reset,
     )
     total_v_per_e = charges.factor * v_per_e * sense.factor
     per_v2 = np.divide(1.0, total_v_per_e**2, out=np.zeros(np.shape(total_v_per_e)), where=total_v_per_e != 0.0)

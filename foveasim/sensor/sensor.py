@@ -645,18 +645,26 @@ class Sensor:
         run_steps(steps, expected_e, sites=self.sites, streams=streams, n_threads=n_threads)
         return electrons.values
 
-    def read(self, electrons: Ints, *, streams: Streams, n_threads: int | None = None) -> NDArray[Any]:
+    def read(
+        self,
+        electrons: Ints,
+        *,
+        streams: Streams,
+        reset_streams: Streams | None = None,
+        n_threads: int | None = None,
+    ) -> NDArray[Any]:
         """
         Convert collected charges to digital codes, (n_site,) uint8 or uint16.
 
         The steps are effects on the charge, conversion to volts, nonlinearity, effects on the voltage, clipping at V_sat, and
         the ADC. For a linear ADC, code ``k`` covers the voltages from ``k * V_sat / 2**bits`` to
-        ``(k + 1) * V_sat / 2**bits``.
+        ``(k + 1) * V_sat / 2**bits``. Reads with the same ``reset_streams`` share the draws at the reset
+        (:attr:`~foveasim.sensor.effects.Effect.is_drawn_at_reset`), for which ``streams`` are the default.
         """
         electrons = self._check_size("electrons", electrons)
         conversion = self._conversion()
         steps = (ChargeCheck("electrons", -np.inf), *self._after_collection, conversion)
-        run_steps(steps, electrons, sites=self.sites, streams=streams, n_threads=n_threads)
+        run_steps(steps, electrons, sites=self.sites, streams=streams, reset_streams=reset_streams, n_threads=n_threads)
         return conversion.values
 
     def expose(
@@ -779,7 +787,7 @@ class Sensor:
         """
         mean_e, variance_e2 = (np.atleast_1d(np.asarray(part, np.float64)) for part in (mean_e, variance_e2))
         return readout_model(
-            [effect for effect in self._effects_at("charge") if is_reset or not effect.is_drawn_at_reset],
+            self._effects_at("charge"),
             self._effects_at("sense_node"),
             self._effects_at("output"),
             mean_e=mean_e,
@@ -789,6 +797,7 @@ class Sensor:
             nonlinearity_fraction=self.nonlinearity_fraction,
             v_sat_v=self.v_sat_v,
             pedestal_v=self.pedestal_v,
+            is_reset=is_reset,
         )
 
     def predict(self, expected_e: Floats, *, n_threads: int | None = None) -> tuple[Floats, Floats]:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import pytest
 import scipy.constants
+import scipy.signal
 
 from foveasim._core.random_streams import Streams
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import grid
 from foveasim.sensor import (
     Calibration,
+    InterPixelCapacitance,
     Sensor,
     calibrate,
     fit_ramp,
@@ -20,6 +24,7 @@ from foveasim.sensor import (
     noise_budget,
     non_destructive_reads,
 )
+from foveasim.sensor.effects import AdditiveNoise, Effect
 
 SIGMAS = 5.0
 N = 20_000
@@ -352,6 +357,195 @@ def test_simulated_ramp_slope_includes_dark_signal():
     variance = np.mean(fit.sigma_e_per_s**2)
     assert fit.rate_e_per_s.mean() == pytest.approx(1000.0, abs=SIGMAS * math.sqrt(variance / N) + 0.1)
     assert fit.rate_e_per_s.var() == pytest.approx(variance, rel=SIGMAS * math.sqrt(2.0 / N) + 0.01)
+
+
+# -- effects in ramps -------------------------------------------------------------------------------------------------
+
+#: Readings without noise other than those under test: 16 bits, 1 e- per code.
+EXACT = {
+    "bits": 16,
+    "v_sat_v": 1.0,
+    "capacitance_f": 65_536 * scipy.constants.e,
+    "shot_noise": "off",
+    "pedestal_v": 0.2,
+}
+RESET_E = math.sqrt(scipy.constants.k * 300.0 * EXACT["capacitance_f"]) / scipy.constants.e
+
+
+@dataclass(frozen=True)
+class NodeReset(AdditiveNoise):
+    """Test effect: voltage noise of the reset of a sense node."""
+
+    name: ClassVar[str] = "node_reset"
+    stage: ClassVar[str] = "sense_node"
+    is_drawn_at_reset: ClassVar[bool] = True
+
+    sigma_v: float = 0.01
+
+    def deviation(self, sites):
+        return self.sigma_v
+
+
+@dataclass(frozen=True)
+class ResetGain(Effect):
+    """Test effect: a factor on the output voltage that is drawn at the reset."""
+
+    name: ClassVar[str] = "reset_gain"
+    stage: ClassVar[str] = "output"
+    is_temporal: ClassVar[bool] = True
+    is_drawn_at_reset: ClassVar[bool] = True
+
+    def apply(self, values, *, sites, rng):
+        return values * (1.0 + 0.1 * rng.standard_normal(values.size))
+
+    def moments(self, mean, variance, *, sites):
+        return mean, variance * 1.01 + 0.01 * mean**2
+
+
+@dataclass(frozen=True)
+class Saturation(Effect):
+    """Test effect: expected charge that saturates at 1000 e-."""
+
+    name: ClassVar[str] = "saturation"
+    stage: ClassVar[str] = "expected"
+    is_temporal: ClassVar[bool] = False
+
+    sign: float = 1.0
+
+    def apply(self, values, *, sites, rng):
+        return values / (1.0 + self.sign * values / 1000.0)
+
+    def moments(self, mean, variance, *, sites):
+        return mean / (1.0 + self.sign * mean / 1000.0), variance
+
+
+def neighbour_correlation(values):
+    """Return the correlation of horizontal neighbours."""
+    rows = values.reshape(100, 200) - values.mean()
+    return np.mean(rows[:, 1:] * rows[:, :-1]) / np.mean(rows**2)
+
+
+@pytest.mark.parametrize("neighbour_fraction", [0.0, 0.1])
+def test_reset_noise_of_ramp_follows_coupling(neighbour_fraction):
+    """Inter-pixel capacitance precedes reset noise, which remains independent between sites."""
+    coupling = InterPixelCapacitance(neighbour_fraction=neighbour_fraction)
+    sensor = Sensor(ROW, **EXACT, ktc_noise=True, coupling=coupling)
+
+    code = non_destructive_reads(sensor, 5000.0, [1.0, 2.0], streams=Streams(3)).code.astype(float)
+
+    for read in code:
+        assert read.var() == pytest.approx(RESET_E**2 + 1.0 / 12.0, rel=SIGMAS * math.sqrt(2.0 / N))
+        assert abs(neighbour_correlation(read)) < SIGMAS / math.sqrt(N)
+    assert np.abs(code[1] - code[0] - 5000.0).max() <= 1.0
+
+
+def test_reset_noise_acts_at_its_stage():
+    sensor = Sensor(ROW, **EXACT, effects=[NodeReset()])
+
+    code = non_destructive_reads(sensor, 5000.0, [1.0, 2.0], streams=Streams(3)).code.astype(float)
+
+    assert code[0].std() == pytest.approx(0.01 * 65_536, rel=SIGMAS * math.sqrt(0.5 / N))
+    assert np.abs(code[1] - code[0] - 5000.0).max() <= 1.0
+
+
+def test_factor_of_reset_is_common():
+    sensor = Sensor(ROW, **EXACT | {"pedestal_v": 0.0}, effects=[ResetGain()])
+
+    code = non_destructive_reads(sensor, 10_000.0, [1.0, 2.0], streams=Streams(3)).code.astype(float)
+
+    assert code[0].std() == pytest.approx(1000.0, rel=SIGMAS * math.sqrt(0.5 / N))
+    assert np.abs(code[1] - 2.0 * code[0]).max() <= 2.0
+
+
+@pytest.mark.parametrize("shot_noise", ["off", "auto"])
+def test_reads_have_expected_charge_of_exposures(shot_noise):
+    sensor = Sensor(ROW, **EXACT | {"shot_noise": shot_noise}, effects=[Saturation()])
+    times = np.array([0.01, 0.1, 10.0])
+    expected_e = 1e4 * times / (1.0 + 1e4 * times / 1000.0)
+
+    electrons = non_destructive_reads(sensor, 1e4, times, streams=Streams(3)).electrons
+
+    if shot_noise == "off":
+        assert np.array_equal(electrons, np.rint(np.broadcast_to(expected_e, (N, 3)).T))
+        return
+    assert electrons.mean(axis=1) == pytest.approx(expected_e, abs=SIGMAS * math.sqrt(expected_e.max() / N))
+    covariance = np.minimum(expected_e[:, None], expected_e)
+    error = np.sqrt((np.outer(expected_e, expected_e) + covariance**2 + covariance) / N)
+    assert np.abs((np.cov(electrons) - covariance) / error).max() < SIGMAS
+
+
+def test_decreasing_expected_charge_is_rejected():
+    sensor = Sensor(ROW[:3], effects=[Saturation(sign=-0.9)])
+
+    with pytest.raises(
+        SimulationError, match=r"the expected charge of site 0 decreases from 1000 to .* at 3 s; effects at"
+    ):
+        non_destructive_reads(sensor, 1000.0 / 1.9, [1.0, 3.0], streams=Streams(0))
+
+
+def test_ramp_noise_excludes_reset_noise():
+    """Noise that is drawn at the reset cancels in the slope, at every stage."""
+    sensor = Sensor(ROW, **EXACT | {"shot_noise": "auto"}, ktc_noise=True, effects=[NodeReset()], read_noise_e=5.0)
+    times = np.linspace(0.5, 4.0, 8)
+
+    fit = fit_ramp(non_destructive_reads(sensor, 500.0, times, streams=Streams(5)).code, times, sensor)
+
+    sigma = math.sqrt(np.mean(fit.sigma_e_per_s**2))
+    assert sigma == pytest.approx(fit_ramp_sigma(500.0, times, 25.0 + 1.0 / 12.0), rel=1e-3)
+    assert fit.rate_e_per_s.std() == pytest.approx(sigma, rel=SIGMAS * math.sqrt(0.5 / N) + 1e-3)
+
+
+def fit_ramp_sigma(rate_e_per_s, times, noise_e2, shot_factor=1.0):
+    """Return the standard deviation of the least-squares slope, from the covariance matrix of the reads."""
+    shot = shot_factor * rate_e_per_s * np.minimum(times[:, None], times)
+    design = np.stack([np.ones(times.size), times], axis=1)
+    inverse = np.linalg.inv(shot + noise_e2 * np.eye(times.size))
+    return math.sqrt(np.linalg.inv(design.T @ inverse @ design)[1, 1])
+
+
+def inside(n_x=200, n_y=100):
+    """Return whether sites are not at the boundary."""
+    y, x = np.divmod(np.arange(n_x * n_y), n_x)
+    return (x > 0) & (x < n_x - 1) & (y > 0) & (y < n_y - 1)
+
+
+@pytest.mark.parametrize("fraction", [0.02, 0.1])
+def test_ramp_noise_includes_coupling(fraction):
+    """Four neighbours reduce the shot noise by ``(1 - 4 a)² + 4 a²``."""
+    coupling = InterPixelCapacitance(neighbour_fraction=fraction)
+    sensor = Sensor(ROW, **EXACT | {"shot_noise": "auto"}, coupling=coupling, read_noise_e=5.0)
+    times = np.linspace(0.5, 4.0, 8)
+
+    fit = fit_ramp(non_destructive_reads(sensor, 4000.0, times, streams=Streams(5)).code, times, sensor)
+
+    kernel = np.array([[0.0, fraction, 0.0], [fraction, 1.0 - 4.0 * fraction, fraction], [0.0, fraction, 0.0]])
+    is_inside = inside()
+    sigma = math.sqrt(np.mean(fit.sigma_e_per_s[is_inside] ** 2))
+    assert sigma == pytest.approx(fit_ramp_sigma(4000.0, times, 25.0 + 1.0 / 12.0, np.sum(kernel**2)), rel=2e-3)
+    correlation = scipy.signal.correlate2d(kernel, kernel) / np.sum(kernel**2)
+    error = math.sqrt(0.5 * np.sum(correlation**2) / is_inside.sum())
+    assert fit.rate_e_per_s[is_inside].std() == pytest.approx(sigma, rel=SIGMAS * error)
+
+
+@pytest.mark.parametrize("estimate", ["ramp", "merge"])
+def test_coupled_noise_agrees_next_to_bright_sites(estimate):
+    """A neighbour of a bright site has a fraction of its charge, and the square of this fraction of its shot noise."""
+    y, x = np.divmod(np.arange(N), 200)
+    is_bright, is_next = (x % 4 == 1) & (y % 4 == 1), (x % 4 == 0) & (y % 4 == 1)
+    rate = np.where(is_bright, 20_000.0, 100.0)
+    coupling = InterPixelCapacitance(neighbour_fraction=0.03)
+    sensor = Sensor(ROW, **EXACT | {"shot_noise": "auto", "pedestal_v": 0.0}, coupling=coupling, read_noise_e=3.0)
+    if estimate == "ramp":
+        times = np.linspace(0.25, 2.0, 8)
+        found = fit_ramp(non_destructive_reads(sensor, rate, times, streams=Streams(5)).code, times, sensor)
+    else:
+        exposures_s = [0.5, 1.0, 2.0]
+        codes = [sensor.expose(rate, t_s, streams=Streams(6, k))[2] for k, t_s in enumerate(exposures_s)]
+        found = merge_exposures(codes, exposures_s, sensor)
+
+    for chosen in (is_bright & inside(), is_next & inside()):
+        ratio = found.rate_e_per_s[chosen].std() / math.sqrt(np.mean(found.sigma_e_per_s[chosen] ** 2))
+        assert ratio == pytest.approx(1.0, abs=SIGMAS * math.sqrt(0.5 / chosen.sum()))
 
 
 # -- random telegraph noise -------------------------------------------------------------------------------------------
