@@ -170,7 +170,8 @@ class Sites:
         """
         if self.known_device is None:
             raise SimulationError(
-                "a fixed pattern that differs between devices must define pattern_moments(), its mean and variance over devices"
+                "a fixed pattern that differs between devices must define pattern_moments(), its mean and variance over "
+                "devices; other effects must define moments() without a device"
             )
         return self.known_device
 
