@@ -93,6 +93,8 @@ def main(out_dir: Path) -> None:
             f"dark current {result.dark_current_e_per_s[c]:,.0f} e-/s, SNR up to {result.snr_max[c]:.1f}, dynamic range "
             f"{result.dynamic_range_db[c]:.1f} dB"
         )
+        low, high = result.intervals["qe"][c]
+        print(f"95 % confidence: QE from {low:.3f} to {high:.3f}; not resolved: {result.records()[c]['not_resolved']}")
 
     # %% Analytical prediction for some of the sites.
     some = np.concatenate([np.flatnonzero(size_um == size)[:N_PREDICTED] for size in PITCH_UM])

@@ -56,6 +56,7 @@ PER_CLASS = dict.fromkeys(
     np.ones(50),
 )  # fmt: skip
 TRANSFER = metrics.PhotonTransfer(np.arange(50), np.arange(50), np.arange(9), *(np.ones((9, 50)),) * 3)
+INTERVALS = metrics.EmvaIntervals(np.arange(50), {"qe": np.ones((50, 2)), "dsnu_e": np.zeros((50, 2))})
 BOUND = metrics.FlowBound(regions=np.arange(1000), n_sites=np.arange(50), information_per_um2=np.ones((50, 2, 2)))
 SPECTRUM = {"nyquist_per_mm": 250.0, "peak_per_mm": 1.0, "frequency_per_mm": MANY}
 
@@ -121,7 +122,7 @@ def examples(tmp_path_factory):
         modes.Shutter(SITES, 0.1), modes.Exposure(modes.Shutter(SITES, 0.1), 0.05), modes.SpikingPixels(SENSOR, threshold_e=np.full(SITES.n_sites, 100.0)),
         metrics.AliasingSpectrum(**SPECTRUM, wave_per_mm=MANY[:2], amplitude=np.ones((9, 9)), baseband_fraction=1.0, alias_fraction=0.0, alias_per_mm=MANY[:2], noise_fraction=0.0),
         metrics.nyquist_vs_eccentricity(SITES), metrics.EdgeMtf(frequency_per_mm=MANY, mtf=MANY, mtf_sigma=MANY, angle_deg=5.0, offset_um=0.0, contrast=1.0, bin_um=0.5, pitch_um=2.0, distance_um=MANY, esf=MANY, n_sites=1000),
-        metrics.Emva1288(np.arange(50), *PER_CLASS.values(), TRANSFER, TRANSFER), BOUND,
+        metrics.Emva1288(np.arange(50), *PER_CLASS.values(), TRANSFER, TRANSFER, INTERVALS), INTERVALS, BOUND,
         metrics.FlowEstimate(regions=np.arange(1000), flow_um=np.ones((50, 2)), bound=BOUND, misfit=MANY), TRANSFER,
         metrics.SamplingSpectrum(**SPECTRUM, power=np.ones((1000, 1000)), n_sites=100),
         metrics.SnrTable(**BY_CLASS, size_um=np.ones(50), signal_dn=np.ones(50), noise_dn=np.ones(50), saturated_fraction=np.ones(50)),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from foveasim.metrics.aliasing import AliasingSpectrum, SamplingSpectrum, aliasing_spectrum, sampling_spectrum
 from foveasim.metrics.emva import Emva1288, emva1288
+from foveasim.metrics.emva_intervals import EmvaIntervals
 from foveasim.metrics.flow import FlowBound, FlowEstimate, estimate_flow, flow_bound, site_gradients_e_per_um
 from foveasim.metrics.photon_transfer import PhotonTransfer, draw_frames, photon_transfer, predicted_photon_transfer
 from foveasim.metrics.pixel_mtf import polygon_mtf, polygon_otf, wave_vectors_per_mm
@@ -32,6 +33,7 @@ __all__ = [
     "EccentricityTable",
     "EdgeMtf",
     "Emva1288",
+    "EmvaIntervals",
     "FlowBound",
     "FlowEstimate",
     "PhotonTransfer",

@@ -3,13 +3,13 @@ EMVA 1288 parameters from frames of a sensor.
 
 System gain, noise, quantum efficiency, saturation, nonuniformity, linearity and dark current according to EMVA Standard 1288,
 Release 4.0 Linear (https://www.emva.org/standards-technology/emva-1288/), for sensors with a linear response. The parameters
-are computed for each class of photosites. The split of the spatial variance into rows, columns and pixels requires a grid and
-is omitted, as are the plots and histograms of the standard.
+are computed for each class of photosites, with intervals of 95 % confidence. The split of the spatial variance into rows,
+columns and pixels requires a grid and is omitted, as are the plots and histograms of the standard.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, finite_array, read_only
 from foveasim.errors import FoveasimWarning, ParameterError, type_name
+from foveasim.metrics.emva_intervals import EmvaIntervals, Jackknife
 from foveasim.metrics.photon_transfer import (
     MIN_DARK_DN2,
     PhotonTransfer,
@@ -26,7 +27,7 @@ from foveasim.metrics.photon_transfer import (
     above_dark,
     codes_of,
     is_linear,
-    photon_transfer,
+    measure_subsets,
     slopes,
 )
 from foveasim.sensor.adc import QUANTISATION_DN2
@@ -39,8 +40,16 @@ LINEARITY_FRACTIONS = (0.05, 0.95)
 PRNU_FRACTION = 0.5
 #: Largest permitted fraction of dark codes that are clipped at 0.
 MAX_UNDERFLOW_FRACTION = 0.005
+#: Largest number of blocks of sites of the jackknife: Student's distribution is then nearly Gaussian.
+N_BLOCKS = 100
+#: Signal at an SNR of 1 without dark noise, e- (the standard's approximation).
+THRESHOLD_E = 0.5
 #: Minimum number of points of a straight-line fit: exposures for the dark current, levels for the linearity error.
 MIN_POINTS = 3
+
+
+#: Parameters that follow from others.
+DERIVED = ("saturation_e", "threshold_e", "snr_max", "snr_max_db", "dynamic_range", "dynamic_range_db")
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,11 +91,21 @@ class Emva1288:
         Fraction of dark codes that are 0.
     transfer, dark : PhotonTransfer
         Photon transfer curves of the frames and the dark frames.
+    intervals : EmvaIntervals
+        95 % confidence intervals of all parameters, and whether the data resolve them.
 
     Notes
     -----
     The saturation is one of the given levels, so that its resolution is their spacing. A full well clips the fluctuations
     above it, so that the variance is highest approximately 2 standard deviations of the shot noise below the full well.
+
+    Intervals come from the jackknife over blocks of consecutive sites. They contain the parameters of the kind of sensor, of
+    which the measured sites are a sample, and assume independent blocks: errors that all sites share, such as a wrong
+    photon number or a nonlinear response, are not included. In 200 simulated sensors of 2,025 sites, 92 to 96 % of the
+    intervals contain the parameter (standard error 1.5 %). Those of saturation and linearity error are simultaneous over
+    levels, and therefore wider, 98 to 100 %; that of the saturation ends at the levels next to those that may have the highest
+    variance. Intervals of standard deviations are those of the variances: a DSNU below the temporal
+    noise of the mean has an interval from 0, whatever the estimate is.
     """
 
     classes: NDArray[Any]
@@ -107,24 +126,30 @@ class Emva1288:
     underflow_fraction: Floats
     transfer: PhotonTransfer
     dark: PhotonTransfer
+    intervals: EmvaIntervals
 
     def __repr__(self) -> str:
         return f"Emva1288({self.transfer.n_frames.size} levels, {self.classes.size} classes)"
 
     def records(self) -> list[dict[str, Any]]:
-        """Return one dict per class, with all parameters of the class."""
-        names = [f.name for f in fields(self) if f.name not in ("classes", "transfer", "dark")]
-        derived = ("saturation_e", "threshold_e", "snr_max", "snr_max_db", "dynamic_range", "dynamic_range_db")
-        columns = {name: np.asarray(getattr(self, name)).tolist() for name in (*names, *derived)}
+        """Return one dict per class, with all parameters, and in ``not_resolved`` those that the data do not resolve."""
+        others = ("classes", "transfer", "dark", "intervals")
+        names = [f.name for f in fields(self) if f.name not in others]
+        columns = {name: np.asarray(getattr(self, name)).tolist() for name in (*names, *DERIVED)}
+        unresolved = {
+            name: self.intervals.is_measured(name) & ~self.intervals.is_resolved(name) for name in self.intervals.limits
+        }
         return [
-            {"class": label, **{name: values[k] for name, values in columns.items()}}
+            {"class": label}
+            | {name: values[k] for name, values in columns.items()}
+            | {"not_resolved": ", ".join(name for name, is_unresolved in unresolved.items() if is_unresolved[k])}
             for k, label in enumerate(self.classes.tolist())
         ]
 
     def _repr_html_(self) -> str:
         from foveasim.view import to_html
 
-        return to_html(self)
+        return to_html(self) + to_html(self.intervals)
 
     @property
     def saturation_e(self) -> Floats:
@@ -205,10 +230,9 @@ def emva1288(
         if not isinstance(levels, Iterable):
             raise ParameterError(name, f"must be a list of levels, got {type_name(levels)}")
     frames, dark = list(frames), list(dark)
-    transfer = photon_transfer(frames, classes=classes)
-    dark_transfer = photon_transfer(dark, classes=classes)
-    groups = SiteClasses(classes, int(transfer.n_sites.sum()))
-    mean_dn, variance_dn2 = above_dark(transfer, dark_transfer)
+    transfer, lit, groups = measure_subsets(frames, classes=classes, n_blocks=N_BLOCKS)
+    dark_transfer, unlit, _ = measure_subsets(dark, classes=classes, n_blocks=N_BLOCKS)
+    mean_dn, _ = above_dark(transfer, dark_transfer)
     level_ph = _photons(photons, groups, len(frames))
     i_saturation, i_class = transfer.saturation_level, np.arange(transfer.classes.size)
     n_at_end = np.count_nonzero(i_saturation == len(frames) - 1)
@@ -218,57 +242,87 @@ def emva1288(
             "reached and is underestimated; add levels of higher irradiance",
             FoveasimWarning,
         )
+    # The levels are chosen once, and the parameters are computed for all subsets of sites.
     saturation_dn = mean_dn[i_saturation, i_class]
-
-    is_used = is_linear(mean_dn, i_saturation)
-    gain_dn_per_e = slopes("frames", mean_dn, variance_dn2, is_used)
-    responsivity = slopes("photons", level_ph, mean_dn, is_used)
-    qe = responsivity / gain_dn_per_e
-
-    dark_current, dark_current_from_variance, noise_dn2 = _dark_current(
-        dark_series, exposure_s, classes, gain_dn_per_e, dark_transfer.temporal_variance_dn2[0]
-    )
-    dark_noise_dn = np.sqrt(np.maximum(noise_dn2, MIN_DARK_DN2))
-
     half = np.abs(mean_dn - PRNU_FRACTION * saturation_dn).argmin(axis=0)
     dark_half = np.minimum(half, dark_transfer.n_frames.size - 1)
-    dark_spatial_dn2 = dark_transfer.spatial_variance_dn2[dark_half, i_class]
-    bright_spatial_dn2 = transfer.spatial_variance_dn2[half, i_class] - dark_spatial_dn2
-    linearity_min, linearity_max = _linearity(level_ph, mean_dn, saturation_dn)
-    parameters: dict[str, NDArray[Any]] = {
-        "classes": transfer.classes,
+    signal_dn, shot_dn2 = lit[0] - unlit[0], lit[1] - unlit[1]
+
+    is_used = is_linear(mean_dn, i_saturation)
+    gain_dn_per_e = slopes("frames", signal_dn, shot_dn2, is_used)
+    responsivity = slopes("photons", np.broadcast_to(level_ph, signal_dn.shape), signal_dn, is_used)
+    qe = responsivity / gain_dn_per_e
+    dark_current, dark_current_from_variance, noise_dn2 = _dark_current(
+        dark_series, exposure_s, classes, gain_dn_per_e, unlit[1][:, 0]
+    )
+    noise_e = np.sqrt(np.maximum(noise_dn2, MIN_DARK_DN2)) / gain_dn_per_e
+    dark_spatial_dn2 = unlit[2][:, dark_half, i_class]
+    bright_spatial_dn2 = lit[2][:, half, i_class] - dark_spatial_dn2
+    deviation, is_compared = _linearity(level_ph, signal_dn, saturation_dn)
+
+    subsets = {
         "gain_dn_per_e": gain_dn_per_e,
         "responsivity_dn_per_ph": responsivity,
         "qe": qe,
-        "dark_noise_dn": dark_noise_dn,
-        "dark_noise_e": np.sqrt(dark_noise_dn**2 - QUANTISATION_DN2) / gain_dn_per_e,
-        "is_quantisation_limited": noise_dn2 < MIN_DARK_DN2,
-        "saturation_ph": level_ph[i_saturation, i_class],
-        "threshold_ph": (dark_noise_dn / gain_dn_per_e + 0.5) / qe,
-        "linearity_error_min_fraction": linearity_min,
-        "linearity_error_max_fraction": linearity_max,
-        "dsnu_e": _standard_deviation(dark_spatial_dn2) / gain_dn_per_e,
-        "prnu_fraction": _standard_deviation(bright_spatial_dn2) / mean_dn[half, i_class],
+        "threshold_ph": (noise_e + THRESHOLD_E) / qe,
+        "threshold_e": noise_e + THRESHOLD_E,
         "dark_current_e_per_s": dark_current,
         "dark_current_from_variance_e_per_s": dark_current_from_variance,
-        "underflow_fraction": _underflow_fraction(dark[0], groups),
     }
+    #: Squares of parameters: differences of variances, which may be estimated as negative.
+    squares = {
+        "dark_noise_dn": np.maximum(noise_dn2, MIN_DARK_DN2),
+        "dark_noise_e": (np.maximum(noise_dn2, MIN_DARK_DN2) - QUANTISATION_DN2) / gain_dn_per_e**2,
+        "dsnu_e": dark_spatial_dn2 / gain_dn_per_e**2,
+        "prnu_fraction": bright_spatial_dn2 / signal_dn[:, half, i_class] ** 2,
+    }
+    underflow = _underflow_fraction(dark[0], groups)
+    estimates: dict[str, NDArray[Any]] = {
+        **{name: values[0] for name, values in subsets.items()},
+        **{name: np.sqrt(np.where(values[0] >= 0.0, values[0], np.nan)) for name, values in squares.items()},
+        "is_quantisation_limited": noise_dn2[0] < MIN_DARK_DN2,
+        "saturation_ph": level_ph[0, i_saturation, i_class],
+        "linearity_error_min_fraction": _extreme(np.min, deviation[0], is_compared),
+        "linearity_error_max_fraction": _extreme(np.max, deviation[0], is_compared),
+        "underflow_fraction": underflow[0],
+    }
+    # Without a dark level below the quantisation, the noise and the threshold have only upper limits.
+    jackknife = Jackknife(groups.n_blocks_of_class)
+    limits = {name: jackknife.interval(values, lowest=0.0) for name, values in subsets.items()}
+    limits |= {name: jackknife.interval_of_root(values) for name, values in squares.items()}
+    is_limited = estimates["is_quantisation_limited"]
+    for name in ("dark_noise_dn", "dark_noise_e"):
+        limits[name][is_limited, 0] = 0.0
+    limits["threshold_e"][is_limited, 0] = THRESHOLD_E
+    limits["threshold_ph"][is_limited, 0] = THRESHOLD_E / limits["qe"][is_limited, 1]
+    extremes = jackknife.interval_of_extremes(deviation, is_compared)
+    limits["linearity_error_min_fraction"], limits["linearity_error_max_fraction"] = extremes
+    limits["saturation_ph"] = _saturation_limits(level_ph[0], jackknife.candidates(lit[1]))
+    limits["underflow_fraction"] = jackknife.interval_of_fraction(underflow, groups.n_sites, len(dark[0]))
+    limits |= _derived_limits(limits)
+    names = [f.name for f in fields(Emva1288)]
     return Emva1288(
-        **{name: read_only(values) for name, values in parameters.items()}, transfer=transfer, dark=dark_transfer
+        **{name: read_only(estimates[name]) for name in names if name in estimates},
+        classes=transfer.classes,
+        transfer=transfer,
+        dark=dark_transfer,
+        intervals=EmvaIntervals(
+            transfer.classes, {name: read_only(limits[name]) for name in (*names, *DERIVED) if name in limits}
+        ),
     )
 
 
 def _photons(photons: ArrayLike, groups: SiteClasses, n_levels: int) -> Floats:
-    """Return the mean photons per site of each level and class, (n_level, n_class)."""
+    """Return the mean photons per site of each subset, level and class, (1 + n_block, n_level, n_class) or (1, ...)."""
     values = finite_array("photons", photons, at_least=0.0)
     n_sites = int(groups.n_sites.sum())
     if values.shape == (n_levels,):
-        level_ph = np.repeat(values[:, None], groups.n_sites.size, axis=1)
+        level_ph = np.repeat(values[None, :, None], groups.n_sites.size, axis=2)
     elif values.shape == (n_levels, n_sites):
-        level_ph = np.stack([groups.mean(level) for level in values])
+        level_ph = np.stack([groups.subset_means(level) for level in values], axis=1)
     else:
         raise ParameterError("photons", f"must have shape ({n_levels},) or ({n_levels}, {n_sites})", values.shape)
-    if np.any(np.diff(level_ph, axis=0) <= 0.0):
+    if np.any(np.diff(level_ph[0], axis=0) <= 0.0):
         raise ParameterError("photons", "must increase from level to level in every class", hint="sort the levels")
     return level_ph
 
@@ -283,13 +337,13 @@ def _dark_current(
     """
     Return the dark currents from mean and variance, and the variance at exposure 0.
 
-    Dark currents are (n_class,) in e-/s, variances (n_class,) in DN².
+    Dark currents are (1 + n_block, n_class) in e-/s, variances (1 + n_block, n_class) in DN².
     """
     if dark_series is None and exposure_s is None:
         return np.full_like(gain_dn_per_e, np.nan), np.full_like(gain_dn_per_e, np.nan), noise_dn2
     if dark_series is None or exposure_s is None:
         raise ParameterError("dark_series", "must be given together with exposure_s")
-    series = photon_transfer(dark_series, classes=classes)
+    series, (mean_dn, variance_dn2, _), _ = measure_subsets(dark_series, classes=classes, n_blocks=N_BLOCKS)
     times_s = finite_array("exposure_s", exposure_s, ndim=1, at_least=0.0)
     if times_s.size != series.n_frames.size or np.unique(times_s).size < MIN_POINTS:
         raise ParameterError(
@@ -299,43 +353,73 @@ def _dark_current(
             "s",
         )
     off_s = times_s - times_s.mean()
-    mean_slope = off_s @ series.mean_dn / (off_s @ off_s)
-    variance_slope = off_s @ series.temporal_variance_dn2 / (off_s @ off_s)
-    at_zero_dn2 = series.temporal_variance_dn2.mean(axis=0) - variance_slope * times_s.mean()
+    mean_slope, variance_slope = (
+        np.tensordot(off_s, values, axes=(0, 1)) / (off_s @ off_s) for values in (mean_dn, variance_dn2)
+    )
+    at_zero_dn2 = variance_dn2.mean(axis=1) - variance_slope * times_s.mean()
     return mean_slope / gain_dn_per_e, variance_slope / gain_dn_per_e**2, at_zero_dn2
 
 
-def _linearity(level_ph: Floats, mean_dn: Floats, saturation_dn: Floats) -> tuple[Floats, Floats]:
-    """Return the extreme relative deviations from a line fitted with weights 1 / signal²."""
-    lowest, highest = np.full_like(saturation_dn, np.nan), np.full_like(saturation_dn, np.nan)
-    for c, full_dn in enumerate(saturation_dn):
-        y = mean_dn[:, c]
-        level = np.arange(y.size)
-        # From the first level above the lower limit to the last level below the upper one.
-        is_above, is_below = y >= LINEARITY_FRACTIONS[0] * full_dn, y <= LINEARITY_FRACTIONS[1] * full_dn
-        first = np.where(is_above, level, y.size).min()
-        last = np.where(is_below, level, -1).max()
-        chosen = slice(first, last + 1)
-        x, y = level_ph[chosen, c], y[chosen]
-        if y.size < MIN_POINTS or y.min() <= 0.0 or np.ptp(x) == 0.0:
-            continue
-        slope, offset = np.linalg.lstsq(np.column_stack((x / y, 1.0 / y)), np.ones(y.size), rcond=None)[0]
-        deviation = y / (slope * x + offset) - 1.0
-        lowest[c], highest[c] = deviation.min(), deviation.max()
-    return lowest, highest
+def _linearity(level_ph: Floats, signal_dn: Floats, saturation_dn: Floats) -> tuple[Floats, Bools]:
+    """
+    Return the relative deviations from a line fitted with weights 1 / signal².
+
+    Of each subset, level and class, (1 + n_block, n_level, n_class); and whether a level is fitted, (n_level, n_class).
+    """
+    y, x = signal_dn, np.broadcast_to(level_ph, signal_dn.shape)
+    n_levels, level = y.shape[1], np.arange(y.shape[1])[:, None]
+    # From the first level above the lower limit to the last level below the upper one.
+    low, high = (fraction * saturation_dn for fraction in LINEARITY_FRACTIONS)
+    first = np.where(y[0] >= low, level, n_levels).min(axis=0)
+    last = np.where(y[0] <= high, level, -1).max(axis=0)
+    is_used = (level >= first) & (level <= last)
+    span_ph = np.where(is_used, x[0], -np.inf).max(axis=0) - np.where(is_used, x[0], np.inf).min(axis=0)
+    is_used &= (is_used.sum(axis=0) >= MIN_POINTS) & (span_ph > 0.0) & ~np.any(is_used & (y[0] <= 0.0), axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):  # levels and classes that are not used
+        # Least squares of slope * u + offset * v - 1 by the normal equations, with columns of similar size.
+        scale_ph, scale_dn = (np.where(is_used, values, 0.0).max(axis=1, keepdims=True) for values in (x, y))
+        u, v = (np.where(is_used, ratio, 0.0) for ratio in (x / scale_ph * (scale_dn / y), scale_dn / y))
+        uu, uv, vv, u1, v1 = ((p * q).sum(axis=1, keepdims=True) for p, q in ((u, u), (u, v), (v, v), (u, 1), (v, 1)))
+        slope, offset = (u1 * vv - v1 * uv) / (uu * vv - uv * uv), (v1 * uu - u1 * uv) / (uu * vv - uv * uv)
+        return y / (scale_dn * (slope * x / scale_ph + offset)) - 1.0, is_used
 
 
-def _standard_deviation(variance_dn2: Floats) -> Floats:
-    """Return the standard deviation in DN; NaN for a negative variance estimate."""
-    return np.sqrt(np.where(variance_dn2 >= 0.0, variance_dn2, np.nan))
+def _extreme(function: Callable[..., Floats], deviation: Floats, is_used: Bools) -> Floats:
+    """Return the smallest or largest deviation of the used levels, (n_class,), NaN without levels."""
+    initial = np.inf if function is np.min else -np.inf
+    found = function(deviation, axis=0, where=is_used, initial=initial)
+    return np.where(is_used.any(axis=0), found, np.nan)
+
+
+def _saturation_limits(level_ph: Floats, may_be_highest: Bools) -> Floats:
+    """Return the levels next to those that may have the highest variance, (n_class, 2); 0 and infinity at the ends."""
+    n_levels = level_ph.shape[0]
+    around = np.concatenate((np.zeros_like(level_ph[:1]), level_ph, np.full_like(level_ph[:1], np.inf)))
+    i_class = np.arange(level_ph.shape[1])
+    first, last = may_be_highest.argmax(axis=0), n_levels - 1 - may_be_highest[::-1].argmax(axis=0)
+    return np.stack((around[first, i_class], around[last + 2, i_class]), axis=-1)
+
+
+def _derived_limits(limits: dict[str, Floats]) -> dict[str, Floats]:
+    """Return the limits of parameters that follow from others: of products and ratios, those of their factors."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # infinite saturation, threshold 0
+        saturation_e = limits["qe"] * limits["saturation_ph"]
+        dynamic_range = limits["saturation_ph"] / limits["threshold_ph"][:, ::-1]
+        return {
+            "saturation_e": saturation_e,
+            "snr_max": np.sqrt(saturation_e),
+            "snr_max_db": 10.0 * np.log10(saturation_e),
+            "dynamic_range": dynamic_range,
+            "dynamic_range_db": 20.0 * np.log10(dynamic_range),
+        }
 
 
 def _underflow_fraction(dark: Any, groups: SiteClasses) -> Floats:
-    """Return the fraction of codes that are 0; warn if it is too large."""
-    fraction = groups.mean((codes_of("dark[0]", dark) == 0).mean(axis=0))
-    if fraction.max() > MAX_UNDERFLOW_FRACTION:
+    """Return the fraction of codes that are 0, (1 + n_block, n_class); warn if it is too large."""
+    fraction = groups.subset_means((codes_of("dark[0]", dark) == 0).mean(axis=0))
+    if fraction[0].max() > MAX_UNDERFLOW_FRACTION:
         warn(
-            f"{100 * fraction.max():.1f} % of the dark codes are 0, which clips the noise: dark noise and DSNU are "
+            f"{100 * fraction[0].max():.1f} % of the dark codes are 0, which clips the noise: dark noise and DSNU are "
             "underestimated; raise the dark level above 0, for example by a pedestal",
             FoveasimWarning,
         )

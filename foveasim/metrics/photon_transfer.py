@@ -43,6 +43,7 @@ __all__ = [
     "codes_of",
     "draw_frames",
     "is_linear",
+    "measure_subsets",
     "photon_transfer",
     "predicted_photon_transfer",
     "slopes",
@@ -179,9 +180,21 @@ class PhotonTransfer:
 
 
 class SiteClasses:
-    """Class labels of sites, and statistics over the sites of each class."""
+    """
+    Class labels of sites, and statistics over the sites of each class.
 
-    def __init__(self, classes: ArrayLike | None, n_sites: int) -> None:
+    With ``n_blocks``, each class is divided into at most this number of blocks of consecutive sites, and statistics of subsets
+    are those of all sites, and of all sites without one of the blocks, for the jackknife.
+
+    Attributes
+    ----------
+    labels, n_sites : (n_class,)
+        Labels, sorted, and sites of each class.
+    class_index : (n_site,) int64
+    n_blocks_of_class : (n_class,) int64
+    """
+
+    def __init__(self, classes: ArrayLike | None, n_sites: int, n_blocks: int = 0) -> None:
         labels = np.zeros(n_sites, np.int64) if classes is None else np.asarray(unmasked("classes", classes))
         if labels.shape != (n_sites,):
             raise ParameterError("classes", f"must have one label for each of the {n_sites} sites, got {labels.shape}")
@@ -190,6 +203,33 @@ class SiteClasses:
         if self.n_sites.min(initial=n_sites) < 2:
             few = self.labels[self.n_sites < 2].tolist()
             raise ParameterError("classes", "must have at least two sites each", few)
+        self._n_blocks = n_blocks
+        self.n_blocks_of_class = np.minimum(max(n_blocks, 1), self.n_sites)
+        order = np.argsort(self.class_index, kind="stable")
+        first = np.concatenate(([0], np.cumsum(self.n_sites)))
+        rank = np.empty(n_sites, np.int64)
+        rank[order] = np.arange(n_sites) - first[self.class_index[order]]
+        block = rank * self.n_blocks_of_class[self.class_index] // self.n_sites[self.class_index]
+        self._block_of_site = self.class_index * max(n_blocks, 1) + block
+        self._subset_sizes = self._subset_sums(np.ones(n_sites))
+
+    def _subset_sums(self, values: Floats) -> Floats:
+        """Compute the sums over the subsets of each class: (1 + n_block, n_class) from (n_site,)."""
+        shape = self.n_sites.size, max(self._n_blocks, 1)
+        of_blocks = np.bincount(self._block_of_site, weights=values, minlength=shape[0] * shape[1]).reshape(shape).T
+        total = of_blocks.sum(axis=0)
+        return np.concatenate((total[None], total - of_blocks)) if self._n_blocks else total[None]
+
+    def subset_means(self, values: Floats) -> Floats:
+        """Compute the means over the subsets of each class: (1 + n_block, n_class) from (n_site,)."""
+        return self._subset_sums(values) / self._subset_sizes
+
+    def subset_variances(self, values: Floats) -> Floats:
+        """Compute the sample variances over the subsets of each class: (1 + n_block, n_class) from (n_site,)."""
+        off = values - self.mean(values)[self.class_index]
+        with np.errstate(divide="ignore", invalid="ignore"):  # subsets of one site
+            correction = self._subset_sizes / (self._subset_sizes - 1.0)
+            return (self.subset_means(off * off) - self.subset_means(off) ** 2) * correction
 
     def mean(self, values: Floats) -> Floats:
         """Compute the mean over the sites of each class: (n_class,) from (n_site,)."""
@@ -291,21 +331,38 @@ def photon_transfer(
         if expected_e is None or seed is None:
             raise ParameterError("expected_e" if expected_e is None else "seed", "must be given for a sensor")
         sensor, n_frames = source, check_count("n_frames", n_frames, at_least=2)
-        groups = SiteClasses(classes, sensor.layout.n_sites)
-        measured = [
-            _statistics(
-                draw_frames(
-                    sensor, level_e, n_frames=n_frames, seed=seed, first_frame=k * n_frames, n_threads=n_threads
-                ),
-                groups,
-            )
+        frames = (
+            draw_frames(sensor, level_e, n_frames=n_frames, seed=seed, first_frame=k * n_frames, n_threads=n_threads)
             for k, level_e in enumerate(_levels(expected_e, sensor.layout.n_sites))
-        ]
-        return _transfer(groups, [n_frames] * len(measured), measured)
+        )
+        return measure_subsets(frames, classes=classes)[0]
     if expected_e is not None or seed is not None:
         raise ParameterError(
             "expected_e" if seed is None else "seed", "must not be given with frames; omit it, or give a sensor"
         )
+    return measure_subsets(source, classes=classes)[0]
+
+
+def measure_subsets(
+    source: Iterable[Any], *, classes: ArrayLike | None = None, n_blocks: int = 0
+) -> tuple[PhotonTransfer, tuple[Floats, Floats, Floats], SiteClasses]:
+    """
+    Compute the photon transfer of frames, for all sites and without each block of sites.
+
+    Parameters
+    ----------
+    source, classes
+        As for :func:`photon_transfer`.
+    n_blocks : int
+        Largest number of blocks of each class, 0 for none.
+
+    Returns
+    -------
+    transfer : PhotonTransfer
+    subsets : tuple of (1 + n_block, n_level, n_class) float64
+        Mean, temporal and spatial variance: first of all sites, then without each block.
+    groups : SiteClasses
+    """
     measured, counts, n_sites = [], [], None
     if not isinstance(source, Iterable):
         raise ParameterError("source", f"must be a foveasim.Sensor or a list of levels, got {type_name(source)}")
@@ -313,14 +370,16 @@ def photon_transfer(
         codes = codes_of(f"frames[{k}]", frames)
         if n_sites is None:
             n_sites = codes.shape[1]
-            groups = SiteClasses(classes, n_sites)
+            groups = SiteClasses(classes, n_sites, n_blocks)
         if codes.shape[1] != n_sites:
             raise ParameterError(f"frames[{k}]", f"must have {n_sites} sites, as the first level", codes.shape[1])
         measured.append(_statistics(codes, groups))
         counts.append(codes.shape[0])
     if n_sites is None:
         raise ParameterError("frames", "must have at least one level")
-    return _transfer(groups, counts, measured)
+    mean_dn, temporal_dn2, spatial_dn2 = (np.stack(values, axis=1) for values in zip(*measured, strict=True))
+    levels_dn = [(mean_dn[0, k], temporal_dn2[0, k], spatial_dn2[0, k]) for k in range(len(measured))]
+    return _transfer(groups, counts, levels_dn), (mean_dn, temporal_dn2, spatial_dn2), groups
 
 
 def predicted_photon_transfer(
@@ -378,21 +437,19 @@ def codes_of(name: str, frames: Any) -> NDArray[Any]:
 
 
 def _statistics(codes: NDArray[Any], groups: SiteClasses) -> tuple[Floats, Floats, Floats]:
-    """Compute mean, temporal variance and spatial variance of each class."""
+    """Compute mean, temporal and spatial variance of the subsets of each class, (1 + n_block, n_class)."""
     n_frames = codes.shape[0]
     mean_dn = codes.mean(axis=0, dtype=np.float64)
     off = codes - mean_dn
-    stack_dn2 = groups.mean((off * off).sum(axis=0) / (n_frames - 1))
-    frame_means_dn = np.array([groups.mean(row) for row in off])
+    stack_dn2 = groups.subset_means((off * off).sum(axis=0) / (n_frames - 1))
+    frame_means_dn = np.array([groups.subset_means(row) for row in off])
     temporal_dn2 = stack_dn2 - frame_means_dn.var(axis=0, ddof=1)
-    return groups.mean(mean_dn), temporal_dn2, groups.variance(mean_dn) - stack_dn2 / n_frames
+    return groups.subset_means(mean_dn), temporal_dn2, groups.subset_variances(mean_dn) - stack_dn2 / n_frames
 
 
 def _transfer(
     groups: SiteClasses, n_frames: Sequence[int], levels_dn: Sequence[tuple[Floats, Floats, Floats]]
 ) -> PhotonTransfer:
-    if not levels_dn:
-        raise ParameterError("expected_e", "must have at least one level")
     mean_dn, temporal_dn2, spatial_dn2 = (np.stack(values) for values in zip(*levels_dn, strict=True))
     return PhotonTransfer(
         classes=read_only(groups.labels),
@@ -419,7 +476,9 @@ def _levels(expected_e: Sequence[ArrayLike] | Floats, n_sites: int) -> list[Floa
         n_levels = len(expected_e)
     except TypeError:
         raise ParameterError("expected_e", "must be a list of levels", expected_e, "e-") from None
-    if np.ndim(expected_e[0] if n_levels else 0) > 1:
+    if not n_levels:
+        raise ParameterError("expected_e", "must have at least one level")
+    if np.ndim(expected_e[0]) > 1:
         raise ParameterError("expected_e", "must have shape (n_level,) or (n_level, n_site)")
     return [_level(f"expected_e[{k}]", level_e, n_sites) for k, level_e in enumerate(expected_e)]
 
@@ -447,10 +506,10 @@ def is_linear(mean_dn: Floats, saturation_level: Ints) -> NDArray[np.bool_]:
 
 
 def slopes(name: str, x: Floats, y: Floats, is_used: NDArray[np.bool_]) -> Floats:
-    """Fit lines through the origin to (n_level, n_class) values; return slopes (n_class,)."""
-    squares = np.where(is_used, x * x, 0.0).sum(axis=0)
+    """Fit lines through the origin to (..., n_level, n_class) values; return slopes (..., n_class)."""
+    squares = np.where(is_used, x * x, 0.0).sum(axis=-2)
     if not np.all(squares > 0.0):
         raise ParameterError(
             name, "must have a signal below 70 % of saturation for every class", hint="add levels of lower irradiance"
         )
-    return np.asarray(np.where(is_used, x * y, 0.0).sum(axis=0) / squares)
+    return np.asarray(np.where(is_used, x * y, 0.0).sum(axis=-2) / squares)

@@ -7,10 +7,13 @@ import math
 import numpy as np
 import pytest
 import scipy.constants
+import scipy.stats
 
 import foveasim as fs
 from foveasim.errors import FoveasimWarning, ParameterError
 from foveasim.metrics import PhotonTransfer, draw_frames, emva1288, photon_transfer, predicted_photon_transfer
+from foveasim.metrics.emva_intervals import Jackknife
+from foveasim.metrics.photon_transfer import measure_subsets
 from foveasim.sensor import Sensor, noise_budget
 from foveasim.units import photon_energy_j
 
@@ -333,6 +336,155 @@ def test_emva_result_is_independent_of_threads():
     assert np.array_equal(one.transfer.temporal_variance_dn2, two.transfer.temporal_variance_dn2)
 
 
+# -- confidence intervals ---------------------------------------------------------------------------------------------------
+
+#: Two kinds of sites in each of 200 sensors, which differ in the DSNU: 40 e- and far below the noise of the mean.
+N_SENSORS, N_OF_KIND = 200, 400
+KINDS = np.repeat([0, 1], N_OF_KIND)
+KIND = {"gain": 0.5, "qe": 0.6, "read_e": 8.0, "prnu": 0.03, "well_e": 9000.0, "dark_e": 400.0, "dark_s": 0.1}
+KIND_DSNU_E = np.array([40.0, 0.2])
+KIND_PH = np.linspace(800.0, 20_000.0, 25)
+KIND_SERIES_S = np.array([0.02, 0.06, 0.1])
+
+
+def simulated_parameters(seed):
+    """Frames of a new sensor from numpy alone, on a pedestal of 100 DN; codes are integers."""
+    rng = np.random.default_rng(seed)
+    response = KIND["qe"] * (1.0 + KIND["prnu"] * rng.standard_normal(KINDS.size))
+    dark_e_per_s = (KIND["dark_e"] + KIND_DSNU_E[KINDS] * rng.standard_normal(KINDS.size)) / KIND["dark_s"]
+
+    def frames(n, photons, time_s):
+        charge = np.minimum(rng.poisson(photons * response + dark_e_per_s * time_s, (n, KINDS.size)), KIND["well_e"])
+        return np.floor(100.0 + KIND["gain"] * (charge + KIND["read_e"] * rng.standard_normal(charge.shape)))
+
+    lit = [frames(4 if 0.4 < p / 14_300 < 0.6 else 2, p, KIND["dark_s"]) for p in KIND_PH]
+    dark = [frames(6, 0.0, KIND["dark_s"])]
+    series = [frames(6, 0.0, t) for t in KIND_SERIES_S]
+    return emva1288(lit, dark, KIND_PH, classes=KINDS, dark_series=series, exposure_s=KIND_SERIES_S)
+
+
+@pytest.fixture(scope="module")
+def sensors():
+    return [simulated_parameters(seed) for seed in range(N_SENSORS)]
+
+
+#: Parameters with an interval that is neither simultaneous nor one-sided, and their values.
+KIND_NOISE_DN2 = (KIND["gain"] * KIND["read_e"]) ** 2 + 1 / 12
+KIND_THRESHOLD_E = math.sqrt(KIND_NOISE_DN2) / KIND["gain"] + 0.5
+EXACT = {
+    "gain_dn_per_e": KIND["gain"],
+    "responsivity_dn_per_ph": KIND["gain"] * KIND["qe"],
+    "qe": KIND["qe"],
+    "dark_noise_dn": math.sqrt(KIND_NOISE_DN2),
+    "dark_noise_e": KIND["read_e"],
+    "threshold_e": KIND_THRESHOLD_E,
+    "threshold_ph": KIND_THRESHOLD_E / KIND["qe"],
+    "prnu_fraction": KIND["prnu"],
+    "dark_current_e_per_s": KIND["dark_e"] / KIND["dark_s"],
+    "dark_current_from_variance_e_per_s": KIND["dark_e"] / KIND["dark_s"],
+}
+
+
+def coverage(sensors, name, true, kind=0):
+    limits = np.array([each.intervals[name][kind] for each in sensors])
+    return np.mean((limits[:, 0] <= true) & (true <= limits[:, 1]))
+
+
+#: Five standard errors of a fraction of 95 %.
+COVERAGE_ERROR = SIGMAS * math.sqrt(0.95 * 0.05 / N_SENSORS)
+
+
+@pytest.mark.parametrize(("name", "true"), [*EXACT.items(), ("dsnu_e", KIND_DSNU_E[0])])
+def test_intervals_contain_parameter_with_stated_probability(sensors, name, true):
+    assert coverage(sensors, name, true) >= 0.95 - COVERAGE_ERROR
+    # They are not wider than required: 1.96 times the standard deviation of the estimates, known to 5 %.
+    half = np.mean([np.ptp(each.intervals[name][0]) / 2.0 for each in sensors])
+    spread = np.std([getattr(each, name)[0] for each in sensors])
+    assert half / (1.96 * spread) == pytest.approx(1.0, abs=0.05 * SIGMAS + 0.03)
+    assert all(each.intervals.is_resolved(name)[0] for each in sensors)
+
+
+def test_simultaneous_intervals_contain_parameters(sensors):
+    for name in ("linearity_error_min_fraction", "linearity_error_max_fraction", "underflow_fraction"):
+        assert coverage(sensors, name, 0.0) >= 0.95 - COVERAGE_ERROR, name
+    # The variance of min(Poisson charge, full well), with the PRNU by quadrature, is highest at the saturation.
+    nodes, weights = np.polynomial.hermite_e.hermegauss(8)
+    photons = np.arange(12_000.0, 14_500.0, 50.0)
+    mean_e = photons[:, None] * KIND["qe"] * (1.0 + KIND["prnu"] * nodes) + KIND["dark_e"]
+    # E X = Σ P(X > k) and E X² = Σ (2 k + 1) P(X > k), for the excess over a charge that all sites have.
+    least_e = 5000.0
+    excess_e = np.arange(KIND["well_e"] - least_e)
+    above = scipy.stats.poisson.sf(least_e + excess_e, mean_e[..., None])
+    variance_e2 = above @ (2.0 * excess_e + 1.0) - above.sum(axis=-1) ** 2
+    saturation_ph = photons[(variance_e2 @ weights).argmax()]
+    saturation_e = KIND["qe"] * saturation_ph
+    for name, true in {
+        "saturation_ph": saturation_ph,
+        "saturation_e": saturation_e,
+        "snr_max": math.sqrt(saturation_e),
+        "snr_max_db": 10.0 * math.log10(saturation_e),
+        "dynamic_range": saturation_e / KIND_THRESHOLD_E,
+        "dynamic_range_db": 20.0 * math.log10(saturation_e / KIND_THRESHOLD_E),
+    }.items():
+        assert coverage(sensors, name, true) >= 0.95 - COVERAGE_ERROR, name
+    # They are a few levels wide: variances of 400 sites have errors of 7 %, and levels are 5.6 % apart.
+    assert np.mean([np.ptp(each.intervals["saturation_ph"][0]) for each in sensors]) < 0.5 * saturation_ph
+
+
+def test_dsnu_below_noise_is_not_resolved(sensors):
+    """The noise of the mean of six frames is 9 e-; a standard deviation of 0.2 e- is lost in its sample variance."""
+    estimates = np.array([each.dsnu_e[1] for each in sensors])
+    is_resolved = np.array([each.intervals.is_resolved("dsnu_e")[1] for each in sensors])
+    limits = np.array([each.intervals["dsnu_e"][1] for each in sensors])
+
+    # Half of the variances are estimated as negative, and the others are far too large.
+    assert np.nanmax(estimates) > 8.0 * KIND_DSNU_E[1]
+    assert np.isnan(estimates).sum() == pytest.approx(0.5 * N_SENSORS, abs=SIGMAS * math.sqrt(0.25 * N_SENSORS))
+    assert is_resolved.mean() < 0.025 + SIGMAS * math.sqrt(0.025 / N_SENSORS)
+    assert np.all(limits[~is_resolved, 0] == 0.0)
+    assert coverage(sensors, "dsnu_e", KIND_DSNU_E[1], kind=1) >= 0.95 - COVERAGE_ERROR
+    unresolved = sensors[int(np.flatnonzero(~is_resolved)[0])]
+    assert "dsnu_e" in unresolved.records()[1]["not_resolved"].split(", ")
+    assert "dsnu_e" not in unresolved.records()[0]["not_resolved"].split(", ")
+    row = next(r for r in unresolved.intervals.records() if (r["class"], r["parameter"]) == (1, "dsnu_e"))
+    assert (row["low"], row["is_resolved"]) == (0.0, False)
+    assert "dsnu_e" in repr(unresolved.intervals)
+
+
+def test_jackknife_of_mean_is_error_of_blocks():
+    """The error of a mean is the standard deviation of the means of equal blocks over the root of their number."""
+    rng = np.random.default_rng(0)
+    frames = rng.normal(100.0, 5.0, (2, 1200))
+    _, (mean, _, spatial), groups = measure_subsets([frames], classes=np.arange(1200) % 2, n_blocks=50)
+    of_sites = frames.mean(axis=0)
+
+    error = Jackknife(groups.n_blocks_of_class).error(mean)
+    for kind in (0, 1):
+        blocks = of_sites[kind::2].reshape(50, 12).mean(axis=1)
+        assert error[0, kind] == pytest.approx(blocks.std(ddof=1) / math.sqrt(50.0), rel=1e-9)
+        without = np.delete(of_sites[kind::2].reshape(50, 12), 7, axis=0)
+        assert mean[8, 0, kind] == pytest.approx(without.mean(), rel=1e-12)
+        noise = np.delete(frames[:, kind::2].reshape(2, 50, 12), 7, axis=1).var(axis=0, ddof=1).mean()
+        assert spatial[8, 0, kind] == pytest.approx(without.var(ddof=1) - noise / 2.0, rel=1e-9)
+
+
+def test_parameters_without_data_have_no_limits(result):
+    faint = LEVELS_PH < 2500.0
+    frames, dark = frames_at_five_e_per_dn(LEVELS_PH[faint]), frames_at_five_e_per_dn([0.0])
+    with pytest.warns(FoveasimWarning, match="saturation is not reached"):
+        short = emva1288(frames, dark, LEVELS_PH[faint])
+
+    assert not short.intervals.is_measured("dark_current_e_per_s")[0]
+    assert "dark_current_e_per_s" not in [row["parameter"] for row in short.intervals.records()]
+    # The full well may be anywhere above the last levels.
+    assert short.intervals["saturation_ph"][0, 1] == math.inf
+    assert not short.intervals.is_resolved("dynamic_range")[0]
+    assert set(result.intervals.limits) >= {"gain_dn_per_e", "saturation_e", "snr_max_db", "prnu_fraction"}
+    assert all(limits.shape == (2, 2) for limits in result.intervals.limits.values())
+    with pytest.raises(ParameterError, match=r"'name' must be a parameter, got 'dsnu'; did you mean 'dsnu_e'"):
+        result.intervals["dsnu"]
+
+
 # -- photon transfer ------------------------------------------------------------------------------------------------------
 
 GRID = fs.layout.grid(n_x=200, n_y=200, pitch_um=2.0)
@@ -471,6 +623,10 @@ def test_quantisation_dominates_with_eight_bits():
     ]
     result = emva1288(frames, [draw_frames(sensor, 10.5 * code_e, seed=9)], light)
     assert result.is_quantisation_limited[0]
+    # Only upper limits of the noise and the threshold, which is 0.5 e- without noise.
+    assert (result.intervals["dark_noise_e"][0, 0], result.intervals["threshold_e"][0, 0]) == (0.0, 0.5)
+    assert result.intervals["dark_noise_e"][0, 1] > result.dark_noise_e[0]
+    assert not result.intervals.is_resolved("dark_noise_e")[0]
     assert result.dark_noise_e[0] == pytest.approx(math.sqrt(0.24 - 1 / 12) / result.gain_dn_per_e[0])
 
 
@@ -569,8 +725,11 @@ def test_results_have_repr_and_are_immutable(result):
     assert [row["dynamic_range_db"] for row in rows] == result.dynamic_range_db.tolist()
     assert "saturation / photons" in result._repr_html_()
     assert repr(result.transfer) == "PhotonTransfer(52 levels, 2 classes of 70000 sites)"
-    with pytest.raises(ValueError, match="read-only"):
-        result.qe[0] = 1.0
+    assert "dsnu_e" in result._repr_html_()
+    assert repr(result.intervals).startswith("EmvaIntervals(20 parameters, 2 classes")
+    for values in (result.qe, result.intervals["qe"]):
+        with pytest.raises(ValueError, match="read-only"):
+            values[0] = 1.0
     with pytest.raises(ParameterError, match="shape"):
         PhotonTransfer(
             *(getattr(result.transfer, n) for n in ("classes", "n_sites", "n_frames")), *[np.zeros((1, 2))] * 3
