@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.extras import import_optional
 from foveasim._core.provenance import copy_plain_data, to_plain_data, versions
-from foveasim._core.validation import Floats, check_count, check_number, finite_array, read_only
+from foveasim._core.validation import Floats, Images, check_count, check_number, finite_array, read_only
 from foveasim.camera import Camera
 from foveasim.compare.annuli import PictureQuality, quality_by_eccentricity
 from foveasim.compare.budgets import BUDGETS, Budget, budget_of, check_equal_budgets
@@ -49,8 +49,8 @@ Method = Literal["cells", "linear", "natural", "least_squares"]
 
 #: Coverage from which a pixel belongs to a camera's picture.
 MIN_COVERAGE = 0.5
-#: Cells of the images for shifts per picture pixel, and margin in picture pixels.
-FINE_CELLS, MARGIN_PIXELS = 2, 4
+#: Images whose covariance is fitted: pixels per side of the smallest site, smallest and largest number along the field.
+SITE_PIXELS, MIN_FIELD_PIXELS, MAX_FIELD_PIXELS = 4, 256, 2048
 #: Frequency of the waves for aliases, in Nyquist frequencies of a square grid; relative margin of the outermost annulus.
 WAVE_NYQUISTS, EDGE_ROUNDING = 1.5, 1e-9
 BY_ECCENTRICITY = "_by_eccentricity"
@@ -356,13 +356,13 @@ def cameras(
             progress(n_done, n_steps)
 
     field = _field(all_layouts, fixation, n_annuli, max_pixels)
-    shots = _simulate(named, scenes, field, exposure_s, seed, method, advance)
+    shots, irradiance = _simulate(named, scenes, field, exposure_s, seed, method, advance)
     covered = {name: one.pictures[0].coverage >= MIN_COVERAGE for name, one in shots.items()}
     is_common, is_field = (combine([*covered.values()], axis=0) for combine in (np.all, np.any))
     if not is_common.any():
         raise ParameterError("cameras", "must have a common part of the field; the layouts do not overlap")
     ideal = shots[first_name].ideal
-    covariance = scene_covariance([np.mean(picture.data, axis=0) for picture in ideal], field.grid.pitch_x_um)
+    covariance = scene_covariance(np.array(irradiance), field.covariance_grid.pitch_x_um)
     density_per_um2 = budgets[first_name].n_sites / budgets[first_name].area_um2
     wave_per_mm = WAVE_NYQUISTS * float(per_mm_from_per_um(0.5 * np.sqrt(density_per_um2)))
     values: dict[str, list[Any]] = {key: [] for name in MEASURES for key in (name, name + BY_ECCENTRICITY)}
@@ -425,12 +425,12 @@ def cameras(
 
 
 class _Field(NamedTuple):
-    """Fixation point, annuli, and the grids of pictures and of images for shifts."""
+    """Fixation point, annuli, and the grids of pictures and of images for their covariance."""
 
     centre_um: tuple[float, float]
     edges_um: Floats
     grid: Grid
-    fine_grid: Grid
+    covariance_grid: Grid
 
 
 class _Shots(NamedTuple):
@@ -445,12 +445,14 @@ def _field(all_layouts: Sequence[Layout], centre_um: tuple[float, float], n_annu
     """Return the common field of layouts."""
     bounds_um = np.array([layout.bounds_um for layout in all_layouts])
     low, high = bounds_um[:, :2].min(axis=0), bounds_um[:, 2:].max(axis=0)
+    site_um = min(math.sqrt(float(layout.area_um2.min())) for layout in all_layouts)
+    n_pixels = math.ceil(SITE_PIXELS * float((high - low).max()) / site_um)
     reach_um = max(float(np.hypot(*(layout.centroid_um - centre_um).T).max()) for layout in all_layouts)
     return _Field(
         centre_um,
         np.linspace(0.0, reach_um * (1.0 + EDGE_ROUNDING), n_annuli + 1),
-        _grid(low, high, max_pixels, 0),
-        _grid(low, high, FINE_CELLS * max_pixels, FINE_CELLS * MARGIN_PIXELS),
+        _grid(low, high, max_pixels),
+        _grid(low, high, min(max(n_pixels, MIN_FIELD_PIXELS), MAX_FIELD_PIXELS)),
     )
 
 
@@ -462,24 +464,29 @@ def _simulate(
     seed: int,
     method: Method,
     advance: Callable[[], None],
-) -> dict[str, _Shots]:
-    """Capture all scenes with all cameras, and reconstruct the pictures on the common grid."""
+) -> tuple[dict[str, _Shots], list[Images]]:
+    """
+    Capture all scenes with all cameras, and reconstruct the pictures on the common grid.
+
+    Also return the mean irradiance of each scene over the colour filters of the first camera, on the grid for covariances.
+    """
     shots = {name: _Shots([], [], []) for name in named}
+    irradiance: list[Images] = []
     first = next(iter(named.values()))
     for scene_name, light in scenes.items():
         if not isinstance(light, Scene | PowerMap):
             raise ParameterError("scenes", f"must be scenes or power maps, got {type_name(light)}", scene_name)
         power_map = first.power_map(light) if isinstance(light, Scene) else light
+        irradiance.append(first.reference(power_map, field.covariance_grid, exposure_s=exposure_s).data.mean(axis=0))
         for name, camera in named.items():
             capture = camera.capture(light, exposure_s=exposure_s, seed=seed)
-            image = camera.reference(power_map, field.fine_grid, exposure_s=exposure_s)
             shots[name].pictures.append(
                 capture.picture(method, of="light_e", per="um2", grid=field.grid, sensor=camera.sensor)
             )
             shots[name].ideal.append(camera.reference(power_map, field.grid, exposure_s=exposure_s))
-            shots[name].measures.append(scene_measures(camera, capture, image, field.centre_um, field.edges_um))
+            shots[name].measures.append(scene_measures(camera, capture, power_map, field.centre_um, field.edges_um))
             advance()
-    return shots
+    return shots, irradiance
 
 
 def _camera_values(
@@ -622,10 +629,10 @@ def _rate(frames_per_s: float | Mapping[str, float] | None, name: str, exposure_
     return frames_per_s
 
 
-def _grid(low: NDArray[np.float64], high: NDArray[np.float64], max_pixels: int, margin: int) -> Grid:
-    """Return a grid of square pixels over a rectangle, with some more on each side."""
+def _grid(low: NDArray[np.float64], high: NDArray[np.float64], max_pixels: int) -> Grid:
+    """Return a grid of square pixels over a rectangle."""
     pitch_um = float((high - low).max()) / max_pixels
-    n_x, n_y = (int(np.ceil(length / pitch_um - 1e-6)) + 2 * margin for length in high - low)
+    n_x, n_y = (int(np.ceil(length / pitch_um - 1e-6)) for length in high - low)
     centre = 0.5 * (low + high)
     return Grid(
         (n_y, n_x), pitch_um, (float(centre[0] - 0.5 * n_x * pitch_um), float(centre[1] - 0.5 * n_y * pitch_um))

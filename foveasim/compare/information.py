@@ -8,24 +8,35 @@ form; for other scenes, the entropy of a Gaussian of the same covariance is an u
 from __future__ import annotations
 
 import math
+from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.validation import Floats, finite_array
+from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_number, finite_array
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
 
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
 __all__ = ["SceneCovariance", "gaussian_information_bits", "scene_covariance", "site_information_bits"]
 
-#: Preceding sites on which a site is conditioned, and neighbours among which they are searched.
-N_CONDITIONS, N_CANDIDATES = 14, 44
-#: Matrix elements that are computed at a time; limits the memory.
-BLOCK_ELEMENTS = 1 << 21
-#: Ratio of the widths of adjacent Gaussian components of a covariance.
-WIDTH_RATIO = 1.5
-#: Largest distance of the covariance as a fraction of the field, beyond which too few pairs contribute.
-MAX_DISTANCE_FRACTION = 0.4
+#: Sites of a block, preceding sites on which it is conditioned, and candidates for these per site.
+BLOCK_SITES, N_CONDITIONS, CANDIDATE_RATIO = 128, 192, 4
+#: Ratio of the widths of adjacent Gaussian components of a covariance, and the smallest width in pixels.
+WIDTH_RATIO, MIN_WIDTH_PIXELS = 1.08, 0.25
+#: Fraction of the width of images on each side along which their window rises from 0 to 1.
+TAPER_FRACTION = 0.05
+#: Width in pixels from which the mean over a pixel is represented by its second moment: exact to 2e-6.
+MOMENT_WIDTH_PIXELS = 8.0
+#: Lowest frequency of the fit in periods per field, and largest one in cycles per pixel.
+MIN_PERIODS, MAX_FREQUENCY = 2.0, 0.5
+#: Spectral density below which errors do not matter, relative to its mean up to 1/8 cycle per pixel, and fits with new weights.
+DENSITY_FLOOR, FLOOR_FREQUENCY, N_FITS = 3e-3, 0.125, 5
+#: Smallest ratio of the width of a component to the longer side of a site for 1 and 2 Gaussians per axis; 3 below.
+MIN_WIDTH_RATIOS = (2.0, 0.35)
 
 
 def gaussian_information_bits(
@@ -147,47 +158,138 @@ class SceneCovariance:
 
 def scene_covariance(images: ArrayLike, pitch_um: float) -> SceneCovariance:
     """
-    Fit an isotropic covariance to images.
+    Fit an isotropic covariance of points to images of pixel means.
 
     Parameters
     ----------
     images : (n_image, n_y, n_x)
-        Irradiance on square pixels; NaN where unknown.
+        Irradiance on square pixels, means over their areas; NaN where unknown.
     pitch_um : float, µm
         Pixel pitch.
 
     Returns
     -------
     SceneCovariance
-        Non-negative least-squares fit of Gaussians to the autocovariance, averaged over images and directions.
+
+    Raises
+    ------
+    ParameterError
+        When the images do not have three axes, or the pitch is not positive.
+
+    Notes
+    -----
+    The radial means of the periodograms are fitted by non-negative sums of the periodograms that are expected for Gaussian
+    covariances: with the aperture of the pixels, aliasing and the window (Guillaumin et al., J. R. Stat. Soc. B 84, 2022). The
+    covariance is therefore that of points, and independent of the pixel pitch as long as the pixels resolve the images. The
+    weights are those of Whittle's likelihood (Biometrika 41, 1954), with the means of the previous fit.
     """
-    from scipy.fft import irfft2, rfft2
     from scipy.optimize import nnls
 
-    stack = np.asarray(images, np.float64)
-    is_known = np.isfinite(stack)
-    mean = np.where(is_known, stack, 0.0).sum(axis=(1, 2)) / is_known.sum(axis=(1, 2))
-    deviation = np.where(is_known, stack - mean[:, np.newaxis, np.newaxis], 0.0)
-    shape = tuple(2 * n for n in stack.shape[1:])
-    products, pairs = (
-        irfft2(np.square(np.abs(rfft2(part, shape))), shape).sum(axis=0) for part in (deviation, is_known.astype(float))
-    )
-    y, x = (np.minimum(np.arange(n), n - np.arange(n)) for n in shape)
-    distance = np.hypot(x, y[:, np.newaxis])
-    reach = MAX_DISTANCE_FRACTION * min(stack.shape[1:])
-    bins = np.rint(distance).astype(np.int64).ravel()
-    is_near = (distance.ravel() <= reach) & (pairs.ravel() > 0.5)
-    sums, counts, distances = (
-        np.bincount(bins[is_near], weights=part.ravel()[is_near]) for part in (products, pairs, pairs * distance)
-    )
-    used = counts > 0.0
-    radius_um, covariance = distances[used] / counts[used] * pitch_um, sums[used] / counts[used]
-    n_widths = max(1, math.ceil(math.log(reach / 0.5, WIDTH_RATIO)))
-    sigma_um = 0.5 * pitch_um * WIDTH_RATIO ** np.arange(n_widths + 1)
-    # Each distance counts alike; the variance at distance 0 is that of pixels.
-    basis = np.exp(-0.5 * np.square(radius_um[:, np.newaxis] / sigma_um))
-    amplitude, _ = nnls(basis, covariance)
-    return SceneCovariance(amplitude[amplitude > 0.0], sigma_um[amplitude > 0.0])
+    stack = as_numbers("images", images, keep_type=True, missing_is_nan=True)
+    if stack.ndim != 3 or not stack.size:
+        raise ParameterError("images", "must have the shape (n_image, n_y, n_x)", list(stack.shape))
+    pitch_um = check_number("pitch_um", pitch_um, above=0.0)
+    spectrum = _RadialSpectrum(stack)
+    n_widths = max(1, math.ceil(math.log(0.5 * max(stack.shape[1:]) / MIN_WIDTH_PIXELS, WIDTH_RATIO)))
+    sigma = MIN_WIDTH_PIXELS * WIDTH_RATIO ** np.arange(n_widths + 1)
+    basis = np.stack([spectrum.of_gaussian(width) for width in sigma.tolist()], axis=1)
+    is_low = spectrum.frequency <= max(FLOOR_FREQUENCY, float(spectrum.frequency[0]))
+    floor = DENSITY_FLOOR * float(np.average(spectrum.density[is_low], weights=spectrum.n_modes[is_low]))
+    if floor <= 0.0:
+        return SceneCovariance(np.empty(0), np.empty(0))
+    expected = spectrum.density
+    for _ in range(N_FITS):
+        weight = np.sqrt(spectrum.n_modes) / (expected + floor)
+        columns = basis * weight[:, np.newaxis]
+        length = np.linalg.norm(columns, axis=0)
+        amplitude = nnls(columns / length, spectrum.density * weight, maxiter=100 * sigma.size)[0] / length
+        expected = basis @ amplitude
+    is_used = amplitude > 0.0
+    return SceneCovariance(amplitude[is_used], sigma[is_used] * pitch_um)
+
+
+class _RadialSpectrum:
+    """
+    Mean spectral density of images in rings of frequencies, in pixels and cycles per pixel.
+
+    Attributes
+    ----------
+    frequency, density, n_modes : (n_ring,) float64
+        Mean frequency, mean of the periodograms, and number of frequencies of each ring.
+    """
+
+    def __init__(self, images: NDArray[np.float64]) -> None:
+        from scipy.fft import fftfreq, rfft2, rfftfreq
+        from scipy.signal.windows import tukey
+
+        shape = images.shape[1:]
+        radius = np.hypot(fftfreq(shape[0])[:, np.newaxis], rfftfreq(shape[1]))
+        # Frequencies that a real transform omits count twice.
+        count = np.full(radius.shape, 2.0)
+        count[:, 0] = 1.0
+        if shape[1] % 2 == 0:
+            count[:, -1] = 1.0
+        n_least = min(shape)
+        lowest = min(MIN_PERIODS / n_least, 0.5 * MAX_FREQUENCY)
+        is_used = (radius >= lowest) & (radius <= MAX_FREQUENCY)
+        self._count = count[is_used]
+        self._is_used = is_used
+        ring = np.floor(radius[is_used] * n_least).astype(np.int64)
+        _, self._ring = np.unique(ring, return_inverse=True)
+        self.n_modes: Floats = np.bincount(self._ring, self._count)
+        self._windows = [tukey(n + 2, 2.0 * TAPER_FRACTION)[1:-1] for n in shape]
+        power = np.zeros(radius.shape)
+        for image in images:
+            window = np.outer(*self._windows)
+            is_known = np.isfinite(image)
+            if not is_known.all():
+                window *= _taper(is_known)
+            if not window.any():
+                continue
+            values = np.where(is_known, image, 0.0).astype(np.float64)
+            values -= float((window * values).sum() / window.sum())
+            power += np.square(np.abs(rfft2(window * values))) / np.square(window).sum()
+        self.frequency: Floats = self._means(radius)
+        self.density: Floats = self._means(power / len(images))
+
+    def _means(self, values: Floats) -> Floats:
+        return np.asarray(np.bincount(self._ring, values[self._is_used] * self._count) / self.n_modes)
+
+    def of_gaussian(self, sigma: float) -> Floats:
+        """Return the expected density of images with a Gaussian covariance of variance 1, (n_ring,)."""
+        y, x = (_expected_periodogram(window, sigma) for window in self._windows)
+        return self._means(np.outer(y, x[: x.size // 2 + 1]))
+
+
+def _expected_periodogram(window: Floats, sigma: float) -> Floats:
+    """Return the expected periodogram of windowed pixel means with the covariance exp(-d² / 2 σ²), in pixels, (n,)."""
+    from scipy.fft import fft, irfft, next_fast_len, rfft
+    from scipy.special import erf
+
+    n = window.size
+    lag = np.arange(n, dtype=np.float64)
+    if sigma < MOMENT_WIDTH_PIXELS:
+        # The second integral of the covariance, and its differences over a pixel.
+        d = np.arange(-1.0, n + 1.0)
+        root = math.sqrt(2.0) * sigma
+        integral = sigma**2 * np.exp(-np.square(d / root)) + math.sqrt(0.5 * math.pi) * sigma * d * erf(d / root)
+        covariance = integral[2:] - 2.0 * integral[1:-1] + integral[:-2]
+    else:
+        variance = sigma**2 + 1.0 / 6.0
+        covariance = sigma / math.sqrt(variance) * np.exp(-0.5 * np.square(lag) / variance)
+    size = next_fast_len(2 * n, real=True)
+    products = irfft(np.square(np.abs(rfft(window, size))), size)[:n]
+    part = covariance * products / products[0]
+    folded = part + np.concatenate(([0.0], part[:0:-1]))
+    return np.asarray(np.maximum(fft(folded).real, 0.0))
+
+
+def _taper(is_known: Bools) -> Floats:
+    """Return a window that decreases to 0 at unknown pixels."""
+    from scipy.ndimage import distance_transform_edt
+
+    distance = distance_transform_edt(is_known)
+    return np.asarray(np.square(np.sin(0.5 * np.pi * np.minimum(1.0, distance / (min(is_known.shape) / 8.0)))))
 
 
 def site_information_bits(
@@ -211,51 +313,133 @@ def site_information_bits(
     noise_variance : (n_scene, n_site)
         Noise variance of the readings, in squared units of the readings.
     n_conditions : int
-        Number of neighbours.
+        Number of preceding sites on which a block of sites is conditioned.
 
     Returns
     -------
     information : (n_scene, n_site) float64, bit
-        The sum over the sites is the information of all readings. It is exact, up to apertures, when every site has at most
+        The sum over the sites is the information of all readings. It is exact, up to apertures, when every block has at most
         ``n_conditions`` preceding sites, and otherwise an upper bound that decreases with ``n_conditions``.
 
     Notes
     -----
-    Chain rule of the entropy, in the order of x, with the conditional variance of each reading given the nearest preceding
-    ones (Vecchia 1988).
+    Chain rule of the entropy, over blocks of adjacent sites, with the conditional covariance of each block given the nearest
+    preceding sites (Vecchia, J. R. Stat. Soc. B 50, 1988; blocks as by Stein et al., ibid. 66, 2004).
+
+    Apertures are sums of equal Gaussians with the second moments of a site and its area: with the integral of the squared
+    aperture. They are exact for structure that is large, and for structure that is small against a site.
     """
     from scipy.spatial import cKDTree
 
     n = layout.n_sites
-    order = np.lexsort((layout.centroid_um[:, 1], layout.centroid_um[:, 0]))
-    xy_um, spread_um2 = layout.centroid_um[order], _second_moments_um2(layout)[order]
-    scale, noise = np.asarray(gain, np.float64)[order], np.asarray(noise_variance, np.float64)[:, order]
-    m = min(n_conditions, n - 1)
-    n_near = min(n, max(N_CANDIDATES, 3 * m + 2))
-    near = np.asarray(cKDTree(xy_um).query(xy_um, k=np.arange(1, n_near + 1))[1], np.int64).reshape(n, n_near)
-    is_before = near < np.arange(n)[:, np.newaxis]
-    chosen = np.take_along_axis(near, np.argsort(~is_before, axis=1, kind="stable")[:, :m], axis=1)
-    n_before = np.minimum(is_before.sum(axis=1), m)
-    members = np.concatenate((chosen, np.arange(n)[:, np.newaxis]), axis=1)
-    is_used = np.concatenate((np.arange(m) < n_before[:, np.newaxis], np.ones((n, 1), bool)), axis=1)
-    found = np.empty(noise.shape)
-    block = max(1, BLOCK_ELEMENTS // (m + 1) ** 2)
-    for start in range(0, n, block):
-        part, used = members[start : start + block], is_used[start : start + block]
-        offset_um = xy_um[part][:, :, np.newaxis] - xy_um[part][:, np.newaxis]
-        spread = spread_um2[part][:, :, np.newaxis] + spread_um2[part][:, np.newaxis]
-        both = used[:, :, np.newaxis] & used[:, np.newaxis]
-        signal = np.where(both, covariance.of_means(offset_um, spread), 0.0)
-        signal *= scale[part][:, :, np.newaxis] * scale[part][:, np.newaxis]
-        for k, variance in enumerate(noise):
-            own = np.where(used, variance[part], 1.0)
+    xy_um = np.asarray(layout.centroid_um, np.float64)
+    order, starts = _blocks(xy_um)
+    position = np.empty(n, np.int64)
+    position[order] = np.arange(n)
+    scale, noise = np.asarray(gain, np.float64), np.asarray(noise_variance, np.float64)
+    apertures = _Apertures(layout, covariance)
+    tree = cKDTree(xy_um)
+    bits = np.empty(noise.shape)
+    for start, stop in pairwise(starts):
+        block = order[start:stop]
+        members = np.concatenate((_preceding(xy_um, tree, block, position, start, n_conditions), block))
+        signal = apertures.covariance(members) * (scale[members][:, np.newaxis] * scale[members])
+        for k, variance in enumerate(noise[:, members]):
             # In units of the noise, for a good condition.
-            root = np.sqrt(own)
-            total = signal / (root[:, :, np.newaxis] * root[:, np.newaxis]) + np.eye(m + 1)
-            found[k, start : start + block] = np.log2(np.linalg.cholesky(total)[:, -1, -1])
-    bits = np.empty(found.shape)
-    bits[:, order] = found
+            root = np.sqrt(variance)
+            total = signal / (root[:, np.newaxis] * root)
+            total[np.diag_indices_from(total)] += 1.0
+            bits[k, block] = np.log2(np.diagonal(np.linalg.cholesky(total))[-block.size :])
     return bits
+
+
+def _blocks(xy_um: Floats) -> tuple[Ints, Ints]:
+    """Return sites in blocks of adjacent ones, (n,), and the first position of each block, by cuts of the longer side."""
+    order, starts = np.arange(len(xy_um)), [0]
+    pending = [(0, len(xy_um))]
+    while pending:
+        start, stop = pending.pop()
+        if stop - start <= BLOCK_SITES:
+            starts.append(stop)
+            continue
+        part = order[start:stop]
+        axis = int(np.ptp(xy_um[part], axis=0).argmax())
+        order[start:stop] = part[np.lexsort((xy_um[part, 1 - axis], xy_um[part, axis]))]
+        middle = (start + stop) // 2
+        pending += [(middle, stop), (start, middle)]
+    return order, np.array(starts)
+
+
+def _preceding(xy_um: Floats, tree: cKDTree, block: Ints, position: Ints, start: int, n_conditions: int) -> Ints:
+    """Return the sites before ``start`` that are nearest to the bounding box of a block."""
+    if n_conditions == 0 or start == 0:
+        return np.empty(0, np.int64)
+    low, high = xy_um[block].min(axis=0), xy_um[block].max(axis=0)
+    n_near = min(len(xy_um), CANDIDATE_RATIO * (block.size + n_conditions))
+    near = np.asarray(tree.query(0.5 * (low + high), k=np.arange(1, n_near + 1))[1], np.int64)
+    near = near[position[near] < start]
+    outside_um = np.maximum(np.maximum(low - xy_um[near], xy_um[near] - high), 0.0)
+    return near[np.argsort(np.hypot(*outside_um.T), kind="stable")[:n_conditions]]
+
+
+class _Apertures:
+    """Sites as sums of Gaussians, with the covariances of their means."""
+
+    def __init__(self, layout: Layout, covariance: SceneCovariance) -> None:
+        xx, yy, xy = _second_moments_um2(layout).T
+        # Principal axes of the second moments.
+        mean, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
+        angle_rad = 0.5 * np.arctan2(2.0 * xy, xx - yy)
+        long_um, short_um = np.sqrt(mean + half), np.sqrt(np.maximum(mean - half, 0.0))
+        unit = np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1)
+        across = np.stack((-unit[:, 1], unit[:, 0]), axis=1)
+        self._axes_um = np.stack((long_um[:, np.newaxis] * unit, short_um[:, np.newaxis] * across), axis=1)
+        self._centre_um = np.ascontiguousarray(layout.centroid_um)
+        # In units of a rectangle of the same moments, per axis: 1 for rectangles, larger for other shapes.
+        norm = np.sqrt(12.0 * long_um * short_um / layout.area_um2)
+        n_orders = len(MIN_WIDTH_RATIOS) + 1
+        self._nodes = np.zeros((n_orders, n_orders))
+        self._spread = np.ones((layout.n_sites, n_orders))
+        for order in range(2, n_orders + 1):
+            node = np.arange(order) - 0.5 * (order - 1)
+            node /= math.sqrt(float(np.mean(np.square(node))))
+            self._nodes[order - 1, :order] = node
+            self._spread[:, order - 1] = _spread_of_norm(node, norm)
+        self._amplitude, self._sigma_um = covariance.amplitude, covariance.sigma_um
+        width = self._sigma_um / (math.sqrt(12.0) * long_um[:, np.newaxis])
+        self._order = 1 + np.sum([width < ratio for ratio in MIN_WIDTH_RATIOS], axis=0, dtype=np.int64)
+
+    def covariance(self, members: Ints) -> Floats:
+        """Return the covariances of the means over sites, (n_member, n_member)."""
+        from foveasim.compare import _kernels
+
+        return np.asarray(
+            _kernels.signal_covariance(
+                members,
+                self._centre_um,
+                self._axes_um,
+                self._spread,
+                self._order,
+                self._nodes,
+                self._amplitude,
+                self._sigma_um,
+            )
+        )
+
+
+def _spread_of_norm(node: Floats, norm: Floats) -> Floats:
+    """
+    Return the variance of Gaussians that represent a site, as a fraction of the second moment of the site.
+
+    The Gaussians are centred on nodes of variance 1 - fraction, so that the sum has the variance 1. ``norm`` is the integral of
+    the square of the aperture times √12.
+    """
+    fraction = np.geomspace(1.0, 1e-4, 2000)
+    apart = np.square(node[:, np.newaxis] - node)[..., np.newaxis] * (1.0 - fraction)
+    # The integral of the product of two Gaussians of variance s² at a distance d is exp(-d²/4s²) / (2 s √π).
+    squares = np.exp(-0.25 * apart / fraction).mean(axis=(0, 1)) * np.sqrt(12.0 / fraction) / (2.0 * math.sqrt(math.pi))
+    least = int(squares.argmin())
+    return np.asarray(np.interp(norm, squares[least:], fraction[least:]))
 
 
 def _second_moments_um2(layout: Layout) -> Floats:

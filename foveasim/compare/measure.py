@@ -16,17 +16,16 @@ from foveasim.camera import Camera
 from foveasim.capture import Capture
 from foveasim.compare.annuli import annulus_of
 from foveasim.compare.information import SceneCovariance, site_information_bits
-from foveasim.errors import CoverageWarning, ParameterError
+from foveasim.errors import FoveasimWarning, ParameterError
+from foveasim.fields import Grid, PowerMap
 from foveasim.layout import Layout
 from foveasim.metrics import (
     aliasing_spectrum,
     flow_bound,
     nyquist_per_mm,
     polygon_mtf,
-    site_gradients_e_per_um,
     size_classes_um,
 )
-from foveasim.reconstruct import Picture
 from foveasim.sensor import signal_to_noise
 from foveasim.sensor.signal_to_noise import SiteSignals
 from foveasim.units import per_mm_from_per_um
@@ -49,6 +48,10 @@ MTF_FREQUENCIES, MAX_FREQUENCY = 200, 1.5
 #: Smallest number of sites for the spectrum of a region.
 MIN_REGION_SITES = 12
 UM2_PER_MM2 = 1e6
+#: Displacement of images for differences of first order, in cells, and largest uncovered area fraction of a site that is used.
+SHIFT_CELLS, MAX_UNCOVERED_FRACTION = 0.05, 1e-9
+#: Relative difference of two charges up to which they are equal.
+ROUNDING = 1e-12
 #: Level of MTF50.
 HALF = 0.5
 
@@ -169,9 +172,9 @@ def layout_measures(
 
 
 def scene_measures(
-    camera: Camera, capture: Capture, image: Picture, centre_um: tuple[float, float], edges_um: Floats
+    camera: Camera, capture: Capture, image: PowerMap, centre_um: tuple[float, float], edges_um: Floats
 ) -> SceneMeasures:
-    """Return SNR and precision of a shift for a capture and its ideal image in e-/µm²."""
+    """Return SNR and precision of a shift for a capture of an image."""
     sensor, layout = camera.sensor, layout_of(camera)
     exposure_s = float(capture.settings["exposure_s"])
     dark_e = sensor.expected_electrons(np.zeros(layout.n_sites), exposure_s)
@@ -181,14 +184,7 @@ def scene_measures(
     sums = np.bincount(annulus[annulus >= 0], signals.ratio[annulus >= 0], minlength=n)
     counts = np.bincount(annulus[annulus >= 0], minlength=n)
     ratio = np.divide(sums, counts, out=np.full(n, np.nan), where=counts > 0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CoverageWarning)
-        gradient = np.zeros((layout.n_sites, 2))
-        for c in np.unique(capture.filter_of_site):
-            sites = np.flatnonzero(capture.filter_of_site == c)
-            density = np.where(np.isfinite(image.data[c]), image.data[c], 0.0)
-            gradient[sites] = site_gradients_e_per_um(layout[sites], density, image.grid)
-    gradient *= np.broadcast_to(sensor.sensitivity, (layout.n_sites,))[:, np.newaxis]
+    gradient = _shift_gradients_e_per_um(camera, image, exposure_s)
     variance_e2 = np.square(signals.noise_e)
     everything = flow_bound(gradient, variance_e2)
     parts = flow_bound(gradient, variance_e2, regions=annulus)
@@ -204,6 +200,34 @@ def scene_measures(
             },
             {"snr_db": 20.0 * np.log10(ratio), "shift_sigma_um": sigma_um},
         )
+
+
+def _shift_gradients_e_per_um(camera: Camera, image: PowerMap, exposure_s: float) -> Floats:
+    """
+    Return the change of the expected charges per displacement of an image, (n_site, 2) e-/µm.
+
+    It is 0 for sites that lie partly or entirely off the image.
+    """
+    grid, layout = image.grid, layout_of(camera)
+    uncovered_um2 = camera.integrator(grid, order=camera.order(image)).uncovered_um2
+    moving = camera.replace()  # displaced images do not fill the camera's cache
+
+    def expected_e(x_um: float, y_um: float) -> Floats:
+        x0_um, y0_um = grid.origin_um
+        moved = PowerMap(image.data, Grid(grid.shape, grid.pitch_um, (x0_um + x_um, y0_um + y_um)), image.wavelength_nm)
+        return camera.sensor.expected_electrons(moving.photoelectrons_per_s(moved), exposure_s)
+
+    gradient = np.empty((layout.n_sites, 2))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FoveasimWarning)  # those of the capture
+        for axis, step_um in enumerate((SHIFT_CELLS * grid.pitch_xy_um).tolist()):
+            x_um, y_um = (step_um, 0.0) if axis == 0 else (0.0, step_um)
+            ahead_e, behind_e = expected_e(x_um, y_um), expected_e(-x_um, -y_um)
+            change_e = ahead_e - behind_e
+            change_e[np.abs(change_e) <= ROUNDING * (ahead_e + behind_e)] = 0.0  # no precision from rounding
+            gradient[:, axis] = change_e / (2.0 * step_um)
+    gradient[uncovered_um2 > MAX_UNCOVERED_FRACTION * layout.area_um2] = 0.0
+    return gradient
 
 
 def information_by_annulus(

@@ -169,7 +169,7 @@ def _definitions(comparison: Comparison) -> ReportSection:
         ),
         (
             "Information is that of Gaussian readings about Gaussian scenes with the isotropic covariance of these scenes, by "
-            "the chain rule over nearest neighbours: an estimate to compare sensors, not a bound for photographs."
+            "the chain rule over blocks of adjacent sites: an estimate to compare sensors, not a bound for photographs."
         ),
         "The precision of a shift is the Cramér–Rao bound for a known image and the sites of an annulus.",
         (

@@ -64,6 +64,50 @@ def test_fovea_is_better_at_centre_only(compared):
         assert values[0, 2] < values[1, 2]
 
 
+def test_information_and_shift_are_independent_of_pictures(foveal, scenes):
+    pair, one = {"a": foveal, "b": foveal}, {"one": scenes["picture 0"]}
+    coarse, fine = (fs.compare.layouts(pair, one, n_annuli=2, max_pixels=n) for n in (32, 256))
+
+    for name in ("information_bit_per_site", "shift_sigma_um"):
+        np.testing.assert_allclose(coarse.values[name], fine.values[name], rtol=1e-9)
+
+
+@pytest.mark.parametrize("side_um", [2.0, 16.0])
+def test_shift_precision_matches_displaced_images(scenes, side_um):
+    square = fs.layout.grid(n_x=round(160.0 / side_um), size_um=(160.0, 160.0))
+    camera, exposure_s, step_um = cameras_of(square, f_number=2.8), 1 / 60, 0.02
+    image = camera.power_map(scenes["picture 1"])
+
+    def expected_e(x_um, y_um):
+        x0_um, y0_um = image.grid.origin_um
+        grid = fs.Grid(image.grid.shape, image.grid.pitch_um, (x0_um + x_um, y0_um + y_um))
+        return camera.capture(
+            fs.PowerMap(image.data, grid, image.wavelength_nm), exposure_s=exposure_s, seed=0
+        ).expected_e
+
+    steps = ((step_um, 0.0), (0.0, step_um))
+    gradient = np.stack([(expected_e(x, y) - expected_e(-x, -y)) / (2.0 * step_um) for x, y in steps], axis=1)
+    noise_e = fs.sensor.signal_to_noise(
+        camera.sensor, expected_e(0.0, 0.0), camera.sensor.expected_electrons(np.zeros(square.n_sites), exposure_s)
+    ).noise_e
+    information = np.einsum("si,sj,s->ij", gradient, gradient, noise_e**-2.0)
+
+    found = fs.compare.cameras({"a": camera, "b": camera}, {"1": image}, exposure_s=exposure_s, max_pixels=32)
+
+    expected_um = np.sqrt(np.mean(np.diagonal(np.linalg.inv(information))))
+    assert found.values["shift_sigma_um"][0, 0] == pytest.approx(expected_um, rel=1e-2)
+
+
+def test_shift_along_edge_is_unobservable():
+    camera = cameras_of(fs.layout.grid(n_x=8, size_um=(16.0, 16.0)))
+    edge = fs.PowerMap(np.array([[[1.0, 2.0]]]), fs.Grid.centred((1, 2), 20.0), np.array([550.0]))
+
+    found = fs.compare.cameras({"a": camera, "b": camera}, {"edge": edge}, exposure_s=0.01, n_annuli=2, max_pixels=16)
+
+    assert np.isinf(found.values["shift_sigma_um"]).all()
+    assert found.values["information_bit_per_site"].min() > 0.0
+
+
 def test_blind_spot_is_stated_and_excluded(compared, foveal):
     blind_um = foveal.provenance["blind_radius_um"]
 

@@ -1,0 +1,75 @@
+"""Numba kernel of the information: covariances of site means."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import types
+
+from foveasim._core.jit import njit
+
+__all__ = ["signal_covariance"]
+
+_ints = types.Array(types.int64, 1, "C", readonly=True)
+_orders = types.Array(types.int64, 2, "C", readonly=True)
+_floats = types.Array(types.float64, 1, "C", readonly=True)
+_points = types.Array(types.float64, 2, "C", readonly=True)
+_tensors = types.Array(types.float64, 3, "C", readonly=True)
+
+#: Distance, in standard deviations, beyond which a Gaussian is 0: exp(-32) = 1e-14.
+REACH_SIGMAS = 8.0
+
+
+@njit(types.float64[:, ::1](_ints, _points, _tensors, _points, _orders, _points, _floats, _floats))
+def signal_covariance(members, centre, axes, spread, order, nodes, amplitude, sigma):
+    """
+    Compute the covariances of the means over sites, (n_member, n_member).
+
+    A site is ``order[site, k]``² equal Gaussians for component k. They have the second moments of the site times
+    ``spread[site, order - 1]``, and are centred on ``nodes[order - 1]`` along the principal ``axes`` of the site, whose lengths
+    are its standard deviations.
+    """
+    n = members.size
+    out = np.zeros((n, n))
+    limit = REACH_SIGMAS * REACH_SIGMAS
+    for a in range(n):
+        i = members[a]
+        for b in range(a + 1):
+            j = members[b]
+            dx, dy = centre[j, 0] - centre[i, 0], centre[j, 1] - centre[i, 1]
+            distance = math.hypot(dx, dy)
+            total = 0.0
+            for k in range(sigma.size):
+                qi, qj = order[i, k], order[j, k]
+                ci, cj = spread[i, qi - 1], spread[j, qj - 1]
+                xx = sigma[k] * sigma[k] + ci * (axes[i, 0, 0] ** 2 + axes[i, 1, 0] ** 2)
+                yy = sigma[k] * sigma[k] + ci * (axes[i, 0, 1] ** 2 + axes[i, 1, 1] ** 2)
+                xy = ci * (axes[i, 0, 0] * axes[i, 0, 1] + axes[i, 1, 0] * axes[i, 1, 1])
+                xx += cj * (axes[j, 0, 0] ** 2 + axes[j, 1, 0] ** 2)
+                yy += cj * (axes[j, 0, 1] ** 2 + axes[j, 1, 1] ** 2)
+                xy += cj * (axes[j, 0, 0] * axes[j, 0, 1] + axes[j, 1, 0] * axes[j, 1, 1])
+                si, sj = math.sqrt(max(0.0, 1.0 - ci)), math.sqrt(max(0.0, 1.0 - cj))
+                extent = si * nodes[qi - 1, qi - 1] * (math.hypot(axes[i, 0, 0], axes[i, 0, 1]))
+                extent += si * nodes[qi - 1, qi - 1] * (math.hypot(axes[i, 1, 0], axes[i, 1, 1]))
+                extent += sj * nodes[qj - 1, qj - 1] * (math.hypot(axes[j, 0, 0], axes[j, 0, 1]))
+                extent += sj * nodes[qj - 1, qj - 1] * (math.hypot(axes[j, 1, 0], axes[j, 1, 1]))
+                if distance > extent + REACH_SIGMAS * math.sqrt(max(xx, yy) + abs(xy)):
+                    continue
+                det = xx * yy - xy * xy
+                part = 0.0
+                for p in range(qi):
+                    for q in range(qi):
+                        ux = dx - si * (nodes[qi - 1, p] * axes[i, 0, 0] + nodes[qi - 1, q] * axes[i, 1, 0])
+                        uy = dy - si * (nodes[qi - 1, p] * axes[i, 0, 1] + nodes[qi - 1, q] * axes[i, 1, 1])
+                        for r in range(qj):
+                            for s in range(qj):
+                                vx = ux + sj * (nodes[qj - 1, r] * axes[j, 0, 0] + nodes[qj - 1, s] * axes[j, 1, 0])
+                                vy = uy + sj * (nodes[qj - 1, r] * axes[j, 0, 1] + nodes[qj - 1, s] * axes[j, 1, 1])
+                                form = (yy * vx * vx - 2.0 * xy * vx * vy + xx * vy * vy) / det
+                                if form < limit:
+                                    part += math.exp(-0.5 * form)
+                total += amplitude[k] * sigma[k] * sigma[k] / math.sqrt(det) * part / (qi * qi * qj * qj)
+            out[a, b] = total
+            out[b, a] = total
+    return out
