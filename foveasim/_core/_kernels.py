@@ -1,5 +1,5 @@
 """
-Counter-based random numbers: Philox generators, uniform and Gaussian numbers.
+Counter-based random numbers (Philox generators, uniform and Gaussian numbers), and positions of points in outlines.
 
 A Philox generator maps a counter and a key to random words: J. K. Salmon, M. A. Moraes, R. O. Dror and D. E. Shaw, Parallel
 random numbers: as easy as 1, 2, 3 (SC11), section 3.3. All generators use ten rounds. Words of 32 bits are stored in 64-bit
@@ -18,6 +18,7 @@ from foveasim._core.jit import njit
 __all__ = [
     "BATCH",
     "add_normals",
+    "count_ray_intersections",
     "fill_normals",
     "fill_uniforms",
     "philox_2x32",
@@ -38,6 +39,8 @@ _12, _ONE_IN_2_52 = np.uint64(12), 2.0**-52
 #: Number of random numbers that are computed at a time: their buffers fit in the L1 cache.
 BATCH = 1024
 _QUARTER, _HALF = BATCH // 4, BATCH // 2
+_points = types.Array(types.float64, 2, "C", readonly=True)
+_ints = types.Array(types.int64, 1, "C", readonly=True)
 #: Last words of the counters, so that Gaussian and uniform numbers of a key are independent.
 _NORMALS, _UNIFORMS = np.uint64(0), np.uint64(1)
 #: Lowest bit of the exponent of a float32; bit patterns of 1.0 and sqrt(1/2); mask of the mantissa.
@@ -192,3 +195,31 @@ def add_normals(values, deviation, key):
             sigma = deviation[first : first + BATCH]
             for j in range(part.size):
                 part[j] += sigma[j] * np.float64(normals[j])
+
+
+@njit(types.int64[::1](_points, _ints, _ints, _points, _points))
+def count_ray_intersections(xy, ring_offsets, site_offsets, centroid, directions):
+    """
+    Count the rays from each site's centroid that intersect the site's outline.
+
+    The count is 0 for sites that contain their centroid (even-odd rule along the first ray). ``directions`` are unit vectors.
+    """
+    n_intersecting = np.zeros(site_offsets.size - 1, np.int64)
+    for i in range(n_intersecting.size):
+        for d in range(directions.shape[0]):
+            cos, sin = directions[d, 0], directions[d, 1]
+            n_crossed = 0
+            for r in range(site_offsets[i], site_offsets[i + 1]):
+                last = ring_offsets[r + 1] - 1
+                x, y = xy[last, 0] - centroid[i, 0], xy[last, 1] - centroid[i, 1]
+                u, v = cos * x + sin * y, cos * y - sin * x
+                for k in range(ring_offsets[r], ring_offsets[r + 1]):
+                    x, y = xy[k, 0] - centroid[i, 0], xy[k, 1] - centroid[i, 1]
+                    next_u, next_v = cos * x + sin * y, cos * y - sin * x
+                    if (v > 0.0) != (next_v > 0.0) and u - v * (next_u - u) / (next_v - v) > 0.0:
+                        n_crossed += 1
+                    u, v = next_u, next_v
+            if d == 0 and n_crossed % 2 == 1:
+                break
+            n_intersecting[i] += n_crossed > 0
+    return n_intersecting

@@ -25,7 +25,6 @@ __all__ = [
     "ADC_TABLE",
     "apply_nonlinearity",
     "convert",
-    "count_ray_intersections",
     "device_uniforms",
     "draw_poisson",
     "mix",
@@ -84,34 +83,6 @@ def device_uniforms(key_0, key_1, first, second):
         word, _, _, _ = philox_4x64(key_0, key_1, first[i], second[i], np.uint64(0), np.uint64(0))
         out[i] = uniform(word)
     return out
-
-
-@njit(types.int64[::1](_points, _ints, _ints, _points, _points))
-def count_ray_intersections(xy, ring_offsets, site_offsets, centroid, directions):
-    """
-    Count the rays from each site's centroid that intersect the site's outline.
-
-    The count is 0 for sites that contain their centroid (even-odd rule along the first ray). ``directions`` are unit vectors.
-    """
-    n_intersecting = np.zeros(site_offsets.size - 1, np.int64)
-    for i in range(n_intersecting.size):
-        for d in range(directions.shape[0]):
-            cos, sin = directions[d, 0], directions[d, 1]
-            n_crossed = 0
-            for r in range(site_offsets[i], site_offsets[i + 1]):
-                last = ring_offsets[r + 1] - 1
-                x, y = xy[last, 0] - centroid[i, 0], xy[last, 1] - centroid[i, 1]
-                u, v = cos * x + sin * y, cos * y - sin * x
-                for k in range(ring_offsets[r], ring_offsets[r + 1]):
-                    x, y = xy[k, 0] - centroid[i, 0], xy[k, 1] - centroid[i, 1]
-                    next_u, next_v = cos * x + sin * y, cos * y - sin * x
-                    if (v > 0.0) != (next_v > 0.0) and u - v * (next_u - u) / (next_v - v) > 0.0:
-                        n_crossed += 1
-                    u, v = next_u, next_v
-            if d == 0 and n_crossed % 2 == 1:
-                break
-            n_intersecting[i] += n_crossed > 0
-    return n_intersecting
 
 
 @njit(inline="always")

@@ -180,7 +180,8 @@ def write_layout(
     Warns
     -----
     LayoutWarning
-        When rounding moves a vertex by more than 1 nm.
+        When rounding moves a vertex by more than 1 nm, or columns leave no room for the identity of the sites, so that sensors
+        of the layout that is read from the file have other fixed patterns.
 
     Examples
     --------

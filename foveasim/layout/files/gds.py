@@ -14,6 +14,9 @@ other numbers as float64, bit for bit. A column with values that do not fit for 
 reported: the properties of a GDSII polygon contain at most 128 bytes, and gdstk is very slow for a large number of distinct
 strings in OASIS. A column without a value for every photosite of a file is not read.
 
+Sites that their rounded outlines do not identify (:mod:`foveasim._core.site_identity`) have the column ``site_id``, so that
+sensors of the layout that is read have the same fixed patterns.
+
 Regular arrays of congruent sites are references to a cell, with the numbers of their sites as a property: ``photosites
 0+1i+640j of 640x480`` in GDSII, the list (0, 1, 640, 640, 480) in OASIS. Their columns are functions of the column i and the
 row j of a site in the array, such as ``row=0+1j``. An array that another program has changed to another number of columns or
@@ -39,6 +42,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.extras import import_optional
 from foveasim._core.rings import positions_in_runs, ring_moments
+from foveasim._core.site_identity import SITE_ID, site_ids
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import MAX_SITES, Floats, Ints, check_number
 from foveasim._io.atomic import atomic_write
@@ -165,7 +169,7 @@ def write(
     _, first, stack_of = np.unique(stack_of, return_index=True, return_inverse=True)
     max_vertices = None if is_oasis else MAX_GDS_VERTICES
     drawing = _draw(layout, snapped, first, origin, drawn, dbu_um, max_vertices)
-    columns = _stored_columns(layout, drawn)
+    columns = _stored_columns(layout, drawn, _site_identity(layout, snapped))
     references, flat = _divide(drawing, stack_of, origin, columns, hierarchy=hierarchy)
 
     cells = _cells(gdstk, drawing, stack_of[references.first], dbu_um, [], SITE_CELL, is_oasis=is_oasis)
@@ -203,6 +207,13 @@ def write(
         else:
             library.write_gds(temporary, max_points=0, timestamp=TIMESTAMP)
         _check_complete(temporary, is_oasis)
+    if SITE_ID in dropped:
+        warn(
+            f"the file does not contain the identity of the sites, column '{SITE_ID}', for which the columns "
+            f"{', '.join(map(repr, layout.columns))} leave no room: sensors of the layout that is read have other fixed "
+            "patterns; write fewer columns, or a .npz file",
+            LayoutWarning,
+        )
     return replace(report, dropped_columns=dropped)
 
 
@@ -234,11 +245,22 @@ def _drawn_layers(layout: Layout, layer: Any, layers: Any, filter_names: Sequenc
     return drawn
 
 
-def _stored_columns(layout: Layout, drawn: list[DrawnLayer]) -> dict[str, NDArray[Any]]:
-    """Return the columns to store; the channel first, unless datatypes represent it."""
+def _stored_columns(
+    layout: Layout, drawn: list[DrawnLayer], identity: dict[str, NDArray[Any]]
+) -> dict[str, NDArray[Any]]:
+    """Return the columns to store: the channel, unless datatypes represent it, the others, and the identity of the sites."""
     others = {name: column for name, column in layout.columns.items() if name != CHANNEL}
     is_datatype = any(d.datatype is None for d in drawn) and bool((layout.channel != layout.channel[:1]).any())
-    return others if is_datatype or CHANNEL not in layout.columns else {CHANNEL: layout.columns[CHANNEL], **others}
+    first = {} if is_datatype or CHANNEL not in layout.columns else {CHANNEL: layout.columns[CHANNEL]}
+    return first | others | identity
+
+
+def _site_identity(layout: Layout, snapped: Layout) -> dict[str, NDArray[Any]]:
+    """Return the column that identifies the sites, if their rounded outlines do not identify them."""
+    if SITE_ID in layout.columns:
+        return {}
+    ids = site_ids(layout)
+    return {} if np.array_equal(ids, site_ids(snapped)) else {SITE_ID: ids}
 
 
 def _divide(

@@ -17,13 +17,18 @@ import numpy as np
 import pytest
 import shapely
 
-from foveasim.errors import FileError, GeometryError, ParameterError
+import foveasim as fs
+from foveasim.errors import FileError, GeometryError, LayoutWarning, ParameterError
 from foveasim.layout import Layout, hexagonal
 from foveasim.layout.files import read_layout, write_layout
+from foveasim.sensor.device import Device
 
 gdstk = pytest.importorskip("gdstk")
 klayout = pytest.importorskip("klayout.db")
 pq = pytest.importorskip("pyarrow.parquet")
+
+#: The columns of some layouts leave no room for the identity of the sites in GDSII.
+pytestmark = pytest.mark.filterwarnings("ignore:the file does not contain the identity of the sites")
 
 EXACT = ["npz", "geojson", "parquet"]
 GDSII_OASIS = ["gds", "oas"]
@@ -237,10 +242,10 @@ def test_divided_sites_round_trip_columns(zoo, tmp_path, extension):
     report = write_layout(zoo, tmp_path / f"a.{extension}")
     again = read_layout(tmp_path / f"a.{extension}")
 
-    assert report.dropped_columns == (("is_dead",) if extension == "gds" else ())
-    assert {*again.columns} == {*zoo.columns} - {*report.dropped_columns}
-    for name, column in again.columns.items():
-        np.testing.assert_array_equal(column, zoo.columns[name], err_msg=name)
+    assert report.dropped_columns == (("is_dead", "site_id") if extension == "gds" else ())
+    assert {*again.columns} - {"site_id"} == {*zoo.columns} - {*report.dropped_columns}
+    for name in {*again.columns} - {"site_id"}:
+        np.testing.assert_array_equal(again.columns[name], zoo.columns[name], err_msg=name)
 
 
 @pytest.mark.parametrize(("n_chars", "dropped"), [(101, ()), (102, ("long",))])
@@ -1041,3 +1046,54 @@ def test_round_trip_of_20000_sites_is_fast(tmp_path, extension):
 
     assert again.n_sites == 20_000
     assert time.perf_counter() - began_s < 5
+
+
+# -- the same device --------------------------------------------------------------------------------------------------
+
+
+def log_polar():
+    return fs.layout.log_polar(n_sectors=24, r_min_um=10.0, r_max_um=60.0, n_rings=6)
+
+
+#: Layouts with centroids off the database grid, on it, and with sites that are identified by their outlines.
+DEVICES = {
+    "log-polar": log_polar,
+    "hexagons": lambda: hexagonal(8, 6, 3.3),
+    "grid": lambda: fs.layout.grid(n_x=9, n_y=7, pitch_um=2.2),
+    "fine grid": lambda: fs.layout.grid(n_x=9, n_y=7, pitch_um=2.20004),
+    "rings": lambda: Layout.from_polygons(
+        [shapely.Polygon(ring(40, r, (3.3, 1.7)), [ring(40, r - 1.0, (3.3, 1.7))] if r > 1 else []) for r in (1, 3, 5)]
+    ),
+    "far": lambda: log_polar().translate(3e5, -2.5e5),
+}
+
+
+@pytest.mark.parametrize("extension", EXACT + GDSII_OASIS)
+@pytest.mark.parametrize("name", DEVICES)
+def test_layout_read_again_is_same_device(tmp_path, name, extension):
+    layout = DEVICES[name]()
+    write_layout(layout, tmp_path / f"a.{extension}")
+    again = read_layout(tmp_path / f"a.{extension}")
+    normals = Device(seed=5, layout=layout).normals("prnu")
+
+    np.testing.assert_array_equal(Device(seed=5, layout=again).normals("prnu"), normals)
+    assert np.unique(normals).size == layout.n_sites
+    part = np.random.default_rng(0).permutation(layout.n_sites)[: layout.n_sites // 2]
+    np.testing.assert_array_equal(Device(seed=5, layout=again[part]).normals("prnu"), normals[part])
+    write_layout(again, tmp_path / f"b.{extension}")
+    twice = read_layout(tmp_path / f"b.{extension}")
+    np.testing.assert_array_equal(Device(seed=5, layout=twice).normals("prnu"), normals)
+
+
+def test_sites_on_database_grid_need_no_identity(tmp_path):
+    write_layout(DEVICES["grid"](), tmp_path / "a.gds")
+
+    assert "site_id" not in read_layout(tmp_path / "a.gds").columns
+
+
+def test_missing_identity_in_gds_warns(tmp_path):
+    layout = log_polar().with_columns(remark=np.array(["a" * 60] * log_polar().n_sites))
+
+    with pytest.warns(LayoutWarning, match=r"does not contain the identity of the sites.*leave no room.*\.npz"):
+        report = write_layout(layout, tmp_path / "a.gds")
+    assert report.dropped_columns == ("site_id",)
