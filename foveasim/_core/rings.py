@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from foveasim._core.validation import Bools, Floats, Ints
 
 __all__ = [
+    "TIE_FRACTION",
     "are_convex",
     "collapse_short_edges",
     "from_frame",
@@ -29,6 +30,9 @@ __all__ = [
     "site_moments",
     "to_frame",
 ]
+
+#: Distances of sites that differ by less than this fraction are equal: rounding of coordinates of a few millimetres.
+TIE_FRACTION = 1e-6
 
 #: Turning angles (rad) below this may be rounding errors.
 MIN_TURN_RAD = 1e-12

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.validation import Floats, Ints, check_choice, check_count, finite_array, read_only
+from foveasim._core.rings import TIE_FRACTION
+from foveasim._core.validation import Bools, Floats, Ints, check_choice, check_count, finite_array, read_only
 from foveasim.errors import ParameterError, type_name
 from foveasim.layout import Layout
 from foveasim.units import per_mm_from_per_um
@@ -88,7 +89,9 @@ def neighbour_spacing_um(layout: Layout, *, per_channel: bool = False) -> tuple[
     """
     Compute the distances to the nearest neighbour and to the nearest row of sites.
 
-    The nearest row is the one next to the line through a site and its nearest neighbour.
+    The nearest row is the one next to the line through a site and its nearest neighbour. With several nearest neighbours, or
+    several sites that may define the row, at equal distances, its distance is the mean over all of them: results do not depend
+    on the order of the sites.
 
     Parameters
     ----------
@@ -120,6 +123,7 @@ def _spacing_um(xy_um: Floats) -> tuple[Floats, Floats]:
     if n < 2:
         return nearest_um, row_um
     tree = cKDTree(xy_um)
+    is_pending = np.ones(n, bool)
     remaining, k = np.arange(n), INITIAL_NEIGHBOURS
     while remaining.size and k <= MAX_NEIGHBOURS:
         block = BLOCK_PAIRS // k
@@ -127,18 +131,48 @@ def _spacing_um(xy_um: Floats) -> tuple[Floats, Floats]:
             sites = remaining[start : start + block]
             # k = 1 is the site itself; missing neighbours have infinite distances.
             distance_um, ids = map(np.asarray, tree.query(xy_um[sites], k=list(range(2, min(k, n) + 1))))
-            step_um = xy_um[ids] - xy_um[sites, np.newaxis]
-            along = step_um[:, 0] / np.maximum(distance_um[:, :1], np.finfo(float).tiny)
-            off_um = np.abs(along[:, :1] * step_um[..., 1] - along[:, 1:] * step_um[..., 0])
-            # A coincident site does not define a direction.
-            is_other_row = (off_um >= MIN_SINE * distance_um) & (distance_um[:, :1] > 0.0)
-            first = is_other_row.argmax(axis=1)
             nearest_um[sites] = distance_um[:, 0]
-            found = np.arange(sites.size)
-            row_um[sites] = np.where(is_other_row[found, first], off_um[found, first], np.nan)
-        remaining = remaining[np.isnan(row_um[remaining])] if k < n else remaining[:0]
+            step_um = xy_um[ids] - xy_um[sites, np.newaxis]
+            row_um[sites], is_complete = _row_um(distance_um, step_um)
+            is_pending[sites] = ~is_complete
+        remaining = remaining[is_pending[remaining]] if k < n else remaining[:0]
         k *= 4
     return nearest_um, row_um
+
+
+def _row_um(distance_um: Floats, step_um: Floats) -> tuple[Floats, Bools]:
+    """
+    Compute the distances to the nearest rows from the nearest neighbours, sorted by distance.
+
+    Parameters
+    ----------
+    distance_um, step_um : (n, n_neighbour), (n, n_neighbour, 2), µm
+        Distances of the neighbours, and vectors to them.
+
+    Returns
+    -------
+    row_um : (n,) µm
+        Mean over ties; NaN without another row.
+    is_complete : (n,) bool
+        Whether further neighbours cannot change the result.
+    """
+    is_nearest = distance_um <= distance_um[:, :1] * (1.0 + TIE_FRACTION)
+    total_um, count = np.zeros(len(distance_um)), np.zeros(len(distance_um))
+    is_complete = np.ones(len(distance_um), bool)
+    direction = step_um / np.maximum(distance_um, np.finfo(float).tiny)[..., np.newaxis]
+    for j in range(int(is_nearest.sum(axis=1).max())):
+        along = direction[:, j]
+        off_um = np.abs(along[:, :1] * step_um[..., 1] - along[:, 1:] * step_um[..., 0])
+        # A coincident site does not define a direction.
+        is_other_row = (off_um >= MIN_SINE * (1.0 - TIE_FRACTION) * distance_um) & (distance_um[:, :1] > 0.0)
+        first_um = np.where(is_other_row, distance_um, np.inf).min(axis=1, keepdims=True)
+        is_used = is_other_row & (distance_um <= first_um * (1.0 + TIE_FRACTION)) & is_nearest[:, j : j + 1]
+        total_um += np.where(is_used, off_um, 0.0).sum(axis=1)
+        count += is_used.sum(axis=1)
+        is_complete &= ~is_nearest[:, j] | (distance_um[:, -1] > first_um[:, 0] * (1.0 + TIE_FRACTION))
+    # The last neighbour is farther than all ties.
+    is_complete &= (distance_um[:, -1] > distance_um[:, 0] * (1.0 + TIE_FRACTION)) & (count > 0)
+    return np.where(count > 0, total_um / np.maximum(count, 1.0), np.nan), is_complete
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

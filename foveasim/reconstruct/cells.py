@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TypeGuard
+from typing import Any, TypeGuard
 
 import numpy as np
 
-from foveasim._core.rings import site_moments
+from foveasim._core.rings import TIE_FRACTION, site_moments
 from foveasim._core.validation import Floats, Ints, finite_array, read_only
 from foveasim.fields import Grid, PackedRings
 from foveasim.integrate import Integrator
@@ -18,8 +18,10 @@ __all__ = ["cells", "fill_channels"]
 
 #: Number of cached layouts, and the largest number of their sites, about 200 bytes each.
 MAX_CACHED, MAX_CACHED_SITES = 2, 1 << 18
-#: Nearest sites of a channel that are averaged in demosaicing.
+#: Nearest sites of a channel that are averaged in demosaicing, with all further ones at the distance of the last.
 NEIGHBOURS = 4
+#: Smallest distance that determines a weight: coincident sites have a finite one.
+MIN_DISTANCE_UM = 1e-12
 
 
 def cells(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | None = None) -> Picture:
@@ -63,15 +65,16 @@ def fill_channels(layout: PackedRings, values: Floats, channel: Ints, n_channels
     Returns
     -------
     filled : (n_channel, n_site) float64
-        The site's value in its own channel; in other channels the mean of the nearest sites of that channel, weighted by
-        inverse distance. NaN for a channel without sites.
+        The site's value in its own channel; in other channels the mean of the four nearest sites of that channel, weighted by
+        inverse distance. Further sites at the distance of the fourth are included, so that the result does not depend on the
+        order of the sites. NaN for a channel without sites.
     """
     arguments = np.asarray(channel, np.int64).tobytes(), n_channels
     neighbours = _neighbours_once(layout, *arguments) if _is_cached(layout) else _neighbours(layout, *arguments)
     filled = np.full((n_channels, values.size), np.nan)
-    for c, (own, others, nearest, weight) in neighbours.items():
+    for c, (own, others, mean_of) in neighbours.items():
         filled[c, own] = values[own]
-        filled[c, others] = (values[nearest] * weight).sum(axis=1) / weight.sum(axis=1)
+        filled[c, others] = mean_of @ values[own]
     return filled
 
 
@@ -86,27 +89,47 @@ def _compiled(layout: PackedRings, grid: Grid, n_threads: int | None) -> tuple[I
     return integrator, coverage_fraction(integrator)
 
 
-def _neighbours(layout: PackedRings, channels: bytes, n_channels: int) -> dict[int, tuple[Ints, Ints, Ints, Floats]]:
+def _neighbours(layout: PackedRings, channels: bytes, n_channels: int) -> dict[int, tuple[Ints, Ints, Any]]:
     """
     Find the nearest sites of each channel for the sites of the others.
 
-    Returns by channel: its sites, the other sites, their nearest sites of the channel, and the inverse distances to these.
-    ``channels`` are the bytes of the channels of the sites, int64.
+    Returns by channel: its sites, the other sites, and the weights of the former in the means of the latter, a sparse matrix
+    (n_other, n_own). ``channels`` are the bytes of the channels of the sites, int64.
     """
-    from scipy.spatial import cKDTree
-
     _, centroid_um = site_moments(layout.xy_um, layout.ring_offsets, layout.site_offsets)
     channel = np.frombuffer(channels, np.int64)
     found = {}
     for c in range(n_channels):
         own, others = np.flatnonzero(channel == c), np.flatnonzero(channel != c)
-        if own.size == 0:
-            continue
-        distance_um, nearest = cKDTree(centroid_um[own]).query(
-            centroid_um[others], k=np.arange(1, min(NEIGHBOURS, own.size) + 1)
-        )
-        found[c] = own, others, own[nearest], 1.0 / np.maximum(distance_um, 1e-12)
+        if own.size:
+            found[c] = own, others, _mean_of_nearest(centroid_um[own], centroid_um[others])
     return found
+
+
+def _mean_of_nearest(points_um: Floats, at_um: Floats) -> Any:
+    """Return the weights of points (n, 2) in the means of the nearest ones, a sparse matrix (n_at, n)."""
+    from scipy.sparse import csr_array
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(points_um)
+    rows, columns, weights = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0)]
+    remaining, k = np.arange(len(at_um)), 2 * NEIGHBOURS
+    while remaining.size:
+        k = min(k, len(points_um))
+        distance_um, nearest = tree.query(at_um[remaining], k=np.arange(1, k + 1))
+        distance_um = np.maximum(distance_um, MIN_DISTANCE_UM)
+        limit_um = distance_um[:, min(NEIGHBOURS, k) - 1 : min(NEIGHBOURS, k)] * (1.0 + TIE_FRACTION)
+        # Rows whose last point is within the limit may have further ties.
+        is_complete = (distance_um[:, -1] > limit_um[:, 0]) | (k == len(points_um))
+        is_used = (distance_um <= limit_um) & is_complete[:, np.newaxis]
+        weight = np.where(is_used, 1.0 / distance_um, 0.0)
+        weight[is_complete] /= weight[is_complete].sum(axis=1, keepdims=True)
+        rows.append(np.broadcast_to(remaining[:, np.newaxis], nearest.shape)[is_used])
+        columns.append(nearest[is_used])
+        weights.append(weight[is_used])
+        remaining, k = remaining[~is_complete], 4 * k
+    entries = np.concatenate(rows), np.concatenate(columns)
+    return csr_array((np.concatenate(weights), entries), shape=(len(at_um), len(points_um)))
 
 
 # Pictures of one layout share its compiled sites and neighbours, such as the samples of a dataset or the frames of a video.

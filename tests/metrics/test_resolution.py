@@ -521,3 +521,32 @@ def test_e2_of_uniform_and_retinal_layouts():
     assert (uniform.e2_um, uniform.growth_fraction) == (np.inf, 0.0)
     # The ring width is proportional to (r + a), so it has doubled at r = a.
     assert retina.e2_um == pytest.approx(20.0, rel=0.1)
+
+
+@pytest.mark.parametrize("kind", ["grid", "hexagonal"])
+def test_neighbour_spacing_is_independent_of_order(kind):
+    rng = np.random.default_rng(3)
+    layout = (
+        fs.layout.grid(n_x=24, n_y=24, pitch_um=2.0)
+        if kind == "grid"
+        else fs.layout.hexagonal(n_columns=24, n_rows=24, pitch_um=2.0)
+    )
+    layout = layout.with_columns(channel=rng.integers(0, 3, layout.n_sites))
+    order = rng.permutation(layout.n_sites)
+
+    for all_um, permuted_um in zip(
+        neighbour_spacing_um(layout, per_channel=True),
+        neighbour_spacing_um(layout[order], per_channel=True),
+        strict=True,
+    ):
+        np.testing.assert_allclose(permuted_um, all_um[order], rtol=1e-12)
+
+
+def test_tied_rows_have_the_mean_distance():
+    # Three sites at 2 µm: the two others are at 2.0, 1.6 or 1.2 µm from the line through one of them.
+    layout = fs.Layout.from_rectangles([[0.0, 0.0], [-2.0, 0.0], [0.0, 2.0], [1.2, -1.6]], size_um=0.5)
+
+    nearest_um, row_um = neighbour_spacing_um(layout)
+
+    assert nearest_um[0] == pytest.approx(2.0, rel=1e-12)
+    assert row_um[0] == pytest.approx((2.0 + 1.6 + 1.2) / 3.0, rel=1e-12)

@@ -101,3 +101,53 @@ def test_invalid_values_raise_by_name(call, message):
 
     with pytest.raises(ParameterError, match=message):
         call(picture)
+
+
+@pytest.mark.parametrize("kind", ["bayer", "ring"])
+def test_picture_is_independent_of_site_order(kind):
+    rng = np.random.default_rng(1)
+    layout = fs.layout.mosaic(fs.layout.grid(n_x=12, n_y=12, pitch_um=2.0), ("RG", "GB"))
+    if kind == "ring":  # 40 red sites at the same distance from a blue one
+        angle = 2.0 * np.pi * np.arange(40) / 40
+        centres_um = np.concatenate(([[0.0, 0.0]], 20.0 * np.stack((np.cos(angle), np.sin(angle)), axis=1)))
+        layout = fs.Layout.from_rectangles(centres_um, size_um=1.0).with_columns(
+            channel=(np.arange(41) == 0).astype(int)
+        )
+    values, order = rng.random(layout.n_sites), rng.permutation(layout.n_sites)
+    n_channels = int(layout.channel.max()) + 1
+    grid = fs.Grid.centred((40, 40), 1.1)
+
+    def picture(sites):
+        one = layout[sites]
+        return cells(one, fill_channels(one, values[sites], one.channel, n_channels), grid).data
+
+    np.testing.assert_allclose(picture(order), picture(np.arange(layout.n_sites)), rtol=1e-6)
+    if kind == "ring":  # the mean of all
+        filled = fill_channels(layout, values, layout.channel, n_channels)
+        assert filled[0, 0] == pytest.approx(values[1:].mean(), rel=1e-12)
+
+
+def test_missing_colours_have_mosaic_symmetry():
+    """Means of four sites, or at green sites of two sites and the four next ones."""
+    layout = fs.layout.mosaic(fs.layout.grid(n_x=8, n_y=8, pitch_um=2.0), ("RG", "GB"))
+    values = np.random.default_rng(2).random(64).reshape(8, 8)
+    channel = layout.channel.reshape(8, 8)
+    filled = fill_channels(layout, values.ravel(), layout.channel, 3).reshape(3, 8, 8)
+
+    def mean(y, x, offsets, weights):
+        return np.average([values[y + dy, x + dx] for dy, dx in offsets], weights=weights)
+
+    cross, diagonal = [(0, 1), (0, -1), (1, 0), (-1, 0)], [(1, 1), (1, -1), (-1, 1), (-1, -1)]
+    for y, x in np.ndindex(8, 8):
+        if not (3 <= y <= 4 and 3 <= x <= 4):
+            continue
+        own = channel[y, x]
+        if own != 1:
+            assert filled[1, y, x] == pytest.approx(mean(y, x, cross, None), rel=1e-12)
+            assert filled[2 - own, y, x] == pytest.approx(mean(y, x, diagonal, None), rel=1e-12)
+            continue
+        for c in (0, 2):
+            along = [(dy, dx) for dy, dx in cross if channel[y + dy, x + dx] == c]
+            across = [(2 * dx + dy, 2 * dy + dx) for dy, dx in along] + [(dy - 2 * dx, dx - 2 * dy) for dy, dx in along]
+            weights = [1.0] * 2 + [5.0**-0.5] * 4
+            assert filled[c, y, x] == pytest.approx(mean(y, x, along + across, weights), rel=1e-12)
