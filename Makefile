@@ -14,8 +14,11 @@ LOWEST_PYTHON ?= 3.11
 UV := $(LOWEST)/uv/bin/uv
 # PyTorch has a separate environment, since its wheel may install gigabytes of CUDA libraries.
 TORCH_VENV ?= .venv-torch
+CHECK_PYTHON = command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) not found; specify one with: make PYTHON=..."; exit 1; }; \
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	{ echo "foveasim requires Python 3.11 or later; specify one with: make PYTHON=python3.12"; exit 1; }
 
-.PHONY: demo test test-lowest test-torch soak lint bench bench-torch peers docs clean
+.PHONY: demo test test-core test-lowest test-torch soak lint bench bench-torch peers docs clean
 .NOTPARALLEL:
 
 demo: $(VENV)/.installed
@@ -23,6 +26,15 @@ demo: $(VENV)/.installed
 
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest $(PARALLEL) $(PYTEST_ARGS)
+
+# The wheel without extras, outside the repository: every function and command works, or names the extra that it requires.
+test-core:
+	@$(CHECK_PYTHON)
+	directory=$$(mktemp -d) && trap 'rm -rf "$$directory"' EXIT && $(PYTHON) -m venv "$$directory/env" && \
+		"$$directory/env/bin/python" -m pip wheel --quiet --no-deps --wheel-dir "$$directory" . && \
+		"$$directory/env/bin/python" -m pip install --quiet "$$directory"/foveasim-*.whl && \
+		cp tests/installation/calls.py "$$directory" && cd "$$directory" && MPLBACKEND=agg env -u PYTHONPATH \
+		env/bin/python calls.py --program env/bin/foveasim
 
 # Deprecation warnings between old versions of dependencies are ignored.
 test-lowest: $(LOWEST)/.installed
@@ -65,9 +77,7 @@ clean:
 	find foveasim tests -name __pycache__ -type d -exec rm -rf {} +
 
 $(VENV)/.made $(LOWEST)/uv/.made $(TORCH_VENV)/.made:
-	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) not found; specify one with: make PYTHON=..."; exit 1; }
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-		{ echo "foveasim requires Python 3.11 or later; specify one with: make PYTHON=python3.12"; exit 1; }
+	@$(CHECK_PYTHON)
 	$(PYTHON) -m venv $(@D) || { rm -rf $(@D); exit 1; }
 	touch $@
 

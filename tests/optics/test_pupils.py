@@ -62,8 +62,8 @@ def point_scene(optics, cells_per_lambda_n=4.0, n=301, wavelength_nm=(WAVELENGTH
         (Slit(0.5), (2 * np.arcsin(0.5) + np.sin(2 * np.arcsin(0.5))) / np.pi),
         (Slit(0.5, angle_deg=40.0), (2 * np.arcsin(0.5) + np.sin(2 * np.arcsin(0.5))) / np.pi),
         ((Annulus(0.5), Slit(1.0)), 0.75),
-        (lambda x, y, w: 0.5, 0.25),  # noqa: ARG005
-        (lambda x, y, w: 1j * np.ones((1, 1)), 1.0),  # noqa: ARG005
+        (lambda x, y, w: 0.5, 0.25),
+        (lambda x, y, w: 1j * np.ones((1, 1)), 1.0),
     ],
 )
 def test_pupil_transmittance_equals_area_fraction(pupil, fraction):
@@ -375,15 +375,15 @@ def test_invalid_pupil_raises(make, message):
 @pytest.mark.parametrize(
     ("pupil", "message"),
     [
-        (lambda x, y, w: 0.0 * x * y, "'pupil' must transmit power, got an empty pupil at 550 nm"),  # noqa: ARG005
-        ((Annulus(0.9), lambda x, y, w: x**2 + y**2 < 0.7), "'pupil' must transmit power"),  # noqa: ARG005
-        (lambda x, y, w: np.full(x.shape, np.nan), "'pupil' must return amplitudes <= 1 at 550 nm, got nan"),  # noqa: ARG005
-        (lambda x, y, w: 2.0, "'pupil' must return amplitudes <= 1 at 550 nm, got 2.0"),  # noqa: ARG005
+        (lambda x, y, w: 0.0 * x * y, "'pupil' must transmit power, got an empty pupil at 550 nm"),
+        ((Annulus(0.9), lambda x, y, w: x**2 + y**2 < 0.7), "'pupil' must transmit power"),
+        (lambda x, y, w: np.full(x.shape, np.nan), "'pupil' must return amplitudes <= 1 at 550 nm, got nan"),
+        (lambda x, y, w: 2.0, "'pupil' must return amplitudes <= 1 at 550 nm, got 2.0"),
         (
-            (Annulus(0.9), lambda x, y, w: np.ones(7)),  # noqa: ARG005
+            (Annulus(0.9), lambda x, y, w: np.ones(7)),
             r"'pupil\[1\]' must return amplitudes that broadcast with x and y",
         ),
-        (lambda x, y, w: "open", "'pupil' must return real or complex amplitudes"),  # noqa: ARG005
+        (lambda x, y, w: "open", "'pupil' must return real or complex amplitudes"),
     ],
 )
 def test_invalid_pupil_amplitudes_raise_on_use(pupil, message):
