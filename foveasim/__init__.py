@@ -32,6 +32,7 @@ from foveasim import (
     view,
 )
 from foveasim._core.calls import check_public_calls
+from foveasim._io.pickling import make_copyable
 from foveasim._version import __version__
 from foveasim.camera import Camera
 from foveasim.capture import Capture
@@ -98,7 +99,9 @@ for _module in (
     "sensor.effects", "tiles", "units", "video", "view",
 ):  # fmt: skip
     check_public_calls(f"{__name__}.{_module}")
+    make_copyable(f"{__name__}.{_module}")
 check_public_calls(__name__)
+make_copyable(__name__)
 
 #: Names that are imported when they are used, and the modules that have them.
 _LAZY = {

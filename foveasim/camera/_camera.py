@@ -143,6 +143,9 @@ class Camera:
         #: The most recent scene with ``fit``, and the framed scene.
         self._framed: tuple[Scene, Scene] | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_integrators": {}, "_bounds_um": [], "_framed": None}  # without caches
+
     def __repr__(self) -> str:
         return f"Camera({self._optics!r}, {self._sensor!r})"
 

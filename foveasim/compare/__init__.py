@@ -7,6 +7,7 @@ Pictures, their quality by eccentricity, signal-to-noise ratio, resolution, alia
 from __future__ import annotations
 
 from foveasim._core.calls import check_public_calls
+from foveasim._io.pickling import make_copyable
 from foveasim.compare.annuli import PictureQuality, quality_by_eccentricity
 from foveasim.compare.budgets import BUDGETS, Budget, budget_of
 from foveasim.compare.comparison import Comparison, cameras, layouts
@@ -42,3 +43,4 @@ __all__ = [
 ]
 
 check_public_calls(__name__)
+make_copyable(__name__)

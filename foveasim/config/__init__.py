@@ -7,6 +7,7 @@ Each section names a call of the package and its parameters: file and Python hav
 from __future__ import annotations
 
 from foveasim._core.calls import check_public_calls
+from foveasim._io.pickling import make_copyable
 from foveasim.config._comparing import compare_files
 from foveasim.config._objects import (
     YAML_EXTENSIONS,
@@ -81,3 +82,4 @@ __all__ = [
 ]
 
 check_public_calls(__name__)
+make_copyable(__name__)

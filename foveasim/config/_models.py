@@ -299,7 +299,7 @@ def _layout_union(title: str, base: type[LayerSection], parameters: Mapping[str,
     )
     descriptions = _documentation(read_layout)[1]
     options: dict[str, Any] = {
-        name: (kind, Field(None, description=descriptions[name])) for name, kind in FILE_OPTIONS.items()
+        name: (kind, Field(None, description=descriptions.get(name))) for name, kind in FILE_OPTIONS.items()
     }
     file = create_model(f"{title} file", __base__=base, file=(str, ...), **options)
     file.__doc__ = (

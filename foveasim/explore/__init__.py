@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from foveasim._core.calls import check_public_calls
+from foveasim._io.pickling import make_copyable
 from foveasim.explore._metrics import METRICS, Metric, import_metric
 from foveasim.explore._schemas import schema_of
 from foveasim.explore.datasets.dataset import Dataset
@@ -51,3 +52,4 @@ __all__ = [
 ]
 
 check_public_calls(__name__)
+make_copyable(__name__)

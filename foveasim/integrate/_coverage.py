@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from foveasim._core.validation import Bools, Floats, read_only
+from foveasim._io.pickling import copyable
 from foveasim.fields import Grid
 
 __all__ = ["Coverage"]
@@ -15,6 +16,7 @@ __all__ = ["Coverage"]
 UNCOVERED_ROUNDING = 1e-12
 
 
+@copyable
 @dataclass(frozen=True, eq=False)
 class Coverage:
     """

@@ -8,6 +8,7 @@ import numpy as np
 
 from foveasim._core.rings import site_bounds_um, site_moments
 from foveasim._core.validation import Floats, Ints, freeze
+from foveasim._io.pickling import copyable
 
 __all__ = ["RectangleLattice"]
 
@@ -15,6 +16,7 @@ __all__ = ["RectangleLattice"]
 SITES_PER_BLOCK = 2**16
 
 
+@copyable
 @dataclass(frozen=True, eq=False)
 class RectangleLattice:
     """

@@ -55,10 +55,10 @@ def make_environment(directory, extra=None):
     return python
 
 
-def run_calls(python, directory, names=()):
-    """Make calls in an environment, and return their outcomes."""
+def run_calls(python, directory, names=(), **variables):
+    """Make calls in an environment, with environment variables, and return their outcomes."""
     report = directory / "report.json"
-    env = {"PATH": "/usr/bin:/bin", "HOME": str(directory), "MPLBACKEND": "agg"}
+    env = {"PATH": "/usr/bin:/bin", "HOME": str(directory), "MPLBACKEND": "agg", **variables}
     ran = subprocess.run(
         [str(python), "-P", str(CALLS), "--report", str(report), *names],
         env=env, cwd=directory, capture_output=True, text=True, timeout=LIMIT_S, check=False,

@@ -74,3 +74,10 @@ def test_single_extra_suffices_for_its_calls(core, extra, tmp_path):
 
     assert [name for name in names if found[name] == extra] == []
     assert [name for name in names if core[name] == extra and found[name]] == []
+
+
+def test_commands_work_without_docstrings_and_assertions(tmp_path):
+    names = [f"foveasim {name}" for name in ("run", "schema", "new", "convert", "describe", "view", "video", "dataset")]
+    python = make_environment(tmp_path / "env")
+
+    assert run_calls(python, tmp_path, names, PYTHONOPTIMIZE="2") == dict.fromkeys(names, "ok")
