@@ -18,7 +18,7 @@ CHECK_PYTHON = command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) not found; s
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	{ echo "foveasim requires Python 3.11 or later; specify one with: make PYTHON=python3.12"; exit 1; }
 
-.PHONY: demo test test-core test-lowest test-torch soak lint bench bench-torch peers docs clean
+.PHONY: demo test test-all test-core test-lowest test-torch soak lint bench bench-torch peers docs clean
 .NOTPARALLEL:
 
 demo: $(VENV)/.installed
@@ -35,6 +35,10 @@ test-core:
 		"$$directory/env/bin/python" -m pip install --quiet "$$directory"/foveasim-*.whl && \
 		cp tests/installation/calls.py "$$directory" && cd "$$directory" && MPLBACKEND=agg env -u PYTHONPATH \
 		env/bin/python calls.py --program env/bin/foveasim
+
+# All pairs of features in tests/compositions, instead of a sample.
+test-all: $(VENV)/.installed-dev
+	FOVEASIM_TESTS_ALL=1 $(BIN)/python -m pytest $(PARALLEL) $(PYTEST_ARGS)
 
 # Deprecation warnings between old versions of dependencies are ignored.
 test-lowest: $(LOWEST)/.installed

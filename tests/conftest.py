@@ -46,6 +46,7 @@ INDEPENDENT = {
     "test_docs.py",
     "test_cli_explore.py",
     "test_principal_point.py",
+    "test_invariants.py",
 }
 
 

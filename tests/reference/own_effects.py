@@ -1,0 +1,105 @@
+"""Effects of a user, one of each kind, for tests that combine them with features of the package."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from foveasim.sensor.effects import AdditiveNoise, Effect, FixedFactor
+
+
+@dataclass(frozen=True)
+class CornerLoss(FixedFactor):
+    """Transmission that falls with the square of the distance from the origin."""
+
+    name = "corner_loss"
+    stage = "photo"
+
+    loss: float
+    radius_um: float
+
+    def pattern(self, sites):
+        """Return the transmission of every site."""
+        radius_um = np.hypot(*sites.layout.centroid_um.T)
+        return 1.0 - self.loss * np.minimum(radius_um / self.radius_um, 1.0) ** 2
+
+
+@dataclass(frozen=True)
+class StitchedGain(FixedFactor):
+    """Two gains, left and right of the origin, cached under names."""
+
+    name = "stitched_gain"
+    stage = "sense_node"
+
+    left: float
+    right: float
+
+    def pattern(self, sites):
+        """Return the gain of every site."""
+        halves = [
+            sites.cached(
+                (self, "half " + str(half)), lambda each, half=half: (each.layout.centroid_um[:, 0] > 0) == half
+            )
+            for half in (False, True)
+        ]
+        return np.where(halves[0], self.left, 0.0) + np.where(halves[1], self.right, 0.0)
+
+
+@dataclass(frozen=True)
+class ResetSag(AdditiveNoise):
+    """Noise of the reset level, in volts, drawn once per reset."""
+
+    name = "reset_sag"
+    stage = "sense_node"
+    is_drawn_at_reset = True
+
+    sigma_v: float
+
+    def deviation(self, sites):
+        """Return the standard deviation, V."""
+        return self.sigma_v
+
+
+@dataclass(frozen=True)
+class LineNoise(Effect):
+    """Temporal noise common to the sites of one band of 5 µm, V."""
+
+    name = "line_noise"
+    stage = "output"
+    is_temporal = True
+    is_local = False
+
+    sigma_v: float
+
+    def apply(self, values, *, sites, rng):
+        """Return the voltages plus one draw per band."""
+        band = np.floor(sites.layout.centroid_um[:, 1] / 5.0).astype(int)
+        draws = rng.standard_normal(64) * self.sigma_v
+        return values + draws[band % 64]
+
+    def moments(self, mean, variance, *, sites):
+        """Add the variance of the draws."""
+        return mean, variance + self.sigma_v**2
+
+
+@dataclass(frozen=True)
+class AfterGlow(Effect):
+    """Charge proportional to the expected charge, before collection."""
+
+    name = "after_glow"
+    stage = "expected"
+    is_temporal = False
+
+    fraction: float
+
+    def apply(self, values, *, sites, rng):
+        """Return the charges with their glow."""
+        return values * (1.0 + self.fraction)
+
+    def moments(self, mean, variance, *, sites):
+        """Scale the moments."""
+        return mean * (1.0 + self.fraction), variance * (1.0 + self.fraction) ** 2
+
+
+OWN_EFFECTS = {each.name: each for each in (CornerLoss, StitchedGain, ResetSag, LineNoise, AfterGlow)}
