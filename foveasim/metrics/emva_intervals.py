@@ -1,4 +1,4 @@
-"""Confidence intervals of EMVA 1288 parameters, by the jackknife over blocks of photosites."""
+"""Confidence intervals of EMVA 1288 parameters by the jackknife."""
 
 from __future__ import annotations
 
@@ -49,7 +49,11 @@ class EmvaIntervals:
         return self.limits[name]
 
     def is_measured(self, name: str) -> Bools:
-        """Return whether the data contain a parameter, (n_class,): without a dark series, the dark current is not."""
+        """
+        Return whether the data contain a parameter, (n_class,).
+
+        Without a dark series, they do not contain the dark current.
+        """
         return np.asarray(~np.isnan(self[name]).any(axis=1))
 
     def is_resolved(self, name: str) -> Bools:
@@ -63,7 +67,7 @@ class EmvaIntervals:
         return np.asarray(np.isfinite(low) & np.isfinite(high) & ((low > 0.0) | (high < 0.0)))
 
     def records(self) -> list[dict[str, Any]]:
-        """Return one dict per class and parameter that was measured, with its limits and ``is_resolved``."""
+        """Return one dict per class and measured parameter: limits and ``is_resolved``."""
         return [
             {
                 "class": label,
@@ -103,7 +107,7 @@ class Jackknife:
         self._n_blocks = n_blocks_of_class
 
     def error(self, values: Floats) -> Floats:
-        """Return standard errors (..., n_class) from values of subsets (1 + n_block, ..., n_class)."""
+        """Return standard errors (..., n_class) from values (1 + n_block, ..., n_class)."""
         without = values[1:]
         shape = (without.shape[0],) + (1,) * (without.ndim - 2) + (self._n_blocks.size,)
         is_block = np.broadcast_to((np.arange(shape[0])[:, None] < self._n_blocks).reshape(shape), without.shape)
@@ -112,23 +116,23 @@ class Jackknife:
         return np.asarray(np.sqrt(squares * (self._n_blocks - 1.0) / self._n_blocks))
 
     def quantile(self, n_values: int | Ints = 1) -> Floats:
-        """Return the two-sided quantiles of Student's distribution, (n_class,), for the extremes of several values."""
+        """Return the two-sided quantiles for the extremes of several values, (n_class,)."""
         from scipy.special import stdtrit
 
         return np.asarray(stdtrit(self._n_blocks - 1.0, 1.0 - 0.5 * (1.0 - CONFIDENCE) / np.maximum(n_values, 1)))
 
-    def interval(self, values: Floats, *, lowest: float = -np.inf) -> Floats:
-        """Return the limits, (n_class, 2), of a parameter from values (1 + n_block, n_class), at least ``lowest``."""
+    def interval(self, values: Floats) -> Floats:
+        """Return the limits, (n_class, 2), of a parameter that is not negative."""
         half = self.quantile() * self.error(values)
-        return np.maximum(np.stack((values[0] - half, values[0] + half), axis=-1), lowest)
+        return np.maximum(np.stack((values[0] - half, values[0] + half), axis=-1), 0.0)
 
-    def interval_of_root(self, squares: Floats) -> Floats:
+    def interval_of_root(self, values: Floats) -> Floats:
         """
         Return the limits, (n_class, 2), of the square root of a parameter.
 
         The interval is that of the square, which may be estimated as negative, and begins at 0 if it contains 0.
         """
-        return np.sqrt(self.interval(squares, lowest=0.0))
+        return np.sqrt(self.interval(values))
 
     def interval_of_extremes(self, values: Floats, is_used: Bools) -> tuple[Floats, Floats]:
         """
@@ -153,7 +157,7 @@ class Jackknife:
 
     def candidates(self, values: Floats) -> Bools:
         """
-        Return the set of values that may be the largest, (n_value, n_class), from values (1 + n_block, n_value, n_class).
+        Return whether values may be the largest, (n_value, n_class).
 
         Comparisons with the largest estimate, with simultaneous limits (Bonferroni): the set contains the largest value with at
         least the probability of an interval (J. C. Hsu, Multiple comparisons, Chapman and Hall, 1996, chapter 4).

@@ -214,18 +214,18 @@ class SiteClasses:
         self._subset_sizes = self._subset_sums(np.ones(n_sites))
 
     def _subset_sums(self, values: Floats) -> Floats:
-        """Compute the sums over the subsets of each class: (1 + n_block, n_class) from (n_site,)."""
+        """Compute sums over the subsets: (1 + n_block, n_class) from (n_site,)."""
         shape = self.n_sites.size, max(self._n_blocks, 1)
         of_blocks = np.bincount(self._block_of_site, weights=values, minlength=shape[0] * shape[1]).reshape(shape).T
         total = of_blocks.sum(axis=0)
         return np.concatenate((total[None], total - of_blocks)) if self._n_blocks else total[None]
 
     def subset_means(self, values: Floats) -> Floats:
-        """Compute the means over the subsets of each class: (1 + n_block, n_class) from (n_site,)."""
+        """Compute means over the subsets: (1 + n_block, n_class) from (n_site,)."""
         return self._subset_sums(values) / self._subset_sizes
 
     def subset_variances(self, values: Floats) -> Floats:
-        """Compute the sample variances over the subsets of each class: (1 + n_block, n_class) from (n_site,)."""
+        """Compute sample variances over the subsets: (1 + n_block, n_class) from (n_site,)."""
         off = values - self.mean(values)[self.class_index]
         with np.errstate(divide="ignore", invalid="ignore"):  # subsets of one site
             correction = self._subset_sizes / (self._subset_sizes - 1.0)
@@ -437,7 +437,7 @@ def codes_of(name: str, frames: Any) -> NDArray[Any]:
 
 
 def _statistics(codes: NDArray[Any], groups: SiteClasses) -> tuple[Floats, Floats, Floats]:
-    """Compute mean, temporal and spatial variance of the subsets of each class, (1 + n_block, n_class)."""
+    """Compute mean, temporal and spatial variance of subsets, (1 + n_block, n_class)."""
     n_frames = codes.shape[0]
     mean_dn = codes.mean(axis=0, dtype=np.float64)
     off = codes - mean_dn
@@ -506,7 +506,7 @@ def is_linear(mean_dn: Floats, saturation_level: Ints) -> NDArray[np.bool_]:
 
 
 def slopes(name: str, x: Floats, y: Floats, is_used: NDArray[np.bool_]) -> Floats:
-    """Fit lines through the origin to (..., n_level, n_class) values; return slopes (..., n_class)."""
+    """Fit lines through the origin to (..., n_level, n_class); return (..., n_class)."""
     squares = np.where(is_used, x * x, 0.0).sum(axis=-2)
     if not np.all(squares > 0.0):
         raise ParameterError(
