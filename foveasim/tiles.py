@@ -18,7 +18,7 @@ import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 from zlib import crc32
@@ -30,6 +30,7 @@ from foveasim._core.extras import import_optional
 from foveasim._core.names import missing_path
 from foveasim._core.provenance import differences, to_plain_data
 from foveasim._core.random_streams import Streams
+from foveasim._core.threads import cached_property
 from foveasim._core.validation import check_count, read_only
 from foveasim._io.formats import as_file_error
 from foveasim._io.mapped_files import in_memory

@@ -188,3 +188,17 @@ def test_unit_rule_finds_missing_unit(tmp_path):
     bad.write_text("def f(radius: float, r_um: float | None = None) -> None: ...\n")
 
     assert [n for n in floating_names(bad) if not n.endswith(tuple(UNIT_SUFFIXES))] == ["radius"]
+
+
+def test_cached_properties_have_no_lock():
+    """That of functools has one lock per class in Python 3.11, which a forked process may inherit locked."""
+    using = {
+        str(path.relative_to(PACKAGE))
+        for path in MODULES
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ImportFrom)
+        and node.module == "functools"
+        and "cached_property" in {alias.name for alias in node.names}
+    }
+
+    assert using == {"_io/pickling.py"}  # recognises both

@@ -1,17 +1,20 @@
-"""Thread count, and execution of independent tasks on threads."""
+"""Thread count, execution of independent tasks on threads, and locks in forked processes."""
 
 from __future__ import annotations
 
+import functools
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
-from typing import TypeVar
+from threading import RLock
+from typing import Any, TypeVar
+from weakref import WeakSet
 
 from foveasim._core.validation import check_count
 
-__all__ = ["in_order", "parallel_map", "thread_count"]
+__all__ = ["ForkSafeLock", "cached_property", "in_order", "parallel_map", "thread_count"]
 
 #: Smallest size of the thread pool: users may request more threads than there are cores.
 MIN_POOL_THREADS = 8
@@ -20,6 +23,51 @@ MAX_THREADS = 4096
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
+
+
+class cached_property(functools.cached_property[_Result]):  # noqa: N801 -- replaces that of Python
+    """
+    Cached property without a lock; threads that compute it at the same time receive the same object.
+
+    That of Python 3.11 has one lock for all instances of a class. A process that is forked while a thread holds it could never
+    compute the property.
+    """
+
+    def __get__(self, instance: object, owner: type | None = None) -> Any:
+        if instance is None:
+            return self
+        values = vars(instance)
+        assert self.attrname is not None
+        if self.attrname not in values:
+            values.setdefault(self.attrname, self.func(instance))
+        return values[self.attrname]
+
+
+class ForkSafeLock:
+    """Reentrant lock that is free in a forked process unless the forking thread holds it."""
+
+    def __init__(self) -> None:
+        self._lock = RLock()
+        _LOCKS.add(self)
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+    def renew(self) -> None:
+        """Replace the lock if a thread holds it that this process does not have."""
+        if not self._lock._is_owned():  # type: ignore[attr-defined]  # noqa: SLF001 -- as Condition of the standard library
+            self._lock = RLock()
+
+
+_LOCKS: WeakSet[ForkSafeLock] = WeakSet()
+
+
+def _renew_locks() -> None:
+    for lock in list(_LOCKS):
+        lock.renew()
 
 
 def thread_count(n_threads: int | None = None) -> int:
@@ -88,6 +136,7 @@ def _pool() -> ThreadPoolExecutor:
 if hasattr(os, "register_at_fork"):
     # A forked process does not inherit the threads of its parent.
     os.register_at_fork(after_in_child=_pool.cache_clear)
+    os.register_at_fork(after_in_child=_renew_locks)
 
 
 def in_order(

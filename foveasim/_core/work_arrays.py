@@ -12,11 +12,12 @@ import gc
 import math
 import sys
 from contextlib import suppress
-from threading import RLock
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
+
+from foveasim._core.threads import ForkSafeLock
 
 __all__ = ["release_memory", "share_heap", "work_array"]
 
@@ -45,7 +46,7 @@ class _Pool:
 
     def __init__(self) -> None:
         # Reentrant: garbage collection may delete an array, and thus call put, at any allocation.
-        self._lock = RLock()
+        self._lock = ForkSafeLock()
         self._unused: list[NDArray[np.uint8]] = []
 
     def get(self, n_bytes: int) -> NDArray[np.uint8]:

@@ -63,7 +63,7 @@ def _unmark(value: Any) -> Any:
 
 
 def _replaced(value: Any, replace: Callable[[Any], Any]) -> Any:
-    """Return a list, tuple or dictionary with replaced elements, the same object if none differs."""
+    """Return a list, tuple or dictionary with replaced elements, itself if none differs."""
     kind = type(value)
     if kind is dict:
         items = {key: replace(item) for key, item in value.items()}
@@ -82,7 +82,7 @@ def _own_classes(kind: type) -> list[type]:
 
 @cache
 def _caches(kind: type) -> dict[str, Callable[[], Any] | None]:
-    """Return the names of the caches of a class, with functions that create empty ones; None for cached properties."""
+    """Return functions that create empty caches by name, None for cached properties."""
     members = [item for base in kind.__mro__ for item in vars(base).items()]
     own_fields = {name for base in _own_classes(kind) for name in get_annotations(base)}
     found: dict[str, Callable[[], Any] | None] = {
@@ -106,7 +106,7 @@ def _setstate(self: Any, state: dict[str, Any]) -> None:
 
 def copyable(kind: _Class) -> _Class:
     """
-    Define the state of a class for pickle and copies, as described in this module; a class decorator.
+    Define the state of a class for pickle and copies; a class decorator.
 
     Classes that define their own state or have no ``__dict__`` are not changed.
     """

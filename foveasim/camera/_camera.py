@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import cached_property
 from threading import Lock
 from typing import Any, Literal, NamedTuple
 
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.provenance import to_plain_data, versions
 from foveasim._core.random_streams import Streams
-from foveasim._core.threads import in_order, thread_count
+from foveasim._core.threads import cached_property, in_order, thread_count
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, check_count, finite_array, read_only
 from foveasim.camera._clock import Clock

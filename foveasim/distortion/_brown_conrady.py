@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from foveasim._core.short_repr import short_repr
-from foveasim._core.threads import parallel_map, thread_count
+from foveasim._core.threads import cached_property, parallel_map, thread_count
 from foveasim._core.validation import Bools, Floats, check_number
 from foveasim.distortion._lens import LensBase
 from foveasim.distortion._registry import LENSES

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
 
+from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, check_choice, check_number, finite_array
 from foveasim.distortion._lens import LensBase
 from foveasim.distortion._registry import LENSES

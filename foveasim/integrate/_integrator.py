@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.rings import site_area_um2
-from foveasim._core.threads import thread_count
+from foveasim._core.threads import cached_property, thread_count
 from foveasim._core.validation import Floats, Ints, check_choice, check_count, finite_array, unmasked
 from foveasim.errors import GeometryError, ParameterError, type_name
 from foveasim.fields import Grid, PackedRings, PointMap

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.rings import next_vertex, to_frame
-from foveasim._core.threads import parallel_map, thread_count
+from foveasim._core.threads import cached_property, parallel_map, thread_count
 from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_count, finite_array, read_only
 from foveasim.errors import ParameterError, type_name
 from foveasim.fields import Grid, PackedRings

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.rings import to_frame
-from foveasim._core.threads import parallel_map
+from foveasim._core.threads import cached_property, parallel_map
 from foveasim._core.validation import Bools, Floats
 from foveasim.fields import Grid
 from foveasim.integrate._coverage import Coverage

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, cast
@@ -24,6 +23,7 @@ from foveasim._core.rings import (
     site_bounds_um,
     site_moments,
 )
+from foveasim._core.threads import cached_property
 from foveasim._core.validation import (
     MAX_LENGTH_UM,
     MAX_SITES,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from foveasim._core.rings import positions_in_runs
+from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, Ints, read_only
 from foveasim.errors import GeometryError, ParameterError, type_name
 from foveasim.integrate import SharedEdges

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import shapely
@@ -13,6 +12,7 @@ import torch
 from torch import Tensor
 
 from foveasim._core.rings import positions_in_runs
+from foveasim._core.threads import cached_property
 from foveasim._core.validation import Bools, Floats, Ints, check_number
 from foveasim.errors import ParameterError, type_name
 from foveasim.layout import DesignRules

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import KW_ONLY, dataclass
-from functools import cached_property
 from itertools import islice
 from threading import Lock
 from typing import Any
@@ -19,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.random_streams import fixed_pattern_key
 from foveasim._core.short_repr import short_repr
-from foveasim._core.threads import parallel_map, thread_count
+from foveasim._core.threads import cached_property, parallel_map, thread_count
 from foveasim._core.validation import Floats, Ints, check_count, finite_array, read_only
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.layout import Layout

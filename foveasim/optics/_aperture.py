@@ -11,12 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.threads import cached_property
 from foveasim._core.validation import Bools, Floats
 from foveasim.errors import ParameterError
 from foveasim.optics.pupils import Annulus, Blades, Pupil, PupilImage, Slit, Spider

@@ -17,13 +17,14 @@ import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, Images, Ints
 from foveasim._io.mapped_files import in_memory
 from foveasim.fields import Grid

@@ -18,14 +18,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from foveasim._core.threads import parallel_map
+from foveasim._core.threads import cached_property, parallel_map
 from foveasim._core.validation import Floats, Images, Ints
 from foveasim._core.work_arrays import work_array
 from foveasim.errors import ParameterError, SimulationError

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable, Sequence
-from functools import cached_property
-from threading import Lock
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.threads import ForkSafeLock, cached_property
 from foveasim._core.validation import Floats, as_numbers
 from foveasim.optics._aperture import Aperture
 
@@ -154,7 +153,7 @@ class TableCache:
     """
 
     def __init__(self) -> None:
-        self._lock = Lock()
+        self._lock = ForkSafeLock()
         self._tables: dict[tuple[Hashable, tuple[float, float]], PlaneTables] = {}
         self._apertures: dict[float, Aperture] = {}
         self._factors: dict[tuple[Hashable, bytes], NDArray[Any] | None] = {}

@@ -10,13 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim._core.threads import parallel_map, thread_count
+from foveasim._core.threads import cached_property, parallel_map, thread_count
 from foveasim._core.validation import Floats, check_choice, check_count, check_number, finite_array, read_only
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PackedRings

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.short_repr import short_repr
+from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, check_choice, check_count, finite_array, read_only
 from foveasim.errors import ParameterError
 from foveasim.sensor.limits import check_plausible, check_plausible_array

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
-from threading import RLock
 from typing import Any
+
+from foveasim._core.threads import ForkSafeLock
 
 __all__ = ["BoundedCache"]
 
@@ -28,7 +29,7 @@ class BoundedCache:
         self._owners: dict[Hashable, Any] = {}
         self._used: set[Hashable] = set()
         # Reentrant: computing a value may use other values.
-        self._lock = RLock()
+        self._lock = ForkSafeLock()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return BoundedCache, (self.max_values,)

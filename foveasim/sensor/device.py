@@ -11,7 +11,6 @@ The identity of a site is that of :mod:`foveasim._core.site_identity`: its posit
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from foveasim._core.random_streams import fixed_pattern_key
 from foveasim._core.short_repr import short_repr
 from foveasim._core.site_identity import site_ids
+from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, Ints
 from foveasim.fields import PackedRings
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, fields, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.names import possible_names
 from foveasim._core.provenance import is_digest
 from foveasim._core.random_streams import Streams
+from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, Ints, check_count, check_number, read_only, unmasked
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.sensor.adc import ADC, Companding, ConversionTables

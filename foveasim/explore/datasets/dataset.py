@@ -10,7 +10,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.provenance import versions
 from foveasim._core.random_streams import Streams
+from foveasim._core.threads import cached_property
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Ints, check_choice, check_count
 from foveasim.capture import Capture

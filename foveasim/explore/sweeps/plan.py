@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from foveasim._core.provenance import identify, versions
 from foveasim._core.random_streams import derive_seed
 from foveasim._core.short_repr import short_repr
+from foveasim._core.threads import cached_property
 from foveasim._core.validation import Ints, check_choice, check_count
 from foveasim._io.yaml_files import position_of, read_yaml
 from foveasim.config import (

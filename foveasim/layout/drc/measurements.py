@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from foveasim._core.registry import Registry
 from foveasim._core.rings import next_vertex, positions_in_runs, ring_moments
 from foveasim._core.short_repr import short_repr
-from foveasim._core.threads import parallel_map, thread_count
+from foveasim._core.threads import cached_property, parallel_map, thread_count
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.layout._noding import node_edges
 from foveasim.layout.adjacency import TOUCHING_UM

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import InitVar, dataclass, field, fields, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ import numpy as np
 
 from foveasim._core.names import possible_names
 from foveasim._core.short_repr import short_repr
+from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, check_choice, check_count, check_number, finite_array
 from foveasim.errors import GeometryError, ParameterError, type_name, with_article
 from foveasim.layout.drc.measurements import RULES, Case, Measurement, Rule, min_width_um

@@ -10,13 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.short_repr import short_repr
+from foveasim._core.threads import cached_property
 from foveasim._core.validation import (
     Floats,
     Ints,

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.short_repr import short_repr
+from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, as_numbers, check_choice, check_count, finite_array, wavelengths_nm
 from foveasim.errors import ParameterError
 from foveasim.sensor.spectral.curves import CURVES, CurveBase, check_within
