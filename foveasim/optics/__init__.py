@@ -5,6 +5,7 @@ from __future__ import annotations
 from foveasim._core.registry import import_all
 from foveasim.optics._optics import Optics
 from foveasim.optics._point_images import PointSpread
+from foveasim.optics._quadrature import PupilEdges
 from foveasim.optics.aberrations import LateralColour, Seidel, Zernike, noll_to_nm, osa_to_nm, zernike
 from foveasim.optics.otf import circular_otf
 from foveasim.optics.pupils import PUPILS, Annulus, Blades, Pupil, PupilImage, Slit, Spider
@@ -17,6 +18,7 @@ __all__ = [
     "Optics",
     "PointSpread",
     "Pupil",
+    "PupilEdges",
     "PupilImage",
     "Seidel",
     "Slit",

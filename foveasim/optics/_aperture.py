@@ -1,5 +1,8 @@
 """
-Sampled complex amplitude in the aperture, and the OTF and PSF computed from it.
+Complex amplitude in the aperture, and the OTF and PSF computed from it.
+
+Point images are integrals over the aperture, by :mod:`foveasim.optics._quadrature`. OTF tables for power maps, and pupils that
+are discontinuous at unknown edges, use equidistant samples.
 
 The amplitude ``P(r)`` in the aperture of radius a produces the amplitude ``∫ P(r) exp(-2πi x·r / (λD)) dr`` at the point x
 of the sensor, at the image distance D. The OTF is the normalised autocorrelation of P, at lags ``λ D f``. In units of the
@@ -9,9 +12,10 @@ aperture radius, with the image-side f-number ``N = D / 2a``, the lag is ``2 λN
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from functools import partial
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +23,7 @@ from numpy.typing import NDArray
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Bools, Floats
 from foveasim.errors import ParameterError
+from foveasim.optics._quadrature import Nodes, PupilEdges, joined, overlap_nodes, plane_waves, pupil_nodes
 from foveasim.optics.pupils import Annulus, Blades, Pupil, PupilImage, Slit, Spider
 from foveasim.units import um_from_nm
 
@@ -34,6 +39,15 @@ MAX_ACROSS = 2048
 PUPIL_POINTS = 1535
 #: Points across the aperture at which the wavefront slope is evaluated.
 SLOPE_POINTS = 193
+#: Frequencies of the quadrature in radians per radius: the first beyond the geometric blur, the factor between attempts, and
+#: the limit beyond which a pupil is sampled.
+FIRST_RADIANS, RADIANS_STEP, MAX_RADIANS = 8.0, 1.5, 500.0
+#: Error of converged integrals over the aperture, relative to that of the modulus.
+INTEGRAL_ERROR = 1e-8
+#: Waves whose integrals are compared, in radians per radius: without a symmetry that would cancel errors.
+PROBES = ((0.0, 0.0), (3.1, 1.3), (-4.2, 5.7))
+#: Largest number of pixel edges along a side of a pupil whose OTF is computed without sampling: 0.1 s per frequency.
+MAX_OTF_LINES = 128
 #: Power transmittance below which a pupil counts as empty.
 MIN_TRANSMITTANCE = 1e-9
 
@@ -47,6 +61,14 @@ class Wavefront(Protocol):
 
         ``x`` and ``y`` are in aperture radii.
         """
+
+
+@runtime_checkable
+class EdgedPupil(Protocol):
+    """Pupil that specifies where it is discontinuous."""
+
+    def edges(self) -> PupilEdges:
+        """Return the curves at which the amplitude, or its derivative, is discontinuous."""
 
 
 def overlaps(n_to: int, to_step: float, n_from: int, from_step: float) -> Any:
@@ -276,10 +298,77 @@ class Aperture:
         table[n_lags, n_lags] = 1.0  # conserves energy exactly
         return table
 
+    @cached_property
+    def _edges(self) -> PupilEdges:
+        """Known edges of all pupils."""
+        parts: Sequence[object] = self.pupils
+        return joined([pupil.edges() for pupil in parts if isinstance(pupil, EdgedPupil)])
+
+    def _transmission(self, x: Floats, y: Floats, wavelength_nm: float) -> NDArray[np.complex128]:
+        """Return the amplitude transmission of all pupils at points (n,) of the aperture."""
+        total = np.ones((1, x.size), np.complex128)
+        if x.size:
+            x, y = x[np.newaxis], y[np.newaxis]
+            disc = x * x + y * y <= 1.0
+            for i, pupil in enumerate(self.pupils):
+                total = total * self._evaluate_pupil(i, pupil, x, y, wavelength_nm, disc)
+        return np.broadcast_to(total, (1, x.size))[0]
+
+    def _amplitude(
+        self, x: Floats, y: Floats, wavelength_nm: float, field_um: tuple[float, float]
+    ) -> NDArray[np.complex128]:
+        """Return transmission times phase factor at points (n,) of the aperture."""
+        amplitude = self._transmission(x, y, wavelength_nm)
+        if not self.wavefronts and not self.defocus_um:
+            return amplitude
+        path_um = self.path_um(x, y, wavelength_nm, field_um)
+        return np.asarray(amplitude * np.exp(2j * np.pi / float(um_from_nm(wavelength_nm)) * path_um))
+
+    def _resolve(
+        self, wavelength_nm: float, field_um: tuple[float, float]
+    ) -> tuple[float | None, NDArray[np.complex128]]:
+        """
+        Return the highest frequency of the amplitude in radians per radius, and integrals over the aperture.
+
+        The frequency is None if the integrals do not converge: a pupil is discontinuous at unknown edges. The integrals are
+        those of the amplitude times each of :data:`PROBES`, of its modulus, and of the squared modulus.
+        """
+        key = "integrals", wavelength_nm, field_um
+        if key not in self._cache:
+            first = FIRST_RADIANS + np.pi * self.blur_lambda_n(wavelength_nm, field_um)
+            radians: float | None = first
+            integrals = self._integrals(wavelength_nm, field_um, first)
+            while radians is not None:
+                finer = self._integrals(wavelength_nm, field_um, RADIANS_STEP * radians)
+                error = np.abs(finer - integrals).max() / max(finer[-2].real, MIN_TRANSMITTANCE)
+                integrals = finer
+                if error <= INTEGRAL_ERROR:
+                    break
+                radians = RADIANS_STEP * radians if radians < max(MAX_RADIANS, 4.0 * first) else None
+            self._cache[key] = radians, integrals
+        found: tuple[float | None, NDArray[np.complex128]] = self._cache[key]
+        return found
+
+    def _integrals(self, wavelength_nm: float, field_um: tuple[float, float], radians: float) -> NDArray[np.complex128]:
+        total = np.zeros(len(PROBES) + 2, np.complex128)
+        for nodes in self._nodes(wavelength_nm, radians):
+            amplitude = self._amplitude(nodes.x, nodes.y, wavelength_nm, field_um)
+            weighted = nodes.weight * amplitude
+            total += [
+                *(weighted @ np.exp(-1j * (kx * nodes.x + ky * nodes.y)) for kx, ky in PROBES),
+                np.abs(weighted).sum(),
+                np.vdot(amplitude, weighted),
+            ]
+        return total
+
+    def _nodes(self, wavelength_nm: float, radians: float) -> Iterator[Nodes]:
+        """Yield the nodes of a quadrature over the aperture, for an integrand of a highest frequency in radians per radius."""
+        return pupil_nodes(self._edges, partial(self._transmission, wavelength_nm=wavelength_nm), radians)
+
     def psf_per_um2(
         self, wavelength_nm: float, lambda_n_um: float, x_um: Floats, y_um: Floats, field_um: tuple[float, float]
     ) -> Floats:
-        """Sample the PSF, normalised to unit energy, at the points (y, x); (n_y, n_x), 1/µm²."""
+        """Sample the PSF, normalised to unit energy, at the equidistant points (y, x); (n_y, n_x), 1/µm²."""
         reach = 2.0 * max(np.abs(x_um).max(), np.abs(y_um).max()) / lambda_n_um
         if reach > 0.5 * MAX_ACROSS:
             raise ParameterError(
@@ -287,13 +376,71 @@ class Aperture:
                 f"times (n_points - 1) / 2 must be at most {MAX_ACROSS // 4} λN = "
                 f"{0.25 * MAX_ACROSS * lambda_n_um:.4g} µm for a sampled pupil, got {0.5 * reach * lambda_n_um:.4g} µm",
             )
-        n_across = max(self.n_across(wavelength_nm, field_um), min(MAX_ACROSS, math.ceil(4.0 * reach)))
-        amplitude, at, power = self.samples(wavelength_nm, n_across, field_um)
-        wave_y, wave_x = (np.exp(-1j * np.pi / lambda_n_um * np.outer(u, at)) for u in (y_um, x_um))
-        field = wave_y @ amplitude @ wave_x.T
-        return np.asarray(np.abs(field) ** 2 / power / (n_across * lambda_n_um) ** 2)
+        # At the image distance D of an aperture of radius a, the phase of the point x changes by 2π a x / (λ D) per radius.
+        along_y, along_x = (np.pi / lambda_n_um * at for at in (y_um, x_um))
+        radians, integrals = self._resolve(wavelength_nm, field_um)
+        if radians is None:
+            n_across = max(
+                self.n_across(wavelength_nm, field_um), min(MAX_ACROSS, PUPIL_POINTS, math.ceil(4.0 * reach))
+            )
+            amplitude, at, power = self.samples(wavelength_nm, n_across, field_um)
+            wave_y, wave_x = (np.exp(-1j * np.outer(along, at)) for along in (along_y, along_x))
+            return np.asarray(np.abs(wave_y @ amplitude @ wave_x.T) ** 2 / power / (n_across * lambda_n_um) ** 2)
+        wave = np.zeros((y_um.size, x_um.size), np.complex128)
+        for nodes in self._nodes(wavelength_nm, radians + 0.5 * np.pi * reach):
+            amplitude = self._amplitude(nodes.x, nodes.y, wavelength_nm, field_um)
+            wave += np.exp(-1j * np.outer(along_y, nodes.row_y)) @ plane_waves(nodes, nodes.weight * amplitude, along_x)
+        return np.asarray(np.abs(wave) ** 2 / integrals[-1].real / (2.0 * lambda_n_um) ** 2)
 
     def strehl(self, wavelength_nm: float, field_um: tuple[float, float]) -> float:
         """Return the PSF at the image point relative to that of the same aperture without phase."""
-        amplitude, _, _ = self.samples(wavelength_nm, self.n_across(wavelength_nm, field_um), field_um)
-        return float(np.abs(amplitude.sum()) ** 2 / np.abs(amplitude).sum() ** 2)
+        radians, integrals = self._resolve(wavelength_nm, field_um)
+        total, size = integrals[0], integrals[-2]
+        if radians is None:
+            n_across = max(self.n_across(wavelength_nm, field_um), PUPIL_POINTS)
+            amplitude, _, _ = self.samples(wavelength_nm, n_across, field_um)
+            total, size = amplitude.sum(), np.abs(amplitude).sum()
+        return float(np.abs(total / size) ** 2)
+
+    def otf(
+        self, wavelength_nm: float, s_x: Floats, s_y: Floats, field_um: tuple[float, float]
+    ) -> NDArray[np.complex128] | None:
+        """
+        Return the OTF at frequencies in units of 1/λN, or None if it must be sampled.
+
+        Each frequency is a quadrature over the overlap of two copies of the aperture.
+        """
+        radians, integrals = self._resolve(wavelength_nm, field_um)
+        if radians is None or max(np.size(self._edges.lines_x), np.size(self._edges.lines_y)) > MAX_OTF_LINES:
+            return None
+        shape = np.broadcast_shapes(s_x.shape, s_y.shape)
+        lags, of_frequency = np.unique(
+            np.stack([np.broadcast_to(s, shape).ravel() for s in (s_x, s_y)], axis=1), axis=0, return_inverse=True
+        )
+        found = [self._overlap(wavelength_nm, (float(x), float(y)), field_um, 2.0 * radians) for x, y in lags]
+        power = integrals[-1].real
+        return np.asarray(np.array(found, np.complex128)[of_frequency.ravel()].reshape(shape) / power)
+
+    def _overlap(
+        self, wavelength_nm: float, shift: tuple[float, float], field_um: tuple[float, float], radians: float
+    ) -> complex:
+        """Return the correlation of the amplitude at points displaced by ``shift`` and its negative."""
+        if math.hypot(*shift) >= 1.0:
+            return 0.0j
+
+        def product(
+            amplitude: Callable[[Floats, Floats], NDArray[np.complex128]], x: Floats, y: Floats
+        ) -> NDArray[np.complex128]:
+            dx, dy = shift
+            both = amplitude(np.concatenate((x - dx, x + dx)), np.concatenate((y - dy, y + dy)))
+            return np.asarray(both[: x.size] * np.conj(both[x.size :]))
+
+        transmission = partial(self._transmission, wavelength_nm=wavelength_nm)
+        amplitude = partial(self._amplitude, wavelength_nm=wavelength_nm, field_um=field_um)
+        return sum(
+            (
+                complex(nodes.weight @ product(amplitude, nodes.x, nodes.y))
+                for nodes in overlap_nodes(self._edges, partial(product, transmission), shift, radians)
+            ),
+            0.0j,
+        )

@@ -1,7 +1,7 @@
 """
 Point images: PSF, OTF, encircled and ensquared energy.
 
-A clear circular pupil in focus uses closed forms; every other aperture is sampled.
+A clear circular pupil in focus uses closed forms; every other aperture is integrated, and sampled for the energy.
 """
 
 from __future__ import annotations
@@ -23,8 +23,10 @@ __all__ = ["Point", "PointImages", "PointSpread"]
 
 #: Default number of PSF samples along either axis, and their pitch in λN.
 PSF_POINTS, PSF_LAMBDA_N = 257, 0.125
-#: Minimum number of samples across the aperture for point images; halves the error of power maps.
+#: Minimum number of samples across the aperture for encircled and ensquared energy; halves the error of power maps.
 POINT_ACROSS = 384
+#: The same for the OTF of an aperture that cannot be integrated.
+OTF_ACROSS = 768
 #: Radial and angular quadratures of the ensquared energy: minimum number of nodes, and additional nodes per λN of the side.
 QUADRATURE_NODES, NODES_PER_LAMBDA_N = 64, 8
 #: Side (λN) above which the asymptotic PSF gives the ensquared energy to 1e-5.
@@ -78,9 +80,13 @@ class Point:
         """Return the OTF at frequencies in units of 1/λN."""
         if self.is_clear_circle:
             return circular_otf(np.hypot(s_x, s_y)).astype(np.complex128)
+        exact = self.aperture.otf(self.wavelength_nm, s_x, s_y, self.field_um)
+        if exact is not None:
+            return exact
         from scipy.ndimage import map_coordinates
 
-        otf, n = self._plane(0.0, "")
+        n = max(OTF_ACROSS, self.aperture.n_across(self.wavelength_nm, self.field_um))
+        otf = self.aperture.compute_otf(self.wavelength_nm, n, n, self.field_um, np.float64)
         at = [np.ravel(s_y) * n + n, np.ravel(s_x) * n + n]
         real, imaginary = (map_coordinates(part, at, order=1, mode="constant") for part in (otf.real, otf.imag))
         return np.asarray(real + 1j * imaginary).reshape(np.shape(s_x))
@@ -180,6 +186,14 @@ class PointImages:
         ------
         ParameterError
             When a value is out of range.
+
+        Notes
+        -----
+        The amplitude is integrated over the pupil by Gauss quadrature between the edges of the pupil. For the pupils of this
+        package with aberrations of 0.5 waves rms, the error is below 1e-6 of the peak at every point. The number of nodes
+        follows from the aberrations and from the distance of the points, so that values do not depend on ``n_points``.
+        Callables are integrated with the same error if they are smooth, or if they specify their discontinuities by a method
+        ``edges()`` that returns :class:`foveasim.optics.PupilEdges`; others are sampled, with an error up to 1e-3 of the peak.
         """
         point = self._point(wavelength_nm, distance_m, field_um)
         pitch_um = (
@@ -221,6 +235,13 @@ class PointImages:
         ------
         ParameterError
             When a value is out of range.
+
+        Notes
+        -----
+        Each frequency is a quadrature as for :meth:`psf`, over the overlap of two displaced copies of the pupil (Hopkins, Proc.
+        R. Soc. A 231 (1955) 91), with an error below 1e-6; it takes 1 to 6 ms, or 30 ms for a picture of 64 x 64 pixels.
+        Pictures of more than 128 x 128 pixels, and callables with discontinuities at unspecified edges, are sampled, with an
+        error up to 1e-3.
         """
         point = self._point(wavelength_nm, distance_m, field_um)
         s = finite_array("frequency_per_mm", frequency_per_mm) * 1e-3 * point.lambda_n_um
@@ -249,7 +270,7 @@ class PointImages:
         """
         Compute the Strehl ratio: PSF at the image point, relative to the unaberrated PSF.
 
-        Parameters and errors as for :meth:`psf`. Approximately ``exp(-(2πσ)²)`` for a wavefront error of σ waves rms
+        Parameters, errors and accuracy as for :meth:`psf`. Approximately ``exp(-(2πσ)²)`` for a wavefront error of σ waves rms
         (Mahajan, J. Opt. Soc. Am. 73 (1983) 860).
         """
         point = self._point(wavelength_nm, distance_m, field_um)

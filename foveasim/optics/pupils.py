@@ -31,8 +31,12 @@ from foveasim._core.validation import (
 from foveasim._io.images import read_picture
 from foveasim.errors import ParameterError
 from foveasim.fields import from_file_rows
+from foveasim.optics._quadrature import PupilEdges
 
 __all__ = ["Annulus", "Blades", "Pupil", "PupilImage", "Slit", "Spider"]
+
+#: Half the length of edges that extend beyond the unit circle.
+LONG = 1.5
 
 #: Callable of x, y in aperture radii and the wavelength in nm that returns real or complex amplitudes.
 Pupil = Callable[[Floats, Floats, float], NDArray[Any]]
@@ -69,6 +73,10 @@ class Annulus:
     def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> Bools:  # noqa: ARG002 -- signature of all pupils
         """Return the amplitudes at points of the aperture."""
         return np.asarray(x * x + y * y >= self.obscuration**2)
+
+    def edges(self) -> PupilEdges:
+        """Return the circle of the obscuration."""
+        return PupilEdges(radii=[self.obscuration])
 
 
 @PUPILS.register("spider")
@@ -109,6 +117,13 @@ class Spider:
             is_open &= (along < 0.0) | (np.abs(across) > self.width_fraction)
         return is_open
 
+    def edges(self) -> PupilEdges:
+        """Return the two long sides and the inner end of each vane."""
+        w = self.width_fraction
+        vane = np.array([[(LONG, w), (0.0, w)], [(0.0, w), (0.0, -w)], [(0.0, -w), (LONG, -w)]])
+        directions = self.angle_deg + 360.0 / self.n_vanes * np.arange(self.n_vanes)
+        return PupilEdges(segments=np.concatenate([_rotated(vane, angle_deg) for angle_deg in directions]))
+
 
 @PUPILS.register("blades")
 @dataclass(frozen=True, slots=True)
@@ -144,6 +159,13 @@ class Blades:
             is_open &= x * np.cos(angle) + y * np.sin(angle) <= inner
         return is_open
 
+    def edges(self) -> PupilEdges:
+        """Return the sides of the polygon."""
+        half = np.sin(np.pi / self.n_blades)
+        side = np.array([[(np.cos(np.pi / self.n_blades), y) for y in (-half, half)]])
+        directions = self.angle_deg + 360.0 / self.n_blades * (np.arange(self.n_blades) + 0.5)
+        return PupilEdges(segments=np.concatenate([_rotated(side, angle_deg) for angle_deg in directions]))
+
 
 @PUPILS.register("slit")
 @dataclass(frozen=True, slots=True)
@@ -176,6 +198,11 @@ class Slit:
         """Return the amplitudes at points of the aperture."""
         angle = np.radians(self.angle_deg)
         return np.asarray(np.abs(y * np.cos(angle) - x * np.sin(angle)) <= self.width_fraction)
+
+    def edges(self) -> PupilEdges:
+        """Return the two long sides."""
+        sides = np.array([[(-LONG, y), (LONG, y)] for y in (-self.width_fraction, self.width_fraction)])
+        return PupilEdges(segments=_rotated(sides, self.angle_deg))
 
 
 @PUPILS.register("image")
@@ -250,3 +277,18 @@ class PupilImage:
         rows, columns = np.broadcast_arrays(0.5 * n * (1.0 - y) - 0.5, 0.5 * n * (1.0 + x) - 0.5)
         path_um = map_coordinates(wavefront_um, [rows, columns], order=1, mode="nearest")
         return np.asarray(there * np.exp(2j * np.pi * path_um / (1e-3 * wavelength_nm)))
+
+    def edges(self) -> PupilEdges:
+        """Return the edges of pixels, and the lines through pixel centres of the wavefront, whose slope changes there."""
+        n = len(as_numbers("picture", self.picture))  # type: ignore[arg-type]
+        lines = np.arange(1, n) * (2.0 / n) - 1.0
+        if self.wavefront_um is not None:
+            n = len(as_numbers("wavefront_um", self.wavefront_um))
+            lines = np.concatenate((lines, (np.arange(n) + 0.5) * (2.0 / n) - 1.0))
+        return PupilEdges(lines_x=lines, lines_y=lines)
+
+
+def _rotated(segments: Floats, angle_deg: float) -> Floats:
+    """Return segments (n, 2, 2) rotated counter-clockwise."""
+    cos, sin = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    return np.asarray(segments @ np.array([[cos, sin], [-sin, cos]]))

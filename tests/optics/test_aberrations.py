@@ -135,23 +135,23 @@ def hopkins(s, waves):
     return value / np.pi
 
 
-@pytest.mark.parametrize(("waves", "tolerance"), [(0.25, 2e-4), (0.5, 2e-4), (1.0, 3e-4), (2.0, 5e-4), (5.0, 2e-3)])
-def test_defocused_circle_has_hopkins_otf(waves, tolerance):
+@pytest.mark.parametrize("waves", [0.25, 0.5, 1.0, 2.0, 5.0])
+def test_defocused_circle_has_hopkins_otf(waves):
     optics = aberrated(coefficients={4: waves / math.sqrt(12)}, unit="waves")
     s = np.linspace(0.0, 1.1, 45)
 
     got = optics.otf(s / LAMBDA_N_UM * 1e3, WAVELENGTH_NM, angle_deg=33.0)
 
-    assert got == pytest.approx(np.array([hopkins(t, waves) for t in s]), abs=tolerance)
+    assert got == pytest.approx(np.array([hopkins(t, waves) for t in s]), abs=1e-8)
 
 
 @pytest.mark.parametrize("waves", [0.1, 0.5, 0.9, 1.5, 3.3])
 def test_defocused_psf_centre_is_squared_sinc(waves):
     optics = aberrated(coefficients={4: waves / math.sqrt(12)}, unit="waves")
 
-    assert optics.strehl(WAVELENGTH_NM) == pytest.approx(np.sinc(waves) ** 2, abs=3e-4)
+    assert optics.strehl(WAVELENGTH_NM) == pytest.approx(np.sinc(waves) ** 2, abs=1e-9)
     centre = optics.psf(WAVELENGTH_NM, n_points=3).psf_per_um2[1, 1]
-    assert centre * LAMBDA_N_UM**2 * 4 / np.pi == pytest.approx(np.sinc(waves) ** 2, abs=3e-4)
+    assert centre * LAMBDA_N_UM**2 * 4 / np.pi == pytest.approx(np.sinc(waves) ** 2, abs=1e-9)
 
 
 @pytest.mark.parametrize("distance_m", [0.3, 0.45, 0.8, 3.0])
