@@ -199,6 +199,7 @@ def _images(camera: Camera, light: Scene | PowerMap) -> list[_Image]:
     used = camera.sensor.filters_used
     e_per_j = camera.sensor.responsivity_e_per_j(light.wavelength_nm)[used]
     optics = camera.optics.resolve_oversample(light)
+    camera._warn_of_coarse_cells(light)
     return [
         _Image(
             camera._to_sensor_frame(grid),

@@ -61,6 +61,8 @@ MAX_CACHED_INTEGRATORS = 4
 #: In cells of at most this width, in units of λN, irradiance is smooth: second-order integration is up to 70 times more
 #: accurate. In cells wider than 0.8 λN it can be less accurate than first order.
 SMOOTH_LAMBDA_N = 0.5
+#: Error of photosites above which a limited automatic oversampling causes a warning.
+MAX_AUTO_ERROR = 1e-3
 
 
 class Camera:
@@ -803,6 +805,7 @@ class Camera:
             warn_of_focal_length(self._optics, self._distortion, light)
             # Lateral chromatic aberration gives images of several sizes, each with its own grid.
             optics = self._optics.resolve_oversample(light)
+            self._warn_of_coarse_cells(light)
             images = optics.image_grids(light)
             maps, grids = (
                 self._images(light, optics, images, e_per_j, clock, cached),
@@ -905,6 +908,32 @@ class Camera:
             raise SimulationError(f"irradiance on site {bad} must be >= 0; the power map is negative there")
         if order == 2:
             self._warn_of_negative(rate_e_per_s, is_negative)
+
+    def _warn_of_coarse_cells(self, scene: Scene) -> None:
+        """Warn when automatic oversampling is limited, and photosites have an error above 1e-3."""
+        optics = self._optics
+        if optics.oversample != "auto":
+            return
+        lambda_n_um = float(um_from_nm(scene.wavelength_nm.min())) * optics.working_f_number(scene.distance_m)
+        side_um = math.sqrt(float(self._layout.area_um2.min(initial=np.inf)))
+        # Wider photosites have proportionally fewer cells at their edges.
+        error = optics.auto_oversample_error(scene) * min(1.0, lambda_n_um / side_um)
+        k, pixel_um = optics.auto_oversample(scene), optics.grid(scene).pitch_x_um
+        is_lattice = optics.source_pixel == "point" and pixel_um > lambda_n_um
+        # Point emitters farther apart than λN have no limit for small cells; they represent a continuous scene for sites > λN.
+        if error <= MAX_AUTO_ERROR or (is_lattice and side_um > lambda_n_um):
+            return
+        reason, cure = (
+            ("source pixels are points farther apart than λN", 'use source_pixel="square"')
+            if is_lattice
+            else ("more would exceed its limits", "set Optics(oversample=...), or use a smaller picture")
+        )
+        warn(
+            f"automatic oversampling chooses {k} x {k} cells of {pixel_um / k:.3g} µm per source pixel, since {reason}: "
+            f"photosites of {side_um:.3g} µm then have errors up to {100.0 * error:.2g} % (λN = {lambda_n_um:.3g} µm); {cure}, "
+            "or Optics(oversample=1) to accept them",
+            SamplingWarning,
+        )
 
     def _warn_of_negative(self, rate_e_per_s: Floats, is_negative: Bools) -> None:
         """Warn when gradients of coarse cells give negative photoelectrons."""

@@ -51,6 +51,8 @@ MAX_OVERSAMPLE = 16
 #: Cells per λN for which the energy of a point in a photosite of side λN is within 1e-3 at second order, for any position of
 #: its edges: the largest error over 600 positions is 1.3e-3 at 5 cells and 6e-4 at 6 (gallery/03_edges_and_cells.py).
 FINE_CELLS_PER_LAMBDA_N = 5.5
+#: Largest relative error for photosites of side λN and n cells per λN, ``CELL_ERROR * n ** CELL_ERROR_POWER``, and its limit.
+CELL_ERROR, CELL_ERROR_POWER, LARGEST_CELL_ERROR = 0.16, -3.1, 0.2
 #: Memory limit of a map: 16 GiB in single precision.
 MAX_CELLS = 1 << 32
 #: Memory limit of a map with automatic oversampling: 512 MiB in single precision.
@@ -122,7 +124,8 @@ class Optics(PointImages):
         Map cells along a side of a source pixel, k: maps have k x k times as many cells, each with its exact mean. ``"auto"``
         is 1, except in a :class:`foveasim.Camera`, which chooses k for each scene by :meth:`auto_oversample`. Finer cells
         resolve the irradiance under photosites whose edges cut cells. They also resolve the lattice of point emitters if
-        source pixels are wider than λN; use ``source_pixel="square"`` in this case.
+        source pixels are wider than λN; use ``source_pixel="square"`` in this case. A camera warns if an automatic choice gives
+        photosites an error above 1e-3.
     padding : {"reflect", "edge", "zero", "periodic"}
         Continuation of the picture beyond its boundary. ``"periodic"`` adds no cells: power that leaves on one side enters on
         the opposite side, so that power is conserved.
@@ -359,14 +362,38 @@ class Optics(PointImages):
         k : int
             The smallest number with at least 5.5 cells per λN at the shortest wavelength, so that the fraction of a point's
             energy that a photosite of side λN collects is accurate to 1e-3 at second order. It is smaller if the map would
-            exceed 2^27 cells, and 1 if source pixels are wider than λN, where finer cells would resolve single emitters.
+            exceed 2^27 cells, and at most 16. It is 1 if the source pixels are points and farther apart than λN, where finer
+            cells would resolve single emitters. A camera warns where :meth:`auto_oversample_error` exceeds 1e-3.
         """
-        per_lambda_n = float(self._lambda_n_um(scene).min()) / self.grid(scene).pitch_x_um
-        if per_lambda_n < 1.0:
+        per_lambda_n = self._pixels_per_lambda_n(scene)
+        if per_lambda_n < 1.0 and self.source_pixel == "point":
             return 1
         wanted = math.ceil(FINE_CELLS_PER_LAMBDA_N / per_lambda_n * (1.0 - 1e-9))
         affordable = math.isqrt(MAX_AUTO_CELLS // math.prod(scene.basis.shape[1:])) if scene.basis.size else 1
-        return max(1, min(wanted, affordable))
+        return max(1, min(wanted, affordable, MAX_OVERSAMPLE))
+
+    def auto_oversample_error(self, scene: SceneLike) -> float:
+        """
+        Return the expected error of photosites of side λN with automatic oversampling.
+
+        Parameters
+        ----------
+        scene : Scene
+
+        Returns
+        -------
+        error : float
+            Largest error over positions, relative to the mean of a scene of independent random pixels. For n cells per λN at
+            the shortest wavelength it is approximately ``0.16 n ** -3.1``, and at most 0.2: measured for square source
+            pixels of 0.97 to 8 λN, and 300 sites each, against maps of 22 cells per λN. For points farther apart than λN it is
+            the error for square pixels of the same size.
+        """
+        cells = self.auto_oversample(scene) * self._pixels_per_lambda_n(scene)
+        return float(min(LARGEST_CELL_ERROR, CELL_ERROR * cells**CELL_ERROR_POWER))
+
+    def _pixels_per_lambda_n(self, scene: SceneLike) -> float:
+        """Return source pixels per λN at the shortest wavelength."""
+        return float(self._lambda_n_um(scene).min()) / self.grid(scene).pitch_x_um
 
     def irradiance_per_radiance(self, distance_m: float) -> float:
         """Return on-axis irradiance over scene radiance (sr), including the transmission."""

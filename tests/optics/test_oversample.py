@@ -144,7 +144,64 @@ def test_wide_source_pixels_disable_auto_oversample():
     auto, plain = (fs.Camera(optics=replace(OPTICS, oversample=k), sensor=sensor) for k in ("auto", 1))
 
     assert auto.oversample(scene) == 1
-    assert (auto.photoelectrons_per_s(scene) == plain.photoelectrons_per_s(scene)).all()
+    with pytest.warns(SamplingWarning, match="since source pixels are points farther apart than λN"):
+        assert (auto.photoelectrons_per_s(scene) == plain.photoelectrons_per_s(scene)).all()
+
+
+def photograph(pixel_lambda_n, shape=(30, 30)):
+    """Random pixels of a given width in λN."""
+    image = np.random.default_rng(1).random((1, *shape))
+    pitch_um = pixel_lambda_n * LAMBDA_N_UM / OPTICS.magnification(DISTANCE_M)
+    return fs.Scene(image, np.ones((1, 1)), np.array([WAVELENGTH_NM]), np.ones(1), pitch_um, DISTANCE_M)
+
+
+def sites_of(side_um, half_um, n=100):
+    at_um = np.random.default_rng(2).uniform(-half_um, half_um, (n, 2))
+    return fs.Sensor(fs.Layout.from_rectangles(at_um, side_um))
+
+
+@pytest.mark.parametrize("pixel_lambda_n", [0.97, 1.03, 1.6, 2.8])
+def test_auto_oversample_resolves_square_pixels_of_any_width(pixel_lambda_n):
+    """Reference: 16 cells per source pixel."""
+    scene = photograph(pixel_lambda_n)
+    sensor = sites_of(LAMBDA_N_UM, 8.0 * pixel_lambda_n * LAMBDA_N_UM)
+    square = replace(OPTICS, source_pixel="square")
+    fine = replace(square, oversample=16 if pixel_lambda_n < 2.0 else "auto")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SamplingWarning)
+        rate, truth = (fs.Camera(optics=o, sensor=sensor).photoelectrons_per_s(scene) for o in (square, fine))
+
+    assert square.auto_oversample(scene) >= 5.5 * pixel_lambda_n
+    assert np.abs(rate - truth).max() < 1e-3 * truth.mean()
+
+
+def test_limited_auto_oversample_warns_with_error():
+    """For wider square pixels, the limit of 16 cells leaves an error, which is at most twice the expected one."""
+    scene = photograph(8.0, (20, 20))
+    optics = replace(OPTICS, source_pixel="square")
+    sensor = sites_of(LAMBDA_N_UM, 40.0 * LAMBDA_N_UM)
+    with pytest.warns(
+        SamplingWarning, match=r"16 x 16 cells .* since more would exceed its limits: .* errors up to 1\.9 %"
+    ):
+        fs.Camera(optics=optics, sensor=sensor).photoelectrons_per_s(scene)
+
+    assert optics.auto_oversample_error(scene) == pytest.approx(0.16 / 2.0**3.1)
+    # Sites twenty times as wide, and pixels that the limit does not affect.
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fs.Camera(optics=optics, sensor=sites_of(20.0 * LAMBDA_N_UM, 20.0 * LAMBDA_N_UM)).photoelectrons_per_s(scene)
+        fs.Camera(optics=optics, sensor=sensor).photoelectrons_per_s(photograph(2.5, (40, 40)))
+
+
+def test_wide_point_pixels_warn_for_small_sites():
+    scene = photograph(1.03)
+    for side, is_warned in ((0.9, True), (1.5, False)):
+        camera = fs.Camera(optics=OPTICS, sensor=sites_of(side * LAMBDA_N_UM, 8.0 * LAMBDA_N_UM))
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            camera.photoelectrons_per_s(scene)
+
+        assert any("automatic oversampling" in str(w.message) for w in found) == is_warned
 
 
 def test_auto_oversample_respects_memory_limit():
@@ -200,7 +257,8 @@ def test_negative_site_values_warn_on_coarse_cells():
     scene = points_of(0.8, (60, 60), [(30, 30)])
     cell_um = LAMBDA_N_UM / 0.8
     layout = fs.layout.grid(n_x=40, n_y=40, pitch_um=0.25 * cell_um).translate(0.5 * cell_um, 0.5 * cell_um)
-    camera = fs.Camera(optics=replace(OPTICS, padding="reflect"), sensor=fs.Sensor(layout), order=2)
+    optics = replace(OPTICS, padding="reflect", oversample=1)
+    camera = fs.Camera(optics=optics, sensor=fs.Sensor(layout), order=2)
     with pytest.warns(SamplingWarning, match=r"negative, [\d.]+ % of all, .* use order=1, or smaller cells"):
         rate = camera.photoelectrons_per_s(scene)
 
