@@ -41,6 +41,7 @@ from foveasim.layout import Layout
 from foveasim.modes import Between, Exposure, Shutter
 from foveasim.optics import Optics
 from foveasim.reconstruct import Picture, reference
+from foveasim.reconstruct.rasters import sum_of_images
 from foveasim.scene import Scene
 from foveasim.sensor import NoiseBudget, Sensor, noise_budget
 from foveasim.sensor.limits import check_plausible, check_plausible_array
@@ -289,7 +290,9 @@ class Camera:
         -------
         PowerMap
             (n_wavelength, n_y, n_x), W/m²: :meth:`Optics.power_map` with :meth:`oversample` cells along a source pixel,
-            centred on the principal point of the distortion model. At the same ``order``, its capture is that of the scene.
+            centred on the principal point of the distortion model. At the same ``order``, its capture is that of the scene,
+            unless lateral chromatic aberration gives images of several sizes: these are resampled to the cells of the ideal
+            image by areas of overlap, which blurs them by up to a cell. Captures and :meth:`reference` do not resample.
 
         Raises
         ------
@@ -744,7 +747,8 @@ class Camera:
         -------
         Picture
             Exact means over the pixels, e-/µm², one channel per filter, without noise and dark signal; NaN outside the image.
-            With the white balance of captures.
+            With the white balance of captures. With lateral chromatic aberration, the sum of the images of all sizes, each on
+            its own cells, as in captures.
 
         Raises
         ------
@@ -754,10 +758,20 @@ class Camera:
         exposure_s = check_plausible("exposure_s", exposure_s)
         if not isinstance(light, Scene | PowerMap):
             raise ParameterError("light", f"must be a Scene or a PowerMap, got {type_name(light)}")
-        power_map = self.power_map(light) if isinstance(light, Scene) else light
         joules_per_w_m2 = float(w_from_w_m2_um2(exposure_s))
         weights = self._sensor.responsivity_e_per_j(light.wavelength_nm) * joules_per_w_m2
-        return replace(reference(power_map, grid, weights=weights), white=self._white(light))
+        if isinstance(light, PowerMap):
+            return replace(reference(light, grid, weights=weights), white=self._white(light))
+        scene = self.frame(light)
+        optics = self._optics.resolve_oversample(scene)
+        images = [
+            (
+                self._to_sensor_frame(source),
+                optics.weighted_maps(scene, weights * is_in_image, grid=source, n_threads=self._n_threads),
+            )
+            for source, is_in_image in optics.image_grids(scene)
+        ]
+        return replace(sum_of_images(images, grid, len(weights)), white=self._white(light))
 
     def noise_budget(self, light: Scene | PowerMap, *, exposure_s: float) -> NoiseBudget:
         """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from foveasim.fields import Grid, PowerMap
 from foveasim.optics import Optics
 from foveasim.reconstruct.picture import Picture
 
-__all__ = ["blur_kernel", "reference"]
+__all__ = ["blur_kernel", "reference", "sum_of_images"]
 
 #: Default encircled energy of a kernel, and its largest radius in pixels.
 DEFAULT_ENERGY_FRACTION, MAX_RADIUS = 0.98, 128
@@ -53,16 +54,36 @@ def reference(power_map: PowerMap, grid: Grid, *, weights: Floats | None = None)
         raise ParameterError(
             "weights", f"must have the shape (n_channel, {power_map.wavelength_nm.size}), got {channel_weights.shape}"
         )
-    along_y, along_x = (_overlaps_1d(grid, power_map.grid, axis) for axis in (0, 1))
-    on_map = np.outer(along_y.sum(axis=1), along_x.sum(axis=1)) / grid.cell_area_um2
-    is_covered = on_map > MIN_COVERAGE
-    data = np.full((channel_weights.shape[0], *grid.shape), np.nan)
-    for channel, weight in zip(data, channel_weights, strict=True):
-        plane = np.tensordot(weight, power_map.data, axes=1)
-        sums = (along_x @ (along_y @ plane).T).T / grid.cell_area_um2
-        channel[is_covered] = sums[is_covered] / on_map[is_covered]
-    coverage = np.where(is_covered, on_map, 0.0).astype(np.float32)
-    return Picture(read_only(data.astype(np.float32)), read_only(coverage), grid)
+    planes = (np.tensordot(weight, power_map.data, axes=1) for weight in channel_weights)
+    return sum_of_images([(power_map.grid, planes)], grid, len(channel_weights))
+
+
+def sum_of_images(images: Sequence[tuple[Grid, Iterable[Any]]], grid: Grid, n_channels: int) -> Picture:
+    """
+    Return the sum of images on grids of their own, as exact area-weighted means over pixels.
+
+    Parameters
+    ----------
+    images : sequence of (Grid, iterable of n_channels planes (n_y, n_x))
+    grid : Grid
+        Pixels of the picture.
+    n_channels : int
+
+    Returns
+    -------
+    Picture
+        NaN where an image does not cover a pixel; the coverage is the smallest of all images.
+    """
+    data, coverage = np.zeros((n_channels, *grid.shape)), np.ones(grid.shape)
+    for source, planes in images:
+        along_y, along_x = (_overlaps_1d(grid, source, axis) for axis in (0, 1))
+        on_map = np.outer(along_y.sum(axis=1), along_x.sum(axis=1)) / grid.cell_area_um2
+        is_covered = on_map > MIN_COVERAGE
+        on_map[~is_covered] = np.nan
+        for k, plane in enumerate(planes):
+            data[k] += (along_x @ (along_y @ plane).T).T / grid.cell_area_um2 / on_map
+        coverage = np.minimum(coverage, np.where(is_covered, on_map, 0.0))
+    return Picture(read_only(data.astype(np.float32)), read_only(coverage.astype(np.float32)), grid)
 
 
 def blur_kernel(

@@ -429,6 +429,21 @@ def test_camera_applies_lateral_colour_without_resampling():
     assert got == pytest.approx(expected, rel=1e-4)
 
 
+def test_reference_with_lateral_colour_equals_capture():
+    """Pixels that cut the cells of every image, on cells wider than the PSF: no image is resampled."""
+    colour = LateralColour(wavelength_nm=[450.0, 650.0], magnification=[0.97, 1.03])
+    image = np.random.default_rng(4).random((90, 90))
+    scene = scene_of(image, wavelength_nm=(450.0, 550.0, 650.0), pitch_um=116.0)
+    pixels = fs.Grid.centred((26, 30), 1.37 * 116.0 * lens().magnification(DISTANCE_M) / 2.0)
+    layout = fs.layout.grid(n_x=30, n_y=26, pitch_um=pixels.pitch_x_um)
+    optics = lens(lateral_colour=colour, precision="single", oversample=1)
+    camera = fs.Camera(optics=optics, sensor=fs.Sensor(layout), order=1)
+
+    got = camera.reference(scene, pixels, exposure_s=0.5).data[0].ravel() * pixels.cell_area_um2
+
+    assert got == pytest.approx(0.5 * camera.photoelectrons_per_s(scene), rel=1e-5)
+
+
 def test_unit_lateral_colour_is_bit_identical():
     scene = scene_of(np.random.default_rng(0).random((80, 80)), wavelength_nm=(500.0, 600.0))
     sensor = fs.Sensor(fs.layout.grid(n_x=6, n_y=6, pitch_um=3.0))
