@@ -1,4 +1,15 @@
-"""Sandbox process with resource limits, for libraries that malformed files can crash."""
+"""
+Sandbox process with resource limits, for libraries that malformed files can crash.
+
+It protects against crashes, endless loops, and excessive memory, processor time and output of a library that reads a malformed
+file: a reader ends with one line, and the process and its descendants end with it. It has a minimal environment, without
+passwords and tokens of the parent, and a session of its own. On Linux (x86-64 and ARM, 64 bits), where the kernel permits
+filters of system calls, it can also not open network sockets, start processes or programs, or send signals.
+
+It does not protect against code in a file that takes control of the process: the process runs as the same user, and can read
+and write the files of this user. Programs that read files of unknown origin for others should run as a user without
+privileges, or in a container.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +28,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._io.zarr_stores import check_plain_files
 from foveasim.errors import FileError
 
 __all__ = ["WALL_TIME_FACTOR", "iterate_in_sandbox", "read_in_sandbox", "run_in_sandbox"]
@@ -28,7 +40,17 @@ MAX_CPU_S, BYTES_PER_S = 10, 2**22
 WALL_TIME_FACTOR = 5
 COMMAND = (sys.executable, "-P", str(Path(__file__).with_name("_sandboxed.py")))
 #: Environment of the process: each thread of a library reserves memory.
-ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "HDF5_PLUGIN_PRELOAD": "::"}
+ENVIRONMENT = {
+    "PATH": os.defpath,
+    "PYTHONUTF8": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "HDF5_PLUGIN_PRELOAD": "::",
+}
+#: Variables that Python and its libraries need to start.
+INHERITED = ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "PYTHONHOME", "SYSTEMROOT", "WINDIR")
+#: Size limits of an answer and of a header, and largest number of arrays.
+MAX_ANSWER_BYTES, MAX_ARRAYS = 2**28, 4096
 
 #: Result of a reader: plain data, and arrays.
 ReaderResult = tuple[dict[str, Any], list[NDArray[Any]]]
@@ -64,8 +86,11 @@ def read_in_sandbox(
     Raises
     ------
     FileError
-        When the reader rejects the file, fails, crashes, prints although ``is_silent`` is set, or exceeds a limit.
+        When the reader rejects the file, fails, crashes, prints although ``is_silent`` is set, or exceeds a limit, or a
+        directory contains links, FIFOs or devices.
     """
+    if path.is_dir():
+        check_plain_files(path)
     n_bytes = path.stat().st_size if path.is_file() else _directory_bytes(path)
     return run_in_sandbox(
         reader,
@@ -111,7 +136,7 @@ def run_in_sandbox(
     FileError
         As in :func:`read_in_sandbox`.
     """
-    with tempfile.TemporaryDirectory(prefix="foveasim-") as directory:
+    with tempfile.TemporaryDirectory(prefix="foveasim-", ignore_cleanup_errors=True) as directory:
         arrays, printed = Path(directory) / "arrays.npy", Path(directory) / "printed.txt"
         files = {
             "file": sys.modules[reader.__module__].__file__ if is_standalone else None,
@@ -119,30 +144,43 @@ def run_in_sandbox(
             "printed": str(printed),
         }
         task = _task(reader, path, args, **files, max_cpu_s=max_cpu_s, max_bytes=max_bytes)
-        try:
-            process = subprocess.run(  # noqa: S603 -- a script of this package
-                COMMAND,
-                input=task,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                timeout=WALL_TIME_FACTOR * max_cpu_s,
-                check=False,
-                env={**os.environ, **ENVIRONMENT},
-            )
-            is_timed_out = process.returncode == -getattr(signal, "SIGXCPU", 0)
-        except subprocess.TimeoutExpired:
-            is_timed_out = True
-        if is_timed_out:
-            raise FileError(path, f"is malformed: reading it took more than {max_cpu_s} s")
-        if process.returncode != 0 or not process.stdout:
+        # A file instead of a pipe, which a descendant of the process could hold open.
+        with tempfile.TemporaryFile() as answer_file:
+            process = _start(task, answer_file, directory)
+            try:
+                process.wait(WALL_TIME_FACTOR * max_cpu_s)
+                is_timed_out = process.returncode == -getattr(signal, "SIGXCPU", 0)
+            except subprocess.TimeoutExpired:
+                is_timed_out = True
+            finally:
+                _end(process)
+            if is_timed_out:
+                raise FileError(path, f"is malformed: reading it took more than {max_cpu_s} s")
+            answer_file.seek(0)
+            text = answer_file.read(MAX_ANSWER_BYTES)
+        if process.returncode != 0 or not text:
             raise FileError(path, f"is malformed: reading it as {kind} crashed")
-        answer = json.loads(process.stdout)
-        if is_silent and printed.stat().st_size:
+        if is_silent and _is_regular(printed) and printed.stat().st_size:
             raise FileError(path, "is corrupt or truncated")
-        if "rejected" in answer:
-            raise FileError(path, answer["rejected"])
-        with arrays.open("rb") as file:
-            return answer["metadata"], [np.load(file, allow_pickle=False) for _ in range(answer["n_arrays"])]
+        try:
+            return _result(path, json.loads(text), arrays)
+        except FileError:
+            raise
+        except (ValueError, KeyError, TypeError, AttributeError, OSError, EOFError, MemoryError, RecursionError):
+            raise FileError(path, f"is malformed: reading it as {kind} gave an invalid answer") from None
+
+
+def _result(path: Path, answer: Any, arrays: Path) -> ReaderResult:
+    """Return the data and the arrays of an answer; raise what malformed ones cause."""
+    if "rejected" in answer:
+        raise FileError(path, _reason(answer))
+    metadata, n_arrays = answer["metadata"], answer["n_arrays"]
+    if not isinstance(metadata, dict) or not isinstance(n_arrays, int) or not 0 <= n_arrays <= MAX_ARRAYS:
+        raise ValueError("the answer has other types")
+    if not _is_regular(arrays):
+        raise ValueError("the arrays are not in a regular file")
+    with arrays.open("rb") as file:
+        return metadata, [np.load(file, allow_pickle=False) for _ in range(n_arrays)]
 
 
 def iterate_in_sandbox(
@@ -180,22 +218,13 @@ def iterate_in_sandbox(
     task = _task(
         reader, path, args, file=None, is_iterator=True, printed=os.devnull, max_cpu_s=None, max_bytes=max_bytes
     )
-    process = subprocess.Popen(  # noqa: S603 -- a script of this package
-        COMMAND,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        env={**os.environ, **ENVIRONMENT},
-    )
-    assert process.stdin is not None
+    process = _start(task, subprocess.PIPE, tempfile.gettempdir())
     assert process.stdout is not None
     with process:
         try:
-            with suppress(BrokenPipeError), process.stdin as task_file:  # it may have ended already
-                task_file.write(task)
             while True:
                 is_late = threading.Event()
-                timer = threading.Timer(max_item_s, _end, (process, is_late))
+                timer = threading.Timer(max_item_s, _end_late, (process, is_late))
                 timer.start()
                 try:
                     header, content = _read_item(process.stdout, max_bytes)
@@ -204,15 +233,19 @@ def iterate_in_sandbox(
                 if is_late.is_set():
                     raise FileError(path, f"is malformed: reading it took more than {max_item_s:g} s")
                 if "rejected" in header:
-                    raise FileError(path, header["rejected"])
+                    raise FileError(path, _reason(header))
                 if header.get("is_last"):
                     return
                 if not header:
                     raise FileError(path, f"is malformed: reading it as {kind} crashed")
                 if "shape" in header:
-                    yield np.frombuffer(content, header["type"]).reshape(header["shape"])
+                    try:
+                        item = np.frombuffer(content, np.dtype(header["type"])).reshape(header["shape"])
+                    except (ValueError, TypeError, KeyError):
+                        raise FileError(path, f"is malformed: reading it as {kind} gave an invalid answer") from None
+                    yield item
         finally:
-            process.kill()
+            _end(process)
 
 
 def _task(reader: Callable[..., Any], path: Path, args: Mapping[str, Any], **options: Any) -> bytes:
@@ -221,21 +254,56 @@ def _task(reader: Callable[..., Any], path: Path, args: Mapping[str, Any], **opt
     return json.dumps(about | {"sys_path": sys.path} | options).encode()
 
 
-def _read_item(file: IO[bytes], max_bytes: int) -> tuple[dict[str, Any], bytes]:
-    """Return the header and the content of an item; an empty header if the process has ended."""
-    try:
-        header = json.loads(file.readline())
-    except ValueError:
-        return {}, b""
-    n_bytes = min(int(header.get("n_bytes", 0)), max_bytes)
-    content = file.read(n_bytes)
-    return (header, content) if len(content) == n_bytes else ({}, b"")
+def _start(task: bytes, output: Any, directory: str) -> subprocess.Popen[bytes]:
+    """Start the process in a session of its own, with a minimal environment and the task as its standard input."""
+    inherited = {name: os.environ[name] for name in INHERITED if name in os.environ}
+    with tempfile.TemporaryFile() as file:
+        file.write(task)
+        file.seek(0)
+        return subprocess.Popen(  # noqa: S603 -- a script of this package
+            COMMAND,
+            stdin=file,
+            stdout=output,
+            stderr=subprocess.DEVNULL,
+            env={**inherited, "TMPDIR": directory, **ENVIRONMENT},
+            start_new_session=True,
+        )
 
 
-def _end(process: subprocess.Popen[bytes], is_late: threading.Event) -> None:
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End the process and the descendants in its group; the group exists until the process is waited for and all ended."""
+    if hasattr(os, "killpg"):
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+    process.kill()
+    process.wait()
+
+
+def _end_late(process: subprocess.Popen[bytes], is_late: threading.Event) -> None:
     """End a process that takes too long."""
     is_late.set()
-    process.kill()
+    _end(process)
+
+
+def _reason(answer: Mapping[str, Any]) -> str:
+    """Return the reason of a rejection as one line."""
+    return " ".join(str(answer["rejected"]).split())
+
+
+def _is_regular(path: Path) -> bool:
+    """Return whether a path of the process is a regular file, not a link, which it could have replaced."""
+    return path.is_file() and not path.is_symlink()
+
+
+def _read_item(file: IO[bytes], max_bytes: int) -> tuple[dict[str, Any], bytes]:
+    """Return the header and the content of an item; an empty header if the process has ended or the header is invalid."""
+    try:
+        header = json.loads(file.readline(MAX_ANSWER_BYTES))
+        n_bytes = min(int(header.get("n_bytes", 0)), max_bytes)
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        return {}, b""
+    content = file.read(max(n_bytes, 0))
+    return (header, content) if len(content) == n_bytes else ({}, b"")
 
 
 def _directory_bytes(path: Path) -> int:

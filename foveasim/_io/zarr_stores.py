@@ -28,6 +28,7 @@ __all__ = [
     "ZARR",
     "Variable",
     "check_codecs",
+    "check_plain_files",
     "free_name",
     "open_store",
     "store_format",
@@ -115,10 +116,11 @@ def check_codecs(source: Path, allowed: Collection[str], what: str) -> None:
     Raises
     ------
     FileError
-        When the metadata name another codec, or storage transformers.
+        When the metadata name another codec, or storage transformers, or as :func:`check_plain_files`.
     ValueError, KeyError, AttributeError, OSError
         When the metadata are corrupt.
     """
+    check_plain_files(source)
     for path in (*source.glob("zarr.json"), *source.glob("*/zarr.json"), *source.glob("*/*/zarr.json")):
         metadata = _metadata(path)
         if metadata.get("storage_transformers"):
@@ -163,7 +165,6 @@ def open_store(
     if not path.is_dir():
         raise FileError(path, missing_path(path, "zarr store"))
     try:
-        _check_plain_files(path)
         check_codecs(path, ("bytes",), what)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -190,13 +191,22 @@ def open_store(
 
 
 def _metadata(path: Path) -> Any:
+    if not path.is_file():  # reading a FIFO waits for its writer
+        raise FileNotFoundError(f"{path.name} is not a regular file")
     if path.stat().st_size > MAX_METADATA_BYTES:
         raise ValueError(f"{path.name} has more than {MAX_METADATA_BYTES} bytes")
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-def _check_plain_files(path: Path) -> None:
-    """Check that a store contains only regular files and directories, no links."""
+def check_plain_files(path: Path) -> None:
+    """
+    Check that a store contains only regular files and directories, no links, before any of them is opened.
+
+    Raises
+    ------
+    FileError
+        When it contains a link, a FIFO, a socket or a device.
+    """
     for directory, directories, files in os.walk(path, followlinks=False):
         for name in (*directories, *files):
             entry = Path(directory) / name
