@@ -196,13 +196,17 @@ def convert(
     dbu_um: Annotated[
         float | None, typer.Option("--dbu-um", help="Database unit of a GDSII or OASIS file in µm.")
     ] = None,
+    invalid: Annotated[
+        str | None,
+        typer.Option("--invalid", help="Invalid outlines of SOURCE, a GDSII or OASIS file: error, skip or repair."),
+    ] = None,
 ) -> None:
     """Convert a layout to another file format, and report rounding and dropped columns."""
     from foveasim.config import read_any_layout
     from foveasim.layout import write_layout
     from foveasim.layout.files import layer_options
 
-    layout = read_any_layout(source, cell=source_cell, **layer_options(source_layer or [])).layout
+    layout = read_any_layout(source, cell=source_cell, invalid=invalid, **layer_options(source_layer or [])).layout
     written = write_layout(layout, target, dbu_um=dbu_um, **layer_options(layer or [], layers))
     dropped = f"; dropped columns: {', '.join(written.dropped_columns)}" if written.dropped_columns else ""
     _report(

@@ -1,5 +1,5 @@
 """
-Counter-based random numbers (Philox generators, uniform and Gaussian numbers), and positions of points in outlines.
+Counter-based random numbers, and positions of points in outlines.
 
 A Philox generator maps a counter and a key to random words: J. K. Salmon, M. A. Moraes, R. O. Dror and D. E. Shaw, Parallel
 random numbers: as easy as 1, 2, 3 (SC11), section 3.3. All generators use ten rounds. Words of 32 bits are stored in 64-bit

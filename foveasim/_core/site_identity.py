@@ -1,5 +1,5 @@
 """
-Identity of the photosites of a layout, from which the fixed patterns of a device are derived.
+Identity of the photosites of a layout, on which fixed patterns depend.
 
 The identity of a site is an integer of 64 bits: the column ``site_id``, or the position of its centroid in units of 0.1 nm. Of
 non-overlapping sites that share a centroid, at most one contains it, for example the disc among concentric rings. The identity
@@ -87,7 +87,7 @@ def site_ids(layout: Any) -> Ints:
 
 
 def _pack(position: Ints) -> Ints:
-    """Return one integer per position, (n, 2); linear in x and y, as positions in a regular array are."""
+    """Return one integer per position, (n, 2), linear in x and y where possible."""
     x, y = position.T
     is_far = (np.abs(position) >= MAX_POSITION).any(axis=1)
     hashed = _hash(position).view(np.int64)

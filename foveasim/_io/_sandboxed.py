@@ -52,9 +52,9 @@ def limit(kind: str, maximum: int) -> None:
 
 def deny_system_calls() -> bool:
     """
-    Deny network sockets, new processes and programs, and signals to others; return whether the kernel permits this.
+    Deny sockets, new processes and programs, and signals to other processes.
 
-    It needs no privileges on Linux: seccomp with a filter (man 2 seccomp), which readers cannot remove. Denied calls
+    Returns whether the kernel permits this. It needs no privileges on Linux: seccomp with a filter (man 2 seccomp), which readers cannot remove. Denied calls
     fail with EPERM.
     """
     if sys.platform != "linux" or os.uname().machine not in DENIED_CALLS or sys.maxsize < 2**32:

@@ -255,7 +255,7 @@ def _task(reader: Callable[..., Any], path: Path, args: Mapping[str, Any], **opt
 
 
 def _start(task: bytes, output: Any, directory: str) -> subprocess.Popen[bytes]:
-    """Start the process in a session of its own, with a minimal environment and the task as its standard input."""
+    """Start the process in a session of its own; its standard input is the task."""
     inherited = {name: os.environ[name] for name in INHERITED if name in os.environ}
     with tempfile.TemporaryFile() as file:
         file.write(task)
@@ -271,7 +271,7 @@ def _start(task: bytes, output: Any, directory: str) -> subprocess.Popen[bytes]:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End the process and the descendants in its group; the group exists until the process is waited for and all ended."""
+    """End the process and the descendants in its group."""
     if hasattr(os, "killpg"):
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)
@@ -291,12 +291,12 @@ def _reason(answer: Mapping[str, Any]) -> str:
 
 
 def _is_regular(path: Path) -> bool:
-    """Return whether a path of the process is a regular file, not a link, which it could have replaced."""
+    """Return whether a path of the process is a regular file, and not a link."""
     return path.is_file() and not path.is_symlink()
 
 
 def _read_item(file: IO[bytes], max_bytes: int) -> tuple[dict[str, Any], bytes]:
-    """Return the header and the content of an item; an empty header if the process has ended or the header is invalid."""
+    """Return header and content of an item; an empty header if it is missing or invalid."""
     try:
         header = json.loads(file.readline(MAX_ANSWER_BYTES))
         n_bytes = min(int(header.get("n_bytes", 0)), max_bytes)

@@ -200,7 +200,7 @@ def _metadata(path: Path) -> Any:
 
 def check_plain_files(path: Path) -> None:
     """
-    Check that a store contains only regular files and directories, no links, before any of them is opened.
+    Check that a store contains only regular files and directories, without opening them.
 
     Raises
     ------

@@ -139,6 +139,7 @@ FILE_OPTIONS: dict[str, Any] = {
     "layers": str | dict[str, _Layer | dict[str, _Layer | float]] | None,
     "channels": dict[str, int | str] | None,
     "filter_names": list[str] | None,
+    "invalid": Literal["error", "skip", "repair"] | None,
 }
 #: Parameters that files do not contain: a density picture covers the rectangle ``size_um``.
 _EXCLUDED = ("density_grid",)

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from foveasim._core.registry import import_all
 from foveasim._io.formats import FileFormat, detect_format, select_writer, validate_options
@@ -60,6 +60,7 @@ def read_layout(
     layers: Mapping[str, Any] | str | Path | None = None,
     channels: Mapping[Any, int | str] | None = None,
     filter_names: Sequence[str] | None = None,
+    invalid: Literal["error", "skip", "repair"] | None = None,
     **options: Any,
 ) -> Layout:
     """
@@ -83,6 +84,10 @@ def read_layout(
         photosite gives its channel.
     filter_names : sequence of str, optional
         GDSII and OASIS: names of the channels 0, 1, ..., such as ``filters.names``; by default R, G, B, W.
+    invalid : {"error", "skip", "repair"}, optional
+        GDSII and OASIS: outlines that are not simple polygons, because they cross themselves or have no area, are an error by
+        default, which lists all of them with their positions. ``"skip"`` reads the others. ``"repair"`` also divides an outline
+        where it crosses itself, and reads the largest part.
     **options
         Options of other formats in :data:`foveasim.layout.files.FORMATS`.
 
@@ -99,6 +104,11 @@ def read_layout(
         channels of filter layers are given.
     ParameterError
         When an option does not belong to the file's format.
+
+    Warns
+    -----
+    LayoutWarning
+        When invalid outlines are skipped or repaired; the message lists them with their positions.
     """
     path = Path(path)
     if str(path) in bundled_layouts() and not path.exists():
@@ -106,6 +116,7 @@ def read_layout(
     _, found = detect_format(path, FORMATS, "layout file")
     assert found.read is not None
     given = {"layer": layer, "cell": cell, "layers": layers, "channels": channels, "filter_names": filter_names}
+    given["invalid"] = invalid
     chosen = validate_options(given | options, found.read_options, FORMATS, "read_options")
     layout: Layout = found.read(path, **chosen)
     return layout

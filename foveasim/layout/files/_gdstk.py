@@ -492,8 +492,8 @@ def _site_numbers(reference: Any, offsets: NDArray[np.float64], line: int) -> ND
 
 def _array_number(reference: Any) -> tuple[int, int, int, int, int] | None:
     """Return first site, steps, columns and rows from the properties of a reference."""
-    text = reference.get_gds_property(NUMBER_PROPERTY)
-    if isinstance(text, str):
+    text = _property(reference, NUMBER_PROPERTY)
+    if text is not None:
         match = NUMBERS.fullmatch(text) or NUMBER.fullmatch(text)
         if match is None or (match.re is NUMBER and match[2]):
             return None
@@ -554,7 +554,7 @@ def _sites(polygons: list[Any]) -> Any:
     """Return photosite, part and number of parts of each polygon, (n, 3)."""
     import numpy as np
 
-    texts = [p.get_gds_property(NUMBER_PROPERTY) for p in polygons]
+    texts = [_property(p, NUMBER_PROPERTY) for p in polygons]
     if None not in texts:
         # A match per line, and no line break within a string.
         text = "\n".join(texts)
@@ -568,8 +568,8 @@ def _sites(polygons: list[Any]) -> Any:
 
 def _site(polygon: Any) -> tuple[int, int, int]:
     """Return photosite, part and number of parts from the properties of a polygon."""
-    text = polygon.get_gds_property(NUMBER_PROPERTY)
-    match = NUMBER.fullmatch(text) if isinstance(text, str) else None
+    text = _property(polygon, NUMBER_PROPERTY)
+    match = None if text is None else NUMBER.fullmatch(text)
     if match:
         return int(match[1]), int(match[2] or 0), int(match[3] or 0)
     numbers = polygon.get_property("photosite")
@@ -578,9 +578,15 @@ def _site(polygon: Any) -> tuple[int, int, int]:
     return (numbers[0], numbers[1], numbers[2]) if len(numbers) == 3 else (numbers[0], 0, 0)
 
 
+def _property(element: Any, attribute: int) -> str | None:
+    """Return a GDSII property, or None without one in UTF-8; gdstk returns others as bytes."""
+    text = element.get_gds_property(attribute)
+    return text if isinstance(text, str) else None
+
+
 def _column_strings(polygons: list[Any]) -> list[str]:
     """Return the column string of each polygon, empty where it has none."""
-    texts = [p.get_gds_property(COLUMNS_PROPERTY) for p in polygons]
+    texts = [_property(p, COLUMNS_PROPERTY) for p in polygons]
     if texts and None not in texts:
         texts = [text.rstrip("\0") for text in texts]
         text = "".join(texts)
@@ -591,15 +597,13 @@ def _column_strings(polygons: list[Any]) -> list[str]:
 
 def _columns(element: Any) -> str:
     """Return the column string of a polygon or reference, empty where it has none."""
-    text = element.get_gds_property(COLUMNS_PROPERTY)
+    text = _property(element, COLUMNS_PROPERTY)
     if text is None:
         values = element.get_property("columns")
         if not values or len(values) % 2 or len(values) > MAX_WORDS:
             return ""
         words = [v.decode("ascii", "replace") if isinstance(v, bytes) else str(v) for v in values]
         text = " ".join(map("=".join, zip(words[::2], words[1::2], strict=True)))
-    if not isinstance(text, str):
-        return ""
     text = text.rstrip("\0")
     return text if len(text) <= MAX_CHARS and text.isascii() and text.isprintable() else ""
 

@@ -44,7 +44,7 @@ from foveasim._core.extras import import_optional
 from foveasim._core.rings import positions_in_runs, ring_moments
 from foveasim._core.site_identity import SITE_ID, site_ids
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import MAX_SITES, Floats, Ints, check_number
+from foveasim._core.validation import MAX_SITES, Floats, Ints, check_choice, check_number
 from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import FileFormat, as_file_error
 from foveasim._io.sandbox import WALL_TIME_FACTOR, run_in_sandbox
@@ -122,6 +122,8 @@ RECORDS_OF_TYPE = {
     6: b"\x02\x06\x12\x19\x1f\x20\x23\x24\x2c\x37\x3a",
 }
 END_OF_LIBRARY = 0x0400
+#: Number of invalid outlines in a message.
+MAX_LISTED_OUTLINES = 50
 #: OASIS: size and type of the END record, which ends the file, and number of the validation scheme CRC-32.
 OASIS_END_BYTES = 256
 OASIS_END = 2
@@ -248,7 +250,7 @@ def _drawn_layers(layout: Layout, layer: Any, layers: Any, filter_names: Sequenc
 def _stored_columns(
     layout: Layout, drawn: list[DrawnLayer], identity: dict[str, NDArray[Any]]
 ) -> dict[str, NDArray[Any]]:
-    """Return the columns to store: the channel, unless datatypes represent it, the others, and the identity of the sites."""
+    """Return the columns to store: channel, unless datatypes represent it, others, identity."""
     others = {name: column for name, column in layout.columns.items() if name != CHANNEL}
     is_datatype = any(d.datatype is None for d in drawn) and bool((layout.channel != layout.channel[:1]).any())
     first = {} if is_datatype or CHANNEL not in layout.columns else {CHANNEL: layout.columns[CHANNEL]}
@@ -256,7 +258,7 @@ def _stored_columns(
 
 
 def _site_identity(layout: Layout, snapped: Layout) -> dict[str, NDArray[Any]]:
-    """Return the column that identifies the sites, if their rounded outlines do not identify them."""
+    """Return the column that identifies the sites, if their rounded outlines do not."""
     if SITE_ID in layout.columns:
         return {}
     ids = site_ids(layout)
@@ -632,11 +634,13 @@ def read(
     layers: Mapping[str, Any] | str | Path | None = None,
     channels: Mapping[Any, Any] | None = None,
     filter_names: Sequence[str] | None = None,
+    invalid: str = "error",
 ) -> Layout:
     """
     Read GDSII or OASIS, detected by content.
 
-    The cell hierarchy is flattened, and the sites are ordered by their numbers.
+    The cell hierarchy is flattened, and the sites are ordered by their numbers. Invalid outlines are an error, which lists all
+    of them, or are skipped or repaired with a warning.
 
     Raises
     ------
@@ -644,9 +648,10 @@ def read(
         When gdstk is not installed, or the file is corrupt, truncated, malformed, contains invalid photosites, or photosites
         without a filter although the channels of filter layers are given.
     ParameterError
-        When a layer or a channel is invalid.
+        When a layer, a channel or ``invalid`` is invalid.
     """
     import_optional(path, "gdstk")
+    check_choice("invalid", invalid, ("error", "skip", "repair"))
     kind = "GDSII or OASIS"
     wanted, filters = _selection(layer, layers, channels, filter_names)
     with as_file_error(path, f"{kind} layout"):
@@ -672,14 +677,19 @@ def read(
         check_sizes(np.ones(counts.size), counts)
         is_undivided = first.size == piece.size
         packed = (pieces.xy_um, pieces.ring_offsets, pieces.site_offsets)
+        kept = np.arange(first.size)
         try:
             layout = layout_from_untrusted(packed if is_undivided else _merge_parts(pieces, first), columns, about)
         except GeometryError:
-            layout = layout_from_untrusted(without_keyholes(_merge_parts(pieces, first)), columns, about)
+            polygons, kept = _valid_polygons(path, without_keyholes(_merge_parts(pieces, first)), invalid)
+            layout = layout_from_untrusted(polygons, {name: c[kept] for name, c in columns.items()}, about)
         if filters:
-            site = np.repeat(np.arange(first.size), np.diff(np.append(first, piece.size)))
+            site_of = np.full(first.size, -1)
+            site_of[kept] = np.arange(kept.size)
+            site = site_of[np.repeat(np.arange(first.size), np.diff(np.append(first, piece.size)))]
             number = tags[piece, 8]
-            equal = np.stack((site[number >= 0], number[number >= 0]))
+            is_filter = (number >= 0) & (site >= 0)
+            equal = np.stack((site[is_filter], number[is_filter]))
             covers_um = _to_um(covers.xy_dbu, answer["dbu_um"])
             channel = _covering_channels(path, layout, equal, covers_um, covers, filters)
             layout = layout.with_columns(channel=channel).with_provenance(about)
@@ -891,6 +901,64 @@ def _merge_parts(pieces: Layout, first: Ints) -> NDArray[Any]:
     return merged
 
 
+def _valid_polygons(path: Path, polygons: NDArray[Any], invalid: str) -> tuple[NDArray[Any], Ints]:
+    """
+    Return the valid polygons and their indices, repaired ones included.
+
+    Raises
+    ------
+    FileError
+        When a polygon is invalid, and ``invalid`` is ``"error"``, or no valid polygon remains.
+    GeometryError
+        When the layout is invalid for other reasons.
+    """
+    check_sizes(np.maximum(shapely.get_num_interior_rings(polygons), 0) + 1, shapely.get_num_coordinates(polygons))
+    polygons = polygons.copy()
+    where: dict[int, str] = {}
+    kept = np.arange(polygons.size)
+    while True:
+        try:
+            Layout.from_polygons(polygons[kept])
+            break
+        except GeometryError as error:
+            bad = kept[list(error.site_ids)]
+            if bad.size == 0:
+                raise
+        is_new = [int(site) not in where for site in bad]
+        where |= {int(site): _place(polygons[site]) for site in bad[is_new]}
+        if invalid == "repair":
+            for site in bad[is_new]:
+                parts = shapely.get_parts(shapely.make_valid(polygons[site]))
+                polygons[site] = parts[np.argmax(shapely.area(parts))] if parts.size else None
+            # Outlines without area vanish, and repaired ones are checked again.
+            bad = bad[[not new or not _is_area(polygons[site]) for new, site in zip(is_new, bad, strict=True)]]
+        kept = np.setdiff1d(kept, bad)
+        if kept.size == 0:
+            break
+    shown = ", ".join(f"site {site} at {where[site]} µm" for site in sorted(where)[:MAX_LISTED_OUTLINES])
+    shown += f" and {len(where) - MAX_LISTED_OUTLINES} more" * (len(where) > MAX_LISTED_OUTLINES)
+    what = f"of {polygons.size} outlines cross themselves or have no area"
+    if invalid == "error" or kept.size == 0:
+        fix = "correct them" if kept.size == 0 else "correct them, or pass invalid='skip' or invalid='repair'"
+        raise FileError(path, f"{len(where)} {what}, {shown}; {fix}")
+    n_skipped = polygons.size - kept.size
+    n_repaired = len(where) - n_skipped
+    done = f"{n_skipped} are skipped" + f", {n_repaired} repaired" * (invalid == "repair")
+    warn(f"{path.name}: {len(where)} {what}, {shown}: {done}", LayoutWarning)
+    return polygons[kept], kept
+
+
+def _place(polygon: Any) -> str:
+    """Return the position of the problem of an outline, or its first vertex."""
+    found = re.search(r"\[(\S+) (\S+)\]", str(shapely.is_valid_reason(polygon)))
+    x, y = map(float, found.groups()) if found else shapely.get_coordinates(polygon)[0]
+    return f"({x:.6g}, {y:.6g})"
+
+
+def _is_area(geometry: Any) -> bool:
+    return isinstance(geometry, shapely.Polygon) and geometry.area > 0.0
+
+
 def _columns(lines: bytes, tags: Ints, first: Ints) -> dict[str, NDArray[Any]]:
     """
     Return the columns with a value for all pieces, equal for all pieces of a site.
@@ -924,7 +992,7 @@ for _name, _title, _suffixes, _magic in (
             signatures=(_magic,),
             read=read,
             write=write,
-            read_options=("layer", "cell", "layers", "channels", "filter_names"),
+            read_options=("layer", "cell", "layers", "channels", "filter_names", "invalid"),
             write_options=("layer", "layers", "filter_names", "dbu_um", "hierarchy"),
         ),
     )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -816,3 +818,88 @@ def test_small_file_of_huge_array_is_rejected(tmp_path):
     (tmp_path / "b.gds").write_bytes(data.replace(struct.pack(">hh", 7, 5), struct.pack(">hh", 32767, 32767)))
     with pytest.raises(FileError, match="has more than the maximum of 50000000 sites"):
         fs.read_layout(tmp_path / "b.gds")
+
+
+# -- files of other programs: other encodings, invalid outlines -------------------------------------------------------
+
+
+def test_latin_1_properties_are_ignored(tmp_path):
+    library = gdstk.Library()
+    top, pixel = library.new_cell("TOP"), library.new_cell("PIXEL")
+    pixel.add(gdstk.rectangle((0, 0), (2, 2)))
+    polygon, reference = gdstk.rectangle((10, 0), (12, 2)), gdstk.Reference(pixel, (20, 0))
+    array = gdstk.Reference(pixel, (30, 0), columns=2, rows=1, spacing=(5, 5))
+    for element in (polygon, reference, array):
+        element.set_gds_property(1, "size 5 #m")
+        element.set_gds_property(2, 'width=5 unit="#m"')
+    top.add(polygon, reference, array)
+    library.write_gds(tmp_path / "a.gds")
+    data = (tmp_path / "a.gds").read_bytes()
+    (tmp_path / "a.gds").write_bytes(data.replace(b"#", "µ".encode("latin-1")))
+
+    layout = fs.read_layout(tmp_path / "a.gds")
+
+    assert sorted(layout.centroid_um[:, 0].tolist()) == [11.0, 21.0, 31.0, 36.0]
+    assert not {"width", "unit"} & {*layout.columns}
+
+
+#: Quadrilaterals whose edges cross at (0.5, 0.5).
+BOW_TIE = np.array([(0.0, 0.0), (1.0, 1.0), (1.0, 0.0), (0.0, 1.0)])
+LOPSIDED = np.array([(-1.5, -1.5), (0.5, 0.5), (0.5, -0.5), (-1.5, 1.5)]) + 0.5
+
+
+@pytest.fixture(params=GDSII_OASIS)
+def invalid_file(request, tmp_path):
+    """Five sites with filters, of which the second and the fourth cross themselves."""
+    library = gdstk.Library()
+    top = library.new_cell("TOP")
+    square = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+    for i, outline in enumerate((square, BOW_TIE, square, LOPSIDED, square)):
+        points = outline + np.array([1.0 + 4.0 * i, 0.0])
+        top.add(gdstk.Polygon(points, layer=77), gdstk.Polygon(points, layer=10 + i % 2))
+    path = tmp_path / f"a.{request.param}"
+    library.write_oas(path) if request.param == "oas" else library.write_gds(path)
+    return path
+
+
+OPTIONS = {"layer": 77, "channels": {10: 0, 11: 1}}
+PLACES = r"2 of 5 outlines cross themselves or have no area, site 1 at \(5\.5, 0\.5\) µm, site 3 at \(13\.5, 0\.5\) µm"
+
+
+def test_all_invalid_outlines_are_listed(invalid_file):
+    with pytest.raises(FileError, match=f"{PLACES}; correct them, or pass invalid='skip' or invalid='repair'$"):
+        fs.read_layout(invalid_file, **OPTIONS)
+    with pytest.raises(ParameterError, match="'invalid' must be one of"):
+        fs.read_layout(invalid_file, **OPTIONS, invalid="ignore")
+
+
+def test_invalid_outlines_are_skipped(invalid_file):
+    with pytest.warns(LayoutWarning, match=f"{PLACES}: 2 are skipped"):
+        layout = fs.read_layout(invalid_file, **OPTIONS, invalid="skip")
+
+    np.testing.assert_allclose(layout.centroid_um, [(1.5, 0.5), (9.5, 0.5), (17.5, 0.5)])
+    np.testing.assert_allclose(layout.area_um2, 1.0)
+    assert layout.channel.tolist() == [0, 0, 0]
+
+
+def test_invalid_outlines_are_repaired(invalid_file):
+    with pytest.warns(LayoutWarning, match=f"{PLACES}: 0 are skipped, 2 repaired"):
+        layout = fs.read_layout(invalid_file, **OPTIONS, invalid="repair")
+
+    # The largest triangle of each: base times height over 2.
+    np.testing.assert_allclose(layout.area_um2, [1.0, 0.25, 1.0, 0.5 * 3.0 * 1.5, 1.0])
+    assert layout.channel.tolist() == [0, 1, 0, 1, 0]
+
+
+def test_command_line_skips_invalid_outlines(invalid_file, tmp_path):
+    command = [sys.executable, "-m", "foveasim", "convert", str(invalid_file), str(tmp_path / "b.npz")]
+    command += ["--source-layer", "77"]
+    skipping, failing = (
+        subprocess.run([*command, *options], capture_output=True, text=True, check=False)
+        for options in (["--invalid", "skip"], [])
+    )
+
+    for result, status in ((skipping, 0), (failing, 2)):
+        assert result.returncode == status
+        assert "site 3 at (13.5, 0.5) µm" in " ".join(result.stderr.split())
+    assert fs.read_layout(tmp_path / "b.npz").n_sites == 3
