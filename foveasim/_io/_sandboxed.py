@@ -54,8 +54,8 @@ def deny_system_calls() -> bool:
     """
     Deny sockets, new processes and programs, and signals to other processes.
 
-    Returns whether the kernel permits this. It needs no privileges on Linux: seccomp with a filter (man 2 seccomp), which readers cannot remove. Denied calls
-    fail with EPERM.
+    Returns whether the kernel permits this. It needs no privileges on Linux: seccomp with a filter (man 2 seccomp), which
+    readers cannot remove. Denied calls fail with EPERM.
     """
     if sys.platform != "linux" or os.uname().machine not in DENIED_CALLS or sys.maxsize < 2**32:
         return False
