@@ -70,7 +70,7 @@ class MappedFile(mmap.mmap):
 
     def read_into(self, values: NDArray[Any], offset: int) -> None:
         """Read contiguous values at an offset in bytes."""
-        target = memoryview(values.reshape(-1).view(np.uint8))
+        target = values.reshape(-1).view(np.uint8).data
         while target:
             n_bytes = os.preadv(self._fd, [target], offset)
             if n_bytes == 0:

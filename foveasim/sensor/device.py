@@ -5,7 +5,7 @@ A counter-based generator computes each number from the seed of the device, the 
 (or the number of its readout line). Crops of a layout, permutations of its sites, other frames and other numbers of workers
 therefore give the same device.
 
-The identity of a site is that of :mod:`foveasim._core.site_identity`: its position, or the column ``site_id``.
+The identity of a site is that of :func:`foveasim._core.rings.site_ids`: its position, or the column ``site_id``.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.random_streams import fixed_pattern_key
+from foveasim._core.rings import site_ids
 from foveasim._core.short_repr import short_repr
-from foveasim._core.site_identity import site_ids
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, Ints
 from foveasim.fields import PackedRings

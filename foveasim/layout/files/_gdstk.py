@@ -555,9 +555,10 @@ def _sites(polygons: list[Any]) -> Any:
     import numpy as np
 
     texts = [_property(p, NUMBER_PROPERTY) for p in polygons]
-    if None not in texts:
+    known = [text for text in texts if text is not None]
+    if len(known) == len(texts):
         # A match per line, and no line break within a string.
-        text = "\n".join(texts)
+        text = "\n".join(known)
         numbers = UNDIVIDED.findall(text)
         if len(numbers) == len(texts) == text.count("\n") + 1:
             table = np.zeros((len(texts), 3), np.int64)
@@ -587,11 +588,11 @@ def _property(element: Any, attribute: int) -> str | None:
 def _column_strings(polygons: list[Any]) -> list[str]:
     """Return the column string of each polygon, empty where it has none."""
     texts = [_property(p, COLUMNS_PROPERTY) for p in polygons]
-    if texts and None not in texts:
-        texts = [text.rstrip("\0") for text in texts]
-        text = "".join(texts)
-        if text.isascii() and text.isprintable() and max(map(len, texts)) <= MAX_CHARS:
-            return texts
+    known = [text.rstrip("\0") for text in texts if text is not None]
+    if known and len(known) == len(texts):
+        text = "".join(known)
+        if text.isascii() and text.isprintable() and max(map(len, known)) <= MAX_CHARS:
+            return known
     return list(map(_columns, polygons))
 
 

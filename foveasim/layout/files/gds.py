@@ -14,7 +14,7 @@ other numbers as float64, bit for bit. A column with values that do not fit for 
 reported: the properties of a GDSII polygon contain at most 128 bytes, and gdstk is very slow for a large number of distinct
 strings in OASIS. A column without a value for every photosite of a file is not read.
 
-Sites that their rounded outlines do not identify (:mod:`foveasim._core.site_identity`) have the column ``site_id``, so that
+Sites that their rounded outlines do not identify (:func:`foveasim._core.rings.site_ids`) have the column ``site_id``, so that
 sensors of the layout that is read have the same fixed patterns.
 
 Regular arrays of congruent sites are references to a cell, with the numbers of their sites as a property: ``photosites
@@ -41,8 +41,7 @@ import shapely
 from numpy.typing import NDArray
 
 from foveasim._core.extras import import_optional
-from foveasim._core.rings import positions_in_runs, ring_moments
-from foveasim._core.site_identity import SITE_ID, site_ids
+from foveasim._core.rings import SITE_ID, positions_in_runs, ring_moments, site_ids
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import MAX_SITES, Floats, Ints, check_choice, check_number
 from foveasim._io.atomic import atomic_write

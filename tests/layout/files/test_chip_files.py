@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import foveasim as fs
-from foveasim._core.site_identity import site_ids
+from foveasim._core.rings import site_ids
 from foveasim.errors import ConfigError, FileError, GeometryError, LayoutWarning, ParameterError
 from foveasim.layout import DERIVED_LAYERS, Layout
 from foveasim.layout.files import _gdstk
