@@ -36,7 +36,6 @@ __all__ = [
     "N_RUN",
     "ROW",
     "SITE",
-    "count_pieces",
     "gather",
     "measure_sites",
     "scatter",
@@ -422,30 +421,6 @@ def measure_sites(xy, ring_offsets, site_offsets):
         areas[site] = 0.5 * twice
         bounds[site, 0], bounds[site, 1], bounds[site, 2], bounds[site, 3] = x_low, y_low, x_high, y_high
     return areas, bounds
-
-
-@njit(
-    types.int64[::1](_points, _ints, _floats, _floats, _points, _count),
-)
-def count_pieces(xy, ring_offsets, first, step, pieces_per_length, max_pieces):
-    """
-    Return the number of pieces of the edge after each vertex, 1 to ``max_pieces``, (n,).
-
-    The number is the length of the edge times the piece density at its midpoint. The density (n_y, n_x) is sampled at the
-    nearest point of a grid that starts at ``first`` with steps of ``step`` (x, y).
-    """
-    n_y, n_x = pieces_per_length.shape
-    out = np.ones(xy.shape[0], np.int64)
-    for ring in range(ring_offsets.size - 1):
-        start, stop = ring_offsets[ring], ring_offsets[ring + 1]
-        for a in range(start, stop):
-            b = a + 1 if a + 1 < stop else start
-            x = int((0.5 * (xy[a, 0] + xy[b, 0]) - first[0]) / step[0] + 0.5)
-            y = int((0.5 * (xy[a, 1] + xy[b, 1]) - first[1]) / step[1] + 0.5)
-            density = pieces_per_length[min(max(y, 0), n_y - 1), min(max(x, 0), n_x - 1)]
-            length = np.hypot(xy[b, 0] - xy[a, 0], xy[b, 1] - xy[a, 1])
-            out[a] = min(max(np.ceil(length * density), 1.0), float(max_pieces))
-    return out
 
 
 @njit(inline="always")

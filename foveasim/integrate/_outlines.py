@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,17 +12,22 @@ from foveasim.fields import Lattice, PackedRings, PointMap
 
 __all__ = ["Outlines", "UndistortedOutlines", "outline_bounds_um", "outlines_of"]
 
-#: Maximum deviation of an undistorted edge from its chords, as a fraction of a cell; exceeded a few times by edges that are
-#: longer than a step of the grid below or need more than the maximum number of pieces.
-CHORD_TOLERANCE = 0.002
-#: Number of points along either axis of the layout at which the curvature of undistorted lines is sampled.
-CURVATURE_POINTS = 65
+#: Maximum deviation of an undistorted edge from its chords, as a fraction of a cell; exceeded a few times by edges along which
+#: the curvature varies several times, or that need more than the maximum number of pieces.
+CHORD_TOLERANCE = 0.001
+#: Positions along an edge at which its deviation from a chord is measured, and the ratio of the largest deviation of a parabola
+#: to that there. Long edges may have an inflection at the midpoint, and are measured at the others too.
+MIDPOINT, THIRDS = (0.5, 1.0), ((1.0 / 3.0, 1.125), (2.0 / 3.0, 1.125))
+#: Length of long edges, in units of the allowed deviation: 8 cells.
+LONG_EDGE = 8.0 / CHORD_TOLERANCE
 #: Accuracy of the bounds of undistorted outlines, as a fraction of the larger side of the layout.
 BOUNDS_TOLERANCE = 1e-6
 #: Sites that are undistorted at once, a memory limit.
 SITES_PER_BLOCK = 2**16
 #: Maximum number of pieces per edge; edges that need more reach the boundary of the image circle.
 MAX_PIECES = 256
+#: Undistorted points beyond this distance are at infinity, on the image circle: areas of their sites are rounding errors.
+MAX_UM = 1e12
 
 
 class Outlines(NamedTuple):
@@ -61,7 +65,7 @@ class UndistortedOutlines:
     lens : object with ``undistort(xy_um, outside="mask")``
         Lens that returns NaN for points outside its image circle.
     pitch_um : float, µm
-        Shorter side of the cells of the map: edges are split until the chord error is at most 0.2 % of this length.
+        Shorter side of the cells of the map: edges are split until the chord error is at most 0.1 % of this length.
 
     Notes
     -----
@@ -70,41 +74,82 @@ class UndistortedOutlines:
     """
 
     def __init__(self, layout: PackedRings, lens: PointMap, pitch_um: float) -> None:
-        self._layout, self._lens = layout, lens
-        self._chord_density = (
-            _ChordDensity(layout.xy_um, lens, CHORD_TOLERANCE * pitch_um) if layout.xy_um.size else None
-        )
+        self._layout, self._lens, self._chord_um = layout, lens, CHORD_TOLERANCE * pitch_um
 
     def __call__(self, first: int, last: int) -> Outlines:
         """Return the outlines of the sites ``first`` to ``last - 1``."""
         outlines = outlines_of(self._layout, first, last)
-        return outlines if self._chord_density is None else _undistort(outlines, self._lens, self._chord_density)
+        return _undistort(outlines, self._lens, self._chord_um) if outlines.xy_um.size else outlines
 
     def count_pieces(self) -> Ints:
         """Return the number of pieces into which the edge after each vertex is split, (n_vertex,)."""
-        if self._chord_density is None:
-            return np.ones(0, np.int64)
-        return self._chord_density.n_pieces(self._layout.xy_um, self._layout.ring_offsets)
+        xy_um, ring_offsets = self._layout.xy_um, self._layout.ring_offsets
+        return _Edges(xy_um, ring_offsets, self._lens).count_pieces(self._chord_um)
 
 
-def _undistort(outlines: Outlines, lens: PointMap, chord_density: _ChordDensity) -> Outlines:
+class _Edges:
+    """
+    Edges of rings, and their undistorted vertices.
+
+    Edges begin at their lexicographically smaller vertex, so that adjacent sites split a shared edge identically.
+    """
+
+    def __init__(self, xy_um: Floats, ring_offsets: Ints, lens: PointMap) -> None:
+        self._lens = lens
+        following = next_vertex(ring_offsets)
+        end = xy_um[following]
+        self.is_reversed = (end[:, 0] < xy_um[:, 0]) | ((end[:, 0] == xy_um[:, 0]) & (end[:, 1] < xy_um[:, 1]))
+        exchanged = self.is_reversed[:, np.newaxis]
+        self.low, self.along = np.where(exchanged, end, xy_um), np.where(exchanged, xy_um - end, end - xy_um)
+        self.undistorted = lens.undistort(xy_um, outside="mask")
+        self._low_to = np.where(exchanged, self.undistorted[following], self.undistorted)
+        self._along_to = np.where(exchanged, -1.0, 1.0) * (self.undistorted[following] - self.undistorted)
+
+    def at(self, edge: Ints | slice, fraction: Any) -> Floats:
+        """Return points on edges, (n, 2)."""
+        return np.asarray(self.low[edge] + fraction * self.along[edge])
+
+    def count_pieces(self, chord_um: float) -> Ints:
+        """
+        Return the number of pieces of every edge for a maximum deviation of chords, 1 to ``MAX_PIECES``, (n,).
+
+        It depends on the edge alone, so that a site has the same outline in every selection of sites. The deviation of n chords
+        is 1/n² of that of one, as for a parabola.
+        """
+        deviation_um = self._deviation_um(slice(None), *MIDPOINT)
+        long = np.flatnonzero(np.hypot(self.along[:, 0], self.along[:, 1]) > LONG_EDGE * chord_um)
+        for fraction, ratio in THIRDS if long.size else ():
+            deviation_um[long] = np.fmax(deviation_um[long], self._deviation_um(long, fraction, ratio))
+        # Edges that leave the image circle have NaN: their sites are outside, as points of these edges or as vertices.
+        n_pieces = np.ceil(np.sqrt(np.nan_to_num(deviation_um, nan=np.inf) / chord_um))
+        is_vertex_outside = np.isnan(self._along_to[:, 0])
+        return np.where(is_vertex_outside, 1.0, np.clip(n_pieces, 1.0, MAX_PIECES)).astype(np.int64)
+
+    def _deviation_um(self, edge: Ints | slice, fraction: float, ratio: float) -> Floats:
+        """Return the deviation of undistorted edges from their chords, from that at a fraction of their length."""
+        chord = self._low_to[edge] + fraction * self._along_to[edge]
+        off = self._lens.undistort(self.at(edge, fraction), outside="mask") - chord
+        return ratio * np.hypot(off[:, 0], off[:, 1])
+
+
+def _undistort(outlines: Outlines, lens: PointMap, chord_um: float) -> Outlines:
     """Return undistorted outlines."""
     xy_um, ring_offsets, site_offsets, _ = outlines
-    n_pieces = chord_density.n_pieces(xy_um, ring_offsets)
-    points = xy_um
+    edges = _Edges(xy_um, ring_offsets, lens)
+    n_pieces = edges.count_pieces(chord_um)
+    points, undistorted = xy_um, edges.undistorted
     if n_pieces.max() > 1:
-        end = xy_um[next_vertex(ring_offsets)]
-        # Interpolate from the lexicographically smaller vertex, so that adjacent sites split a shared edge identically.
-        is_reversed = (end[:, 0] < xy_um[:, 0]) | ((end[:, 0] == xy_um[:, 0]) & (end[:, 1] < xy_um[:, 1]))
-        low, high = np.where(is_reversed[:, np.newaxis], end, xy_um), np.where(is_reversed[:, np.newaxis], xy_um, end)
         edge = np.repeat(np.arange(xy_um.shape[0]), n_pieces)
         step = positions_in_runs(n_pieces)
-        fraction = np.where(is_reversed[edge], n_pieces[edge] - step, step) / n_pieces[edge]
-        points = low[edge] + fraction[:, np.newaxis] * (high - low)[edge]
+        fraction = np.where(edges.is_reversed[edge], n_pieces[edge] - step, step) / n_pieces[edge]
+        points = edges.at(edge, fraction[:, np.newaxis])
         points[step == 0] = xy_um
         ring_offsets = np.concatenate(([0], np.cumsum(n_pieces)))[ring_offsets]
-    undistorted = lens.undistort(points, outside="mask")
-    is_outside = np.logical_or.reduceat(np.isnan(undistorted[:, 0]), ring_offsets[site_offsets[:-1]])
+        undistorted = np.empty_like(points)
+        undistorted[step == 0] = edges.undistorted
+        undistorted[step > 0] = lens.undistort(points[step > 0], outside="mask")
+    is_lost = ~(np.abs(undistorted).max(axis=1) < MAX_UM)  # NaN too
+    is_outside = np.logical_or.reduceat(is_lost, ring_offsets[site_offsets[:-1]])
     if is_outside.any():
         is_outside_vertex = np.repeat(is_outside, np.diff(ring_offsets[site_offsets]))
         undistorted = np.where(is_outside_vertex[:, np.newaxis], points, undistorted)
@@ -148,43 +193,3 @@ def outline_bounds_um(layout: PackedRings, distortion: PointMap | None = None) -
         if not (low_um <= high_um).all():
             return np.nan, np.nan, np.nan, np.nan
     return float(low_um[0]), float(low_um[1]), float(high_um[0]), float(high_um[1])
-
-
-class _ChordDensity:
-    """Number of chords per length of edges, sampled on a coarse grid over a layout."""
-
-    def __init__(self, xy_um: Floats, lens: PointMap, chord_um: float) -> None:
-        self._first_um = np.array([xy_um[:, i].min() for i in (0, 1)])
-        size_um = np.array([xy_um[:, i].max() for i in (0, 1)]) - self._first_um
-        self._step_um = np.maximum(size_um, chord_um) / (CURVATURE_POINTS - 1)
-        # A chord of length L deviates by L² / 8 times the second derivative.
-        self._pieces_per_um = np.sqrt(_max_curvature(self._first_um, self._step_um, lens) / (8.0 * chord_um))
-
-    def n_pieces(self, xy_um: Floats, ring_offsets: Ints) -> Ints:
-        """Return the number of pieces of every edge, in the order of the first vertices."""
-        from foveasim.integrate import _kernels
-
-        count: Callable[..., Ints] = _kernels.count_pieces
-        return count(xy_um, ring_offsets, self._first_um, self._step_um, self._pieces_per_um, MAX_PIECES)
-
-
-def _max_curvature(first_um: Floats, step_um: Floats, lens: PointMap) -> Floats:
-    """
-    Return the largest second derivative of the undistorted position, 1/µm.
-
-    The maximum over all directions and the neighbourhood of every point of a coarse grid.
-    """
-    from scipy.ndimage import maximum_filter
-
-    # One additional point on every side for the finite differences.
-    x, y = (first_um[i] + step_um[i] * np.arange(-1, CURVATURE_POINTS + 1) for i in (0, 1))
-    undistorted = lens.undistort(np.stack(np.meshgrid(x, y), axis=-1), outside="mask")
-    inner = undistorted[1:-1, 1:-1]
-    xx = (undistorted[1:-1, 2:] - 2.0 * inner + undistorted[1:-1, :-2]) / step_um[0] ** 2
-    yy = (undistorted[2:, 1:-1] - 2.0 * inner + undistorted[:-2, 1:-1]) / step_um[1] ** 2
-    mixed = undistorted[2:, 2:] - undistorted[2:, :-2] - undistorted[:-2, 2:] + undistorted[:-2, :-2]
-    xy = mixed / (4.0 * step_um[0] * step_um[1])
-    # The second derivative along (c, s) is c² xx + 2 c s xy + s² yy.
-    size = np.hypot(xx[..., 0], xx[..., 1]), np.hypot(yy[..., 0], yy[..., 1]), np.hypot(xy[..., 0], xy[..., 1])
-    curvature = np.maximum(size[0], size[1]) + size[2]
-    return np.asarray(maximum_filter(np.nan_to_num(curvature, nan=0.0), size=3, mode="nearest"))

@@ -338,6 +338,19 @@ def test_gaze_by_integer_cells_shifts_picture():
     assert np.allclose(found, expected, rtol=1e-12)
 
 
+def test_repeated_gaze_has_identical_rates():
+    layout = fs.layout.log_polar(n_sectors=16, r_max_um=12.0, r_min_um=2.0, n_rings=5)
+    light = fs.PowerMap(np.random.default_rng(0).random((1, 80, 80)), fs.Grid.centred((80, 80), 0.5), np.array([550.0]))
+    camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout))
+    path = [(1.3, -0.7), (0.0, 0.0), (1.3, -0.7), (0.2, 0.4), (1.3, -0.7), (0.0, 0.0)]
+
+    found = list(camera.rates((light, position_um) for position_um in path))
+
+    for first, again in ((0, 2), (0, 4), (1, 5)):
+        np.testing.assert_array_equal(found[again], found[first])
+    np.testing.assert_array_equal(found[1], camera.photoelectrons_per_s(light))
+
+
 def test_subcell_gaze_is_exact_on_linear_field():
     grid = fs.Grid.centred((60, 80), 0.5)
     x_um, y_um = np.meshgrid(grid.x_um, grid.y_um)
