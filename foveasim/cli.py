@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn, TextIO
+from threading import current_thread, main_thread
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TextIO
 
 import typer
 
@@ -29,6 +31,8 @@ BAD_INPUT = 2
 FAILED = 1
 #: Exit code after Ctrl-C, by the convention of shells: 128 + SIGINT.
 INTERRUPTED = 130
+#: Messages about an interruption that were printed.
+_interruption_said: list[str] = []
 
 app = typer.Typer(
     help="Simulate image sensors with polygonal photosites.",
@@ -535,8 +539,28 @@ def main() -> None:
 def _main() -> None:
     show_warning = warnings.showwarning
     warnings.showwarning = _show_warning
+    signals: list[int] = []
+
+    def interrupt(number: int, _frame: Any) -> None:
+        signals.append(number)
+        raise KeyboardInterrupt
+
+    handlers: dict[int, Any] = {}
+    _interruption_said.clear()
+    if current_thread() is main_thread():
+        handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
+        for number, handler in handlers.items():
+            if handler is not signal.SIG_IGN:
+                signal.signal(number, interrupt)
         app()
+    except (KeyboardInterrupt, SystemExit) as error:
+        if not signals or (isinstance(error, SystemExit) and error.code != INTERRUPTED):
+            raise
+        if not _interruption_said:
+            _report_error("interrupted")
+        # By convention 128 plus the number of the signal: 130 for Ctrl-C, 143 for SIGTERM.
+        sys.exit(128 + signals[0])
     except FoveasimError as error:
         _exit("; ".join([f"error: {error}", *getattr(error, "__notes__", ())]), BAD_INPUT)
     except MemoryError:
@@ -547,6 +571,8 @@ def _main() -> None:
         _exit(f"error: {named}", BAD_INPUT)
     finally:
         warnings.showwarning = show_warning
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 @contextmanager
@@ -601,6 +627,8 @@ def _report_error(text: str) -> None:
 
 def _exit(text: str, code: int) -> NoReturn:
     _report_error(text)
+    if code == INTERRUPTED:
+        _interruption_said.append(text)
     sys.exit(code)
 
 

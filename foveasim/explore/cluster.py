@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import current_process, get_context
+from threading import current_thread, main_thread
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -111,10 +112,12 @@ def open_client(scheduler: str | None, n_workers: int) -> Iterator[Client]:
             | NO_HTTP
             | {"distributed.worker.multiprocessing-method": _start_method()}
         ),
+        ExitStack() as workers,
         ExitStack() as stack,
     ):
         try:
-            cluster = stack.enter_context(
+            stack.enter_context(_deferred_signals())
+            cluster = workers.enter_context(
                 LocalCluster(
                     n_workers=n_workers,
                     security=security,
@@ -129,7 +132,8 @@ def open_client(scheduler: str | None, n_workers: int) -> Iterator[Client]:
                     silence_logs=logging.CRITICAL,
                 )
             )
-            client = stack.enter_context(Client(cluster, set_as_default=False))
+            client = workers.enter_context(Client(cluster, set_as_default=False))
+            stack.close()  # an interruption during the start is raised here, when workers can be closed
         except Exception as error:  # noqa: BLE001 -- the start fails in many ways when memory or time is short
             reason = " ".join(str(error).split()) or type(error).__name__
             raise SimulationError(
@@ -137,6 +141,24 @@ def open_client(scheduler: str | None, n_workers: int) -> Iterator[Client]:
                 'under if __name__ == "__main__":, because workers import the program'
             ) from None
         yield client
+
+
+@contextmanager
+def _deferred_signals() -> Iterator[None]:
+    """Handle Ctrl-C and SIGTERM at the end of the block: a half started cluster cannot be closed."""
+    received: list[int] = []
+    handlers: dict[int, Any] = {}
+    if current_thread() is main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if callable(signal.getsignal(number)):
+                handlers[number] = signal.signal(number, lambda found, _: received.append(found))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        if received:
+            handlers[received[0]](received[0], None)
 
 
 def _start_method() -> str:
@@ -162,9 +184,12 @@ def _start_fork_server() -> None:
     path = os.pathsep.join(map(os.path.abspath, sys.path))
     saved = dict(os.environ)
     os.environ.update(defaults | saved | {"PYTHONPATH": path, "PYTHONSAFEPATH": "1"})
+    # The process, and the workers that it forks, inherit the blocked signal: Ctrl-C is handled by the main program alone.
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         forkserver.ensure_running()
     finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for name in os.environ.keys() - saved.keys():
             del os.environ[name]
         os.environ.update(saved)

@@ -116,7 +116,7 @@ def _mean_of_nearest(points_um: Floats, at_um: Floats) -> Any:
     remaining, k = np.arange(len(at_um)), 2 * NEIGHBOURS
     while remaining.size:
         k = min(k, len(points_um))
-        distance_um, nearest = tree.query(at_um[remaining], k=np.arange(1, k + 1))
+        distance_um, nearest = map(np.asarray, tree.query(at_um[remaining], k=np.arange(1, k + 1)))
         distance_um = np.maximum(distance_um, MIN_DISTANCE_UM)
         limit_um = distance_um[:, min(NEIGHBOURS, k) - 1 : min(NEIGHBOURS, k)] * (1.0 + TIE_FRACTION)
         # Rows whose last point is within the limit may have further ties.

@@ -8,8 +8,9 @@ import math
 import os
 import re
 import secrets
+import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -159,7 +160,7 @@ def run_study(
         workers = min(check_count("workers", workers, at_most=1024), plan.batch)
     optuna = import_optional("study", "optuna")
     url = _url(storage)
-    with _file_lock(storage, url):
+    with _file_lock(storage, url), _without_empty_file(url):
         token = secrets.token_hex(8)
         with _suppress_logs(optuna), _storage_errors(storage):
             optuna_study = _open_study(optuna, storage, url, plan)
@@ -395,6 +396,26 @@ def _file_lock(storage: str | Path | None, url: str | None) -> Iterator[None]:
                 is_locked = lock_path.exists() and os.path.samestat(lock_path.stat(), os.fstat(lock_file.fileno()))
         stack.callback(partial(lock_path.unlink, missing_ok=True))
         yield
+
+
+@contextmanager
+def _without_empty_file(url: str | None) -> Iterator[None]:
+    """Remove a new SQLite file after an exception before the first result."""
+    file = None if url is None else _sqlite_path(url)
+    is_new = file is not None and not file.exists()
+    try:
+        yield
+    except BaseException:
+        if file is not None and is_new and not _has_results(file):
+            file.unlink(missing_ok=True)
+        raise
+
+
+def _has_results(file: Path) -> bool:
+    """Return whether an SQLite file of Optuna contains a finished trial."""
+    with suppress(sqlite3.Error), closing(sqlite3.connect(file)) as database:
+        return bool(database.execute("SELECT 1 FROM trials WHERE state IN ('COMPLETE', 'FAIL')").fetchone())
+    return False
 
 
 def _sqlite_path(url: str) -> Path | None:
