@@ -184,7 +184,7 @@ def _start_fork_server() -> None:
     path = os.pathsep.join(map(os.path.abspath, sys.path))
     saved = dict(os.environ)
     os.environ.update(defaults | saved | {"PYTHONPATH": path, "PYTHONSAFEPATH": "1"})
-    # The process, and the workers that it forks, inherit the blocked signal: Ctrl-C is handled by the main program alone.
+    # The process and the workers that it forks inherit the blocked signal: Ctrl-C is handled by the main program alone.
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         forkserver.ensure_running()

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 import zipfile
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,7 @@ from PIL import Image
 
 from foveasim import cli, explore
 from foveasim.config import build_shot
-from foveasim.errors import ConfigError, FileError
+from foveasim.errors import ConfigError, FileError, SimulationError
 from foveasim.explore import _records
 from foveasim.explore._records import Journal, Record
 from foveasim.explore.datasets.label_files import match_label_files, read_boxes, read_labels
@@ -214,6 +214,65 @@ def ended(end, folder, n_trials):
         os.killpg(running.pid, end)
     _, said = running.communicate(timeout=60)
     return running.returncode, said
+
+
+def processes_of(group):
+    """Return the processes of a process group."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            fields = path.read_text().rpartition(")")[2].split()
+            if int(fields[2]) == group:
+                found.append(int(path.parent.name))
+    return found
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("command", ["study", "sweep"])
+def test_signal_while_workers_start_gives_one_line(folder, command, end):
+    own = {
+        "study": STUDY | {"trials": 400, "batch": 2},
+        "sweep": {"shot": "shot.yaml", "vary": {"exposure_s": {"from": 0.001, "to": 0.01, "n": 400}}},
+    }[command]
+    (folder / "own.yaml").write_text(json.dumps(own))
+    running = subprocess.Popen(
+        [sys.executable, "-m", "foveasim.cli", command, "own.yaml", "--workers", "2"],
+        cwd=folder,
+        start_new_session=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    limit_s = time.monotonic() + 60.0
+    while len(processes_of(running.pid)) < 3 and running.poll() is None:  # the resource tracker and the fork server
+        assert time.monotonic() < limit_s
+        time.sleep(0.01)
+    if end == signal.SIGINT:  # a terminal sends Ctrl-C to all processes
+        os.killpg(running.pid, end)
+    else:
+        running.send_signal(end)
+    _, said = running.communicate(timeout=60)
+
+    assert running.returncode == 128 + end
+    assert said.startswith("interrupted; finished ")
+    assert said.count("\n") == 1
+    assert not list(folder.glob("*.db"))
+    while processes_of(running.pid):
+        assert time.monotonic() < limit_s
+        time.sleep(0.05)
+
+
+def test_failed_study_leaves_no_file(folder, monkeypatch):
+    def fail(*_, **__):
+        raise SimulationError("the workers did not start")
+
+    monkeypatch.setattr(sys.modules[explore.run_study.__module__], "executor", fail)
+    (folder / "own.yaml").write_text(json.dumps(STUDY))
+    with pytest.raises(SimulationError, match="did not start"):
+        explore.run_study(explore.read_study(folder / "own.yaml"), storage=folder / "own.db")
+
+    assert not list(folder.glob("own.db*"))
 
 
 def test_study_interrupted_twice_resumes_identically(folder):
