@@ -1,4 +1,4 @@
-"""Numba kernel of the information: covariances of site means."""
+"""Numba kernels of the information: covariances of site means, spectra in rings."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = ["signal_covariance"]
+__all__ = ["ring_sums", "signal_covariance"]
 
 _ints = types.Array(types.int64, 1, "C", readonly=True)
 _orders = types.Array(types.int64, 2, "C", readonly=True)
@@ -17,8 +17,26 @@ _floats = types.Array(types.float64, 1, "C", readonly=True)
 _points = types.Array(types.float64, 2, "C", readonly=True)
 _tensors = types.Array(types.float64, 3, "C", readonly=True)
 
-#: Distance, in standard deviations, beyond which a Gaussian is 0: exp(-32) = 1e-14.
-REACH_SIGMAS = 8.0
+#: Distance, in standard deviations, beyond which a Gaussian is 0: exp(-21) = 7e-10.
+REACH_SIGMAS = 6.5
+
+
+@njit(types.float64[:, ::1](_orders, _points, _points, types.int64))
+def ring_sums(ring, y, x, n_rings):
+    """
+    Sum products y[i, k] x[j, k] over the elements (i, j) of each ring, (n_ring, n_k).
+
+    ``ring[i, j]`` is -1 for elements outside all rings.
+    """
+    n_k = y.shape[1]
+    out = np.zeros((n_rings, n_k))
+    for i in range(ring.shape[0]):
+        for j in range(ring.shape[1]):
+            r = ring[i, j]
+            if r >= 0:
+                for k in range(n_k):
+                    out[r, k] += y[i, k] * x[j, k]
+    return out
 
 
 @njit(types.float64[:, ::1](_ints, _points, _tensors, _points, _orders, _points, _floats, _floats))

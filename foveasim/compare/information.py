@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["SceneCovariance", "gaussian_information_bits", "scene_covariance", "site_information_bits"]
 
 #: Sites of a block, preceding sites on which it is conditioned, and candidates for these per site.
-BLOCK_SITES, N_CONDITIONS, CANDIDATE_RATIO = 128, 192, 4
+BLOCK_SITES, N_CONDITIONS, CANDIDATE_RATIO = 128, 128, 4
 #: Ratio of the widths of adjacent Gaussian components of a covariance, and the smallest width in pixels.
 WIDTH_RATIO, MIN_WIDTH_PIXELS = 1.08, 0.25
 #: Fraction of the width of images on each side along which their window rises from 0 to 1.
@@ -36,7 +36,7 @@ MIN_PERIODS, MAX_FREQUENCY = 2.0, 0.5
 #: Spectral density below which errors do not matter, relative to its mean up to 1/8 cycle per pixel, and fits with new weights.
 DENSITY_FLOOR, FLOOR_FREQUENCY, N_FITS = 3e-3, 0.125, 5
 #: Smallest ratio of the width of a component to the longer side of a site for 1 and 2 Gaussians per axis; 3 below.
-MIN_WIDTH_RATIOS = (2.0, 0.35)
+MIN_WIDTH_RATIOS = (1.5, 0.25)
 
 
 def gaussian_information_bits(
@@ -191,8 +191,8 @@ def scene_covariance(images: ArrayLike, pitch_um: float) -> SceneCovariance:
     pitch_um = check_number("pitch_um", pitch_um, above=0.0)
     spectrum = _RadialSpectrum(stack)
     n_widths = max(1, math.ceil(math.log(0.5 * max(stack.shape[1:]) / MIN_WIDTH_PIXELS, WIDTH_RATIO)))
-    sigma = MIN_WIDTH_PIXELS * WIDTH_RATIO ** np.arange(n_widths + 1)
-    basis = np.stack([spectrum.of_gaussian(width) for width in sigma.tolist()], axis=1)
+    sigma = MIN_WIDTH_PIXELS * WIDTH_RATIO ** np.arange(n_widths + 1, dtype=np.float64)
+    basis = spectrum.of_gaussians(np.asarray(sigma, np.float64))
     is_low = spectrum.frequency <= max(FLOOR_FREQUENCY, float(spectrum.frequency[0]))
     floor = DENSITY_FLOOR * float(np.average(spectrum.density[is_low], weights=spectrum.n_modes[is_low]))
     if floor <= 0.0:
@@ -225,18 +225,16 @@ class _RadialSpectrum:
         shape = images.shape[1:]
         radius = np.hypot(fftfreq(shape[0])[:, np.newaxis], rfftfreq(shape[1]))
         # Frequencies that a real transform omits count twice.
-        count = np.full(radius.shape, 2.0)
-        count[:, 0] = 1.0
+        self._count = np.full(radius.shape[1], 2.0)
+        self._count[0] = 1.0
         if shape[1] % 2 == 0:
-            count[:, -1] = 1.0
-        n_least = min(shape)
-        lowest = min(MIN_PERIODS / n_least, 0.5 * MAX_FREQUENCY)
+            self._count[-1] = 1.0
+        lowest = min(MIN_PERIODS / min(shape), 0.5 * MAX_FREQUENCY)
         is_used = (radius >= lowest) & (radius <= MAX_FREQUENCY)
-        self._count = count[is_used]
-        self._is_used = is_used
-        ring = np.floor(radius[is_used] * n_least).astype(np.int64)
-        _, self._ring = np.unique(ring, return_inverse=True)
-        self.n_modes: Floats = np.bincount(self._ring, self._count)
+        self._ring = np.full(radius.shape, -1, np.int64)
+        width = np.floor(radius[is_used] * min(shape)).astype(np.int64)
+        self._ring[is_used] = np.unique(width, return_inverse=True)[1].ravel()
+        self.n_modes: Floats = self._sums(np.ones(radius.shape))
         self._windows = [tukey(n + 2, 2.0 * TAPER_FRACTION)[1:-1] for n in shape]
         power = np.zeros(radius.shape)
         for image in images:
@@ -252,17 +250,32 @@ class _RadialSpectrum:
         self.frequency: Floats = self._means(radius)
         self.density: Floats = self._means(power / len(images))
 
-    def _means(self, values: Floats) -> Floats:
-        return np.asarray(np.bincount(self._ring, values[self._is_used] * self._count) / self.n_modes)
+    def _sums(self, values: Floats) -> Floats:
+        is_used = self._ring >= 0
+        return np.asarray(np.bincount(self._ring[is_used], (values * self._count)[is_used]), np.float64)
 
-    def of_gaussian(self, sigma: float) -> Floats:
-        """Return the expected density of images with a Gaussian covariance of variance 1, (n_ring,)."""
-        y, x = (_expected_periodogram(window, sigma) for window in self._windows)
-        return self._means(np.outer(y, x[: x.size // 2 + 1]))
+    def _means(self, values: Floats) -> Floats:
+        return self._sums(values) / self.n_modes
+
+    def of_gaussians(self, sigma: Floats) -> Floats:
+        """Return the densities expected for Gaussian covariances of variance 1, (n_ring, n_sigma)."""
+        from foveasim.compare import _kernels
+
+        y, x = (
+            np.stack([_expected_periodogram(window, width) for width in sigma.tolist()], axis=1)
+            for window in self._windows
+        )
+        x = np.ascontiguousarray(x[: self._count.size] * self._count[:, np.newaxis])
+        sums = _kernels.ring_sums(self._ring, y, x, self.n_modes.size)
+        return np.asarray(sums / self.n_modes[:, np.newaxis])
 
 
 def _expected_periodogram(window: Floats, sigma: float) -> Floats:
-    """Return the expected periodogram of windowed pixel means with the covariance exp(-d² / 2 σ²), in pixels, (n,)."""
+    """
+    Return the expected periodogram of windowed pixel means, (n,).
+
+    The covariance of points is exp(-d² / 2 σ²), with d and σ in pixels.
+    """
     from scipy.fft import fft, irfft, next_fast_len, rfft
     from scipy.special import erf
 
@@ -354,7 +367,11 @@ def site_information_bits(
 
 
 def _blocks(xy_um: Floats) -> tuple[Ints, Ints]:
-    """Return sites in blocks of adjacent ones, (n,), and the first position of each block, by cuts of the longer side."""
+    """
+    Return sites in blocks of adjacent ones, (n,), and the first position of each block.
+
+    Blocks are halved across their longer side, and followed by n.
+    """
     order, starts = np.arange(len(xy_um)), [0]
     pending = [(0, len(xy_um))]
     while pending:
@@ -396,7 +413,7 @@ class _Apertures:
         self._axes_um = np.stack((long_um[:, np.newaxis] * unit, short_um[:, np.newaxis] * across), axis=1)
         self._centre_um = np.ascontiguousarray(layout.centroid_um)
         # In units of a rectangle of the same moments, per axis: 1 for rectangles, larger for other shapes.
-        norm = np.sqrt(12.0 * long_um * short_um / layout.area_um2)
+        norm: Floats = np.asarray(np.sqrt(12.0 * long_um * short_um / layout.area_um2), np.float64)
         n_orders = len(MIN_WIDTH_RATIOS) + 1
         self._nodes = np.zeros((n_orders, n_orders))
         self._spread = np.ones((layout.n_sites, n_orders))
@@ -404,7 +421,7 @@ class _Apertures:
             node = np.arange(order) - 0.5 * (order - 1)
             node /= math.sqrt(float(np.mean(np.square(node))))
             self._nodes[order - 1, :order] = node
-            self._spread[:, order - 1] = _spread_of_norm(node, norm)
+            self._spread[:, order - 1] = _spread_of_norm(np.asarray(node, np.float64), norm)
         self._amplitude, self._sigma_um = covariance.amplitude, covariance.sigma_um
         width = self._sigma_um / (math.sqrt(12.0) * long_um[:, np.newaxis])
         self._order = 1 + np.sum([width < ratio for ratio in MIN_WIDTH_RATIOS], axis=0, dtype=np.int64)
@@ -429,10 +446,10 @@ class _Apertures:
 
 def _spread_of_norm(node: Floats, norm: Floats) -> Floats:
     """
-    Return the variance of Gaussians that represent a site, as a fraction of the second moment of the site.
+    Return the variance of Gaussians that represent a site.
 
-    The Gaussians are centred on nodes of variance 1 - fraction, so that the sum has the variance 1. ``norm`` is the integral of
-    the square of the aperture times √12.
+    It is a fraction of the second moment of the site. The Gaussians are centred on nodes of variance 1 - fraction, so that the
+    sum has the variance 1. ``norm`` is the integral of the square of the aperture times √12.
     """
     fraction = np.geomspace(1.0, 1e-4, 2000)
     apart = np.square(node[:, np.newaxis] - node)[..., np.newaxis] * (1.0 - fraction)

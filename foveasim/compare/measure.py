@@ -204,7 +204,7 @@ def scene_measures(
 
 def _shift_gradients_e_per_um(camera: Camera, image: PowerMap, exposure_s: float) -> Floats:
     """
-    Return the change of the expected charges per displacement of an image, (n_site, 2) e-/µm.
+    Return the change of expected charges per image displacement, (n_site, 2) e-/µm.
 
     It is 0 for sites that lie partly or entirely off the image.
     """
