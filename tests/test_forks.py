@@ -82,7 +82,7 @@ def test_forked_process_captures_during_capture():
 
 
 @pytest.mark.parametrize("lock", [_POOL._lock, ForkSafeLock()])
-def test_lock_of_other_thread_is_free_after_fork(lock):
+def test_lock_of_other_thread_is_renewed(lock):
     is_held, may_end = threading.Event(), threading.Event()
 
     def hold():

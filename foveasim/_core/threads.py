@@ -27,10 +27,10 @@ _Result = TypeVar("_Result")
 
 class cached_property(functools.cached_property[_Result]):  # noqa: N801 -- replaces that of Python
     """
-    Cached property without a lock; threads that compute it at the same time receive the same object.
+    Cached property without a lock.
 
-    That of Python 3.11 has one lock for all instances of a class. A process that is forked while a thread holds it could never
-    compute the property.
+    Threads that compute it at the same time receive the same object. That of Python 3.11 has one lock for all instances of a
+    class: a process that is forked while a thread holds it could never compute the property.
     """
 
     def __get__(self, instance: object, owner: type | None = None) -> Any:
