@@ -181,7 +181,7 @@ def test_empty_layout_gives_empty_mesh():
 def test_missing_pyvista_error_names_install_command(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyvista", None)
 
-    with pytest.raises(ParameterError, match=r"is missing; install it with: pip install 'foveasim\[view\]'"):
+    with pytest.raises(ParameterError, match=r"needs pyvista; install it with: pip install 'foveasim\[view\]'"):
         ODD_LAYOUT.to_pyvista()
 
 
@@ -713,7 +713,7 @@ def test_missing_libraries_give_no_candidates(monkeypatch):
 def test_missing_pyvista_message_names_command(monkeypatch):
     monkeypatch.setattr(renderer, "find_spec", lambda _: None)
 
-    assert renderer.missing_software() == "PyVista is not installed; install it with: pip install 'foveasim[view]'"
+    assert renderer.missing_software() == "rendering needs pyvista; install it with: pip install 'foveasim[view]'"
     assert renderer.find_renderer.__wrapped__() is None
 
 
