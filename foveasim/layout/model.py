@@ -12,6 +12,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.names import possible_names
 from foveasim._core.provenance import copy_plain_data
 from foveasim._core.rings import (
@@ -188,7 +189,7 @@ class Layout:
     # -- constructors -----------------------------------------------------------------------------------------------
 
     @classmethod
-    def from_rectangles(cls, centre_um: ArrayLike, size_um: ArrayLike, **columns: ArrayLike) -> Layout:
+    def from_rectangles(cls, centre_um: ArrayLike, size_um: ArrayLike, **columns: OwnCheck[ArrayLike]) -> Layout:
         """
         Build a layout of rectangular photosites from their centres and sizes.
 
@@ -281,7 +282,7 @@ class Layout:
         channel: ArrayLike | None = None,
         readout_line: ArrayLike | None = None,
         provenance: Mapping[str, Any] | None = None,
-        **columns: ArrayLike,
+        **columns: OwnCheck[ArrayLike],
     ) -> Layout:
         """
         Build a layout from simple polygons, with or without holes, of any winding order.
@@ -538,7 +539,7 @@ class Layout:
             self._extend_provenance(f"sorted by {names}"),
         )
 
-    def with_columns(self, **columns: ArrayLike) -> Layout:
+    def with_columns(self, **columns: OwnCheck[ArrayLike]) -> Layout:
         """Return the layout with columns added or replaced."""
         return self._with_columns(columns, f"columns {', '.join(columns)} set")
 
@@ -637,7 +638,7 @@ class Layout:
         return check(self, rules)
 
     def enforce(
-        self, rules: DesignRules, *, repair: Literal["drop", "merge"] = "drop"
+        self, rules: DesignRules, *, repair: Literal["drop", "merge", "refill"] = "drop"
     ) -> tuple[Layout, tuple[Change, ...]]:
         """Repair violations of design rules; see :func:`foveasim.layout.enforce`."""
         from foveasim.layout.drc.repair import enforce

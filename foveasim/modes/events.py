@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.extras import import_optional
 from foveasim._core.provenance import to_plain_data
 from foveasim._core.user_warnings import warn
@@ -157,7 +158,7 @@ class Events:
         return Events(self.t_s[part], self.site[part], self.polarity[part], self.layout)
 
     @classmethod
-    def concatenate(cls, parts: Iterable[Events]) -> Events:
+    def concatenate(cls, parts: OwnCheck[Iterable[Events]]) -> Events:
         """Concatenate consecutive batches of events."""
         batches = list(_check_consecutive("parts", parts))
         if not batches:
@@ -351,7 +352,7 @@ class Events:
             return cls(arrays["t_s"], arrays["site"], arrays["polarity"], layout)
 
 
-def write_events(batches: Iterable[Events], path: str | Path, *, pitch_um: float | None = None) -> int:
+def write_events(batches: OwnCheck[Iterable[Events]], path: str | Path, *, pitch_um: float | None = None) -> int:
     """
     Write batches of events to an HDF5 file incrementally and atomically.
 

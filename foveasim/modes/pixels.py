@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.random_streams import fixed_pattern_key
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property, parallel_map, thread_count
@@ -153,7 +154,7 @@ class EventPixels:
 
     def stream(
         self,
-        rates: Iterable[ArrayLike],
+        rates: OwnCheck[Iterable[ArrayLike]],
         *,
         frame_s: float,
         seed: int,
@@ -194,7 +195,9 @@ class EventPixels:
         key = fixed_pattern_key(check_count("seed", seed, at_least=0), "change events")
         return self._stream(rates, frame_s, key, batch, thread_count(n_threads))
 
-    def events(self, rates: Iterable[ArrayLike], *, frame_s: float, seed: int, n_threads: int | None = None) -> Events:
+    def events(
+        self, rates: OwnCheck[Iterable[ArrayLike]], *, frame_s: float, seed: int, n_threads: int | None = None
+    ) -> Events:
         """Return all events at once; parameters as for :meth:`stream`."""
         return _concatenate(self.stream(rates, frame_s=frame_s, seed=seed, n_threads=n_threads), self.sensor)
 
@@ -306,7 +309,7 @@ class SpikingPixels:
 
     def stream(
         self,
-        rates: Iterable[ArrayLike],
+        rates: OwnCheck[Iterable[ArrayLike]],
         *,
         frame_s: float,
         seed: int,
@@ -347,7 +350,9 @@ class SpikingPixels:
         key = fixed_pattern_key(check_count("seed", seed, at_least=0), "spikes")
         return self._stream(rates, frame_s, key, batch, thread_count(n_threads))
 
-    def events(self, rates: Iterable[ArrayLike], *, frame_s: float, seed: int, n_threads: int | None = None) -> Events:
+    def events(
+        self, rates: OwnCheck[Iterable[ArrayLike]], *, frame_s: float, seed: int, n_threads: int | None = None
+    ) -> Events:
         """Return all spikes at once; parameters as for :meth:`stream`."""
         return _concatenate(self.stream(rates, frame_s=frame_s, seed=seed, n_threads=n_threads), self.sensor)
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import thread_count
 from foveasim._core.user_warnings import warn
@@ -169,7 +170,7 @@ class Optics(PointImages):
     emission: Literal["lambertian", "isotropic"] = "lambertian"
     lens: Literal["thin", "aplanatic"] = "thin"
     transmission: float = 1.0
-    pupil: Pupil | Sequence[Pupil] | None = None
+    pupil: OwnCheck[Pupil | Sequence[Pupil] | None] = None
     zernike: Zernike | None = None
     seidel: Seidel | None = None
     focus_distance_m: float | None = None

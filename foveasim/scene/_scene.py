@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.validation import (
     MAX_WAVELENGTH_NM,
     Floats,
@@ -362,7 +363,7 @@ class Scene:
     @classmethod
     def from_cube(
         cls,
-        path: str | Path,
+        path: OwnCheck[str | Path],
         *,
         distance_m: float | None = None,
         pitch_um: float | None = None,

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.names import possible_names
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property
@@ -129,7 +130,7 @@ class DesignRules:
     grid_um: float | None = None
     max_overlap_um2: float | None = None
     max_gap_um2: float | None = None
-    die_um: tuple[float, float, float, float] | None = None
+    die_um: OwnCheck[tuple[float, float, float, float] | None] = None
     min_growth: float | None = None
     max_growth: float | None = None
     max_neighbour_ratio: float | None = None

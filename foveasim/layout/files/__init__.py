@@ -22,6 +22,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.registry import import_all
 from foveasim._io.formats import FileFormat, detect_format, select_writer, validate_options
 from foveasim.errors import FileError
@@ -55,7 +56,7 @@ LayerChoice: TypeAlias = int | str | tuple[int, int] | Sequence[int | str | tupl
 def read_layout(
     path: str | Path,
     *,
-    layer: LayerChoice | None = None,
+    layer: OwnCheck[LayerChoice | None] = None,
     cell: str | None = None,
     layers: Mapping[str, Any] | str | Path | None = None,
     channels: Mapping[Any, int | str] | None = None,
@@ -138,7 +139,7 @@ def write_layout(
     layout: Layout,
     path: str | Path,
     *,
-    layer: LayerChoice | None = None,
+    layer: OwnCheck[LayerChoice | None] = None,
     layers: Mapping[str, Any] | str | Path | None = None,
     filter_names: Sequence[str] | None = None,
     dbu_um: float | None = None,

@@ -1,9 +1,10 @@
 """
 Messages for calls with wrong arguments.
 
-Python reports a misspelt, missing or surplus argument as a TypeError. Public functions, constructors and methods raise an
-:class:`~foveasim.errors.ArgumentError` instead, with the signature of the call and the closest name. Signatures, types and
-docstrings are those of the original function.
+Python reports a misspelt, missing or surplus argument as a TypeError, and a value of another type somewhere inside the function,
+or not at all. Public functions, constructors and methods raise an :class:`~foveasim.errors.ArgumentError` instead, with the
+signature of the call and the closest name, and a :class:`~foveasim.errors.ParameterError` for values of other kinds than those
+of the annotations. Signatures, types and docstrings are those of the original function.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from collections.abc import Callable, Mapping
 from types import FunctionType
 from typing import Any, ParamSpec, TypeVar, cast
 
+from foveasim._core.calls.kinds import Kind, check_kind, kind_of, resolve_annotation
 from foveasim._core.names import did_you_mean
 from foveasim.errors import ArgumentError
 
@@ -28,13 +30,15 @@ MAX_SIGNATURE = 150
 MAX_DEFAULT = 12
 #: Parameters that Python passes.
 BOUND = ("self", "cls")
+#: Kinds of the parameters of a call by position and by name, and of other named arguments.
+_Kinds = tuple[list[tuple[str, Kind | None]], dict[str, Kind | None], Kind | None]
 #: Attribute of checked functions.
 CHECKED = "_arguments_are_checked"
 
 
 def check_arguments(call: Callable[P, R]) -> Callable[P, R]:
     """
-    Return a function that raises an ArgumentError for arguments outside its signature.
+    Return a function that raises an error for arguments outside its signature.
 
     Parameters
     ----------
@@ -42,14 +46,27 @@ def check_arguments(call: Callable[P, R]) -> Callable[P, R]:
 
     Notes
     -----
-    The only cost of a valid call is that of a Python call.
+    A valid call takes about 1 µs longer; the annotations are read at the first call.
     """
     if not isinstance(call, FunctionType) or hasattr(call, CHECKED):
         return call
-    find_problem = _find_problem  # not a global of the function below
+    # Not globals of the function below.
+    find_problem, find_kinds, check = _find_problem, _find_kinds, check_kind
+    kinds: _Kinds | None = None
 
     def checked(*args: P.args, **kwargs: P.kwargs) -> R:
         __tracebackhide__ = True  # in the tracebacks of IPython and pytest
+        nonlocal kinds
+        if kinds is None:
+            kinds = find_kinds(call)
+        by_position, by_name, every = kinds
+        for (name, kind), value in zip(by_position, args):  # noqa: B905 -- surplus arguments are reported below
+            if kind is not None and not kind.accepts(value):
+                check(name, value, kind)
+        for name, value in kwargs.items():
+            kind = by_name.get(name, every)
+            if kind is not None and not kind.accepts(value):
+                check(name, value, kind)
         try:
             return call(*args, **kwargs)
         except TypeError as error:
@@ -66,6 +83,25 @@ def check_arguments(call: Callable[P, R]) -> Callable[P, R]:
     functools.update_wrapper(found, call)
     setattr(found, CHECKED, True)
     return cast("Callable[P, R]", found)
+
+
+def _find_kinds(call: Callable[..., Any]) -> _Kinds:
+    """Return the kinds of parameters by position and by name, and of other named arguments."""
+    names = getattr(inspect.unwrap(call), "__globals__", {})
+    by_position: list[tuple[str, Kind | None]] = []
+    by_name: dict[str, Kind | None] = {}
+    every = None
+    for k, parameter in enumerate(inspect.signature(call).parameters.values()):
+        annotation = parameter.annotation
+        is_bound = k == 0 and parameter.name in BOUND
+        known = None if annotation is parameter.empty or is_bound else kind_of(resolve_annotation(annotation, names))
+        if parameter.kind is parameter.VAR_KEYWORD:
+            every = known
+        elif parameter.kind is not parameter.VAR_POSITIONAL:
+            by_name[parameter.name] = known
+            if parameter.kind is not parameter.KEYWORD_ONLY:
+                by_position.append((parameter.name, known))
+    return by_position, by_name, every
 
 
 def check_public_calls(module_name: str) -> None:

@@ -1,0 +1,415 @@
+"""
+Kinds of values that annotations specify, for the validation of arguments.
+
+A kind is coarser than its annotation: numbers may be of numpy, arrays may be lists, and sequences of a fixed length may be of
+any type. Values, shapes and bounds are validated by the functions themselves; here, a value is rejected that no code of the
+function could use. Items of lists, tuples and sets are checked, those of iterators are not.
+"""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import inspect
+import os
+import sys
+from collections import abc
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import InitVar
+from enum import Enum
+from functools import lru_cache
+from importlib import import_module
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from foveasim._core.names import did_you_mean, list_names
+from foveasim.errors import ParameterError, type_name, with_article
+
+__all__ = ["Kind", "OwnCheck", "check_kind", "kind_of", "resolve_annotation"]
+
+T = TypeVar("T")
+OWN_CHECK = "checked by the call"
+#: Annotation of a parameter whose call checks the kind of its values itself, with a message of its own.
+OwnCheck = Annotated[T, OWN_CHECK]
+#: Words for the lengths of sequences.
+COUNTS = {1: "one", 2: "two", 3: "three", 4: "four"}
+
+
+class Kind(NamedTuple):
+    """
+    Values that a parameter accepts.
+
+    Attributes
+    ----------
+    accepts : function of a value
+    one, many : str
+        Names of one value and of several, for messages.
+    choices : tuple of str
+        Possible strings, if they are few.
+    is_class : bool
+        Whether values are identified by their class, which messages show instead of the value.
+    item : Kind, optional
+        Kind of the items of a collection, or of the values of a mapping.
+    """
+
+    accepts: Callable[[Any], bool]
+    one: str
+    many: str
+    choices: tuple[str, ...] = ()
+    is_class: bool = False
+    item: Any = None
+
+
+def check_kind(name: str, value: object, kind: Kind) -> None:
+    """
+    Check that a value is of a kind.
+
+    Raises
+    ------
+    ParameterError
+        When it is not.
+    """
+    if not kind.accepts(value):
+        if kind.item is not None and _is_sequence(value):
+            for k, item in enumerate(value):
+                check_kind(f"{name}[{k}]", item, kind.item)
+        if kind.item is not None and isinstance(value, Mapping):
+            for key, item in value.items():
+                check_kind(f"{name}[{key!r}]", item, kind.item)
+        if kind.is_class:
+            raise ParameterError(name, f"must be {kind.one}, got {type_name(value)}")
+        hint = did_you_mean(value, kind.choices) if isinstance(value, str) else ""
+        raise ParameterError(name, f"must be {kind.one}", value, hint=hint)
+
+
+class _Named(type):
+    """Metaclass of types of libraries that are not imported at run time, which are identified by their names."""
+
+    library: str
+
+    def __getattr__(cls, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return _named(cls.library, name)
+
+    def __getitem__(cls, key: object) -> Any:
+        return cls
+
+    def __instancecheck__(cls, value: object) -> bool:
+        return any(
+            each.__name__ == cls.__name__ and each.__module__.partition(".")[0] == cls.library
+            for each in type(value).__mro__
+        )
+
+
+def _named(library: str, name: str) -> Any:
+    """Return a stand-in for a type of a library."""
+    return _Named(name, (), {"library": library})
+
+
+@lru_cache(maxsize=256)
+def _types_of(module: str) -> dict[str, Any]:
+    """Return the names that a module imports for type checkers alone: types of this package, stand-ins for others."""
+    found: dict[str, Any] = {}
+    for node in ast.walk(ast.parse(inspect.getsource(sys.modules[module]))):
+        if not isinstance(node, ast.If) or ast.unparse(node.test) != "TYPE_CHECKING":
+            continue
+        for each in ast.walk(node):
+            if isinstance(each, ast.Import):
+                found.update((name.asname or name.name, _named(name.name, name.name)) for name in each.names)
+            elif isinstance(each, ast.ImportFrom) and each.module is not None:
+                library = each.module.partition(".")[0]
+                for name in each.names:
+                    if library == __name__.partition(".")[0]:
+                        found[name.asname or name.name] = getattr(import_module(each.module), name.name)
+                    else:
+                        found[name.asname or name.name] = _named(library, name.name)
+    return found
+
+
+class _Names(dict[str, Any]):
+    """Names in annotations of a module."""
+
+    def __init__(self, known: Mapping[str, Any]) -> None:
+        super().__init__(known)
+
+    def __missing__(self, name: str) -> Any:
+        if hasattr(builtins, name):
+            return getattr(builtins, name)
+        try:
+            return _types_of(self["__name__"])[name]
+        except (OSError, TypeError, KeyError):  # no source code
+            raise KeyError(name) from None
+
+
+def resolve_annotation(annotation: Any, names: Mapping[str, Any]) -> Any:
+    """
+    Return the type of an annotation that is a string.
+
+    Parameters
+    ----------
+    annotation : type or str
+    names : mapping
+        Global names of the module of the annotation.
+
+    Returns
+    -------
+    type
+        :data:`~typing.Any` when a name is not known, as in annotations that were inherited from other modules.
+    """
+    if not isinstance(annotation, str):
+        return annotation
+    try:
+        return eval(annotation, {}, _Names(names))  # noqa: S307 -- source code of the package
+    except NameError:
+        return Any
+
+
+def kind_of(annotation: Any) -> Kind | None:
+    """Return the kind of the values of a type; None if it accepts any value."""
+    if isinstance(annotation, InitVar):
+        return kind_of(annotation.type)
+    if get_origin(annotation) is Annotated:
+        first, *others = get_args(annotation)
+        return None if OWN_CHECK in others else kind_of(first)
+    members = set(get_args(annotation)) if get_origin(annotation) in (Union, UnionType) else {annotation}
+    kinds: list[Kind | None] = []
+    if members >= _ARRAY_LIKE:
+        # ``str | ArrayLike`` is indistinguishable from ArrayLike, which accepts strings.
+        members -= _ARRAY_LIKE
+        kinds.append(_ARRAY)
+    paths = {each for each in members if isinstance(each, type) and issubclass(each, os.PathLike)}
+    if paths and str in members:
+        members -= paths | {str}
+        kinds.append(_PATH)
+    kinds += [_single_kind(each) for each in _in_order(annotation, members)]
+    if any(kind is None for kind in kinds):
+        return None
+    return _either([kind for kind in kinds if kind is not None])
+
+
+def _in_order(annotation: Any, members: set[Any]) -> list[Any]:
+    """Return the members of a union in their order, None last."""
+    every = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
+    return sorted((each for each in every if each in members), key=lambda each: each is NoneType)
+
+
+def _either(kinds: list[Kind]) -> Kind:
+    """Return the kind of a union; messages do not mention None."""
+    tests = tuple(kind.accepts for kind in kinds)
+    shown = [kind for kind in kinds if kind is not _NONE] or kinds
+    if len(shown) == 1:
+        first, *_ = shown
+        return first if len(kinds) == 1 else first._replace(accepts=lambda value: value is None or first.accepts(value))
+    one, many = (" or ".join(dict.fromkeys(getattr(kind, each) for kind in shown)) for each in ("one", "many"))
+    collections = [kind for kind in shown if kind.item is not None]
+    return Kind(
+        lambda value: any(test(value) for test in tests),
+        one,
+        many,
+        choices=tuple(choice for kind in shown for choice in kind.choices),
+        is_class=any(kind.is_class for kind in shown),
+        item=collections[0].item if len(collections) == 1 else None,
+    )
+
+
+def _single_kind(kind: Any) -> Kind | None:
+    """Return the kind of a type that is not a union."""
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return _choice(arguments)
+    if origin is np.ndarray or kind is np.ndarray:
+        scalar = get_args(arguments[1])[0] if arguments else Any
+        return _NUMBERS if isinstance(scalar, type) and issubclass(scalar, np.number | np.bool_) else _ARRAY
+    if origin is tuple and Ellipsis not in arguments:
+        return _fixed_sequence(arguments)
+    found = _KINDS.get(kind) or _KINDS.get(origin)
+    if found is not None:
+        return found
+    if origin in (tuple, list, abc.Sequence):
+        return _collection(_is_sequence, arguments[0])
+    if origin in (abc.Iterable, abc.Collection, abc.Container, set, frozenset, abc.Set):
+        return _collection(_is_iterable, arguments[0])
+    if origin in (dict, abc.Mapping, abc.MutableMapping):
+        return _mapping(arguments[1])
+    owner = origin or kind
+    if not isinstance(owner, type) or owner in (object, Any):
+        return None
+    if getattr(owner, "_is_protocol", False):
+        return _protocol(owner)
+    return _class(owner.__name__, lambda value: isinstance(value, owner))
+
+
+def _choice(values: tuple[Any, ...]) -> Kind:
+    names = tuple(value for value in values if isinstance(value, str))
+    shown = list_names(names) if len(names) == len(values) else ", ".join(map(repr, values))
+
+    def accepts(value: Any) -> bool:
+        return isinstance(value, str | int | None) and value in values
+
+    return Kind(accepts, f"one of {shown}", f"of {shown}", names)
+
+
+def _class(name: str, accepts: Callable[[Any], bool]) -> Kind:
+    return Kind(accepts, with_article(name), f"{name} objects", is_class=True)
+
+
+def _fixed_sequence(items: tuple[Any, ...]) -> Kind | None:
+    """Return the kind of a sequence of a fixed length; functions check its numbers, and name the invalid one."""
+    kinds = [kind_of(item) for item in items]
+    tests = [None if kind in (None, _NUMBER, _INTEGER) else kind.accepts for kind in kinds if kind]
+    n = len(items)
+
+    def accepts(value: Any) -> bool:
+        if not _is_sequence(value) or len(value) != n:
+            return False
+        return len(tests) != n or all(test is None or test(item) for test, item in zip(tests, value, strict=True))
+
+    names = {kind.many if kind else "values" for kind in kinds}
+    one = f"{COUNTS.get(n, n)} {names.pop() if len(names) == 1 else 'values'}"
+    return Kind(accepts, one, f"lists of {one}")
+
+
+def _collection(is_collection: Callable[[Any], bool], item: Any) -> Kind:
+    kind = kind_of(item)
+    if kind is None:
+        return Kind(is_collection, "a list", "lists")
+    if kind in (_NUMBER, _INTEGER) and is_collection is _is_sequence:
+        return _NUMBERS  # one number stands for a list of one, as in numpy.atleast_1d
+    test = kind.accepts
+
+    def accepts(value: Any) -> bool:
+        # Iterators and lazy sequences are not read.
+        is_read = isinstance(value, list | tuple | set | frozenset | np.ndarray)
+        return is_collection(value) and (not is_read or all(map(test, value)))
+
+    return Kind(accepts, f"a list of {kind.many}", f"lists of {kind.many}", item=kind)
+
+
+def _mapping(item: Any) -> Kind:
+    kind = kind_of(item)
+
+    def accepts(value: Any) -> bool:
+        return isinstance(value, Mapping) and (kind is None or all(map(kind.accepts, value.values())))
+
+    of = f" to {kind.many}" if kind else ""
+    return Kind(accepts, f"a mapping{of}", f"mappings{of}", item=kind)
+
+
+def _protocol(protocol: type) -> Kind:
+    names = [
+        name
+        for each in protocol.__mro__
+        if getattr(each, "_is_protocol", False)
+        for name in {**getattr(each, "__annotations__", {}), **vars(each)}
+        if not name.startswith("_") or name == "__call__"
+    ]
+    return _class(protocol.__name__.removesuffix("Like"), lambda value: all(hasattr(value, name) for name in names))
+
+
+def _accepts_path(value: Any) -> bool:
+    return isinstance(value, str | os.PathLike)
+
+
+def _accepts_number(value: Any) -> bool:
+    kind = type(value)
+    if kind is float or kind is int:
+        return True
+    if isinstance(value, str | bytes) or not hasattr(kind, "__float__"):
+        return False
+    return getattr(value, "ndim", 0) == 0 and getattr(getattr(value, "dtype", None), "kind", "f") in "biuf"
+
+
+def _accepts_integer(value: Any) -> bool:
+    if type(value) is int:
+        return True
+    if not _accepts_number(value):
+        return False
+    return isinstance(value, int | np.integer) or float(value).is_integer()
+
+
+def _accepts_bool(value: Any) -> bool:
+    return isinstance(value, bool | np.bool_) or (type(value) is int and value in (0, 1))
+
+
+def _is_sequence(value: Any) -> bool:
+    """Return whether items have an order and a number."""
+    if isinstance(value, list | tuple):
+        return True
+    if isinstance(value, str | bytes | Mapping | type):
+        return False
+    if isinstance(value, np.ndarray):
+        return value.ndim > 0
+    return isinstance(value, abc.Sequence | abc.KeysView | abc.ValuesView) or (
+        hasattr(value, "__len__") and hasattr(value, "__getitem__")
+    )
+
+
+def _is_iterable(value: Any) -> bool:
+    if isinstance(value, np.ndarray):
+        return value.ndim > 0
+    return hasattr(value, "__iter__") and not isinstance(value, str | bytes | type)
+
+
+def _accepts_array(value: Any, kinds: str) -> bool:
+    dtype = getattr(value, "dtype", None)
+    if dtype is not None and hasattr(value, "shape"):  # arrays of any library; they are not loaded
+        return getattr(dtype, "kind", kinds[0]) in kinds
+    if isinstance(value, bool | int | float | complex | str | bytes | np.generic):
+        return np.asarray(value).dtype.kind in kinds
+    if value is None or isinstance(value, Mapping | set | frozenset | type | Enum | slice):
+        return False
+    if not isinstance(value, list | tuple) and not hasattr(value, "__array__") and not hasattr(value, "__len__"):
+        return False
+    return all(dtype in kinds for dtype in _dtypes(value))
+
+
+def _dtypes(value: Any) -> Iterator[str]:
+    """Yield the kinds of the scalars in nested lists; ``O`` for other objects."""
+    if isinstance(value, list | tuple):
+        for each in value:
+            kind = type(each)
+            if kind is float or kind is int:
+                yield "f"
+            else:
+                yield from _dtypes(each)
+    elif hasattr(value, "dtype"):
+        yield getattr(value.dtype, "kind", "f")
+    else:
+        yield "O" if value is None else np.asarray(value).dtype.kind
+
+
+_NONE = Kind(lambda value: value is None, "None", "None")
+_NUMBER = Kind(_accepts_number, "one number", "numbers")
+_INTEGER = Kind(_accepts_integer, "an integer", "integers")
+_STRING = Kind(lambda value: isinstance(value, str), "a string", "strings")
+_PATH = Kind(_accepts_path, "a path", "paths")
+_NUMBERS = Kind(lambda value: _accepts_array(value, "fiub"), "an array of numbers", "arrays of numbers")
+_ARRAY = Kind(lambda value: _accepts_array(value, "fiubcSUTmMV"), "an array of numbers", "arrays of numbers")
+_FUNCTION = Kind(callable, "a callable", "callables")
+_LIST = Kind(_is_sequence, "a list", "lists")
+#: Kinds of types without arguments, and of types whose arguments are not checked.
+_KINDS: dict[Any, Kind] = {
+    NoneType: _NONE,
+    # Random streams are None where nothing is drawn.
+    np.random.Generator: Kind(
+        lambda value: value is None or isinstance(value, np.random.Generator),
+        "a Generator",
+        "Generator objects",
+        is_class=True,
+    ),
+    bool: Kind(_accepts_bool, "True or False", "True or False"),
+    float: _NUMBER,
+    int: _INTEGER,
+    str: _STRING,
+    list: _LIST,
+    tuple: _LIST,
+    dict: Kind(lambda value: isinstance(value, Mapping), "a mapping", "mappings"),
+    abc.Callable: _FUNCTION,
+    abc.Iterator: Kind(lambda value: hasattr(value, "__next__"), "an iterator", "iterators"),
+    type: Kind(lambda value: isinstance(value, type), "a class", "classes"),
+}
+_ARRAY_LIKE = frozenset(get_args(ArrayLike))
