@@ -95,7 +95,7 @@ __all__ = [
 
 
 for _module in (
-    "distortion", "layout", "maps", "metrics", "modes", "optics", "reconstruct", "scene", "scene.charts", "sensor",
+    "distortion", "errors", "layout", "maps", "metrics", "modes", "optics", "reconstruct", "scene", "scene.charts", "sensor",
     "sensor.effects", "tiles", "units", "video", "view",
 ):  # fmt: skip
     check_public_calls(f"{__name__}.{_module}")

@@ -6,7 +6,7 @@ Constants are the exact values of the 2019 SI (CODATA 2018).
 
 from __future__ import annotations
 
-from foveasim._core.validation import Floats, as_numbers
+from foveasim._core.validation import Floats, as_numbers, check_broadcast
 
 __all__ = [
     "BOLTZMANN_J_PER_K",
@@ -88,9 +88,13 @@ def photon_energy_j(wavelength_nm: Floats | float) -> Floats:
 
 def electrons_to_volts(charge_e: Floats | float, capacitance_f: Floats | float) -> Floats:
     """Convert a charge in electrons on a capacitance to a voltage, ``q n / C``."""
-    return ELEMENTARY_CHARGE_C * as_numbers("charge_e", charge_e) / as_numbers("capacitance_f", capacitance_f)
+    charge_e, capacitance_f = as_numbers("charge_e", charge_e), as_numbers("capacitance_f", capacitance_f)
+    check_broadcast(charge_e=charge_e, capacitance_f=capacitance_f)
+    return ELEMENTARY_CHARGE_C * charge_e / capacitance_f
 
 
 def volts_to_electrons(voltage_v: Floats | float, capacitance_f: Floats | float) -> Floats:
     """Convert a voltage on a capacitance to a charge in electrons, ``C U / q``."""
-    return as_numbers("voltage_v", voltage_v) * as_numbers("capacitance_f", capacitance_f) / ELEMENTARY_CHARGE_C
+    voltage_v, capacitance_f = as_numbers("voltage_v", voltage_v), as_numbers("capacitance_f", capacitance_f)
+    check_broadcast(voltage_v=voltage_v, capacitance_f=capacitance_f)
+    return voltage_v * capacitance_f / ELEMENTARY_CHARGE_C

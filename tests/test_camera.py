@@ -202,9 +202,9 @@ def test_compiled_layouts_are_cached():
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ({"optics": "lens"}, r"'optics' must be a foveasim\.Optics, got a str"),
-        ({"sensor": rgb_layout()}, r"'sensor' must be a foveasim\.Sensor, got a Layout"),
-        ({"sensor": OPTICS, "optics": fs.Sensor(rgb_layout())}, r"'optics' must be a foveasim\.Optics, got a Sensor"),
+        ({"optics": "lens"}, r"'optics' must be an? Optics, got a str"),
+        ({"sensor": rgb_layout()}, r"'sensor' must be an? Sensor, got a Layout"),
+        ({"sensor": OPTICS, "optics": fs.Sensor(rgb_layout())}, r"'optics' must be an? Optics, got a Sensor"),
     ],
 )
 def test_parts_of_wrong_type_are_rejected(parts, message):

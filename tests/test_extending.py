@@ -142,7 +142,7 @@ def test_modules_of_any_name_are_imported(name, tmp_path, monkeypatch):
 
 
 def test_wrong_extensions_give_messages():
-    with pytest.raises(ParameterError, match="'custom' must be a mapping of rule name to limit, got 3"):
+    with pytest.raises(ParameterError, match="'custom' must be a mapping to numbers, got 3"):
         foveasim.DesignRules(custom=3)
     with pytest.raises(
         ParameterError,

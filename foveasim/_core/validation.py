@@ -34,6 +34,7 @@ __all__ = [
     "Images",
     "Ints",
     "as_numbers",
+    "check_broadcast",
     "check_choice",
     "check_count",
     "check_length_um",
@@ -416,6 +417,27 @@ def finite_array(
             position = f" at [{', '.join(map(str, where))}]" if where else ""
             raise ParameterError(name, f"{rule} everywhere", float(array[where]), (unit_of(name) + position).strip())
     return array
+
+
+def check_broadcast(**arrays: NDArray[Any]) -> tuple[int, ...]:
+    """
+    Return the common shape of arrays, by the names of their parameters.
+
+    Raises
+    ------
+    ParameterError
+        When the shapes cannot be broadcast together.
+    """
+    names = list(arrays)
+    for n in range(2, len(names) + 1):
+        try:
+            np.broadcast_shapes(*(arrays[name].shape for name in names[:n]))
+        except ValueError:
+            others = ", ".join(f"'{name}' {arrays[name].shape}" for name in names[: n - 1])
+            raise ParameterError(
+                names[n - 1], f"must have a shape that broadcasts with {others}, got {arrays[names[n - 1]].shape}"
+            ) from None
+    return np.broadcast_shapes(*(array.shape for array in arrays.values()))
 
 
 def exact_integers(values: Sequence[int]) -> NDArray[Any] | None:

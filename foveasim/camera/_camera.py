@@ -17,6 +17,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.provenance import to_plain_data, versions
 from foveasim._core.random_streams import Streams
 from foveasim._core.threads import cached_property, in_order, thread_count
@@ -525,7 +526,7 @@ class Camera:
             "layout": to_plain_data(dict(self._layout.provenance)),
         }
 
-    def rates(self, frames: Iterable[Frame], *, ahead: int = 0) -> Iterator[Floats]:
+    def rates(self, frames: OwnCheck[Iterable[Frame]], *, ahead: int = 0) -> Iterator[Floats]:
         """
         Yield the expected photoelectrons of every site per second, frame by frame.
 
@@ -551,7 +552,7 @@ class Camera:
 
     def video(
         self,
-        frames: Iterable[Frame],
+        frames: OwnCheck[Iterable[Frame]],
         *,
         exposure_s: float | Sequence[float],
         seed: int,

@@ -9,6 +9,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, check_choice, check_number, finite_array
 from foveasim.distortion._lens import LensBase
@@ -230,7 +231,7 @@ class Scaramuzza(_AngularLens):
 
     a: Sequence[float]
     pixel_um: float
-    focal_um: float
+    focal_um: OwnCheck[float]
     stretch: Sequence[Sequence[float]] = ((1.0, 0.0), (0.0, 1.0))
     centre_um: tuple[float, float] = (0.0, 0.0)
 

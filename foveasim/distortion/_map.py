@@ -8,6 +8,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.validation import Floats, Images, check_choice, check_count, read_only
 from foveasim.errors import ParameterError, type_name
 from foveasim.fields import Grid, PointMap, PowerMap
@@ -32,7 +33,7 @@ DIFFERENCE_STEP = 1e-3
 
 def distort_map(
     power_map: PowerMap,
-    lens: PointMap,
+    lens: OwnCheck[PointMap],
     *,
     grid: Grid | None = None,
     conserve: Conserve = "flux",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.rings import site_area_um2
 from foveasim._core.threads import cached_property, thread_count
 from foveasim._core.validation import Floats, Ints, check_choice, check_count, finite_array, unmasked
@@ -99,10 +100,10 @@ class Integrator:
 
     def __init__(
         self,
-        layout: PackedRings,
+        layout: OwnCheck[PackedRings],
         grid: Grid,
         *,
-        distortion: PointMap | None = None,
+        distortion: OwnCheck[PointMap | None] = None,
         conserve: Literal["flux", "density"] = "flux",
         order: Literal[1, 2] = 1,
         compiled: bool = True,

@@ -117,7 +117,7 @@ class Layout:
     xy_um: Floats
     ring_offsets: Ints
     site_offsets: Ints
-    columns: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    columns: OwnCheck[Mapping[str, NDArray[Any]]] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
     #: Rows and columns of rectangles whose vertices are computed when they are read, or None.
     lattice: RectangleLattice | None = field(default=None, init=False)
@@ -225,7 +225,7 @@ class Layout:
     def from_lattice(
         cls,
         lattice: RectangleLattice,
-        columns: Mapping[str, ArrayLike] | None = None,
+        columns: OwnCheck[Mapping[str, ArrayLike] | None] = None,
         provenance: Mapping[str, Any] | None = None,
     ) -> Layout:
         """
@@ -256,7 +256,7 @@ class Layout:
     def from_equal_rings(
         cls,
         rings_um: Floats,
-        columns: Mapping[str, ArrayLike] | None = None,
+        columns: OwnCheck[Mapping[str, ArrayLike] | None] = None,
         provenance: Mapping[str, Any] | None = None,
     ) -> Layout:
         """

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, finite_array, read_only
 from foveasim.errors import FoveasimWarning, ParameterError, type_name
@@ -187,8 +188,8 @@ class Emva1288:
 
 
 def emva1288(
-    frames: Sequence[Any],
-    dark: Sequence[Any],
+    frames: OwnCheck[Sequence[Any]],
+    dark: OwnCheck[Sequence[Any]],
     photons: ArrayLike,
     *,
     classes: ArrayLike | None = None,

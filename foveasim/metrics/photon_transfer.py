@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import (
     Floats,
@@ -286,7 +287,7 @@ def draw_frames(
 
 
 def photon_transfer(
-    source: Sensor | Sequence[Any],
+    source: OwnCheck[Sensor | Sequence[Any]],
     expected_e: Sequence[ArrayLike] | Floats | None = None,
     *,
     classes: ArrayLike | None = None,

@@ -64,6 +64,12 @@ class Picture:
         for name, missing_is_nan in (("data", True), ("coverage", False)):
             values = unmasked(name, getattr(self, name), missing_is_nan=missing_is_nan)
             object.__setattr__(self, name, own(np.asarray(values)))
+        if self.data.ndim != 3 or self.coverage.shape != self.data.shape[1:]:
+            raise ParameterError(
+                "data",
+                f"and 'coverage' must have the shapes (n_channel, n_y, n_x) and (n_y, n_x), got {self.data.shape} and "
+                f"{self.coverage.shape}",
+            )
         if self.white is not None:
             white = finite_array("white", self.white, ndim=1, above=0.0)
             if white.size != self.data.shape[0]:

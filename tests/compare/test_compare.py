@@ -177,8 +177,8 @@ def cameras_of(layout, **optics):
     ("change", "message"),
     [
         (lambda one: {"a": one}, "must be at least two, got 1"),
-        (lambda one: [one, one], "must be a mapping of names to cameras, got a list"),
-        (lambda one: {"a": one, "b": 3}, "must be cameras, got an int for 'b'"),
+        (lambda one: [one, one], "'cameras' must be a mapping to Camera objects, got a list"),
+        (lambda one: {"a": one, "b": 3}, "'cameras\\['b'\\]' must be a Camera, got an int"),
         (
             lambda one: {"a": one, "b": cameras_of(one.sensor.layout, f_number=2.0)},
             "must have the same optics: those of 'a' and 'b' differ",

@@ -574,7 +574,7 @@ def test_from_xarray_rejects_invalid_arrays(change, message):
 
 
 def test_xarray_conversion_rejects_wrong_types():
-    with pytest.raises(ParameterError, match=r"'data_array' must be an xarray\.DataArray, got an ndarray"):
+    with pytest.raises(ParameterError, match=r"'data_array' must be a DataArray, got an ndarray"):
         from_xarray(np.ones((3, 3)))
     with pytest.raises(ParameterError, match=r"'power_map' must be a PowerMap"):
         to_xarray(np.ones((3, 3)))

@@ -201,9 +201,9 @@ def test_invalid_flow_arguments_raise():
         flow_bound(np.ones((3, 3)), 1.0)
     with pytest.raises(ParameterError, match="'regions' must be 3 integers"):
         flow_bound(np.ones((3, 2)), 1.0, regions=[0.5, 1.0, 2.0])
-    with pytest.raises(ParameterError, match=r"'layout' must be a foveasim\.Layout, got a NoneType"):
+    with pytest.raises(ParameterError, match=r"'layout' must be a Layout, got a NoneType"):
         estimate_flow(None, values, map_e, GRID, variance_e2=1.0)
-    with pytest.raises(ParameterError, match=r"'layout' must be a foveasim\.Layout, got a list"):
+    with pytest.raises(ParameterError, match=r"'layout' must be a Layout, got a list"):
         site_gradients_e_per_um([FOVEAL], map_e, GRID)
     with pytest.raises(ParameterError, match="'values_e' must have one value for each of the"):
         estimate_flow(FOVEAL, values[:5], map_e, GRID, variance_e2=1.0)

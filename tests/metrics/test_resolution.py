@@ -484,7 +484,7 @@ def test_coincident_sites_have_nan_nyquist():
     ],
 )
 def test_invalid_layout_raises(call):
-    with pytest.raises(ParameterError, match=r"'layout' must be a foveasim\.Layout, got a NoneType"):
+    with pytest.raises(ParameterError, match=r"'layout' must be a Layout, got a NoneType"):
         call(None)
 
 

@@ -403,11 +403,11 @@ def test_invalid_snr_arguments_raise():
         measured_snr_by_class(ZONES, frames, frames[:, :7], bits=12)
     with pytest.raises(ParameterError, match="'classes' must have one label for each"):
         snr_by_class(camera(), flat(), exposure_s=EXPOSURE_S, classes=[1, 2])
-    with pytest.raises(ParameterError, match=r"'camera' must be a foveasim\.Camera, got a NoneType"):
+    with pytest.raises(ParameterError, match=r"'camera' must be a Camera, got a NoneType"):
         snr_by_class(None, None, exposure_s=1.0)
-    with pytest.raises(ParameterError, match=r"'camera' must be a foveasim\.Camera, got a Sensor"):
+    with pytest.raises(ParameterError, match=r"'camera' must be a Camera, got a Sensor"):
         relative_exposure_at_snr_fraction(camera().sensor, flat(), exposure_s=1.0)
-    with pytest.raises(ParameterError, match=r"'layout' must be a foveasim\.Layout, got a NoneType"):
+    with pytest.raises(ParameterError, match=r"'layout' must be a Layout, got a NoneType"):
         measured_snr_by_class(None, frames, frames, bits=12)
     with pytest.raises(ParameterError, match="'snr' must be > 0"):
         relative_exposure_at_snr_fraction(camera(), flat(), exposure_s=EXPOSURE_S, snr=0.0)

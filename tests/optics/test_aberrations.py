@@ -522,7 +522,7 @@ def test_zernike_is_hashable_and_immutable():
             "'wavelength_nm' must be strictly increasing and have one value per",
         ),
         (lambda: zernike(2, 1, 0.0, 0.0), "'m' must be from -n to n = 2 in steps of two, got 1"),
-        (lambda: lens(zernike={4: 0.1}), "'zernike' must be a foveasim.optics.Zernike, got a dict"),
+        (lambda: lens(zernike={4: 0.1}), "'zernike' must be a Zernike, got a dict"),
         (lambda: lens(seidel=Seidel(coma_um=1.0)), "'padding' must not be 'periodic' with aberrations that vary"),
         (lambda: lens(focus_distance_m=0.02), "'focus_distance_m' must be larger than the focal length, 0.022 m"),
         (lambda: lens(focus_distance_m=-1.0), "'focus_distance_m' must be > 0"),

@@ -365,7 +365,7 @@ def test_channels_use_their_own_sites():
     [
         ({}, "'mu' must be a number without 'variance'"),
         ({"mu": 0.0}, "'mu' must be > 0"),
-        ({"mu": "magic"}, "'mu' must be one of 'roughness', 'discrepancy'"),
+        ({"mu": "magic"}, "'mu' must be one number or one of 'roughness', 'discrepancy'"),
         ({"variance": 0.0}, "'variance' must be > 0.0 everywhere"),
         ({"variance": np.ones(3)}, "'variance' must be one number, or have the shape"),
         ({"variance": 1.0, "response": np.ones(3)}, "'response' must have the shape"),
@@ -617,7 +617,7 @@ def test_loaded_capture_gives_same_picture(tmp_path):
             lambda c, _: c.picture("least_squares"),
             "'sensor' must be given: the settings of the capture do not contain all values of 'capacitance_f'",
         ),
-        (lambda c, _: c.picture(per="um2", sensor="magic"), "'sensor' must be the Sensor of the capture's layout"),
+        (lambda c, _: c.picture(per="um2", sensor="magic"), "'sensor' must be a Sensor, got a str"),
         (
             lambda _, k: k.reference("magic", fs.Grid((2, 2), 1.0), exposure_s=1.0),
             "'light' must be a Scene or a PowerMap",

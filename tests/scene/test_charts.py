@@ -620,7 +620,7 @@ def test_charts_reject_invalid_contrast_or_radiance(kind, changed, name):
         ("zone_plate", {"radius_mm": 4.0}, "'radius_mm' must yield a chart within"),
         ("bars", {"groups": []}, "'groups' must be a list of integers, got []"),
         ("bars", {"groups": 3}, "'groups' must be a list of integers, got 3"),
-        ("bars", {"groups": "3"}, "'groups[0]' must be one number"),
+        ("bars", {"groups": "3"}, "'groups' must be an array of numbers, got '3'"),
         ("bars", {"groups": [1.5]}, "'groups[0]' must be an integer"),
         ("bars", {"groups": [2, 2]}, "'groups' must be unique"),
         ("bars", {"groups": [-3]}, "'groups' must yield a chart within the picture of 8 x 9 mm"),

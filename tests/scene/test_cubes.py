@@ -374,7 +374,7 @@ def test_large_pixel_interleaved_cube_is_converted(tmp_path, monkeypatch):
         ({"rows": (0, 5)}, r"'rows' must be \(start, stop\) with 0 <= start < stop <= 4, got \(0, 5\)"),
         ({"columns": (3, 3)}, r"'columns' must be \(start, stop\)"),
         ({"columns": (3,)}, r"'columns' must be two integers"),
-        ({"rows": 3}, "'rows' must be a sequence of integers, got 3"),
+        ({"rows": 3}, "'rows' must be two integers, got 3"),
         ({"bands": 3}, "'bands' must be a sequence of integers, got 3"),
         ({"bands": [3]}, "'bands' must be from 0 to 2, the bands of the cube, got 3"),
         ({"bands": [0, 0]}, "'bands' must be different indices"),

@@ -410,7 +410,7 @@ def test_from_picture_rejects_missing_file(tmp_path):
     ],
 )
 def test_point_sources_reject_invalid_parameters(changed, name):
-    with pytest.raises(ParameterError, match=rf"^'{name}' [^\n]*$"):
+    with pytest.raises(ParameterError, match=rf"^'{name}(\[\d\])?' [^\n]*$"):
         points(**changed)
 
 

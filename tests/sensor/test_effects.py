@@ -401,7 +401,7 @@ class Duplicate(LampFlicker):
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"effects": [3.0]}, "'effects' must contain only foveasim.sensor.effects.Effect objects, got 3.0"),
+        ({"effects": [3.0]}, "'effects[0]' must be an Effect, got a float"),
         ({"effects": LampFlicker()}, "'effects' must be a list of Effect objects, got"),
         ({"effects": [Nameless()]}, "'effects' must define the class attribute 'name' of type str"),
         ({"effects": [Early()]}, "'early' at the stage 'photo' is temporal; use the stage 'charge'"),
@@ -409,7 +409,7 @@ class Duplicate(LampFlicker):
         ({"effects": [Duplicate()]}, "'effects' must have unique names, got 'read' twice"),
         ({"effects": [LampFlicker(), LampFlicker()]}, "got 'flicker' twice"),
         ({"disabled": ["raed"]}, "'disabled' must contain names of effects, got 'raed'; did you mean 'read'"),
-        ({"disabled": 3}, "'disabled' must contain names of effects, got 3"),
+        ({"disabled": 3}, "'disabled' must be a list of strings, got 3"),
     ],
 )
 def test_invalid_effects_are_rejected(keywords, message):

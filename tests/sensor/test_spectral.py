@@ -272,8 +272,8 @@ def test_each_primary_has_highest_matching_transmission(wavelength_nm, name):
     ("curves", "names", "message"),
     [
         ([], None, "'curves' must be one or more functions of wavelength"),
-        ([0.5], None, "'curves' must be one or more functions of wavelength"),
-        ("ab", None, "'curves' must be one or more functions of wavelength"),
+        ([0.5], None, "'curves[0]' must be a Curve, got a float"),
+        ("ab", None, "'curves' must be a list of Curve objects, got a str"),
         ([ConstantCurve()], ["a", "b"], "'names' must have one name for each of the 1 curves"),
     ],
 )
@@ -498,13 +498,13 @@ def test_product_domain_is_intersection():
 
 @pytest.mark.parametrize("factor", [1.5, -0.1, math.nan, "0.5", None])
 def test_invalid_factor_is_rejected(factor):
-    with pytest.raises(ParameterError, match=r"^'curves' must be"):
+    with pytest.raises(ParameterError, match=r"^'curves(\[1\])?' must be"):
         SILICON * factor
 
 
 @pytest.mark.parametrize("curves", [[], "ab", None, 0.5])
 def test_empty_product_is_rejected(curves):
-    with pytest.raises(ParameterError, match=r"^'curves' must be one or more curves or numbers"):
+    with pytest.raises(ParameterError, match=r"^'curves' must be (one or more curves or numbers|a list of)"):
         ProductCurve(curves)
 
 

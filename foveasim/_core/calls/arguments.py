@@ -1,10 +1,10 @@
 """
 Messages for calls with wrong arguments.
 
-Python reports a misspelt, missing or surplus argument as a TypeError, and a value of another type somewhere inside the function,
-or not at all. Public functions, constructors and methods raise an :class:`~foveasim.errors.ArgumentError` instead, with the
-signature of the call and the closest name, and a :class:`~foveasim.errors.ParameterError` for values of other kinds than those
-of the annotations. Signatures, types and docstrings are those of the original function.
+Python reports a misspelt, missing or surplus argument as a TypeError, and a value of another type somewhere inside the
+function, or not at all. Public functions, constructors and methods raise an :class:`~foveasim.errors.ArgumentError` instead,
+with the signature of the call and the closest name, and a :class:`~foveasim.errors.ParameterError` for values of other kinds
+than those of the annotations. Signatures, types and docstrings are those of the original function.
 """
 
 from __future__ import annotations

@@ -124,9 +124,9 @@ def _types_of(module: str) -> dict[str, Any]:
                 library = each.module.partition(".")[0]
                 for name in each.names:
                     if library == __name__.partition(".")[0]:
-                        found[name.asname or name.name] = getattr(import_module(each.module), name.name)
-                    else:
-                        found[name.asname or name.name] = _named(library, name.name)
+                        import_module(each.module)
+                    loaded = getattr(sys.modules.get(each.module), name.name, None)
+                    found[name.asname or name.name] = _named(library, name.name) if loaded is None else loaded
     return found
 
 
@@ -204,7 +204,8 @@ def _either(kinds: list[Kind]) -> Kind:
     if len(shown) == 1:
         first, *_ = shown
         return first if len(kinds) == 1 else first._replace(accepts=lambda value: value is None or first.accepts(value))
-    one, many = (" or ".join(dict.fromkeys(getattr(kind, each) for kind in shown)) for each in ("one", "many"))
+    separator = " or " if all(kind.is_class for kind in shown) else ", or "
+    one, many = (separator.join(dict.fromkeys(getattr(kind, each) for kind in shown)) for each in ("one", "many"))
     collections = [kind for kind in shown if kind.item is not None]
     return Kind(
         lambda value: any(test(value) for test in tests),

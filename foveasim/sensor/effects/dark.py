@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, Self, get_args
+from typing import TYPE_CHECKING, ClassVar, Literal, Self, get_args
 
 import numpy as np
 
 from foveasim._core.validation import Floats, check_choice
 from foveasim.sensor.effects.contract import FixedFactor, FixedOffset, Sites, Stage
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
+
+if TYPE_CHECKING:
+    from foveasim.sensor.sensor import Sensor
 
 __all__ = ["DarkLaw", "DarkSignal", "HotSites", "dark_current_factor"]
 
@@ -114,7 +117,7 @@ class DarkSignal(FixedFactor):
     dsnu_fraction: float
 
     @classmethod
-    def from_sensor(cls, sensor: Any) -> Self | None:
+    def from_sensor(cls, sensor: Sensor) -> Self | None:
         """Return the effect that a sensor's keywords specify, or None."""
         return cls(sensor.dsnu_fraction) if sensor.dsnu_fraction else None
 
@@ -149,7 +152,7 @@ class HotSites(FixedOffset):
     hot_e_per_s: float
 
     @classmethod
-    def from_sensor(cls, sensor: Any) -> Self | None:
+    def from_sensor(cls, sensor: Sensor) -> Self | None:
         """Return the effect that a sensor's keywords specify, or None."""
         is_on = sensor.hot_fraction and sensor.hot_e_per_s
         return cls(sensor.hot_fraction, sensor.hot_e_per_s * sensor.dark_current_ratio) if is_on else None

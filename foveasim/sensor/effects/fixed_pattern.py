@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
 from foveasim._core.validation import Floats
 from foveasim.sensor.effects.contract import FixedFactor, FixedOffset, Sites, Stage
+
+if TYPE_CHECKING:
+    from foveasim.sensor.sensor import Sensor
 
 __all__ = ["ColumnOffset", "PixelGain", "PixelOffset"]
 
@@ -31,7 +34,7 @@ class PixelGain(FixedFactor):
     gain_fpn_fraction: float
 
     @classmethod
-    def from_sensor(cls, sensor: Any) -> Self | None:
+    def from_sensor(cls, sensor: Sensor) -> Self | None:
         """Return the effect that a sensor's keywords specify, or None."""
         return cls(sensor.gain_fpn_fraction) if sensor.gain_fpn_fraction else None
 
@@ -63,7 +66,7 @@ class PixelOffset(FixedOffset):
     offset_v: float
 
     @classmethod
-    def from_sensor(cls, sensor: Any) -> Self | None:
+    def from_sensor(cls, sensor: Sensor) -> Self | None:
         """Return the effect that a sensor's keywords specify, or None."""
         is_on = sensor.pixel_fpn_fraction and not sensor.cds
         return cls(sensor.v_sat_v * sensor.pixel_fpn_fraction) if is_on else None
@@ -96,7 +99,7 @@ class ColumnOffset(FixedOffset):
     offset_v: float
 
     @classmethod
-    def from_sensor(cls, sensor: Any) -> Self | None:
+    def from_sensor(cls, sensor: Sensor) -> Self | None:
         """Return the effect that a sensor's keywords specify, or None."""
         return cls(sensor.v_sat_v * sensor.line_fpn_fraction) if sensor.line_fpn_fraction else None
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self, cast
+from typing import TYPE_CHECKING, ClassVar, Self, cast
 
 import numpy as np
 
@@ -11,6 +11,9 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats
 from foveasim.sensor.effects.contract import AdditiveNoise, Effect, Sites, Stage
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
+
+if TYPE_CHECKING:
+    from foveasim.sensor.sensor import Sensor
 
 __all__ = ["ReadNoise", "ResetNoise", "TelegraphNoise"]
 
@@ -33,7 +36,7 @@ class ResetNoise(AdditiveNoise):
     temperature_k: float
 
     @classmethod
-    def from_sensor(cls, sensor: Any) -> Self | None:
+    def from_sensor(cls, sensor: Sensor) -> Self | None:
         """Return the effect that a sensor's keywords specify, or None; CDS removes it."""
         return cls(sensor.temperature_k) if sensor.ktc_noise and not sensor.cds else None
 
@@ -62,7 +65,7 @@ class ReadNoise(AdditiveNoise):
     __repr__ = short_repr
 
     @classmethod
-    def from_sensor(cls, sensor: Any) -> Self | None:
+    def from_sensor(cls, sensor: Sensor) -> Self | None:
         """Return the effect that a sensor's keywords specify, or None."""
         return cls(sensor.read_noise_e) if np.any(sensor.read_noise_e) else None
 
@@ -100,7 +103,7 @@ class TelegraphNoise(Effect):
     rts_e: float
 
     @classmethod
-    def from_sensor(cls, sensor: Any) -> Self | None:
+    def from_sensor(cls, sensor: Sensor) -> Self | None:
         """Return the effect that a sensor's keywords specify, or None."""
         return cls(sensor.rts_fraction, sensor.rts_e) if sensor.rts_fraction and sensor.rts_e else None
 

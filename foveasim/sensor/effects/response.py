@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
 from foveasim._core.validation import Floats
 from foveasim.sensor.effects.contract import FixedFactor, Sites, Stage
+
+if TYPE_CHECKING:
+    from foveasim.sensor.sensor import Sensor
 
 __all__ = ["DeadSites", "PhotoResponse"]
 
@@ -31,7 +34,7 @@ class PhotoResponse(FixedFactor):
     prnu_fraction: float
 
     @classmethod
-    def from_sensor(cls, sensor: Any) -> Self | None:
+    def from_sensor(cls, sensor: Sensor) -> Self | None:
         """Return the effect that a sensor's keywords specify, or None."""
         return cls(sensor.prnu_fraction) if sensor.prnu_fraction else None
 
@@ -63,7 +66,7 @@ class DeadSites(FixedFactor):
     dead_fraction: float
 
     @classmethod
-    def from_sensor(cls, sensor: Any) -> Self | None:
+    def from_sensor(cls, sensor: Sensor) -> Self | None:
         """Return the effect that a sensor's keywords specify, or None."""
         return cls(sensor.dead_fraction) if sensor.dead_fraction else None
 

@@ -153,6 +153,8 @@ def plot_noise_budget(
         When there is not one class per site.
     """
     ax = new_axes(7.0, 0.64) if ax is None else ax
+    if not noise_e:
+        raise ParameterError("noise_e", "must contain at least one source of noise")
     n_sites = next(iter(noise_e.values())).size
     labels = np.zeros(n_sites, np.int64) if classes is None else np.asarray(unmasked("classes", classes))
     if labels.shape != (n_sites,):

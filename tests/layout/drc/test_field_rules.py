@@ -149,9 +149,9 @@ def test_lines_without_tracks_are_reported():
         ({"max_density": 1.2, "density_window_um": 9.0}, "'max_density' must be <= 1"),
         ({"max_density": 0.2, "density_window_um": 0.0}, "'density_window_um' must be > 0"),
         ({"max_data_rate_gbit_per_s": 1.0}, "'readout' must be given for 'max_data_rate_gbit_per_s'"),
-        ({"max_data_rate_gbit_per_s": 1.0, "readout": 30}, "'readout' must be a Readout, got 30"),
+        ({"max_data_rate_gbit_per_s": 1.0, "readout": 30}, "'readout' must be a Readout, got an int"),
         ({"max_track_utilisation": 1.0}, "'routing' must be given for 'max_track_utilisation'"),
-        ({"routing": "up"}, "'routing' must be a Routing, got 'up'"),
+        ({"routing": "up"}, "'routing' must be a Routing, got a str"),
         ({"preset": "sky"}, "'preset' must be one of 'sky130_met1', .*, got 'sky'"),
     ],
 )
