@@ -74,7 +74,7 @@ def layout_family(
             given.apply_defaults()
             unknown = select_unknown(name, solve_for, given.arguments) if solve_for else None
             if unknown is None:
-                layout = generator(*args, **kwargs)
+                layout = checked(*args, **kwargs)
             else:
                 layout, given.arguments[unknown.name] = layout_with_n_sites(name, generate, unknown, given.arguments)
             if not isinstance(layout, Layout):

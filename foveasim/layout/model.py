@@ -269,6 +269,7 @@ class Layout:
         columns, provenance : mappings
             As for the class.
         """
+        rings_um = finite_array("rings_um", rings_um, ndim=3)
         n_sites, n_vertices = rings_um.shape[:2]
         site_offsets = freeze(np.arange(n_sites + 1))
         xy_um, ring_offsets = rings_um.reshape(-1, 2), freeze(n_vertices * site_offsets)

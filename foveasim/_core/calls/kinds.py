@@ -63,7 +63,7 @@ class Kind(NamedTuple):
     item: Any = None
 
 
-def check_kind(name: str, value: object, kind: Kind) -> None:
+def check_kind(name: str, value: Any, kind: Kind) -> None:
     """
     Check that a value is of a kind.
 
@@ -74,11 +74,11 @@ def check_kind(name: str, value: object, kind: Kind) -> None:
     """
     if not kind.accepts(value):
         if kind.item is not None and _is_sequence(value):
-            for k, item in enumerate(value):
-                check_kind(f"{name}[{k}]", item, kind.item)
+            for k, each in enumerate(value):
+                check_kind(f"{name}[{k}]", each, kind.item)
         if kind.item is not None and isinstance(value, Mapping):
-            for key, item in value.items():
-                check_kind(f"{name}[{key!r}]", item, kind.item)
+            for key, each in value.items():
+                check_kind(f"{name}[{key!r}]", each, kind.item)
         if kind.is_class:
             raise ParameterError(name, f"must be {kind.one}, got {type_name(value)}")
         hint = did_you_mean(value, kind.choices) if isinstance(value, str) else ""

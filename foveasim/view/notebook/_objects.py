@@ -38,7 +38,6 @@ __all__ = ["html_table", "to_html", "to_png"]
 PNG_PIXELS, MAX_PNG_BYTES = 640, 400_000
 
 
-@singledispatch
 def to_html(item: Any) -> str:
     """
     Return an object as HTML for notebooks.
@@ -59,6 +58,11 @@ def to_html(item: Any) -> str:
     ParameterError
         When the object is of another type.
     """
+    return _to_html(item)
+
+
+@singledispatch
+def _to_html(item: Any) -> str:
     if not hasattr(item, "records"):
         raise ParameterError("item", "must be an object of foveasim with figures to show", item)
     records = item.records()
@@ -80,7 +84,7 @@ def to_png(picture: Picture) -> bytes:
     return encode_png(picture_pixels(picture, PNG_PIXELS), MAX_PNG_BYTES)[0]
 
 
-@to_html.register
+@_to_html.register
 def _layout(layout: Layout) -> str:
     title = f"Layout of {layout.n_sites:,} photosites"
     return panel(title, site_thumbnail(layout, title), facts(_layout_facts(layout)))
@@ -108,7 +112,7 @@ def _layout_facts(layout: Layout) -> dict[str, object]:
     return rows | {"columns": ", ".join(layout.columns)}
 
 
-@to_html.register
+@_to_html.register
 def _capture(capture: Capture) -> str:
     title = f"Capture of {capture.layout.n_sites:,} photosites"
     rows: dict[str, object] = {}
@@ -129,7 +133,7 @@ def _capture(capture: Capture) -> str:
     return panel(title, site_thumbnail(capture, title), facts(rows))
 
 
-@to_html.register
+@_to_html.register
 def _sensor(sensor: Sensor) -> str:
     return panel(
         f"Sensor with {sensor.layout.n_sites:,} photosites", facts(_sensor_facts(sensor)), _effects_table(sensor)
@@ -189,7 +193,7 @@ def _describe(name: str, value: Any) -> str:
     return f"{text} {unit}" if unit else text
 
 
-@to_html.register
+@_to_html.register
 def _optics(optics: Optics) -> str:
     return panel(f"Optics of {optics.focal_length_mm:g} mm, f/{optics.f_number:g}", facts(_given_parameters(optics)))
 
@@ -204,7 +208,7 @@ def _given_parameters(item: Any) -> Iterable[tuple[str, str]]:
             yield title_of(f.name).partition(" / ")[0], _describe(f.name, value)
 
 
-@to_html.register
+@_to_html.register
 def _camera(camera: Camera) -> str:
     sensor, optics = camera.sensor, camera.optics
     layout = cast("Layout", sensor.layout)  # checked by Camera
@@ -218,7 +222,7 @@ def _camera(camera: Camera) -> str:
     return panel(title, site_thumbnail(layout, title), facts(rows), _effects_table(sensor))
 
 
-@to_html.register
+@_to_html.register
 def _scene(scene: Scene) -> str:
     n_basis, n_y, n_x = scene.basis.shape
     title = f"Scene of {n_x:,} x {n_y:,} pixels"
@@ -241,7 +245,7 @@ def _scene(scene: Scene) -> str:
     return panel(title, thumbnail(scene_pixels(scene, THUMBNAIL_PIXELS), title), facts(rows))
 
 
-@to_html.register
+@_to_html.register
 def _power_map(power_map: PowerMap) -> str:
     n_bands, n_y, n_x = power_map.data.shape
     title = f"Power map of {n_x:,} x {n_y:,} cells"
@@ -258,7 +262,7 @@ def _power_map(power_map: PowerMap) -> str:
     return panel(title, thumbnail(power_map_pixels(power_map, THUMBNAIL_PIXELS), title), facts(rows))
 
 
-@to_html.register
+@_to_html.register
 def _picture(picture: Picture) -> str:
     n_y, n_x = picture.coverage.shape
     return panel(
@@ -266,7 +270,7 @@ def _picture(picture: Picture) -> str:
     )
 
 
-@to_html.register
+@_to_html.register
 def _cortical_image(image: CorticalImage) -> str:
     n_channels, n_rings, n_sectors = image.data.shape
     title = f"Log-polar image of {n_rings:,} rings and {n_sectors:,} sectors"
@@ -285,7 +289,7 @@ def _cortical_image(image: CorticalImage) -> str:
     return panel(title, pixels, facts(rows))
 
 
-@to_html.register
+@_to_html.register
 def _report(report: Report) -> str:
     title = f"Design rules on {report.n_sites:,} photosites: {'satisfied' if report.ok else 'violated'}"
     colours = iter(RULE_COLOURS * (1 + len(report.results) // len(RULE_COLOURS)))
@@ -305,7 +309,7 @@ def _report(report: Report) -> str:
     )
 
 
-@to_html.register
+@_to_html.register
 def _summary(summary: Summary) -> str:
     largest = max((int(n) for n in summary.size_counts), default=0) or 1
     sizes = [(r["from_um"], r["to_um"], r["n_sites"], bar(r["n_sites"] / largest)) for r in summary.records()]

@@ -284,7 +284,7 @@ def test_giotto_scales_with_unit():
             "'n_across' must be > 151, the diameter of 76 rings of unit height, got 151; take a larger",
         ),
         ({"n_across": 600.5}, "'n_across' must be an integer, got 600.5"),
-        ({"n_across": "600"}, "'n_across' must be one number, got '600'"),
+        ({"n_across": "600"}, "'n_across' must be an integer, got '600'"),
         ({"n_theta": 2, "fovea": "none"}, "'n_theta' must be >= 3, got 2"),
         ({"n_theta": 59}, "'n_theta' must be >= 60, three times 'n_fovea', got 59; or take fovea='none'"),
         ({"n_theta": 10_000_000}, "'n_sites' must be <= 50000000"),

@@ -576,7 +576,7 @@ def test_zones_reject_invalid_parameters(side_um, pitch_um, message):
     [
         (grid, {"n_x": 0, "n_y": 1, "pitch_um": 1.0}, "'n_x' must be >= 1, got 0"),
         (grid, {"n_x": 1, "n_y": 2.5, "pitch_um": 1.0}, "'n_y' must be an integer, got 2.5"),
-        (grid, {"n_x": "3", "n_y": 1, "pitch_um": 1.0}, "'n_x' must be one number, got '3'"),
+        (grid, {"n_x": "3", "n_y": 1, "pitch_um": 1.0}, "'n_x' must be an integer, got '3'"),
         (grid, {"n_x": 1, "n_y": 1, "pitch_um": 0.0}, "'pitch_um' must be > 0, got 0.0 µm"),
         (grid, {"n_x": 1, "n_y": 1, "pitch_um": np.nan}, "'pitch_um' must be finite, got nan µm"),
         (grid, {"n_x": 1, "n_y": 1, "pitch_um": 1.0, "width_um": 1.5}, "'width_um' must be <= 1, got 1.5 µm"),
