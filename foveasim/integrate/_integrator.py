@@ -101,7 +101,7 @@ class Integrator:
     def __init__(
         self,
         layout: OwnCheck[PackedRings],
-        grid: Grid,
+        grid: OwnCheck[Grid],
         *,
         distortion: OwnCheck[PointMap | None] = None,
         conserve: Literal["flux", "density"] = "flux",

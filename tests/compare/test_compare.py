@@ -177,7 +177,7 @@ def cameras_of(layout, **optics):
     ("change", "message"),
     [
         (lambda one: {"a": one}, "must be at least two, got 1"),
-        (lambda one: [one, one], "'cameras' must be a mapping to Camera objects, got a list"),
+        (lambda one: [one, one], "'cameras' must be a mapping to Camera objects, got "),
         (lambda one: {"a": one, "b": 3}, "'cameras\\['b'\\]' must be a Camera, got an int"),
         (
             lambda one: {"a": one, "b": cameras_of(one.sensor.layout, f_number=2.0)},

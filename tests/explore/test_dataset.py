@@ -1276,7 +1276,7 @@ def test_invalid_distribution_is_rejected_before_sampling(vary, error, message):
         (
             {"shot": SHOT | {"exposure_s": object()}},
             ConfigError,
-            "^shot: must contain only numbers, strings, lists and mappings",
+            r"^shot\.exposure_s: must be a number, string, list or section",
         ),
         ({"shot": 5}, ParameterError, "'shot' must be a settings file or a mapping of settings, got an int"),
         ({"shot": "missing.yaml"}, ConfigError, "missing.yaml: no such file"),

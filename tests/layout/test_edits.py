@@ -161,7 +161,7 @@ def test_union_has_all_sites_and_common_columns():
     ("call", "message"),
     [
         (lambda: union([]), "'layouts' must be one or more layouts"),
-        (lambda: union([GRID, 3]), "'layouts[1]' must be a Layout, got an int"),
+        (lambda: union([GRID, 3]), r"'layouts(\[1\])?' must be (one or more layouts|a Layout)"),
         (lambda: clip(GRID, (0, 0, 1, 1)), "'region' must have 2 dimensions, got the shape"),
         (lambda: clip(GRID, shapely.Point(0, 0)), "'region' must be a shapely Polygon or MultiPolygon, got a Point"),
         (lambda: clip(GRID, shapely.Polygon([(0, 0), (1, 1), (1, 0), (0, 1)])), "'region' must be a valid"),

@@ -401,7 +401,7 @@ class Duplicate(LampFlicker):
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"effects": [3.0]}, "'effects[0]' must be an Effect, got a float"),
+        ({"effects": [3.0]}, r"'effects\[0\]' must be an Effect, got a float"),
         ({"effects": LampFlicker()}, "'effects' must be a list of Effect objects, got"),
         ({"effects": [Nameless()]}, "'effects' must define the class attribute 'name' of type str"),
         ({"effects": [Early()]}, "'early' at the stage 'photo' is temporal; use the stage 'charge'"),

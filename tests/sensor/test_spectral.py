@@ -272,8 +272,8 @@ def test_each_primary_has_highest_matching_transmission(wavelength_nm, name):
     ("curves", "names", "message"),
     [
         ([], None, "'curves' must be one or more functions of wavelength"),
-        ([0.5], None, "'curves[0]' must be a Curve, got a float"),
-        ("ab", None, "'curves' must be a list of Curve objects, got a str"),
+        ([0.5], None, r"'curves\[0\]' must be a Curve, got a float"),
+        ("ab", None, "'curves' must be a list of Curve objects, got 'ab'"),
         ([ConstantCurve()], ["a", "b"], "'names' must have one name for each of the 1 curves"),
     ],
 )

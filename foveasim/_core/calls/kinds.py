@@ -86,7 +86,7 @@ def check_kind(name: str, value: Any, kind: Kind) -> None:
 
 
 class _Named(type):
-    """Metaclass of types of libraries that are not imported at run time, which are identified by their names."""
+    """Metaclass of stand-ins for types of libraries, which are identified by their names."""
 
     library: str
 
@@ -112,7 +112,7 @@ def _named(library: str, name: str) -> Any:
 
 @lru_cache(maxsize=256)
 def _types_of(module: str) -> dict[str, Any]:
-    """Return the names that a module imports for type checkers alone: types of this package, stand-ins for others."""
+    """Return types that a module imports for type checkers only, or their stand-ins."""
     found: dict[str, Any] = {}
     for node in ast.walk(ast.parse(inspect.getsource(sys.modules[module]))):
         if not isinstance(node, ast.If) or ast.unparse(node.test) != "TYPE_CHECKING":
@@ -259,7 +259,7 @@ def _class(name: str, accepts: Callable[[Any], bool]) -> Kind:
 
 
 def _fixed_sequence(items: tuple[Any, ...]) -> Kind | None:
-    """Return the kind of a sequence of a fixed length; functions check its numbers, and name the invalid one."""
+    """Return the kind of a sequence of a fixed length; functions check its numbers."""
     kinds = [kind_of(item) for item in items]
     tests = [None if kind in (None, _NUMBER, _INTEGER) else kind.accepts for kind in kinds if kind]
     n = len(items)

@@ -17,6 +17,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.provenance import versions
 from foveasim._core.random_streams import Streams
 from foveasim._core.threads import cached_property
@@ -166,19 +167,19 @@ class Dataset:
     def __init__(
         self,
         pictures: Any,
-        shot: str | Path | Mapping[str, Any],
-        vary: Mapping[str, Any] | None = None,
+        shot: OwnCheck[str | Path | Mapping[str, Any]],
+        vary: OwnCheck[Mapping[str, Any] | None] = None,
         *,
         cameras: int = 1,
         draws: int = 1,
         seed: int = 0,
         fields: Sequence[str] = ("code", "electrons"),
-        labels: Sequence[int | str] | None = None,
+        labels: OwnCheck[Sequence[int | str] | None] = None,
         boxes: Sequence[Any] | None = None,
         masks: Sequence[Any] | None = None,
         flows: Sequence[Any] | None = None,
-        raster: Mapping[str, Any] | None = None,
-        cortical: Mapping[str, Any] | None = None,
+        raster: OwnCheck[Mapping[str, Any] | None] = None,
+        cortical: OwnCheck[Mapping[str, Any] | None] = None,
         fit: Literal["cover", "contain", "width"] | None = None,
         changes: Mapping[str, Any] | None = None,
         source: Source | str | Path | None = None,

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.names import did_you_mean, possible_names
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import check_count
@@ -200,7 +201,7 @@ def read_study(path: str | Path, *, metrics: Sequence[str] = (), n_trials: int |
 def plan_study(
     shot: str | Path | Mapping[str, Any],
     search: Mapping[str, Search],
-    objectives: Mapping[str, Literal["maximize", "minimize"]],
+    objectives: OwnCheck[Mapping[str, Literal["maximize", "minimize"]]],
     *,
     n_trials: int,
     constraints: Limits | None = None,

@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.extras import import_optional
 from foveasim._core.names import possible_names
 from foveasim._core.random_streams import derive_seed
@@ -43,7 +44,7 @@ WRITER = "writer"
 def study(
     shot: str | Path | Mapping[str, Any],
     search: Mapping[str, Search],
-    objectives: Mapping[str, Literal["maximize", "minimize"]],
+    objectives: OwnCheck[Mapping[str, Literal["maximize", "minimize"]]],
     *,
     n_trials: int,
     constraints: Limits | None = None,

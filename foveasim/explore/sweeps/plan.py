@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.provenance import identify, versions
 from foveasim._core.random_streams import derive_seed
 from foveasim._core.short_repr import short_repr
@@ -311,7 +312,7 @@ def read_sweep(path: str | Path, *, metrics: Sequence[str] = ()) -> Plan:
 
 def plan_sweep(
     shot: str | Path | Mapping[str, Any],
-    vary: Mapping[str, Iterable[Any]] | Sequence[Mapping[str, Any]],
+    vary: OwnCheck[Mapping[str, Iterable[Any]] | Sequence[Mapping[str, Any]]],
     *,
     mode: Literal["product", "zip"] = "product",
     repeats: int = 1,

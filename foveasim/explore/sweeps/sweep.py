@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.threads import thread_count
 from foveasim._core.validation import check_count
 from foveasim.errors import SimulationError
@@ -37,7 +38,7 @@ Progress = Callable[[int, int], None]
 
 def sweep(
     shot: str | Path | Mapping[str, Any],
-    vary: Mapping[str, Iterable[Any]] | Sequence[Mapping[str, Any]],
+    vary: OwnCheck[Mapping[str, Iterable[Any]] | Sequence[Mapping[str, Any]]],
     *,
     mode: Literal["product", "zip"] = "product",
     repeats: int = 1,
