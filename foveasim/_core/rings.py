@@ -5,11 +5,11 @@ Rings are stored consecutively in ``xy_um`` (n_vertex, 2); ring r has the vertic
 ring_offsets[r + 1]`` and site s the rings ``site_offsets[s] : site_offsets[s + 1]``. The first vertex is not repeated.
 Outer rings are counter-clockwise and holes clockwise, so that the area of a site is the sum of signed ring areas.
 
-Fixed patterns depend on the identity of a site (:func:`site_ids`), an integer of 64 bits: the column ``site_id``, or the position of its centroid in units of 0.1 nm. Of
-non-overlapping sites that share a centroid, at most one contains it, for example the disc among concentric rings. The identity
-of a site that surrounds its centroid without containing it (a ring, a C shape) is therefore a hash of its outline: of the
-positions of all its vertices, in any order. Concentric rings are thus distinct sites, and each has the same identity with or
-without the others.
+Fixed patterns depend on the identity of a site (:func:`site_ids`), an integer of 64 bits: the column ``site_id``, or the
+position of its centroid in units of 0.1 nm. Of non-overlapping sites that share a centroid, at most one contains it, for
+example the disc among concentric rings. The identity of a site that surrounds its centroid without containing it (a ring, a C
+shape) is therefore a hash of its outline: of the positions of all its vertices, in any order. Concentric rings are thus
+distinct sites, and each has the same identity with or without the others.
 
 An arc of up to 180 degrees, as in log-polar layouts with few sectors, does not contain its centroid either, but the centroid of
 another site rarely coincides with it. The identity of an arc is its centroid, unless the layout contains such a coinciding

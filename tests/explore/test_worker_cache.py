@@ -8,12 +8,12 @@ import json
 import typing
 from dataclasses import fields, is_dataclass
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
 from pydantic import BaseModel
 
 from foveasim import explore
+from foveasim._io.images import write_picture
 from foveasim.config import Source
 from foveasim.config._models import models
 from foveasim.config._objects import put_setting
@@ -266,7 +266,7 @@ def runner(tmp_path, monkeypatch):
     """Return a function that creates runners, and the components that their caches returned."""
     rng = np.random.default_rng(5)
     for name in ("picture.png", "other.png"):
-        iio.imwrite(tmp_path / name, rng.integers(0, 256, (20, 24, 3), dtype=np.uint8))
+        write_picture(tmp_path / name, rng.integers(0, 256, (20, 24, 3), dtype=np.uint8))
     np.save(tmp_path / "map.npy", rng.random((24, 24)))
     monkeypatch.chdir(tmp_path)
     returned = {}
