@@ -11,8 +11,8 @@ example the disc among concentric rings. The identity of a site that surrounds i
 shape) is therefore a hash of its outline: of the positions of all its vertices, in any order. Concentric rings are thus
 distinct sites, and each has the same identity with or without the others.
 
-An arc of up to 180 degrees, as in log-polar layouts with few sectors, does not contain its centroid either, but the centroid of
-another site rarely coincides with it. The identity of an arc is its centroid, unless the layout contains such a coinciding
+An arc of up to 180 degrees, as in log-polar layouts with few sectors, does not contain its centroid either, but the centroid
+of another site rarely coincides with it. The identity of an arc is its centroid, unless the layout contains such a coinciding
 site; only then the identity of the arc changes when it is cropped out of the layout. Two sites with equal outlines have the
 same identity, unless a column ``site_id`` distinguishes them.
 

@@ -121,7 +121,10 @@ class Scene:
     Spectral radiance of pixel [iy, ix] at wavelength k: ``sum_b basis[b, iy, ix] * spectrum[b, k]``.
     """
 
-    basis: Images = _BasisImages()  # type: ignore[assignment]
+    if TYPE_CHECKING:
+        basis: Images
+    else:
+        basis: Images = _BasisImages()
     spectrum_w_m2_sr_nm: Floats
     wavelength_nm: Floats
     band_width_nm: Floats

@@ -934,6 +934,8 @@ def _valid_polygons(path: Path, polygons: NDArray[Any], invalid: str) -> tuple[N
         kept = np.setdiff1d(kept, bad)
         if kept.size == 0:
             break
+    if not where:
+        return polygons, kept
     shown = ", ".join(f"site {site} at {where[site]} µm" for site in sorted(where)[:MAX_LISTED_OUTLINES])
     shown += f" and {len(where) - MAX_LISTED_OUTLINES} more" * (len(where) > MAX_LISTED_OUTLINES)
     what = f"of {polygons.size} outlines cross themselves or have no area"
