@@ -328,9 +328,9 @@ class Aperture:
         self, wavelength_nm: float, field_um: tuple[float, float]
     ) -> tuple[float | None, NDArray[np.complex128]]:
         """
-        Return the highest frequency of the amplitude in radians per radius, and integrals over the aperture.
+        Return the highest frequency of the amplitude, and integrals over the aperture.
 
-        The frequency is None if the integrals do not converge: a pupil is discontinuous at unknown edges. The integrals are
+        The frequency is in radians per radius. It is None if the integrals do not converge: a pupil is discontinuous at unknown edges. The integrals are
         those of the amplitude times each of :data:`PROBES`, of its modulus, and of the squared modulus.
         """
         key = "integrals", wavelength_nm, field_um
@@ -362,13 +362,13 @@ class Aperture:
         return total
 
     def _nodes(self, wavelength_nm: float, radians: float) -> Iterator[Nodes]:
-        """Yield the nodes of a quadrature over the aperture, for an integrand of a highest frequency in radians per radius."""
+        """Yield the nodes of a quadrature for a highest frequency in radians per radius."""
         return pupil_nodes(self._edges, partial(self._transmission, wavelength_nm=wavelength_nm), radians)
 
     def psf_per_um2(
         self, wavelength_nm: float, lambda_n_um: float, x_um: Floats, y_um: Floats, field_um: tuple[float, float]
     ) -> Floats:
-        """Sample the PSF, normalised to unit energy, at the equidistant points (y, x); (n_y, n_x), 1/µm²."""
+        """Sample the PSF of unit energy, 1/µm², at equidistant points (y, x), (n_y, n_x)."""
         reach = 2.0 * max(np.abs(x_um).max(), np.abs(y_um).max()) / lambda_n_um
         if reach > 0.5 * MAX_ACROSS:
             raise ParameterError(
@@ -424,7 +424,7 @@ class Aperture:
     def _overlap(
         self, wavelength_nm: float, shift: tuple[float, float], field_um: tuple[float, float], radians: float
     ) -> complex:
-        """Return the correlation of the amplitude at points displaced by ``shift`` and its negative."""
+        """Return the correlation of the amplitude at the lag ``2 * shift``."""
         if math.hypot(*shift) >= 1.0:
             return 0.0j
 

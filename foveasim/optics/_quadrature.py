@@ -84,8 +84,8 @@ class PupilEdges:
 def joined(parts: Sequence[PupilEdges]) -> PupilEdges:
     """Return the edges of a product of pupils."""
 
-    def of_all(name: str, none: Floats) -> Floats:
-        return np.concatenate([none, *(np.asarray(getattr(part, name)) for part in parts)])
+    def of_all(name: str, start: Floats) -> Floats:
+        return np.concatenate([start, *(np.asarray(getattr(part, name)) for part in parts)])
 
     segments = of_all("segments", np.zeros((0, 2, 2)))
     return PupilEdges(
@@ -147,7 +147,7 @@ class Curves:
         return np.concatenate((self.circles, self.discs))
 
     def corners(self) -> tuple[Floats, Floats]:
-        """Return the rows of intersections of curves other than segments, and the rows that touch a circle."""
+        """Return rows of intersections of lines and circles, and rows that touch a circle."""
         circles = self.all_circles
         tangents = np.concatenate((circles[:, 1] - circles[:, 2], circles[:, 1] + circles[:, 2]))
         (x, y, r), at = circles.T[:, :, np.newaxis], self.lines_x
@@ -166,7 +166,7 @@ class Curves:
 
     def inner_columns(self) -> tuple[Ints, Ints]:
         """
-        Return the first and last of ``lines_x`` between which no edge crosses each interval of ``lines_y``.
+        Return the first and last of ``lines_x`` without edges between, per ``lines_y`` interval.
 
         Intervals are numbered from that before the first line. Without such columns, both are 0.
         """
@@ -181,7 +181,7 @@ class Curves:
         return first, last
 
     def effective_segments(self, transmission: Amplitude) -> Floats:
-        """Return the pieces of segments between intersections at which the amplitude is discontinuous."""
+        """Return the pieces of segments at which the amplitude is discontinuous."""
         if not len(self.segments):
             return self.segments
         start, along = self.segments[:, :2], self.segments[:, 2:] - self.segments[:, :2]
@@ -227,7 +227,7 @@ def _gauss(n: int) -> tuple[Floats, Floats]:
 
 @lru_cache(maxsize=1)
 def _largest_phases() -> Floats:
-    """Return the half phase that each number of Gauss nodes, from 0, integrates to :data:`ACCURACY`."""
+    """Return the half phase that 0, 1, ... Gauss nodes integrate to :data:`ACCURACY`."""
     n = np.arange(1, MAX_SMALL_RULE + 1)
     # The remainder of n nodes for exp(i k t) is k^(2n) 2^(2n+1) (n!)^4 / ((2n+1) ((2n)!)^3) at most, and the integral is 2.
     factorials = np.cumsum(np.log(np.arange(1, 2 * MAX_SMALL_RULE + 1)))
@@ -270,7 +270,7 @@ def _expand(centre: Floats, half: Floats, n: Ints) -> tuple[Ints, Floats, Floats
 
 
 def _graded(corners: Floats, tangents: Floats) -> Floats:
-    """Return the bounds of bands between corners, which become shorter towards tangents outside a band."""
+    """Return bounds of bands between corners, shorter towards tangents outside a band."""
     cuts, ordered = [corners], np.sort(tangents)
     is_tangent = _coincides(corners, ordered)
     width = np.diff(corners)
@@ -368,7 +368,7 @@ def nodes_of(curves: Curves, transmission: Amplitude, radians: float) -> Iterato
 
 
 def _columns(curves: Curves, radians: float) -> Iterator[Nodes]:
-    """Yield the nodes of rectangles between lines that no other edge crosses: a product of two rules, which is much faster."""
+    """Yield the nodes of rectangles that no edge crosses: products of two rules, faster."""
     first, last = curves.inner_columns()
     if not last.any():
         return
@@ -393,7 +393,7 @@ def _columns(curves: Curves, radians: float) -> Iterator[Nodes]:
 
 
 def _block(curves: Curves, segments: Floats, rows: list[Floats], radians: float) -> Nodes:
-    """Return the nodes of rows, given by position and weight of each, and the ends of its band."""
+    """Return the nodes of rows, given by position, weight, and the ends of their bands."""
     y, row_weight, low, high = rows
 
     def half_chord(circles: Floats) -> Floats:
@@ -441,9 +441,9 @@ def overlap_nodes(
     edges: PupilEdges, transmission: Amplitude, shift: tuple[float, float], radians: float
 ) -> Iterator[Nodes]:
     """
-    Yield the nodes of a quadrature over the overlap of two copies of a pupil, displaced by ``shift`` and its negative.
+    Yield the nodes of a quadrature over the overlap of two displaced copies of a pupil.
 
-    Parameters are those of :func:`nodes_of`; ``transmission`` is that of the product of both copies.
+    The copies are displaced by ``shift`` and its negative. Other parameters are those of :func:`nodes_of`; ``transmission`` is that of the product of both copies.
     """
     centres = [shift, (-shift[0], -shift[1])]
     discs = np.array([[x, y, 1.0] for x, y in centres])

@@ -279,7 +279,7 @@ class PupilImage:
         return np.asarray(there * np.exp(2j * np.pi * path_um / (1e-3 * wavelength_nm)))
 
     def edges(self) -> PupilEdges:
-        """Return the edges of pixels, and the lines through pixel centres of the wavefront, whose slope changes there."""
+        """Return pixel edges, and lines at which the slope of the wavefront changes."""
         n = len(as_numbers("picture", self.picture))  # type: ignore[arg-type]
         lines = np.arange(1, n) * (2.0 / n) - 1.0
         if self.wavefront_um is not None:

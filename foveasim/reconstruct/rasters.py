@@ -60,7 +60,7 @@ def reference(power_map: PowerMap, grid: Grid, *, weights: Floats | None = None)
 
 def sum_of_images(images: Sequence[tuple[Grid, Iterable[Any]]], grid: Grid, n_channels: int) -> Picture:
     """
-    Return the sum of images on grids of their own, as exact area-weighted means over pixels.
+    Return the sum of images on several grids, as area-weighted means over pixels.
 
     Parameters
     ----------

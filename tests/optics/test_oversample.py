@@ -161,7 +161,7 @@ def sites_of(side_um, half_um, n=100):
 
 
 @pytest.mark.parametrize("pixel_lambda_n", [0.97, 1.03, 1.6, 2.8])
-def test_auto_oversample_resolves_square_pixels_of_any_width(pixel_lambda_n):
+def test_auto_oversample_resolves_wide_square_pixels(pixel_lambda_n):
     """Reference: 16 cells per source pixel."""
     scene = photograph(pixel_lambda_n)
     sensor = sites_of(LAMBDA_N_UM, 8.0 * pixel_lambda_n * LAMBDA_N_UM)
