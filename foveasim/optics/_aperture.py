@@ -330,8 +330,9 @@ class Aperture:
         """
         Return the highest frequency of the amplitude, and integrals over the aperture.
 
-        The frequency is in radians per radius. It is None if the integrals do not converge: a pupil is discontinuous at unknown edges. The integrals are
-        those of the amplitude times each of :data:`PROBES`, of its modulus, and of the squared modulus.
+        The frequency is in radians per radius. It is None if the integrals do not converge: a pupil is discontinuous at
+        unknown edges. The integrals are those of the amplitude times each of :data:`PROBES`, of its modulus, and of the
+        squared modulus.
         """
         key = "integrals", wavelength_nm, field_um
         if key not in self._cache:

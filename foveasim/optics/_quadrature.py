@@ -166,7 +166,7 @@ class Curves:
 
     def inner_columns(self) -> tuple[Ints, Ints]:
         """
-        Return the first and last of ``lines_x`` without edges between, per ``lines_y`` interval.
+        Return first and last of ``lines_x`` without edges between, per ``lines_y`` interval.
 
         Intervals are numbered from that before the first line. Without such columns, both are 0.
         """
@@ -443,7 +443,8 @@ def overlap_nodes(
     """
     Yield the nodes of a quadrature over the overlap of two displaced copies of a pupil.
 
-    The copies are displaced by ``shift`` and its negative. Other parameters are those of :func:`nodes_of`; ``transmission`` is that of the product of both copies.
+    The copies are displaced by ``shift`` and its negative. Other parameters are those of :func:`nodes_of`; ``transmission``
+    is that of the product of both copies.
     """
     centres = [shift, (-shift[0], -shift[1])]
     discs = np.array([[x, y, 1.0] for x, y in centres])
