@@ -78,7 +78,7 @@ def pupil_integrals(pupils, path_waves, points, wavelength_nm=550.0, **accuracy)
     amplitude = weight * np.ones_like(x)
     power = weight.copy()
     for pupil in pupils:
-        values = pupil(x, y, wavelength_nm)
+        values = 1.0 * pupil(x, y, wavelength_nm)
         amplitude = amplitude * values
         power = power * np.abs(values) ** 2
     is_open = amplitude != 0.0
