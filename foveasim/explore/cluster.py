@@ -145,7 +145,7 @@ def open_client(scheduler: str | None, n_workers: int) -> Iterator[Client]:
 
 @contextmanager
 def _deferred_signals() -> Iterator[None]:
-    """Handle Ctrl-C and SIGTERM at the end of the block: a half started cluster cannot be closed."""
+    """Defer Ctrl-C and SIGTERM to the end of the block: a starting cluster is not closed."""
     received: list[int] = []
     handlers: dict[int, Any] = {}
     if current_thread() is main_thread():
@@ -155,8 +155,8 @@ def _deferred_signals() -> Iterator[None]:
     try:
         yield
     finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+        for deferred, handler in handlers.items():
+            signal.signal(deferred, handler)
         if received:
             handlers[received[0]](received[0], None)
 

@@ -111,10 +111,10 @@ class _Edges:
 
     def count_pieces(self, chord_um: float) -> Ints:
         """
-        Return the number of pieces of every edge for a maximum deviation of chords, 1 to ``MAX_PIECES``, (n,).
+        Return the number of pieces of every edge for a maximum deviation of chords, (n,).
 
-        It depends on the edge alone, so that a site has the same outline in every selection of sites. The deviation of n chords
-        is 1/n² of that of one, as for a parabola.
+        At most ``MAX_PIECES``. The number depends on the edge alone, so that a site has the same outline in every selection of
+        sites. The deviation of n chords is 1/n² of that of one, as for a parabola.
         """
         deviation_um = self._deviation_um(slice(None), *MIDPOINT)
         long = np.flatnonzero(np.hypot(self.along[:, 0], self.along[:, 1]) > LONG_EDGE * chord_um)
@@ -126,7 +126,7 @@ class _Edges:
         return np.where(is_vertex_outside, 1.0, np.clip(n_pieces, 1.0, MAX_PIECES)).astype(np.int64)
 
     def _deviation_um(self, edge: Ints | slice, fraction: float, ratio: float) -> Floats:
-        """Return the deviation of undistorted edges from their chords, from that at a fraction of their length."""
+        """Return the deviation of undistorted edges from chords, from that at a fraction."""
         chord = self._low_to[edge] + fraction * self._along_to[edge]
         off = self._lens.undistort(self.at(edge, fraction), outside="mask") - chord
         return ratio * np.hypot(off[:, 0], off[:, 1])

@@ -142,7 +142,7 @@ def _spacing_um(xy_um: Floats) -> tuple[Floats, Floats]:
 
 def _row_um(distance_um: Floats, step_um: Floats) -> tuple[Floats, Bools]:
     """
-    Compute the distances to the nearest rows from the nearest neighbours, sorted by distance.
+    Compute the distances to the nearest rows from neighbours sorted by distance.
 
     Parameters
     ----------

@@ -132,7 +132,7 @@ def _neighbours(layout: PackedRings, channels: bytes, n_channels: int) -> dict[i
 
 
 def _mean_of_nearest(points_um: Floats, at_um: Floats) -> Any:
-    """Return the weights of points (n, 2) in the means of the nearest ones, a sparse matrix (n_at, n)."""
+    """Return the weights of points in the means of the nearest ones, sparse (n_at, n)."""
     from scipy.sparse import csr_array
     from scipy.spatial import cKDTree
 
