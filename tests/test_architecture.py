@@ -141,7 +141,7 @@ def test_random_numbers_come_from_named_streams_only(path):
     }
 
     allowed = {"Generator", "PCG64DXSM", "Philox", "SeedSequence"} if path.name == "random_streams.py" else set()
-    if path.parent.name == "effects":
+    if path.parent.name == "effects" or path.name == "kinds.py":
         allowed = {"Generator"}  # the type of what effects draw from
     if path.name == "cluster.py":
         allowed = {"seed"}  # of the workers of metrics, which may use the global generator

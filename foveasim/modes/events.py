@@ -105,12 +105,12 @@ class Events:
         """Number of events."""
         return int(self.t_s.size)
 
-    def counts(self, *, polarity: int | None = None) -> Ints:
+    def counts(self, *, polarity: OwnCheck[int | None] = None) -> Ints:
         """Return the number of events per site, (n_site,), of one polarity or both."""
         sites = self.site if polarity is None else self.site[self._has_polarity(polarity)]
         return np.bincount(sites, minlength=self.layout.n_sites).astype(np.int64)
 
-    def histogram(self, edges_s: ArrayLike, *, polarity: int | None = None) -> Ints:
+    def histogram(self, edges_s: ArrayLike, *, polarity: OwnCheck[int | None] = None) -> Ints:
         """
         Return the number of events per time bin and site.
 
