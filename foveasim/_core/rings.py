@@ -64,7 +64,7 @@ def next_vertex(ring_offsets: Ints) -> Ints:
 
 def collapse_short_edges(xy: Floats, ring_offsets: Ints, shortest: float) -> tuple[Floats, Ints]:
     """
-    Return packed rings without edges up to a length, whose ends become one vertex in all rings.
+    Return packed rings without edges up to a length; their ends become one vertex.
 
     Vertices that rings share are equal before and after.
     """
