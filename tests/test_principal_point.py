@@ -10,6 +10,9 @@ import pytest
 import foveasim as fs
 from foveasim.distortion import BrownConrady, Fisheye, from_opencv, read_calibration
 
+#: Sites are smaller than λN, so that points are located precisely.
+pytestmark = pytest.mark.filterwarnings("ignore:automatic oversampling chooses")
+
 cv2 = pytest.importorskip("cv2")
 
 SIZE = N_X, N_Y = 160, 120

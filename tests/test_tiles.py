@@ -77,6 +77,7 @@ def test_tiles_equal_complete_capture(camera, scene, complete, n_blocks):
         np.testing.assert_array_equal(joined(parts, name), getattr(complete, name))
 
 
+@pytest.mark.filterwarnings("ignore:automatic oversampling chooses")
 @pytest.mark.parametrize("order", [1, 2])
 def test_tiles_of_distorted_rings_equal_capture(order):
     layout = fs.layout.log_polar(n_sectors=512, n_rings=300, r_min_um=30.0, r_max_um=290.0)

@@ -623,7 +623,7 @@ CALLS = {
     "sensor.read_filters": lambda o: sensor.read_filters(o.text(".csv", "nm,R,G\n400,0.1,0.2\n700,0.2,0.3\n")),
     "sensor.rgb_filters": lambda o: sensor.rgb_filters(),
     "sensor.signal_to_noise": lambda o: sensor.signal_to_noise(o.sensor, o.expected_e, 0.0 * o.expected_e),
-    "sensor.effects.dark_current_factor": lambda o: effects.dark_current_factor(310.0, 300.0, 8.0),
+    "sensor.effects.dark_current_factor": lambda o: effects.dark_current_factor(310.0, 300.0, doubling_k=8.0),
     "sensor.effects.draw_shot_noise": lambda o: effects.draw_shot_noise(o.expected_e, "exact", 100.0, o.streams),
     "studio.run_studio": lambda o: fs.studio.run_studio(o.shot_file, open_browser=False, announce=interrupt),
     "tiles.capture_tiles": lambda o: list(tiles.capture_tiles(o.simple, o.scene, exposure_s=0.01, seed=0)),

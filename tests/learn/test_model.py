@@ -225,7 +225,7 @@ def test_distortion_derivative_inverts_forward_model():
         ({"names": ("k11",)}, "did you mean 'k1'"),
         ({"names": ("k1",), "coefficients": torch.zeros(2, dtype=torch.float64)}, "one per name"),
         ({"points": torch.zeros(3, 3)}, "'points' must have the shape"),
-        ({"lens": 3}, "'lens' must be a lens model"),
+        ({"lens": 3}, "'lens' must be a Lens"),
     ],
 )
 def test_wrong_distortion_arguments_are_rejected(arguments, message):

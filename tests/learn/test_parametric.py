@@ -179,7 +179,7 @@ def test_other_tensors_are_rejected(value):
 def test_function_must_return_layout():
     with pytest.raises(ParameterError, match="'generator' must return a Layout, got an int"):
         learn.generated(lambda pitch_um: int(2 * pitch_um), {"pitch_um": 2.0})
-    with pytest.raises(ParameterError, match="'generator' must be the name of a layout family or a function"):
+    with pytest.raises(ParameterError, match="'generator' must be a string, or a callable"):
         learn.generated(3, {})
 
 

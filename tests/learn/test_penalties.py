@@ -228,10 +228,10 @@ def test_unsupported_rule_lists_supported_ones():
     ("arguments", "message"),
     [
         ({"rules": fs.DesignRules(max_aspect_ratio=1.0)}, "'rules' must have a limit 'max_aspect_ratio' above 1"),
-        ({"rules": 3}, "'rules' must be DesignRules, got an int"),
+        ({"rules": 3}, "'rules' must be a DesignRules, got an int"),
         ({"rules": ALL_RULES, "weight": 0.0}, "'weight' must be > 0"),
         ({"rules": ALL_RULES, "margin_fraction": -1.0}, "'margin_fraction' must be > 0"),
-        ({"rules": ALL_RULES, "outlines": "mesh"}, "'outlines' must be Outlines or a Mesh, got a str"),
+        ({"rules": ALL_RULES, "outlines": "mesh"}, "'outlines' must be an Outlines or a Mesh, got a str"),
     ],
 )
 def test_invalid_arguments_give_one_line(arguments, message):
