@@ -366,6 +366,7 @@ CALLS = {
     "compare.Comparison.plot": lambda o: o.comparison.plot(),
     "compare.default_sensor": lambda o: compare.default_sensor(o.plain),
     "compare.gaussian_information_bits": lambda o: compare.gaussian_information_bits(np.eye(3), np.ones(3)),
+    "compare.median_interval": lambda o: compare.median_interval(np.arange(5.0)),
     "compare.layouts": lambda o: compare.layouts(
         {"a": o.plain, "b": o.plain}, {"flat": o.scene}, optics=o.optics, exposure_s=0.01, n_annuli=2, max_pixels=32
     ),
@@ -379,6 +380,7 @@ CALLS = {
     "compare.site_information_bits": lambda o: compare.site_information_bits(
         o.plain, o.covariance, o.plain.area_um2, np.ones((1, o.plain.n_sites)), n_conditions=4
     ),
+    "config.plain_settings": lambda o: config.plain_settings(None, {"optics": {"f_number": 2}}),
     "config.build_shot": lambda o: config.build_shot("shot", SHOT),
     "config.bundled_layouts": lambda o: [fs.read_layout(path) for path in config.bundled_layouts().values()],
     "config.check_directory": lambda o: config.check_directory(o.directory / "new"),
