@@ -62,7 +62,7 @@ def next_vertex(ring_offsets: Ints) -> Ints:
     return after
 
 
-def collapse_short_edges(xy: Floats, ring_offsets: Ints, shortest: float) -> tuple[Floats, Ints]:
+def collapse_short_edges(xy: Floats, ring_offsets: Ints, shortest_um: float) -> tuple[Floats, Ints]:
     """
     Return packed rings without edges up to a length; their ends become one vertex.
 
@@ -70,7 +70,7 @@ def collapse_short_edges(xy: Floats, ring_offsets: Ints, shortest: float) -> tup
     """
     while True:
         after = next_vertex(ring_offsets)
-        is_short = np.hypot(*(xy[after] - xy).T) <= shortest
+        is_short = np.hypot(*(xy[after] - xy).T) <= shortest_um
         if not is_short.any():
             return xy, ring_offsets
         # Of the two ends of an edge, all rings keep the smaller one in the order of x, then y.

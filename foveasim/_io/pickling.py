@@ -125,4 +125,5 @@ def make_copyable(module_name: str) -> None:
         item = vars(module).get(name)
         if isinstance(item, type) and not issubclass(item, BaseException | tuple | dict):
             for kind in _own_classes(item):
-                copyable(kind)
+                if not getattr(kind, "_is_protocol", False):  # a state would be a member that implementations need
+                    copyable(kind)

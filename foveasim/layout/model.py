@@ -278,7 +278,7 @@ class Layout:
     @classmethod
     def from_polygons(
         cls,
-        polygons: Sequence[Any] | NDArray[Any] | tuple[ArrayLike, ArrayLike, ArrayLike],
+        polygons: OwnCheck[Sequence[Any] | NDArray[Any] | tuple[ArrayLike, ArrayLike, ArrayLike]],
         *,
         channel: ArrayLike | None = None,
         readout_line: ArrayLike | None = None,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.names import possible_names
 from foveasim._core.provenance import is_digest
 from foveasim._core.random_streams import Streams
@@ -464,7 +465,7 @@ class Sensor:
         """
         return replace(self, disabled=tuple(dict.fromkeys((*self.disabled, *names))))
 
-    def part(self, selection: slice | Ints) -> Sensor:
+    def part(self, selection: OwnCheck[slice | Ints]) -> Sensor:
         """
         Return the sensor of some of the sites, with their fixed patterns and effects.
 

@@ -569,8 +569,8 @@ def test_invalid_gap_edge_and_pitch_are_rejected(value):
         ([[0.0, math.nan, 0.0]], "must be finite everywhere"),
         ([0.1, 0.8, 0.1], "must have 2 dimensions"),
         ([[0.1, 0.8], [0.1]], "must be an array of numbers"),
-        (None, "must have 2 dimensions"),
-        (1.0, "must have 2 dimensions"),
+        (None, "must be a list of arrays"),
+        (1.0, "must be a list of arrays"),
     ],
 )
 def test_invalid_kernel_is_rejected(kernel, rule):

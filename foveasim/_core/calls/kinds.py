@@ -308,7 +308,18 @@ def _protocol(protocol: type) -> Kind:
         for name in {**getattr(each, "__annotations__", {}), **vars(each)}
         if not name.startswith("_") or name == "__call__"
     ]
-    return _class(protocol.__name__.removesuffix("Like"), lambda value: all(hasattr(value, name) for name in names))
+    return _class(protocol.__name__.removesuffix("Like"), lambda value: all(_has(value, name) for name in names))
+
+
+def _has(value: Any, name: str) -> bool:
+    """Whether an object has an attribute; properties and fields that are made on use are not computed."""
+    if any(name in vars(kind).get("__annotations__", ()) for kind in type(value).__mro__):
+        return True
+    try:
+        inspect.getattr_static(value, name)
+    except AttributeError:
+        return hasattr(value, name)
+    return True
 
 
 def _accepts_path(value: Any) -> bool:
@@ -380,7 +391,10 @@ def _dtypes(value: Any) -> Iterator[str]:
     elif hasattr(value, "dtype"):
         yield getattr(value.dtype, "kind", "f")
     else:
-        yield "O" if value is None else np.asarray(value).dtype.kind
+        try:
+            yield "O" if value is None else np.asarray(value).dtype.kind
+        except (TypeError, ValueError):  # nested objects of the package, or rows of different lengths
+            yield "O"
 
 
 _NONE = Kind(lambda value: value is None, "None", "None")

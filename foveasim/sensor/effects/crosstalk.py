@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import (
@@ -317,7 +318,7 @@ class Diffusion(_Crosstalk):
         steps = float(brentq(lambda s: 2.0 * float(_mean_square_steps(np.array(s))) - fraction, 0.0, 1.0, xtol=1e-15))
         return cls(spread_um=steps * pitch_um, max_gap_um=max_gap_um)
 
-    def compile(self, layout: Neighbourhood, *, shared_um: csr_array[Any] | None = None) -> CrosstalkOperator:
+    def compile(self, layout: OwnCheck[Neighbourhood], *, shared_um: csr_array[Any] | None = None) -> CrosstalkOperator:
         """
         Compile the diffusion for a layout.
 
@@ -425,7 +426,7 @@ class KernelCrosstalk(_Crosstalk):
         if self.pitch_um is not None:
             object.__setattr__(self, "pitch_um", check_pitch_um("pitch_um", self.pitch_um))
 
-    def compile(self, layout: Neighbourhood) -> CrosstalkOperator:
+    def compile(self, layout: OwnCheck[Neighbourhood]) -> CrosstalkOperator:
         """
         Compile the convolution for a layout of grid sites, in any order and with gaps.
 
@@ -551,7 +552,7 @@ class InterPixelCapacitance(_Crosstalk):
 
     def compile(
         self,
-        layout: Neighbourhood,
+        layout: OwnCheck[Neighbourhood],
         *,
         capacitance_f: ArrayLike | None = None,
         shared_um: csr_array[Any] | None = None,
