@@ -30,7 +30,7 @@ SHOT = {
         "peak_radiance_w_m2_sr_nm": 0.004,
         "wavelength_nm": [620, 550, 450],
     },
-    "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    "optics": {"focal_length_mm": 8.0, "f_number": 2.8, "source_pixel": "square"},
     "layout": "foveal_blind_spot",
     "sensor": {"qe": 0.6, "filters": "rgb", "capacitance_f": {"per_um2": 1e-16}, "v_sat_v": 1.0, "bits": 10},
     "exposure_s": 0.02,

@@ -18,6 +18,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats, Ints, finite_array
 from foveasim.errors import ParameterError
 
@@ -66,6 +67,8 @@ class PupilEdges:
     ParameterError
         When an array has another shape or is not finite.
     """
+
+    __repr__ = short_repr
 
     segments: ArrayLike = field(default_factory=lambda: np.zeros((0, 2, 2)))
     radii: ArrayLike = ()

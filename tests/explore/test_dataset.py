@@ -401,7 +401,7 @@ def test_site_flow_is_mean_over_pixels(reference):
     is_clear = area_um2 > 0.1
     assert is_clear.sum() > 30
     assert found.is_known[is_clear].all()
-    np.testing.assert_allclose(found.flow_um[is_clear], sums[is_clear] / area_um2[is_clear, np.newaxis], atol=2e-3)
+    np.testing.assert_allclose(found.flow_um[is_clear], sums[is_clear] / area_um2[is_clear, np.newaxis], atol=3e-3)
     assert not found.is_known[area_um2 == 0.0].any()
     assert np.isfinite(found.flow_um).all()
 

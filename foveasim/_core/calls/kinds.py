@@ -313,7 +313,7 @@ def _protocol(protocol: type) -> Kind:
 
 def _has(value: Any, name: str) -> bool:
     """Whether an object has an attribute; properties and fields that are made on use are not computed."""
-    if any(name in vars(kind).get("__annotations__", ()) for kind in type(value).__mro__):
+    if any(name in inspect.get_annotations(kind) for kind in type(value).__mro__):
         return True
     try:
         inspect.getattr_static(value, name)

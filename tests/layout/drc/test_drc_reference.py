@@ -62,7 +62,8 @@ def limited(rule, layout, fraction, has_field):
         return fs.DesignRules(**field)
     other = {"max_gap_um2": field, "min_space_um": {"grid_um": 0.7}}.get(rule, {}) if has_field else {}
     limit = between([value for _, value in REFERENCES[rule](layout, fs.DesignRules(**other))], fraction)
-    return fs.DesignRules(**{rule: min(limit, 180.0) if rule == "min_angle_deg" else limit}, **other)
+    limit = {"min_angle_deg": min(limit, 180.0), "max_sites": int(limit)}.get(rule, limit)
+    return fs.DesignRules(**{rule: limit}, **other)
 
 
 def compare(rule, layout, rules):

@@ -600,7 +600,7 @@ def test_svg_draws_rings_in_channel_colours(zoo, tmp_path):
 
 @pytest.mark.parametrize("colour", ['red"/><script>', "url(#a)", "", "#12345", 7])
 def test_svg_rejects_invalid_colours(zoo, tmp_path, colour):
-    with pytest.raises(ParameterError, match="must be a CSS colour name, #rgb or #rrggbb|must be a string"):
+    with pytest.raises(ParameterError, match=r"must be a CSS colour name, #rgb or #rrggbb|must be a string"):
         write_layout(zoo, tmp_path / "a.svg", colours={0: colour})
 
 
