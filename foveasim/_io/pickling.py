@@ -96,7 +96,8 @@ def _caches(kind: type) -> dict[str, Callable[[], Any] | None]:
 
 def _getstate(self: Any) -> dict[str, Any]:
     caches = _caches(self.__class__)
-    return {name: _mark(value) for name, value in vars(self).items() if name not in caches}
+    # By attribute: descriptors check values of mapped files.
+    return {name: _mark(getattr(self, name)) for name in vars(self) if name not in caches}
 
 
 def _setstate(self: Any, state: dict[str, Any]) -> None:

@@ -175,9 +175,6 @@ class Scene:
         object.__setattr__(self, "distance_m", distance_m)
         object.__setattr__(self, "pitch_um", self._checked_pitch_um())
 
-    def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"basis": self.basis}
-
     def _checked_pitch_um(self) -> float | None:
         """Return the given pitch or that of the field of view; None with ``fit``."""
         if self.fit is not None:

@@ -312,7 +312,7 @@ def _protocol(protocol: type) -> Kind:
 
 
 def _has(value: Any, name: str) -> bool:
-    """Whether an object has an attribute; properties and fields that are made on use are not computed."""
+    """Whether an object has an attribute, without computing it."""
     if any(name in inspect.get_annotations(kind) for kind in type(value).__mro__):
         return True
     try:
