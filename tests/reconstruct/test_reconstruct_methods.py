@@ -365,7 +365,7 @@ def test_channels_use_their_own_sites():
     [
         ({}, "'mu' must be a number without 'variance'"),
         ({"mu": 0.0}, "'mu' must be > 0"),
-        ({"mu": "magic"}, "'mu' must be one number or one of 'roughness', 'discrepancy'"),
+        ({"mu": "magic"}, "'mu' must be one number, or one of 'roughness', 'discrepancy'"),
         ({"variance": 0.0}, "'variance' must be > 0.0 everywhere"),
         ({"variance": np.ones(3)}, "'variance' must be one number, or have the shape"),
         ({"variance": 1.0, "response": np.ones(3)}, "'response' must have the shape"),

@@ -375,8 +375,8 @@ def test_scene_fits_and_fills_picture(viewpoint):
         ({"oversampling": 0}, "'oversampling' must be >= 1"),
         ({"size_px": (0, 5)}, r"'size_px\[0\]' must be >= 1"),
         ({"size_px": (100_000, 5)}, "'size_px' must be <= "),
-        ({"background": (1, 2)}, "'background' must be three numbers"),
-        ({"background": (1, 2, 300)}, "'background' must be three numbers"),
+        ({"background": (1, 2)}, "'background' must be three"),
+        ({"background": (1, 2, 300)}, "'background' must be three"),
         ({"renderer": "best"}, "'renderer' must be one of"),
     ],
 )
@@ -400,7 +400,7 @@ def test_invalid_viewpoints_raise_by_name(parameters, message):
 
 
 def test_invalid_scene_raises():
-    with pytest.raises(ParameterError, match="'scene' must be a Layout, a Capture, a Mesh"):
+    with pytest.raises(ParameterError, match="'scene' must be a Mesh"):
         render(3)
     with pytest.raises(ParameterError, match="'scene' must be a Layout, a Capture, a Mesh"):
         render([ODD_LAYOUT])

@@ -205,7 +205,7 @@ def test_page_loads_no_external_resources():
         (
             lambda: web_page(MIXED_LAYOUT, report="none"),
             ParameterError,
-            "'report' must be a Report of a check, got a str",
+            "'report' must be a Report, got a str",
         ),
         (
             lambda: web_page(MIXED_LAYOUT, report=MOSAIC.check(fs.DesignRules(min_size_um=1.0))),
