@@ -212,14 +212,14 @@ class Aperture:
             self._cache[key] = float(np.hypot(dx, dy)[x * x + y * y <= 1.0].max())
         return 2.0 * (slope + float(self._cache.get(key, 0.0)))
 
-    def n_across(self, wavelength_nm: float, field_um: tuple[float, float]) -> int:
+    def _checked_blur(self, wavelength_nm: float, field_um: tuple[float, float]) -> float:
         """
-        Return the number of samples across the aperture that the OTF requires.
+        Return :meth:`blur_lambda_n` within the limit of the largest transform.
 
         Raises
         ------
         ParameterError
-            When the geometric blur exceeds the limit of the largest transform.
+            When the blur is larger.
         """
         blur = self.blur_lambda_n(wavelength_nm, field_um)
         if blur * ACROSS_PER_BLUR > MAX_ACROSS:
@@ -229,7 +229,18 @@ class Aperture:
                 hint="check the unit of the coefficients and that focus_distance_m is in m; diffraction is negligible "
                 "in a larger blur, so the picture can be blurred beforehand instead",
             )
-        return max(MIN_ACROSS, math.ceil(blur * ACROSS_PER_BLUR))
+        return blur
+
+    def n_across(self, wavelength_nm: float, field_um: tuple[float, float]) -> int:
+        """
+        Return the number of samples across the aperture that the OTF requires.
+
+        Raises
+        ------
+        ParameterError
+            When the geometric blur exceeds the limit of the largest transform.
+        """
+        return max(MIN_ACROSS, math.ceil(self._checked_blur(wavelength_nm, field_um) * ACROSS_PER_BLUR))
 
     def samples(
         self, wavelength_nm: float, n_across: float, field_um: tuple[float, float]
@@ -336,7 +347,7 @@ class Aperture:
         """
         key = "integrals", wavelength_nm, field_um
         if key not in self._cache:
-            first = FIRST_RADIANS + np.pi * self.blur_lambda_n(wavelength_nm, field_um)
+            first = FIRST_RADIANS + np.pi * self._checked_blur(wavelength_nm, field_um)
             radians: float | None = first
             integrals = self._integrals(wavelength_nm, field_um, first)
             while radians is not None:
