@@ -402,7 +402,7 @@ def test_invalid_viewpoints_raise_by_name(parameters, message):
 def test_invalid_scene_raises():
     with pytest.raises(ParameterError, match="'scene' must be a Mesh"):
         render(3)
-    with pytest.raises(ParameterError, match="'scene(.0.)?' must be"):
+    with pytest.raises(ParameterError, match=r"'scene(.0.)?' must be"):
         render([ODD_LAYOUT])
     with pytest.raises(GeometryError, match="the scene is empty"):
         render([])
