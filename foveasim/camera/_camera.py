@@ -926,15 +926,23 @@ class Camera:
         if order == 2:
             self._warn_of_negative(rate_e_per_s, is_negative)
 
+    @cached_property
+    def _min_side_um(self) -> float:
+        """Square root of the area of the smallest photosite; infinite without photosites."""
+        return math.sqrt(float(self._layout.area_um2.min(initial=np.inf)))
+
     def _warn_of_coarse_cells(self, scene: Scene) -> None:
         """Warn when automatic oversampling is limited, and photosites have an error above 1e-3."""
         optics = self._optics
         if optics.oversample != "auto":
             return
+        error = optics.auto_oversample_error(scene)  # of sites of side λN, an upper limit for wider ones
+        if error <= MAX_AUTO_ERROR:
+            return
         lambda_n_um = float(um_from_nm(scene.wavelength_nm.min())) * optics.working_f_number(scene.distance_m)
-        side_um = math.sqrt(float(self._layout.area_um2.min(initial=np.inf)))
+        side_um = self._min_side_um
         # Wider photosites have proportionally fewer cells at their edges.
-        error = optics.auto_oversample_error(scene) * min(1.0, lambda_n_um / side_um)
+        error *= min(1.0, lambda_n_um / side_um)
         k, pixel_um = optics.auto_oversample(scene), optics.grid(scene).pitch_x_um
         is_lattice = optics.source_pixel == "point" and pixel_um > lambda_n_um
         # Point emitters farther apart than λN have no limit for small cells; they represent a continuous scene for sites > λN.

@@ -141,15 +141,16 @@ def position_settings(task: Task, every: int = 1) -> dict[str, Any]:
 
 def _with_path(frames: Iterable[Frame]) -> Iterable[Frame]:
     """Return frames with a path, if all are in memory: their positions are known in advance."""
-    if not isinstance(frames, Sequence):
+    if not isinstance(frames, list | tuple):  # other sequences may read each frame on access
         return frames
-    pairs = [frame for frame in frames if isinstance(frame, tuple) and len(frame) == 2]
-    if len(pairs) < len(frames) or any(isinstance(position_um, PathPosition) for _, position_um in pairs):
+    if not all(isinstance(frame, tuple) and len(frame) == 2 for frame in frames):
+        return frames
+    if any(isinstance(position_um, PathPosition) for _, position_um in frames):
         return frames
     try:
-        positions_um = np.array([position_um for _, position_um in pairs], np.float64).reshape(-1, 2)
+        positions_um = np.array([position_um for _, position_um in frames], np.float64).reshape(-1, 2)
         along = path_positions(positions_um, positions_um.tolist())
-        return [(light, position_um) for (light, _), position_um in zip(pairs, along, strict=True)]
+        return [(light, position_um) for (light, _), position_um in zip(frames, along, strict=True)]
     except (TypeError, ValueError):  # reported with the frame
         return frames
 
