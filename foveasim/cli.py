@@ -548,11 +548,12 @@ def _main() -> None:
     handlers: dict[int, Any] = {}
     _interruption_said.clear()
     if current_thread() is main_thread():
-        handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        found = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        # None is a handler that Python did not install, and cannot restore.
+        handlers = {number: handler for number, handler in found.items() if handler not in (None, signal.SIG_IGN)}
     try:
-        for number, handler in handlers.items():
-            if handler is not signal.SIG_IGN:
-                signal.signal(number, interrupt)
+        for number in handlers:
+            signal.signal(number, interrupt)
         app()
     except (KeyboardInterrupt, SystemExit) as error:
         if not signals or (isinstance(error, SystemExit) and error.code != INTERRUPTED):

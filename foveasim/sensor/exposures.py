@@ -427,9 +427,9 @@ def _estimate_collected(sensor: Sensor, charge_e: Floats) -> Floats:
     For inter-pixel capacitance with the fractions K, the iteration ``q <- q + (charge - K q)`` (P. H. van Cittert, Zeitschrift
     für Physik 69, 298, 1931) is ended early, since its limit amplifies noise. Without mixing, charges are returned unchanged.
     """
-    at_zero = sensor.readout_model(np.zeros(sensor.layout.n_sites))
-    if not at_zero.is_mixed:
+    if not any(effect.mixes_means and effect.stage == "charge" for effect in sensor.chain):
         return charge_e
+    at_zero = sensor.readout_model(np.zeros(sensor.layout.n_sites))
     collected_e = charge_e
     for _ in range(N_UNMIXING_STEPS):
         mixed_e = sensor.readout_model(collected_e).mean_e - at_zero.mean_e

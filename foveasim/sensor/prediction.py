@@ -158,7 +158,7 @@ def readout_model(
     is_mixed = False
     local: list[Effect] = []
     for effect in charge:
-        if effect.is_local or effect.is_temporal:
+        if not effect.mixes_means:
             local.append(effect)
             continue
         before = _LinearModel(local, mean_e, variance_e2, sites, is_reset=is_reset)

@@ -487,12 +487,12 @@ class Sensor:
                 hint=f"switch them off: sensor.without({', '.join(map(repr, connecting))})",
             )
         chosen = selection
-        if not isinstance(selection, slice) or selection.step not in (None, 1):
+        if not isinstance(selection, slice) or not _is_range(selection):
             try:
                 chosen = np.arange(self.layout.n_sites)[selection]
                 if chosen.ndim != 1:
                     raise IndexError
-            except IndexError:
+            except (IndexError, TypeError, ValueError):
                 rule = f"must be a slice, or a list of indices of the {self.layout.n_sites} sites"
                 raise ParameterError("selection", rule, selection) from None
         values: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(Sensor)}
@@ -914,6 +914,12 @@ class SensorPart(Sensor):
     @property
     def _complete_sites(self) -> CompleteSites:
         return CompleteSites(self._complete.sites, self._selection)
+
+
+def _is_range(selection: slice) -> bool:
+    """Whether a slice has integer bounds and no step."""
+    bounds = selection.start, selection.stop
+    return selection.step in (None, 1) and all(bound is None or isinstance(bound, int) for bound in bounds)
 
 
 def _object(classes: Mapping[str, Any], name: str, data: Any) -> Any:

@@ -220,7 +220,7 @@ class Sites:
         Parameters
         ----------
         key : Effect, or tuple of an Effect and hashable values
-            As for :meth:`cached`; different functions of an effect have different results.
+            As for :meth:`cached`; methods of an effect with different names have different results.
         compute : callable
             Called with all sites of the layout; returns one number, or one for each of them.
 
@@ -253,7 +253,13 @@ class Sites:
 
 def _cache_key(parts: tuple[Any, ...]) -> Hashable:
     """Return a key of effects and devices by identity, and of other values by type and value."""
-    key = tuple((type(part), id(part) if isinstance(part, Effect | Device) else part) for part in parts)
+
+    def typed(part: Any) -> Any:
+        if isinstance(part, Effect | Device):
+            return type(part), id(part)
+        return type(part), tuple(map(typed, part)) if isinstance(part, tuple) else part
+
+    key = tuple(map(typed, parts))
     try:
         hash(key)
     except TypeError:
@@ -292,6 +298,11 @@ class Effect(ABC):
     is_local: ClassVar[bool] = True
     is_drawn_at_reset: ClassVar[bool] = False
     needs_layout: ClassVar[bool] = True
+
+    @property
+    def mixes_means(self) -> bool:
+        """Whether the mean of a site depends on other sites, as for crosstalk: neither local nor temporal."""
+        return not (self.is_local or self.is_temporal)
 
     @abstractmethod
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:

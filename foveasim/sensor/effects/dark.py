@@ -10,6 +10,7 @@ import numpy as np
 
 from foveasim._core.validation import Floats, check_choice
 from foveasim.sensor.effects.contract import FixedFactor, FixedOffset, Sites, Stage
+from foveasim.sensor.limits import check_plausible
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ def dark_current_factor(
     Raises
     ------
     ParameterError
-        If the law is unknown.
+        If the law is unknown, or a value is out of range (:data:`foveasim.sensor.LIMITS`).
 
     Notes
     -----
@@ -82,6 +83,11 @@ def dark_current_factor(
     3.2
     """
     check_choice("dark_law", law, get_args(DarkLaw))
+    temperature_k = check_plausible("temperature_k", temperature_k)
+    reference_k = check_plausible("dark_reference_k", reference_k)
+    doubling_k = check_plausible("dark_doubling_k", doubling_k)
+    activation_ev = check_plausible("dark_activation_ev", activation_ev)
+    diffusion_fraction = check_plausible("dark_diffusion_fraction", diffusion_fraction)
     try:
         if law == "doubling":
             return float(2.0 ** ((temperature_k - reference_k) / doubling_k))
