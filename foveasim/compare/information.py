@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_number, finite_array
+from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_count, check_number, finite_array
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
 
@@ -120,7 +120,12 @@ class SceneCovariance:
     """
 
     def __init__(self, amplitude: ArrayLike, sigma_um: ArrayLike) -> None:
-        self.amplitude, self.sigma_um = np.asarray(amplitude, np.float64), np.asarray(sigma_um, np.float64)
+        self.amplitude = np.ascontiguousarray(finite_array("amplitude", amplitude, ndim=1, at_least=0.0))
+        self.sigma_um = np.ascontiguousarray(finite_array("sigma_um", sigma_um, ndim=1, above=0.0))
+        if self.amplitude.shape != self.sigma_um.shape:
+            raise ParameterError(
+                "sigma_um", f"must have one width per amplitude, {self.amplitude.size}, got {self.sigma_um.size}"
+            )
 
     def __repr__(self) -> str:
         return f"SceneCovariance({self.amplitude.size} Gaussians)"
@@ -129,31 +134,6 @@ class SceneCovariance:
         """Return the covariance of two points at a distance in µm."""
         d2 = np.square(np.asarray(distance_um, np.float64))[..., np.newaxis]
         return np.asarray((self.amplitude * np.exp(-0.5 * d2 / self.sigma_um**2)).sum(axis=-1))
-
-    def of_means(self, offset_um: Floats, spread_um2: Floats) -> Floats:
-        """
-        Return the covariance of the means over two apertures.
-
-        Parameters
-        ----------
-        offset_um : (..., 2), µm
-            From one centroid to the other.
-        spread_um2 : (..., 3), µm²
-            Sum of the central second moments of both apertures: xx, yy, xy.
-
-        Notes
-        -----
-        Exact for apertures with Gaussian sensitivity, otherwise for the same second moments.
-        """
-        dx, dy = offset_um[..., 0], offset_um[..., 1]
-        xx, yy, xy = (spread_um2[..., k] for k in range(3))
-        total = np.zeros(dx.shape)
-        for a, sigma2 in zip(self.amplitude, self.sigma_um**2, strict=True):
-            sxx, syy = xx + sigma2, yy + sigma2
-            det = sxx * syy - xy * xy
-            form = (syy * dx * dx - 2.0 * xy * dx * dy + sxx * dy * dy) / det
-            total += a * sigma2 / np.sqrt(det) * np.exp(-0.5 * form)
-        return total
 
 
 def scene_covariance(images: ArrayLike, pitch_um: float) -> SceneCovariance:
@@ -236,7 +216,7 @@ class _RadialSpectrum:
         self._ring[is_used] = np.unique(width, return_inverse=True)[1].ravel()
         self.n_modes: Floats = self._sums(np.ones(radius.shape))
         self._windows = [tukey(n + 2, 2.0 * TAPER_FRACTION)[1:-1] for n in shape]
-        power = np.zeros(radius.shape)
+        power, n_used = np.zeros(radius.shape), 0
         for image in images:
             window = np.outer(*self._windows)
             is_known = np.isfinite(image)
@@ -247,8 +227,9 @@ class _RadialSpectrum:
             values = np.where(is_known, image, 0.0).astype(np.float64)
             values -= float((window * values).sum() / window.sum())
             power += np.square(np.abs(rfft2(window * values))) / np.square(window).sum()
+            n_used += 1
         self.frequency: Floats = self._means(radius)
-        self.density: Floats = self._means(power / len(images))
+        self.density: Floats = self._means(power / max(n_used, 1))
 
     def _sums(self, values: Floats) -> Floats:
         is_used = self._ring >= 0
@@ -334,6 +315,11 @@ def site_information_bits(
         The sum over the sites is the information of all readings. It is exact, up to apertures, when every block has at most
         ``n_conditions`` preceding sites, and otherwise an upper bound that decreases with ``n_conditions``.
 
+    Raises
+    ------
+    ParameterError
+        When an array has another shape, a noise variance is not positive, or the covariance is singular within rounding.
+
     Notes
     -----
     Chain rule of the entropy, over blocks of adjacent sites, with the conditional covariance of each block given the nearest
@@ -349,7 +335,12 @@ def site_information_bits(
     order, starts = _blocks(xy_um)
     position = np.empty(n, np.int64)
     position[order] = np.arange(n)
-    scale, noise = np.asarray(gain, np.float64), np.asarray(noise_variance, np.float64)
+    n_conditions = check_count("n_conditions", n_conditions, at_least=0)
+    scale = finite_array("gain", gain, ndim=1)
+    noise = finite_array("noise_variance", noise_variance, ndim=2, above=0.0)
+    for name, values in (("gain", scale), ("noise_variance", noise)):
+        if values.shape[-1] != n:
+            raise ParameterError(name, f"must have one value for each of the {n} sites, got {values.shape[-1]}")
     apertures = _Apertures(layout, covariance)
     tree = cKDTree(xy_um)
     bits = np.empty(noise.shape)
@@ -362,7 +353,12 @@ def site_information_bits(
             root = np.sqrt(variance)
             total = signal / (root[:, np.newaxis] * root)
             total[np.diag_indices_from(total)] += 1.0
-            bits[k, block] = np.log2(np.diagonal(np.linalg.cholesky(total))[-block.size :])
+            try:
+                cholesky = np.linalg.cholesky(total)
+            except np.linalg.LinAlgError:
+                rule = "must not be so small that the covariance is singular within rounding"
+                raise ParameterError("noise_variance", rule, float(variance.min())) from None
+            bits[k, block] = np.log2(np.diagonal(cholesky)[-block.size :])
     return bits
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -210,7 +211,7 @@ def _shift_gradients_e_per_um(camera: Camera, image: PowerMap, exposure_s: float
     """
     grid, layout = image.grid, layout_of(camera)
     uncovered_um2 = camera.integrator(grid, order=camera.order(image)).uncovered_um2
-    moving = camera.replace()  # displaced images do not fill the camera's cache
+    moving = copy(camera)  # displaced images do not fill the camera's cache
 
     def expected_e(x_um: float, y_um: float) -> Floats:
         x0_um, y0_um = grid.origin_um

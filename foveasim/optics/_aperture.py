@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Bools, Floats
-from foveasim.errors import ParameterError
+from foveasim.errors import ParameterError, type_name
 from foveasim.optics._quadrature import Nodes, PupilEdges, joined, overlap_nodes, plane_waves, pupil_nodes
 from foveasim.optics.pupils import Annulus, Blades, Pupil, PupilImage, Slit, Spider
 from foveasim.units import um_from_nm
@@ -42,6 +42,10 @@ SLOPE_POINTS = 193
 #: Frequencies of the quadrature in radians per radius: the first beyond the geometric blur, the factor between attempts, and
 #: the limit beyond which a pupil is sampled.
 FIRST_RADIANS, RADIANS_STEP, MAX_RADIANS = 8.0, 1.5, 500.0
+#: Relative difference of the power from that of samples above which the quadrature has missed edges; smooth pupils: 3e-5.
+MISSED_POWER = 5e-5
+#: Largest number of nodes of OTFs without sampling: some seconds.
+MAX_OTF_NODES = 1 << 27
 #: Error of converged integrals over the aperture, relative to that of the modulus.
 INTEGRAL_ERROR = 1e-8
 #: Waves whose integrals are compared, in radians per radius: without a symmetry that would cancel errors.
@@ -69,6 +73,17 @@ class EdgedPupil(Protocol):
 
     def edges(self) -> PupilEdges:
         """Return the curves at which the amplitude, or its derivative, is discontinuous."""
+
+
+def _edges_of(pupil: EdgedPupil) -> PupilEdges:
+    """Return the edges of a pupil after checking their type."""
+    try:
+        found: object = pupil.edges()
+    except TypeError as error:
+        raise ParameterError("pupil", f"must have a method edges() without arguments; {error}") from error
+    if not isinstance(found, PupilEdges):
+        raise ParameterError("pupil", f"must return PupilEdges from edges(), got {type_name(found)}")
+    return found
 
 
 def overlaps(n_to: int, to_step: float, n_from: int, from_step: float) -> Any:
@@ -313,7 +328,7 @@ class Aperture:
     def _edges(self) -> PupilEdges:
         """Known edges of all pupils."""
         parts: Sequence[object] = self.pupils
-        return joined([pupil.edges() for pupil in parts if isinstance(pupil, EdgedPupil)])
+        return joined([_edges_of(pupil) for pupil in parts if isinstance(pupil, EdgedPupil)])
 
     def _transmission(self, x: Floats, y: Floats, wavelength_nm: float) -> NDArray[np.complex128]:
         """Return the amplitude transmission of all pupils at points (n,) of the aperture."""
@@ -357,6 +372,11 @@ class Aperture:
                 if error <= INTEGRAL_ERROR:
                     break
                 radians = RADIANS_STEP * radians if radians < max(MAX_RADIANS, 4.0 * first) else None
+            if radians is not None and not all(isinstance(pupil, EdgedPupil) for pupil in self.pupils):
+                # Coarse quadratures may agree although both miss an edge of a callable.
+                sampled = math.pi * self.transmittance(wavelength_nm)
+                if abs(integrals[-1].real - sampled) > MISSED_POWER * sampled:
+                    radians = None
             self._cache[key] = radians, integrals
         found: tuple[float | None, NDArray[np.complex128]] = self._cache[key]
         return found
@@ -412,7 +432,7 @@ class Aperture:
             n_across = max(self.n_across(wavelength_nm, field_um), PUPIL_POINTS)
             amplitude, _, _ = self.samples(wavelength_nm, n_across, field_um)
             total, size = amplitude.sum(), np.abs(amplitude).sum()
-        return float(np.abs(total / size) ** 2)
+        return min(1.0, float(np.abs(total / size) ** 2))  # 1 exceeded by rounding
 
     def otf(
         self, wavelength_nm: float, s_x: Floats, s_y: Floats, field_um: tuple[float, float]
@@ -422,13 +442,18 @@ class Aperture:
 
         Each frequency is a quadrature over the overlap of two copies of the aperture.
         """
+        n_lines = max(np.size(self._edges.lines_x), np.size(self._edges.lines_y))
+        if n_lines > MAX_OTF_LINES:
+            return None
         radians, integrals = self._resolve(wavelength_nm, field_um)
-        if radians is None or max(np.size(self._edges.lines_x), np.size(self._edges.lines_y)) > MAX_OTF_LINES:
+        if radians is None:
             return None
         shape = np.broadcast_shapes(s_x.shape, s_y.shape)
         lags, of_frequency = np.unique(
             np.stack([np.broadcast_to(s, shape).ravel() for s in (s_x, s_y)], axis=1), axis=0, return_inverse=True
         )
+        if len(lags) * (2.0 * radians + 4.0 * n_lines) ** 2 > MAX_OTF_NODES:
+            return None
         found = [self._overlap(wavelength_nm, (float(x), float(y)), field_um, 2.0 * radians) for x, y in lags]
         power = integrals[-1].real
         return np.asarray(np.array(found, np.complex128)[of_frequency.ravel()].reshape(shape) / power)

@@ -27,6 +27,8 @@ __all__ = ["Nodes", "PupilEdges", "overlap_nodes", "plane_waves", "pupil_nodes"]
 #: Complex amplitude at points (x, y) of the aperture.
 Amplitude = Callable[[Floats, Floats], NDArray[np.complex128]]
 
+#: Approximate number of nodes of an interval between two curves.
+NODES_PER_INTERVAL = 8
 #: Relative error of an integral over an interval.
 ACCURACY = 1e-9
 #: Largest number of nodes from the remainder of a Gauss rule; beyond it, the number is :data:`NODES_PER_RADIAN` times the phase
@@ -65,7 +67,7 @@ class PupilEdges:
     Raises
     ------
     ParameterError
-        When an array has another shape or is not finite.
+        When an array has another shape or is not finite, or a radius is negative.
     """
 
     __repr__ = short_repr
@@ -80,7 +82,8 @@ class PupilEdges:
         if segments.ndim != 3 or segments.shape[1:] != (2, 2):
             raise ParameterError("segments", f"must have shape (n, 2, 2), got {segments.shape}")
         object.__setattr__(self, "segments", segments)
-        for name in ("radii", "lines_x", "lines_y"):
+        object.__setattr__(self, "radii", finite_array("radii", self.radii, ndim=1, at_least=0.0))
+        for name in ("lines_x", "lines_y"):
             object.__setattr__(self, name, finite_array(name, getattr(self, name), ndim=1))
 
 
@@ -365,7 +368,7 @@ def nodes_of(curves: Curves, transmission: Amplitude, radians: float) -> Iterato
     rows = _rows(curves, segments, _distinct(np.concatenate(([low], inner, [high]))), tangents, radians)
     yield from _columns(curves, radians)
     n_curves = len(segments) + 2 * len(curves.circles) + curves.lines_x.size + 2
-    n_together = max(1, int(BLOCK_SIZE / (n_curves + radians)))
+    n_together = max(1, int(BLOCK_SIZE / (NODES_PER_INTERVAL * n_curves + radians)))
     for begin in range(0, rows[0].size, n_together):
         yield _block(curves, segments, [part[begin : begin + n_together, np.newaxis] for part in rows], radians)
 

@@ -218,19 +218,13 @@ def test_uniform_images_have_no_covariance():
     np.testing.assert_allclose(found.at([0.0, 3.0]), 0.0, atol=1e-20)
 
 
-def test_covariance_of_means_matches_gaussians():
-    covariance = SceneCovariance(np.array([2.0]), np.array([3.0]))
-    spread_um2 = np.array([4.0, 1.0, 0.5])
-    s = np.array([[4.0, 0.5], [0.5, 1.0]])
-    d = np.array([1.0, -2.0])
-    expected = (
-        2.0
-        * 9.0
-        / np.sqrt(np.linalg.det(s + 9.0 * np.eye(2)))
-        * np.exp(-0.5 * d @ np.linalg.solve(s + 9.0 * np.eye(2), d))
-    )
+def test_unknown_images_do_not_change_covariance():
+    images = np.random.default_rng(0).random((3, 64, 64))
+    unknown = np.concatenate((np.full((1, 64, 64), np.nan), images))
 
-    assert covariance.of_means(d, spread_um2) == pytest.approx(expected)
+    np.testing.assert_allclose(
+        scene_covariance(unknown, 1.0).at([0.0, 2.0]), scene_covariance(images, 1.0).at([0.0, 2.0])
+    )
 
 
 def test_scene_covariance_recovers_its_model():

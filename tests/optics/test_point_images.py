@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import shapely
+from reference.pupil_integrals import pupil_integrals, pupil_nodes
 from scipy.special import j1
 
 import foveasim as fs
 from foveasim.errors import ParameterError
 from foveasim.optics import Annulus, Blades, PupilEdges, PupilImage, Slit, Spider, Zernike, noll_to_nm, zernike
-from tests.reference.pupil_integrals import pupil_integrals, pupil_nodes
 
 WAVELENGTH_NM = 550.0
 LAMBDA_N_UM = 0.55 * 4.0
@@ -257,3 +257,22 @@ def test_invalid_edges_raise():
         PupilEdges(segments=np.zeros((3, 2)))
     with pytest.raises(ParameterError, match="'radii' must be"):
         PupilEdges(radii=[float("nan")])
+
+
+@pytest.mark.parametrize(
+    ("pupil", "fraction"),
+    [
+        (lambda x, y, _: np.hypot(x - 0.31, y - 0.17) < 0.05, 0.0025),
+        (lambda x, y, _: np.hypot(x - 0.31, y - 0.17) >= 0.05, 0.9975),
+        (lambda x, y, _: np.abs(y - 0.31) >= 0.01 + 0.0 * x, 1.0 - 0.04 * np.sqrt(1.0 - 0.31**2) / np.pi),
+    ],
+    ids=["hole", "speck", "vane"],
+)
+def test_small_features_of_callables_are_seen(pupil, fraction):
+    clear_peak, peak = (
+        fs.Optics(focal_length_mm=22.0, f_number=4.0, pupil=each).psf(WAVELENGTH_NM, n_points=9).psf_per_um2.max()
+        for each in (None, lambda x, y, nm: pupil(x, y, nm).astype(float))
+    )
+
+    # The peak of a real pupil is proportional to its area.
+    assert peak / clear_peak == pytest.approx(fraction, rel=2e-2 if fraction < 0.5 else 2e-3)
