@@ -23,17 +23,20 @@ REJECTIONS = {"FoveasimError", "FormatError"}
 
 
 #: Linux: the architecture that a filter of system calls checks, and the numbers of the denied calls: sockets, processes,
-#: programs, signals, other sessions and groups, tracing, io_uring. ``clone`` without a thread flag is denied as well.
+#: programs, signals, other sessions and groups, tracing, io_uring. ``clone`` without a thread flag is denied as well,
+#: and so are ``tgkill`` and ``prlimit64``, the last two numbers, for other processes.
 DENIED_CALLS = {
     "x86_64": (
         0xC000003E,
         56,
-        (41, 57, 58, 59, 62, 101, 109, 112, 200, 310, 311, 322, 425),
+        (41, 57, 58, 59, 62, 101, 109, 112, 129, 200, 297, 310, 311, 322, 424, 425),
+        (234, 302),
     ),
     "aarch64": (
         0xC00000B7,
         220,
-        (198, 221, 129, 117, 154, 157, 130, 270, 271, 281, 425),
+        (198, 221, 129, 117, 138, 154, 157, 130, 240, 270, 271, 281, 424, 425),
+        (131, 261),
     ),
 }
 CLONE3, CLONE_THREAD, X32_CALLS = 435, 0x00010000, 0x40000000
@@ -62,7 +65,7 @@ def deny_system_calls() -> bool:
     import ctypes
     import struct
 
-    architecture, clone, denied = DENIED_CALLS[os.uname().machine]
+    architecture, clone, denied, (tgkill, prlimit) = DENIED_CALLS[os.uname().machine]
     # Instructions of BPF: code, jumps if true and if false, operand.
     load, equal, at_least, any_bit, give = 0x20, 0x15, 0x35, 0x45, 0x06
     allow, eperm, enosys = 0x7FFF0000, 0x00050001, 0x00050026
@@ -78,6 +81,8 @@ def deny_system_calls() -> bool:
     ]
     for number in denied:
         program += [(equal, 0, 1, number), (give, 0, 0, eperm)]
+    for number, own in ((tgkill, os.getpid()), (prlimit, 0)):
+        program += [(equal, 0, 4, number), (load, 0, 0, 16), (equal, 1, 0, own), (give, 0, 0, eperm), (load, 0, 0, 0)]
     program += [
         (equal, 0, 3, clone),
         (load, 0, 0, 16),

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property, parallel_map, thread_count
 from foveasim._core.validation import Bools, Floats, check_number
@@ -72,7 +73,7 @@ class BrownConrady(LensBase):
     1825.742
     """
 
-    focal_um: float | tuple[float, float]
+    focal_um: OwnCheck[float | tuple[float, float]]
     k1: float = 0.0
     k2: float = 0.0
     k3: float = 0.0

@@ -105,7 +105,7 @@ class Fisheye(_AngularLens):
     """
 
     projection: Projection
-    focal_um: float | tuple[float, float]
+    focal_um: OwnCheck[float | tuple[float, float]]
     centre_um: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
@@ -166,7 +166,7 @@ class PolynomialFisheye(_AngularLens):
     """
 
     k: Sequence[float]
-    focal_um: float | tuple[float, float]
+    focal_um: OwnCheck[float | tuple[float, float]]
     centre_um: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:

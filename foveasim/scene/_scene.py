@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -305,6 +306,8 @@ class Scene:
             fit = "cover"
         check_choice("encoding", encoding, get_args(Encoding))
         peak = check_number("peak_radiance_w_m2_sr_nm", peak_radiance_w_m2_sr_nm, at_least=0.0, at_most=MAX_RADIANCE)
+        if isinstance(picture, os.PathLike):
+            picture = Path(picture)
         is_file = isinstance(picture, str | Path)
         pixels = read_picture(picture) if is_file else _picture_array(picture)  # type: ignore[arg-type]
         if (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -202,7 +202,7 @@ class Sensor:
     dnl_dn: float = 0.0
     device_seed: int = 0
     effects: Sequence[Effect] = ()
-    disabled: Sequence[str] = ()
+    disabled: Iterable[str] = ()
 
     def __post_init__(self) -> None:
         if not all(hasattr(self.layout, name) for name in ("n_sites", "channel", "columns")):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import inspect
+import os
 from collections.abc import Iterable, Iterator, Sized
 from dataclasses import replace
 from functools import partial
@@ -180,7 +181,11 @@ class FrameSource:
                 Scene.from_picture(picture, **self._scene) if self._template is None else self._from_template(picture)
             )
             if shape is not None and scene.basis.shape != shape:
-                where = picture if isinstance(picture, str | Path) else f"frame {self._start + k * self._step}"
+                where = (
+                    os.fspath(picture)
+                    if isinstance(picture, str | os.PathLike)
+                    else f"frame {self._start + k * self._step}"
+                )
                 raise FileError(
                     where,
                     f"has the shape {scene.basis.shape}, but previous frames have {shape}; use frames of equal shape",

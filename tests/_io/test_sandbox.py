@@ -143,7 +143,7 @@ def test_invalid_items_give_one_line(iterate, monkeypatch):
 # -- results of a reader, and its limits ------------------------------------------------------------------------------
 
 PROBES = """
-import os, socket, subprocess, time
+import os, resource, signal, socket, subprocess, time
 import numpy as np
 
 def environment(path):
@@ -159,6 +159,8 @@ def denied(path):
         ("exec", lambda: os.execv("/bin/true", ["true"])),
         ("kill", lambda: os.kill(os.getppid(), 0)),
         ("session", os.setsid),
+        ("pidfd", lambda: signal.pidfd_send_signal(os.pidfd_open(os.getppid()), 0)),
+        ("limit", lambda: resource.prlimit(os.getppid(), resource.RLIMIT_CPU)),
     ):
         try:
             call()
@@ -228,7 +230,7 @@ def test_network_and_processes_are_denied(read):
 
     about, _ = read("denied")
 
-    assert about == dict.fromkeys(("socket", "unix", "fork", "program", "exec", "kill", "session"), "PermissionError")
+    assert about == dict.fromkeys(("socket", "unix", "fork", "program", "exec", "kill", "session", "pidfd", "limit"), "PermissionError")
 
 
 def test_threads_are_permitted(read):

@@ -30,8 +30,8 @@ MAX_SIGNATURE = 150
 MAX_DEFAULT = 12
 #: Parameters that Python passes.
 BOUND = ("self", "cls")
-#: Kinds of the parameters of a call by position and by name, and of other named arguments.
-_Kinds = tuple[list[tuple[str, Kind | None]], dict[str, Kind | None], Kind | None]
+#: Kinds of the parameters of a call by position and by name, of other positional and of other named arguments.
+_Kinds = tuple[list[tuple[str, Kind | None]], dict[str, Kind | None], tuple[str, Kind] | None, Kind | None]
 #: Attribute of checked functions.
 CHECKED = "_arguments_are_checked"
 
@@ -46,7 +46,8 @@ def check_arguments(call: Callable[P, R]) -> Callable[P, R]:
 
     Notes
     -----
-    A valid call takes about 1 µs longer; the annotations are read at the first call.
+    A valid call takes 1 to 2 µs longer, and lists of numbers a time in proportion to their length; the annotations are read at
+    the first call.
     """
     if not isinstance(call, FunctionType) or hasattr(call, CHECKED):
         return call
@@ -59,10 +60,14 @@ def check_arguments(call: Callable[P, R]) -> Callable[P, R]:
         nonlocal kinds
         if kinds is None:
             kinds = find_kinds(call)
-        by_position, by_name, every = kinds
+        by_position, by_name, rest, every = kinds
         for (name, kind), value in zip(by_position, args):  # noqa: B905 -- surplus arguments are reported below
             if kind is not None and not kind.accepts(value):
                 check(name, value, kind)
+        if rest is not None:
+            for k, value in enumerate(args[len(by_position) :]):
+                if not rest[1].accepts(value):
+                    check(f"{rest[0]}[{k}]", value, rest[1])
         for name, value in kwargs.items():
             kind = by_name.get(name, every)
             if kind is not None and not kind.accepts(value):
@@ -86,22 +91,24 @@ def check_arguments(call: Callable[P, R]) -> Callable[P, R]:
 
 
 def _find_kinds(call: Callable[..., Any]) -> _Kinds:
-    """Return the kinds of parameters by position and by name, and of other named arguments."""
+    """Return the kinds of parameters by position and by name, and of other positional and named arguments."""
     names = getattr(inspect.unwrap(call), "__globals__", {})
     by_position: list[tuple[str, Kind | None]] = []
     by_name: dict[str, Kind | None] = {}
-    every = None
+    rest, every = None, None
     for k, parameter in enumerate(inspect.signature(call).parameters.values()):
         annotation = parameter.annotation
         is_bound = k == 0 and parameter.name in BOUND
         known = None if annotation is parameter.empty or is_bound else kind_of(resolve_annotation(annotation, names))
         if parameter.kind is parameter.VAR_KEYWORD:
             every = known
-        elif parameter.kind is not parameter.VAR_POSITIONAL:
+        elif parameter.kind is parameter.VAR_POSITIONAL:
+            rest = None if known is None else (parameter.name, known)
+        else:
             by_name[parameter.name] = known
             if parameter.kind is not parameter.KEYWORD_ONLY:
                 by_position.append((parameter.name, known))
-    return by_position, by_name, every
+    return by_position, by_name, rest, every
 
 
 def check_public_calls(module_name: str) -> None:

@@ -3,7 +3,8 @@ Kinds of values that annotations specify, for the validation of arguments.
 
 A kind is coarser than its annotation: numbers may be of numpy, arrays may be lists, and sequences of a fixed length may be of
 any type. Values, shapes and bounds are validated by the functions themselves; here, a value is rejected that no code of the
-function could use. Items of lists, tuples and sets are checked, those of iterators are not.
+function could use. Items of sequences, sets and mappings are checked where the annotation is abstract (``Sequence[str]``);
+those of ``list[...]`` and ``tuple[..., ...]``, and of iterators, are not.
 """
 
 from __future__ import annotations
@@ -177,14 +178,17 @@ def kind_of(annotation: Any) -> Kind | None:
         return None if OWN_CHECK in others else kind_of(first)
     members = set(get_args(annotation)) if get_origin(annotation) in (Union, UnionType) else {annotation}
     kinds: list[Kind | None] = []
+    paths = {each for each in members if isinstance(each, type) and issubclass(each, os.PathLike)}
+    is_path = bool(paths) and str in members
+    if is_path:
+        members -= paths
+        kinds.append(_PATH)
     if members >= _ARRAY_LIKE:
         # ``str | ArrayLike`` is indistinguishable from ArrayLike, which accepts strings.
         members -= _ARRAY_LIKE
         kinds.append(_ARRAY)
-    paths = {each for each in members if isinstance(each, type) and issubclass(each, os.PathLike)}
-    if paths and str in members:
-        members -= paths | {str}
-        kinds.append(_PATH)
+    elif is_path:
+        members -= {str}
     kinds += [_single_kind(each) for each in _in_order(annotation, members)]
     if any(kind is None for kind in kinds):
         return None
@@ -230,11 +234,11 @@ def _single_kind(kind: Any) -> Kind | None:
     found = _KINDS.get(kind) or _KINDS.get(origin)
     if found is not None:
         return found
-    if origin in (tuple, list, abc.Sequence):
+    if origin is abc.Sequence:
         return _collection(_is_sequence, arguments[0])
     if origin in (abc.Iterable, abc.Collection, abc.Container, set, frozenset, abc.Set):
         return _collection(_is_iterable, arguments[0])
-    if origin in (dict, abc.Mapping, abc.MutableMapping):
+    if origin in (abc.Mapping, abc.MutableMapping):
         return _mapping(arguments[1])
     owner = origin or kind
     if not isinstance(owner, type) or owner in (object, Any):
@@ -249,9 +253,11 @@ def _choice(values: tuple[Any, ...]) -> Kind:
     shown = list_names(names) if len(names) == len(values) else ", ".join(map(repr, values))
 
     def accepts(value: Any) -> bool:
-        return isinstance(value, str | int | None) and value in values
+        if isinstance(value, np.generic | np.ndarray) and value.ndim == 0:
+            value = value.item()
+        return isinstance(value, str | int | float | None) and value in values
 
-    return Kind(accepts, f"one of {shown}", f"of {shown}", names)
+    return Kind(accepts, f"one of {shown}", f"names among {shown}", names)
 
 
 def _class(name: str, accepts: Callable[[Any], bool]) -> Kind:
@@ -311,15 +317,17 @@ def _protocol(protocol: type) -> Kind:
     return _class(protocol.__name__.removesuffix("Like"), lambda value: all(_has(value, name) for name in names))
 
 
+@lru_cache(maxsize=1024)
+def _class_has(kind: type, name: str) -> bool:
+    """Whether instances have an attribute by their class; any one, if the class computes attributes on access."""
+    return hasattr(kind, "__getattr__") or any(
+        name in vars(each) or name in inspect.get_annotations(each) for each in kind.__mro__
+    )
+
+
 def _has(value: Any, name: str) -> bool:
     """Whether an object has an attribute, without computing it."""
-    if any(name in inspect.get_annotations(kind) for kind in type(value).__mro__):
-        return True
-    try:
-        inspect.getattr_static(value, name)
-    except AttributeError:
-        return hasattr(value, name)
-    return True
+    return _class_has(type(value), name) or name in getattr(value, "__dict__", ())
 
 
 def _accepts_path(value: Any) -> bool:
@@ -340,7 +348,10 @@ def _accepts_integer(value: Any) -> bool:
         return True
     if not _accepts_number(value):
         return False
-    return isinstance(value, int | np.integer) or float(value).is_integer()
+    try:
+        return isinstance(value, int | np.integer) or float(value).is_integer()
+    except (OverflowError, ValueError):  # fractions and decimals without a float
+        return False
 
 
 def _accepts_bool(value: Any) -> bool:
@@ -369,14 +380,21 @@ def _is_iterable(value: Any) -> bool:
 def _accepts_array(value: Any, kinds: str) -> bool:
     dtype = getattr(value, "dtype", None)
     if dtype is not None and hasattr(value, "shape"):  # arrays of any library; they are not loaded
-        return getattr(dtype, "kind", kinds[0]) in kinds
+        kind = getattr(dtype, "kind", kinds[0])
+        return kind in kinds or (kind == "O" and all(map(_accepts_number, np.asarray(value).flat)))
     if isinstance(value, bool | int | float | complex | str | bytes | np.generic):
         return np.asarray(value).dtype.kind in kinds
     if value is None or isinstance(value, Mapping | set | frozenset | type | Enum | slice):
         return False
-    if not isinstance(value, list | tuple) and not hasattr(value, "__array__") and not hasattr(value, "__len__"):
+    if not isinstance(value, list | tuple):
+        if hasattr(type(value), "__array__") or hasattr(type(value), "__array_interface__"):
+            return True  # converted, and checked, by the function
+        if not hasattr(value, "__len__"):
+            return False
+    try:
+        return all(dtype in kinds for dtype in _dtypes(value))
+    except RecursionError:  # a list that contains itself
         return False
-    return all(dtype in kinds for dtype in _dtypes(value))
 
 
 def _dtypes(value: Any) -> Iterator[str]:
@@ -384,15 +402,21 @@ def _dtypes(value: Any) -> Iterator[str]:
     if isinstance(value, list | tuple):
         for each in value:
             kind = type(each)
-            if kind is float or kind is int:
+            if kind is float or kind is int or issubclass(kind, np.floating | np.integer):
                 yield "f"
             else:
                 yield from _dtypes(each)
+    elif getattr(getattr(value, "dtype", None), "kind", "") == "O":
+        yield from ("f" if _accepts_number(each) else "O" for each in np.asarray(value).flat)
     elif hasattr(value, "dtype"):
         yield getattr(value.dtype, "kind", "f")
+    elif value is None:
+        yield "O"
+    elif _accepts_number(value):
+        yield "f"
     else:
         try:
-            yield "O" if value is None else np.asarray(value).dtype.kind
+            yield np.asarray(value).dtype.kind
         except (TypeError, ValueError):  # nested objects of the package, or rows of different lengths
             yield "O"
 

@@ -7,7 +7,7 @@ polygons in µm.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -38,13 +38,13 @@ from foveasim.layout.model import INTEGER_RANGES, Layout
 __all__ = ["clip", "cut_out", "inset", "joining_groups", "merge", "merge_small", "node", "snap", "split", "union"]
 
 
-def union(layouts: Sequence[Layout]) -> Layout:
+def union(layouts: Iterable[Layout]) -> Layout:
     """
     Concatenate the sites of several layouts, in order.
 
     Parameters
     ----------
-    layouts : sequence of Layout
+    layouts : iterable of Layout
 
     Returns
     -------
