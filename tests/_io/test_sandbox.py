@@ -230,7 +230,9 @@ def test_network_and_processes_are_denied(read):
 
     about, _ = read("denied")
 
-    assert about == dict.fromkeys(("socket", "unix", "fork", "program", "exec", "kill", "session", "pidfd", "limit"), "PermissionError")
+    assert about == dict.fromkeys(
+        ("socket", "unix", "fork", "program", "exec", "kill", "session", "pidfd", "limit"), "PermissionError"
+    )
 
 
 def test_threads_are_permitted(read):
