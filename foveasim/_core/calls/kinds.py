@@ -325,9 +325,10 @@ def _class_has(kind: type, name: str) -> bool:
     )
 
 
-def _has(value: Any, name: str) -> bool:
+def _has(value: object, name: str) -> bool:
     """Whether an object has an attribute, without computing it."""
-    return _class_has(type(value), name) or name in getattr(value, "__dict__", ())
+    kind: type = type(value)
+    return _class_has(kind, name) or name in getattr(value, "__dict__", ())
 
 
 def _accepts_path(value: Any) -> bool:
