@@ -31,8 +31,6 @@ BAD_INPUT = 2
 FAILED = 1
 #: Exit code after Ctrl-C, by the convention of shells: 128 + SIGINT.
 INTERRUPTED = 130
-#: Messages about an interruption that were printed.
-_interruption_said: list[str] = []
 
 app = typer.Typer(
     help="Simulate image sensors with polygonal photosites.",
@@ -476,7 +474,7 @@ def video(
     except KeyboardInterrupt:
         n = count_recorded_frames(out) if is_store and partial_path(out).is_dir() else 0
         stored = f"; {n:,} frames are stored next to {out}, {RESUME}" if n else ""
-        _exit(f"interrupted{stored}", INTERRUPTED)
+        _interrupt(f"interrupted{stored}")
     status = f"{out} was already complete" if was_finished else f"wrote {out}"
     _report(f"{status}: {n:,} frames")
 
@@ -523,7 +521,7 @@ def _run(settings: Sequence[Path], changes: Sequence[str], out: Path, threads: i
                 results.append(result)
                 written += paths
     except KeyboardInterrupt:
-        _exit("interrupted", INTERRUPTED)
+        _interrupt("interrupted")
     console.print(results_table(results))
     for path in written:
         _report(f"wrote {path}")
@@ -546,7 +544,6 @@ def _main() -> None:
         raise KeyboardInterrupt
 
     handlers: dict[int, Any] = {}
-    _interruption_said.clear()
     if current_thread() is main_thread():
         found = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
         # None is a handler that Python did not install, and cannot restore.
@@ -558,7 +555,7 @@ def _main() -> None:
     except (KeyboardInterrupt, SystemExit) as error:
         if not signals or (isinstance(error, SystemExit) and error.code != INTERRUPTED):
             raise
-        if not _interruption_said:
+        if not isinstance(error, _Interrupted):
             _report_error("interrupted")
         # By convention 128 plus the number of the signal: 130 for Ctrl-C, 143 for SIGTERM.
         sys.exit(128 + signals[0])
@@ -601,7 +598,7 @@ def _progress(name: str, note: str) -> Iterator[Callable[[int, int], None]]:
     try:
         yield show
     except KeyboardInterrupt:
-        _exit(f"interrupted; {note}", INTERRUPTED)
+        _interrupt(f"interrupted; {note}")
     finally:
         if progress.live.is_started:
             progress.stop()
@@ -628,9 +625,16 @@ def _report_error(text: str) -> None:
 
 def _exit(text: str, code: int) -> NoReturn:
     _report_error(text)
-    if code == INTERRUPTED:
-        _interruption_said.append(text)
     sys.exit(code)
+
+
+class _Interrupted(SystemExit):
+    """Exit after an interruption that was reported."""
+
+
+def _interrupt(text: str) -> NoReturn:
+    _report_error(text)
+    raise _Interrupted(INTERRUPTED)
 
 
 def _show_warning(

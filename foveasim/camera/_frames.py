@@ -23,6 +23,7 @@ __all__ = [
     "Position",
     "Task",
     "check_frames",
+    "path_digests",
     "path_positions",
     "position_settings",
     "tasks",
@@ -67,21 +68,25 @@ class PathPosition(tuple[float, float]):  # noqa: SLOT001 -- tuples have no slot
         return new
 
 
-def path_positions(gaze_um: Floats, positions_um: Iterable[Sequence[float]]) -> Iterator[PathPosition]:
+def path_digests(gaze_um: Floats) -> list[bytes]:
     """
-    Yield sensor positions with the points of a path, (n, 2) µm, that they belong to.
+    Return a digest of a path, (n, 2) µm, from each point to its end, and the one of no point.
 
-    A digest of the path from each point to its end identifies the rest of the path, also when its beginning is skipped.
+    It identifies the rest of a path, also when its beginning is skipped.
     """
     digests = [bytes(DIGEST_BYTES)]
     for x_um, y_um in gaze_um[::-1].tolist():
         point = struct.pack("<dd", x_um + 0.0, y_um + 0.0)  # + 0.0 removes the sign of zero
         digests.append(blake2b(point + digests[-1], digest_size=DIGEST_BYTES).digest())
     digests.reverse()
-    return (
-        PathPosition((float(x_um), float(y_um)), (float(at_um[0]), float(at_um[1])), digests, k)
-        for k, (at_um, (x_um, y_um)) in enumerate(zip(gaze_um, positions_um, strict=True))
-    )
+    return digests
+
+
+def path_positions(gaze_um: Floats) -> Iterator[PathPosition]:
+    """Yield the points of a path, (n, 2) µm, as sensor positions."""
+    digests = path_digests(gaze_um)
+    for k, (x_um, y_um) in enumerate(gaze_um.tolist()):
+        yield PathPosition((x_um, y_um), (x_um, y_um), digests, k)
 
 
 class Task(NamedTuple):
@@ -148,11 +153,11 @@ def _with_path(frames: Iterable[Frame]) -> Iterable[Frame]:
     if any(isinstance(position_um, PathPosition) for _, position_um in frames):
         return frames
     try:
-        positions_um = np.array([position_um for _, position_um in frames], np.float64).reshape(-1, 2)
-        along = path_positions(positions_um, positions_um.tolist())
-        return [(light, position_um) for (light, _), position_um in zip(frames, along, strict=True)]
+        positions_um = np.array([position_um for _, position_um in frames], np.float64).reshape(len(frames), 2)
     except (TypeError, ValueError):  # reported with the frame
         return frames
+    along = path_positions(positions_um)
+    return [(light, position_um) for (light, _), position_um in zip(frames, along, strict=True)]
 
 
 def _split_frame(frame: Frame) -> tuple[Scene | PowerMap, Position]:

@@ -173,7 +173,7 @@ def _start_method() -> str:
 
 def _start_fork_server() -> None:
     """Start the process from which workers are forked, with the module path of this process."""
-    from multiprocessing import forkserver
+    from multiprocessing import forkserver, resource_tracker
 
     import dask
 
@@ -184,6 +184,7 @@ def _start_fork_server() -> None:
     path = os.pathsep.join(map(os.path.abspath, sys.path))
     saved = dict(os.environ)
     os.environ.update(defaults | saved | {"PYTHONPATH": path, "PYTHONSAFEPATH": "1"})
+    resource_tracker.ensure_running()  # unblocks the signal after its start
     # The process and the workers that it forks inherit the blocked signal: Ctrl-C is handled by the main program alone.
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

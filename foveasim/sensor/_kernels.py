@@ -75,12 +75,12 @@ _quadrature = types.NamedUniTuple(_floats, 2, Quadrature)
 _LOW, _ONE_IN_2_32 = np.uint64(0xFFFFFFFF), 2.0**-32
 
 
-@njit(types.float64[::1](types.uint64, types.uint64, _words, _words))
+@njit(types.float64[::1](types.uint64, types.uint64, _words, types.uint64))
 def device_uniforms(key_0, key_1, first, second):
-    """Return a reproducible uniform number, in (0, 1), for each pair of counter words."""
+    """Return a reproducible uniform number, in (0, 1), for each first word of the counter, with a common second word."""
     out = np.empty(first.size, np.float64)
     for i in range(first.size):
-        word, _, _, _ = philox_4x64(key_0, key_1, first[i], second[i], np.uint64(0), np.uint64(0))
+        word, _, _, _ = philox_4x64(key_0, key_1, first[i], second, np.uint64(0), np.uint64(0))
         out[i] = uniform(word)
     return out
 

@@ -28,7 +28,9 @@ __all__ = ["Device"]
 
 Words = NDArray[np.uint64]
 #: Words of the sites of each layout.
-_words: WeakKeyDictionary[Any, tuple[Words, Words]] = WeakKeyDictionary()
+_words: WeakKeyDictionary[Any, Words] = WeakKeyDictionary()
+#: Second words of the counters of sites and of readout lines.
+SITES, LINES = np.uint64(1 << 63), np.uint64(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,17 +67,16 @@ class Device:
         return Device(self.seed, layout, None if is_lattice else (self, selection))
 
     @cached_property
-    def words(self) -> tuple[Words, Words]:
-        """Two words per site that identify it, which all devices of a layout share."""
+    def words(self) -> Words:
+        """Word per site that identifies it, (n_site,) uint64, which all devices of a layout share."""
         if self._complete is not None:
             device, selection = self._complete
-            one, other = device.words
-            return one[selection], other[selection]
+            return np.ascontiguousarray(device.words[selection])
         if type(self.layout).__hash__ is not object.__hash__:  # not immutable
-            return _site_words(self.layout)
+            return site_ids(self.layout).view(np.uint64)
         words = _words.get(self.layout)
         if words is None:
-            words = _words[self.layout] = _site_words(self.layout)
+            words = _words[self.layout] = site_ids(self.layout).view(np.uint64)
         return words
 
     def key(self, effect: str) -> tuple[np.uint64, np.uint64]:
@@ -86,7 +87,7 @@ class Device:
         """Return a uniform number in (0, 1) for each site, (n_site,)."""
         from foveasim.sensor import _kernels
 
-        out: Floats = _kernels.device_uniforms(*self.key(effect), *self.words)
+        out: Floats = _kernels.device_uniforms(*self.key(effect), self.words, SITES)
         return out
 
     def normals(self, effect: str) -> Floats:
@@ -112,10 +113,5 @@ class Device:
         from foveasim.sensor import _kernels
 
         words = np.ascontiguousarray(lines, np.int64).view(np.uint64)
-        return np.asarray(ndtri(_kernels.device_uniforms(*self.key(effect), words, np.zeros_like(words))))
+        return np.asarray(ndtri(_kernels.device_uniforms(*self.key(effect), words, LINES)))
 
-
-def _site_words(layout: PackedRings) -> tuple[Words, Words]:
-    """Return two words per site that identify it."""
-    ids = site_ids(layout)
-    return ids.view(np.uint64), np.full(ids.size, 1 << 63, np.uint64)

@@ -479,13 +479,7 @@ class Sensor:
         ParameterError
             If effects, such as crosstalk, connect sites with others, or an index is not that of a site.
         """
-        connecting = [effect.name for effect in self.chain if not effect.is_local]
-        if connecting:
-            raise ParameterError(
-                "sensor",
-                f"must have no effects between sites to be divided, got {', '.join(map(repr, connecting))}",
-                hint=f"switch them off: sensor.without({', '.join(map(repr, connecting))})",
-            )
+        self._check_local()
         chosen = selection
         if not isinstance(selection, slice) or not _is_range(selection):
             try:
@@ -498,6 +492,15 @@ class Sensor:
         values: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(Sensor)}
         values |= {name: values[name][chosen] for name in _PER_SITE if np.ndim(values[name])}
         return SensorPart(**values | {"layout": self.layout[chosen]}, _complete=self, _selection=chosen)
+
+    def _check_local(self) -> None:
+        connecting = ", ".join(repr(effect.name) for effect in self.chain if not effect.is_local)
+        if connecting:
+            raise ParameterError(
+                "sensor",
+                f"must have no effects between sites to be divided, got {connecting}",
+                hint=f"switch them off: sensor.without({connecting})",
+            )
 
     def nominal(self) -> Sensor:
         """Return the sensor without the fixed patterns of its device."""
@@ -886,7 +889,7 @@ class SensorPart(Sensor):
     Raises
     ------
     ParameterError
-        If the device or the number of sites is not that of the part.
+        If the device or the number of sites is not that of the part, or effects connect its sites with others.
     """
 
     #: Sensor with all sites, whose layout the effects use, and indices of the sites of the part.
@@ -905,6 +908,7 @@ class SensorPart(Sensor):
         n_sites = self._complete.sites.block(self._selection).n_sites
         if self.layout.n_sites != n_sites:
             raise ParameterError("layout", f"must have the {n_sites} sites of the part, got {self.layout.n_sites}")
+        self._check_local()
 
     @cached_property
     def device(self) -> Device:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -14,7 +13,7 @@ from foveasim._core.random_streams import Streams
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, check_number, check_shape, finite_array, read_only
 from foveasim.camera import Camera
-from foveasim.camera._frames import path_positions
+from foveasim.camera._frames import PathPosition, path_digests, path_positions
 from foveasim.errors import ParameterError, type_name, with_article
 from foveasim.fields import PowerMap
 from foveasim.optics import Optics
@@ -175,7 +174,7 @@ def shift_sensor(source: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Sce
         When an argument is of another class.
     """
     _check_types(("source", source, (Scene, PowerMap)), ("path", path, (GazePath,)))
-    return ((source, position_um) for position_um in path_positions(path.xy_um, path.xy_um))
+    return ((source, position_um) for position_um in path_positions(path.xy_um))
 
 
 def pan_camera(
@@ -239,13 +238,11 @@ def _parts(
     free_y, free_x = scene.basis.shape[1] - n_y, scene.basis.shape[2] - n_x
     previous: tuple[int, int] | None = None
     part = scene
-    # The positions are the remaining shifts, which are known when a part is cropped.
-    shifts_um: deque[tuple[float, float]] = deque()
-    positions = path_positions(path.xy_um, (shifts_um.popleft() for _ in path.t_s))
-    for t_s, position_um in zip(path.t_s, path.xy_um, strict=True):
+    digests = path_digests(path.xy_um)
+    for k, (t_s, position_um) in enumerate(zip(path.t_s.tolist(), path.xy_um.tolist(), strict=True)):
         # The centre of the part is off by half a pixel if the number of free pixels is odd.
         left, bottom = (
-            round(float(at_um) / cell_um + 0.5 * free)
+            round(at_um / cell_um + 0.5 * free)
             for at_um, free in zip(position_um, (free_x, free_y), strict=True)
         )
         if not (0 <= left <= free_x and 0 <= bottom <= free_y):
@@ -253,18 +250,17 @@ def _parts(
                 "path",
                 f"must stay within the scene, but leaves it at {t_s:g} s: a part of {n_x} x {n_y} pixels can move by at most "
                 f"({0.5 * free_x * cell_um:.4g}, {0.5 * free_y * cell_um:.4g}) µm",
-                tuple(float(at_um) for at_um in position_um),
+                tuple(position_um),
                 "µm",
             )
         if (left, bottom) != previous:
             part = _crop(scene, left, bottom, n_y, n_x)
             previous = left, bottom
         x_um, y_um = (
-            float(at_um) - (at - 0.5 * free) * cell_um
+            at_um - (at - 0.5 * free) * cell_um
             for at_um, at, free in zip(position_um, (left, bottom), (free_x, free_y), strict=True)
         )
-        shifts_um.append((x_um, y_um))
-        yield part, next(positions)
+        yield part, PathPosition((x_um, y_um), (position_um[0], position_um[1]), digests, k)
 
 
 def _check_types(*arguments: tuple[str, object, tuple[type, ...]]) -> None:

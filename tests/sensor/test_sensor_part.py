@@ -13,7 +13,7 @@ import foveasim as fs
 from foveasim._core.random_streams import Streams
 from foveasim.errors import ParameterError
 from foveasim.sensor import Sensor, noise_budget, signal_to_noise
-from foveasim.sensor.effects import AdditiveNoise, Effect, FixedFactor, FixedOffset
+from foveasim.sensor.effects import AdditiveNoise, Effect, FixedFactor, FixedOffset, InterPixelCapacitance
 
 LAYOUT = fs.layout.mosaic(fs.layout.grid(n_x=40, n_y=25, pitch_um=2.0), ("RG", "GB"))
 LAYOUT = LAYOUT.with_columns(readout_line=np.arange(1000) // 40)
@@ -169,6 +169,14 @@ def test_nested_parts_have_patterns_of_sensor():
     ):
         for name in ("shading", "offset_per_site", "ranked_gain", "prnu"):
             assert np.array_equal(part.pattern(name), sensor.pattern(name)[index]), name
+
+
+def test_part_accepts_no_effects_between_sites():
+    part = make_sensor().part(slice(200, 700))
+
+    for change in ({"coupling": InterPixelCapacitance(neighbour_fraction=0.01)}, {"device_seed": 5}, {"layout": LAYOUT}):
+        with pytest.raises(ParameterError):
+            replace(part, **change)
 
 
 def test_part_of_arcs_has_numbers_of_sensor():
