@@ -114,4 +114,3 @@ class Device:
 
         words = np.ascontiguousarray(lines, np.int64).view(np.uint64)
         return np.asarray(ndtri(_kernels.device_uniforms(*self.key(effect), words, LINES)))
-

@@ -242,8 +242,7 @@ def _parts(
     for k, (t_s, position_um) in enumerate(zip(path.t_s.tolist(), path.xy_um.tolist(), strict=True)):
         # The centre of the part is off by half a pixel if the number of free pixels is odd.
         left, bottom = (
-            round(at_um / cell_um + 0.5 * free)
-            for at_um, free in zip(position_um, (free_x, free_y), strict=True)
+            round(at_um / cell_um + 0.5 * free) for at_um, free in zip(position_um, (free_x, free_y), strict=True)
         )
         if not (0 <= left <= free_x and 0 <= bottom <= free_y):
             raise ParameterError(

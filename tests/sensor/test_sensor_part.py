@@ -174,7 +174,11 @@ def test_nested_parts_have_patterns_of_sensor():
 def test_part_accepts_no_effects_between_sites():
     part = make_sensor().part(slice(200, 700))
 
-    for change in ({"coupling": InterPixelCapacitance(neighbour_fraction=0.01)}, {"device_seed": 5}, {"layout": LAYOUT}):
+    for change in (
+        {"coupling": InterPixelCapacitance(neighbour_fraction=0.01)},
+        {"device_seed": 5},
+        {"layout": LAYOUT},
+    ):
         with pytest.raises(ParameterError):
             replace(part, **change)
 
