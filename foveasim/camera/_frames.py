@@ -70,7 +70,7 @@ class PathPosition(tuple[float, float]):  # noqa: SLOT001 -- tuples have no slot
 
 def path_digests(gaze_um: Floats) -> list[bytes]:
     """
-    Return a digest of a path, (n, 2) µm, from each point to its end, and the one of no point.
+    Return a digest of a path, (n, 2) µm, from each point to its end, and that of none.
 
     It identifies the rest of a path, also when its beginning is skipped.
     """

@@ -77,7 +77,11 @@ _LOW, _ONE_IN_2_32 = np.uint64(0xFFFFFFFF), 2.0**-32
 
 @njit(types.float64[::1](types.uint64, types.uint64, _words, types.uint64))
 def device_uniforms(key_0, key_1, first, second):
-    """Return a reproducible uniform number, in (0, 1), for each first word of the counter, with a common second word."""
+    """
+    Return a reproducible uniform number, in (0, 1), for each first word of the counter.
+
+    The second word is common.
+    """
     out = np.empty(first.size, np.float64)
     for i in range(first.size):
         word, _, _, _ = philox_4x64(key_0, key_1, first[i], second, np.uint64(0), np.uint64(0))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from foveasim.errors import FileError, FoveasimError, ParameterError, printable
 
-__all__ = ["decode_part", "encode_part", "from_json", "one_line", "to_json"]
+__all__ = ["decode_part", "encode_part", "from_json", "is_answer_to_freeze", "one_line", "to_json"]
 
 #: Alignment of arrays in bytes: typed arrays of JavaScript require offsets that are multiples of their item size.
 ALIGNMENT = 8
@@ -132,3 +132,8 @@ def one_line(error: BaseException) -> str:
     text = str(error) if isinstance(error, FoveasimError) else f"{type(error).__name__}: {error}".removesuffix(": ")
     text = printable(" ".join(text.split()))
     return text if len(text) <= MAX_MESSAGE_LENGTH else text[: MAX_MESSAGE_LENGTH - 3] + "..."
+
+
+def is_answer_to_freeze(message: str) -> bool:
+    """Return whether a message is the one after the parts of a variant."""
+    return message.startswith('{"kind": "done"') and bool(json.loads(message)["is_freeze"])

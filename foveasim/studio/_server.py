@@ -31,7 +31,7 @@ from foveasim.layout import write_layout
 from foveasim.studio._exports import archive
 from foveasim.studio._files import file_name, presets
 from foveasim.studio._frames import camera_frame
-from foveasim.studio._messages import one_line
+from foveasim.studio._messages import is_answer_to_freeze, one_line
 from foveasim.studio._session import MAX_SESSION_BYTES, Session, Start
 
 __all__ = ["UNSPECIFIED", "Studio", "host_names", "serve"]
@@ -247,7 +247,11 @@ class Studio:
 
 
 class _Outbox:
-    """Messages that wait for a connection; newer parts replace older ones of the same view."""
+    """
+    Messages that wait for a connection; newer parts replace older ones of the same view.
+
+    Parts before the answer to ``freeze`` are those of the variant, which the page keeps.
+    """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
@@ -260,6 +264,8 @@ class _Outbox:
 
     def _put(self, message: str | bytes) -> None:
         name = _part_name(message) if isinstance(message, bytes) else None
+        if isinstance(message, str) and is_answer_to_freeze(message):
+            self._messages = deque((None, earlier) for _, earlier in self._messages)
         if name is not None:
             self._messages = deque(item for item in self._messages if item[0] != name)
         if len(self._messages) < MAX_OUTGOING:

@@ -436,7 +436,7 @@ class Session:
                     self._simulate(self.history.settings, can_stop=False)
                 self._frozen_result = self.result
                 self._frozen = {"summary": summary_of(self.result), "settings": self.history.settings}
-                self._send_parts(can_interrupt=False)  # before later changes: the page keeps those of the variant
+                self._send_parts(is_freeze=True)  # before later changes: the page keeps those of the variant
             case "unfreeze":
                 self._frozen = self._frozen_result = None
                 self._views.forget("comparison")
@@ -546,8 +546,12 @@ class Session:
             "is_preview": result is not None and result.is_preview,
         })  # fmt: skip
 
-    def _send_parts(self, *, can_interrupt: bool = True) -> None:
-        """Compute and send the parts that changed, until newer messages interrupt."""
+    def _send_parts(self, *, is_freeze: bool = False) -> None:
+        """
+        Compute and send the parts that changed, until newer messages interrupt.
+
+        Those of a variant are complete.
+        """
         if self.result is None:
             return
         times_ms = self._views.send_changed(
@@ -556,7 +560,7 @@ class Session:
             self._last_id,
             key=self._key,
             is_dragging=self._is_dragging,
-            is_interrupted=lambda: can_interrupt and bool(self._waiting),
+            is_interrupted=lambda: not is_freeze and bool(self._waiting),
         )
         if times_ms is not None:
             times_ms["simulation"] = 1e3 * self.result.seconds_s
@@ -566,6 +570,7 @@ class Session:
                 "version": self._version,
                 "ms": times_ms,
                 "is_preview": self.is_preview,
+                "is_freeze": is_freeze,
             })  # fmt: skip
 
     def _line(self, error: BaseException) -> str:

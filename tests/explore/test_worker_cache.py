@@ -6,7 +6,8 @@ import copy
 import hashlib
 import json
 import typing
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -19,6 +20,22 @@ from foveasim.config._models import models
 from foveasim.config._objects import put_setting
 from foveasim.explore.worker_cache import ShotRunner, WorkerCache
 from foveasim.layout import Layout
+from foveasim.sensor.effects import EFFECTS, FixedFactor
+
+
+@EFFECTS.register("ramp of test_worker_cache")
+@dataclass(frozen=True)
+class Ramp(FixedFactor):
+    """Test effect: a loss that increases with the number of the site."""
+
+    name: ClassVar[str] = "ramp"
+    stage: ClassVar[str] = "photo"
+
+    loss: float = 0.5
+
+    def pattern(self, sites):
+        return 1.0 - self.loss * np.linspace(0.0, 1.0, sites.n_sites)
+
 
 #: A shot with every section, in which almost every setting changes the result.
 SHOT = {
@@ -112,6 +129,7 @@ OTHERS = {
     "optics.focus_distance_m": 0.9,
     "optics.oversample": 3,
     "sensor.bits": 10,
+    "sensor.effects": [{"kind": "ramp of test_worker_cache", "loss": 0.3}],
     "distortion.focal_um": [300.0, 320.0],
     "distortion.centre_um": [3.0, -2.0],
     "layout.parameters.min_size_um": 3.0,

@@ -405,6 +405,19 @@ def test_slow_connections_receive_newest_parts():
     assert [message[-2:-1] for message in messages if isinstance(message, bytes)] == [b"4"]
 
 
+def test_slow_connections_receive_parts_of_variant():
+    """Newer parts do not replace those that precede the answer to freeze."""
+
+    async def fill():
+        outbox = _server._Outbox(asyncio.get_running_loop())
+        for k in range(4):
+            outbox._put(b'\0\0\0\0{"part":"columns","version":%d}' % k)
+            outbox._put(json.dumps({"kind": "done", "id": k, "is_freeze": k == 1}))
+        return [message for _, message in outbox._messages if isinstance(message, bytes)]
+
+    assert [message[-2:-1] for message in asyncio.run(fill())] == [b"1", b"3"]
+
+
 class Program:
     """The command in a process of its own."""
 

@@ -91,7 +91,7 @@ def check_arguments(call: Callable[P, R]) -> Callable[P, R]:
 
 
 def _find_kinds(call: Callable[..., Any]) -> _Kinds:
-    """Return the kinds of parameters by position and by name, and of other positional and named arguments."""
+    """Return the kinds of parameters, by position and by name, and of other arguments."""
     names = getattr(inspect.unwrap(call), "__globals__", {})
     by_position: list[tuple[str, Kind | None]] = []
     by_name: dict[str, Kind | None] = {}

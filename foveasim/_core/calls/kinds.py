@@ -319,7 +319,7 @@ def _protocol(protocol: type) -> Kind:
 
 @lru_cache(maxsize=1024)
 def _class_has(kind: type, name: str) -> bool:
-    """Whether instances have an attribute by their class; any one, if the class computes attributes on access."""
+    """Whether a class has an attribute for its instances, or computes any on access."""
     return hasattr(kind, "__getattr__") or any(
         name in vars(each) or name in inspect.get_annotations(each) for each in kind.__mro__
     )
