@@ -12,6 +12,7 @@ from __future__ import annotations
 import mmap
 import os
 import weakref
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,7 +23,7 @@ from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Images
 from foveasim.errors import FileError
 
-__all__ = ["check_unchanged", "in_memory", "map_file", "value_range"]
+__all__ = ["check_unchanged", "in_memory", "map_file", "range_and_values", "value_range"]
 
 _Array = TypeVar("_Array", bound=NDArray[Any])
 
@@ -115,11 +116,17 @@ def check_unchanged(array: _Array) -> _Array:
     return array
 
 
-def in_memory(array: NDArray[Any]) -> NDArray[Any]:
+def in_memory(array: NDArray[Any], seen: Callable[[NDArray[Any]], None] | None = None) -> NDArray[Any]:
     """
     Return the same array, or a copy in memory of an array of :func:`map_file`.
 
     The copy has the memory order of the file. It contains the values of the unchanged file, or the function raises.
+
+    Parameters
+    ----------
+    array : array
+    seen : function, optional
+        Is called with each part of a copy in some thread, while the part is in the cache of the processor.
 
     Raises
     ------
@@ -147,14 +154,27 @@ def in_memory(array: NDArray[Any]) -> NDArray[Any]:
             for row in part:
                 index = np.unravel_index(row, view.shape[:n_outer])
                 offset = start + sum(int(i) * step for i, step in zip(index, steps, strict=True))
-                mapped.read_into(rows[row], offset)
+                for first in range(0, rows.shape[1], BLOCK_VALUES):
+                    values = rows[row, first : first + BLOCK_VALUES]
+                    mapped.read_into(values, offset + first * view.itemsize)
+                    if seen is not None:
+                        seen(values)
 
         parallel_map(read, _parts(rows.shape[0], n_bytes), thread_count())
     else:  # on Windows, where a mapped file cannot be truncated
         copy[...] = view
+        if seen is not None and array.size:
+            seen(copy)
     mapped.check()
     back = np.argsort(order)
     return copy.transpose(back)[forwards]
+
+
+def range_and_values(images: Images) -> tuple[tuple[float, float], Images]:
+    """Return the lowest and the highest value, and :func:`in_memory`, in one pass over a file."""
+    ranges: list[tuple[Any, Any]] = []
+    copy = in_memory(images, lambda values: ranges.append((values.min(), values.max())))
+    return _joined(ranges) if ranges else value_range(copy), copy
 
 
 def value_range(images: Images) -> tuple[float, float]:
@@ -173,7 +193,10 @@ def value_range(images: Images) -> tuple[float, float]:
     """
     n_bytes = images.shape[2] * images.itemsize
     parts = [(image, rows) for image in images for rows in _parts(images.shape[1], n_bytes)]
-    ranges = parallel_map(_range_of_rows, parts, thread_count())
+    return _joined(parallel_map(_range_of_rows, parts, thread_count()))
+
+
+def _joined(ranges: Iterable[tuple[Any, Any]]) -> tuple[float, float]:
     low, high = (f(values) for f, values in zip((np.min, np.max), zip(*ranges, strict=True), strict=True))
     return float(low), float(high)
 

@@ -24,7 +24,7 @@ from foveasim._core.validation import (
     wavelengths_nm,
 )
 from foveasim._io.formats import FormatError
-from foveasim._io.mapped_files import in_memory, value_range
+from foveasim._io.mapped_files import in_memory, range_and_values, value_range
 from foveasim._io.rasters import MAX_BANDS
 from foveasim.errors import ParameterError
 from foveasim.scene.cubes._cube import Cube
@@ -125,12 +125,15 @@ def select(cube: Cube, selection: Selection) -> Cube:
     scale, offset = (_per_band(name, getattr(cube, name), n_bands)[index] for name in ("scale", "offset"))
     if not np.all(scale > 0.0):
         raise FormatError(f"has the scale factor {scale.min():.6g}, expected positive numbers")
-    images = _load(cube.data, index, y, x)
+    images, limits = _load(cube.data, index, y, x)
     if cube.is_y_descending:
         images = images[:, ::-1]
     if cube.is_x_descending:
         images = images[:, :, ::-1]
-    images = _checked(images, cube.missing, offset / scale, selection.invalid, index, (rows.start, columns.start))
+    if limits is not None and not offset.any() and _is_valid(*limits, cube.missing):
+        images = freeze(images)
+    else:
+        images = _checked(images, cube.missing, offset / scale, selection.invalid, index, (rows.start, columns.start))
     widths = cube.band_width_nm
     fov_deg = cube.field_of_view_deg
     if fov_deg is not None:
@@ -247,8 +250,12 @@ def _per_band(name: str, values: Any, n_bands: int) -> Floats:
     return np.array(np.broadcast_to(array, (n_bands,)))
 
 
-def _load(data: Any, index: Ints, y: slice, x: slice) -> Images:
-    """Return selected bands: a view of floating-point data, otherwise a converted copy."""
+def _load(data: Any, index: Ints, y: slice, x: slice) -> tuple[Images, tuple[float, float] | None]:
+    """
+    Return selected bands, and the range of their values where it is known.
+
+    They are floating-point data without a copy or from a mapped file, otherwise a converted copy.
+    """
     is_small = data.dtype.itemsize <= (4 if data.dtype.kind == "f" else 2)
     real: Any = np.float32 if is_small else np.float64
     span = slice(int(index.min()), int(index.max()) + 1)
@@ -260,7 +267,10 @@ def _load(data: Any, index: Ints, y: slice, x: slice) -> Images:
     is_by_pixel = view.shape[0] > 1 and view.strides[0] == view.itemsize
     is_run = bool(np.all(np.diff(index) == 1))
     if is_run and view.dtype == real and not is_by_pixel:
-        return in_memory(view) if view.nbytes <= MAX_COPIED_BYTES else view
+        if view.nbytes > MAX_COPIED_BYTES:
+            return view, None
+        limits, images = range_and_values(view)
+        return images, limits
     _check_fits((index.size, *view.shape[1:]), real)
     images = np.empty((index.size, *view.shape[1:]), real)
     index = index - int(index.min())
@@ -271,7 +281,7 @@ def _load(data: Any, index: Ints, y: slice, x: slice) -> Images:
         part = in_memory(view[:, rows]) if is_by_pixel else view[:, rows]
         for k, band in enumerate(index):
             images[k, rows] = in_memory(part[band])
-    return images
+    return images, None
 
 
 def _check_fits(shape: tuple[int, int, int], real: Any) -> None:
@@ -314,6 +324,11 @@ def _checked(
             "invalid='zero' to replace them, or select bands=, rows= and columns="
         )
     return freeze(images)
+
+
+def _is_valid(low: float, high: float, missing: float | None) -> bool:
+    """Return whether all values of a range are finite, not negative and not missing."""
+    return low >= 0.0 and high < np.inf and (missing is None or missing < low or missing > high)
 
 
 def _writeable(images: Images) -> Images:
