@@ -31,6 +31,8 @@ _Array = TypeVar("_Array", bound=NDArray[Any])
 BLOCK_VALUES = 2**18
 #: Bytes that a thread reads, or whose range it computes, at a time.
 PART_BYTES = 2**24
+#: Ranges of the values of read-only arrays that own their memory, by identity.
+_ranges: dict[int, tuple[weakref.ref[NDArray[Any]], tuple[float, float]]] = {}
 
 
 class MappedFile(mmap.mmap):
@@ -171,15 +173,25 @@ def in_memory(array: NDArray[Any], seen: Callable[[NDArray[Any]], None] | None =
 
 
 def range_and_values(images: Images) -> tuple[tuple[float, float], Images]:
-    """Return the lowest and the highest value, and :func:`in_memory`, in one pass over a file."""
+    """
+    Return the lowest and the highest value, and :func:`in_memory`, in one pass over a file.
+
+    A copy is read-only, and :func:`value_range` knows its range.
+    """
     ranges: list[tuple[Any, Any]] = []
     copy = in_memory(images, lambda values: ranges.append((values.min(), values.max())))
-    return _joined(ranges) if ranges else value_range(copy), copy
+    if not ranges:
+        return value_range(copy), copy
+    owner = _owner(copy)
+    owner.flags.writeable = copy.flags.writeable = False
+    return _remember(owner, _joined(ranges)), copy
 
 
 def value_range(images: Images) -> tuple[float, float]:
     """
     Return the lowest and the highest value; NaN if there is a NaN.
+
+    It is computed once for read-only arrays that own their memory, and their complete views.
 
     Parameters
     ----------
@@ -191,9 +203,28 @@ def value_range(images: Images) -> tuple[float, float]:
     FileError
         As :func:`in_memory`.
     """
+    owner = _owner(images)
+    is_constant = owner.flags.owndata and not owner.flags.writeable and owner.size == images.size
+    known = _ranges.get(id(owner)) if is_constant else None
+    if known is not None and known[0]() is owner:
+        return known[1]
     n_bytes = images.shape[2] * images.itemsize
     parts = [(image, rows) for image in images for rows in _parts(images.shape[1], n_bytes)]
-    return _joined(parallel_map(_range_of_rows, parts, thread_count()))
+    found = _joined(parallel_map(_range_of_rows, parts, thread_count()))
+    return _remember(owner, found) if is_constant else found
+
+
+def _remember(owner: NDArray[Any], limits: tuple[float, float]) -> tuple[float, float]:
+    key = id(owner)
+    _ranges[key] = weakref.ref(owner, lambda _: _ranges.pop(key, None)), limits
+    return limits
+
+
+def _owner(array: NDArray[Any]) -> NDArray[Any]:
+    """Return the array whose memory a view shows."""
+    while isinstance(array.base, np.ndarray):
+        array = array.base
+    return array
 
 
 def _joined(ranges: Iterable[tuple[Any, Any]]) -> tuple[float, float]:

@@ -618,6 +618,8 @@ def _picture_array(picture: ArrayLike) -> NDArray[Any]:
 
 def _relative_radiance(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Images:
     """Return the relative radiance (n_channel, n_y, n_x) float32, multiplied by alpha."""
+    from foveasim.scene import _kernels
+
     pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
     if pixels.dtype == np.bool_:
         pixels = pixels.astype(np.uint8) * np.uint8(255)
@@ -625,8 +627,9 @@ def _relative_radiance(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: b
         peak = float(np.iinfo(pixels.dtype).max)
         table = decode(np.arange(peak + 1) / peak, encoding).astype(np.float32)
         values = np.arange(peak + 1, dtype=np.float32) / np.float32(peak)
-        colours = pixels[..., :-1] if has_alpha else pixels
-        radiance = np.take(table, np.ascontiguousarray(from_file_rows(colours)))
+        colours = from_file_rows(pixels[..., :-1] if has_alpha else pixels)
+        radiance = np.empty(colours.shape, np.float32)
+        _kernels.look_up(colours, table, radiance)
         alpha = values[from_file_rows(pixels[..., -1])] if has_alpha else None
     elif pixels.dtype.kind == "f":
         if not np.isfinite(pixels).all() or pixels.min() < 0:

@@ -1,0 +1,71 @@
+"""Ranges of the values of images: computed once for constant arrays, and never of other values."""
+
+from __future__ import annotations
+
+import gc
+
+import numpy as np
+import pytest
+
+from foveasim._io import mapped_files
+from foveasim._io.mapped_files import map_file, range_and_values, value_range
+
+IMAGES = np.random.default_rng(0).normal(size=(3, 700, 500)).astype(np.float32)
+
+
+@pytest.fixture
+def mapped(tmp_path):
+    IMAGES.tofile(tmp_path / "images.raw")
+    return map_file(tmp_path / "images.raw", IMAGES.dtype, IMAGES.shape, 0)
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        np.s_[:],
+        np.s_[:, ::-1],
+        np.s_[1:, 100:200, 7:300],
+        np.s_[:, ::-1, ::-1],
+        np.s_[:1, :, :0:-3],
+    ],
+)
+def test_copies_have_range_and_values(mapped, view):
+    limits, copy = range_and_values(mapped[view])
+
+    assert np.array_equal(copy, IMAGES[view])
+    assert limits == value_range(copy) == value_range(IMAGES[view]) == (IMAGES[view].min(), IMAGES[view].max())
+    assert not copy.flags.writeable
+
+
+def test_nan_is_reported(tmp_path):
+    images = IMAGES.copy()
+    images[1, 3, 4] = np.nan
+    images.tofile(tmp_path / "images.raw")
+
+    limits, _ = range_and_values(map_file(tmp_path / "images.raw", images.dtype, images.shape, 0))
+    assert np.isnan(limits).all()
+    assert np.isnan(value_range(images)).all()
+
+
+def test_range_follows_changes_and_parts():
+    images = IMAGES.copy()
+    for value in (10.0, 20.0):
+        images[0, 0, 0] = value
+        assert value_range(images)[1] == value
+        assert value_range(images[::-1])[1] == value
+    images.flags.writeable = False
+    assert value_range(images)[1] == 20.0
+    assert value_range(images[:, ::-1])[1] == 20.0
+    assert value_range(images[1:])[1] == IMAGES[1:].max()
+
+
+def test_ranges_are_forgotten_with_their_arrays():
+    gc.collect()
+    before = set(mapped_files._ranges)
+    images = IMAGES.copy()
+    images.flags.writeable = False
+    value_range(images)
+    assert set(mapped_files._ranges) - before == {id(images)}
+
+    del images
+    assert set(mapped_files._ranges) <= before
