@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import stat
 import warnings
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -209,8 +210,11 @@ def check_plain_files(path: Path) -> None:
     """
     for directory, directories, files in os.walk(path, followlinks=False):
         for name in (*directories, *files):
-            entry = Path(directory) / name
-            if entry.is_symlink() or not (entry.is_file() or entry.is_dir()):
+            try:
+                mode = (Path(directory) / name).lstat().st_mode
+            except FileNotFoundError:  # a temporary file of a process that writes
+                continue
+            if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
                 raise FileError(path, f"contains {format_value(name)}, which is neither a regular file nor a directory")
 
 

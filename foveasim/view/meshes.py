@@ -359,7 +359,8 @@ def _cells(layout: Layout) -> tuple[Floats, Ints, Ints, Ints]:
     Return polygons of all sites: points (n_point, 2), offsets, corners and sites.
 
     Sites with holes, which VTK polygons cannot have, are split into triangles. VTK draws quadrilaterals with a reflex vertex
-    incorrectly, but not polygons with more vertices: these have the centre of an edge as an additional point.
+    incorrectly: these begin at this vertex, so that a triangle fan is correct, and have the centre of an edge as an additional
+    point.
     """
     counts, has_hole = np.diff(layout.ring_offsets), np.diff(layout.site_offsets) > 1
     first_ring = layout.site_offsets[:-1]
@@ -373,11 +374,15 @@ def _cells(layout: Layout) -> tuple[Floats, Ints, Ints, Ints]:
     site = np.concatenate((simple, caps.site[is_part]))
     starts = layout.ring_offsets[first_ring[simple]]
     vertices = np.repeat(starts, counts[first_ring[simple]]) + positions_in_runs(counts[first_ring[simple]])
-    flat = np.concatenate((vertices, caps.triangles[is_part].ravel()))
-    # Additional points after the last corner of their site.
     quads = np.flatnonzero(is_quad)
     start = layout.ring_offsets[first_ring[quads]]
-    middle_um = 0.5 * (layout.xy_um[start] + layout.xy_um[start + 3])
+    places = start[:, np.newaxis] + np.arange(4)
+    reflex = np.argmin(_turn_sines(layout.xy_um, layout.ring_offsets)[places], axis=1)
+    places = start[:, np.newaxis] + (reflex[:, np.newaxis] + np.arange(4)) % 4
+    vertices[np.searchsorted(vertices, start)[:, np.newaxis] + np.arange(4)] = places
+    flat = np.concatenate((vertices, caps.triangles[is_part].ravel()))
+    # Additional points after the last corner of their site.
+    middle_um = 0.5 * (layout.xy_um[places[:, 0]] + layout.xy_um[places[:, 3]])
     last = np.cumsum(sizes)[np.searchsorted(simple, quads)]
     flat = np.insert(flat, last, layout.xy_um.shape[0] + np.arange(quads.size))
     sizes[np.searchsorted(simple, quads)] += 1

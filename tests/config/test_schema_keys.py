@@ -15,8 +15,9 @@ WRONG = [[], {}, [[]], [1, "x"], {"kind": []}, {"kind": "none such"}, "none such
 
 
 def resolve(schema, definitions):
-    while "$ref" in schema:
-        schema = definitions[schema["$ref"].rpartition("/")[2]]
+    while "$ref" in schema or "allOf" in schema:  # older versions of pydantic write references as "allOf"
+        (part,) = schema.get("allOf", [schema])
+        schema = definitions[part["$ref"].rpartition("/")[2]]
     return schema
 
 

@@ -161,7 +161,9 @@ def test_integer_keys_equal_string_keys():
 
     assert explore.plan_sweep(shot, vary).to_dict() == by_change.to_dict() == expected.to_dict()
     assert study.base.settings == expected.settings
-    assert in_process(explore.plan_sweep(shot, vary)).equals(in_process(expected))
+    # By name, since older versions of xarray find no string arrays of variable width equal.
+    found, wanted = (in_process(plan).to_dict()["data_vars"] for plan in (explore.plan_sweep(shot, vary), expected))
+    np.testing.assert_equal(found, wanted)
     coefficients = explore.plan_sweep(shot, {"optics.zernike.coefficients.4": [0.1, 0.3]}).settings_of(1)["optics"]
     assert coefficients["zernike"]["coefficients"] == {"4": 0.3, "7": 0.2}
 

@@ -159,13 +159,14 @@ def resolve_annotation(annotation: Any, names: Mapping[str, Any]) -> Any:
     Returns
     -------
     type
-        :data:`~typing.Any` when a name is not known, as in annotations that were inherited from other modules.
+        :data:`~typing.Any` when a name is not known, as in annotations that were inherited from other modules, or when an older
+        version of a library does not have the type.
     """
     if not isinstance(annotation, str):
         return annotation
     try:
         return eval(annotation, {}, _Names(names))  # noqa: S307 -- source code of the package
-    except NameError:
+    except (NameError, TypeError):
         return Any
 
 
