@@ -23,7 +23,7 @@ from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Images
 from foveasim.errors import FileError
 
-__all__ = ["check_unchanged", "in_memory", "map_file", "range_and_values", "value_range"]
+__all__ = ["check_unchanged", "in_memory", "map_file", "range_and_values", "remember_range", "value_range"]
 
 _Array = TypeVar("_Array", bound=NDArray[Any])
 
@@ -31,7 +31,7 @@ _Array = TypeVar("_Array", bound=NDArray[Any])
 BLOCK_VALUES = 2**18
 #: Bytes that a thread reads, or whose range it computes, at a time.
 PART_BYTES = 2**24
-#: Ranges of the values of read-only arrays that own their memory, by identity.
+#: Known ranges of the values of constant arrays, by identity.
 _ranges: dict[int, tuple[weakref.ref[NDArray[Any]], tuple[float, float]]] = {}
 
 
@@ -176,22 +176,26 @@ def range_and_values(images: Images) -> tuple[tuple[float, float], Images]:
     """
     Return the lowest and the highest value, and :func:`in_memory`, in one pass over a file.
 
-    A copy is read-only, and :func:`value_range` knows its range.
+    Callers without changes to the copy pass the range to :func:`remember_range`.
     """
     ranges: list[tuple[Any, Any]] = []
     copy = in_memory(images, lambda values: ranges.append((values.min(), values.max())))
-    if not ranges:
-        return value_range(copy), copy
-    owner = _owner(copy)
-    owner.flags.writeable = copy.flags.writeable = False
-    return _remember(owner, _joined(ranges)), copy
+    return _joined(ranges) if ranges else value_range(copy), copy
+
+
+def remember_range(images: Images, limits: tuple[float, float]) -> None:
+    """Let :func:`value_range` know the range of an array that nobody changes any more."""
+    owner = _owner(images)
+    if owner.flags.owndata and _is_complete(images, owner):
+        key = id(owner)
+        _ranges[key] = weakref.ref(owner, lambda _: _ranges.pop(key, None)), limits
 
 
 def value_range(images: Images) -> tuple[float, float]:
     """
     Return the lowest and the highest value; NaN if there is a NaN.
 
-    It is computed once for read-only arrays that own their memory, and their complete views.
+    It is known for the arrays of :func:`remember_range`, in any order of their axes.
 
     Parameters
     ----------
@@ -204,20 +208,17 @@ def value_range(images: Images) -> tuple[float, float]:
         As :func:`in_memory`.
     """
     owner = _owner(images)
-    is_constant = owner.flags.owndata and not owner.flags.writeable and owner.size == images.size
-    known = _ranges.get(id(owner)) if is_constant else None
-    if known is not None and known[0]() is owner:
+    known = _ranges.get(id(owner))
+    if known is not None and known[0]() is owner and _is_complete(images, owner):
         return known[1]
     n_bytes = images.shape[2] * images.itemsize
     parts = [(image, rows) for image in images for rows in _parts(images.shape[1], n_bytes)]
-    found = _joined(parallel_map(_range_of_rows, parts, thread_count()))
-    return _remember(owner, found) if is_constant else found
+    return _joined(parallel_map(_range_of_rows, parts, thread_count()))
 
 
-def _remember(owner: NDArray[Any], limits: tuple[float, float]) -> tuple[float, float]:
-    key = id(owner)
-    _ranges[key] = weakref.ref(owner, lambda _: _ranges.pop(key, None)), limits
-    return limits
+def _is_complete(view: NDArray[Any], owner: NDArray[Any]) -> bool:
+    """Return whether a view contains every value once, in any order of the axes."""
+    return view.size == owner.size and sorted(map(abs, view.strides)) == sorted(owner.strides)
 
 
 def _owner(array: NDArray[Any]) -> NDArray[Any]:

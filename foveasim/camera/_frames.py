@@ -70,9 +70,9 @@ class PathPosition(tuple[float, float]):  # noqa: SLOT001 -- tuples have no slot
 
 def path_digests(gaze_um: Floats) -> list[bytes]:
     """
-    Return a digest of a path, (n, 2) µm, from each point to its end, and that of none.
+    Return n + 1 digests of a path, (n, 2) µm: from each point to its end, and of no point.
 
-    It identifies the rest of a path, also when its beginning is skipped.
+    They identify the rest of a path, also when its beginning is skipped.
     """
     digests = [bytes(DIGEST_BYTES)]
     for x_um, y_um in gaze_um[::-1].tolist():

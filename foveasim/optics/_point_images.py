@@ -239,10 +239,9 @@ class PointImages:
         Notes
         -----
         Each frequency is a quadrature as for :meth:`psf`, over the overlap of two displaced copies of the pupil (Hopkins, Proc.
-        R. Soc. A 231 (1955) 91), with an error below 1e-6; it takes 1 to 6 ms, 25 ms for the
-        largest aberrations, or 30 ms for a picture of 64 x 64 pixels. Pictures of more than 128 x 128 pixels (with those of a
-        wavefront, together), computations of more than 2^27 nodes, and callables with discontinuities at unspecified edges are
-        sampled, with an error up to 1e-3.
+        R. Soc. A 231 (1955) 91), with an error below 1e-6; it takes 1 to 6 ms, 25 ms for the largest aberrations, or 30 ms for
+        a picture of 64 x 64 pixels. Pictures of more than 128 x 128 pixels (with those of a wavefront, together), computations
+        of more than 2^27 nodes, and callables with discontinuities at unspecified edges are sampled, with an error up to 1e-3.
         """
         point = self._point(wavelength_nm, distance_m, field_um)
         s = finite_array("frequency_per_mm", frequency_per_mm) * 1e-3 * point.lambda_n_um

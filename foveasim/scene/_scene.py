@@ -618,12 +618,12 @@ def _picture_array(picture: ArrayLike) -> NDArray[Any]:
 
 def _relative_radiance(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Images:
     """Return the relative radiance (n_channel, n_y, n_x) float32, multiplied by alpha."""
-    from foveasim.scene import _kernels
-
     pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
     if pixels.dtype == np.bool_:
         pixels = pixels.astype(np.uint8) * np.uint8(255)
     if pixels.dtype in (np.uint8, np.uint16):
+        from foveasim.scene import _kernels
+
         peak = float(np.iinfo(pixels.dtype).max)
         table = decode(np.arange(peak + 1) / peak, encoding).astype(np.float32)
         values = np.arange(peak + 1, dtype=np.float32) / np.float32(peak)

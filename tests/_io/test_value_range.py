@@ -1,4 +1,4 @@
-"""Ranges of the values of images: computed once for constant arrays, and never of other values."""
+"""Ranges of the values of images: known for constant copies of files, and never of other values."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import gc
 import numpy as np
 import pytest
 
+from foveasim._core.validation import freeze
 from foveasim._io import mapped_files
-from foveasim._io.mapped_files import map_file, range_and_values, value_range
+from foveasim._io.mapped_files import map_file, range_and_values, remember_range, value_range
 
 IMAGES = np.random.default_rng(0).normal(size=(3, 700, 500)).astype(np.float32)
 
@@ -34,7 +35,6 @@ def test_copies_have_range_and_values(mapped, view):
 
     assert np.array_equal(copy, IMAGES[view])
     assert limits == value_range(copy) == value_range(IMAGES[view]) == (IMAGES[view].min(), IMAGES[view].max())
-    assert not copy.flags.writeable
 
 
 def test_nan_is_reported(tmp_path):
@@ -53,18 +53,31 @@ def test_range_follows_changes_and_parts():
         images[0, 0, 0] = value
         assert value_range(images)[1] == value
         assert value_range(images[::-1])[1] == value
-    images.flags.writeable = False
-    assert value_range(images)[1] == 20.0
-    assert value_range(images[:, ::-1])[1] == 20.0
+    for value in (30.0, np.nan):  # also those of an array that was read-only in between
+        images.flags.writeable = False
+        value_range(images)
+        images.flags.writeable = True
+        images[0, 0, 0] = value
+        images.flags.writeable = False
+        np.testing.assert_equal(value_range(images)[1], value)
     assert value_range(images[1:])[1] == IMAGES[1:].max()
+
+
+def test_known_range_is_that_of_complete_views():
+    images = freeze(IMAGES.copy())
+    remember_range(images, (-100.0, 100.0))  # not computed again
+
+    for view in (images, images[:, ::-1], images[:, ::-1, ::-1], images.transpose(0, 2, 1)):
+        assert value_range(view) == (-100.0, 100.0)
+    for view in (images[1:], np.broadcast_to(images[:, :, :1], images.shape)):
+        assert value_range(view) == (view.min(), view.max())
 
 
 def test_ranges_are_forgotten_with_their_arrays():
     gc.collect()
     before = set(mapped_files._ranges)
-    images = IMAGES.copy()
-    images.flags.writeable = False
-    value_range(images)
+    images = freeze(IMAGES.copy())
+    remember_range(images, (0.0, 1.0))
     assert set(mapped_files._ranges) - before == {id(images)}
 
     del images

@@ -24,7 +24,7 @@ from foveasim._core.validation import (
     wavelengths_nm,
 )
 from foveasim._io.formats import FormatError
-from foveasim._io.mapped_files import in_memory, range_and_values, value_range
+from foveasim._io.mapped_files import in_memory, range_and_values, remember_range, value_range
 from foveasim._io.rasters import MAX_BANDS
 from foveasim.errors import ParameterError
 from foveasim.scene.cubes._cube import Cube
@@ -131,7 +131,7 @@ def select(cube: Cube, selection: Selection) -> Cube:
     if cube.is_x_descending:
         images = images[:, :, ::-1]
     if limits is not None and not offset.any() and _is_valid(*limits, cube.missing):
-        images = freeze(images)
+        remember_range(freeze(images), limits)
     else:
         images = _checked(images, cube.missing, offset / scale, selection.invalid, index, (rows.start, columns.start))
     widths = cube.band_width_nm
@@ -254,7 +254,7 @@ def _load(data: Any, index: Ints, y: slice, x: slice) -> tuple[Images, tuple[flo
     """
     Return selected bands, and the range of their values where it is known.
 
-    They are floating-point data without a copy or from a mapped file, otherwise a converted copy.
+    Floating-point data are not copied, except from a mapped file up to :data:`MAX_COPIED_BYTES`; others are converted.
     """
     is_small = data.dtype.itemsize <= (4 if data.dtype.kind == "f" else 2)
     real: Any = np.float32 if is_small else np.float64

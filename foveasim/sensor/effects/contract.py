@@ -301,7 +301,7 @@ class Effect(ABC):
 
     @property
     def mixes_means(self) -> bool:
-        """Whether means depend on other sites, as for crosstalk: not local or temporal."""
+        """Whether means depend on other sites, as for crosstalk: neither local nor temporal."""
         return not (self.is_local or self.is_temporal)
 
     @abstractmethod
