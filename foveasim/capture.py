@@ -15,6 +15,7 @@ from foveasim._core.extras import import_optional
 from foveasim._core.names import possible_names
 from foveasim._core.provenance import copy_plain_data, to_plain_data
 from foveasim._core.rings import same_rings
+from foveasim._core.show import drawn
 from foveasim._core.validation import Floats, Ints, check_choice, check_count, own, read_only, unit_of, unmasked
 from foveasim._io.atomic import atomic_directory
 from foveasim._io.npz import open_archive, write_archive
@@ -380,28 +381,10 @@ class Capture:
             return estimate_from_code(self.code, electronics, exposure_s)
         return estimate_from_charge(getattr(self, of), electronics, exposure_s)
 
-    def to_pyvista(self) -> PolyData:
-        """Return the sites as PyVista PolyData with their values: :func:`foveasim.view.polydata`."""
-        from foveasim.view import polydata
-
-        return polydata(self)
-
-    def plot(self, by: str | ArrayLike = "code", **options: Any) -> Axes:
-        """Draw the photosites coloured by value: :func:`foveasim.view.plot_capture`."""
-        from foveasim.view import plot_capture
-
-        return plot_capture(self, by, **options)
-
-    def plot3d(self, height: str | ArrayLike | None = None, **options: Any) -> None:
-        """Show the photosites as columns in a window: :func:`foveasim.view.show_columns`."""
-        from foveasim.view import show_columns
-
-        show_columns(self, height, **options)
-
-    def _repr_html_(self) -> str:
-        from foveasim.view import to_html
-
-        return to_html(self)
+    to_pyvista = drawn["PolyData"]("polydata")
+    plot = drawn["Axes"]("plot_capture")
+    plot3d = drawn[None]("show_columns")
+    _repr_html_ = drawn[str]("to_html")
 
     def to_xarray(self) -> xr.Dataset:
         """

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.show import drawn
 from foveasim._core.validation import (
     Floats,
     Images,
@@ -283,16 +284,8 @@ class PowerMap:
         bands = f"1 band at {low_nm:g} nm" if n_bands == 1 else f"{n_bands} bands from {low_nm:g} to {high_nm:g} nm"
         return f"PowerMap({n_x} x {n_y} cells of {self.grid.pitch_x_um:.4g} x {self.grid.pitch_y_um:.4g} µm, {bands})"
 
-    def plot(self, band: int | None = None, **options: Any) -> Axes:
-        """Draw the irradiance on matplotlib axes; see :func:`foveasim.view.plot_power_map`."""
-        from foveasim.view import plot_power_map
-
-        return plot_power_map(self, band, **options)
-
-    def _repr_html_(self) -> str:
-        from foveasim.view import to_html
-
-        return to_html(self)
+    plot = drawn["Axes"]("plot_power_map")
+    _repr_html_ = drawn[str]("to_html")
 
     @classmethod
     def from_array(

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from foveasim._core.calls import OwnCheck
 from foveasim._core.provenance import to_plain_data, versions
 from foveasim._core.random_streams import Streams
+from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property, in_order, thread_count
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, check_count, finite_array, read_only
@@ -152,10 +153,7 @@ class Camera:
     def __repr__(self) -> str:
         return f"Camera({self._optics!r}, {self._sensor!r})"
 
-    def _repr_html_(self) -> str:
-        from foveasim.view import to_html
-
-        return to_html(self)
+    _repr_html_ = drawn[str]("to_html")
 
     @property
     def optics(self) -> Optics:

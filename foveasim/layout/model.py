@@ -17,6 +17,7 @@ from foveasim._core.names import possible_names
 from foveasim._core.provenance import copy_plain_data
 from foveasim._core.rings import (
     are_convex,
+from foveasim._core.show import drawn
     next_vertex,
     positions_in_runs,
     ring_moments,
@@ -599,28 +600,10 @@ class Layout:
 
         return describe(self, readout)
 
-    def to_pyvista(self) -> PolyData:
-        """Convert to PyVista PolyData with all columns; see :func:`foveasim.view.polydata`."""
-        from foveasim.view import polydata
-
-        return polydata(self)
-
-    def plot(self, by: str | ArrayLike | None = None, **options: Any) -> Axes:
-        """Draw on matplotlib axes, coloured by values; see :func:`foveasim.view.plot_layout`."""
-        from foveasim.view import plot_layout
-
-        return plot_layout(self, by, **options)
-
-    def plot3d(self, height: str | ArrayLike | None = None, **options: Any) -> None:
-        """Show the photosites as columns in a window; see :func:`foveasim.view.show_columns`."""
-        from foveasim.view import show_columns
-
-        show_columns(self, height, **options)
-
-    def _repr_html_(self) -> str:
-        from foveasim.view import to_html
-
-        return to_html(self)
+    to_pyvista = drawn["PolyData"]("polydata")
+    plot = drawn["Axes"]("plot_layout")
+    plot3d = drawn[None]("show_columns")
+    _repr_html_ = drawn[str]("to_html")
 
     # -- neighbours ----------------------------------------------------------------------------------------------
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
+from foveasim._core.show import drawn
 from foveasim._core.validation import Floats, Ints
 from foveasim.errors import ParameterError
 from foveasim.layout.drc.routing import Readout
@@ -108,10 +109,7 @@ class Summary:
     def __str__(self) -> str:
         return "\n".join(f"{name}: {value}" for name, value in self.rows())
 
-    def _repr_html_(self) -> str:
-        from foveasim.view import to_html
-
-        return to_html(self)
+    _repr_html_ = drawn[str]("to_html")
 
     def __rich__(self) -> RenderableType:
         from rich.console import Group

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.calls import OwnCheck
 from foveasim._core.short_repr import short_repr
+from foveasim._core.show import drawn
 from foveasim._core.threads import thread_count
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import (
@@ -185,10 +186,7 @@ class Optics(PointImages):
 
     __repr__ = short_repr
 
-    def _repr_html_(self) -> str:
-        from foveasim.view import to_html
-
-        return to_html(self)
+    _repr_html_ = drawn[str]("to_html")
 
     def __post_init__(self) -> None:
         numbers = {

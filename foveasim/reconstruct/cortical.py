@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.short_repr import short_repr
+from foveasim._core.show import drawn
 from foveasim._core.validation import (
     Floats,
     Images,
@@ -99,16 +100,8 @@ class CorticalImage:
         for name, values in (("data", data), ("radius_um", radius_um), ("start_rad", start_rad)):
             object.__setattr__(self, name, own(values))
 
-    def plot(self, channel: int | None = None, **options: Any) -> Axes:
-        """Draw on matplotlib axes; see :func:`foveasim.view.plot_cortical`."""
-        from foveasim.view import plot_cortical
-
-        return plot_cortical(self, channel, **options)
-
-    def _repr_html_(self) -> str:
-        from foveasim.view import to_html
-
-        return to_html(self)
+    plot = drawn["Axes"]("plot_cortical")
+    _repr_html_ = drawn[str]("to_html")
 
     @property
     def ring_centre_um(self) -> Floats:

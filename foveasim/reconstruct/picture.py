@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.show import drawn
 from foveasim._core.validation import Floats, Images, check_count, finite_array, own, unmasked
 from foveasim._io.encodings import decode, encode_srgb_values
 from foveasim._io.images import picture_format, write_picture
@@ -85,21 +86,9 @@ class Picture:
         pixels = f"{n_x} x {n_y} pixels of {self.grid.pitch_x_um:.4g} x {self.grid.pitch_y_um:.4g} µm"
         return f"Picture({pixels}, {n_channels} channel{'s' * (n_channels != 1)}, {extent})"
 
-    def plot(self, **options: Any) -> Axes:
-        """Draw on matplotlib axes; see :func:`foveasim.view.plot_picture`."""
-        from foveasim.view import plot_picture
-
-        return plot_picture(self, **options)
-
-    def _repr_html_(self) -> str:
-        from foveasim.view import to_html
-
-        return to_html(self)
-
-    def _repr_png_(self) -> bytes | None:
-        from foveasim.view import to_png
-
-        return to_png(self)
+    plot = drawn["Axes"]("plot_picture")
+    _repr_html_ = drawn[str]("to_html")
+    _repr_png_ = drawn[bytes | None]("to_png")
 
     def to_image(
         self,

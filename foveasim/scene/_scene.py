@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import OwnCheck
+from foveasim._core.show import drawn
 from foveasim._core.validation import (
     MAX_WAVELENGTH_NM,
     Floats,
@@ -235,16 +236,8 @@ class Scene:
             f"{self.wavelength_nm.size} wavelengths, from {printable(self.source)[:MAX_SOURCE]})"
         )
 
-    def plot(self, **options: Any) -> Axes:
-        """Draw approximate colours on matplotlib axes; see :func:`foveasim.view.plot_scene`."""
-        from foveasim.view import plot_scene
-
-        return plot_scene(self, **options)
-
-    def _repr_html_(self) -> str:
-        from foveasim.view import to_html
-
-        return to_html(self)
+    plot = drawn["Axes"]("plot_scene")
+    _repr_html_ = drawn[str]("to_html")
 
     @classmethod
     def from_picture(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from foveasim._core.show import drawn
 from foveasim._core.validation import Floats, as_numbers
 from foveasim.errors import ParameterError
 from foveasim.sensor.effects import STANDARD
@@ -81,16 +82,8 @@ class NoiseBudget(dict[str, Floats]):
             for name, is_temporal, values in (*parts, *sums)
         ]
 
-    def plot(self, **options: Any) -> Axes:
-        """Draw as bars on matplotlib axes; see :func:`foveasim.view.plot_noise_budget`."""
-        from foveasim.view import plot_noise_budget
-
-        return plot_noise_budget(self, **options)
-
-    def _repr_html_(self) -> str:
-        from foveasim.view import to_html
-
-        return to_html(self)
+    plot = drawn["Axes"]("plot_noise_budget")
+    _repr_html_ = drawn[str]("to_html")
 
 
 def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> NoiseBudget:

@@ -13,6 +13,7 @@ from foveasim._core.calls import OwnCheck
 from foveasim._core.names import possible_names
 from foveasim._core.provenance import is_digest
 from foveasim._core.random_streams import Streams
+from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, Ints, check_count, check_number, read_only, unmasked
 from foveasim.errors import ParameterError, SimulationError, type_name
@@ -310,10 +311,7 @@ class Sensor:
     def __repr__(self) -> str:
         return f"Sensor({self.layout!r}, filters {', '.join(self.filter_names)}, {self.bits} bits)"
 
-    def _repr_html_(self) -> str:
-        from foveasim.view import to_html
-
-        return to_html(self)
+    _repr_html_ = drawn[str]("to_html")
 
     def _per_site(self, name: str, value: PerSite) -> PerSite:
         if np.ndim(value) == 0:

@@ -18,6 +18,7 @@ import numpy as np
 from foveasim._core.calls import OwnCheck
 from foveasim._core.names import possible_names
 from foveasim._core.short_repr import short_repr
+from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, check_choice, check_count, check_number, finite_array
 from foveasim.errors import GeometryError, ParameterError, type_name, with_article
@@ -391,16 +392,8 @@ class Report:
             for violation in self.violations
         ]
 
-    def plot(self, layout: Layout | None = None, **options: Any) -> Axes:
-        """Plot the violations on the checked layout; see :func:`foveasim.view.plot_report`."""
-        from foveasim.view import plot_report
-
-        return plot_report(self, layout, **options)
-
-    def _repr_html_(self) -> str:
-        from foveasim.view import to_html
-
-        return to_html(self)
+    plot = drawn["Axes"]("plot_report")
+    _repr_html_ = drawn[str]("to_html")
 
     def write(self, path: str | Path) -> None:
         """

@@ -1,0 +1,95 @@
+"""Methods that draw their object: functions of :mod:`foveasim.view`, which is imported on use."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable
+from importlib import import_module
+from types import MethodType
+from typing import Any, Generic, Self, TypeVar, overload
+
+__all__ = ["drawn"]
+
+R = TypeVar("R")
+#: First parameter of a numpydoc section, with its description.
+FIRST_PARAMETER = re.compile(r"(\n *Parameters\n *-+\n)( *)\S.*\n(?:\2 +.*\n|\n(?=\2 ))*")
+NO_PARAMETERS = re.compile(r"\n *Parameters\n *-+\n(?=\s*(\n *\w+\n *-+\n|$))")
+
+
+class _OfFunction:
+    """Attribute of a method that is derived from its function."""
+
+    def __init__(self, of_function: Callable[[Callable[..., Any]], Any], of_class: Any = None) -> None:
+        self.of_function, self.of_class = of_function, of_class
+
+    def __get__(self, method: drawn[Any] | None, owner: type | None = None) -> Any:
+        return self.of_class if method is None else self.of_function(method.function)
+
+
+def _signature(function: Callable[..., Any]) -> inspect.Signature:
+    """Return the signature of a method: the first parameter is the object."""
+    signature = inspect.signature(function)
+    first, *others = signature.parameters.values()
+    return signature.replace(
+        parameters=[inspect.Parameter("self", first.POSITIONAL_OR_KEYWORD), *others],
+    )
+
+
+def _docstring(function: Callable[..., Any]) -> str:
+    """Return the docstring of a method: without the first parameter."""
+    text = FIRST_PARAMETER.sub(r"\1", inspect.getdoc(function) or "", count=1)
+    return NO_PARAMETERS.sub("", text)
+
+
+class drawn(Generic[R]):  # noqa: N801 -- in class bodies it reads as a decorator
+    __doc__ = _OfFunction(
+        _docstring,
+        """
+    Method that is a function of :mod:`foveasim.view` with the object as first argument.
+
+    Lower modules thereby draw their objects without importing the package, which is loaded on use. Signature and docstring are
+    those of the function, without its first parameter.
+
+    Parameters
+    ----------
+    name : str
+        Name of the function.
+
+    Examples
+    --------
+    >>> class Spot:
+    ...     plot = drawn[object]("plot_layout")
+    >>> import inspect
+    >>> list(inspect.signature(Spot().plot).parameters)[:2]
+    ['by', 'label']
+    """,
+    )
+    __signature__ = _OfFunction(_signature, inspect.Signature([inspect.Parameter("name", inspect.Parameter.POSITIONAL_OR_KEYWORD)]))
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self.__name__ = self.__qualname__ = name
+        self.__module__ = __name__
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.__name__, self.__qualname__, self.__module__ = name, f"{owner.__qualname__}.{name}", owner.__module__
+
+    @property
+    def function(self) -> Callable[..., R]:
+        """The function that draws."""
+        found: Callable[..., R] = getattr(import_module("foveasim.view"), self._name)
+        return found
+
+    @overload
+    def __get__(self, item: None, owner: type) -> Self: ...
+    @overload
+    def __get__(self, item: object, owner: type) -> Callable[..., R]: ...
+    def __get__(self, item: object, owner: type) -> Self | Callable[..., R]:
+        return self if item is None else MethodType(self, item)
+
+    def __call__(self, item: object, *args: Any, **kwargs: Any) -> R:
+        return self.function(item, *args, **kwargs)
+
+    def __repr__(self) -> str:
+        return f"<method {self.__qualname__}: foveasim.view.{self._name}>"
