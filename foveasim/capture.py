@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from foveasim._core.extras import import_optional
 from foveasim._core.names import possible_names
@@ -45,8 +45,6 @@ from foveasim.sensor import Sensor, signal_to_noise
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
-    from matplotlib.axes import Axes
-    from pyvista import PolyData  # noqa: TID251 -- a type alone
 
 __all__ = ["Capture"]
 
@@ -381,10 +379,10 @@ class Capture:
             return estimate_from_code(self.code, electronics, exposure_s)
         return estimate_from_charge(getattr(self, of), electronics, exposure_s)
 
-    to_pyvista = drawn["PolyData"]("polydata")
-    plot = drawn["Axes"]("plot_capture")
-    plot3d = drawn[None]("show_columns")
-    _repr_html_ = drawn[str]("to_html")
+    to_pyvista = drawn("polydata")
+    plot = drawn("plot_capture")
+    plot3d = drawn("show_columns")
+    _repr_html_ = drawn("to_html")
 
     def to_xarray(self) -> xr.Dataset:
         """

@@ -31,7 +31,7 @@ from foveasim._core.validation import (
 from foveasim.errors import ParameterError, type_name
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    pass
 
 __all__ = [
     "Grid",
@@ -284,8 +284,8 @@ class PowerMap:
         bands = f"1 band at {low_nm:g} nm" if n_bands == 1 else f"{n_bands} bands from {low_nm:g} to {high_nm:g} nm"
         return f"PowerMap({n_x} x {n_y} cells of {self.grid.pitch_x_um:.4g} x {self.grid.pitch_y_um:.4g} µm, {bands})"
 
-    plot = drawn["Axes"]("plot_power_map")
-    _repr_html_ = drawn[str]("to_html")
+    plot = drawn("plot_power_map")
+    _repr_html_ = drawn("to_html")
 
     @classmethod
     def from_array(

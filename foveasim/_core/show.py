@@ -7,9 +7,13 @@ import re
 from collections.abc import Callable
 from importlib import import_module
 from types import MethodType
-from typing import Any, Generic, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar, overload
 
-__all__ = ["drawn"]
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from pyvista import PolyData  # noqa: TID251 -- a type alone
+
+__all__ = ["Drawn", "drawn"]
 
 R = TypeVar("R")
 #: First parameter of a numpydoc section, with its description.
@@ -23,7 +27,7 @@ class _OfFunction:
     def __init__(self, of_function: Callable[[Callable[..., Any]], Any], of_class: Any = None) -> None:
         self.of_function, self.of_class = of_function, of_class
 
-    def __get__(self, method: drawn[Any] | None, owner: type | None = None) -> Any:
+    def __get__(self, method: Drawn[Any] | None, owner: type | None = None) -> Any:
         return self.of_class if method is None else self.of_function(method.function)
 
 
@@ -42,30 +46,14 @@ def _docstring(function: Callable[..., Any]) -> str:
     return NO_PARAMETERS.sub("", text)
 
 
-class drawn(Generic[R]):  # noqa: N801 -- in class bodies it reads as a decorator
+class Drawn(Generic[R]):
     __doc__ = _OfFunction(
         _docstring,
-        """
-    Method that is a function of :mod:`foveasim.view` with the object as first argument.
-
-    Lower modules thereby draw their objects without importing the package, which is loaded on use. Signature and docstring are
-    those of the function, without its first parameter.
-
-    Parameters
-    ----------
-    name : str
-        Name of the function.
-
-    Examples
-    --------
-    >>> class Spot:
-    ...     plot = drawn[object]("plot_layout")
-    >>> import inspect
-    >>> list(inspect.signature(Spot().plot).parameters)[:2]
-    ['by', 'label']
-    """,
+        "Method that is a function of :mod:`foveasim.view`; created by :func:`drawn`.",
     )
-    __signature__ = _OfFunction(_signature, inspect.Signature([inspect.Parameter("name", inspect.Parameter.POSITIONAL_OR_KEYWORD)]))
+    __signature__ = _OfFunction(
+        _signature, inspect.Signature([inspect.Parameter("name", inspect.Parameter.POSITIONAL_OR_KEYWORD)])
+    )
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -93,3 +81,47 @@ class drawn(Generic[R]):  # noqa: N801 -- in class bodies it reads as a decorato
 
     def __repr__(self) -> str:
         return f"<method {self.__qualname__}: foveasim.view.{self._name}>"
+
+
+@overload
+def drawn(name: Literal["to_html"]) -> Drawn[str]: ...
+@overload
+def drawn(name: Literal["to_png"]) -> Drawn[bytes | None]: ...
+@overload
+def drawn(name: Literal["polydata"]) -> Drawn[PolyData]: ...
+@overload
+def drawn(name: Literal["show_columns"]) -> Drawn[None]: ...
+@overload
+def drawn(
+    name: Literal[
+        "plot_capture",
+        "plot_cortical",
+        "plot_layout",
+        "plot_noise_budget",
+        "plot_picture",
+        "plot_power_map",
+        "plot_report",
+        "plot_scene",
+    ],
+) -> Drawn[Axes]: ...
+def drawn(name: str) -> Drawn[Any]:
+    """
+    Return a method that is a function of :mod:`foveasim.view` with the object as first argument.
+
+    Lower modules thereby draw their objects without importing the package, which is loaded on use. Signature and docstring are
+    those of the function, without its first parameter.
+
+    Parameters
+    ----------
+    name : str
+        Name of the function.
+
+    Examples
+    --------
+    >>> class Spot:
+    ...     plot = drawn("plot_layout")
+    >>> import inspect
+    >>> list(inspect.signature(Spot().plot).parameters)[:2]
+    ['by', 'label']
+    """
+    return Drawn(name)

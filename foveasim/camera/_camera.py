@@ -153,7 +153,7 @@ class Camera:
     def __repr__(self) -> str:
         return f"Camera({self._optics!r}, {self._sensor!r})"
 
-    _repr_html_ = drawn[str]("to_html")
+    _repr_html_ = drawn("to_html")
 
     @property
     def optics(self) -> Optics:

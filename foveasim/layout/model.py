@@ -17,7 +17,6 @@ from foveasim._core.names import possible_names
 from foveasim._core.provenance import copy_plain_data
 from foveasim._core.rings import (
     are_convex,
-from foveasim._core.show import drawn
     next_vertex,
     positions_in_runs,
     ring_moments,
@@ -25,6 +24,7 @@ from foveasim._core.show import drawn
     site_bounds_um,
     site_moments,
 )
+from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import (
     MAX_LENGTH_UM,
@@ -45,8 +45,6 @@ from foveasim.errors import GeometryError, ParameterError, printable, type_name
 from foveasim.layout.lattice import RectangleLattice
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from pyvista import PolyData  # noqa: TID251 -- for annotations only
     from scipy.sparse import csr_array
 
     from foveasim.layout.drc.repair import Change
@@ -600,10 +598,10 @@ class Layout:
 
         return describe(self, readout)
 
-    to_pyvista = drawn["PolyData"]("polydata")
-    plot = drawn["Axes"]("plot_layout")
-    plot3d = drawn[None]("show_columns")
-    _repr_html_ = drawn[str]("to_html")
+    to_pyvista = drawn("polydata")
+    plot = drawn("plot_layout")
+    plot3d = drawn("show_columns")
+    _repr_html_ = drawn("to_html")
 
     # -- neighbours ----------------------------------------------------------------------------------------------
 

@@ -109,7 +109,7 @@ class Summary:
     def __str__(self) -> str:
         return "\n".join(f"{name}: {value}" for name, value in self.rows())
 
-    _repr_html_ = drawn[str]("to_html")
+    _repr_html_ = drawn("to_html")
 
     def __rich__(self) -> RenderableType:
         from rich.console import Group

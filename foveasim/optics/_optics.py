@@ -186,7 +186,7 @@ class Optics(PointImages):
 
     __repr__ = short_repr
 
-    _repr_html_ = drawn[str]("to_html")
+    _repr_html_ = drawn("to_html")
 
     def __post_init__(self) -> None:
         numbers = {

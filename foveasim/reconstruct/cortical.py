@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,7 +38,7 @@ from foveasim.layout import Layout
 from foveasim.reconstruct.picture import Picture
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    pass
 
 __all__ = ["CorticalImage", "cortical", "from_cortical", "to_cortical"]
 
@@ -100,8 +100,8 @@ class CorticalImage:
         for name, values in (("data", data), ("radius_um", radius_um), ("start_rad", start_rad)):
             object.__setattr__(self, name, own(values))
 
-    plot = drawn["Axes"]("plot_cortical")
-    _repr_html_ = drawn[str]("to_html")
+    plot = drawn("plot_cortical")
+    _repr_html_ = drawn("to_html")
 
     @property
     def ring_centre_um(self) -> Floats:

@@ -20,7 +20,7 @@ from foveasim.fields import Grid, Lattice, PackedRings, to_file_rows
 from foveasim.integrate import Integrator
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    pass
 
 __all__ = ["Picture", "coverage_fraction", "raster_grid"]
 
@@ -86,9 +86,9 @@ class Picture:
         pixels = f"{n_x} x {n_y} pixels of {self.grid.pitch_x_um:.4g} x {self.grid.pitch_y_um:.4g} µm"
         return f"Picture({pixels}, {n_channels} channel{'s' * (n_channels != 1)}, {extent})"
 
-    plot = drawn["Axes"]("plot_picture")
-    _repr_html_ = drawn[str]("to_html")
-    _repr_png_ = drawn[bytes | None]("to_png")
+    plot = drawn("plot_picture")
+    _repr_html_ = drawn("to_html")
+    _repr_png_ = drawn("to_png")
 
     def to_image(
         self,

@@ -41,7 +41,7 @@ from foveasim.scene.registry import SCENES
 from foveasim.units import m_from_um, um_from_m
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    pass
 
 __all__ = ["FRAMINGS", "Fit", "Scene"]
 
@@ -236,8 +236,8 @@ class Scene:
             f"{self.wavelength_nm.size} wavelengths, from {printable(self.source)[:MAX_SOURCE]})"
         )
 
-    plot = drawn["Axes"]("plot_scene")
-    _repr_html_ = drawn[str]("to_html")
+    plot = drawn("plot_scene")
+    _repr_html_ = drawn("to_html")
 
     @classmethod
     def from_picture(

@@ -18,7 +18,7 @@ from foveasim.sensor.sensor import Sensor
 from foveasim.sensor.signal_to_noise import local_step_e
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    pass
 
 __all__ = ["FIXED", "TEMPORAL", "NoiseBudget", "noise_budget"]
 
@@ -82,8 +82,8 @@ class NoiseBudget(dict[str, Floats]):
             for name, is_temporal, values in (*parts, *sums)
         ]
 
-    plot = drawn["Axes"]("plot_noise_budget")
-    _repr_html_ = drawn[str]("to_html")
+    plot = drawn("plot_noise_budget")
+    _repr_html_ = drawn("to_html")
 
 
 def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> NoiseBudget:

@@ -311,7 +311,7 @@ class Sensor:
     def __repr__(self) -> str:
         return f"Sensor({self.layout!r}, filters {', '.join(self.filter_names)}, {self.bits} bits)"
 
-    _repr_html_ = drawn[str]("to_html")
+    _repr_html_ = drawn("to_html")
 
     def _per_site(self, name: str, value: PerSite) -> PerSite:
         if np.ndim(value) == 0:

@@ -13,7 +13,7 @@ import pytest
 
 import foveasim as fs
 from foveasim import view
-from foveasim._core.show import drawn
+from foveasim._core.show import Drawn
 from foveasim.layout import Report, Summary
 from foveasim.reconstruct import CorticalImage, Picture
 from foveasim.sensor import NoiseBudget
@@ -22,7 +22,7 @@ CLASSES = (
     *(fs.Camera, fs.Capture, fs.Layout, fs.Optics, fs.PowerMap, fs.Scene, fs.Sensor),
     *(CorticalImage, NoiseBudget, Picture, Report, Summary),
 )
-METHODS = [(kind, name) for kind in CLASSES for name, member in vars(kind).items() if isinstance(member, drawn)]
+METHODS = [(kind, name) for kind in CLASSES for name, member in vars(kind).items() if isinstance(member, Drawn)]
 LAYOUT = fs.layout.grid(n_x=3, n_y=2, pitch_um=5.0)
 
 
@@ -54,7 +54,7 @@ def test_help_shows_method():
     assert "Draw photosites" in text
     assert "plot(self, by:" in pydoc.plain(pydoc.render_doc(fs.Layout))
     assert inspect.isroutine(fs.Layout.plot)
-    assert list(inspect.signature(LAYOUT.plot).parameters)[0] == "by"
+    assert next(iter(inspect.signature(LAYOUT.plot).parameters)) == "by"
 
 
 def test_bound_methods_draw_and_can_be_pickled():

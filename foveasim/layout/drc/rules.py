@@ -28,7 +28,6 @@ from foveasim.layout.drc.routing import Readout, Routing
 from foveasim.layout.model import Layout
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from rich.table import Table
 
 __all__ = ["RULES", "DesignRules", "Report", "RuleResult", "Violation", "check", "min_width_um"]
@@ -392,8 +391,8 @@ class Report:
             for violation in self.violations
         ]
 
-    plot = drawn["Axes"]("plot_report")
-    _repr_html_ = drawn[str]("to_html")
+    plot = drawn("plot_report")
+    _repr_html_ = drawn("to_html")
 
     def write(self, path: str | Path) -> None:
         """
