@@ -37,10 +37,11 @@ from foveasim._io.mapped_files import in_memory
 from foveasim._io.resumable import LOCK, disk_errors, finish, partial_path, resumable_directory
 from foveasim._io.zarr_stores import ZARR, check_codecs
 from foveasim.camera import Camera
-from foveasim.camera._camera import WeightedMap
 from foveasim.camera._clock import Clock
 from foveasim.camera._coverage import Covered, warn_of_coverage
 from foveasim.camera._lens_scale import warn_of_focal_length
+from foveasim.camera._sampling import warn_of_coarse_cells
+from foveasim.camera._steps import WeightedMap, capture_settings, expose, integrate_maps, to_sensor_frame, white_dn
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError, type_name
 from foveasim.fields import Grid, PowerMap
@@ -50,6 +51,7 @@ from foveasim.layout.packed import layout_from_arrays, layout_to_arrays
 from foveasim.optics._imaging import MapRows, rows_of
 from foveasim.reconstruct import Picture, raster_grid
 from foveasim.scene import Scene
+from foveasim.sensor import Sensor
 from foveasim.sensor.blocks import BLOCK_SITES
 from foveasim.sensor.limits import check_plausible
 
@@ -108,7 +110,7 @@ def capture_tiles(
     Yields
     ------
     Capture
-        Of the layout ``camera.sensor.layout[first:last]``. Its settings are those of the camera; ``tile`` contains
+        Of the layout ``camera.layout[first:last]``. Its settings are those of the camera; ``tile`` contains
         ``first_site`` and the number of sites of the complete layout. Fixed patterns, effects, codes and charges are those of
         ``camera.capture``, except for rounding of the irradiance.
 
@@ -131,7 +133,7 @@ def capture_tiles(
     streams = Streams(seed, frame)
     exposure_s = check_plausible("exposure_s", exposure_s)
     tile_sites = _whole_blocks(tile_sites)
-    n_tiles = -(-camera.sensor.layout.n_sites // tile_sites)
+    n_tiles = -(-camera.layout.n_sites // tile_sites)
     first_tile = check_count("first_tile", first_tile, at_least=0, at_most=n_tiles)
     camera.sensor.part(slice(0, 0))  # raises an error for sensors with crosstalk
     return _tiles(camera, light, exposure_s, streams, tile_sites, range(first_tile, n_tiles))
@@ -145,7 +147,7 @@ def _whole_blocks(tile_sites: int) -> int:
 def _tiles(
     camera: Camera, source: Scene | PowerMap, exposure_s: float, streams: Streams, tile_sites: int, tiles: range
 ) -> Iterator[Capture]:
-    layout, light = camera.sensor.layout, source if isinstance(source, PowerMap) else camera.frame(source)
+    layout, light = camera.layout, source if isinstance(source, PowerMap) else camera.frame(source)
     if isinstance(light, Scene):
         warn_of_focal_length(camera.optics, camera.distortion, light)
     images = _images(camera, light)
@@ -154,39 +156,28 @@ def _tiles(
         first, last = tile * tile_sites, min((tile + 1) * tile_sites, layout.n_sites)
         clock = Clock()
         with clock.stage("compile layout"):
-            part = Camera(
-                optics=camera.optics,
-                sensor=camera.sensor.part(slice(first, last)),
-                distortion=camera.distortion,
-                order=camera.order(light),
-                n_threads=camera._n_threads,
-            )
-            # Arrays per site are those of all sites, as in a stored capture.
-            part._shared_settings = camera._shared_settings
-            bounds_um = outline_bounds_um(part.sensor.layout, camera.distortion)
+            sensor = camera.sensor.part(slice(first, last))
+            bounds_um = outline_bounds_um(sensor.layout, camera.distortion)
             strips = [_rows_under(image.grid, bounds_um) for image in images]
             integrators = [
                 Integrator(
-                    part.sensor.layout,
+                    sensor.layout,
                     _strip(image.grid, *rows),
                     distortion=camera.distortion,
                     order=camera.order(light),
                     compiled=False,
-                    n_threads=camera._n_threads,
+                    n_threads=camera.n_threads,
                 )
                 for image, rows in zip(images, strips, strict=True)
             ]
         smallest = min(integrators, key=lambda integrator: integrator.grid.cell_area_um2)
         coverages.append(Covered.by(smallest))
-        rate_e_per_s = part._integrate(light, _maps(part, light, images, strips, clock), integrators, clock)
-        yield part._expose(
-            light,
-            rate_e_per_s,
-            exposure_s,
-            Streams(streams.seed, streams.frame, first // BLOCK_SITES),
-            clock,
-            tile={"first_site": first, "n_sites": layout.n_sites},
-        )
+        rate_e_per_s = integrate_maps(sensor, light, _maps(sensor, light, images, strips, clock), integrators, clock)
+        # Arrays per site are those of all sites, as in a stored capture.
+        about = capture_settings(camera, light, exposure_s, streams)
+        about["tile"] = {"first_site": first, "n_sites": layout.n_sites}
+        part_streams = Streams(streams.seed, streams.frame, first // BLOCK_SITES)
+        yield expose(sensor, light, rate_e_per_s, exposure_s, part_streams, clock, about, camera.n_threads)
     if coverages:
         smallest_image = min((image.grid for image in images), key=lambda grid: grid.cell_area_um2)
         warn_of_coverage(source, Covered.union(smallest_image.bounds_um, coverages), layout.n_sites)
@@ -199,14 +190,14 @@ def _images(camera: Camera, light: Scene | PowerMap) -> list[_Image]:
     used = camera.sensor.filters_used
     e_per_j = camera.sensor.responsivity_e_per_j(light.wavelength_nm)[used]
     optics = camera.optics.resolve_oversample(light)
-    camera._warn_of_coarse_cells(light)
+    warn_of_coarse_cells(camera.optics, light, camera.layout)
     return [
         _Image(
-            camera._to_sensor_frame(grid),
+            to_sensor_frame(camera.distortion, grid),
             dict(
                 zip(
                     used.tolist(),
-                    optics.weighted_rows(light, e_per_j * is_in_image, grid=grid, n_threads=camera._n_threads),
+                    optics.weighted_rows(light, e_per_j * is_in_image, grid=grid, n_threads=camera.n_threads),
                     strict=True,
                 )
             ),
@@ -233,19 +224,18 @@ def _strip(grid: Grid, first: int, last: int) -> Grid:
 
 
 def _maps(
-    part: Camera, light: Scene | PowerMap, images: Iterable[_Image], strips: Iterable[tuple[int, int]], clock: Clock
+    sensor: Sensor, light: Scene | PowerMap, images: Iterable[_Image], strips: Iterable[tuple[int, int]], clock: Clock
 ) -> Iterator[WeightedMap]:
     """Yield the rows of all maps under a tile, each with its sites and their weights."""
-    sensor = part.sensor
     e_per_j = sensor.responsivity_e_per_j(light.wavelength_nm)
     for k, (image, strip) in enumerate(zip(images, strips, strict=True)):
         for c, rows in image.rows.items():
             if isinstance(light, PowerMap):
                 yield WeightedMap(k, rows(*strip), None, e_per_j[sensor.filter_of_site, c])
-            elif c in part._sites_of_filter:
+            elif c in sensor.sites_of_filter:
                 with clock.stage("optics"):
                     cells = rows(*strip)
-                yield WeightedMap(k, cells, part._sites_of_filter[c], None)
+                yield WeightedMap(k, cells, sensor.sites_of_filter[c], None)
                 del cells
 
 
@@ -413,7 +403,7 @@ def write_tiles(
     start = partial(capture_tiles, camera, light, exposure_s=exposure_s, seed=seed, frame=frame, tile_sites=tile_sites)
     start()  # checks the arguments
     plan = _plan(camera, light, exposure_s, Streams(seed, frame), _whole_blocks(tile_sites))
-    layout = camera._layout
+    layout = camera.layout
     if not layout.n_sites:
         raise ParameterError("camera", "must have a layout with photosites")
     if target.exists():
@@ -478,14 +468,14 @@ def _plan(
     camera: Camera, light: Scene | PowerMap, exposure_s: float, streams: Streams, tile_sites: int
 ) -> dict[str, Any]:
     """Return plain data that identify a tiled capture; arrays of the light as checksums."""
-    settings = camera._describe(light, check_plausible("exposure_s", exposure_s), streams)
+    settings = capture_settings(camera, light, check_plausible("exposure_s", exposure_s), streams)
     arrays = [light.data] if isinstance(light, PowerMap) else [light.basis]
     checksum = 0
     for array in arrays:
         for plane in array:
             for first in range(0, plane.shape[0], 256):
                 checksum = crc32(np.ascontiguousarray(in_memory(plane[first : first + 256])).data, checksum)
-    n_sites = camera.sensor.layout.n_sites
+    n_sites = camera.layout.n_sites
     plan = {"settings": settings, "light_crc32": checksum, "n_sites": n_sites, "tile_sites": tile_sites}
     found: dict[str, Any] = json.loads(json.dumps(plan))
     return found
@@ -498,13 +488,13 @@ def _create(directory: Path, camera: Camera, light: Scene | PowerMap, plan: Mapp
             shutil.rmtree(path)
         elif path.name != LOCK:
             path.unlink()
-    sensor, layout = camera.sensor, camera._layout
+    sensor, layout = camera.sensor, camera.layout
     attributes = {
         "format": FORMAT,
         "version": VERSION,
         "filter_names": list(sensor.filter_names),
         "bits": sensor.bits,
-        "white_dn": camera._white(light).tolist(),
+        "white_dn": white_dn(sensor, light).tolist(),
         "provenance": to_plain_data(dict(layout.provenance)),
         "plan": plan,
     }

@@ -9,7 +9,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 import foveasim
 from foveasim._core.validation import UNIT_SUFFIXES
@@ -100,6 +103,40 @@ def test_imports_go_one_way(path):
     allowed = set().union(*LAYERS[:layer]) | {name}
 
     assert imported_subpackages(path) <= allowed
+
+
+def imported_modules(path, names):
+    """Return the modules of the package that a module imports, those for annotations alone excepted."""
+    modules = set()
+
+    def visit(node):
+        if isinstance(node, ast.If) and getattr(node.test, "id", None) == "TYPE_CHECKING":
+            return
+        if isinstance(node, ast.ImportFrom) and node.module:
+            paths = [f"{node.module}.{alias.name}" for alias in node.names]
+            modules.update(found if found in names else node.module for found in paths)
+        elif isinstance(node, ast.Import):
+            modules.update(alias.name for alias in node.names)
+        for child in ast.iter_child_nodes(node):
+            visit(child)
+
+    visit(ast.parse(path.read_text()))
+    return modules & names
+
+
+def module_name(path):
+    return ".".join(("foveasim", *path.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__")
+
+
+def test_circles_of_imports_stay_in_one_package():
+    names = {module_name(path): k for k, path in enumerate(MODULES)}
+    arrows = [(k, names[other]) for k, path in enumerate(MODULES) for other in imported_modules(path, names.keys())]
+    graph = coo_array((np.ones(len(arrows)), np.transpose(arrows)), shape=(len(MODULES), len(MODULES)))
+    n_circles, circle_of = connected_components(graph, connection="strong")
+    packages = [{subpackage_of(MODULES[k]) for k in np.flatnonzero(circle_of == c)} for c in range(n_circles)]
+
+    assert [found for found in packages if len(found) > 1] == []
+    assert n_circles > 100  # otherwise no circle could be found
 
 
 def test_nothing_heavy_is_loaded_by_import():

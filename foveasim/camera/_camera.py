@@ -6,19 +6,18 @@ The only module that knows the order of the stages and creates random streams.
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from threading import Lock
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.calls import OwnCheck
-from foveasim._core.provenance import to_plain_data, versions
+from foveasim._core.provenance import to_plain_data
 from foveasim._core.random_streams import Streams
 from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property, in_order, thread_count
@@ -28,13 +27,13 @@ from foveasim.camera._clock import Clock
 from foveasim.camera._coverage import Covered, format_point, size_um, warn_of_coverage
 from foveasim.camera._frames import Frame, ImageCache, Position, Task, check_frames, position_settings, tasks
 from foveasim.camera._lens_scale import warn_of_focal_length
+from foveasim.camera._sampling import warn_of_coarse_cells
+from foveasim.camera._steps import WeightedMap, capture_settings, expose, integrate_maps, to_sensor_frame, white_dn
 from foveasim.capture import Capture
 from foveasim.distortion import Lens
 from foveasim.errors import (
     FoveasimWarning,
     ParameterError,
-    SamplingWarning,
-    SimulationError,
     type_name,
 )
 from foveasim.fields import Grid, PowerMap
@@ -53,10 +52,6 @@ __all__ = ["Camera"]
 
 #: Margin of a picture that covers undistorted outlines: their edges are curves of limited accuracy.
 COVER_MARGIN = 1e-5
-#: Fourier transforms in float32 leave negative rates of up to this fraction of the largest one.
-NEGATIVE_ROUNDING = 1e-4
-#: Lower limit of a filter's response, relative to the strongest filter, for white balance.
-MIN_WHITE_FRACTION = 0.01
 #: Exposures that exceed the time between them by this fraction do so by rounding.
 TIME_ROUNDING = 1e-9
 #: Number of compiled layouts in the cache, per grid of one image.
@@ -64,8 +59,6 @@ MAX_CACHED_INTEGRATORS = 4
 #: In cells of at most this width, in units of λN, irradiance is smooth: second-order integration is up to 70 times more
 #: accurate. In cells wider than 0.8 λN it can be less accurate than first order.
 SMOOTH_LAMBDA_N = 0.5
-#: Error of photosites above which a limited automatic oversampling causes a warning.
-MAX_AUTO_ERROR = 1e-3
 
 
 class Camera:
@@ -170,6 +163,26 @@ class Camera:
         """The lens model of the distortion, or None."""
         return self._distortion
 
+    @property
+    def layout(self) -> Layout:
+        """The layout of the sensor."""
+        return self._layout
+
+    @property
+    def n_threads(self) -> int:
+        """Number of threads."""
+        return self._n_threads
+
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        """Settings of optics, distortion, sensor and layout, as plain data: those that all captures of the camera share."""
+        return {
+            "optics": to_plain_data(self._optics),
+            "distortion": None if self._distortion is None else to_plain_data(self._distortion),
+            "sensor": to_plain_data(self._sensor, without=("layout",)),
+            "layout": to_plain_data(dict(self._layout.provenance)),
+        }
+
     def oversample(self, light: Scene | PowerMap) -> int:
         """Return the number of map cells along a source pixel; 1 for power maps."""
         light = self._with_pitch(light)
@@ -236,7 +249,7 @@ class Camera:
         unit_um = 1.0 / self._optics.magnification(scene.distance_m)
         one = scene.with_pitch(unit_um)
         images = [self._optics.grid(one)] if fit == "width" else [grid for grid, _ in self._optics.image_grids(one)]
-        half_um = 0.5 * np.array([size_um(self._to_sensor_frame(grid).bounds_um) for grid in images])
+        half_um = 0.5 * np.array([size_um(to_sensor_frame(self._distortion, grid).bounds_um) for grid in images])
         if fit == "width":
             scale = 0.5 * (below_um + above_um)[0] / half_um[0, 0]
         elif fit == "cover":
@@ -275,7 +288,7 @@ class Camera:
         ParameterError
             When the scene is not a Scene, or its distance is at most the focal length.
         """
-        return self._to_sensor_frame(self._optics.grid(self.frame(scene)))
+        return to_sensor_frame(self._distortion, self._optics.grid(self.frame(scene)))
 
     def power_map(self, scene: Scene) -> PowerMap:
         """
@@ -300,18 +313,7 @@ class Camera:
         """
         scene = self.frame(scene)
         power_map = self._optics.resolve_oversample(scene).power_map(scene, n_threads=self._n_threads)
-        return PowerMap(power_map.data, self._to_sensor_frame(power_map.grid), power_map.wavelength_nm)
-
-    def _to_sensor_frame(self, grid: Grid) -> Grid:
-        """Transform a grid from the frame of the optics to the frame of the sensor."""
-        if self._distortion is None:
-            return grid
-        centre_um = np.array(self._distortion.centre_um)
-        focal_um = np.broadcast_to(np.asarray(self._distortion.focal_um), (2,))
-        scale = focal_um / math.sqrt(focal_um[0] * focal_um[1])
-        pitch_x_um, pitch_y_um = grid.pitch_xy_um * scale
-        x0_um, y0_um = centre_um + grid.origin_um * scale
-        return Grid(grid.shape, (float(pitch_x_um), float(pitch_y_um)), (float(x0_um), float(y0_um)))
+        return PowerMap(power_map.data, to_sensor_frame(self._distortion, power_map.grid), power_map.wavelength_nm)
 
     def integrator(
         self,
@@ -463,66 +465,8 @@ class Camera:
         **settings: Any,
     ) -> Capture:
         """Simulate the sensor for photoelectron rates."""
-        sensor = self._sensor
-        with clock.stage("sensor"):
-            expected_e, electrons, code = sensor.expose(
-                photo_e_per_s, exposure_s, streams=streams, n_threads=self._n_threads
-            )
-        return Capture(
-            layout=self._layout,
-            code=read_only(code),
-            electrons=read_only(electrons),
-            expected_e=read_only(expected_e),
-            filter_of_site=sensor.filter_of_site,
-            filter_names=sensor.filter_names,
-            bits=sensor.bits,
-            white_dn=self._white(light),
-            settings=self._describe(light, exposure_s, streams) | settings,
-            stage_s=clock.stage_s,
-        )
-
-    def _describe(self, light: Scene | PowerMap, exposure_s: float, streams: Streams) -> dict[str, Any]:
-        """Return the settings of a capture, as plain data."""
-        return {
-            "light": self._describe_light(light),
-            **self._shared_settings,
-            "oversample": self.oversample(light),
-            "integration_order": self.order(light),
-            "exposure_s": exposure_s,
-            "seed": streams.seed,
-            "frame": streams.frame,
-            "versions": versions(),
-        }
-
-    def _describe_light(self, light: Scene | PowerMap) -> dict[str, object]:
-        if isinstance(light, PowerMap):
-            return {
-                "kind": "PowerMap",
-                "grid": to_plain_data(light.grid),
-                "wavelength_nm": light.wavelength_nm.tolist(),
-            }
-        return {
-            "kind": "Scene",
-            "source": light.source,
-            "shape": list(light.basis.shape),
-            "pitch_um": self.frame(light).pitch_um,
-            "fit": light.fit,
-            "field_of_view_deg": light.field_of_view_deg,
-            "distance_m": light.distance_m,
-            "wavelength_nm": light.wavelength_nm.tolist(),
-            "band_width_nm": light.band_width_nm.tolist(),
-            "spectrum_w_m2_sr_nm": to_plain_data(light.spectrum_w_m2_sr_nm),
-        }
-
-    @cached_property
-    def _shared_settings(self) -> dict[str, Any]:
-        """Settings that all captures of the camera share, as plain data."""
-        return {
-            "optics": to_plain_data(self._optics),
-            "distortion": None if self._distortion is None else to_plain_data(self._distortion),
-            "sensor": to_plain_data(self._sensor, without=("layout",)),
-            "layout": to_plain_data(dict(self._layout.provenance)),
-        }
+        about = capture_settings(self, light, exposure_s, streams) | settings
+        return expose(self._sensor, light, photo_e_per_s, exposure_s, streams, clock, about, self._n_threads)
 
     def rates(self, frames: OwnCheck[Iterable[Frame]], *, ahead: int = 0) -> Iterator[Floats]:
         """
@@ -761,17 +705,17 @@ class Camera:
         joules_per_w_m2 = float(w_from_w_m2_um2(exposure_s))
         weights = self._sensor.responsivity_e_per_j(light.wavelength_nm) * joules_per_w_m2
         if isinstance(light, PowerMap):
-            return replace(reference(light, grid, weights=weights), white=self._white(light))
+            return replace(reference(light, grid, weights=weights), white=white_dn(self._sensor, light))
         scene = self.frame(light)
         optics = self._optics.resolve_oversample(scene)
         images = [
             (
-                self._to_sensor_frame(source),
+                to_sensor_frame(self._distortion, source),
                 optics.weighted_maps(scene, weights * is_in_image, grid=source, n_threads=self._n_threads),
             )
             for source, is_in_image in optics.image_grids(scene)
         ]
-        return replace(sum_of_images(images, grid, len(weights)), white=self._white(light))
+        return replace(sum_of_images(images, grid, len(weights)), white=white_dn(self._sensor, light))
 
     def noise_budget(self, light: Scene | PowerMap, *, exposure_s: float) -> NoiseBudget:
         """
@@ -819,11 +763,11 @@ class Camera:
             warn_of_focal_length(self._optics, self._distortion, light)
             # Lateral chromatic aberration gives images of several sizes, each with its own grid.
             optics = self._optics.resolve_oversample(light)
-            self._warn_of_coarse_cells(light)
+            warn_of_coarse_cells(self._optics, light, self._layout)
             images = optics.image_grids(light)
             maps, grids = (
                 self._images(light, optics, images, e_per_j, clock, cached),
-                [self._to_sensor_frame(grid) for grid, _ in images],
+                [to_sensor_frame(self._distortion, grid) for grid, _ in images],
             )
         with clock.stage("compile layout"):
             order = self.order(light)
@@ -840,32 +784,7 @@ class Camera:
             ]
         smallest = min(integrators, key=lambda integrator: integrator.grid.cell_area_um2)
         warn_of_coverage(source, Covered.by(smallest), self._layout.n_sites, is_moving=position_um is not None)
-        return self._integrate(light, maps, integrators, clock)
-
-    def _integrate(
-        self, light: Scene | PowerMap, maps: Iterable[WeightedMap], integrators: Sequence[Integrator], clock: Clock
-    ) -> Floats:
-        """Return the sums of weighted maps over every site, photoelectrons per second."""
-        rate_e_per_s = np.zeros(self._layout.n_sites)
-        for image, cells, where, weight in maps:
-            with clock.stage("integration"):
-                if image == 0 and weight is None:  # each site belongs to one filter
-                    integrators[0](cells, where=where, out=rate_e_per_s)
-                else:
-                    power = integrators[image](cells, where=where)
-                    rate_e_per_s += power if weight is None else np.multiply(power, weight, out=power)
-            del cells
-        with clock.stage("integration"):
-            rate_e_per_s *= w_from_w_m2_um2(1.0)
-            self._check_rates(light, rate_e_per_s)
-            return np.maximum(rate_e_per_s, 0.0, out=rate_e_per_s)
-
-    @cached_property
-    def _sites_of_filter(self) -> dict[int, Bools | None]:
-        """Sites of each filter that occurs, (n_site,); None for all sites."""
-        filter_of_site = self._sensor.filter_of_site
-        used = self._sensor.filters_used.tolist()
-        return dict.fromkeys(used) if len(used) == 1 else {c: read_only(filter_of_site == c) for c in used}
+        return integrate_maps(self._sensor, light, maps, integrators, clock)
 
     def _bands(self, power_map: PowerMap, e_per_j: Floats) -> Iterator[WeightedMap]:
         """Yield each band of a power map, with every site's photoelectrons per joule in it."""
@@ -901,95 +820,7 @@ class Camera:
             new = used if cached is None else np.array([c for c in used if (grid, c) not in cached], np.int64)
             maps = optics.weighted_maps(scene, e_per_j[new] * is_in_image, grid=grid, n_threads=self._n_threads)
             for c in used:
-                yield WeightedMap(k, image(grid, int(c), maps), self._sites_of_filter[int(c)], None)
-
-    def _check_rates(self, light: Scene | PowerMap, rate_e_per_s: Floats) -> None:
-        """Raise or warn when rates are not finite, or negative beyond rounding."""
-        # Minimum and maximum propagate NaN, and need no array.
-        lowest, highest = (float(find(rate_e_per_s, initial=0.0)) for find in (np.min, np.max))
-        if lowest == 0.0 and highest < np.inf:
-            return
-        if not np.isfinite(rate_e_per_s).all():
-            bad = int(np.flatnonzero(~np.isfinite(rate_e_per_s))[0])
-            raise SimulationError(
-                f"irradiance on site {bad} must be finite; the power map contains NaN or infinity there"
-            )
-        is_negative = rate_e_per_s < -NEGATIVE_ROUNDING * highest
-        if not is_negative.any():
-            return
-        order = self.order(light)
-        if isinstance(light, PowerMap) and (order == 1 or np.nanmin(light.data) < 0.0):
-            bad = int(rate_e_per_s.argmin())
-            raise SimulationError(f"irradiance on site {bad} must be >= 0; the power map is negative there")
-        if order == 2:
-            self._warn_of_negative(rate_e_per_s, is_negative)
-
-    @cached_property
-    def _min_side_um(self) -> float:
-        """Square root of the area of the smallest photosite; infinite without photosites."""
-        return math.sqrt(float(self._layout.area_um2.min(initial=np.inf)))
-
-    def _warn_of_coarse_cells(self, scene: Scene) -> None:
-        """Warn when automatic oversampling is limited, and photosites have an error above 1e-3."""
-        optics = self._optics
-        if optics.oversample != "auto":
-            return
-        error = optics.auto_oversample_error(scene)  # of sites of side λN, an upper limit for wider ones
-        if error <= MAX_AUTO_ERROR:
-            return
-        lambda_n_um = float(um_from_nm(scene.wavelength_nm.min())) * optics.working_f_number(scene.distance_m)
-        side_um = self._min_side_um
-        # Wider photosites have proportionally fewer cells at their edges.
-        error *= min(1.0, lambda_n_um / side_um)
-        k, pixel_um = optics.auto_oversample(scene), optics.grid(scene).pitch_x_um
-        is_lattice = optics.source_pixel == "point" and pixel_um > lambda_n_um
-        # Point emitters farther apart than λN have no limit for small cells; they represent a continuous scene for sites > λN.
-        if error <= MAX_AUTO_ERROR or (is_lattice and side_um > lambda_n_um):
-            return
-        reason, cure = (
-            ("source pixels are points farther apart than λN", 'use source_pixel="square"')
-            if is_lattice
-            else ("more would exceed its limits", "set Optics(oversample=...), or use a smaller picture")
-        )
-        warn(
-            f"automatic oversampling chooses {k} x {k} cells of {pixel_um / k:.3g} µm per source pixel, since {reason}: "
-            f"photosites of {side_um:.3g} µm then have errors up to {100.0 * error:.2g} % (λN = {lambda_n_um:.3g} µm); {cure}, "
-            "or Optics(oversample=1) to accept them",
-            SamplingWarning,
-        )
-
-    def _warn_of_negative(self, rate_e_per_s: Floats, is_negative: Bools) -> None:
-        """Warn when gradients of coarse cells give negative photoelectrons."""
-        fraction = -float(rate_e_per_s[is_negative].sum()) / float(np.abs(rate_e_per_s).sum())
-        warn(
-            f"second-order integration makes the photoelectrons of {int(is_negative.sum()):,} of {rate_e_per_s.size:,} "
-            f"photosites negative, {100.0 * fraction:.3g} % of all, and they are set to 0: the image is too sharp for cells of "
-            "this size; use order=1, or smaller cells (Optics(oversample=...))",
-            SamplingWarning,
-        )
-
-    def _white(self, light: Scene | PowerMap) -> Floats:
-        """Return each filter's relative response to an equal-energy spectrum, as a code."""
-        width_nm = light.band_width_nm if isinstance(light, Scene) else np.ones(light.wavelength_nm.size)
-        response = self._sensor.responsivity_e_per_j(light.wavelength_nm) @ width_nm
-        max_response = float(response.max(initial=0.0))
-        if max_response == 0.0:
-            return np.ones(response.size)
-        return np.maximum(response / max_response, MIN_WHITE_FRACTION) * (2**self._sensor.bits - 1)
-
-
-class WeightedMap(NamedTuple):
-    """
-    A power map, and the index of its grid.
-
-    ``where`` are the sites that it contributes to, (n_site,), None for all; ``weight`` is a factor on their powers, (n_site,),
-    None for 1.
-    """
-
-    image: int
-    cells: NDArray[Any]
-    where: Bools | None
-    weight: Floats | None
+                yield WeightedMap(k, image(grid, int(c), maps), self._sensor.sites_of_filter[int(c)], None)
 
 
 def _load_kernels(light: Scene | PowerMap) -> None:

@@ -19,7 +19,7 @@ from foveasim.camera import Camera
 from foveasim.compare.annuli import PictureQuality, quality_by_eccentricity
 from foveasim.compare.budgets import BUDGETS, Budget, budget_of, check_equal_budgets
 from foveasim.compare.information import SceneCovariance, scene_covariance
-from foveasim.compare.intervals import MedianInterval, median_interval
+from foveasim.compare.intervals import MedianInterval, format_interval, format_number, median_interval
 from foveasim.compare.measure import (
     MEASURES,
     SceneMeasures,
@@ -572,31 +572,6 @@ def layouts(
         if not isinstance(layout, Layout):
             raise ParameterError("layouts", f"must be layouts, got {type_name(layout)} for {format_value(name)}")
     return cameras(cameras_of(layouts, optics, sensor), scenes, exposure_s=exposure_s, **options)
-
-
-def format_number(value: float) -> str:
-    """Format a number with at most five digits, or as an integer with separators."""
-    if isinstance(value, int) or abs(value) >= 1e4:
-        return f"{value:,.0f}"
-    return f"{value:.5g}"
-
-
-def format_interval(median: float, low: float, high: float) -> str:
-    """
-    Format a median with its confidence interval.
-
-    Examples
-    --------
-    >>> format_interval(25.123, 24.6, 26.31), format_interval(25.123, 25.123, 25.123), format_interval(float("nan"), 0, 1)
-    ('25.12 [24.60, 26.31]', '25.12', '–')
-    """
-    if not np.isfinite(median):
-        return "∞" if median > 0 else "–"
-    width = high - low
-    if np.isnan(width) or width == 0.0:
-        return f"{median:,.4g}" if abs(median) < 1e4 else f"{median:,.0f}"
-    digits = min(max(0, 1 - math.floor(math.log10(0.5 * width))), 6) if np.isfinite(width) else 2
-    return f"{median:,.{digits}f} [{low:,.{digits}f}, {high:,.{digits}f}]".replace("inf", "∞")
 
 
 def _check_cameras(cameras: Mapping[str, Camera]) -> dict[str, Camera]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, as_numbers
 from foveasim.errors import ParameterError
 
-__all__ = ["CONFIDENCE", "MIN_SCENES", "MedianInterval", "median_interval"]
+__all__ = ["CONFIDENCE", "MIN_SCENES", "MedianInterval", "format_interval", "format_number", "median_interval"]
 
 #: Confidence of the intervals, and the smallest sample with one: the range of 5 values covers the median in 93.75 %.
 CONFIDENCE, MIN_SCENES = 0.95, 5
@@ -96,3 +97,28 @@ def _between(low: Floats, high: Floats, weight: float) -> Floats:
     """Interpolate between two order statistics, which can be infinite."""
     with np.errstate(invalid="ignore"):
         return np.where((low == high) | (weight == 0.0), low, (1.0 - weight) * low + weight * high)
+
+
+def format_number(value: float) -> str:
+    """Format a number with at most five digits, or as an integer with separators."""
+    if isinstance(value, int) or abs(value) >= 1e4:
+        return f"{value:,.0f}"
+    return f"{value:.5g}"
+
+
+def format_interval(median: float, low: float, high: float) -> str:
+    """
+    Format a median with its confidence interval.
+
+    Examples
+    --------
+    >>> format_interval(25.123, 24.6, 26.31), format_interval(25.123, 25.123, 25.123), format_interval(float("nan"), 0, 1)
+    ('25.12 [24.60, 26.31]', '25.12', '–')
+    """
+    if not np.isfinite(median):
+        return "∞" if median > 0 else "–"
+    width = high - low
+    if np.isnan(width) or width == 0.0:
+        return f"{median:,.4g}" if abs(median) < 1e4 else f"{median:,.0f}"
+    digits = min(max(0, 1 - math.floor(math.log10(0.5 * width))), 6) if np.isfinite(width) else 2
+    return f"{median:,.{digits}f} [{low:,.{digits}f}, {high:,.{digits}f}]".replace("inf", "∞")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from foveasim.compare.budgets import BUDGETS
 from foveasim.compare.figures import measure_figure, sizes_figure
-from foveasim.compare.intervals import MIN_SCENES
+from foveasim.compare.intervals import MIN_SCENES, format_interval, format_number
 from foveasim.compare.measure import MEASURES
 from foveasim.reconstruct import Picture
 from foveasim.view.web._report_page import (
@@ -55,8 +55,6 @@ def report_page(comparison: Comparison) -> str:
 
 
 def _summary(comparison: Comparison) -> ReportSection:
-    from foveasim.compare.comparison import format_interval, format_number
-
     budget, n = comparison.settings["budget"], len(comparison.scenes)
     equal = (
         f"Equal budget: {BUDGETS[budget][1]}, within {100.0 * comparison.settings['tolerance']:g} %."

@@ -15,7 +15,7 @@ from foveasim._core.provenance import is_digest
 from foveasim._core.random_streams import Streams
 from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import Floats, Ints, check_count, check_number, read_only, unmasked
+from foveasim._core.validation import Bools, Floats, Ints, check_count, check_number, read_only, unmasked
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.sensor.adc import ADC, Companding, ConversionTables
 from foveasim.sensor.blocks import for_each_block
@@ -359,6 +359,12 @@ class Sensor:
     def filters_used(self) -> Ints:
         """Indices of the filters of the layout's sites, in ascending order."""
         return read_only(np.flatnonzero(np.bincount(self.filter_of_site)))
+
+    @cached_property
+    def sites_of_filter(self) -> dict[int, Bools | None]:
+        """Sites of each filter in :attr:`filters_used`, (n_site,) bool; None for all sites."""
+        used = self.filters_used.tolist()
+        return dict.fromkeys(used) if len(used) == 1 else {c: read_only(self.filter_of_site == c) for c in used}
 
     def _transmission(self, wavelength_nm: Floats) -> Floats:
         """Compute filter times quantum efficiency, (n_filter, n_wavelength)."""

@@ -9,7 +9,7 @@ import pytest
 
 import foveasim as fs
 from foveasim.compare import median_interval
-from foveasim.compare.comparison import format_interval
+from foveasim.compare.intervals import format_interval
 from foveasim.errors import ParameterError
 
 N_SCENES, N_SAMPLES = 120, 20_000

@@ -1,0 +1,176 @@
+"""Steps of a capture, shared by the camera and its tiles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim._core.provenance import to_plain_data, versions
+from foveasim._core.random_streams import Streams
+from foveasim._core.validation import Bools, Floats, read_only
+from foveasim.camera._clock import Clock
+from foveasim.camera._sampling import warn_of_negative
+from foveasim.capture import Capture
+from foveasim.distortion import Lens
+from foveasim.errors import SimulationError
+from foveasim.fields import Grid, PowerMap
+from foveasim.integrate import Integrator
+from foveasim.layout import Layout
+from foveasim.scene import Scene
+from foveasim.sensor import Sensor
+from foveasim.units import w_from_w_m2_um2
+
+if TYPE_CHECKING:
+    from foveasim.camera._camera import Camera
+
+__all__ = ["WeightedMap", "capture_settings", "expose", "integrate_maps", "to_sensor_frame", "white_dn"]
+
+#: Fourier transforms in float32 leave negative rates of up to this fraction of the largest one.
+NEGATIVE_ROUNDING = 1e-4
+#: Lower limit of a filter's response, relative to the strongest filter, for white balance.
+MIN_WHITE_FRACTION = 0.01
+
+
+class WeightedMap(NamedTuple):
+    """
+    A power map, and the index of its grid.
+
+    ``where`` are the sites that it contributes to, (n_site,), None for all; ``weight`` is a factor on their powers, (n_site,),
+    None for 1.
+    """
+
+    image: int
+    cells: NDArray[Any]
+    where: Bools | None
+    weight: Floats | None
+
+
+def to_sensor_frame(lens: Lens | None, grid: Grid) -> Grid:
+    """Transform a grid from the frame of the optics to the frame of the sensor behind a lens model."""
+    if lens is None:
+        return grid
+    centre_um = np.array(lens.centre_um)
+    focal_um = np.broadcast_to(np.asarray(lens.focal_um), (2,))
+    scale = focal_um / math.sqrt(focal_um[0] * focal_um[1])
+    pitch_x_um, pitch_y_um = grid.pitch_xy_um * scale
+    x0_um, y0_um = centre_um + grid.origin_um * scale
+    return Grid(grid.shape, (float(pitch_x_um), float(pitch_y_um)), (float(x0_um), float(y0_um)))
+
+
+def integrate_maps(
+    sensor: Sensor,
+    light: Scene | PowerMap,
+    maps: Iterable[WeightedMap],
+    integrators: Sequence[Integrator],
+    clock: Clock,
+) -> Floats:
+    """Return the sums of weighted maps over every site, photoelectrons per second."""
+    rate_e_per_s = np.zeros(sensor.layout.n_sites)
+    for image, cells, where, weight in maps:
+        with clock.stage("integration"):
+            if image == 0 and weight is None:  # each site belongs to one filter
+                integrators[0](cells, where=where, out=rate_e_per_s)
+            else:
+                power = integrators[image](cells, where=where)
+                rate_e_per_s += power if weight is None else np.multiply(power, weight, out=power)
+        del cells
+    with clock.stage("integration"):
+        rate_e_per_s *= w_from_w_m2_um2(1.0)
+        _check_rates(light, rate_e_per_s, integrators[0].order)
+        return np.maximum(rate_e_per_s, 0.0, out=rate_e_per_s)
+
+
+def _check_rates(light: Scene | PowerMap, rate_e_per_s: Floats, order: int) -> None:
+    """Raise or warn when rates are not finite, or negative beyond rounding."""
+    # Minimum and maximum propagate NaN, and need no array.
+    lowest, highest = (float(find(rate_e_per_s, initial=0.0)) for find in (np.min, np.max))
+    if lowest == 0.0 and highest < np.inf:
+        return
+    if not np.isfinite(rate_e_per_s).all():
+        bad = int(np.flatnonzero(~np.isfinite(rate_e_per_s))[0])
+        raise SimulationError(f"irradiance on site {bad} must be finite; the power map contains NaN or infinity there")
+    is_negative = rate_e_per_s < -NEGATIVE_ROUNDING * highest
+    if not is_negative.any():
+        return
+    if isinstance(light, PowerMap) and (order == 1 or np.nanmin(light.data) < 0.0):
+        bad = int(rate_e_per_s.argmin())
+        raise SimulationError(f"irradiance on site {bad} must be >= 0; the power map is negative there")
+    if order == 2:
+        warn_of_negative(rate_e_per_s, is_negative)
+
+
+def expose(
+    sensor: Sensor,
+    light: Scene | PowerMap,
+    photo_e_per_s: Floats,
+    exposure_s: float,
+    streams: Streams,
+    clock: Clock,
+    settings: dict[str, Any],
+    n_threads: int,
+) -> Capture:
+    """Simulate a sensor for photoelectron rates."""
+    with clock.stage("sensor"):
+        expected_e, electrons, code = sensor.expose(photo_e_per_s, exposure_s, streams=streams, n_threads=n_threads)
+    assert isinstance(sensor.layout, Layout)  # as in every camera
+    return Capture(
+        layout=sensor.layout,
+        code=read_only(code),
+        electrons=read_only(electrons),
+        expected_e=read_only(expected_e),
+        filter_of_site=sensor.filter_of_site,
+        filter_names=sensor.filter_names,
+        bits=sensor.bits,
+        white_dn=white_dn(sensor, light),
+        settings=settings,
+        stage_s=clock.stage_s,
+    )
+
+
+def white_dn(sensor: Sensor, light: Scene | PowerMap) -> Floats:
+    """Return each filter's relative response to an equal-energy spectrum, as a code."""
+    width_nm = light.band_width_nm if isinstance(light, Scene) else np.ones(light.wavelength_nm.size)
+    response = sensor.responsivity_e_per_j(light.wavelength_nm) @ width_nm
+    max_response = float(response.max(initial=0.0))
+    if max_response == 0.0:
+        return np.ones(response.size)
+    return np.maximum(response / max_response, MIN_WHITE_FRACTION) * (2**sensor.bits - 1)
+
+
+def capture_settings(camera: Camera, light: Scene | PowerMap, exposure_s: float, streams: Streams) -> dict[str, Any]:
+    """Return the settings of a capture, as plain data."""
+    return {
+        "light": _light_settings(camera, light),
+        **camera.settings,
+        "oversample": camera.oversample(light),
+        "integration_order": camera.order(light),
+        "exposure_s": exposure_s,
+        "seed": streams.seed,
+        "frame": streams.frame,
+        "versions": versions(),
+    }
+
+
+def _light_settings(camera: Camera, light: Scene | PowerMap) -> dict[str, object]:
+    if isinstance(light, PowerMap):
+        return {
+            "kind": "PowerMap",
+            "grid": to_plain_data(light.grid),
+            "wavelength_nm": light.wavelength_nm.tolist(),
+        }
+    return {
+        "kind": "Scene",
+        "source": light.source,
+        "shape": list(light.basis.shape),
+        "pitch_um": camera.frame(light).pitch_um,
+        "fit": light.fit,
+        "field_of_view_deg": light.field_of_view_deg,
+        "distance_m": light.distance_m,
+        "wavelength_nm": light.wavelength_nm.tolist(),
+        "band_width_nm": light.band_width_nm.tolist(),
+        "spectrum_w_m2_sr_nm": to_plain_data(light.spectrum_w_m2_sr_nm),
+    }
