@@ -68,7 +68,9 @@ def test_invalid_idx_files_are_reported(gallery, tmp_path, change):
 
 
 @pytest.mark.parametrize(
-    "data", [b"", b"not compressed", gzip.compress(bytes(100))[:-9], gzip.compress(idx(np.arange(20)))]
+    "data",
+    [b"", b"not compressed", gzip.compress(bytes(100))[:-9], gzip.compress(idx(np.arange(20)))],
+    ids=["empty", "not compressed", "truncated", "too few"],  # compressed data contain the time
 )
 def test_invalid_labels_are_reported(gallery, tmp_path, data):
     write_mnist(tmp_path)
