@@ -27,6 +27,7 @@ import shapely
 from dense import bench_dense
 from exploring import bench_exploring
 from gradients import bench_gradients
+from kernels import bench_first_capture, bench_kernels
 from learning import bench_learning, bench_stored
 from looking import bench_looking
 from report import Report, best_s
@@ -379,6 +380,8 @@ def main() -> int:
             bench(report, shape)
     with console.status("bench dense"):
         bench_dense(report, 512 if is_quick else 2048)
+    with console.status("bench kernels"):
+        bench_kernels(report, 512 if is_quick else 2048)
     with console.status("bench sensor"):
         bench_sensor(report, 100 if is_quick else 1000)
     with console.status("bench layouts"):
@@ -393,6 +396,8 @@ def main() -> int:
     with console.status("bench looking"):
         bench_looking(report, 20_000 if is_quick else 1_000_000)
     bench_import(report)
+    with console.status("bench first capture"):
+        bench_first_capture(report)
     console.print(report.table)
     return 1 if report.missed else 0
 

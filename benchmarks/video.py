@@ -82,7 +82,7 @@ def _bench_camera(report: Report, camera: fs.Camera) -> None:
             pass
 
     def from_pictures() -> None:
-        for _ in camera.video(_footage(pictures * 2), exposure_s=EXPOSURE_S, seed=0, ahead=thread_count()):
+        for _ in camera.video(_footage(pictures * 2), exposure_s=EXPOSURE_S, seed=0):
             pass
 
     def gaze() -> None:

@@ -32,6 +32,7 @@ from foveasim import (
     view,
 )
 from foveasim._core.calls import check_public_calls
+from foveasim._core.jit import compile_kernels
 from foveasim._io.pickling import make_copyable
 from foveasim._version import __version__
 from foveasim.camera import Camera
@@ -69,6 +70,7 @@ __all__ = [
     "SiliconQE",
     "__version__",
     "compare",
+    "compile_kernels",
     "config",
     "distortion",
     "errors",

@@ -127,6 +127,16 @@ def check(
         raise typer.Exit(FAILED)
 
 
+@app.command(name="compile")
+def compile_(workers: Workers = None) -> None:
+    """Compile all kernels for this machine, for example when a container is built."""
+    from foveasim._core.jit import compile_kernels
+
+    with _status("compiling kernels"):
+        n_kernels = compile_kernels(n_workers=workers)
+    console.print(f"compiled {n_kernels} kernels")
+
+
 @app.command()
 def layouts() -> None:
     """List the bundled layouts, by name, and the layout generators."""

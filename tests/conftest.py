@@ -6,12 +6,12 @@ import os
 import shutil
 import signal
 import sys
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from reference.kernels import kernel_modules
+
+from foveasim import compile_kernels
 
 # Bytecode is stored next to the sources, as is the machine code of kernels, even where the environment disables it: the tests start
 # hundreds of processes, and each would compile the package.
@@ -53,8 +53,7 @@ INDEPENDENT = {
 def pytest_configure(config):
     """Compile all kernels once, before several processes would each compile them."""
     if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
-        for name in kernel_modules():
-            import_module(name)
+        compile_kernels()
 
 
 @pytest.hookimpl(optionalhook=True)  # of pytest-xdist

@@ -57,7 +57,7 @@ _C2, _C4, _C6, _C8, _C10 = (np.float32((-1.0) ** k / math.factorial(2 * k)) for 
 _L1, _L3, _L5, _L7, _L9 = (np.float32(2.0 / k) for k in range(1, 10, 2))
 
 
-@njit(inline="always")
+@njit()
 def _high_word(a, b):
     """Return the upper 64 bits of the product of two 64-bit integers."""
     a_low, a_high, b_low, b_high = a & _LOW, a >> _32, b & _LOW, b >> _32
@@ -78,7 +78,7 @@ def philox_4x64(key_0, key_1, c0, c1, c2, c3):
     return c0, c1, c2, c3
 
 
-@njit(inline="always")
+@njit()
 def philox_4x32(key_0, key_1, c0, c1, c2, c3):
     """
     Return four random words of 32 bits.
@@ -93,7 +93,7 @@ def philox_4x32(key_0, key_1, c0, c1, c2, c3):
     return c0, c1, c2, c3
 
 
-@njit(inline="always")
+@njit()
 def philox_2x32(key, c0, c1):
     """
     Return two random words of 32 bits, at a fifth of the cost of Philox 4x64.
@@ -107,7 +107,7 @@ def philox_2x32(key, c0, c1):
     return c0, c1
 
 
-@njit(inline="always")
+@njit()
 def uniform(word):
     """
     Convert a word of 64 bits to a number in the open interval (0, 1).
@@ -118,7 +118,7 @@ def uniform(word):
     return (np.float64(word >> _12) + 0.5) * _ONE_IN_2_52
 
 
-@njit(types.void(types.uint64, types.int64, types.uint32[::1], types.float32[::1]), error_model="numpy")
+@njit(types.void(types.uint64, types.int64, types.uint32[::1], types.float32[::1]))
 def fill_normals(key, batch, words, out):
     """
     Compute a batch of standard Gaussian numbers.
@@ -164,7 +164,7 @@ def fill_normals(key, batch, words, out):
         y[j] = np.copysign(radius * (cosine - sine), np.float32(np.int32(word << np.int32(1))))
 
 
-@njit(types.void(types.uint64, types.int64, types.float64[::1], types.float64[::1]), error_model="numpy")
+@njit(types.void(types.uint64, types.int64, types.float64[::1], types.float64[::1]))
 def fill_uniforms(key, batch, first, second):
     """
     Compute a batch of pairs of uniform numbers in the open interval (0, 1).
@@ -179,9 +179,7 @@ def fill_uniforms(key, batch, first, second):
         first[j], second[j] = uniform((a << _32) | b), uniform((c << _32) | d)
 
 
-@njit(
-    types.void(types.float64[::1], types.Array(types.float64, 1, "C", readonly=True), types.uint64), error_model="numpy"
-)
+@njit(types.void(types.float64[::1], types.Array(types.float64, 1, "C", readonly=True), types.uint64))
 def add_normals(values, deviation, key):
     """Add Gaussian numbers in place; ``sigma`` has a standard deviation per value, or one."""
     words, normals = np.empty(BATCH, np.uint32), np.empty(BATCH, np.float32)

@@ -529,8 +529,9 @@ class Camera:
         between : {"hold", "linear"}
             Irradiance between frames: constant until the next frame, or interpolated linearly.
         ahead : int
-            Number of frames to compute in advance, each in one thread, which is faster than one frame in all threads. Only
-            for frames that do not depend on earlier captures.
+            Number of frames to compute in advance, each in one thread. This can be faster than one frame in all threads for
+            frames that are slow to read, or with many cores; on two cores it is slower. Only for frames that do not depend on
+            earlier captures.
 
         Yields
         ------

@@ -28,7 +28,7 @@ LAST_STEP = 1e-9
 FOLD_MARGIN = 1e-3
 
 
-@njit(inline="always")
+@njit()
 def _map(x, y, k1, k2, k3, k4, k5, k6, p1, p2):
     """Return the distorted position and its Jacobian: x_d, y_d, dx_d/dx, dx_d/dy, dy_d/dy."""
     r2 = x * x + y * y
@@ -43,7 +43,7 @@ def _map(x, y, k1, k2, k3, k4, k5, k6, p1, p2):
     return x_d, y_d, xx, xy, yy
 
 
-@njit(inline="always")
+@njit()
 def _is_inside(x, y, determinant, fold, min_fold):
     """Return whether an ideal point lies within the fold radii of equally spaced directions."""
     if not determinant > 0.0:

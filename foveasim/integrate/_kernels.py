@@ -52,6 +52,9 @@ CUT_ROW = 2
 
 #: Cells per block of the partial sums of a row: fastest measured value (eight float32 convert to one vector of float64).
 BLOCK = 8
+#: Unsigned constants: with a signed one, an unsigned index would become a float.
+ZERO, ONE, TWO, THREE, FOUR, FIVE, SIX, SEVEN, EIGHT = map(np.uintp, range(BLOCK + 1))
+TWO_BLOCKS = np.uintp(2 * BLOCK)
 #: Shorter runs are stored cell by cell, which is faster than a separate sum.
 MIN_RUN = 12
 #: Weights below this fraction of the total height of the edges in a row are rounding errors. The limit is for up to eight
@@ -85,13 +88,13 @@ _moment_list = types.float64[:, ::1]
 _int_list = types.int64[::1]
 
 
-@njit(inline="always")
+@njit()
 def _lowest_bit(word):
     """Return the position of the lowest bit of a word that is not 0."""
     return BIT_POSITIONS[((word & (~word + np.uint64(1))) * DE_BRUIJN) >> np.uint64(58)]
 
 
-@njit(inline="always")
+@njit()
 def _set_bits(words, offset, first, last):
     """Set the bits ``first`` to ``last`` of the words from ``offset`` on."""
     ones = ~np.uint64(0)
@@ -100,7 +103,7 @@ def _set_bits(words, offset, first, last):
         words[offset + k] |= (ones >> np.uint64(63 - high + low)) << np.uint64(low)
 
 
-@njit(inline="always")
+@njit()
 def _touched_columns(touched, row, n_words, columns):
     """List the columns of a row that edges touch, in ascending order, and clear their bits."""
     n = 0
@@ -114,7 +117,7 @@ def _touched_columns(touched, row, n_words, columns):
     return n
 
 
-@njit(inline="always")
+@njit()
 def _add_moments(moment, ua, ub, va, vb, height):
     """
     Add the moments of an edge piece of signed ``height`` from (ua, va) to (ub, vb).
@@ -130,7 +133,7 @@ def _add_moments(moment, ua, ub, va, vb, height):
     moment[2] += height * (v_mean * (u_mean + 0.5) + (vb - va) * spread)
 
 
-@njit(inline="always")
+@njit()
 def _add_edge(ua, va, ub, vb, n_x, bottom, top, left, n_columns, n_words, rows, cover, moment, touched):
     """
     Add one edge to the cells of a box.
@@ -199,26 +202,36 @@ def _add_edge(ua, va, ub, vb, n_x, bottom, top, left, n_columns, n_words, rows, 
         row += 1
 
 
-@njit(inline="always")
+@njit(allocates=True)
 def _grow(array, n_used, n_more):
+    """Return the array, or a longer copy if ``n_more`` further numbers do not fit."""
+    if n_used + n_more <= array.size:
+        return array
+    longer = np.empty(2 * array.size + n_more, array.dtype)
+    for i in range(n_used):
+        longer[i] = array[i]
+    return longer
+
+
+@njit(allocates=True)
+def _grow_rows(array, n_used, n_more):
     """Return the array, or a longer copy if ``n_more`` further rows do not fit."""
     if n_used + n_more <= array.shape[0]:
         return array
-    larger = np.empty((2 * array.shape[0] + n_more, *array.shape[1:]), array.dtype)
-    # Element by element: numba needs seconds to compile a slice assignment, because of its error message.
-    to, old = larger.ravel(), array.ravel()
-    for i in range(n_used * (larger.size // larger.shape[0])):
-        to[i] = old[i]
-    return larger
+    longer = np.empty((2 * array.shape[0] + n_more, array.shape[1]), array.dtype)
+    for i in range(n_used):
+        for k in range(array.shape[1]):
+            longer[i, k] = array[i, k]
+    return longer
 
 
-@njit(inline="always")
+@njit()
 def _rounding(rows, i_row):
     """Return the rounding error of weights and moments in a row."""
     return NO_COVERAGE * rows[i_row, 1] * max(rows[i_row, 2] / 8.0, 1.0)
 
 
-@njit(inline="always")
+@njit()
 def _write_row(columns, n_touched, left, cover, base, rows, i_row, n_x, site, row, spans, n_spans, weights, n_weights):
     """Append the spans of one row of one site; return the new counts and the covered area."""
     winding = rows[i_row, 0]  # weight of the cells before the next touched cell: sum of the heights from that cell on
@@ -267,7 +280,7 @@ def _write_row(columns, n_touched, left, cover, base, rows, i_row, n_x, site, ro
     return n_spans, n_weights, covered
 
 
-@njit(inline="always")
+@njit()
 def _gradient_scale(index, n):
     """Return the reciprocal distance of the neighbours of the gradient; 0 along a single cell."""
     if n == 1:
@@ -275,7 +288,7 @@ def _gradient_scale(index, n):
     return 0.5 if 0 < index < n - 1 else 1.0
 
 
-@njit(inline="always")
+@njit()
 def _write_cuts(columns, n_touched, left, moment, base, rows, i_row, n_y, n_x, site, row, cuts, moments, n_cuts):
     """Append the cuts of one row of one site; return their new number."""
     tilt = 0.0  # moment along v of the cells before the next touched cell
@@ -306,31 +319,32 @@ def _write_cuts(columns, n_touched, left, moment, base, rows, i_row, n_y, n_x, s
     return n_cuts
 
 
-@njit(inline="always")
+@njit()
 def _sum_cells(cells, row, start, stop):
     """Return the sum of the cells ``start`` to ``stop - 1`` of a row in float64."""
+    # Signed indices would be checked for negative ones at each cell.
+    row, c, end = np.uintp(row), np.uintp(start), np.uintp(stop)
     total = 0.0
-    c = start
-    if stop - start >= 2 * BLOCK:
+    if c + TWO_BLOCKS <= end:
         a0, a1, a2, a3, a4, a5, a6, a7 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        while c + BLOCK <= stop:
+        while c + EIGHT <= end:
             a0 += cells[row, c]
-            a1 += cells[row, c + 1]
-            a2 += cells[row, c + 2]
-            a3 += cells[row, c + 3]
-            a4 += cells[row, c + 4]
-            a5 += cells[row, c + 5]
-            a6 += cells[row, c + 6]
-            a7 += cells[row, c + 7]
-            c += BLOCK
+            a1 += cells[row, c + ONE]
+            a2 += cells[row, c + TWO]
+            a3 += cells[row, c + THREE]
+            a4 += cells[row, c + FOUR]
+            a5 += cells[row, c + FIVE]
+            a6 += cells[row, c + SIX]
+            a7 += cells[row, c + SEVEN]
+            c += EIGHT
         total = ((a0 + a1) + (a2 + a3)) + ((a4 + a5) + (a6 + a7))
-    while c < stop:
+    while c < end:
         total += cells[row, c]
-        c += 1
+        c += ONE
     return total
 
 
-@njit(inline="always")
+@njit()
 def _sum_row(columns, n_touched, left, cover, base, rows, i_row, cells, row):
     """Return the sum of weight x cell over one row of one site; as :func:`_write_row`."""
     n_x = cells.shape[1]
@@ -351,7 +365,7 @@ def _sum_row(columns, n_touched, left, cover, base, rows, i_row, cells, row):
     return total
 
 
-@njit(inline="always")
+@njit()
 def _sum_gradients(columns, n_touched, left, moment, base, rows, i_row, cells, row):
     """Return the sum of moment x gradient over one row of one site; as :func:`_write_cuts`."""
     n_y, n_x = cells.shape
@@ -380,7 +394,7 @@ def _sum_gradients(columns, n_touched, left, moment, base, rows, i_row, cells, r
     return total
 
 
-@njit(inline="always")
+@njit()
 def _box(uv, start, stop, n_y, n_x):
     """Return bottom and top row, left column and number of columns of the cells in a box."""
     u_low, v_low, u_high, v_high = np.inf, np.inf, -np.inf, -np.inf
@@ -423,7 +437,7 @@ def measure_sites(xy, ring_offsets, site_offsets):
     return areas, bounds
 
 
-@njit(inline="always")
+@njit()
 def _add_rings(
     uv, ring_offsets, first_ring, last_ring, n_x, bottom, top, left, n_columns, rows, cover, moment, touched
 ):
@@ -452,7 +466,7 @@ def _add_rings(
             a = b
 
 
-@njit(inline="always")
+@njit()
 def _clear_row(columns, n_touched, i_row, n_columns, rows, cover, moment):
     """Set the accumulators of a row to 0."""
     rows[i_row, 0] = 0.0
@@ -502,7 +516,7 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
     has_moments = order == 2
     cuts = np.empty((8 * n_sites + n_x if has_moments else 0, 3), np.int32)
     moments = np.empty((cuts.shape[0], 2), np.float64)
-    n_spans, n_weights, n_cuts = 0, 0, 0
+    n_spans, n_weights, n_cuts = np.int64(0), np.int64(0), np.int64(0)  # a literal 0 would be a further type
     # Accumulators of a box of cells; all are 0 between boxes.
     rows = np.zeros((64, 3))
     cover = np.zeros((1024, 2))
@@ -533,7 +547,7 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
                 n_touched = _touched_columns(touched, i_row, n_words, columns)
                 base = i_row * n_columns
                 # A touched cell adds at most two spans, its own weight, and one weight of a run or the weights of a short run.
-                spans = _grow(spans, n_spans, 2 * n_touched)
+                spans = _grow_rows(spans, n_spans, 2 * n_touched)
                 weights = _grow(weights, n_weights, MIN_RUN * n_touched)
                 n_spans, n_weights, area = _write_row(
                     columns,
@@ -554,8 +568,8 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
                 covered[i_site] += area
                 if has_moments:
                     if n_cuts + n_x > cuts.shape[0]:
-                        cuts = _grow(cuts, n_cuts, n_x)
-                        moments = _grow(moments, n_cuts, n_x)
+                        cuts = _grow_rows(cuts, n_cuts, n_x)
+                        moments = _grow_rows(moments, n_cuts, n_x)
                     n_cuts = _write_cuts(
                         columns, n_touched, left, moment, base, rows, i_row, n_y, n_x, site, row, cuts, moments, n_cuts
                     )
@@ -611,7 +625,7 @@ def sort_cuts(cuts, moments, next_cut, first_slot, rows_per_band, out_cuts, out_
         next_cut[row] = to
 
 
-@njit(inline="always")
+@njit()
 def _add_gradients(cells, row, row_cuts, cuts, moments, slots):
     """Add moment x gradient over the cuts of a row to the slots."""
     n_y, n_x = cells.shape

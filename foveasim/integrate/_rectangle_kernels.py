@@ -17,7 +17,7 @@ import numpy as np
 from numba import types
 
 from foveasim._core.jit import njit
-from foveasim.integrate._kernels import _sum_cells
+from foveasim.integrate._kernels import ONE, ZERO, _sum_cells
 
 __all__ = ["find_rectangles", "gather_lattice", "gather_rectangles"]
 
@@ -66,7 +66,7 @@ def find_rectangles(xy, ring_offsets, site_offsets):
     return out
 
 
-@njit(inline="always")
+@njit()
 def _covered_cells(low, high, n):
     """
     Return (first, last, w_first, w_last, m_first, m_last) of an interval on ``n`` cells.
@@ -89,47 +89,54 @@ def _covered_cells(low, high, n):
     return first, last, w_first, w_last, 0.5 * w_first * (low - first), 0.5 * w_last * (high - last - 1.0)
 
 
-@njit(inline="always")
+@njit()
 def _along_row(cells, row, first, last, w_first, w_last):
-    """Return the integral of a row over an interval."""
+    """Return the integral of a row over an interval, from unsigned indices."""
     total = w_first * cells[row, first]
     if last > first:
         total += w_last * cells[row, last]
-        if last > first + 1:
-            total += _sum_cells(cells, row, first + 1, last)
+        if last > first + ONE:
+            total += _sum_cells(cells, row, first + ONE, last)
     return total
 
 
-@njit(inline="always")
+@njit()
+def _neighbours(index, n):
+    """Return the indices before and after an unsigned one, within ``n``."""
+    return index - ONE if index > ZERO else ZERO, index + ONE if index + ONE < np.uintp(n) else index
+
+
+@njit()
 def _difference(cells, row, c):
     """Return the gradient of a row at a cell, per cell; 0 along a single cell."""
-    n = cells.shape[1]
-    if n == 1:
-        return 0.0
-    step = np.float64(cells[row, min(c + 1, n - 1)]) - np.float64(cells[row, max(c - 1, 0)])
-    return 0.5 * step if 0 < c < n - 1 else step
+    before, after = _neighbours(c, cells.shape[1])
+    step = np.float64(cells[row, after]) - np.float64(cells[row, before])
+    return 0.5 * step if after > before + ONE else step
 
 
-@njit(inline="always")
+@njit()
 def _tilt(cells, row, first, last, w_first, w_last):
     """Return the integral over an interval of a row's gradient along v, per cell."""
-    n = cells.shape[0]
-    if n == 1:
+    below, above = _neighbours(row, cells.shape[0])
+    if below == above:
         return 0.0
-    above = _along_row(cells, min(row + 1, n - 1), first, last, w_first, w_last)
-    below = _along_row(cells, max(row - 1, 0), first, last, w_first, w_last)
-    return 0.5 * (above - below) if 0 < row < n - 1 else above - below
+    step = _along_row(cells, above, first, last, w_first, w_last) - _along_row(
+        cells, below, first, last, w_first, w_last
+    )
+    return 0.5 * step if above > below + ONE else step
 
 
-@njit(inline="always")
+@njit()
 def _integral(cells, u, v, order):
     """Return the integral over a rectangle, from its covered cells along x and along y."""
-    first, last, w_first, w_last, m_first, m_last = u
-    bottom, top, w_bottom, w_top, m_bottom, m_top = v
     total = 0.0
-    if last < first:
+    if u[1] < u[0] or v[1] < v[0]:
         return total
-    for row in range(bottom, top + 1):
+    first, last, bottom, top = np.uintp(u[0]), np.uintp(u[1]), np.uintp(v[0]), np.uintp(v[1])
+    w_first, w_last, m_first, m_last = u[2:]
+    w_bottom, w_top, m_bottom, m_top = v[2:]
+    row = bottom
+    while row <= top:
         weight = w_bottom if row == bottom else (w_top if row == top else 1.0)
         value = _along_row(cells, row, first, last, w_first, w_last)
         if order == 2:
@@ -138,8 +145,9 @@ def _integral(cells, u, v, order):
             if m_last != 0.0:
                 value += m_last * _difference(cells, row, last)
         total += weight * value
+        row += ONE
     if order == 2:
-        if m_bottom != 0.0 and top >= bottom:
+        if m_bottom != 0.0:
             total += m_bottom * _tilt(cells, bottom, first, last, w_first, w_last)
         if m_top != 0.0:
             total += m_top * _tilt(cells, top, first, last, w_first, w_last)
@@ -152,7 +160,8 @@ def _integral(cells, u, v, order):
             _input(cell, 2), _points, types.int64, types.int64, _flags, types.float64, types.int64, types.float64[::1]
         )
         for cell in (types.float32, types.float64)
-    ]
+    ],
+    allocates=False,
 )
 def gather_rectangles(cells, bounds, first_site, last_site, where, scale, order, out):
     """
@@ -193,34 +202,40 @@ def gather_lattice(cells, u, v, first_row, last_row, where, scale, order, out):
     """
     n_y, n_x = cells.shape
     n_columns = u.shape[0]
-    firsts, lasts = np.empty(n_columns, np.int64), np.empty(n_columns, np.int64)
+    columns = np.empty((n_columns, 2), np.int64)
     weights = np.empty((n_columns, 4))
     is_narrow = True
     for i in range(n_columns):
-        firsts[i], lasts[i], weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3] = _covered_cells(
+        columns[i, 0], columns[i, 1], weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3] = _covered_cells(
             u[i, 0], u[i, 1], n_x
         )
-        is_narrow &= 0 <= lasts[i] - firsts[i] <= 1
-    w_first, w_last = weights[:, 0].copy(), weights[:, 1].copy()
+        is_narrow &= 0 <= columns[i, 1] - columns[i, 0] <= 1
+    is_covered = columns[:, 1] >= columns[:, 0]
+    firsts, lasts = np.empty(n_columns, np.uintp), np.empty(n_columns, np.uintp)
+    w_first, w_last = np.empty(n_columns), np.empty(n_columns)
+    for i in range(n_columns):
+        firsts[i], lasts[i] = np.uintp(columns[i, 0]), np.uintp(max(columns[i, 1], columns[i, 0]))
+        w_first[i], w_last[i] = weights[i, 0], weights[i, 1]
     along = np.empty(n_columns)
     done = -1  # the row of the map in ``along``
-    chosen = np.empty(n_columns, np.int64)
+    chosen = np.empty(n_columns, np.uintp)
     for j in range(first_row, last_row):
         covered = _covered_cells(v[j, 0], v[j, 1], n_y)
         bottom, top, w_bottom, w_top = covered[:4]
         start = j * n_columns
+        sums = out[start : start + n_columns]
         n_chosen = 0
         for i in range(n_columns):
-            chosen[n_chosen] = i
+            chosen[n_chosen] = np.uintp(i)
             n_chosen += 1 if where.size == 0 or where[start + i] else 0
         if order == 2:
             for k in range(n_chosen):
                 i = chosen[k]
-                columns = (firsts[i], lasts[i], weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3])
-                out[start + i] = scale * _integral(cells, columns, covered, order)
+                interval = (columns[i, 0], columns[i, 1], weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3])
+                sums[i] = scale * _integral(cells, interval, covered, order)
             continue
         for k in range(n_chosen):
-            out[start + chosen[k]] = 0.0
+            sums[chosen[k]] = 0.0
         for row in range(bottom, top + 1):
             line = cells[row]
             weight = scale * (w_bottom if row == bottom else (w_top if row == top else 1.0))
@@ -230,18 +245,21 @@ def gather_lattice(cells, u, v, first_row, last_row, where, scale, order, out):
                     value = 0.0
                     if is_narrow:
                         value = w_first[i] * line[firsts[i]] + w_last[i] * line[lasts[i]]
-                    elif lasts[i] >= firsts[i]:
-                        value = _along_row(cells, row, firsts[i], lasts[i], w_first[i], w_last[i])
-                    out[start + i] += weight * value
+                    elif is_covered[i]:
+                        value = _along_row(cells, np.uintp(row), firsts[i], lasts[i], w_first[i], w_last[i])
+                    sums[i] += weight * value
                 continue
             if row != done:
                 done = row
-                for i in range(n_columns):
-                    if is_narrow:
+                if is_narrow:
+                    for i in range(n_columns):
                         along[i] = w_first[i] * line[firsts[i]] + w_last[i] * line[lasts[i]]
-                    elif lasts[i] >= firsts[i]:
-                        along[i] = _along_row(cells, row, firsts[i], lasts[i], w_first[i], w_last[i])
-                    else:
-                        along[i] = 0.0
+                else:
+                    for i in range(n_columns):
+                        along[i] = (
+                            _along_row(cells, np.uintp(row), firsts[i], lasts[i], w_first[i], w_last[i])
+                            if is_covered[i]
+                            else 0.0
+                        )
             for i in range(n_columns):
-                out[start + i] += weight * along[i]
+                sums[i] += weight * along[i]

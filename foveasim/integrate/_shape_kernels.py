@@ -30,7 +30,7 @@ _out3 = types.float64[:, :, ::1]
 _out2 = types.float64[:, ::1]
 
 
-@njit(inline="always")
+@njit()
 def _clip(start, step, size, first, last):
     """Return the part of a range of τ in which ``start + τ step`` is from 0 to ``size``."""
     if step == 0.0:
@@ -43,7 +43,7 @@ def _clip(start, step, size, first, last):
     return max(first, enter), min(last, leave)
 
 
-@njit(inline="always")
+@njit()
 def _first_cell(start, step, t, size, side):
     """Return the cell that a line enters at τ = t; ``side`` 1 is below a boundary."""
     position = start + t * step
@@ -55,13 +55,13 @@ def _first_cell(start, step, t, size, side):
     return min(max(cell, 0), size - 1)
 
 
-@njit(inline="always")
+@njit()
 def _n_sides(ua, va, ub, vb):
     """Return 2 for an edge along a cell boundary, else 1."""
     return 2 if (ua == ub and ua == np.floor(ua)) or (va == vb and va == np.floor(va)) else 1
 
 
-@njit(inline="always")
+@njit()
 def _next(start, inverse, cell, step):
     """Return τ at which a line leaves a cell along one axis."""
     if step == 0.0:
@@ -69,7 +69,7 @@ def _next(start, inverse, cell, step):
     return ((cell + 1 if step > 0.0 else cell) - start) * inverse
 
 
-@njit(inline="always")
+@njit()
 def _gradient(cells, i_map, row, column):
     """Return the change of the map per cell along u and v."""
     n_y, n_x = cells.shape[1], cells.shape[2]
@@ -180,7 +180,7 @@ def spread_moments(weights, i_map, begin, end, order, cells):
                 t = t_next
 
 
-@njit(inline="always")
+@njit()
 def _value(cells, i_map, row, column, u, v, order):
     """Return the map at a point, as seen from one cell; 0 outside the map."""
     n_y, n_x = cells.shape[1], cells.shape[2]

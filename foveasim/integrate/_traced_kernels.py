@@ -48,7 +48,7 @@ _points = _input(types.float64, 2)
 _flags = _input(types.boolean, 1)
 
 
-@njit(inline="always")
+@njit()
 def _ends(uv, start, stop):
     """Return lowest and highest vertex of a ring, and whether it is monotone along v."""
     low, high = start, start
@@ -70,7 +70,7 @@ def _ends(uv, start, stop):
     return low, high, is_monotone
 
 
-@njit(inline="always")
+@njit()
 def _gradient_u(cells, row, column):
     """Return the change of the map per cell along u at a cell."""
     n_x = cells.shape[1]
@@ -78,7 +78,15 @@ def _gradient_u(cells, row, column):
     return _gradient_scale(column, n_x) * (after - before)
 
 
-@njit(inline="always")
+@njit()
+def _gradient_v(cells, row, column):
+    """Return the change of the map per cell along v at a cell."""
+    n_y = cells.shape[0]
+    above, below = np.float64(cells[min(row + 1, n_y - 1), column]), np.float64(cells[max(row - 1, 0), column])
+    return _gradient_scale(row, n_y) * (above - below)
+
+
+@njit()
 def _sum_gradients_v(cells, row, start, stop):
     """Return the sum of the changes of the map along v, over the cells of a row."""
     n_y = cells.shape[0]
@@ -89,7 +97,7 @@ def _sum_gradients_v(cells, row, start, stop):
     return _gradient_scale(row, n_y) * (above - below)
 
 
-@njit(inline="always")
+@njit()
 def _between(sum_of, cells, row, start, stop):
     """Return a sum from ``start`` to ``stop``, signed."""
     if stop >= start:
@@ -97,7 +105,7 @@ def _between(sum_of, cells, row, start, stop):
     return -sum_of(cells, row, stop, start)
 
 
-@njit(inline="always")
+@njit()
 def _integrate_chain(cells, uv, start, stop, first, last, is_right, bottom, order, reference):
     """
     Return the integral of F dv along a chain of edges, upwards from ``first`` to ``last``.
@@ -169,7 +177,7 @@ def _integrate_chain(cells, uv, start, stop, first, last, is_right, bottom, orde
                     u_mean, v_mean = 0.5 * (u + u_next) - (column + 0.5), 0.5 * (v + v_next)
                     spread = (u_next - u) / 12.0
                     total += height * v_mean * before_v
-                    gradient_v = _sum_gradients_v(cells, row, column, column + 1)
+                    gradient_v = _gradient_v(cells, row, column)
                     before_v += gradient_v
                     if weight > NO_COVERAGE:
                         moment_u = 0.5 * (u_mean * u_mean + (u_next - u) * spread - 0.25)
@@ -184,7 +192,7 @@ def _integrate_chain(cells, uv, start, stop, first, last, is_right, bottom, orde
     return total
 
 
-@njit(inline="always")
+@njit()
 def _prefetch(cells, bottom, top, left, right):
     """
     Read one cell of each cache line of a box.
@@ -198,7 +206,7 @@ def _prefetch(cells, bottom, top, left, right):
     return 1.0 if probe == NEVER else 0.0  # used, so that the loop is not optimised away
 
 
-@njit(inline="always")
+@njit()
 def _is_within(uv, start, stop, n_y, n_x):
     """Whether all vertices of a ring are on the map."""
     is_within = True

@@ -1,10 +1,10 @@
 """
 Numba kernels of asynchronous photosites: change events, and spikes of collected charge.
 
-The kernels use arrays only, release the GIL, and are compiled for explicit types when this module is imported. Each kernel
-processes some sites frame by frame and updates the state of every site. Events are written to arrays in this order, site by
-site in each frame; ``ends`` contains the number of events up to the end of each frame. When the arrays are full, events are
-only counted, so that the caller can repeat the call with longer arrays; counting stops above ``max_events``.
+The kernels use arrays only, and release the GIL. Each kernel processes some sites frame by frame and updates the state of
+every site. Events are written to arrays in this order, site by site in each frame; ``ends`` contains the number of events up
+to the end of each frame. When the arrays are full, events are only counted, so that the caller can repeat the call with longer
+arrays; counting stops above ``max_events``.
 
 An event whose time would be rounded to another frame is moved to the nearest time in its own frame: change events are in
 ``(begin, end]`` of a frame, spikes in ``[begin, end)``. The order of events therefore does not depend on the batches.
@@ -42,7 +42,7 @@ _row = types.Array(types.float64, 1, "C", readonly=True)
 _rows = types.Array(types.float64, 2, "C", readonly=True)
 
 
-@njit(inline="always")
+@njit()
 def _random_words(key_0, key_1, site, number):
     return philox_4x64(key_0, key_1, np.uint64(site), np.uint64(number), np.uint64(0), np.uint64(0))
 

@@ -1,8 +1,7 @@
 """
 Numba kernels of the optics: relative illumination, padding, transfer functions.
 
-The kernels operate on plain arrays and release the global interpreter lock. They are compiled for explicit types when this
-module is imported; the machine code is cached on disk.
+The kernels operate on plain arrays and release the global interpreter lock.
 """
 
 from __future__ import annotations
@@ -44,7 +43,6 @@ COLUMNS_TOGETHER = 8
         for cell in (types.float32, types.float64)
         for real in (types.float32, types.float64)
     ],
-    error_model="numpy",
 )
 def apply_falloff(rows, x2, y2, power, source_column, n_before, out):
     """
@@ -141,6 +139,19 @@ def replicate(lines, n_columns, phase_x, phase_y, first, out):
                 out[column, begin + row] = value * (phase_y[begin + row] * phase_x[first + column])
 
 
+@njit()
+def _count_below(values, row, limit):
+    """Return the number of values below a limit in a row, which is ascending."""
+    low, high = 0, values.shape[1]
+    while low < high:
+        middle = (low + high) // 2
+        if values[row, middle] < limit:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
 @njit(
     [
         types.void(
@@ -173,7 +184,7 @@ def radial_factor(table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, first, 
                 continue
             reach = np.sqrt((last - u) * (last + u)) / per_step
             for ky in range(fy.shape[0]):
-                for iy in range(np.searchsorted(fy[ky], -reach), np.searchsorted(fy[ky], reach)):
+                for iy in range(_count_below(fy, ky, -reach), _count_below(fy, ky, reach)):
                     v = fy[ky, iy] * per_step
                     s = np.sqrt(u * u + v * v)
                     i = min(np.int32(s), np.int32(table.size - 2))
@@ -182,7 +193,7 @@ def radial_factor(table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, first, 
                     h[iy] += (a + t * (table[i + 1] - a)) * (gain_x[kx, ix] * gain_y[ky, iy])
 
 
-@njit(inline="always")
+@njit()
 def _interpolate_plane(table, u, v):
     """
     Interpolate a table over (f_y, f_x) bilinearly; 0 outside.
@@ -288,7 +299,7 @@ def filter_and_sum(lines, factors, coefficients, first, is_added, out):
                 total[:] = 0.0
 
 
-@njit(inline="always")
+@njit(allocates=True)
 def _alias_gain(cycles, k, source_cells, is_alternating):
     """
     Return ``sinc(f) * sinc(source_cells * f)`` for ``f = cycles + k``, (n_alias, n).

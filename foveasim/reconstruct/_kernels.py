@@ -3,8 +3,7 @@ Numba kernels of reconstruction: natural neighbours and the roughness gradient.
 
 A **triangulation** is three arrays with one row per triangle: ``corners`` (its sites, counter-clockwise), ``neighbours`` (the
 triangle across the edge opposite each corner, -1 where there is none) and ``circles`` (centre and squared radius of the
-circumcircle). The kernels take arrays only, release the interpreter lock, and are compiled for explicit types when this module
-is imported; the machine code is cached on disk.
+circumcircle). The kernels take arrays only, and release the interpreter lock.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """
 Numba kernels of the sensor: device random numbers, shot noise, conversion to codes.
 
-The kernels accept arrays and named tuples of arrays and numbers. They are compiled for explicit types when this module is
-imported. Arrays of per-site parameters have size n, or size 1 for a value common to all sites.
+The kernels accept arrays and named tuples of arrays and numbers. Arrays of per-site parameters have size n, or size 1 for a
+value common to all sites.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def device_uniforms(key_0, key_1, first, second):
     return out
 
 
-@njit(inline="always")
+@njit()
 def _poisson(mean, first, second, tables):
     """
     Draw a Poisson number from two uniform numbers.
@@ -112,7 +112,7 @@ def _poisson(mean, first, second, tables):
     return np.float64(n + added)
 
 
-@njit(types.void(types.float64[::1], types.float64, _poisson_tables, types.uint64), error_model="numpy")
+@njit(types.void(types.float64[::1], types.float64, _poisson_tables, types.uint64))
 def draw_poisson(charge_e, gaussian_above_e, tables, key):
     """
     Replace expectations by Poisson draws, in whole electrons.
@@ -150,7 +150,6 @@ def draw_poisson(charge_e, gaussian_above_e, tables, key):
 
 @njit(
     [types.void(_floats, index, index, _floats, types.int64, types.float64[::1]) for index in (_lines, _ints)],
-    error_model="numpy",
 )
 def mix(fractions, columns, offsets, charge_e, first, mixed_e):
     """Multiply rows of a sparse matrix, from row ``first``, by the charges of all sites."""
@@ -165,12 +164,12 @@ def mix(fractions, columns, offsets, charge_e, first, mixed_e):
         mixed_e[i] = total
 
 
-@njit(inline="always")
+@njit()
 def _value_of_site(values, i):
     return values[i] if values.size > 1 else values[0]
 
 
-@njit(inline="always")
+@njit()
 def _compand(fraction, adc):
     """Map a fraction of the voltage range to a fraction of the code range."""
     if adc.companding_index == ADC_ROOT:
@@ -184,32 +183,32 @@ def _compand(fraction, adc):
     return fraction
 
 
-@njit(inline="always")
+@njit()
 def _apply_nonlinearity(v, nonlinearity, v_sat_v):
     """Return the voltage after the nonlinearity."""
     return v * (1.0 - nonlinearity * min(max(v / v_sat_v, 0.0), 1.0))
 
 
-@njit(types.void(types.float64[::1], types.float64, types.float64), error_model="numpy")
+@njit(types.void(types.float64[::1], types.float64, types.float64))
 def apply_nonlinearity(voltage_v, nonlinearity, v_sat_v):
     """Apply the nonlinearity, the relative signal loss at full range, in place."""
     for i in range(voltage_v.size):
         voltage_v[i] = _apply_nonlinearity(voltage_v[i], nonlinearity, v_sat_v)
 
 
-@njit(inline="always")
+@njit()
 def _relative_voltage(v, v_sat_v):
     """Return the fraction of the voltage range, clipped to 0 .. 1."""
     return min(max(v / v_sat_v, 0.0), 1.0)
 
 
-@njit(inline="always")
+@njit()
 def _index(position):
     """Truncate to an index; unsigned integers avoid the check for negative indices."""
     return np.uint32(np.int32(position))
 
 
-@njit(inline="always")
+@njit()
 def _add_inl(value, n_codes, inl):
     """Add the integral nonlinearity to an unquantised code."""
     # The number of codes is a power of 2: its inverse is exact.
@@ -218,7 +217,7 @@ def _add_inl(value, n_codes, inl):
     return value + (inl[k] + (position - k) * (inl[k + 1] - inl[k]))
 
 
-@njit(inline="always")
+@njit()
 def _unquantised_code(charge, site, adc):
     """Return the code of a charge before quantisation; ``site``: transfer parameters."""
     per_e, sense_v, scale, output_v, nonlinearity = site
@@ -227,33 +226,33 @@ def _unquantised_code(charge, site, adc):
     return _add_inl(value, adc.n_codes, adc.inl) if adc.inl.size > 1 else value
 
 
-@njit(inline="always")
+@njit()
 def _dnl_position(key, line, code, n_quantiles):
     """Return the fractional index into the Gaussian quantiles for a readout line and a code."""
     word, _ = philox_2x32(key, np.uint64(line) & _LOW, np.uint64(code))
     return np.float64(word) * (_ONE_IN_2_32 * (n_quantiles - 1))
 
 
-@njit(inline="always")
+@njit()
 def _interpolate(quantiles, position):
     """Interpolate quantiles linearly."""
     k = _index(position)
     return quantiles[k] + (position - k) * (quantiles[k + 1] - quantiles[k])
 
 
-@njit(inline="always")
+@njit()
 def _dnl_normal(key, line, code, quantiles):
     """Return the standard Gaussian DNL number of a readout line and a code."""
     return _interpolate(quantiles, _dnl_position(key, line, code, quantiles.size))
 
 
-@njit(inline="always")
+@njit()
 def _quantise(value, n_codes):
     """Quantise to a code in float64."""
     return np.float64(np.int32(min(max(value + CODE_ROUNDING, 0.0), n_codes - 1.0)))
 
 
-@njit(inline="always")
+@njit()
 def _quantise_with_dnl(value, line, adc):
     """Quantise to a code, with differential nonlinearity."""
     code = _quantise(value, adc.n_codes)
@@ -308,7 +307,7 @@ def _charge_at_code(value, site, adc):
     return (v - sense_v) / per_e
 
 
-@njit([types.void(_floats, _lines, _adc, code[::1]) for code in (types.uint8, types.uint16)], error_model="numpy")
+@njit([types.void(_floats, _lines, _adc, code[::1]) for code in (types.uint8, types.uint16)])
 def convert(voltage_v, line, adc, code):
     """
     Convert voltages to codes: clipping, companding, INL, DNL, quantisation.
@@ -349,7 +348,7 @@ def convert(voltage_v, line, adc, code):
                 codes[j] = np.int32(_quantise(value[j] + dnl * _interpolate(quantiles, position[j]), n_codes))
 
 
-@njit(inline="always")
+@njit()
 def _edgeworth_cdf(x, skewness):
     """Return the standardised Gaussian CDF with the first Edgeworth term (skewness)."""
     gaussian = 0.5 * math.erfc(-x * SQRT_HALF)
@@ -358,7 +357,7 @@ def _edgeworth_cdf(x, skewness):
     return gaussian - skewness / 6.0 * (x * x - 1.0) * math.exp(-0.5 * x * x) / SQRT_TWO_PI
 
 
-@njit(inline="always")
+@njit()
 def _probability_below(q, nodes, weights, n_nodes, mean, deviation, third, well_e, sigma, half_step):
     """
     Return the probability that a charge plus readout noise is below ``q``.

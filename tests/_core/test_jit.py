@@ -1,4 +1,4 @@
-"""Compiled kernels: corrupt machine code on disk is compiled again, or its directory is reported."""
+"""Compiled kernels: types, threads, calls between kernels; corrupt machine code is compiled again, or reported."""
 
 from __future__ import annotations
 
@@ -8,28 +8,33 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
-from reference.kernels import kernel_modules
 
 import foveasim
-from foveasim._core.jit import njit
+from foveasim._core import jit
+from foveasim._core.jit import kernel_modules, njit
 
 PACKAGE = Path(foveasim.__file__).parent
-#: Load a small kernel module, and parse the GDSII records HEADER and ENDLIB, 6 and 4 bytes.
+#: Load a small kernel, and parse the GDSII records HEADER and ENDLIB, 6 and 4 bytes.
 PROGRAM = """
 import sys
 import numpy as np
 from foveasim.errors import FoveasimError
+from foveasim.layout.files._kernels import walk_records
+records = bytes([0, 6, 0, 2, 2, 88, 0, 4, 4, 0])
 try:
-    from foveasim.layout.files._kernels import walk_records
+    print(walk_records(np.frombuffer(records, np.uint8), np.ones(2**16, bool), 0x0400))
 except FoveasimError as error:
     sys.exit(str(error))
-records = bytes([0, 6, 0, 2, 2, 88, 0, 4, 4, 0])
-print(walk_records(np.frombuffer(records, np.uint8), np.ones(2**16, bool), 0x0400))
 """
 
 
@@ -85,12 +90,177 @@ def test_irreplaceable_machine_code_is_reported(filled_cache, tmp_path):
     assert re.fullmatch(r"/.*: contains compiled kernels that can be neither read nor replaced .*; delete .*", message)
 
 
+def test_kernels_are_compiled_for_the_types_that_are_used(monkeypatch):
+    signatures = [numba.void(real[::1], numba.int64) for real in (numba.float32, numba.float64)]
+    monkeypatch.setattr(jit, "_announced", {__name__})
+
+    @njit(signatures)
+    def increase(values, by):
+        for i in range(values.size):
+            values[i] += by
+
+    assert repr(increase) == f"<kernel {__name__}.{increase.__qualname__}, 0 of 2 compiled>"
+    for dtype, n_compiled in ((np.float64, 1), (np.float64, 1), (np.float32, 2)):
+        values = np.arange(3.0, dtype=dtype)
+        increase(values, 2)
+
+        assert values.tolist() == [2.0, 3.0, 4.0]
+        assert f"{n_compiled} of 2" in repr(increase)
+    with pytest.raises(TypeError, match="no signature for complex64"):
+        increase(np.zeros(3, np.complex64), 2)
+
+
+def test_kernels_are_distinguished_by_the_fewest_arrays():
+    pairs = [(numba.float32, numba.int8), (numba.float64, numba.int8), (numba.float64, numba.int16)]
+
+    @njit([numba.float64(numba.float64[::1], a[::1], a, b[::1]) for a, b in pairs])
+    def add(x, y, z, w):
+        return x[0] + y[0] + z + w[0]
+
+    assert [
+        add(np.ones(1), np.full(1, 2.0, y), z, np.full(1, 4, w))
+        for y, z, w in ((np.float32, np.float32(3.0), np.int8), (np.float64, 3.0, np.int8), (np.float64, 3.0, np.int16))
+    ] == [10.0] * 3
+    assert "3 of 3" in repr(add)
+
+
+def test_threads_compile_a_kernel_once(monkeypatch):
+    compiled = []
+
+    def compile_slowly(function, *_):
+        compiled.append(function.__name__)
+        time.sleep(0.05)
+        return function
+
+    monkeypatch.setattr(jit, "_compile", compile_slowly)
+
+    @njit(numba.int64(numba.int64))
+    def double(x):
+        return 2 * x
+
+    with ThreadPoolExecutor(8) as pool:
+        assert list(pool.map(double, range(8))) == list(range(0, 16, 2))
+    assert compiled == ["double"]
+
+
+def test_kernels_call_kernels_and_functions():
+    @njit(numba.float64(numba.float64[::1]))
+    def total(values):
+        found = 0.0
+        for value in values:
+            found += value
+        return found
+
+    @njit()
+    def half(value):
+        return 0.5 * value
+
+    @njit(numba.float64(numba.float64[::1]))
+    def half_total(values):
+        return half(total(values))
+
+    assert half_total(np.arange(5.0)) == 5.0
+    assert total(np.arange(5.0)) == 10.0
+
+
+@pytest.mark.skipif("FOVEASIM_TESTS_ALL" not in os.environ, reason="compiles all kernels: make test-all")
+def test_functions_that_return_arrays_count_references():
+    """Without reference counts, an array that is returned could be released while it is used."""
+    program = """
+from importlib import import_module
+from numba import types
+from numba.core.dispatcher import Dispatcher
+from foveasim._core.jit import kernel_modules
+from foveasim._core.jit import Kernel
+
+def has_array(kind):
+    return isinstance(kind, types.Array) or any(map(has_array, kind if isinstance(kind, types.BaseTuple) else ()))
+
+objects = [value for name in kernel_modules() for value in vars(import_module(name)).values()]
+for kernel in objects:
+    if isinstance(kernel, Kernel):
+        kernel.compile()
+functions = [value._inner if isinstance(value, Kernel) else value for value in objects]
+types_of = [(f, o.signature.return_type) for f in functions if isinstance(f, Dispatcher) for o in f.overloads.values()]
+assert len(types_of) > 100
+print([f.__name__ for f, kind in types_of if has_array(kind) and not f.targetoptions["_nrt"]])
+"""
+    with tempfile.TemporaryDirectory() as cache:  # functions that are inlined are compiled with their kernels only
+        done = subprocess.run(
+            [sys.executable, "-c", program],
+            env={**os.environ, "NUMBA_CACHE_DIR": cache, "PYTHONPATH": str(PACKAGE.parent)},
+            stdout=subprocess.PIPE,
+            text=True,
+            check=True,
+        )
+
+    assert done.stdout == "[]\n"
+
+
+def test_division_by_zero_is_that_of_numpy():
+    @njit(numba.float64(numba.float64, numba.float64))
+    def ratio(a, b):
+        return a / b
+
+    assert [ratio(1.0, 0.0), ratio(-1.0, 0.0)] == [np.inf, -np.inf]
+    assert np.isnan(ratio(0.0, 0.0))
+
+
+@pytest.mark.parametrize("n_workers", [1, 2])
+def test_kernels_are_compiled_ahead(tmp_path, n_workers):
+    program = f"""
+from foveasim._core import jit
+jit.kernel_modules = lambda: ["foveasim.layout.files._kernels", "foveasim.scene._kernels"]
+print(jit.compile_kernels(n_workers={n_workers}))
+"""
+    run = partial(
+        subprocess.run,
+        env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(PACKAGE.parent)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert run([sys.executable, "-c", program]).stdout == "3\n"
+    stored = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb[ic]")}
+
+    assert len(list(tmp_path.rglob("*.nbc"))) == 4  # two kernels of files, and one for two types of pixels
+    assert load_kernels(tmp_path) == ("(10, 1024)", "")
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb[ic]")} == stored
+
+
+def test_errors_of_workers_are_raised(filled_cache, tmp_path):
+    program = """
+import sys
+from foveasim._core import jit
+from foveasim.errors import FileError
+jit.kernel_modules = lambda: ["foveasim.layout.files._kernels"]
+try:
+    jit.compile_kernels(n_workers=2)
+except FileError as error:
+    sys.exit(str(error))
+"""
+    cache = shutil.copytree(filled_cache, tmp_path / "numba")
+    for path in cache.rglob("*.nbi"):
+        path.unlink()
+        path.mkdir()
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env={**os.environ, "NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": str(PACKAGE.parent)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+    assert done.returncode == 1
+    assert re.fullmatch(r"/.*: contains compiled kernels that can be neither .*; delete .*", done.stderr.strip())
+
+
 def test_other_compilation_errors_pass_through():
     def kernel(x):
         return x + 1
 
     with pytest.raises(numba.TypingError):
-        njit(numba.int64(numba.types.unicode_type))(kernel)
+        njit(numba.int64(numba.types.unicode_type))(kernel).compile()
 
 
 def test_kernel_modules_are_found_by_content():
@@ -115,4 +285,4 @@ def test_kernels_are_imported_inside_functions(path):
         for name in (getattr(node, "module", None) or "", *(alias.name for alias in node.names))
     ]
 
-    assert [name for name in imported if name.endswith("_kernels")] == []
+    assert [name for name in imported if re.search(r"(^|\.)_\w*kernels$", name)] == []

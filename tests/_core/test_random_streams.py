@@ -7,7 +7,9 @@ import math
 import os
 import subprocess
 import sys
+from functools import cache
 
+import numba
 import numpy as np
 import pytest
 import scipy.special
@@ -121,8 +123,14 @@ def test_keys_of_blocks_are_distinct(other):
 MASK_32 = 2**32 - 1
 
 
+@cache
+def from_python(function):
+    """Return a function of kernels as one that Python can call."""
+    return numba.njit(function.py_func)
+
+
 def known(generator, key, counter):
-    words = generator(*(np.uint64(word) for word in (*key, *counter)))
+    words = from_python(generator)(*(np.uint64(word) for word in (*key, *counter)))
     return tuple(int(word) for word in words)
 
 
@@ -199,7 +207,8 @@ def reference_normal(key, i):
 
 @pytest.mark.parametrize("word", [0, 1, 2**12 - 1, 2**63 - 1, 2**63, 2**64 - 2**12, 2**64 - 1])
 def test_uniform_numbers_exclude_zero_and_one(word):
-    number, opposite = _kernels.uniform(np.uint64(word)), _kernels.uniform(np.uint64(2**64 - 1 - word))
+    uniform = from_python(_kernels.uniform)
+    number, opposite = uniform(np.uint64(word)), uniform(np.uint64(2**64 - 1 - word))
 
     # Differences below 1 of multiples of 2**-53 are exact.
     assert number == 1.0 - opposite
