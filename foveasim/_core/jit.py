@@ -1,5 +1,5 @@
 """
-Compilation of numba kernels, on first use or ahead of it, with machine code cached on disk.
+Compilation of numba kernels, on first use or ahead, with machine code on disk.
 
 Kernels are defined in separate modules, ``_kernels.py``, which are imported by the functions that call them: importing numba
 takes half a second, so it does not happen at ``import foveasim``. A kernel is compiled when it is first called, for the types
@@ -256,7 +256,7 @@ def _arguments(signature: Any) -> tuple[Any, ...]:
 
 
 def _distinct_positions(signatures: Sequence[Any]) -> tuple[int, ...]:
-    """Return the positions of as few arrays as possible whose dtypes distinguish the signatures."""
+    """Return the positions of the fewest arrays whose dtypes distinguish the signatures."""
     positions: list[int] = []
     columns = list(zip(*map(_arguments, signatures), strict=True))
     while len({tuple(columns[k][i] for k in positions) for i in range(len(signatures))}) < len(signatures):

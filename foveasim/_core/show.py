@@ -1,4 +1,4 @@
-"""Methods that draw their object: functions of :mod:`foveasim.view`, which is imported on use."""
+"""Methods that draw: functions of :mod:`foveasim.view`, which is imported on use."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def drawn(
 ) -> Drawn[Axes]: ...
 def drawn(name: str) -> Drawn[Any]:
     """
-    Return a method that is a function of :mod:`foveasim.view` with the object as first argument.
+    Return a method that calls a function of :mod:`foveasim.view` with its object.
 
     Lower modules thereby draw their objects without importing the package, which is loaded on use. Signature and docstring are
     those of the function, without its first parameter.

@@ -175,7 +175,7 @@ class Camera:
 
     @cached_property
     def settings(self) -> dict[str, Any]:
-        """Settings of optics, distortion, sensor and layout, as plain data: those that all captures of the camera share."""
+        """Settings that all captures share, as plain data: optics, distortion, sensor, layout."""
         return {
             "optics": to_plain_data(self._optics),
             "distortion": None if self._distortion is None else to_plain_data(self._distortion),

@@ -50,7 +50,7 @@ class WeightedMap(NamedTuple):
 
 
 def to_sensor_frame(lens: Lens | None, grid: Grid) -> Grid:
-    """Transform a grid from the frame of the optics to the frame of the sensor behind a lens model."""
+    """Transform a grid from the frame of the optics to that of the sensor behind a lens."""
     if lens is None:
         return grid
     centre_um = np.array(lens.centre_um)

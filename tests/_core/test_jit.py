@@ -90,7 +90,7 @@ def test_irreplaceable_machine_code_is_reported(filled_cache, tmp_path):
     assert re.fullmatch(r"/.*: contains compiled kernels that can be neither read nor replaced .*; delete .*", message)
 
 
-def test_kernels_are_compiled_for_the_types_that_are_used(monkeypatch):
+def test_kernels_are_compiled_for_used_types(monkeypatch):
     signatures = [numba.void(real[::1], numba.int64) for real in (numba.float32, numba.float64)]
     monkeypatch.setattr(jit, "_announced", {__name__})
 
