@@ -10,6 +10,7 @@ from numba import types
 from foveasim._core.jit import njit
 
 __all__ = [
+    "areas_in_boxes",
     "aspect_ratios",
     "colour_greedily",
     "contacts",
@@ -48,6 +49,50 @@ def fill_rectangles(x, y, first, xy):
         xy[4 * k + 1, 0], xy[4 * k + 1, 1] = x1, y0
         xy[4 * k + 2, 0], xy[4 * k + 2, 1] = x1, y1
         xy[4 * k + 3, 0], xy[4 * k + 3, 1] = x0, y1
+
+
+@njit(types.float64[::1](_points, _ints, _ints, _ints, _points))
+def areas_in_boxes(xy, ring_offsets, site_offsets, sites, boxes):
+    """
+    Return the areas of sites (n,) within boxes (n, 4).
+
+    A row of ``boxes`` is x_min, y_min, x_max, y_max; ``sites`` are indices. By Green's theorem, the area is the sum over the
+    edges of the integral of ``clip(x, x_min, x_max) - x_min`` dy, between y_min and y_max. Outer rings are counter-clockwise,
+    and holes clockwise.
+    """
+    areas = np.zeros(sites.size)
+    for i in range(sites.size):
+        x0, y0, x1, y1 = boxes[i]
+        for ring in range(site_offsets[sites[i]], site_offsets[sites[i] + 1]):
+            a = ring_offsets[ring + 1] - 1
+            for b in range(ring_offsets[ring], ring_offsets[ring + 1]):
+                areas[i] += _area_beside_edge(xy[a, 0], xy[a, 1], xy[b, 0], xy[b, 1], x0, y0, x1, y1)
+                a = b
+    return areas
+
+
+@njit()
+def _area_beside_edge(ax, ay, bx, by, x0, y0, x1, y1):
+    """Return the area of a box to the left of an edge; negative for a falling edge."""
+    sign = 1.0
+    if ay > by:
+        ax, ay, bx, by, sign = bx, by, ax, ay, -1.0
+    low, high = max(ay, y0), min(by, y1)
+    if not low < high:
+        return 0.0
+    slope = (bx - ax) / (by - ay)
+    start = ax if low == ay else ax + (low - ay) * slope
+    end = bx if high == by else ax + (high - ay) * slope
+    left, right = min(start, end), max(start, end)
+    if right <= x0:
+        return 0.0
+    if left >= x1:
+        return sign * (high - low) * (x1 - x0)
+    first, last = max(left, x0), min(right, x1)
+    width = right - left
+    within = (last - first) / width if width > 0.0 else 1.0
+    beyond = (right - last) / width if width > 0.0 else 0.0
+    return sign * (high - low) * (within * (0.5 * (first + last) - x0) + beyond * (x1 - x0))
 
 
 @njit()

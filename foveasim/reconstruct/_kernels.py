@@ -13,7 +13,7 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = ["add_roughness", "natural_neighbours"]
+__all__ = ["add_roughness", "find_triangles", "interpolate"]
 
 #: Largest number of natural neighbours: a random point has six, and the centre of a ring of sites has the complete ring.
 MAX_TRIANGLES = 4096
@@ -22,6 +22,9 @@ MAX_TRIANGLES = 4096
 HULL_FRACTION = 1e-5
 #: A point closer to a corner than this fraction of its triangle's longest edge coincides with the corner.
 CORNER_FRACTION = 1e-10
+#: A point outside the hull by less than this fraction of the squared extent of the sites, as the area of the triangle with the
+#: hull edge, is on the hull.
+HULL_AREA = 1e-14
 
 
 def _input(dtype, ndim):
@@ -38,6 +41,51 @@ def _cross(ax, ay, bx, by):
     return ax * by - ay * bx
 
 
+@njit()
+def _step(x, y, t, xy, corners, neighbours):
+    """
+    Return the next triangle on a walk towards a point.
+
+    It is across an edge that has the point on its other side: -1 outside the hull, and the same triangle if it contains the
+    point.
+    """
+    for k in range(3):
+        a, b = corners[t, (k + 1) % 3], corners[t, (k + 2) % 3]
+        area = _cross(xy[a, 0] - x, xy[a, 1] - y, xy[b, 0] - x, xy[b, 1] - y)
+        other = neighbours[t, k]
+        if area < 0.0 and (other >= 0 or area < -HULL_AREA):
+            return other
+    return t
+
+
+@njit(types.void(_points, _points, _table, _table, types.int64[::1]))
+def find_triangles(points, xy, corners, neighbours, found):
+    """
+    Find the triangle of a Delaunay triangulation that contains each point, -1 outside.
+
+    Each search walks towards the point from the triangle of the previous one. In a Delaunay triangulation every such walk
+    ends (O. Devillers, S. Pion and M. Teillaud, Walking in a triangulation, 2002, section 2.2), except for rounding errors in
+    flat triangles: after as many steps as there are triangles, all are searched.
+    """
+    start = 0
+    for p in range(points.shape[0]):
+        x, y = points[p, 0], points[p, 1]
+        at = start
+        for _ in range(corners.shape[0]):
+            before, at = at, _step(x, y, at, xy, corners, neighbours)
+            if at < 0 or at == before:
+                break
+        else:
+            at = -1
+            for t in range(corners.shape[0]):
+                if _step(x, y, t, xy, corners, neighbours) == t:
+                    at = t
+                    break
+        found[p] = at
+        if at >= 0:
+            start = at
+
+
 @njit(
     types.void(
         _points,
@@ -47,15 +95,16 @@ def _cross(ax, ay, bx, by):
         _table,
         _table,
         _points,
+        types.boolean,
         types.float64[:, ::1],
     ),
 )
-def natural_neighbours(points, start, xy, values, corners, neighbours, circles, out):
+def interpolate(points, start, xy, values, corners, neighbours, circles, is_smooth, out):
     """
-    Evaluate Sibson's interpolant at points in known triangles.
+    Evaluate the linear interpolant, or Sibson's, at points in known triangles.
 
-    ``points`` (n, 2) lie in the triangles ``start``; sites at ``xy`` (n_site, 2) have ``values`` (n_site, n_channel); results
-    are written to ``out`` (n, n_channel).
+    The latter for ``is_smooth``. ``points`` (n, 2) lie in the triangles ``start``; sites at ``xy`` (n_site, 2) have ``values``
+    (n_site, n_channel); results are written to ``out`` (n, n_channel). The linear interpolant does not use ``circles``.
 
     Inserting a point replaces the triangles whose circumcircles contain it. Its Voronoi cell takes a polygon from the cell of
     each of their sites. The polygon vertices are the circumcentres of those triangles, and the centres of the circles through
@@ -70,6 +119,7 @@ def natural_neighbours(points, start, xy, values, corners, neighbours, circles, 
     # Area taken from each site; allocated once and cleared where it was used.
     area = np.zeros(xy.shape[0], np.float64)
     is_inside = np.zeros(corners.shape[0], np.bool_)
+    barycentric = np.empty(3)
 
     for p in range(points.shape[0]):
         px, py = points[p, 0], points[p, 1]
@@ -81,8 +131,7 @@ def natural_neighbours(points, start, xy, values, corners, neighbours, circles, 
             a, b = corners[containing, k], corners[containing, (k + 1) % 3]
             longest2 = max(longest2, (xy[a, 0] - xy[b, 0]) ** 2 + (xy[a, 1] - xy[b, 1]) ** 2)
         double_area = 0.0
-        is_straight = False
-        barycentric = np.empty(3)
+        is_straight = not is_smooth
         for k in range(3):
             a, b = corners[containing, (k + 1) % 3], corners[containing, (k + 2) % 3]
             barycentric[k] = _cross(xy[a, 0] - px, xy[a, 1] - py, xy[b, 0] - px, xy[b, 1] - py)

@@ -10,6 +10,7 @@ import shapely
 import skimage.data
 from PIL import Image, features
 from reference.neighbours import sibson_weights
+from scipy.spatial import Delaunay
 from skimage.color import rgb2gray
 from skimage.transform import resize
 
@@ -20,6 +21,7 @@ from foveasim.integrate import Integrator
 from foveasim.metrics import psnr_db
 from foveasim.reconstruct import (
     Picture,
+    _kernels,
     blur_kernel,
     cells,
     estimate_from_charge,
@@ -156,6 +158,33 @@ def test_linear_field_exact_inside_hull_clamped_outside(layout, method):
 
     assert (is_seen & ~inside).any()
     assert np.abs(picture.data[0] - expected)[is_seen].max() < 2e-5
+
+
+@pytest.mark.parametrize("kind", ["random", "lattice", "ring", "almost collinear"])
+def test_points_are_in_their_triangles(kind):
+    rng = np.random.default_rng(4)
+    angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+    xy = {
+        "random": rng.uniform(-0.5, 0.5, (300, 2)),
+        "lattice": np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 9), np.linspace(-0.5, 0.5, 9)), axis=-1).reshape(-1, 2),
+        "ring": 0.5 * np.stack((np.cos(angle), np.sin(angle)), axis=1),
+        "almost collinear": np.stack((np.linspace(-0.5, 0.5, 40), 1e-9 * rng.uniform(-0.5, 0.5, 40)), axis=1),
+    }[kind]
+    mesh = Delaunay(xy)
+    corners, neighbours = (np.ascontiguousarray(part, np.int64) for part in (mesh.simplices, mesh.neighbors))
+    # Any points, the sites, and points on edges.
+    points = np.concatenate((rng.uniform(-0.6, 0.6, (500, 2)), xy, xy[corners[:, :2]].mean(axis=1)))
+    points[:500, 1] *= np.abs(xy[:, 1]).max() / 0.5
+    found = np.empty(points.shape[0], np.int64)
+
+    _kernels.find_triangles(points, xy, corners, neighbours, found)
+
+    polygons = shapely.polygons(xy[corners[np.maximum(found, 0)]])
+    outside_hull = shapely.distance(shapely.points(points), shapely.MultiPoint(xy).convex_hull)
+    assert shapely.distance(shapely.points(points), polygons)[found >= 0].max() < 1e-12
+    assert (outside_hull[found < 0] > 0.0).all()
+    assert (outside_hull[found >= 0] < 1e-12).all()
+    assert (found[500:] >= 0).all()
 
 
 def test_natural_neighbours_match_voronoi_reference():

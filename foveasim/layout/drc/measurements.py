@@ -510,6 +510,8 @@ def _densities(case: Case) -> Measurement:
 
 def _filled_um2(layout: Layout, x_um: Floats, y_um: Floats) -> Floats:
     """Compute the area covered by sites in every grid cell, (n_y - 1, n_x - 1) µm²."""
+    from foveasim.layout import _kernels
+
     box = layout.site_bounds_um
     columns, rows = x_um.size - 1, y_um.size - 1
     first_x, last_x = (np.clip(np.searchsorted(x_um, box[:, i], "right") - 1, 0, columns - 1) for i in (0, 2))
@@ -523,11 +525,10 @@ def _filled_um2(layout: Layout, x_um: Floats, y_um: Floats) -> Floats:
     position = positions_in_runs(wide * high)
     owner = np.repeat(np.arange(cut.size), wide * high)
     ix, iy = first_x[cut][owner] + position % wide[owner], first_y[cut][owner] + position // wide[owner]
-    pieces = shapely.intersection(
-        layout[cut].polygons()[owner], shapely.box(x_um[ix], y_um[iy], x_um[ix + 1], y_um[iy + 1])
-    )
+    boxes = np.stack((x_um[ix], y_um[iy], x_um[ix + 1], y_um[iy + 1]), axis=1)
+    pieces_um2 = _kernels.areas_in_boxes(layout.xy_um, layout.ring_offsets, layout.site_offsets, cut[owner], boxes)
     cells = np.concatenate((cell, iy * columns + ix))
-    filled = np.bincount(cells, np.concatenate((area_um2, shapely.area(pieces))), rows * columns)
+    filled = np.bincount(cells, np.concatenate((area_um2, pieces_um2)), rows * columns)
     return np.asarray(filled.reshape(rows, columns), dtype=np.float64)
 
 
