@@ -74,12 +74,14 @@ def brown_conrady_inverse(xy, k, p1, p2, fold, ideal, per_step):
     last = ideal.size - 1
     for i in range(xy.shape[0]):
         u, v = xy[i, 0], xy[i, 1]
-        # Adjacent sites of a layout share corners.
-        same = -1
-        for j in range(max(i - N_COMPARED, 0), i):
+        # Adjacent sites of a layout share corners. Unsigned indices avoid the check for negative ones.
+        same = np.uintp(i)
+        for back in range(1, min(i, N_COMPARED) + 1):
+            j = np.uintp(i - back)
             if xy[j, 0] == u and xy[j, 1] == v:
                 same = j
-        if same >= 0:
+                break
+        if same != np.uintp(i):
             found[i, 0], found[i, 1] = found[same, 0], found[same, 1]
             continue
         distance = np.sqrt(u * u + v * v)

@@ -36,6 +36,8 @@ __all__ = [
     "N_RUN",
     "ROW",
     "SITE",
+    "edges",
+    "find_reversed_edges",
     "gather",
     "measure_sites",
     "scatter",
@@ -435,6 +437,32 @@ def measure_sites(xy, ring_offsets, site_offsets):
         areas[site] = 0.5 * twice
         bounds[site, 0], bounds[site, 1], bounds[site, 2], bounds[site, 3] = x_low, y_low, x_high, y_high
     return areas, bounds
+
+
+@njit(types.boolean[::1](_points, _ints))
+def find_reversed_edges(xy, ring_offsets):
+    """Return whether the edge after each vertex begins at its lexicographically larger one."""
+    is_reversed = np.empty(xy.shape[0], np.bool_)
+    for ring in range(ring_offsets.size - 1):
+        stop = ring_offsets[ring + 1]
+        for a in range(ring_offsets[ring], stop):
+            b = a + 1 if a + 1 < stop else ring_offsets[ring]
+            is_reversed[a] = xy[b, 0] < xy[a, 0] or (xy[b, 0] == xy[a, 0] and xy[b, 1] < xy[a, 1])
+    return is_reversed
+
+
+@njit(types.Tuple((_moment_list, _moment_list))(_points, _ints, _flags))
+def edges(xy, ring_offsets, is_reversed):
+    """Return the start (n, 2) of the edge after each vertex, and the vector (n, 2) to its end."""
+    start, along = np.empty((xy.shape[0], 2)), np.empty((xy.shape[0], 2))
+    for ring in range(ring_offsets.size - 1):
+        stop = ring_offsets[ring + 1]
+        for a in range(ring_offsets[ring], stop):
+            b = a + 1 if a + 1 < stop else ring_offsets[ring]
+            first, last = (b, a) if is_reversed[a] else (a, b)
+            start[a, 0], start[a, 1] = xy[first, 0], xy[first, 1]
+            along[a, 0], along[a, 1] = xy[last, 0] - xy[first, 0], xy[last, 1] - xy[first, 1]
+    return start, along
 
 
 @njit()

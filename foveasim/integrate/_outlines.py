@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from foveasim._core.rings import next_vertex, positions_in_runs
+from foveasim._core.rings import positions_in_runs
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.fields import Lattice, PackedRings, PointMap
 
@@ -95,15 +95,13 @@ class _Edges:
     """
 
     def __init__(self, xy_um: Floats, ring_offsets: Ints, lens: PointMap) -> None:
+        from foveasim.integrate import _kernels
+
         self._lens = lens
-        following = next_vertex(ring_offsets)
-        end = xy_um[following]
-        self.is_reversed = (end[:, 0] < xy_um[:, 0]) | ((end[:, 0] == xy_um[:, 0]) & (end[:, 1] < xy_um[:, 1]))
-        exchanged = self.is_reversed[:, np.newaxis]
-        self.low, self.along = np.where(exchanged, end, xy_um), np.where(exchanged, xy_um - end, end - xy_um)
         self.undistorted = lens.undistort(xy_um, outside="mask")
-        self._low_to = np.where(exchanged, self.undistorted[following], self.undistorted)
-        self._along_to = np.where(exchanged, -1.0, 1.0) * (self.undistorted[following] - self.undistorted)
+        self.is_reversed = _kernels.find_reversed_edges(xy_um, ring_offsets)
+        self.low, self.along = _kernels.edges(xy_um, ring_offsets, self.is_reversed)
+        self._low_to, self._along_to = _kernels.edges(self.undistorted, ring_offsets, self.is_reversed)
 
     def at(self, edge: Ints | slice, fraction: Any) -> Floats:
         """Return points on edges, (n, 2)."""
@@ -117,7 +115,8 @@ class _Edges:
         sites. The deviation of n chords is 1/n² of that of one, as for a parabola.
         """
         deviation_um = self._deviation_um(slice(None), *MIDPOINT)
-        long = np.flatnonzero(np.hypot(self.along[:, 0], self.along[:, 1]) > LONG_EDGE * chord_um)
+        length2_um2 = self.along[:, 0] * self.along[:, 0] + self.along[:, 1] * self.along[:, 1]
+        long = np.flatnonzero(length2_um2 > (LONG_EDGE * chord_um) ** 2)
         for fraction, ratio in THIRDS if long.size else ():
             deviation_um[long] = np.fmax(deviation_um[long], self._deviation_um(long, fraction, ratio))
         # Edges that leave the image circle have NaN: their sites are outside, as points of these edges or as vertices.
@@ -148,7 +147,8 @@ def _undistort(outlines: Outlines, lens: PointMap, chord_um: float) -> Outlines:
         undistorted = np.empty_like(points)
         undistorted[step == 0] = edges.undistorted
         undistorted[step > 0] = lens.undistort(points[step > 0], outside="mask")
-    is_lost = ~(np.abs(undistorted).max(axis=1) < MAX_UM)  # NaN too
+    # Column by column, as above; NaN too.
+    is_lost = ~((np.abs(undistorted[:, 0]) < MAX_UM) & (np.abs(undistorted[:, 1]) < MAX_UM))
     is_outside = np.logical_or.reduceat(is_lost, ring_offsets[site_offsets[:-1]])
     if is_outside.any():
         is_outside_vertex = np.repeat(is_outside, np.diff(ring_offsets[site_offsets]))
