@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
 from pkgutil import iter_modules
 from typing import Any, Generic, TypeVar, overload
 
@@ -30,6 +30,14 @@ def import_all(package: str, path: Iterable[str], *, skip: str = "_kernels") -> 
 T = TypeVar("T")
 F = TypeVar("F")
 _log = logging.getLogger("foveasim")
+
+
+@cache
+def _entry_points() -> Any:
+    """Return the entry points of all installed packages; ``select`` returns those of a group."""
+    from importlib.metadata import entry_points
+
+    return entry_points()
 
 
 class Registry(Mapping[str, T], Generic[T]):
@@ -88,7 +96,7 @@ class Registry(Mapping[str, T], Generic[T]):
     def _all(self) -> dict[str, T]:
         if not self._is_complete:
             self._is_complete = True
-            for point in entry_points(group=self.group):
+            for point in _entry_points().select(group=self.group):
                 try:
                     self.register(point.name, point.load())
                 except Exception as error:  # noqa: BLE001 -- code of another package may raise anything
