@@ -323,6 +323,7 @@ SQUARE = shapely.box(-3.0, -3.0, 3.0, 3.0)
 POINT = [[0.1, 0.2]]
 #: Names relative to the package, and functions of :class:`Objects`.
 CALLS = {
+    "compile_kernels": lambda o: fs.compile_kernels(),
     "rgb_filters": lambda o: fs.rgb_filters(),
     "read_layout": lambda o: fs.read_layout(o.written(".npz", o.layout.write)),
     "read_layout geojson": lambda o: fs.read_layout(o.written(".geojson", o.layout.write)),
@@ -730,6 +731,7 @@ COMMANDS = {
         "--report",
         o.path(".lyrdb"),
     ],
+    "compile": lambda o: [],
     "layouts": lambda o: [],
     "describe": lambda o: [next(iter(config.bundled_layouts())), "--fps", "30"],
     "convert": lambda o: [o.written(".npz", o.layout.write), o.path(".geojson")],
