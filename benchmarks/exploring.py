@@ -24,7 +24,7 @@ from foveasim.explore.executor import _compute, _Dispatch, _pickle, _Results, _S
 from foveasim.explore.sweeps.sweep import _Points
 from foveasim.explore.worker_cache import ShotRunner
 
-N_TASKS, N_REPEATS = 3000, 5
+N_TASKS, N_REPEATS = 3000, 20
 SHOT = {
     "scene": {
         "kind": "flat",
