@@ -7,10 +7,11 @@ import json
 import re
 import subprocess
 import sys
+from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import numpy as np
-import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -66,9 +67,22 @@ def subpackage_of(path):
     return relative.parts[0].removesuffix(".py")
 
 
-@pytest.mark.parametrize("folder", sorted({path.parent for path in MODULES}), ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_packages_have_at_most_15_modules(folder):
-    assert len(list(folder.glob("*.py"))) <= 15
+@cache
+def parsed(path):
+    return ast.parse(path.read_text())
+
+
+def offenders(find, paths=MODULES):
+    """Return what a function finds in each module, by the path of the module, where it finds anything."""
+    found = {str(path.relative_to(PACKAGE)): find(path) for path in paths}
+    assert len(found) == len(paths) > 0
+    return {path: items for path, items in found.items() if items}
+
+
+def test_packages_have_at_most_15_modules():
+    n_modules = Counter(path.parent for path in MODULES)
+
+    assert {folder for folder, n in n_modules.items() if n > 15} == set()
 
 
 def test_package_lists_public_names_only():
@@ -77,8 +91,7 @@ def test_package_lists_public_names_only():
 
 def imported_subpackages(path):
     subpackages = set()
-    tree = ast.parse(path.read_text())
-    for node in ast.walk(tree):
+    for node in ast.walk(parsed(path)):
         names = []
         if isinstance(node, ast.ImportFrom) and node.module:
             names = [node.module, *(f"{node.module}.{a.name}" for a in node.names if node.module == "foveasim")]
@@ -94,15 +107,14 @@ def test_every_subpackage_has_a_layer():
     assert subpackages == set().union(*LAYERS)
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_imports_go_one_way(path):
-    name = subpackage_of(path)
-    if name == "__init__":
-        return
-    layer = next(i for i, subpackages in enumerate(LAYERS) if name in subpackages)
-    allowed = set().union(*LAYERS[:layer]) | {name}
+def test_imports_go_one_way():
+    layer_of = {name: k for k, names in enumerate(LAYERS) for name in names}
 
-    assert imported_subpackages(path) <= allowed
+    def upwards(path):
+        name = subpackage_of(path)
+        return {other for other in imported_subpackages(path) - {name} if layer_of[other] >= layer_of[name]}
+
+    assert offenders(upwards, [path for path in MODULES if path != PACKAGE / "__init__.py"]) == {}
 
 
 def imported_modules(path, names):
@@ -120,7 +132,7 @@ def imported_modules(path, names):
         for child in ast.iter_child_nodes(node):
             visit(child)
 
-    visit(ast.parse(path.read_text()))
+    visit(parsed(path))
     return modules & names
 
 
@@ -147,37 +159,41 @@ def test_nothing_heavy_is_loaded_by_import():
     assert set(loaded) & HEAVY == set()
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_random_numbers_come_from_named_streams_only(path):
+def unnamed_random_numbers(path):
+    """Return the names of ``numpy.random`` that a module uses against the rules, and the standard library's ``random``."""
     used = {
         node.attr
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in ast.walk(parsed(path))
         if isinstance(node, ast.Attribute)
         and isinstance(node.value, ast.Attribute)
         and node.value.attr == "random"
         and isinstance(node.value.value, ast.Name)
         and node.value.value.id in {"np", "numpy"}
     }
-    modules = {
-        alias.name
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.Import)
-        for alias in node.names
-    }
-
+    modules = {alias.name for node in ast.walk(parsed(path)) if isinstance(node, ast.Import) for alias in node.names}
     allowed = {"Generator", "PCG64DXSM", "Philox", "SeedSequence"} if path.name == "random_streams.py" else set()
     if path.parent.name == "effects" or path.name == "kinds.py":
         allowed = {"Generator"}  # the type of what effects draw from
     if path.name == "cluster.py":
         allowed = {"seed"}  # of the workers of metrics, which may use the global generator
 
-    assert used <= allowed
-    assert "random" not in modules
+    return (used - allowed) | (modules & {"random"})
+
+
+def test_random_numbers_come_from_named_streams_only():
+    assert offenders(unnamed_random_numbers) == {}
+
+
+def test_random_rule_finds_global_state(tmp_path):
+    bad = tmp_path / "bad.py"
+    bad.write_text("import random\nimport numpy as np\nnp.random.seed(0)\n")
+
+    assert unnamed_random_numbers(bad) == {"random", "seed"}
 
 
 def floating_names(path):
     """Return the names of parameters and dataclass fields with float annotations."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.FunctionDef):
             arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
             pairs = [(a.arg, a.annotation) for a in arguments if a.annotation is not None]
@@ -192,15 +208,16 @@ def floating_names(path):
         yield from (name for name, kind in pairs if FLOATING.search(ast.unparse(kind)))
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_floating_point_names_carry_their_unit(path):
-    bad = {
+def names_without_unit(path):
+    return {
         name
         for name in floating_names(path)
         if not name.endswith(tuple(UNIT_SUFFIXES)) and name not in DIMENSIONLESS | INTERNAL
     }
 
-    assert bad == set()
+
+def test_floating_point_names_carry_their_unit():
+    assert offenders(names_without_unit) == {}
 
 
 def test_unit_rule_exceptions_are_needed():
