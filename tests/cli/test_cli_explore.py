@@ -89,7 +89,7 @@ import time
 from pathlib import Path
 
 def patient(shot, camera, capture):
-    time.sleep(0.05)
+    time.sleep(0.15)
     return float(capture.code.mean())
 
 def harsh(shot, camera, capture):
