@@ -86,7 +86,7 @@ class Capture:
     settings : mapping
         Plain data: optics, sensor, layout, scene, exposure, seed, frame, versions.
     stage_s : mapping of str to float
-        Elapsed seconds of each stage; not saved.
+        Elapsed seconds of each stage, with those of kernels that are compiled in it; not saved.
     """
 
     layout: Layout

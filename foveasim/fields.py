@@ -9,7 +9,7 @@ two orders.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,9 +29,6 @@ from foveasim._core.validation import (
     wavelengths_nm,
 )
 from foveasim.errors import ParameterError, type_name
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = [
     "Grid",

@@ -137,6 +137,17 @@ def test_shot_noise_is_poisson_for_any_qe(qe):
     assert abs(deviation.var() - 1) < 5 * np.sqrt(2 / 40_000)
 
 
+def test_changed_copy_of_settings_changes_no_capture():
+    camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(fs.layout.grid(n_x=2, n_y=2, pitch_um=2.0), bits=9))
+    light = fs.PowerMap(np.ones((1, 4, 4)), fs.Grid.centred((4, 4), 1.0), np.array([550.0]))
+    settings = camera.settings
+    settings["sensor"]["bits"] = 3
+    capture = camera.capture(light, exposure_s=1e-3, seed=0)
+
+    assert capture.settings["sensor"]["bits"] == 9
+    assert capture.settings["sensor"] == camera.settings["sensor"]
+
+
 def test_capture_is_independent_of_threads():
     sensor = fs.Sensor(rgb_layout(), filters="rgb", read_noise_e=2.0)
     scene = picture_scene(shape=(500, 600))

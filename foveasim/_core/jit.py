@@ -3,7 +3,7 @@ Compilation of numba kernels, on first use or ahead, with machine code on disk.
 
 Kernels are defined in separate modules, ``_kernels.py``, which are imported by the functions that call them: importing numba
 takes half a second, so it does not happen at ``import foveasim``. A kernel is compiled when it is first called, for the types
-of this call: compiling all of them takes about a minute of processor time, and a capture needs a third.
+of this call: compiling all of them takes five times as long as those of one capture.
 """
 
 from __future__ import annotations
@@ -189,7 +189,7 @@ def compile_kernels(*, n_workers: int | None = None) -> int:
     --------
     >>> import foveasim as fs
     >>> fs.compile_kernels()  # doctest: +SKIP
-    71
+    60
     """
     n_workers = thread_count() if n_workers is None else check_count("n_workers", n_workers)
     kernels = sorted(_all_kernels(), key=_cost, reverse=True)

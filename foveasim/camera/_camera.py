@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.calls import OwnCheck
-from foveasim._core.provenance import to_plain_data
+from foveasim._core.provenance import copy_plain_data, to_plain_data
 from foveasim._core.random_streams import Streams
 from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property, in_order, thread_count
@@ -173,9 +173,13 @@ class Camera:
         """Number of threads."""
         return self._n_threads
 
-    @cached_property
+    @property
     def settings(self) -> dict[str, Any]:
-        """Settings that all captures share, as plain data: optics, distortion, sensor, layout."""
+        """Copy of the settings that all captures share: optics, distortion, sensor, layout."""
+        return copy_plain_data(self._settings)
+
+    @cached_property
+    def _settings(self) -> dict[str, Any]:
         return {
             "optics": to_plain_data(self._optics),
             "distortion": None if self._distortion is None else to_plain_data(self._distortion),

@@ -147,7 +147,7 @@ def _undistort(outlines: Outlines, lens: PointMap, chord_um: float) -> Outlines:
         undistorted = np.empty_like(points)
         undistorted[step == 0] = edges.undistorted
         undistorted[step > 0] = lens.undistort(points[step > 0], outside="mask")
-    # Column by column, as above; NaN too.
+    # Column by column, which is faster than a maximum along the last axis. A NaN is lost, too.
     is_lost = ~((np.abs(undistorted[:, 0]) < MAX_UM) & (np.abs(undistorted[:, 1]) < MAX_UM))
     is_outside = np.logical_or.reduceat(is_lost, ring_offsets[site_offsets[:-1]])
     if is_outside.any():

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,9 +35,6 @@ from foveasim.errors import ParameterError, type_name
 from foveasim.fields import Grid
 from foveasim.layout import Layout
 from foveasim.reconstruct.picture import Picture
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["CorticalImage", "cortical", "from_cortical", "to_cortical"]
 

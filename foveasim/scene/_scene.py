@@ -40,9 +40,6 @@ from foveasim.scene.cubes import IlluminantTable, Invalid, Quantity, Selection, 
 from foveasim.scene.registry import SCENES
 from foveasim.units import m_from_um, um_from_m
 
-if TYPE_CHECKING:
-    pass
-
 __all__ = ["FRAMINGS", "Fit", "Scene"]
 
 #: Framing of a picture on a layout.

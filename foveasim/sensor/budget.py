@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,9 +16,6 @@ from foveasim.sensor.limits import check_plausible
 from foveasim.sensor.prediction import MIN_SLOPE
 from foveasim.sensor.sensor import Sensor
 from foveasim.sensor.signal_to_noise import local_step_e
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["FIXED", "TEMPORAL", "NoiseBudget", "noise_budget"]
 
