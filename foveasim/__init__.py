@@ -13,43 +13,46 @@ and codes follow::
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from foveasim import (
-    distortion,
-    errors,
-    layout,
-    maps,
-    metrics,
-    modes,
-    optics,
-    reconstruct,
-    scene,
-    sensor,
-    tiles,
-    units,
-    video,
-    view,
-)
-from foveasim._core.calls import check_public_calls
-from foveasim._core.jit import compile_kernels
-from foveasim._io.pickling import make_copyable
 from foveasim._version import __version__
-from foveasim.camera import Camera
-from foveasim.capture import Capture
-from foveasim.errors import FoveasimError
-from foveasim.fields import Grid, PowerMap
-from foveasim.integrate import Integrator
-from foveasim.layout import DesignRules, Layout
-from foveasim.maps import read_power_map, write_power_map
-from foveasim.optics import Optics
-from foveasim.reconstruct import Picture
-from foveasim.scene import Scene
-from foveasim.sensor import FilterSet, GaussianCurve, PolynomialCurve, Sensor, SiliconQE, rgb_filters
 
 if TYPE_CHECKING:
-    from foveasim import compare, explore, learn, studio
+    from foveasim import (
+        compare,
+        config,
+        distortion,
+        errors,
+        explore,
+        layout,
+        learn,
+        maps,
+        metrics,
+        modes,
+        optics,
+        reconstruct,
+        scene,
+        sensor,
+        studio,
+        tiles,
+        units,
+        video,
+        view,
+    )
+    from foveasim._core.jit import compile_kernels
+    from foveasim.camera import Camera
+    from foveasim.capture import Capture
     from foveasim.config import read_layout
+    from foveasim.errors import FoveasimError
+    from foveasim.fields import Grid, PowerMap
+    from foveasim.integrate import Integrator
+    from foveasim.layout import DesignRules, Layout
+    from foveasim.maps import read_power_map, write_power_map
+    from foveasim.optics import Optics
+    from foveasim.reconstruct import Picture
+    from foveasim.scene import Scene
+    from foveasim.sensor import FilterSet, GaussianCurve, PolynomialCurve, Sensor, SiliconQE, rgb_filters
 
 __all__ = [
     "Camera",
@@ -96,38 +99,37 @@ __all__ = [
 ]
 
 
-for _module in (
-    "distortion", "errors", "layout", "maps", "metrics", "modes", "optics", "reconstruct", "scene", "scene.charts", "sensor",
-    "sensor.effects", "tiles", "units", "video", "view",
-):  # fmt: skip
-    check_public_calls(f"{__name__}.{_module}")
-    make_copyable(f"{__name__}.{_module}")
-check_public_calls(__name__)
-make_copyable(__name__)
-
-#: Names that are imported when they are used, and the modules that have them.
-_LAZY = {
-    "compare": "foveasim.compare",
-    "config": "foveasim.config",
-    "explore": "foveasim.explore",
-    "learn": "foveasim.learn",
-    "read_layout": "foveasim.config",
-    "studio": "foveasim.studio",
+#: Modules of the names that are not modules themselves. All are imported on use.
+_HOMES = {
+    "camera": ["Camera"],
+    "capture": ["Capture"],
+    "config": ["read_layout"],
+    "errors": ["FoveasimError"],
+    "fields": ["Grid", "PowerMap"],
+    "integrate": ["Integrator"],
+    "layout": ["DesignRules", "Layout"],
+    "maps": ["read_power_map", "write_power_map"],
+    "optics": ["Optics"],
+    "reconstruct": ["Picture"],
+    "scene": ["Scene"],
+    "sensor": ["FilterSet", "GaussianCurve", "PolynomialCurve", "Sensor", "SiliconQE", "rgb_filters"],
+    "_core.jit": ["compile_kernels"],
 }
 
 if not TYPE_CHECKING:  # type checkers would take any name for an attribute
 
     def __getattr__(name: str) -> Any:
-        """Import the names of ``_LAZY``."""
-        if name not in _LAZY:
+        """Import a public name, which is then an attribute."""
+        if name not in __all__:
             from foveasim._core.names import did_you_mean
 
             hint = "" if name.startswith("__") else did_you_mean(name, __all__)  # protocols of other libraries
             raise AttributeError(f"module '{__name__}' has no attribute '{name}'{'; ' if hint else ''}{hint}")
-        from importlib import import_module
-
-        module = import_module(_LAZY[name])
-        return module if module.__name__ == f"{__name__}.{name}" else getattr(module, name)
+        home = next((home for home, names in _HOMES.items() if name in names), None)
+        if home is None:
+            return import_module(f"{__name__}.{name}")
+        globals()[name] = getattr(import_module(f"{__name__}.{home}"), name)
+        return globals()[name]
 
 
 def __dir__() -> list[str]:

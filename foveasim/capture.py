@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.calls import publish
 from foveasim._core.extras import import_optional
 from foveasim._core.names import possible_names
 from foveasim._core.provenance import copy_plain_data, to_plain_data
@@ -593,3 +594,6 @@ def _variable(name: str, dims: tuple[str, ...], values: NDArray[Any], *, is_rena
     """Return an array with the unit in its name; xarray writes the unit of times itself."""
     units = {} if values.dtype.kind in "mM" else {"units": UNITS.get(name) or unit_of(name) or "1"}
     return Variable(dims, values, units | ({"long_name": name} if is_renamed else {}))
+
+
+publish(__name__)

@@ -40,11 +40,6 @@ __all__ = [
     "ParameterError",
     "SamplingWarning",
     "SimulationError",
-    "disk_problem",
-    "format_value",
-    "printable",
-    "type_name",
-    "with_article",
 ]
 
 

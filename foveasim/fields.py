@@ -14,6 +14,7 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import publish
 from foveasim._core.show import drawn
 from foveasim._core.validation import (
     Floats,
@@ -374,3 +375,6 @@ def with_ascending_axes(
     flipped = images[..., :: -1 if is_y_falling else 1, :: -1 if is_x_falling else 1]
     contiguous = np.ascontiguousarray(flipped)
     return contiguous if contiguous is flipped else read_only(contiguous)
+
+
+publish(__name__)

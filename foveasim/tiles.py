@@ -26,6 +26,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.calls import publish
 from foveasim._core.extras import import_optional
 from foveasim._core.names import missing_path
 from foveasim._core.provenance import differences, to_plain_data
@@ -591,3 +592,6 @@ def _is_same_layout(group: Any, layout: Layout) -> bool:
         )
         for name, values in arrays.items()
     )
+
+
+publish(__name__)

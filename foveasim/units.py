@@ -6,6 +6,7 @@ Constants are the exact values of the 2019 SI (CODATA 2018).
 
 from __future__ import annotations
 
+from foveasim._core.calls import publish
 from foveasim._core.validation import Floats, as_numbers, check_broadcast
 
 __all__ = [
@@ -98,3 +99,6 @@ def volts_to_electrons(voltage_v: Floats | float, capacitance_f: Floats | float)
     voltage_v, capacitance_f = as_numbers("voltage_v", voltage_v), as_numbers("capacitance_f", capacitance_f)
     check_broadcast(voltage_v=voltage_v, capacitance_f=capacitance_f)
     return voltage_v * capacitance_f / ELEMENTARY_CHARGE_C
+
+
+publish(__name__)

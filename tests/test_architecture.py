@@ -244,4 +244,4 @@ def test_cached_properties_have_no_lock():
         and "cached_property" in {alias.name for alias in node.names}
     }
 
-    assert using == {"_io/pickling.py"}  # recognises both
+    assert using == {"_core/calls/pickling.py"}  # recognises both

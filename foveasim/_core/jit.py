@@ -21,6 +21,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from foveasim._core.calls import check_arguments
 from foveasim._core.threads import ForkSafeLock, cached_property, thread_count
 from foveasim._core.validation import check_count
 from foveasim.errors import FileError
@@ -160,6 +161,7 @@ class Kernel:
             return compiled
 
 
+@check_arguments
 def compile_kernels(*, n_workers: int | None = None) -> int:
     """
     Compile all kernels that are not yet compiled for this machine.

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from foveasim._core.calls import publish
 from foveasim.camera._camera import Camera
 from foveasim.camera._frames import Frame
 
 __all__ = ["Camera", "Frame"]
+
+publish(__name__)

@@ -6,8 +6,7 @@ Pictures, their quality by eccentricity, signal-to-noise ratio, resolution, alia
 
 from __future__ import annotations
 
-from foveasim._core.calls import check_public_calls
-from foveasim._io.pickling import make_copyable
+from foveasim._core.calls import publish
 from foveasim.compare.annuli import PictureQuality, quality_by_eccentricity
 from foveasim.compare.budgets import BUDGETS, Budget, budget_of
 from foveasim.compare.comparison import Comparison, cameras, layouts
@@ -42,5 +41,4 @@ __all__ = [
     "site_information_bits",
 ]
 
-check_public_calls(__name__)
-make_copyable(__name__)
+publish(__name__)

@@ -6,8 +6,7 @@ Each section names a call of the package and its parameters: file and Python hav
 
 from __future__ import annotations
 
-from foveasim._core.calls import check_public_calls
-from foveasim._io.pickling import make_copyable
+from foveasim._core.calls import publish
 from foveasim.config._comparing import compare_files
 from foveasim.config._objects import (
     YAML_EXTENSIONS,
@@ -81,5 +80,4 @@ __all__ = [
     "write_starting_file",
 ]
 
-check_public_calls(__name__)
-make_copyable(__name__)
+publish(__name__)

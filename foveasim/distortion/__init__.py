@@ -8,6 +8,7 @@ of the photosites once. :func:`distort_map` resamples a power map for display an
 
 from __future__ import annotations
 
+from foveasim._core.calls import publish
 from foveasim._core.registry import import_all
 from foveasim.distortion._brown_conrady import BrownConrady
 from foveasim.distortion._calibration import from_opencv, read_calibration, to_opencv
@@ -30,3 +31,5 @@ __all__ = [
 ]
 
 import_all(__name__, __path__)
+
+publish(__name__)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from foveasim._core.calls import check_public_calls
-from foveasim._io.pickling import make_copyable
+from foveasim._core.calls import publish
 from foveasim.explore._metrics import METRICS, Metric, import_metric
 from foveasim.explore._schemas import schema_of
 from foveasim.explore.datasets.dataset import Dataset
@@ -51,5 +50,4 @@ __all__ = [
     "write_dataset",
 ]
 
-check_public_calls(__name__)
-make_copyable(__name__)
+publish(__name__)

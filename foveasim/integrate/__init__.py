@@ -8,8 +8,11 @@ exactly ``sum over cells of map[cell] * area(site ∩ cell)``; at second order e
 
 from __future__ import annotations
 
+from foveasim._core.calls import publish
 from foveasim.integrate._integrator import Integrator
 from foveasim.integrate._outlines import UndistortedOutlines, outline_bounds_um
 from foveasim.integrate._shape import EdgeMoments, SharedEdges, vertex_gradient
 
 __all__ = ["EdgeMoments", "Integrator", "SharedEdges", "UndistortedOutlines", "outline_bounds_um", "vertex_gradient"]
+
+publish(__name__)

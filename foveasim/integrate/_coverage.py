@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from foveasim._core.calls import copyable
 from foveasim._core.validation import Bools, Floats, read_only
-from foveasim._io.pickling import copyable
 from foveasim.fields import Grid
 
 __all__ = ["Coverage"]

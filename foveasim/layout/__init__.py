@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from foveasim._core.calls import publish
 from foveasim.layout.adjacency import adjacency
 from foveasim.layout.channels import MOSAICS, graph_colouring, mosaic, random_channels
 from foveasim.layout.drc.measurements import RULES, Rule
@@ -146,3 +147,5 @@ __all__ = [
 
 if not TYPE_CHECKING:  # families registered by other packages or at run time
     __getattr__ = LAYOUTS.attributes_of(__name__)
+
+publish(__name__)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from foveasim._core.calls import copyable
 from foveasim._core.rings import site_bounds_um, site_moments
 from foveasim._core.validation import Floats, Ints, freeze
-from foveasim._io.pickling import copyable
 
 __all__ = ["RectangleLattice"]
 

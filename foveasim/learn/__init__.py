@@ -10,7 +10,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from foveasim._core.calls import check_public_calls
+from foveasim._core.calls import publish
 from foveasim._core.extras import needs
 
 __all__ = [
@@ -39,7 +39,7 @@ if TYPE_CHECKING or find_spec("torch") is not None:
     from foveasim.learn.power_cells import PowerCells
     from foveasim.learn.readout import Readout
 
-    check_public_calls(__name__)
+    publish(__name__)
 else:
 
     def __getattr__(name: str) -> Any:

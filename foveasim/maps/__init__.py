@@ -25,6 +25,7 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 
+from foveasim._core.calls import publish
 from foveasim._core.registry import import_all
 from foveasim._core.validation import freeze
 from foveasim._io.atomic import atomic_write
@@ -154,3 +155,5 @@ def write_power_map(power_map: PowerMap, path: str | Path) -> None:
 
 
 import_all(__name__, __path__)
+
+publish(__name__)

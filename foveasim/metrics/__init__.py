@@ -6,6 +6,7 @@ Photon transfer, EMVA 1288 parameters, resolution, aliasing, optical flow, and i
 
 from __future__ import annotations
 
+from foveasim._core.calls import publish
 from foveasim.metrics.aliasing import AliasingSpectrum, SamplingSpectrum, aliasing_spectrum, sampling_spectrum
 from foveasim.metrics.emva import Emva1288, emva1288
 from foveasim.metrics.emva_intervals import EmvaIntervals
@@ -62,3 +63,5 @@ __all__ = [
     "ssim",
     "wave_vectors_per_mm",
 ]
+
+publish(__name__)

@@ -10,8 +10,11 @@ Acquisition modes other than global exposures: rolling shutters, events, spikes.
 
 from __future__ import annotations
 
+from foveasim._core.calls import publish
 from foveasim.modes.events import Events, write_events
 from foveasim.modes.pixels import EventPixels, SpikingPixels
 from foveasim.modes.shutter import Between, Exposure, Shutter
 
 __all__ = ["Between", "EventPixels", "Events", "Exposure", "Shutter", "SpikingPixels", "write_events"]
+
+publish(__name__)

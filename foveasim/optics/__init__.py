@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from foveasim._core.calls import publish
 from foveasim._core.registry import import_all
 from foveasim.optics._optics import Optics
 from foveasim.optics._point_images import PointSpread
@@ -31,3 +32,5 @@ __all__ = [
 ]
 
 import_all(__name__, __path__, skip="_")  # deferred: these modules import scipy, which only imaging needs
+
+publish(__name__)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from foveasim._core.calls import publish
 from foveasim.reconstruct.cells import cells, fill_channels
 from foveasim.reconstruct.cortical import CorticalImage, cortical, from_cortical, to_cortical
 from foveasim.reconstruct.estimates import SiteEstimates, electrons_per_code, estimate_from_charge, estimate_from_code
@@ -29,3 +30,5 @@ __all__ = [
     "reference",
     "to_cortical",
 ]
+
+publish(__name__)

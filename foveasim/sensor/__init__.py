@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from foveasim._core.calls import publish
 from foveasim.sensor.budget import FIXED, TEMPORAL, NoiseBudget, noise_budget
 from foveasim.sensor.calibration import Calibration, calibrate, linearise
 from foveasim.sensor.effects.crosstalk import CrosstalkOperator, Diffusion, InterPixelCapacitance, KernelCrosstalk
@@ -73,3 +74,5 @@ __all__ = [
     "rgb_filters",
     "signal_to_noise",
 ]
+
+publish(__name__)

@@ -18,7 +18,7 @@ import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 
-from foveasim._core.calls import check_public_calls
+from foveasim._core.calls import publish
 from foveasim._core.extras import import_optional
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import check_count
@@ -169,4 +169,4 @@ def _is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-check_public_calls(__name__)
+publish(__name__)

@@ -9,6 +9,7 @@ Videos: scenes from pictures and gaze paths; recordings of captures and video fi
 
 from __future__ import annotations
 
+from foveasim._core.calls import publish
 from foveasim.video.frame_source import FrameSource
 from foveasim.video.gaze import GazePath, pan_camera, saccades, shift_sensor
 from foveasim.video.recording import Recording, count_recorded_frames, partial_path, read_recording
@@ -26,3 +27,5 @@ __all__ = [
     "shift_sensor",
     "write_video",
 ]
+
+publish(__name__)

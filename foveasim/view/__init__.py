@@ -6,6 +6,7 @@ matplotlib is imported when something is drawn.
 
 from __future__ import annotations
 
+from foveasim._core.calls import publish
 from foveasim.view.id_map import SitePixels, id_map, site_at
 from foveasim.view.meshes import Mesh, polydata, prisms
 from foveasim.view.notebook import to_html, to_png, widget
@@ -78,3 +79,5 @@ __all__ = [
     "write_solid_page",
     "write_web_page",
 ]
+
+publish(__name__)

@@ -1,8 +1,15 @@
-"""Validation of the arguments of public calls: their names, number and types."""
+"""Properties of all public names: checked arguments, copies and pickles."""
 
 from __future__ import annotations
 
 from foveasim._core.calls.arguments import CHECKED, check_arguments, check_public_calls
 from foveasim._core.calls.kinds import OwnCheck
+from foveasim._core.calls.pickling import copyable, make_copyable
 
-__all__ = ["CHECKED", "OwnCheck", "check_arguments", "check_public_calls"]
+__all__ = ["CHECKED", "OwnCheck", "check_arguments", "copyable", "publish"]
+
+
+def publish(module_name: str) -> None:
+    """Check calls of the names in ``__all__``, and define the state of the classes."""
+    check_public_calls(module_name)
+    make_copyable(module_name)

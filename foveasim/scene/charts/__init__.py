@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from foveasim._core.calls import publish
 from foveasim._core.registry import import_all
 from foveasim.scene._illuminants import illuminant
 from foveasim.scene.charts._colours import PATCH_NAMES, patch_reflectance
@@ -47,3 +48,5 @@ import_all(__name__, __path__)
 globals().update(SCENES.within(__name__))
 if not TYPE_CHECKING:  # charts of other packages and charts registered later
     __getattr__ = SCENES.attributes_of(__name__)
+
+publish(__name__)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from foveasim._core.calls import publish
 from foveasim._core.registry import import_all
 from foveasim.sensor.effects.contract import (
     EFFECTS,
@@ -75,3 +76,5 @@ STANDARD: tuple[Any, ...] = (
 )
 
 import_all(__name__, __path__)
+
+publish(__name__)
