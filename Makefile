@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out
-# Arguments for pytest in all test targets: make test PYTEST_ARGS="tests/cli"
+# Arguments for pytest in all test targets.
 PYTEST_ARGS ?=
 PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 
@@ -24,6 +24,7 @@ CHECK_PYTHON = command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) not found; s
 demo: $(VENV)/.installed
 	$(BIN)/foveasim demo --out $(OUT)
 
+# All tests but the slow ones; those of single files or directories with PYTEST_ARGS="tests/cli", which contains the slow ones.
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest $(PARALLEL) $(PYTEST_ARGS)
 
@@ -36,13 +37,13 @@ test-core:
 		cp tests/installation/calls.py "$$directory" && cd "$$directory" && MPLBACKEND=agg env -u PYTHONPATH \
 		env/bin/python calls.py --program env/bin/foveasim
 
-# All pairs of features in tests/compositions, instead of a sample.
+# The slow tests, too, and all pairs of features in tests/compositions instead of a sample.
 test-all: $(VENV)/.installed-dev
 	FOVEASIM_TESTS_ALL=1 $(BIN)/python -m pytest $(PARALLEL) $(PYTEST_ARGS)
 
 # Deprecation warnings between old versions of dependencies are ignored.
 test-lowest: $(LOWEST)/.installed
-	NUMBA_CACHE_DIR="$(CURDIR)/$(LOWEST)/numba" $(LOWEST)/env/bin/python -m pytest $(PARALLEL) \
+	FOVEASIM_TESTS_ALL=1 NUMBA_CACHE_DIR="$(CURDIR)/$(LOWEST)/numba" $(LOWEST)/env/bin/python -m pytest $(PARALLEL) \
 		-W default::DeprecationWarning -W default::PendingDeprecationWarning -W error::pytest.PytestWarning $(PYTEST_ARGS)
 
 test-torch: $(TORCH_VENV)/.installed

@@ -1,4 +1,10 @@
-"""Requirements of tests, ``@pytest.mark.needs("renderer")``, ``"chromium"``, ``"torch"``; kernels; distribution to processes."""
+"""
+Selection of tests, their requirements, kernels, and distribution to processes.
+
+The default run leaves out tests marked ``slow``, except for those that ``keep`` selects: a number of parameter sets of each
+function, spread evenly, or parts of their names. Runs of named files and directories, and those with FOVEASIM_TESTS_ALL=1,
+contain all tests. ``needs("renderer")``, ``"chromium"``, ``"torch"`` mark requirements.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +12,18 @@ import os
 import shutil
 import signal
 import sys
+from collections import defaultdict
 from importlib.util import find_spec
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 from foveasim import compile_kernels
+
+# New examples in each run on a developer's machine, the same ones in continuous integration.
+hypothesis.settings.register_profile("foveasim", deadline=None, derandomize="CI" in os.environ)
+hypothesis.settings.load_profile("foveasim")
 
 # Bytecode is stored next to the sources, as is the machine code of kernels, even where the environment disables it: the tests start
 # hundreds of processes, and each would compile the package.
@@ -51,9 +63,33 @@ INDEPENDENT = {
 
 
 def pytest_configure(config):
-    """Compile all kernels once, before several processes would each compile them."""
-    if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
+    """Select all tests of named files; compile all kernels once, before several processes would each compile them."""
+    if hasattr(config, "workerinput"):
+        return
+    if config.args_source is config.ArgsSource.ARGS:
+        os.environ.setdefault("FOVEASIM_TESTS_ALL", "1")
+    if getattr(config.option, "numprocesses", None):
         compile_kernels()
+
+
+def pytest_collection_modifyitems(config, items):
+    """Leave out slow tests, except for those that their markers keep."""
+    if os.environ.get("FOVEASIM_TESTS_ALL") == "1":
+        return
+    of_function = defaultdict(list)
+    for item in items:
+        if item.get_closest_marker("slow"):
+            of_function[item.parent, item.originalname].append(item)
+    dropped = set()
+    for k, sets in enumerate(of_function.values()):
+        keep, n = sets[0].get_closest_marker("slow").kwargs.get("keep", 0), len(sets)
+        if isinstance(keep, int):  # other sets for the next function, so that all occur in a file
+            kept = {sets[(k + j * n // keep) % n] for j in range(min(keep, n))}
+        else:
+            kept = {item for item in sets if any(part in item.name for part in keep)}
+        dropped.update(set(sets) - kept)
+    config.hook.pytest_deselected(items=list(dropped))
+    items[:] = [item for item in items if item not in dropped]
 
 
 @pytest.hookimpl(optionalhook=True)  # of pytest-xdist

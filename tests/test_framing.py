@@ -72,7 +72,7 @@ def test_edges_of_picture_meet_layout(fit):
 
 
 @given(n_x=st.integers(2, 60), n_y=st.integers(2, 60), n_columns=st.integers(1, 9), n_rows=st.integers(1, 9))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_cover_and_contain_are_dual(n_x, n_y, n_columns, n_rows):
     """A picture lies within a layout when the layout, as a picture, covers the picture, as a layout."""
     within = camera_of(fs.layout.grid(n_x=n_columns, n_y=n_rows, pitch_um=1.0)).frame(

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 nbformat = pytest.importorskip("nbformat")
 nbclient = pytest.importorskip("nbclient")
 
@@ -22,6 +24,7 @@ def stems(paths):
     return [pytest.param(path, marks=NEEDS.get(path.stem, []), id=path.stem) for path in paths]
 
 
+@pytest.mark.slow(keep=("photon_transfer",))
 @pytest.mark.parametrize("path", stems(NOTEBOOKS))
 def test_notebook_runs_and_shows_results(path, tmp_path, monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
@@ -39,6 +42,7 @@ def test_notebook_runs_and_shows_results(path, tmp_path, monkeypatch):
     assert shown & {"image/png", "text/html"}
 
 
+@pytest.mark.slow(keep=7)
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_stored_notebook_has_no_outputs(path):
     notebook = nbformat.read(path, 4)

@@ -66,6 +66,7 @@ def opencv_file(path, matrix, coefficients, model):
     return read_calibration(path, pixel_um=PIXEL_UM)
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("source", ["arrays", "file"])
 @pytest.mark.parametrize("model", ["plumb_bob", "fisheye"])
 @pytest.mark.parametrize("focal_px", [(FOCAL_PX, FOCAL_PX), (1.03 * FOCAL_PX, FOCAL_PX / 1.03)])
@@ -119,6 +120,7 @@ def test_relative_illumination_falls_from_principal_point(emission, power):
     assert rate / rate[nearest] == pytest.approx(expected / expected[nearest], rel=3e-4)
 
 
+@pytest.mark.slow
 def test_field_dependent_aberrations_centre_on_axis():
     """Coma vanishes on the axis: the image of the axial point is symmetric about the principal point."""
     lens = Fisheye(projection="equidistant", focal_um=FOCAL_PX * PIXEL_UM, centre_um=CENTRE_UM)

@@ -8,6 +8,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import OwnCheck
 from foveasim._core.rings import next_vertex, to_frame
 from foveasim._core.threads import cached_property, parallel_map, thread_count
 from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_count, finite_array, read_only
@@ -53,7 +54,7 @@ class SharedEdges:
     point: Ints
 
     @classmethod
-    def from_layout(cls, layout: PackedRings) -> SharedEdges:
+    def from_layout(cls, layout: OwnCheck[PackedRings]) -> SharedEdges:
         """Return the edges of a layout; vertices with equal coordinates are the same point."""
         if not all(hasattr(layout, name) for name in ("xy_um", "ring_offsets", "site_offsets")):
             raise ParameterError("layout", f"must be a Layout or packed rings, got {type_name(layout)}")
@@ -205,7 +206,7 @@ class EdgeMoments:
 
 
 def vertex_gradient(
-    layout: PackedRings,
+    layout: OwnCheck[PackedRings],
     grid: Grid,
     power_map: ArrayLike,
     site_weights: ArrayLike,

@@ -67,6 +67,7 @@ def filled_cache(tmp_path_factory):
     return cache
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("extension", "corrupt"),
     [
@@ -89,6 +90,7 @@ def test_corrupt_machine_code_is_compiled_again(filled_cache, tmp_path, extensio
     assert load_kernels(cache) == ("(10, 1024)", "")
 
 
+@pytest.mark.slow
 def test_irreplaceable_machine_code_is_reported(filled_cache, tmp_path):
     result, message = load_kernels(with_irreplaceable_index(filled_cache, tmp_path))
 
@@ -169,7 +171,7 @@ def test_kernels_call_kernels_and_functions():
     assert total(np.arange(5.0)) == 10.0
 
 
-@pytest.mark.skipif("FOVEASIM_TESTS_ALL" not in os.environ, reason="compiles all kernels: make test-all")
+@pytest.mark.slow
 def test_functions_that_return_arrays_count_references(tmp_path):
     """Without reference counts, an array that is returned could be released while it is used."""
     program = """
@@ -203,6 +205,7 @@ def test_division_by_zero_is_that_of_numpy():
     assert np.isnan(ratio(0.0, 0.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_workers", [1, 2])
 def test_kernels_are_compiled_ahead(tmp_path, n_workers):
     program = f"""
@@ -218,6 +221,7 @@ print(jit.compile_kernels(n_workers={n_workers}))
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb[ic]")} == stored
 
 
+@pytest.mark.slow
 def test_errors_of_workers_are_raised(filled_cache, tmp_path):
     program = """
 import sys

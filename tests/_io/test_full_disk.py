@@ -67,6 +67,7 @@ print(json.dumps([found, sorted(path.name for path in folder.iterdir())]))
 """
 
 
+@pytest.mark.slow
 def test_writers_report_reason_and_leave_nothing(tmp_path):
     pytest.importorskip("resource")
     (tmp_path / "out").mkdir()

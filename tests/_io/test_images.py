@@ -639,6 +639,7 @@ def with_correct_checksums(content):
     return bytes(fixed)
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize("name", SEEDS)
 def test_flipped_bits_give_picture_or_file_error(tmp_path, name):
     rng = np.random.default_rng([12, *name.encode()])

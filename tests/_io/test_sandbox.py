@@ -96,6 +96,7 @@ def test_problems_give_one_line(iterate, name, text):
         next(arrays)
 
 
+@pytest.mark.slow
 def test_slow_array_is_an_error(iterate):
     arrays = iterate("hang", max_item_s=3.0)
     next(arrays)
@@ -315,6 +316,7 @@ while not os.path.getsize(path):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
 @pytest.mark.parametrize("then", ["", "time.sleep(600)"])
 def test_grandchild_ends_with_process(read, iterate, monkeypatch, tmp_path, then):

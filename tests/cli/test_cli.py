@@ -243,6 +243,7 @@ def test_blind_spot_is_central_hole_only(foveasim, tmp_path, layout, radius):
     assert line.split("│")[2].strip() == radius
 
 
+@pytest.mark.slow
 def test_layouts_lists_bundled_layouts(foveasim, tmp_path):
     result = foveasim("layouts", cwd=tmp_path)
 

@@ -180,6 +180,7 @@ def test_study_command_equals_call(foveasim, folder):
         assert int(bits) == trial.params["sensor.bits"]
 
 
+@pytest.mark.slow
 def test_extended_study_equals_longer_study(foveasim, folder):
     for n_trials in (4, 9, 14):
         code, said, _ = foveasim("study", "study.yaml", "--trials", n_trials, "-o", "few.db")
@@ -227,6 +228,7 @@ def processes_of(group):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("command", ["study", "sweep"])
@@ -275,6 +277,7 @@ def test_failed_study_leaves_no_file(folder, monkeypatch):
     assert not list(folder.glob("own.db*"))
 
 
+@pytest.mark.slow
 def test_study_interrupted_twice_resumes_identically(folder):
     (folder / "slow.yaml").write_text(json.dumps(STUDY | {"trials": 40}))
 
@@ -601,6 +604,7 @@ def test_pictures_come_from_several_sources(folder):
         np.testing.assert_array_equal(array[4 * k]["electrons"], files[4 * k]["electrons"], err_msg=name)
 
 
+@pytest.mark.slow
 def test_interrupted_dataset_resumes_identically(folder):
     (folder / "long.yaml").write_text(json.dumps(DATA_SET | {"cameras": 100, "per_shard": 10}))
     command = [sys.executable, "-m", "foveasim.cli", "dataset", "long.yaml", "--workers", "2"]

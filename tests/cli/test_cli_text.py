@@ -146,6 +146,7 @@ def test_control_characters_are_escaped(foveasim, tmp_path):
         assert result.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_names_outside_utf8_are_escaped(tmp_path):
     name = os.fsdecode(b"$caf\xe9$^.yaml")
     (tmp_path / name).write_text(yaml.safe_dump(SHOT))
@@ -161,6 +162,7 @@ def test_names_outside_utf8_are_escaped(tmp_path):
     assert failed.stderr == rb"error: $caf\udce9$^.yamlx: no such file; did you mean '$caf\udce9$^.yaml'?" + b"\n"
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize(
     ("arguments", "code", "printed"),
     [

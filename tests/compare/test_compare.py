@@ -46,6 +46,7 @@ def compared(foveal, scenes):
     return fs.compare.layouts(layouts, scenes, **OPTIONS)
 
 
+@pytest.mark.slow
 def test_identical_layouts_have_identical_measures(compared):
     for name in MEASURES:
         for key in (name, f"{name}_by_eccentricity"):
@@ -64,6 +65,7 @@ def test_fovea_is_better_at_centre_only(compared):
         assert values[0, 2] < values[1, 2]
 
 
+@pytest.mark.slow
 def test_information_and_shift_are_independent_of_pictures(foveal, scenes):
     pair, one = {"a": foveal, "b": foveal}, {"one": scenes["picture 0"]}
     coarse, fine = (fs.compare.layouts(pair, one, n_annuli=2, max_pixels=n) for n in (32, 256))
@@ -72,6 +74,7 @@ def test_information_and_shift_are_independent_of_pictures(foveal, scenes):
         np.testing.assert_allclose(coarse.values[name], fine.values[name], rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side_um", [2.0, 16.0])
 def test_shift_precision_matches_displaced_images(scenes, side_um):
     square = fs.layout.grid(n_x=round(160.0 / side_um), size_um=(160.0, 160.0))
@@ -258,6 +261,7 @@ def test_dataset_has_units_and_settings(compared):
     assert records[1]["psnr_db"] == pytest.approx(float(data["psnr_db"].sel(camera="square").median()))
 
 
+@pytest.mark.slow
 def test_report_is_escaped_and_self_contained(compared, tmp_path):
     compared.write(tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()

@@ -2,7 +2,7 @@
 Invariants of captures over combinations of features.
 
 Each row of a table contains one feature of every axis of ``reference.features``. The complete run (``make test-all``) contains
-every pair of features, the default run a sample of rows in which each feature occurs.
+every pair of features, the default run a sample of rows in which each feature occurs, some of them for each invariant.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from foveasim.errors import FoveasimWarning
 from foveasim.explore import Dataset
 
 IS_COMPLETE = os.environ.get("FOVEASIM_TESTS_ALL") == "1"
-ROWS = pairwise_rows() if IS_COMPLETE else sample_rows(50)
+ROWS = pairwise_rows() if IS_COMPLETE else sample_rows(22)
 #: Rounding of integrals: sums over rows of a map in another order.
 ROUNDING = 1e-9
 N_FRAMES = 200
 #: Standard errors of a sample that a statistical test admits.
 N_SIGMA = 5.0
 
-pytestmark = pytest.mark.filterwarnings("ignore::foveasim.errors.FoveasimWarning")
+pytestmark = [pytest.mark.filterwarnings("ignore::foveasim.errors.FoveasimWarning"), pytest.mark.slow(keep=6)]
 
 
 def name_of(row):

@@ -375,6 +375,7 @@ def errors_of(kind, data):
     return [error.message for error in validator.iter_errors(data)]
 
 
+@pytest.mark.slow(keep=5)
 @pytest.mark.parametrize("name", sorted(bundled_layouts()))
 def test_bundled_layout_satisfies_schema(name):
     data = read_yaml(bundled_layouts()[name])

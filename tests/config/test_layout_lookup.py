@@ -90,6 +90,7 @@ def test_read_layout_suggests_bundled_names(tmp_path, monkeypatch):
         fs.layout.read_layout("giotto_2")
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("name", "words"),
     [

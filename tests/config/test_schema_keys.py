@@ -79,6 +79,7 @@ def message(kind, settings):
     return None
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("kind", FILES)
 def test_wrong_values_give_one_line(kind):
     found = [(key, message(kind, settings)) for key, settings in wrong_settings(kind)]
@@ -89,6 +90,7 @@ def test_wrong_values_give_one_line(kind):
     assert [line for key, line in errors if "\n" in line or key not in line] == []
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("kind", FILES)
 def test_validation_accepts_what_schema_accepts(kind):
     jsonschema = pytest.importorskip("jsonschema")

@@ -24,7 +24,7 @@ from foveasim.errors import ConfigError, FileError, GeometryError, ParameterErro
 
 cv2 = pytest.importorskip("cv2")
 
-relaxed = settings(deadline=None, derandomize=True, max_examples=40)
+relaxed = settings(max_examples=40)
 SIZE = (1920, 1080)
 PIXEL_UM = 2.2
 
@@ -50,6 +50,7 @@ def to_um(pixels):
 # -- Brown-Conrady ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_inverse_is_accurate_for_random_coefficients():
     rng = np.random.default_rng(1)
     worst_px = 0.0

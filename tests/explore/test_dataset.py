@@ -184,6 +184,7 @@ def test_random_settings_are_drawn_independently():
 N_DRAWS = 4000
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize(
     ("distribution", "cdf"),
     [
@@ -281,6 +282,7 @@ def test_code_dtype_follows_largest_bit_depth():
     assert explore.Dataset(pictures(1), SHOT)[0]["code"].dtype == np.uint8
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("name", ["data.zarr", "data"])
 @pytest.mark.parametrize(
     "vary",
@@ -640,6 +642,7 @@ def test_palette_mask_gives_indices(tmp_path):
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("name", ["data.zarr", "data"])
 @pytest.mark.parametrize("workers", [1, 2])
 def test_stored_samples_equal_simulated_samples(name, workers, tmp_path):
@@ -830,6 +833,7 @@ def corrupt_directory(tmp_path):
     return directory, complete
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["data.zarr", "data"])
 @pytest.mark.parametrize("workers", [1, 2])
 def test_writing_resumes_after_corrupt_picture(name, workers, tmp_path):
@@ -856,6 +860,7 @@ def test_writing_resumes_after_corrupt_picture(name, workers, tmp_path):
         assert_same(stored[k], data[k])
 
 
+@pytest.mark.slow
 def test_crash_leaves_only_complete_shards(tmp_path):
     script = tmp_path / "write.py"
     script.write_text(
@@ -894,6 +899,7 @@ def test_crash_leaves_only_complete_shards(tmp_path):
             assert_same(stored[k], data[k])
 
 
+@pytest.mark.slow
 def test_missing_main_guard_is_reported(tmp_path):
     script = tmp_path / "write.py"
     script.write_text(
@@ -912,6 +918,7 @@ def test_missing_main_guard_is_reported(tmp_path):
     assert 'make the call under if __name__ == "__main__":' in result.stderr.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_worker_processes_end_with_program(tmp_path):
     script = tmp_path / "write.py"
     script.write_text(

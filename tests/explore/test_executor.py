@@ -58,6 +58,7 @@ def lines(path):
     return [line.split() for line in path.read_text().splitlines()] if path.exists() else []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(N_ROUNDS))
 def test_no_item_is_lost_with_workers(seed, tmp_path):
     rng, log = random.Random(seed), tmp_path / "log"
@@ -222,6 +223,7 @@ def scheduler():
         yield cluster.scheduler_address
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["data", "data.zarr"])
 def test_datasets_are_equal_on_a_scheduler(scheduler, name, tmp_path):
     data = explore.Dataset(np.arange(20 * 24 * 24, dtype=np.uint32).astype(np.uint8).reshape(20, 24, 24), SHOT)

@@ -8,14 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from foveasim.explore.datasets import packed
 from foveasim.explore.datasets.packed import PackedBoxes, PackedFiles, PackedStrings
 
 
-@settings(deadline=None)
 @given(st.lists(st.text(max_size=9), max_size=9))
 def test_packed_strings_equal_a_list(strings):
     found = pickle.loads(pickle.dumps(PackedStrings(strings)))

@@ -168,6 +168,7 @@ def test_integer_keys_equal_string_keys():
     assert coefficients["zernike"]["coefficients"] == {"4": 0.3, "7": 0.2}
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("workers", [1, 2, 4])
 def test_results_do_not_depend_on_workers(workers, reference_results, tmp_path):
     found = explore.run_sweep(plan_200(), out=tmp_path / "r.zarr", workers=workers)
@@ -251,6 +252,7 @@ def scheduler_of_one_worker():
         yield started
 
 
+@pytest.mark.slow
 def test_results_are_equal_on_external_scheduler(scheduler, reference_results):
     found = explore.run_sweep(plan_200(), scheduler=scheduler[0])
 
@@ -268,6 +270,7 @@ def where(request):
         yield {"scheduler": request.getfixturevalue(fixture)[0]}
 
 
+@pytest.mark.slow
 def test_crashing_metric_fails_only_its_point(where, tmp_path):
     (log,) = logging_metric(tmp_path).values()
 
@@ -291,6 +294,7 @@ def test_crashing_metric_fails_only_its_point(where, tmp_path):
     assert all(seeds.count(seed) <= 2 for seed in seeds if seed != fatal)
 
 
+@pytest.mark.slow
 def test_points_of_killed_worker_are_retried(where, tmp_path):
     metrics = logging_metric(tmp_path, SLOW_S)
     plan = explore.plan_sweep(SHOT, {"exposure_s": np.linspace(0.01, 0.02, 40)}, metrics=metrics)
@@ -349,6 +353,7 @@ def pausing_plan(when):
     return explore.plan_sweep(SHOT, {"sensor.bits": list(range(4, 16))}, metrics=[pausing])
 
 
+@pytest.mark.slow
 def test_tasks_of_paused_worker_are_moved(monkeypatch):
     monkeypatch.setattr("foveasim.explore.cluster.PAUSED_S", 1.0)
     found = with_timeout(lambda: explore.run_sweep(pausing_plan(lambda bits: bits == 4), workers=2))
@@ -358,6 +363,7 @@ def test_tasks_of_paused_worker_are_moved(monkeypatch):
     assert (found["pausing"] == one).sum() < 6
 
 
+@pytest.mark.slow
 def test_pause_of_all_workers_is_reported(monkeypatch):
     monkeypatch.setattr("foveasim.explore.cluster.PAUSED_S", 1.0)
     monkeypatch.setattr("foveasim.explore.executor.NO_WORKER_TIMEOUT_S", 1.0)
@@ -481,6 +487,7 @@ def interrupt(number, directory, n_points):
     return running.returncode, messages, journal_points(store)
 
 
+@pytest.mark.slow
 def test_interrupted_sweep_resumes_without_repetition(directory):
     code, printed, after_stop = interrupt(signal.SIGINT, directory, 10)
     n_stop = len(executions(directory))
@@ -514,6 +521,7 @@ def test_interrupted_sweep_resumes_without_repetition(directory):
     assert len(seeds[n_kill:]) == 60 - len(after_kill)
 
 
+@pytest.mark.slow
 def test_failed_points_are_reported_and_retried(tmp_path):
     fatal = tmp_path / "fatal"
     fatal.touch()
@@ -547,6 +555,7 @@ def test_failed_points_are_reported_and_retried(tmp_path):
     assert journal_path(tmp_path / "r.zarr").exists()
 
 
+@pytest.mark.slow
 def test_failed_points_can_be_retried_repeatedly(tmp_path, monkeypatch):
     monkeypatch.setattr("foveasim.explore.cluster.SCHEDULER_S", 0.5)
     bad = tmp_path / "bad"
@@ -1068,6 +1077,7 @@ def test_other_servers_are_rejected_as_scheduler():
             explore.run_sweep(PLAN, scheduler=f"tcp://127.0.0.1:{server.getsockname()[1]}")
 
 
+@pytest.mark.slow
 def test_missing_main_guard_is_reported_once(tmp_path):
     (tmp_path / "own.py").write_text(
         f"from foveasim import explore\nexplore.sweep({SHOT!r}, {{'sensor.bits': [8]}}, workers=1)\n"

@@ -328,6 +328,7 @@ def compare_with_fresh(runner, base, values):
     return unchanged
 
 
+@pytest.mark.slow
 def test_cached_components_equal_fresh_ones(runner):
     values = list(varied(SHOT, aberrations=False))
 

@@ -13,6 +13,8 @@ from foveasim.cli import app
 from installation.calls import CALLS, COMMANDS, failures, required_extra
 from installation.environments import make_environment, run_calls
 
+pytestmark = pytest.mark.slow
+
 #: Extras with modules that the package imports.
 EXTRAS = sorted(set(EXTRA_OF.values()))
 MODULES = (
@@ -49,6 +51,7 @@ def public_functions():
                 yield f"{name}.{public}".removeprefix(".")
 
 
+@pytest.mark.slow(keep=1)
 def test_table_contains_every_function_and_command():
     commands = {name.split()[0] for name in COMMANDS}
 

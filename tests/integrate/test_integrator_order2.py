@@ -118,7 +118,7 @@ def test_linear_fields_are_exact_over_the_zoo(name):
     )
 
 
-@settings(max_examples=1000, deadline=None, derandomize=True)
+@settings(max_examples=1000)
 @given(polygon=polygons(SHAPE))
 def test_linear_fields_are_exact_over_random_polygons(polygon):
     assert second(polygon)(linear_means())[0] == pytest.approx(linear_integral(polygon), rel=EXACT, abs=0.0)
@@ -131,7 +131,7 @@ def test_random_map_equals_clipping_over_zoo(name):
     )
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=150)
 @given(polygon=polygons(SHAPE))
 def test_random_map_equals_clipping_over_polygons(polygon):
     expected = second_order_by_clipping(polygon, MAP)
@@ -139,7 +139,7 @@ def test_random_map_equals_clipping_over_polygons(polygon):
         assert second(polygon, compiled=compiled)(MAP)[0] == pytest.approx(expected, rel=EXACT, abs=1e-15)
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=200)
 @given(polygon=polygons((2, 2)))
 def test_two_by_two_map_is_exact(polygon):
     got = second(polygon, fs.Grid((2, 2), 1.0))(linear_means((2, 2)))[0]

@@ -147,7 +147,7 @@ def test_weights_agree_with_shapely_clipping(layout):
 
 
 @ORDER
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=60)
 @given(
     pitch=st.tuples(st.floats(0.05, 20.0), st.floats(0.05, 20.0)),
     origin=st.tuples(st.floats(-9.0, 1.0), st.floats(-9.0, 1.0)),

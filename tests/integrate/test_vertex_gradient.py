@@ -71,6 +71,7 @@ def check_against_differences(layout, cells, order, rng, n_checks):
     return n_compared
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
 def test_gradient_agrees_with_difference_quotients(order):
     rng = np.random.default_rng(order)
@@ -83,7 +84,7 @@ def test_gradient_agrees_with_difference_quotients(order):
 
 @pytest.mark.parametrize("order", [1, 2])
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_drawn_outlines_agree_with_differences(order, seed):
     check_against_differences(random_layout(seed), random_map(seed % 1000), order, np.random.default_rng(seed), 3)
 

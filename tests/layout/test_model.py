@@ -18,7 +18,7 @@ from shapely import affinity
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout import Layout
 
-relaxed = settings(deadline=None, derandomize=True, max_examples=60)
+relaxed = settings(max_examples=60)
 
 #: Coordinates are multiples of this, so that shifts by whole µm are exact.
 STEP_UM = 2.0**-16

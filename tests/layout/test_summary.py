@@ -147,7 +147,7 @@ def test_all_lines_cross_first_ring():
 
 
 @pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")  # large ratios end below r_max_um
-@settings(deadline=None, derandomize=True, max_examples=40)
+@settings(max_examples=40)
 @given(
     n_sectors=st.integers(10, 40),
     fovea=st.sampled_from(["none", "rings", "linear", "hexagons"]),

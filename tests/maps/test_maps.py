@@ -133,6 +133,7 @@ def test_from_array_rejects_invalid_arrays(data, metadata, message):
 # -- round trips ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("extension", EXTENSIONS)
 @pytest.mark.usefixtures("in_sandbox")
@@ -1146,6 +1147,7 @@ MALFORMED = {
 }
 
 
+@pytest.mark.slow
 def test_malformed_files_raise_one_line_errors(tmp_path):
     paths = [tmp_path / f"{i}" for i in range(len(MALFORMED))]
     for path, make in zip(paths, MALFORMED.values(), strict=True):
@@ -1219,6 +1221,7 @@ FRAGILE = ("exr", "nc", "mat", "mat73")
 N_CORRUPT = 40
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("extension", ["npy", "npz", "fits", "tif", *FRAGILE])
 def test_corrupt_files_are_handled(valid_files, tmp_path, extension):
     """Truncated files, random bytes after the header, and flipped bits: each yields a map or an error of one line."""

@@ -72,6 +72,7 @@ def test_single_step_matches_lucas_kanade():
     assert found.flow_um[0] == pytest.approx([0.05, -0.03], rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", ["Gaussian", "Poisson"])
 def test_flow_covariance_attains_cramer_rao_bound(noise):
     n_runs, shift = 400, np.array([0.3, -0.2])

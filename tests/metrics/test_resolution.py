@@ -151,6 +151,7 @@ def lens_times_pixel(layout, frequency_per_mm, angle_deg):
     return lens * cells * polygon_mtf(layout, frequency_per_mm, angle_deg=angle_deg).mean(axis=0)
 
 
+@pytest.mark.slow(keep=6)
 @pytest.mark.parametrize("angle_deg", [5.0, -5.0, 85.0, 175.0, -95.0, 23.0])
 @pytest.mark.parametrize("layout", [SQUARES, HEXAGONS], ids=["squares", "hexagons"])
 def test_edge_mtf_matches_lens_times_pixel(layout, angle_deg):
@@ -298,6 +299,7 @@ def test_edge_mtf_noise_is_below_standard():
     assert np.abs(slanted_edge_mtf(GRID, values, frequency_per_mm=f).mtf - mtf(f)).max() < 0.002
 
 
+@pytest.mark.slow
 def test_mtf_sigma_matches_scatter():
     values, mtf = squares_at_an_edge()
     f = np.array([0.0, 20.0, 60.0, 100.0, 140.0, 166.0])
@@ -318,6 +320,7 @@ def test_mtf_sigma_matches_scatter():
     assert slanted_edge_mtf(GRID, values).mtf_sigma.max() < 0.002
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("kind", ["box of 2 pitches", "box of 20 pitches", "two-sided exponential", "core and halo"])
 def test_widening_bins_preserve_mtf_of_wide_edges(kind):
     from scipy.special import ndtr

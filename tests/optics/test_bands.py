@@ -60,6 +60,7 @@ SPECTRA = {
 }
 
 
+@pytest.mark.slow(keep=8)
 @pytest.mark.parametrize("spectrum", SPECTRA.values(), ids=SPECTRA)
 @pytest.mark.parametrize("n_outputs", [1, 3, 8])
 @pytest.mark.parametrize(

@@ -182,6 +182,7 @@ def test_on_axis_irradiance_follows_camera_equation(f_number, distance_m):
     assert on_axis == pytest.approx(np.pi * 15.0 / (1 + 4 * n_image**2), rel=1e-6)
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize(("emission", "power"), [("lambertian", 4), ("isotropic", 3)])
 @pytest.mark.parametrize(("precision", "tolerance"), [("single", 1e-6), ("double", 1e-12)])
 @pytest.mark.parametrize("at", [(64, 128), (0, 64), (128, 0), (10, 97)])

@@ -46,6 +46,7 @@ def clear(x, y, wavelength_nm):
     return np.ones(np.broadcast_shapes(x.shape, y.shape))
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("term", [4, 7, 22, 36])
 @pytest.mark.parametrize("name", PUPILS)
 def test_psf_and_strehl_match_polar_quadrature(name, term):
@@ -73,6 +74,7 @@ def test_psf_and_strehl_match_polar_quadrature(name, term):
     assert optics.strehl(WAVELENGTH_NM) == pytest.approx(strehl, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pupil", [(), (Annulus(0.5),), (Blades(6), Spider(3, 0.02))])
 def test_strehl_matches_quadrature_for_36_terms(pupil):
     x, y, weight = pupil_nodes(pupil, n_radial=90)
@@ -86,6 +88,7 @@ def test_strehl_matches_quadrature_for_36_terms(pupil):
         assert got == pytest.approx(np.abs(weight @ wave) ** 2 / weight.sum() ** 2, rel=1e-6), term
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("name", ["circle", "obstructed", "picture"])
 def test_psf_is_independent_of_window(name):
     optics = lens(PUPILS[name][0], z8=0.5, z36=-0.2)

@@ -137,6 +137,7 @@ def test_measured_tilt_displaces_psf():
 # -- transfer functions -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_across", [192.0, 200.3, 333.3, 512.0])
 def test_sampled_circle_otf_matches_closed_form(n_across):
     n = int(np.ceil(n_across))
@@ -294,6 +295,7 @@ def test_obstructed_pupil_conserves_flux(precision, tolerance):
     assert got / full == pytest.approx(Aperture(optics.pupil, [], 0.0).transmittance(550.0), rel=tolerance)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_weighted_maps_equal_weighted_sum_of_maps(precision):
     rng = np.random.default_rng(1)

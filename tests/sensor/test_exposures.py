@@ -286,6 +286,7 @@ def simulate_ramps(rate_e_per_s, times_s, seed):
     return np.clip(np.floor(codes), 0, 4095)
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("rate_e_per_s", [0.0, 3.0, 30.0, 300.0, 2000.0])
 def test_ramp_slope_matches_generalised_least_squares(rate_e_per_s):
     """The reference inverts the covariance matrix of the reads, with a free offset."""

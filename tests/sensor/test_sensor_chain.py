@@ -322,6 +322,7 @@ def test_draws_are_independent_of_thread_count():
         assert np.array_equal(code, noisy.read(first, streams=Streams(1), n_threads=n_threads))
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize("n_threads", [1, 2, 7])
 @pytest.mark.parametrize(
     "extra", [{}, {"crosstalk": fs.sensor.Diffusion(spread_um=0.3)}, {"shot_noise": "exact"}], ids=str

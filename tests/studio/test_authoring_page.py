@@ -13,7 +13,7 @@ pytest.importorskip("uvicorn")
 
 from studio.page_tools import SHOT, change, set_value, setting, settle, until
 
-pytestmark = pytest.mark.needs("chromium")
+pytestmark = [pytest.mark.needs("chromium"), pytest.mark.slow]
 
 #: 12 x 10 squares of 20 µm around (-140, 320) µm.
 PITCH_UM = 20.0
@@ -100,6 +100,7 @@ def undo(page):
 # -- drawing ----------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(keep=1)
 def test_drawn_polygon_is_in_geojson(edit):
     page = edit("polygon")
     corners = [(-15.0, -15.0), (30.0, -15.0), (30.0, 15.0), (0.0, 30.0)]

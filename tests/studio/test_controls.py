@@ -32,6 +32,7 @@ def keys_of(definition):
     return set(root["$defs"][definition]["properties"])
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize(
     ("section", "definition"),
     [

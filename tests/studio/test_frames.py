@@ -116,6 +116,7 @@ def test_frames_use_constant_disk_and_cache(recorder, clip):
     assert set(sizes) == {(1, sizes[0][1])}
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("n", [10, -1, 1.0, True, None, "1"])
 def test_missing_frames_give_one_line(recorder, clip, n):
     opened(recorder, clip)
@@ -135,6 +136,7 @@ def test_only_newest_waiting_frame_is_decoded(recorder, clip):
     assert recorder.session._version == version + 1
 
 
+@pytest.mark.slow
 def test_saved_settings_name_the_frame(make_session, tmp_path, clip):
     recorder = make_session(out=tmp_path / "out")
     opened(recorder, clip)
@@ -355,6 +357,7 @@ def test_notebook_without_files_names_none(settings):
     assert "Required" not in first["source"]
 
 
+@pytest.mark.slow
 def test_archive_runs_unchanged(recorder, tmp_path):
     path = recorder.session.add_file("photo.png", png(pixels(8)))
     recorder.do(do="file", path=str(path), **{"as": "scene"}, id=1)

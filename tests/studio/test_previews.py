@@ -299,6 +299,7 @@ def test_check_stops_before_the_next_stage(settings):
     assert engine.n_built["layout"] == 1
 
 
+@pytest.mark.slow
 def test_newer_change_stops_a_simulation(settings, make_threaded, monkeypatch):
     session = make_threaded(settings)
     listener = Listener(session)

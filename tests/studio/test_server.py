@@ -152,6 +152,7 @@ def test_pages_have_security_headers(served):
     assert permitted["camera"] == "(self)"
 
 
+@pytest.mark.slow(keep=5)
 @pytest.mark.parametrize(
     "path",
     ["/static/..%2f__init__.py", "/static/%2e%2e/_server.py", "/web/_serve.py", "/web/..%2f..%2fcli.py", "/web/template.html", "/static/", "/file", "/static/.js", "/x"],
@@ -220,6 +221,7 @@ def test_page_receives_state_and_parts(served, settings):
     assert np.array_equal(page.code, codes_of({**settings, "exposure_s": 0.02}))
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize(
     "text", ["", "{", "null", "[1]", "NaN", '"x"', "1" * 5000, "[" * 5000, '{"do": "set", "value": Infinity}']
 )
@@ -361,6 +363,7 @@ def test_failed_downloads_give_one_line(served, monkeypatch):
     assert "No space left on device" in json.loads(content)["error"]
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("what", ["yaml", "python", "gds", "oas", "geojson", "npz", "svg", "png"])
 def test_downloads_contain_current_state(served, what, tmp_path):
     async def visit():
@@ -438,6 +441,7 @@ class Program:
         return self.process.returncode, time.monotonic() - start_s, errors
 
 
+@pytest.mark.slow
 def test_restarted_server_restores_settings(tmp_path, settings):
     shot = tmp_path / "shot.yaml"
     shot.write_text(yaml.safe_dump(settings))

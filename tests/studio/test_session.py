@@ -660,6 +660,7 @@ def other_values(control):
             return []
 
 
+@pytest.mark.slow
 def test_no_setting_leaves_stale_views(make_session, settings):
     lens = {"kind": "brown_conrady", "focal_um": 8000.0, "radial": [-0.1], "centre_um": [1.0, 0.5]}
     settings = {**settings, "distortion": lens}

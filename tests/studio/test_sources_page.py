@@ -28,7 +28,7 @@ from studio.page_tools import (
 
 from foveasim.config import read_shot
 
-pytestmark = pytest.mark.needs("chromium")
+pytestmark = [pytest.mark.needs("chromium"), pytest.mark.slow]
 
 #: A camera that shows a moving picture.
 FAKE_CAMERA = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
@@ -231,6 +231,7 @@ def test_corrupt_picture_of_folder_is_named(visit):
     assert "a.png" in setting(page, "scene.picture")
 
 
+@pytest.mark.slow(keep=1)
 def test_source_menu_selects_test_chart(visit):
     page = visit()
     page.focus("#source")

@@ -27,11 +27,12 @@ from studio.page_tools import (
     until,
 )
 
-pytestmark = pytest.mark.needs("chromium")
+pytestmark = [pytest.mark.needs("chromium"), pytest.mark.slow]
 
 # -- views ------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(keep=1)
 def test_every_view_shows_data(visit):
     page = visit(width=2560, height=1440)
     until(page, "() => ['noise', 'spectrum', 'mtf', 'rules', 'scene'].every((name) => studio.page.parts[name])")
@@ -262,6 +263,7 @@ def test_alternative_brings_its_parameters(visit):
     assert page.evaluate("document.activeElement.closest('.control').dataset.key") == "layout"
 
 
+@pytest.mark.slow(keep=1)
 def test_slider_drag_is_one_step(visit):
     page = visit()
     page.evaluate("() => { window.sent = []; const send = studio.connection.send.bind(studio.connection);"

@@ -17,7 +17,7 @@ from studio.page_tools import codes, setting
 
 import foveasim as fs
 
-pytestmark = pytest.mark.needs("chromium")
+pytestmark = [pytest.mark.needs("chromium"), pytest.mark.slow]
 
 SCRIPT = Path(fs.__file__).parents[1] / "docs" / "studio_pictures.py"
 
@@ -43,6 +43,7 @@ def table(page):
     )
 
 
+@pytest.mark.slow(keep=1)
 def test_photograph_is_captured(page, tasks):
     gaze_um = np.array(setting(page, "layout.move_um"))
     tasks.photograph(page, Path(str(files("skimage.data") / "coffee.png")))

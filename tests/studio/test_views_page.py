@@ -10,7 +10,7 @@ pytest.importorskip("uvicorn")
 
 from studio.page_tools import change, has_picture, set_value, settle, until
 
-pytestmark = pytest.mark.needs("chromium")
+pytestmark = [pytest.mark.needs("chromium"), pytest.mark.slow]
 
 #: Browsers without WebGL.
 WITHOUT_WEBGL = """{ const own = HTMLCanvasElement.prototype.getContext;
@@ -79,6 +79,7 @@ def test_signal_mark_follows_exposure(visit):
     assert page.evaluate("studio.charts.photon_transfer.marks[0].x") == pytest.approx(before / 2, rel=1e-3)
 
 
+@pytest.mark.slow(keep=1)
 def test_logarithmic_chart_reads_values_at_mouse(visit):
     page = visit()
     show(page, "snr")

@@ -112,6 +112,7 @@ def test_image_of_same_object_is_computed_once():
     assert np.array_equal(second.expected_e, third.expected_e)
 
 
+@pytest.mark.slow(keep=5)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize(
     "changes", [{}, {"pupil": fs.optics.Blades(6), "zernike": fs.optics.Zernike(coefficients={7: 0.05})}]
@@ -884,6 +885,7 @@ def small_chunks(monkeypatch):
     monkeypatch.setattr(sys.modules[read_recording.__module__], "CHUNK_CODES", 500)
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.usefixtures("small_chunks")
 @pytest.mark.parametrize("n_added", [(0, 3), (4, 1, 4), (5, 6), (11,), (1, 0, 1)])
 def test_interrupted_recording_resumes_bit_identically(tmp_path, n_added):
@@ -942,6 +944,7 @@ def wait_for(condition, limit_s=60.0):
         time.sleep(0.005)
 
 
+@pytest.mark.slow
 def test_killed_process_leaves_valid_recording(tmp_path, monkeypatch):
     script, path = tmp_path / "record.py", tmp_path / "v.zarr"
     script.write_text(f"TESTS = {str(Path(__file__).parent)!r}\n{RECORDER}")
@@ -960,6 +963,7 @@ def test_killed_process_leaves_valid_recording(tmp_path, monkeypatch):
     assert files_of(path) == files_of(tmp_path / "expected.zarr")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small_chunks")
 def test_full_disk_loses_no_complete_frame(tmp_path, monkeypatch):
     write_video(rolling(0), tmp_path / "expected.zarr")
@@ -1015,6 +1019,7 @@ def test_frames_are_written_at_time_intervals(tmp_path, monkeypatch):
     assert n_recorded == list(range(11))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small_chunks")
 def test_different_recording_is_not_resumed(tmp_path):
     path = tmp_path / "v.zarr"
@@ -1083,6 +1088,7 @@ print(count_recorded_frames("v.zarr"))
 """
 
 
+@pytest.mark.slow
 def test_functions_are_equal_in_new_processes(tmp_path):
     def run(hash_seed):
         environment = os.environ | {"PYTHONHASHSEED": str(hash_seed), "PYTHONDONTWRITEBYTECODE": "1"}
@@ -1114,6 +1120,7 @@ GAZE_FRAMES = {
 }
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("kind", GAZE_FRAMES)
 @pytest.mark.parametrize("every", [1, 2])
 def test_recordings_store_and_check_gaze(tmp_path, kind, every):
@@ -1358,6 +1365,7 @@ def run_command(*arguments, **options):
     )
 
 
+@pytest.mark.slow
 def test_stopped_command_resumes(directory, capsys):
     frames, out = directory / "frames", directory / "v.zarr"
     for k in range(3, 400):

@@ -36,6 +36,7 @@ def flipped(content, seed):
     return bytes(bad)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "codec"), [("a.mp4", "libx264"), ("a.mkv", "ffv1")])
 def test_flipped_bits_give_frames_or_file_errors(tmp_path, name, codec):
     content = write_film(tmp_path / name, codec)

@@ -51,6 +51,7 @@ def _backend_stays():
     mpl.rcParams["backend"] = before
 
 
+@pytest.mark.slow
 def test_scripts_do_not_import_pyplot(monkeypatch):
     monkeypatch.setenv("MPLBACKEND", INLINE)  # as in programs that a notebook starts
     done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False)
@@ -154,6 +155,7 @@ CELLS = {
 }
 
 
+@pytest.mark.slow
 def test_plots_appear_in_notebook(monkeypatch):
     monkeypatch.delenv("MPLBACKEND", raising=False)
     book = nbformat.v4.new_notebook()

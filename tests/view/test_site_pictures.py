@@ -63,7 +63,8 @@ def test_pixels_are_exact_means_of_clipped_polygons():
             assert picture[row, column, 3] == pytest.approx(255 * area_um2.sum() / 4.0, abs=0.501)
 
 
-@settings(max_examples=25, deadline=None)
+@pytest.mark.slow
+@settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 9), st.integers(1, 9), st.sampled_from(["viridis", "gray"]))
 def test_values_have_colours_of_their_map_only(seed, n_y, n_x, colour_map):
     rng = np.random.default_rng(seed)

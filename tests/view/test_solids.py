@@ -41,6 +41,7 @@ def hull_um2(layout):
 # -- closed surfaces and volumes -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_parts_are_closed_without_overlap(name):
     model = solids(LAYOUTS[name](), STACK)
@@ -144,6 +145,7 @@ def test_fill_factor_matches_layout():
         )
 
 
+@pytest.mark.slow
 def test_ten_thousand_sites_closed_without_overlap():
     layout = fs.layout.grid(n_x=100, n_y=100, pitch_um=4.0)
     model = solids(layout, SensorStack(trench_width_um=0.4))
@@ -264,6 +266,7 @@ def test_invalid_thicknesses_raise_by_name(parameters, message):
 # -- cuts ----------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(keep=5)
 @pytest.mark.parametrize("name", ["squares", "rings with arcs", "zones"])
 @pytest.mark.parametrize("shape", ["quarter", "slanted", "disc", "two pieces"])
 def test_cut_solids_closed_with_remaining_volume(name, shape):

@@ -657,6 +657,7 @@ print(fs.view.find_renderer(), len(np.unique(picture)) > 2, *[w.message for w in
 """
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("machine", MACHINES)
 def test_missing_drivers_do_not_crash_interpreter(machine):
     bare = {k: v for k, v in os.environ.items() if k not in {"DISPLAY", renderer.VTK_VARIABLE}}

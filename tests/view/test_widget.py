@@ -116,6 +116,7 @@ def position(page, frame, x_um, y_um):
     return box["x"] + x, box["y"] + y
 
 
+@pytest.mark.slow
 @pytest.mark.needs("chromium")
 def test_hover_and_pin_reach_python(show):
     widget = fs.view.widget(LAYOUT)
@@ -164,6 +165,7 @@ def test_colours_are_set_in_both_directions(show):
     until(frame, lambda: page.query_selector("iframe").bounding_box()["height"] == 400)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.needs("chromium")
 @pytest.mark.parametrize(("style", "theme"), [("color: #eee", "dark"), ("color: #111", "light")])
 def test_theme_follows_the_notebook(show, style, theme):

@@ -58,7 +58,7 @@ def test_site_overlapping_several_is_dropped_alone():
     assert changed(changes) == {0}
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 10_000), repair=st.sampled_from(["drop", "merge", "refill"]))
 def test_repair_satisfies_rules_and_preserves_rest(seed, repair):
     rng = np.random.default_rng(seed)

@@ -20,7 +20,7 @@ from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout import DesignRules, Layout, grid, hexagonal, log_polar, zones
 from foveasim.layout.drc.rules import min_width_um
 
-relaxed = settings(deadline=None, derandomize=True, max_examples=40)
+relaxed = settings(max_examples=40)
 
 #: All rules of this file; a layout of 25 unit squares around the origin satisfies them.
 ALL_RULES = DesignRules(

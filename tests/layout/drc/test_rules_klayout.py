@@ -17,7 +17,7 @@ import foveasim as fs
 kdb = pytest.importorskip("klayout.db")
 rdb = pytest.importorskip("klayout.rdb")
 
-relaxed = settings(deadline=None, derandomize=True, max_examples=40)
+relaxed = settings(max_examples=40)
 seeds = st.integers(0, 2**32 - 1)
 
 #: Database unit of polygons compared in memory.
@@ -92,6 +92,7 @@ def giotto():
     return fs.layout.giotto(n_rho=152, n_theta=252, n_fovea=42, n_across=1090, unit_um=6.45, fovea="none")
 
 
+@pytest.mark.slow
 def test_klayout_finds_same_narrow_giotto_sites(giotto, tmp_path):
     giotto.write(tmp_path / "giotto.gds")
     region, dbu_um = read(tmp_path / "giotto.gds")

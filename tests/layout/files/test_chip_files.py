@@ -121,6 +121,7 @@ def trench_family(name):
     }[name]
 
 
+@pytest.mark.slow(keep=7)
 @pytest.mark.parametrize("extension", GDSII_OASIS)
 @pytest.mark.parametrize("hierarchy", [True, False])
 @pytest.mark.parametrize(
@@ -517,6 +518,7 @@ def family(name):
     }[name]()
 
 
+@pytest.mark.slow(keep=7)
 @pytest.mark.parametrize("extension", GDSII_OASIS)
 @pytest.mark.parametrize(
     ("name", "max_bytes"),
@@ -563,6 +565,7 @@ def test_flat_file_has_same_content(bayer, tmp_path, extension):
     assert_lossless(fs.read_layout(tmp_path / f"False.{extension}"), bayer)
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize(("extension", "then"), [("gds", "gds"), ("gds", "oas"), ("oas", "oas")])
 @pytest.mark.parametrize("name", ["grid", "one row", "hexagons", "x_trans", "flags"])
 def test_arrays_survive_klayout(tmp_path, extension, then, name):
@@ -667,7 +670,7 @@ def lattices(draw):
     return rng.permutation(table) if draw(st.booleans()) else table
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(lattices())
 def test_arrays_reproduce_every_site_once(table):
     columns = {"a": table[:, 3]}
@@ -687,7 +690,7 @@ def test_arrays_reproduce_every_site_once(table):
     assert sorted(seen) == list(range(len(table)))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(-9, 9), st.integers(-9, 9)), min_size=1, max_size=30))
 def test_congruent_sites_are_equal_up_to_translation(sites):
     shapes = [
@@ -707,7 +710,7 @@ def test_congruent_sites_are_equal_up_to_translation(sites):
     assert origin.tolist() == [r.min(0).tolist() for r in rings]
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.lists(st.tuples(st.integers(3, 12), st.integers(3, 12), st.integers(0, 2**32)), min_size=1, max_size=5))
 def test_parts_of_holed_sites_cover_them(sites):
     polygons = []
@@ -891,6 +894,7 @@ def test_invalid_outlines_are_repaired(invalid_file):
     assert layout.channel.tolist() == [0, 1, 0, 1, 0]
 
 
+@pytest.mark.slow
 def test_command_line_skips_invalid_outlines(invalid_file, tmp_path):
     command = [sys.executable, "-m", "foveasim", "convert", str(invalid_file), str(tmp_path / "b.npz")]
     command += ["--source-layer", "77"]

@@ -288,6 +288,7 @@ def test_dropped_columns_are_reported(tmp_path, extension):
     assert write_layout(layout[:0], tmp_path / f"a.{extension}").dropped_columns == tuple(sorted(layout.columns))
 
 
+@pytest.mark.slow(keep=8)
 @pytest.mark.parametrize("extension", GDSII_OASIS)
 @pytest.mark.parametrize("name", ["a b", "a=b", 'say "a"', "µ", "", "1", '"a"', "%s", "a\n", "photosite"])
 def test_unusual_column_names_round_trip(tmp_path, extension, name):
@@ -767,6 +768,7 @@ def small():
     return Layout.from_polygons(holed, channel=np.arange(9) % 3, name=np.array(list("abcdefghi")))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("extension", [*EXACT, *GDSII_OASIS])
 def test_corrupt_files_read_or_raise_within_seconds(small, tmp_path, extension):
     write_layout(small, tmp_path / f"a.{extension}")
@@ -785,6 +787,7 @@ def test_corrupt_files_read_or_raise_within_seconds(small, tmp_path, extension):
     assert time.perf_counter() - began_s < 120
 
 
+@pytest.mark.slow
 def test_corrupt_oasis_with_valid_checksum_terminates(small, tmp_path):
     write_layout(small, tmp_path / "a.oas")
     data = (tmp_path / "a.oas").read_bytes()
@@ -1068,6 +1071,7 @@ DEVICES = {
 }
 
 
+@pytest.mark.slow(keep=10)
 @pytest.mark.parametrize("extension", EXACT + GDSII_OASIS)
 @pytest.mark.parametrize("name", DEVICES)
 def test_layout_read_again_is_same_device(tmp_path, name, extension):

@@ -761,6 +761,7 @@ HARMLESS = {
 }
 
 
+@pytest.mark.slow(keep=("geojson-", "yaml-"))
 @pytest.mark.parametrize(
     ("extension", "name"), [(extension, name) for extension, bombs in BOMBS.items() for name in bombs]
 )
@@ -828,6 +829,7 @@ def numbered(directory, files, extension):
     return paths
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("extension", FORMATS)
 def test_truncated_files_and_noise_are_rejected(valid_files, tmp_path, extension):
     files = truncated(valid_files[extension], 30) + noise(np.random.default_rng(21), 20, extension)
@@ -836,6 +838,7 @@ def test_truncated_files_and_noise_are_rejected(valid_files, tmp_path, extension
         assert_harmless(answer, ERRORS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("extension", FORMATS)
 def test_flipped_bits_raise_or_give_layout(valid_files, tmp_path, extension):
     files = flipped(valid_files[extension], np.random.default_rng(22), 30, extension)
@@ -844,6 +847,7 @@ def test_flipped_bits_raise_or_give_layout(valid_files, tmp_path, extension):
         assert_harmless(answer, ERRORS | {"Layout"})
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("extension", ["npz", "parquet"])
 def test_flipped_directory_bits_raise_or_give_layout(valid_files, tmp_path, extension):
     data = valid_files[extension]

@@ -19,7 +19,7 @@ from foveasim.layout.generators.giotto import giotto, giotto_ratio
 from foveasim.layout.generators.grid import grid
 from foveasim.layout.generators.octagonal import octagonal
 
-relaxed = settings(deadline=None, derandomize=True, max_examples=40)
+relaxed = settings(max_examples=40)
 
 units_um = st.floats(0.05, 50.0)
 
@@ -188,6 +188,7 @@ def test_giotto_neighbours_share_edges_exactly(parameters):
     assert set(counts) == {1, 2}
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("chords_per_arc", [1, 2, 3, 4, 7])
 @pytest.mark.parametrize("stagger", [False, True])
 @pytest.mark.parametrize("fovea", ["rings", "none"])
@@ -576,6 +577,7 @@ def test_octagonal_rejects_invalid_parameters(changed, message):
 # -- all families ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("make", "parameters", "n_sites", "area_um2"),
     [

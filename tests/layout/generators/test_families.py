@@ -26,8 +26,6 @@ from foveasim.layout import LAYOUTS
 
 #: Most random combinations of parameters are invalid, and generators reject them with an error of the package.
 random_settings = settings(
-    deadline=None,
-    derandomize=True,
     max_examples=60,
     suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
 )
@@ -226,6 +224,7 @@ def test_generators_with_minimum_size():
     assert {"log_polar", "tiling"} <= set(WITH_MIN_SIZE)
 
 
+@pytest.mark.slow
 @without_warnings
 @pytest.mark.parametrize("name", WITH_MIN_SIZE)
 def test_generator_satisfies_minimum_size(name):

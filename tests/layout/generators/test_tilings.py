@@ -14,7 +14,7 @@ import foveasim as fs
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout import fill, giotto, grid, hexagonal, log_polar, merge_small, tiling, zones
 
-relaxed = settings(deadline=None, derandomize=True, max_examples=40)
+relaxed = settings(max_examples=40)
 
 NOTCHED = shapely.Polygon([(-20, -15), (25, -18), (22, 4), (3, 2), (6, 20), (-18, 17)])
 HOLED = NOTCHED.difference(shapely.Point(-8, -2).buffer(5.0))
@@ -175,6 +175,7 @@ def filled_log_polar(draw):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")  # large ratios end below r_max_um
 @relaxed
 @given(parameters=filled_log_polar(), fovea=st.sampled_from(["rings", "linear", "hexagons"]))
@@ -227,6 +228,7 @@ def test_linear_polar_fovea_uses_outer_sectors():
     assert np.all(layout.readout_line[inside] % (48 // n_sites[layout.columns["ring"][inside]]) == 0)
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("fovea", ["rings", "linear", "hexagons"])
 @pytest.mark.parametrize("chords_per_arc", [1, 2, 3, 4, 7])
 def test_giotto_1_fills_disc_with_fovea(fovea, chords_per_arc):
@@ -338,6 +340,7 @@ OUTLINES = [
 ]
 
 
+@pytest.mark.slow
 @relaxed
 @given(
     pitches_um=st.tuples(st.floats(0.8, 2.0), st.floats(1.5, 4.0), st.floats(3.0, 8.0)),
