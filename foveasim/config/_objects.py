@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, TypeAdapter
+from pydantic import BaseModel
 
 from foveasim._core.names import possible_names
 from foveasim._core.random_streams import Streams
@@ -19,7 +19,7 @@ from foveasim._io.images import read_picture
 from foveasim._io.yaml_files import parse_yaml, read_yaml
 from foveasim.camera import Camera
 from foveasim.config._models import FILE_OPTIONS, LayerSection, PerArea, call_of, models
-from foveasim.config._problems import plain_settings, validate
+from foveasim.config._problems import adapter_of, plain_settings, validate
 from foveasim.config._sources import Source
 from foveasim.errors import ConfigError, FoveasimError, ParameterError
 from foveasim.fields import Grid, PowerMap
@@ -361,7 +361,7 @@ def read_rules(path: str | Path) -> DesignRules:
 def schema(section: Any = "shot", title: str = "foveasim settings") -> dict[str, Any]:
     """Return the JSON schema of a ``"shot"``, a ``"layout"`` or ``"rules"``, or of a model."""
     model = getattr(models(), section) if isinstance(section, str) else section
-    model_schema = TypeAdapter(model).json_schema()
+    model_schema = adapter_of("section", model).json_schema()
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **model_schema, "title": title}
 
 

@@ -10,12 +10,12 @@ from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import numpy as np
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import BaseModel, PydanticUserError, TypeAdapter, ValidationError
 
 from foveasim._core.names import closest_name, did_you_mean, list_names, possible_names
 from foveasim.config._models import call_of
 from foveasim.config._sources import Source
-from foveasim.errors import ConfigError, format_value
+from foveasim.errors import ConfigError, ParameterError, format_value
 
 __all__ = ["plain_settings", "validate"]
 
@@ -67,6 +67,16 @@ def plain_settings(source: Source | str | Path | None, value: Any, key_path: tup
     raise Source.of(source).error(key_path, f"must be a number, string, list or section, got {format_value(value)}")
 
 
+def adapter_of(name: str, kind: Any) -> TypeAdapter[Any]:
+    """Return the validator of a model, or raise a ParameterError for a parameter that is none."""
+    try:
+        if not isinstance(kind, str):  # the name of a type, for pydantic
+            return TypeAdapter(kind)
+    except PydanticUserError:
+        pass
+    raise ParameterError(name, "must be a model of settings", kind)
+
+
 def validate(source: Source | str | Path | None, kind: Any, data: Mapping[str, Any]) -> Any:
     """
     Return settings as an instance of a model.
@@ -77,9 +87,10 @@ def validate(source: Source | str | Path | None, kind: Any, data: Mapping[str, A
         With the file, its line and column, the path of the key, and the expected and actual value.
     """
     source = Source.of(source)
+    adapter = adapter_of("kind", kind)
     try:
         plain = plain_settings(source, data)
-        return TypeAdapter(kind).validate_json(json.dumps(plain), strict=True)
+        return adapter.validate_json(json.dumps(plain), strict=True)
     except ValidationError as error:
         (key_path, first), *others = _problems(kind, plain, error)
         more = len(others) + 1 - MAX_PROBLEMS

@@ -698,7 +698,11 @@ def _check_packed(xy_um: ArrayLike, ring_offsets: ArrayLike, site_offsets: Array
 def _pack_polygons(polygons: Any) -> tuple[Floats, Ints, Ints]:
     """Return packed rings of shapely polygons, closing vertices included."""
     items = polygons.geoms if hasattr(polygons, "geoms") else polygons
-    if isinstance(items, str | bytes | shapely.Geometry) or not isinstance(items, Iterable):
+    if (
+        isinstance(items, str | bytes | shapely.Geometry)
+        or not isinstance(items, Iterable)
+        or (isinstance(items, np.ndarray) and not items.ndim)
+    ):
         raise ParameterError("polygons", "must be a sequence of shapely polygons, or packed rings", items)
     geometries = np.fromiter(items, dtype=object)
     is_polygon = np.array([isinstance(g, shapely.Polygon) for g in geometries], bool)

@@ -21,6 +21,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import (
     Floats,
     as_numbers,
+    check_broadcast,
     check_choice,
     check_count,
     check_number,
@@ -98,7 +99,7 @@ def zernike(n: int, m: int, x: ArrayLike, y: ArrayLike) -> Floats:
     Raises
     ------
     ParameterError
-        When n and m are not the orders of a Zernike polynomial.
+        When n and m are not the orders of a Zernike polynomial, or the shapes of x and y cannot be broadcast together.
 
     Notes
     -----
@@ -110,6 +111,7 @@ def zernike(n: int, m: int, x: ArrayLike, y: ArrayLike) -> Floats:
     if n < abs(m) or (n - m) % 2:
         raise ParameterError("m", f"must be from -n to n = {n} in steps of two", m)
     x, y = as_numbers("x", x), as_numbers("y", y)
+    check_broadcast(x=x, y=y)
     r2 = x * x + y * y
     k = (n - abs(m)) // 2
     radial = (-1) ** k * eval_jacobi(k, abs(m), 0, 1.0 - 2.0 * r2)

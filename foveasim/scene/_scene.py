@@ -19,6 +19,7 @@ from foveasim._core.validation import (
     MAX_WAVELENGTH_NM,
     Floats,
     Images,
+    as_numbers,
     check_choice,
     check_number,
     check_shape,
@@ -137,7 +138,7 @@ class Scene:
     def __post_init__(self) -> None:
         basis = np.asarray(unmasked("basis", self.basis))
         if basis.dtype not in (np.float32, np.float64):
-            basis = read_only(basis.astype(np.float64))
+            basis = read_only(as_numbers("basis", basis))
         if basis.ndim != 3 or 0 in basis.shape:
             raise ParameterError("basis", f"must have the shape (n_basis, n_y, n_x), got {basis.shape}")
         lowest, highest = value_range(basis)

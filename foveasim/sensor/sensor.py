@@ -720,7 +720,10 @@ class Sensor:
     def _exposure(self, photo_e_per_s: Floats, exposure_s: float) -> tuple[Floats, tuple[Step, ...]]:
         """Return the rates of all sites, and the steps from them to the expected charges."""
         exposure_s = check_plausible("exposure_s", exposure_s)
-        photo = np.broadcast_to(np.asarray(unmasked("photo_e_per_s", photo_e_per_s)), self.layout.n_sites)
+        photo = np.asarray(unmasked("photo_e_per_s", photo_e_per_s))
+        if photo.shape not in ((), (1,)):
+            photo = self._check_size("photo_e_per_s", photo)
+        photo = np.broadcast_to(photo, self.layout.n_sites)
         return photo, (*self._before_exposure, Factor(exposure_s), *self._effects_at("expected"))
 
     @cached_property
