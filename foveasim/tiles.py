@@ -54,7 +54,7 @@ from foveasim.reconstruct import Picture, raster_grid
 from foveasim.scene import Scene
 from foveasim.sensor import Sensor
 from foveasim.sensor.blocks import BLOCK_SITES
-from foveasim.sensor.limits import check_plausible
+from foveasim.sensor.limits import EXPOSURE
 
 __all__ = ["TiledCapture", "capture_tiles", "read_tiles", "write_tiles"]
 
@@ -132,7 +132,7 @@ def capture_tiles(
     if not isinstance(light, Scene | PowerMap):
         raise ParameterError("light", f"must be a Scene or a PowerMap, got {type_name(light)}")
     streams = Streams(seed, frame)
-    exposure_s = check_plausible("exposure_s", exposure_s)
+    exposure_s = EXPOSURE.check("exposure_s", exposure_s)
     tile_sites = _whole_blocks(tile_sites)
     n_tiles = -(-camera.layout.n_sites // tile_sites)
     first_tile = check_count("first_tile", first_tile, at_least=0, at_most=n_tiles)
@@ -469,7 +469,7 @@ def _plan(
     camera: Camera, light: Scene | PowerMap, exposure_s: float, streams: Streams, tile_sites: int
 ) -> dict[str, Any]:
     """Return plain data that identify a tiled capture; arrays of the light as checksums."""
-    settings = capture_settings(camera, light, check_plausible("exposure_s", exposure_s), streams)
+    settings = capture_settings(camera, light, EXPOSURE.check("exposure_s", exposure_s), streams)
     arrays = [light.data] if isinstance(light, PowerMap) else [light.basis]
     checksum = 0
     for array in arrays:

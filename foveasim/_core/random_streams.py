@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Annotated
 from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.validation import check_count
+from foveasim._core.calls import NOT_NEGATIVE, Declared
 
 __all__ = ["Streams", "derive_seed", "fixed_pattern_key", "random_key"]
 
@@ -46,7 +47,7 @@ def _block_key(seed: int, frame: int, effect: str) -> NDArray[np.uint64]:
 
 
 @dataclass(frozen=True, slots=True)
-class Streams:
+class Streams(Declared):
     """
     Random streams of one frame.
 
@@ -75,14 +76,9 @@ class Streams:
     fixed pattern of a device come from published counter-based generators.
     """
 
-    seed: int
-    frame: int = 0
-    first_block: int = 0
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "seed", check_count("seed", self.seed, at_least=0))
-        object.__setattr__(self, "frame", check_count("frame", self.frame, at_least=0))
-        object.__setattr__(self, "first_block", check_count("first_block", self.first_block, at_least=0))
+    seed: Annotated[int, NOT_NEGATIVE]
+    frame: Annotated[int, NOT_NEGATIVE] = 0
+    first_block: Annotated[int, NOT_NEGATIVE] = 0
 
     def of(self, effect: str, block: int | None = None) -> np.random.Generator:
         """

@@ -384,6 +384,7 @@ def finite_array(
     at_least: float | None = None,
     above: float | None = None,
     at_most: float | None = None,
+    hint: str = "",
 ) -> Floats:
     """
     Return the value as a float64 array of finite numbers.
@@ -415,7 +416,8 @@ def finite_array(
         if is_bad is not None and np.any(is_bad):
             where = tuple(int(i) for i in np.argwhere(is_bad)[0])
             position = f" at [{', '.join(map(str, where))}]" if where else ""
-            raise ParameterError(name, f"{rule} everywhere", float(array[where]), (unit_of(name) + position).strip())
+            unit = (unit_of(name) + position).strip()
+            raise ParameterError(name, f"{rule} everywhere", float(array[where]), unit, hint)
     return array
 
 

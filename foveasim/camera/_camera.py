@@ -45,7 +45,7 @@ from foveasim.reconstruct import Picture, reference
 from foveasim.reconstruct.rasters import sum_of_images
 from foveasim.scene import Scene
 from foveasim.sensor import NoiseBudget, Sensor, noise_budget
-from foveasim.sensor.limits import check_plausible, check_plausible_array
+from foveasim.sensor.limits import EXPOSURE
 from foveasim.units import um_from_nm, w_from_w_m2_um2
 
 __all__ = ["Camera"]
@@ -447,7 +447,7 @@ class Camera:
             When a value is out of range, or the parts are incompatible.
         """
         streams = Streams(seed, frame)
-        exposure_s = check_plausible("exposure_s", exposure_s)
+        exposure_s = EXPOSURE.check("exposure_s", exposure_s)
         clock = Clock()
         if photo_e_per_s is None:
             photo_e_per_s = self._photoelectrons_per_s(light, clock)
@@ -574,7 +574,7 @@ class Camera:
         >>> [c.settings["frame"] for c in camera.video([scene, scene], exposure_s=0.01, seed=0)]
         [0, 1]
         """
-        exposures_s = check_plausible_array("exposure_s", exposure_s)
+        exposures_s = EXPOSURE.check_array("exposure_s", exposure_s)
         if exposures_s.ndim > 1 or exposures_s.size == 0:
             raise ParameterError("exposure_s", "must be one time, or a sequence of times", exposure_s, "s")
         exposures_s = np.atleast_1d(exposures_s)
@@ -704,7 +704,7 @@ class Camera:
         ParameterError, SimulationError
             As for :meth:`capture`.
         """
-        exposure_s = check_plausible("exposure_s", exposure_s)
+        exposure_s = EXPOSURE.check("exposure_s", exposure_s)
         if not isinstance(light, Scene | PowerMap):
             raise ParameterError("light", f"must be a Scene or a PowerMap, got {type_name(light)}")
         joules_per_w_m2 = float(w_from_w_m2_um2(exposure_s))

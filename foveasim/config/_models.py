@@ -15,7 +15,9 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, create_model
 
+from foveasim._core.calls import NOT_NEGATIVE, Declaration, Usual
 from foveasim._core.registry import Registry
+from foveasim._core.validation import unit_of
 from foveasim.distortion import LENSES
 from foveasim.layout import EDITS, LAYOUTS, PRESETS, RULES, DesignRules, Readout, Routing, read_layout
 from foveasim.maps import read_power_map
@@ -31,6 +33,7 @@ from foveasim.sensor import (
     read_filters,
 )
 from foveasim.sensor.effects import EFFECTS
+from foveasim.sensor.limits import EXPOSURE
 from foveasim.sensor.spectral import CURVES
 
 __all__ = ["FILE_OPTIONS", "LayerSection", "Models", "PerArea", "call_of", "models"]
@@ -51,12 +54,12 @@ class _Section(BaseModel):
 
 def _model(name: str, call: Callable[..., Any], skip: Sequence[str] = (), **types: Any) -> type[_Section]:
     """Return a model with the parameters of a call, with file types for some."""
-    hints = get_type_hints(call)
+    hints = get_type_hints(call, include_extras=True)
     summary, descriptions = _documentation(call)
     keys: dict[str, Any] = {
         p.name: (
             types.get(p.name, hints.get(p.name)),
-            Field(... if p.default is inspect.Parameter.empty else p.default, description=descriptions.get(p.name)),
+            _field(p.name, p.default, descriptions.get(p.name), Declaration.of(hints.get(p.name))),
         )
         for p in inspect.signature(call).parameters.values()
         if p.name not in skip
@@ -64,6 +67,22 @@ def _model(name: str, call: Callable[..., Any], skip: Sequence[str] = (), **type
     model = create_model(name, __base__=_Section, __doc__=summary, **keys)
     _CALLS[model] = call
     return model
+
+
+def _field(name: str, default: Any, description: str | None, declared: Declaration) -> Any:
+    """Return a key with its unit and range, which the call checks: its messages have hints."""
+    default = ... if default is inspect.Parameter.empty else default
+    if declared.limits is None:
+        return Field(default, description=description)
+    rule = declared.limits.schema
+    words = " ".join(part for part in (declared.limits.range, unit_of(name)) if part)
+    note = f"{words[:1].upper()}{words[1:]}{', also per site' * declared.is_per_site}." if words else ""
+    extra: dict[str, Any] = {} if Sequence in declared.kinds else dict(rule)
+    if declared.is_per_site or Sequence in declared.kinds:
+        extra["items"] = {"type": "number", **rule}
+    if declared.usual is not None:
+        extra["usual"] = list(declared.usual)
+    return Field(default, description=f"{description or ''} {note}".strip(), json_schema_extra=extra)
 
 
 def call_of(section: BaseModel | type[BaseModel]) -> Callable[..., Any] | None:
@@ -202,8 +221,8 @@ def _models(_versions: tuple[int, ...]) -> Models:
         "distortion": (lens | None, Field(None, description="distortion model of the lens")),
         "layout": (str | layout, Field(description="a layout file, the name of a bundled layout, or a generator")),
         "sensor": (sensor, Field(default_factory=sensor, description="parameters of the photosites and their readout")),
-        "exposure_s": (float, Field(description="exposure time, s")),
-        "seed": (int, Field(0, description="seed of the noise")),
+        "exposure_s": (float, _field("exposure_s", ..., "exposure time", Declaration({}, EXPOSURE, Usual(1e-5, 1.0)))),
+        "seed": (int, _field("seed", 0, "seed of the noise", Declaration({}, NOT_NEGATIVE, Usual(0, 100)))),
         "integration_order": (
             Literal[1, 2] | None,
             Field(None, description="cells of constant irradiance, or with a gradient; chosen by default"),

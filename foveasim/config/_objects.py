@@ -30,7 +30,7 @@ from foveasim.optics import Optics
 from foveasim.scene import Scene
 from foveasim.scene._scene import FRAMINGS
 from foveasim.sensor import Sensor
-from foveasim.sensor.limits import check_plausible
+from foveasim.sensor.limits import EXPOSURE
 
 __all__ = [
     "YAML_EXTENSIONS",
@@ -240,7 +240,7 @@ def build_shot(
     # Errors of a capture are raised here, before it starts, with the path of the key.
     _call(source, "scene", sensor.responsivity_e_per_j, {"wavelength_nm": scene.wavelength_nm})
     streams = _call(source, "", Streams, {"seed": settings.seed})
-    exposure_s = _call(source, "", check_plausible, {"name": "exposure_s", "value": settings.exposure_s})
+    exposure_s = _call(source, "", EXPOSURE.check, {"name": "exposure_s", "value": settings.exposure_s})
     order = settings.integration_order
     camera = cache(
         "camera",

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from foveasim._core.calls import OwnCheck
+from foveasim._core.calls import FINITE, OwnCheck
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property, parallel_map, thread_count
-from foveasim._core.validation import Bools, Floats, check_number
+from foveasim._core.validation import Bools, Floats
 from foveasim.distortion._lens import LensBase
 from foveasim.distortion._registry import LENSES
 from foveasim.distortion._solve import smallest_roots
@@ -74,22 +74,17 @@ class BrownConrady(LensBase):
     """
 
     focal_um: OwnCheck[float | tuple[float, float]]
-    k1: float = 0.0
-    k2: float = 0.0
-    k3: float = 0.0
-    k4: float = 0.0
-    k5: float = 0.0
-    k6: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
+    k1: Annotated[float, FINITE] = 0.0
+    k2: Annotated[float, FINITE] = 0.0
+    k3: Annotated[float, FINITE] = 0.0
+    k4: Annotated[float, FINITE] = 0.0
+    k5: Annotated[float, FINITE] = 0.0
+    k6: Annotated[float, FINITE] = 0.0
+    p1: Annotated[float, FINITE] = 0.0
+    p2: Annotated[float, FINITE] = 0.0
     centre_um: tuple[float, float] = (0.0, 0.0)
 
     __repr__ = short_repr
-
-    def __post_init__(self) -> None:
-        for name in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"):
-            object.__setattr__(self, name, check_number(name, getattr(self, name)))
-        self._check_position()
 
     def _radial(self, r2: Floats) -> tuple[Floats, Floats]:
         """Return the radial factor and its derivative with respect to r²."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
 import numpy as np
 
-from foveasim._core.calls import OwnCheck
+from foveasim._core.calls import POSITIVE, OwnCheck
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import Floats, check_choice, check_number, finite_array
+from foveasim._core.validation import Floats, check_number, finite_array
 from foveasim.distortion._lens import LensBase
 from foveasim.distortion._registry import LENSES
 from foveasim.distortion._solve import invert_monotonic, smallest_roots
@@ -108,10 +108,6 @@ class Fisheye(_AngularLens):
     focal_um: OwnCheck[float | tuple[float, float]]
     centre_um: tuple[float, float] = (0.0, 0.0)
 
-    def __post_init__(self) -> None:
-        check_choice("projection", self.projection, get_args(Projection))
-        self._check_position()
-
     def _height(self, theta_rad: Floats) -> Floats:
         match self.projection:
             case "equidistant":
@@ -174,7 +170,7 @@ class PolynomialFisheye(_AngularLens):
         if k.shape != (4,):
             raise ParameterError("k", "must be four numbers", self.k)
         object.__setattr__(self, "k", tuple(k.tolist()))
-        self._check_position()
+        super().__post_init__()
 
     @cached_property
     def _series(self) -> np.polynomial.Polynomial:
@@ -230,7 +226,7 @@ class Scaramuzza(_AngularLens):
     """
 
     a: Sequence[float]
-    pixel_um: float
+    pixel_um: Annotated[float, POSITIVE]
     focal_um: OwnCheck[float]
     stretch: Sequence[Sequence[float]] = ((1.0, 0.0), (0.0, 1.0))
     centre_um: tuple[float, float] = (0.0, 0.0)
@@ -244,11 +240,10 @@ class Scaramuzza(_AngularLens):
             raise ParameterError("stretch", "must be a 2 x 2 matrix with a positive determinant", self.stretch)
         object.__setattr__(self, "a", tuple((a * np.sign(a[0])).tolist()))
         object.__setattr__(self, "stretch", tuple(map(tuple, stretch.tolist())))
-        object.__setattr__(self, "pixel_um", check_number("pixel_um", self.pixel_um, above=0.0))
         object.__setattr__(
             self, "focal_um", check_number("focal_um", self.focal_um, hint="use 'stretch' for unequal axes")
         )
-        self._check_position()
+        super().__post_init__()
 
     @cached_property
     def _matrix(self) -> Floats:

@@ -7,6 +7,7 @@ from typing import Literal, Protocol, TypeAlias, get_args, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from foveasim._core.calls import check_declared
 from foveasim._core.rings import from_frame, to_frame
 from foveasim._core.validation import Floats, check_choice, check_length_um, finite_array
 from foveasim.errors import GeometryError, ParameterError
@@ -47,7 +48,8 @@ class LensBase:
     focal_um: float | tuple[float, float]
     centre_um: tuple[float, float]
 
-    def _check_position(self) -> None:
+    def __post_init__(self) -> None:
+        check_declared(self)
         focal = np.atleast_1d(finite_array("focal_um", self.focal_um, above=0.0))
         if focal.shape not in ((1,), (2,)):
             raise ParameterError("focal_um", "must be one number, or two (along x and y)", self.focal_um, "µm")

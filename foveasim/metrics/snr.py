@@ -24,7 +24,7 @@ from foveasim.metrics.sampling import require_layout
 from foveasim.scene import Scene
 from foveasim.sensor import Sensor, SiteSignals, signal_to_noise
 from foveasim.sensor.adc import ADC, QUANTISATION_DN2
-from foveasim.sensor.limits import check_plausible
+from foveasim.sensor.limits import EXPOSURE
 from foveasim.sensor.signal_to_noise import CLIPPING_SIGMAS
 
 if TYPE_CHECKING:
@@ -201,7 +201,7 @@ def snr_by_class(
     Signal and noise are those of :func:`foveasim.sensor.signal_to_noise`, in linear codes: the noise includes quantisation
     once; companding and response nonlinearity are referred to the charge.
     """
-    exposure_s = check_plausible("exposure_s", exposure_s)
+    exposure_s = EXPOSURE.check("exposure_s", exposure_s)
     sensor, layout = _sensor_and_layout(camera)
     groups = SiteClasses(size_classes_um(layout) if classes is None else classes, layout.n_sites)
     expected_e = sensor.expected_electrons(camera.photoelectrons_per_s(light), exposure_s)
@@ -242,7 +242,7 @@ def relative_exposure_at_snr_fraction(
     -----
     The relative exposure is found by iteration over predictions as in :func:`snr_by_class`.
     """
-    exposure_s = check_plausible("exposure_s", exposure_s)
+    exposure_s = EXPOSURE.check("exposure_s", exposure_s)
     snr = check_number("snr", snr, above=0.0)
     sensor, layout = _sensor_and_layout(camera)
     groups = SiteClasses(size_classes_um(layout) if classes is None else classes, layout.n_sites)

@@ -8,15 +8,15 @@ events do not depend on the size of the batches of a video.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from itertools import islice
 from threading import Lock
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.calls import OwnCheck
+from foveasim._core.calls import Limits, OwnCheck, check_declared
 from foveasim._core.random_streams import fixed_pattern_key
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property, parallel_map, thread_count
@@ -25,13 +25,17 @@ from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.layout import Layout
 from foveasim.modes.events import Events
 from foveasim.sensor import Sensor
-from foveasim.sensor.limits import check_plausible, check_plausible_array
+from foveasim.sensor.limits import CHARGE, DURATION, EXPOSURE, RATE, SPREAD, TEMPERATURE, WIDE_SPREAD
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
 
 __all__ = ["EventPixels", "SpikingPixels"]
 
 #: Smallest threshold of a site as a fraction of the mean, for any mismatch.
 MIN_THRESHOLD_FRACTION = 0.1
+#: Thresholds below 1e-3 are below the noise of any circuit, and would emit too many events for memory.
+CONTRAST = Limits(above=0.0, low=1e-3, at_most=20.0, hint="contrasts are natural logarithms: 0.2 is 22 %")
+CAPACITANCE = Limits(at_least=0.0, low=1e-18, at_most=1e-9, hint="capacitances are in farad: 1 fF is 1e-15")
+EVENT_RATE = Limits(at_least=0.0, at_most=1e9, hint="rates are per second and photosite")
 #: Sites per task; fixed, so that results do not depend on the number of threads.
 BLOCK_SITES = 2048
 #: More events per batch than this indicate a wrong threshold or a wrong unit of the rates.
@@ -106,29 +110,23 @@ class EventPixels:
 
     sensor: Sensor
     _: KW_ONLY
-    contrast_on: float = 0.2
-    contrast_off: float = 0.2
-    mismatch_fraction: float = 0.0
-    refractory_s: float = 0.0
-    capacitance_f: float = 0.0
-    temperature_k: float = 300.0
-    leak_per_s: float = 0.0
-    leak_spread_fraction: float = 0.0
-    noise_per_s: float = 0.0
-    noise_half_e_per_s: float = 1e4
-    floor_e_per_s: float = 1.0
+    contrast_on: Annotated[float, CONTRAST] = 0.2
+    contrast_off: Annotated[float, CONTRAST] = 0.2
+    mismatch_fraction: Annotated[float, SPREAD] = 0.0
+    refractory_s: Annotated[float, EXPOSURE] = 0.0
+    capacitance_f: Annotated[float, CAPACITANCE] = 0.0
+    temperature_k: Annotated[float, TEMPERATURE] = 300.0
+    leak_per_s: Annotated[float, EVENT_RATE] = 0.0
+    leak_spread_fraction: Annotated[float, WIDE_SPREAD] = 0.0
+    noise_per_s: Annotated[float, EVENT_RATE] = 0.0
+    noise_half_e_per_s: Annotated[float, replace(RATE, above=0.0)] = 1e4
+    floor_e_per_s: Annotated[float, RATE] = 1.0
 
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
         _check_sensor(self.sensor)
-        for name in (
-            *("contrast_on", "contrast_off", "mismatch_fraction", "refractory_s", "temperature_k", "leak_per_s"),
-            *("leak_spread_fraction", "noise_per_s", "noise_half_e_per_s", "floor_e_per_s"),
-        ):
-            object.__setattr__(self, name, check_plausible(name, getattr(self, name)))
-        capacitance_f = check_plausible("capacitance_f", self.capacitance_f, class_name="EventPixels")
-        object.__setattr__(self, "capacitance_f", capacitance_f)
+        check_declared(self)
 
     @cached_property
     def thresholds(self) -> tuple[Floats, Floats]:
@@ -190,7 +188,7 @@ class EventPixels:
             When the current of a site is zero, or the events do not fit in memory.
         """
         _check_rates(rates)
-        frame_s = check_plausible("frame_s", frame_s)
+        frame_s = DURATION.check("frame_s", frame_s)
         batch = check_count("batch", batch)
         key = fixed_pattern_key(check_count("seed", seed, at_least=0), "change events")
         return self._stream(rates, frame_s, key, batch, thread_count(n_threads))
@@ -290,22 +288,14 @@ class SpikingPixels:
 
     sensor: Sensor
     _: KW_ONLY
-    threshold_e: float | Floats = 1000.0
-    refractory_s: float = 0.0
+    threshold_e: Annotated[float | Floats, replace(CHARGE, at_least=1.0)] = 1000.0
+    refractory_s: Annotated[float, EXPOSURE] = 0.0
 
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
         _check_sensor(self.sensor)
-        threshold_e = check_plausible_array("threshold_e", finite_array("threshold_e", self.threshold_e, at_least=1.0))
-        if threshold_e.shape not in ((), (self.sensor.layout.n_sites,)):
-            raise ParameterError(
-                "threshold_e", f"must be one number, or one for each of the {self.sensor.layout.n_sites} sites"
-            )
-        object.__setattr__(
-            self, "threshold_e", read_only(threshold_e.copy()) if threshold_e.ndim else float(threshold_e)
-        )
-        object.__setattr__(self, "refractory_s", check_plausible("refractory_s", self.refractory_s))
+        check_declared(self, n_sites=self.sensor.layout.n_sites)
 
     def stream(
         self,
@@ -345,7 +335,7 @@ class SpikingPixels:
             When the spikes do not fit in memory.
         """
         _check_rates(rates)
-        frame_s = check_plausible("frame_s", frame_s)
+        frame_s = DURATION.check("frame_s", frame_s)
         batch = check_count("batch", batch)
         key = fixed_pattern_key(check_count("seed", seed, at_least=0), "spikes")
         return self._stream(rates, frame_s, key, batch, thread_count(n_threads))
@@ -396,9 +386,7 @@ class SpikingPixels:
 # -- parts ------------------------------------------------------------------------------------------------------------
 
 
-def _check_sensor(sensor: object) -> None:
-    if not isinstance(sensor, Sensor):
-        raise ParameterError("sensor", f"must be a foveasim.Sensor, got {type_name(sensor)}")
+def _check_sensor(sensor: Sensor) -> None:
     if not isinstance(sensor.layout, Layout):
         raise ParameterError("sensor", f"must have a foveasim.Layout, got {type_name(sensor.layout)}")
 

@@ -8,15 +8,16 @@ is constant until the next frame, or interpolated linearly between frames.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
+from foveasim._core.calls import check_declared
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, check_choice, check_count, finite_array
+from foveasim._core.validation import Floats, check_count, finite_array
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.layout import Layout
-from foveasim.sensor.limits import check_plausible
+from foveasim.sensor.limits import DURATION, EXPOSURE
 
 __all__ = ["Between", "Exposure", "Shutter"]
 
@@ -61,18 +62,14 @@ class Shutter:
     """
 
     layout: Layout
-    frame_s: float
-    line_s: float = 0.0
+    frame_s: Annotated[float, DURATION]
+    line_s: Annotated[float, EXPOSURE] = 0.0
     between: Between = "hold"
 
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        if not isinstance(self.layout, Layout):
-            raise ParameterError("layout", f"must be a foveasim.Layout, got {type_name(self.layout)}")
-        object.__setattr__(self, "frame_s", check_plausible("frame_s", self.frame_s))
-        object.__setattr__(self, "line_s", check_plausible("line_s", self.line_s))
-        check_choice("between", self.between, ("hold", "linear"))
+        check_declared(self)
         if self.line_s and "readout_order" not in self.layout.columns:
             raise SimulationError(
                 "a rolling shutter needs the line of each site; add a column 'readout_order' to the layout, for example with "
@@ -94,7 +91,7 @@ class Shutter:
         Frame 0 begins with the first line.
         """
         frame = check_count("frame", frame, at_least=0)
-        exposure_s = check_plausible("exposure_s", exposure_s)
+        exposure_s = EXPOSURE.check("exposure_s", exposure_s)
         delay_s = self.delay_s
         if not exposure_s:  # instantaneous exposure
             return np.where((delay_s >= frame * self.frame_s) & (delay_s < (frame + 1) * self.frame_s), 1.0, 0.0)
@@ -106,7 +103,7 @@ class Shutter:
 
     def last_frame(self, exposure_s: float) -> int:
         """Return the last frame that overlaps the exposure of any site."""
-        exposure_s = check_plausible("exposure_s", exposure_s)
+        exposure_s = EXPOSURE.check("exposure_s", exposure_s)
         end = (float(self.delay_s.max(initial=0.0)) + exposure_s) / self.frame_s
         frames = int(np.ceil(end - TIME_ROUNDING))
         return max(frames - 1, 0) if self.between == "hold" else frames
@@ -132,7 +129,7 @@ class Exposure:
     def __init__(self, shutter: Shutter, exposure_s: float) -> None:
         if not isinstance(shutter, Shutter):
             raise ParameterError("shutter", f"must be a foveasim.modes.Shutter, got {type_name(shutter)}")
-        exposure_s = check_plausible("exposure_s", exposure_s)
+        exposure_s = EXPOSURE.check("exposure_s", exposure_s)
         self._shutter, self.exposure_s = shutter, exposure_s
         self._last = shutter.last_frame(exposure_s)
         self._n_added = 0

@@ -7,12 +7,12 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.calls import OwnCheck
+from foveasim._core.calls import Limits, OwnCheck, Usual, check_declared
 from foveasim._core.short_repr import short_repr
 from foveasim._core.show import drawn
 from foveasim._core.threads import thread_count
@@ -20,8 +20,6 @@ from foveasim._core.user_warnings import warn
 from foveasim._core.validation import (
     Bools,
     Floats,
-    check_choice,
-    check_count,
     check_number,
     finite_array,
     read_only,
@@ -42,6 +40,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Optics"]
 
+FOCAL_LENGTH = Limits(above=0.0, at_least=0.01, at_most=1e6, hint="check the unit: focal lengths are in mm")
+F_NUMBER = Limits(above=0.0, at_least=0.5, at_most=1e4, hint="f/0.5 is the limit for a lens in air")
 #: Fraction of the PSF energy outside the default padding radius.
 LOST_FRACTION = 0.01
 #: Fraction of the PSF energy that an isoplanatic patch may displace.
@@ -136,11 +136,6 @@ class Optics(PointImages):
     precision : {"single", "double"}
         Precision of the Fourier transforms and the maps.
 
-    Raises
-    ------
-    ParameterError
-        When a value is out of range.
-
     Notes
     -----
     Each cell of a map contains the *mean* irradiance over the cell: the point spread function is integrated exactly over
@@ -166,21 +161,21 @@ class Optics(PointImages):
     increases.
     """
 
-    focal_length_mm: float
-    f_number: float
+    focal_length_mm: Annotated[float, FOCAL_LENGTH, Usual(1.0, 200.0)]
+    f_number: Annotated[float, F_NUMBER, Usual(1.0, 32.0)]
     emission: Literal["lambertian", "isotropic"] = "lambertian"
     lens: Literal["thin", "aplanatic"] = "thin"
-    transmission: float = 1.0
+    transmission: Annotated[float, Limits(above=0.0, at_most=1.0)] = 1.0
     pupil: OwnCheck[Pupil | Sequence[Pupil] | None] = None
     zernike: Zernike | None = None
     seidel: Seidel | None = None
-    focus_distance_m: float | None = None
+    focus_distance_m: Annotated[float | None, Usual(0.05, 100.0)] = None
     lateral_colour: LateralColour | None = None
-    field_patches: int = 5
+    field_patches: Annotated[int, Limits(at_least=1, at_most=64), Usual(1, 15)] = 5
     source_pixel: Literal["point", "square"] = "point"
-    oversample: int | Literal["auto"] = "auto"
+    oversample: Annotated[int | Literal["auto"], Limits(at_least=1, at_most=MAX_OVERSAMPLE)] = "auto"
     padding: Literal["reflect", "edge", "zero", "periodic"] = "reflect"
-    padding_cells: int | None = None
+    padding_cells: Annotated[int | None, Limits(at_least=0, at_most=2**20)] = None
     precision: Literal["single", "double"] = "single"
     _cache: TableCache = field(default_factory=TableCache, init=False, repr=False, compare=False)
 
@@ -189,43 +184,10 @@ class Optics(PointImages):
     _repr_html_ = drawn("to_html")
 
     def __post_init__(self) -> None:
-        numbers = {
-            "focal_length_mm": check_number(
-                "focal_length_mm",
-                self.focal_length_mm,
-                above=0.0,
-                at_least=0.01,
-                at_most=1e6,
-                hint="check the unit: focal lengths are in mm",
-            ),
-            "f_number": check_number(
-                "f_number",
-                self.f_number,
-                above=0.0,
-                at_least=0.5,
-                at_most=1e4,
-                hint="f/0.5 is the limit for a lens in air",
-            ),
-            "transmission": check_number("transmission", self.transmission, above=0.0, at_most=1.0),
-        }
+        check_declared(self)
         if self.focus_distance_m is not None:
-            numbers["focus_distance_m"] = self._check_distance("focus_distance_m", self.focus_distance_m)
-        if self.oversample != "auto":
-            numbers["oversample"] = check_count("oversample", self.oversample, at_most=MAX_OVERSAMPLE)
-        numbers["field_patches"] = check_count("field_patches", self.field_patches, at_most=64)
-        if self.padding_cells is not None:
-            numbers["padding_cells"] = check_count("padding_cells", self.padding_cells, at_least=0, at_most=2**20)
-        for name, number in numbers.items():
-            object.__setattr__(self, name, number)
-        check_choice("emission", self.emission, ("lambertian", "isotropic"))
-        check_choice("lens", self.lens, ("thin", "aplanatic"))
-        check_choice("source_pixel", self.source_pixel, ("point", "square"))
-        check_choice("padding", self.padding, PADDINGS)
-        check_choice("precision", self.precision, ("single", "double"))
-        for name, kind in (("zernike", Zernike), ("seidel", Seidel), ("lateral_colour", LateralColour)):
-            part = getattr(self, name)
-            if part is not None and not isinstance(part, kind):
-                raise ParameterError(name, f"must be a foveasim.optics.{kind.__name__}, got {type_name(part)}")
+            distance_m = self._check_distance("focus_distance_m", self.focus_distance_m)
+            object.__setattr__(self, "focus_distance_m", distance_m)
         if isinstance(self.pupil, Sequence):
             object.__setattr__(self, "pupil", tuple(self.pupil))
         if not all(_is_pupil(pupil) for pupil in self._pupils()):

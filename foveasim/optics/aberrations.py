@@ -12,19 +12,18 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from foveasim._core.calls import Declared, Limits, check_declared
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import (
     Floats,
     as_numbers,
     check_broadcast,
-    check_choice,
     check_count,
-    check_number,
     finite_array,
     wavelengths_nm,
 )
@@ -37,6 +36,7 @@ __all__ = ["LateralColour", "Seidel", "Zernike", "noll_to_nm", "osa_to_nm", "zer
 MAX_INDEX = 5151
 #: Largest wavefront error, µm or waves: 10 cm is beyond any lens.
 MAX_PATH = 1e5
+PATH = Limits(at_least=-MAX_PATH, at_most=MAX_PATH)
 
 
 def noll_to_nm(j: int) -> tuple[int, int]:
@@ -160,8 +160,7 @@ class Zernike:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        check_choice("index", self.index, ("noll", "osa"))
-        check_choice("unit", self.unit, ("um", "waves"))
+        check_declared(self)
         if not isinstance(self.coefficients, Mapping) or not self.coefficients:
             raise ParameterError(
                 "coefficients", "must be a mapping of indices to numbers, such as {4: 0.1}", self.coefficients
@@ -223,7 +222,7 @@ def _zernike(coefficients: Any, index: Any, unit: Any, wavelength_nm: Any) -> Ze
 
 
 @dataclass(frozen=True, kw_only=True)
-class Seidel:
+class Seidel(Declared):
     """
     Third-order (Seidel) wave aberrations, which depend on the field position.
 
@@ -237,29 +236,17 @@ class Seidel:
     field_radius_um : float, µm
         Reference distance from the axis on the sensor.
 
-    Raises
-    ------
-    ParameterError
-        When a value is not finite, or the radius is not positive.
-
     Notes
     -----
     W. T. Welford, Aberrations of Optical Systems, chapter 7: the wave aberration coefficients W040, W131, W222, W220. The
     fifth, distortion, is a lens model of ``foveasim.distortion``.
     """
 
-    spherical_um: float = 0.0
-    coma_um: float = 0.0
-    astigmatism_um: float = 0.0
-    field_curvature_um: float = 0.0
-    field_radius_um: float = field(default=1000.0)
-
-    def __post_init__(self) -> None:
-        for name in ("spherical_um", "coma_um", "astigmatism_um", "field_curvature_um"):
-            path_um = check_number(name, getattr(self, name), at_least=-MAX_PATH, at_most=MAX_PATH)
-            object.__setattr__(self, name, path_um)
-        radius_um = check_number("field_radius_um", self.field_radius_um, above=0.0, at_most=1e7)
-        object.__setattr__(self, "field_radius_um", radius_um)
+    spherical_um: Annotated[float, PATH] = 0.0
+    coma_um: Annotated[float, PATH] = 0.0
+    astigmatism_um: Annotated[float, PATH] = 0.0
+    field_curvature_um: Annotated[float, PATH] = 0.0
+    field_radius_um: Annotated[float, Limits(above=0.0, at_most=1e7)] = 1000.0
 
     @property
     def is_varying(self) -> bool:

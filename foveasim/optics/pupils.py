@@ -11,20 +11,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import FINITE, FRACTION, Declared, Limits
 from foveasim._core.registry import Registry
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import (
     Bools,
     Floats,
     as_numbers,
-    check_choice,
-    check_count,
-    check_number,
     finite_array,
     read_only,
 )
@@ -48,7 +46,7 @@ PUPILS: Registry[Callable[..., Any]] = Registry("pupil", "foveasim.pupils")
 
 @PUPILS.register("annulus")
 @dataclass(frozen=True, slots=True)
-class Annulus:
+class Annulus(Declared):
     """
     Annular pupil with a central obscuration, as in a telescope with a secondary mirror.
 
@@ -56,19 +54,9 @@ class Annulus:
     ----------
     obscuration : float
         Radius of the obscuration over the aperture radius, 0 to 0.999.
-
-    Raises
-    ------
-    ParameterError
-        When the value is out of range.
     """
 
-    obscuration: float
-
-    def __post_init__(self) -> None:
-        object.__setattr__(
-            self, "obscuration", check_number("obscuration", self.obscuration, at_least=0.0, at_most=0.999)
-        )
+    obscuration: Annotated[float, Limits(at_least=0.0, at_most=0.999)]
 
     def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> Bools:  # noqa: ARG002 -- signature of all pupils
         """Return the amplitudes at points of the aperture."""
@@ -81,7 +69,7 @@ class Annulus:
 
 @PUPILS.register("spider")
 @dataclass(frozen=True, slots=True)
-class Spider:
+class Spider(Declared):
     """
     Spider vanes: radial bars that support a secondary mirror.
 
@@ -92,22 +80,11 @@ class Spider:
         Width of a vane over the aperture diameter, 0 to 1.
     angle_deg : float, degrees
         Direction of the first vane, counter-clockwise from the x axis.
-
-    Raises
-    ------
-    ParameterError
-        When a value is out of range.
     """
 
-    n_vanes: int
-    width_fraction: float
-    angle_deg: float = 0.0
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "n_vanes", check_count("n_vanes", self.n_vanes, at_most=360))
-        width = check_number("width_fraction", self.width_fraction, at_least=0.0, at_most=1.0)
-        object.__setattr__(self, "width_fraction", width)
-        object.__setattr__(self, "angle_deg", check_number("angle_deg", self.angle_deg))
+    n_vanes: Annotated[int, Limits(at_least=1, at_most=360)]
+    width_fraction: Annotated[float, FRACTION]
+    angle_deg: Annotated[float, FINITE] = 0.0
 
     def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> Bools:  # noqa: ARG002
         """Return the amplitudes at points of the aperture."""
@@ -127,7 +104,7 @@ class Spider:
 
 @PUPILS.register("blades")
 @dataclass(frozen=True, slots=True)
-class Blades:
+class Blades(Declared):
     """
     Iris diaphragm: regular polygon with its vertices on the circle.
 
@@ -137,19 +114,10 @@ class Blades:
         Number of blades, at least 3.
     angle_deg : float, degrees
         Direction of the first vertex, counter-clockwise from the x axis.
-
-    Raises
-    ------
-    ParameterError
-        When a value is out of range.
     """
 
-    n_blades: int
-    angle_deg: float = 0.0
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "n_blades", check_count("n_blades", self.n_blades, at_least=3, at_most=360))
-        object.__setattr__(self, "angle_deg", check_number("angle_deg", self.angle_deg))
+    n_blades: Annotated[int, Limits(at_least=3, at_most=360)]
+    angle_deg: Annotated[float, FINITE] = 0.0
 
     def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> Bools:  # noqa: ARG002
         """Return the amplitudes at points of the aperture."""
@@ -169,7 +137,7 @@ class Blades:
 
 @PUPILS.register("slit")
 @dataclass(frozen=True, slots=True)
-class Slit:
+class Slit(Declared):
     """
     Straight slit across the circle.
 
@@ -179,20 +147,10 @@ class Slit:
         Width over the aperture diameter, above 0 and at most 1.
     angle_deg : float, degrees
         Direction of the slit's long side, counter-clockwise from the x axis.
-
-    Raises
-    ------
-    ParameterError
-        When a value is out of range.
     """
 
-    width_fraction: float
-    angle_deg: float = 0.0
-
-    def __post_init__(self) -> None:
-        width = check_number("width_fraction", self.width_fraction, above=0.0, at_most=1.0)
-        object.__setattr__(self, "width_fraction", width)
-        object.__setattr__(self, "angle_deg", check_number("angle_deg", self.angle_deg))
+    width_fraction: Annotated[float, Limits(above=0.0, at_most=1.0)]
+    angle_deg: Annotated[float, FINITE] = 0.0
 
     def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> Bools:  # noqa: ARG002
         """Return the amplitudes at points of the aperture."""
@@ -237,7 +195,6 @@ class PupilImage:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        check_choice("values", self.values, ("amplitude", "power"))
         is_file = isinstance(self.picture, str | Path)
         pixels = read_picture(self.picture) if is_file else as_numbers("picture", self.picture, keep_type=True)  # type: ignore[arg-type]
         peak = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else 1.0

@@ -15,7 +15,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats, finite_array
 from foveasim.errors import ParameterError
 from foveasim.sensor import Sensor, linearise
-from foveasim.sensor.limits import check_plausible
+from foveasim.sensor.limits import EXPOSURE
 from foveasim.units import volts_to_electrons
 
 __all__ = ["SiteEstimates", "electrons_per_code", "estimate_from_charge", "estimate_from_code"]
@@ -66,7 +66,7 @@ def estimate_from_charge(charge_e: ArrayLike, sensor: Sensor, exposure_s: float)
         When a charge is not finite, there is not one charge per site of the sensor, or the exposure is negative.
     """
     charge = _per_site("charge_e", charge_e, sensor)
-    exposure_s = check_plausible("exposure_s", exposure_s)
+    exposure_s = EXPOSURE.check("exposure_s", exposure_s)
     shot = sensor.shot
     _, variance_e2 = shot.moments(np.maximum(charge, 0.0), np.full(charge.size, float(shot.is_drawn)))
     return SiteEstimates(

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from foveasim._core.calls import publish
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from foveasim._core.calls import Limits, declarations_of, publish
 from foveasim.sensor.budget import FIXED, TEMPORAL, NoiseBudget, noise_budget
 from foveasim.sensor.calibration import Calibration, calibrate, linearise
 from foveasim.sensor.effects.crosstalk import CrosstalkOperator, Diffusion, InterPixelCapacitance, KernelCrosstalk
 from foveasim.sensor.effects.shot import draw_shot_noise
 from foveasim.sensor.exposures import Ramp, Rates, fit_ramp, merge_exposures, non_destructive_reads
-from foveasim.sensor.limits import LIMITS, Limits
 from foveasim.sensor.presets import PRESETS
 from foveasim.sensor.sensor import Sensor
 from foveasim.sensor.signal_to_noise import SiteSignals, signal_to_noise
@@ -74,5 +76,10 @@ __all__ = [
     "rgb_filters",
     "signal_to_noise",
 ]
+
+#: Plausible ranges of the parameters of :class:`Sensor`.
+LIMITS: Mapping[str, Limits] = MappingProxyType(
+    {name: each.limits for name, each in declarations_of(Sensor).items() if each.limits is not None}
+)
 
 publish(__name__)

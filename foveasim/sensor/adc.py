@@ -4,22 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from foveasim._core.calls import Limits, check_declared
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import Floats, check_choice, check_count, finite_array, read_only
+from foveasim._core.validation import Floats, finite_array, read_only
 from foveasim.errors import ParameterError
-from foveasim.sensor.limits import check_plausible, check_plausible_array
 
 __all__ = ["ADC", "QUANTISATION_DN2", "Companding", "ConversionTables"]
 
 #: Transfer functions from fraction of the voltage range to fraction of the code range.
 Companding = Literal["linear", "root", "log", "table"]
 COMPANDINGS: tuple[Companding, ...] = ("linear", "root", "log", "table")
+BITS = Limits(at_least=1, at_most=16)
+LOG_STRENGTH = Limits(above=0.0, at_most=1e9)
+DNL = Limits(at_least=0.0, at_most=2.0**16, hint="deviations are in codes")
+INL = Limits(low=-(2.0**16), at_most=2.0**16, hint="deviations are in codes")
 #: Number of tabulated Gaussian quantiles for differential nonlinearity, interpolated linearly.
 N_QUANTILES = 4096
 #: Quantisation variance in units of the squared code width: a uniform distribution over one code.
@@ -68,24 +72,19 @@ class ADC:
         If a value is out of range.
     """
 
-    bits: int = 8
+    bits: Annotated[int, BITS] = 8
     companding: Companding = "linear"
-    log_strength: float = 100.0
+    log_strength: Annotated[float, LOG_STRENGTH] = 100.0
     companding_table: Sequence[float] | None = None
-    inl_dn: Sequence[float] = ()
-    dnl_dn: float = 0.0
+    inl_dn: Annotated[Sequence[float], INL] = ()
+    dnl_dn: Annotated[float, DNL] = 0.0
 
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "bits", check_count("bits", self.bits, at_least=1, at_most=16))
-        check_choice("companding", self.companding, COMPANDINGS)
-        for name in ("log_strength", "dnl_dn"):
-            object.__setattr__(self, name, check_plausible(name, getattr(self, name)))
-        inl = check_plausible_array("inl_dn", self.inl_dn, ndim=1)
-        if inl.size == 1:
+        check_declared(self)
+        if len(self.inl_dn) == 1:
             raise ParameterError("inl_dn", "must have at least two values, at equal code intervals", self.inl_dn, "DN")
-        object.__setattr__(self, "inl_dn", tuple(inl.tolist()))
         if (self.companding_table is not None) != (self.companding == "table"):
             raise ParameterError(
                 "companding_table", "must be given if and only if companding='table'", self.companding_table

@@ -12,7 +12,7 @@ from foveasim._core.show import drawn
 from foveasim._core.validation import Floats, as_numbers
 from foveasim.errors import ParameterError
 from foveasim.sensor.effects import STANDARD
-from foveasim.sensor.limits import check_plausible
+from foveasim.sensor.limits import EXPOSURE
 from foveasim.sensor.prediction import MIN_SLOPE
 from foveasim.sensor.sensor import Sensor
 from foveasim.sensor.signal_to_noise import local_step_e
@@ -114,7 +114,7 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> No
     :meth:`~foveasim.sensor.effects.Effect.moments`, for fixed patterns over all devices. Crosstalk and inter-pixel
     capacitance, which mix sites, are not included.
     """
-    exposure_s = check_plausible("exposure_s", exposure_s)
+    exposure_s = EXPOSURE.check("exposure_s", exposure_s)
     photo_e_per_s = as_numbers("photo_e_per_s", photo_e_per_s)
     n_sites = sensor.layout.n_sites
     if photo_e_per_s.shape != (n_sites,):

@@ -8,18 +8,19 @@ temporal dark noise, defect pixels. All quantities refer to linear codes: compan
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import FRACTION
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Bools, Floats, as_numbers, check_count, check_number, finite_array, own, unmasked
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.sensor.adc import QUANTISATION_DN2
 from foveasim.sensor.effects.crosstalk import Neighbourhood
-from foveasim.sensor.limits import check_plausible, check_plausible_array
+from foveasim.sensor.limits import CHARGE, DURATION, EXPOSURE, RATIO
 from foveasim.sensor.sensor import Sensor
 from foveasim.units import volts_to_electrons
 
@@ -263,7 +264,7 @@ class Calibration:
         """
         if exposure_s is None:
             return self.offset_dn
-        exposure_s = check_plausible("exposure_s", exposure_s)
+        exposure_s = EXPOSURE.check("exposure_s", exposure_s)
         if exposure_s == self.exposure_s:
             return self.offset_dn
         if self.dark_rate_dn_per_s is None or self.exposure_s is None:
@@ -425,10 +426,10 @@ def calibrate(
     True
     """
     _require_sensor(sensor)
-    exposure_s = check_plausible("exposure_s", check_number("exposure_s", exposure_s, above=0.0))
+    exposure_s = DURATION.check("exposure_s", exposure_s)
     n_frames = check_count("n_frames", n_frames, at_least=2)
     n_sites = sensor.layout.n_sites
-    flat = np.ascontiguousarray(_one_or_per_site("flat_e", check_plausible_array("flat_e", flat_e), n_sites, above=0.0))
+    flat = np.ascontiguousarray(_one_or_per_site("flat_e", CHARGE.check_array("flat_e", flat_e), n_sites, above=0.0))
     nominal = sensor.nominal()
     zero_e = np.zeros(n_sites)
     dark_e = nominal.expected_electrons(zero_e, exposure_s)
@@ -453,8 +454,7 @@ def calibrate(
         return stack
 
     if long_exposure_s is not None:
-        check_plausible("long_exposure_s", long_exposure_s)
-        long_exposure_s = check_number("long_exposure_s", long_exposure_s, above=exposure_s)
+        long_exposure_s = replace(DURATION, above=exposure_s).check("long_exposure_s", long_exposure_s)
     return _calibration(
         frames(zero_e, exposure_s, 0),
         frames(flat, exposure_s, 1),
@@ -525,15 +525,15 @@ def _calibration(
     for name, stack in (("flat", flat), ("dark_long", dark_long)):
         if stack is not None and stack.mean_dn.size != n_sites:
             raise ParameterError(name, f"must have the {n_sites} sites of the dark frames, got {stack.mean_dn.size}")
-    hot_sigmas = check_plausible("hot_sigmas", hot_sigmas)
-    dead_fraction = check_number("dead_fraction", dead_fraction, at_least=0.0, at_most=1.0)
-    noisy_ratio = check_plausible("noisy_ratio", check_number("noisy_ratio", noisy_ratio, at_least=1.0))
-    max_clipped_fraction = check_number("max_clipped_fraction", max_clipped_fraction, at_least=0.0, at_most=1.0)
+    hot_sigmas = RATIO.check("hot_sigmas", hot_sigmas)
+    dead_fraction = FRACTION.check("dead_fraction", dead_fraction)
+    noisy_ratio = replace(RATIO, at_least=1.0).check("noisy_ratio", noisy_ratio)
+    max_clipped_fraction = FRACTION.check("max_clipped_fraction", max_clipped_fraction)
     expected = _one_or_per_site("expected_dn", expected_dn, n_sites, above=0.0)
     expected_rate = _one_or_per_site("expected_dark_dn_per_s", expected_dark_dn_per_s, n_sites, above=None)
     expected_noise = _one_or_per_site("expected_noise_dn", expected_noise_dn, n_sites, above=0.0)
     if exposure_s is not None:
-        exposure_s = check_plausible("exposure_s", exposure_s)
+        exposure_s = EXPOSURE.check("exposure_s", exposure_s)
     elif dark_long is not None or expected_rate.any():
         raise ParameterError("exposure_s", "must be given with 'dark_long' or 'expected_dark_dn_per_s'", None)
     if (dark_long is None) != (long_exposure_s is None):

@@ -7,7 +7,7 @@ common to all reads; weights from individual reads would favour those that are l
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from foveasim._core.validation import Floats, Ints, as_numbers, own, unmasked
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.sensor.calibration import Calibration, linearise, nominal_e_per_dn
 from foveasim.sensor.effects.shot import MAX_CHARGE_E, ROUNDING_E2
-from foveasim.sensor.limits import check_plausible_array
+from foveasim.sensor.limits import DURATION, EXPOSURE, RATE
 from foveasim.sensor.sensor import Sensor
 
 __all__ = ["Ramp", "Rates", "fit_ramp", "merge_exposures", "non_destructive_reads"]
@@ -162,7 +162,7 @@ def merge_exposures(
     >>> round(float(np.nansum(weight * rates.rate_e_per_s / sensitivity) / np.nansum(weight)), 1)
     50000.0
     """
-    times_s = check_plausible_array("exposures_s", exposures_s, ndim=1)
+    times_s = DURATION.check_array("exposures_s", exposures_s, ndim=1)
     codes, linear_dn, e_per_dn = _linearise_reads(code, times_s.size, sensor, "exposure")
     n_sites = sensor.layout.n_sites
     dark_e_per_s = np.zeros(1)
@@ -260,7 +260,7 @@ def non_destructive_reads(
     if not isinstance(sensor, Sensor):
         raise ParameterError("sensor", f"must be a foveasim.Sensor, got {type_name(sensor)}")
     n_sites = sensor.layout.n_sites
-    photo = check_plausible_array("photo_e_per_s", photo_e_per_s)
+    photo = RATE.check_array("photo_e_per_s", photo_e_per_s)
     if photo.shape not in ((), (n_sites,)):
         raise ParameterError(
             "photo_e_per_s", f"must be one number, or one for each of the {n_sites} sites, got the shape {photo.shape}"
@@ -359,7 +359,7 @@ def fit_ramp(
         longest_s = times[-1] - times[0]
         rate = _estimate_collected(sensor, np.maximum(rate, 0.0) * longest_s) / longest_s
     else:
-        rate = check_plausible_array("weight_rate_e_per_s", weight_rate_e_per_s)
+        rate = replace(RATE, at_least=None, low=-RATE.high).check_array("weight_rate_e_per_s", weight_rate_e_per_s)
         if rate.shape not in ((), (n_sites,)):
             raise ParameterError(
                 "weight_rate_e_per_s", f"must be one number, or one for each of the {n_sites} sites, got {rate.shape}"
@@ -395,7 +395,7 @@ def _make_read_only(instance: Any) -> None:
 
 
 def _check_increasing(name: str, times_s: ArrayLike) -> Floats:
-    times = check_plausible_array(name, times_s, ndim=1)
+    times = EXPOSURE.check_array(name, times_s, ndim=1)
     if times.size == 0 or np.any(np.diff(times) <= 0.0):
         raise ParameterError(name, "must be one or more strictly increasing times", times_s, "s")
     return times

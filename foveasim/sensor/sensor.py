@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.calls import OwnCheck
+from foveasim._core.calls import FRACTION, NOT_NEGATIVE, Limits, OwnCheck, Usual, check_declared, declarations_of
 from foveasim._core.names import possible_names
 from foveasim._core.provenance import is_digest
 from foveasim._core.random_streams import Streams
 from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import Bools, Floats, Ints, check_count, check_number, read_only, unmasked
-from foveasim.errors import ParameterError, SimulationError, type_name
-from foveasim.sensor.adc import ADC, Companding, ConversionTables
+from foveasim._core.validation import Bools, Floats, Ints, read_only, unmasked
+from foveasim.errors import ParameterError, SimulationError
+from foveasim.sensor.adc import ADC, BITS, DNL, INL, LOG_STRENGTH, Companding, ConversionTables
 from foveasim.sensor.blocks import for_each_block
 from foveasim.sensor.chain import (
     ChargeCheck,
@@ -39,8 +39,20 @@ from foveasim.sensor.device import Device
 from foveasim.sensor.effects import EFFECTS, STANDARD, DarkLaw, Effect, Photosites, Sites, dark_current_factor
 from foveasim.sensor.effects.contract import CompleteSites, FixedFactor, FixedOffset
 from foveasim.sensor.effects.crosstalk import Diffusion, InterPixelCapacitance, KernelCrosstalk
-from foveasim.sensor.effects.shot import ShotChoice, ShotNoise
-from foveasim.sensor.limits import LIMITS, check_plausible, check_plausible_array
+from foveasim.sensor.effects.dark import ACTIVATION, DOUBLING
+from foveasim.sensor.effects.shot import GAUSSIAN_ABOVE, ShotChoice, ShotNoise
+from foveasim.sensor.limits import (
+    CHARGE,
+    EXPOSURE,
+    NOISE,
+    OFFSET,
+    RATE,
+    SHARE,
+    SPREAD,
+    TEMPERATURE,
+    VOLTS,
+    WIDE_SPREAD,
+)
 from foveasim.sensor.prediction import (
     ChargeDistributions,
     ReadoutModel,
@@ -56,15 +68,6 @@ if TYPE_CHECKING:
     from foveasim.sensor.calibration import Calibration
 
 __all__ = ["PerSite", "Photosites", "Sensor"]
-
-#: Parameters with one value or one per site, and parameters with one value only.
-_PER_SITE = ("sensitivity", "dark_e_per_s", "full_well_e", "read_noise_e", "capacitance_f")
-_NUMBERS = (
-    *("prnu_fraction", "dsnu_fraction", "pixel_fpn_fraction", "line_fpn_fraction", "gain_fpn_fraction"),
-    *("hot_fraction", "dead_fraction", "rts_fraction", "nonlinearity_fraction", "hot_e_per_s", "rts_e"),
-    *("temperature_k", "dark_reference_k", "dark_doubling_k", "dark_activation_ev", "dark_diffusion_fraction"),
-    *("v_sat_v", "pedestal_v"),
-)
 
 #: One value for all sites, or an array (n_site,).
 PerSite = float | NDArray[np.float64]
@@ -93,7 +96,7 @@ class Sensor:
         Fraction of the incident power that a site collects, in addition to quantum efficiency and filter, as for a smaller
         microlens or opening.
     prnu_fraction : float
-        Photo-response non-uniformity (PRNU): standard deviation over mean of a Gaussian distribution, at most 0.3.
+        Photo-response non-uniformity (PRNU): standard deviation over mean of a Gaussian distribution.
     dark_e_per_s : float or (n_site,), e-/s
         Dark current at ``dark_reference_k``.
     temperature_k, dark_reference_k : float, K
@@ -133,7 +136,7 @@ class Sensor:
     capacitance_f : float or (n_site,), F
         Capacitance of the sense node: 1e-13 F in the paper's foveal run.
     gain_fpn_fraction : float
-        Gain FPN: standard deviation over mean of the conversion gain, a Gaussian distribution; at most 0.3.
+        Gain FPN: standard deviation over mean of the conversion gain, a Gaussian distribution.
     nonlinearity_fraction : float
         Response nonlinearity: relative voltage loss at V_sat; the loss grows with the square of the voltage.
     pedestal_v : float, V
@@ -163,98 +166,79 @@ class Sensor:
 
     layout: Photosites
     _: KW_ONLY
-    qe: float | Curve | Sequence[float | Curve] = 1.0
+    qe: Annotated[float | Curve | Sequence[float | Curve], FRACTION] = 1.0
     filters: FilterSet | Literal["rgb"] | None = None
-    sensitivity: PerSite = 1.0
-    prnu_fraction: float = 0.0
-    dark_e_per_s: PerSite = 0.0
-    temperature_k: float = 300.0
-    dark_reference_k: float = 300.0
+    sensitivity: Annotated[PerSite, SHARE] = 1.0
+    prnu_fraction: Annotated[float, SPREAD] = 0.0
+    dark_e_per_s: Annotated[PerSite, RATE] = 0.0
+    temperature_k: Annotated[float, TEMPERATURE, Usual(230.0, 350.0)] = 300.0
+    dark_reference_k: Annotated[float, TEMPERATURE, Usual(230.0, 350.0)] = 300.0
     dark_law: DarkLaw = "doubling"
-    dark_doubling_k: float = 8.0
-    dark_activation_ev: float = 0.67
-    dark_diffusion_fraction: float = 0.5
-    dsnu_fraction: float = 0.0
-    hot_fraction: float = 0.0
-    hot_e_per_s: float = 0.0
-    dead_fraction: float = 0.0
+    dark_doubling_k: Annotated[float, DOUBLING, Usual(4.0, 12.0)] = 8.0
+    dark_activation_ev: Annotated[float, ACTIVATION, Usual(0.4, 1.3)] = 0.67
+    dark_diffusion_fraction: Annotated[float, SHARE] = 0.5
+    dsnu_fraction: Annotated[float, WIDE_SPREAD, Usual(0.0, 2.0)] = 0.0
+    hot_fraction: Annotated[float, SHARE, Usual(0.0, 0.1)] = 0.0
+    hot_e_per_s: Annotated[float, RATE] = 0.0
+    dead_fraction: Annotated[float, SHARE, Usual(0.0, 0.1)] = 0.0
     crosstalk: Diffusion | KernelCrosstalk | None = None
     shot_noise: ShotChoice = "auto"
-    gaussian_above_e: float = 100.0
-    full_well_e: PerSite | None = None
+    gaussian_above_e: Annotated[float, GAUSSIAN_ABOVE] = 100.0
+    full_well_e: Annotated[PerSite | None, CHARGE] = None
     coupling: InterPixelCapacitance | None = None
     ktc_noise: bool = False
     cds: bool = False
-    read_noise_e: PerSite = 0.0
-    rts_fraction: float = 0.0
-    rts_e: float = 0.0
-    capacitance_f: PerSite = 1e-13
-    gain_fpn_fraction: float = 0.0
-    nonlinearity_fraction: float = 0.0
-    pedestal_v: float = 0.0
-    pixel_fpn_fraction: float = 0.0
-    line_fpn_fraction: float = 0.0
-    v_sat_v: float = 3.0
-    bits: int = 8
+    read_noise_e: Annotated[PerSite, NOISE, Usual(0.0, 50.0)] = 0.0
+    rts_fraction: Annotated[float, SHARE, Usual(0.0, 0.1)] = 0.0
+    rts_e: Annotated[float, NOISE] = 0.0
+    capacitance_f: Annotated[
+        PerSite, Limits(above=0.0, low=1e-18, at_most=1e-6, hint="capacitances are in farad: 1 fF is 1e-15")
+    ] = 1e-13
+    gain_fpn_fraction: Annotated[float, SPREAD] = 0.0
+    nonlinearity_fraction: Annotated[
+        float, Limits(at_least=0.0, at_most=0.5, hint="above 0.5 the voltage would decrease with charge")
+    ] = 0.0
+    pedestal_v: Annotated[float, VOLTS] = 0.0
+    pixel_fpn_fraction: Annotated[float, OFFSET, Usual(0.0, 0.1)] = 0.0
+    line_fpn_fraction: Annotated[float, OFFSET, Usual(0.0, 0.1)] = 0.0
+    v_sat_v: Annotated[float, replace(VOLTS, above=0.0, low=1e-6), Usual(0.1, 5.0)] = 3.0
+    bits: Annotated[int, BITS] = 8
     companding: Companding = "linear"
-    log_strength: float = 100.0
+    log_strength: Annotated[float, LOG_STRENGTH] = 100.0
     companding_table: Sequence[float] | None = None
-    inl_dn: Sequence[float] = ()
-    dnl_dn: float = 0.0
-    device_seed: int = 0
+    inl_dn: Annotated[Sequence[float], INL] = ()
+    dnl_dn: Annotated[float, DNL] = 0.0
+    device_seed: Annotated[int, NOT_NEGATIVE] = 0
     effects: Sequence[Effect] = ()
     disabled: Iterable[str] = ()
 
     def __post_init__(self) -> None:
-        if not all(hasattr(self.layout, name) for name in ("n_sites", "channel", "columns")):
-            raise ParameterError("layout", f"must be a Layout, got {type_name(self.layout)}")
+        check_declared(self, n_sites=self.layout.n_sites)
         if isinstance(self.qe, list | tuple):
             object.__setattr__(self, "qe", tuple(self.qe))
         elif not callable(self.qe):
-            object.__setattr__(self, "qe", check_number("qe", self.qe, at_least=0.0, at_most=1.0))
-        is_rgb = isinstance(self.filters, str) and self.filters == "rgb"
-        if self.filters is not None and not is_rgb and not isinstance(self.filters, FilterSet):
-            raise ParameterError("filters", "must be None, 'rgb' or a FilterSet", self.filters)
-        for name in _PER_SITE:
-            value = getattr(self, name)
-            if value is not None or name != "full_well_e":
-                object.__setattr__(self, name, self._per_site(name, value))
-        numbers: dict[str, float] = {
-            **{name: check_plausible(name, getattr(self, name)) for name in _NUMBERS},
-            "gaussian_above_e": check_number("gaussian_above_e", self.gaussian_above_e),
-            "device_seed": check_count("device_seed", self.device_seed, at_least=0),
-        }
-        if numbers["pedestal_v"] >= numbers["v_sat_v"]:
+            object.__setattr__(self, "qe", FRACTION.check("qe", self.qe))
+        if self.pedestal_v >= self.v_sat_v:
             raise ParameterError(
                 "pedestal_v",
-                f"must be < v_sat_v = {numbers['v_sat_v']:g} V",
-                numbers["pedestal_v"],
+                f"must be < v_sat_v = {self.v_sat_v:g} V",
+                self.pedestal_v,
                 "V",
                 "with a pedestal above the range all sites have the highest code",
             )
-        for name, number in numbers.items():
-            object.__setattr__(self, name, number)
         hottest_e_per_s = self.dark_current_ratio * float(np.max(self.dark_e_per_s, initial=0.0) + self.hot_e_per_s)
-        if hottest_e_per_s > LIMITS["dark_e_per_s"].high:
+        if hottest_e_per_s > RATE.high:
             raise ParameterError(
                 "dark_e_per_s",
-                f"{LIMITS['dark_e_per_s'].rule} at temperature_k = {self.temperature_k:g} K",
+                f"must be <= {RATE.high:g} at temperature_k = {self.temperature_k:g} K",
                 hottest_e_per_s,
                 "e-/s",
                 "check dark_reference_k and the parameters of dark_law",
             )
-        for name in ("ktc_noise", "cds"):
-            if not isinstance(getattr(self, name), bool):
-                raise ParameterError(name, "must be True or False", getattr(self, name))
-        ShotNoise(self.shot_noise, self.gaussian_above_e)
-        for name, kinds in (("crosstalk", (Diffusion, KernelCrosstalk)), ("coupling", (InterPixelCapacitance,))):
-            part = getattr(self, name)
-            if part is not None and not isinstance(part, kinds):
-                raise ParameterError(name, f"must be of type {' or '.join(k.__name__ for k in kinds)}", part)
         object.__setattr__(self, "effects", check_effects(self.effects))
         object.__setattr__(self, "disabled", check_names(self.disabled, self.effects))
         _ = self._filters_and_qe
-        for name in ("bits", "companding_table", "inl_dn"):
+        for name in ("companding_table", "inl_dn"):
             object.__setattr__(self, name, getattr(self.adc, name))
         if (self.line_fpn_fraction or self.dnl_dn) and "readout_line" not in self.layout.columns:
             raise SimulationError(
@@ -312,16 +296,6 @@ class Sensor:
         return f"Sensor({self.layout!r}, filters {', '.join(self.filter_names)}, {self.bits} bits)"
 
     _repr_html_ = drawn("to_html")
-
-    def _per_site(self, name: str, value: PerSite) -> PerSite:
-        if np.ndim(value) == 0:
-            return check_plausible(name, value)
-        array = check_plausible_array(name, value, ndim=1)
-        if array.size != self.layout.n_sites:
-            raise ParameterError(
-                name, f"must be one number, or one for each of the {self.layout.n_sites} sites, got {array.size}"
-            )
-        return read_only(array.copy())
 
     # -- filters and quantum efficiency -------------------------------------------------------------------------
 
@@ -494,7 +468,8 @@ class Sensor:
                 rule = f"must be a slice, or a list of indices of the {self.layout.n_sites} sites"
                 raise ParameterError("selection", rule, selection) from None
         values: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(Sensor)}
-        values |= {name: values[name][chosen] for name in _PER_SITE if np.ndim(values[name])}
+        per_site = (name for name, declared in declarations_of(Sensor).items() if declared.is_per_site)
+        values |= {name: values[name][chosen] for name in per_site if np.ndim(values[name])}
         return SensorPart(**values | {"layout": self.layout[chosen]}, _complete=self, _selection=chosen)
 
     def _check_local(self) -> None:
@@ -719,7 +694,7 @@ class Sensor:
 
     def _exposure(self, photo_e_per_s: Floats, exposure_s: float) -> tuple[Floats, tuple[Step, ...]]:
         """Return the rates of all sites, and the steps from them to the expected charges."""
-        exposure_s = check_plausible("exposure_s", exposure_s)
+        exposure_s = EXPOSURE.check("exposure_s", exposure_s)
         photo = np.asarray(unmasked("photo_e_per_s", photo_e_per_s))
         if photo.shape not in ((), (1,)):
             photo = self._check_size("photo_e_per_s", photo)

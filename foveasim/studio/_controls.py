@@ -12,20 +12,14 @@ from typing import Any
 
 from foveasim._core.validation import UNIT_SUFFIXES
 from foveasim.config import bundled_layouts, schema
-from foveasim.sensor.limits import LIMITS
 from foveasim.studio._templates import INITIAL, PER_AREA, WITHOUT_MOSAIC, templates
 
 __all__ = ["chosen_value", "controls_of", "structure_of", "value_at"]
 
 #: Ranges of sliders by parameter: lowest and highest value; logarithmic if the lowest is positive and far below the highest.
 RANGES: dict[str, tuple[float, float]] = {
-    "bits": (1.0, 16.0),
-    "dark_activation_ev": (0.4, 1.3),
-    "dark_doubling_k": (4.0, 12.0),
-    "dark_reference_k": (230.0, 350.0),
     "depth_um": (0.5, 10.0),
     "distance_m": (0.05, 100.0),
-    "exposure_s": (1e-5, 1.0),
     "f_number": (1.0, 32.0),
     "field_of_view_deg": (1.0, 120.0),
     "field_patches": (1.0, 15.0),
@@ -33,30 +27,18 @@ RANGES: dict[str, tuple[float, float]] = {
     "focus_distance_m": (0.05, 100.0),
     "fwhm_nm": (10.0, 300.0),
     "peak_radiance_w_m2_sr_nm": (1e-5, 1.0),
-    "qe": (0.0, 1.0),
     "radiance_w_m2_sr_nm": (1e-5, 1.0),
-    "read_noise_e": (0.0, 50.0),
     "rotation_deg": (-180.0, 180.0),
-    "seed": (0.0, 100.0),
-    "sensitivity": (0.0, 1.0),
-    "temperature_k": (230.0, 350.0),
-    "transmission": (0.0, 1.0),
-    "v_sat_v": (0.1, 5.0),
     "wavelength_nm": (350.0, 1000.0),
-    "prnu_fraction": (0.0, 0.3),
-    "gain_fpn_fraction": (0.0, 0.3),
-    "dsnu_fraction": (0.0, 2.0),
-    "pixel_fpn_fraction": (0.0, 0.1),
-    "line_fpn_fraction": (0.0, 0.1),
-    "hot_fraction": (0.0, 0.1),
-    "dead_fraction": (0.0, 0.1),
-    "rts_fraction": (0.0, 0.1),
-    "nonlinearity_fraction": (0.0, 0.5),
 }
 #: Ratio of the ends of a logarithmic slider.
 LOG_RATIO = 50.0
 #: Range of a slider around a value without a known range.
 BELOW, ABOVE = 0.25, 4.0
+#: Valid ranges up to this length are those of sliders: fractions, bits.
+SHORT_RANGE = 20.0
+#: Keys of ranges, also of unions.
+BOUNDS = ("minimum", "exclusiveMinimum", "maximum", "usual")
 #: Parameters with a list of valid numbers.
 ENUMERATED = ("integration_order",)
 #: Keys that select an alternative of a section.
@@ -296,8 +278,10 @@ def _options(root: dict[str, Any], node: dict[str, Any]) -> Iterator[dict[str, A
     node = _resolved(root, node)
     for union in ("anyOf", "oneOf"):
         if union in node:
+            bounds = {name: node[name] for name in BOUNDS if name in node}
             for option in node[union]:
-                yield from _options(root, option)
+                for each in _options(root, option):
+                    yield {**each, **bounds} if each.get("type") in ("number", "integer") else each
             return
     yield node
 
@@ -432,7 +416,6 @@ def _initial_value(name: str, option: dict[str, Any], value: Any) -> Any:
         return option["enum"][0]
     if name in INITIAL and _is_of(option, INITIAL[name]):
         return copy.deepcopy(INITIAL[name])
-    limits = LIMITS.get(name)
     match option.get("type"):
         case "object" if "properties" in option:
             return _initial(_schema(), option, None)
@@ -449,7 +432,7 @@ def _initial_value(name: str, option: dict[str, Any], value: Any) -> Any:
         case "string":
             return ""
         case _:
-            return 1.0 if limits is None else min(max(1.0, limits.low), limits.high)
+            return min(max(1.0, option.get("minimum", 1.0)), option.get("maximum", 1.0))
 
 
 def _simple(name: str, options: list[dict[str, Any]], value: Any, default: Any, started: Any) -> dict[str, Any]:
@@ -473,20 +456,17 @@ def _simple(name: str, options: list[dict[str, Any]], value: Any, default: Any, 
             return {"kind": "list", "length": length}
 
 
-def _range(name: str, option: dict[str, Any], value: Any, started: Any) -> dict[str, Any]:
+def _range(name: str, option: Mapping[str, Any], value: Any, started: Any) -> dict[str, Any]:
     """Return the valid and the suggested range of a number, and the scale of its slider."""
-    limits = LIMITS.get(name)
-    minimum = option.get("minimum", limits.low if limits is not None else None)
-    if limits is not None and limits.low > 0.0 and not limits.is_positive:
-        minimum = 0.0  # 0 is valid for any lower end
-    maximum = option.get("maximum", limits.high if limits is not None else None)
-    low, high = RANGES.get(name, (None, None))
+    minimum = option.get("minimum", option.get("exclusiveMinimum"))
+    maximum = option.get("maximum")
+    low, high = option.get("usual") or RANGES.get(name) or (None, None)
+    if low is None and minimum is not None and maximum is not None and maximum - minimum <= SHORT_RANGE:
+        low, high = minimum, maximum
     around = next((x for x in (started, value) if isinstance(x, int | float) and math.isfinite(x)), None)
     if low is None or high is None:
         size = abs(around) if around else 1.0
-        if name.endswith("_fraction"):
-            low, high = 0.0, 1.0
-        elif around is not None and around > 0.0:
+        if around is not None and around > 0.0:
             low, high = size * BELOW, size * ABOVE
         elif around is not None and around < 0.0:
             low, high = -2.0 * size, 2.0 * size

@@ -10,14 +10,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, runtime_checkable
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import FINITE, POSITIVE, Limits, check_declared
 from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import Floats, check_choice, check_count, check_number, check_shape, finite_array
+from foveasim._core.validation import Floats, check_choice, check_count, check_shape, finite_array
 from foveasim._io.images import write_picture
 from foveasim.capture import Capture
 from foveasim.errors import FoveasimWarning, GeometryError, ParameterError, SimulationError
@@ -106,17 +107,14 @@ class Viewpoint:
         When a number is out of range.
     """
 
-    azimuth_deg: float = -65.0
-    elevation_deg: float = 38.0
-    zoom: float = 1.0
+    azimuth_deg: Annotated[float, FINITE] = -65.0
+    elevation_deg: Annotated[float, Limits(at_least=-90.0, at_most=90.0)] = 38.0
+    zoom: Annotated[float, POSITIVE] = 1.0
     focus_um: tuple[float, float, float] | None = None
-    view_deg: float = 25.0
+    view_deg: Annotated[float, Limits(at_least=1.0, at_most=120.0)] = 25.0
 
     def __post_init__(self) -> None:
-        check_number("azimuth_deg", self.azimuth_deg)
-        check_number("elevation_deg", self.elevation_deg, at_least=-90.0, at_most=90.0)
-        check_number("zoom", self.zoom, above=0.0)
-        check_number("view_deg", self.view_deg, at_least=1.0, at_most=120.0)
+        check_declared(self)
         if self.focus_um is not None and finite_array("focus_um", self.focus_um).shape != (3,):
             raise ParameterError("focus_um", "must be three numbers (x, y, z)", self.focus_um, "µm")
 

@@ -23,16 +23,17 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import LENGTH, Declared, Limits
 from foveasim._core.extras import import_optional
 from foveasim._core.rings import next_vertex, positions_in_runs
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, Ints, check_count, check_length_um, check_number
+from foveasim._core.validation import Floats, Ints
 from foveasim._io.atomic import atomic_write
 from foveasim.capture import Capture
 from foveasim.errors import FileError, GeometryError, ParameterError
@@ -59,10 +60,11 @@ TERRACES = (((0.39, 0.61), ("filters", "lenses")), ((0.27, 0.73), ("lenses",)))
 OVERLAP_TOLERANCE = 1e-9
 #: Upper limit of the thickness of a layer.
 MAX_THICKNESS_UM = 1000.0
+THICKNESS = replace(LENGTH, above=None, at_least=0.0, low=LENGTH.lowest, at_most=MAX_THICKNESS_UM)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SensorStack:
+class SensorStack(Declared):
     """
     Layer thicknesses of a sensor.
 
@@ -81,28 +83,14 @@ class SensorStack:
     n_lens_corners : int
         Minimum number of vertices of a lens outline, which becomes rounder toward the apex. 0 uses the vertices of the site,
         and its shape from rim to apex.
-
-    Raises
-    ------
-    ParameterError
-        When a number is out of range.
     """
 
-    well_depth_um: float = 3.0
-    trench_width_um: float = 0.2
-    filter_thickness_um: float = 0.6
-    lens_height_um: float = 0.7
-    n_lens_steps: int = 6
-    n_lens_corners: int = 0
-
-    def __post_init__(self) -> None:
-        check_length_um("well_depth_um", self.well_depth_um, at_most=MAX_THICKNESS_UM)
-        for name in ("trench_width_um", "filter_thickness_um", "lens_height_um"):
-            check_number(name, getattr(self, name), at_least=0.0, at_most=MAX_THICKNESS_UM)
-            if getattr(self, name) > 0.0:
-                check_length_um(name, getattr(self, name))
-        check_count("n_lens_steps", self.n_lens_steps, at_most=64)
-        check_count("n_lens_corners", self.n_lens_corners, at_least=0, at_most=256)
+    well_depth_um: Annotated[float, replace(LENGTH, at_most=MAX_THICKNESS_UM)] = 3.0
+    trench_width_um: Annotated[float, THICKNESS] = 0.2
+    filter_thickness_um: Annotated[float, THICKNESS] = 0.6
+    lens_height_um: Annotated[float, THICKNESS] = 0.7
+    n_lens_steps: Annotated[int, Limits(at_least=1, at_most=64)] = 6
+    n_lens_corners: Annotated[int, Limits(at_least=0, at_most=256)] = 0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -252,8 +252,8 @@ def test_solids_of_empty_layout_raise():
     [
         ({"well_depth_um": 0.0}, "'well_depth_um' must be > 0"),
         ({"trench_width_um": -0.1}, "'trench_width_um' must be >= 0"),
-        ({"filter_thickness_um": 1e-7}, "'filter_thickness_um' must be >= 0.0001"),
-        ({"lens_height_um": 5000.0}, "'lens_height_um' must be <= 1000"),
+        ({"filter_thickness_um": 1e-7}, "'filter_thickness_um' must be 0, or from 0.0001 to 1000"),
+        ({"lens_height_um": 5000.0}, "'lens_height_um' must be 0, or from 0.0001 to 1000"),
         ({"n_lens_steps": 0}, "'n_lens_steps' must be >= 1"),
         ({"n_lens_corners": -1}, "'n_lens_corners' must be >= 0"),
     ],

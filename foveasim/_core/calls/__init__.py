@@ -4,9 +4,39 @@ from __future__ import annotations
 
 from foveasim._core.calls.arguments import CHECKED, check_arguments, check_public_calls
 from foveasim._core.calls.kinds import OwnCheck
+from foveasim._core.calls.limits import (
+    FINITE,
+    FRACTION,
+    LENGTH,
+    NOT_NEGATIVE,
+    POSITIVE,
+    Declaration,
+    Declared,
+    Limits,
+    Usual,
+    check_declared,
+    declarations_of,
+)
 from foveasim._core.calls.pickling import copyable, make_copyable
 
-__all__ = ["CHECKED", "OwnCheck", "check_arguments", "copyable", "publish"]
+__all__ = [
+    "CHECKED",
+    "FINITE",
+    "FRACTION",
+    "LENGTH",
+    "NOT_NEGATIVE",
+    "POSITIVE",
+    "Declaration",
+    "Declared",
+    "Limits",
+    "OwnCheck",
+    "Usual",
+    "check_arguments",
+    "check_declared",
+    "copyable",
+    "declarations_of",
+    "publish",
+]
 
 
 def publish(module_name: str) -> None:

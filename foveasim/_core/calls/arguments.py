@@ -13,10 +13,12 @@ import functools
 import inspect
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import is_dataclass
 from types import FunctionType
 from typing import Any, ParamSpec, TypeVar, cast
 
 from foveasim._core.calls.kinds import Kind, check_kind, kind_of, resolve_annotation
+from foveasim._core.calls.limits import Converter, Declaration, without_declarations
 from foveasim._core.names import did_you_mean
 from foveasim.errors import ArgumentError
 
@@ -32,17 +34,21 @@ MAX_DEFAULT = 12
 BOUND = ("self", "cls")
 #: Kinds of the parameters of a call by position and by name, of other positional and of other named arguments.
 _Kinds = tuple[list[tuple[str, Kind | None]], dict[str, Kind | None], tuple[str, Kind] | None, Kind | None]
+#: Converters of parameters with declared limits, by position and by name.
+_Converters = tuple[list[tuple[int, str, Converter]], dict[str, Converter]]
 #: Attribute of checked functions.
 CHECKED = "_arguments_are_checked"
 
 
-def check_arguments(call: Callable[P, R]) -> Callable[P, R]:
+def check_arguments(call: Callable[P, R], *, converts: bool = True) -> Callable[P, R]:
     """
-    Return a function that raises an error for arguments outside its signature.
+    Return a function that rejects arguments outside its signature or declared limits.
 
     Parameters
     ----------
     call : function
+    converts : bool
+        Whether arguments with declared limits are checked and converted, to floats and integers; dataclasses do so themselves.
 
     Notes
     -----
@@ -52,14 +58,18 @@ def check_arguments(call: Callable[P, R]) -> Callable[P, R]:
     if not isinstance(call, FunctionType) or hasattr(call, CHECKED):
         return call
     # Not globals of the function below.
-    find_problem, find_kinds, check = _find_problem, _find_kinds, check_kind
+    find_problem, find_kinds, find_converters, check = _find_problem, _find_kinds, _find_converters, check_kind
     kinds: _Kinds | None = None
+    converters: _Converters = [], {}
+    annotations = call.__annotations__
 
     def checked(*args: P.args, **kwargs: P.kwargs) -> R:
         __tracebackhide__ = True  # in the tracebacks of IPython and pytest
-        nonlocal kinds
+        nonlocal kinds, converters
         if kinds is None:
             kinds = find_kinds(call)
+            if converts:
+                converters = find_converters(call, annotations)
         by_position, by_name, rest, every = kinds
         for (name, kind), value in zip(by_position, args):  # noqa: B905 -- surplus arguments are reported below
             if kind is not None and not kind.accepts(value):
@@ -72,6 +82,12 @@ def check_arguments(call: Callable[P, R]) -> Callable[P, R]:
             kind = by_name.get(name, every)
             if kind is not None and not kind.accepts(value):
                 check(name, value, kind)
+        for k, name, convert in converters[0]:
+            if k < len(args):
+                args = (*args[:k], convert(name, args[k], None), *args[k + 1 :])  # type: ignore[assignment]
+        for name, convert in converters[1].items():
+            if name in kwargs:
+                kwargs[name] = convert(name, kwargs[name], None)
         try:
             return call(*args, **kwargs)
         except TypeError as error:
@@ -87,6 +103,8 @@ def check_arguments(call: Callable[P, R]) -> Callable[P, R]:
     found = FunctionType(checked.__code__, call.__globals__, call.__name__, None, checked.__closure__)
     functools.update_wrapper(found, call)
     setattr(found, CHECKED, True)
+    # ``help`` shows the signature of the original.
+    call.__annotations__ = {name: without_declarations(each) for name, each in annotations.items()}
     return cast("Callable[P, R]", found)
 
 
@@ -109,6 +127,21 @@ def _find_kinds(call: Callable[..., Any]) -> _Kinds:
             if parameter.kind is not parameter.KEYWORD_ONLY:
                 by_position.append((parameter.name, known))
     return by_position, by_name, rest, every
+
+
+def _find_converters(call: Callable[..., Any], annotations: Mapping[str, Any]) -> _Converters:
+    """Return the converters of parameters with limits, by position and by name."""
+    names = getattr(inspect.unwrap(call), "__globals__", {})
+    by_position: list[tuple[int, str, Converter]] = []
+    by_name: dict[str, Converter] = {}
+    for k, (name, parameter) in enumerate(inspect.signature(call).parameters.items()):
+        declared = Declaration.of(resolve_annotation(annotations.get(name), names))
+        if declared.limits is None or (convert := declared.converter) is None:
+            continue
+        by_name[name] = convert
+        if parameter.kind is not parameter.KEYWORD_ONLY:
+            by_position.append((k, name, convert))
+    return by_position, by_name
 
 
 def check_public_calls(module_name: str) -> None:
@@ -144,7 +177,7 @@ def _check_methods(kind: type) -> None:
         if isinstance(member, classmethod | staticmethod):
             setattr(kind, name, type(member)(check_arguments(member.__func__)))
         elif isinstance(member, FunctionType):
-            setattr(kind, name, check_arguments(member))
+            setattr(kind, name, check_arguments(member, converts=name != "__init__" or not is_dataclass(kind)))
 
 
 def _find_problem(call: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> ArgumentError | None:

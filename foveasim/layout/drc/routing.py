@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
+from foveasim._core.calls import LENGTH, NOT_NEGATIVE, POSITIVE, Declared, Limits
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, Ints, as_numbers, check_choice, check_count, check_length_um, check_number
+from foveasim._core.validation import Floats, Ints, as_numbers
 from foveasim.layout.model import Layout
 
 __all__ = ["Readout", "Routing", "TrackDemand", "track_demand"]
@@ -19,7 +20,7 @@ SAME_STRIP_UM = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Readout:
+class Readout(Declared):
     """
     Frame rate, bit depth and lanes of the readout.
 
@@ -33,23 +34,12 @@ class Readout:
         Time without data as a fraction of the time with data, such as 0.2.
     n_lanes : int
         Number of output lanes, with equal data rates.
-
-    Raises
-    ------
-    ParameterError
-        When a number is out of range.
     """
 
-    frames_per_s: float
-    bits: int
-    blanking: float = 0.0
-    n_lanes: int = 1
-
-    def __post_init__(self) -> None:
-        check_number("frames_per_s", self.frames_per_s, above=0.0)
-        check_count("bits", self.bits, at_most=64)
-        check_number("blanking", self.blanking, at_least=0.0)
-        check_count("n_lanes", self.n_lanes)
+    frames_per_s: Annotated[float, POSITIVE]
+    bits: Annotated[int, Limits(at_least=1, at_most=64)]
+    blanking: Annotated[float, NOT_NEGATIVE] = 0.0
+    n_lanes: Annotated[int, Limits(at_least=1)] = 1
 
     def gbit_per_s(self, n_sites: int) -> float:
         """
@@ -66,7 +56,7 @@ class Readout:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Routing:
+class Routing(Declared):
     """
     Metal tracks for the readout lines.
 
@@ -78,23 +68,12 @@ class Routing:
         Number of metal layers for the lines.
     direction : {"outwards", "upwards"}
         Direction of the lines: radially away from the optical axis (sectors), or along y (columns).
-
-    Raises
-    ------
-    ParameterError
-        When a number is out of range.
     """
 
-    width_um: float
-    space_um: float
-    n_layers: int = 1
+    width_um: Annotated[float, LENGTH]
+    space_um: Annotated[float, LENGTH]
+    n_layers: Annotated[int, Limits(at_least=1, at_most=1000)] = 1
     direction: Literal["outwards", "upwards"] = "outwards"
-
-    def __post_init__(self) -> None:
-        check_length_um("width_um", self.width_um)
-        check_length_um("space_um", self.space_um)
-        check_count("n_layers", self.n_layers, at_most=1000)
-        check_choice("direction", self.direction, get_args(Literal["outwards", "upwards"]))
 
     def n_tracks(self, strip_um: Floats) -> Ints:
         """

@@ -11,11 +11,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import InitVar, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from foveasim._core.calls import OwnCheck
+from foveasim._core.calls import FRACTION, NOT_NEGATIVE, POSITIVE, Limits, OwnCheck, check_declared
 from foveasim._core.names import possible_names
 from foveasim._core.short_repr import short_repr
 from foveasim._core.show import drawn
@@ -33,11 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["RULES", "DesignRules", "Report", "RuleResult", "Violation", "check", "min_width_um"]
 
 
-#: Parameters that are not numbers.
-NON_NUMERIC = {"custom", "die_um", "readout", "routing", "waivers"}
-#: Upper bounds of limits, and limits that must be positive.
-UPPER_BOUNDS = {"min_angle_deg": 180.0, "edge_angle_step_deg": 180.0, "min_density": 1.0, "max_density": 1.0}
-POSITIVE = ("min_angle_deg", "edge_angle_step_deg", "grid_um", "density_window_um")
+ANGLE = Limits(at_least=0.0, above=0.0, at_most=180.0)
 #: Further parameter that a rule requires, and its type.
 REQUIRED: dict[str, tuple[str, type | None]] = {
     "min_density": ("density_window_um", None),
@@ -118,29 +114,29 @@ class DesignRules:
     0.14
     """
 
-    min_size_um: float | None = None
-    max_size_um: float | None = None
-    min_area_um2: float | None = None
-    min_hole_um2: float | None = None
-    min_width_um: float | None = None
-    min_space_um: float | None = None
-    max_aspect_ratio: float | None = None
-    min_angle_deg: float | None = None
-    edge_angle_step_deg: float | None = None
-    grid_um: float | None = None
-    max_overlap_um2: float | None = None
-    max_gap_um2: float | None = None
+    min_size_um: Annotated[float | None, NOT_NEGATIVE] = None
+    max_size_um: Annotated[float | None, NOT_NEGATIVE] = None
+    min_area_um2: Annotated[float | None, NOT_NEGATIVE] = None
+    min_hole_um2: Annotated[float | None, NOT_NEGATIVE] = None
+    min_width_um: Annotated[float | None, NOT_NEGATIVE] = None
+    min_space_um: Annotated[float | None, NOT_NEGATIVE] = None
+    max_aspect_ratio: Annotated[float | None, NOT_NEGATIVE] = None
+    min_angle_deg: Annotated[float | None, ANGLE] = None
+    edge_angle_step_deg: Annotated[float | None, ANGLE] = None
+    grid_um: Annotated[float | None, POSITIVE] = None
+    max_overlap_um2: Annotated[float | None, NOT_NEGATIVE] = None
+    max_gap_um2: Annotated[float | None, NOT_NEGATIVE] = None
     die_um: OwnCheck[tuple[float, float, float, float] | None] = None
-    min_growth: float | None = None
-    max_growth: float | None = None
-    max_neighbour_ratio: float | None = None
-    max_sites: int | None = None
-    min_density: float | None = None
-    max_density: float | None = None
-    density_window_um: float | None = None
-    max_data_rate_gbit_per_s: float | None = None
+    min_growth: Annotated[float | None, NOT_NEGATIVE] = None
+    max_growth: Annotated[float | None, NOT_NEGATIVE] = None
+    max_neighbour_ratio: Annotated[float | None, NOT_NEGATIVE] = None
+    max_sites: Annotated[int | None, NOT_NEGATIVE] = None
+    min_density: Annotated[float | None, FRACTION] = None
+    max_density: Annotated[float | None, FRACTION] = None
+    density_window_um: Annotated[float | None, POSITIVE] = None
+    max_data_rate_gbit_per_s: Annotated[float | None, NOT_NEGATIVE] = None
     readout: Readout | None = None
-    max_track_utilisation: float | None = None
+    max_track_utilisation: Annotated[float | None, NOT_NEGATIVE] = None
     routing: Routing | None = None
     waivers: Mapping[str, str] | None = None
     custom: Mapping[str, float] | None = None
@@ -153,16 +149,7 @@ class DesignRules:
             for name, limit in PRESETS[check_choice("preset", preset, tuple(PRESETS))].limits.items():
                 if getattr(self, name) is None:
                     object.__setattr__(self, name, limit)
-        for rule in fields(self):
-            value = getattr(self, rule.name)
-            if value is not None and rule.name not in NON_NUMERIC:
-                object.__setattr__(self, rule.name, check_number(rule.name, value, at_least=0.0))
-        for name, upper_bound in UPPER_BOUNDS.items():
-            if getattr(self, name) is not None:
-                check_number(name, getattr(self, name), at_most=upper_bound)
-        for name in POSITIVE:
-            if getattr(self, name) is not None:
-                check_number(name, getattr(self, name), above=0.0)
+        check_declared(self)
         for name, (required, kind) in REQUIRED.items():
             value = getattr(self, required)
             if value is None and getattr(self, name) is not None:

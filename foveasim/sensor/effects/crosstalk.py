@@ -10,21 +10,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.calls import OwnCheck
+from foveasim._core.calls import LENGTH, NOT_NEGATIVE, Declared, Limits, OwnCheck
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import (
     Floats,
     Ints,
     as_numbers,
-    check_choice,
-    check_length_um,
-    check_number,
     check_pitch_um,
     finite_array,
 )
@@ -39,6 +36,7 @@ __all__ = ["CrosstalkOperator", "Diffusion", "InterPixelCapacitance", "KernelCro
 
 #: Maximum fraction of charge that a site loses in one step; larger fractions would make the exchange oscillate.
 MAX_STEP_FRACTION = 0.5
+NEIGHBOUR_FRACTION = Limits(at_least=0.0, at_most=MAX_STEP_FRACTION)
 #: Maximum number of steps; more would take seconds per frame for a million sites.
 MAX_STEPS = 1000
 #: Up to this ratio of spread to distance, charge crosses at most one boundary (to float64); above it, a Fourier series is used.
@@ -192,7 +190,7 @@ class CrosstalkOperator:
         return array
 
 
-class _Crosstalk(Effect):
+class _Crosstalk(Declared, Effect):
     """Crosstalk in the chain, compiled for the sites at first use."""
 
     is_temporal: ClassVar[bool] = False
@@ -237,11 +235,6 @@ class Diffusion(_Crosstalk):
         Maximum width of gaps between neighbouring sites, which exchange charge as if they were in contact. By default only
         sites that share an edge are neighbours.
 
-    Raises
-    ------
-    ParameterError
-        If a number is negative or not finite, or the spread is out of range.
-
     Notes
     -----
     For a uniform charge density n, a Gaussian spread moves ``n * spread / sqrt(2 pi)`` across each unit of length of a
@@ -275,17 +268,12 @@ class Diffusion(_Crosstalk):
     name: ClassVar[str] = "crosstalk"
     stage: ClassVar[Stage] = "expected"
 
-    spread_um: float
-    max_gap_um: float | None = None
+    spread_um: Annotated[float, Limits(at_least=0.0, at_most=MAX_SPREAD_UM)]
+    max_gap_um: Annotated[float | None, NOT_NEGATIVE] = None
 
     def compile_for(self, sites: Sites) -> CrosstalkOperator:
         """Return the operator for all sites of the layout."""
         return self.compile(sites.layout)
-
-    def __post_init__(self) -> None:
-        spread_um = check_number("spread_um", self.spread_um, at_least=0.0, at_most=MAX_SPREAD_UM)
-        object.__setattr__(self, "spread_um", spread_um)
-        object.__setattr__(self, "max_gap_um", _gap_um(self.max_gap_um))
 
     @classmethod
     def from_neighbour_fraction(
@@ -312,8 +300,8 @@ class Diffusion(_Crosstalk):
         """
         from scipy.optimize import brentq
 
-        fraction = check_number("neighbour_fraction", neighbour_fraction, at_least=0.0, at_most=MAX_STEP_FRACTION)
-        pitch_um = check_length_um("pitch_um", pitch_um)
+        fraction = NEIGHBOUR_FRACTION.check("neighbour_fraction", neighbour_fraction)
+        pitch_um = LENGTH.check("pitch_um", pitch_um)
         # Upper bracket: with a spread equal to the pitch a pixel loses far more than half.
         steps = float(brentq(lambda s: 2.0 * float(_mean_square_steps(np.array(s))) - fraction, 0.0, 1.0, xtol=1e-15))
         return cls(spread_um=steps * pitch_um, max_gap_um=max_gap_um)
@@ -422,7 +410,7 @@ class KernelCrosstalk(_Crosstalk):
         if kernel.sum() > 1.0 + KERNEL_ROUNDING:
             raise ParameterError("kernel", "must have a sum of at most 1", float(kernel.sum()))
         object.__setattr__(self, "kernel", tuple(tuple(float(fraction) for fraction in row) for row in kernel))
-        check_choice("border", self.border, ("kept", "lost"))
+        super().__post_init__()
         if self.pitch_um is not None:
             object.__setattr__(self, "pitch_um", check_pitch_um("pitch_um", self.pitch_um))
 
@@ -504,11 +492,6 @@ class InterPixelCapacitance(_Crosstalk):
     max_gap_um : float, optional, µm
         Maximum width of gaps between neighbouring sites; by default neighbours share an edge.
 
-    Raises
-    ------
-    ParameterError
-        If the fraction is not from 0 to 1/2, or a length is out of range.
-
     Notes
     -----
     Two nodes with a common boundary of length e have a coupling capacitance ``k e``. With a capacitance C to ground, the
@@ -535,20 +518,13 @@ class InterPixelCapacitance(_Crosstalk):
     name: ClassVar[str] = "ipc"
     stage: ClassVar[Stage] = "charge"
 
-    neighbour_fraction: float
-    edge_um: float | None = None
-    max_gap_um: float | None = None
+    neighbour_fraction: Annotated[float, NEIGHBOUR_FRACTION]
+    edge_um: Annotated[float | None, LENGTH] = None
+    max_gap_um: Annotated[float | None, NOT_NEGATIVE] = None
 
     def compile_for(self, sites: Sites) -> CrosstalkOperator:
         """Return the operator for all sites of the layout and their sense-node capacitances."""
         return self.compile(sites.layout, capacitance_f=sites.capacitance_f if sites.capacitance_f.size > 1 else None)
-
-    def __post_init__(self) -> None:
-        fraction = check_number("neighbour_fraction", self.neighbour_fraction, at_least=0.0, at_most=MAX_STEP_FRACTION)
-        object.__setattr__(self, "neighbour_fraction", fraction)
-        if self.edge_um is not None:
-            object.__setattr__(self, "edge_um", check_length_um("edge_um", self.edge_um))
-        object.__setattr__(self, "max_gap_um", _gap_um(self.max_gap_um))
 
     def compile(
         self,
@@ -613,10 +589,6 @@ class InterPixelCapacitance(_Crosstalk):
 # -- helpers ----------------------------------------------------------------------------------------------------------
 
 _ALTERNATIVE = "use Diffusion, which supports sites of any shape"
-
-
-def _gap_um(max_gap_um: object) -> float | None:
-    return None if max_gap_um is None else check_number("max_gap_um", max_gap_um, at_least=0.0)
 
 
 def _require_layout(layout: object) -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal, Self, get_args
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 import numpy as np
 
-from foveasim._core.validation import Floats, check_choice
+from foveasim._core.calls import Limits
+from foveasim._core.validation import Floats
 from foveasim.sensor.effects.contract import FixedFactor, FixedOffset, Sites, Stage
-from foveasim.sensor.limits import check_plausible
+from foveasim.sensor.limits import SHARE, TEMPERATURE
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
 
 if TYPE_CHECKING:
@@ -21,19 +22,21 @@ __all__ = ["DarkLaw", "DarkSignal", "HotSites", "dark_current_factor"]
 #: Temperature dependence of the dark current.
 DarkLaw = Literal["doubling", "arrhenius", "diffusion_generation"]
 
+DOUBLING = Limits(above=0.0, low=0.1, at_most=1000.0, hint="dark current doubles every 5 to 10 K")
+ACTIVATION = Limits(above=0.0, low=0.01, at_most=10.0, hint="in silicon, generation has 0.63 eV and diffusion 1.27 eV")
 BOLTZMANN_EV_PER_K = BOLTZMANN_J_PER_K / ELEMENTARY_CHARGE_C
 #: Band gap of silicon at 0 K, and the coefficients of its temperature dependence: Y. P. Varshni, Physica 34, 149 (1967).
 BAND_GAP_0_EV, BAND_GAP_EV_PER_K, BAND_GAP_K = 1.1557, 7.021e-4, 1108.0
 
 
 def dark_current_factor(
-    temperature_k: float,
-    reference_k: float,
+    temperature_k: Annotated[float, TEMPERATURE],
+    reference_k: Annotated[float, TEMPERATURE],
     law: DarkLaw = "doubling",
     *,
-    doubling_k: float = 8.0,
-    activation_ev: float = 0.67,
-    diffusion_fraction: float = 0.5,
+    doubling_k: Annotated[float, DOUBLING] = 8.0,
+    activation_ev: Annotated[float, ACTIVATION] = 0.67,
+    diffusion_fraction: Annotated[float, SHARE] = 0.5,
 ) -> float:
     """
     Compute the ratio of the dark currents at two temperatures.
@@ -65,7 +68,7 @@ def dark_current_factor(
     Raises
     ------
     ParameterError
-        If the law is unknown, or a value is out of range (:data:`foveasim.sensor.LIMITS`).
+        If the law is unknown, or a value is out of range.
 
     Notes
     -----
@@ -82,12 +85,6 @@ def dark_current_factor(
     >>> round(dark_current_factor(233.0, 300.0) / generation, 1)
     3.2
     """
-    check_choice("dark_law", law, get_args(DarkLaw))
-    temperature_k = check_plausible("temperature_k", temperature_k)
-    reference_k = check_plausible("dark_reference_k", reference_k)
-    doubling_k = check_plausible("dark_doubling_k", doubling_k)
-    activation_ev = check_plausible("dark_activation_ev", activation_ev)
-    diffusion_fraction = check_plausible("dark_diffusion_fraction", diffusion_fraction)
     try:
         if law == "doubling":
             return float(2.0 ** ((temperature_k - reference_k) / doubling_k))

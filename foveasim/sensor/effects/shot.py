@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
-from typing import ClassVar, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.calls import Declared, Limits
 from foveasim._core.random_streams import Streams, random_key
-from foveasim._core.validation import Floats, Ints, check_choice, check_number, read_only, unmasked
+from foveasim._core.validation import Floats, Ints, read_only, unmasked
 from foveasim.errors import ParameterError
 from foveasim.sensor.blocks import for_each_block
 from foveasim.sensor.effects.contract import Effect, Sites, Stage
@@ -22,6 +23,7 @@ ShotChoice = Literal["auto", "exact", "off"]
 
 #: Maximum mean of exact Poisson draws by inversion: its tables have 6 MB.
 MAX_INVERSION_MEAN_E = 700.0
+GAUSSIAN_ABOVE = Limits(at_least=10.0, at_most=MAX_INVERSION_MEAN_E)
 #: Limit of numpy's Poisson generator. Larger expectations are rounded: their relative shot noise is below 1e-9.
 MAX_EXACT_E = 1e18
 #: Upper limit of charges: 2**62 fits int64 with headroom for sums.
@@ -67,7 +69,7 @@ def poisson_tables(max_mean: int) -> PoissonTables:
 
 
 @dataclass(frozen=True)
-class ShotNoise(Effect):
+class ShotNoise(Declared, Effect):
     """
     Shot-noise draw from expected to collected charge, in whole electrons.
 
@@ -101,11 +103,7 @@ class ShotNoise(Effect):
     needs_layout: ClassVar[bool] = False
 
     how: ShotChoice = "auto"
-    gaussian_above_e: float = 100.0
-
-    def __post_init__(self) -> None:
-        check_choice("shot_noise", self.how, ("auto", "exact", "off"))
-        check_number("gaussian_above_e", self.gaussian_above_e, at_least=10.0, at_most=MAX_INVERSION_MEAN_E)
+    gaussian_above_e: Annotated[float, GAUSSIAN_ABOVE] = 100.0
 
     @property
     def is_drawn(self) -> bool:

@@ -11,14 +11,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from foveasim._core.calls import FRACTION, NOT_NEGATIVE, POSITIVE, Declared, Limits, Usual
 from foveasim._core.registry import Registry
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, as_numbers, check_count, check_number
+from foveasim._core.validation import Floats, as_numbers, check_number
 from foveasim.errors import FoveasimError, ParameterError
 
 __all__ = [
@@ -49,11 +50,12 @@ class Curve(Protocol):
         """Return the values at the wavelengths, of the same shape."""
 
 
+PEAK = Limits(above=0.0, at_most=1.0)
 #: Valid factors of a curve: another curve, or a constant from 0 to 1.
 Factor = Curve | float
 
 
-class CurveBase(ABC):
+class CurveBase(Declared, ABC):
     """Base class of curves that defines products: ``curve * curve`` and ``0.9 * curve``."""
 
     #: Makes numpy scalars defer multiplication to the curve.
@@ -87,17 +89,9 @@ class ConstantCurve(CurveBase):
     ----------
     value : float
         Value at all wavelengths, from 0 to 1.
-
-    Raises
-    ------
-    ParameterError
-        If the value is out of range.
     """
 
-    value: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_number("value", self.value, at_least=0.0, at_most=1.0)
+    value: Annotated[float, FRACTION] = 1.0
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
         """Return the values at the wavelengths, of the same shape."""
@@ -116,21 +110,11 @@ class GaussianCurve(CurveBase):
         Centre wavelength and full width at half maximum.
     peak : float
         Value at the centre.
-
-    Raises
-    ------
-    ParameterError
-        If a value is out of range.
     """
 
-    centre_nm: float
-    fwhm_nm: float
-    peak: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_number("centre_nm", self.centre_nm, above=0.0)
-        check_number("fwhm_nm", self.fwhm_nm, above=0.0)
-        check_number("peak", self.peak, above=0.0, at_most=1.0)
+    centre_nm: Annotated[float, POSITIVE]
+    fwhm_nm: Annotated[float, POSITIVE, Usual(10.0, 300.0)]
+    peak: Annotated[float, PEAK] = 1.0
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
         """Return the values at the wavelengths, of the same shape."""
@@ -171,22 +155,19 @@ class PassBand(CurveBase):
     array([0.9, 0.5, 0.1])
     """
 
-    from_nm: float | None = None
-    to_nm: float | None = None
-    edge_nm: float = 10.0
-    peak: float = 1.0
+    from_nm: Annotated[float | None, POSITIVE] = None
+    to_nm: Annotated[float | None, POSITIVE] = None
+    edge_nm: Annotated[float, NOT_NEGATIVE] = 10.0
+    peak: Annotated[float, PEAK] = 1.0
 
     def __post_init__(self) -> None:
         if self.from_nm is None and self.to_nm is None:
             raise ParameterError(
                 "from_nm", "or 'to_nm' must be given; for the same transmission at all wavelengths use ConstantCurve"
             )
-        if self.from_nm is not None:
-            check_number("from_nm", self.from_nm, above=0.0)
-        if self.to_nm is not None:
-            check_number("to_nm", self.to_nm, above=0.0 if self.from_nm is None else self.from_nm)
-        check_number("edge_nm", self.edge_nm, at_least=0.0)
-        check_number("peak", self.peak, above=0.0, at_most=1.0)
+        super().__post_init__()
+        if self.from_nm is not None and self.to_nm is not None:
+            check_number("to_nm", self.to_nm, above=self.from_nm)
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
         """Return the values at the wavelengths, of the same shape."""
@@ -232,12 +213,8 @@ class SiliconQE(CurveBase):
     ``transmission * (1 - exp(-depth / l))`` with the absorption length ``l(wavelength)`` (Beer-Lambert law).
     """
 
-    depth_um: float
-    transmission: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_number("depth_um", self.depth_um, above=0.0, at_most=1e5)
-        check_number("transmission", self.transmission, above=0.0, at_most=1.0)
+    depth_um: Annotated[float, Limits(above=0.0, at_most=1e5), Usual(0.5, 10.0)]
+    transmission: Annotated[float, PEAK] = 1.0
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
         """Return the values at the wavelengths, of the same shape."""
@@ -314,16 +291,10 @@ class BandMean(CurveBase):
     """
 
     curve: Curve
-    band_width_nm: float
-    n_points: int = 64
+    band_width_nm: Annotated[float, POSITIVE]
+    n_points: Annotated[int, Limits(at_least=1, at_most=100_000)] = 64
 
     __repr__ = short_repr
-
-    def __post_init__(self) -> None:
-        if not callable(self.curve):
-            raise ParameterError("curve", "must be a function of wavelength", self.curve)
-        check_number("band_width_nm", self.band_width_nm, above=0.0)
-        object.__setattr__(self, "n_points", check_count("n_points", self.n_points, at_most=100_000))
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
         """Return the values at the wavelengths, of the same shape."""

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import Floats, as_numbers, check_choice, check_count, finite_array, wavelengths_nm
+from foveasim._core.validation import Floats, as_numbers, check_count, finite_array, wavelengths_nm
 from foveasim.errors import ParameterError
 from foveasim.sensor.spectral.curves import CURVES, CurveBase, check_within
 
@@ -95,7 +95,6 @@ class TableCurve(CurveBase):
 
     def __post_init__(self) -> None:
         _set_table(self)
-        check_choice("beyond", self.beyond, get_args(Beyond))
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
         """Return the values at the wavelengths, of the same shape."""
@@ -138,7 +137,6 @@ class SplineCurve(CurveBase):
 
     def __post_init__(self) -> None:
         _set_table(self)
-        check_choice("beyond", self.beyond, get_args(Beyond))
 
     @cached_property
     def _interpolator(self) -> Any:
@@ -192,7 +190,6 @@ class StepCurve(CurveBase):
             )
         if np.any(np.diff(edges_nm) <= 0.0):
             raise ParameterError("edge_nm", "must ascend", self.edge_nm, "nm")
-        check_choice("beyond", self.beyond, get_args(Beyond))
         object.__setattr__(self, "edge_nm", tuple(edges_nm.tolist()))
         object.__setattr__(self, "value", tuple(values.tolist()))
 
