@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from foveasim._core.calls import check_public_calls
 from foveasim._io.pickling import make_copyable
+from foveasim.explore import metrics  # noqa: F401 -- registers the metrics
 from foveasim.explore._metrics import METRICS, Metric, import_metric
 from foveasim.explore._schemas import schema_of
 from foveasim.explore.datasets.dataset import Dataset
