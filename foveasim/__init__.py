@@ -48,7 +48,7 @@ from foveasim.scene import Scene
 from foveasim.sensor import FilterSet, GaussianCurve, PolynomialCurve, Sensor, SiliconQE, rgb_filters
 
 if TYPE_CHECKING:
-    from foveasim import compare, explore, learn, studio
+    from foveasim import compare, explore, learn, studio, testing
     from foveasim.config import read_layout
 
 __all__ = [
@@ -88,6 +88,7 @@ __all__ = [
     "scene",
     "sensor",
     "studio",
+    "testing",
     "tiles",
     "units",
     "video",
@@ -113,6 +114,7 @@ _LAZY = {
     "learn": "foveasim.learn",
     "read_layout": "foveasim.config",
     "studio": "foveasim.studio",
+    "testing": "foveasim.testing",
 }
 
 if not TYPE_CHECKING:  # type checkers would take any name for an attribute

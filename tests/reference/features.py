@@ -110,10 +110,10 @@ def layouts():
         name: {
             "layout": {
                 "generator": name,
-                "parameters": plain({**family.example, **LAYOUT_FILE_ARGUMENTS.get(name, {})}),
+                "parameters": plain({**LAYOUTS.example(name), **LAYOUT_FILE_ARGUMENTS.get(name, {})}),
             }
         }
-        for name, family in LAYOUTS.items()
+        for name in LAYOUTS
     }
 
 
@@ -125,8 +125,8 @@ def edits():
     return {
         "none": {},
         **{
-            name: {"layout": {"edits": [{"kind": name, **plain(EDIT_FILE_ARGUMENTS.get(name, edit.example))}]}}
-            for name, edit in EDITS.items()
+            name: {"layout": {"edits": [{"kind": name, **plain(EDIT_FILE_ARGUMENTS.get(name, EDITS.example(name)))}]}}
+            for name in EDITS
             if name not in COLOUR_EDITS
         },
     }
