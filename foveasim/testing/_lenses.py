@@ -32,7 +32,7 @@ ROUNDING = 1e-12
 def check_pupil(extension: Extension) -> None:
     """Check amplitudes, edges, and the power of the image of a point."""
     pupil = extension.make()
-    at = (np.arange(N_ACROSS) + 0.5) * (2.0 / N_ACROSS) - 1.0
+    at = np.linspace(-1.0, 1.0, 2 * N_ACROSS + 1, dtype=np.float64)[1::2]
     x, y = np.meshgrid(at, at)
     is_inside = x * x + y * y < 1.0
     power = np.zeros(len(WAVELENGTHS_NM))

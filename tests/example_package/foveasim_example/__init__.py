@@ -11,10 +11,12 @@ import shapely
 import foveasim as fs
 from foveasim.distortion import LENSES
 from foveasim.explore import METRICS
-from foveasim.layout import FORMATS, RULES, FileFormat, Rule, WrittenLayout, layout_family
+from foveasim.layout import DERIVED_LAYERS, FORMATS, RULES, FileFormat, Rule, WrittenLayout, layout_edit, layout_family
+from foveasim.maps import MAP_FORMATS, Found
 from foveasim.optics import PUPILS
 from foveasim.scene import CUBE_FORMATS, SCENES
 from foveasim.sensor.effects import EFFECTS, AdditiveNoise
+from foveasim.sensor.spectral import CURVES
 
 
 @layout_family(example={"n_petals": 12, "petal_um": 3.0})
@@ -26,6 +28,23 @@ def daisy(*, n_petals: int, petal_um: float) -> fs.Layout:
     discs = shapely.buffer(shapely.points(centres), 0.9 * petal_um)
     centre = shapely.Point(0.0, 0.0).buffer(ring_um - petal_um)
     return fs.Layout.from_polygons([centre, *discs], ring=np.r_[0, np.ones(n_petals, int)])
+
+
+@layout_edit(example={"factor": 2.0})
+def stretch_x(layout: fs.Layout, *, factor: float) -> fs.Layout:
+    """Stretch the layout along x."""
+    stretched = fs.Layout.from_polygons(
+        [shapely.affinity.scale(polygon, factor, 1.0, origin=(0.0, 0.0)) for polygon in layout.polygons()],
+        **layout.columns,
+    )
+    steps = [*layout.provenance.get("steps", []), f"stretch_x {factor}"]
+    return stretched.with_provenance({**layout.provenance, "steps": steps})
+
+
+@DERIVED_LAYERS.register("pad", example={"radius_um": 2.0}, expected=16.0 * 32.0 * np.sin(np.pi / 16.0) / 2.0 * 4.0)
+def pad(layout: fs.Layout, *, radius_um: float = 1.0) -> np.ndarray:
+    """Return a polygon with 32 corners at the centroid of each site."""
+    return shapely.buffer(shapely.points(layout.centroid_um), radius_um, quad_segs=8)
 
 
 @EFFECTS.register("supply_ripple", example={"sigma_v": 2e-3})
@@ -100,6 +119,34 @@ def example_lines(path: Path) -> np.ndarray:
 
 lines = FileFormat(title="lines", suffixes=(".lines",), signatures=(b"LINES",), read=read_lines)
 CUBE_FORMATS.register("lines", lines, example=example_lines)
+
+
+def example_powers(path: Path) -> fs.PowerMap:
+    """Write a table of two rows, the top row first."""
+    path.write_text("POWER\n1 2 3\n4 5 6\n", encoding="utf-8")
+    return fs.PowerMap.from_array(np.array([[4.0, 5.0, 6.0], [1.0, 2.0, 3.0]]), pitch_um=1.0, wavelength_nm=550.0)
+
+
+def read_powers(path: Path, name: str | None) -> Found:
+    """Read a table of irradiance in cells of 1 µm, W/m²."""
+    values = np.loadtxt(path, skiprows=1, ndmin=2)
+    return Found(data=values, is_y_descending=True, pitch_um=(1.0, 1.0), wavelength_nm=[550.0], unit="w_m2")
+
+
+powers = FileFormat(title="powers", suffixes=(".powers",), signatures=(b"POWER",), read=read_powers)
+MAP_FORMATS.register("powers", powers, example=example_powers)
+
+
+@CURVES.register("comb", example={"period_nm": 100.0}, expected={500.0: 1.0, 525.0: 0.5, 550.0: 0.0})
+@dataclass(frozen=True)
+class Comb:
+    """A curve with periodic maxima."""
+
+    period_nm: float
+
+    def __call__(self, wavelength_nm):
+        """Return the values at the wavelengths."""
+        return 0.5 + 0.5 * np.cos(2.0 * np.pi * np.asarray(wavelength_nm) / self.period_nm)
 
 
 @SCENES.register(
