@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import foveasim
+from foveasim.layout import LAYOUTS
+from foveasim.scene import SCENES
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -84,8 +86,14 @@ MODULES = {
     "foveasim.config": "Settings files in YAML.",
     "foveasim.studio": "Interactive design in the browser.",
     **({"foveasim.learn": LEARN} if find_spec("torch") else {}),
+    "foveasim.testing": "Checks of extensions.",
     "foveasim.errors": "Exceptions and warnings.",
     "foveasim.units": "Unit conversions.",
+}
+#: Functions that modules list by their registry.
+REGISTERED = {
+    "foveasim.layout": LAYOUTS.within("foveasim.layout.generators"),
+    "foveasim.scene.charts": SCENES.within("foveasim.scene.charts"),
 }
 REFERENCE = Path(__file__).parent / "reference"
 
@@ -102,7 +110,8 @@ def public_names() -> dict[str, list[str]]:
         # Names that a package imports from its subpackages are listed there.
         hidden = {"__version__"}.union(*(other.__all__ for at, other in modules.items() if at.startswith(f"{name}.")))
         # Modules are not imported for this: foveasim.learn needs PyTorch.
-        names = [n for n in module.__all__ if n not in hidden | parts[name]]
+        listed = dict.fromkeys([*module.__all__, *REGISTERED.get(name, {})])
+        names = [n for n in listed if n not in hidden | parts[name]]
         public[name] = [n for n in names if not inspect.ismodule(getattr(module, n))]
     return public
 

@@ -26,7 +26,7 @@ def families() -> dict[str, fs.Layout]:
     """Return the example layout of each registered generator, and variants of two of them."""
     make = fs.layout
     return {
-        **{name.replace("_", " "): generator(**generator.example) for name, generator in make.LAYOUTS.items()},
+        **{name.replace("_", " "): generator(**make.LAYOUTS.example(name)) for name, generator in make.LAYOUTS.items()},
         "zones of hexagons": make.zones(side_um=(9, 19, 36), pitch_um=(1, 2, 4), cells="hexagons"),
         "dual pixels": make.split(make.grid(n_x=10, n_y=10, pitch_um=3.0)),
     }
@@ -36,10 +36,11 @@ def main(out_dir: Path) -> None:
     """Write the overview of generators and the foveas to a directory."""
     # %% One layout per generator, with different colours for neighbours.
     layouts = families()
-    figure = Figure(figsize=(8.0, 13.5), layout="constrained")
+    n_rows = -(-len(layouts) // 3)
+    figure = Figure(figsize=(8.0, 2.7 * n_rows), layout="constrained")
     colours = np.array([(0.55, 0.7, 0.86), (0.98, 0.85, 0.55), (0.75, 0.85, 0.65), (0.9, 0.65, 0.6)])
     for position, (name, layout) in enumerate(layouts.items(), start=1):
-        axes = figure.add_subplot(5, 3, position)
+        axes = figure.add_subplot(n_rows, 3, position)
         plot_layout(layout, colours[fs.layout.graph_colouring(layout, 4).channel], ax=axes)
         axes.set_title(f"{name}: {layout.n_sites} sites", fontsize=10)
     save_figure(figure, out_dir / "04_families.png", dpi=140)

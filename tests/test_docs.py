@@ -6,8 +6,10 @@ import ast
 import gc
 import re
 import runpy
+import sys
 from dataclasses import fields
 from pathlib import Path
+from types import ModuleType
 
 import matplotlib as mpl
 import pytest
@@ -74,9 +76,9 @@ def test_code_on_a_page_runs(page, tmp_path, monkeypatch):
     mpl.use("agg")
     monkeypatch.chdir(tmp_path)
     Image.fromarray(astronaut()).save("photo.jpg")
-    names = {"__name__": "__main__"}
+    monkeypatch.setitem(sys.modules, "__main__", main := ModuleType("__main__"))  # whose classes can be pickled
     for block in BLOCK.findall(page.read_text()):
-        exec(compile(block, str(page), "exec"), names)
+        exec(compile(block, str(page), "exec"), vars(main))
 
 
 @pytest.mark.slow(keep=1)

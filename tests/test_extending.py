@@ -33,6 +33,7 @@ import numpy as np
 import foveasim as fs
 from foveasim.config import read_shot, schema
 from foveasim.explore import METRICS
+from foveasim.testing import check_extension, extensions
 
 shot = read_shot("shot.yaml")
 capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed)
@@ -44,7 +45,13 @@ capture.save("capture.npz")
 again = fs.Capture.load("capture.npz")
 open("two.lines", "w").write("LINES\\n1 2\\n3 4\\n")
 cube = fs.Scene.from_cube("two.lines", distance_m=1.0)
+names = {"daisy", "stretch_x", "min_roundness", "boxes", "pad", "powers", "lines", "supply_ripple", "comb", "half_plane",
+         "half_moon", "magnifier", "darkest_code_dn"}
+own = [found for found in extensions() if found[1] in names]
+for kind, name in own:
+    check_extension(kind, name)
 print(json.dumps({
+    "checked": len({kind for kind, _ in own}) == len({kind for kind, _ in extensions()}) == len(own),
     "generator": capture.layout.provenance["generator"],
     "effects": [effect.name for effect in shot.camera.sensor.chain],
     "ripple": bool(budget["supply_ripple"].min() > 0),
@@ -77,6 +84,7 @@ def extended(tmp_path_factory):
 def test_installed_package_extends_every_kind(extended):
     assert extended.returncode == 0, extended.stderr
     assert json.loads(extended.stdout) == {
+        "checked": True,
         "generator": "daisy",
         "effects": ["shot", "read", "supply_ripple"],
         "ripple": True,
@@ -100,7 +108,9 @@ def test_name_is_registered_once():
     registry = Registry("thing", "foveasim.tests")
     registry.register("one", int)
 
+    assert registry.register("one", int, example={"x": 1}) is int
     assert registry.register("one", int) is int
+    assert registry.example("one") == {"x": 1}
     with pytest.raises(ParameterError, match="'name' must be new: another thing has this name, got 'one'"):
         registry.register("one", float)
 

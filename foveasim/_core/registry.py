@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from importlib import import_module
 from pkgutil import iter_modules
-from typing import Any, Generic, TypeVar, overload
+from types import MappingProxyType
+from typing import Any, Generic, NamedTuple, TypeVar, overload
 
 from foveasim._core.names import did_you_mean, possible_names
 from foveasim.errors import ParameterError, with_article
@@ -40,9 +41,23 @@ def _entry_points() -> Any:
     return entry_points()
 
 
+def _identity(item: Any) -> tuple[str, str | int]:
+    """Return a key of a function or class that is the same after a reload."""
+    return getattr(item, "__module__", ""), getattr(item, "__qualname__", id(item))
+
+
+class _Example(NamedTuple):
+    """Example of a registered object, and its known result."""
+
+    example: Any = MappingProxyType({})
+    expected: Any = None
+
+
 class Registry(Mapping[str, T], Generic[T]):
     """
     Objects of one kind by name: built-in, registered by users, or from entry points.
+
+    The checks of :mod:`foveasim.testing`, the gallery and the tests of all objects of a kind use their examples.
 
     Parameters
     ----------
@@ -56,17 +71,18 @@ class Registry(Mapping[str, T], Generic[T]):
     def __init__(self, kind: str, group: str) -> None:
         self.kind, self.group = kind, group
         self._objects: dict[str, T] = {}
+        self._examples: dict[str, _Example] = {}
         self._is_complete = False
         #: Number of registrations so far; data derived from a registry are rebuilt when it changes.
         self.version = 0
 
     @overload
-    def register(self, name: str, item: T) -> T: ...
+    def register(self, name: str, item: T, *, example: Any = None, expected: Any = None) -> T: ...
 
     @overload
-    def register(self, name: str) -> Callable[[F], F]: ...
+    def register(self, name: str, *, example: Any = None, expected: Any = None) -> Callable[[F], F]: ...
 
-    def register(self, name: str, item: Any = None) -> Any:
+    def register(self, name: str, item: Any = None, *, example: Any = None, expected: Any = None) -> Any:
         """
         Register an object, or return a decorator that does.
 
@@ -75,6 +91,12 @@ class Registry(Mapping[str, T], Generic[T]):
         name : str
         item : object, optional
             Object to register; by default a decorator is returned.
+        example : mapping or callable, optional
+            Valid parameters of the object, by default none, or a function of an empty directory that writes the files of the
+            example and returns the parameters. For file formats, a function of a path: :mod:`foveasim.testing` describes the
+            examples of all kinds.
+        expected : object, optional
+            Known result of the example, in the form of the kind.
 
         Raises
         ------
@@ -82,16 +104,31 @@ class Registry(Mapping[str, T], Generic[T]):
             When another object has this name.
         """
         if item is None:
-            return lambda decorated: self.register(name, decorated)
-        existing = self._objects.get(name)
-        if existing is not None and (getattr(existing, "__module__", 0), getattr(existing, "__qualname__", 0)) != (
-            getattr(item, "__module__", 1),
-            getattr(item, "__qualname__", 1),
-        ):
+            return lambda decorated: self.register(name, decorated, example=example, expected=expected)
+        if name in self._objects and _identity(self._objects[name]) != _identity(item):
             raise ParameterError("name", f"must be new: another {self.kind} has this name", name)
         self._objects[name] = item
+        if example is not None or expected is not None:  # an entry point has the example of its decorator
+            self._examples[name] = _Example({} if example is None else example, expected)
         self.version += 1
         return item
+
+    def example(self, name: str) -> Any:
+        """
+        Return the example with which an object was registered, an empty mapping by default.
+
+        Raises
+        ------
+        ParameterError
+            When no object has this name.
+        """
+        self.find("name", name)
+        found = self._examples.get(name, _Example()).example
+        return dict(found) if isinstance(found, Mapping) else found
+
+    def expected(self, name: str) -> Any:
+        """Return the known result of the example of an object, or None."""
+        return self._examples.get(name, _Example()).expected
 
     def _all(self) -> dict[str, T]:
         if not self._is_complete:

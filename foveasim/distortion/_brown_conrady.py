@@ -28,7 +28,9 @@ START_POINTS = 4097
 MAX_RADIUS = 100.0
 
 
-@LENSES.register("brown_conrady")
+@LENSES.register(
+    "brown_conrady", example={"focal_um": 60.0, "k1": -0.2, "k2": 0.05}, expected={(6.0, 0.0): (5.98803, 0.0)}
+)
 @dataclass(frozen=True, kw_only=True)
 class BrownConrady(LensBase):
     """

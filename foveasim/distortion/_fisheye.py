@@ -73,7 +73,11 @@ def _scale_radially(xy: Floats, radius: Floats, new_radius: Floats, slope: float
     return np.asarray(xy * scale[:, np.newaxis])
 
 
-@LENSES.register("fisheye")
+@LENSES.register(
+    "fisheye",
+    example={"projection": "equidistant", "focal_um": 60.0},
+    expected={(60.0, 0.0): (15.0 * math.pi, 0.0)},
+)
 @dataclass(frozen=True, kw_only=True)
 class Fisheye(_AngularLens):
     """
@@ -134,7 +138,11 @@ class Fisheye(_AngularLens):
         return 0.5 * math.pi - ANGLE_MARGIN_RAD
 
 
-@LENSES.register("polynomial_fisheye")
+@LENSES.register(
+    "polynomial_fisheye",
+    example={"k": [-0.1, 0.02, 0.0, 0.0], "focal_um": 60.0},
+    expected={(0.0, 60.0): (0.0, 15.0 * math.pi * (1.0 - 0.1 * (math.pi / 4.0) ** 2 + 0.02 * (math.pi / 4.0) ** 4))},
+)
 @dataclass(frozen=True, kw_only=True)
 class PolynomialFisheye(_AngularLens):
     """
@@ -191,7 +199,11 @@ class PolynomialFisheye(_AngularLens):
         return invert_monotonic(self._series, self._series.deriv(), height, self._max_angle_rad)
 
 
-@LENSES.register("scaramuzza")
+@LENSES.register(
+    "scaramuzza",
+    example={"a": [72.0, -0.004, 0.0, 0.0], "pixel_um": 1.0, "focal_um": 60.0},
+    expected={(600.0 / 71.6, 0.0): (10.0, 0.0)},
+)
 @dataclass(frozen=True, kw_only=True)
 class Scaramuzza(_AngularLens):
     """

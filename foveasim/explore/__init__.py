@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from foveasim._core.calls import publish
+from foveasim.explore import metrics  # noqa: F401 -- registers the metrics
 from foveasim.explore._metrics import METRICS, Metric, import_metric
 from foveasim.explore._schemas import schema_of
 from foveasim.explore.datasets.dataset import Dataset

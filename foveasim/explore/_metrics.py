@@ -1,4 +1,4 @@
-"""Registered metrics of a capture, and the lookup of metrics by name or function."""
+"""Registry of metrics of a capture, and the lookup of metrics by name or function."""
 
 from __future__ import annotations
 
@@ -8,18 +8,12 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from foveasim._core.names import possible_names
 from foveasim._core.registry import Registry
 from foveasim.camera import Camera
 from foveasim.capture import Capture
 from foveasim.config import Shot
 from foveasim.errors import ParameterError
-from foveasim.layout import Readout
-from foveasim.metrics import psnr_db
-from foveasim.reconstruct import Picture, raster_grid
-from foveasim.sensor import signal_to_noise
 
 __all__ = [
     "DEFAULT_METRICS",
@@ -37,8 +31,6 @@ Metric = Callable[[Shot, Camera, Capture], Any]
 
 #: Metrics by name. Installed packages add metrics as entry points of the group ``foveasim.metrics``.
 METRICS: Registry[Metric] = Registry("metric", "foveasim.metrics")
-#: Side of the compared pictures, pixels.
-PSNR_PIXELS = 256
 #: Variables and dimensions of results that are not metrics.
 RESERVED = ("seed", "error", "warning", "point", "repeat")
 #: Hint for functions that are not registered.
@@ -47,76 +39,9 @@ OTHER_METRICS = "pass other functions in Python, or with --metric module:functio
 DEFAULT_METRICS = ("mean_code_dn", "saturated_fraction", "snr", "n_sites")
 
 
-@METRICS.register("mean_code_dn")
-def mean_code_dn(shot: Shot, camera: Camera, capture: Capture) -> float:  # noqa: ARG001 -- the signature of metrics
-    """Return the mean code, DN."""
-    return float(np.mean(capture.code))
-
-
-@METRICS.register("saturated_fraction")
-def saturated_fraction(shot: Shot, camera: Camera, capture: Capture) -> float:  # noqa: ARG001
-    """Return the fraction of sites with the highest code."""
-    return capture.saturated_fraction
-
-
-@METRICS.register("snr")
-def snr(shot: Shot, camera: Camera, capture: Capture) -> dict[str, float]:
-    """
-    Compute the mean and median signal-to-noise ratio of the sites analytically.
-
-    The ratio is that of :func:`foveasim.sensor.signal_to_noise`: signal over temporal noise. Saturated sites are excluded; the
-    result is NaN when all sites are saturated.
-    """
-    sensor = camera.sensor
-    dark_e = sensor.expected_electrons(np.zeros(sensor.layout.n_sites), shot.exposure_s)
-    found = signal_to_noise(sensor, capture.expected_e, dark_e)
-    ratio = found.ratio[~found.is_saturated]
-    if not ratio.size:
-        return {"mean": float("nan"), "median": float("nan")}
-    return {"mean": float(ratio.mean()), "median": float(np.median(ratio))}
-
-
-@METRICS.register("n_sites")
-def n_sites(shot: Shot, camera: Camera, capture: Capture) -> int:  # noqa: ARG001
-    """Return the number of photosites of the layout."""
-    return capture.layout.n_sites
-
-
-@METRICS.register("data_rate_gbit_per_s")
-def data_rate_gbit_per_s(shot: Shot, camera: Camera, capture: Capture) -> float:
-    """
-    Return the data rate of one lane, Gbit/s.
-
-    The readout of the design rules determines the rate. Without a readout, one frame per exposure time is assumed.
-    """
-    if shot.rules is not None and shot.rules.readout is not None:
-        readout = shot.rules.readout
-    else:
-        readout = Readout(frames_per_s=1.0 / shot.exposure_s, bits=camera.sensor.bits)
-    return readout.gbit_per_s(capture.layout.n_sites)
-
-
-def ideal_picture(shot: Shot, camera: Camera) -> Picture:
-    """Return the noise-free picture of an ideal sensor for a scene, layout and exposure."""
-    grid = raster_grid(camera.sensor.layout, PSNR_PIXELS)
-    return camera.reference(shot.scene, grid, exposure_s=shot.exposure_s)
-
-
-@METRICS.register("psnr_db")
-def picture_psnr_db(shot: Shot, camera: Camera, capture: Capture, reference: Picture | None = None) -> float:
-    """
-    Compute the PSNR of the reconstructed picture against the ideal picture, dB.
-
-    Both are rasters of photoelectrons per µm²; the reference is that of :func:`ideal_picture`.
-    """
-    reference = ideal_picture(shot, camera) if reference is None else reference
-    picture = capture.picture(of="light_e", per="um2", grid=reference.grid, sensor=camera.sensor)
-    return psnr_db(picture, reference)
-
-
 #: Functions that compute the reference of a metric. It depends on the photoelectron rates of an ideal raster, exposure time and
 #: bit depth only, so captures share it.
-REFERENCES: dict[Callable[..., Any], Callable[[Shot, Camera], Any]] = {picture_psnr_db: ideal_picture}
+REFERENCES: dict[Callable[..., Any], Callable[[Shot, Camera], Any]] = {}
 
 
 def import_metric(name: str) -> Metric:

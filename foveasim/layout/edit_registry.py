@@ -24,7 +24,7 @@ def layout_edit(*, example: Mapping[str, Any], name: str | None = None) -> Calla
     Parameters
     ----------
     example : mapping
-        Parameters that are valid for a grid of 4 x 4 squares of 10 µm around the optical axis; used by the tests of all edits.
+        Parameters that are valid for a grid of 4 x 4 squares of 10 µm around the optical axis; used by the checks of all edits.
     name : str, optional
         Name of the edit; by default that of the function.
 
@@ -36,8 +36,7 @@ def layout_edit(*, example: Mapping[str, Any], name: str | None = None) -> Calla
     """
 
     def register(edit: E) -> E:
-        edit.example = dict(example)  # type: ignore[attr-defined]
-        EDITS.register(name or edit.__name__, edit)
+        EDITS.register(name or edit.__name__, edit, example=example)
         return edit
 
     return register

@@ -35,7 +35,7 @@ def layout_family(
     Parameters
     ----------
     example : mapping
-        Parameters of a small layout, used by the gallery and by the tests of all families.
+        Parameters of a small layout, used by the gallery and by the checks of all families.
     picture : str, optional
         Name of the parameter that is the path of a picture in settings files.
     solve_for : sequence of SolveFor
@@ -44,7 +44,7 @@ def layout_family(
 
     Notes
     -----
-    The decorated function has the attributes ``example``, ``picture`` and ``solve_for``. Parameters are recorded as plain
+    The decorated function has the attributes ``picture`` and ``solve_for``. Parameters are recorded as plain
     data. To record one in another form, a generator includes it in the ``"parameters"`` of its own provenance.
 
     Examples
@@ -86,9 +86,8 @@ def layout_family(
             parameters = {key: _to_plain(value) for key, value in given.arguments.items()} | own.pop("parameters", {})
             return layout.with_provenance({"generator": name, "parameters": parameters, **own})
 
-        family.example, family.picture = dict(example), picture  # type: ignore[attr-defined]
-        family.solve_for = tuple(solve_for)  # type: ignore[attr-defined]
-        return LAYOUTS.register(name, family)
+        family.picture, family.solve_for = picture, tuple(solve_for)  # type: ignore[attr-defined]
+        return LAYOUTS.register(name, family, example=example)
 
     return decorate
 

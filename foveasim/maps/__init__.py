@@ -32,7 +32,6 @@ from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import as_file_error, detect_format, select_writer
 from foveasim.errors import FileError, ParameterError, type_name
 from foveasim.fields import Pitch, PowerMap
-from foveasim.maps import _dataset, _exr, _fits, _isetcam, _npy, _tiff  # noqa: F401 -- they register their formats
 from foveasim.maps._common import Found, Given, to_power_map
 from foveasim.maps._formats import MAP_FORMATS, read_found
 from foveasim.maps._units import Unit

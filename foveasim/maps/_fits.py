@@ -65,7 +65,8 @@ def read(path: Path, name: str | None) -> Found:
     n_bytes = path.stat().st_size
     with (
         warnings.catch_warnings(),
-        fits.open(path, mode="readonly", memmap=False, disable_image_compression=True, lazy_load_hdus=True) as file,
+        path.open("rb") as binary,  # astropy does not close truncated files
+        fits.open(binary, mode="readonly", memmap=False, disable_image_compression=True, lazy_load_hdus=True) as file,
     ):
         warnings.simplefilter("ignore")  # warns about deviations from the standard
         hdu = _image(file, name)

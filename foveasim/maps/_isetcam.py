@@ -9,13 +9,29 @@ since November 2021; earlier versions used the image distance).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from foveasim._io.formats import FileFormat
-from foveasim._io.rasters.mat import MAT5_MAGIC, MAT73_MAGIC, IsetStruct, MatFile, find_struct, open_mat5, open_mat73
-from foveasim.fields import from_file_rows
+from foveasim._io.rasters.mat import (
+    MAT5_MAGIC,
+    MAT73_MAGIC,
+    IsetStruct,
+    MatFile,
+    find_struct,
+    open_mat5,
+    open_mat73,
+    write_mat5,
+    write_mat73,
+)
+from foveasim.fields import PowerMap, from_file_rows
 from foveasim.maps._common import Found
 from foveasim.maps._formats import MAP_FORMATS
+from foveasim.units import photon_energy_j
 
 __all__ = ["read_mat5", "read_mat73"]
 
@@ -58,7 +74,24 @@ def _pitch_um(image: IsetStruct) -> float | None:
     return 2.0 * focal_m * math.tan(math.radians(0.5 * angle_deg)) / image.photons.shape[1] * 1e6
 
 
-for _name, _magic, _reader in (("mat73", MAT73_MAGIC, read_mat73), ("mat", MAT5_MAGIC, read_mat5)):
+def _example(write: Callable[[Path, Mapping[str, Any]], None], path: Path) -> PowerMap:
+    """Write an optical image of 3 x 2 cells of 2 µm: 90 degrees, focal length 3 µm."""
+    waves_nm = np.array([500.0, 510.0])
+    photons = np.array([[[1, 2], [3, 4], [5, 6]], [[7, 8], [9, 10], [11, 12]]]) * 1e18
+    image = {"data": {"photons": photons}, "spectrum": {"wave": waves_nm[:, np.newaxis]}, "wAngular": 90.0}
+    write(
+        path, {"oi": {"type": "opticalimage", "optics": {"focalLength": 3e-6, "model": "diffractionlimited"}, **image}}
+    )
+    data_w_m2 = np.moveaxis(photons, 2, 0)[:, ::-1] * (10.0 * photon_energy_j(waves_nm))[:, np.newaxis, np.newaxis]
+    return PowerMap.from_array(data_w_m2, pitch_um=2.0, wavelength_nm=waves_nm)
+
+
+for _name, _magic, _reader, _writer in (
+    ("mat73", MAT73_MAGIC, read_mat73, write_mat73),
+    ("mat", MAT5_MAGIC, read_mat5, write_mat5),
+):
     MAP_FORMATS.register(
-        _name, FileFormat(title="MAT", suffixes=(".mat",), signatures=(_magic,), read=_reader, is_sandboxed=True)
+        _name,
+        FileFormat(title="MAT", suffixes=(".mat",), signatures=(_magic,), read=_reader, is_sandboxed=True),
+        example=partial(_example, _writer),
     )

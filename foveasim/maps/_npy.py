@@ -120,7 +120,16 @@ def _array(file: IO[bytes], size: int, n_bytes: int) -> NDArray[Any]:
     return read_array(file, size, check)
 
 
-MAP_FORMATS.register("npy", FileFormat(title="npy", suffixes=(".npy",), signatures=(NPY_MAGIC,), read=read_npy))
+def _example(path: Path) -> tuple[PowerMap, dict[str, Any]]:
+    """Write one band of 2 x 3 cells, bottom row first."""
+    values, metadata = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), {"pitch_um": 2.0, "wavelength_nm": 550.0}
+    np.save(path, values)
+    return PowerMap.from_array(values, **metadata), {**metadata, "unit": "w_m2"}  # type: ignore[arg-type]
+
+
+MAP_FORMATS.register(
+    "npy", FileFormat(title="npy", suffixes=(".npy",), signatures=(NPY_MAGIC,), read=read_npy), example=_example
+)
 MAP_FORMATS.register(
     "npz", FileFormat(title="npz", suffixes=(".npz",), signatures=ZIP_MAGICS, read=read_npz, write=write_npz)
 )

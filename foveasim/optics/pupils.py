@@ -26,7 +26,7 @@ from foveasim._core.validation import (
     finite_array,
     read_only,
 )
-from foveasim._io.images import read_picture
+from foveasim._io.images import read_picture, write_picture
 from foveasim.errors import ParameterError
 from foveasim.fields import from_file_rows
 from foveasim.optics._quadrature import PupilEdges
@@ -44,7 +44,7 @@ Pupil = Callable[[Floats, Floats, float], NDArray[Any]]
 PUPILS: Registry[Callable[..., Any]] = Registry("pupil", "foveasim.pupils")
 
 
-@PUPILS.register("annulus")
+@PUPILS.register("annulus", example={"obscuration": 0.4}, expected=0.84)
 @dataclass(frozen=True, slots=True)
 class Annulus(Declared):
     """
@@ -67,7 +67,7 @@ class Annulus(Declared):
         return PupilEdges(radii=[self.obscuration])
 
 
-@PUPILS.register("spider")
+@PUPILS.register("spider", example={"n_vanes": 3, "width_fraction": 0.1})
 @dataclass(frozen=True, slots=True)
 class Spider(Declared):
     """
@@ -102,7 +102,7 @@ class Spider(Declared):
         return PupilEdges(segments=np.concatenate([_rotated(vane, angle_deg) for angle_deg in directions]))
 
 
-@PUPILS.register("blades")
+@PUPILS.register("blades", example={"n_blades": 4, "angle_deg": 10.0}, expected=2.0 / np.pi)
 @dataclass(frozen=True, slots=True)
 class Blades(Declared):
     """
@@ -135,7 +135,7 @@ class Blades(Declared):
         return PupilEdges(segments=np.concatenate([_rotated(side, angle_deg) for angle_deg in directions]))
 
 
-@PUPILS.register("slit")
+@PUPILS.register("slit", example={"width_fraction": 0.4, "angle_deg": 30.0})
 @dataclass(frozen=True, slots=True)
 class Slit(Declared):
     """
@@ -163,7 +163,14 @@ class Slit(Declared):
         return PupilEdges(segments=_rotated(sides, self.angle_deg))
 
 
-@PUPILS.register("image")
+def _example_picture(directory: Path) -> dict[str, Any]:
+    """Write a picture with a bright left half and dark quarters on the right."""
+    path = directory / "pupil.png"
+    write_picture(path, np.array([[255, 0], [255, 128]], np.uint8))
+    return {"picture": str(path), "values": "power"}
+
+
+@PUPILS.register("image", example=_example_picture, expected=0.5 + 0.25 * 128.0 / 255.0)
 @dataclass(frozen=True, eq=False)
 class PupilImage:
     """

@@ -32,7 +32,7 @@ from foveasim._core.validation import (
 )
 from foveasim._io.encodings import Encoding, decode
 from foveasim._io.formats import as_file_error
-from foveasim._io.images import read_picture
+from foveasim._io.images import read_picture, write_picture
 from foveasim._io.mapped_files import check_unchanged, value_range
 from foveasim.errors import FileError, ParameterError, printable, type_name
 from foveasim.fields import from_file_rows
@@ -666,10 +666,33 @@ def band_widths_nm(wavelength_nm: Floats, band_width_nm: float | Sequence[float]
     return widths
 
 
-for _name, _scene in (
-    ("picture", Scene.from_picture),
-    ("flat", Scene.flat),
-    ("point_sources", Scene.point_sources),
-    ("cube", Scene.from_cube),
-):
-    SCENES.register(_name, _scene)
+#: Common parameters of the examples: the size of pixels, the distance, and one band.
+_GEOMETRY = {"pitch_um": 100.0, "distance_m": 1.0}
+_BAND = {"wavelength_nm": [550.0], "band_width_nm": 10.0}
+
+
+def _example_picture(directory: Path) -> dict[str, Any]:
+    """Write a picture with bright pixels at the upper left and below."""
+    path = directory / "picture.png"
+    write_picture(path, np.array([[255, 0, 0], [255, 0, 0], [255, 255, 0]], np.uint8))
+    return {"picture": str(path), "peak_radiance_w_m2_sr_nm": 0.02, **_BAND, **_GEOMETRY}
+
+
+def _example_cube(directory: Path) -> dict[str, Any]:
+    """Write an ENVI cube of two bands."""
+    np.array([[[3, 0, 0], [3, 3, 0]]] * 2, "<f4").tofile(directory / "cube.img")
+    entries = "samples = 3\nlines = 2\nbands = 2\ndata type = 4\ninterleave = bsq\nwavelength = {500, 600}\n"
+    (directory / "cube.hdr").write_text(f"ENVI\n{entries}", encoding="utf-8")
+    return {"path": str(directory / "cube.hdr"), "quantity": "radiance", "unit": "W/m2/sr/nm", **_GEOMETRY}
+
+
+SCENES.register("picture", Scene.from_picture, example=_example_picture, expected=("#..", "#..", "##."))
+_FLAT = {**_GEOMETRY, **_BAND, "shape": (4, 6), "radiance_w_m2_sr_nm": 0.02}
+SCENES.register("flat", Scene.flat, example=_FLAT, expected=("##", "##"))
+SCENES.register(
+    "point_sources",
+    Scene.point_sources,
+    example={**_GEOMETRY, **_BAND, "shape": (4, 6), "pixels": [(0, 0), (3, 0), (3, 5)], "intensity_w_sr_nm": 1e-9},
+    expected=("#....#", "......", "......", "#....."),
+)
+SCENES.register("cube", Scene.from_cube, example=_example_cube, expected=("#..", "##."))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from foveasim._core.registry import Registry
 
-__all__ = ["SCENES", "chart"]
+__all__ = ["EXAMPLE_PICTURE", "SCENES", "chart"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -29,11 +29,20 @@ PICTURE_PARAMETERS = """shape : (n_y, n_x)
         Widths of the bands; by default bands extend halfway to the adjacent wavelengths. Required for one wavelength."""
 
 
-def chart(name: str) -> Callable[[F], F]:
-    """Register a chart function and insert the common parameters into its docstring."""
+#: Common parameters of the examples of charts: 80 x 60 pixels of 0.1 mm.
+EXAMPLE_PICTURE = {"shape": (60, 80), "pitch_um": 100.0, "distance_m": 1.0, "band_width_nm": 10.0}
+
+
+def chart(name: str, *, example: Mapping[str, Any], expected: Sequence[str]) -> Callable[[F], F]:
+    """
+    Register a chart function and insert the common parameters into its docstring.
+
+    The example is completed by :data:`EXAMPLE_PICTURE` and a radiance.
+    """
 
     def decorate(function: F) -> F:
         function.__doc__ = (function.__doc__ or "").replace("{picture}", PICTURE_PARAMETERS)
-        return SCENES.register(name, function)  # type: ignore[return-value]
+        complete = {**EXAMPLE_PICTURE, "radiance_w_m2_sr_nm": 2.0, **example}
+        return SCENES.register(name, function, example=complete, expected=expected)  # type: ignore[return-value]
 
     return decorate

@@ -141,7 +141,7 @@ def test_identity_is_constant_during_use():
 
 
 def test_package_metrics_are_identified_by_name():
-    assert identify(explore.METRICS["snr"]) == "foveasim.explore._metrics:snr"
+    assert identify(explore.METRICS["snr"]) == "foveasim.explore.metrics.snr:snr"
 
 
 @pytest.mark.parametrize(

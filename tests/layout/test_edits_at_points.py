@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 import foveasim as fs
 from foveasim.errors import FoveasimError, GeometryError, ParameterError
 from foveasim.layout import EDITS
+from foveasim.testing._extension import shot_with
 
 GRID = fs.layout.mosaic(fs.layout.grid(n_x=4, n_y=4, pitch_um=10.0), ["RG", "GB"])
 RINGS = fs.layout.log_polar(n_sectors=24, r_min_um=4.0, r_max_um=33.0, stagger=True)
@@ -20,43 +21,22 @@ def overlap_um2(layout):
     return layout.area_um2.sum() - shapely.union_all(layout.polygons()).area
 
 
-@pytest.mark.parametrize("name", list(EDITS))
-def test_edit_returns_layout_with_step(name):
-    before = GRID.xy_um.copy()
-    edited = EDITS[name](GRID, **EDITS[name].example)
+def test_edits_with_objects_equal_settings():
+    parameters = {"n_x": 2, "n_y": 1, "pitch_um": 8.0}
+    for name, called, setting in (
+        ("repair", {"rules": fs.DesignRules(min_size_um=5.0)}, {"rules": {"min_size_um": 5.0}}),
+        (
+            "overlay",
+            {"layer": fs.layout.grid(**parameters)},
+            {"layer": {"generator": "grid", "parameters": parameters}},
+        ),
+    ):
+        further = {"operation": "replace", "margin_um": 1.0} if name == "overlay" else {}
+        shot = shot_with("layout", {"mosaic": ["RG", "GB"], "edits": [{"kind": name, **setting, **further}]})
+        edited = EDITS[name](GRID, **called, **further)
 
-    assert edited.n_sites > 0
-    assert edited.channel.shape == (edited.n_sites,)
-    assert name in ("repair", "merge_small") or len(edited.provenance["steps"]) > len(GRID.provenance["steps"])
-    assert np.array_equal(GRID.xy_um, before)
-
-
-@pytest.mark.parametrize("name", list(EDITS))
-def test_edit_of_settings_equals_call(name):
-    section = {"generator": "grid", "parameters": {"n_x": 4, "n_y": 4, "pitch_um": 10.0}, "mosaic": ["RG", "GB"]}
-    example = dict(EDITS[name].example)
-    if "layer" in example:
-        example["layer"] = fs.layout.grid(n_x=2, n_y=1, pitch_um=8.0)
-    plain = {
-        "rules": {"min_size_um": 5.0},
-        "layer": {"generator": "grid", "parameters": {"n_x": 2, "n_y": 1, "pitch_um": 8.0}},
-    }
-    edit = {"kind": name, **{key: plain.get(key, value) for key, value in example.items()}}
-    scene = {"kind": "flat", "radiance_w_m2_sr_nm": 0.02, "shape": [32, 32], "pitch_um": 500.0, "distance_m": 1.0}
-    shot = fs.config.build_shot(
-        None,
-        {
-            "scene": {**scene, "wavelength_nm": 550.0, "band_width_nm": 50.0},
-            "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
-            "layout": {**section, "edits": [edit]},
-            "sensor": {"filters": "rgb"},
-            "exposure_s": 0.01,
-        },
-    )
-    called = EDITS[name](GRID, **example)
-
-    assert np.array_equal(shot.camera.sensor.layout.xy_um, called.xy_um)
-    assert np.array_equal(shot.camera.sensor.layout.channel, called.channel)
+        assert np.array_equal(shot.camera.sensor.layout.xy_um, edited.xy_um)
+        assert np.array_equal(shot.camera.sensor.layout.channel, edited.channel)
 
 
 def test_removed_sites_leave_others_unchanged():

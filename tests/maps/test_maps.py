@@ -21,6 +21,7 @@ import tifffile
 import foveasim as fs
 from foveasim import maps
 from foveasim._io import sandbox
+from foveasim._io.rasters.mat import write_mat73
 from foveasim._io.rasters.units import length_in_um
 from foveasim.errors import FileError, ParameterError
 from foveasim.maps import _dataset, from_xarray, read_power_map, to_xarray, write_power_map
@@ -625,30 +626,10 @@ def optical_image(photons, wave, **changes):
     }
 
 
-def save_v73(path, tree):
-    """Write a MAT file of version 7.3 as MATLAB: reversed axes, text as numbers, a header before the HDF5 data."""
-
-    def fill(group, values):
-        for name, value in values.items():
-            if isinstance(value, dict):
-                fill(group.create_group(name), value)
-            elif isinstance(value, str):
-                group[name] = np.array([[ord(c)] for c in value], np.uint16)
-                group[name].attrs["MATLAB_class"] = np.bytes_("char")
-            else:
-                group[name] = np.atleast_2d(value).T
-                group[name].attrs["MATLAB_class"] = np.bytes_("double")
-
-    with h5py.File(path, "w", userblock_size=512) as file:
-        fill(file, tree)
-    with path.open("r+b") as file:
-        file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
-
-
 SAVERS = {
     "v7": lambda path, tree: scipy.io.savemat(path, tree, do_compression=True),
     "v6": scipy.io.savemat,
-    "v7.3": save_v73,
+    "v7.3": write_mat73,
 }
 
 
@@ -1210,7 +1191,7 @@ def valid_files(tmp_path_factory):
     np.save(directory / "map.npy", random_map().data[0])
     tree = {"oi": optical_image(np.ones((4, 6)), [550.0])}
     scipy.io.savemat(directory / "map.mat", tree)
-    save_v73(directory / "map.mat73", tree)
+    write_mat73(directory / "map.mat73", tree)
     files = {path.suffix[1:]: path.read_bytes() for path in directory.iterdir()}
     files["fits"] = files["fits"].rstrip(b"\0")  # truncated padding of the last block would not be an error
     return files

@@ -1,8 +1,8 @@
 """
 Features of the package as axes of a table, and settings of a shot with one feature of each axis.
 
-Every feature is a piece of a settings file. Names of layouts, edits, charts, pupils and lens models come from the registries, so
-that an entry without an example here or in the registry fails.
+Every feature is a piece of a settings file. Names and examples of layouts, edits, charts, pupils and lens models come from the
+registries.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ BASE = {
     "exposure_s": EXPOSURE_S,
     "seed": 5,
 }
-#: Scenes: the arguments that differ from those of all of them.
+#: Scenes: their geometry, and arguments instead of those of the examples, whose sizes in mm are smaller.
 GEOMETRY = {"pitch_um": PITCH_UM, "distance_m": DISTANCE_M}
 CHART = GEOMETRY | {"shape": list(SHAPE)}
 RADIANCE = {"radiance_w_m2_sr_nm": [0.03, 0.05, 0.04], "wavelength_nm": [450.0, 550.0, 620.0], "band_width_nm": 60.0}
@@ -59,24 +59,6 @@ SCENE_ARGUMENTS: dict[str, dict[str, Any]] = {
     "zone_plate": CHART | GREY | {"line_pairs_per_mm": 0.2},
     "siemens_star": CHART | RADIANCE,
 }
-PUPIL_ARGUMENTS: dict[str, dict[str, Any]] = {
-    "annulus": {"obscuration": 0.4},
-    "spider": {"n_vanes": 3, "width_fraction": 0.1},
-    "blades": {"n_blades": 5, "angle_deg": 10.0},
-    "slit": {"width_fraction": 0.4, "angle_deg": 30.0},
-    "image": {"picture": "pupil.png"},
-}
-LENS_ARGUMENTS: dict[str, dict[str, Any]] = {
-    "brown_conrady": {"focal_um": IMAGE_UM, "k1": -0.2, "k2": 0.05, "centre_um": CENTRE_UM},
-    "fisheye": {"projection": "equidistant", "focal_um": IMAGE_UM, "centre_um": CENTRE_UM},
-    "polynomial_fisheye": {"k": [-0.1, 0.02, 0.0, 0.0], "focal_um": IMAGE_UM, "centre_um": CENTRE_UM},
-    "scaramuzza": {
-        "a": [1.2 * IMAGE_UM, -0.004, 0.0, 0.0],
-        "pixel_um": 1.0,
-        "focal_um": IMAGE_UM,
-        "centre_um": CENTRE_UM,
-    },
-}
 #: Parameters of generators and edits in files that differ from those in Python.
 LAYOUT_FILE_ARGUMENTS = {
     "grid": {"stagger": False, "trench_um": 0.0},
@@ -96,6 +78,15 @@ EDIT_FILE_ARGUMENTS: dict[str, dict[str, Any]] = {
 }
 
 
+#: Position of all lens models; lengths in their examples are for a focal length of 60 µm.
+LENS = {"focal_um": IMAGE_UM, "centre_um": CENTRE_UM}
+
+
+def pupil_arguments(name):
+    """Return the example of a pupil, with a picture in the directory of :func:`write_files`."""
+    return {"picture": "pupil.png"} if name == "image" else PUPILS.example(name)
+
+
 def plain(value):
     """Return settings with lists instead of tuples and arrays."""
     if isinstance(value, dict):
@@ -110,10 +101,10 @@ def layouts():
         name: {
             "layout": {
                 "generator": name,
-                "parameters": plain({**family.example, **LAYOUT_FILE_ARGUMENTS.get(name, {})}),
+                "parameters": plain({**LAYOUTS.example(name), **LAYOUT_FILE_ARGUMENTS.get(name, {})}),
             }
         }
-        for name, family in LAYOUTS.items()
+        for name in LAYOUTS
     }
 
 
@@ -125,8 +116,8 @@ def edits():
     return {
         "none": {},
         **{
-            name: {"layout": {"edits": [{"kind": name, **plain(EDIT_FILE_ARGUMENTS.get(name, edit.example))}]}}
-            for name, edit in EDITS.items()
+            name: {"layout": {"edits": [{"kind": name, **plain(EDIT_FILE_ARGUMENTS.get(name, EDITS.example(name)))}]}}
+            for name in EDITS
             if name not in COLOUR_EDITS
         },
     }
@@ -165,10 +156,13 @@ def own(name, **values):
 def axes():
     """Return the features of each axis, as settings by name."""
     return {
-        "scene": {name: {"scene": {"kind": name, **SCENE_ARGUMENTS[name]}} for name in SCENES},
+        "scene": {
+            name: {"scene": {"kind": name, **(SCENE_ARGUMENTS.get(name) or plain(SCENES.example(name)) | GEOMETRY)}}
+            for name in SCENES
+        },
         "optics": {
             "circle": {},
-            **{name: {"optics": {"pupil": {"kind": name, **PUPIL_ARGUMENTS[name]}}} for name in PUPILS},
+            **{name: {"optics": {"pupil": {"kind": name, **pupil_arguments(name)}}} for name in PUPILS},
             "zernike": {"optics": {"zernike": {"coefficients": {4: 0.1, 7: 0.15}}}},
             "seidel": {"optics": {"seidel": {"coma_um": 0.4}, "field_patches": 2}},
             "lateral_colour": {
@@ -180,7 +174,7 @@ def axes():
         },
         "distortion": {
             "none": {},
-            **{name: {"distortion": {"kind": name, **LENS_ARGUMENTS[name]}} for name in LENSES},
+            **{name: {"distortion": {"kind": name, **LENSES.example(name), **LENS}} for name in LENSES},
         },
         "order": {"auto": {}, "1": {"integration_order": 1}, "2": {"integration_order": 2}},
         "layout": layouts(),

@@ -18,6 +18,7 @@ import scipy.constants
 import scipy.io
 
 import foveasim as fs
+from foveasim._io.rasters.mat import write_mat73
 from foveasim.config import read_shot, schema
 from foveasim.errors import ConfigError, FileError, FoveasimWarning, ParameterError
 from foveasim.scene import CUBE_FORMATS, Scene
@@ -628,30 +629,10 @@ def test_bad_labelled_cubes_give_one_line(tmp_path, change, match):
     assert_rejected(tmp_path / "cube.nc", match)
 
 
-def save_v73(path, tree):
-    """Write a MAT file of version 7.3 as MATLAB: reversed axes, text as numbers, a header before the HDF5 data."""
-
-    def fill(group, values):
-        for name, value in values.items():
-            if isinstance(value, dict):
-                fill(group.create_group(name), value)
-            elif isinstance(value, str):
-                group[name] = np.array([[ord(c)] for c in value], np.uint16)
-                group[name].attrs["MATLAB_class"] = np.bytes_("char")
-            else:
-                group[name] = np.atleast_2d(value).T
-                group[name].attrs["MATLAB_class"] = np.bytes_("double")
-
-    with h5py.File(path, "w", userblock_size=512) as file:
-        fill(file, tree)
-    with path.open("r+b") as file:
-        file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
-
-
 SAVERS = {
     "v7": lambda path, tree: scipy.io.savemat(path, tree, do_compression=True),
     "v6": scipy.io.savemat,
-    "v7.3": save_v73,
+    "v7.3": write_mat73,
 }
 
 

@@ -17,6 +17,7 @@ from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import grid
 from foveasim.sensor import Sensor, effects, noise_budget, signal_to_noise
 from foveasim.sensor.effects import AdditiveNoise, Effect, FixedFactor, FixedOffset, ShotNoise, Sites
+from foveasim.testing import check_sensor_effect
 
 SIGMAS = 5.0
 N = 40_000
@@ -72,28 +73,15 @@ class Hum(Effect):
 
 
 #: Keywords that enable a single effect, by its name.
-CASES = {
-    "shot": {},
-    "prnu": {"prnu_fraction": 0.02},
-    "dead": {"dead_fraction": 0.1},
-    "dsnu": {"dark_e_per_s": 4000.0, "dsnu_fraction": 0.3},
-    "hot": {"hot_fraction": 0.05, "hot_e_per_s": 3000.0},
-    "reset": {"ktc_noise": True},
-    "read": {"read_noise_e": np.linspace(5.0, 20.0, N)},
-    "rts": {"rts_fraction": 0.3, "rts_e": 60.0},
-    "gain_fpn": {"gain_fpn_fraction": 0.02},
-    "pixel_fpn": {"pixel_fpn_fraction": 1e-3},
-    "column_fpn": {"line_fpn_fraction": 1e-3},
-    "flicker": {"effects": [LampFlicker()]},
-    "shading": {"effects": [LensShading()]},
-    "hum": {"effects": [Hum()]},
+CASES = {effect.name: effect.example for effect in (*effects.STANDARD, ShotNoise)} | {
+    effect.name: {"effects": [effect]} for effect in (LampFlicker(), LensShading(), Hum())
 }
 every_effect = pytest.mark.parametrize("name", CASES)
 
 
 def make_sensor(name="", *, shot_noise="off", **more):
     keywords = CASES.get(name, {})
-    return Sensor(ROW, **FINE, **{"shot_noise": "auto" if name == "shot" else shot_noise, **keywords, **more})
+    return Sensor(ROW, **FINE, **{"shot_noise": shot_noise, **keywords, **more})
 
 
 def codes(sensor, frame=0, seed=1):
@@ -102,60 +90,16 @@ def codes(sensor, frame=0, seed=1):
     return sensor.read(sensor.collect(expected_e, streams=streams), streams=streams).astype(float)
 
 
-def assert_moments(draws, mean, variance):
-    """Check mean and variance over sites to five standard errors, with a tolerance for rounding to codes."""
-    z = (draws - mean) / np.sqrt(variance)
-    rounding = 0.25 / np.min(variance)
-    assert abs(z.mean()) < SIGMAS * z.std() / np.sqrt(z.size) + 0.1 * np.sqrt(rounding)
-    assert abs(np.mean(z**2) - 1.0) < SIGMAS * np.std(z**2) / np.sqrt(z.size) + rounding
-
-
-def test_every_standard_effect_is_tested():
-    assert {effect.name for effect in effects.STANDARD} <= set(CASES)
-
-
 @every_effect
 def test_draws_moments_and_budget_agree(name):
-    quiet, noisy = make_sensor(), make_sensor(name)
-    (effect,) = (e for e in noisy.chain if e.name == name)
-    dark_e = float(np.mean(noisy.nominal_dark_e_per_s)) * EXPOSURE_S
-    sites = noisy.sites if effect.is_temporal else noisy.sites.without_device()
-    e_per_unit = {"photo": EXPOSURE_S, "dark": EXPOSURE_S, "sense_node": 65_536 / 3.0, "output": 65_536 / 3.0}
-    unit = 1.0 / e_per_unit.get(effect.stage, 1.0)
-    nominal = {"photo": PHOTO_E, "dark": dark_e}.get(effect.stage, PHOTO_E + dark_e)
-    nominal_unit = nominal * unit + (FINE["pedestal_v"] if effect.stage == "output" else 0.0)
-    mean, variance = effect.moments(np.full(N, nominal_unit), np.zeros(N), sites=sites)
-    shift_e, variance_e2 = (mean - nominal_unit) / unit, variance / unit**2
-    drawn_e = codes(noisy) - np.mean(codes(quiet)) - dark_e
-
-    budget = noise_budget(noisy, np.full(N, PHOTO_E / EXPOSURE_S), EXPOSURE_S)
-    lines = ("photon_shot", "dark_shot") if name == "shot" else (name,)
-    line_e = np.sqrt(sum(budget[line] ** 2 for line in lines))
-
-    np.testing.assert_allclose(line_e, np.hypot(np.sqrt(variance_e2), shift_e), rtol=1e-6)
-    shift_e, variance_e2 = (np.broadcast_to(part, N) for part in (shift_e, variance_e2))
-    some = variance_e2 > 0.0
-    assert_moments(drawn_e[some], shift_e[some], variance_e2[some])
-    assert np.ptp(drawn_e[~some]) <= 1.0 if (~some).any() else name != "rts"
-
-
-@every_effect
-def test_prediction_agrees_with_draws(name):
-    sensor = make_sensor(name, shot_noise="auto")
-    expected_e = sensor.expected_electrons(np.full(N, PHOTO_E / EXPOSURE_S), EXPOSURE_S)
-
-    mean_dn, variance_dn2 = sensor.predict(expected_e)
-
-    some = variance_dn2 > 0.0
-    assert_moments(codes(sensor)[some], mean_dn[some], variance_dn2[some])
-    assert np.array_equal(codes(sensor)[~some], mean_dn[~some])
+    check_sensor_effect(name, CASES[name])
 
 
 @every_effect
 def test_disabled_effect_leaves_other_draws(name):
     everything = {key: value for case in CASES.values() for key, value in case.items()}
     everything["effects"] = [LampFlicker(), LensShading(), Hum()]
-    sensor = make_sensor(shot_noise="auto", **everything)
+    sensor = make_sensor(**everything)
     without = sensor.without(name)
 
     assert [e.name for e in without.chain if e.name != "shot"] == [
@@ -170,7 +114,7 @@ def test_disabled_effect_leaves_other_draws(name):
             if e.name == effect.name and e.name != name
         ]
         assert all(np.array_equal(drawn[0], other) for other in drawn)
-    alone = make_sensor(shot_noise="off", **CASES[name]) if name != "shot" else make_sensor("shot")
+    alone = make_sensor(name)
     assert not np.array_equal(codes(alone), codes(alone.without(name)))
 
 

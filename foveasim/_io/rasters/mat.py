@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
@@ -24,7 +24,17 @@ from foveasim._core.names import possible_names
 from foveasim._io.formats import FormatError
 from foveasim._io.rasters import check_size, max_decompressed_bytes
 
-__all__ = ["MAT5_MAGIC", "MAT73_MAGIC", "IsetStruct", "MatFile", "find_struct", "open_mat5", "open_mat73"]
+__all__ = [
+    "MAT5_MAGIC",
+    "MAT73_MAGIC",
+    "IsetStruct",
+    "MatFile",
+    "find_struct",
+    "open_mat5",
+    "open_mat73",
+    "write_mat5",
+    "write_mat73",
+]
 
 MAT5_MAGIC, MAT73_MAGIC = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
 #: Fields of ISETCam structs with photons and wavelengths.
@@ -251,3 +261,33 @@ def _inflate(file: IO[bytes], length: int, max_bytes: int) -> bytes:
             size += len(parts[-1])
             compressed = inflater.unconsumed_tail
     return b"".join(parts)
+
+
+def write_mat5(path: Path, tree: Mapping[str, Any]) -> None:
+    """Write a MAT file of version 5."""
+    from scipy.io import savemat
+
+    savemat(path, dict(tree))
+
+
+def write_mat73(path: Path, tree: Mapping[str, Any]) -> None:
+    """
+    Write numbers, strings and mappings as MATLAB does.
+
+    Axes are reversed, text is stored as numbers, and a header precedes the HDF5 data.
+    """
+    h5py = import_optional(path, "h5py", "maps")
+
+    def fill(group: Any, values: Mapping[str, Any]) -> None:
+        for name, value in values.items():
+            if isinstance(value, Mapping):
+                fill(group.create_group(name), value)
+                continue
+            is_text = isinstance(value, str)
+            group[name] = np.array([[ord(c)] for c in value], np.uint16) if is_text else np.atleast_2d(value).T
+            group[name].attrs["MATLAB_class"] = np.bytes_("char" if is_text else "double")
+
+    with h5py.File(path, "w", userblock_size=512) as file:
+        fill(file, tree)
+    with path.open("r+b") as binary:
+        binary.write((MAT73_MAGIC + b", Platform: GLNXA64").ljust(124) + b"\x00\x02IM")

@@ -18,7 +18,7 @@ from foveasim._core.threads import cached_property, parallel_map, thread_count
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.layout._noding import node_edges
 from foveasim.layout.adjacency import TOUCHING_UM
-from foveasim.layout.drc.routing import track_demand
+from foveasim.layout.drc.routing import Readout, Routing, track_demand
 from foveasim.layout.model import Layout
 
 if TYPE_CHECKING:
@@ -559,79 +559,133 @@ def _track_utilisations(case: Case) -> Measurement:
 #: Rules by name. The built-in rules are fields of :class:`foveasim.layout.DesignRules`. Limits of other rules, registered by
 #: programs or by installed packages (entry points of the group ``foveasim.rules``), are set with its parameter ``custom``.
 RULES: Registry[Rule] = Registry("design rule", "foveasim.rules")
-for _name, _rule in {
-    "min_size_um": Rule(
-        "the size of a site, the square root of its area, is at least the limit", "µm", _sizes, repair="merge"
+
+
+def _rectangles(*bounds_um: tuple[float, float, float, float], **columns: Any) -> Callable[[], Layout]:
+    """Return a function that returns a layout of rectangles (x_min, y_min, x_max, y_max)."""
+    return lambda: Layout.from_polygons(list(shapely.box(*np.transpose(bounds_um))), **columns)
+
+
+def _frame() -> Layout:
+    """Return a square with a hole of 4 µm²."""
+    return Layout.from_polygons([shapely.box(0.0, 0.0, 9.0, 9.0).difference(shapely.box(3.0, 3.0, 5.0, 5.0))])
+
+
+#: Layouts of examples: sizes 10 and 20 µm in two rings; 16 squares of 8 µm at a pitch of 10 µm; eight squares around a gap.
+_GROWING = _rectangles((0.0, 0.0, 10.0, 10.0), (10.0, 0.0, 30.0, 20.0), ring=[0, 1])
+_SPACED = _rectangles(*((x, y, x + 8.0, y + 8.0) for x in range(0, 40, 10) for y in range(0, 40, 10)))
+_HOLLOW = _rectangles(
+    *((x, y, x + 10.0, y + 10.0) for x in range(0, 30, 10) for y in range(0, 30, 10) if x != 10 or y != 10)
+)
+_WINDOWS = {"layout": _SPACED, "density_window_um": 10.0, "die_um": (-1.0, -1.0, 39.0, 39.0)}
+
+for _name, _rule, _satisfied, _violated, _further in (
+    (
+        "min_size_um",
+        Rule("the size of a site, the square root of its area, is at least the limit", "µm", _sizes, repair="merge"),
+        10.0, 10.1, {},
     ),
-    "max_size_um": Rule(
-        "the size of a site, the square root of its area, is at most the limit", "µm", _sizes, is_upper=True
+    (
+        "max_size_um",
+        Rule("the size of a site, the square root of its area, is at most the limit", "µm", _sizes, is_upper=True),
+        10.0, 9.9, {},
     ),
-    "min_area_um2": Rule("the area of a site is at least the limit", "µm²", _areas, repair="merge"),
-    "min_hole_um2": Rule("the area of a hole in a site is at least the limit", "µm²", _holes),
-    "min_width_um": Rule("the width of a site is at least the limit", "µm", _widths, repair="merge"),
-    "min_space_um": Rule("the space between sites that do not touch is at least the limit", "µm", _spaces),
-    "max_aspect_ratio": Rule("the aspect ratio of a site is at most the limit", "", _aspect_ratios, is_upper=True),
-    "min_angle_deg": Rule("the interior angle of a corner is at least the limit", "degrees", _corner_angles),
-    "edge_angle_step_deg": Rule(
-        "edge angles are multiples of the limit",
-        "degrees",
-        _edge_angles,
-        is_upper=True,
-        is_deviation=True,
-        rounding=1e-4,
+    ("min_area_um2", Rule("the area of a site is at least the limit", "µm²", _areas, repair="merge"), 100.0, 101.0, {}),
+    ("min_hole_um2", Rule("the area of a hole in a site is at least the limit", "µm²", _holes), 4.0, 4.1, {"layout": _frame}),
+    ("min_width_um", Rule("the width of a site is at least the limit", "µm", _widths, repair="merge"), 10.0, 10.1, {}),
+    (
+        "min_space_um",
+        Rule("the space between sites that do not touch is at least the limit", "µm", _spaces),
+        2.0, 2.1, {"layout": _SPACED},
     ),
-    "grid_um": Rule("vertices lie on the manufacturing grid", "µm", _grid_deviations, is_upper=True, is_deviation=True),
-    "max_overlap_um2": Rule(
-        "the overlap of two sites is at most the limit", "µm²", _overlaps, is_upper=True, rounding=0.0
+    (
+        "max_aspect_ratio",
+        Rule("the aspect ratio of a site is at most the limit", "", _aspect_ratios, is_upper=True),
+        2.0, 1.9, {"layout": _rectangles((0.0, 0.0, 10.0, 20.0))},
     ),
-    "max_gap_um2": Rule(
-        "the area of a gap is at most the limit", "µm²", _gaps, is_upper=True, rounding=0.0, repair=None
+    ("min_angle_deg", Rule("the interior angle of a corner is at least the limit", "degrees", _corner_angles), 90.0, 91.0, {}),
+    (
+        "edge_angle_step_deg",
+        Rule(
+            "edge angles are multiples of the limit", "degrees", _edge_angles,
+            is_upper=True, is_deviation=True, rounding=1e-4,
+        ),
+        90.0, 50.0, {},
     ),
-    "die_um": Rule("sites lie within the die", "µm", _reach_beyond_die, is_upper=True, is_deviation=True),
-    "min_growth": Rule("the size ratio of successive rings is at least the limit", "", _growths, repair=None),
-    "max_growth": Rule(
-        "the size ratio of successive rings is at most the limit", "", _growths, is_upper=True, repair=None
+    (
+        "grid_um",
+        Rule("vertices lie on the manufacturing grid", "µm", _grid_deviations, is_upper=True, is_deviation=True),
+        10.0, 3.0, {},
     ),
-    "max_neighbour_ratio": Rule(
-        "the size ratio of neighbouring sites is at most the limit",
-        "",
-        _neighbour_ratios,
-        is_upper=True,
-        rounding=1e-9,
-        repair=None,
+    (
+        "max_overlap_um2",
+        Rule("the overlap of two sites is at most the limit", "µm²", _overlaps, is_upper=True, rounding=0.0),
+        4.0, 3.9, {"layout": _rectangles((0.0, 0.0, 10.0, 10.0), (8.0, 8.0, 20.0, 20.0))},
     ),
-    "max_sites": Rule(
-        "the number of sites is at most the limit", "", _counts, is_upper=True, rounding=0.0, repair=None
+    (
+        "max_gap_um2",
+        Rule("the area of a gap is at most the limit", "µm²", _gaps, is_upper=True, rounding=0.0, repair=None),
+        101.0, 99.0, {"layout": _HOLLOW},
     ),
-    "min_density": Rule(
-        "the fill factor of every window is at least the limit", "", _densities, rounding=AREA_ROUNDING, repair=None
+    (
+        "die_um",
+        Rule("sites lie within the die", "µm", _reach_beyond_die, is_upper=True, is_deviation=True),
+        (-20.0, -20.0, 20.0, 20.0), (-20.0, -20.0, 20.0, 19.0), {},
     ),
-    "max_density": Rule(
-        "the fill factor of every window is at most the limit",
-        "",
-        _densities,
-        is_upper=True,
-        rounding=AREA_ROUNDING,
-        repair=None,
+    (
+        "min_growth",
+        Rule("the size ratio of successive rings is at least the limit", "", _growths, repair=None),
+        2.0, 2.1, {"layout": _GROWING},
     ),
-    "max_data_rate_gbit_per_s": Rule(
-        "the data rate of a lane is at most the limit",
-        "Gbit/s",
-        _data_rates,
-        is_upper=True,
-        rounding=0.0,
-        repair=None,
+    (
+        "max_growth",
+        Rule("the size ratio of successive rings is at most the limit", "", _growths, is_upper=True, repair=None),
+        2.0, 1.9, {"layout": _GROWING},
     ),
-    "max_track_utilisation": Rule(
-        "the number of readout lines per track is at most the limit",
-        "",
-        _track_utilisations,
-        is_upper=True,
-        rounding=0.0,
-        repair=None,
+    (
+        "max_neighbour_ratio",
+        Rule(
+            "the size ratio of neighbouring sites is at most the limit", "", _neighbour_ratios,
+            is_upper=True, rounding=1e-9, repair=None,
+        ),
+        2.0, 1.9, {"layout": _GROWING},
     ),
-}.items():
-    RULES.register(_name, _rule)
+    (
+        "max_sites",
+        Rule("the number of sites is at most the limit", "", _counts, is_upper=True, rounding=0.0, repair=None),
+        16, 15, {},
+    ),
+    (
+        "min_density",
+        Rule("the fill factor of every window is at least the limit", "", _densities, rounding=AREA_ROUNDING, repair=None),
+        0.63, 0.65, _WINDOWS,
+    ),
+    (
+        "max_density",
+        Rule(
+            "the fill factor of every window is at most the limit", "", _densities,
+            is_upper=True, rounding=AREA_ROUNDING, repair=None,
+        ),
+        0.65, 0.63, _WINDOWS,
+    ),
+    (
+        "max_data_rate_gbit_per_s",
+        Rule(
+            "the data rate of a lane is at most the limit", "Gbit/s", _data_rates,
+            is_upper=True, rounding=0.0, repair=None,
+        ),
+        0.161, 0.159, {"readout": Readout(frames_per_s=1e6, bits=10)},
+    ),
+    (
+        "max_track_utilisation",
+        Rule(
+            "the number of readout lines per track is at most the limit", "", _track_utilisations,
+            is_upper=True, rounding=0.0, repair=None,
+        ),
+        0.5, 0.4, {"routing": Routing(width_um=3.0, space_um=2.0, direction="upwards")},
+    ),
+):  # fmt: skip
+    RULES.register(_name, _rule, example={"satisfied": _satisfied, "violated": _violated, **_further})
 
 
 def is_below_size(area_um2: Floats, min_size_um: float) -> Bools:

@@ -24,8 +24,8 @@ from typing import Any, Literal, TypeAlias
 
 from foveasim._core.calls import OwnCheck
 from foveasim._core.registry import import_all
-from foveasim._io.formats import FileFormat, detect_format, select_writer, validate_options
-from foveasim.errors import FileError
+from foveasim._io.formats import FileFormat, as_file_error, detect_format, select_writer, validate_options
+from foveasim.errors import FileError, FoveasimError
 from foveasim.layout.files._bundled import bundled_layouts, layout_path
 from foveasim.layout.files._common import FORMATS, WrittenLayout
 from foveasim.layout.files._derived import DERIVED_LAYERS, LayoutLayer
@@ -119,8 +119,9 @@ def read_layout(
     given = {"layer": layer, "cell": cell, "layers": layers, "channels": channels, "filter_names": filter_names}
     given["invalid"] = invalid
     chosen = validate_options(given | options, found.read_options, FORMATS, "read_options")
-    layout: Layout = found.read(path, **chosen)
-    return layout
+    with as_file_error(path, f"{found.title} layout", passes=(FoveasimError,)):
+        layout: Layout = found.read(path, **chosen)
+        return layout
 
 
 def check_no_options(**options: object) -> None:

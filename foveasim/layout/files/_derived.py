@@ -92,13 +92,13 @@ DerivedLayer: TypeAlias = Callable[..., NDArray[Any]] | LayoutLayer
 DERIVED_LAYERS: Registry[DerivedLayer] = Registry("derived layer", "foveasim.derived_layers")
 
 
-@DERIVED_LAYERS.register("well")
+@DERIVED_LAYERS.register("well", example={"inset_um": 0.5}, expected=16.0 * 81.0)
 def _well(layout: Layout, *, inset_um: float = 0.1) -> NDArray[Any]:
     """Return the wells of the photodiodes: outlines with an inward offset, half a trench."""
     return _offset(layout.polygons(), -check_number("inset_um", inset_um, at_least=0.0))
 
 
-@DERIVED_LAYERS.register("microlens")
+@DERIVED_LAYERS.register("microlens", example={"inset_um": 1.0}, expected=16.0 * 64.0)
 def _microlens(layout: Layout, *, inset_um: float = 0.0, corner_radius_um: float = 0.0) -> NDArray[Any]:
     """Return the bases of the microlenses: outlines without holes, inset, with round corners."""
     inset_um = check_number("inset_um", inset_um, at_least=0.0)
@@ -107,13 +107,13 @@ def _microlens(layout: Layout, *, inset_um: float = 0.0, corner_radius_um: float
     return np.asarray(shapely.buffer(_offset(outlines, -inset_um - radius_um), radius_um, quad_segs=8))
 
 
-@DERIVED_LAYERS.register("metal_keep_out")
+@DERIVED_LAYERS.register("metal_keep_out", example={"outset_um": 0.5}, expected=41.0**2)
 def _metal_keep_out(layout: Layout, *, outset_um: float = 0.0) -> NDArray[Any]:
     """Return the areas without metal: outlines with an outward offset, inward if negative."""
     return _offset(layout.polygons(), check_number("outset_um", outset_um))
 
 
-@DERIVED_LAYERS.register("trench")
+@DERIVED_LAYERS.register("trench", example={"outset_um": 0.5, "inset_um": 0.5}, expected=41.0**2 - 16.0 * 81.0)
 @LayoutLayer
 def _trench(layout: Layout, *, outset_um: float = 0.0, inset_um: float = 0.0) -> PlacedShapes:
     """

@@ -66,7 +66,11 @@ class BarElement:
     side_mm: float
 
 
-@chart("checkerboard")
+@chart(
+    "checkerboard",
+    example={"square_mm": 2.03},
+    expected=("##..##..", "..##..##", "..##..##", "##..##..", "##..##..", "..##..##"),
+)
 def checkerboard(
     *,
     square_mm: float,
@@ -132,7 +136,11 @@ def checkerboard(
     return canvas.scene(fractions, contrast, "a checkerboard")
 
 
-@chart("slanted_edge")
+@chart(
+    "slanted_edge",
+    example={"angle_deg": 25.0},
+    expected=(".. #####", "...#####", "... ####", "....####", ".... ###", ".....###"),
+)
 def slanted_edge(
     *,
     angle_deg: float = 5.0,
@@ -177,7 +185,11 @@ def slanted_edge(
     return canvas.scene(fractions, contrast, "a slanted edge")
 
 
-@chart("bars")
+@chart(
+    "bars",
+    example={"groups": [1], "shape": (90, 80)},
+    expected=("########", "###  ###", "#### ###", "########", "###  ###", *["########"] * 4),
+)
 def bars(
     *,
     groups: Sequence[int],
@@ -306,7 +318,11 @@ def bar_elements(groups: Sequence[int]) -> tuple[BarElement, ...]:
     )
 
 
-@chart("letter_f")
+@chart(
+    "letter_f",
+    example={"height_mm": 4.7},
+    expected=("###  ###", "## . ###", "## .####", "## .####", "##  ####", "########"),
+)
 def letter_f(
     *,
     height_mm: float,

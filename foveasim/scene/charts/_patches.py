@@ -11,7 +11,7 @@ from foveasim.scene._illuminants import Illuminant, illuminant_spectrum
 from foveasim.scene._scene import GREY_NM, MAX_RADIANCE, Scene
 from foveasim.scene.charts._canvas import Canvas, Fractions, OneOrMore, add_rectangle
 from foveasim.scene.charts._colours import PATCH_NAMES, nonnegative_factors, patch_reflectance
-from foveasim.scene.registry import SCENES, chart
+from foveasim.scene.registry import EXAMPLE_PICTURE, SCENES, chart
 
 __all__ = ["colour_chart", "grey_scale"]
 
@@ -23,7 +23,11 @@ N_ROWS, N_COLUMNS = 4, 6
 MAX_STEPS = 1000
 
 
-@chart("grey_scale")
+@chart(
+    "grey_scale",
+    example={"patch_mm": 1.9, "n_steps": 4},
+    expected=("........", "........", "##  ....", "##  ....", "........", "........"),
+)
 def grey_scale(
     *,
     n_steps: int = 12,
@@ -80,7 +84,11 @@ def grey_scale(
     return canvas.scene(fractions, 1.0, "a grey scale")
 
 
-@SCENES.register("colour_chart")
+@SCENES.register(
+    "colour_chart",
+    example={**EXAMPLE_PICTURE, "radiance_w_m2_sr_nm": 2.0, "patch_mm": 1.03, "gap_mm": 0.11},
+    expected=("........", ".. ..  .", ". . .  .", "....#  .", " ## ....", "........"),
+)
 def colour_chart(
     *,
     patch_mm: float,
@@ -95,7 +103,7 @@ def colour_chart(
     band_width_nm: OneOrMore | None = None,
 ) -> Scene:
     """
-    Return the Macbeth ColorChecker on black under an illuminant.
+    Return the Macbeth ColorChecker on black under an illuminant. Exact.
 
     The 24 patches are arranged in four rows of six.
 

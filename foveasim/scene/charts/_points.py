@@ -10,7 +10,7 @@ from foveasim._core.validation import check_number, check_shape
 from foveasim.errors import ParameterError
 from foveasim.scene._scene import GREY_NM, Scene
 from foveasim.scene.charts._canvas import Canvas, OneOrMore
-from foveasim.scene.registry import SCENES
+from foveasim.scene.registry import EXAMPLE_PICTURE, SCENES
 
 __all__ = ["point_grid"]
 
@@ -18,7 +18,11 @@ __all__ = ["point_grid"]
 ROUNDING_PIXELS = 1e-6
 
 
-@SCENES.register("point_grid")
+@SCENES.register(
+    "point_grid",
+    example={**EXAMPLE_PICTURE, "spacing_mm": 2.0, "n_points": (2, 3), "intensity_w_sr_nm": 3e-6},
+    expected=("........", "..#.#.#.", "........", "..#.#.#.", "........", "........"),
+)
 def point_grid(
     *,
     spacing_mm: float,

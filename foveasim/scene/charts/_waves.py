@@ -26,7 +26,11 @@ SQUARE_WAVE_AMPLITUDE = 1e9
 GAUSS = ((-0.5 * np.sqrt(0.6), 5.0 / 18.0), (0.0, 8.0 / 18.0), (0.5 * np.sqrt(0.6), 5.0 / 18.0))
 
 
-@chart("sine")
+@chart(
+    "sine",
+    example={"line_pairs_per_mm": 0.23, "angle_deg": 30.0},
+    expected=(". ##.. #", "..## ..#", ".. ##.. ", " ..## ..", "#.. ##..", "# ..## ."),
+)
 def sine(
     *,
     line_pairs_per_mm: float,
@@ -87,7 +91,11 @@ def sine(
     return canvas.scene(fractions, contrast, "a sine wave")
 
 
-@chart("zone_plate")
+@chart(
+    "zone_plate",
+    example={"line_pairs_per_mm": 0.9},
+    expected=("  ####  ", " # .. # ", " #.##.# ", " #.##.# ", " # .. # ", "  ####  "),
+)
 def zone_plate(
     *,
     line_pairs_per_mm: float,
@@ -158,7 +166,11 @@ def zone_plate(
     return canvas.scene(canvas.fill(block), contrast, "a zone plate")
 
 
-@chart("siemens_star")
+@chart(
+    "siemens_star",
+    example={"n_spokes": 3},
+    expected=("  ##..  ", "  ##..  ", " .. .## ", " .. .## ", "  ##..  ", "  ##..  "),
+)
 def siemens_star(
     *,
     n_spokes: int = 36,

@@ -14,8 +14,10 @@ from foveasim._io.formats import FormatError
 from foveasim._io.rasters.units import length_in_um
 from foveasim.errors import ParameterError
 
-__all__ = ["Cube", "Quantity"]
+__all__ = ["EXAMPLE_NM", "EXAMPLE_UNIT", "Cube", "Quantity", "example_radiance"]
 
+#: Wavelengths and unit of the cubes of examples.
+EXAMPLE_NM, EXAMPLE_UNIT = (500.0, 600.0), "W m-2 sr-1 nm-1"
 #: Physical quantity of the values of a cube.
 Quantity: TypeAlias = Literal["radiance", "reflectance"]
 #: Relative tolerance of square pixels: positions may be float32.
@@ -137,3 +139,8 @@ class Cube:
                 "field_of_view_deg="
             )
         return along_x
+
+
+def example_radiance() -> Floats:
+    """Return the radiance of examples, (n_band, n_y, n_x), bottom row first."""
+    return np.arange(1.0, 2.0 * 4.0 * 5.0 + 1.0).reshape(2, 4, 5)

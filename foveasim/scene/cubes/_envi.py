@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.names import did_you_mean
+from foveasim._core.validation import Floats
 from foveasim._io.formats import FileFormat, FormatError
 from foveasim._io.mapped_files import map_file
-from foveasim.scene.cubes._cube import Cube, Quantity
+from foveasim.scene.cubes._cube import EXAMPLE_NM, EXAMPLE_UNIT, Cube, Quantity, example_radiance
 from foveasim.scene.cubes._formats import CUBE_FORMATS
 
 __all__ = ["read_envi"]
@@ -205,4 +206,16 @@ def _numbers(entries: dict[str, str], key: str) -> list[float] | None:
         raise FormatError(f"'{key}' must be a list of numbers, got {entries[key]!r:.40}") from None
 
 
-CUBE_FORMATS.register("envi", FileFormat(title="ENVI", suffixes=(".hdr",), matches=is_envi, read=read_envi))
+def _example(path: Path) -> Floats:
+    """Write big-endian data by line, top row first."""
+    radiance = example_radiance()
+    radiance[:, ::-1].transpose(1, 0, 2).astype(">f4").tofile(path.with_suffix(".bil"))
+    sizes = "bands = 2\nlines = 4\nsamples = 5\ninterleave = bil\ndata type = 4\nbyte order = 1\n"
+    bands = f"wavelength = {{{EXAMPLE_NM[0]}, {EXAMPLE_NM[1]}}}\nwavelength units = nm\ndata units = {EXAMPLE_UNIT}\n"
+    path.write_text(f"ENVI\n{bands}{sizes}", encoding="utf-8")
+    return radiance
+
+
+CUBE_FORMATS.register(
+    "envi", FileFormat(title="ENVI", suffixes=(".hdr",), matches=is_envi, read=read_envi), example=_example
+)

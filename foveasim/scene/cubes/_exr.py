@@ -11,10 +11,14 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
+
+from foveasim._core.extras import import_optional
 from foveasim._core.names import possible_names
+from foveasim._core.validation import Floats
 from foveasim._io.formats import FileFormat, FormatError
 from foveasim._io.rasters.exr import MAGIC, POLARISATION, band_of_channel, read_channels, read_header
-from foveasim.scene.cubes._cube import Cube, Quantity
+from foveasim.scene.cubes._cube import EXAMPLE_NM, Cube, Quantity, example_radiance
 from foveasim.scene.cubes._formats import CUBE_FORMATS
 
 __all__ = ["read_exr"]
@@ -52,7 +56,18 @@ def read_exr(path: Path, name: str | None) -> Cube:
     )
 
 
+def _example(path: Path) -> Floats:
+    """Write one channel per band, top row first."""
+    exr, radiance = import_optional(path, "OpenEXR", "maps"), example_radiance()
+    channels = {f"S0.{nm:g}nm": np.float32(band[::-1]) for nm, band in zip(EXAMPLE_NM, radiance, strict=True)}
+    header = {"compression": exr.NO_COMPRESSION, "type": exr.scanlineimage, "emissiveUnits": "W.m^-2.sr^-1.nm^-1"}
+    with exr.File(header, channels) as file:
+        file.write(str(path))
+    return radiance
+
+
 CUBE_FORMATS.register(
     "exr",
     FileFormat(title="EXR", suffixes=(".exr",), signatures=(MAGIC,), read=read_exr, is_sandboxed=True, is_silent=True),
+    example=_example,
 )

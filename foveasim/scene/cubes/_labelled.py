@@ -13,11 +13,15 @@ from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from foveasim._core.extras import import_optional
+from foveasim._core.validation import Floats
 from foveasim._io.formats import FileFormat
 from foveasim._io.rasters import pitch_of_axes
 from foveasim._io.rasters.datasets import HDF5_MAGIC, NETCDF3_MAGICS, is_zarr, open_netcdf, open_zarr, select_array
 from foveasim._io.rasters.labels import BAND, coordinate, in_order, length_of_coordinate, squeeze, unit_of_array
-from foveasim.scene.cubes._cube import Cube
+from foveasim.scene.cubes._cube import EXAMPLE_NM, EXAMPLE_UNIT, Cube, example_radiance
 from foveasim.scene.cubes._formats import CUBE_FORMATS
 
 if TYPE_CHECKING:
@@ -93,6 +97,18 @@ def _wavelengths(array: xr.DataArray, band: Hashable | None) -> tuple[list[float
     return None, None
 
 
+def _example(path: Path) -> Floats:
+    """Write an array with ascending y."""
+    xr, radiance = import_optional(path, "xarray", "maps"), example_radiance()
+    coords = {"wavelength": ("wavelength", list(EXAMPLE_NM), {"units": "nm"}), "y": np.arange(4.0), "x": np.arange(5.0)}
+    array = xr.DataArray(radiance, coords, ("wavelength", "y", "x"), "radiance", {"units": EXAMPLE_UNIT})
+    if path.suffix == ".zarr":
+        array.to_dataset().to_zarr(path, zarr_format=3, consolidated=False)
+    else:
+        array.to_netcdf(path, engine="h5netcdf")
+    return radiance
+
+
 CUBE_FORMATS.register(
     "netcdf",
     FileFormat(
@@ -102,6 +118,7 @@ CUBE_FORMATS.register(
         read=read_netcdf,
         is_sandboxed=True,
     ),
+    example=_example,
 )
 CUBE_FORMATS.register(
     "zarr",
@@ -113,4 +130,5 @@ CUBE_FORMATS.register(
         is_sandboxed=True,
         is_directory=True,
     ),
+    example=_example,
 )

@@ -11,15 +11,27 @@ bands. A variable ``unit`` or ``units`` contains the unit.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from foveasim._core.names import possible_names
+from foveasim._core.validation import Floats
 from foveasim._io.formats import FileFormat, FormatError
-from foveasim._io.rasters.mat import MAT5_MAGIC, MAT73_MAGIC, MatFile, find_struct, open_mat5, open_mat73
-from foveasim.scene.cubes._cube import Cube
+from foveasim._io.rasters.mat import (
+    MAT5_MAGIC,
+    MAT73_MAGIC,
+    MatFile,
+    find_struct,
+    open_mat5,
+    open_mat73,
+    write_mat5,
+    write_mat73,
+)
+from foveasim.scene.cubes._cube import EXAMPLE_NM, EXAMPLE_UNIT, Cube, example_radiance
 from foveasim.scene.cubes._formats import CUBE_FORMATS
 
 __all__ = ["read_mat5", "read_mat73"]
@@ -97,7 +109,19 @@ def _bands_first(data: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     return np.moveaxis(data, 2, 0) if data.ndim == 3 else data
 
 
-for _name, _magic, _reader in (("mat73", MAT73_MAGIC, read_mat73), ("mat", MAT5_MAGIC, read_mat5)):
+def _example(write: Callable[[Path, dict[str, Any]], None], path: Path) -> Floats:
+    """Write an array (row, column, band), top row first."""
+    radiance = example_radiance()
+    write(path, {"cube": np.moveaxis(radiance[:, ::-1], 0, 2), "wave": np.array(EXAMPLE_NM), "unit": EXAMPLE_UNIT})
+    return radiance
+
+
+for _name, _magic, _reader, _writer in (
+    ("mat73", MAT73_MAGIC, read_mat73, write_mat73),
+    ("mat", MAT5_MAGIC, read_mat5, write_mat5),
+):
     CUBE_FORMATS.register(
-        _name, FileFormat(title="MAT", suffixes=(".mat",), signatures=(_magic,), read=_reader, is_sandboxed=True)
+        _name,
+        FileFormat(title="MAT", suffixes=(".mat",), signatures=(_magic,), read=_reader, is_sandboxed=True),
+        example=partial(_example, _writer),
     )

@@ -61,7 +61,8 @@ __all__ = [
     "draw_shot_noise",
 ]
 
-#: Effects of a sensor's keywords, in the order of the chain; ``from_sensor`` returns None for an effect that is off.
+#: Effects of a sensor's keywords, in the order of the chain; ``from_sensor`` returns None for an effect that is off, and
+#: ``example`` contains keywords that enable it.
 STANDARD: tuple[Any, ...] = (
     PhotoResponse,
     DeadSites,

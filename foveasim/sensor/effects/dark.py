@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 
@@ -113,6 +114,7 @@ class DarkSignal(FixedFactor):
         Ratio of standard deviation to mean.
     """
 
+    example: ClassVar[Mapping[str, Any]] = {"dark_e_per_s": 4000.0, "dsnu_fraction": 0.3}
     name: ClassVar[str] = "dsnu"
     stage: ClassVar[Stage] = "dark"
     needs_layout: ClassVar[bool] = False
@@ -147,6 +149,7 @@ class HotSites(FixedOffset):
         Additional dark current at the sensor's temperature.
     """
 
+    example: ClassVar[Mapping[str, Any]] = {"hot_fraction": 0.05, "hot_e_per_s": 3000.0}
     name: ClassVar[str] = "hot"
     stage: ClassVar[Stage] = "dark"
     needs_layout: ClassVar[bool] = False

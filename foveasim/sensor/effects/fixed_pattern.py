@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -27,6 +28,7 @@ class PixelGain(FixedFactor):
         Standard deviation.
     """
 
+    example: ClassVar[Mapping[str, Any]] = {"gain_fpn_fraction": 0.02}
     name: ClassVar[str] = "gain_fpn"
     stage: ClassVar[Stage] = "sense_node"
     needs_layout: ClassVar[bool] = False
@@ -59,6 +61,7 @@ class PixelOffset(FixedOffset):
         Standard deviation.
     """
 
+    example: ClassVar[Mapping[str, Any]] = {"pixel_fpn_fraction": 1e-3}
     name: ClassVar[str] = "pixel_fpn"
     stage: ClassVar[Stage] = "output"
     needs_layout: ClassVar[bool] = False
@@ -92,6 +95,7 @@ class ColumnOffset(FixedOffset):
         Standard deviation.
     """
 
+    example: ClassVar[Mapping[str, Any]] = {"line_fpn_fraction": 1e-3}
     name: ClassVar[str] = "column_fpn"
     stage: ClassVar[Stage] = "output"
     needs_layout: ClassVar[bool] = False

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Self, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
 
 import numpy as np
 
@@ -28,6 +29,7 @@ class ResetNoise(AdditiveNoise):
     temperature_k : float, K
     """
 
+    example: ClassVar[Mapping[str, Any]] = {"ktc_noise": True}
     name: ClassVar[str] = "reset"
     stage: ClassVar[Stage] = "charge"
     is_drawn_at_reset: ClassVar[bool] = True
@@ -56,6 +58,7 @@ class ReadNoise(AdditiveNoise):
         Standard deviation, referred to the charge.
     """
 
+    example: ClassVar[Mapping[str, Any]] = {"read_noise_e": 12.0}
     name: ClassVar[str] = "read"
     stage: ClassVar[Stage] = "charge"
     needs_layout: ClassVar[bool] = False
@@ -94,6 +97,7 @@ class TelegraphNoise(Effect):
     The variance is ``rts_e² / 4`` on RTS sites. Averaged over all devices it is ``rts_fraction * rts_e² / 4`` on each site.
     """
 
+    example: ClassVar[Mapping[str, Any]] = {"rts_fraction": 0.3, "rts_e": 60.0}
     name: ClassVar[str] = "rts"
     stage: ClassVar[Stage] = "charge"
     is_temporal: ClassVar[bool] = True

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -27,6 +28,7 @@ class PhotoResponse(FixedFactor):
         Standard deviation.
     """
 
+    example: ClassVar[Mapping[str, Any]] = {"prnu_fraction": 0.02}
     name: ClassVar[str] = "prnu"
     stage: ClassVar[Stage] = "photo"
     needs_layout: ClassVar[bool] = False
@@ -59,6 +61,7 @@ class DeadSites(FixedFactor):
         Probability that a site is dead.
     """
 
+    example: ClassVar[Mapping[str, Any]] = {"dead_fraction": 0.1}
     name: ClassVar[str] = "dead"
     stage: ClassVar[Stage] = "photo"
     needs_layout: ClassVar[bool] = False

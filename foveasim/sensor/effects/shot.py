@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Annotated, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,6 +98,7 @@ class ShotNoise(Declared, Effect):
     limit of 100 e-, 3e-5 at 700 e-.
     """
 
+    example: ClassVar[Mapping[str, Any]] = {"shot_noise": "auto"}
     name: ClassVar[str] = "shot"
     stage: ClassVar[Stage] = "collection"
     is_temporal: ClassVar[bool] = True

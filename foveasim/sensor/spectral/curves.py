@@ -79,7 +79,7 @@ class CurveBase(Declared, ABC):
 CURVES: Registry[Callable[..., Any]] = Registry("curve", "foveasim.curves")
 
 
-@CURVES.register("constant")
+@CURVES.register("constant", example={"value": 0.4}, expected={550.0: 0.4})
 @dataclass(frozen=True)
 class ConstantCurve(CurveBase):
     """
@@ -98,7 +98,9 @@ class ConstantCurve(CurveBase):
         return np.full(np.shape(wavelength_nm), float(self.value))
 
 
-@CURVES.register("gaussian")
+@CURVES.register(
+    "gaussian", example={"centre_nm": 550.0, "fwhm_nm": 80.0, "peak": 0.8}, expected={550.0: 0.8, 590.0: 0.4}
+)
 @dataclass(frozen=True, kw_only=True)
 class GaussianCurve(CurveBase):
     """
@@ -122,7 +124,9 @@ class GaussianCurve(CurveBase):
         return np.asarray(self.peak * np.exp(-4.0 * np.log(2.0) * offset**2))
 
 
-@CURVES.register("pass_band")
+@CURVES.register(
+    "pass_band", example={"from_nm": 500.0, "to_nm": 600.0, "peak": 0.8}, expected={500.0: 0.4, 550.0: 0.8}
+)
 @dataclass(frozen=True, kw_only=True)
 class PassBand(CurveBase):
     """
@@ -190,7 +194,7 @@ SILICON_ABSORPTION_UM = (
 )  # fmt: skip
 
 
-@CURVES.register("silicon")
+@CURVES.register("silicon", example={"depth_um": 1.561}, expected={550.0: 0.6321205588})
 @dataclass(frozen=True, kw_only=True)
 class SiliconQE(CurveBase):
     """

@@ -58,7 +58,14 @@ class _Table:
     values: Floats
 
 
-@CURVES.register("file")
+def _example_file(directory: Path) -> dict[str, str]:
+    """Write a table in percent."""
+    path = directory / "curve.csv"
+    path.write_text("wavelength (nm),QE (%)\n400,20\n500,60\n700,40\n", encoding="utf-8")
+    return {"path": str(path)}
+
+
+@CURVES.register("file", example=_example_file, expected={450.0: 0.4, 600.0: 0.5})
 def read_curve(
     path: str | Path,
     column: str | int | None = None,

@@ -15,7 +15,7 @@ from foveasim.sensor.spectral.tables import SplineCurve, TableCurve
 __all__ = ["camera_filters", "ccd_qe"]
 
 
-@CURVES.register("ccd")
+@CURVES.register("ccd", expected={440.0: 0.857})
 def ccd_qe() -> TableCurve | SplineCurve:
     """
     Read the measured quantum efficiency of a back-illuminated CCD (cf. the paper's Fig. 5).

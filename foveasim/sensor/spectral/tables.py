@@ -17,12 +17,14 @@ from foveasim.sensor.spectral.curves import CURVES, CurveBase, check_within
 
 __all__ = ["Beyond", "PolynomialCurve", "SplineCurve", "StepCurve", "TableCurve"]
 
+#: Example of curves with a table.
+TABLE = {"wavelength_nm": [400.0, 500.0, 700.0], "value": [0.2, 0.6, 0.4]}
 #: Values outside the table: raise an error, 0, or the value at the end.
 Beyond = Literal["raise", "zero", "hold"]
 BEYOND_HINT = "set beyond='zero' or beyond='hold' to extrapolate"
 
 
-@CURVES.register("polynomial")
+@CURVES.register("polynomial", example={**TABLE, "degree": 2}, expected={500.0: 0.6, 700.0: 0.4})
 @dataclass(frozen=True, kw_only=True)
 class PolynomialCurve(CurveBase):
     """
@@ -65,7 +67,7 @@ class PolynomialCurve(CurveBase):
         return np.clip(self._fit(as_numbers("wavelength_nm", wavelength_nm)), 0.0, 1.0)
 
 
-@CURVES.register("table")
+@CURVES.register("table", example=TABLE, expected={450.0: 0.4, 600.0: 0.5})
 @dataclass(frozen=True, kw_only=True)
 class TableCurve(CurveBase):
     """
@@ -102,7 +104,7 @@ class TableCurve(CurveBase):
         return np.where(is_known, np.interp(waves_nm, self.wavelength_nm, self.value), 0.0)
 
 
-@CURVES.register("spline")
+@CURVES.register("spline", example=TABLE, expected={500.0: 0.6, 700.0: 0.4})
 @dataclass(frozen=True, kw_only=True)
 class SplineCurve(CurveBase):
     """
@@ -150,7 +152,9 @@ class SplineCurve(CurveBase):
         return np.where(is_known, np.clip(self._interpolator(waves_nm), 0.0, 1.0), 0.0)
 
 
-@CURVES.register("step")
+@CURVES.register(
+    "step", example={"edge_nm": [400.0, 500.0, 700.0], "value": [0.2, 0.6]}, expected={450.0: 0.2, 500.0: 0.6}
+)
 @dataclass(frozen=True, kw_only=True)
 class StepCurve(CurveBase):
     """

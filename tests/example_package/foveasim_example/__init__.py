@@ -9,8 +9,14 @@ import numpy as np
 import shapely
 
 import foveasim as fs
-from foveasim.layout import FileFormat, Rule, WrittenLayout, layout_family
-from foveasim.sensor.effects import AdditiveNoise
+from foveasim.distortion import LENSES
+from foveasim.explore import METRICS
+from foveasim.layout import DERIVED_LAYERS, FORMATS, RULES, FileFormat, Rule, WrittenLayout, layout_edit, layout_family
+from foveasim.maps import MAP_FORMATS, Found
+from foveasim.optics import PUPILS
+from foveasim.scene import CUBE_FORMATS, SCENES
+from foveasim.sensor.effects import EFFECTS, AdditiveNoise
+from foveasim.sensor.spectral import CURVES
 
 
 @layout_family(example={"n_petals": 12, "petal_um": 3.0})
@@ -24,6 +30,24 @@ def daisy(*, n_petals: int, petal_um: float) -> fs.Layout:
     return fs.Layout.from_polygons([centre, *discs], ring=np.r_[0, np.ones(n_petals, int)])
 
 
+@layout_edit(example={"factor": 2.0})
+def stretch_x(layout: fs.Layout, *, factor: float) -> fs.Layout:
+    """Stretch the layout along x."""
+    stretched = fs.Layout.from_polygons(
+        [shapely.affinity.scale(polygon, factor, 1.0, origin=(0.0, 0.0)) for polygon in layout.polygons()],
+        **layout.columns,
+    )
+    steps = [*layout.provenance.get("steps", []), f"stretch_x {factor}"]
+    return stretched.with_provenance({**layout.provenance, "steps": steps})
+
+
+@DERIVED_LAYERS.register("pad", example={"radius_um": 2.0}, expected=16.0 * 32.0 * np.sin(np.pi / 16.0) / 2.0 * 4.0)
+def pad(layout: fs.Layout, *, radius_um: float = 1.0) -> np.ndarray:
+    """Return a polygon with 32 corners at the centroid of each site."""
+    return shapely.buffer(shapely.points(layout.centroid_um), radius_um, quad_segs=8)
+
+
+@EFFECTS.register("supply_ripple", example={"sigma_v": 2e-3})
 @dataclass(frozen=True)
 class SupplyRipple(AdditiveNoise):
     """Noise of the supply on the output voltage."""
@@ -43,6 +67,7 @@ min_roundness = Rule(
     "",
     lambda case: 4.0 * np.pi * case.layout.area_um2 / shapely.length(case.polygons) ** 2,
 )
+RULES.register("min_roundness", min_roundness, example={"satisfied": 0.78, "violated": 0.79})  # π/4 for squares
 
 
 def read_boxes(path: Path) -> fs.Layout:
@@ -63,6 +88,12 @@ def write_boxes(layout: fs.Layout, path: Path, *, digits: int = 3) -> WrittenLay
     )
 
 
+def example_boxes(path: Path) -> fs.Layout:
+    """Write two rectangles."""
+    path.write_text("BOXES\n0 0 2 2\n2 1 5 2\n", encoding="utf-8")
+    return fs.Layout.from_rectangles([[1.0, 1.0], [3.5, 1.5]], [[2.0, 2.0], [3.0, 1.0]])
+
+
 boxes = FileFormat(
     title="boxes",
     suffixes=(".boxes",),
@@ -71,6 +102,7 @@ boxes = FileFormat(
     write=write_boxes,
     write_options=("digits",),
 )
+FORMATS.register("boxes", boxes, example=example_boxes)
 
 
 def read_lines(path: Path, name: str | None) -> fs.scene.Cube:
@@ -79,9 +111,47 @@ def read_lines(path: Path, name: str | None) -> fs.scene.Cube:
     return fs.scene.Cube(data=values, wavelength=[550.0], band_width_nm=[10.0], unit="W m-2 sr-1 nm-1")
 
 
+def example_lines(path: Path) -> np.ndarray:
+    """Write a picture of 2 x 2 pixels, and return it bottom row first."""
+    path.write_text("LINES\n1 2\n3 4\n", encoding="utf-8")
+    return np.array([[[3.0, 4.0], [1.0, 2.0]]])
+
+
 lines = FileFormat(title="lines", suffixes=(".lines",), signatures=(b"LINES",), read=read_lines)
+CUBE_FORMATS.register("lines", lines, example=example_lines)
 
 
+def example_powers(path: Path) -> fs.PowerMap:
+    """Write a table of two rows, the top row first."""
+    path.write_text("POWER\n1 2 3\n4 5 6\n", encoding="utf-8")
+    return fs.PowerMap.from_array(np.array([[4.0, 5.0, 6.0], [1.0, 2.0, 3.0]]), pitch_um=1.0, wavelength_nm=550.0)
+
+
+def read_powers(path: Path, name: str | None) -> Found:
+    """Read a table of irradiance in cells of 1 µm, W/m²."""
+    values = np.loadtxt(path, skiprows=1, ndmin=2)
+    return Found(data=values, is_y_descending=True, pitch_um=(1.0, 1.0), wavelength_nm=[550.0], unit="w_m2")
+
+
+powers = FileFormat(title="powers", suffixes=(".powers",), signatures=(b"POWER",), read=read_powers)
+MAP_FORMATS.register("powers", powers, example=example_powers)
+
+
+@CURVES.register("comb", example={"period_nm": 100.0}, expected={500.0: 1.0, 525.0: 0.5, 550.0: 0.0})
+@dataclass(frozen=True)
+class Comb:
+    """A curve with periodic maxima."""
+
+    period_nm: float
+
+    def __call__(self, wavelength_nm):
+        """Return the values at the wavelengths."""
+        return 0.5 + 0.5 * np.cos(2.0 * np.pi * np.asarray(wavelength_nm) / self.period_nm)
+
+
+@SCENES.register(
+    "half_plane", example={"shape": (4, 6), "pitch_um": 100.0, "distance_m": 1.0}, expected=("...###",) * 2
+)
 def half_plane(*, shape: tuple[int, int], pitch_um: float, distance_m: float, wavelength_nm: float = 550.0) -> fs.Scene:
     """A chart: dark on the left, bright on the right."""
     picture = np.zeros(shape)
@@ -96,6 +166,7 @@ def half_plane(*, shape: tuple[int, int], pitch_um: float, distance_m: float, wa
     )
 
 
+@PUPILS.register("half_moon", expected=0.5)
 @dataclass(frozen=True)
 class HalfMoon:
     """A pupil that lets light through its upper half."""
@@ -106,7 +177,12 @@ class HalfMoon:
         """Return the amplitude at pupil coordinates."""
         return (y > self.tilt).astype(float)
 
+    def edges(self):
+        """Return the line between the halves."""
+        return fs.optics.PupilEdges(lines_y=[self.tilt])
 
+
+@LENSES.register("magnifier", example={"factor": 1.2}, expected={(5.0, 10.0): (6.0, 12.0)})
 @dataclass(frozen=True)
 class Magnifier:
     """A lens model that enlarges everything."""
@@ -125,6 +201,7 @@ class Magnifier:
         return np.asarray(xy_um) / self.factor
 
 
+@METRICS.register("darkest_code_dn")
 def darkest_code_dn(shot, camera, capture):
     """Return the lowest code."""
     return int(capture.code.min())

@@ -1,0 +1,30 @@
+"""Metric of the signal-to-noise ratio."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from foveasim.camera import Camera
+from foveasim.capture import Capture
+from foveasim.config import Shot
+from foveasim.explore._metrics import METRICS
+from foveasim.sensor import signal_to_noise
+
+__all__ = ["snr"]
+
+
+@METRICS.register("snr")
+def snr(shot: Shot, camera: Camera, capture: Capture) -> dict[str, float]:
+    """
+    Compute the mean and median signal-to-noise ratio of the sites analytically.
+
+    The ratio is that of :func:`foveasim.sensor.signal_to_noise`: signal over temporal noise. Saturated sites are excluded; the
+    result is NaN when all sites are saturated.
+    """
+    sensor = camera.sensor
+    dark_e = sensor.expected_electrons(np.zeros(sensor.layout.n_sites), shot.exposure_s)
+    found = signal_to_noise(sensor, capture.expected_e, dark_e)
+    ratio = found.ratio[~found.is_saturated]
+    if not ratio.size:
+        return {"mean": float("nan"), "median": float("nan")}
+    return {"mean": float(ratio.mean()), "median": float(np.median(ratio))}

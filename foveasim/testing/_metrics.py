@@ -1,0 +1,57 @@
+"""Check of metrics: numbers that depend on the capture only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from foveasim.capture import Capture
+from foveasim.explore import METRICS
+from foveasim.scene import Scene
+from foveasim.testing._extension import Extension, check_of, require, shot_with
+
+__all__ = ["check_metric"]
+
+
+@check_of(METRICS)
+def check_metric(extension: Extension) -> None:
+    """Check the results of a metric for a capture, and for the same capture in a file."""
+    shot = shot_with("sensor", {"read_noise_e": 3.0})
+    camera = shot.camera
+    capture = camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=1)
+    assert isinstance(shot.scene, Scene)
+    inputs = [capture.code, capture.electrons, capture.expected_e, shot.scene.basis, capture.layout.xy_um]
+    before = [array.copy() for array in inputs]
+
+    def results(of: Capture) -> dict[str, Any]:
+        found = extension.item(shot, camera, of)
+        return dict(found) if isinstance(found, Mapping) else {"": found}
+
+    found = results(capture)
+    for name, value in found.items():
+        require(
+            isinstance(value, str) or np.asarray(value).dtype.kind in "biuf",
+            f"must return a number, a string, or a mapping of names to numbers, got {type(value).__name__} {name}".rstrip(),
+        )
+        if not isinstance(value, str):
+            is_documented = "nan" in str(extension.item.__doc__).lower()
+            require(
+                is_documented or np.isfinite(np.asarray(value, np.float64)).all(), "must be finite, or document NaN"
+            )
+    require(
+        all(np.array_equal(a, b) for a, b in zip(inputs, before, strict=True)),
+        "must not change the capture or its scene",
+    )
+    require(_is_same(results(capture), found), "must return the same numbers for the same capture")
+    capture.save(extension.directory / "capture.npz")
+    loaded = Capture.load(extension.directory / "capture.npz")
+    require(_is_same(results(loaded), found), "must return the same numbers for a capture that was saved and loaded")
+
+
+def _is_same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    return one.keys() == other.keys() and all(
+        value == other[name] if isinstance(value, str) else np.array_equal(value, other[name], equal_nan=True)
+        for name, value in one.items()
+    )
