@@ -18,7 +18,7 @@ CHECK_PYTHON = command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) not found; s
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	{ echo "foveasim requires Python 3.11 or later; specify one with: make PYTHON=python3.12"; exit 1; }
 
-.PHONY: demo test test-all test-core test-lowest test-torch soak lint bench bench-torch peers docs clean
+.PHONY: demo test test-all test-core test-lowest test-torch soak lint lint-js bench bench-torch peers docs clean
 .NOTPARALLEL:
 
 demo: $(VENV)/.installed
@@ -61,6 +61,12 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# Types and rules of the JavaScript of the pages; the pages themselves need neither Node nor a build.
+lint-js:
+	@command -v node >/dev/null && command -v npm >/dev/null || { echo "lint-js requires Node 20 or later with npm"; exit 1; }
+	npm ci --silent --no-audit --no-fund
+	npm run --silent lint
+
 bench: $(VENV)/.installed-dev
 	$(BIN)/python benchmarks/run.py
 
@@ -78,7 +84,7 @@ docs: $(VENV)/.installed-docs
 	@echo "open docs/_build/html/index.html"
 
 clean:
-	rm -rf $(VENV) $(LOWEST) $(TORCH_VENV) out docs/_build docs/gallery docs/reference .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(LOWEST) $(TORCH_VENV) out docs/_build docs/gallery docs/reference node_modules .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find foveasim tests -name __pycache__ -type d -exec rm -rf {} +
 
 $(VENV)/.made $(LOWEST)/uv/.made $(TORCH_VENV)/.made:

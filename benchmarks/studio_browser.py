@@ -43,8 +43,9 @@ LEAK_MIB = 200.0
 #: Sends a change, and resolves to the times until the photosites are drawn and until the frame with all views is painted. The
 #: page tells when it is done: timers or frames that poll would take time from it.
 CHANGE = """([key, value]) => new Promise((resolve) => {
-  const { page, connection } = studio, start = performance.now(), property = { configurable: true, enumerable: true };
-  let { doneId } = page, id = Infinity;
+  const { page, connection } = studio, { requests } = connection, start = performance.now();
+  const property = { configurable: true, enumerable: true };
+  let { doneId } = requests, id = Infinity;
   const finish = () => {
     if (page.asked === null) resolve([page.drawnAt > start ? page.drawnAt - start : NaN, performance.now() - start]);
     else setTimeout(finish, 2);
@@ -52,10 +53,10 @@ CHANGE = """([key, value]) => new Promise((resolve) => {
   const set = (value) => {
     doneId = value;
     if (doneId < id) return;
-    Object.defineProperty(page, "doneId", { ...property, value, writable: true });
+    Object.defineProperty(requests, "doneId", { ...property, value, writable: true });
     setTimeout(finish);  // set at the beginning of a frame: after it
   };
-  Object.defineProperty(page, "doneId", { ...property, get: () => doneId, set });
+  Object.defineProperty(requests, "doneId", { ...property, get: () => doneId, set });
   id = connection.set(key, value, true);
 })"""
 #: Sends messages, and resolves to null when the last one is done and drawn, and with a second argument also all previews
@@ -65,11 +66,11 @@ SEND = """([messages, isComplete]) => new Promise((resolve) => {
   const { page, connection } = studio;
   let nFrames = 0;
   for (const message of messages) connection.send(message);
-  const { id } = connection;  // also of messages that the page has sent, such as the choice of views
+  const id = connection.requests.lastId;  // also of messages that the page has sent, such as the choice of views
   const count = () => { nFrames++; requestAnimationFrame(count); };
   const describe = () => {
-    const { isBusy, doneId, asked, isPreview } = page, { isOpen, waiting } = connection;
-    return { messages, id, doneId, isBusy, isPreview, isDrawn: asked === null, isOpen, waiting, longestGapMs };
+    const { isBusy, doneId, isPreview, draftId } = connection.requests, { isOpen } = connection;
+    return { messages, id, doneId, isBusy, isPreview, isDrawn: page.asked === null, isOpen, draftId, longestGapMs };
   };
   const start = performance.now();
   let last = start, longestGapMs = 0;
@@ -77,8 +78,9 @@ SEND = """([messages, isComplete]) => new Promise((resolve) => {
     const now = performance.now();
     longestGapMs = Math.max(longestGapMs, now - last);
     last = now;
-    const isFinal = !page.isPreview && !page.sizeTimer && page.doneId >= connection.id;
-    if (page.doneId >= id && studio.isReady && (isFinal || !isComplete)) resolve(null);
+    const { isPreview, doneId, lastId } = connection.requests;
+    const isFinal = !isPreview && !page.sizeTimer && doneId >= lastId;
+    if (doneId >= id && studio.isReady && (isFinal || !isComplete)) resolve(null);
     else if (performance.now() - start < 60000) setTimeout(step, 5);
     else {
       const before = describe();
@@ -94,7 +96,7 @@ PARTS = """() => {
   const sum = (array) => bytes(array).reduce((total, byte) => (31 * total + byte) | 0, 7);
   const sums = (arrays) => Object.entries(arrays).map(([key, array]) => key + sum(array)).join();
   const text = ({ about, arrays }) => JSON.stringify(about) + sums(arrays);
-  return Object.fromEntries(Object.entries(studio.page.parts).map(([name, part]) => [name, text(part)]));
+  return Object.fromEntries(Object.entries(studio.views.parts).map(([name, part]) => [name, text(part)]));
 }"""
 CODES = """() => Array.from(studio.panes.b.columns.find(({ key }) => key === "code").values)"""
 CONTROLS = (
@@ -119,7 +121,7 @@ class Studio:
         self.page.on("pageerror", lambda error: self._log(str(error)))
         self.page.goto(address)
         self.page.wait_for_function(
-            "window.studio && studio.isReady && studio.page.doneId !== undefined", timeout=TIMEOUT_MS
+            "window.studio && studio.isReady && studio.connection.requests.nDone > 0", timeout=TIMEOUT_MS
         )
         self.start = self.page.evaluate("() => studio.page.state.settings")
         self.devtools = context.new_cdp_session(self.page)

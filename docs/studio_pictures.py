@@ -20,7 +20,7 @@ from playwright.sync_api import Page, sync_playwright
 PICTURES = Path(__file__).parent / "pictures"
 WIDTH, HEIGHT, TIMEOUT_MS = 1440, 900, 120_000
 SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-READY = "studio.isReady && !(studio.page.doneId < studio.connection.id)"
+READY = "studio.isReady && !(studio.connection.requests.doneId < studio.connection.requests.lastId)"
 
 
 def wait_for_views(page: Page) -> None:

@@ -43,11 +43,6 @@ BOUNDS = ("minimum", "exclusiveMinimum", "maximum", "usual")
 ENUMERATED = ("integration_order",)
 #: Keys that select an alternative of a section.
 TAGS = ("kind", "generator")
-#: Scenes whose single band requires a width.
-ONE_BAND = (
-    "bars", "checkerboard", "colour_chart", "flat", "grey_scale", "letter_f", "picture", "point_grid", "point_sources",
-    "siemens_star", "sine", "slanted_edge", "zone_plate",
-)  # fmt: skip
 #: Required parameters that are files without a bundled one.
 FROM_FILES = {"path", "file"}
 #: Depth of nested sections.
@@ -399,7 +394,8 @@ def _initial(root: dict[str, Any], option: dict[str, Any], value: Any) -> dict[s
     if "fit" in found and any(found.get(name) is not None for name in ("pitch_um", "field_of_view_deg")):
         del found["fit"]
     wavelength_nm = found.get("wavelength_nm", INITIAL["wavelength_nm"])
-    if found.get("kind") in ONE_BAND and not (isinstance(wavelength_nm, list) and len(wavelength_nm) > 1):
+    # Scenes with a single band require its width.
+    if "band_width_nm" in option["properties"] and not (isinstance(wavelength_nm, list) and len(wavelength_nm) > 1):
         found.setdefault("band_width_nm", INITIAL["band_width_nm"])
     if found.get("generator") in WITHOUT_MOSAIC:
         found.pop("mosaic", None)

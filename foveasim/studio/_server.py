@@ -96,6 +96,7 @@ class Studio:
         routes = [
             Route("/", self._index),
             Route("/static/{name}", self._static),
+            Route("/static/views/{name}", self._view),
             Route("/web/{name}", self._web),
             Route("/file", self._file, methods=["POST"]),
             Route("/download", self._download),
@@ -145,6 +146,9 @@ class Studio:
 
     async def _static(self, request: Request) -> Response:
         return _package_file("foveasim.studio", "static", request.path_params["name"])
+
+    async def _view(self, request: Request) -> Response:
+        return _package_file("foveasim.studio", "static/views", request.path_params["name"])
 
     async def _web(self, request: Request) -> Response:
         name = request.path_params["name"]

@@ -134,7 +134,7 @@ class Session:
         settings = self.history.settings
         return {
             "controls": controls_of(settings, self.start.settings),
-            "views": [{"name": part.name, "label": part.label} for part in PARTS.values()],
+            "views": [part.about() for part in PARTS.values()],
             "can_save": self.start.out is not None,
             "settings": to_json(settings),
             "name": self.start.name,
@@ -439,7 +439,9 @@ class Session:
                 self._send_parts(is_freeze=True)  # before later changes: the page keeps those of the variant
             case "unfreeze":
                 self._frozen = self._frozen_result = None
-                self._views.forget("comparison")
+                for part in PARTS.values():
+                    if part.is_of_variants:
+                        self._views.forget(part.name)
             case "text":
                 what, exported = string_of(message, "what"), self.exported()
                 self._send({

@@ -48,7 +48,7 @@ class Views:
     ) -> None:
         self._send, self._line, self._costs = send, line, costs
         self.left_out: list[str] = []
-        self._names = [part.name for part in PARTS.values() if not part.is_costly]
+        self._names = [name for name, part in PARTS.items() if part.has_data and not part.is_costly]
         self._pixels = PICTURE_PIXELS
         # Weak references to what each view was computed from: a view that is not shown retains no earlier result.
         self._sent: dict[str, list[Any]] = {}
@@ -118,7 +118,7 @@ class Views:
         times_ms: dict[str, float] = {}
         self.left_out = []
         drawn_s = time.perf_counter()
-        shown = [name for name in self._names if name != "comparison" or result.frozen is not None]
+        shown = [name for name in self._names if result.frozen is not None or not PARTS[name].is_of_variants]
         # Sites and their values belong together; the others in the order of their age.
         first = [name for name in FIRST if name in shown]
         names = first + sorted(

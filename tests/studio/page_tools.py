@@ -91,13 +91,16 @@ def until(page, condition, argument=None):
 
 def settle(page):
     """Wait until all parts that the page asked for are drawn."""
-    until(page, "() => window.studio && studio.isReady && studio.page.parts.picture && studio.page.nDone > 0")
+    until(
+        page,
+        "() => window.studio && studio.isReady && studio.views.parts.picture && studio.connection.requests.nDone > 0",
+    )
 
 
 def change(page, script, argument=None):
     """Run a script that sends messages, and wait for the answer to the last one."""
     page.evaluate(script, argument)
-    until(page, "() => studio.isReady && studio.page.doneId >= studio.connection.id")
+    until(page, "() => studio.isReady && studio.connection.requests.doneId >= studio.connection.requests.lastId")
 
 
 def set_value(page, key, value):

@@ -71,7 +71,10 @@ def drag(page, start, end, *, steps=4):
 
 def wait(page):
     """Wait until the last edit is drawn."""
-    until(page, "() => studio.isReady && !studio.editor.pending && studio.page.doneId >= studio.connection.id")
+    until(
+        page,
+        "() => studio.isReady && !studio.editor.pending && studio.connection.requests.doneId >= studio.connection.requests.lastId",
+    )
 
 
 def edits(page):

@@ -15,7 +15,7 @@ def result(settings):
 
 
 def test_layers_have_thicknesses_of_the_stack(result):
-    about, arrays = PARTS["stack"].make(result)
+    about, arrays = PARTS["solid"].make(result)
     bodies = about["bodies"]
     x0, y0, x1, y1 = result.capture.layout.bounds_um
 
@@ -28,7 +28,7 @@ def test_layers_have_thicknesses_of_the_stack(result):
 
 def test_large_layouts_show_their_centre(result, monkeypatch):
     monkeypatch.setattr(solid, "MAX_STACK_SITES", 16)
-    about, arrays = PARTS["stack"].make(result)
+    about, arrays = PARTS["solid"].make(result)
     sites = np.unique(arrays["run_sites"]).astype(int) - 1
 
     assert sites.size == 16
@@ -42,7 +42,7 @@ def test_narrow_photosites_have_no_trenches(settings):
         "parameters": {"n_x": 4, "n_y": 4, "pitch_um": 0.15},
         "mosaic": ["RG", "GB"],
     }
-    about, _ = PARTS["stack"].make(Engine(n_threads=1).simulate(settings))
+    about, _ = PARTS["solid"].make(Engine(n_threads=1).simulate(settings))
 
     assert [body["name"] for body in about["bodies"]["list"]] == ["wells", "filters"]
     assert "no trenches" in about["note"]

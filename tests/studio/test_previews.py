@@ -164,13 +164,13 @@ def test_sites_arrive_before_their_values(recorder, slow):
 
 
 def test_layers_are_not_computed_while_dragging(recorder):
-    recorder.do(do="views", names=["sites", "columns", "stack"])
-    assert "stack" in recorder.part_names
+    recorder.do(do="views", names=["sites", "columns", "solid"])
+    assert "solid" in recorder.part_names
     drag(recorder, 13.0, key="layout.parameters.pitch_um")
-    assert "stack" not in recorder.part_names
+    assert "solid" not in recorder.part_names
     recorder.parts.clear()
     recorder.session._complete()
-    assert recorder.part_names == ["stack"]
+    assert recorder.part_names == ["solid"]
 
 
 def test_costs_remember_slow_changes():

@@ -142,7 +142,14 @@ def codes_of(settings):
 
 
 def test_pages_have_security_headers(served):
-    for path in ("/", "/static/index.html", "/web/map.js", "/static/missing.js"):
+    for path in (
+        "/",
+        "/static/index.html",
+        "/web/map.js",
+        "/static/views/mtf.js",
+        "/static/views/missing.js",
+        "/static/missing.js",
+    ):
         status, headers, content = served.get(path)
         assert status == (404 if "missing" in path else 200)
         assert {headers[name.lower()] for name in HEADERS} == set(HEADERS.values())
@@ -155,7 +162,7 @@ def test_pages_have_security_headers(served):
 @pytest.mark.slow(keep=5)
 @pytest.mark.parametrize(
     "path",
-    ["/static/..%2f__init__.py", "/static/%2e%2e/_server.py", "/web/_serve.py", "/web/..%2f..%2fcli.py", "/web/template.html", "/static/", "/file", "/static/.js", "/x"],
+    ["/static/..%2f__init__.py", "/static/%2e%2e/_server.py", "/static/views/..%2findex.html", "/web/_serve.py", "/web/..%2f..%2fcli.py", "/web/template.html", "/static/", "/file", "/static/.js", "/x"],
 )  # fmt: skip
 def test_other_files_are_not_served(served, path):
     assert served.get(path)[0] in (404, 405)

@@ -64,7 +64,9 @@ def video(tmp_path, name="clip.mp4", n_frames=12):
 
 
 def ready(page):
-    until(page, "() => studio.isReady && !studio.sources.film?.isBusy && studio.sources.waiting.length === 0")
+    until(
+        page, "() => studio.isReady && !studio.sources.film?.isBusy && studio.connection.requests.waiting.length === 0"
+    )
 
 
 def film(page):
@@ -306,9 +308,9 @@ def test_restarted_camera_sends_frames_once(visit_camera):
     page = visit_camera()
     start_camera(page)
     until(page, "() => studio.state.film && studio.state.film.n >= 2")
-    page.evaluate("""() => { const { sources } = studio, answered = sources._answered.bind(sources);
+    page.evaluate("""() => { const { sources } = studio, answered = sources._shown.bind(sources);
       window.waiting = window.most = 0;
-      sources._answered = async (id) => { window.most = Math.max(window.most, ++window.waiting); const found = await answered(id); window.waiting--; return found; };
+      sources._shown = async (id) => { window.most = Math.max(window.most, ++window.waiting); const found = await answered(id); window.waiting--; return found; };
       sources.stopCamera(); sources.startCamera(); }""")
     until(page, "() => studio.sources.isLive && studio.state.film.n >= 2")
     page.evaluate("() => { window.most = 0; }")

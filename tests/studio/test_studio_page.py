@@ -35,7 +35,7 @@ pytestmark = [pytest.mark.needs("chromium"), pytest.mark.slow]
 @pytest.mark.slow(keep=1)
 def test_every_view_shows_data(visit):
     page = visit(width=2560, height=1440)
-    until(page, "() => ['noise', 'spectrum', 'mtf', 'rules', 'scene'].every((name) => studio.page.parts[name])")
+    until(page, "() => ['noise', 'spectrum', 'mtf', 'rules', 'scene'].every((name) => studio.views.parts[name])")
     for selector in (
         "#map .cells",
         "#picture .image",
@@ -89,12 +89,12 @@ def test_cursor_is_common_to_views(visit):
 
 def test_enlarged_pictures_have_more_pixels(visit):
     page = visit()
-    until(page, "() => studio.page.pixels === studio.page.parts.picture.about.width")
-    before = page.evaluate("studio.page.pixels")
+    until(page, "() => studio.connection.requests.pixels === studio.views.parts.picture.about.width")
+    before = page.evaluate("studio.connection.requests.pixels")
     for _ in range(4):
         page.keyboard.press("+")
-    until(page, "before => studio.page.pixels > before", before)
-    until(page, "() => studio.page.pixels === studio.page.parts.picture.about.width")
+    until(page, "before => studio.connection.requests.pixels > before", before)
+    until(page, "() => studio.connection.requests.pixels === studio.views.parts.picture.about.width")
 
 
 def test_selection_matches_its_sites(visit):
@@ -159,7 +159,7 @@ def test_violations_of_earlier_layout_vanish(visit):
     assert page.evaluate("nDrawn") == 1
     assert page.evaluate("studio.rules.traceOn(studio.panes.b.sites)") is None
     page.click("[data-tile=rules]")
-    until(page, "() => studio.isReady && studio.page.doneId >= studio.connection.id")
+    until(page, "() => studio.isReady && studio.connection.requests.doneId >= studio.connection.requests.lastId")
     assert page.evaluate("studio.rules.sites === studio.panes.b.sites")
 
 
@@ -280,7 +280,7 @@ def test_slider_drag_is_one_step(visit):
     page.mouse.up()
     until(
         page,
-        "() => studio.isReady && sent.length && sent[sent.length - 1].final && studio.page.doneId >= studio.connection.id",
+        "() => studio.isReady && sent.length && sent[sent.length - 1].final && studio.connection.requests.doneId >= studio.connection.requests.lastId",
     )
     sent = page.evaluate("sent")
 
@@ -297,7 +297,7 @@ def test_slider_back_at_start_is_released(visit):
     page.evaluate("""() => { const slider = document.querySelector(".control[data-key='optics.f_number'] input[type=range]"), start = slider.value;
       for (const value of [Number(start) + 50, start]) { slider.value = value; slider.dispatchEvent(new Event("input", { bubbles: true })); }
       slider.dispatchEvent(new PointerEvent("pointerup", { bubbles: true })); }""")
-    until(page, "() => studio.isReady && studio.page.doneId >= studio.connection.id")
+    until(page, "() => studio.isReady && studio.connection.requests.doneId >= studio.connection.requests.lastId")
     assert setting(page, "optics.f_number") == 2.8
     assert page.is_disabled("#undo")
     change(page, "() => { studio.connection.set('optics.f_number', 5.6, true); }")
@@ -308,7 +308,7 @@ def test_slider_back_at_start_is_released(visit):
 def test_previews_wait_for_answers(visit):
     page = visit()
     page.evaluate("""() => { window.waits = []; const send = studio.connection.socket.send.bind(studio.connection.socket);
-      studio.connection.socket.send = (text) => { waits.push([JSON.parse(text).value, performance.now(), studio.page.nDone]); send(text); };
+      studio.connection.socket.send = (text) => { waits.push([JSON.parse(text).value, performance.now(), studio.connection.requests.nDone]); send(text); };
       for (let k = 0; k < 50; k++) studio.connection.set("exposure_s", 0.01 + 0.001 * k, false); }""")
     until(page, "() => studio.isReady && studio.state.settings.exposure_s > 0.0589")
     waits = page.evaluate("waits")
@@ -444,7 +444,10 @@ def test_gaze_follows_drag_on_scene(visit):
     page.mouse.move(0.5 * (ax + bx), 0.5 * (ay + by))
     page.mouse.move(bx, by)
     page.mouse.up()
-    until(page, "() => studio.isReady && studio.state.can_undo && studio.page.doneId >= studio.connection.id")
+    until(
+        page,
+        "() => studio.isReady && studio.state.can_undo && studio.connection.requests.doneId >= studio.connection.requests.lastId",
+    )
 
     assert setting(page, "layout.move_um") == pytest.approx([-40.0, 260.0], abs=3.0)
     assert page.evaluate("studio.panes.scene.frame") == pytest.approx([x0 + 100, y0 - 60, x1 + 100, y1 - 60], abs=3.0)
@@ -477,7 +480,7 @@ def test_dropped_photograph_becomes_the_scene(visit):
     drop(page, "photo.png", buffer.getvalue())
     until(
         page,
-        "() => /photo/.test(studio.state.settings.scene.picture) && studio.isReady && studio.page.doneId >= studio.connection.id",
+        "() => /photo/.test(studio.state.settings.scene.picture) && studio.isReady && studio.connection.requests.doneId >= studio.connection.requests.lastId",
     )
 
     assert not np.array_equal(codes(page), before)
@@ -550,7 +553,10 @@ def test_restarted_server_restores_state(browser, tmp_path, visit):
             page,
             "() => studio.isReady && studio.state.settings.exposure_s === 0.007 && studio.state.settings.optics.f_number === 4",
         )
-        until(page, "() => !document.body.classList.contains('offline') && studio.page.doneId >= studio.connection.id")
+        until(
+            page,
+            "() => !document.body.classList.contains('offline') && studio.connection.requests.doneId >= studio.connection.requests.lastId",
+        )
         change(page, "() => { studio.connection.set('optics.f_number', 2.8, true); }")
         assert np.array_equal(codes(page), before)
         page.reload()

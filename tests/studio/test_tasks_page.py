@@ -39,7 +39,7 @@ def page(visit, tasks):
 
 def table(page):
     return page.evaluate(
-        "() => Object.fromEntries(studio.page.parts.comparison.about.rows.map((row) => [row.name, row.values]))"
+        "() => Object.fromEntries(studio.views.parts.comparison.about.rows.map((row) => [row.name, row.values]))"
     )
 
 

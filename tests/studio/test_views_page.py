@@ -31,7 +31,7 @@ def show_solid(page, mode="columns"):
     show(page, "solid")
     if mode == "stack":
         page.click("[data-solid=stack]")
-        until(page, "() => studio.page.parts.stack")
+        until(page, "() => studio.views.parts.solid")
     until(
         page,
         "mode => studio.solid.shown.mode === mode && studio.solid.view.counts.screen > 0 && !studio.solid.isAsked",
@@ -57,7 +57,7 @@ def pixels(page):
 def test_charts_have_curves_marks_and_notes(visit, scheme):
     page = visit(color_scheme=scheme)
     show(page, "photon_transfer", "snr", "mtf")
-    until(page, "() => ['photon_transfer', 'snr', 'mtf'].every((name) => studio.page.parts[name])")
+    until(page, "() => ['photon_transfer', 'snr', 'mtf'].every((name) => studio.views.parts[name])")
 
     for name in ("photon_transfer", "snr", "mtf"):
         assert has_picture(page, f"#{name} canvas"), name
@@ -66,29 +66,29 @@ def test_charts_have_curves_marks_and_notes(visit, scheme):
     assert "full range" in page.inner_text("#photon_transfer .chart-note")
     assert "Dynamic range / dB: R" in page.inner_text("#snr .chart-note")
     assert "Nyquist" in page.inner_text("#mtf")
-    assert page.evaluate("studio.charts.snr.marks.length") == 6
+    assert page.evaluate("studio.views.made.snr.chart.marks.length") == 6
 
 
 def test_signal_mark_follows_exposure(visit):
     page = visit()
     show(page, "photon_transfer")
-    until(page, "() => studio.charts.photon_transfer.marks.length")
-    before = page.evaluate("studio.charts.photon_transfer.marks[0].x")
+    until(page, "() => studio.views.made.photon_transfer.chart.marks.length")
+    before = page.evaluate("studio.views.made.photon_transfer.chart.marks[0].x")
     set_value(page, "exposure_s", 0.01)
 
-    assert page.evaluate("studio.charts.photon_transfer.marks[0].x") == pytest.approx(before / 2, rel=1e-3)
+    assert page.evaluate("studio.views.made.photon_transfer.chart.marks[0].x") == pytest.approx(before / 2, rel=1e-3)
 
 
 @pytest.mark.slow(keep=1)
 def test_logarithmic_chart_reads_values_at_mouse(visit):
     page = visit()
     show(page, "snr")
-    until(page, "() => studio.page.parts.snr")
+    until(page, "() => studio.views.parts.snr")
     box = page.locator("#snr canvas").bounding_box()
     page.mouse.move(box["x"] + 46 + 0.5 * (box["width"] - 56), box["y"] + 40)
     first, *values = page.locator("#snr li").all_inner_texts()
     low, high = page.evaluate(
-        "() => { const all = studio.charts.snr.curves.flatMap((c) => [...c.x]); return [Math.min(...all), Math.max(...all)]; }"
+        "() => { const all = studio.views.made.snr.chart.curves.flatMap((c) => [...c.x]); return [Math.min(...all), Math.max(...all)]; }"
     )
 
     assert float(first.split()[0]) == pytest.approx(np.sqrt(low * high), rel=0.03)
@@ -241,12 +241,12 @@ def test_hidden_view_computes_nothing(visit):
     show(page, "histogram")
     set_value(page, "exposure_s", 0.01)
 
-    assert page.evaluate("studio.solid.view") is None
+    assert page.evaluate("studio.solid === undefined")
     show_solid(page, "stack")
     show(page, "histogram")
-    page.evaluate("() => { delete studio.page.parts.stack; window.drawn = studio.solid.view.counts.image; }")
+    page.evaluate("() => { delete studio.views.parts.solid; window.drawn = studio.solid.view.counts.image; }")
     set_value(page, "layout.parameters.n_sectors", 40)
-    assert page.evaluate("[studio.page.parts.stack === undefined, studio.solid.view.counts.image - window.drawn]") == [
+    assert page.evaluate("[studio.views.parts.solid === undefined, studio.solid.view.counts.image - window.drawn]") == [
         True,
         0,
     ]
@@ -285,9 +285,9 @@ def test_drag_shows_previews_and_then_everything(visit, monkeypatch):
     page = visit()
     page.evaluate("() => { studio.connection.set('optics.f_number', 4, false); }")
     until(page, "() => /^preview, /.test(document.getElementById('status').textContent.trim())")
-    assert page.evaluate("studio.page.parts.columns.is_preview && studio.state.is_preview")
+    assert page.evaluate("studio.views.parts.columns.is_preview && studio.state.is_preview")
     # Without further changes the complete result follows.
-    until(page, "() => studio.isReady && !studio.page.isPreview && !studio.state.is_preview")
+    until(page, "() => studio.isReady && !studio.connection.requests.isPreview && !studio.state.is_preview")
     assert "preview" not in page.inner_text("#status")
     set_value(page, "optics.f_number", 5.6)
     shot = build_shot(None, page.evaluate("studio.state.settings"))

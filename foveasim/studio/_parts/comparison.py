@@ -7,10 +7,10 @@ from foveasim.studio._engine import Simulated
 from foveasim.studio._parts.registry import PartData, part
 from foveasim.studio._variants import compare
 
-__all__ = ["comparison"]
 
-
-@part("A and B", lambda result: (result.capture, result.frozen and result.frozen.capture))
+@part(
+    "A and B", lambda result: (result.capture, result.frozen and result.frozen.capture), order=130, is_of_variants=True
+)
 def comparison(result: Simulated) -> PartData:
     """Return budgets and picture quality of the frozen variant and the current one."""
     if result.frozen is None:

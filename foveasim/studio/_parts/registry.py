@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from foveasim._core.short_repr import short_repr
 from foveasim.studio._engine import Simulated
 
-__all__ = ["PARTS", "Part", "PartData", "capture_of", "curves_of", "layout_of", "part"]
+__all__ = ["PARTS", "Part", "PartData", "capture_of", "curves_of", "layout_of", "page_part", "part"]
 
+#: Order of the first view in a tile.
+FIRST_TILE = 10
 #: Data of a part: plain data, and arrays by name.
 PartData = tuple[dict[str, Any], dict[str, NDArray[Any]]]
 
@@ -26,41 +28,82 @@ class Part:
     Attributes
     ----------
     name : str
+        Also of its module in ``static/views``.
     label : str
         Heading on the page.
     make : function of Simulated
-        Returns the data.
+        Returns the data; :func:`of_page` if the page has them.
     depends : function of Simulated
         Returns objects that determine the data: the part is computed again when one of them is another object, or a tuple
         that is not equal.
+    order : int
+        Position on the page; views below :data:`FIRST_TILE` are always shown, others in tiles.
+    is_first : bool
+        Whether the tile is shown at first.
     is_costly : bool
         Whether the part is computed only when a page asks for it, and not for previews.
+    is_of_variants : bool
+        Whether the part is computed only when there is a variant A.
     """
 
     name: str
     label: str
     make: Callable[[Simulated], PartData]
     depends: Callable[[Simulated], tuple[Any, ...]]
+    order: int = 1000
+    is_first: bool = False
     is_costly: bool = False
+    is_of_variants: bool = False
 
     __repr__ = short_repr
 
+    @property
+    def has_data(self) -> bool:
+        """Whether the server sends data."""
+        return self.make is not of_page
 
-#: Views by name.
+    def about(self) -> dict[str, Any]:
+        """Return what the page needs to know."""
+        return {
+            "name": self.name,
+            "label": self.label,
+            "is_tile": self.order >= FIRST_TILE,
+            "is_first": self.is_first,
+            "is_costly": self.is_costly,
+            "has_data": self.has_data,
+        }
+
+
+#: Views by name, in their order on the page.
 PARTS: dict[str, Part] = {}
 
 
+def _add(added: Part) -> None:
+    PARTS[added.name] = added
+    for each in sorted(PARTS.values(), key=lambda each: each.order):
+        PARTS[each.name] = PARTS.pop(each.name)
+
+
 def part(
-    label: str, depends: Callable[[Simulated], tuple[Any, ...]], *, is_costly: bool = False
+    label: str, depends: Callable[[Simulated], tuple[Any, ...]], **options: Any
 ) -> Callable[[Callable[[Simulated], PartData]], Callable[[Simulated], PartData]]:
-    """Register a function as the view with its name."""
+    """Register a function as the view with its name; options are attributes of :class:`Part`."""
 
     def register(make: Callable[[Simulated], PartData]) -> Callable[[Simulated], PartData]:
-        name = make.__name__
-        PARTS[name] = Part(name, label, make, depends, is_costly)
+        _add(Part(make.__name__, label, make, depends, **options))
         return make
 
     return register
+
+
+def page_part(name: str, label: str, **options: Any) -> None:
+    """Register a view whose data the page has."""
+    _add(Part(name, label, of_page, lambda _: (), **options))
+
+
+def of_page(_result: Simulated) -> PartData:
+    """Return nothing: the page has the data."""
+    return {}, {}
 
 
 def capture_of(result: Simulated) -> tuple[Any, ...]:

@@ -3,6 +3,7 @@
 import { clamp, roundStep, shown } from "/web/colours.js";
 import { outline, positionText } from "/web/marks.js";
 import { inkOf, make, notice, speak } from "/web/page_parts.js";
+import { ARROWS } from "/web/shell.js";
 import { KEY, boxOf, pathsOf, pointIn } from "./edits.js";
 import { fitted } from "./site_pane.js";
 import { nextVertex, onGrid, snap } from "./snapping.js";
@@ -18,24 +19,30 @@ const MOST_REMEMBERED = 300;
 // More selected sites than this are not followed through edits.
 const MOST_FOLLOWED = 50000;
 const INK = "#d6006c", HALO = "#ffffff", WRONG = "#d3261b";
-const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 // Fraction of the smallest site that the first design rules require of widths.
 const WIDTH_FRACTION = 0.5;
 
 export class Editor {
+  pane; button; studio; isOn = false; at = null; raw = null; shift = [0, 0]; ghost = null; pending = null;
+  base = null; kept = null; error = ""; rejected = ""; highlighted = null; trail = new Map(); known = ""; isByKeys = false;
+  isPlaced = true;
+
   // studio: the page through functions; see studio.js.
   constructor(pane, section, button, studio) {
-    Object.assign(this, { pane, button, studio, isOn: false, at: null, raw: null, points: [], shift: [0, 0], ghost: null, pending: null, base: null, kept: null, error: "", rejected: "", highlighted: null, trail: new Map(), known: "", isByKeys: false, isPlaced: true });
+    Object.assign(this, { pane, button, studio, points: [] });
     this.canvas = make("canvas", undefined, "ghost");
     this.canvas.setAttribute("aria-hidden", "true");
     pane.root.append(this.canvas);
     this.bar = new ToolBar(section, {
-      use: (name) => this.use(name), act: (name) => this.act(name), apply: () => this.tool.enter(), typed: (text) => this.placeTyped(text), grid: () => this.draw(),
+      use: (name) => this.use(name), act: (name) => this.act(name), apply: () => this.tool.enter(),
+      typed: (text) => this.placeTyped(text), grid: () => this.draw(),
       rules: () => this.useRules(),
     });
     this.tools = {
-      select: new PickTool(this, null), polygon: new PolygonTool(this), rectangle: new RectangleTool(this), move: new MoveTool(this), vertex: new VertexTool(this), cut: new CutTool(this),
-      merge: new PickTool(this, "merge"), split: new PickTool(this, "split"), channel: new PickTool(this, "channel"), layer: new LayerTool(this),
+      select: new PickTool(this, null), polygon: new PolygonTool(this), rectangle: new RectangleTool(this), move: new MoveTool(this),
+      vertex: new VertexTool(this), cut: new CutTool(this),
+      merge: new PickTool(this, "merge"), split: new PickTool(this, "split"), channel: new PickTool(this, "channel"),
+      layer: new LayerTool(this),
     };
     this.use("select");
     button.addEventListener("click", () => this.toggle());
@@ -64,7 +71,7 @@ export class Editor {
     if (isOn === this.isOn) return;
     if (!isOn) this.cancel();
     this.isOn = this.pane.isEdited = isOn;
-    this.button.setAttribute("aria-pressed", isOn);
+    this.button.setAttribute("aria-pressed", String(isOn));
     this.pane.root.classList.toggle("edited", isOn);
     this.bar.show(isOn);
     this.studio.opened(isOn);
@@ -84,7 +91,8 @@ export class Editor {
   // Reason for which the tool is not available.
   get problem() {
     const { inset_um: inset } = this.layout;
-    return this.name === "vertex" && inset > 0 ? "Vertices are those before the inset of " + shown(inset) + " µm: set inset in Layout to 0 to move them." : "";
+    return this.name === "vertex" && inset > 0 ? "Vertices are those before the inset of " + shown(inset)
+      + " µm: set inset in Layout to 0 to move them." : "";
   }
 
   // The settings changed.
@@ -163,7 +171,8 @@ export class Editor {
   // The edit that draws an outline through positions.
   drawing(path) {
     const channel = this.bar.number("channel");
-    return { kind: "draw", outlines_um: [path.map(this.toLayout)], overlap: this.bar.value("overlap"), ...(channel === null ? {} : { channel }) };
+    return { kind: "draw", outlines_um: [path.map(this.toLayout)], overlap: this.bar.value("overlap"),
+      ...(channel === null ? {} : { channel }) };
   }
 
   // Shows an edit that is not a step; by is the distance in µm by which selected sites move.
@@ -195,7 +204,9 @@ export class Editor {
     this.ghost = paths;
   }
 
-  commitAll(edits, [dx, dy] = [0, 0]) {
+  /** @param {any[]} edits @param {number[]} by */
+  commitAll(edits, by = [0, 0]) {
+    const [dx, dy] = by;
     const before = JSON.stringify(this.edits);
     this._remember(before);
     this._settle();
@@ -240,7 +251,8 @@ export class Editor {
   nudge([ux, uy], factor) {
     const { step, edits } = this, by = [ux * step * factor, uy * step * factor], last = edits.at(-1);
     const isNext = this.nudged && last && JSON.stringify(last) === this.nudged;
-    const edit = isNext ? { ...last, by_um: this.rounded([last.by_um[0] + by[0], last.by_um[1] + by[1]]) } : { kind: "move_sites", points_um: this.points, by_um: this.rounded(by) };
+    const edit = isNext ? { ...last, by_um: this.rounded([last.by_um[0] + by[0], last.by_um[1] + by[1]]) }
+      : { kind: "move_sites", points_um: this.points, by_um: this.rounded(by) };
     this.commitAll([...(isNext ? edits.slice(0, -1) : edits), edit], by);
     this.nudged = JSON.stringify(edit);
   }
@@ -249,9 +261,11 @@ export class Editor {
   addLayer(at, corners) {
     const found = this.studio.generators().find(({ label }) => label === this.bar.value("generator"));
     if (!found || !this.map) return;
-    const { generator, parameters, mosaic } = found.value, middle = corners ? { x: 0.5 * (corners[0].x + corners[2].x), y: 0.5 * (corners[0].y + corners[2].y) } : this.map;
+    const { generator, parameters, mosaic } = found.value, middle = corners
+      ? { x: 0.5 * (corners[0].x + corners[2].x), y: 0.5 * (corners[0].y + corners[2].y) } : this.map;
     const centre = at || { x: onGrid(middle.x, this.step), y: onGrid(middle.y, this.step) };
-    const layer = { generator, parameters, ...(mosaic ? { mosaic } : {}), move_um: this.toLayout(centre) }, margin = this.bar.number("margin_um");
+    const layer = { generator, parameters, ...(mosaic ? { mosaic } : {}), move_um: this.toLayout(centre) };
+    const margin = this.bar.number("margin_um");
     const region = corners ? { region: corners.map(this.toLayout) } : {};
     this.commit({ kind: "overlay", layer, operation: this.bar.value("operation"), ...(margin ? { margin_um: margin } : {}), ...region });
     this.studio.showSteps(this.edits.length - 1);
@@ -261,8 +275,12 @@ export class Editor {
   useRules() {
     const { rules } = this.layout, smallest = this.studio.summary()?.min_size_um;
     if (rules) { this.studio.showRules(); return; }
-    const floor = (value) => { const unit = 10 ** (Math.floor(Math.log10(value)) - 1); return Number((Math.floor(value / unit + 1e-9) * unit).toPrecision(2)); };
-    this.studio.send("layout.rules", { min_size_um: floor(smallest), min_width_um: floor(WIDTH_FRACTION * smallest), max_overlap_um2: 0 }, true);
+    const floor = (value) => {
+      const unit = 10 ** (Math.floor(Math.log10(value)) - 1);
+      return Number((Math.floor(value / unit + 1e-9) * unit).toPrecision(2));
+    };
+    this.studio.send("layout.rules", { min_size_um: floor(smallest), min_width_um: floor(WIDTH_FRACTION * smallest),
+      max_overlap_um2: 0 }, true);
     this.studio.showRules();
   }
 
@@ -306,14 +324,17 @@ export class Editor {
         if (event.type === "pointercancel") this.tool.cancel();
         else if (this.tool.isHeld && this.isDragged) this.tool.release(this.at);
         else if (this.tool.isHeld) this.tool.tap(this.at);
-      } else if (isClick && event.type === "pointerup") this.tool.click(this.raw, { isSecond: event.shiftKey || event.ctrlKey || event.metaKey });
+      } else if (isClick && event.type === "pointerup") this.tool.click(this.raw,
+        { isSecond: event.shiftKey || event.ctrlKey || event.metaKey });
       start = null;
       this.isDragged = isUsed = false;
       this.studio.redraw();
     };
     root.addEventListener("pointerup", end, true);
     root.addEventListener("pointercancel", end, true);
-    this.pane.marks.addEventListener("pointerleave", () => { if (!start && !this.isByKeys && !this.tool.isHeld) { this.at = this.raw = null; this.draw(); } });
+    this.pane.marks.addEventListener("pointerleave", () => {
+      if (!start && !this.isByKeys && !this.tool.isHeld) { this.at = this.raw = null; this.draw(); }
+    });
     addEventListener("keyup", ({ key }) => { if (key === " ") this.isSpace = false; });
     addEventListener("blur", () => { this.isSpace = false; });
   }
@@ -350,7 +371,8 @@ export class Editor {
     if (!isPlain) return (event.ctrlKey || event.metaKey) && letter === "z" && !event.shiftKey && this._undone(this.tool.back());
     const onMap = event.target === this.pane.marks || event.target === document.body;
     if (key === "Escape") return this._escape();
-    if (key === "Delete" || key === "Backspace") return this._undone((key === "Backspace" && this.tool.back()) || this.tool.remove()) || this._removeSelected();
+    if (key === "Delete" || key === "Backspace") return this._undone((key === "Backspace" && this.tool.back()) || this.tool.remove())
+      || this._removeSelected();
     if (onMap && key === " ") { this.isSpace = true; return true; }
     if (onMap && key === "Enter") { this._enter(event.shiftKey); return true; }
     if (onMap && ARROWS[key]) return this._arrow(ARROWS[key], event.shiftKey ? 10 : 1);
@@ -406,8 +428,10 @@ export class Editor {
     if (name === "move" && !tool.isHeld && this.selected.length) { this.nudge(direction, factor); return true; }
     this._startKeys();
     this.isPlaced = false;
-    const next = name === "vertex" && !tool.isHeld && this.sites ? nextVertex(this.at, direction, this.sites, 0.5 * (map.width / map.scale)) : null;
-    this._moveTo(next || { x: onGrid(this.at.x + direction[0] * step * factor, step), y: onGrid(this.at.y + direction[1] * step * factor, step), kind: "grid", isExact: true });
+    const next = name === "vertex" && !tool.isHeld && this.sites
+      ? nextVertex(this.at, direction, this.sites, 0.5 * (map.width / map.scale)) : null;
+    this._moveTo(next || { x: onGrid(this.at.x + direction[0] * step * factor, step),
+      y: onGrid(this.at.y + direction[1] * step * factor, step), kind: "grid", isExact: true });
     return true;
   }
 
@@ -448,8 +472,8 @@ export class Editor {
   // Outlines of an edit on the map; edits at sites have those of the sites that are there.
   outlinesOf(edit) {
     const [mx, my] = this.move, { sites } = this, layer = edit.region ? null : edit.layer?.move_um;
-    const paths = layer ? [{ points: [layer] }] : pathsOf(edit);
-    return paths.map(({ points, isClosed }) => ({ points: points.map(([x, y]) => [x + mx, y + my]), isClosed })).flatMap((path) => {
+    const paths = layer ? [{ points: [layer], isClosed: false }] : pathsOf(edit);
+    return paths.map((path) => ({ ...path, points: path.points.map(([x, y]) => [x + mx, y + my]) })).flatMap((path) => {
       if (path.points.length > 1 || !sites) return [path];
       const all = sites.pickAll(...path.points[0]);
       return all.length && !layer ? [{ site: all[all.length - 1], points: path.points }] : [path];
@@ -458,7 +482,9 @@ export class Editor {
 
   // Box of an edit on the map, or null.
   boxOf(edit) {
-    const { sites } = this, points = this.outlinesOf(edit).flatMap(({ points, site }) => (site === undefined ? points : [[sites.box[4 * site], sites.box[4 * site + 1]], [sites.box[4 * site + 2], sites.box[4 * site + 3]]]));
+    const { sites } = this;
+    const points = this.outlinesOf(edit).flatMap(({ points, site }) =>
+      (site === undefined ? points : [[sites.box[4 * site], sites.box[4 * site + 1]], [sites.box[4 * site + 2], sites.box[4 * site + 3]]]));
     return boxOf(points);
   }
 
@@ -475,14 +501,15 @@ export class Editor {
   }
 
   draw() {
-    const { pane, map, canvas } = this;
+    const { pane, canvas } = this;
     if (!this.isOn || !pane.isShown) { if (canvas.width > 1 && !this.isOn) fitted(canvas); return; }
     const { context } = fitted(canvas), paths = this.problem ? [] : [...(this.ghost || []), ...this.tool.paths];
     if (this.highlighted && this.edits[this.highlighted.index]) this._drawHighlight(context, this.edits[this.highlighted.index]);
     for (const path of paths) this._drawPath(context, path);
     if (this.at && this.tool.snaps) this._drawMarker(context, this.at);
     else if (this.isByKeys && this.at) this._drawMarker(context, { ...this.at, kind: "grid" });
-    const active = this.tool.paths.filter((path) => !path.isFaint), box = active.length ? boxOf(active.flatMap((path) => path.points)) : null;
+    const active = this.tool.paths.filter((path) => !path.isFaint);
+    const box = active.length ? boxOf(active.flatMap((path) => path.points)) : null;
     if (this.at && this.tool.snaps) this._drawTag(context, this.kept ? this.violationsIn(box) : [], active);
     this._describe();
   }
@@ -530,7 +557,12 @@ export class Editor {
     const { map } = this, px = map.toX(x), py = map.toY(y);
     outline(context, () => {
       if (kind === "vertex") context.rect(px - 5, py - 5, 10, 10);
-      else if (kind === "midpoint") { context.moveTo(px, py - 6); context.lineTo(px + 6, py + 5); context.lineTo(px - 6, py + 5); context.closePath(); }
+      else if (kind === "midpoint") {
+        context.moveTo(px, py - 6);
+        context.lineTo(px + 6, py + 5);
+        context.lineTo(px - 6, py + 5);
+        context.closePath();
+      }
       else if (kind === "edge") { context.moveTo(px + 5, py); context.arc(px, py, 5, 0, 7); }
       else { context.moveTo(px - 6, py); context.lineTo(px + 6, py); context.moveTo(px, py - 6); context.lineTo(px, py + 6); }
     }, [4.5, 2], [HALO, this.error ? WRONG : INK]);
@@ -538,13 +570,15 @@ export class Editor {
 
   // Coordinates, distances and violations next to the cursor.
   _drawTag(context, violations, active) {
-    const { map, at, tool } = this, { origin } = tool, figure = (value) => positionText(value, map.scale), lines = [this._positionOf(at) + " µm"];
+    const { map, at, tool } = this, { origin } = tool, figure = (value) => positionText(value, map.scale);
+    const lines = [this._positionOf(at) + " µm"];
     if (origin) {
       const dx = at.x - origin.x, dy = at.y - origin.y, angle = (Math.atan2(dy, dx) * 180) / Math.PI;
       if (active[0]?.isBox) lines.push(figure(Math.abs(dx)) + " × " + figure(Math.abs(dy)) + " µm");
       else lines.push("Δ " + figure(dx) + ", " + figure(dy), figure(Math.hypot(dx, dy)) + " µm  " + Math.round(angle * 10) / 10 + "°");
     }
-    if (violations.length) lines.push([...new Set(violations)].slice(0, 2).join(", ") + (violations.length > 1 ? " (" + shown(violations.length) + ")" : ""));
+    if (violations.length) lines.push([...new Set(violations)].slice(0, 2).join(", ")
+      + (violations.length > 1 ? " (" + shown(violations.length) + ")" : ""));
     context.font = "11.5px system-ui, sans-serif";
     const width = Math.max(...lines.map((line) => context.measureText(line).width)) + 12, height = 15 * lines.length + 6;
     let x = map.toX(at.x) + 14, y = map.toY(at.y) + 14;
@@ -564,12 +598,16 @@ export class Editor {
 
   _describe() {
     const { layout, bar, selected, at } = this, violations = this.studio.violations(), n = this.studio.nViolations();
-    const inset = layout.inset_um > 0 && ["polygon", "rectangle", "cut"].includes(this.name) ? "Outlines are drawn before the inset of " + shown(layout.inset_um) + " µm." : "";
-    const picked = ["merge", "split", "channel", "move"].includes(this.name) && selected.length ? shown(selected.length) + (selected.length === 1 ? " site selected. " : " sites selected. ") : "";
+    const inset = layout.inset_um > 0 && ["polygon", "rectangle", "cut"].includes(this.name)
+      ? "Outlines are drawn before the inset of " + shown(layout.inset_um) + " µm." : "";
+    const picked = ["merge", "split", "channel", "move"].includes(this.name) && selected.length
+      ? shown(selected.length) + (selected.length === 1 ? " site selected. " : " sites selected. ") : "";
     bar.describe({
-      note: this.problem || inset || (picked && picked + bar.usual), error: this.error || this.rejected, isReady: this.tool.isReady, isSelected: selected.length > 0, position: at ? this._positionOf(at) : "", step: this.step,
+      note: this.problem || inset || (picked && picked + bar.usual), error: this.error || this.rejected, isReady: this.tool.isReady,
+      isSelected: selected.length > 0, position: at ? this._positionOf(at) : "", step: this.step,
       rules: layout.rules
-        ? { exist: true, text: n ? shown(n) + (n === 1 ? " violation" : " violations") : "rules satisfied", title: "Show the design rules", isWrong: n > 0 && Boolean(violations) }
+        ? { exist: true, text: n ? shown(n) + (n === 1 ? " violation" : " violations") : "rules satisfied",
+          title: "Show the design rules", isWrong: n > 0 && Boolean(violations) }
         : { exist: false, text: "Add design rules", title: "Check the smallest size, width and overlaps while drawing", isWrong: false },
     });
   }

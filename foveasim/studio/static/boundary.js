@@ -22,7 +22,8 @@ export function boundaryOf(sites) {
 
 // Pairs of positions of the edges that occur once.
 function outerEdges({ position, ringOffsets }) {
-  const n = position.length, size = 2 ** Math.ceil(Math.log2(4 * n + 16)), table = new Int32Array(size).fill(-1), next = new Uint32Array(n), count = new Uint8Array(n);
+  const n = position.length, size = 2 ** Math.ceil(Math.log2(4 * n + 16)), table = new Int32Array(size).fill(-1);
+  const next = new Uint32Array(n), count = new Uint8Array(n);
   for (let ring = 0; ring + 1 < ringOffsets.length; ring++) {
     for (let v = ringOffsets[ring], to = ringOffsets[ring + 1]; v < to; v++) next[v] = v + 1 < to ? v + 1 : ringOffsets[ring];
   }

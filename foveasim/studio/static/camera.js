@@ -23,7 +23,7 @@ export class Camera {
       this.video.muted = this.video.playsInline = true;
       this.video.srcObject = this.stream;
       await this.video.play();
-    } catch (error) {
+    } catch (/** @type {any} */ error) {
       this.stop();
       return PROBLEMS[error.name] || "The camera does not start (" + error.name + ")";
     }

@@ -3,13 +3,15 @@
 import { brief, clamp, roundStep, shown } from "/web/colours.js";
 import { watchSize } from "/web/gl.js";
 import { inkOf, make } from "/web/page_parts.js";
+import { listenToRange } from "/web/shell.js";
 import { sizeOf } from "./frames.js";
 import { fitted } from "./site_pane.js";
 
 const FONT = "11px system-ui, sans-serif";
 // Names of curves with a colour of their own; other curves have the next of the list, by theme.
 const NAMED = { R: ["#c62828", "#ff7b72"], G: ["#1b7f3b", "#5fd37f"], B: ["#1f5fbf", "#7db3ff"], W: ["#566073", "#c3cad6"] };
-const INKS = [["#1f5fbf", "#7db3ff"], ["#c2571a", "#ffa657"], ["#1b7f3b", "#5fd37f"], ["#8338a8", "#d2a8ff"], ["#a02c5a", "#ff8cc0"], ["#566073", "#c3cad6"]];
+const INKS = [["#1f5fbf", "#7db3ff"], ["#c2571a", "#ffa657"], ["#1b7f3b", "#5fd37f"], ["#8338a8", "#d2a8ff"], ["#a02c5a", "#ff8cc0"],
+  ["#566073", "#c3cad6"]];
 const STEPS = 72;
 
 const theme = () => (document.documentElement.dataset.theme === "dark" ? 1 : 0);
@@ -30,7 +32,8 @@ function limitsOf(arrays) {
 
 // Powers of ten in a range; with few of them also 2 and 5 times.
 function decadesOf(low, high, most) {
-  const first = Math.floor(Math.log10(low)), last = Math.ceil(Math.log10(high)), skip = Math.ceil((last - first) / Math.max(1, most)), ticks = [];
+  const first = Math.floor(Math.log10(low)), last = Math.ceil(Math.log10(high)), skip = Math.ceil((last - first) / Math.max(1, most));
+  const ticks = [];
   for (let e = first; e <= last; e++) {
     for (const step of 3 * (last - first) <= most ? [1, 2, 5] : [1]) {
       const tick = Number((step * 10 ** e).toPrecision(3));
@@ -44,9 +47,11 @@ const decadeText = (value) => (value >= 1e-3 && value < 1e4 ? String(value) : va
 
 // Conversion of numbers to fractions of an axis, and its ticks.
 function axisOf(low, high, isLog) {
-  if (!isLog) return { low, high, at: (v) => (v - low) / (high - low), value: (t) => low + t * (high - low), ticks: (most) => ticksOf(low, high, most), text: brief };
+  if (!isLog) return { low, high, at: (v) => (v - low) / (high - low), value: (t) => low + t * (high - low),
+    ticks: (most) => ticksOf(low, high, most), text: brief };
   const span = Math.log(high / low);
-  return { low, high, at: (v) => Math.log(v / low) / span, value: (t) => low * Math.exp(t * span), ticks: (most) => decadesOf(low, high, most), text: decadeText };
+  return { low, high, at: (v) => Math.log(v / low) / span, value: (t) => low * Math.exp(t * span),
+    ticks: (most) => decadesOf(low, high, most), text: decadeText };
 }
 
 // Limits of positive numbers for a logarithmic axis.
@@ -58,8 +63,10 @@ function decadeLimits(arrays) {
 
 // Curves y of x with their legend; dashed curves are those of variant A. Axes in "log" (such as "xy") are logarithmic.
 export class CurveChart {
+  root; nameX; nameY; label; log; marks = []; lines = [];
+
   constructor(root, { nameX, nameY, label, log = "" }) {
-    Object.assign(this, { root, nameX, nameY, label, log, marks: [], lines: [] });
+    Object.assign(this, { root, nameX, nameY, label, log });
     this.canvas = make("canvas");
     this.canvas.setAttribute("role", "img");
     this.legend = make("ul", undefined, "chart-legend");
@@ -69,7 +76,10 @@ export class CurveChart {
     this.curves = [];
     this.at = null;
     watchSize(this.canvas, () => this.draw());
-    this.canvas.addEventListener("pointermove", (event) => { this.at = event.clientX - this.canvas.getBoundingClientRect().left; this.draw(); });
+    this.canvas.addEventListener("pointermove", (event) => {
+      this.at = event.clientX - this.canvas.getBoundingClientRect().left;
+      this.draw();
+    });
     this.canvas.addEventListener("pointerleave", () => { this.at = null; this.draw(); });
   }
 
@@ -80,7 +90,10 @@ export class CurveChart {
     this.note.textContent = note;
     this.note.hidden = !note;
     const own = curves.filter((curve) => !curve.isDashed);
-    this.canvas.setAttribute("aria-label", this.label + ": " + (own.length ? own.map((curve) => curve.label + ", largest value " + shown(Number(limitsOf([curve.y])[1].toPrecision(3)))).join("; ") : "no data"));
+    this.canvas.setAttribute("aria-label", this.label + ": "
+      + (own.length
+        ? own.map((curve) => curve.label + ", largest value " + shown(Number(limitsOf([curve.y])[1].toPrecision(3)))).join("; ")
+          : "no data"));
     this.draw();
   }
 
@@ -88,7 +101,8 @@ export class CurveChart {
     if (!sizeOf(this.root).width) return;
     const { curves } = this, own = curves.filter((curve) => !curve.isDashed), left = 46, right = 10, top = 8, bottom = 32;
     const inks = curves.map((curve) => inkOfCurve(curve, own.findIndex((one) => one.label === curve.label)));
-    const isLogX = this.log.includes("x"), isLogY = this.log.includes("y"), allX = [...curves.map((curve) => curve.x), this.marks.map((mark) => mark.x)];
+    const isLogX = this.log.includes("x"), isLogY = this.log.includes("y");
+    const allX = [...curves.map((curve) => curve.x), this.marks.map((mark) => mark.x)];
     const axisX = axisOf(...(isLogX ? decadeLimits(allX) : limitsOf(allX)), isLogX), wide = sizeOf(this.canvas).width - left - right;
     const here = this.at === null || !own.length ? null : axisX.value(clamp((this.at - left) / wide, 0, 1));
     // The legend first: the rest of the height is for the canvas.
@@ -194,7 +208,8 @@ export class CurveChart {
       swatch.style.background = inks[k];
       const value = here === null ? "" : " " + brief(Number(valueAt(curve, here).toPrecision(3)));
       const line = curve.isDashed ? null : this.lines.find((one) => one.label === curve.label);
-      const text = (curve.isDashed ? "A: " : "") + curve.label + value + (line && here === null ? ", " + line.of + " " + brief(Number(line.x.toPrecision(3))) : "");
+      const text = (curve.isDashed ? "A: " : "") + curve.label + value
+        + (line && here === null ? ", " + line.of + " " + brief(Number(line.x.toPrecision(3))) : "");
       item.append(swatch, make("span", text));
       return item;
     });
@@ -202,6 +217,26 @@ export class CurveChart {
     this.legend.replaceChildren(...items);
   }
 }
+
+const curvesOf = ({ about, arrays }, isDashed) =>
+  about.curves.map((curve, k) => ({ ...curve, x: arrays["x-" + k], y: arrays["y-" + k], isDashed }));
+const isSame = (one, other) => one.label === other.label && one.y.length === other.y.length && one.y.every((v, i) => v === other.y[i]);
+
+// Returns the function "create" of a view that shows curves of the server, with those of variant A as dashed ones.
+export const curveView = (options) => (root) => {
+  const frame = make("div", undefined, "chart"), chart = new CurveChart(frame, options);
+  frame.id = root.id.replace("tile-", "");
+  root.append(frame);
+  return {
+    chart,
+    draw: () => chart.draw(),
+    use(part, before) {
+      const curves = curvesOf(part, false), others = before ? curvesOf(before, true) : [];
+      // Curves of A that are equal in B would be hidden.
+      chart.use([...curves, ...others.filter((one) => !curves.some((other) => isSame(one, other)))], part.about);
+    },
+  };
+};
 
 // Linear interpolation on increasing x.
 function valueAt({ x, y }, at) {
@@ -220,18 +255,8 @@ export class Histogram {
     this.root = root;
     root.append(this.canvas);
     watchSize(this.canvas, () => this.draw(...(this.drawn || [])));
-    let start = null;
-    const valueAtEvent = (event) => {
-      const box = this.canvas.getBoundingClientRect(), { scale } = this, value = scale.value(clamp((event.clientX - box.left - this.left) / this.wide, 0, 1));
-      return scale.column.is_integer && !scale.isLog ? Math.round(value) : value;
-    };
-    this.canvas.addEventListener("pointerdown", (event) => { if (this.scale) { start = valueAtEvent(event); this.canvas.setPointerCapture(event.pointerId); } });
-    this.canvas.addEventListener("pointermove", (event) => {
-      if (start === null || !event.buttons) return;
-      const now = valueAtEvent(event);
-      onRange(start === now ? null : [Math.min(start, now), Math.max(start, now)]);
-    });
-    this.canvas.addEventListener("pointerup", (event) => { if (start !== null && valueAtEvent(event) === start) onRange(null); start = null; });
+    const fractionOf = (event) => (event.clientX - this.canvas.getBoundingClientRect().left - this.left) / this.wide;
+    listenToRange(this.canvas, () => this.scale, fractionOf, onRange);
   }
 
   use(scale, other) {
@@ -244,7 +269,8 @@ export class Histogram {
     const { scale, counts, others } = this;
     this.drawn = [range, value];
     if (!scale || !sizeOf(this.root).width) return;
-    const { context, width, height } = fitted(this.canvas), left = 46, right = 10, top = 8, bottom = 32, w = width - left - right, h = height - top - bottom;
+    const { context, width, height } = fitted(this.canvas), left = 46, right = 10, top = 8, bottom = 32, w = width - left - right;
+    const h = height - top - bottom;
     this.left = left;
     this.wide = w;
     const most = Math.max(1, ...counts, ...(others || [])), tall = (count) => (count ? Math.max(1.5, Math.sqrt(count / most) * h) : 0);
@@ -269,7 +295,11 @@ export class Histogram {
       context.strokeStyle = inkOf("--text");
       context.lineWidth = 1;
       context.beginPath();
-      others.forEach((count, i) => { const y = top + h - tall(count); context.lineTo(left + i * step, y); context.lineTo(left + (i + 1) * step, y); });
+      others.forEach((count, i) => {
+        const y = top + h - tall(count);
+        context.lineTo(left + i * step, y);
+        context.lineTo(left + (i + 1) * step, y);
+      });
       context.stroke();
     }
     context.fillStyle = inkOf("--line");
@@ -280,7 +310,8 @@ export class Histogram {
     const ticks = isKinds && column.names && column.names.length <= 12 ? column.names.map((_, k) => k) : scale.ticks(Math.max(2, w / 48));
     for (const tick of ticks) {
       const at = isKinds ? (tick - scale.from + 0.5) * step : scale.fraction(tick) * w;
-      if (at >= -0.5 && at <= w + 0.5) context.fillText(isKinds && column.names ? column.names[tick] : brief(tick), clamp(left + at, left, width - 14), top + h + 15);
+      if (at >= -0.5 && at <= w + 0.5) context.fillText(isKinds && column.names ? column.names[tick] : brief(tick),
+        clamp(left + at, left, width - 14), top + h + 15);
     }
     context.fillText(axisTitle(column.label, column.unit), left + 0.5 * w, height - 4);
     if (Number.isFinite(value)) {
@@ -299,7 +330,8 @@ export class Histogram {
 
 // Rows of horizontal bars: sources of noise by size, with those of variant A as a line.
 export function barRows(sources, others, unit) {
-  const before = new Map((others || []).map((source) => [source.name, source.values])), most = Math.max(1e-12, ...sources.map((source) => source.values), ...before.values());
+  const before = new Map((others || []).map((source) => [source.name, source.values]));
+  const most = Math.max(1e-12, ...sources.map((source) => source.values), ...before.values());
   return [...sources].sort((a, b) => b.values - a.values).map((source) => {
     const row = make("li"), bar = make("i"), was = before.get(source.name), track = make("span", undefined, "track");
     bar.style.width = (100 * source.values) / most + "%";

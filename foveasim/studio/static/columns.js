@@ -32,7 +32,8 @@ export class Columns {
       owners.fill(site + 1, from, to);
       owners.fill(site + 1, n + from, n + to);
       for (let ring = sites.firstRing(site); ring < sites.firstRing(site + 1); ring++) {
-        for (let v = sites.ringOffsets[ring], end = sites.ringOffsets[ring + 1]; v < end; v++) after[v] = v + 1 < end ? v + 1 : sites.ringOffsets[ring];
+        for (let v = sites.ringOffsets[ring], end = sites.ringOffsets[ring + 1]; v < end; v++) after[v] = v + 1 < end ? v + 1
+          : sites.ringOffsets[ring];
       }
     }
     const { corners, tiles: flat } = sites.triangles(), indices = new Uint32Array(corners.length + 6 * n), tiles = [];

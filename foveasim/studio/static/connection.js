@@ -23,26 +23,62 @@ export function readPart(buffer) {
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
   const arrays = {};
   for (const { name, type, size, offset } of header.arrays) arrays[name] = new TYPES[type](buffer, 4 + length + offset, size);
-  return { part: header.part, version: header.version, is_preview: Boolean(header.is_preview), hasMore: Boolean(header.has_more), about: header.about, arrays };
+  return { part: header.part, version: header.version, is_preview: Boolean(header.is_preview), hasMore: Boolean(header.has_more),
+    about: header.about, arrays };
+}
+
+// Messages of one connection: their numbers, which of them wait for an answer, and the views that the page asked for.
+export class Requests {
+  lastId; doneId; nDone = 0; lastMs = NaN; isBusy = false; isPreview = false; sentAt = new Map(); waiting = [];
+  draftId = null; nextDraft = null; views = ""; pixels = 0;
+
+  constructor(lastId = 0) {
+    Object.assign(this, { lastId });
+  }
+
+  // Returns the number of a new message.
+  next() {
+    this.sentAt.set(++this.lastId, performance.now());
+    return this.lastId;
+  }
+
+  // Resolves to whether the message with this number succeeded; without a number it failed.
+  answered(id) { return id === null ? Promise.resolve(false) : new Promise((resolve) => { this.waiting.push({ id, resolve }); }); }
+
+  // Messages up to this number are answered; only the last one can have failed.
+  settle(id, isFailed) {
+    const isAnswered = (one) => id >= one.id;
+    for (const one of this.waiting.filter(isAnswered)) one.resolve(!isFailed || (one.id !== id && id !== Infinity));
+    this.waiting = this.waiting.filter((one) => !isAnswered(one));
+  }
+
+  // A result is shown: measures the time since its message.
+  show(id) {
+    const start = this.sentAt.get(id);
+    for (const old of this.sentAt.keys()) if (old <= id) this.sentAt.delete(old);
+    if (start !== undefined) this.lastMs = performance.now() - start;
+    this.doneId = id;
+  }
 }
 
 export class Connection {
-  // Callbacks: hello(message, { isSame: whether the token is that of an earlier connection }), message(message), part(part), status("open" | "lost" | "denied").
+  // Callbacks: hello(message, { isSame: whether the token is that of an earlier connection }), message(message), part(part),
+  // status("open" | "lost" | "denied").
   constructor(on) {
     this.on = on;
     // Settings of a link may follow.
     this.token = location.hash.slice(1).split("&").find((part) => !part.includes("=")) || memory.get("token") || "";
-    this.id = 0;
+    this.requests = new Requests();
     this.delay = FIRST_DELAY_MS;
     this.isOpen = false;
-    this.waiting = null;
-    this.preview = null;
     this.unsent = new Map();
-    this.sentAt = new Map();
     const now = () => { if (!this.socket && !this.isDenied) this.open(); };
     addEventListener("online", now);
     addEventListener("focus", now);
   }
+
+  // Whether all drafts are answered, and the server computes nothing.
+  get isSettled() { return this.isOpen && !this.requests.isBusy && this.requests.draftId === null; }
 
   open() {
     clearTimeout(this.retry);
@@ -61,7 +97,9 @@ export class Connection {
     if (socket !== this.socket) return;
     this.socket = null;
     this.isOpen = false;
-    this._settle(Infinity);
+    clearTimeout(this.patience);
+    this.requests.settle(Infinity, true);
+    this.requests = new Requests(this.requests.lastId);
     this.isDenied = code === WRONG_TOKEN;
     this.on.status(this.isDenied ? "denied" : "lost");
     if (this.isDenied) return;
@@ -70,7 +108,8 @@ export class Connection {
   }
 
   _receive(message) {
-    if (message.kind === "hello") {
+    const { requests } = this, { kind, id } = message;
+    if (kind === "hello") {
       const isSame = memory.get("token") === this.token;
       this.isOpen = true;
       this.delay = FIRST_DELAY_MS;
@@ -82,35 +121,49 @@ export class Connection {
       this.unsent.clear();
       return;
     }
-    this.on.message(message);
-    const isAnswer = message.kind === "done" || (message.kind === "error" && !message.part) || (message.kind === "state" && Object.keys(message.errors || {}).length > 0);
-    if (isAnswer) this._settle(message.id);
+    const isFailed = (kind === "error" && !message.part) || (kind === "state" && Object.keys(message.errors || {}).length > 0);
+    if (kind === "busy") requests.isBusy = true;
+    else if (kind === "done" || kind === "error" || isFailed) requests.isBusy = false;
+    if (kind === "done") {
+      requests.nDone++;
+      requests.isPreview = Boolean(message.is_preview);
+    }
+    this.on.message(message, { isFailed });
+    if (kind !== "done" && !isFailed) return;
+    requests.settle(id, isFailed);
+    if (requests.draftId !== null && id >= requests.draftId) this._sendDraft();
   }
 
-  // The message with this number, and all before it, are answered: the newest waiting preview follows.
-  _settle(id) {
-    if (this.waiting === null || !(id >= this.waiting)) return;
+  // The draft is answered, or takes too long: the newest one that waits follows.
+  _sendDraft() {
+    const { requests } = this, next = requests.nextDraft;
     clearTimeout(this.patience);
-    this.waiting = null;
-    const next = this.preview;
-    this.preview = null;
+    requests.draftId = requests.nextDraft = null;
     if (next && this.isOpen) this.set(next.key, next.value, false);
   }
 
   // Returns the number of the message, or null without a connection.
   send(message) {
     if (!this.isOpen) return null;
-    const id = ++this.id;
-    this.sentAt.set(id, performance.now());
+    const id = this.requests.next();
     this.socket.send(JSON.stringify({ ...message, id }));
     return id;
+  }
+
+  // Asks for the data of views, and for pictures of this size, unless they are those of the last time.
+  askFor(names, pixels) {
+    const views = JSON.stringify({ do: "views", names, pixels });
+    if (!this.isOpen || views === this.requests.views) return;
+    this.requests.views = views;
+    this.requests.pixels = pixels;
+    this.send({ do: "views", names, pixels });
   }
 
   // Sends a frame of the camera: its header with the number of the message, and its pixels. Returns the number, or null.
   sendFrame(header, pixels) {
     if (!this.isOpen) return null;
-    const id = ++this.id, text = new TextEncoder().encode(JSON.stringify({ ...header, id })), message = new Uint8Array(4 + text.length + pixels.length);
-    this.sentAt.set(id, performance.now());
+    const id = this.requests.next(), text = new TextEncoder().encode(JSON.stringify({ ...header, id }));
+    const message = new Uint8Array(4 + text.length + pixels.length);
     new DataView(message.buffer).setUint32(0, text.length, true);
     message.set(text, 4);
     message.set(pixels, 4 + text.length);
@@ -118,35 +171,29 @@ export class Connection {
     return id;
   }
 
-  // Sets a value. Previews wait until the one before is answered, and the newest wins; final values are sent at once.
+  // Sets a value. Drafts wait until the one before is answered, and the newest wins; final values are sent at once.
   set(key, value, isFinal) {
+    const { requests } = this;
     if (!this.isOpen) {
       if (isFinal) this.unsent.set(key, value);
       return null;
     }
-    if (!isFinal && this.waiting !== null) {
-      this.preview = { key, value };
+    if (!isFinal && requests.draftId !== null) {
+      requests.nextDraft = { key, value };
       return null;
     }
-    if (isFinal) this.preview = null;
+    if (isFinal) requests.nextDraft = null;
     const id = this.send({ do: "set", key, value, final: isFinal });
-    this.waiting = id;
+    requests.draftId = id;
     clearTimeout(this.patience);
-    this.patience = setTimeout(() => this._settle(Infinity), PATIENCE_MS);
+    this.patience = setTimeout(() => this._sendDraft(), PATIENCE_MS);
     return id;
   }
 
   // Removes a value, with its default after that.
   remove(key) {
-    this.preview = null;
+    this.requests.nextDraft = null;
     return this.send({ do: "delete", key });
-  }
-
-  // Time in ms since a message was sent.
-  since(id) {
-    const start = this.sentAt.get(id);
-    for (const old of this.sentAt.keys()) if (old <= id) this.sentAt.delete(old);
-    return start === undefined ? NaN : performance.now() - start;
   }
 
   get headers() { return { Authorization: "Bearer " + this.token, "X-Session": memory.get("session") || "" }; }

@@ -11,7 +11,8 @@ const TAGS = ["kind", "generator"];
 const LOG_STEP = 1.02;
 const LINEAR_STEPS = 200;
 
-export const valueAt = (settings, key) => key.split(".").reduce((part, name) => (part === null || part === undefined ? undefined : part[name]), settings);
+export const valueAt = (settings, key) => key.split(".").reduce((part, name) =>
+  (part === null || part === undefined ? undefined : part[name]), settings);
 
 // Formats a value of a setting for its field.
 export function fieldText(value) {
@@ -49,7 +50,8 @@ function sliderOf({ minimum, maximum, suggested, scale, kind }, value) {
       },
     };
   }
-  const unit = isInteger ? Math.max(1, roundStep((high - low) / 1000, true)) : roundStep((high - low) / LINEAR_STEPS), steps = Math.ceil((high - low) / unit - 1e-9);
+  const unit = isInteger ? Math.max(1, roundStep((high - low) / 1000, true)) : roundStep((high - low) / LINEAR_STEPS);
+  const steps = Math.ceil((high - low) / unit - 1e-9);
   return {
     steps, unit,
     toStep: (v) => (clamp(v, low, high) - low) / unit,
@@ -67,7 +69,8 @@ function chosenOf({ choices, selected }, value) {
   if (equal >= 0) return equal;
   if (isSection(value)) {
     const tag = value.kind !== undefined ? "kind" : "generator";
-    const found = value[tag] === undefined ? -1 : choices.findIndex((choice) => isSection(choice.value) && choice.value[tag] === value[tag]);
+    const found = value[tag] === undefined ? -1 : choices.findIndex((choice) => isSection(choice.value)
+      && choice.value[tag] === value[tag]);
     return found >= 0 ? found : selected ?? -1;
   }
   if (value === null || value === undefined) return selected ?? -1;
@@ -84,12 +87,14 @@ function labelOf({ key, label }) {
   return label.split(" ").map((word) => SHORT[word] || word).join(" ");
 }
 
-const choicesOf = (control) => (control.choices || []).map((choice) => (choice !== null && typeof choice === "object" && "value" in choice ? choice : { label: fieldText(choice), value: choice }));
+const choicesOf = (control) => (control.choices || []).map((choice) =>
+  (choice !== null && typeof choice === "object" && "value" in choice ? choice : { label: fieldText(choice), value: choice }));
 
 // What the elements of a control depend on, without its values and ranges.
 function shapeOf(control) {
   const { key, kind, label, unit, help, section, is_value: isValue, default: initial } = control;
-  return JSON.stringify([key, kind, label, unit, help, section, isValue, initial, choicesOf(control).map((choice) => choice.label), Boolean(sliderOf(control, NaN))]);
+  return JSON.stringify([key, kind, label, unit, help, section, isValue, initial, choicesOf(control).map((choice) => choice.label),
+    Boolean(sliderOf(control, NaN))]);
 }
 
 let made = 0;
@@ -106,7 +111,7 @@ class Row {
     this.root = make("div", undefined, "control kind-" + control.kind);
     this.root.dataset.key = control.key;
     this.root.dataset.id = control.id || control.key;
-    this.root.style.setProperty("--depth", Math.max(0, control.key.split(".").length - 2 + (control.is_value ? 1 : 0)));
+    this.root.style.setProperty("--depth", String(Math.max(0, control.key.split(".").length - 2 + (control.is_value ? 1 : 0))));
     this.label = make("label", control.is_value ? "value" : control.label);
     this.label.htmlFor = this.id;
     this.label.title = control.key + (control.help ? ": " + control.help : "");
@@ -141,11 +146,15 @@ class Row {
         option.value = i;
         this.field.append(option);
       });
-      this.field.addEventListener("change", () => { const choice = this.choices[this.field.value]; if (choice) this._send(choice.value, true); });
+      this.field.addEventListener("change", () => {
+        const choice = this.choices[this.field.value];
+        if (choice) this._send(choice.value, true);
+      });
     } else if (kind === "boolean") {
-      this.field = make("input");
-      this.field.type = "checkbox";
-      this.field.addEventListener("change", () => this._send(this.field.checked, true));
+      const box = make("input");
+      this.field = box;
+      box.type = "checkbox";
+      box.addEventListener("change", () => this._send(box.checked, true));
     } else {
       this.field = make("input");
       this.field.type = "text";
@@ -169,8 +178,8 @@ class Row {
     if (!range) return;
     this.slider = make("input");
     this.slider.type = "range";
-    this.slider.min = 0;
-    this.slider.step = 1;
+    this.slider.min = "0";
+    this.slider.step = "1";
     this.slider.setAttribute("aria-label", this.control.label + " slider");
     const value = () => this.range.toValue(Number(this.slider.value));
     const release = () => {
@@ -212,12 +221,12 @@ class Row {
     this.choices = choicesOf(this.control);
     ["Add…", ...this.choices.map(({ label }) => label)].forEach((text, i) => {
       const option = make("option", text);
-      option.value = i - 1;
+      option.value = String(i - 1);
       adder.append(option);
     });
     adder.addEventListener("change", () => {
       const choice = this.choices[adder.value];
-      adder.value = -1;
+      adder.value = "-1";
       if (choice) this._send([...(this.value || []), choice.value], true);
     });
     const line = make("div", undefined, "line");
@@ -236,14 +245,14 @@ class Row {
   // Moves the slider to a value.
   _place(value) {
     this.range = sliderOf(this.control, value);
-    this.slider.max = this.range.steps;
+    this.slider.max = String(this.range.steps);
     const base = Number.isFinite(value) ? value : typeof this.control.default === "number" ? this.control.default : this.range.toValue(0);
-    this.slider.value = this.range.toStep(base);
+    this.slider.value = String(this.range.toStep(base));
     this.slider.setAttribute("aria-valuetext", fieldText(base) + " " + (this.control.unit || ""));
     this._fill();
   }
 
-  _fill() { this.slider.style.setProperty("--filled", (100 * this.slider.value) / Math.max(1, this.slider.max) + "%"); }
+  _fill() { this.slider.style.setProperty("--filled", (100 * Number(this.slider.value)) / Math.max(1, Number(this.slider.max)) + "%"); }
 
   _key(event) {
     const { kind } = this.control;
@@ -291,7 +300,8 @@ class Row {
     else this.field?.removeAttribute("aria-invalid");
     this.value = value;
     // Settings that are absent and may be are behind a button.
-    this.isExtra = Boolean(this.control.is_optional) && !this.control.is_value && this.control.kind !== "group" && (value === null || value === undefined) && !isChanged && !error;
+    this.isExtra = Boolean(this.control.is_optional) && !this.control.is_value && this.control.kind !== "group"
+      && (value === null || value === undefined) && !isChanged && !error;
     if (!this.field || error || this.isDirty || this.isHeld || (id !== null && id < this.sent)) return;
     this._show();
   }
@@ -302,20 +312,19 @@ class Row {
     this.isCurrent = true;
     if (control.kind === "choice") {
       const chosen = chosenOf({ ...control, choices: this.choices }, value ?? control.default);
-      let other = this.field.querySelector("option[value='-1']");
-      if (chosen < 0 && !other) {
-        other = make("option", "–");
-        other.value = -1;
-        this.field.prepend(other);
-      } else if (chosen >= 0) other?.remove();
+      const other = this.field.querySelector("option[value='-1']");
+      if (chosen < 0 && !other) this.field.prepend(new Option("–", "-1"));
+      else if (chosen >= 0) other?.remove();
       this.field.value = chosen;
-    } else if (control.kind === "boolean") this.field.checked = Boolean(value ?? control.default);
+    } else if (control.kind === "boolean") Object.assign(this.field, { checked: Boolean(value ?? control.default) });
     else if (this.field.value !== fieldText(value)) this.field.value = fieldText(value);
     if (this.slider) this._place(typeof value === "number" ? value : NaN);
   }
 }
 
 export class Controls {
+  root; search; onlyChanged; on;
+
   // Callbacks: send(key, value, isFinal) returns the number of the message; reset(key), remove(key).
   constructor(root, search, onlyChanged, on) {
     Object.assign(this, { root, search, onlyChanged, on });
@@ -330,14 +339,15 @@ export class Controls {
       event.stopPropagation();
     });
     onlyChanged.addEventListener("click", () => {
-      onlyChanged.setAttribute("aria-pressed", onlyChanged.getAttribute("aria-pressed") !== "true");
+      onlyChanged.setAttribute("aria-pressed", String(onlyChanged.getAttribute("aria-pressed") !== "true"));
       this._filter();
     });
   }
 
   // Shows a list of controls; rows that are the same keep their state and focus.
   describe(list) {
-    const focused = document.activeElement, focusedKey = focused?.closest?.(".control")?.dataset.id, wasSlider = focused?.type === "range";
+    const focused = document.activeElement, wasSlider = Boolean(focused?.matches("input[type=range]"));
+    const focusedKey = focused?.closest(".control")?.getAttribute("data-id");
     const before = this.rows;
     this.rows = new Map();
     const groups = new Map();
@@ -346,7 +356,8 @@ export class Controls {
       // The value after the choice of its form.
       const control = { ...described, label: labelOf(described), is_value: forms.has(described.key) && described.id === described.key };
       if (/\.per_um2$/.test(control.key)) control.unit = "";
-      if (!control.unit && / fraction$/.test(control.label)) Object.assign(control, { label: control.label.slice(0, -9), unit: "fraction" });
+      if (!control.unit && / fraction$/.test(control.label)) Object.assign(control,
+        { label: control.label.slice(0, -9), unit: "fraction" });
       const id = control.id || control.key, known = before.get(id), shape = shapeOf(control);
       // The heading of a section is enough.
       if (control.kind === "group" && !control.key.includes(".")) continue;
@@ -358,7 +369,8 @@ export class Controls {
       row.shape = shape;
       row.refresh(control);
       this.rows.set(id, row);
-      const isAlone = control.section === control.key && !list.some((one) => one.key.startsWith(control.key + ".")) && control.kind !== "choice";
+      const isAlone = control.section === control.key && !list.some((one) => one.key.startsWith(control.key + "."))
+        && control.kind !== "choice";
       const section = isAlone || control.key === "integration_order" ? OPEN[0] : control.section || control.key.split(".")[0];
       if (!groups.has(section)) groups.set(section, []);
       groups.get(section).push(row);
@@ -383,7 +395,8 @@ export class Controls {
   _fillSection(name, rows) {
     let section = this.sections.get(name);
     if (!section) {
-      const root = make("details", undefined, "section"), heading = make("summary"), count = make("span", "", "count"), body = make("div", undefined, "body");
+      const root = make("details", undefined, "section"), heading = make("summary"), count = make("span", "", "count");
+      const body = make("div", undefined, "body");
       heading.append(make("span", name.replaceAll("_", " ")), count);
       const more = make("button", "", "more");
       more.type = "button";
@@ -397,25 +410,29 @@ export class Controls {
     section.rows = rows;
     this.root.append(section.root);
     const nodes = rows.map((row) => row.root);
-    if (nodes.length !== section.body.children.length || nodes.some((node, i) => section.body.children[i] !== node)) section.body.replaceChildren(...nodes);
+    if (nodes.length !== section.body.children.length
+      || nodes.some((node, i) => section.body.children[i] !== node)) section.body.replaceChildren(...nodes);
   }
 
   _filter() {
-    const words = this.search.value.toLowerCase().split(/\s+/).filter(Boolean), isOnly = this.onlyChanged.getAttribute("aria-pressed") === "true";
+    const words = this.search.value.toLowerCase().split(/\s+/).filter(Boolean);
+    const isOnly = this.onlyChanged.getAttribute("aria-pressed") === "true";
     const isFiltered = words.length > 0 || isOnly;
     let found = 0;
     for (const section of this.sections.values()) {
       let visible = 0, extra = 0;
       for (const row of section.rows) {
         if (!isFiltered && row.isExtra) extra++;
-        const isFound = (isFiltered || section.isFull || !row.isExtra || row.root.contains(document.activeElement)) && words.every((word) => row.words.includes(word)) && (!isOnly || row.root.classList.contains("changed"));
+        const isFound = (isFiltered || section.isFull || !row.isExtra || row.root.contains(document.activeElement))
+          && words.every((word) => row.words.includes(word)) && (!isOnly || row.root.classList.contains("changed"));
         change(row.root, { hidden: !isFound });
         visible += isFound;
       }
       found += visible;
       change(section.root, { hidden: visible === 0 && extra === 0 });
       change(section.more, {
-        hidden: extra === 0, textContent: section.isFull ? "Hide settings that are not set" : "Show " + shown(extra) + " more", ariaExpanded: String(section.isFull),
+        hidden: extra === 0, textContent: section.isFull ? "Hide settings that are not set" : "Show " + shown(extra) + " more",
+        ariaExpanded: String(section.isFull),
       });
       if (isFiltered && section.wasOpen === null) section.wasOpen = section.root.open;
       if (isFiltered) section.root.open = true;

@@ -13,20 +13,28 @@ function useOf(name) {
 }
 
 export class Files {
+  connection; on; wantsToken = false;
+
   // Callbacks: busy(text) while a file is sent, with null at its end; dropped(transfer) returns whether it takes the files.
   constructor(connection, on) {
-    Object.assign(this, { connection, on, wantsToken: false });
+    Object.assign(this, { connection, on });
     this._listenToDrops();
-    $("chosen-file").addEventListener("change", () => { if ($("chosen-file").files[0]) this.upload($("chosen-file").files[0]); $("chosen-file").value = ""; });
+    $("chosen-file").addEventListener("change", () => {
+      if ($("chosen-file").files[0]) this.upload($("chosen-file").files[0]);
+      $("chosen-file").value = "";
+    });
     listenToMenu($("file"), $("file-menu"));
-    $("file-menu").addEventListener("click", (event) => { const button = event.target.closest("button"); if (button) this._choose(button.dataset); });
+    $("file-menu").addEventListener("click", (event) => {
+      const button = /** @type {Element} */ (event.target).closest("button");
+      if (button) this._choose(button.dataset);
+    });
     $("save-form").addEventListener("submit", (event) => {
-      if (event.submitter?.value === "save") connection.send({ do: "save", name: $("save-name").value });
+      if (event.submitter?.getAttribute("value") === "save") connection.send({ do: "save", name: $("save-name").value });
     });
     $("link-form").addEventListener("submit", async (event) => {
       const text = $("link-text").value;
       $("link-text").value = "";
-      if (event.submitter?.value === "open" && !(await this.openLink(text))) notice("The text is not a link of the studio");
+      if (event.submitter?.getAttribute("value") === "open" && !(await this.openLink(text))) notice("The text is not a link of the studio");
     });
     addEventListener("hashchange", () => { if (connection.isOpen) this.openLink(location.hash); });
   }
@@ -34,7 +42,9 @@ export class Files {
   _listenToDrops() {
     const hasFile = (event) => [...(event.dataTransfer?.types || [])].includes("Files");
     let depth = 0;
-    document.addEventListener("dragenter", (event) => { if (hasFile(event)) { depth++; $("drop").hidden = false; event.preventDefault(); } });
+    document.addEventListener("dragenter", (event) => {
+      if (hasFile(event)) { depth++; $("drop").hidden = false; event.preventDefault(); }
+    });
     document.addEventListener("dragleave", (event) => { if (hasFile(event) && --depth <= 0) { depth = 0; $("drop").hidden = true; } });
     document.addEventListener("dragover", (event) => { if (hasFile(event)) event.preventDefault(); });
     document.addEventListener("drop", (event) => {
@@ -47,11 +57,15 @@ export class Files {
     });
   }
 
+  /** @param {DOMStringMap} data */
   async _choose({ do: action, copy, file, extension }) {
     const { connection } = this;
     if (action === "open") $("chosen-file").click();
     else if (action === "open-link") $("link-dialog").showModal();
-    else if (action === "link" || action === "share") { this.wantsToken = action === "link"; connection.send({ do: "text", what: "link" }); }
+    else if (action === "link" || action === "share") {
+      this.wantsToken = action === "link";
+      connection.send({ do: "text", what: "link" });
+    }
     else if (action === "save") $("save-dialog").showModal();
     else if (action === "diff") connection.send({ do: "text", what: "diff" });
     else if (copy) connection.send({ do: "text", what: copy });
@@ -76,7 +90,8 @@ export class Files {
 
   async receiveText({ what, text, files }) {
     if (what === "link") {
-      await copyText(location.origin + location.pathname + "#" + (await fragmentOf(text, this.wantsToken ? this.connection.token : "")), "Link");
+      await copyText(location.origin + location.pathname + "#"
+        + (await fragmentOf(text, this.wantsToken ? this.connection.token : "")), "Link");
       if (files.length) notice("The link contains only the names of uploaded files: " + files.join(", "));
     } else if (what === "diff") showText("Differences", text || "The settings are those at the start.");
     else copyText(text, what === "yaml" ? "YAML" : "Python");

@@ -4,7 +4,10 @@
 const PICTURE_S = 0.5;
 
 export class Film {
+  count; n; frameS; isSkipping; show; changed;
+
   // show(n, isFinal) shows a frame, and resolves to false when it failed; changed() is called when the state changes.
+  /** @param {{ count: number, frameS?: number, isSkipping: boolean, show: Function, changed: Function, n?: number }} options */
   constructor({ count, frameS, isSkipping, show, changed, n = 0 }) {
     Object.assign(this, { count, n, frameS: frameS || PICTURE_S, isSkipping, show, changed });
     this.isPlaying = false;
@@ -47,7 +50,8 @@ export class Film {
     if (this.n >= this.count - 1) await this.go(0, false);
     let start = performance.now() - 1000 * this.frameS * this.n;
     while (this.isPlaying && this.n < this.count - 1) {
-      const due = Math.floor((performance.now() - start) / (1000 * this.frameS)), next = this.isSkipping ? Math.max(due, this.n + 1) : this.n + 1;
+      const due = Math.floor((performance.now() - start) / (1000 * this.frameS));
+      const next = this.isSkipping ? Math.max(due, this.n + 1) : this.n + 1;
       const wait = start + 1000 * this.frameS * next - performance.now();
       if (wait > 0) await new Promise((resolve) => { setTimeout(resolve, wait); });
       if (!this.isPlaying) break;

@@ -1,8 +1,9 @@
 // A picture on the sensor: the reconstructed picture or the optical image, with the cursor and the view of the map.
 
 import { pixelRatio } from "/web/gl.js";
-import { outline, traceCross } from "/web/marks.js";
+import { drawCross, drawView, outline } from "/web/marks.js";
 import { make } from "/web/page_parts.js";
+import { ARROWS } from "/web/shell.js";
 import { sizeOf } from "./frames.js";
 import { fitted } from "./site_pane.js";
 
@@ -10,10 +11,12 @@ import { fitted } from "./site_pane.js";
 const GAZE_STEP = 0.02;
 
 export class ImagePane {
-  // Callbacks: hover(x, y, pane), leave(), click(x, y), gaze(dx, dy, isFinal). canMove() is whether the gaze can be dragged.
-  constructor(root, on, { label, canMove = () => false }) {
+  // Callbacks: hover(x, y, pane), leave(), click(x, y), gaze(dx, dy, isFinal). canMove() is whether the gaze can be dragged;
+  // mapOf() is the map whose view the picture can follow.
+  constructor(root, on, { label, mapOf, canMove = () => false }) {
     this.root = root;
     this.on = on;
+    this.mapOf = mapOf;
     this.canMove = canMove;
     this.image = make("canvas", undefined, "image");
     this.marks = make("canvas", undefined, "marks");
@@ -31,7 +34,10 @@ export class ImagePane {
 
   _listen() {
     const { marks, on } = this;
-    const at = (event) => { const box = marks.getBoundingClientRect(), view = this.view(); return [view.fromX(event.clientX - box.left), view.fromY(event.clientY - box.top)]; };
+    const at = (event) => {
+      const box = marks.getBoundingClientRect(), view = this.view();
+      return [view.fromX(event.clientX - box.left), view.fromY(event.clientY - box.top)];
+    };
     let start = null, isMoving = false;
     marks.addEventListener("pointerdown", (event) => {
       if (!this.bounds || event.button !== 0) return;
@@ -65,7 +71,7 @@ export class ImagePane {
     marks.addEventListener("pointercancel", end);
     marks.addEventListener("pointerleave", () => { if (!start) on.leave(); });
     marks.addEventListener("keydown", (event) => {
-      const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+      const step = ARROWS[event.key];
       if (!step || !this.frame || !this.canMove() || event.ctrlKey || event.metaKey || event.altKey) return;
       event.preventDefault();
       const [a, , c] = this.frame, length = GAZE_STEP * (c - a) * (event.shiftKey ? 5 : 1);
@@ -83,16 +89,19 @@ export class ImagePane {
     this.frame = frame || null;
     this.pixels.width = width;
     this.pixels.height = height;
-    this.pixels.getContext("2d", { willReadFrequently: true }).putImageData(new ImageData(new Uint8ClampedArray(rgba.buffer, rgba.byteOffset, rgba.length), width, height), 0, 0);
+    this.pixels.getContext("2d",
+      { willReadFrequently: true }).putImageData(new ImageData(new Uint8ClampedArray(rgba.buffer, rgba.byteOffset, rgba.length),
+        width, height), 0, 0);
   }
 
   // Conversions between µm on the sensor and CSS pixels: the complete picture, or the view of a map.
   view() {
     const { width, height } = sizeOf(this.root), [x0, y0, x1, y1] = this.bounds || [0, 0, 1, 1];
     let x = 0.5 * (x0 + x1), y = 0.5 * (y0 + y1), perUm = Math.min(width / (x1 - x0), height / (y1 - y0));
-    if (this.follows && this.map) {
-      ({ x, y } = this.map);
-      perUm = this.map.scale * Math.min(width / this.map.width, height / this.map.height);
+    const map = this.follows ? this.mapOf() : null;
+    if (map) {
+      ({ x, y } = map);
+      perUm = map.scale * Math.min(width / map.width, height / map.height);
     }
     return {
       perUm, width, height,
@@ -125,7 +134,8 @@ export class ImagePane {
   drawMarks({ cursor, map, boundary }) {
     if (!this.isShown) return;
     const view = this.view(), isAt = cursor && cursor.from !== this;
-    const state = JSON.stringify([view.width, view.height, view.toX(0), view.toY(0), view.perUm, this.frame, this.offset, isAt && [cursor.x, cursor.y], map && !this.follows && [map.x, map.y, map.scale, map.width, map.height]]);
+    const state = JSON.stringify([view.width, view.height, view.toX(0), view.toY(0), view.perUm, this.frame, this.offset,
+      isAt && [cursor.x, cursor.y], map && !this.follows && [map.x, map.y, map.scale, map.width, map.height]]);
     // Drawn again only when the marks change: each layer costs time to compose the page.
     if (state === this.shown && boundary === this.shownBoundary) return;
     this.shown = state;
@@ -133,15 +143,10 @@ export class ImagePane {
     const { context, width, height } = fitted(this.marks);
     if (boundary && this.frame) {
       const [dx, dy] = this.offset;
-      outline(context, () => boundary(context, (x) => view.toX(x + dx), (y) => view.toY(y + dy)), [3.5, 1.5], ["rgb(0 0 0 / 60%)", "#ffd34d"]);
+      outline(context, () => boundary(context, (x) => view.toX(x + dx), (y) => view.toY(y + dy)), [3.5, 1.5],
+        ["rgb(0 0 0 / 60%)", "#ffd34d"]);
     }
-    if (map && !this.follows) {
-      const x0 = view.toX(map.fromX(0)), y0 = view.toY(map.fromY(0)), x1 = view.toX(map.fromX(map.width)), y1 = view.toY(map.fromY(map.height));
-      if (x0 > 1 || y0 > 1 || x1 < width - 1 || y1 < height - 1) {
-        const w = Math.max(5, x1 - x0), h = Math.max(5, y1 - y0);
-        outline(context, () => context.rect(0.5 * (x0 + x1 - w), 0.5 * (y0 + y1 - h), w, h), [3.5, 1.75], ["rgb(0 0 0 / 55%)", "#ffffff"]);
-      }
-    }
-    if (isAt) outline(context, () => traceCross(context, view.toX(cursor.x), view.toY(cursor.y), 3, 10), [3.5, 1.5], ["rgb(0 0 0 / 65%)", "#ffffff"]);
+    if (map && !this.follows) drawView(context, view, map, width, height);
+    if (isAt) drawCross(context, view.toX(cursor.x), view.toY(cursor.y), true);
   }
 }

@@ -7,7 +7,7 @@ export function listenToMenu(button, menu) {
   const items = () => [...menu.querySelectorAll("button:not(:disabled)")].filter((item) => item.offsetParent);
   const show = (isOpen) => {
     menu.hidden = !isOpen;
-    button.setAttribute("aria-expanded", isOpen);
+    button.setAttribute("aria-expanded", String(isOpen));
     if (isOpen) items()[0]?.focus();
   };
   button.setAttribute("aria-haspopup", "true");
@@ -20,8 +20,12 @@ export function listenToMenu(button, menu) {
     if (event.key === "Escape") { show(false); button.focus(); event.stopPropagation(); }
     else if (next !== undefined) { all[(next + all.length) % all.length]?.focus(); event.preventDefault(); }
   });
-  document.addEventListener("pointerdown", (event) => { if (!menu.hidden && !menu.contains(event.target) && !button.contains(event.target)) show(false); });
-  menu.addEventListener("focusout", (event) => { if (event.relatedTarget && !menu.contains(event.relatedTarget) && event.relatedTarget !== button) show(false); });
+  document.addEventListener("pointerdown", (event) => {
+    if (!menu.hidden && !menu.contains(event.target) && !button.contains(event.target)) show(false);
+  });
+  menu.addEventListener("focusout", (event) => {
+    if (event.relatedTarget && !menu.contains(event.relatedTarget) && event.relatedTarget !== button) show(false);
+  });
 }
 
 export async function copyText(text, what) {
@@ -36,7 +40,8 @@ export async function copyText(text, what) {
 // Shows a text in a dialog, with a button to copy it.
 export function showText(title, text) {
   $("text-title").textContent = title;
-  const lines = text.split("\n").map((line) => make("span", line + "\n", /^\+(?!\+\+)/.test(line) ? "added" : /^-(?!--)/.test(line) ? "removed" : undefined));
+  const lines = text.split("\n").map((line) => make("span", line + "\n",
+    /^\+(?!\+\+)/.test(line) ? "added" : /^-(?!--)/.test(line) ? "removed" : undefined));
   $("text").replaceChildren(...(title === "Differences" ? lines : [text]));
   if (!$("text-dialog").open) $("text-dialog").showModal();
 }

@@ -9,7 +9,8 @@ const FEW_SAMPLES = 2, MANY_SAMPLES = 3;
 const MOST_SAMPLES = 1.2e7;
 // Levels of linear light in the table of bytes.
 const LEVELS = 4096;
-const LINEAR = Uint16Array.from({ length: 256 }, (_, i) => Math.round((LEVELS - 1) * (i / 255 <= 0.04045 ? i / 255 / 12.92 : ((i / 255 + 0.055) / 1.055) ** 2.4)));
+const LINEAR = Uint16Array.from({ length: 256 },
+  (_, i) => Math.round((LEVELS - 1) * (i / 255 <= 0.04045 ? i / 255 / 12.92 : ((i / 255 + 0.055) / 1.055) ** 2.4)));
 const ENCODED = Uint8Array.from({ length: LEVELS }, (_, i) => {
   const light = i / (LEVELS - 1);
   return Math.round(255 * (light <= 0.0031308 ? 12.92 * light : 1.055 * light ** (1 / 2.4) - 0.055));
@@ -26,7 +27,8 @@ export class RasterMap extends MapView {
     super.use(sites);
     this.drawn = null;
     this.smallest = Infinity;
-    for (let i = 0; i < sites.box.length; i += 4) this.smallest = Math.min(this.smallest, Math.max(sites.box[i + 2] - sites.box[i], sites.box[i + 3] - sites.box[i + 1]));
+    for (let i = 0; i < sites.box.length; i += 4) this.smallest = Math.min(this.smallest,
+      Math.max(sites.box[i + 2] - sites.box[i], sites.box[i + 3] - sites.box[i + 1]));
   }
 
   // Colours are read when the map is drawn.
@@ -45,7 +47,8 @@ export class RasterMap extends MapView {
       if (this.owner?.constructor !== Numbers || this.owner.length !== size) this.owner = new Numbers(size);
       findOwners(this, n * width, n * height, this.owner);
       this.mixed = n === 1 ? null : mixedPixels(this.owner, width, height, n);
-      if (!this.picture || this.picture.width !== width || this.picture.height !== height) this.picture = this.context.createImageData(width, height);
+      if (!this.picture || this.picture.width !== width
+        || this.picture.height !== height) this.picture = this.context.createImageData(width, height);
       if (this.table?.length !== this.sites.n + 1) this.table = new Uint32Array(this.sites.n + 1);
       this.drawn = view;
     }
@@ -61,7 +64,8 @@ export class RasterMap extends MapView {
 
 // Returns the site of the first sample of every pixel, and the pixels that have several sites.
 function mixedPixels(owner, width, height, n) {
-  const row = n * width, first = new owner.constructor(width * height), pixels = new Uint32Array(width * height), corner = (n - 1) * (row + 1);
+  const row = n * width, first = new owner.constructor(width * height), pixels = new Uint32Array(width * height);
+  const corner = (n - 1) * (row + 1);
   let nMixed = 0;
   for (let y = 0, p = 0; y < height; y++) {
     for (let x = 0, at = y * n * row; x < width; x++, p++, at += n) {
@@ -117,7 +121,8 @@ function findOwners(view, width, height, owner) {
   for (let site = 0; site < sites.n; site++) {
     const at = 4 * site;
     if (box[at] > right || box[at + 2] < left || box[at + 1] > top || box[at + 3] < bottom) continue;
-    const first = Math.max(0, Math.ceil((top - box[at + 3]) * step - 0.5)), last = Math.min(height - 1, Math.floor((top - box[at + 1]) * step - 0.5));
+    const first = Math.max(0, Math.ceil((top - box[at + 3]) * step - 0.5));
+    const last = Math.min(height - 1, Math.floor((top - box[at + 1]) * step - 0.5));
     if (last < first) continue;
     const firstRing = sites.firstRing(site), endRing = sites.firstRing(site + 1), most = ringOffsets[endRing] - ringOffsets[firstRing];
     if ((last - first + 1) * most > crossings.length) crossings = new Float64Array(2 * (last - first + 1) * most);
@@ -127,10 +132,12 @@ function findOwners(view, width, height, owner) {
       for (let v = ringOffsets[ring]; v < to; v++) {
         const q = 2 * position[v], ay = xy[p + 1], by = xy[q + 1];
         // One row more at both ends: the comparison below decides, which both sites of an edge make with equal numbers.
-        const from = Math.max(first, Math.floor((top - Math.max(ay, by)) * step - 0.5)), end = Math.min(last, Math.ceil((top - Math.min(ay, by)) * step - 0.5));
+        const from = Math.max(first, Math.floor((top - Math.max(ay, by)) * step - 0.5));
+        const end = Math.min(last, Math.ceil((top - Math.min(ay, by)) * step - 0.5));
         for (let row = from; row <= end; row++) {
           const y = top - (row + 0.5) / step;
-          if (ay > y !== by > y) crossings[(row - first) * most + counts[row]++] = (xy[p] + ((y - ay) / (by - ay)) * (xy[q] - xy[p]) - left) * step;
+          if (ay > y !== by > y) crossings[(row - first) * most + counts[row]++] = (xy[p]
+            + ((y - ay) / (by - ay)) * (xy[q] - xy[p]) - left) * step;
         }
         p = q;
       }
@@ -139,7 +146,8 @@ function findOwners(view, width, height, owner) {
       const start = (row - first) * most, n = counts[row];
       counts[row] = 0;
       if (n > 2) crossings.subarray(start, start + n).sort();
-      else if (n === 2 && crossings[start] > crossings[start + 1]) [crossings[start], crossings[start + 1]] = [crossings[start + 1], crossings[start]];
+      else if (n === 2 && crossings[start] > crossings[start + 1]) [crossings[start], crossings[start + 1]] = [crossings[start + 1],
+        crossings[start]];
       for (let k = start; k + 1 < start + n; k += 2) {
         const from = Math.max(0, Math.ceil(crossings[k] - 0.5)), to = Math.min(width, Math.ceil(crossings[k + 1] - 0.5));
         for (let x = from, base = row * width; x < to; x++) owner[base + x] = site + 1;

@@ -5,14 +5,12 @@ import { listenToPointers } from "/web/gestures.js";
 import { fitCanvas, pixelRatio } from "/web/gl.js";
 import { drawRamp, kindsOf, swatchItem, tickLabels, titleOf } from "/web/legend.js";
 import { SensorMap } from "/web/map.js";
-import { drawOutlines, outline, ringSite, traceCross } from "/web/marks.js";
+import { drawCross, drawOutlines, drawSelected, drawTrace, ringSites } from "/web/marks.js";
 import { Overview } from "/web/overview.js";
 import { change, inkOf, make } from "/web/page_parts.js";
 import { sitesIn } from "/web/measure.js";
 import { sizeOf } from "./frames.js";
 import { RasterMap } from "./raster_map.js";
-
-const MOST_SELECTED = 4000;
 
 export const groundColour = () => bytesOfHex(inkOf("--map"));
 
@@ -32,11 +30,19 @@ export function fitted(canvas) {
 }
 
 export class SitePane {
+  // Whether the sites are edited; violations of a view: their version, their markers, and the chosen one.
+  isEdited = false; violations = () => null; drawViolations = (_context, _map) => {}; trace = () => null;
+
   // Callbacks of listenToPointers, without conversions: moved(), hover(x, y), leave(), click(), select(rectangle).
   constructor(root, on, { renderer, label }) {
     this.root = root;
     this.renderer = renderer;
-    const layer = (name) => { const canvas = make("canvas", undefined, name); canvas.setAttribute("aria-hidden", "true"); root.append(canvas); return canvas; };
+    const layer = (name) => {
+      const canvas = make("canvas", undefined, name);
+      canvas.setAttribute("aria-hidden", "true");
+      root.append(canvas);
+      return canvas;
+    };
     this.cells = layer("cells");
     this.overviewCanvas = layer("overview");
     this.lines = layer("lines");
@@ -87,7 +93,7 @@ export class SitePane {
     else this.map.use(sites);
     // The raster map averages small sites itself.
     clearTimeout(this.overview?.resting);
-    this.overview = this.map.gl ? new Overview(this.overviewCanvas, sites) : null;
+    this.overview = this.map instanceof SensorMap ? new Overview(this.overviewCanvas, sites) : null;
     if (isNew) this.resize();
     if (isWhole) this.fit();
     else this.map.set(this.map.x, this.map.y, this.map.scale);
@@ -97,10 +103,11 @@ export class SitePane {
   _createMap(sites) {
     // By the processor, a table of the sites of all pixels is faster than WebGL.
     if (this.renderer && !this.renderer.isSlow) {
-      this.map = new SensorMap(this.cells, sites, this.renderer);
-      if (this.map.gl) {
+      const map = new SensorMap(this.cells, sites, this.renderer);
+      if (map.gl) {
+        this.map = map;
         this.cells.addEventListener("webglcontextlost", (event) => event.preventDefault());
-        this.cells.addEventListener("webglcontextrestored", () => { this.map.restore(); this.draw(); });
+        this.cells.addEventListener("webglcontextrestored", () => { map.restore(); this.draw(); });
         return;
       }
       const fresh = make("canvas", undefined, "cells");
@@ -176,10 +183,10 @@ export class SitePane {
     map.draw(groundColour());
     this.overview?.update(map, this.scale, this.range);
     // Layers are drawn again only when they change: each costs time to compose the page.
-    if (!this._isNew("lines", [this.viewState, this.violations?.()])) return;
+    if (!this._isNew("lines", [this.viewState, this.violations()])) return;
     const { context, width, height } = fitted(this.lines);
     drawOutlines(context, map, width, height);
-    this.drawViolations?.(context, map);
+    this.drawViolations(context, map);
   }
 
   get viewState() {
@@ -198,26 +205,15 @@ export class SitePane {
   // Draws marks: { cursor, hovered, pinned, rectangle, selected, trace }.
   drawMarks({ cursor, hovered, pinned, rectangle, selected, trace }) {
     if (!this.isShown) return;
-    const isAt = cursor && cursor.from !== this, state = [hovered, pinned, rectangle, selected.length, selected[0], trace && [...trace.box], isAt && [cursor.x, cursor.y]];
+    const isAt = cursor && cursor.from !== this, state = [hovered, pinned, rectangle, selected.length, selected[0],
+      trace && [...trace.box], isAt && [cursor.x, cursor.y]];
     const isEmpty = hovered < 0 && pinned < 0 && !rectangle && !selected.length && !trace && !isAt;
     if (!this._isNew("marks", isEmpty ? [this.map.width, this.map.height] : [this.viewState, state])) return;
-    const { map, sites } = this, { context } = fitted(this.marks);
-    if (trace) {
-      outline(context, () => trace.path(context, map), [8, 4], ["#ffffff", "#d3261b"]);
-      const [a, b, c, d] = trace.box;
-      outline(context, () => context.arc(map.toX(0.5 * (a + c)), map.toY(0.5 * (b + d)), Math.max(16, 0.75 * map.scale * Math.hypot(c - a, d - b)), 0, 7), [4, 2], ["#ffffff", "#d3261b"]);
-    }
-    if (selected.length) outline(context, () => { for (const site of selected.slice(0, MOST_SELECTED)) if (site < sites.n) sites.trace(context, site, map); }, [3, 1.5], ["#ffffff", "#1f5fbf"]);
-    if (rectangle) {
-      const [[x0, y0], [x1, y1]] = rectangle;
-      const box = [map.toX(Math.min(x0, x1)), map.toY(Math.max(y0, y1)), Math.abs(x1 - x0) * map.scale, Math.abs(y1 - y0) * map.scale];
-      context.fillStyle = "rgb(31 95 191 / 14%)";
-      context.fillRect(...box);
-      outline(context, () => context.rect(...box), [4, 2], ["#ffffff", "#1f5fbf"]);
-    }
-    if (pinned >= 0 && pinned < sites.n) ringSite(context, map, pinned, ["#ffffff", "#1f5fbf"]);
-    if (hovered >= 0 && hovered < sites.n && hovered !== pinned) ringSite(context, map, hovered, ["#ffffff", "#10151f"]);
-    if (isAt) outline(context, () => traceCross(context, map.toX(cursor.x), map.toY(cursor.y), 4, 13), [4, 2], ["#ffffff", "#10151f"]);
+    const { map } = this, { context } = fitted(this.marks);
+    if (trace) drawTrace(context, map, trace);
+    drawSelected(context, map, rectangle, selected);
+    ringSites(context, map, pinned, hovered);
+    if (isAt) drawCross(context, map.toX(cursor.x), map.toY(cursor.y));
   }
 
   pick(x, y) {

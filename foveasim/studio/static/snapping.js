@@ -4,6 +4,7 @@
 export const REACH = 9;
 // Where more sites than this are that near, only the grid counts.
 const MOST_SITES = 500;
+/** @typedef {{ sites: any, points?: any[], isExcluded?: Function, isSkipped?: Function, kinds?: string[] }} Where */
 const KINDS = ["vertex", "midpoint", "edge"];
 // Digits of positions on the grid, in µm.
 const DIGITS = 9;
@@ -33,17 +34,21 @@ export function nearestOn(x, y, ax, ay, bx, by) {
 
 // Returns the nearest vertex, midpoint and edge within a distance in µm, each { x, y, kind, distance } or null.
 // points are further vertices, [x, y]; isExcluded(site) and isSkipped(x, y) exclude some; kinds are the ones of interest.
+/** @type {(x: number, y: number, reach: number, where: Where) => any} */
 export function featuresNear(x, y, reach, { sites, points = [], isExcluded, isSkipped, kinds = KINDS }) {
   const found = { vertex: null, midpoint: null, edge: null };
   const offer = (kind, px, py, more) => {
     const distance = Math.hypot(px - x, py - y);
-    if (distance <= (found[kind]?.distance ?? reach) && kinds.includes(kind) && !isSkipped?.(px, py)) found[kind] = { x: px, y: py, kind, distance, ...more };
+    if (distance <= (found[kind]?.distance ?? reach) && kinds.includes(kind) && !isSkipped?.(px, py)) {
+      found[kind] = { x: px, y: py, kind, distance, ...more };
+    }
   };
   for (const [px, py] of points) offer("vertex", px, py);
   for (const site of sites?.within(x - reach, y - reach, x + reach, y + reach, MOST_SITES) || []) {
     if (isExcluded?.(site)) continue;
     eachEdge(sites, site, (ax, ay, bx, by) => {
-      if (Math.max(ax, bx) < x - reach || Math.min(ax, bx) > x + reach || Math.max(ay, by) < y - reach || Math.min(ay, by) > y + reach) return;
+      if (Math.max(ax, bx) < x - reach || Math.min(ax, bx) > x + reach || Math.max(ay, by) < y - reach
+        || Math.min(ay, by) > y + reach) return;
       offer("vertex", bx, by);
       offer("vertex", ax, ay);
       offer("midpoint", 0.5 * (ax + bx), 0.5 * (ay + by));
@@ -56,8 +61,8 @@ export function featuresNear(x, y, reach, { sites, points = [], isExcluded, isSk
 
 // Snaps a position: to a vertex, a midpoint, an edge, else the grid. With `from` and isStraight, to a direction from there;
 // with isFree, to nothing. Returns { x, y, kind }; scale is in pixels per µm, step that of the grid in µm.
-export function snap(x, y, { scale, step, from, isStraight, isFree, ...where }) {
-  const near = isFree ? {} : featuresNear(x, y, REACH / scale, where);
+export function snap(x, y, { scale, step, from, isStraight, isFree, sites, ...where }) {
+  const near = isFree ? {} : featuresNear(x, y, REACH / scale, { sites, ...where });
   if (from && isStraight) return alongDirection(x, y, from, isFree ? null : step, near.vertex);
   if (isFree) return { x, y, kind: "free" };
   return near.vertex || near.midpoint || (near.edge && onLine(near.edge, step)) || { x: onGrid(x, step), y: onGrid(y, step), kind: "grid" };
@@ -68,12 +73,14 @@ function onLine(edge, step) {
   const { x, y, segment: [ax, ay, bx, by] } = edge, gx = onGrid(x, step), gy = onGrid(y, step), crossings = [];
   if (bx !== ax) crossings.push([gx, ay + ((gx - ax) / (bx - ax)) * (by - ay), (gx - ax) / (bx - ax)]);
   if (by !== ay) crossings.push([ax + ((gy - ay) / (by - ay)) * (bx - ax), gy, (gy - ay) / (by - ay)]);
-  const [px, py] = crossings.filter(([, , t]) => t > 0 && t < 1).sort((a, b) => Math.hypot(a[0] - x, a[1] - y) - Math.hypot(b[0] - x, b[1] - y))[0] || [x, y];
+  const [px, py] = crossings.filter(([, , t]) => t > 0 && t < 1).sort((a, b) =>
+    Math.hypot(a[0] - x, a[1] - y) - Math.hypot(b[0] - x, b[1] - y))[0] || [x, y];
   return { ...edge, x: px, y: py };
 }
 
 function alongDirection(x, y, from, step, vertex) {
-  const octant = Math.round(Math.atan2(y - from.y, x - from.x) / (Math.PI / 4)), ux = Math.round(Math.cos((octant * Math.PI) / 4)), uy = Math.round(Math.sin((octant * Math.PI) / 4));
+  const octant = Math.round(Math.atan2(y - from.y, x - from.x) / (Math.PI / 4)), ux = Math.round(Math.cos((octant * Math.PI) / 4));
+  const uy = Math.round(Math.sin((octant * Math.PI) / 4));
   const round = (value) => (step ? onGrid(value, step) : value), kind = "direction";
   if (ux && uy) {
     const length = round(0.5 * (Math.abs(x - from.x) + Math.abs(y - from.y)));

@@ -18,7 +18,6 @@ export class Sources {
   constructor(pane, on) {
     this.pane = pane;
     this.on = on;
-    this.waiting = [];
     this.film = null;
     this.folder = null;
     this.camera = new Camera();
@@ -28,7 +27,8 @@ export class Sources {
   // -- elements -------------------------------------------------------------------------------------------------------------
 
   _build() {
-    const bar = this.pane.querySelector(".bar"), frame = make("div", undefined, "menu-frame"), button = make("button", "Source "), arrow = make("span", "▾");
+    const bar = this.pane.querySelector(".bar"), frame = make("div", undefined, "menu-frame"), button = make("button", "Source ");
+    const arrow = make("span", "▾");
     button.type = "button";
     button.id = "source";
     button.title = "Photograph, video, folder, camera or test chart as the scene";
@@ -38,7 +38,8 @@ export class Sources {
     this.menu.id = "source-menu";
     this.menu.hidden = true;
     this.directory = make("input");
-    Object.assign(this.directory, { type: "file", webkitdirectory: true, multiple: true, className: "unseen", tabIndex: -1, id: "chosen-folder" });
+    Object.assign(this.directory, { type: "file", webkitdirectory: true, multiple: true, className: "unseen", tabIndex: -1,
+      id: "chosen-folder" });
     this.directory.setAttribute("aria-label", "Folder of pictures");
     frame.append(button, this.menu, this.directory);
     bar.insertBefore(frame, $("follow-scene"));
@@ -64,7 +65,8 @@ export class Sources {
       play: item("▶", "Play", () => this._play()),
       forward: item("▸", "One frame forward", () => this.film?.step(1)),
       close: item("✕", "Close", () => this._close()),
-      camera: item("Stop", "Stop the camera; its last frame stays the scene", () => (this.camera.isOn ? this.stopCamera() : this.startCamera())),
+      camera: item("Stop", "Stop the camera; its last frame stays the scene",
+        () => (this.camera.isOn ? this.stopCamera() : this.startCamera())),
     };
     this.slider = make("input");
     Object.assign(this.slider, { type: "range", min: 0, step: 1, value: 0 });
@@ -73,8 +75,8 @@ export class Sources {
     this.slider.addEventListener("change", () => this.film?.go(Number(this.slider.value), true));
     this.size = make("select");
     this.size.setAttribute("aria-label", "Longer side of camera frames");
-    this.size.append(...SIZES.map((size) => { const option = make("option", size + " px"); option.value = size; return option; }));
-    this.size.value = FIRST_SIZE;
+    this.size.append(...SIZES.map((size) => { return new Option(size + " px", String(size)); }));
+    this.size.value = String(FIRST_SIZE);
     this.size.addEventListener("change", () => { this.camera.size = Number(this.size.value); });
     this.label = make("span", undefined, "quiet");
     const { back, play, forward, camera, close } = this.buttons;
@@ -82,21 +84,32 @@ export class Sources {
     button.addEventListener("click", () => this._fillMenu());
     listenToMenu(button, this.menu);
     this.menu.addEventListener("click", (event) => {
-      const chosen = event.target.closest("button");
+      const chosen = /** @type {Element} */ (event.target).closest("button");
       if (chosen) this._choose(chosen.dataset);
     });
-    this.directory.addEventListener("change", () => { this.openFolder([...this.directory.files].filter((file) => file.webkitRelativePath.split("/").length <= 2)); this.directory.value = ""; });
+    this.directory.addEventListener("change", () => {
+      this.openFolder([...this.directory.files].filter((file) => file.webkitRelativePath.split("/").length <= 2));
+      this.directory.value = "";
+    });
   }
 
   _fillMenu() {
-    const entry = (text, data) => { const button = make("button", text); button.type = "button"; Object.assign(button.dataset, data); return button; };
+    const entry = (text, data) => {
+      const button = make("button", text);
+      button.type = "button";
+      Object.assign(button.dataset, data);
+      return button;
+    };
     const charts = this.on.charts().filter(({ label }) => label !== "picture");
     this.menu.replaceChildren(
-      entry("Photograph or video…", { source: "file" }), entry("Folder of pictures…", { source: "folder" }), entry(this.camera.isOn ? "Stop the camera" : "Camera", { source: "camera" }),
-      make("hr"), make("h3", "Test charts"), ...charts.map(({ label }) => entry(label[0].toUpperCase() + label.slice(1), { source: "chart", label })),
+      entry("Photograph or video…", { source: "file" }), entry("Folder of pictures…", { source: "folder" }),
+      entry(this.camera.isOn ? "Stop the camera" : "Camera", { source: "camera" }),
+      make("hr"), make("h3", "Test charts"),
+      ...charts.map(({ label }) => entry(label[0].toUpperCase() + label.slice(1), { source: "chart", label })),
     );
   }
 
+  /** @param {DOMStringMap} data */
   _choose({ source, label }) {
     if (source === "file") this.on.choose();
     else if (source === "folder") this.directory.click();
@@ -109,31 +122,20 @@ export class Sources {
 
   // -- answers of the server --------------------------------------------------------------------------------------------------
 
-  // Resolves to whether the message succeeded, after its result is shown.
-  _answered(id) { return id === null ? Promise.resolve(false) : new Promise((resolve) => { this.waiting.push({ id, resolve }); }); }
-
-  receive(message) {
-    const { kind, id } = message, isFailed = (kind === "error" && !message.part) || (kind === "state" && Object.keys(message.errors || {}).length > 0);
-    if (kind === "state") this._useState(message);
-    if (kind !== "done" && !isFailed) return;
-    for (const one of this.waiting.filter((each) => id >= each.id)) one.resolve(!isFailed || one.id !== id);
-    if (isFailed && this.waiting.some((each) => each.id === id)) notice(message.text || Object.values(message.errors)[0]);
-    this.waiting = this.waiting.filter((each) => !(id >= each.id));
-  }
+  _shown(id) { return this.on.connection().requests.answered(id); }
 
   lost() {
-    for (const { resolve } of this.waiting) resolve(false);
-    this.waiting = [];
     this.film?.pause();
     if (this.camera.isOn) this.stopCamera();
   }
 
-  _useState({ film, settings }) {
+  use({ film, settings }) {
     const picture = settings.scene?.picture, k = this.folder ? this.folder.findIndex(({ path }) => path && path === picture) : -1;
     if (film?.kind === "video") {
       if (this.kind !== "video" || this.shownName !== film.name || this.film.count !== film.n_frames) {
         this.film?.pause();
-        this.film = new Film({ count: film.n_frames, n: film.n, frameS: film.frame_s, isSkipping: true, show: (n) => this._answered(this.on.connection().send({ do: "frame", n })), changed: () => this._show() });
+        this.film = new Film({ count: film.n_frames, n: film.n, frameS: film.frame_s, isSkipping: true,
+          show: (n) => this._shown(this.on.connection().send({ do: "frame", n })), changed: () => this._show() });
       } else if (!this.film.isBusy) this.film.n = film.n;
       this.shownName = film.name;
     } else if (film?.kind === "camera") {
@@ -173,7 +175,7 @@ export class Sources {
       return;
     }
     const total = String(film.count);
-    this.slider.max = film.count - 1;
+    this.slider.max = String(film.count - 1);
     if (film.isPlaying || !film.isBusy) this.slider.value = film.n;
     this.slider.setAttribute("aria-valuetext", "Frame " + (film.n + 1) + " of " + total);
     play.textContent = film.isPlaying ? "❚❚" : "▶";
@@ -188,7 +190,7 @@ export class Sources {
     if (kind === "folder") [...this.strip.children].forEach((cell, k) => {
       const isCurrent = k === film.n;
       if (isCurrent && cell.getAttribute("aria-current") !== "true") cell.scrollIntoView({ block: "nearest", inline: "nearest" });
-      cell.setAttribute("aria-current", isCurrent);
+      cell.setAttribute("aria-current", String(isCurrent));
     });
   }
 
@@ -212,7 +214,8 @@ export class Sources {
 
   // Uses files of a drop that are more than one, or in a folder; returns whether it does.
   dropped(transfer) {
-    const entries = [...transfer.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean), directory = entries.find((entry) => entry.isDirectory);
+    const entries = [...transfer.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean);
+    const directory = entries.find((entry) => entry.isDirectory);
     if (directory) {
       filesOf(directory).then((files) => this.openFolder(files), () => notice("The folder cannot be read"));
       return true;
@@ -224,7 +227,8 @@ export class Sources {
   }
 
   openFolder(files) {
-    const pictures = files.filter(({ name }) => PICTURE.test(name) && !name.startsWith(".")).sort((a, b) => a.name.localeCompare(b.name, "en", { numeric: true }));
+    const pictures = files.filter(({ name }) => PICTURE.test(name)
+      && !name.startsWith(".")).sort((a, b) => a.name.localeCompare(b.name, "en", { numeric: true }));
     if (!pictures.length) { notice("The folder contains no pictures"); return; }
     if (pictures.length > MAX_PICTURES) notice("The first " + MAX_PICTURES + " of " + pictures.length + " pictures are used");
     this._forgetFolder();
@@ -250,7 +254,8 @@ export class Sources {
   }
 
   _folderFilm(n) {
-    return new Film({ count: this.folder.length, n, isSkipping: false, show: (k, isFinal) => this._showPicture(k, isFinal), changed: () => this._show() });
+    return new Film({ count: this.folder.length, n, isSkipping: false, show: (k, isFinal) => this._showPicture(k, isFinal),
+      changed: () => this._show() });
   }
 
   async _showPicture(k, isFinal) {
@@ -263,7 +268,8 @@ export class Sources {
     }
     // The first picture makes the scene a photograph; the next ones replace it.
     const { scene } = this.on.state().settings, isOfFolder = this.folder?.some(({ path }) => path && path === scene.picture);
-    return this._answered(connection.send(isOfFolder ? { do: "set", key: "scene.picture", value: item.path, final: isFinal } : { do: "file", path: item.path, as: "scene" }));
+    return this._shown(connection.send(isOfFolder ? { do: "set", key: "scene.picture", value: item.path, final: isFinal }
+      : { do: "file", path: item.path, as: "scene" }));
   }
 
   _forgetFolder() {
@@ -293,7 +299,7 @@ export class Sources {
         continue;
       }
       const { width, height, pixels } = this.camera.frame();
-      const isShown = await this._answered(this.on.connection().sendFrame({ width, height, is_first: isFirst }, pixels));
+      const isShown = await this._shown(this.on.connection().sendFrame({ width, height, is_first: isFirst }, pixels));
       if (!isShown) break;
       this.isLive = true;
       isFirst = false;

@@ -5,30 +5,39 @@ import { make, notice } from "/web/page_parts.js";
 // Name, key, heading, icon (lines in a square of 16), and hint.
 export const TOOLS = [
   ["select", "v", "Select and pan", "M3.5 2l9 6-4.2.8L6.3 13z", "Click selects a site, Shift adds; drag pans, Shift-drag selects an area."],
-  ["polygon", "p", "Draw polygon", "M8 2l6 4.6-2.3 7H4.3L2 6.6z", "Click vertices; Enter, a double click or the first vertex closes; Backspace removes the last."],
+  ["polygon", "p", "Draw polygon", "M8 2l6 4.6-2.3 7H4.3L2 6.6z",
+    "Click vertices; Enter, a double click or the first vertex closes; Backspace removes the last."],
   ["rectangle", "r", "Draw rectangle", "M2.5 4h11v8.5h-11z", "Drag, or click two corners; Shift draws a square."],
-  ["move", "m", "Move photosites", "M8 1.5v13M1.5 8h13M6 3.5l2-2 2 2M6 12.5l2 2 2-2M3.5 6l-2 2 2 2M12.5 6l2 2-2 2", "Drag a site, or all selected ones; arrows move the selection by the grid."],
-  ["vertex", "n", "Move vertex", "M2 13.5L8 5l6 8.5M6.2 1.8h3.6v3.6H6.2z", "Drag a vertex of all its sites, or an edge for a new one; Delete or Alt-click removes."],
-  ["cut", "c", "Cut", "M2.5 4h11v8.5h-11zM11.5 1.5l-7 13", "Click a line across sites, then Enter; with a selection, only selected sites are cut."],
+  ["move", "m", "Move photosites", "M8 1.5v13M1.5 8h13M6 3.5l2-2 2 2M6 12.5l2 2 2-2M3.5 6l-2 2 2 2M12.5 6l2 2-2 2",
+    "Drag a site, or all selected ones; arrows move the selection by the grid."],
+  ["vertex", "n", "Move vertex", "M2 13.5L8 5l6 8.5M6.2 1.8h3.6v3.6H6.2z",
+    "Drag a vertex of all its sites, or an edge for a new one; Delete or Alt-click removes."],
+  ["cut", "c", "Cut", "M2.5 4h11v8.5h-11zM11.5 1.5l-7 13",
+    "Click a line across sites, then Enter; with a selection, only selected sites are cut."],
   ["merge", "j", "Merge", "M1.5 8H6M4 5.5L6.5 8 4 10.5M14.5 8H10M12 5.5L9.5 8l2.5 2.5M8 2.5v11", "Click adjacent sites, then Enter."],
   ["split", "d", "Split", "M2.5 3h11v10h-11zM8 3v10M2.5 8h11", "Click sites, then Enter."],
   ["channel", "f", "Set filter", "M8 1.8C5.5 5.2 3.8 7.5 3.8 9.8a4.2 4.2 0 0 0 8.4 0C12.2 7.5 10.5 5.2 8 1.8z", "Click sites, then Enter."],
-  ["layer", "l", "Add layer…", "M8 2l6.5 3.5L8 9 1.5 5.5zM1.5 9L8 12.5 14.5 9", "Drag a rectangle for it, or click its centre; Enter for the centre of the view."],
+  ["layer", "l", "Add layer…", "M8 2l6.5 3.5L8 9 1.5 5.5zM1.5 9L8 12.5 14.5 9",
+    "Drag a rectangle for it, or click its centre; Enter for the centre of the view."],
 ];
 const ACTIONS = [
   ["remove", "Delete", "Delete selected sites (Delete)", "M3 4.5h10M6.5 4.5v-2h3v2M4.5 4.5l.7 9h5.6l.7-9M6.8 7v4.5M9.2 7v4.5"],
-  ["repair", "", "Repair violations of the design rules", "M10.5 2.2a3.6 3.6 0 0 0-3.3 5L2.4 12l1.9 1.9 4.8-4.8a3.6 3.6 0 0 0 4.6-4.6l-2.1 2.1-2-2z"],
+  ["repair", "", "Repair violations of the design rules",
+    "M10.5 2.2a3.6 3.6 0 0 0-3.3 5L2.4 12l1.9 1.9 4.8-4.8a3.6 3.6 0 0 0 4.6-4.6l-2.1 2.1-2-2z"],
 ];
 const APPLY = { polygon: "Close", cut: "Cut", merge: "Merge", split: "Split", channel: "Set", layer: "Add" };
 const PLACING = ["polygon", "rectangle", "cut", "move", "vertex", "layer"];
 const OVERLAPS = [["cut", "cuts sites"], ["fill", "fills gaps"], ["keep", "overlaps"]];
-const OPERATIONS = [["replace", "replaces sites"], ["fill", "fills gaps"], ["union", "overlaps"], ["clip", "clips sites"], ["cut_out", "cuts sites out"]];
+const OPERATIONS = [["replace", "replaces sites"], ["fill", "fills gaps"], ["union", "overlaps"], ["clip", "clips sites"],
+  ["cut_out", "cuts sites out"]];
 
 function icon(path) {
-  const picture = document.createElementNS("http://www.w3.org/2000/svg", "svg"), line = document.createElementNS("http://www.w3.org/2000/svg", "path");
+  const picture = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+  const line = document.createElementNS("http://www.w3.org/2000/svg", "path");
   picture.setAttribute("viewBox", "0 0 16 16");
   picture.setAttribute("aria-hidden", "true");
-  for (const [name, value] of Object.entries({ d: path, fill: "none", stroke: "currentColor", "stroke-width": 1.4, "stroke-linejoin": "round" })) line.setAttribute(name, value);
+  for (const [name, value] of Object.entries({ d: path, fill: "none", stroke: "currentColor", "stroke-width": 1.4,
+    "stroke-linejoin": "round" })) line.setAttribute(name, value);
   picture.append(line);
   return picture;
 }
@@ -73,14 +82,16 @@ export class ToolBar {
     this.strip.setAttribute("role", "toolbar");
     this.strip.setAttribute("aria-label", "Tools");
     this.strip.setAttribute("aria-orientation", "vertical");
-    this.buttons = new Map(TOOLS.map(([name, key, title, path]) => [name, this._button(name, title + " (" + key.toUpperCase() + ")", path, () => on.use(name))]));
+    this.buttons = new Map(TOOLS.map(([name, key, title, path]) =>
+      [name, this._button(name, title + " (" + key.toUpperCase() + ")", path, () => on.use(name))]));
     this.actions = new Map(ACTIONS.map(([name, , title, path]) => [name, this._button(name, title, path, () => on.act(name))]));
     for (const button of this.buttons.values()) button.setAttribute("aria-pressed", "false");
     this.strip.append(...this.buttons.values(), make("hr"), ...this.actions.values());
     this.strip.addEventListener("keydown", (event) => {
-      const step = { ArrowDown: 1, ArrowRight: 1, ArrowUp: -1, ArrowLeft: -1 }[event.key], all = [...this.strip.querySelectorAll("button:not(:disabled)")];
+      const step = { ArrowDown: 1, ArrowRight: 1, ArrowUp: -1, ArrowLeft: -1 }[event.key];
+      const all = [...this.strip.querySelectorAll("button")].filter((button) => !button.disabled);
       if (!step) return;
-      all[(all.indexOf(document.activeElement) + step + all.length) % all.length]?.focus();
+      all[(all.findIndex((button) => button === document.activeElement) + step + all.length) % all.length]?.focus();
       event.preventDefault();
       event.stopPropagation();
     });
@@ -104,9 +115,12 @@ export class ToolBar {
     const { on } = this;
     this.fields = {
       overlap: select("What happens to sites below", OVERLAPS), channel: select("Filter", [["", "nearest filter"]]),
-      n_x: textField("Parts along x", { size: 2, value: "2", mode: "numeric" }), n_y: textField("Parts along y", { size: 2, value: "1", mode: "numeric" }),
-      generator: select("Generator", []), operation: select("Operation", OPERATIONS), margin_um: textField("Margin in µm", { size: 3, value: "0" }),
-      at: textField("Position in µm: x, y, or @dx, dy from the last one", { size: 11, mode: "text", placeholder: "x, y" }), grid: textField("Grid in µm", { size: 3 }),
+      n_x: textField("Parts along x", { size: 2, value: "2", mode: "numeric" }),
+      n_y: textField("Parts along y", { size: 2, value: "1", mode: "numeric" }),
+      generator: select("Generator", []), operation: select("Operation", OPERATIONS),
+      margin_um: textField("Margin in µm", { size: 3, value: "0" }),
+      at: textField("Position in µm: x, y, or @dx, dy from the last one", { size: 11, mode: "text", placeholder: "x, y" }),
+      grid: textField("Grid in µm", { size: 3 }),
     };
     this.applyButton = make("button", "Apply", "apply");
     this.applyButton.type = "button";
@@ -117,7 +131,12 @@ export class ToolBar {
     this.hint = make("p", "", "tool-hint");
     this.problem = make("p", "", "tool-problem");
     this.problem.setAttribute("role", "alert");
-    const part = (tools, label, ...nodes) => { const span = make("label", label); span.append(...nodes); this.parts.push([tools, span]); return span; };
+    const part = (tools, label, ...nodes) => {
+      const span = make("label", label);
+      span.append(...nodes);
+      this.parts.push([tools, span]);
+      return span;
+    };
     this.parts = [];
     const { fields } = this, note = make("div", undefined, "tool-note");
     note.append(this.hint, this.problem, this.rulesButton);
@@ -125,13 +144,19 @@ export class ToolBar {
       part(["polygon", "rectangle"], "", fields.overlap), part(["polygon", "rectangle", "channel"], "", fields.channel),
       part(["split"], "x", fields.n_x), part(["split"], "y", fields.n_y),
       part(["layer"], "", fields.generator), part(["layer"], "", fields.operation), part(["layer"], "margin", fields.margin_um),
-      part(PLACING, "at", fields.at), this.applyButton, part(PLACING.filter((tool) => tool !== "layer"), "grid", fields.grid, make("span", "µm")), note,
+      part(PLACING, "at", fields.at), this.applyButton, part(PLACING.filter((tool) => tool !== "layer"), "grid", fields.grid,
+        make("span", "µm")), note,
     );
     fields.at.addEventListener("input", () => { this.isTyping = true; });
     fields.at.addEventListener("blur", () => { this.isTyping = false; });
     fields.at.addEventListener("keydown", (event) => {
       if (event.key === "Enter") {
-        if (this.isTyping) { if (on.typed(fields.at.value)) { this.isTyping = false; fields.at.select(); } else notice("A position is two numbers in µm, such as 12.5, -3 or @10, 0"); }
+        if (this.isTyping) {
+          if (on.typed(fields.at.value)) {
+            this.isTyping = false;
+            fields.at.select();
+          } else notice("A position is two numbers in µm, such as 12.5, -3 or @10, 0");
+        }
         else on.apply();
       } else if (event.key === "Escape") { this.isTyping = false; fields.at.blur(); } else return;
       event.preventDefault();
@@ -143,7 +168,7 @@ export class ToolBar {
   show(isOn) { this.strip.hidden = this.row.hidden = !isOn; }
 
   use(tool) {
-    for (const [name, button] of this.buttons) button.setAttribute("aria-pressed", name === tool);
+    for (const [name, button] of this.buttons) button.setAttribute("aria-pressed", String(name === tool));
     const [, , title, , hint] = TOOLS.find(([name]) => name === tool);
     this.usual = title.replace("…", "") + ": " + hint[0].toLowerCase() + hint.slice(1);
     for (const [tools, span] of this.parts) span.hidden = !tools.includes(tool);

@@ -75,9 +75,11 @@ export class PickTool extends Tool {
 
 // Vertices by clicks: polygons, and lines that cut.
 class PathTool extends Tool {
+  least; isClosed; path = []; last = [];
+
   constructor(editor, { least, isClosed }) {
     super(editor);
-    Object.assign(this, { least, isClosed, path: [], last: [] });
+    Object.assign(this, { least, isClosed });
   }
 
   get origin() { return this.path.at(-1) || null; }
@@ -102,6 +104,9 @@ class PathTool extends Tool {
   }
 
   preview() {}
+
+  // The edit of a path; of subclasses.
+  edit(_path) { return null; }
 
   enter() {
     const { path, editor } = this;
@@ -251,7 +256,8 @@ export class VertexTool extends Tool {
 
   get paths() {
     const { editor } = this, { at } = editor;
-    if (this.isHeld && at) return this.rings.map(({ points, indices }) => ({ points: points.map((point, i) => (indices.has(i) ? [at.x, at.y] : point)), isClosed: true }));
+    if (this.isHeld && at) return this.rings.map(({ points, indices }) =>
+      ({ points: points.map((point, i) => (indices.has(i) ? [at.x, at.y] : point)), isClosed: true }));
     const site = editor.raw && editor.sites ? editor.pick(editor.raw.x, editor.raw.y) : -1;
     return site < 0 ? [] : ringsOf(editor.sites, site).map((points) => ({ points, isClosed: true, marks: points, isFaint: true }));
   }
@@ -277,7 +283,8 @@ export class VertexTool extends Tool {
           const [bx, by] = ring[(i + 1) % ring.length], [ax, ay] = point;
           if (isSame({ x: ax, y: ay }, { x, y }, VERTEX_UM)) indices.add(points.length);
           points.push(point);
-          const on = nearestOn(x, y, ax, ay, bx, by), isEnd = isSame({ x: ax, y: ay }, { x, y }, VERTEX_UM) || isSame({ x: bx, y: by }, { x, y }, VERTEX_UM);
+          const on = nearestOn(x, y, ax, ay, bx, by), isEnd = isSame({ x: ax, y: ay }, { x, y }, VERTEX_UM)
+            || isSame({ x: bx, y: by }, { x, y }, VERTEX_UM);
           if (!isEnd && isSame(on, { x, y }, VERTEX_UM)) { indices.add(points.length); points.push([x, y]); }
         });
         if (indices.size) found.push({ points, indices });

@@ -31,8 +31,8 @@ POLICY = (
     "default-src 'none'; script-src '{script}'; style-src '{style}'; img-src data: blob:; base-uri 'none'; "
     "form-action 'none'"
 )
-#: Import and export statements of modules: on separate lines, without aliases.
-IMPORT = re.compile(r'^import \{[\w$, ]+\} from "\./(\w+\.js)";\n', re.MULTILINE)
+#: Import and export statements of modules: without aliases.
+IMPORT = re.compile(r'^import \{[\w$,\s]+\} from "\./(\w+\.js)";\n', re.MULTILINE)
 EXPORT = re.compile(r"^export (?=(?:async )?function |class |const )", re.MULTILINE)
 
 

@@ -23,7 +23,10 @@ function lit(fraction, colour, palette) {
 //   kinds  integers of categories
 // alsoValues are other values that the scale includes.
 export class Scale {
-  constructor(column, values, filterOf, palette, { wantsLog, wantedMap, alsoValues } = {}) {
+  column; values; filterOf; palette;
+
+  /** @typedef {{ wantsLog?: boolean, wantedMap?: string | null, alsoValues?: ArrayLike<number> | null }} ScaleOptions */
+  constructor(column, values, filterOf, palette, /** @type {ScaleOptions} */ { wantsLog, wantedMap, alsoValues } = {}) {
     Object.assign(this, { column, values, filterOf, palette });
     let low = Infinity, high = -Infinity;
     for (const part of [values, alsoValues || []]) {
@@ -138,7 +141,8 @@ export function roundStep(length, isWhole) {
 
 // Formats a length in nm, µm or mm.
 export function formatLength(length) {
-  return length >= 1000 ? length / 1000 + " mm" : length >= 0.1 ? Number(length.toPrecision(3)) + " µm" : Number((1000 * length).toPrecision(3)) + " nm";
+  return length >= 1000 ? length / 1000 + " mm" : length >= 0.1 ? Number(length.toPrecision(3)) + " µm"
+    : Number((1000 * length).toPrecision(3)) + " nm";
 }
 
 // Made once: numbers are formatted many times faster than by toLocaleString.

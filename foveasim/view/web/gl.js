@@ -29,7 +29,10 @@ export function fitCanvas(canvas, width, height) {
 export function watchSize(element, onChange) {
   new ResizeObserver(onChange).observe(element);
   const watchRatio = () => {
-    matchMedia(`(resolution: ${window.devicePixelRatio}dppx)`).addEventListener("change", () => { watchRatio(); onChange(); }, { once: true });
+    matchMedia(`(resolution: ${window.devicePixelRatio}dppx)`).addEventListener("change", () => {
+      watchRatio();
+      onChange();
+    }, { once: true });
   };
   watchRatio();
 }

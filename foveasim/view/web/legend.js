@@ -126,7 +126,8 @@ function footOf(context, most, bar, scales, items) {
   for (const scale of scales) {
     if (scale.column.kind === "kinds") {
       const kinds = kindsOf(scale);
-      [{ colours: [], text: titleOf(scale.column) }, ...kinds.items, ...(kinds.rest ? [{ colours: [], text: kinds.rest }] : [])].forEach(add);
+      [{ colours: [], text: titleOf(scale.column) }, ...kinds.items,
+        ...(kinds.rest ? [{ colours: [], text: kinds.rest }] : [])].forEach(add);
       continue;
     }
     const ends = brief(scale.from) + " to " + brief(scale.to) + (scale.isLog ? ", log" : "");

@@ -2,6 +2,8 @@
 
 import { clamp } from "./colours.js";
 
+// Inks of lines around others: on maps, of the pinned, the hovered and a wrong site; on pictures.
+const WHITE = "#ffffff", ACCENT = "#1f5fbf", DARK = "#10151f", WRONG = "#d3261b", SHADE = "rgb(0 0 0 / 60%)";
 // More outlines than this are not drawn, because they would not be distinguishable.
 export const MOST_OUTLINES = 4000;
 
@@ -17,21 +19,62 @@ export function outline(context, trace, widths, inks) {
   });
 }
 
-// Traces four lines around a point, from and to a distance.
-export function traceCross(context, x, y, from, to) {
-  for (const [u, v] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
-    context.moveTo(x + from * u, y + from * v);
-    context.lineTo(x + to * u, y + to * v);
-  }
+// Draws the cursor of another view: four lines around a point, of a map or a picture.
+export function drawCross(context, x, y, isOnPicture = false) {
+  const from = isOnPicture ? 3 : 4, to = isOnPicture ? 10 : 13;
+  const trace = () => {
+    for (const [u, v] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
+      context.moveTo(x + from * u, y + from * v);
+      context.lineTo(x + to * u, y + to * v);
+    }
+  };
+  outline(context, trace, [4, 2], isOnPicture ? [SHADE, WHITE] : [WHITE, DARK]);
 }
 
 // Outlines a site, with a circle around sites of a few pixels, which could be missed.
-export function ringSite(context, map, site, inks) {
+function ringSite(context, map, site, inks) {
   const { sites } = map, [a, b, c, d] = sites.box.subarray(4 * site, 4 * site + 4);
   outline(context, () => sites.trace(context, site, map), [5, 2.5], inks);
   if ((c - a) * map.scale < 10 && (d - b) * map.scale < 10) {
     outline(context, () => context.arc(map.toX(0.5 * (a + c)), map.toY(0.5 * (b + d)), 9, 0, 7), [4, 2], inks);
   }
+}
+
+// Outlines the pinned and the hovered site, -1 for none.
+export function ringSites(context, map, pinned, hovered) {
+  const isSite = (site) => site >= 0 && site < map.sites.n;
+  if (isSite(pinned)) ringSite(context, map, pinned, [WHITE, ACCENT]);
+  if (isSite(hovered) && hovered !== pinned) ringSite(context, map, hovered, [WHITE, DARK]);
+}
+
+// Draws the rectangle of a selection, and outlines selected sites.
+export function drawSelected(context, map, rectangle, selected) {
+  const { sites } = map, trace = () => {
+    for (const site of selected.slice(0, MOST_OUTLINES)) if (site < sites.n) sites.trace(context, site, map);
+  };
+  if (selected.length) outline(context, trace, [3, 1.5], [WHITE, ACCENT]);
+  if (!rectangle) return;
+  const [[x0, y0], [x1, y1]] = rectangle, wide = Math.abs(x1 - x0) * map.scale, tall = Math.abs(y1 - y0) * map.scale;
+  const box = [map.toX(Math.min(x0, x1)), map.toY(Math.max(y0, y1)), wide, tall];
+  context.fillStyle = "rgb(31 95 191 / 14%)";
+  context.fillRect(...box);
+  outline(context, () => context.rect(...box), [4, 2], [WHITE, ACCENT]);
+}
+
+// Draws a chosen violation { path, box }, with a circle around it.
+export function drawTrace(context, map, { path, box: [a, b, c, d] }) {
+  const radius = Math.max(16, 0.75 * map.scale * Math.hypot(c - a, d - b));
+  outline(context, () => path(context, map), [8, 4], [WHITE, WRONG]);
+  outline(context, () => context.arc(map.toX(0.5 * (a + c)), map.toY(0.5 * (b + d)), radius, 0, 7), [4, 2], [WHITE, WRONG]);
+}
+
+// Draws the view of a map as a rectangle on a picture of this size, unless the map shows all of it.
+export function drawView(context, picture, map, width, height) {
+  const x0 = picture.toX(map.fromX(0)), y0 = picture.toY(map.fromY(0));
+  const x1 = picture.toX(map.fromX(map.width)), y1 = picture.toY(map.fromY(map.height));
+  if (x0 <= 1 && y0 <= 1 && x1 >= width - 1 && y1 >= height - 1) return;
+  const w = Math.max(5, x1 - x0), h = Math.max(5, y1 - y0);
+  outline(context, () => context.rect(0.5 * (x0 + x1 - w), 0.5 * (y0 + y1 - h), w, h), [3.5, 1.75], [SHADE, WHITE]);
 }
 
 // Draws the outlines of all sites in view, if they are sufficiently large.

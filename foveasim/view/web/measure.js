@@ -7,7 +7,8 @@ import { downloadText, make } from "./page_parts.js";
 // Length and direction of a line between two points in µm.
 export function lengthText([x0, y0], [x1, y1]) {
   const dx = x1 - x0, dy = y1 - y0, length = Math.hypot(dx, dy), digits = (v) => String(Number(v.toPrecision(4)));
-  const text = length >= 1000 ? digits(length / 1000) + " mm" : length < 0.1 && length > 0 ? digits(1000 * length) + " nm" : digits(length) + " µm";
+  const text = length >= 1000 ? digits(length / 1000) + " mm" : length < 0.1 && length > 0 ? digits(1000 * length) + " nm"
+    : digits(length) + " µm";
   return { length, text, detail: "Δx " + digits(dx) + ", Δy " + digits(dy) + " µm, " + digits((Math.atan2(dy, dx) * 180) / Math.PI) + "°" };
 }
 
@@ -55,7 +56,9 @@ export function statisticsRows(columns, chosen) {
     if (column.names) {
       const counts = new Map();
       for (const site of chosen) counts.set(column.values[site], (counts.get(column.values[site]) || 0) + 1);
-      const kinds = [...counts].sort((a, b) => b[1] - a[1]), cell = make("td", kinds.slice(0, 6).map(([kind, n]) => column.names[kind] + " " + shown(n)).join(", ") + (kinds.length > 6 ? ", …" : ""));
+      const kinds = [...counts].sort((a, b) => b[1] - a[1]);
+      const cell = make("td", kinds.slice(0, 6).map(([kind, n]) => column.names[kind] + " " + shown(n)).join(", ")
+        + (kinds.length > 6 ? ", …" : ""));
       cell.colSpan = COLUMNS.length;
       line.append(cell);
     } else {
@@ -73,7 +76,8 @@ export function tableOf(sites, columns, chosen) {
   const listed = columns.filter((column) => !column.is_repeat && column.values);
   const quote = (text) => (/[",\r\n]/.test(text) ? '"' + text.replace(/"/g, '""') + '"' : text);
   const word = (text) => quote(/^[=+\-@\t\r]/.test(text) ? "'" + text : text);
-  const value = (column, site) => (column.names ? word(column.names[column.values[site]]) : Number.isNaN(column.values[site]) ? "" : String(column.values[site]));
+  const value = (column, site) => (column.names ? word(column.names[column.values[site]]) : Number.isNaN(column.values[site]) ? ""
+    : String(column.values[site]));
   const lines = [["site", "x_um", "y_um", ...listed.map((column) => word(column.key))]];
   for (const site of chosen) lines.push([site, ...sites.centre(site), ...listed.map((column) => value(column, site))]);
   return lines.map((line) => line.join(",") + "\r\n").join("");

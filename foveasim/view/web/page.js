@@ -1,28 +1,28 @@
 // The page: controls, the photosite under the mouse, colours, design rules, picture, links.
 
 import { connect, hasAddress, report } from "./bridge.js";
-import { Scale, bytesOfHex, clamp, formatLength, roundStep, shown, textOf } from "./colours.js";
+import { Scale, bytesOfHex, clamp, shown } from "./colours.js";
 import { COLOUR_MAPS } from "./colour_maps.js";
 import { listenToPointers } from "./gestures.js";
 import { findRenderer, fitCanvas, pixelRatio, watchSize } from "./gl.js";
 import { drawRamp, kindsOf, pictureOf, summaryOf, swatchItem, tickLabels, titleOf } from "./legend.js";
 import { SensorMap } from "./map.js";
-import { MOST_OUTLINES, drawOutlines, outline, pathBetween, positionText, ringSite, traceCross } from "./marks.js";
+import { drawCross, drawOutlines, drawSelected, drawTrace, drawView, outline, positionText, ringSites } from "./marks.js";
 import { downloadTable, lengthText, sitesIn, statisticsRows, tableOf } from "./measure.js";
 import { Overview } from "./overview.js";
-import { $, downloadPicture, inkOf, isForPage, listenToHelp, make, notice, speak, startTheme, stayingNotice, useTheme } from "./page_parts.js";
+import { $, downloadPicture, inkOf, isForPage, listenToHelp, make, notice, speak, startTheme, stayingNotice,
+  useTheme } from "./page_parts.js";
+import { RulesList, VIOLATION_ARRAYS } from "./rules_list.js";
+import { drawScaleBar, flyTo, listenToRange, panByKey, siteHeading, siteRows, spokenSite, stopFlight, zoomByKey } from "./shell.js";
 import { Sites } from "./sites.js";
 import { unpack } from "./unpack.js";
-import { Violations } from "./violations.js";
 
 const about = JSON.parse($("about").textContent);
-const reducesMotion = matchMedia("(prefers-reduced-motion: reduce)");
-const VIOLATIONS_AT_A_TIME = 200;
 const STEPS = 72;
 
 const state = {
   sites: null, map: null, columns: [], scale: null, column: null, range: null, wantsLog: undefined,
-  hovered: -1, others: [], pinned: -1, cursor: null, chosen: null, shownViolations: 0, drawn: 0, drawMs: 0, loaded: false, isSlow: false,
+  hovered: -1, others: [], pinned: -1, cursor: null, rules: null, drawn: 0, drawMs: 0, loaded: false, isSlow: false,
   wantedMap: null, second: null, secondMap: null, tool: null, start: null, ruler: null, selection: null, selected: [],
 };
 const asks = { map: false, marks: false };
@@ -58,9 +58,11 @@ async function colourBy(key, range = null) {
 
 // The scale of a column; with the values of the other map if that shows the same quantity, so that colours are comparable.
 async function scaleOf(column, other) {
-  const filterOf = about.filter && column.kind === "lit" ? await array(about.filter) : null, quantity = (one) => one.key.replace(/^second-/, "");
+  const filterOf = about.filter && column.kind === "lit" ? await array(about.filter) : null;
+  const quantity = (one) => one.key.replace(/^second-/, "");
   const alsoValues = other && quantity(other.column) === quantity(column) ? await valuesOf(other.column) : null;
-  return new Scale(column, await valuesOf(column), filterOf, about.palette, { wantsLog: state.wantsLog, wantedMap: state.wantedMap, alsoValues });
+  return new Scale(column, await valuesOf(column), filterOf, about.palette,
+    { wantsLog: state.wantsLog, wantedMap: state.wantedMap, alsoValues });
 }
 
 function repaint() {
@@ -96,7 +98,8 @@ async function showSecond(key) {
 }
 
 function createSecond() {
-  const map = new SensorMap($("second-cells"), state.sites, state.renderer), overview = new Overview($("second-overview"), state.sites), first = state.map;
+  const map = new SensorMap($("second-cells"), state.sites, state.renderer);
+  const overview = new Overview($("second-overview"), state.sites), first = state.map;
   listenToPointers($("second-marks"), {
     drag: (dx, dy) => { first.set(first.x - dx / first.scale, first.y + dy / first.scale, first.scale); moved(); },
     pinch: (factor, px, py) => { first.zoom(factor, px, py); moved(); },
@@ -115,9 +118,7 @@ function drawSecond() {
   overview.update(map, scale, null);
 }
 
-function groundColour() {
-  return bytesOfHex(getComputedStyle(document.documentElement).getPropertyValue("--map").trim());
-}
+const groundColour = () => bytesOfHex(inkOf("--map"));
 
 // -- legend and histogram ---------------------------------------------------------------------------------------------------
 
@@ -194,15 +195,10 @@ function fillRange() {
 
 function listenToHistogram() {
   const canvas = $("histogram");
-  let start = null;
-  const valueAt = (event) => {
+  listenToRange(canvas, () => state.scale, (event) => {
     const box = canvas.getBoundingClientRect();
-    const value = state.scale.value(clamp((event.clientX - box.left) / box.width, 0, 1));
-    return state.column.is_integer && !state.scale.isLog ? Math.round(value) : value;
-  };
-  canvas.addEventListener("pointerdown", (event) => { start = valueAt(event); canvas.setPointerCapture(event.pointerId); });
-  canvas.addEventListener("pointermove", (event) => { if (start !== null && event.buttons) setRange(start, valueAt(event)); });
-  canvas.addEventListener("pointerup", (event) => { if (start !== null && valueAt(event) === start) setRange(null); start = null; });
+    return (event.clientX - box.left) / box.width;
+  }, (range) => setRange(...(range || [null])));
   for (const id of ["range-from", "range-to"]) {
     $(id).addEventListener("change", () => {
       // An unchanged bound keeps its full precision, which its field does not show.
@@ -246,7 +242,7 @@ function drawMap() {
   state.overview.update(state.map, state.scale, state.range);
   if (state.second) drawSecond();
   drawLines();
-  drawScaleBar();
+  state.scaleBar = drawScaleBar($("scale-bar"), state.map);
   state.drawn++;
   state.drawMs = performance.now() - start;
 }
@@ -256,46 +252,25 @@ function drawLines() {
   const { map } = state, { context, width, height } = state.lines;
   context.clearRect(0, 0, width, height);
   drawOutlines(context, map, width, height);
-  if (state.violations) state.violations.drawMarkers(context, map, Number($("rule").value));
-}
-
-// Outlines the pinned and the hovered site on a map.
-function drawSites(context, map) {
-  if (state.pinned >= 0) ringSite(context, map, state.pinned, ["#ffffff", "#1f5fbf"]);
-  if (state.hovered >= 0 && state.hovered !== state.pinned) ringSite(context, map, state.hovered, ["#ffffff", "#10151f"]);
-}
-
-function drawCursor(context, map) {
-  const x = map.toX(state.cursor.x), y = map.toY(state.cursor.y);
-  outline(context, () => traceCross(context, x, y, 4, 13), [4, 2], ["#ffffff", "#10151f"]);
+  state.rules?.draw(context, map, state.sites);
 }
 
 function drawMarks() {
-  const { map, violations, cursor } = state, { context, width, height } = state.marks;
+  const { map, cursor, second, sites, pinned, hovered, selection, selected } = state, { context, width, height } = state.marks;
   context.clearRect(0, 0, width, height);
-  if (state.chosen !== null) {
-    outline(context, () => violations.trace(context, state.chosen, map), [8, 4], ["#ffffff", "#d3261b"]);
-    const [a, b, c, d] = violations.boxes.subarray(4 * state.chosen, 4 * state.chosen + 4);
-    const radius = Math.max(16, 0.75 * map.scale * Math.hypot(c - a, d - b));
-    outline(context, () => context.arc(map.toX(0.5 * (a + c)), map.toY(0.5 * (b + d)), radius, 0, 7), [4, 2], ["#ffffff", "#d3261b"]);
+  const trace = state.rules?.traceOn(sites);
+  if (trace) drawTrace(context, map, trace);
+  ringSites(context, map, pinned, hovered);
+  if (cursor && cursor.from !== "mouse") drawCross(context, map.toX(cursor.x), map.toY(cursor.y));
+  if (second) {
+    const { context: other, ...size } = fitted($("second-marks"));
+    other.clearRect(0, 0, size.width, size.height);
+    ringSites(other, second.map, pinned, hovered);
+    if (cursor && cursor.from !== "second") drawCross(other, second.map.toX(cursor.x), second.map.toY(cursor.y));
   }
-  drawSites(context, map);
-  if (cursor && cursor.from !== "mouse") drawCursor(context, map);
-  if (state.second) {
-    const second = fitted($("second-marks"));
-    second.context.clearRect(0, 0, second.width, second.height);
-    drawSites(second.context, state.second.map);
-    if (cursor && cursor.from !== "second") drawCursor(second.context, state.second.map);
-  }
-  drawTools(context);
+  drawSelected(context, map, selection, selection ? [] : selected);
+  if (state.ruler) drawRuler(context);
   drawPictureMarks();
-}
-
-function drawScaleBar() {
-  const { map } = state, length = roundStep(90 / map.scale / 2), bar = $("scale-bar");
-  bar.querySelector("span").textContent = formatLength(length);
-  bar.querySelector("i").style.width = length * map.scale + "px";
-  state.scaleBar = { length, width: length * map.scale };
 }
 
 // -- the picture -----------------------------------------------------------------------------------------------------------------
@@ -315,19 +290,13 @@ function pictureBox() {
 function drawPictureMarks() {
   const { context, width, height } = fitted($("picture-marks")), box = pictureBox(), { map, cursor } = state;
   context.clearRect(0, 0, width, height);
-  const x0 = box.toX(map.fromX(0)), y0 = box.toY(map.fromY(0)), x1 = box.toX(map.fromX(map.width)), y1 = box.toY(map.fromY(map.height));
-  if (x0 > 1 || y0 > 1 || x1 < width - 1 || y1 < height - 1) {
-    const w = Math.max(5, x1 - x0), h = Math.max(5, y1 - y0), x = 0.5 * (x0 + x1 - w), y = 0.5 * (y0 + y1 - h);
-    outline(context, () => context.rect(x, y, w, h), [3.5, 1.75], ["rgb(0 0 0 / 55%)", "#ffffff"]);
-  }
-  if (cursor) {
-    const x = box.toX(cursor.x), y = box.toY(cursor.y);
-    outline(context, () => traceCross(context, x, y, 3, 9), [3.5, 1.5], ["rgb(0 0 0 / 65%)", "#ffffff"]);
-  }
+  drawView(context, box, map, width, height);
+  if (cursor) drawCross(context, box.toX(cursor.x), box.toY(cursor.y), true);
 }
 
 function listenToPicture() {
   const frame = $("picture-frame");
+  /** @type {(event: MouseEvent) => [number, number]} */
   const position = (event) => {
     const area = frame.getBoundingClientRect(), box = pictureBox();
     return [box.fromX(event.clientX - area.left), box.fromY(event.clientY - area.top)];
@@ -344,7 +313,7 @@ function listenToPicture() {
     const main = document.querySelector("main"), isSideBySide = main.classList.toggle("side-by-side");
     if (isSideBySide) main.insertBefore(frame, document.querySelector("aside"));
     else $("picture-heading").closest("section").append(frame);
-    $("enlarge").setAttribute("aria-pressed", isSideBySide);
+    $("enlarge").setAttribute("aria-pressed", String(isSideBySide));
     resize();
   });
 }
@@ -381,19 +350,14 @@ function tellSite() {
   report("pinned", state.pinned);
   $("site").classList.toggle("empty", site < 0);
   $("unpin").hidden = state.pinned < 0;
-  $("site-heading").textContent = site < 0 ? "Photosite" : "Photosite " + site.toLocaleString("en-US") + (site === state.pinned ? " (pinned)" : "");
-  const rows = [];
-  for (const column of about.columns) {
-    if (column.is_repeat) continue;
-    rows.push([column.label, site < 0 ? "–" : textOf(column, site, state.sites.area), column === state.column || (column.array && column.array === state.column.array)]);
-  }
-  const centre = site < 0 ? null : state.sites.centre(site);
-  rows.push(["centre / µm", centre ? centre.map((v) => shown(Math.round(1e6 * v) / 1e6 + 0)).join(", ") : "–"]);
+  $("site-heading").textContent = siteHeading(site, state.pinned);
+  const rows = siteRows(state.sites, about.columns, site, 6);
+  const isColoured = (column) => column === state.column || (column.array && column.array === state.column.array);
   if (site >= 0 && site === state.hovered && state.others.length) rows.push(["overlaps", state.others.join(", ")]);
   const cells = [];
-  for (const [label, text, isShown] of rows) {
+  for (const [label, text, column] of rows) {
     const value = make("dd", text);
-    if (isShown && site >= 0) {
+    if (column && isColoured(column) && site >= 0) {
       const swatch = make("span", undefined, "swatch");
       swatch.style.background = "rgb(" + state.scale.colour(site) + ")";
       value.prepend(swatch);
@@ -402,12 +366,7 @@ function tellSite() {
   }
   $("values").replaceChildren(...cells);
   drawHistogram();
-  speak(site < 0 ? null : () => describeSite(site));
-}
-
-function describeSite(site) {
-  const parts = about.columns.filter((column) => !column.is_repeat).map((column) => column.label + " " + textOf(column, site, state.sites.area));
-  return "Photosite " + site + ": " + parts.join(", ");
+  speak(site < 0 ? null : () => spokenSite(about.columns, site, state.sites.area));
 }
 
 function pin(site) {
@@ -428,23 +387,7 @@ function goTo(site) {
 
 // -- navigation -------------------------------------------------------------------------------------------------------------------------
 
-let flight = 0;
-
-function fly(x, y, scale) {
-  const { map } = state, from = { x: map.x, y: map.y, scale: map.scale };
-  map.set(x, y, scale);
-  const to = { x: map.x, y: map.y, scale: map.scale };
-  cancelAnimationFrame(flight);
-  if (reducesMotion.matches) { moved(); return; }
-  map.set(from.x, from.y, from.scale);
-  const start = performance.now(), path = pathBetween(from, to);
-  const step = () => {
-    const t = clamp((performance.now() - start) / 450, 0, 1), at = path(t);
-    map.set(at.x, at.y, at.scale);
-    if (t < 1) { ask("map"); flight = requestAnimationFrame(step); } else { map.set(to.x, to.y, to.scale); moved(); }
-  };
-  step();
-}
+function fly(x, y, scale) { flyTo(state.map, [x, y, scale], moved); }
 
 function moved() {
   ask("map");
@@ -472,7 +415,7 @@ function listenToMap() {
   const canvas = $("marks"), { map } = state;
   let held = null;
   listenToPointers(canvas, {
-    press: (px, py) => { cancelAnimationFrame(flight); held = [map.fromX(px), map.fromY(py)]; },
+    press: (px, py) => { stopFlight(); held = [map.fromX(px), map.fromY(py)]; },
     drag: (dx, dy, { px, py, isSecond }) => {
       if (state.tool && !isSecond) { extend(held, [map.fromX(px), map.fromY(py)]); return; }
       map.set(map.x - dx / map.scale, map.y + dy / map.scale, map.scale);
@@ -480,7 +423,7 @@ function listenToMap() {
     },
     pinch: (factor, px, py) => { map.zoom(factor, px, py); moved(); },
     wheel: (factor, px, py) => {
-      cancelAnimationFrame(flight);
+      stopFlight();
       map.zoom(factor, px, py);
       hover(map.fromX(px), map.fromY(py), "mouse");
       moved();
@@ -491,27 +434,25 @@ function listenToMap() {
   });
   canvas.addEventListener("blur", () => { if (state.cursor && state.cursor.from === "keys") leave(); });
   canvas.addEventListener("keydown", (event) => {
-    const step = 60 / map.scale;
-    const moves = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    if (moves[event.key]) map.set(map.x + step * moves[event.key][0], map.y + step * moves[event.key][1], map.scale);
-    else if (event.key === "Enter" || event.key === " ") { hover(map.x, map.y, "keys"); if (state.tool) setPoint(); else pin(state.hovered); } else return;
+    const isMoved = panByKey(map, event.key);
+    if (!isMoved && event.key !== "Enter" && event.key !== " ") return;
     event.preventDefault();
-    cancelAnimationFrame(flight);
+    stopFlight();
     hover(map.x, map.y, "keys");
-    if (moves[event.key] && state.tool && state.start) extend(state.start, [map.x, map.y]);
+    if (!isMoved && state.tool) setPoint();
+    else if (!isMoved) pin(state.hovered);
+    if (isMoved && state.tool && state.start) extend(state.start, [map.x, map.y]);
     moved();
   });
   document.addEventListener("keydown", (event) => {
     if (!isForPage(event)) return;
-    const nearer = (factor) => { map.zoom(factor, 0.5 * map.width, 0.5 * map.height); moved(); };
-    if (event.key === "+" || event.key === "=") nearer(1.4);
-    else if (event.key === "-" || event.key === "_") nearer(1 / 1.4);
+    if (zoomByKey(map, event.key)) moved();
     else if (event.key === "0") fit();
     else if (event.key === "/") { $("find-site").focus(); event.preventDefault(); }
     else if (event.key === "r" || event.key === "R") useTool("ruler");
     else if (event.key === "s" || event.key === "S") useTool("select");
-    else if (event.key === "Escape") { clearTools(); state.pinned = -1; choose(null); setRange(null); tellSite(); moved(); }
+    else if (event.key === "Escape") { clearTools(); state.pinned = -1; state.rules?.choose(null); setRange(null); tellSite(); moved(); }
     if (document.activeElement === canvas) hover(map.x, map.y, "keys");
   });
   $("nearer").addEventListener("click", () => fly(map.x, map.y, 2 * map.scale));
@@ -527,7 +468,7 @@ function listenToMap() {
 function useTool(name) {
   state.tool = state.tool === name ? null : name;
   state.start = null;
-  for (const id of ["ruler", "select"]) $(id).setAttribute("aria-pressed", state.tool === id);
+  for (const id of ["ruler", "select"]) $(id).setAttribute("aria-pressed", String(state.tool === id));
   $("marks").classList.toggle("measuring", Boolean(state.tool));
   if (state.tool) notice(state.tool === "ruler" ? "Drag to measure a length" : "Drag to select photosites");
 }
@@ -575,43 +516,32 @@ function select(rectangle, sites = rectangle ? sitesIn(state.sites, rectangle) :
 function showSelection() {
   const { selection, selected } = state, size = (v) => String(Number(Math.abs(v).toPrecision(4)));
   $("selection-heading").textContent = "Selection: " + shown(selected.length) + (selected.length === 1 ? " photosite" : " photosites");
-  const where = selection ? "Centres in " + size(selection[1][0] - selection[0][0]) + " × " + size(selection[1][1] - selection[0][1]) + " µm; " : "";
+  const where = selection ? "Centres in " + size(selection[1][0] - selection[0][0]) + " × " + size(selection[1][1] - selection[0][1])
+    + " µm; " : "";
   $("selection-note").textContent = where + "std is the sample standard deviation.";
   $("statistics").replaceChildren(...statisticsRows(about.columns, selected));
   $("export").disabled = !selected.length || !state.loaded;
   rememberView();
 }
 
-function drawTools(context) {
-  const { map, ruler, selection } = state;
-  if (selection) {
-    const [[x0, y0], [x1, y1]] = selection;
-    const box = [map.toX(Math.min(x0, x1)), map.toY(Math.max(y0, y1)), Math.abs(x1 - x0) * map.scale, Math.abs(y1 - y0) * map.scale];
-    context.fillStyle = "rgb(31 95 191 / 14%)";
-    context.fillRect(...box);
-    outline(context, () => context.rect(...box), [4, 2], ["#ffffff", "#1f5fbf"]);
-  } else if (state.selected.length) {
-    const { sites } = state, shownSites = state.selected.slice(0, MOST_OUTLINES);
-    outline(context, () => { for (const site of shownSites) sites.trace(context, site, map); }, [3.5, 1.75], ["#ffffff", "#1f5fbf"]);
-  }
-  if (ruler) {
-    const [[x0, y0], [x1, y1]] = ruler.map(([x, y]) => [map.toX(x), map.toY(y)]), length = Math.hypot(x1 - x0, y1 - y0) || 1;
-    const [u, v] = [(-6 * (y1 - y0)) / length, (6 * (x1 - x0)) / length];
-    const line = () => {
-      context.moveTo(x0, y0);
-      context.lineTo(x1, y1);
-      for (const [x, y] of [[x0, y0], [x1, y1]]) { context.moveTo(x - u, y - v); context.lineTo(x + u, y + v); }
-    };
-    outline(context, line, [5, 2], ["#ffffff", "#10151f"]);
-    const { text } = lengthText(...ruler);
-    context.font = "600 13px system-ui, sans-serif";
-    const width = context.measureText(text).width + 12;
-    const x = clamp(0.5 * (x0 + x1) - 0.5 * width, 4, Math.max(4, map.width - width - 4)), y = clamp(0.5 * (y0 + y1) - 30, 4, map.height - 26);
-    context.fillStyle = inkOf("--raised");
-    context.fillRect(x, y, width, 21);
-    context.fillStyle = inkOf("--text");
-    context.fillText(text, x + 6, y + 15);
-  }
+function drawRuler(context) {
+  const { map, ruler } = state;
+  const [[x0, y0], [x1, y1]] = ruler.map(([x, y]) => [map.toX(x), map.toY(y)]), length = Math.hypot(x1 - x0, y1 - y0) || 1;
+  const [u, v] = [(-6 * (y1 - y0)) / length, (6 * (x1 - x0)) / length];
+  const line = () => {
+    context.moveTo(x0, y0);
+    context.lineTo(x1, y1);
+    for (const [x, y] of [[x0, y0], [x1, y1]]) { context.moveTo(x - u, y - v); context.lineTo(x + u, y + v); }
+  };
+  outline(context, line, [5, 2], ["#ffffff", "#10151f"]);
+  const { text } = lengthText(...ruler);
+  context.font = "600 13px system-ui, sans-serif";
+  const width = context.measureText(text).width + 12, x = clamp(0.5 * (x0 + x1) - 0.5 * width, 4, Math.max(4, map.width - width - 4));
+  const y = clamp(0.5 * (y0 + y1) - 30, 4, map.height - 26);
+  context.fillStyle = inkOf("--raised");
+  context.fillRect(x, y, width, 21);
+  context.fillStyle = inkOf("--text");
+  context.fillText(text, x + 6, y + 15);
 }
 
 function listenToMeasurements() {
@@ -623,73 +553,22 @@ function listenToMeasurements() {
 // -- design rules -----------------------------------------------------------------------------------------------------------------------
 
 async function loadRules() {
-  for (const element of document.querySelectorAll(".for-rules")) element.hidden = !about.rules.length;
+  for (const element of document.querySelectorAll(".for-rules")) element.toggleAttribute("hidden", !about.rules.length);
   if (!about.rules.length) return;
-  const names = ["violation_value", "violation_sites", "violation_site_counts", "marker_part_counts", "marker_sizes", "marker_xy_um"];
-  const arrays = Object.fromEntries(await Promise.all(names.map(async (name) => [name, await array(name)])));
-  state.violations = new Violations(arrays, about.rules, state.sites);
-  $("rules").hidden = false;
-  const total = about.rules.reduce((sum, rule) => sum + rule.count, 0);
-  const option = (value, text) => { const element = make("option", text); element.value = value; return element; };
-  $("rule").append(option(-1, "all (" + shown(total) + ")"), ...about.rules.map((rule, k) => option(k, rule.name + " (" + shown(rule.count) + (rule.waiver ? ", waived)" : ")"))));
-  $("rule").addEventListener("change", () => { state.shownViolations = 0; choose(null); listViolations(); ask("map"); });
-  $("more").addEventListener("click", listViolations);
-  $("violations").addEventListener("keydown", (event) => {
-    const step = { ArrowDown: 1, ArrowUp: -1 }[event.key], buttons = [...$("violations").querySelectorAll("button")];
-    const next = buttons[buttons.indexOf(document.activeElement) + step];
-    if (step && next) { next.focus(); event.preventDefault(); }
+  const arrays = Object.fromEntries(await Promise.all(VIOLATION_ARRAYS.map(async (name) => [name, await array(name)])));
+  const elements = { select: $("rule"), note: $("rule-description"), list: $("violations"), more: $("more") };
+  state.rules = new RulesList(elements, (i) => {
+    const at = state.rules.frameOf(i, state.map);
+    if (at) fly(...at);
+    else notice("The report has no position for this violation");
   });
-  listViolations();
+  state.rules.use(about.rules, arrays, state.sites);
+  $("rules").hidden = false;
+  $("rule").addEventListener("change", () => ask("map"));
 }
 
-// Lists the next violations of the chosen rule after those that are listed.
-function listViolations() {
-  const rule = Number($("rule").value), { violations } = state, asked = rule < 0 ? about.rules : [about.rules[rule]];
-  const of = [];
-  for (let i = 0; i < violations.n; i++) if (rule < 0 || violations.rule[i] === rule) of.push(i);
-  if (!state.shownViolations) $("violations").replaceChildren();
-  const next = of.slice(state.shownViolations, state.shownViolations + VIOLATIONS_AT_A_TIME);
-  $("violations").append(...next.map(violationItem));
-  state.shownViolations += next.length;
-  $("more").hidden = state.shownViolations >= of.length;
-  const count = asked.reduce((sum, r) => sum + r.count, 0), listed = asked.reduce((sum, r) => sum + r.listed, 0);
-  const rest = listed < count ? " The worst " + shown(listed) + " are listed." : "";
-  if (rule >= 0) {
-    const { description: text, limit, unit, waiver } = about.rules[rule];
-    const bound = limit === null ? "" : "; the limit is " + shown(limit) + (unit ? " " + unit : "");
-    $("rule-description").textContent = text + bound + "." + (waiver ? " Waived: " + waiver + "." : "") + rest;
-  } else $("rule-description").textContent = (count ? "" : "All rules are satisfied.") + rest;
-  if (!$("rule-description").textContent) $("rule-description").textContent = shown(about.rules.filter((r) => !r.count).length) + " of " + about.rules.length + " rules are satisfied.";
-}
-
-function violationItem(i) {
-  const { rule, sites, value } = state.violations.describe(i);
-  const item = make("li"), button = make("button");
-  button.type = "button";
-  button.dataset.violation = i;
-  button.append(make("span", Number($("rule").value) < 0 ? rule.name + ": " + sites : sites), make("span", value));
-  button.title = rule.name + ": " + sites + (value ? ", " + value : "");
-  button.addEventListener("click", () => flyToViolation(i));
-  item.append(button);
-  return item;
-}
-
-function choose(i) {
-  state.chosen = i;
-  for (const button of $("violations").querySelectorAll("button")) {
-    if (Number(button.dataset.violation) === i) button.setAttribute("aria-current", "true");
-    else button.removeAttribute("aria-current");
-  }
-}
-
-function flyToViolation(i) {
-  const { violations, map, sites } = state, box = [...violations.boxes.subarray(4 * i, 4 * i + 4)];
-  choose(i);
-  if (!Number.isFinite(box[0])) { notice("The report has no position for this violation"); return; }
-  fly(0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3]), (0.3 * Math.min(map.width, map.height)) / (violations.widthOf(i, sites) || 1));
-}
-
-// -- links, pictures, themes -----------------------------------------------------------------------------------------------------------------
+// -- links, pictures, themes
+// -----------------------------------------------------------------------------------------------------------------
 
 let remembering = 0;
 
@@ -703,13 +582,13 @@ function viewHash() {
   const digits = clamp(Math.ceil(Math.log10(map.scale)) + 2, 0, 12);
   words.set("x", map.x.toFixed(digits));
   words.set("y", map.y.toFixed(digits));
-  words.set("width", Number((map.width / map.scale).toPrecision(5)));
+  words.set("width", String(Number((map.width / map.scale).toPrecision(5))));
   words.set("by", column.key);
   if (range) words.set("range", range.map((v) => Number(v.toPrecision(7))).join(" "));
   if (state.wantedMap) words.set("map", state.wantedMap);
   if (state.second) words.set("second", state.second.column.key);
   if (state.selection) words.set("select", state.selection.flat().map((v) => Number(v.toPrecision(9))).join(" "));
-  if (pinned >= 0) words.set("site", pinned);
+  if (pinned >= 0) words.set("site", String(pinned));
   return "#" + words;
 }
 
@@ -743,10 +622,12 @@ function viewAsPicture() {
   if (state.overview.isNeeded(map)) state.overview.draw(map, scale, state.range);
   if (second) drawSecond();
   // The second map may be below the first, and of another height.
-  const views = [visible(["cells", "overview", "lines", "marks"]), ...(second ? [visible(["second-cells", "second-overview", "second-marks"])] : [])];
+  const views = [visible(["cells", "overview", "lines", "marks"]),
+    ...(second ? [visible(["second-cells", "second-overview", "second-marks"])] : [])];
   const bar = { text: $("scale-bar").querySelector("span").textContent, width: scaleBar.width };
   const hasOwnScale = second && second.column.key.replace(/^second-/, "") !== state.column.key;
-  return pictureOf(views, { width: map.width + (second ? second.map.width : 0), height: map.height, bar, scales: [scale, ...(hasOwnScale ? [second.scale] : [])], items: [] });
+  return pictureOf(views, { width: map.width + (second ? second.map.width : 0), height: map.height, bar,
+    scales: [scale, ...(hasOwnScale ? [second.scale] : [])], items: [] });
 }
 
 function listenToTools() {
@@ -757,7 +638,7 @@ function listenToTools() {
     event.preventDefault();
     const text = $("find-site").value.replace(/[\s,_]/g, ""), site = text === "" ? NaN : Number(text);
     const isThere = Number.isInteger(site) && site >= 0 && site < state.sites.n;
-    $("find-site").setAttribute("aria-invalid", !isThere);
+    $("find-site").setAttribute("aria-invalid", String(!isThere));
     if (isThere) goTo(site);
     else notice("Photosites are numbered from 0 to " + shown(state.sites.n - 1));
   });
@@ -769,7 +650,8 @@ function listenToTools() {
   });
 }
 
-// -- loading --------------------------------------------------------------------------------------------------------------------------------
+// -- loading
+// --------------------------------------------------------------------------------------------------------------------------------
 
 function showTheme() {
   if (!state.scale) return;
@@ -818,11 +700,7 @@ async function open() {
   if (!state.map.gl) throw new Error("WebGL2 was lost");
   listenToLosses();
   for (const id of ["colouring", "second-column"]) {
-    $(id).append(...about.columns.map((column) => {
-      const option = make("option", titleOf(column));
-      option.value = column.key;
-      return option;
-    }));
+    $(id).append(...about.columns.map((column) => new Option(titleOf(column), column.key)));
   }
   $("second-column").addEventListener("change", () => showSecond($("second-column").value));
   $("colouring").addEventListener("change", () => colourBy($("colouring").value));
@@ -838,7 +716,8 @@ async function open() {
   listenToPicture();
   listenToTools();
   listenToMeasurements();
-  const second = about.columns.find((column) => column.key.startsWith("second-")), asked = new URLSearchParams(location.hash.slice(1)).get("second");
+  const second = about.columns.find((column) => column.key.startsWith("second-"));
+  const asked = new URLSearchParams(location.hash.slice(1)).get("second");
   if (asked !== null || second) await showSecond(asked !== null ? asked : second.key);
   tellSite();
   drawAsked();
@@ -879,13 +758,16 @@ const handle = {
   get view() { const { x, y, scale, width, height } = state.map; return { x, y, scale, width, height }; },
   get hovered() { return state.hovered; },
   get pinned() { return state.pinned; },
-  get chosen() { return state.chosen; },
+  get chosen() { return state.rules?.chosen ?? null; },
   get range() { return state.range; },
   get drawMs() { return state.drawMs; },
   get column() { return state.column.key; },
   // CSS pixels of the window, for mouse events.
   toWindow: (x, y) => { const box = $("marks").getBoundingClientRect(); return [box.left + state.map.toX(x), box.top + state.map.toY(y)]; },
-  fromWindow: (px, py) => { const box = $("marks").getBoundingClientRect(); return [state.map.fromX(px - box.left), state.map.fromY(py - box.top)]; },
+  fromWindow: (px, py) => {
+    const box = $("marks").getBoundingClientRect();
+    return [state.map.fromX(px - box.left), state.map.fromY(py - box.top)];
+  },
   get selected() { return [...state.selected]; },
   get ruler() { return state.ruler && lengthText(...state.ruler).length; },
   get tool() { return state.tool; },
@@ -899,18 +781,20 @@ const handle = {
   overview: () => {
     const canvas = $("overview");
     state.overview.draw(state.map, state.scale, state.range);
-    return { width: canvas.width, height: canvas.height, data: [...canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data] };
+    return { width: canvas.width, height: canvas.height,
+      data: [...canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data] };
   },
   // Colours of the drawn pixels of the map, (r, g, b, a) at a position on the sensor.
   pixel: (x, y) => {
     const { map } = state, { gl } = map, ratio = map.canvas.width / map.width, bytes = new Uint8Array(4);
     map.draw(groundColour());
-    gl.readPixels(Math.floor(map.toX(x) * ratio), map.canvas.height - 1 - Math.floor(map.toY(y) * ratio), 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+    gl.readPixels(Math.floor(map.toX(x) * ratio), map.canvas.height - 1 - Math.floor(map.toY(y) * ratio), 1, 1, gl.RGBA,
+      gl.UNSIGNED_BYTE, bytes);
     return [...bytes];
   },
   picture: () => viewAsPicture().toDataURL("image/png"),
 };
-window.foveasim = handle;
+Object.assign(window, { foveasim: handle });
 handle.ready = open().then(() => { handle.readyMs = performance.now(); }).catch((error) => {
   showPlain("The map cannot be shown (" + error.message + "); only the picture is shown.");
   throw error;

@@ -1,10 +1,20 @@
 // Common parts of all pages: elements by id, themes, short notices, downloads, the list of keys.
 
-export const $ = (id) => document.getElementById(id);
+/** @typedef {HTMLInputElement & HTMLSelectElement & HTMLDialogElement & HTMLCanvasElement} PageElement */
 
+/** @type {(id: string) => PageElement} */
+export const $ = (id) => /** @type {any} */ (document.getElementById(id));
+
+/**
+ * @template {keyof HTMLElementTagNameMap} Tag
+ * @param {Tag} tag
+ * @param {string | number} [text]
+ * @param {string} [className]
+ * @returns {HTMLElementTagNameMap[Tag]}
+ */
 export function make(tag, text, className) {
   const element = document.createElement(tag);
-  if (text !== undefined) element.textContent = text;
+  if (text !== undefined) element.textContent = String(text);
   if (className) element.className = className;
   return element;
 }
@@ -87,7 +97,9 @@ export function download(blob, name, extension) {
 
 export function downloadPicture(canvas, name) { canvas.toBlob((blob) => download(blob, name, "png")); }
 
-export function downloadText(text, name, extension, type) { download(new Blob([text], { type: type + ";charset=utf-8" }), name, extension); }
+export function downloadText(text, name, extension, type) {
+  download(new Blob([text], { type: type + ";charset=utf-8" }), name, extension);
+}
 
 // -- keys -------------------------------------------------------------------------------------------------------------------
 

@@ -3,6 +3,8 @@
 import { offsetsOf, positionsOf } from "./unpack.js";
 
 export class Sites {
+  _sizes;
+
   constructor(arrays, about) {
     this.n = about.n_sites;
     this.bounds = about.bounds_um;
@@ -165,7 +167,7 @@ export class Sites {
 
   // Corners of all triangles, by tiles of the layout, so that tiles out of view need not be drawn.
   triangles() {
-    const { n, ringOffsets, box, cuts } = this, [x0, y0, x1, y1] = this.bounds;
+    const { n, box, cuts } = this, [x0, y0, x1, y1] = this.bounds;
     const side = Math.max(1, Math.min(64, Math.round(Math.sqrt(n / 1500))));
     const counts = new Uint32Array(side * side), tileOf = new Uint16Array(n);
     for (let site = 0; site < n; site++) {

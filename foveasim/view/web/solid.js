@@ -12,7 +12,8 @@ import { SolidView } from "./solid_view.js";
 import { unpack } from "./unpack.js";
 
 const about = JSON.parse($("about").textContent);
-const ARRAYS = ["position_x", "position_y", "positions", "z", "corners", "run_sites", "run_points", "run_triangles", "run_colours", "tile_runs"];
+const ARRAYS = ["position_x", "position_y", "positions", "z", "corners", "run_sites", "run_points", "run_triangles", "run_colours",
+  "tile_runs"];
 const state = { view: null, area: null, pinned: -1, part: -1, pinnedPart: -1, pointer: null, anchor: null, isAsked: false, scale: null };
 // Steps of the position of the cut.
 const CUT_STEPS = 200;
@@ -30,8 +31,10 @@ function showSite() {
   $("site").classList.toggle("empty", site < 0);
   $("unpin").hidden = pinned < 0;
   $("site-heading").textContent = site < 0 ? "Photosite" : "Photosite " + site.toLocaleString("en-US") + (notes ? " (" + notes + ")" : "");
-  $("values").replaceChildren(...columns.flatMap((column) => [make("dt", column.label), make("dd", site < 0 ? "–" : textOf(column, site, state.area))]));
-  speak(site < 0 ? null : () => "Photosite " + site + ": " + columns.map((column) => column.label + " " + textOf(column, site, state.area)).join(", "));
+  $("values").replaceChildren(...columns.flatMap((column) =>
+    [make("dt", column.label), make("dd", site < 0 ? "–" : textOf(column, site, state.area))]));
+  speak(site < 0 ? null
+    : () => "Photosite " + site + ": " + columns.map((column) => column.label + " " + textOf(column, site, state.area)).join(", "));
 }
 
 // The site and part of the nearest surface under the pointer; the surface stays under it during zoom.
@@ -238,7 +241,7 @@ function nextCut() {
 
 function moveCut(steps) {
   if (!$("cut").value) return;
-  $("cut-position").value = clamp(Number($("cut-position").value) + steps, 0, CUT_STEPS);
+  $("cut-position").value = String(clamp(Number($("cut-position").value) + steps, 0, CUT_STEPS));
   cutAt();
 }
 
@@ -316,10 +319,12 @@ async function open() {
   $("notes").textContent = about.notes.join(" · ");
   const renderer = findRenderer();
   if (!renderer) {
-    $("opening").textContent = "This browser has no WebGL2, which three dimensions need. Use another browser, or enable graphics acceleration in the settings.";
+    $("opening").textContent = "This browser has no WebGL2, which three dimensions need. "
+      + "Use another browser, or enable graphics acceleration in the settings.";
     return;
   }
-  const arrays = Object.fromEntries(await Promise.all([...ARRAYS, "area_um2"].map(async (name) => [name, await unpack(name, about.arrays[name])])));
+  const arrays = Object.fromEntries(await Promise.all([...ARRAYS,
+    "area_um2"].map(async (name) => [name, await unpack(name, about.arrays[name])])));
   const bodies = new Bodies(about.bodies, arrays), smallest = Math.sqrt(arrays.area_um2.reduce((a, b) => Math.min(a, b)));
   state.area = arrays.area_um2;
   const orbit = new Orbit(bodies.low, bodies.high, Math.max(4096 * bodies.lattice, 0.1 * smallest));
@@ -346,7 +351,7 @@ async function openRest() {
   showSite();
 }
 
-window.foveasim = {
+const handle = {
   nSites: about.n_sites,
   ready: null,
   complete: null,
@@ -370,7 +375,8 @@ window.foveasim = {
   // The eye, the target, and the visible length of a vertical line at the target, in µm with heights scaled.
   get camera() {
     const { orbit } = state.view;
-    return { eye: [...orbit.eye([0, 0, 0])], target: [...orbit.target], distance: orbit.distance, height: orbit.height, near: orbit.near, far: orbit.far };
+    return { eye: [...orbit.eye([0, 0, 0])], target: [...orbit.target], distance: orbit.distance, height: orbit.height,
+      near: orbit.near, far: orbit.far };
   },
   // CSS pixels in the window of a position on the sensor in µm.
   toWindow: (x, y, z) => {
@@ -378,7 +384,8 @@ window.foveasim = {
     return [box.left + px, box.top + py];
   },
 };
-window.foveasim.ready = open().then(() => { window.foveasim.readyMs = performance.now(); });
-window.foveasim.complete = window.foveasim.ready.then(() => state.view && openRest());
-window.foveasim.ready.catch((error) => { $("opening").textContent = "The solids cannot be shown (" + error.message + ")."; });
-window.foveasim.complete.catch(() => {});
+Object.assign(window, { foveasim: handle });
+handle.ready = open().then(() => { handle.readyMs = performance.now(); });
+handle.complete = handle.ready.then(() => state.view && openRest());
+handle.ready.catch((error) => { $("opening").textContent = "The solids cannot be shown (" + error.message + ")."; });
+handle.complete.catch(() => {});

@@ -120,7 +120,8 @@ export class SolidView {
     this.nSites = nSites;
     // Heights of the sites as fractions of the tallest, at index site + 1, for bodies with "tallest" lattice steps.
     this.heights = null;
-    this.parts = bodies.list.map((body) => ({ name: body.name, nTriangles: body.nTriangles, isVisible: true, painted: null, cutShift: 0, body }));
+    this.parts = bodies.list.map((body) => ({ name: body.name, nTriangles: body.nTriangles, isVisible: true, painted: null,
+      cutShift: 0, body }));
   }
 
   // Shows other bodies; the GPU resources of those before are freed.
@@ -318,7 +319,8 @@ export class SolidView {
   // Draws all visible parts with the current program, without tiles out of view and back faces.
   _drawParts({ at }) {
     const { gl, orbit, bodies: { lattice, origin }, targets: { width, height } } = this, { target, distance } = orbit;
-    const cx = (target[0] - origin[0]) / lattice, cy = (target[1] - origin[1]) / lattice, cz = (target[2] / orbit.height - origin[2]) / lattice;
+    const cx = (target[0] - origin[0]) / lattice, cy = (target[1] - origin[1]) / lattice;
+    const cz = (target[2] / orbit.height - origin[2]) / lattice;
     const wx = Math.round(cx), wy = Math.round(cy), wz = Math.round(cz), unit = lattice / distance;
     gl.viewport(0, 0, width, height);
     gl.enable(gl.DEPTH_TEST);

@@ -72,7 +72,8 @@ export class Violations {
   // Returns the sites and the value of a violation in words.
   describe(i) {
     const rule = this.rules[this.rule[i]], ids = [...this.sitesOf(i)], unit = rule.unit ? " " + rule.unit : "";
-    const sites = ids.length ? (ids.length > 1 ? "sites " : "site ") + ids.slice(0, 4).join(", ") + (ids.length > 4 ? ", …" : "") : "position";
+    const sites = ids.length ? (ids.length > 1 ? "sites " : "site ") + ids.slice(0, 4).join(", ") + (ids.length > 4 ? ", …" : "")
+      : "position";
     const limit = rule.limit === null ? "" : ", limit " + shown(rule.limit) + unit;
     return { rule, sites, value: Number.isNaN(this.value[i]) ? "" : shown(Number(this.value[i].toPrecision(4))) + unit + limit };
   }

@@ -5,13 +5,14 @@ import { brief, bytesOfHex, clamp } from "/web/colours.js";
 import { listenToPointers } from "/web/gestures.js";
 import { findRenderer, pixelRatio, textureSize, watchSize } from "/web/gl.js";
 import { titleOf } from "/web/legend.js";
-import { outline, traceCross } from "/web/marks.js";
+import { drawCross } from "/web/marks.js";
 import { Orbit } from "/web/orbit.js";
 import { $, inkOf } from "/web/page_parts.js";
+import { ARROWS } from "/web/shell.js";
 import { SolidView } from "/web/solid_view.js";
-import { Columns } from "./columns.js";
-import { inNextFrame } from "./frames.js";
-import { fitted } from "./site_pane.js";
+import { Columns } from "../columns.js";
+import { inNextFrame } from "../frames.js";
+import { fitted } from "../site_pane.js";
 
 const NO_WEBGL = "This browser has no WebGL2, which three dimensions need; enable graphics acceleration, or use another browser.";
 const ASIDE = [Math.atan2(-0.9, 0.35), Math.atan2(0.75, Math.hypot(0.35, 0.9))], ABOVE = [-0.5 * Math.PI, 0.5 * Math.PI];
@@ -23,16 +24,42 @@ const STACK_HEIGHT = 0.05;
 const TERRACE = 0.06;
 const LAYERS = ["wells", "trenches", "filters", "lenses"];
 
-export class SolidPane {
-  // Callbacks: hover(x, y, from, site), leave(), click(site), changed() when other parts are needed.
-  constructor(on) {
-    Object.assign(this, { on, mode: "columns", view: null, shown: {}, hovered: -1, pinned: -1, isAsked: false, source: null, stack: null, pointer: null, anchor: null, factors: {} });
-    this.root = $("tile-solid");
+const PAGE = `<div class="bar">
+    <div class="group" role="group" aria-label="Content">
+      <button type="button" data-solid="columns" aria-pressed="true" title="Photosites as columns of their values">Columns</button>
+      <button type="button" data-solid="stack" aria-pressed="false"
+        title="Layers of the sensor: silicon, trenches, colour filters, microlenses">Layers</button>
+    </div>
+    <span class="space"></span>
+    <button type="button" id="solid-above" title="Top view (T)">Top</button>
+    <button type="button" id="solid-fit" title="Show all (0)" aria-label="Show all"></button>
+  </div>
+  <div class="stage"><div class="half" id="solid">
+    <canvas class="cells" aria-hidden="true"></canvas>
+    <canvas class="marks" tabindex="0" role="application" aria-label="The sensor in three dimensions. Arrow keys rotate, with Shift
+      they pan, plus and minus zoom, 0 shows all, T shows the top view, Enter pins the photosite in the centre."></canvas>
+    <p id="solid-note" hidden></p>
+  </div></div>
+  <div class="bar sliders">
+    <label>Height <input type="range" id="solid-height" min="-2" max="7" step="0.25" value="0"> <span id="solid-factor">× 1</span></label>
+    <label hidden>Cut <input type="range" id="solid-cut" min="0" max="100" step="1" value="30"></label>
+    <span id="solid-text" class="quiet"></span>
+  </div>`;
+
+export const create = (root, studio) => new SolidPane(root, studio);
+
+class SolidPane {
+  root; studio; cursor = null; mode = "columns"; view = null; shown = {}; hovered = -1; pinned = -1; isAsked = false; source = null;
+  stack = null; pointer = null; anchor = null; factors = {};
+
+  constructor(root, studio) {
+    Object.assign(this, { root, studio });
+    this._build();
     this.half = $("solid");
     this.canvas = this.half.querySelector(".cells");
-    this.marks = this.half.querySelector(".marks");
+    this.marks = /** @type {HTMLCanvasElement} */ (this.half.querySelector(".marks"));
     watchSize(this.half, () => this._resize());
-    for (const button of this.root.querySelectorAll("[data-solid]")) button.addEventListener("click", () => this.setMode(button.dataset.solid));
+    for (const button of this.buttons) button.addEventListener("click", () => this.setMode(button.dataset.solid));
     $("solid-height").addEventListener("input", () => this._setHeight(2 ** Number($("solid-height").value)));
     $("solid-cut").addEventListener("input", () => this._cut());
     $("solid-fit").addEventListener("click", () => this._look(ASIDE));
@@ -40,26 +67,40 @@ export class SolidPane {
     this._listen();
   }
 
+  // A pane next to the map instead of a tile.
+  _build() {
+    const { root } = this, heading = root.querySelector("h2");
+    root.className = "pane";
+    root.dataset.view = "solid";
+    root.insertAdjacentHTML("beforeend", PAGE);
+    root.querySelector(".bar").prepend(heading);
+    this.buttons = [...root.querySelectorAll("[data-solid]")];
+    $("solid-fit").append($("fit").firstElementChild.cloneNode(true));
+    $("pane-picture").before(root);
+  }
+
   get isShown() { return !this.root.hidden && this.half.clientWidth > 0; }
 
-  // Names of the parts of the server that it needs.
-  get parts() { return !this.root.hidden && this.mode === "stack" ? ["stack"] : []; }
+  // Layers are data of the server, columns those of the map.
+  get wantsData() { return this.mode === "stack"; }
 
   setMode(mode) {
     this.mode = mode;
-    for (const button of this.root.querySelectorAll("[data-solid]")) button.setAttribute("aria-pressed", button.dataset.solid === mode);
-    this.on.changed();
+    for (const button of this.buttons) button.setAttribute("aria-pressed", String(button.dataset.solid === mode));
+    this.studio.sendViews();
     this.ask();
   }
 
-  // Takes sites, scale and range of a map of photosites.
-  follow(pane) {
-    document.body.classList.toggle("solid", !this.root.hidden);
-    this.source = pane.scale ? { sites: pane.sites, scale: pane.scale, range: pane.range } : null;
-    if (!this.root.hidden) this.ask();
+  onShown(isShown) { document.body.classList.toggle("solid", isShown); }
+
+  // Takes sites, scale and range of the map of photosites.
+  onMap() {
+    const { sites, scale, range } = this.studio.panes.b;
+    this.source = scale ? { sites, scale, range } : null;
+    this.ask();
   }
 
-  useStack(part) {
+  use(part) {
     this.stack = part;
     this.ask();
   }
@@ -79,10 +120,12 @@ export class SolidPane {
     if (this.renderer === undefined) this.renderer = findRenderer();
     if (!this.renderer) return this._explain(NO_WEBGL);
     const content = mode === "columns" ? source.sites : this.stack;
-    if (!content || (mode === "stack" && !content.about.bodies)) return this._explain(content ? content.about.note : "Computing the layers…");
+    if (!content || (mode === "stack" && !content.about.bodies)) return this._explain(content ? content.about.note
+      : "Computing the layers…");
     if (mode === "stack" && content.about.n_sites !== source.sites.n) return Boolean(this.view) && shown.content !== undefined;
     this._explain("");
-    if (shown.content !== content) this._useBodies(mode === "columns" ? new Columns(source.sites) : new Bodies(content.about.bodies, content.arrays), content);
+    if (shown.content !== content) this._useBodies(mode === "columns" ? new Columns(source.sites)
+      : new Bodies(content.about.bodies, content.arrays), content);
     if (shown.scale !== source.scale || shown.range !== source.range || shown.ground !== ground) this._paint(ground);
     return true;
   }
@@ -116,7 +159,7 @@ export class SolidPane {
     if (isNew) {
       const wide = Math.max(bodies.high[0] - bodies.low[0], bodies.high[1] - bodies.low[1]), tall = bodies.high[2] - bodies.low[2];
       const first = mode === "columns" ? 1 : 2 ** clamp(Math.round(Math.log2((STACK_HEIGHT * wide) / tall)), 0, 7);
-      $("solid-height").value = Math.log2(this.factors[mode] || first);
+      $("solid-height").value = String(Math.log2(this.factors[mode] || first));
       this._setHeight(this.factors[mode] || first);
       this.view.orbit.look(this.view.orbit.azimuth, this.view.orbit.elevation);
     }
@@ -146,7 +189,8 @@ export class SolidPane {
     }
     view.setColours(view.parts[0], bytes);
     view.setHeights(heights);
-    $("solid-text").textContent = isKinds ? "Colour: " + titleOf(column) : "Height and colour: " + titleOf(column) + (scale.isLog ? ", log" : "") + ", " + brief(scale.from) + " to " + brief(scale.to);
+    $("solid-text").textContent = isKinds ? "Colour: " + titleOf(column)
+      : "Height and colour: " + titleOf(column) + (scale.isLog ? ", log" : "") + ", " + brief(scale.from) + " to " + brief(scale.to);
   }
 
   // -- view -------------------------------------------------------------------------------------------------------------
@@ -167,8 +211,7 @@ export class SolidPane {
   }
 
   // Marks the cursor of another view.
-  mark({ cursor, hovered, pinned }) {
-    if (this.root.hidden) return;
+  onMarks({ cursor, hovered, pinned }) {
     const state = [cursor && cursor.from !== this ? [cursor.x, cursor.y] : null, hovered, pinned].join();
     if (state === this.state) return;
     this.state = state;
@@ -179,8 +222,9 @@ export class SolidPane {
   _drawMarks() {
     const { context } = fitted(this.marks), { cursor, view: { orbit } } = this;
     if (!cursor) return;
-    const heights = this.view.heights, [px, py] = orbit.project(cursor.x, cursor.y, heights && this.hovered >= 0 ? heights[this.hovered + 1] * this.view.bodies.high[2] : this.view.bodies.high[2], [0, 0]);
-    outline(context, () => traceCross(context, px, py, 4, 13), [4, 2], ["#ffffff", "#10151f"]);
+    const heights = this.view.heights, [px, py] = orbit.project(cursor.x, cursor.y,
+      heights && this.hovered >= 0 ? heights[this.hovered + 1] * this.view.bodies.high[2] : this.view.bodies.high[2], [0, 0]);
+    drawCross(context, px, py);
   }
 
   _resize() {
@@ -226,11 +270,17 @@ export class SolidPane {
 
   // The site under the pointer is that of the common cursor.
   _hover() {
-    const { view, pointer } = this, found = view.pick(...pointer), at = view.orbit.pointAt(pointer[0], pointer[1], found.depth, new Float64Array(3));
+    const { view, pointer } = this, found = view.pick(...pointer);
+    const at = view.orbit.pointAt(pointer[0], pointer[1], found.depth, new Float64Array(3));
     if (!this.anchor) this.anchor = at;
-    if (found.site < 0) this.on.leave();
-    else this.on.hover(at[0], at[1], this, found.site);
+    if (found.site < 0) this.studio.leave();
+    else this.studio.hover(at[0], at[1], this, found.site);
     this.hovered = found.site;
+  }
+
+  _pin(px, py) {
+    const { site } = this.view.pick(px, py);
+    if (site >= 0) this.studio.pin(site);
   }
 
   _listen() {
@@ -253,21 +303,25 @@ export class SolidPane {
         this._moved();
       }),
       pinch: ifView((factor, px, py) => { orbit().zoom(1 / factor, orbit().pointAt(px, py, 1, point)); this._moved(); }),
-      wheel: ifView((factor, px, py) => { orbit().zoom(1 / factor, this.anchor || orbit().pointAt(px, py, 1, point)); this.view.change(); this.ask(); }),
-      click: ifView((px, py) => this.on.click(this.view.pick(px, py).site)),
+      wheel: ifView((factor, px, py) => {
+        orbit().zoom(1 / factor, this.anchor || orbit().pointAt(px, py, 1, point));
+        this.view.change();
+        this.ask();
+      }),
+      click: ifView((px, py) => this._pin(px, py)),
       move: ifView((px, py, isHeld) => { this.pointer = isHeld ? null : [px, py]; this.anchor = null; this.ask(); }),
-      leave: () => { this.pointer = this.anchor = null; this.on.leave(); },
+      leave: () => { this.pointer = this.anchor = null; this.studio.leave(); },
     });
     marks.addEventListener("keydown", (event) => {
       if (!this.view || event.ctrlKey || event.metaKey || event.altKey) return;
-      const way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+      const way = ARROWS[event.key];
       if (way && event.shiftKey) orbit().pan(-60 * way[0], 60 * way[1]);
       else if (way) orbit().turn(0.12 * way[0], 0.1 * way[1]);
       else if (event.key === "+" || event.key === "=") orbit().zoom(1 / 1.3);
       else if (event.key === "-" || event.key === "_") orbit().zoom(1.3);
       else if (event.key === "0") orbit().look(...ASIDE);
       else if (event.key === "t" || event.key === "T") orbit().look(...ABOVE);
-      else if (event.key === "Enter" || event.key === " ") this.on.click(this.view.pick(0.5 * orbit().width, 0.5 * orbit().tall).site);
+      else if (event.key === "Enter" || event.key === " ") this._pin(0.5 * orbit().width, 0.5 * orbit().tall);
       else return;
       this._moved();
       event.preventDefault();

@@ -1,10 +1,8 @@
-"""Pictures: the reconstruction from the codes, and the optical image."""
+"""Optical image."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -12,27 +10,11 @@ from numpy.typing import NDArray
 
 from foveasim.fields import Grid, PowerMap
 from foveasim.studio._engine import Simulated, block_means
+from foveasim.studio._parts.picture import pixels_of
 from foveasim.studio._parts.registry import PartData, part
-from foveasim.view.site_colours import encode_light
-
-__all__ = ["picture", "scene"]
 
 #: Fraction of the cells of an optical image that are not brighter than white.
 WHITE_QUANTILE = 0.995
-#: Levels of linear light in the table of sRGB bytes.
-N_LEVELS = 1 << 14
-
-
-@part("Picture", lambda result: (result.capture, (result.picture_pixels,)))
-def picture(result: Simulated) -> PartData:
-    """Return the picture that is reconstructed from the codes."""
-    capture = result.capture
-    # The picture of a layout that only moved is that of the earlier one, whose compiled outlines are cached.
-    unmoved = capture if result.unmoved is None else replace(capture, layout=result.unmoved)
-    found = unmoved.picture(max_pixels=result.picture_pixels)
-    levels = found.data / capture.white_dn.reshape(-1, 1, 1).astype(np.float32)
-    bounds_um = tuple(side + move for side, move in zip(found.grid.bounds_um, 2 * result.move_um, strict=True))
-    return _picture(levels, found.coverage, bounds_um)
 
 
 def _light_of(result: Simulated) -> tuple[Any, ...]:
@@ -44,7 +26,7 @@ def _light_of(result: Simulated) -> tuple[Any, ...]:
     return (*result.images.values(), tuple(result.images), numbers)
 
 
-@part("Optical image", _light_of)
+@part("Optical image", _light_of, order=3)
 def scene(result: Simulated) -> PartData:
     """Return the optical image through each colour filter."""
     camera, source = result.shot.camera, result.shot.scene
@@ -63,7 +45,7 @@ def scene(result: Simulated) -> PartData:
     data, grid = _reduced(bands, grid, result.picture_pixels)
     data /= np.asarray(white, np.float32).reshape(-1, 1, 1)
     scale = float(np.quantile(data, WHITE_QUANTILE)) or 1.0
-    about, arrays = _picture(data / scale, np.ones(data.shape[1:], np.float32), grid.bounds_um)
+    about, arrays = pixels_of(data / scale, np.ones(data.shape[1:], np.float32), grid.bounds_um)
     return about, arrays
 
 
@@ -77,21 +59,3 @@ def _reduced(bands: Sequence[NDArray[Any]], grid: Grid, n_pixels: int) -> tuple[
         data[band] = block_means(cells, block)
     pitch_x_um, pitch_y_um = grid.pitch_x_um * block, grid.pitch_y_um * block
     return data, Grid((rows, n_columns), (pitch_x_um, pitch_y_um), grid.origin_um)
-
-
-def _picture(light: NDArray[Any], coverage: NDArray[Any], bounds_um: tuple[float, ...]) -> PartData:
-    """Return bytes of a picture, top row first, from linear (n_channel, n_y, n_x)."""
-    if light.shape[0] not in (1, 3):
-        light = light.mean(axis=0, keepdims=True)
-    level = np.clip(np.nan_to_num(light) * np.float32(N_LEVELS - 1), 0, N_LEVELS - 1).astype(np.uint16)
-    pixels = np.empty((*coverage.shape, 4), np.uint8)
-    pixels[..., :3] = np.moveaxis(_srgb_table()[level], 0, -1)[::-1]
-    pixels[..., 3] = np.rint(255.0 * np.clip(coverage, 0.0, 1.0))[::-1]
-    about = {"width": pixels.shape[1], "height": pixels.shape[0], "bounds_um": list(bounds_um)}
-    return about, {"rgba": pixels}
-
-
-@lru_cache(maxsize=1)
-def _srgb_table() -> NDArray[np.uint8]:
-    """Return the sRGB byte of each level of linear light."""
-    return encode_light(np.linspace(0.0, 1.0, N_LEVELS))

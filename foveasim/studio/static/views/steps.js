@@ -1,8 +1,8 @@
 // The list of edits of the layout: their order, and their numbers as fields.
 
 import { make } from "/web/page_parts.js";
-import { fieldText, listOf } from "./controls.js";
-import { CHOICES, describe } from "./edits.js";
+import { fieldText, listOf } from "../controls.js";
+import { CHOICES, describe } from "../edits.js";
 
 const BUTTONS = [["up", "↑", "Move up"], ["down", "↓", "Move down"], ["copy", "+", "Duplicate"], ["remove", "✕", "Delete"]];
 
@@ -15,23 +15,27 @@ function* parametersOf(edit, path = []) {
   }
 }
 
-function withValue(edit, [key, ...rest], value) {
-  const copy = { ...edit };
+function withValue(edit, path, value) {
+  const [key, ...rest] = path, copy = { ...edit };
   if (rest.length) copy[key] = withValue(edit[key], rest, value);
   else if (value === undefined) delete copy[key];
   else copy[key] = value;
   return copy;
 }
 
-export class Steps {
+class Steps {
+  root; editor; choose; opened = -1; shown = "";
+
   // editor: its edits; choose(index) shows an edit on the map.
   constructor(root, editor, choose) {
-    Object.assign(this, { root, editor, choose, opened: -1, shown: "" });
+    Object.assign(this, { root, editor, choose });
     this.note = make("p", "No edits. Press E to draw, move and merge photosites.", "quiet");
     this.list = make("ol", undefined, "steps");
     root.append(this.note, this.list);
     this.list.addEventListener("keydown", (event) => {
-      const heads = [...this.list.querySelectorAll(".step-name")], at = heads.indexOf(document.activeElement), next = heads[at + { ArrowDown: 1, ArrowUp: -1 }[event.key]];
+      const heads = [.../** @type {NodeListOf<HTMLElement>} */ (this.list.querySelectorAll(".step-name"))];
+      const at = heads.findIndex((head) => head === document.activeElement);
+      const next = heads[at + { ArrowDown: 1, ArrowUp: -1 }[event.key]];
       if (at < 0) return;
       if (event.key === "Delete") this._act("remove", at);
       else if (next) next.focus();
@@ -46,10 +50,11 @@ export class Steps {
     const { edits } = this.editor, text = JSON.stringify([edits, this.opened]);
     if (text === this.shown) return;
     this.shown = text;
-    const focused = this.root.contains(document.activeElement) ? document.activeElement.dataset.at : null;
+    const focused = this.root.contains(document.activeElement) ? document.activeElement?.getAttribute("data-at") : null;
     this.note.hidden = edits.length > 0;
     this.list.replaceChildren(...edits.map((edit, i) => this._item(edit, i, edits.length)));
-    if (focused) (this.root.querySelector(`[data-at="${focused}"]`) || [...this.root.querySelectorAll(".step-name")].at(-1))?.focus({ preventScroll: true });
+    if (focused) (this.root.querySelector(`[data-at="${focused}"]`)
+      || [...this.root.querySelectorAll(".step-name")].at(-1))?.focus({ preventScroll: true });
   }
 
   open(index) {
@@ -63,7 +68,7 @@ export class Steps {
     const head = make("button", undefined, "step-name");
     head.append(make("span", i + 1 + ". " + name), make("span", detail));
     head.title = name + ": " + detail;
-    head.setAttribute("aria-expanded", isOpen);
+    head.setAttribute("aria-expanded", String(isOpen));
     head.addEventListener("click", () => {
       this.opened = this.opened === i ? -1 : i;
       this.choose(this.opened === i ? i : null);
@@ -94,7 +99,11 @@ export class Steps {
       let field;
       if (choices && typeof value === "string") {
         field = make("select");
-        field.append(...choices.map((choice) => { const option = make("option", choice.replaceAll("_", " ")); option.value = choice; return option; }));
+        field.append(...choices.map((choice) => {
+          const option = make("option", choice.replaceAll("_", " "));
+          option.value = choice;
+          return option;
+        }));
         field.value = value;
       } else if (typeof value === "boolean") {
         field = make("input");
@@ -117,7 +126,8 @@ export class Steps {
   // Empty fields remove a parameter, whose default then applies.
   _set(i, path, field, before) {
     const text = field.value.trim(), isList = Array.isArray(before) || /^[[{]/.test(text);
-    const value = field.type === "checkbox" ? field.checked : text === "" ? undefined : isList ? listOf(text) : Number.isFinite(Number(text)) ? Number(text) : text;
+    const value = field.type === "checkbox" ? field.checked : text === "" ? undefined : isList ? listOf(text)
+      : Number.isFinite(Number(text)) ? Number(text) : text;
     this._commit(this.editor.edits.map((edit, k) => (k === i ? withValue(edit, path, value) : edit)));
   }
 
@@ -140,4 +150,11 @@ export class Steps {
     this.editor.commitAll(edits);
     this.update();
   }
+}
+
+export function create(root, { editor, flyToStep }) {
+  const frame = make("div"), steps = new Steps(frame, editor, flyToStep);
+  frame.id = "steps";
+  root.append(frame);
+  return { onState: () => steps.update(), open: (index) => steps.open(index) };
 }

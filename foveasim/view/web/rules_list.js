@@ -1,22 +1,20 @@
-// Design rules: their results, and violations that the map flies to.
+// List of violations of design rules.
 
-import { shown } from "/web/colours.js";
-import { make } from "/web/page_parts.js";
-import { Violations } from "/web/violations.js";
+import { shown } from "./colours.js";
+import { make } from "./page_parts.js";
+import { Violations } from "./violations.js";
 
-const AT_A_TIME = 100;
-const ARRAYS = ["violation_value", "violation_sites", "violation_site_counts", "marker_part_counts", "marker_sizes", "marker_xy_um"];
+const AT_A_TIME = 200;
+export const VIOLATION_ARRAYS = [
+  "violation_value", "violation_sites", "violation_site_counts", "marker_part_counts", "marker_sizes", "marker_xy_um",
+];
 
 export class RulesList {
-  constructor(root, onChoose) {
-    this.onChoose = onChoose;
-    this.note = make("p", "", "quiet");
-    this.select = make("select");
-    this.select.setAttribute("aria-label", "Design rule");
-    this.list = make("ol", undefined, "violations");
-    this.more = make("button", "Show more");
-    this.more.type = "button";
-    root.append(this.select, this.note, this.list, this.more);
+  select; note; list; more; fly;
+
+  // Elements: a choice of rules, a note, the list, a button for more of it. fly(i) is called when a violation is chosen.
+  constructor({ select, note, list, more }, fly) {
+    Object.assign(this, { select, note, list, more, fly });
     this.violations = null;
     this.chosen = null;
     this.rules = [];
@@ -35,12 +33,13 @@ export class RulesList {
     const before = this.rules[this.rule]?.name;
     this.rules = rules;
     this.sites = sites;
-    this.violations = rules.length && ARRAYS.every((name) => arrays[name]) ? new Violations(arrays, rules, sites) : null;
+    this.violations = rules.length && VIOLATION_ARRAYS.every((name) => arrays[name]) ? new Violations(arrays, rules, sites) : null;
     this.chosen = null;
-    const option = (value, text) => { const element = make("option", text); element.value = value; return element; };
     const total = rules.reduce((sum, rule) => sum + rule.count, 0);
-    this.select.replaceChildren(option(-1, "all rules (" + shown(total) + ")"), ...rules.map((rule, k) => option(k, rule.name + " (" + shown(rule.count) + (rule.waiver ? ", waived)" : ")"))));
-    this.select.value = Math.max(-1, rules.findIndex((rule) => rule.name === before));
+    const textOf = ({ name, count, waiver }) => name + " (" + shown(count) + (waiver ? ", waived)" : ")");
+    this.select.replaceChildren(new Option("all (" + shown(total) + ")", "-1"),
+      ...rules.map((rule, k) => new Option(textOf(rule), String(k))));
+    this.select.value = String(Math.max(-1, rules.findIndex((rule) => rule.name === before)));
     this.select.hidden = !rules.length;
     this._list(true);
   }
@@ -53,14 +52,20 @@ export class RulesList {
     this.list.append(...next.map((i) => this._item(i)));
     this.listed += next.length;
     this.more.hidden = this.listed >= of.length;
-    if (!rules.length) { this.note.textContent = "The settings have no design rules."; return; }
+    this.note.textContent = rules.length ? this._describe() : "The settings have no design rules.";
+  }
+
+  _describe() {
+    const { rules, rule } = this, chosen = rule < 0 ? rules : [rules[rule]];
+    const sum = (key) => chosen.reduce((total, each) => total + each[key], 0);
+    const rest = sum("listed") < sum("count") ? " The worst " + shown(sum("listed")) + " are listed." : "";
     if (rule < 0) {
-      const met = rules.filter((one) => !one.count).length;
-      this.note.textContent = met === rules.length ? "All " + shown(met) + " rules are satisfied." : shown(met) + " of " + shown(rules.length) + " rules are satisfied.";
-    } else {
-      const { description, limit, unit, waiver } = rules[rule];
-      this.note.textContent = description + (limit === null ? "" : "; the limit is " + shown(limit) + (unit ? " " + unit : "")) + "." + (waiver ? " Waived: " + waiver + "." : "");
+      const met = rules.filter((one) => !one.count).length, all = shown(rules.length);
+      return (met === rules.length ? "All " + all + " rules are satisfied." : shown(met) + " of " + all + " rules are satisfied.") + rest;
     }
+    const { description, limit, unit, waiver } = rules[rule];
+    const bound = limit === null ? "" : "; the limit is " + shown(limit) + (unit ? " " + unit : "");
+    return description + bound + "." + (waiver ? " Waived: " + waiver + "." : "") + rest;
   }
 
   _item(i) {
@@ -68,8 +73,9 @@ export class RulesList {
     const item = make("li"), button = make("button");
     button.type = "button";
     button.dataset.violation = i;
+    button.title = rule.name + ": " + sites + (value ? ", " + value : "");
     button.append(make("span", this.rule < 0 ? rule.name + ": " + sites : sites), make("span", value));
-    button.addEventListener("click", () => { this.choose(i); this.onChoose(i); });
+    button.addEventListener("click", () => { this.choose(i); this.fly(i); });
     item.append(button);
     return item;
   }
@@ -80,6 +86,12 @@ export class RulesList {
       if (Number(button.dataset.violation) === i) button.setAttribute("aria-current", "true");
       else button.removeAttribute("aria-current");
     }
+  }
+
+  // Position and scale at which a map shows a violation, or null.
+  frameOf(i, map) {
+    const [a, b, c, d] = this.violations.boxes.subarray(4 * i, 4 * i + 4), wide = this.violations.widthOf(i, this.sites) || 1;
+    return Number.isFinite(a) ? [0.5 * (a + c), 0.5 * (b + d), (0.3 * Math.min(map.width, map.height)) / wide] : null;
   }
 
   // Returns the chosen violation as a path with its box, or null; also for sites other than those of the violations.

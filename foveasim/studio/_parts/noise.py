@@ -1,0 +1,22 @@
+"""Noise budget."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from foveasim.sensor import noise_budget
+from foveasim.studio._engine import Simulated
+from foveasim.studio._parts.registry import PartData, capture_of, part
+
+
+@part("Noise", capture_of, order=40, is_first=True)
+def noise(result: Simulated) -> PartData:
+    """Return the noise budget: median over the photosites by source, e-."""
+    sensor, capture = result.shot.camera.sensor, result.capture
+    budget = noise_budget(sensor, result.photo_e_per_s, result.shot.exposure_s)
+    sources = [
+        {"name": name, "label": name.replace("_", " "), "is_temporal": name in budget.temporal, "values": found}
+        for name, values in budget.items()
+        if (found := float(np.median(values))) > 0.0
+    ]
+    return {"sources": sources, "unit": "e⁻", "median_electrons": float(np.median(capture.electrons))}, {}

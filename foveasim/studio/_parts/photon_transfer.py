@@ -1,0 +1,77 @@
+"""Photon transfer: noise against signal."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from foveasim._core.validation import Floats
+from foveasim.sensor import NoiseBudget, Sensor, noise_budget
+from foveasim.sensor.signal_to_noise import signal_to_noise
+from foveasim.studio._engine import Simulated
+from foveasim.studio._parts.registry import PartData, capture_of, curves_of, part
+
+#: Number of levels of a curve.
+N_LEVELS = 129
+#: Lowest signal, e-; highest relative to the full range of a photosite.
+LOWEST_E, HIGHEST = 0.1, 4.0
+#: Temporal entries of the noise budget with their own curves.
+SEPARATE = PHOTON_SHOT, QUANTISATION = "photon_shot", "quantisation"
+
+
+@part("Photon transfer", capture_of, order=60)
+def photon_transfer(result: Simulated) -> PartData:
+    """Return noise against signal of the photosite of median charge."""
+    sensor, capture, exposure_s = result.shot.camera.sensor, result.capture, result.shot.exposure_s
+    if exposure_s == 0.0:
+        return curves_of([], [], [])
+    site = median_site(capture.expected_e)
+    copies = copies_of(sensor, site, N_LEVELS)
+    range_e = full_range_e(copies)
+    sensitivity = float(np.broadcast_to(copies.sensitivity, N_LEVELS)[0]) or 1.0
+    photo_e_per_s = np.geomspace(LOWEST_E, HIGHEST * range_e, N_LEVELS) / (exposure_s * sensitivity)
+    dark_e = copies.expected_electrons(np.zeros(N_LEVELS), exposure_s)
+    found = signal_to_noise(copies, copies.expected_electrons(photo_e_per_s, exposure_s), dark_e)
+    budget = noise_budget(copies, photo_e_per_s, exposure_s)
+    fixed = [name for name in budget if name not in budget.temporal]
+    shown = {
+        "temporal noise": found.noise_e,
+        "photon shot": budget[PHOTON_SHOT],
+        "dark and read": _root_sum_of_squares(budget, [name for name in budget.temporal if name not in SEPARATE]),
+        "quantisation": budget[QUANTISATION],
+        "fixed pattern": _root_sum_of_squares(budget, fixed),
+    }
+    # Above saturation, signal and noise are those at saturation.
+    is_shown = ~found.is_saturated & (found.signal_e > 0.0)
+    shown = {name: values[is_shown] for name, values in shown.items() if (values[is_shown] > 0.0).all()}
+    curves = [{"label": name, "unit_x": "e⁻", "unit_y": "e⁻"} for name in shown]
+    about, arrays = curves_of(curves, [found.signal_e[is_shown]] * len(curves), list(shown.values()))
+    now = signal_to_noise(copies_of(sensor, site, 1), capture.expected_e[[site]], dark_e[:1])
+    x, y = float(now.signal_e[0]), float(now.noise_e[0])
+    about["marks"] = [{"x": x, "y": y}] if min(x, y) > 0.0 and curves else []
+    about["note"] = (
+        f"Photosite {site:,}, {float(now.gain_dn_per_e.flat[0]):.3g} DN/e⁻, full range {range_e:,.0f} e⁻"
+        f"{'; now saturated' if now.is_saturated[0] else ''}"
+    )
+    return about, arrays
+
+
+def _root_sum_of_squares(budget: NoiseBudget, names: list[str]) -> Floats:
+    return np.sqrt(sum((np.square(budget[name]) for name in names), np.zeros(N_LEVELS)))
+
+
+def median_site(values: Floats) -> int:
+    """Return the index of the median; with an even number of values, the larger of both."""
+    middle = values.size // 2
+    return int(np.argpartition(values, middle)[middle])
+
+
+def copies_of(sensor: Sensor, site: int, n: int) -> Sensor:
+    """Return a sensor of n copies of a photosite, without exchange of charge."""
+    connecting = [effect.name for effect in sensor.chain if not effect.is_local]
+    return (sensor.without(*connecting) if connecting else sensor).part(np.full(n, site))
+
+
+def full_range_e(sensor: Sensor) -> float:
+    """Return the charge of full well or highest code, whichever is smaller, e-."""
+    top_e = (sensor.v_sat_v - sensor.pedestal_v) / sensor.v_per_e
+    return float(np.minimum(np.broadcast_to(top_e, sensor.layout.n_sites), sensor.well_e)[0])

@@ -1,0 +1,47 @@
+"""Picture: the reconstruction from the codes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim.studio._engine import Simulated
+from foveasim.studio._parts.registry import PartData, part
+from foveasim.view.site_colours import encode_light
+
+#: Levels of linear light in the table of sRGB bytes.
+N_LEVELS = 1 << 14
+
+
+@part("Picture", lambda result: (result.capture, (result.picture_pixels,)), order=2)
+def picture(result: Simulated) -> PartData:
+    """Return the picture that is reconstructed from the codes."""
+    capture = result.capture
+    # The picture of a layout that only moved is that of the earlier one, whose compiled outlines are cached.
+    unmoved = capture if result.unmoved is None else replace(capture, layout=result.unmoved)
+    found = unmoved.picture(max_pixels=result.picture_pixels)
+    levels = found.data / capture.white_dn.reshape(-1, 1, 1).astype(np.float32)
+    bounds_um = tuple(side + move for side, move in zip(found.grid.bounds_um, 2 * result.move_um, strict=True))
+    return pixels_of(levels, found.coverage, bounds_um)
+
+
+def pixels_of(light: NDArray[Any], coverage: NDArray[Any], bounds_um: tuple[float, ...]) -> PartData:
+    """Return bytes of a picture, top row first, from linear (n_channel, n_y, n_x)."""
+    if light.shape[0] not in (1, 3):
+        light = light.mean(axis=0, keepdims=True)
+    level = np.clip(np.nan_to_num(light) * np.float32(N_LEVELS - 1), 0, N_LEVELS - 1).astype(np.uint16)
+    pixels = np.empty((*coverage.shape, 4), np.uint8)
+    pixels[..., :3] = np.moveaxis(_srgb_table()[level], 0, -1)[::-1]
+    pixels[..., 3] = np.rint(255.0 * np.clip(coverage, 0.0, 1.0))[::-1]
+    about = {"width": pixels.shape[1], "height": pixels.shape[0], "bounds_um": list(bounds_um)}
+    return about, {"rgba": pixels}
+
+
+@lru_cache(maxsize=1)
+def _srgb_table() -> NDArray[np.uint8]:
+    """Return the sRGB byte of each level of linear light."""
+    return encode_light(np.linspace(0.0, 1.0, N_LEVELS))

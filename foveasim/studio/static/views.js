@@ -1,0 +1,139 @@
+// Views: the server lists them; each is a module in views/, which is imported when its view is first needed.
+
+import { $, make, notice } from "/web/page_parts.js";
+
+// From this width, all tiles are shown at first that cost little.
+const WIDE = 1800;
+
+// A module exports create(root, studio), which adds elements to its tile and returns an object with any of these methods:
+// use(part, before) for data of the server and those of variant A or null, prepare(part) for work while the server computes,
+// draw() after a change of size or theme, onShown(isShown), and, only while the tile is shown, onState() after new settings,
+// onValues() after the colours of the map, onSite() after the photosite under the mouse, onSelection(), onMap() when the map is
+// drawn, onMarks(marks). Data are requested unless wantsData is false.
+const FOLLOWED = ["onState", "onValues", "onSite", "onSelection", "onMap", "draw"];
+
+export class Views {
+  studio; changed; list = []; made = {}; parts = {}; shown = new Set(); needed = new Set(); nLoading = 0;
+
+  // changed() is called when other views are shown.
+  constructor(studio, changed) {
+    Object.assign(this, { studio, changed });
+  }
+
+  // Uses the list of the server: { name, label, is_tile, is_first, is_costly, has_data }.
+  describe(list) {
+    // A server that was started again counts from the beginning.
+    for (const part of Object.values(this.parts)) part.version = -1;
+    if (this.list.length) return;
+    this.list = list;
+    let chosen = null;
+    try { chosen = JSON.parse(localStorage.getItem("foveasim-studio-tiles")); } catch { /* the first ones */ }
+    const isFirst = innerWidth >= WIDE ? (view) => !view.is_costly : (view) => view.is_first;
+    for (const view of list.filter((each) => each.is_tile)) {
+      const tile = make("section", undefined, "tile"), button = make("button", view.label);
+      tile.id = "tile-" + view.name;
+      tile.append(make("h2", view.label));
+      button.type = "button";
+      button.dataset.tile = view.name;
+      button.addEventListener("click", () => this.show(view.name, !this.shown.has(view.name)));
+      $("tiles").append(tile);
+      $("tabs").append(button);
+      if (Array.isArray(chosen) ? chosen.includes(view.name) : isFirst(view)) this.shown.add(view.name);
+      this._mark(view.name);
+    }
+    for (const view of list.filter((each) => !each.is_tile)) this.needed.add(view.name);
+    this._load();
+  }
+
+  // Names of the data that the page needs.
+  get wanted() {
+    return this.list.filter(({ name, has_data: hasData }) => hasData && this._isNeeded(name)
+      && this.made[name]?.wantsData !== false).map(({ name }) => name);
+  }
+
+  _isNeeded(name) { return this.needed.has(name) || this.shown.has(name); }
+
+  // Resolves when the view is loaded.
+  show(name, isShown) {
+    if (isShown === this.shown.has(name)) return Promise.resolve();
+    if (isShown) this.shown.add(name);
+    else this.shown.delete(name);
+    try { localStorage.setItem("foveasim-studio-tiles", JSON.stringify([...this.shown])); } catch { /* not kept */ }
+    this._mark(name);
+    if (this.made[name]) this._refresh(name);
+    const loaded = this._load();
+    this.changed();
+    if (isShown) $("tile-" + name).scrollIntoView({ block: "nearest", inline: "nearest" });
+    return loaded;
+  }
+
+  // Data that are needed although their tile is hidden.
+  need(name, isNeeded) {
+    if (isNeeded) this.needed.add(name);
+    else this.needed.delete(name);
+    this._load();
+    this.changed();
+  }
+
+  _mark(name) {
+    $("tile-" + name).hidden = !this.shown.has(name);
+    document.querySelector(`#tabs button[data-tile="${name}"]`).setAttribute("aria-pressed", String(this.shown.has(name)));
+    this._call(name, "onShown", this.shown.has(name));
+  }
+
+  async _load() {
+    const names = this.list.map(({ name }) => name).filter((name) => this._isNeeded(name) && this.made[name] === undefined);
+    for (const name of names) this.made[name] = null;
+    this.nLoading++;
+    const modules = await Promise.allSettled(names.map((name) => import("./views/" + name + ".js")));
+    this.nLoading--;
+    names.forEach((name, i) => {
+      const result = modules[i], root = $("tile-" + name);
+      try {
+        if (result.status === "rejected") throw result.reason;
+        this.made[name] = result.value.create(root, this.studio);
+      } catch (error) {
+        this._explain(name, error);
+        return;
+      }
+      if (root) this._call(name, "onShown", this.shown.has(name));
+      this._refresh(name);
+    });
+  }
+
+  _explain(name, error) {
+    const { label } = this.list.find((view) => view.name === name), text = label + " cannot be shown: " + error.message;
+    console.error(text);
+    notice(text);
+  }
+
+  // Calls a method of a view if it has that; an error in one view leaves the others.
+  _call(name, method, ...values) {
+    const view = this.made[name];
+    if (!view?.[method]) return;
+    try { view[method](...values); } catch (error) { this._explain(name, error); }
+  }
+
+  tell(method, ...values) { for (const name of this.shown) this._call(name, method, ...values); }
+
+  _refresh(name) {
+    if (this.parts[name]) this._use(this.parts[name]);
+    if (this.shown.has(name) && this.studio.state) for (const method of FOLLOWED) this._call(name, method);
+  }
+
+  // Shows all again, after variant A came or went.
+  refresh() { for (const { name } of this.list) if (name !== "sites" && name !== "columns") this._refresh(name); }
+
+  prepare(part) { this._call(part.part, "prepare", part); }
+
+  use(part) {
+    if (this.parts[part.part]?.version > part.version) return;
+    this.parts[part.part] = part;
+    this._use(part);
+  }
+
+  _use(part) {
+    const before = this.studio.page.frozen?.parts?.[part.part];
+    this._call(part.part, "use", part, before && before !== part ? before : null);
+  }
+}

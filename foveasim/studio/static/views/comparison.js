@@ -1,0 +1,65 @@
+// Table of the variants A and B: budgets and picture quality.
+
+import { shown } from "/web/colours.js";
+import { make } from "/web/page_parts.js";
+
+// Largest relative difference of equal numbers of photosites: generators solve for a number within this tolerance.
+const MATCHED = 0.01;
+// Notes on rows, by name.
+const NOTES = { frames_per_s: "At the data rate of A", total_e: "Signal of all photosites in a frame",
+  read_noise_e: "Root sum of squares over all photosites",
+  readout_steps: "Photosites on the longest readout line; lines are read in parallel", area_mm2: "Total area of the photosites" };
+/** @type {[number, string][]} */
+const [NO_PREFIX, ...PREFIXES] = [[1, ""], [1e9, " G"], [1e6, " M"], [1e5, " k"]];
+
+// Four digits; large numbers with a prefix.
+function figure(value) {
+  if (typeof value !== "number") return value ? "∞" : "–";
+  const [limit, prefix] = PREFIXES.find(([from]) => Math.abs(value) >= from) || NO_PREFIX, scale = prefix === " k" ? 1e3 : limit;
+  return shown(Number((value / scale).toPrecision(4))) + prefix;
+}
+
+// Shows rows of { name, label, unit, values: [a, b] }; null without variants.
+function show({ table, note, button }, about) {
+  note.hidden = Boolean(about);
+  table.hidden = button.hidden = !about;
+  if (!about) return;
+  const head = make("tr"), sizes = [about.fovea_um, about.field_um].map((side) => shown(Math.round(side)));
+  head.append(make("td"), ...["A", "B"].map((name) => { const cell = make("th", name); cell.scope = "col"; return cell; }));
+  const rows = about.rows.map(({ name, label, unit, values }) => {
+    const row = make("tr"), title = make("th", label + (unit ? ", " + unit : ""));
+    title.scope = "row";
+    row.dataset.name = name;
+    title.title = NOTES[name] || "";
+    if (/^(fovea|field)_/.test(name)) title.title = "Against the optical image, after a fit of one gain, on a square of "
+      + sizes[name.startsWith("fovea") ? 0 : 1] + " µm";
+    row.append(title, ...values.map((value) => make("td", name === "n_sites" ? shown(value) : figure(value))));
+    row.classList.toggle("differs", values[0] !== values[1]);
+    return row;
+  });
+  table.replaceChildren(head, ...rows);
+  const [a, b] = about.rows[0].values;
+  button.disabled = !about.can_match || Math.abs(a - b) <= MATCHED * a;
+  button.title = about.can_match ? "Same number of photosites as A, in the same field" : "The layout of B has no generator";
+}
+
+export function create(root, { page, connection }) {
+  const head = make("div", undefined, "head"), button = make("button", "Match B to A"), table = make("table");
+  const note = make("p", "Press A|B to keep the present sensor as A, and change it.", "quiet"), elements = { table, note, button };
+  Object.assign(button, { type: "button", id: "match" });
+  table.id = "comparison";
+  note.id = "comparison-note";
+  head.append(root.querySelector("h2"), button);
+  root.append(head, note, table);
+  button.addEventListener("click", () => connection.send({ do: "match" }));
+  show(elements, null);
+  // Rows of an earlier variant A are not those of the next one.
+  const variants = new WeakMap();
+  return {
+    use(part) {
+      if (!variants.has(part)) variants.set(part, page.frozen);
+      show(elements, page.frozen && variants.get(part) === page.frozen ? part.about : null);
+    },
+    onState() { if (!page.frozen) show(elements, null); },
+  };
+}

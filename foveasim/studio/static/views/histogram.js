@@ -1,0 +1,45 @@
+// Histogram and statistics of the values that the map shows.
+
+import { shown } from "/web/colours.js";
+import { statistics } from "/web/measure.js";
+import { make } from "/web/page_parts.js";
+import { Histogram } from "../charts.js";
+
+// Returns statistics of the values of a pane by name, as texts.
+function statisticsOf({ column, sites }) {
+  if (column.names) return { n: shown(sites.n) };
+  const sorted = Float64Array.from(column.values).sort(), figure = (v) => (Number.isNaN(v) ? "–" : shown(Number(v.toPrecision(4))));
+  // NaN is last.
+  const found = statistics(sorted, sorted.keys()), first = sorted.findIndex((v) => v > -Infinity);
+  const median = found.n ? sorted[first + (found.n >> 1)] : NaN;
+  return {
+    n: shown(found.n), mean: figure(found.mean), median: figure(median), std: figure(found.std), min: figure(found.min),
+    max: figure(found.max),
+  };
+}
+
+export function create(root, { page, panes, setRange }) {
+  const frame = make("div", undefined, "chart"), list = make("dl", undefined, "figures"), chart = new Histogram(frame, setRange);
+  frame.id = "histogram";
+  list.id = "statistics";
+  root.append(frame, list);
+  const draw = () => {
+    const { scale, column } = panes.b, site = page.pinned >= 0 ? page.pinned : page.hovered;
+    if (scale) chart.draw(page.range, site >= 0 ? column.values[site] : NaN);
+  };
+  return {
+    draw,
+    onSite: draw,
+    onValues() {
+      const { a, b } = panes, { unit } = b.column || {};
+      if (!b.scale) return;
+      list.replaceChildren(...Object.entries(statisticsOf(b)).map(([name, value]) => {
+        const item = make("div");
+        item.append(make("dt", name), make("dd", value + (unit && name !== "n" ? " " + unit : "")));
+        return item;
+      }));
+      chart.use(b.scale, page.frozen && a.scale?.column.key === b.column.key ? a.scale : null);
+      draw();
+    },
+  };
+}

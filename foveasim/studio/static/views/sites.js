@@ -1,0 +1,28 @@
+// Outlines of the photosites on their map.
+
+import { Sites } from "/web/sites.js";
+import { boundaryOf } from "../boundary.js";
+
+export function create(root, { page, panes, editor, ask }) {
+  const { b, scene } = panes;
+  const prepare = (part) => {
+    part.sites = new Sites(part.arrays, part.about);
+    part.boundary = boundaryOf(part.sites);
+  };
+  return {
+    prepare,
+    use(part) {
+      if (!part.sites) prepare(part);
+      const { sites } = part;
+      if (!b.map) document.getElementById("views").classList.add("loaded");
+      b.useSites(sites, part.about.palette);
+      page.boundary = part.boundary;
+      page.hovered = -1;
+      if (page.pinned >= sites.n) page.pinned = -1;
+      page.selected = page.rectangle && !editor.isOn ? b.sitesIn(page.rectangle) : editor.useSites(sites);
+      // Frames of the layout move with it.
+      if (scene.bounds) scene.frame = part.about.bounds_um;
+      ask("map");
+    },
+  };
+}
