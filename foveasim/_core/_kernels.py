@@ -128,8 +128,6 @@ def fill_normals(key, batch, words, out):
     generation of random normal deviates (Ann. Math. Statist. 29, 1958): the radius is ``sqrt(-2 ln u)`` with u from one word,
     so that numbers are below 6.8. Of a second word, 30 bits are the angle in the first quadrant, and two bits the signs.
 
-    Notes
-    -----
     With the angle ``pi/4 + a`` and ``r = sqrt(-ln u)``, the pair is ``r (cos a + sin a)`` and ``r (cos a - sin a)``: ``a`` is
     at most pi/4, so sine and cosine need no range reduction. Logarithm, sine and cosine are evaluated by sums and products in a
     fixed order: the compiler vectorises them, and results are bit-identical on every machine.

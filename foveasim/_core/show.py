@@ -111,10 +111,7 @@ def drawn(name: str) -> Drawn[Any]:
     Lower modules thereby draw their objects without importing the package, which is loaded on use. Signature and docstring are
     those of the function, without its first parameter.
 
-    Parameters
-    ----------
-    name : str
-        Name of the function.
+    ``name``: name of the function.
 
     Examples
     --------

@@ -74,10 +74,7 @@ def thread_count(n_threads: int | None = None) -> int:
     """
     Return the number of threads to use, by default all cores available to this process.
 
-    Raises
-    ------
-    ParameterError
-        When ``n_threads`` is not an integer from 1 to 4096.
+    Raises ParameterError when ``n_threads`` is not an integer from 1 to 4096.
     """
     if n_threads is not None:
         return check_count("n_threads", n_threads, at_most=MAX_THREADS)

@@ -40,12 +40,6 @@ def check_arguments(call: Callable[P, R]) -> Callable[P, R]:
     """
     Return a function that raises an error for arguments outside its signature.
 
-    Parameters
-    ----------
-    call : function
-
-    Notes
-    -----
     A valid call takes 1 to 2 µs longer, and lists of numbers a time in proportion to their length; the annotations are read at
     the first call.
     """
