@@ -131,10 +131,7 @@ def read_head(path: Path) -> bytes:
     """
     Return the first bytes of a file.
 
-    Raises
-    ------
-    FileError
-        When the file is missing, unreadable, empty or too large.
+    Raises FileError when the file is missing, unreadable, empty or too large.
     """
     try:
         if not path.is_file():

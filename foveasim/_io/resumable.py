@@ -34,26 +34,10 @@ def resumable_directory(
     """
     Create or open the directory of an unfinished target, and lock it.
 
-    Parameters
-    ----------
-    target : Path
-        The finished directory; the unfinished one is :func:`partial_path`.
-    what : str
-        Kind of the data, for messages.
-    is_ours : callable
-        Whether a directory contains such data.
-    has_content : callable
-        Whether a directory is worth resuming; if not, it is deleted after the block.
-
-    Yields
-    ------
-    directory : Path
-        Call :func:`finish` at the end of the block.
-
-    Raises
-    ------
-    FileError
-        When the directory contains other data, or another process writes it.
+    ``target``: the finished directory; the unfinished one is :func:`partial_path`. ``what``: kind of the data, for messages.
+    ``is_ours``: whether a directory contains such data. ``has_content``: whether a directory is worth resuming; if not, it is
+    deleted after the block. Yields ``directory``: call :func:`finish` at the end of the block. Raises FileError when the
+    directory contains other data, or another process writes it.
     """
     directory = partial_path(target)
     if not target.parent.is_dir():

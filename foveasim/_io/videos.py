@@ -73,15 +73,8 @@ class VideoFile:
         """
         Iterate over the pixels of frames, (n_y, n_x, 3) uint8, top row first.
 
-        Parameters
-        ----------
-        start : int
-            First frame; earlier ones are decoded but not converted.
-
-        Raises
-        ------
-        FileError
-            When a frame is corrupt or too large.
+        ``start``: first frame; earlier ones are decoded but not converted. Raises FileError when a frame is corrupt or too
+        large.
         """
         return (frame_pixels(self.path, frame) for frame in islice(self, start, None))
 
@@ -89,10 +82,7 @@ class VideoFile:
         """
         Return the number of encoded frames, without decoding them.
 
-        Raises
-        ------
-        FileError
-            When the file is corrupt.
+        Raises FileError when the file is corrupt.
         """
         with _open_video(self.path) as container, _as_video_error(self.path, "is corrupt"):
             return sum(packet.size > 0 for packet in container.demux(container.streams.video[0]))
@@ -157,10 +147,7 @@ class SandboxedVideo:
         """
         Iterate over the pixels of frames, as :meth:`VideoFile.pixels`.
 
-        Raises
-        ------
-        FileError
-            When a frame is corrupt or too large, or takes too long.
+        Raises FileError when a frame is corrupt or too large, or takes too long.
         """
         return iterate_in_sandbox(_decode, self.path, {"start": start}, kind=KIND, max_bytes=MAX_BYTES)
 

@@ -41,10 +41,7 @@ def read_header(path: Path) -> ExrHeader:
     """
     Read the header of a file with one image.
 
-    Raises
-    ------
-    FormatError
-        If the file contains several images, or is too large.
+    Raises FormatError if the file contains several images, or is too large.
     """
     exr = import_optional(path, "OpenEXR", "maps")
     with exr.File(str(path), header_only=True) as file:
@@ -84,10 +81,7 @@ def read_channels(path: Path, names: Sequence[str]) -> NDArray[Any]:
     """
     Read channels as bands (n_band, n_y, n_x), top row first.
 
-    Raises
-    ------
-    FormatError
-        If a channel is subsampled.
+    Raises FormatError if a channel is subsampled.
     """
     exr = import_optional(path, "OpenEXR", "maps")
     with exr.File(str(path), separate_channels=True) as file:

@@ -51,10 +51,7 @@ def in_order(array: xr.DataArray) -> tuple[xr.DataArray, Hashable | None, tuple[
 
     Those are the dimension of the bands or None, and those of rows and columns.
 
-    Raises
-    ------
-    FormatError
-        If the array is empty, or has other dimensions.
+    Raises FormatError if the array is empty, or has other dimensions.
     """
     if 0 in array.shape:
         raise FormatError(f"contains an empty array of shape {array.shape}")

@@ -164,19 +164,9 @@ def find_struct(file: MatFile, name: str | None, known: tuple[str, ...], what: s
 
     Without either, the variables ``data`` and ``photons`` are its fields.
 
-    Parameters
-    ----------
-    file : MatFile
-    name : str, optional
-    known : tuple of str
-        Names in files of ISETCam; the first one is the usual name.
-    what, cure : str
-        Kind of the struct and the function that computes it, for messages.
-
-    Raises
-    ------
-    FormatError
-        If the file does not contain the struct, or its photons are invalid.
+    ``known``: names in files of ISETCam; the first one is the usual name. ``what``, ``cure``: kind of the struct and the
+    function that computes it, for messages. Raises FormatError if the file does not contain the struct, or its photons are
+    invalid.
     """
     struct = next((one for one in (known if name is None else (name,)) if one in file.names), None)
     if struct is None and (name is not None or not {"data", "photons"} & set(file.names)):
