@@ -66,11 +66,8 @@ class RectangleLattice:
         """
         Return the packed rings of the sites ``first`` to ``last - 1``, by default of all.
 
-        Returns
-        -------
-        xy_um : (4 n, 2) float64, µm
-            Counter-clockwise from the lower left corner.
-        ring_offsets, site_offsets : (n + 1,) int64
+        Returns ``xy_um`` (4 n, 2) float64, µm: counter-clockwise from the lower left corner. ``ring_offsets``,
+        ``site_offsets`` (n + 1,) int64.
         """
         from foveasim.layout import _kernels
 

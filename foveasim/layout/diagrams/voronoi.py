@@ -29,27 +29,11 @@ def voronoi_cells(centres_um: Floats, region: shapely.Polygon) -> tuple[Floats, 
     """
     Compute the Voronoi cells of points, clipped to a region, one per point in their order.
 
-    Parameters
-    ----------
-    centres_um : (n, 2) float64, µm
-        Distinct points inside the region.
-    region : shapely Polygon, µm
-        Convex or concave.
+    ``centres_um`` (n, 2) float64, µm: distinct points inside the region. ``region`` (shapely Polygon, µm): convex or concave.
+    Returns ``xy_um`` (n_vertex, 2) float64, µm: corners, cell after cell, counter-clockwise. Corners that neighbours share are
+    bit-identical. ``ring_offsets`` (n + 1,) int64: cell i has the corners ``ring_offsets[i] : ring_offsets[i + 1]``. Raises
+    GeometryError when a point lies outside, two are equal or too close for float64, or a cell encloses a hole of the region.
 
-    Returns
-    -------
-    xy_um : (n_vertex, 2) float64, µm
-        Corners, cell after cell, counter-clockwise. Corners that neighbours share are bit-identical.
-    ring_offsets : (n + 1,) int64
-        Cell i has the corners ``ring_offsets[i] : ring_offsets[i + 1]``.
-
-    Raises
-    ------
-    GeometryError
-        When a point lies outside, two are equal or too close for float64, or a cell encloses a hole of the region.
-
-    Notes
-    -----
     Cells inside the region are assembled from arrays of corner indices. The few cells at its boundary are the faces of
     their edges and the outline of the region; each intersection is computed once for both neighbours. A part that a notch
     of the region separates from its cell is assigned to the neighbour with which it shares the longest boundary.
@@ -169,15 +153,8 @@ class IncrementalCells:
         """
         Return the last cells as packed rings, like :func:`voronoi_cells`.
 
-        Returns
-        -------
-        xy_um : (n_vertex, 2) float64, µm
-        ring_offsets : (n + 1,) int64
-
-        Raises
-        ------
-        GeometryError
-            When centres are too close for float64, or a cell encloses a hole of the region.
+        Returns ``xy_um`` (n_vertex, 2) float64, µm. ``ring_offsets`` (n + 1,) int64. Raises GeometryError when centres are too
+        close for float64, or a cell encloses a hole of the region.
         """
         diagram = _without_short_edges(self._diagram())
         unclipped = _unclipped_rings(

@@ -201,10 +201,7 @@ def shapes_of_sites(name: str, layout: Layout, parameters: Mapping[str, Any]) ->
     """
     Return the polygons of a derived layer, one per site.
 
-    Raises
-    ------
-    ParameterError
-        When a parameter is invalid, or the function does not return one geometry per site.
+    Raises ParameterError when a parameter is invalid, or the function does not return one geometry per site.
     """
     polygons = np.asarray(_call(name, layout, parameters))
     if polygons.shape != (layout.n_sites,) or not shapely.is_geometry(polygons).all():
@@ -220,10 +217,7 @@ def shapes_of_layout(name: str, layout: Layout, parameters: Mapping[str, Any]) -
     """
     Return the polygons of a derived layer of the complete layout.
 
-    Raises
-    ------
-    ParameterError
-        When a parameter is invalid, or the function does not return polygons.
+    Raises ParameterError when a parameter is invalid, or the function does not return polygons.
     """
     found = _call(name, layout, parameters)
     if isinstance(found, PlacedShapes):

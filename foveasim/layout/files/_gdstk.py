@@ -122,33 +122,13 @@ def read(
     """
     Read a cell with its complete hierarchy.
 
-    Parameters
-    ----------
-    path : str
-    limit : callable
-        Function that sets limits of memory and processor time. Tighter limits apply while gdstk reads the file.
-    is_oasis : bool
-    layers : list of (layer, datatype), optional
-        Layers of the photosites; a datatype of None stands for all.
-    filters : list of (layer, datatype)
-        Layers of the colour filters.
-    cell : str, optional
-        Cell selected by the user.
-    max_sites, max_memory_bytes, max_text_bytes, max_cpu_s : int
-        Limits of the flattened content.
-
-    Returns
-    -------
-    about : dict
-        Database unit ``dbu_um``, name ``cell``, and ``layers`` of the photosites.
-    arrays : list
-        ``xy`` in database units, ``counts``, ``tags`` (see :class:`Shapes`) of the photosites, the text of their columns, and
-        the same three arrays of the filters without the outline of a photosite.
-
-    Raises
-    ------
-    FormatError
-        When the file is rejected.
+    ``limit``: function that sets limits of memory and processor time. Tighter limits apply while gdstk reads the file.
+    ``layers``: layers of the photosites; a datatype of None stands for all. ``filters``: layers of the colour filters.
+    ``cell``: cell selected by the user. ``max_sites``, ``max_memory_bytes``, ``max_text_bytes``, ``max_cpu_s``: limits of the
+    flattened content. Returns ``about``: database unit ``dbu_um``, name ``cell``, and ``layers`` of the photosites.
+    ``arrays``: ``xy`` in database units, ``counts``, ``tags`` (see :class:`Shapes`) of the photosites, the text of their
+    columns, and the same three arrays of the filters without the outline of a photosite. Raises FormatError when the file is
+    rejected.
     """
     import gdstk
 

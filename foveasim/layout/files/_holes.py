@@ -35,11 +35,8 @@ def hole_free_rings(layout: Layout, max_vertices: int | None) -> tuple[Ints, Int
     """
     Return hole-free rings of all sites, in their order.
 
-    Returns
-    -------
-    site, part, n_parts : (n_ring,) int64
-        Index of the site, number of the part from 1, and number of parts; 0 and 0 for an undivided site.
-    rings_um : list of (n, 2), µm
+    Returns ``site``, ``part``, ``n_parts`` (n_ring,) int64: index of the site, number of the part from 1, and number of parts;
+    0 and 0 for an undivided site. ``rings_um``, list of (n, 2), µm.
     """
     rings_of_site = np.diff(layout.site_offsets)
     outline = layout.site_offsets[:-1]
@@ -119,8 +116,6 @@ def _hole_free_parts(polygon: Any, max_vertices: int | None) -> list[Floats]:
     """
     Divide a polygon into rings without holes and without additional vertices.
 
-    Notes
-    -----
     Triangles of a constrained Delaunay triangulation are merged as long as each adds a new vertex. Such a part has no
     repeated vertex, and is therefore simple and without holes.
     """
