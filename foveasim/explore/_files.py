@@ -19,14 +19,7 @@ def digests(files: Iterable[Path]) -> dict[str, str]:
 
     A layout file, for example, may reference the picture of a density.
 
-    Parameters
-    ----------
-    files : iterable of Path
-
-    Returns
-    -------
-    digests : dict of str to str
-        By file path. Empty for a missing file; the reader of the file reports it.
+    Returns ``digests``: by file path. Empty for a missing file; the reader of the file reports it.
     """
     digest_by_path: dict[str, str] = {}
     pending = list(files)

@@ -94,10 +94,7 @@ class WorkerCache:
         """
         Remove the least recently used components, except those of the last point.
 
-        Returns
-        -------
-        warnings : list of str
-            Warnings of the components of the last point.
+        Returns ``warnings``: warnings of the components of the last point.
         """
         for key in self._used:
             # Measured again for cameras and images, which grow with use.
