@@ -36,17 +36,8 @@ def encode_png(pixels: NDArray[np.uint8], max_bytes: int = MAX_BYTES) -> tuple[b
     """
     Encode pixels as a PNG file.
 
-    Parameters
-    ----------
-    pixels : (n_y, n_x, n_channel) uint8
-        Top row first: grey, grey with alpha, RGB or RGBA.
-    max_bytes : int
-        Pictures that need more have fewer colours, then fewer pixels.
-
-    Returns
-    -------
-    png : bytes
-    size : (width, height)
+    ``pixels`` (n_y, n_x, n_channel) uint8: top row first: grey, grey with alpha, RGB or RGBA. ``max_bytes``: pictures that
+    need more have fewer colours, then fewer pixels.
     """
     from PIL import Image
 
