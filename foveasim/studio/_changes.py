@@ -113,20 +113,8 @@ def with_file(
     """
     Return settings with an uploaded file.
 
-    Parameters
-    ----------
-    settings, start : mapping
-        Current and initial settings.
-    files : Files
-    path : str
-    use : {"scene", "layout", "settings"}
-
-    Raises
-    ------
-    FileError
-        When the file is not available, or invalid.
-    ParameterError
-        When the use is unknown.
+    ``settings``, ``start``: current and initial settings. ``use``: {"scene", "layout", "settings"}. Raises FileError when the
+    file is not available, or invalid. Raises ParameterError when the use is unknown.
     """
     match use:
         case "scene":

@@ -113,16 +113,8 @@ class Engine:
         """
         Simulate the shot of settings.
 
-        Parameters
-        ----------
-        settings : mapping
-        is_preview : bool
-            Whether a large scene may be reduced: means of blocks of its pixels, and no finer cells of the optical image.
-
-        Raises
-        ------
-        FoveasimError
-            When a setting is invalid, or the parts are incompatible; in one line.
+        ``is_preview``: whether a large scene may be reduced: means of blocks of its pixels, and no finer cells of the optical
+        image. Raises FoveasimError when a setting is invalid, or the parts are incompatible; in one line.
         """
         start_s = time.perf_counter()
         cache = self._runner.cache

@@ -34,21 +34,9 @@ def camera_frame(message: bytes) -> dict[str, Any]:
     """
     Decode a camera frame.
 
-    Parameters
-    ----------
-    message : bytes
-        Length of the header as little-endian uint32; header in JSON with ``id``, ``width``, ``height`` and ``is_first``;
-        pixels, RGB, uint8, top row first.
-
-    Returns
-    -------
-    message : dict
-        With ``pixels``, (n_y, n_x, 3) uint8.
-
-    Raises
-    ------
-    ParameterError
-        When the message is invalid.
+    ``message``: length of the header as little-endian uint32; header in JSON with ``id``, ``width``, ``height`` and
+    ``is_first``; pixels, RGB, uint8, top row first. Returns ``message``: with ``pixels``, (n_y, n_x, 3) uint8. Raises
+    ParameterError when the message is invalid.
     """
     start = 4 + int.from_bytes(message[:4], "little")
     try:
@@ -98,15 +86,8 @@ class Frames:
         """
         Open a video file at its first frame.
 
-        Returns
-        -------
-        is_video : bool
-            False for a single frame, which is a picture.
-
-        Raises
-        ------
-        FileError
-            When the file is not a video, is corrupt, or the extra ``video`` is not installed.
+        Returns ``is_video``: false for a single frame, which is a picture. Raises FileError when the file is not a video, is
+        corrupt, or the extra ``video`` is not installed.
         """
         video = SandboxedVideo(path)
         n_frames = video.n_frames
@@ -135,12 +116,7 @@ class Frames:
         """
         Decode a frame of the video.
 
-        Raises
-        ------
-        FileError
-            When the frame is corrupt.
-        ParameterError
-            When there is no video, or it has no such frame.
+        Raises FileError when the frame is corrupt. Raises ParameterError when there is no video, or it has no such frame.
         """
         if self._video is None:
             raise ParameterError("n", "must be the number of a frame of an open video")
@@ -241,10 +217,7 @@ class Frames:
         """
         Write the current frame to a file with its own name, if it is the scene of settings.
 
-        Returns
-        -------
-        files : dict of str to Path
-            The file by the path in the settings; empty if the scene is another one.
+        Returns ``files``: the file by the path in the settings; empty if the scene is another one.
         """
         with self._lock:
             if self.path is None or self._pixels is None or not self._is_used(settings):

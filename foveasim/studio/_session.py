@@ -462,16 +462,8 @@ class Session:
         """
         Return the current settings in a text format, or their changes as a difference.
 
-        Parameters
-        ----------
-        what : {"yaml", "python", "notebook", "link", "diff"}
-        exported : tuple, optional
-            As :meth:`exported` returns it, for several texts of the same state.
-
-        Raises
-        ------
-        ParameterError
-            When the format is unknown.
+        ``what``: {"yaml", "python", "notebook", "link", "diff"}. ``exported``: as :meth:`exported` returns it, for several
+        texts of the same state. Raises ParameterError when the format is unknown.
         """
         settings, files = self.exported() if exported is None else exported
         return text_of(what, settings, self.start.settings, self.start.name, list(files))
@@ -482,16 +474,7 @@ class Session:
         """
         Return the current settings with names of uploaded files for their paths, and the files.
 
-        Parameters
-        ----------
-        name_of : function of a path
-            Returns the name of a file.
-
-        Returns
-        -------
-        settings : dict
-        files : dict of str to Path
-            Uploaded files by name, and the current frame of a source.
+        ``name_of``: returns the name of a file. Returns ``files``: uploaded files by name, and the current frame of a source.
         """
         settings = self.history.settings
         return without_directories(settings, self.uploads, self.frames.export(settings), name_of)

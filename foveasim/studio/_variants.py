@@ -130,17 +130,8 @@ def with_n_sites(settings: dict[str, Any], n_sites: int, layout: Layout) -> dict
 
     Rasters have the field of the present layout, and other pitches; of other generators, one parameter is solved for.
 
-    Parameters
-    ----------
-    settings : dict
-    n_sites : int
-    layout : Layout
-        Present layout of the settings.
-
-    Raises
-    ------
-    ParameterError
-        When the layout has no generator, or its generator has no such parameter.
+    ``layout``: present layout of the settings. Raises ParameterError when the layout has no generator, or its generator has no
+    such parameter.
     """
     if not _is_generated(settings):
         raise ParameterError("layout", "must have a generator, whose number of photosites can be chosen")
