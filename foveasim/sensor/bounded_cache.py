@@ -41,13 +41,8 @@ class BoundedCache:
         """
         Return the value of a key, computed at the first call.
 
-        Parameters
-        ----------
-        key : hashable
-        compute : callable
-            Called without arguments.
-        owner : object
-            Stored with the value, so that the addresses of its parts remain theirs.
+        ``compute``: called without arguments. ``owner``: stored with the value, so that the addresses of its parts remain
+        theirs.
         """
         try:
             value = self._values[key]
