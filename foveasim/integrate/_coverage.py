@@ -60,14 +60,8 @@ class Coverage:
         """
         Return the coverage of sites.
 
-        Parameters
-        ----------
-        grid : Grid
-        bounds_um : (n_site, 4) float64, µm
-        area_um2, covered_um2 : (n_site,) float64, µm²
-            Area of each outline, and its area on the grid.
-        is_outside : (n_site,) bool, optional
-            Sites outside the image circle.
+        ``bounds_um``: (n_site, 4) float64, µm. ``area_um2``, ``covered_um2`` (n_site,) float64, µm²: area of each outline, and
+        its area on the grid. ``is_outside`` (n_site,) bool: sites outside the image circle.
         """
         n_sites = area_um2.size
         if is_outside is None or not is_outside.any():

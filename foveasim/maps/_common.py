@@ -204,10 +204,7 @@ def check_numbers(data: Images) -> None:
     """
     Reject invalid irradiance.
 
-    Raises
-    ------
-    FormatError
-        If a value is not finite, or negative by more than the rounding error.
+    Raises FormatError if a value is not finite, or negative by more than the rounding error.
     """
     lowest, highest = float(data.min()), float(data.max())
     if not (np.isfinite(lowest) and np.isfinite(highest)):

@@ -36,10 +36,7 @@ def write_zarr(power_map: PowerMap, path: Path) -> None:
     """
     Write an uncompressed zarr directory atomically.
 
-    Raises
-    ------
-    FileError
-        If zarr is missing, the path exists and is not a zarr directory, or it cannot be written.
+    Raises FileError if zarr is missing, the path exists and is not a zarr directory, or it cannot be written.
     """
     for module in ("zarr", "xarray"):
         import_optional(path, module, "maps")

@@ -32,10 +32,7 @@ def write(power_map: PowerMap, path: Path) -> None:
     """
     Write one uncompressed channel per band.
 
-    Raises
-    ------
-    ParameterError
-        If the map is not float32, or two bands have the same wavelength.
+    Raises ParameterError if the map is not float32, or two bands have the same wavelength.
     """
     exr = import_optional(path, "OpenEXR", "maps")
     if power_map.data.dtype != np.float32:

@@ -36,10 +36,7 @@ def found_in_metadata(text: str, data: NDArray[Any], *, is_y_descending: bool) -
     """
     Return the map with the metadata of a string that foveasim wrote.
 
-    Raises
-    ------
-    FormatError
-        If the string has the format of foveasim and is invalid.
+    Raises FormatError if the string has the format of foveasim and is invalid.
     """
     about = _parse(text)
     if not isinstance(about, dict) or about.get("format") != FILE_FORMAT:

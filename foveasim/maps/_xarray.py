@@ -122,10 +122,7 @@ def found_in_array(array: xr.DataArray) -> Found:
     """
     Return data and metadata of a labelled array.
 
-    Raises
-    ------
-    FormatError
-        If the dimensions are not those of a map, or the coordinates are not uniform.
+    Raises FormatError if the dimensions are not those of a map, or the coordinates are not uniform.
     """
     array = squeeze(array)
     if is_unnamed(array):

@@ -138,13 +138,8 @@ class Jackknife:
         """
         Return the limits, (n_class, 2) each, of the smallest and the largest of several values.
 
-        Parameters
-        ----------
-        values : (1 + n_block, n_value, n_class)
-        is_used : (n_value, n_class) bool
+        ``is_used``: (n_value, n_class) bool.
 
-        Notes
-        -----
         With the probability of the interval, at least, all values are within their simultaneous limits (Bonferroni), and so are
         their extremes: the smallest of the lower limits and the smallest of the upper limits bound the smallest value.
         """

@@ -50,10 +50,7 @@ def cube_of_array(array: xr.DataArray, close: Callable[[], None] | None = None) 
     """
     Return the cube of a labelled array; the values are not read.
 
-    Raises
-    ------
-    FormatError
-        If the dimensions are not those of a cube, or the positions are not uniform.
+    Raises FormatError if the dimensions are not those of a cube, or the positions are not uniform.
     """
     array, band, (y, x) = in_order(squeeze(array))
     along_x, along_y = (coordinate(array, d) for d in (x, y))
