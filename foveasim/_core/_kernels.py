@@ -15,18 +15,6 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = [
-    "BATCH",
-    "add_normals",
-    "count_ray_intersections",
-    "fill_normals",
-    "fill_uniforms",
-    "philox_2x32",
-    "philox_4x32",
-    "philox_4x64",
-    "uniform",
-]
-
 #: Multipliers and Weyl increments of Philox 4x64.
 _M0, _M1 = np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157)
 _W0, _W1 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBB67AE8584CAA73B)

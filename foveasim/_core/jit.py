@@ -25,8 +25,6 @@ from foveasim._core.threads import ForkSafeLock, cached_property, thread_count
 from foveasim._core.validation import check_count
 from foveasim.errors import FileError
 
-__all__ = ["Kernel", "compile_kernels", "compile_named", "kernel_modules", "njit"]
-
 _log = logging.getLogger("foveasim")
 #: The package, whose modules ``_*kernels`` contain the kernels.
 PACKAGE = Path(__file__).parents[1]

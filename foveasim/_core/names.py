@@ -10,8 +10,6 @@ from pathlib import Path
 
 from foveasim.errors import printable
 
-__all__ = ["closest_name", "did_you_mean", "list_names", "missing_path", "possible_names"]
-
 #: Longest complete list of names in a message; of longer lists, it contains the closest names and the total number.
 MAX_LISTED = 16
 #: Similarity of names, 0 to 1, from which one is suggested for the other, as in :func:`difflib.get_close_matches`.

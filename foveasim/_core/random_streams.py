@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from foveasim._core.validation import check_count
 
-__all__ = ["Streams", "derive_seed", "fixed_pattern_key", "random_key"]
-
 
 def fixed_pattern_key(seed: int, effect: str) -> tuple[np.uint64, np.uint64]:
     """Return the generator key for the fixed pattern of an effect in a device."""

@@ -30,24 +30,6 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.validation import Bools, Floats, Ints, read_only
 from foveasim.errors import ParameterError
 
-__all__ = [
-    "SITE_ID",
-    "TIE_FRACTION",
-    "are_convex",
-    "collapse_short_edges",
-    "from_frame",
-    "next_vertex",
-    "positions_in_runs",
-    "ring_moments",
-    "ring_unsigned_area_um2",
-    "same_rings",
-    "site_area_um2",
-    "site_bounds_um",
-    "site_ids",
-    "site_moments",
-    "to_frame",
-]
-
 #: Distances of sites that differ by less than this fraction are equal: rounding of coordinates of a few millimetres.
 TIE_FRACTION = 1e-6
 

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from pyvista import PolyData  # noqa: TID251 -- a type alone
 
-__all__ = ["Drawn", "drawn"]
-
 R = TypeVar("R")
 #: First parameter of a numpydoc section, with its description.
 FIRST_PARAMETER = re.compile(r"(\n *Parameters\n *-+\n)( *)\S.*\n(?:\2 +.*\n|\n(?=\2 ))*")

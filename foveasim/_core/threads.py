@@ -14,8 +14,6 @@ from weakref import WeakSet
 
 from foveasim._core.validation import check_count
 
-__all__ = ["ForkSafeLock", "cached_property", "in_order", "parallel_map", "thread_count"]
-
 #: Smallest size of the thread pool: users may request more threads than there are cores.
 MIN_POOL_THREADS = 8
 #: Upper limit, above the number of cores of any machine.

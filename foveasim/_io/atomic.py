@@ -14,8 +14,6 @@ from typing import IO
 
 from foveasim.errors import FileError, disk_problem
 
-__all__ = ["atomic_directory", "atomic_write", "check_free_space", "lock", "remove_directory"]
-
 #: A disk with less free space than one block is full.
 FULL_DISK_BYTES = 4096
 #: Waiting times before each attempt to remove a directory.

@@ -34,19 +34,6 @@ from foveasim.errors import FileError, disk_problem
 if TYPE_CHECKING:
     from PIL import Image
 
-__all__ = [
-    "PICTURE_EXTENSIONS",
-    "PICTURE_FORMATS",
-    "PictureFormat",
-    "check_picture_size",
-    "picture_format",
-    "picture_names",
-    "pixels_of_image",
-    "pixels_of_page",
-    "read_picture",
-    "write_picture",
-]
-
 #: Larger pictures are rejected: 2**28 pixels are 3 GiB as three float32 channels.
 MAX_PIXELS = 2**28
 #: Limits of decompressed EXR data: for small files, and per byte of larger ones, the maximum ratio of deflate.

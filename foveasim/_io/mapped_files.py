@@ -23,8 +23,6 @@ from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Images
 from foveasim.errors import FileError
 
-__all__ = ["check_unchanged", "in_memory", "map_file", "range_and_values", "remember_range", "value_range"]
-
 _Array = TypeVar("_Array", bound=NDArray[Any])
 
 #: Values whose range is computed at once, about 1 MB: within the second-level cache.

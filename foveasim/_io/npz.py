@@ -20,8 +20,6 @@ from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import as_file_error
 from foveasim.errors import FileError
 
-__all__ = ["open_archive", "read_archive", "read_array", "write_archive", "zip_members"]
-
 #: Name of the array that contains the metadata as JSON.
 ABOUT = "about"
 SUFFIX = ".npy"

@@ -11,8 +11,6 @@ from typing import IO
 from foveasim._io.atomic import lock, remove_directory
 from foveasim.errors import FileError
 
-__all__ = ["LOCK", "disk_errors", "finish", "partial_path", "resumable_directory"]
-
 #: File that is locked while a directory is written, and extension of incomplete files of zarr.
 LOCK, INCOMPLETE = "lock", ".partial"
 

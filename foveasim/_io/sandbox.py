@@ -31,8 +31,6 @@ from numpy.typing import NDArray
 from foveasim._io.zarr_stores import check_plain_files
 from foveasim.errors import FileError
 
-__all__ = ["WALL_TIME_FACTOR", "iterate_in_sandbox", "read_in_sandbox", "run_in_sandbox"]
-
 #: Memory of the process and its libraries, and number of copies of the data in memory.
 BASE_BYTES, DATA_COPIES = 2**31, 3
 MAX_CPU_S, BYTES_PER_S = 10, 2**22

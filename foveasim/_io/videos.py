@@ -16,8 +16,6 @@ from foveasim._io.images import check_picture_size
 from foveasim._io.sandbox import iterate_in_sandbox, read_in_sandbox
 from foveasim.errors import FileError, printable
 
-__all__ = ["SandboxedVideo", "VideoFile", "frame_pixels"]
-
 KIND = "a video"
 #: Limit of the memory of the sandbox process: threads of the decoder and its reference frames.
 MAX_BYTES = 2**32

@@ -12,8 +12,6 @@ import yaml
 from foveasim._core.names import missing_path
 from foveasim.errors import ConfigError
 
-__all__ = ["MAX_FILE_BYTES", "format_yaml", "parse_yaml", "position_of", "read_text", "read_yaml"]
-
 #: Size limit: settings files are written by hand.
 MAX_FILE_BYTES = 1 << 20
 

@@ -25,17 +25,6 @@ from foveasim._core.extras import import_optional
 from foveasim._core.names import missing_path
 from foveasim.errors import FileError, format_value
 
-__all__ = [
-    "ZARR",
-    "Variable",
-    "check_codecs",
-    "check_plain_files",
-    "free_name",
-    "open_store",
-    "store_format",
-    "write_variables",
-]
-
 ZARR = ".zarr"
 #: Size limit of the metadata of a group or an array.
 MAX_METADATA_BYTES = 2**26

@@ -48,8 +48,6 @@ from foveasim.sensor import NoiseBudget, Sensor, noise_budget
 from foveasim.sensor.limits import check_plausible, check_plausible_array
 from foveasim.units import um_from_nm, w_from_w_m2_um2
 
-__all__ = ["Camera"]
-
 #: Margin of a picture that covers undistorted outlines: their edges are curves of limited accuracy.
 COVER_MARGIN = 1e-5
 #: Exposures that exceed the time between them by this fraction do so by rounding.

@@ -15,8 +15,6 @@ from foveasim._core.validation import check_choice
 from foveasim._io.atomic import atomic_write
 from foveasim.errors import FileError
 
-__all__ = ["STARTING_FILES", "starting_command", "starting_file", "write_starting_file"]
-
 #: Kinds of files.
 STARTING_FILES = ("shot", "layout", "rules", "sweep", "study", "dataset")
 #: A line that stands for the content of another file.

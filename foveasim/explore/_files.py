@@ -10,8 +10,6 @@ from foveasim._io.yaml_files import read_yaml
 from foveasim.config import YAML_EXTENSIONS, resolve_files
 from foveasim.errors import ConfigError
 
-__all__ = ["digests"]
-
 
 def digests(files: Iterable[Path]) -> dict[str, str]:
     """

@@ -21,17 +21,6 @@ from foveasim.metrics import psnr_db
 from foveasim.reconstruct import Picture, raster_grid
 from foveasim.sensor import signal_to_noise
 
-__all__ = [
-    "DEFAULT_METRICS",
-    "METRICS",
-    "REFERENCES",
-    "Metric",
-    "add_metrics",
-    "has_result",
-    "import_metric",
-    "resolve_metrics",
-]
-
 #: A function of a shot, its camera and its capture that returns a number, a mapping of names to numbers, or a labelled array.
 Metric = Callable[[Shot, Camera, Capture], Any]
 

@@ -21,8 +21,6 @@ from foveasim._core.provenance import differences
 from foveasim._io.atomic import lock
 from foveasim.errors import FileError, ParameterError, type_name
 
-__all__ = ["WORKER_LOST", "Journal", "Record", "Value", "check_same_plan", "check_unique", "journal_path", "to_values"]
-
 FORMAT, VERSION = "foveasim sweep", 1
 #: Beginning of a journal: a checksum and the format.
 TRUNCATED_HEADER = rb'[0-9a-f]{1,8} \{"format": "foveasim'

@@ -10,8 +10,6 @@ from foveasim.explore.datasets.plan import DatasetSection
 from foveasim.explore.studies.plan import StudySection
 from foveasim.explore.sweeps.plan import SweepSection
 
-__all__ = ["schema_of"]
-
 #: Models of the file kinds; the first three depend on registered extensions.
 FILES: dict[str, Any] = {
     "shot": "shot",

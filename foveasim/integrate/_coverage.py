@@ -10,8 +10,6 @@ from foveasim._core.validation import Bools, Floats, read_only
 from foveasim._io.pickling import copyable
 from foveasim.fields import Grid
 
-__all__ = ["Coverage"]
-
 #: Tolerance for rounding errors of vertices outside the grid, relative to the largest grid coordinate.
 UNCOVERED_ROUNDING = 1e-12
 

@@ -29,23 +29,6 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = [
-    "COLUMN",
-    "CUT_ROW",
-    "N_PARTIAL",
-    "N_RUN",
-    "ROW",
-    "SITE",
-    "edges",
-    "find_reversed_edges",
-    "gather",
-    "measure_sites",
-    "scatter",
-    "sort_cuts",
-    "sort_spans",
-    "trace_sites",
-]
-
 #: Columns of ``spans``. A finished plan is in the order of the rows and has no column ``ROW``; its first column is the index of
 #: the accumulator instead of the site.
 SITE, COLUMN, N_PARTIAL, N_RUN, ROW = range(5)

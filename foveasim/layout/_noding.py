@@ -8,8 +8,6 @@ import shapely
 from foveasim._core.rings import next_vertex
 from foveasim._core.validation import Floats, Ints
 
-__all__ = ["ON_EDGE_UM", "insert_points", "merge_coincident_points", "node_edges", "points_on_edges"]
-
 #: Tolerance within which a point lies on an edge, and two points are the same.
 ON_EDGE_UM = 1e-6
 

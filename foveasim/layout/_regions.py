@@ -11,8 +11,6 @@ import shapely
 from foveasim._core.validation import MAX_LENGTH_UM, as_numbers, check_length_um, finite_array
 from foveasim.errors import ParameterError, printable, type_name
 
-__all__ = ["as_region", "disc", "parse_region", "region_as_plain_data"]
-
 #: Vertices of a polygonal disc, by default: its area is that of the circle within 7 ppm.
 DISC_CORNERS = 960
 #: Characters of an invalid text that messages show.

@@ -12,8 +12,6 @@ from torch import Tensor
 
 from foveasim.errors import ParameterError, type_name
 
-__all__ = ["as_array", "check_tensor", "constant"]
-
 
 def check_tensor(name: str, value: object, shape: Sequence[int | None], description: str = "") -> Tensor:
     """

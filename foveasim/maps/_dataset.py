@@ -14,8 +14,6 @@ from foveasim.maps._common import Found
 from foveasim.maps._formats import MAP_FORMATS
 from foveasim.maps._xarray import NAME, found_in_array, to_xarray
 
-__all__ = ["read_netcdf", "read_zarr", "write_netcdf", "write_zarr"]
-
 #: Upper bound of the size of headers and attributes in a netCDF file written here, without data and coordinates.
 NETCDF_BYTES = 2**16
 

@@ -17,8 +17,6 @@ from foveasim.fields import from_file_rows
 from foveasim.maps._common import Found
 from foveasim.maps._formats import MAP_FORMATS
 
-__all__ = ["read_mat5", "read_mat73"]
-
 #: Names of the struct in files of scripts and of vcExportObject.
 NAMES = ("oi", "opticalimage", "opticalImage")
 

@@ -12,8 +12,6 @@ from foveasim._io.formats import FormatError
 from foveasim.fields import PowerMap
 from foveasim.maps._common import Found
 
-__all__ = ["found_in_metadata", "map_metadata"]
-
 FILE_FORMAT = "foveasim power map"
 FILE_VERSION = 1
 #: Longer strings are not metadata of foveasim.

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import ArrayLike
 
-__all__ = ["NAME", "found_in_array", "from_xarray", "to_xarray"]
-
 #: Name of the map in a file with several arrays.
 NAME = "irradiance"
 #: Largest difference, in cells, of coordinates from the pitch and origin in attributes: rounding errors.

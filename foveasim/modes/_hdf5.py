@@ -17,8 +17,6 @@ from foveasim.errors import FileError, ParameterError
 from foveasim.layout import Layout
 from foveasim.layout.packed import layout_from_arrays, layout_to_arrays
 
-__all__ = ["EventFile", "max_file_bytes", "read_events"]
-
 FORMAT, VERSION = "foveasim events", 2
 #: Events, or milliseconds, per chunk.
 CHUNK = 1 << 16

@@ -27,8 +27,6 @@ from foveasim.optics._quadrature import Nodes, PupilEdges, joined, overlap_nodes
 from foveasim.optics.pupils import Annulus, Blades, Pupil, PupilImage, Slit, Spider
 from foveasim.units import um_from_nm
 
-__all__ = ["Aperture", "Wavefront"]
-
 #: Samples across an unaberrated aperture; the OTF is then accurate to 4e-4.
 MIN_ACROSS = 192
 #: Samples across the aperture per λN of geometric blur; the PSF at the blur radius is then too low by 1.3 %.

@@ -32,8 +32,6 @@ from foveasim.optics._aperture import Aperture
 from foveasim.optics._transform import Factor, Transform, source_pixels
 from foveasim.optics.otf import Tables
 
-__all__ = ["Imaging", "MapRows", "PatchExtent", "isoplanatic_error", "isoplanatic_maps", "reach_cells", "rows_of"]
-
 #: Function of (first, last) that returns the rows ``first`` to ``last - 1`` of a map.
 MapRows = Callable[[int, int], NDArray[Any]]
 

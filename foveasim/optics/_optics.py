@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from foveasim.optics._imaging import Imaging, MapRows
     from foveasim.optics._transform import Factor, Transform
 
-__all__ = ["Optics"]
-
 #: Fraction of the PSF energy outside the default padding radius.
 LOST_FRACTION = 0.01
 #: Fraction of the PSF energy that an isoplanatic patch may displace.

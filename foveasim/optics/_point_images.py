@@ -19,8 +19,6 @@ from foveasim.fields import Grid
 from foveasim.optics._aperture import Aperture
 from foveasim.optics.otf import circular_otf
 
-__all__ = ["Point", "PointImages", "PointSpread"]
-
 #: Default number of PSF samples along either axis, and their pitch in λN.
 PSF_POINTS, PSF_LAMBDA_N = 257, 0.125
 #: Minimum number of samples across the aperture for encircled and ensquared energy; halves the error of power maps.

@@ -22,8 +22,6 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats, Ints, finite_array
 from foveasim.errors import ParameterError
 
-__all__ = ["Nodes", "PupilEdges", "overlap_nodes", "plane_waves", "pupil_nodes"]
-
 #: Complex amplitude at points (x, y) of the aperture.
 Amplitude = Callable[[Floats, Floats], NDArray[np.complex128]]
 

@@ -30,8 +30,6 @@ from foveasim._core.work_arrays import work_array
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.optics.otf import MAX_ALIASES
 
-__all__ = ["Factor", "Transform", "source_pixels"]
-
 #: Callable of (first, last) that returns the columns of a transfer function, (last - first, n): real with the rows of
 #: frequencies >= 0 along y, or complex with all rows.
 Factor: TypeAlias = Callable[[int, int], NDArray[Any]]

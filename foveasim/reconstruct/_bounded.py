@@ -17,8 +17,6 @@ import numpy as np
 from foveasim._core.validation import Floats
 from foveasim.errors import SimulationError
 
-__all__ = ["minimise_nonnegative"]
-
 Operator = Callable[[Floats], Floats]
 
 

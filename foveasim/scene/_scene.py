@@ -40,8 +40,6 @@ from foveasim.scene.cubes import IlluminantTable, Invalid, Quantity, Selection, 
 from foveasim.scene.registry import SCENES
 from foveasim.units import m_from_um, um_from_m
 
-__all__ = ["FRAMINGS", "Fit", "Scene"]
-
 #: Framing of a picture on a layout.
 Fit: TypeAlias = Literal["cover", "contain", "width"]
 #: Parameters of which one determines the size of a scene.

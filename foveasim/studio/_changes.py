@@ -12,11 +12,6 @@ from foveasim.studio._controls import controls_of, value_at
 from foveasim.studio._files import Files, with_layout
 from foveasim.studio._templates import WITHOUT_MOSAIC
 
-__all__ = [
-    "ONCE", "changed_keys", "check_depth", "is_change", "is_draft", "is_frame", "key_of", "match_filters", "reset",
-    "string_of", "with_file",
-]  # fmt: skip
-
 #: Messages that change the settings.
 CHANGES = ("set", "reset", "delete", "undo", "redo", "preset", "restore", "file", "video", "frame", "match")
 #: Changes that advance a source of frames: newer ones do not stop their simulations.

@@ -22,8 +22,6 @@ from foveasim.explore.worker_cache import ShotRunner
 from foveasim.layout import Layout
 from foveasim.scene import Scene
 
-__all__ = ["Engine", "Simulated", "block_means"]
-
 #: Longer side of pictures where the page gives none.
 PICTURE_PIXELS = 512
 #: Largest difference of vertices of equal outlines: rounding of positions of a few millimetres.

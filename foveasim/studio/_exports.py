@@ -19,8 +19,6 @@ from foveasim.errors import FoveasimError, ParameterError, printable
 from foveasim.layout import Layout, write_layout
 from foveasim.studio._messages import to_json
 
-__all__ = ["archive", "notebook", "text_of", "without_directories"]
-
 #: Date of the files in archives, so that equal states have equal archives; the earliest that the format can represent.
 DATE = (1980, 1, 1, 0, 0, 0)
 #: Permissions of the files in archives: read by all, written by the owner.

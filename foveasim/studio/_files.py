@@ -21,8 +21,6 @@ from foveasim.config import (
 from foveasim.config._objects import BUNDLED_PICTURE, FILE_SETTINGS
 from foveasim.errors import FileError, ParameterError, printable
 
-__all__ = ["Files", "apply_preset", "file_name", "is_unused_or_copy", "presets", "start_settings", "unused_path"]
-
 #: Longest name and extension of an uploaded file.
 MAX_NAME_LENGTH, MAX_EXTENSION_LENGTH = 80, 8
 #: Characters that names of stored files do not contain.

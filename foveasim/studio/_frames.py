@@ -18,8 +18,6 @@ from foveasim._io.images import write_picture
 from foveasim._io.videos import SandboxedVideo
 from foveasim.errors import FileError, ParameterError
 
-__all__ = ["Frames", "camera_frame"]
-
 #: Largest size of the decoded frames that are stored for steps back.
 MAX_DECODED_BYTES = 64 << 20
 #: Largest number of pixels of a camera frame: three bytes per pixel and a header are one message of a page.

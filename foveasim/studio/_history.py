@@ -6,8 +6,6 @@ import copy
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["History"]
-
 #: Largest number of undo steps; earlier ones are discarded.
 MAX_STEPS = 1000
 

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from foveasim.errors import FileError, FoveasimError, ParameterError, printable
 
-__all__ = ["decode_part", "encode_part", "from_json", "is_answer_to_freeze", "one_line", "to_json"]
-
 #: Alignment of arrays in bytes: typed arrays of JavaScript require offsets that are multiples of their item size.
 ALIGNMENT = 8
 #: Longest message of an error.

@@ -34,8 +34,6 @@ from foveasim.studio._frames import camera_frame
 from foveasim.studio._messages import is_answer_to_freeze, one_line
 from foveasim.studio._session import MAX_SESSION_BYTES, Session, Start
 
-__all__ = ["UNSPECIFIED", "Studio", "host_names", "serve"]
-
 #: Largest uploaded file.
 MAX_FILE_BYTES = 64 << 20
 #: Largest message of a page.

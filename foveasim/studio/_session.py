@@ -46,8 +46,6 @@ from foveasim.studio._parts import PARTS, summary_of
 from foveasim.studio._variants import with_n_sites
 from foveasim.studio._views import Views
 
-__all__ = ["MAX_SESSION_BYTES", "Session", "Start"]
-
 #: Size limit of all uploaded files.
 MAX_SESSION_BYTES = 512 << 20
 #: Largest number of messages that wait.

@@ -15,8 +15,6 @@ from foveasim.fields import Grid
 from foveasim.layout import LAYOUTS, Layout
 from foveasim.studio._engine import Simulated
 
-__all__ = ["compare", "fovea_um", "with_n_sites"]
-
 #: Side of the compared pictures, pixels.
 N_PIXELS = 160
 #: Half side of the fovea as a fraction of that of the field.

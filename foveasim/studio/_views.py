@@ -15,8 +15,6 @@ from foveasim.studio._engine import PICTURE_PIXELS, Simulated
 from foveasim.studio._messages import encode_part
 from foveasim.studio._parts import PARTS
 
-__all__ = ["Views"]
-
 #: Parts that are sent first and together: sites, and their values.
 FIRST = ("sites", "columns")
 #: Limit of the longer side of pictures.

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from foveasim.view.site_colours import Rgb, SiteColours, as_fractions
 
-__all__ = ["Label", "add_strip", "strip_width_px"]
-
 #: Height of text as a fraction of that of the picture, and its smallest number of pixels.
 TEXT_FRACTION, MIN_TEXT_PX = 0.027, 12.0
 #: Widths of a colour bar with its numbers, and of a character, in heights of text.

@@ -20,8 +20,6 @@ from foveasim._core.calls.kinds import Kind, check_kind, kind_of, resolve_annota
 from foveasim._core.names import did_you_mean
 from foveasim.errors import ArgumentError
 
-__all__ = ["check_arguments", "check_public_calls"]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 #: Characters of a signature in a message; optional parameters beyond are replaced by "...".

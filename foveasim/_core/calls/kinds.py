@@ -29,8 +29,6 @@ from numpy.typing import ArrayLike
 from foveasim._core.names import did_you_mean, list_names
 from foveasim.errors import ParameterError, type_name, with_article
 
-__all__ = ["Kind", "OwnCheck", "check_kind", "kind_of", "resolve_annotation"]
-
 T = TypeVar("T")
 OWN_CHECK = "checked by the call"
 #: Annotation of a parameter whose call checks the kind of its values itself, with a message of its own.

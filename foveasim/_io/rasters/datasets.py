@@ -25,8 +25,6 @@ from foveasim._io.rasters.labels import X, Y
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["HDF5_MAGIC", "NETCDF3_MAGICS", "is_zarr", "open_netcdf", "open_zarr", "select_array"]
-
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 NETCDF3_MAGICS = (b"CDF\x01", b"CDF\x02")
 ZARR_FILES = ("zarr.json", ".zgroup", ".zarray", ".zattrs", ".zmetadata")

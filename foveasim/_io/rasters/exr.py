@@ -16,8 +16,6 @@ from foveasim._io.formats import FormatError
 from foveasim._io.rasters import MAX_BANDS, check_size
 from foveasim._io.rasters.units import length_in_um, round_factor
 
-__all__ = ["MAGIC", "POLARISATION", "ExrHeader", "band_of_channel", "read_channels", "read_header"]
-
 MAGIC = b"\x76\x2f\x31\x01"
 #: Channel of a band: optional layer, wavelength and unit. A layer is not a number: ``550.5nm`` has none.
 CHANNEL = re.compile(

@@ -24,8 +24,6 @@ from foveasim._core.names import possible_names
 from foveasim._io.formats import FormatError
 from foveasim._io.rasters import check_size, max_decompressed_bytes
 
-__all__ = ["MAT5_MAGIC", "MAT73_MAGIC", "IsetStruct", "MatFile", "find_struct", "open_mat5", "open_mat73"]
-
 MAT5_MAGIC, MAT73_MAGIC = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
 #: Fields of ISETCam structs with photons and wavelengths.
 PHOTONS, WAVES = ("data/photons", "photons"), ("spectrum/wave", "wave", "data/wave")

@@ -13,8 +13,6 @@ from foveasim._core.validation import Ints
 from foveasim.errors import GeometryError
 from foveasim.layout.model import Layout
 
-__all__ = ["SLIVER", "concatenate_layouts", "replace_sites", "separate_parts"]
-
 #: Area of a piece, relative to its site, below which it is a rounding artefact of the cut.
 SLIVER = 1e-9
 

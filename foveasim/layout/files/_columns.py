@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 
 from foveasim._core.validation import Bools, Ints, exact_integers
 
-__all__ = ["CHANNEL", "MAX_COLUMN_BYTES", "column_strings", "linear_text", "parse_columns", "storable_columns"]
-
 #: Column that GDSII and OASIS store as the datatype.
 CHANNEL = "channel"
 #: Maximum number of columns of a file.

@@ -19,22 +19,6 @@ from foveasim._io.formats import FileFormat
 from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.layout.model import Layout
 
-__all__ = [
-    "FORMATS",
-    "WrittenLayout",
-    "check_decompressed",
-    "check_header",
-    "check_site_count",
-    "check_sizes",
-    "header",
-    "layout_from_untrusted",
-    "lossless_report",
-    "max_decompressed_bytes",
-    "restore_column",
-    "rounding_report",
-    "string_column",
-]
-
 #: Formats of layout files. ``read(path, **options)`` returns a :class:`foveasim.Layout`, ``write(layout, path, **options)`` a
 #: :class:`foveasim.layout.WrittenLayout`. Installed packages add formats as entry points of the group ``foveasim.formats``.
 FORMATS: Registry[FileFormat] = Registry("layout format", "foveasim.formats")

@@ -22,8 +22,6 @@ from foveasim.errors import ParameterError
 from foveasim.layout.files._hierarchy import congruence_classes
 from foveasim.layout.model import Layout
 
-__all__ = ["DERIVED_LAYERS", "LayoutLayer", "PlacedShapes", "shapes_of_layout", "shapes_of_sites"]
-
 #: Corners are extended by at most this multiple of the offset.
 MITRE_LIMIT = 100.0
 #: Vertices are compared in units far below any database unit.

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["FormatError", "read"]
-
 #: Prefix of cells that KLayout adds for its own metadata.
 KLAYOUT_METADATA = "$$$CONTEXT_INFO$$$"
 #: Number of names in a message.

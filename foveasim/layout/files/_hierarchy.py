@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from foveasim._core.rings import positions_in_runs
 from foveasim._core.validation import Ints
 
-__all__ = ["Arrays", "concatenate", "congruence_classes", "find_arrays", "single_sites"]
-
 #: Maximum number of columns and of rows of an array in GDSII.
 MAX_ARRAY_SIDE = 32767
 #: Integers below this limit are exact as steps of an array; columns with larger ones count as constant.

@@ -20,8 +20,6 @@ from foveasim._core.validation import Floats, Ints
 from foveasim.layout.files._common import check_sizes
 from foveasim.layout.model import Layout, valid_sites
 
-__all__ = ["hole_free_rings", "without_keyholes"]
-
 Point: TypeAlias = tuple[float, float]
 
 #: Maximum number of vertices after noding an outline with slits, as a multiple of its own.

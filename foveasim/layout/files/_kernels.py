@@ -7,8 +7,6 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = ["progressions", "walk_records"]
-
 _bytes = types.Array(types.uint8, 1, "C", readonly=True)
 _flags = types.Array(types.boolean, 1, "C", readonly=True)
 

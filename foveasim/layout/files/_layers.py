@@ -31,18 +31,6 @@ from foveasim._core.validation import check_count
 from foveasim.errors import ConfigError, ParameterError
 from foveasim.layout.files._derived import DERIVED_LAYERS, LayoutLayer
 
-__all__ = [
-    "FILTER_NAMES",
-    "DrawnLayer",
-    "LayerNumber",
-    "layer_options",
-    "parse_channels",
-    "parse_layer",
-    "parse_layer_map",
-    "parse_selection",
-    "read_layer_map",
-]
-
 #: Layer and datatype; None for any datatype.
 LayerNumber: TypeAlias = tuple[int, int | None]
 

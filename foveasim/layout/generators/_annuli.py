@@ -11,8 +11,6 @@ import numpy as np
 
 from foveasim._core.validation import Floats, Ints, read_only
 
-__all__ = ["MIN_SITES_PER_RHO", "Annuli", "Fovea", "Ring", "annuli", "fovea_rings", "ring_outlines"]
-
 #: Minimum number of sites of a ring of the fovea, per unit of its radius.
 MIN_SITES_PER_RHO = 3
 #: Number of circles that are cached: those between rings of equal sectors are of at most two kinds, in alternation.

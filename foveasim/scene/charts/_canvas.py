@@ -23,18 +23,6 @@ from foveasim.errors import ParameterError, SamplingWarning
 from foveasim.scene._scene import MAX_DISTANCE_M, MAX_PITCH_UM, MAX_RADIANCE, Scene, band_widths_nm
 from foveasim.units import m_from_um
 
-__all__ = [
-    "Canvas",
-    "Fractions",
-    "OneOrMore",
-    "add_rectangle",
-    "check_contrast",
-    "half_plane",
-    "ink_to_white",
-    "interval",
-    "sample_means",
-]
-
 #: A number, or one for each wavelength.
 OneOrMore = float | Sequence[float]
 Fractions = NDArray[np.float32]

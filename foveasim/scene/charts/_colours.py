@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike
 from foveasim._core.validation import Floats, read_only
 from foveasim.scene._illuminants import interpolate_table, read_table
 
-__all__ = ["PATCH_NAMES", "nonnegative_factors", "patch_reflectance"]
-
 #: Names of the patches, row by row from the upper left.
 PATCH_NAMES = (
     *("dark skin", "light skin", "blue sky", "foliage", "blue flower", "bluish green"),

@@ -22,8 +22,6 @@ from foveasim.scene.charts._canvas import (
 )
 from foveasim.scene.registry import chart
 
-__all__ = ["BarElement", "bar_elements", "bars", "checkerboard", "letter_f", "slanted_edge"]
-
 Ink = Literal["dark", "bright"]
 
 #: Elements per group; the ratio of successive frequencies is the sixth root of 2.

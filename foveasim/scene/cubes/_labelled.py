@@ -23,8 +23,6 @@ from foveasim.scene.cubes._formats import CUBE_FORMATS
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["cube_of_array", "read_netcdf", "read_zarr"]
-
 
 def read_netcdf(path: Path, name: str | None) -> Cube:
     """Read the named variable, or the only one of three dimensions."""

@@ -22,8 +22,6 @@ from foveasim._io.rasters.mat import MAT5_MAGIC, MAT73_MAGIC, MatFile, find_stru
 from foveasim.scene.cubes._cube import Cube
 from foveasim.scene.cubes._formats import CUBE_FORMATS
 
-__all__ = ["read_mat5", "read_mat73"]
-
 SCENE = ("scene",)
 WAVELENGTHS = (
     *("wavelength_nm", "wavelengths_nm", "wavelengths", "wavelength", "waves", "wave", "wl", "lambda", "lambdas"),

@@ -29,8 +29,6 @@ from foveasim._io.rasters import MAX_BANDS
 from foveasim.errors import ParameterError
 from foveasim.scene.cubes._cube import Cube
 
-__all__ = ["Invalid", "Selection", "interpolation_weights", "select"]
-
 #: Treatment of NaN, infinite, negative and missing values.
 Invalid: TypeAlias = Literal["raise", "zero"]
 #: Values that are converted at a time.

@@ -17,8 +17,6 @@ from foveasim.view.notebook._blocks import Html, picture
 from foveasim.view.plots.rules import MAX_SHOWN, RULE_COLOURS
 from foveasim.view.site_colours import BACKGROUND, BOUNDARY, Rgb, SiteColours, colours_of
 
-__all__ = ["THUMBNAIL_PIXELS", "encode_png", "report_thumbnail", "site_thumbnail", "thumbnail"]
-
 #: Longer side of a thumbnail, and the largest size of its file.
 THUMBNAIL_PIXELS, MAX_BYTES = 280, 45_000
 #: Shorter side of a thumbnail of a narrow layout.

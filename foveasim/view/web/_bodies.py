@@ -21,8 +21,6 @@ from foveasim.layout import Layout
 from foveasim.view.meshes import Mesh
 from foveasim.view.web._pack import back_references, to_smallest_type
 
-__all__ = ["bodies_of"]
-
 #: Largest number of lattice steps along the longest side of all surfaces: differences are exact in int32.
 MAX_STEPS = 2**30
 #: Smallest number of lattice steps: the resolution of float32.

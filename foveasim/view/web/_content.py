@@ -31,8 +31,6 @@ from foveasim.view.site_pictures import site_picture
 from foveasim.view.web._pack import back_references, to_smallest_type
 from foveasim.view.web._shapes import shapes_of
 
-__all__ = ["Content", "content_of", "describe_sites", "outlines_of", "rules_of"]
-
 #: Columns of a second capture.
 SECOND = ("picture", "code", "electrons", "expected_e", "snr")
 #: Longer side of the picture.

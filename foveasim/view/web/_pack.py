@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from foveasim._core.validation import Ints
 
-__all__ = ["back_references", "pack", "to_smallest_type"]
-
 #: Higher levels take several times longer and save a few per cent.
 GZIP_LEVEL = 5
 

@@ -22,8 +22,6 @@ from foveasim.layout import Layout, Report
 from foveasim.view.web._content import Content, content_of
 from foveasim.view.web._pack import pack
 
-__all__ = ["assemble_page", "bundle", "check_page_path", "page_of", "part", "web_page", "write_web_page"]
-
 #: File extensions of pages.
 EXTENSIONS = (".html", ".htm")
 #: Content security policy: only embedded scripts and style, identified by checksums, and embedded pictures.

@@ -11,8 +11,6 @@ from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.layout import Layout
 from foveasim.view.meshes import delaunay, triangle_fans
 
-__all__ = ["Shapes", "shapes_of"]
-
 #: Tolerance for reversed triangles of a fan, as a fraction of the site's area.
 ROUNDING = 1e-12
 
