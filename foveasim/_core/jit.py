@@ -169,8 +169,6 @@ def compile_kernels(*, n_workers: int | None = None) -> int:
     ------
     FileError
         When machine code cannot be stored, or corrupt machine code cannot be replaced.
-    ParameterError
-        When ``n_workers`` is not a positive integer.
 
     Examples
     --------

@@ -57,11 +57,6 @@ class Streams:
     first_block : int
         Number of the first block of sites, at least 0: for part of a layout.
 
-    Raises
-    ------
-    ParameterError
-        When a value is negative or not an integer.
-
     Notes
     -----
     A stream depends only on (seed, frame, name of the effect), not on the order of calls or on the number of threads or

@@ -78,11 +78,6 @@ class Camera:
     n_threads : int, optional
         Number of threads, by default one per core. Results are bit-identical for any number.
 
-    Raises
-    ------
-    ParameterError
-        When an argument has another type.
-
     Warns
     -----
     CoverageWarning
@@ -371,11 +366,6 @@ class Camera:
         Return a camera with other optics, another sensor, or both.
 
         Compiled layouts are shared when the new sensor has the same layout object.
-
-        Raises
-        ------
-        ParameterError
-            When an argument has another type.
         """
         other = Camera(
             optics=self._optics if optics is None else optics,

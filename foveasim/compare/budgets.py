@@ -59,11 +59,6 @@ def budget_of(camera: Camera, frames_per_s: float) -> Budget:
     ----------
     camera : Camera
     frames_per_s : float, 1/s
-
-    Raises
-    ------
-    ParameterError
-        When an argument is invalid.
     """
     if not isinstance(camera, Camera):
         raise ParameterError("camera", f"must be a foveasim.Camera, got {type_name(camera)}")

@@ -30,11 +30,6 @@ def starting_file(kind: str) -> str:
     Parameters
     ----------
     kind : {"shot", "layout", "rules", "sweep", "study", "dataset"}
-
-    Raises
-    ------
-    ParameterError
-        When ``kind`` is none of these.
     """
     check_choice("kind", kind, STARTING_FILES)
     text = (files("foveasim.config") / "starting_files" / f"{kind}.yaml").read_text(encoding="utf-8")
@@ -74,8 +69,6 @@ def write_starting_file(kind: str, path: str | Path | None = None, *, force: boo
 
     Raises
     ------
-    ParameterError
-        When ``kind`` is none of these.
     FileError
         When the file exists, or cannot be written.
     """

@@ -153,11 +153,6 @@ class PolynomialFisheye(_AngularLens):
     centre_um : (x, y), µm
         Intersection of the optical axis with the sensor plane.
 
-    Raises
-    ------
-    ParameterError
-        If a value is out of range.
-
     Notes
     -----
     The model is valid up to the angle at which the height stops increasing, at most 90°.

@@ -28,11 +28,6 @@ def schema_of(kind: str) -> dict[str, Any]:
     Parameters
     ----------
     kind : {"shot", "layout", "rules", "sweep", "study", "dataset"}
-
-    Raises
-    ------
-    ParameterError
-        When ``kind`` is none of these.
     """
     check_choice("kind", kind, FILES)
     return schema(FILES[kind], f"foveasim {kind}")

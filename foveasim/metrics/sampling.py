@@ -62,11 +62,6 @@ def nyquist_per_mm(
     nyquist : (n_site,) float64, 1/mm
         Line pairs per mm. NaN without suitable neighbours, as in a single row, or with coincident sites.
 
-    Raises
-    ------
-    ParameterError
-        When an option is invalid.
-
     Examples
     --------
     >>> from foveasim.layout import grid, hexagonal

@@ -139,11 +139,6 @@ class EventPixels(_Pixels):
     floor_e_per_s : float, e-/s
         Rate added to the photocurrent of every site, so that the logarithm is finite at zero irradiance.
 
-    Raises
-    ------
-    ParameterError
-        When a value is out of range.
-
     Notes
     -----
     The logarithm L(t) of the photocurrent I is interpolated linearly between frames, and event times are the threshold

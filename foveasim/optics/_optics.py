@@ -134,11 +134,6 @@ class Optics(PointImages):
     precision : {"single", "double"}
         Precision of the Fourier transforms and the maps.
 
-    Raises
-    ------
-    ParameterError
-        When a value is out of range.
-
     Notes
     -----
     Each cell of a map contains the *mean* irradiance over the cell: the point spread function is integrated exactly over

@@ -180,11 +180,6 @@ class PointImages:
         PointSpread
             Samples of the PSF, normalised to unit energy (1/µm²).
 
-        Raises
-        ------
-        ParameterError
-            When a value is out of range.
-
         Notes
         -----
         The amplitude is integrated over the pupil by Gauss quadrature between the edges of the pupil. For the pupils of this
@@ -228,11 +223,6 @@ class PointImages:
         -------
         otf : array of the same shape, complex128
             ``∫ PSF(r) exp(-2πi f·r) dr``, 1 at zero frequency.
-
-        Raises
-        ------
-        ParameterError
-            When a value is out of range.
 
         Notes
         -----

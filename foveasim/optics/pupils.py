@@ -56,11 +56,6 @@ class Annulus:
     ----------
     obscuration : float
         Radius of the obscuration over the aperture radius, 0 to 0.999.
-
-    Raises
-    ------
-    ParameterError
-        When the value is out of range.
     """
 
     obscuration: float
@@ -92,11 +87,6 @@ class Spider:
         Width of a vane over the aperture diameter, 0 to 1.
     angle_deg : float, degrees
         Direction of the first vane, counter-clockwise from the x axis.
-
-    Raises
-    ------
-    ParameterError
-        When a value is out of range.
     """
 
     n_vanes: int
@@ -137,11 +127,6 @@ class Blades:
         Number of blades, at least 3.
     angle_deg : float, degrees
         Direction of the first vertex, counter-clockwise from the x axis.
-
-    Raises
-    ------
-    ParameterError
-        When a value is out of range.
     """
 
     n_blades: int
@@ -179,11 +164,6 @@ class Slit:
         Width over the aperture diameter, above 0 and at most 1.
     angle_deg : float, degrees
         Direction of the slit's long side, counter-clockwise from the x axis.
-
-    Raises
-    ------
-    ParameterError
-        When a value is out of range.
     """
 
     width_fraction: float

@@ -105,11 +105,6 @@ def blur_kernel(
     kernel : (2 radius + 1, 2 radius + 1) float64
         Normalised to a sum of 1, which redistributes the energy outside the kernel.
 
-    Raises
-    ------
-    ParameterError
-        When a value is out of range.
-
     Notes
     -----
     On the optical axis: field-dependent aberrations are those of the field centre. The PSF is sampled at λN/4 or finer, and

@@ -81,11 +81,6 @@ class SensorStack:
     n_lens_corners : int
         Minimum number of vertices of a lens outline, which becomes rounder toward the apex. 0 uses the vertices of the site,
         and its shape from rim to apex.
-
-    Raises
-    ------
-    ParameterError
-        When a number is out of range.
     """
 
     well_depth_um: float = 3.0

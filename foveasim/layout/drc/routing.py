@@ -33,11 +33,6 @@ class Readout:
         Time without data as a fraction of the time with data, such as 0.2.
     n_lanes : int
         Number of output lanes, with equal data rates.
-
-    Raises
-    ------
-    ParameterError
-        When a number is out of range.
     """
 
     frames_per_s: float
@@ -78,11 +73,6 @@ class Routing:
         Number of metal layers for the lines.
     direction : {"outwards", "upwards"}
         Direction of the lines: radially away from the optical axis (sectors), or along y (columns).
-
-    Raises
-    ------
-    ParameterError
-        When a number is out of range.
     """
 
     width_um: float

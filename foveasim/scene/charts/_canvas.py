@@ -51,11 +51,6 @@ class Canvas:
     wavelength_nm : sequence, nm
     band_width_nm : number or sequence or None, nm
         As for :meth:`Scene.from_picture`.
-
-    Raises
-    ------
-    ParameterError
-        If a value is out of range.
     """
 
     shape: tuple[int, int]

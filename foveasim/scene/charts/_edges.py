@@ -159,11 +159,6 @@ def slanted_edge(
     -------
     scene : Scene
         One basis image.
-
-    Raises
-    ------
-    ParameterError
-        If a value is out of range.
     """
     canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
     contrast = check_contrast(contrast)

@@ -58,11 +58,6 @@ def sine(
     scene : Scene
         One basis image.
 
-    Raises
-    ------
-    ParameterError
-        If a value is out of range.
-
     Warns
     -----
     SamplingWarning

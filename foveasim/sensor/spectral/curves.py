@@ -87,11 +87,6 @@ class ConstantCurve(CurveBase):
     ----------
     value : float
         Value at all wavelengths, from 0 to 1.
-
-    Raises
-    ------
-    ParameterError
-        If the value is out of range.
     """
 
     value: float = 1.0
@@ -116,11 +111,6 @@ class GaussianCurve(CurveBase):
         Centre wavelength and full width at half maximum.
     peak : float
         Value at the centre.
-
-    Raises
-    ------
-    ParameterError
-        If a value is out of range.
     """
 
     centre_nm: float
