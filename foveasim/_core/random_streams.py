@@ -48,17 +48,9 @@ class Streams:
     """
     Random streams of one frame.
 
-    Parameters
-    ----------
-    seed : int
-        Seed of the run, at least 0.
-    frame : int
-        Index of the frame, at least 0.
-    first_block : int
-        Number of the first block of sites, at least 0: for part of a layout.
+    ``seed``: seed of the run, at least 0. ``frame``: index of the frame, at least 0. ``first_block``: number of the first
+    block of sites, at least 0: for part of a layout.
 
-    Notes
-    -----
     A stream depends only on (seed, frame, name of the effect), not on the order of calls or on the number of threads or
     processes. The draws of a site depend on its index in the layout, not on the number of sites.
 

@@ -392,12 +392,8 @@ class PictureFormat(FileFormat):
     """
     A format of written pictures; entry of :data:`PICTURE_FORMATS`.
 
-    Parameters
-    ----------
-    types : tuple of str
-        Types of the numbers that the format stores; the first is the default.
-    has_alpha : bool
-        Whether the format stores the coverage of pixels.
+    ``types``: types of the numbers that the format stores; the first is the default. ``has_alpha``: whether the format stores
+    the coverage of pixels.
     """
 
     types: tuple[str, ...] = ("uint8",)

@@ -25,21 +25,8 @@ class VideoFile:
     """
     Decoded frames of a video file, before conversion to pixels.
 
-    Parameters
-    ----------
-    path : Path
-
-    Attributes
-    ----------
-    frame_s : float or None, s
-        Frame period.
-    n_frames : int or None
-        Number of frames according to the file, which may be wrong.
-
-    Raises
-    ------
-    FileError
-        When the file is not a readable video, or the extra ``video`` is not installed.
+    ``frame_s`` (float or None, s): frame period. ``n_frames``: number of frames according to the file, which may be wrong.
+    Raises FileError when the file is not a readable video, or the extra ``video`` is not installed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -129,10 +116,7 @@ class SandboxedVideo:
 
     The number of frames is that of the encoded ones.
 
-    Raises
-    ------
-    FileError
-        When the file is not a readable video, or exceeds a limit.
+    Raises FileError when the file is not a readable video, or exceeds a limit.
     """
 
     def __init__(self, path: Path) -> None:

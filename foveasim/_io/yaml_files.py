@@ -102,7 +102,7 @@ def position_of(path: Path, keys: Sequence[str], *, is_exact: bool = False) -> t
     Return the line and column of a key in a YAML file, from 1.
 
     ``keys``: keys, and indices of lists. ``is_exact``: whether the file must contain the key; by default the position is that
-    of the innermost section with it. Returns ``position`` (line, column) or None: none when the file cannot be read, or does
+    of the innermost section with it. Returns ``position`` (line, column) or None: None when the file cannot be read, or does
     not contain the key.
     """
     try:

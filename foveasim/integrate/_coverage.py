@@ -20,14 +20,9 @@ class Coverage:
     """
     Position of sites relative to a grid and to the image circle.
 
-    Attributes
-    ----------
-    bounds_um : (x_min, y_min, x_max, y_max), µm
-        Bounds of all outlines inside the image circle; NaN without any.
-    uncovered_um2 : (n_site,) float64, µm²
-        Area of each site outside the grid or the image circle; without memory if all are 0.
-    is_outside : (n_site,) bool
-        Sites with a vertex outside the image circle; without memory if there are none.
+    ``bounds_um`` (x_min, y_min, x_max, y_max), µm: bounds of all outlines inside the image circle; NaN without any.
+    ``uncovered_um2`` (n_site,) float64, µm²: area of each site outside the grid or the image circle; without memory if all are
+    0. ``is_outside`` (n_site,) bool: sites with a vertex outside the image circle; without memory if there are none.
     """
 
     bounds_um: tuple[float, float, float, float]

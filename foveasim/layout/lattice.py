@@ -25,12 +25,8 @@ class RectangleLattice:
     Site ``row * n_columns + column`` is the rectangle ``x_um[column]`` by ``y_um[row]``. Vertices are computed on demand, so
     that the memory of a dense sensor does not depend on the number of its sites.
 
-    Parameters
-    ----------
-    x_um : (n_column, 2) float64, µm
-        Lower and upper x of the sites of each column.
-    y_um : (n_row, 2) float64, µm
-        Lower and upper y of the sites of each row.
+    ``x_um`` (n_column, 2) float64, µm: lower and upper x of the sites of each column. ``y_um`` (n_row, 2) float64, µm: lower
+    and upper y of the sites of each row.
     """
 
     x_um: Floats

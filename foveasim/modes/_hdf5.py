@@ -49,14 +49,8 @@ class EventFile:
     """
     Writer of events to an open HDF5 file.
 
-    Parameters
-    ----------
-    file : h5py.File
-        File that is open for writing.
-    layout : Layout
-        Layout of the photosites.
-    x, y : (n_site,) uint16
-        Address of each site.
+    ``file``: file that is open for writing. ``layout``: layout of the photosites. ``x``, ``y`` (n_site,) uint16: address of
+    each site.
     """
 
     def __init__(self, file: Any, layout: Layout, x: NDArray[np.uint16], y: NDArray[np.uint16]) -> None:

@@ -108,14 +108,8 @@ class Aperture:
     """
     Amplitude transmission and wavefront of an aperture.
 
-    Attributes
-    ----------
-    pupils : sequence of callables
-        Amplitude transmissions, multiplied; 0 outside the unit circle.
-    wavefronts : sequence of Wavefront
-        Path differences, added.
-    defocus_um : float, µm
-        Path difference at the edge of the aperture; proportional to the squared radius.
+    ``pupils``: amplitude transmissions, multiplied; 0 outside the unit circle. ``wavefronts``: path differences, added.
+    ``defocus_um`` (float, µm): path difference at the edge of the aperture; proportional to the squared radius.
     """
 
     pupils: Sequence[Pupil]

@@ -16,10 +16,6 @@ class BoundedCache:
 
     Values that have not been used recently are discarded, and computed again when required. Reading a stored value takes no
     lock. Neither the lock nor the values are part of the state: copies and pickles are empty.
-
-    Parameters
-    ----------
-    max_values : int
     """
 
     def __init__(self, max_values: int) -> None:

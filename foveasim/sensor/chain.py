@@ -103,10 +103,7 @@ class ChargeCheck(_Deterministic):
     """
     Check that charges are at least a limit, in e-, and not NaN.
 
-    Raises
-    ------
-    ParameterError
-        With the name of the charges and the smallest one of the block.
+    Raises ParameterError with the name of the charges and the smallest one of the block.
     """
 
     def __init__(self, name: str, at_least: float) -> None:

@@ -38,12 +38,7 @@ class Device:
     """
     Source of the fixed patterns of a device.
 
-    Parameters
-    ----------
-    seed : int
-        Seed of the device.
-    layout : packed rings with ``columns``
-        Sites of the device.
+    ``seed``: seed of the device. ``layout`` (packed rings with ``columns``): sites of the device.
     """
 
     seed: int

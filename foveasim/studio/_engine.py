@@ -86,12 +86,8 @@ class Engine:
 
     Layout, scene, optics, distortion, compiled outlines, optical images and power on sites are cached by their settings.
 
-    Parameters
-    ----------
-    n_threads : int, optional
-        Number of threads; one per core by default.
-    check : callable, optional
-        Called before each stage; it may raise an exception to stop the simulation.
+    ``n_threads``: number of threads; one per core by default. ``check``: called before each stage; it may raise an exception
+    to stop the simulation.
     """
 
     def __init__(self, *, n_threads: int | None = None, check: Callable[[], None] | None = None) -> None:

@@ -95,14 +95,8 @@ class Files:
 
     These are pictures of scikit-image, uploaded files, files of the initial settings, and files in their directory.
 
-    Parameters
-    ----------
-    start : mapping
-        The initial settings, with absolute paths.
-    directory : Path, optional
-        Directory of the settings file.
-    uploads : Path
-        Directory of the uploaded files.
+    ``start``: the initial settings, with absolute paths. ``directory``: directory of the settings file. ``uploads``: directory
+    of the uploaded files.
     """
 
     def __init__(self, start: Mapping[str, Any], directory: Path | None, uploads: Path) -> None:

@@ -55,12 +55,7 @@ class Frames:
     The settings contain a fixed path, :attr:`path`. Its file is written when it is required; simulations read the current frame
     from another file, whose name differs for each frame.
 
-    Parameters
-    ----------
-    uploads : Path
-        Directory of uploaded files.
-    new_path : function of a name
-        Returns an unused path there.
+    ``uploads``: directory of uploaded files. ``new_path``: returns an unused path there.
     """
 
     def __init__(self, uploads: Path, new_path: Callable[[str], Path]) -> None:
@@ -84,7 +79,7 @@ class Frames:
         """
         Open a video file at its first frame.
 
-        Returns ``is_video``: false for a single frame, which is a picture. Raises FileError when the file is not a video, is
+        Returns ``is_video``: False for a single frame, which is a picture. Raises FileError when the file is not a video, is
         corrupt, or the extra ``video`` is not installed.
         """
         video = SandboxedVideo(path)

@@ -16,10 +16,7 @@ class History:
 
     A draft is a state while a control is dragged: it is not an undo step.
 
-    Parameters
-    ----------
-    start : mapping
-        Initial settings.
+    ``start``: initial settings.
     """
 
     def __init__(self, start: Mapping[str, Any]) -> None:

@@ -81,13 +81,7 @@ class Session:
     """
     Settings of a page with history, and a thread that simulates them.
 
-    Parameters
-    ----------
-    name : str
-        Identifier.
-    start : Start
-    n_threads : int, optional
-        Number of threads of the simulation.
+    ``name``: identifier. ``n_threads``: number of threads of the simulation.
     """
 
     def __init__(self, name: str, start: Start, *, n_threads: int | None = None) -> None:

@@ -28,14 +28,8 @@ class Views:
     """
     Selected views, and what was sent of them.
 
-    Parameters
-    ----------
-    send : function of a message
-        Receives parts as bytes, and errors as dicts.
-    line : function of an exception
-        Returns its message in one line.
-    costs : Costs
-        Receives the times of views; slow ones are left out during drags.
+    ``send``: receives parts as bytes, and errors as dicts. ``line``: returns its message in one line. ``costs``: receives the
+    times of views; slow ones are left out during drags.
     """
 
     def __init__(

@@ -34,12 +34,7 @@ class SiteImage(AxesImage):
 
     Pixels are exact area-weighted means, as in :func:`foveasim.view.site_picture`.
 
-    Parameters
-    ----------
-    ax : matplotlib axes
-        With linear scales.
-    layout : Layout
-    colours : SiteColours
+    ``ax``: with linear scales.
     """
 
     def __init__(self, ax: Axes, layout: Layout, colours: SiteColours) -> None:

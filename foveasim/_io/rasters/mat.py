@@ -41,15 +41,9 @@ class MatFile:
     """
     An open MAT file.
 
-    Attributes
-    ----------
-    names : list of str
-        Variables.
-    shapes : dict
-        Shapes of the variables that are plain numeric arrays, in the order of MATLAB.
-    read : function
-        Function that returns a variable, or a field such as ``oi/optics/focalLength``; None if it is missing or not an array of
-        numbers or text.
+    ``names``: variables. ``shapes``: shapes of the variables that are plain numeric arrays, in the order of MATLAB. ``read``:
+    function that returns a variable, or a field such as ``oi/optics/focalLength``; None if it is missing or not an array of
+    numbers or text.
     """
 
     names: list[str]
@@ -131,14 +125,9 @@ class IsetStruct:
     """
     An optical image or a scene of ISETCam.
 
-    Attributes
-    ----------
-    photons : (n_row, n_column[, n_wave])
-        Photon rates per nm, top row first.
-    wavelength_nm, band_width_nm : list of float, nm
-        None if missing. A single wavelength has a band width of 1 nm, as ISETCam's ``bin width``.
-    field : function
-        Function that returns a field by its path, as :attr:`MatFile.read`.
+    ``photons`` (n_row, n_column[, n_wave]): photon rates per nm, top row first. ``wavelength_nm``, ``band_width_nm`` (list of
+    float, nm): None if missing. A single wavelength has a band width of 1 nm, as ISETCam's ``bin width``. ``field``: function
+    that returns a field by its path, as :attr:`MatFile.read`.
     """
 
     photons: NDArray[Any]

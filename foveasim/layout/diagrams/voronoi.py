@@ -99,18 +99,9 @@ class IncrementalCells:
     Unordered edges are sufficient for areas and masses, and faster to compute than rings. Parts of cells that notches of the
     region separate are assigned to neighbours as in :func:`voronoi_cells`, and have edges of their own.
 
-    Parameters
-    ----------
-    region : shapely Polygon, µm
-        Convex or concave.
-    mass_of : callable, optional
-        Returns the masses (n,) of n polygons from their edges. Of a cell that a notch divides, the heaviest part is then
-        the cell; otherwise the part that contains the centre.
-
-    Attributes
-    ----------
-    centres_um : (n, 2) float64, µm
-        The centres of the last update.
+    ``region`` (shapely Polygon, µm): convex or concave. ``mass_of``: returns the masses (n,) of n polygons from their edges.
+    Of a cell that a notch divides, the heaviest part is then the cell; otherwise the part that contains the centre.
+    ``centres_um`` (n, 2) float64, µm: the centres of the last update.
     """
 
     def __init__(self, region: shapely.Polygon, mass_of: MassOf | None = None) -> None:

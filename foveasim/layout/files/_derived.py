@@ -69,12 +69,8 @@ class PlacedShapes:
     """
     Shapes that are repeated at several positions.
 
-    Attributes
-    ----------
-    polygons : (n,) geometries, µm
-    shape : (m,) int64
-        Index of the polygon at each position.
-    position_um : (m, 2) float64, µm
+    ``polygons``: (n,) geometries, µm. ``shape`` (m,) int64: index of the polygon at each position. ``position_um``: (m, 2)
+    float64, µm.
     """
 
     polygons: NDArray[Any]

@@ -288,14 +288,8 @@ class _Selected:
     A filter with the outline of a photosite in the same cell covers no other photosite. It is not expanded with the
     hierarchy: its index is an attribute of the photosite.
 
-    Attributes
-    ----------
-    polygons, paths : list
-        The filters that are not attributes follow the photosites.
-    filters : list of int
-        Filter of each polygon, -1 for none.
-    copies : list of int
-        Number of repetitions of each polygon.
+    ``polygons``, ``paths``: the filters that are not attributes follow the photosites. ``filters``: filter of each polygon, -1
+    for none. ``copies``: number of repetitions of each polygon.
     """
 
     def __init__(self, cell: Any, is_site: set[tuple[int, int]], filter_of: dict[tuple[int, int], int]) -> None:

@@ -119,10 +119,7 @@ class _Document:
 
     As Python objects, all features together would require ten times the memory of their text.
 
-    Attributes
-    ----------
-    members : dict
-        Members of the collection other than the features.
+    ``members``: members of the collection other than the features.
     """
 
     def __init__(self, path: Path) -> None:
