@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from foveasim.optics._imaging import Imaging, MapRows
     from foveasim.optics._transform import Factor, Transform
 
+__all__ = ["Optics"]
+
 #: Fraction of the PSF energy outside the default padding radius.
 LOST_FRACTION = 0.01
 #: Fraction of the PSF energy that an isoplanatic patch may displace.
@@ -133,6 +135,11 @@ class Optics(PointImages):
         Width of the padding; by default approximately the radius of 99 % encircled energy.
     precision : {"single", "double"}
         Precision of the Fourier transforms and the maps.
+
+    Raises
+    ------
+    ParameterError
+        When a value is out of range.
 
     Notes
     -----

@@ -143,9 +143,18 @@ def check_plausible(name: str, value: object, *, class_name: str = "") -> float:
     """
     Return the value as a float after checking its plausible range.
 
-    ``name``: keyword, a key of :data:`LIMITS`. ``class_name``: class of the keyword, for keywords that are prefixed with their
-    class in the table. Raises ParameterError if the value is not one finite number, or outside the range; the message states
-    range and unit.
+    Parameters
+    ----------
+    name : str
+        Keyword, a key of :data:`LIMITS`.
+    value : object
+    class_name : str
+        Class of the keyword, for keywords that are prefixed with their class in the table.
+
+    Raises
+    ------
+    ParameterError
+        If the value is not one finite number, or outside the range; the message states range and unit.
     """
     limits = LIMITS[f"{class_name}.{name}" if class_name else name]
     number = check_number(name, value, above=0.0 if limits.is_positive else None, at_least=0.0, hint=limits.hint)
@@ -157,8 +166,18 @@ def check_plausible_array(name: str, value: ArrayLike, *, ndim: int | None = Non
     """
     Return the values as a float64 array after checking their plausible range.
 
-    ``name``: keyword, a key of :data:`LIMITS`. ``ndim``: required number of dimensions; any by default. Raises ParameterError
-    if a value is not finite, or outside the range; the message states the index of the first such value.
+    Parameters
+    ----------
+    name : str
+        Keyword, a key of :data:`LIMITS`.
+    value : array_like
+    ndim : int, optional
+        Required number of dimensions; any by default.
+
+    Raises
+    ------
+    ParameterError
+        If a value is not finite, or outside the range; the message states the index of the first such value.
     """
     limits = LIMITS[name]
     at_least = 0.0 if limits.low >= 0.0 else None

@@ -20,6 +20,8 @@ from foveasim._core.calls.kinds import Kind, check_kind, kind_of, resolve_annota
 from foveasim._core.names import did_you_mean
 from foveasim.errors import ArgumentError
 
+__all__ = ["check_arguments", "check_public_calls"]
+
 P = ParamSpec("P")
 R = TypeVar("R")
 #: Characters of a signature in a message; optional parameters beyond are replaced by "...".
@@ -38,6 +40,12 @@ def check_arguments(call: Callable[P, R]) -> Callable[P, R]:
     """
     Return a function that raises an error for arguments outside its signature.
 
+    Parameters
+    ----------
+    call : function
+
+    Notes
+    -----
     A valid call takes 1 to 2 µs longer, and lists of numbers a time in proportion to their length; the annotations are read at
     the first call.
     """

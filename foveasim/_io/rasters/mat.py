@@ -24,6 +24,8 @@ from foveasim._core.names import possible_names
 from foveasim._io.formats import FormatError
 from foveasim._io.rasters import check_size, max_decompressed_bytes
 
+__all__ = ["MAT5_MAGIC", "MAT73_MAGIC", "IsetStruct", "MatFile", "find_struct", "open_mat5", "open_mat73"]
+
 MAT5_MAGIC, MAT73_MAGIC = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
 #: Fields of ISETCam structs with photons and wavelengths.
 PHOTONS, WAVES = ("data/photons", "photons"), ("spectrum/wave", "wave", "data/wave")
@@ -41,9 +43,15 @@ class MatFile:
     """
     An open MAT file.
 
-    ``names``: variables. ``shapes``: shapes of the variables that are plain numeric arrays, in the order of MATLAB. ``read``:
-    function that returns a variable, or a field such as ``oi/optics/focalLength``; None if it is missing or not an array of
-    numbers or text.
+    Attributes
+    ----------
+    names : list of str
+        Variables.
+    shapes : dict
+        Shapes of the variables that are plain numeric arrays, in the order of MATLAB.
+    read : function
+        Function that returns a variable, or a field such as ``oi/optics/focalLength``; None if it is missing or not an array of
+        numbers or text.
     """
 
     names: list[str]
@@ -125,9 +133,14 @@ class IsetStruct:
     """
     An optical image or a scene of ISETCam.
 
-    ``photons`` (n_row, n_column[, n_wave]): photon rates per nm, top row first. ``wavelength_nm``, ``band_width_nm`` (list of
-    float, nm): None if missing. A single wavelength has a band width of 1 nm, as ISETCam's ``bin width``. ``field``: function
-    that returns a field by its path, as :attr:`MatFile.read`.
+    Attributes
+    ----------
+    photons : (n_row, n_column[, n_wave])
+        Photon rates per nm, top row first.
+    wavelength_nm, band_width_nm : list of float, nm
+        None if missing. A single wavelength has a band width of 1 nm, as ISETCam's ``bin width``.
+    field : function
+        Function that returns a field by its path, as :attr:`MatFile.read`.
     """
 
     photons: NDArray[Any]
@@ -151,9 +164,19 @@ def find_struct(file: MatFile, name: str | None, known: tuple[str, ...], what: s
 
     Without either, the variables ``data`` and ``photons`` are its fields.
 
-    ``known``: names in files of ISETCam; the first one is the usual name. ``what``, ``cure``: kind of the struct and the
-    function that computes it, for messages. Raises FormatError if the file does not contain the struct, or its photons are
-    invalid.
+    Parameters
+    ----------
+    file : MatFile
+    name : str, optional
+    known : tuple of str
+        Names in files of ISETCam; the first one is the usual name.
+    what, cure : str
+        Kind of the struct and the function that computes it, for messages.
+
+    Raises
+    ------
+    FormatError
+        If the file does not contain the struct, or its photons are invalid.
     """
     struct = next((one for one in (known if name is None else (name,)) if one in file.names), None)
     if struct is None and (name is not None or not {"data", "photons"} & set(file.names)):

@@ -14,6 +14,8 @@ from foveasim._io.formats import FormatError
 from foveasim._io.rasters.units import length_in_um
 from foveasim.errors import ParameterError
 
+__all__ = ["Cube", "Quantity"]
+
 #: Physical quantity of the values of a cube.
 Quantity: TypeAlias = Literal["radiance", "reflectance"]
 #: Relative tolerance of square pixels: positions may be float32.

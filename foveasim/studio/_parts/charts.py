@@ -17,6 +17,8 @@ from foveasim.studio._engine import Simulated
 from foveasim.studio._parts.registry import PartData, capture_of, curves_of, part
 from foveasim.units import per_mm_from_per_um, photon_energy_j
 
+__all__ = ["mtf", "noise", "spectrum"]
+
 #: Wavelengths of the spectrum: the first range that all curves of the sensor cover; else the bands of the scene.
 RANGES_NM = ((350.0, 1000.0), (400.0, 1000.0), (380.0, 780.0), (400.0, 700.0))
 N_WAVELENGTHS = 131

@@ -7,6 +7,8 @@ from foveasim.studio._engine import Simulated
 from foveasim.studio._parts.registry import PartData, part
 from foveasim.studio._variants import compare
 
+__all__ = ["comparison"]
+
 
 @part("A and B", lambda result: (result.capture, result.frozen and result.frozen.capture))
 def comparison(result: Simulated) -> PartData:

@@ -13,6 +13,8 @@ from foveasim.sensor.signal_to_noise import signal_to_noise
 from foveasim.studio._engine import Simulated
 from foveasim.studio._parts.registry import PartData, capture_of, curves_of, part
 
+__all__ = ["photon_transfer", "snr"]
+
 #: Number of levels of a curve.
 N_LEVELS = 129
 #: Lowest signal, e-; highest relative to the full range of a photosite.

@@ -15,6 +15,8 @@ from foveasim.studio._engine import Simulated, block_means
 from foveasim.studio._parts.registry import PartData, part
 from foveasim.view.site_colours import encode_light
 
+__all__ = ["picture", "scene"]
+
 #: Fraction of the cells of an optical image that are not brighter than white.
 WHITE_QUANTILE = 0.995
 #: Levels of linear light in the table of sRGB bytes.

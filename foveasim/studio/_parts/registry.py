@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from foveasim._core.short_repr import short_repr
 from foveasim.studio._engine import Simulated
 
+__all__ = ["PARTS", "Part", "PartData", "capture_of", "curves_of", "layout_of", "part"]
+
 #: Data of a part: plain data, and arrays by name.
 PartData = tuple[dict[str, Any], dict[str, NDArray[Any]]]
 

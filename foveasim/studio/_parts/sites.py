@@ -12,6 +12,8 @@ from foveasim.studio._engine import Simulated
 from foveasim.studio._parts.registry import PartData, capture_of, layout_of, part
 from foveasim.view.web._content import describe_sites, outlines_of, rules_of
 
+__all__ = ["columns", "rules", "sites", "summary_of"]
+
 
 @part("Photosites", layout_of)
 def sites(result: Simulated) -> PartData:

@@ -11,6 +11,8 @@ from foveasim.studio._parts.registry import PartData, layout_of, part
 from foveasim.view.solids import SensorStack, Solids, solids
 from foveasim.view.web._bodies import bodies_of
 
+__all__ = ["stack"]
+
 #: Largest number of photosites whose layers are shown: those nearest to the centre of the layout.
 MAX_STACK_SITES = 20_000
 #: Stacks with decreasing demands on the shape of photosites, and what they lack.
