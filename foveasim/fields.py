@@ -157,11 +157,6 @@ class Grid:
     origin_um : (x0, y0), µm
         Lower left corner of cell [0, 0].
 
-    Raises
-    ------
-    ParameterError
-        When a value is out of range.
-
     Examples
     --------
     >>> grid = Grid(shape=(2, 4), pitch_um=0.5, origin_um=(-1.0, -0.5))

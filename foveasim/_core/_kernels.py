@@ -15,18 +15,6 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = [
-    "BATCH",
-    "add_normals",
-    "count_ray_intersections",
-    "fill_normals",
-    "fill_uniforms",
-    "philox_2x32",
-    "philox_4x32",
-    "philox_4x64",
-    "uniform",
-]
-
 #: Multipliers and Weyl increments of Philox 4x64.
 _M0, _M1 = np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157)
 _W0, _W1 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBB67AE8584CAA73B)
@@ -128,8 +116,6 @@ def fill_normals(key, batch, words, out):
     generation of random normal deviates (Ann. Math. Statist. 29, 1958): the radius is ``sqrt(-2 ln u)`` with u from one word,
     so that numbers are below 6.8. Of a second word, 30 bits are the angle in the first quadrant, and two bits the signs.
 
-    Notes
-    -----
     With the angle ``pi/4 + a`` and ``r = sqrt(-ln u)``, the pair is ``r (cos a + sin a)`` and ``r (cos a - sin a)``: ``a`` is
     at most pi/4, so sine and cosine need no range reduction. Logarithm, sine and cosine are evaluated by sums and products in a
     fixed order: the compiler vectorises them, and results are bit-identical on every machine.

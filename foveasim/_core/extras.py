@@ -8,8 +8,6 @@ from typing import Any
 
 from foveasim.errors import FileError, ParameterError
 
-__all__ = ["EXTRA_OF", "import_optional", "needs"]
-
 #: Smallest extra that installs each optional module.
 EXTRA_OF = {
     "OpenEXR": "pictures",

@@ -26,8 +26,6 @@ from foveasim._core.threads import ForkSafeLock, cached_property, thread_count
 from foveasim._core.validation import check_count
 from foveasim.errors import FileError
 
-__all__ = ["Kernel", "compile_kernels", "compile_named", "kernel_modules", "njit"]
-
 _log = logging.getLogger("foveasim")
 #: The package, whose modules ``_*kernels`` contain the kernels.
 PACKAGE = Path(__file__).parents[1]
@@ -52,22 +50,11 @@ def njit(
     code is stored in the temporary directory. Machine code that numba cannot read, for example after a full disk or a crash, is
     deleted and compiled again.
 
-    Parameters
-    ----------
-    signature : numba type or list of them, optional
-        Argument types, which differ in the dtypes of arrays. Without it, the function can be called by kernels only, and is
-        inlined in them.
-    allocates : bool, optional
-        Whether the function creates arrays; by default True with a signature, and False without. Otherwise arrays are not
-        reference-counted in it, which in a loop takes more time than the loop itself: each assignment of an array, and each
-        use in a branch, is an atomic operation.
-    **options
-        Further options of :func:`numba.njit`.
-
-    Returns
-    -------
-    Callable
-        That decorates: it returns a :class:`Kernel`, or a function of numba for kernels.
+    ``signature`` (numba type or list of them): argument types, which differ in the dtypes of arrays. Without it, the function
+    can be called by kernels only, and is inlined in them. ``allocates``: whether the function creates arrays; by default True
+    with a signature, and False without. Otherwise arrays are not reference-counted in it, which in a loop takes more time than
+    the loop itself: each assignment of an array, and each use in a branch, is an atomic operation. ``**options``: further
+    options of :func:`numba.njit`. The decorator returns a :class:`Kernel`, or a function of numba for kernels.
     """
     if signature is None:
         import numba
@@ -184,8 +171,6 @@ def compile_kernels(*, n_workers: int | None = None) -> int:
     ------
     FileError
         When machine code cannot be stored, or corrupt machine code cannot be replaced.
-    ParameterError
-        When ``n_workers`` is not a positive integer.
 
     Examples
     --------

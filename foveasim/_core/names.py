@@ -10,8 +10,6 @@ from pathlib import Path
 
 from foveasim.errors import printable
 
-__all__ = ["closest_name", "did_you_mean", "list_names", "missing_path", "possible_names"]
-
 #: Longest complete list of names in a message; of longer lists, it contains the closest names and the total number.
 MAX_LISTED = 16
 #: Similarity of names, 0 to 1, from which one is suggested for the other, as in :func:`difflib.get_close_matches`.
@@ -67,12 +65,7 @@ def list_names(names: Collection[str], name: object = "") -> str:
     """
     Return a list of names for a message.
 
-    Parameters
-    ----------
-    names : collection of str
-        More than ``MAX_LISTED`` names are reduced to the closest ones, in the given order.
-    name : object
-        The unknown name.
+    ``names``: more than ``MAX_LISTED`` names are reduced to the closest ones, in the given order. ``name``: the unknown name.
 
     Examples
     --------
@@ -105,16 +98,8 @@ def missing_path(path: Path, kind: str = "file") -> str:
     """
     Return the problem of a path that is not an existing file or directory.
 
-    Parameters
-    ----------
-    path : Path
-    kind : str
-        Expected kind of the path: ``"file"``, ``"directory"``, ``"file or directory"``.
-
-    Returns
-    -------
-    problem : str
-        Such as ``no such file; did you mean 'photo.jpg'?``, with the closest name in the same directory.
+    ``kind``: expected kind of the path: ``"file"``, ``"directory"``, ``"file or directory"``. Returns ``problem``: such as
+    ``no such file; did you mean 'photo.jpg'?``, with the closest name in the same directory.
     """
     try:
         if path.exists():

@@ -21,9 +21,6 @@ import numpy as np
 from foveasim._core.validation import own
 from foveasim._version import __version__
 
-__all__ = ["copy_plain_data", "differences", "find_user_module", "identify", "is_digest", "to_plain_data", "versions"]
-
-
 #: Arrays up to this size are stored as lists; larger arrays as shape, dtype and checksum.
 MAX_LISTED_VALUES = 64
 _ATOMS = frozenset({str, int, float, bool, type(None)})

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from foveasim._core.calls import NOT_NEGATIVE, Declared
 
-__all__ = ["Streams", "derive_seed", "fixed_pattern_key", "random_key"]
-
 
 def fixed_pattern_key(seed: int, effect: str) -> tuple[np.uint64, np.uint64]:
     """Return the generator key for the fixed pattern of an effect in a device."""
@@ -51,22 +49,9 @@ class Streams(Declared):
     """
     Random streams of one frame.
 
-    Parameters
-    ----------
-    seed : int
-        Seed of the run, at least 0.
-    frame : int
-        Index of the frame, at least 0.
-    first_block : int
-        Number of the first block of sites, at least 0: for part of a layout.
+    ``seed``: seed of the run, at least 0. ``frame``: index of the frame, at least 0. ``first_block``: number of the first
+    block of sites, at least 0: for part of a layout.
 
-    Raises
-    ------
-    ParameterError
-        When a value is negative or not an integer.
-
-    Notes
-    -----
     A stream depends only on (seed, frame, name of the effect), not on the order of calls or on the number of threads or
     processes. The draws of a site depend on its index in the layout, not on the number of sites.
 

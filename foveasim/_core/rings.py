@@ -30,24 +30,6 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.validation import Bools, Floats, Ints, read_only
 from foveasim.errors import ParameterError
 
-__all__ = [
-    "SITE_ID",
-    "TIE_FRACTION",
-    "are_convex",
-    "collapse_short_edges",
-    "from_frame",
-    "next_vertex",
-    "positions_in_runs",
-    "ring_moments",
-    "ring_unsigned_area_um2",
-    "same_rings",
-    "site_area_um2",
-    "site_bounds_um",
-    "site_ids",
-    "site_moments",
-    "to_frame",
-]
-
 #: Distances of sites that differ by less than this fraction are equal: rounding of coordinates of a few millimetres.
 TIE_FRACTION = 1e-6
 
@@ -131,15 +113,9 @@ def ring_moments(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Floats]:
     """
     Return the signed area and the first moments of every ring.
 
-    Returns
-    -------
-    area_um2 : (n_ring,) float64, µm²
-        Shoelace formula; positive for counter-clockwise rings.
-    moment_um3 : (n_ring, 2) float64, µm³
-        Integral of x and y over the ring: centroid times area.
+    Returns ``area_um2`` (n_ring,) float64, µm²: shoelace formula; positive for counter-clockwise rings. ``moment_um3``
+    (n_ring, 2) float64, µm³: integral of x and y over the ring: centroid times area.
 
-    Notes
-    -----
     Computed relative to the first vertex of each ring, which avoids cancellation for small rings far from the origin.
     """
     if ring_offsets.size == 1:
@@ -172,8 +148,6 @@ def are_convex(xy_um: Floats, ring_offsets: Ints) -> Bools:
     """
     Return whether each ring is strictly convex, (n_ring,) bool, in either orientation.
 
-    Notes
-    -----
     A closed polyline whose turning angles have one sign and add up to a single revolution is convex, and so does not intersect
     itself. Turning angles below 1e-12 rad may be rounding errors: rings with such a vertex are not counted as convex.
     """
@@ -247,19 +221,9 @@ def site_ids(layout: Any) -> Ints:
     """
     Return the identity of each site.
 
-    Parameters
-    ----------
-    layout : packed rings, optionally with ``columns``
-
-    Returns
-    -------
-    ids : (n_site,) int64
-        The column ``site_id``, or positions: equal numbers for equal sites of any layouts.
-
-    Raises
-    ------
-    ParameterError
-        When the column ``site_id`` does not contain integers.
+    ``layout``: packed rings, optionally with ``columns``. Returns ``ids`` (n_site,) int64: the column ``site_id``, or
+    positions: equal numbers for equal sites of any layouts. Raises ParameterError when the column ``site_id`` does not contain
+    integers.
     """
     from foveasim._core import _kernels
 

@@ -10,8 +10,6 @@ import numpy as np
 
 from foveasim.errors import format_value
 
-__all__ = ["format_field", "short_repr"]
-
 #: Characters of a representation, and of the value of a field.
 MAX_REPR, MAX_FIELD = 200, 60
 #: Largest number of elements of an array that is written as a list.

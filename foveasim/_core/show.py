@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from pyvista import PolyData  # noqa: TID251 -- a type alone
 
-__all__ = ["Drawn", "drawn"]
-
 R = TypeVar("R")
 #: First parameter of a numpydoc section, with its description.
 FIRST_PARAMETER = re.compile(r"(\n *Parameters\n *-+\n)( *)\S.*\n(?:\2 +.*\n|\n(?=\2 ))*")
@@ -111,10 +109,7 @@ def drawn(name: str) -> Drawn[Any]:
     Lower modules thereby draw their objects without importing the package, which is loaded on use. Signature and docstring are
     those of the function, without its first parameter.
 
-    Parameters
-    ----------
-    name : str
-        Name of the function.
+    ``name``: name of the function.
 
     Examples
     --------

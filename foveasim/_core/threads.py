@@ -14,8 +14,6 @@ from weakref import WeakSet
 
 from foveasim._core.validation import check_count
 
-__all__ = ["ForkSafeLock", "cached_property", "in_order", "parallel_map", "thread_count"]
-
 #: Smallest size of the thread pool: users may request more threads than there are cores.
 MIN_POOL_THREADS = 8
 #: Upper limit, above the number of cores of any machine.
@@ -74,10 +72,7 @@ def thread_count(n_threads: int | None = None) -> int:
     """
     Return the number of threads to use, by default all cores available to this process.
 
-    Raises
-    ------
-    ParameterError
-        When ``n_threads`` is not an integer from 1 to 4096.
+    Raises ParameterError when ``n_threads`` is not an integer from 1 to 4096.
     """
     if n_threads is not None:
         return check_count("n_threads", n_threads, at_most=MAX_THREADS)

@@ -19,8 +19,6 @@ from numpy.typing import DTypeLike, NDArray
 
 from foveasim._core.threads import ForkSafeLock
 
-__all__ = ["release_memory", "share_heap", "work_array"]
-
 #: Smaller arrays are allocated as usual: the allocator reuses their memory.
 MIN_BYTES = 1 << 20
 #: Options of mallopt of the C library of GNU: M_ARENA_MAX, the number of heaps; M_MMAP_THRESHOLD, the size of blocks outside

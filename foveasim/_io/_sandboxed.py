@@ -16,8 +16,6 @@ import sys
 import warnings
 from typing import Any, BinaryIO
 
-__all__ = ["deny_system_calls", "limit"]
-
 #: Names of the exceptions that readers raise to reject a file; other exceptions mean that the file is corrupt.
 REJECTIONS = {"FoveasimError", "FormatError"}
 

@@ -14,8 +14,6 @@ from typing import IO
 
 from foveasim.errors import FileError, disk_problem
 
-__all__ = ["atomic_directory", "atomic_write", "check_free_space", "lock", "remove_directory"]
-
 #: A disk with less free space than one block is full.
 FULL_DISK_BYTES = 4096
 #: Waiting times before each attempt to remove a directory.
@@ -62,10 +60,8 @@ def atomic_directory(target: Path, *, is_ours: Callable[[Path], bool]) -> Iterat
 
     If the block fails, the temporary directory is removed.
 
-    Raises
-    ------
-    FileError
-        When the target exists and ``is_ours`` is false for it, its parent directory does not exist, or writing fails.
+    Raises FileError when the target exists and ``is_ours`` is false for it, its parent directory does not exist, or writing
+    fails.
     """
     token = secrets.token_hex(8)
     new, old = (target.with_name(f".foveasim-{token}-{label}{target.suffix}") for label in ("new", "old"))
@@ -109,17 +105,8 @@ def check_free_space(path: Path, n_bytes: int) -> None:
     """
     Check that the disk has space for a file, before a library that crashes on a full disk.
 
-    Parameters
-    ----------
-    path : Path
-        An existing file.
-    n_bytes : int
-        Size of the file after writing.
-
-    Raises
-    ------
-    OSError
-        When the disk has too little free space, or the size exceeds the file size limit of the process.
+    ``path``: an existing file. ``n_bytes``: size of the file after writing. Raises OSError when the disk has too little free
+    space, or the size exceeds the file size limit of the process.
     """
     if n_bytes > _file_size_limit():
         raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))

@@ -8,8 +8,6 @@ import numpy as np
 
 from foveasim._core.validation import Floats
 
-__all__ = ["Encoding", "decode", "encode_srgb_values"]
-
 #: sRGB (photographs), the square root of the radiance (the paper), linear radiance.
 Encoding = Literal["srgb", "sqrt", "linear"]
 

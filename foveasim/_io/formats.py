@@ -12,17 +12,6 @@ from foveasim._core.names import did_you_mean, missing_path, possible_names
 from foveasim._core.short_repr import short_repr
 from foveasim.errors import FileError, FoveasimError, ParameterError
 
-__all__ = [
-    "FileFormat",
-    "FormatError",
-    "as_file_error",
-    "detect_format",
-    "one_line",
-    "read_head",
-    "select_writer",
-    "validate_options",
-]
-
 #: Size limit of files that are read.
 MAX_FILE_BYTES = 8 * 2**30
 HEAD_BYTES = 1024
@@ -131,10 +120,7 @@ def read_head(path: Path) -> bytes:
     """
     Return the first bytes of a file.
 
-    Raises
-    ------
-    FileError
-        When the file is missing, unreadable, empty or too large.
+    Raises FileError when the file is missing, unreadable, empty or too large.
     """
     try:
         if not path.is_file():

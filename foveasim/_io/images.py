@@ -34,19 +34,6 @@ from foveasim.errors import FileError, disk_problem
 if TYPE_CHECKING:
     from PIL import Image
 
-__all__ = [
-    "PICTURE_EXTENSIONS",
-    "PICTURE_FORMATS",
-    "PictureFormat",
-    "check_picture_size",
-    "picture_format",
-    "picture_names",
-    "pixels_of_image",
-    "pixels_of_page",
-    "read_picture",
-    "write_picture",
-]
-
 #: Larger pictures are rejected: 2**28 pixels are 3 GiB as three float32 channels.
 MAX_PIXELS = 2**28
 #: Limits of decompressed EXR data: for small files, and per byte of larger ones, the maximum ratio of deflate.
@@ -113,24 +100,11 @@ def read_picture(path: str | Path) -> NDArray[Any]:
     """
     Read a picture file.
 
-    Parameters
-    ----------
-    path : path
-        PNG, JPEG, TIFF, WebP, BMP, GIF, PPM, JPEG 2000, Radiance HDR; with the extra ``pictures`` also EXR.
+    ``path``: PNG, JPEG, TIFF, WebP, BMP, GIF, PPM, JPEG 2000, Radiance HDR; with the extra ``pictures`` also EXR. Returns
+    ``picture`` (n_y, n_x) or (n_y, n_x, n_channel), uint8, uint16 or float32: top row first; 1 to 4 channels: grey, grey and
+    alpha, colour, colour and alpha. Palettes are converted to colours, and the orientation tag is applied. Raises FileError
+    when the file is missing, not a picture, truncated, too large, or contains several pictures.
 
-    Returns
-    -------
-    picture : (n_y, n_x) or (n_y, n_x, n_channel), uint8, uint16 or float32
-        Top row first; 1 to 4 channels: grey, grey and alpha, colour, colour and alpha. Palettes are converted to colours, and
-        the orientation tag is applied.
-
-    Raises
-    ------
-    FileError
-        When the file is missing, not a picture, truncated, too large, or contains several pictures.
-
-    Notes
-    -----
     Bit errors are detected in formats with checksums: PNG, and EXR and TIFF with deflate compression. EXR is read in the
     sandbox process, because corrupt files can crash its library.
     """
@@ -196,10 +170,7 @@ def pixels_of_image(image: Image.Image) -> NDArray[Any]:
     """
     Convert an image of Pillow to an array as in :func:`read_picture`.
 
-    Raises
-    ------
-    Exception
-        Of any type, when the file is corrupt or the mode cannot be converted.
+    Raises Exception of any type, when the file is corrupt or the mode cannot be converted.
     """
     image.load()  # Pillow applies the orientation of TIFF on load and removes the tag
     orientation = _orientation(image)
@@ -318,17 +289,8 @@ def pixels_of_page(path: Path, page: Any) -> NDArray[Any]:
     """
     Return the pixels of a TIFF page, after checking that the file contains all of them.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    page : tifffile.TiffPage
-        Page of the open file; tifffile would read missing data as 0.
-
-    Raises
-    ------
-    FileError
-        When a strip or tile is outside the file or missing in the metadata.
+    ``path``: the file. ``page``: page of the open file; tifffile would read missing data as 0. Raises FileError when a strip
+    or tile is outside the file or missing in the metadata.
     """
     n_bytes = path.stat().st_size
     segments = list(zip(page.dataoffsets, page.databytecounts, strict=False))
@@ -416,10 +378,7 @@ def check_picture_size(path: Path, width: int, height: int) -> None:
     """
     Check the picture size in a file header, before memory is allocated.
 
-    Raises
-    ------
-    FileError
-        When the number of pixels exceeds ``MAX_PIXELS``.
+    Raises FileError when the number of pixels exceeds ``MAX_PIXELS``.
     """
     if width * height > MAX_PIXELS:
         raise FileError(path, f"has {width} x {height} pixels, more than the limit of {MAX_PIXELS}")
@@ -433,12 +392,8 @@ class PictureFormat(FileFormat):
     """
     A format of written pictures; entry of :data:`PICTURE_FORMATS`.
 
-    Parameters
-    ----------
-    types : tuple of str
-        Types of the numbers that the format stores; the first is the default.
-    has_alpha : bool
-        Whether the format stores the coverage of pixels.
+    ``types``: types of the numbers that the format stores; the first is the default. ``has_alpha``: whether the format stores
+    the coverage of pixels.
     """
 
     types: tuple[str, ...] = ("uint8",)
@@ -448,10 +403,7 @@ class PictureFormat(FileFormat):
         """
         Check that the format can store an array.
 
-        Raises
-        ------
-        FileError
-            When it cannot.
+        Raises FileError when it cannot.
         """
         n_channels = (picture.shape[2:] or (1,))[0]
         if picture.dtype.name not in self.types or picture.ndim not in (2, 3) or 0 in picture.shape or n_channels > 4:
@@ -535,10 +487,7 @@ def picture_format(path: str | Path) -> PictureFormat:
     """
     Return the format that has the extension of a file.
 
-    Raises
-    ------
-    FileError
-        When no format has it; the message lists the extensions.
+    Raises FileError when no format has it; the message lists the extensions.
     """
     found = select_writer(Path(path), PICTURE_FORMATS)
     assert isinstance(found, PictureFormat)
@@ -549,18 +498,11 @@ def write_picture(path: str | Path, picture: NDArray[Any]) -> None:
     """
     Write a picture file atomically.
 
-    Parameters
-    ----------
-    path : path
-        The extension selects one of :data:`PICTURE_FORMATS`. ``.png`` and ``.tif`` store uint8 and uint16 losslessly; ``.tif``
-        and, with the extra ``pictures``, ``.exr`` store float32 losslessly, including NaN; other formats store uint8.
-    picture : (n_y, n_x) or (n_y, n_x, n_channel) uint8, uint16 or float32
-        Top row first; grey, grey and alpha, colour, or colour and alpha.
-
-    Raises
-    ------
-    FileError
-        When the extension is unknown, the format does not support the array, or the file cannot be written.
+    ``path``: the extension selects one of :data:`PICTURE_FORMATS`. ``.png`` and ``.tif`` store uint8 and uint16 losslessly;
+    ``.tif`` and, with the extra ``pictures``, ``.exr`` store float32 losslessly, including NaN; other formats store uint8.
+    ``picture`` (n_y, n_x) or (n_y, n_x, n_channel) uint8, uint16 or float32: top row first; grey, grey and alpha, colour, or
+    colour and alpha. Raises FileError when the extension is unknown, the format does not support the array, or the file cannot
+    be written.
     """
     target = Path(path)
     chosen = picture_format(target)

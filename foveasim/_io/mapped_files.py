@@ -23,8 +23,6 @@ from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Images
 from foveasim.errors import FileError
 
-__all__ = ["check_unchanged", "in_memory", "map_file", "range_and_values", "remember_range", "value_range"]
-
 _Array = TypeVar("_Array", bound=NDArray[Any])
 
 #: Values whose range is computed at once, about 1 MB: within the second-level cache.
@@ -86,19 +84,8 @@ def map_file(path: Path, dtype: np.dtype[Any], shape: tuple[int, ...], offset: i
     """
     Map an array in a file of raw numbers into memory.
 
-    Parameters
-    ----------
-    path : Path
-    dtype : dtype
-    shape : tuple of int
-        Shape in C order.
-    offset : int, bytes
-        Position of the first number.
-
-    Returns
-    -------
-    array : shape, read-only
-        It and its views are accepted by :func:`check_unchanged` and :func:`in_memory`.
+    ``shape``: shape in C order. ``offset``: position of the first number. Returns ``array``: it and its views are accepted by
+    :func:`check_unchanged` and :func:`in_memory`.
     """
     return np.ndarray(shape, dtype, MappedFile.open(path), offset)
 
@@ -107,10 +94,8 @@ def check_unchanged(array: _Array) -> _Array:
     """
     Return the same array, after a check that the file it is mapped from has not changed.
 
-    Raises
-    ------
-    FileError
-        If the file of an array of :func:`map_file` has another size or time of modification than when it was opened.
+    Raises FileError if the file of an array of :func:`map_file` has another size or time of modification than when it was
+    opened.
     """
     mapped = _mapping(array)
     if mapped is not None:
@@ -124,16 +109,8 @@ def in_memory(array: NDArray[Any], seen: Callable[[NDArray[Any]], None] | None =
 
     The copy has the memory order of the file. It contains the values of the unchanged file, or the function raises.
 
-    Parameters
-    ----------
-    array : array
-    seen : function, optional
-        Is called with each part of a copy in some thread, while the part is in the cache of the processor.
-
-    Raises
-    ------
-    FileError
-        As :func:`check_unchanged`, also for changes while the file is read.
+    ``seen``: is called with each part of a copy in some thread, while the part is in the cache of the processor. Raises
+    FileError as :func:`check_unchanged`, also for changes while the file is read.
     """
     mapped = _mapping(array)
     if mapped is None:
@@ -197,15 +174,7 @@ def value_range(images: Images) -> tuple[float, float]:
 
     It is known for the arrays of :func:`remember_range`, in any order of their axes.
 
-    Parameters
-    ----------
-    images : (n_band, n_y, n_x)
-        Read band by band if it is mapped from a file.
-
-    Raises
-    ------
-    FileError
-        As :func:`in_memory`.
+    ``images`` (n_band, n_y, n_x): read band by band if it is mapped from a file. Raises FileError as :func:`in_memory`.
     """
     owner = _owner(images)
     known = _ranges.get(id(owner))

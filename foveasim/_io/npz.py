@@ -20,8 +20,6 @@ from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import as_file_error
 from foveasim.errors import FileError
 
-__all__ = ["open_archive", "read_archive", "read_array", "write_archive", "zip_members"]
-
 #: Name of the array that contains the metadata as JSON.
 ABOUT = "about"
 SUFFIX = ".npy"
@@ -39,21 +37,9 @@ def write_archive(
     """
     Write arrays and metadata atomically.
 
-    Parameters
-    ----------
-    path : path
-        File with the extension ``.npz``.
-    about : mapping
-        Metadata: plain data that JSON can represent.
-    arrays : mapping of str to array
-        Arrays by name.
-    is_compressed : bool
-        Whether to compress the arrays: smaller files, slower writes.
-
-    Raises
-    ------
-    FileError
-        When the extension is not ``.npz``, an array contains Python objects, or the file cannot be written.
+    ``path``: file with the extension ``.npz``. ``about``: metadata: plain data that JSON can represent. ``arrays``: arrays by
+    name. ``is_compressed``: whether to compress the arrays: smaller files, slower writes. Raises FileError when the extension
+    is not ``.npz``, an array contains Python objects, or the file cannot be written.
     """
     target = Path(path)
     if target.suffix.lower() != ".npz":
@@ -71,12 +57,8 @@ def read_archive(path: Path, *, max_bytes: int | None = None) -> tuple[Any, dict
     """
     Read the metadata, None if there are none, and the arrays of :func:`write_archive`.
 
-    Raises
-    ------
-    FileError
-        When the file would decompress to too many bytes, or has a compression method that numpy does not use.
-    Exception
-        Of any type, when the file is corrupt; :func:`open_archive` converts it to a FileError.
+    Raises FileError when the file would decompress to too many bytes, or has a compression method that numpy does not use.
+    Raises Exception of any type, when the file is corrupt; :func:`open_archive` converts it to a FileError.
     """
     limit = MAX_DECOMPRESSED_BYTES if max_bytes is None else max_bytes
     arrays = {}
@@ -97,19 +79,9 @@ def open_archive(
     """
     Yield the metadata and the arrays of a file; exceptions of the block become FileErrors.
 
-    Parameters
-    ----------
-    path : path
-        File that :func:`write_archive` wrote.
-    what : str
-        Expected kind of the file, for messages: ``"foveasim capture"``.
-    file_format, version
-        Required values of ``format`` and ``version`` in the metadata.
-
-    Raises
-    ------
-    FileError
-        When the file is missing, too large, corrupt, or of another format.
+    ``path``: file that :func:`write_archive` wrote. ``what``: expected kind of the file, for messages: ``"foveasim capture"``.
+    ``file_format``, ``version``: required values of ``format`` and ``version`` in the metadata. Raises FileError when the file
+    is missing, too large, corrupt, or of another format.
     """
     source = Path(path)
     if not source.is_file():
@@ -128,10 +100,7 @@ def zip_members(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, zipfile
     """
     Open a zip archive of arrays; yield it with its members by array name.
 
-    Raises
-    ------
-    FileError
-        When a member has a compression method that numpy does not use.
+    Raises FileError when a member has a compression method that numpy does not use.
     """
     with zipfile.ZipFile(path) as archive:
         items = {item.filename.removesuffix(SUFFIX): item for item in archive.infolist()}
@@ -148,19 +117,9 @@ def read_array(
 
     The check prevents allocations larger than the file.
 
-    Parameters
-    ----------
-    file : binary file
-        File in the ``.npy`` format.
-    n_bytes : int
-        Size of the file.
-    check : callable, optional
-        Function that receives shape and dtype before memory is allocated, and may raise.
-
-    Raises
-    ------
-    ValueError
-        When the header is invalid or does not match the size, or the array contains Python objects.
+    ``file``: file in the ``.npy`` format. ``n_bytes``: size of the file. ``check``: function that receives shape and dtype
+    before memory is allocated, and may raise. Raises ValueError when the header is invalid or does not match the size, or the
+    array contains Python objects.
     """
     version = npy.read_magic(file)
     if version not in ((1, 0), (2, 0)):

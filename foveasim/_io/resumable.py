@@ -11,8 +11,6 @@ from typing import IO
 from foveasim._io.atomic import lock, remove_directory
 from foveasim.errors import FileError
 
-__all__ = ["LOCK", "disk_errors", "finish", "partial_path", "resumable_directory"]
-
 #: File that is locked while a directory is written, and extension of incomplete files of zarr.
 LOCK, INCOMPLETE = "lock", ".partial"
 
@@ -34,26 +32,10 @@ def resumable_directory(
     """
     Create or open the directory of an unfinished target, and lock it.
 
-    Parameters
-    ----------
-    target : Path
-        The finished directory; the unfinished one is :func:`partial_path`.
-    what : str
-        Kind of the data, for messages.
-    is_ours : callable
-        Whether a directory contains such data.
-    has_content : callable
-        Whether a directory is worth resuming; if not, it is deleted after the block.
-
-    Yields
-    ------
-    directory : Path
-        Call :func:`finish` at the end of the block.
-
-    Raises
-    ------
-    FileError
-        When the directory contains other data, or another process writes it.
+    ``target``: the finished directory; the unfinished one is :func:`partial_path`. ``what``: kind of the data, for messages.
+    ``is_ours``: whether a directory contains such data. ``has_content``: whether a directory is worth resuming; if not, it is
+    deleted after the block. Yields ``directory``: call :func:`finish` at the end of the block. Raises FileError when the
+    directory contains other data, or another process writes it.
     """
     directory = partial_path(target)
     if not target.parent.is_dir():

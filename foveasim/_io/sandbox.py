@@ -31,8 +31,6 @@ from numpy.typing import NDArray
 from foveasim._io.zarr_stores import check_plain_files
 from foveasim.errors import FileError
 
-__all__ = ["WALL_TIME_FACTOR", "iterate_in_sandbox", "read_in_sandbox", "run_in_sandbox"]
-
 #: Memory of the process and its libraries, and number of copies of the data in memory.
 BASE_BYTES, DATA_COPIES = 2**31, 3
 MAX_CPU_S, BYTES_PER_S = 10, 2**22
@@ -68,26 +66,12 @@ def read_in_sandbox(
     """
     Run a reader of the package in the sandbox process, with limits by file size.
 
-    Parameters
-    ----------
-    reader : function
-        Module-level function of the path as a string and ``args``; returns plain data that JSON can represent, and arrays.
-    path : Path
-        A file or a directory.
-    kind : str
-        Kind of the file, for messages.
-    max_decompressed_bytes : function
-        Function of the file size in bytes that returns the maximum size of the decompressed data in bytes.
-    is_silent : bool
-        Whether output of the reader on standard output means that the file is corrupt.
-    **args
-        Keywords of the reader, plain data.
-
-    Raises
-    ------
-    FileError
-        When the reader rejects the file, fails, crashes, prints although ``is_silent`` is set, or exceeds a limit, or a
-        directory contains links, FIFOs or devices.
+    ``reader``: module-level function of the path as a string and ``args``; returns plain data that JSON can represent, and
+    arrays. ``path``: a file or a directory. ``kind``: kind of the file, for messages. ``max_decompressed_bytes``: function of
+    the file size in bytes that returns the maximum size of the decompressed data in bytes. ``is_silent``: whether output of
+    the reader on standard output means that the file is corrupt. ``**args``: keywords of the reader, plain data. Raises
+    FileError when the reader rejects the file, fails, crashes, prints although ``is_silent`` is set, or exceeds a limit, or a
+    directory contains links, FIFOs or devices.
     """
     if path.is_dir():
         check_plain_files(path)
@@ -117,24 +101,11 @@ def run_in_sandbox(
     """
     Run a reader in the sandbox process, with given limits.
 
-    Parameters
-    ----------
-    reader, path, kind, is_silent
-        As in :func:`read_in_sandbox`.
-    args : mapping
-        Keywords of the reader, plain data.
-    max_cpu_s : int, s
-        Processor time limit; the wall time limit is ``WALL_TIME_FACTOR`` times as long.
-    max_bytes : int
-        Limit of the address space.
-    is_standalone : bool
-        Whether the module of the reader imports no other module of the package. It is then loaded without the package, which is
-        faster and needs less memory, and the reader receives the keyword ``limit``, the function that sets resource limits.
-
-    Raises
-    ------
-    FileError
-        As in :func:`read_in_sandbox`.
+    ``reader``, ``path``, ``kind``, ``is_silent``: as in :func:`read_in_sandbox`. ``args``: keywords of the reader, plain data.
+    ``max_cpu_s`` (int, s): processor time limit; the wall time limit is ``WALL_TIME_FACTOR`` times as long. ``max_bytes``:
+    limit of the address space. ``is_standalone``: whether the module of the reader imports no other module of the package. It
+    is then loaded without the package, which is faster and needs less memory, and the reader receives the keyword ``limit``,
+    the function that sets resource limits. Raises FileError as in :func:`read_in_sandbox`.
     """
     with tempfile.TemporaryDirectory(prefix="foveasim-", ignore_cleanup_errors=True) as directory:
         arrays, printed = Path(directory) / "arrays.npy", Path(directory) / "printed.txt"
@@ -197,23 +168,10 @@ def iterate_in_sandbox(
 
     The process ends with the iterator. It waits while no array is requested.
 
-    Parameters
-    ----------
-    reader : function
-        Module-level function of the path as a string and ``args``; yields arrays, and None for skipped ones.
-    path, kind
-        As in :func:`read_in_sandbox`.
-    args : mapping
-        Keywords of the reader, plain data.
-    max_bytes : int
-        Limit of the address space.
-    max_item_s : float, s
-        Limit of the time for each array.
-
-    Raises
-    ------
-    FileError
-        When the reader rejects the file, fails, crashes or exceeds a limit.
+    ``reader``: module-level function of the path as a string and ``args``; yields arrays, and None for skipped ones. ``path``,
+    ``kind``: as in :func:`read_in_sandbox`. ``args``: keywords of the reader, plain data. ``max_bytes``: limit of the address
+    space. ``max_item_s`` (float, s): limit of the time for each array. Raises FileError when the reader rejects the file,
+    fails, crashes or exceeds a limit.
     """
     task = _task(
         reader, path, args, file=None, is_iterator=True, printed=os.devnull, max_cpu_s=None, max_bytes=max_bytes

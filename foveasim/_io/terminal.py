@@ -19,8 +19,6 @@ from rich.text import Text
 
 from foveasim.errors import printable
 
-__all__ = ["PlainConsole", "as_plain_text", "plain_streams", "select_spinner", "with_progress"]
-
 T = TypeVar("T")
 #: Name of the encoding error handler of streams.
 HANDLER = "foveasim.plain"

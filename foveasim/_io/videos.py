@@ -16,8 +16,6 @@ from foveasim._io.images import check_picture_size
 from foveasim._io.sandbox import iterate_in_sandbox, read_in_sandbox
 from foveasim.errors import FileError, printable
 
-__all__ = ["SandboxedVideo", "VideoFile", "frame_pixels"]
-
 KIND = "a video"
 #: Limit of the memory of the sandbox process: threads of the decoder and its reference frames.
 MAX_BYTES = 2**32
@@ -27,21 +25,8 @@ class VideoFile:
     """
     Decoded frames of a video file, before conversion to pixels.
 
-    Parameters
-    ----------
-    path : Path
-
-    Attributes
-    ----------
-    frame_s : float or None, s
-        Frame period.
-    n_frames : int or None
-        Number of frames according to the file, which may be wrong.
-
-    Raises
-    ------
-    FileError
-        When the file is not a readable video, or the extra ``video`` is not installed.
+    ``frame_s`` (float or None, s): frame period. ``n_frames``: number of frames according to the file, which may be wrong.
+    Raises FileError when the file is not a readable video, or the extra ``video`` is not installed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -73,15 +58,8 @@ class VideoFile:
         """
         Iterate over the pixels of frames, (n_y, n_x, 3) uint8, top row first.
 
-        Parameters
-        ----------
-        start : int
-            First frame; earlier ones are decoded but not converted.
-
-        Raises
-        ------
-        FileError
-            When a frame is corrupt or too large.
+        ``start``: first frame; earlier ones are decoded but not converted. Raises FileError when a frame is corrupt or too
+        large.
         """
         return (frame_pixels(self.path, frame) for frame in islice(self, start, None))
 
@@ -89,10 +67,7 @@ class VideoFile:
         """
         Return the number of encoded frames, without decoding them.
 
-        Raises
-        ------
-        FileError
-            When the file is corrupt.
+        Raises FileError when the file is corrupt.
         """
         with _open_video(self.path) as container, _as_video_error(self.path, "is corrupt"):
             return sum(packet.size > 0 for packet in container.demux(container.streams.video[0]))
@@ -141,10 +116,7 @@ class SandboxedVideo:
 
     The number of frames is that of the encoded ones.
 
-    Raises
-    ------
-    FileError
-        When the file is not a readable video, or exceeds a limit.
+    Raises FileError when the file is not a readable video, or exceeds a limit.
     """
 
     def __init__(self, path: Path) -> None:
@@ -157,10 +129,7 @@ class SandboxedVideo:
         """
         Iterate over the pixels of frames, as :meth:`VideoFile.pixels`.
 
-        Raises
-        ------
-        FileError
-            When a frame is corrupt or too large, or takes too long.
+        Raises FileError when a frame is corrupt or too large, or takes too long.
         """
         return iterate_in_sandbox(_decode, self.path, {"start": start}, kind=KIND, max_bytes=MAX_BYTES)
 

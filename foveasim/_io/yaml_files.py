@@ -12,8 +12,6 @@ import yaml
 from foveasim._core.names import missing_path
 from foveasim.errors import ConfigError
 
-__all__ = ["MAX_FILE_BYTES", "format_yaml", "parse_yaml", "position_of", "read_text", "read_yaml"]
-
 #: Size limit: settings files are written by hand.
 MAX_FILE_BYTES = 1 << 20
 
@@ -81,10 +79,7 @@ def parse_yaml(path: Path, text: str) -> Any:
     """
     Parse a YAML string; errors name the file.
 
-    Raises
-    ------
-    ConfigError
-        When the string is not YAML, or contains tags, anchors, duplicate keys or deep nesting.
+    Raises ConfigError when the string is not YAML, or contains tags, anchors, duplicate keys or deep nesting.
     """
     try:
         return yaml.load(text, _SafeLoader)  # noqa: S506 -- a SafeLoader
@@ -106,18 +101,9 @@ def position_of(path: Path, keys: Sequence[str], *, is_exact: bool = False) -> t
     """
     Return the line and column of a key in a YAML file, from 1.
 
-    Parameters
-    ----------
-    path : Path
-    keys : sequence of str
-        Keys, and indices of lists.
-    is_exact : bool
-        Whether the file must contain the key; by default the position is that of the innermost section with it.
-
-    Returns
-    -------
-    position : (line, column) or None
-        None when the file cannot be read, or does not contain the key.
+    ``keys``: keys, and indices of lists. ``is_exact``: whether the file must contain the key; by default the position is that
+    of the innermost section with it. Returns ``position`` (line, column) or None: None when the file cannot be read, or does
+    not contain the key.
     """
     try:
         node = yaml.compose(read_text(path), _SafeLoader)
@@ -141,10 +127,7 @@ def read_text(path: Path) -> str:
     """
     Read a small UTF-8 text file.
 
-    Raises
-    ------
-    ConfigError
-        When the file is missing, too large, or not UTF-8 text.
+    Raises ConfigError when the file is missing, too large, or not UTF-8 text.
     """
     if not path.is_file():
         raise ConfigError(path, missing_path(path))
@@ -160,10 +143,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """
     Read a settings file.
 
-    Raises
-    ------
-    ConfigError
-        When the file is missing, too large, not UTF-8 text, not YAML, or not a mapping.
+    Raises ConfigError when the file is missing, too large, not UTF-8 text, not YAML, or not a mapping.
     """
     text = read_text(path)
     data = parse_yaml(path, text)

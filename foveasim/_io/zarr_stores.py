@@ -25,17 +25,6 @@ from foveasim._core.extras import import_optional
 from foveasim._core.names import missing_path
 from foveasim.errors import FileError, format_value
 
-__all__ = [
-    "ZARR",
-    "Variable",
-    "check_codecs",
-    "check_plain_files",
-    "free_name",
-    "open_store",
-    "store_format",
-    "write_variables",
-]
-
 ZARR = ".zarr"
 #: Size limit of the metadata of a group or an array.
 MAX_METADATA_BYTES = 2**26
@@ -72,10 +61,7 @@ def write_variables(group: Any, variables: Mapping[str, Variable]) -> None:
     """
     Write arrays to an open group, each uncompressed in one chunk, with dimension names.
 
-    Raises
-    ------
-    FileError
-        When the installed version of zarr does not support the type of an array.
+    Raises FileError when the installed version of zarr does not support the type of an array.
     """
     with warnings.catch_warnings():
         # zarr warns that fixed-length strings are not portable; xarray reads them.
@@ -114,12 +100,8 @@ def check_codecs(source: Path, allowed: Collection[str], what: str) -> None:
     """
     Check that the metadata of a store name only allowed codecs.
 
-    Raises
-    ------
-    FileError
-        When the metadata name another codec, or storage transformers, or as :func:`check_plain_files`.
-    ValueError, KeyError, AttributeError, OSError
-        When the metadata are corrupt.
+    Raises FileError when the metadata name another codec, or storage transformers, or as :func:`check_plain_files`. Raises
+    ValueError, KeyError, AttributeError, OSError when the metadata are corrupt.
     """
     check_plain_files(source)
     for path in (*source.glob("zarr.json"), *source.glob("*/zarr.json"), *source.glob("*/*/zarr.json")):
@@ -141,26 +123,10 @@ def open_store(
     """
     Open a store of :func:`write_variables`; exceptions of the block become FileErrors.
 
-    Parameters
-    ----------
-    path : Path
-        Directory of the store.
-    what : str
-        Expected kind of the store, for messages: ``"foveasim capture"``.
-    file_format, version
-        Required values of ``format`` and ``version`` in the attributes.
-
-    Yields
-    ------
-    attributes : mapping
-        Attributes of the root.
-    arrays : mapping of str to zarr array
-        Arrays by path, such as ``"code"`` and ``"layout/xy_um"``; all chunks are complete.
-
-    Raises
-    ------
-    FileError
-        When zarr is not installed, or the store is missing, corrupt, incomplete or of another format.
+    ``path``: directory of the store. ``what``: expected kind of the store, for messages: ``"foveasim capture"``.
+    ``file_format``, ``version``: required values of ``format`` and ``version`` in the attributes. Yields ``attributes``:
+    attributes of the root. ``arrays``: arrays by path, such as ``"code"`` and ``"layout/xy_um"``; all chunks are complete.
+    Raises FileError when zarr is not installed, or the store is missing, corrupt, incomplete or of another format.
     """
     zarr = import_optional(path, "zarr")
     if not path.is_dir():
@@ -203,10 +169,7 @@ def check_plain_files(path: Path) -> None:
     """
     Check that a store contains only regular files and directories, without opening them.
 
-    Raises
-    ------
-    FileError
-        When it contains a link, a FIFO, a socket or a device.
+    Raises FileError when it contains a link, a FIFO, a socket or a device.
     """
     for directory, directories, files in os.walk(path, followlinks=False):
         for name in (*directories, *files):

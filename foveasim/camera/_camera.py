@@ -48,8 +48,6 @@ from foveasim.sensor import NoiseBudget, Sensor, noise_budget
 from foveasim.sensor.limits import EXPOSURE
 from foveasim.units import um_from_nm, w_from_w_m2_um2
 
-__all__ = ["Camera"]
-
 #: Margin of a picture that covers undistorted outlines: their edges are curves of limited accuracy.
 COVER_MARGIN = 1e-5
 #: Exposures that exceed the time between them by this fraction do so by rounding.
@@ -79,11 +77,6 @@ class Camera:
         2 for scenes whose image has cells of at most λN/2 at all wavelengths, else 1; always 1 for power maps.
     n_threads : int, optional
         Number of threads, by default one per core. Results are bit-identical for any number.
-
-    Raises
-    ------
-    ParameterError
-        When an argument has another type.
 
     Warns
     -----
@@ -373,11 +366,6 @@ class Camera:
         Return a camera with other optics, another sensor, or both.
 
         Compiled layouts are shared when the new sensor has the same layout object.
-
-        Raises
-        ------
-        ParameterError
-            When an argument has another type.
         """
         other = Camera(
             optics=self._optics if optics is None else optics,

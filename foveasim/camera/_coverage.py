@@ -14,8 +14,6 @@ from foveasim.fields import PowerMap
 from foveasim.integrate import Integrator
 from foveasim.scene import Scene
 
-__all__ = ["Covered", "format_point", "size_um", "warn_of_coverage"]
-
 #: Cameras warn when the layout measures less than this fraction of the width of a photograph.
 MIN_PICTURE_FRACTION = 0.25
 

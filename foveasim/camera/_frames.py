@@ -15,20 +15,6 @@ from foveasim.errors import ParameterError, type_name
 from foveasim.fields import Grid, PowerMap
 from foveasim.scene import Scene
 
-__all__ = [
-    "DIGEST_BYTES",
-    "Frame",
-    "ImageCache",
-    "PathPosition",
-    "Position",
-    "Task",
-    "check_frames",
-    "path_digests",
-    "path_positions",
-    "position_settings",
-    "tasks",
-]
-
 #: A position in the image plane, (x, y) in µm.
 Position = tuple[float, float]
 #: One frame: a scene or a power map, or either with the position of the sensor's centre in its image.

@@ -13,8 +13,6 @@ from foveasim.optics import Optics
 from foveasim.scene import Scene
 from foveasim.units import um_from_m
 
-__all__ = ["warn_of_focal_length"]
-
 #: Cameras warn when the focal length of the lens model differs from the image distance by more than this fraction.
 MAX_FOCAL_DIFFERENCE = 0.02
 

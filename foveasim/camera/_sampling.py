@@ -14,8 +14,6 @@ from foveasim.optics import Optics
 from foveasim.scene import Scene
 from foveasim.units import um_from_nm
 
-__all__ = ["warn_of_coarse_cells", "warn_of_negative"]
-
 #: Error of photosites above which a limited automatic oversampling causes a warning.
 MAX_AUTO_ERROR = 1e-3
 

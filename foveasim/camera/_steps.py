@@ -27,8 +27,6 @@ from foveasim.units import w_from_w_m2_um2
 if TYPE_CHECKING:
     from foveasim.camera._camera import Camera
 
-__all__ = ["WeightedMap", "capture_settings", "expose", "integrate_maps", "to_sensor_frame", "white_dn"]
-
 #: Fourier transforms in float32 leave negative rates of up to this fraction of the largest one.
 NEGATIVE_ROUNDING = 1e-4
 #: Lower limit of a filter's response, relative to the strongest filter, for white balance.

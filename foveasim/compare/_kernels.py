@@ -9,8 +9,6 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = ["ring_sums", "signal_covariance"]
-
 _ints = types.Array(types.int64, 1, "C", readonly=True)
 _orders = types.Array(types.int64, 2, "C", readonly=True)
 _floats = types.Array(types.float64, 1, "C", readonly=True)

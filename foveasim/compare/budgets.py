@@ -59,11 +59,6 @@ def budget_of(camera: Camera, frames_per_s: float) -> Budget:
     ----------
     camera : Camera
     frames_per_s : float, 1/s
-
-    Raises
-    ------
-    ParameterError
-        When an argument is invalid.
     """
     if not isinstance(camera, Camera):
         raise ParameterError("camera", f"must be a foveasim.Camera, got {type_name(camera)}")
@@ -83,18 +78,9 @@ def check_equal_budgets(budgets: Mapping[str, Budget], budget: str | None, toler
     """
     Check that cameras have the same budget.
 
-    Parameters
-    ----------
-    budgets : mapping of str to Budget
-    budget : {"n_sites", "data_rate", "readout_time", "area", "read_noise"} or None
-        The budget to compare; None for no check.
-    tolerance : float
-        Largest relative difference from the first camera.
-
-    Raises
-    ------
-    ParameterError
-        When the budget of a camera differs by more.
+    ``budget`` ({"n_sites", "data_rate", "readout_time", "area", "read_noise"} or None): the budget to compare; None for no
+    check. ``tolerance``: largest relative difference from the first camera. Raises ParameterError when the budget of a camera
+    differs by more.
     """
     tolerance = check_number("tolerance", tolerance, at_least=0.0)
     if budget is None:

@@ -192,10 +192,8 @@ class _RadialSpectrum:
     """
     Mean spectral density of images in rings of frequencies, in pixels and cycles per pixel.
 
-    Attributes
-    ----------
-    frequency, density, n_modes : (n_ring,) float64
-        Mean frequency, mean of the periodograms, and number of frequencies of each ring.
+    ``frequency``, ``density``, ``n_modes`` (n_ring,) float64: mean frequency, mean of the periodograms, and number of
+    frequencies of each ring.
     """
 
     def __init__(self, images: NDArray[np.float64]) -> None:

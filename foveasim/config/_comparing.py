@@ -15,8 +15,6 @@ from foveasim.fields import PowerMap
 from foveasim.layout.files import layout_path
 from foveasim.scene import Scene
 
-__all__ = ["compare_files"]
-
 
 def compare_files(
     paths: Sequence[str | Path],

@@ -32,24 +32,6 @@ from foveasim.scene._scene import FRAMINGS
 from foveasim.sensor import Sensor
 from foveasim.sensor.limits import EXPOSURE
 
-__all__ = [
-    "YAML_EXTENSIONS",
-    "LayoutFile",
-    "Shot",
-    "build_shot",
-    "check_settings",
-    "picture_path",
-    "put_setting",
-    "read_any_layout",
-    "read_layout",
-    "read_layout_file",
-    "read_rules",
-    "read_settings",
-    "read_shot",
-    "resolve_files",
-    "schema",
-]
-
 #: Prefix of the names of pictures that scikit-image contains.
 BUNDLED_PICTURE = "skimage:"
 #: Extensions of settings files; the format of other layout files follows from their content.

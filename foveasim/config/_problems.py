@@ -17,8 +17,6 @@ from foveasim.config._models import call_of
 from foveasim.config._sources import Source
 from foveasim.errors import ConfigError, ParameterError, format_value
 
-__all__ = ["plain_settings", "validate"]
-
 #: Maximum number of problems in one message.
 MAX_PROBLEMS = 3
 

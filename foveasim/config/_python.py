@@ -18,8 +18,6 @@ from foveasim.config._problems import plain_settings, validate
 from foveasim.config._sources import Source
 from foveasim.layout import LAYOUTS, Layout
 
-__all__ = ["to_python"]
-
 #: Modules with public names, in the order of preference, and their names in the source.
 MODULES = {
     "foveasim": "fs",

@@ -22,8 +22,6 @@ from foveasim.layout import Layout, Report
 from foveasim.view import hidden_figures, plot_capture, prisms, render, save_figure
 from foveasim.view.renderer import missing_software
 
-__all__ = ["Result", "check_directory", "demo_settings", "results_table", "run_shot", "write_results"]
-
 #: Shots of the demo, in the order of the table.
 DEMO_SHOTS = ("foveal", "four_zones")
 #: Longer side of the pictures that a shot writes.

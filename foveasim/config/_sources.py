@@ -10,8 +10,6 @@ from pathlib import Path
 from foveasim._io.yaml_files import position_of
 from foveasim.errors import ConfigError
 
-__all__ = ["Source"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Source:

@@ -15,8 +15,6 @@ from foveasim._core.validation import check_choice
 from foveasim._io.atomic import atomic_write
 from foveasim.errors import FileError
 
-__all__ = ["STARTING_FILES", "starting_command", "starting_file", "write_starting_file"]
-
 #: Kinds of files.
 STARTING_FILES = ("shot", "layout", "rules", "sweep", "study", "dataset")
 #: A line that stands for the content of another file.
@@ -32,11 +30,6 @@ def starting_file(kind: str) -> str:
     Parameters
     ----------
     kind : {"shot", "layout", "rules", "sweep", "study", "dataset"}
-
-    Raises
-    ------
-    ParameterError
-        When ``kind`` is none of these.
     """
     check_choice("kind", kind, STARTING_FILES)
     text = (files("foveasim.config") / "starting_files" / f"{kind}.yaml").read_text(encoding="utf-8")
@@ -76,8 +69,6 @@ def write_starting_file(kind: str, path: str | Path | None = None, *, force: boo
 
     Raises
     ------
-    ParameterError
-        When ``kind`` is none of these.
     FileError
         When the file exists, or cannot be written.
     """

@@ -17,8 +17,6 @@ from foveasim.scene import Scene
 from foveasim.video import FrameSource, count_recorded_frames, write_video
 from foveasim.video.frame_source import list_pictures
 
-__all__ = ["run_video"]
-
 #: Frame period in video files when none is specified.
 DEFAULT_FRAME_S = 1.0 / 25.0
 #: Attributes of the scene that the frames replace.

@@ -14,8 +14,6 @@ from foveasim.errors import FileError, ParameterError, printable
 from foveasim.layout import Layout, Report
 from foveasim.layout.drc.report import is_lyrdb, read_lyrdb
 
-__all__ = ["Viewable", "read_viewable"]
-
 #: Arrays of a capture's npz file that a layout's does not contain.
 CAPTURE_ARRAYS = {"code.npy", "electrons.npy"}
 

@@ -16,8 +16,6 @@ from foveasim.distortion._lens import LensBase
 from foveasim.distortion._registry import LENSES
 from foveasim.distortion._solve import smallest_roots
 
-__all__ = ["BrownConrady"]
-
 #: Number of directions in which the fold radius is computed.
 N_DIRECTIONS = 720
 #: Points per work item of a thread.

@@ -23,8 +23,6 @@ from foveasim.distortion._fisheye import PolynomialFisheye, Scaramuzza
 from foveasim.distortion._lens import Lens
 from foveasim.errors import ConfigError, ParameterError
 
-__all__ = ["from_opencv", "read_calibration", "to_opencv"]
-
 #: OpenCV's order of coefficients; calibrations contain the first 4, 5 or 8 of them.
 OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 #: Alternative keys in calibration files, in lower case without underscores.

@@ -17,8 +17,6 @@ from foveasim.distortion._registry import LENSES
 from foveasim.distortion._solve import invert_monotonic, smallest_roots
 from foveasim.errors import ParameterError
 
-__all__ = ["Fisheye", "PolynomialFisheye", "Scaramuzza"]
-
 Projection = Literal["equidistant", "equisolid", "stereographic", "orthographic"]
 #: Points within this normalised radius are scaled linearly, which avoids a division by 0.
 MIN_RADIUS = 1e-12
@@ -158,11 +156,6 @@ class PolynomialFisheye(_AngularLens):
         Distance of the image plane, f.
     centre_um : (x, y), µm
         Intersection of the optical axis with the sensor plane.
-
-    Raises
-    ------
-    ParameterError
-        If a value is out of range.
 
     Notes
     -----

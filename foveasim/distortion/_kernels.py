@@ -7,8 +7,6 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = ["brown_conrady_inverse"]
-
 _points = types.Array(types.float64, 2, "C", readonly=True)
 _numbers = types.Array(types.float64, 1, "C", readonly=True)
 

@@ -12,8 +12,6 @@ from foveasim._core.rings import from_frame, to_frame
 from foveasim._core.validation import Floats, check_choice, check_length_um, finite_array
 from foveasim.errors import GeometryError, ParameterError
 
-__all__ = ["Lens", "LensBase", "Outside"]
-
 #: Treatment of points outside the valid radius of a lens: raise an error, or return NaN.
 Outside: TypeAlias = Literal["error", "mask"]
 

@@ -13,8 +13,6 @@ from foveasim._core.validation import Floats, Images, check_choice, check_count,
 from foveasim.errors import ParameterError, type_name
 from foveasim.fields import Grid, PointMap, PowerMap
 
-__all__ = ["Conserve", "distort_map"]
-
 #: Conserved quantity: the power on an area of the image, or the power per area.
 Conserve: TypeAlias = Literal["flux", "density"]
 #: Highest spline order of ``scipy.ndimage``.

@@ -7,8 +7,6 @@ from typing import Any
 
 from foveasim._core.registry import Registry
 
-__all__ = ["LENSES"]
-
 #: Lens models by their names in settings files; calling an entry returns an object with ``distort`` and ``undistort``.
 #: Installed packages add models as entry points of the group ``foveasim.lenses``.
 LENSES: Registry[Callable[..., Any]] = Registry("lens model", "foveasim.lenses")

@@ -9,8 +9,6 @@ import numpy as np
 
 from foveasim._core.validation import Floats
 
-__all__ = ["invert_monotonic", "smallest_roots"]
-
 #: Maximum number of bracketed Newton steps; bisection alone needs 60.
 MAX_STEPS = 100
 #: Largest ratio of imaginary and absolute value of a real root; roots above 1 / MIN_RECIPROCAL are ignored.

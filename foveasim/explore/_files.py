@@ -10,8 +10,6 @@ from foveasim._io.yaml_files import read_yaml
 from foveasim.config import YAML_EXTENSIONS, resolve_files
 from foveasim.errors import ConfigError
 
-__all__ = ["digests"]
-
 
 def digests(files: Iterable[Path]) -> dict[str, str]:
     """
@@ -19,14 +17,7 @@ def digests(files: Iterable[Path]) -> dict[str, str]:
 
     A layout file, for example, may reference the picture of a density.
 
-    Parameters
-    ----------
-    files : iterable of Path
-
-    Returns
-    -------
-    digests : dict of str to str
-        By file path. Empty for a missing file; the reader of the file reports it.
+    Returns ``digests``: by file path. Empty for a missing file; the reader of the file reports it.
     """
     digest_by_path: dict[str, str] = {}
     pending = list(files)

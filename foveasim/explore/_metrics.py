@@ -15,17 +15,6 @@ from foveasim.capture import Capture
 from foveasim.config import Shot
 from foveasim.errors import ParameterError
 
-__all__ = [
-    "DEFAULT_METRICS",
-    "METRICS",
-    "REFERENCES",
-    "Metric",
-    "add_metrics",
-    "has_result",
-    "import_metric",
-    "resolve_metrics",
-]
-
 #: A function of a shot, its camera and its capture that returns a number, a mapping of names to numbers, or a labelled array.
 Metric = Callable[[Shot, Camera, Capture], Any]
 
@@ -73,10 +62,7 @@ def resolve_metrics(metrics: Iterable[str | Metric] | Mapping[str, Metric] | Non
     """
     Return metrics by the names of their results.
 
-    Raises
-    ------
-    ParameterError
-        When a name is not in :data:`METRICS` or occurs twice, or a metric is not a function.
+    Raises ParameterError when a name is not in :data:`METRICS` or occurs twice, or a metric is not a function.
     """
     if metrics is None:
         metrics = DEFAULT_METRICS
@@ -116,17 +102,8 @@ def add_metrics(metrics: Mapping[str, Metric], names: Iterable[str]) -> dict[str
     """
     Return the metrics of a file and those of the command line.
 
-    Parameters
-    ----------
-    metrics : mapping of str to function
-        Metrics of the file.
-    names : iterable of str
-        Names in :data:`METRICS`, or ``module:function``. The import of a module runs its code.
-
-    Raises
-    ------
-    ParameterError
-        When a metric does not exist, or its name is already used.
+    ``metrics``: metrics of the file. ``names``: names in :data:`METRICS`, or ``module:function``. The import of a module runs
+    its code. Raises ParameterError when a metric does not exist, or its name is already used.
     """
     found = dict(metrics)
     for name in names:

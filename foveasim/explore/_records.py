@@ -21,8 +21,6 @@ from foveasim._core.provenance import differences
 from foveasim._io.atomic import lock
 from foveasim.errors import FileError, ParameterError, type_name
 
-__all__ = ["WORKER_LOST", "Journal", "Record", "Value", "check_same_plan", "check_unique", "journal_path", "to_values"]
-
 FORMAT, VERSION = "foveasim sweep", 1
 #: Beginning of a journal: a checksum and the format.
 TRUNCATED_HEADER = rb'[0-9a-f]{1,8} \{"format": "foveasim'
@@ -57,10 +55,7 @@ def to_values(name: str, given: Any) -> dict[str, Scalar | Value]:
     """
     Convert the result of a metric to values by variable name.
 
-    Raises
-    ------
-    ParameterError
-        When the result is not a number, string, mapping, array or labelled array, or cannot be stored.
+    Raises ParameterError when the result is not a number, string, mapping, array or labelled array, or cannot be stored.
     """
     if isinstance(given, Mapping):
         found: dict[str, Scalar | Value] = {}
@@ -86,10 +81,7 @@ def check_unique(found: Collection[str], names: Iterable[str]) -> None:
     """
     Check that the names of new variables are not used yet.
 
-    Raises
-    ------
-    ParameterError
-        With the repeated name.
+    Raises ParameterError with the repeated name.
     """
     repeated = next((name for name in names if name in found), None)
     if repeated is not None:
@@ -224,10 +216,7 @@ class Journal:
         """
         Write a record.
 
-        Raises
-        ------
-        FileError
-            When writing fails, for example on a full disk. Records that were written before remain valid.
+        Raises FileError when writing fails, for example on a full disk. Records that were written before remain valid.
         """
         try:
             self._write(_line(record))
@@ -284,10 +273,7 @@ def _check_same(path: Path, found: Any, header: Mapping[str, Any]) -> None:
     """
     Check that a journal belongs to a plan.
 
-    Raises
-    ------
-    FileError
-        When it belongs to another plan.
+    Raises FileError when it belongs to another plan.
     """
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise FileError(path, "is not a sweep journal; move it, or write the results elsewhere")
@@ -300,10 +286,7 @@ def check_same_plan(path: Path, found: Mapping[str, Any], expected: Mapping[str,
     """
     Check that results belong to a plan.
 
-    Raises
-    ------
-    FileError
-        When they belong to another plan.
+    Raises FileError when they belong to another plan.
     """
     expected = json.loads(json.dumps(expected))
     different = next(differences(found, expected), None)

@@ -10,8 +10,6 @@ from foveasim.explore.datasets.plan import DatasetSection
 from foveasim.explore.studies.plan import StudySection
 from foveasim.explore.sweeps.plan import SweepSection
 
-__all__ = ["schema_of"]
-
 #: Models of the file kinds; the first three depend on registered extensions.
 FILES: dict[str, Any] = {
     "shot": "shot",
@@ -30,11 +28,6 @@ def schema_of(kind: str) -> dict[str, Any]:
     Parameters
     ----------
     kind : {"shot", "layout", "rules", "sweep", "study", "dataset"}
-
-    Raises
-    ------
-    ParameterError
-        When ``kind`` is none of these.
     """
     check_choice("kind", kind, FILES)
     return schema(FILES[kind], f"foveasim {kind}")

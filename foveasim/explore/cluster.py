@@ -48,10 +48,7 @@ def check_installed() -> None:
     """
     Check that the libraries for worker processes are installed.
 
-    Raises
-    ------
-    ParameterError
-        When one is missing.
+    Raises ParameterError when one is missing.
     """
     for module in ("distributed", "dask", "cloudpickle", "cryptography"):
         import_optional("workers", module)
@@ -62,26 +59,9 @@ def open_client(scheduler: str | None, n_workers: int) -> Iterator[Client]:
     """
     Connect to a scheduler, or to local workers that end with the context.
 
-    Parameters
-    ----------
-    scheduler : str or None
-        Address of a dask scheduler; None starts local workers.
-    n_workers : int
-        Number of local workers.
+    ``scheduler``: address of a dask scheduler; None starts local workers. ``n_workers``: number of local workers. Raises
+    ParameterError when no scheduler answers. Raises SimulationError when local workers do not start.
 
-    Yields
-    ------
-    client : distributed.Client
-
-    Raises
-    ------
-    ParameterError
-        When no scheduler answers.
-    SimulationError
-        When local workers do not start.
-
-    Notes
-    -----
     Every peer that can connect to a dask scheduler or worker can run code with the rights of its owner. Local clusters use
     TLS with a key of this run, which stays in the memory of its processes, and reject connections without it. The
     configuration of dask (``distributed.comm.tls``) determines the connection to an external scheduler.
@@ -269,10 +249,7 @@ class WorkerStates:
         """
         Read the worker states from the scheduler.
 
-        Raises
-        ------
-        SimulationError
-            When the scheduler does not answer.
+        Raises SimulationError when the scheduler does not answer.
         """
         try:
             if self._client.cluster is not None:

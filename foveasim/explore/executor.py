@@ -58,34 +58,15 @@ def executor(
     """
     Start workers that evaluate one function.
 
-    Parameters
-    ----------
-    function : callable
-        Function of an item that returns its result. Each worker process has one copy, which may cache shared components.
-    what : str
-        Name of the user objects in the function, for the message when it cannot be pickled.
-    users : iterable of callables, optional
-        User functions inside ``function``. Their modules are pickled by value, so workers need not import them.
-    scheduler : str, optional
-        Address of a dask scheduler; by default local worker processes.
-    workers : int, optional
-        Number of local processes; None evaluates in this process, without dask.
+    ``function``: function of an item that returns its result. Each worker process has one copy, which may cache shared
+    components. ``what``: name of the user objects in the function, for the message when it cannot be pickled. ``users``: user
+    functions inside ``function``. Their modules are pickled by value, so workers need not import them. ``scheduler``: address
+    of a dask scheduler; by default local worker processes. ``workers``: number of local processes; None evaluates in this
+    process, without dask. Yields ``run``: see :data:`Run`. A ``FoveasimError`` of the function ends the run. Raises
+    ParameterError when dask is not installed, or no scheduler answers. Raises SimulationError when workers do not start, or
+    the function cannot be pickled; from ``run`` when the scheduler or all workers are lost, or workers cannot evaluate the
+    function at all.
 
-    Yields
-    ------
-    run : callable
-        See :data:`Run`. A ``FoveasimError`` of the function ends the run.
-
-    Raises
-    ------
-    ParameterError
-        When dask is not installed, or no scheduler answers.
-    SimulationError
-        When workers do not start, or the function cannot be pickled; from ``run`` when the scheduler or all workers are lost,
-        or workers cannot evaluate the function at all.
-
-    Notes
-    -----
     Dask restarts local workers, detects live workers and lost tasks, and copies the function to each worker. Its queue would
     distribute neighbouring items, which share compiled layouts and optical images, to all workers in turn, and each worker
     would build the same components. Each worker therefore gets a range of neighbouring items, in tasks of about 0.5 s, and a
@@ -409,10 +390,7 @@ class _Shared:
         """
         Return the function, as the same object in every call.
 
-        Raises
-        ------
-        RuntimeError
-            When this process has other versions of the libraries: its results might differ.
+        Raises RuntimeError when this process has other versions of the libraries: its results might differ.
         """
         import cloudpickle
 

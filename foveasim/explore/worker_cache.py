@@ -57,10 +57,7 @@ class WorkerCache:
     Components are layouts, scenes, lenses, cameras, optical images and power on sites. Results do not depend on the contents of
     the cache: a component is a function of its settings, and its warnings are stored with it.
 
-    Parameters
-    ----------
-    max_bytes : int
-        Size limit of all arrays. Components of the last point are never removed.
+    ``max_bytes``: size limit of all arrays. Components of the last point are never removed.
     """
 
     def __init__(self, max_bytes: int = MAX_BYTES) -> None:
@@ -94,10 +91,7 @@ class WorkerCache:
         """
         Remove the least recently used components, except those of the last point.
 
-        Returns
-        -------
-        warnings : list of str
-            Warnings of the components of the last point.
+        Returns ``warnings``: warnings of the components of the last point.
         """
         for key in self._used:
             # Measured again for cameras and images, which grow with use.

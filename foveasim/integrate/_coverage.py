@@ -10,8 +10,6 @@ from foveasim._core.calls import copyable
 from foveasim._core.validation import Bools, Floats, read_only
 from foveasim.fields import Grid
 
-__all__ = ["Coverage"]
-
 #: Tolerance for rounding errors of vertices outside the grid, relative to the largest grid coordinate.
 UNCOVERED_ROUNDING = 1e-12
 
@@ -22,14 +20,9 @@ class Coverage:
     """
     Position of sites relative to a grid and to the image circle.
 
-    Attributes
-    ----------
-    bounds_um : (x_min, y_min, x_max, y_max), µm
-        Bounds of all outlines inside the image circle; NaN without any.
-    uncovered_um2 : (n_site,) float64, µm²
-        Area of each site outside the grid or the image circle; without memory if all are 0.
-    is_outside : (n_site,) bool
-        Sites with a vertex outside the image circle; without memory if there are none.
+    ``bounds_um`` (x_min, y_min, x_max, y_max), µm: bounds of all outlines inside the image circle; NaN without any.
+    ``uncovered_um2`` (n_site,) float64, µm²: area of each site outside the grid or the image circle; without memory if all are
+    0. ``is_outside`` (n_site,) bool: sites with a vertex outside the image circle; without memory if there are none.
     """
 
     bounds_um: tuple[float, float, float, float]
@@ -60,14 +53,8 @@ class Coverage:
         """
         Return the coverage of sites.
 
-        Parameters
-        ----------
-        grid : Grid
-        bounds_um : (n_site, 4) float64, µm
-        area_um2, covered_um2 : (n_site,) float64, µm²
-            Area of each outline, and its area on the grid.
-        is_outside : (n_site,) bool, optional
-            Sites outside the image circle.
+        ``bounds_um``: (n_site, 4) float64, µm. ``area_um2``, ``covered_um2`` (n_site,) float64, µm²: area of each outline, and
+        its area on the grid. ``is_outside`` (n_site,) bool: sites outside the image circle.
         """
         n_sites = area_um2.size
         if is_outside is None or not is_outside.any():

@@ -23,8 +23,6 @@ from foveasim.integrate._traced import TracedOutlines
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-__all__ = ["Integrator"]
-
 
 class Integrator:
     """

@@ -29,23 +29,6 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = [
-    "COLUMN",
-    "CUT_ROW",
-    "N_PARTIAL",
-    "N_RUN",
-    "ROW",
-    "SITE",
-    "edges",
-    "find_reversed_edges",
-    "gather",
-    "measure_sites",
-    "scatter",
-    "sort_cuts",
-    "sort_spans",
-    "trace_sites",
-]
-
 #: Columns of ``spans``. A finished plan is in the order of the rows and has no column ``ROW``; its first column is the index of
 #: the accumulator instead of the site.
 SITE, COLUMN, N_PARTIAL, N_RUN, ROW = range(5)
@@ -525,17 +508,10 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
     to cell ``c`` and ``d`` to every cell to the left. Areas outside the grid contribute 0. The moments are computed from the
     same pieces.
 
-    Returns
-    -------
-    spans : (n_span, 5) int32
-        Site by site, sorted by row and column within each site.
-    weights : (n_weight,) float64
-        Per span its ``n_partial`` weights, followed by one weight for the run if ``n_run > 0``.
-    cuts : (n_cut, 3) int32
-        In the order of the spans at second order; empty at first order.
-    moments : (n_cut, 2) float64
-    covered : (n_site,) float64, cells
-        Area of each site on the grid.
+    Returns ``spans`` (n_span, 5) int32: site by site, sorted by row and column within each site. ``weights`` (n_weight,)
+    float64: per span its ``n_partial`` weights, followed by one weight for the run if ``n_run > 0``. ``cuts`` (n_cut, 3)
+    int32: in the order of the spans at second order; empty at first order. ``moments`` (n_cut, 2) float64. ``covered``
+    (n_site,) float64, cells: area of each site on the grid.
     """
     n_sites = site_offsets.size - 1
     covered = np.zeros(n_sites, np.float64)

@@ -10,8 +10,6 @@ from foveasim._core.rings import positions_in_runs
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.fields import Lattice, PackedRings, PointMap
 
-__all__ = ["Outlines", "UndistortedOutlines", "outline_bounds_um", "outlines_of"]
-
 #: Maximum deviation of an undistorted edge from its chords, as a fraction of a cell; exceeded a few times by edges along which
 #: the curvature varies several times, or that need more than the maximum number of pieces.
 CHORD_TOLERANCE = 0.001

@@ -19,8 +19,6 @@ from foveasim.integrate._outlines import Outlines
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-__all__ = ["Plan", "compile_plan"]
-
 #: Sites per work item of tracing; fixed, so that a plan does not depend on the number of threads.
 SITES_PER_PIECE = 2048
 #: Maximum number of bands of rows; one thread sums each band into separate slots.

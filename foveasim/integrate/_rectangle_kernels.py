@@ -19,8 +19,6 @@ from numba import types
 from foveasim._core.jit import njit
 from foveasim.integrate._kernels import ONE, ZERO, _sum_cells
 
-__all__ = ["find_rectangles", "gather_lattice", "gather_rectangles"]
-
 #: Covered fractions of the outermost cells up to this value are rounding errors.
 NO_COVERAGE = 4e-15
 

@@ -13,8 +13,6 @@ from foveasim._core.validation import Bools, Floats
 from foveasim.fields import Grid, Lattice, PackedRings
 from foveasim.integrate._coverage import Coverage
 
-__all__ = ["LatticePlan", "RectanglePlan", "rectangle_plan"]
-
 #: Sites per work item; results do not depend on it.
 SITES_PER_PIECE = 2**15
 #: Up to this number of sites are integrated by the calling thread.

@@ -15,8 +15,6 @@ from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_cou
 from foveasim.errors import ParameterError, type_name
 from foveasim.fields import Grid, PackedRings
 
-__all__ = ["EdgeMoments", "SharedEdges", "vertex_gradient"]
-
 #: Edges per work item; results do not depend on it.
 EDGES_PER_PIECE = 4096
 #: Order of integration.

@@ -16,8 +16,6 @@ from numba import types
 from foveasim._core.jit import njit
 from foveasim.integrate._kernels import _gradient_scale
 
-__all__ = ["differentiate_moments", "measure_moments", "spread_moments"]
-
 
 def _input(dtype, ndim):
     return types.Array(dtype, ndim, "C", readonly=True)

@@ -15,8 +15,6 @@ from foveasim.fields import Grid
 from foveasim.integrate._coverage import Coverage
 from foveasim.integrate._outlines import Outlines
 
-__all__ = ["TracedOutlines"]
-
 #: Sites per work item; results do not depend on it.
 SITES_PER_PIECE = 1024
 

@@ -31,8 +31,6 @@ from foveasim.integrate._kernels import (
     _touched_columns,
 )
 
-__all__ = ["integrate_sites"]
-
 #: Cells of float32 in a cache line.
 LINE_CELLS = 16
 #: A sum of cells that does not occur.

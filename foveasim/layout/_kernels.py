@@ -9,18 +9,6 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = [
-    "areas_in_boxes",
-    "aspect_ratios",
-    "colour_greedily",
-    "contacts",
-    "fill_rectangles",
-    "intersecting_boxes",
-    "min_widths",
-    "overhangs",
-    "shared_lengths",
-]
-
 _ints = types.Array(types.int64, 1, "C", readonly=True)
 _floats = types.Array(types.float64, 1, "C", readonly=True)
 _points = types.Array(types.float64, 2, "C", readonly=True)

@@ -8,8 +8,6 @@ import shapely
 from foveasim._core.rings import next_vertex
 from foveasim._core.validation import Floats, Ints
 
-__all__ = ["ON_EDGE_UM", "insert_points", "merge_coincident_points", "node_edges", "points_on_edges"]
-
 #: Tolerance within which a point lies on an edge, and two points are the same.
 ON_EDGE_UM = 1e-6
 
@@ -20,18 +18,9 @@ def points_on_edges(
     """
     Return the points that lie on edges, end points excluded.
 
-    Parameters
-    ----------
-    points_um : (n_point, 2) float64, µm
-    begin_um, end_um : (n_edge, 2) float64, µm
-    tolerance_um : float, µm
-        Distance within which a point lies on an edge.
-
-    Returns
-    -------
-    edge, point : (n,) int64
-    fraction : (n,) float64
-        Position along the edge, from 0 to 1.
+    ``points_um``: (n_point, 2) float64, µm. ``begin_um``, ``end_um``: (n_edge, 2) float64, µm. ``tolerance_um`` (float, µm):
+    distance within which a point lies on an edge. Returns ``edge``, ``point`` (n,) int64. ``fraction`` (n,) float64: position
+    along the edge, from 0 to 1.
     """
     edges = shapely.linestrings(np.stack((begin_um, end_um), axis=1))
     edge, point = shapely.STRtree(shapely.points(points_um)).query(edges, predicate="dwithin", distance=tolerance_um)
@@ -49,20 +38,9 @@ def insert_points(
     """
     Insert points as vertices into the edges on which they lie.
 
-    Parameters
-    ----------
-    xy_um : (n_vertex, 2) float64, µm
-    ring_offsets : (n_ring + 1,) int64
-    points_um : (n_point, 2) float64, µm
-    tolerance_um : float, µm
-        Distance within which a point lies on an edge.
-
-    Returns
-    -------
-    xy_um : (n, 2) float64, µm
-    ring_offsets : (n_ring + 1,) int64
-    point : (n - n_vertex,) int64
-        Inserted points, those of several edges repeatedly.
+    ``xy_um``: (n_vertex, 2) float64, µm. ``ring_offsets``: (n_ring + 1,) int64. ``points_um``: (n_point, 2) float64, µm.
+    ``tolerance_um`` (float, µm): distance within which a point lies on an edge. Returns ``xy_um`` (n, 2) float64, µm.
+    ``ring_offsets`` (n_ring + 1,) int64. ``point`` (n - n_vertex,) int64: inserted points, those of several edges repeatedly.
     """
     n_vertices = xy_um.shape[0]
     edge, point, fraction = points_on_edges(points_um, xy_um, xy_um[next_vertex(ring_offsets)], tolerance_um)
@@ -77,13 +55,7 @@ def node_edges(begin_um: Floats, end_um: Floats) -> tuple[Floats, Floats]:
     """
     Return edges with coincident end points merged, split at end points of other edges.
 
-    Parameters
-    ----------
-    begin_um, end_um : (n_edge, 2) float64, µm
-
-    Returns
-    -------
-    begin_um, end_um : (n, 2) float64, µm
+    ``begin_um``, ``end_um``: (n_edge, 2) float64, µm. Returns ``begin_um``, ``end_um`` (n, 2) float64, µm.
     """
     points, ends = merge_coincident_points(np.concatenate((begin_um, end_um)))
     first, last = np.split(ends, 2)

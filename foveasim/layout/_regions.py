@@ -11,8 +11,6 @@ import shapely
 from foveasim._core.validation import MAX_LENGTH_UM, as_numbers, check_length_um, finite_array
 from foveasim.errors import ParameterError, printable, type_name
 
-__all__ = ["as_region", "disc", "parse_region", "region_as_plain_data"]
-
 #: Vertices of a polygonal disc, by default: its area is that of the circle within 7 ppm.
 DISC_CORNERS = 960
 #: Characters of an invalid text that messages show.
@@ -23,18 +21,9 @@ def parse_region(*, size_um: Any = None, radius_um: float | None = None, region:
     """
     Return the specified region as a shapely Polygon or MultiPolygon in µm.
 
-    Parameters
-    ----------
-    size_um : (width, height), optional, µm
-        Rectangle around the optical axis.
-    radius_um : float, optional, µm
-        Disc around the optical axis.
-    region : shapely polygon or (n, 2) vertices, optional, µm
-
-    Raises
-    ------
-    ParameterError
-        When not exactly one is specified, or it is not a valid region.
+    ``size_um`` (width, height), µm: rectangle around the optical axis. ``radius_um`` (float, µm): disc around the optical
+    axis. ``region``: shapely polygon or (n, 2) vertices, µm. Raises ParameterError when not exactly one is specified, or it is
+    not a valid region.
     """
     if sum(x is not None for x in (size_um, radius_um, region)) != 1:
         raise ParameterError("region", "or 'size_um' or 'radius_um' must be given, but only one of them")
@@ -54,10 +43,7 @@ def as_region(name: str, region: Any) -> Any:
 
     The region is such a polygon, its well-known text (WKT), or an (n, 2) array of vertices in µm.
 
-    Raises
-    ------
-    ParameterError
-        When it is none of these, crosses itself, is empty, or lies too far from the origin.
+    Raises ParameterError when it is none of these, crosses itself, is empty, or lies too far from the origin.
     """
     outline = region
     if isinstance(region, str):

@@ -25,12 +25,8 @@ class RectangleLattice:
     Site ``row * n_columns + column`` is the rectangle ``x_um[column]`` by ``y_um[row]``. Vertices are computed on demand, so
     that the memory of a dense sensor does not depend on the number of its sites.
 
-    Parameters
-    ----------
-    x_um : (n_column, 2) float64, µm
-        Lower and upper x of the sites of each column.
-    y_um : (n_row, 2) float64, µm
-        Lower and upper y of the sites of each row.
+    ``x_um`` (n_column, 2) float64, µm: lower and upper x of the sites of each column. ``y_um`` (n_row, 2) float64, µm: lower
+    and upper y of the sites of each row.
     """
 
     x_um: Floats
@@ -66,11 +62,8 @@ class RectangleLattice:
         """
         Return the packed rings of the sites ``first`` to ``last - 1``, by default of all.
 
-        Returns
-        -------
-        xy_um : (4 n, 2) float64, µm
-            Counter-clockwise from the lower left corner.
-        ring_offsets, site_offsets : (n + 1,) int64
+        Returns ``xy_um`` (4 n, 2) float64, µm: counter-clockwise from the lower left corner. ``ring_offsets``,
+        ``site_offsets`` (n + 1,) int64.
         """
         from foveasim.layout import _kernels
 

@@ -37,12 +37,8 @@ def layout_from_arrays(arrays: Mapping[str, NDArray[Any]], provenance: Mapping[s
     """
     Build a layout from named arrays; only structure and holes of the outlines are checked.
 
-    Raises
-    ------
-    KeyError
-        When an array of the outlines is missing.
-    GeometryError, ParameterError
-        When array sizes are inconsistent, holes do not lie in their outlines, or a column is malformed.
+    Raises KeyError when an array of the outlines is missing. Raises GeometryError, ParameterError when array sizes are
+    inconsistent, holes do not lie in their outlines, or a column is malformed.
     """
     from foveasim.layout.files._common import check_sizes
 

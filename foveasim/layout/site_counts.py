@@ -82,10 +82,7 @@ def select_unknown(family: str, unknowns: Sequence[SolveFor], parameters: Mappin
     """
     Return the parameter to solve for, or None when ``n_sites`` is not given.
 
-    Raises
-    ------
-    ParameterError
-        When a required parameter is missing, or nothing is left to solve for.
+    Raises ParameterError when a required parameter is missing, or nothing is left to solve for.
     """
     free = [unknown for unknown in unknowns if parameters[unknown.name] is None]
     if parameters.get("n_sites") is None:
@@ -116,16 +113,8 @@ def layout_with_n_sites(
     """
     Generate the layout whose number of sites is nearest to ``parameters["n_sites"]``.
 
-    Returns
-    -------
-    layout : Layout
-    value : int or float
-        Value of the unknown parameter.
-
-    Raises
-    ------
-    ParameterError
-        When the number differs by more than 1 %, with the nearest possible one; or as the generator.
+    Returns ``value``: value of the unknown parameter. Raises ParameterError when the number differs by more than 1 %, with the
+    nearest possible one; or as the generator.
     """
     target = check_count("n_sites", parameters["n_sites"], at_most=MAX_SITES)
     search = _Search(generate, unknown, {**parameters, "n_sites": None}, target)

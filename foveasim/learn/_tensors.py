@@ -12,8 +12,6 @@ from torch import Tensor
 
 from foveasim.errors import ParameterError, type_name
 
-__all__ = ["as_array", "check_tensor", "constant"]
-
 
 def check_tensor(name: str, value: object, shape: Sequence[int | None], description: str = "") -> Tensor:
     """
@@ -21,11 +19,6 @@ def check_tensor(name: str, value: object, shape: Sequence[int | None], descript
 
     ``None`` in the shape stands for any size; a leading ``...`` in the description for further axes, which
     the caller flattens.
-
-    Raises
-    ------
-    ParameterError
-        When it is not.
     """
     if not isinstance(value, Tensor):
         raise ParameterError(name, f"must be a torch.Tensor, got {type_name(value)}", hint="use torch.as_tensor")

@@ -42,11 +42,6 @@ class Mesh(nn.Module):
     outlines : Outlines
         Topology.
 
-    Raises
-    ------
-    ParameterError
-        When an argument differs from the above.
-
     Examples
     --------
     >>> import foveasim as fs

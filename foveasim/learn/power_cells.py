@@ -53,8 +53,6 @@ class PowerCells(nn.Module):
 
     Raises
     ------
-    ParameterError
-        When an argument differs from the above.
     GeometryError
         When a centre lies outside the region, or its cell is empty; the message specifies its index.
 

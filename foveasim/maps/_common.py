@@ -25,13 +25,6 @@ from foveasim.errors import ParameterError
 from foveasim.fields import Grid, Pitch, PowerMap, with_ascending_axes
 from foveasim.maps._units import PER_NM, UNITS, Unit, irradiance_unit, per_band_w_m2
 
-__all__ = [
-    "Found",
-    "Given",
-    "check_numbers",
-    "to_power_map",
-]
-
 #: Relative tolerance of square cells: rounding error of a pitch from float32 coordinates.
 SQUARE_TOLERANCE = 1e-6
 #: Largest negative value relative to the maximum: rounding error of Fourier transforms in float32.
@@ -204,10 +197,7 @@ def check_numbers(data: Images) -> None:
     """
     Reject invalid irradiance.
 
-    Raises
-    ------
-    FormatError
-        If a value is not finite, or negative by more than the rounding error.
+    Raises FormatError if a value is not finite, or negative by more than the rounding error.
     """
     lowest, highest = float(data.min()), float(data.max())
     if not (np.isfinite(lowest) and np.isfinite(highest)):

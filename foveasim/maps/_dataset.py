@@ -14,8 +14,6 @@ from foveasim.maps._common import Found
 from foveasim.maps._formats import MAP_FORMATS
 from foveasim.maps._xarray import NAME, found_in_array, to_xarray
 
-__all__ = ["read_netcdf", "read_zarr", "write_netcdf", "write_zarr"]
-
 #: Upper bound of the size of headers and attributes in a netCDF file written here, without data and coordinates.
 NETCDF_BYTES = 2**16
 
@@ -36,10 +34,7 @@ def write_zarr(power_map: PowerMap, path: Path) -> None:
     """
     Write an uncompressed zarr directory atomically.
 
-    Raises
-    ------
-    FileError
-        If zarr is missing, the path exists and is not a zarr directory, or it cannot be written.
+    Raises FileError if zarr is missing, the path exists and is not a zarr directory, or it cannot be written.
     """
     for module in ("zarr", "xarray"):
         import_optional(path, module, "maps")

@@ -23,8 +23,6 @@ from foveasim.maps._common import Found
 from foveasim.maps._formats import MAP_FORMATS
 from foveasim.maps._json_metadata import found_in_metadata, map_metadata
 
-__all__ = ["read", "write"]
-
 ATTRIBUTE = "foveasim"
 
 
@@ -32,10 +30,7 @@ def write(power_map: PowerMap, path: Path) -> None:
     """
     Write one uncompressed channel per band.
 
-    Raises
-    ------
-    ParameterError
-        If the map is not float32, or two bands have the same wavelength.
+    Raises ParameterError if the map is not float32, or two bands have the same wavelength.
     """
     exr = import_optional(path, "OpenEXR", "maps")
     if power_map.data.dtype != np.float32:

@@ -26,8 +26,6 @@ from foveasim.maps._common import Found
 from foveasim.maps._formats import MAP_FORMATS
 from foveasim.maps._json_metadata import found_in_metadata, map_metadata
 
-__all__ = ["MAGIC", "read", "write"]
-
 MAGIC = b"SIMPLE  ="
 KEYWORD = "FOVEASIM"
 #: Maximum number of header-data units that are searched.

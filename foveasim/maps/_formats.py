@@ -15,8 +15,6 @@ from foveasim._io.rasters import as_images, read_raster
 from foveasim.errors import ParameterError
 from foveasim.maps._common import Found
 
-__all__ = ["MAP_FORMATS", "read_found"]
-
 #: Formats of power maps. ``read(path, name)`` returns a :class:`foveasim.maps.Found`, ``write(power_map, path)`` None.
 #: Installed packages add formats as entry points of the group ``foveasim.map_formats``.
 MAP_FORMATS: Registry[FileFormat] = Registry("power map format", "foveasim.map_formats")

@@ -33,8 +33,6 @@ from foveasim.maps._common import Found
 from foveasim.maps._formats import MAP_FORMATS
 from foveasim.units import photon_energy_j
 
-__all__ = ["read_mat5", "read_mat73"]
-
 #: Names of the struct in files of scripts and of vcExportObject.
 NAMES = ("oi", "opticalimage", "opticalImage")
 

@@ -12,8 +12,6 @@ from foveasim._io.formats import FormatError
 from foveasim.fields import PowerMap
 from foveasim.maps._common import Found
 
-__all__ = ["found_in_metadata", "map_metadata"]
-
 FILE_FORMAT = "foveasim power map"
 FILE_VERSION = 1
 #: Longer strings are not metadata of foveasim.
@@ -36,10 +34,7 @@ def found_in_metadata(text: str, data: NDArray[Any], *, is_y_descending: bool) -
     """
     Return the map with the metadata of a string that foveasim wrote.
 
-    Raises
-    ------
-    FormatError
-        If the string has the format of foveasim and is invalid.
+    Raises FormatError if the string has the format of foveasim and is invalid.
     """
     about = _parse(text)
     if not isinstance(about, dict) or about.get("format") != FILE_FORMAT:

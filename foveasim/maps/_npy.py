@@ -23,8 +23,6 @@ from foveasim.fields import PowerMap
 from foveasim.maps._common import Found
 from foveasim.maps._formats import MAP_FORMATS
 
-__all__ = ["NPY_MAGIC", "ZIP_MAGICS", "read_npy", "read_npz", "write_npz"]
-
 NPY_MAGIC = b"\x93NUMPY"
 #: Signatures of zip archives: nonempty and empty.
 ZIP_MAGICS = (b"PK\x03\x04", b"PK\x05\x06")

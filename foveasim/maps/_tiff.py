@@ -21,8 +21,6 @@ from foveasim.maps._common import Found
 from foveasim.maps._formats import MAP_FORMATS
 from foveasim.maps._json_metadata import found_in_metadata, map_metadata
 
-__all__ = ["MAGICS", "read", "write"]
-
 MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 #: TIFF tag of the orientation, and its values for top row first and bottom row first.
 ORIENTATION_TAG, TOP_FIRST, BOTTOM_FIRST = 274, 1, 4

@@ -10,8 +10,6 @@ from foveasim._core.validation import Floats
 from foveasim._io.rasters.units import Powers, parse_unit, round_factor
 from foveasim.units import photon_energy_j
 
-__all__ = ["PER_NM", "UNITS", "Unit", "irradiance_unit", "per_band_w_m2"]
-
 #: Units of a map: power or photons per second, per square metre, per band or per nanometre.
 Unit: TypeAlias = Literal["w_m2", "w_m2_nm", "photons_s_m2", "photons_s_m2_nm"]
 UNITS: tuple[Unit, ...] = get_args(Unit)

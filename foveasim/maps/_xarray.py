@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import ArrayLike
 
-__all__ = ["NAME", "found_in_array", "from_xarray", "to_xarray"]
-
 #: Name of the map in a file with several arrays.
 NAME = "irradiance"
 #: Largest difference, in cells, of coordinates from the pitch and origin in attributes: rounding errors.
@@ -122,10 +120,7 @@ def found_in_array(array: xr.DataArray) -> Found:
     """
     Return data and metadata of a labelled array.
 
-    Raises
-    ------
-    FormatError
-        If the dimensions are not those of a map, or the coordinates are not uniform.
+    Raises FormatError if the dimensions are not those of a map, or the coordinates are not uniform.
     """
     array = squeeze(array)
     if is_unnamed(array):

@@ -91,13 +91,8 @@ class Jackknife:
     """
     Standard errors and intervals from values without each block of sites.
 
-    Parameters
-    ----------
-    n_blocks_of_class : (n_class,) int64
-        Number of blocks of each class; further blocks are empty.
+    ``n_blocks_of_class`` (n_class,) int64: number of blocks of each class; further blocks are empty.
 
-    Notes
-    -----
     Delete-a-group jackknife: with g blocks, the variance of an estimate is ``(g - 1) / g`` times the sum of the squares of the
     deviations from their mean of the estimates without one block (J. Shao and D. Tu, The jackknife and bootstrap, Springer,
     1995, chapter 2). Intervals use Student's distribution with g - 1 degrees of freedom.
@@ -138,13 +133,8 @@ class Jackknife:
         """
         Return the limits, (n_class, 2) each, of the smallest and the largest of several values.
 
-        Parameters
-        ----------
-        values : (1 + n_block, n_value, n_class)
-        is_used : (n_value, n_class) bool
+        ``is_used``: (n_value, n_class) bool.
 
-        Notes
-        -----
         With the probability of the interval, at least, all values are within their simultaneous limits (Bonferroni), and so are
         their extremes: the smallest of the lower limits and the smallest of the upper limits bound the smallest value.
         """

@@ -350,19 +350,8 @@ def measure_subsets(
     """
     Compute the photon transfer of frames, for all sites and without each block of sites.
 
-    Parameters
-    ----------
-    source, classes
-        As for :func:`photon_transfer`.
-    n_blocks : int
-        Largest number of blocks of each class, 0 for none.
-
-    Returns
-    -------
-    transfer : PhotonTransfer
-    subsets : tuple of (1 + n_block, n_level, n_class) float64
-        Mean, temporal and spatial variance: first of all sites, then without each block.
-    groups : SiteClasses
+    ``source``, ``classes``: as for :func:`photon_transfer`. ``n_blocks``: largest number of blocks of each class, 0 for none.
+    Returns ``subsets``: mean, temporal and spatial variance: first of all sites, then without each block.
     """
     measured, counts, n_sites = [], [], None
     if not isinstance(source, Iterable):

@@ -106,21 +106,9 @@ def ssim_map(
     """
     Compute the structural similarity of each pixel, a mean over the channels.
 
-    Parameters
-    ----------
-    one, other : (n_channel, n_y, n_x)
-        Finite everywhere.
-    is_compared : (n_y, n_x) bool
-    data_range : float
-        Peak value.
-    window : int, pixels
-        Odd side of the square window.
-
-    Returns
-    -------
-    similarity : (n_y, n_x) float64
-    fits : (n_y, n_x) bool
-        Whether the window of a pixel contains only compared pixels.
+    ``one``, ``other`` (n_channel, n_y, n_x): finite everywhere. ``is_compared``: (n_y, n_x) bool. ``data_range``: peak value.
+    ``window`` (int, pixels): odd side of the square window. Returns ``similarity`` (n_y, n_x) float64. ``fits`` (n_y, n_x)
+    bool: whether the window of a pixel contains only compared pixels.
     """
     from scipy.ndimage import minimum_filter
     from skimage.metrics import structural_similarity

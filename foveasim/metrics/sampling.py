@@ -62,11 +62,6 @@ def nyquist_per_mm(
     nyquist : (n_site,) float64, 1/mm
         Line pairs per mm. NaN without suitable neighbours, as in a single row, or with coincident sites.
 
-    Raises
-    ------
-    ParameterError
-        When an option is invalid.
-
     Examples
     --------
     >>> from foveasim.layout import grid, hexagonal
@@ -144,17 +139,9 @@ def _row_um(distance_um: Floats, step_um: Floats) -> tuple[Floats, Bools]:
     """
     Compute the distances to the nearest rows from neighbours sorted by distance.
 
-    Parameters
-    ----------
-    distance_um, step_um : (n, n_neighbour), (n, n_neighbour, 2), µm
-        Distances of the neighbours, and vectors to them.
-
-    Returns
-    -------
-    row_um : (n,) µm
-        Mean over ties; NaN without another row.
-    is_complete : (n,) bool
-        Whether further neighbours cannot change the result.
+    ``distance_um``, ``step_um`` (n, n_neighbour), (n, n_neighbour, 2), µm: distances of the neighbours, and vectors to them.
+    Returns ``row_um`` (n,) µm: mean over ties; NaN without another row. ``is_complete`` (n,) bool: whether further neighbours
+    cannot change the result.
     """
     is_nearest = distance_um <= distance_um[:, :1] * (1.0 + TIE_FRACTION)
     total_um, count = np.zeros(len(distance_um)), np.zeros(len(distance_um))
@@ -325,10 +312,7 @@ def require_layout(layout: object) -> None:
     """
     Validate that an argument is a layout.
 
-    Raises
-    ------
-    ParameterError
-        When it is not a :class:`foveasim.Layout`.
+    Raises ParameterError when it is not a :class:`foveasim.Layout`.
     """
     if not isinstance(layout, Layout):
         raise ParameterError("layout", f"must be a foveasim.Layout, got {type_name(layout)}")

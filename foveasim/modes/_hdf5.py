@@ -17,8 +17,6 @@ from foveasim.errors import FileError, ParameterError
 from foveasim.layout import Layout
 from foveasim.layout.packed import layout_from_arrays, layout_to_arrays
 
-__all__ = ["EventFile", "max_file_bytes", "read_events"]
-
 FORMAT, VERSION = "foveasim events", 2
 #: Events, or milliseconds, per chunk.
 CHUNK = 1 << 16
@@ -37,14 +35,8 @@ def max_file_bytes(layout: Layout, n_before: int, t_us: Ints) -> int:
     """
     Return an upper bound of the file size after adding events: the uncompressed size.
 
-    Parameters
-    ----------
-    layout : Layout
-        Layout of the photosites.
-    n_before : int
-        Number of events in the file.
-    t_us : (n,) int64, µs
-        Times of the events to add.
+    ``layout``: layout of the photosites. ``n_before``: number of events in the file. ``t_us`` (n,) int64, µs: times of the
+    events to add.
     """
     per_event = sum(np.dtype(kind).itemsize for kind in KINDS.values())
     n_chunks = min(int(t_us[-1]) // 1000 + 1, MAX_MS) // CHUNK + 1 if t_us.size else 1
@@ -57,14 +49,8 @@ class EventFile:
     """
     Writer of events to an open HDF5 file.
 
-    Parameters
-    ----------
-    file : h5py.File
-        File that is open for writing.
-    layout : Layout
-        Layout of the photosites.
-    x, y : (n_site,) uint16
-        Address of each site.
+    ``file``: file that is open for writing. ``layout``: layout of the photosites. ``x``, ``y`` (n_site,) uint16: address of
+    each site.
     """
 
     def __init__(self, file: Any, layout: Layout, x: NDArray[np.uint16], y: NDArray[np.uint16]) -> None:
@@ -130,10 +116,7 @@ def read_events(path: Path) -> tuple[Floats, NDArray[np.int32], NDArray[np.int8]
 
     Times are rounded down to microseconds.
 
-    Raises
-    ------
-    FileError
-        When the file is corrupt, malformed, or contains other data.
+    Raises FileError when the file is corrupt, malformed, or contains other data.
     """
     metadata, found = read_in_sandbox(_read, path, kind="HDF5", max_decompressed_bytes=_max_decompressed_bytes)
     arrays = dict(zip(metadata["names"], found, strict=True))

@@ -23,8 +23,6 @@ from numba import types
 from foveasim._core._kernels import philox_4x64, uniform
 from foveasim._core.jit import njit
 
-__all__ = ["DIFFERENCE", "HAZARD", "LEVEL", "MISSING", "REFRACTORY_END", "change_events", "charge_spikes"]
-
 #: State of a change-detecting site: low-pass level, its difference from the level of the last event, end of the refractory
 #: time, and integrated noise rate until the next noise event.
 LEVEL, DIFFERENCE, REFRACTORY_END, HAZARD = range(4)

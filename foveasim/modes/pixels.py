@@ -7,11 +7,12 @@ events do not depend on the size of the batches of a video.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import KW_ONLY, dataclass, replace
 from itertools import islice
 from threading import Lock
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -47,8 +48,72 @@ KernelCall = Callable[[slice, int, NDArray[Any], Ints, Ints, Floats, NDArray[np.
 BlockEvents = tuple[Ints, Floats, NDArray[np.int32], NDArray[np.int8]]
 
 
+class _Pixels:
+    """Photosites that generate events from the photoelectron rates of frames."""
+
+    sensor: Sensor
+    #: Name of the random stream of the noise.
+    _noise_name: ClassVar[str]
+
+    def stream(
+        self,
+        rates: OwnCheck[Iterable[ArrayLike]],
+        *,
+        frame_s: float,
+        seed: int,
+        batch: int = 32,
+        n_threads: int | None = None,
+    ) -> Iterator[Events]:
+        """
+        Yield the events or spikes of successive batches of frames.
+
+        Parameters
+        ----------
+        rates : iterable of (n_site,), e-/s
+            Photoelectron rates of the frames, as from :meth:`foveasim.Camera.rates`.
+        frame_s : float, s
+            Frame period; the first frame is at 0 s.
+        seed : int
+            Seed of the noise.
+        batch : int
+            Frames per batch; events do not depend on it.
+        n_threads : int, optional
+            Number of threads, by default all cores. Events do not depend on it.
+
+        Yields
+        ------
+        Events
+            Events of a batch, all later than those of previous batches. Spikes are of polarity 1.
+
+        Raises
+        ------
+        ParameterError
+            Immediately when a value is out of range; during iteration when a frame does not have one rate >= 0 per site.
+        SimulationError
+            When the events do not fit in memory, or the current of a site of :class:`EventPixels` is zero.
+        """
+        _check_rates(rates)
+        frame_s = DURATION.check("frame_s", frame_s)
+        batch = check_count("batch", batch)
+        key = fixed_pattern_key(check_count("seed", seed, at_least=0), self._noise_name)
+        return self._stream(rates, frame_s, key, batch, thread_count(n_threads))
+
+    def events(
+        self, rates: OwnCheck[Iterable[ArrayLike]], *, frame_s: float, seed: int, n_threads: int | None = None
+    ) -> Events:
+        """Return all events at once; parameters as for :meth:`stream`."""
+        empty = Events(np.zeros(0), np.zeros(0, np.int32), np.zeros(0, np.int8), _layout(self.sensor))
+        return Events.concatenate([empty, *self.stream(rates, frame_s=frame_s, seed=seed, n_threads=n_threads)])
+
+    @abstractmethod
+    def _stream(
+        self, rates: Iterable[ArrayLike], frame_s: float, key: tuple[Any, Any], batch: int, n_threads: int
+    ) -> Iterator[Events]:
+        """Yield the events of batches; the arguments are valid."""
+
+
 @dataclass(frozen=True, eq=False)
-class EventPixels:
+class EventPixels(_Pixels):
     """
     Photosites of an event camera (dynamic vision sensor), which detect contrast changes.
 
@@ -77,11 +142,6 @@ class EventPixels:
         Photocurrent at which the noise rate is half: ``noise_per_s / (1 + I / noise_half)``.
     floor_e_per_s : float, e-/s
         Rate added to the photocurrent of every site, so that the logarithm is finite at zero irradiance.
-
-    Raises
-    ------
-    ParameterError
-        When a value is out of range.
 
     Notes
     -----
@@ -122,6 +182,7 @@ class EventPixels:
     noise_half_e_per_s: Annotated[float, replace(RATE, above=0.0)] = 1e4
     floor_e_per_s: Annotated[float, RATE] = 1.0
 
+    _noise_name: ClassVar[str] = "change events"
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
@@ -149,55 +210,6 @@ class EventPixels:
         if not self.leak_spread_fraction:
             return read_only(np.full(1, self.leak_per_s))
         return read_only(self.leak_per_s * self.sensor.device.log_normals("event leak", self.leak_spread_fraction))
-
-    def stream(
-        self,
-        rates: OwnCheck[Iterable[ArrayLike]],
-        *,
-        frame_s: float,
-        seed: int,
-        batch: int = 32,
-        n_threads: int | None = None,
-    ) -> Iterator[Events]:
-        """
-        Yield the events of successive batches of frames.
-
-        Parameters
-        ----------
-        rates : iterable of (n_site,), e-/s
-            Photoelectron rates of the frames, as from :meth:`foveasim.Camera.rates`.
-        frame_s : float, s
-            Frame period; the first frame is at 0 s.
-        seed : int
-            Seed of the noise.
-        batch : int
-            Frames per batch; events do not depend on it.
-        n_threads : int, optional
-            Number of threads, by default all cores. Events do not depend on it.
-
-        Yields
-        ------
-        Events
-            Events of a batch, all later than those of previous batches.
-
-        Raises
-        ------
-        ParameterError
-            Immediately when a value is out of range; during iteration when a frame does not have one rate >= 0 per site.
-        SimulationError
-            When the current of a site is zero, or the events do not fit in memory.
-        """
-        _check_rates(rates)
-        frame_s = DURATION.check("frame_s", frame_s)
-        batch = check_count("batch", batch)
-        key = fixed_pattern_key(check_count("seed", seed, at_least=0), "change events")
-        return self._stream(rates, frame_s, key, batch, thread_count(n_threads))
-
-    def events(
-        self, rates: OwnCheck[Iterable[ArrayLike]], *, frame_s: float, seed: int, n_threads: int | None = None
-    ) -> Events:
-        """Return all events at once; parameters as for :meth:`stream`."""
-        return _concatenate(self.stream(rates, frame_s=frame_s, seed=seed, n_threads=n_threads), self.sensor)
 
     def _stream(
         self, rates: Iterable[ArrayLike], frame_s: float, key: tuple[Any, Any], batch: int, n_threads: int
@@ -252,7 +264,7 @@ class EventPixels:
 
 
 @dataclass(frozen=True, eq=False)
-class SpikingPixels:
+class SpikingPixels(_Pixels):
     """
     Integrate-and-fire photosites with a charge threshold.
 
@@ -291,60 +303,12 @@ class SpikingPixels:
     threshold_e: Annotated[float | Floats, replace(CHARGE, at_least=1.0)] = 1000.0
     refractory_s: Annotated[float, EXPOSURE] = 0.0
 
+    _noise_name: ClassVar[str] = "spikes"
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
         _check_sensor(self.sensor)
         check_declared(self, n_sites=self.sensor.layout.n_sites)
-
-    def stream(
-        self,
-        rates: OwnCheck[Iterable[ArrayLike]],
-        *,
-        frame_s: float,
-        seed: int,
-        batch: int = 32,
-        n_threads: int | None = None,
-    ) -> Iterator[Events]:
-        """
-        Yield the spikes of successive batches of frames.
-
-        Parameters
-        ----------
-        rates : iterable of (n_site,), e-/s
-            Photoelectron rates of the frames, as from :meth:`foveasim.Camera.rates`.
-        frame_s : float, s
-            Frame period; the first frame begins at 0 s.
-        seed : int
-            Seed of the shot noise.
-        batch : int
-            Frames per batch; spikes do not depend on it.
-        n_threads : int, optional
-            Number of threads, by default all cores. Spikes do not depend on it.
-
-        Yields
-        ------
-        Events
-            Spikes of a batch, all of polarity 1 and later than those of previous batches.
-
-        Raises
-        ------
-        ParameterError
-            Immediately when a value is out of range; during iteration when a frame does not have one rate >= 0 per site.
-        SimulationError
-            When the spikes do not fit in memory.
-        """
-        _check_rates(rates)
-        frame_s = DURATION.check("frame_s", frame_s)
-        batch = check_count("batch", batch)
-        key = fixed_pattern_key(check_count("seed", seed, at_least=0), "spikes")
-        return self._stream(rates, frame_s, key, batch, thread_count(n_threads))
-
-    def events(
-        self, rates: OwnCheck[Iterable[ArrayLike]], *, frame_s: float, seed: int, n_threads: int | None = None
-    ) -> Events:
-        """Return all spikes at once; parameters as for :meth:`stream`."""
-        return _concatenate(self.stream(rates, frame_s=frame_s, seed=seed, n_threads=n_threads), self.sensor)
 
     def _stream(
         self, rates: Iterable[ArrayLike], frame_s: float, key: tuple[Any, Any], batch: int, n_threads: int
@@ -486,11 +450,6 @@ def _stable_argsort(values: Floats) -> Ints:
     tied = order[is_tied]
     order[is_tied] = tied[np.lexsort((tied, values[tied]))]
     return order
-
-
-def _concatenate(batches: Iterator[Events], sensor: Sensor) -> Events:
-    empty = Events(np.zeros(0), np.zeros(0, np.int32), np.zeros(0, np.int8), _layout(sensor))
-    return Events.concatenate([empty, *batches])
 
 
 def _layout(sensor: Sensor) -> Layout:

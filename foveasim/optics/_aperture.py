@@ -27,8 +27,6 @@ from foveasim.optics._quadrature import Nodes, PupilEdges, joined, overlap_nodes
 from foveasim.optics.pupils import Annulus, Blades, Pupil, PupilImage, Slit, Spider
 from foveasim.units import um_from_nm
 
-__all__ = ["Aperture", "Wavefront"]
-
 #: Samples across an unaberrated aperture; the OTF is then accurate to 4e-4.
 MIN_ACROSS = 192
 #: Samples across the aperture per λN of geometric blur; the PSF at the blur radius is then too low by 1.3 %.
@@ -90,9 +88,7 @@ def overlaps(n_to: int, to_step: float, n_from: int, from_step: float) -> Any:
     """
     Compute the overlaps of two centred rows of cells, as fractions of the target cells.
 
-    Returns
-    -------
-    fractions : (n_to, n_from) sparse array
+    Returns ``fractions`` (n_to, n_from) sparse array.
     """
     from scipy.sparse import coo_array, diags_array
 
@@ -112,14 +108,8 @@ class Aperture:
     """
     Amplitude transmission and wavefront of an aperture.
 
-    Attributes
-    ----------
-    pupils : sequence of callables
-        Amplitude transmissions, multiplied; 0 outside the unit circle.
-    wavefronts : sequence of Wavefront
-        Path differences, added.
-    defocus_um : float, µm
-        Path difference at the edge of the aperture; proportional to the squared radius.
+    ``pupils``: amplitude transmissions, multiplied; 0 outside the unit circle. ``wavefronts``: path differences, added.
+    ``defocus_um`` (float, µm): path difference at the edge of the aperture; proportional to the squared radius.
     """
 
     pupils: Sequence[Pupil]
@@ -197,10 +187,7 @@ class Aperture:
         """
         Return the transmitted power relative to that of the clear circle.
 
-        Raises
-        ------
-        ParameterError
-            When no power is transmitted.
+        Raises ParameterError when no power is transmitted.
         """
         return self._transmittance_slope_edge(wavelength_nm)[0] if self.pupils else 1.0
 
@@ -231,10 +218,7 @@ class Aperture:
         """
         Return :meth:`blur_lambda_n` within the limit of the largest transform.
 
-        Raises
-        ------
-        ParameterError
-            When the blur is larger.
+        Raises ParameterError when the blur is larger.
         """
         blur = self.blur_lambda_n(wavelength_nm, field_um)
         if blur * ACROSS_PER_BLUR > MAX_ACROSS:
@@ -250,10 +234,7 @@ class Aperture:
         """
         Return the number of samples across the aperture that the OTF requires.
 
-        Raises
-        ------
-        ParameterError
-            When the geometric blur exceeds the limit of the largest transform.
+        Raises ParameterError when the geometric blur exceeds the limit of the largest transform.
         """
         return max(MIN_ACROSS, math.ceil(self._checked_blur(wavelength_nm, field_um) * ACROSS_PER_BLUR))
 
@@ -263,19 +244,10 @@ class Aperture:
         """
         Sample the complex amplitude in the aperture.
 
-        Parameters
-        ----------
-        n_across : float
-            Samples across the diameter, not necessarily an integer.
-
-        Returns
-        -------
-        amplitude : (n, n) complex128
-            Pupil transmission, averaged over the squares around the points, times the phase factor at the points.
-        at : (n,) float64
-            Sample positions along either axis, in aperture radii.
-        power : float
-            Sum of the squared amplitudes in the limit of fine sampling.
+        ``n_across``: samples across the diameter, not necessarily an integer. Returns ``amplitude`` (n, n) complex128: pupil
+        transmission, averaged over the squares around the points, times the phase factor at the points. ``at`` (n,) float64:
+        sample positions along either axis, in aperture radii. ``power``: sum of the squared amplitudes in the limit of fine
+        sampling.
         """
         n = math.ceil(n_across)
         pitch = 2.0 / n_across
@@ -302,10 +274,8 @@ class Aperture:
         """
         Compute the OTF at integer lags, as the normalised autocorrelation of the amplitude.
 
-        Returns
-        -------
-        otf : (2 n_lags + 1, 2 n_lags + 1) complex64 or complex128
-            At frequencies ``k / (n_across λN)``, k from -n_lags to n_lags, rows along y.
+        Returns ``otf`` (2 n_lags + 1, 2 n_lags + 1) complex64 or complex128: at frequencies ``k / (n_across λN)``, k from
+        -n_lags to n_lags, rows along y.
         """
         import scipy.fft
 

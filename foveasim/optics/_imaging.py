@@ -32,8 +32,6 @@ from foveasim.optics._aperture import Aperture
 from foveasim.optics._transform import Factor, Transform, source_pixels
 from foveasim.optics.otf import Tables
 
-__all__ = ["Imaging", "MapRows", "PatchExtent", "isoplanatic_error", "isoplanatic_maps", "reach_cells", "rows_of"]
-
 #: Function of (first, last) that returns the rows ``first`` to ``last - 1`` of a map.
 MapRows = Callable[[int, int], NDArray[Any]]
 
@@ -50,14 +48,9 @@ class Step:
     """
     Basis images that are added to maps in one pass, and their sums of OTFs.
 
-    Attributes
-    ----------
-    outputs, basis : (n_output,), (n_basis,)
-        Indices of the maps and the basis images.
-    weights : (n_sum, n_wavelength)
-        Weights of the wavelengths in each sum of OTFs.
-    coefficients : (n_output, n_basis, n_sum)
-        Weight of each sum in the transfer function from a basis image to a map.
+    ``outputs``, ``basis`` (n_output,), (n_basis,): indices of the maps and the basis images. ``weights`` (n_sum,
+    n_wavelength): weights of the wavelengths in each sum of OTFs. ``coefficients`` (n_output, n_basis, n_sum): weight of each
+    sum in the transfer function from a basis image to a map.
     """
 
     outputs: Ints
@@ -71,12 +64,8 @@ class Group:
     """
     Maps and basis images that contribute to each other, and to no others.
 
-    Attributes
-    ----------
-    basis : (n_basis,)
-    steps : sequence of Step
-        One step per basis image, to all maps, if there are more basis images than maps; else one step for every n_basis maps,
-        from all basis images.
+    ``basis``: (n_basis,). ``steps``: one step per basis image, to all maps, if there are more basis images than maps; else one
+    step for every n_basis maps, from all basis images.
     """
 
     basis: Ints
@@ -308,14 +297,9 @@ class PatchExtent:
     """
     Extent of an isoplanatic patch along one axis.
 
-    Attributes
-    ----------
-    sources, weight : (n_pixel,)
-        Indices of the picture pixels of the patch, and their linear weights.
-    pixels : slice
-        Position of these pixels among the cells.
-    cells : (n_cell,)
-        Indices of the picture cells that the patch reaches, in order; negative or beyond the picture in the padding.
+    ``sources``, ``weight`` (n_pixel,): indices of the picture pixels of the patch, and their linear weights. ``pixels``:
+    position of these pixels among the cells. ``cells`` (n_cell,): indices of the picture cells that the patch reaches, in
+    order; negative or beyond the picture in the padding.
     """
 
     sources: Ints

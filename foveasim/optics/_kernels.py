@@ -11,19 +11,6 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = [
-    "alias_sum",
-    "alias_sum_plane",
-    "apply_falloff",
-    "filter_and_sum",
-    "load_rows",
-    "pad_lines",
-    "plane_factor",
-    "radial_factor",
-    "replicate",
-    "store_rows",
-]
-
 _floats = types.Array(types.float64, 1, "C", readonly=True)
 #: Columns per pass of a transposition: a cache line of complex64.
 COLUMNS_TOGETHER = 8

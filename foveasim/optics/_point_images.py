@@ -19,8 +19,6 @@ from foveasim.fields import Grid
 from foveasim.optics._aperture import Aperture
 from foveasim.optics.otf import circular_otf
 
-__all__ = ["Point", "PointImages", "PointSpread"]
-
 #: Default number of PSF samples along either axis, and their pitch in λN.
 PSF_POINTS, PSF_LAMBDA_N = 257, 0.125
 #: Minimum number of samples across the aperture for encircled and ensquared energy; halves the error of power maps.
@@ -182,11 +180,6 @@ class PointImages:
         PointSpread
             Samples of the PSF, normalised to unit energy (1/µm²).
 
-        Raises
-        ------
-        ParameterError
-            When a value is out of range.
-
         Notes
         -----
         The amplitude is integrated over the pupil by Gauss quadrature between the edges of the pupil. For the pupils of this
@@ -230,11 +223,6 @@ class PointImages:
         -------
         otf : array of the same shape, complex128
             ``∫ PSF(r) exp(-2πi f·r) dr``, 1 at zero frequency.
-
-        Raises
-        ------
-        ParameterError
-            When a value is out of range.
 
         Notes
         -----

@@ -22,8 +22,6 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats, Ints, finite_array
 from foveasim.errors import ParameterError
 
-__all__ = ["Nodes", "PupilEdges", "overlap_nodes", "plane_waves", "pupil_nodes"]
-
 #: Complex amplitude at points (x, y) of the aperture.
 Amplitude = Callable[[Floats, Floats], NDArray[np.complex128]]
 
@@ -245,14 +243,9 @@ def _n_nodes(phase: Floats, rho: Floats | float = np.inf) -> Ints:
     """
     Return the number of Gauss nodes of intervals.
 
-    Parameters
-    ----------
-    phase : array
-        Change of the phase over half of each interval, in radians.
-    rho : array
-        Sum of the semi-axes of the ellipse, with foci at the ends of an interval of half length 1, in which the integrand is
-        analytic. The error decreases as ``rho ** (-2 n)``: Trefethen, Approximation Theory and Approximation Practice,
-        chapter 19.
+    ``phase``: change of the phase over half of each interval, in radians. ``rho``: sum of the semi-axes of the ellipse, with
+    foci at the ends of an interval of half length 1, in which the integrand is analytic. The error decreases as ``rho ** (-2
+    n)``: Trefethen, Approximation Theory and Approximation Practice, chapter 19.
     """
     small = np.searchsorted(_largest_phases(), phase)
     large = np.ceil(NODES_PER_RADIAN * phase + NODES_PER_ROOT * np.cbrt(phase) + NODES_AT_LEAST)
@@ -350,13 +343,8 @@ def nodes_of(curves: Curves, transmission: Amplitude, radians: float) -> Iterato
     """
     Yield the nodes of a quadrature over the intersection of discs, in blocks of rows.
 
-    Parameters
-    ----------
-    curves : Curves
-    transmission : callable
-        Amplitude whose discontinuities the segments are.
-    radians : float
-        Highest frequency of the integrand, in radians per radius.
+    ``transmission``: amplitude whose discontinuities the segments are. ``radians``: highest frequency of the integrand, in
+    radians per radius.
     """
     segments = curves.effective_segments(transmission)
     corners, tangents = curves.corners()
@@ -475,16 +463,8 @@ def plane_waves(nodes: Nodes, values: NDArray[np.complex128], radians_x: Floats)
     """
     Return the sums ``sum_k values[k] exp(-i radians_x x[k])`` along each row of nodes.
 
-    Parameters
-    ----------
-    nodes : Nodes
-    values : (n_node,) complex128
-    radians_x : (n_x,) float64, radians per radius
-        Equidistant.
-
-    Returns
-    -------
-    sums : (n_row, n_x) complex128
+    ``values``: (n_node,) complex128. ``radians_x`` (n_x,) float64, radians per radius: equidistant. Returns ``sums`` (n_row,
+    n_x) complex128.
     """
     if nodes.column_x is not None:
         return np.asarray(values.reshape(nodes.row_y.size, -1) @ np.exp(-1j * np.outer(nodes.column_x, radians_x)))

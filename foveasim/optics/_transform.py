@@ -30,8 +30,6 @@ from foveasim._core.work_arrays import work_array
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.optics.otf import MAX_ALIASES
 
-__all__ = ["Factor", "Transform", "source_pixels"]
-
 #: Callable of (first, last) that returns the columns of a transfer function, (last - first, n): real with the rows of
 #: frequencies >= 0 along y, or complex with all rows.
 Factor: TypeAlias = Callable[[int, int], NDArray[Any]]
@@ -282,17 +280,10 @@ class Transform:
         """
         Add ``sum_br coefficients[c, b, r] * factors[r] * spectra[b]`` to ``out[c]``.
 
-        Parameters
-        ----------
-        spectra : (n_basis, n_columns, n_rows)
-        factors : n_factor transfer functions
-        coefficients : (n_output, n_basis, n_factor)
-        out : (n_output, n_columns, n_rows)
-            May be the first of the spectra, if there are at least as many as outputs and they have the same shape.
-        is_first : bool
-            Whether the result is written to ``out`` instead of being added.
-        is_last : bool
-            Whether to transform the sum back along y, for :meth:`inverse`.
+        ``spectra``: (n_basis, n_columns, n_rows). ``coefficients``: (n_output, n_basis, n_factor). ``out`` (n_output,
+        n_columns, n_rows): may be the first of the spectra, if there are at least as many as outputs and they have the same
+        shape. ``is_first``: whether the result is written to ``out`` instead of being added. ``is_last``: whether to transform
+        the sum back along y, for :meth:`inverse`.
         """
         coefficients = np.ascontiguousarray(coefficients, self._real)
 

@@ -17,8 +17,6 @@ import numpy as np
 from foveasim._core.validation import Floats
 from foveasim.errors import SimulationError
 
-__all__ = ["minimise_nonnegative"]
-
 Operator = Callable[[Floats], Floats]
 
 
@@ -35,31 +33,12 @@ def minimise_nonnegative(
     """
     Minimise ``x·A x / 2 - b·x`` subject to x >= 0.
 
-    Parameters
-    ----------
-    matrix : callable
-        A, symmetric and positive semi-definite: maps x to A x, (n,).
-    bound : (n,) float64
-        Diagonal of a matrix D with ``x·A x <= x·D x`` for all x.
-    precondition : callable
-        Approximate inverse of A, symmetric and positive definite.
-    right, start : (n,) float64
-        b, and the starting point.
-    threshold : float
-        Convergence threshold of the root of ``g·M g``, with the projected gradient g and the preconditioner M (the inverse
-        of D for unknowns at 0): approximately the distance from the minimum in the norm of A.
-    max_steps : int
-
-    Returns
-    -------
-    x : (n,) float64
-    n_steps : int
-        Number of applications of A.
-
-    Raises
-    ------
-    SimulationError
-        When the iteration does not converge within ``max_steps``.
+    ``matrix``: A, symmetric and positive semi-definite: maps x to A x, (n,). ``bound`` (n,) float64: diagonal of a matrix D
+    with ``x·A x <= x·D x`` for all x. ``precondition``: approximate inverse of A, symmetric and positive definite. ``right``,
+    ``start`` (n,) float64: b, and the starting point. ``threshold``: convergence threshold of the root of ``g·M g``, with the
+    projected gradient g and the preconditioner M (the inverse of D for unknowns at 0): approximately the distance from the
+    minimum in the norm of A. Returns ``x`` (n,) float64. ``n_steps``: number of applications of A. Raises SimulationError when
+    the iteration does not converge within ``max_steps``.
     """
     x = np.maximum(start, 0.0)
     gradient = matrix(x) - right

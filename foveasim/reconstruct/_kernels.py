@@ -13,8 +13,6 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = ["add_roughness", "find_triangles", "interpolate"]
-
 #: Largest number of natural neighbours: a random point has six, and the centre of a ring of sites has the complete ring.
 MAX_TRIANGLES = 4096
 #: Values are linear between the ends of a hull edge at points closer to it than this fraction of its length, where

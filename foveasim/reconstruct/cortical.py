@@ -297,11 +297,6 @@ def from_cortical(image: CorticalImage, grid: Grid, *, method: str = "linear") -
     -------
     Picture
         NaN outside the rings, and where the image is unknown.
-
-    Raises
-    ------
-    ParameterError
-        When an argument is invalid.
     """
     if not isinstance(image, CorticalImage):
         raise ParameterError("image", f"must be a CorticalImage, got {type_name(image)}")

@@ -86,10 +86,7 @@ def site_values(values: Floats, n_sites: int) -> Floats:
     """
     Return values, NaN where missing, with the shape (n_channel, n_site).
 
-    Raises
-    ------
-    ParameterError
-        When there is not one value per site, a value is infinite, or a channel has no values.
+    Raises ParameterError when there is not one value per site, a value is infinite, or a channel has no values.
     """
     channels = np.atleast_2d(as_numbers("values", values, missing_is_nan=True))
     if channels.ndim != 2 or channels.shape[1] != n_sites:

@@ -62,17 +62,8 @@ def sum_of_images(images: Sequence[tuple[Grid, Iterable[Any]]], grid: Grid, n_ch
     """
     Return the sum of images on several grids, as area-weighted means over pixels.
 
-    Parameters
-    ----------
-    images : sequence of (Grid, iterable of n_channels planes (n_y, n_x))
-    grid : Grid
-        Pixels of the picture.
-    n_channels : int
-
-    Returns
-    -------
-    Picture
-        NaN where an image does not cover a pixel; the coverage is the smallest of all images.
+    ``images``: sequence of (Grid, iterable of n_channels planes (n_y, n_x)). ``grid``: pixels of the picture. NaN where
+    an image does not cover a pixel; the coverage is the smallest of all images.
     """
     data, coverage = np.zeros((n_channels, *grid.shape)), np.ones(grid.shape)
     for source, planes in images:
@@ -113,11 +104,6 @@ def blur_kernel(
     -------
     kernel : (2 radius + 1, 2 radius + 1) float64
         Normalised to a sum of 1, which redistributes the energy outside the kernel.
-
-    Raises
-    ------
-    ParameterError
-        When a value is out of range.
 
     Notes
     -----

@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike
 from foveasim._core.validation import Floats, check_choice, read_only, wavelengths_nm
 from foveasim.errors import ParameterError
 
-__all__ = ["Illuminant", "illuminant", "illuminant_spectrum", "interpolate_table", "read_table"]
-
 Illuminant = Literal["A", "D50", "D55", "D65", "D75", "E"]
 
 #: Revision of Planck's second constant since the definition of the daylight illuminants, from 1.438 to 1.4388 cm K: their

@@ -6,8 +6,6 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = ["look_up"]
-
 _images = types.float32[:, :, ::1]
 _table = types.Array(types.float32, 1, "C", readonly=True)
 

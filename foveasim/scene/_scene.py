@@ -41,8 +41,6 @@ from foveasim.scene.cubes import IlluminantTable, Invalid, Quantity, Selection, 
 from foveasim.scene.registry import SCENES
 from foveasim.units import m_from_um, um_from_m
 
-__all__ = ["FRAMINGS", "Fit", "Scene"]
-
 #: Framing of a picture on a layout.
 Fit: TypeAlias = Literal["cover", "contain", "width"]
 #: Parameters of which one determines the size of a scene.
@@ -213,11 +211,6 @@ class Scene:
         -------
         Scene
             Shares the arrays of this scene.
-
-        Raises
-        ------
-        ParameterError
-            When the pitch is out of range.
         """
         # Not dataclasses.replace, which would check all pixels again.
         scene = copy.copy(self)
@@ -510,11 +503,6 @@ class Scene:
         pitch_um, distance_m, wavelength_nm, band_width_nm
             As for :meth:`from_picture`.
         radiance_w_m2_sr_nm : float, W/(m² sr nm)
-
-        Raises
-        ------
-        ParameterError
-            If a value is out of range.
         """
         radiance = check_number("radiance_w_m2_sr_nm", radiance_w_m2_sr_nm, at_least=0.0, at_most=MAX_RADIANCE)
         waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)

@@ -18,19 +18,6 @@ from foveasim.sensor.adc import ConversionTables
 from foveasim.sensor.effects.shot import PoissonTables
 from foveasim.sensor.prediction import ChargeDistributions, Quadrature, Transfer
 
-__all__ = [
-    "ADC_LINEAR",
-    "ADC_LOG",
-    "ADC_ROOT",
-    "ADC_TABLE",
-    "apply_nonlinearity",
-    "convert",
-    "device_uniforms",
-    "draw_poisson",
-    "mix",
-    "predict_codes",
-]
-
 #: ADC transfer functions, as numbered by ``ConversionTables.companding_index``.
 ADC_LINEAR, ADC_ROOT, ADC_LOG, ADC_TABLE = range(4)
 #: Tolerance of code transitions, in codes: covers the rounding error of a division.

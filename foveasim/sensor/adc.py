@@ -65,11 +65,6 @@ class ADC:
     dnl_dn : float, DN
         Differential nonlinearity (DNL): standard deviation of the offset of each code transition in each readout line (0.5 in
         the paper). It is fixed for a device. The transfer function is then not necessarily monotonic.
-
-    Raises
-    ------
-    ParameterError
-        If a value is out of range.
     """
 
     bits: Annotated[int, BITS] = 8

@@ -16,10 +16,6 @@ class BoundedCache:
 
     Values that have not been used recently are discarded, and computed again when required. Reading a stored value takes no
     lock. Neither the lock nor the values are part of the state: copies and pickles are empty.
-
-    Parameters
-    ----------
-    max_values : int
     """
 
     def __init__(self, max_values: int) -> None:
@@ -41,13 +37,8 @@ class BoundedCache:
         """
         Return the value of a key, computed at the first call.
 
-        Parameters
-        ----------
-        key : hashable
-        compute : callable
-            Called without arguments.
-        owner : object
-            Stored with the value, so that the addresses of its parts remain theirs.
+        ``compute``: called without arguments. ``owner``: stored with the value, so that the addresses of its parts remain
+        theirs.
         """
         try:
             value = self._values[key]

@@ -103,10 +103,7 @@ class ChargeCheck(_Deterministic):
     """
     Check that charges are at least a limit, in e-, and not NaN.
 
-    Raises
-    ------
-    ParameterError
-        With the name of the charges and the smallest one of the block.
+    Raises ParameterError with the name of the charges and the smallest one of the block.
     """
 
     def __init__(self, name: str, at_least: float) -> None:
@@ -207,10 +204,7 @@ def check_effects(added: Any) -> tuple[Effect, ...]:
     """
     Validate additional effects of a sensor and return them as a tuple.
 
-    Raises
-    ------
-    ParameterError
-        If an effect violates the contract, or its name is not unique.
+    Raises ParameterError if an effect violates the contract, or its name is not unique.
     """
     if not isinstance(added, list | tuple):
         raise ParameterError("effects", "must be a list of Effect objects", added)
@@ -242,10 +236,7 @@ def check_names(names: Any, effects: Iterable[Effect]) -> tuple[str, ...]:
     """
     Validate names of effects and return them as a tuple.
 
-    Raises
-    ------
-    ParameterError
-        If a name is not that of an effect; the message contains the closest name and all names.
+    Raises ParameterError if a name is not that of an effect; the message contains the closest name and all names.
     """
     if isinstance(names, str):
         names = (names,)
@@ -273,10 +264,7 @@ def apply_steps(
     """
     Return the values of all sites after steps of the chain, (n_site,) float64.
 
-    Parameters
-    ----------
-    steps, values, sites, streams, reset_streams, n_threads
-        As for :func:`run_steps`.
+    ``steps``, ``values``, ``sites``, ``streams``, ``reset_streams``, ``n_threads``: as for :func:`run_steps`.
     """
     result = Save()
     run_steps((*steps, result), values, sites=sites, streams=streams, reset_streams=reset_streams, n_threads=n_threads)
@@ -298,19 +286,9 @@ def run_steps(
     Results are written by :class:`Save` and :class:`Conversion`. Consecutive local steps process one block of sites after
     another, which stays in the cache for all of them.
 
-    Parameters
-    ----------
-    steps : iterable of Step
-    values : (n_site,)
-        Not modified.
-    sites : Sites
-        All sites.
-    streams : Streams, optional
-        Random streams of the frame; required for temporal steps.
-    reset_streams : Streams, optional
-        Random streams of the last reset, for effects that are drawn at the reset; by default those of the frame.
-    n_threads : int, optional
-        Number of threads; all cores by default. Results do not depend on it.
+    ``values`` (n_site,): not modified. ``sites``: all sites. ``streams``: random streams of the frame; required for temporal
+    steps. ``reset_streams``: random streams of the last reset, for effects that are drawn at the reset; by default those of
+    the frame. ``n_threads``: number of threads; all cores by default. Results do not depend on it.
     """
 
     def rng_of(step: Step, *block: int) -> Any:

@@ -38,12 +38,7 @@ class Device:
     """
     Source of the fixed patterns of a device.
 
-    Parameters
-    ----------
-    seed : int
-        Seed of the device.
-    layout : packed rings with ``columns``
-        Sites of the device.
+    ``seed``: seed of the device. ``layout`` (packed rings with ``columns``): sites of the device.
     """
 
     seed: int
@@ -56,11 +51,7 @@ class Device:
         """
         Return the device of some of its sites, with their numbers.
 
-        Parameters
-        ----------
-        selection : slice or (n,) int64
-        layout : packed rings with ``columns``
-            The layout of these sites.
+        ``selection``: slice or (n,) int64. ``layout`` (packed rings with ``columns``): the layout of these sites.
         """
         # Outlines of a lattice are rectangles, each identified by its own centroid, and are not all in memory.
         is_lattice = getattr(self.layout, "lattice", None) is not None

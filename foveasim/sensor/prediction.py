@@ -139,21 +139,10 @@ def readout_model(
     """
     Compute the first-order readout model at the mean collected charges.
 
-    Parameters
-    ----------
-    charge, sense_node, output : iterables of Effect
-        Effects of these stages, in order.
-    mean_e, variance_e2 : (..., n_site) or (1,), e- and e-²
-        Moments of collected charges.
-    sites : Sites
-        All sites, with a device or without.
-    v_per_e : (n_site,) or (1,), V/e-
-        Nominal conversion gain.
-    nonlinearity_fraction : float
-        Response nonlinearity: relative signal loss at full range.
-    v_sat_v, pedestal_v : float, V
-    is_reset : bool
-        Whether to include the noise of effects that are drawn at the reset.
+    ``charge``, ``sense_node``, ``output``: effects of these stages, in order. ``mean_e``, ``variance_e2`` (..., n_site) or
+    (1,), e- and e-²: moments of collected charges. ``sites``: all sites, with a device or without. ``v_per_e`` (n_site,) or
+    (1,), V/e-: nominal conversion gain. ``nonlinearity_fraction``: response nonlinearity: relative signal loss at full range.
+    ``v_sat_v``, ``pedestal_v``: float, V. ``is_reset``: whether to include the noise of effects that are drawn at the reset.
     """
     is_mixed = False
     local: list[Effect] = []

@@ -153,14 +153,8 @@ def local_step_e(sensor: Sensor, charge_e: Floats, volts_per_e: Floats, offset_v
 
     The width is the inverse of the local gain of the complete chain.
 
-    Parameters
-    ----------
-    sensor : Sensor
-        Its ADC and response nonlinearity are used.
-    charge_e : (n_site,) float64, e-
-        Mean charge.
-    volts_per_e, offset_v : (n_site,) or (1,) float64, V
-        Conversion gain and offset, of the device or nominal.
+    ``sensor``: its ADC and response nonlinearity are used. ``charge_e`` (n_site,) float64, e-: mean charge. ``volts_per_e``,
+    ``offset_v`` (n_site,) or (1,) float64, V: conversion gain and offset, of the device or nominal.
     """
     offset = np.asarray(offset_v, np.float64)
     return _local_step_e(sensor, charge_e, volts_per_e, np.zeros(1), np.ones(1), offset)

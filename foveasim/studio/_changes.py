@@ -12,11 +12,6 @@ from foveasim.studio._controls import controls_of, value_at
 from foveasim.studio._files import Files, with_layout
 from foveasim.studio._templates import WITHOUT_MOSAIC
 
-__all__ = [
-    "ONCE", "changed_keys", "check_depth", "is_change", "is_draft", "is_frame", "key_of", "match_filters", "reset",
-    "string_of", "with_file",
-]  # fmt: skip
-
 #: Messages that change the settings.
 CHANGES = ("set", "reset", "delete", "undo", "redo", "preset", "restore", "file", "video", "frame", "match")
 #: Changes that advance a source of frames: newer ones do not stop their simulations.
@@ -113,20 +108,8 @@ def with_file(
     """
     Return settings with an uploaded file.
 
-    Parameters
-    ----------
-    settings, start : mapping
-        Current and initial settings.
-    files : Files
-    path : str
-    use : {"scene", "layout", "settings"}
-
-    Raises
-    ------
-    FileError
-        When the file is not available, or invalid.
-    ParameterError
-        When the use is unknown.
+    ``settings``, ``start``: current and initial settings. ``use``: {"scene", "layout", "settings"}. Raises FileError when the
+    file is not available, or invalid. Raises ParameterError when the use is unknown.
     """
     match use:
         case "scene":

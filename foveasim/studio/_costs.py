@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-__all__ = ["RELEASE_S", "REST_S", "Costs", "SupersededError"]
-
 #: Simulations and views that take longer are reduced or left out while a control is dragged.
 SLOW_S = 0.15
 #: Rest after which a preview is replaced by the complete result.

@@ -22,8 +22,6 @@ from foveasim.explore.worker_cache import ShotRunner
 from foveasim.layout import Layout
 from foveasim.scene import Scene
 
-__all__ = ["Engine", "Simulated", "block_means"]
-
 #: Longer side of pictures where the page gives none.
 PICTURE_PIXELS = 512
 #: Largest difference of vertices of equal outlines: rounding of positions of a few millimetres.
@@ -88,12 +86,8 @@ class Engine:
 
     Layout, scene, optics, distortion, compiled outlines, optical images and power on sites are cached by their settings.
 
-    Parameters
-    ----------
-    n_threads : int, optional
-        Number of threads; one per core by default.
-    check : callable, optional
-        Called before each stage; it may raise an exception to stop the simulation.
+    ``n_threads``: number of threads; one per core by default. ``check``: called before each stage; it may raise an exception
+    to stop the simulation.
     """
 
     def __init__(self, *, n_threads: int | None = None, check: Callable[[], None] | None = None) -> None:
@@ -113,16 +107,8 @@ class Engine:
         """
         Simulate the shot of settings.
 
-        Parameters
-        ----------
-        settings : mapping
-        is_preview : bool
-            Whether a large scene may be reduced: means of blocks of its pixels, and no finer cells of the optical image.
-
-        Raises
-        ------
-        FoveasimError
-            When a setting is invalid, or the parts are incompatible; in one line.
+        ``is_preview``: whether a large scene may be reduced: means of blocks of its pixels, and no finer cells of the optical
+        image. Raises FoveasimError when a setting is invalid, or the parts are incompatible; in one line.
         """
         start_s = time.perf_counter()
         cache = self._runner.cache

@@ -19,8 +19,6 @@ from foveasim.errors import FoveasimError, ParameterError, printable
 from foveasim.layout import Layout, write_layout
 from foveasim.studio._messages import to_json
 
-__all__ = ["archive", "notebook", "text_of", "without_directories"]
-
 #: Date of the files in archives, so that equal states have equal archives; the earliest that the format can represent.
 DATE = (1980, 1, 1, 0, 0, 0)
 #: Permissions of the files in archives: read by all, written by the owner.
@@ -31,20 +29,9 @@ def text_of(what: str, settings: Mapping[str, Any], start: Mapping[str, Any], na
     """
     Return settings in a text format, or their changes as a difference.
 
-    Parameters
-    ----------
-    what : {"yaml", "python", "notebook", "link", "diff"}
-    settings, start : mapping
-        Current and initial settings.
-    name : str
-        Name of the shot.
-    files : sequence of str
-        Files that the settings contain, which must be next to the text.
-
-    Raises
-    ------
-    ParameterError
-        When the format is unknown.
+    ``what``: {"yaml", "python", "notebook", "link", "diff"}. ``settings``, ``start``: current and initial settings. ``name``:
+    name of the shot. ``files``: files that the settings contain, which must be next to the text. Raises ParameterError when
+    the format is unknown.
     """
     note = f"# Uploaded files, next to this file: {', '.join(files)}\n" if files else ""
     match what:
@@ -69,15 +56,8 @@ def without_directories(
     """
     Return settings with names for the paths of uploaded files, and the files by name.
 
-    Parameters
-    ----------
-    settings : dict
-    uploads : Path
-        Directory of uploaded files.
-    frames : mapping of str to Path
-        Files that replace others, by the path in the settings.
-    name_of : function of a path
-        Returns the name of a file.
+    ``uploads``: directory of uploaded files. ``frames``: files that replace others, by the path in the settings. ``name_of``:
+    returns the name of a file.
     """
     files: dict[str, Path] = {}
 
@@ -100,18 +80,8 @@ def notebook(settings: Mapping[str, Any], name: str, files: Sequence[str]) -> st
     """
     Return a notebook that simulates a shot and shows its picture and photosites.
 
-    Parameters
-    ----------
-    settings : mapping
-    name : str
-        Heading.
-    files : sequence of str
-        Files that the settings contain, which must be next to the notebook.
-
-    Returns
-    -------
-    text : str
-        JSON of notebook format 4.
+    ``name``: heading. ``files``: files that the settings contain, which must be next to the notebook. Returns ``text``: JSON
+    of notebook format 4.
     """
     needed = [f"Required next to this notebook: {', '.join(f'`{file}`' for file in files)}."] if files else []
     source = re.sub(r'\A""".*?"""\n', "", to_python(settings), flags=re.DOTALL).strip()
@@ -150,16 +120,8 @@ def archive(name: str, texts: Mapping[str, str], files: Mapping[str, Path], layo
     """
     Return a zip archive with all files of a state.
 
-    Parameters
-    ----------
-    name : str
-        Stem of the file of the layout.
-    texts : mapping of str to str
-        Text files by name.
-    files : mapping of str to Path
-        Copied files by name.
-    layout : Layout, optional
-        Written as GDSII, or as GeoJSON without the extra ``layout``.
+    ``name``: stem of the file of the layout. ``texts``: text files by name. ``files``: copied files by name. ``layout``:
+    written as GDSII, or as GeoJSON without the extra ``layout``.
     """
     content = io.BytesIO()
     with tempfile.TemporaryDirectory(prefix="foveasim-studio-") as directory, zipfile.ZipFile(content, "w") as file:

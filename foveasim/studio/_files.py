@@ -21,8 +21,6 @@ from foveasim.config import (
 from foveasim.config._objects import BUNDLED_PICTURE, FILE_SETTINGS
 from foveasim.errors import FileError, ParameterError, printable
 
-__all__ = ["Files", "apply_preset", "file_name", "is_unused_or_copy", "presets", "start_settings", "unused_path"]
-
 #: Longest name and extension of an uploaded file.
 MAX_NAME_LENGTH, MAX_EXTENSION_LENGTH = 80, 8
 #: Characters that names of stored files do not contain.
@@ -33,10 +31,7 @@ def start_settings(shot: str | Path | None) -> tuple[dict[str, Any], str]:
     """
     Return the settings of a file or the demo with absolute paths, and the name.
 
-    Raises
-    ------
-    ConfigError
-        When the file cannot be read, or is not YAML.
+    Raises ConfigError when the file cannot be read, or is not YAML.
     """
     path = demo_settings()[0] if shot is None else Path(shot)
     settings = read_settings(path)
@@ -60,10 +55,7 @@ def apply_preset(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     """
     Return the settings of a preset; a layout replaces that of the given settings.
 
-    Raises
-    ------
-    ParameterError
-        When the preset does not exist.
+    Raises ParameterError when the preset does not exist.
     """
     kind, _, stem = name.partition(":")
     shots = {path.stem: path for path in demo_settings()}
@@ -103,14 +95,8 @@ class Files:
 
     These are pictures of scikit-image, uploaded files, files of the initial settings, and files in their directory.
 
-    Parameters
-    ----------
-    start : mapping
-        The initial settings, with absolute paths.
-    directory : Path, optional
-        Directory of the settings file.
-    uploads : Path
-        Directory of the uploaded files.
+    ``start``: the initial settings, with absolute paths. ``directory``: directory of the settings file. ``uploads``: directory
+    of the uploaded files.
     """
 
     def __init__(self, start: Mapping[str, Any], directory: Path | None, uploads: Path) -> None:
@@ -134,10 +120,7 @@ class Files:
         """
         Check the files of settings.
 
-        Raises
-        ------
-        FileError
-            For a file that the settings may not contain.
+        Raises FileError for a file that the settings may not contain.
         """
         if isinstance(settings, Mapping):
             for name, value in settings.items():
@@ -178,10 +161,7 @@ class Files:
         """
         Return the settings of a YAML file.
 
-        Raises
-        ------
-        FileError
-            When the file is not available, or not valid YAML.
+        Raises FileError when the file is not available, or not valid YAML.
         """
         self.available(path)
         return resolve_files(Path(path).parent, read_settings(path))
@@ -190,10 +170,7 @@ class Files:
         """
         Return the section of a layout file.
 
-        Raises
-        ------
-        FileError
-            When the file is not available, or not valid YAML.
+        Raises FileError when the file is not available, or not valid YAML.
         """
         return _inlined(self.available(path), Path())
 
@@ -201,10 +178,7 @@ class Files:
         """
         Return the path of a file after a check that settings may contain it.
 
-        Raises
-        ------
-        FileError
-            When the file is not available.
+        Raises FileError when the file is not available.
         """
         if not self.allows(path):
             raise FileError(None, f"{printable(path)[:100]!r} is not available here; upload the file")

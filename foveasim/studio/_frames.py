@@ -18,8 +18,6 @@ from foveasim._io.images import write_picture
 from foveasim._io.videos import SandboxedVideo
 from foveasim.errors import FileError, ParameterError
 
-__all__ = ["Frames", "camera_frame"]
-
 #: Largest size of the decoded frames that are stored for steps back.
 MAX_DECODED_BYTES = 64 << 20
 #: Largest number of pixels of a camera frame: three bytes per pixel and a header are one message of a page.
@@ -34,21 +32,9 @@ def camera_frame(message: bytes) -> dict[str, Any]:
     """
     Decode a camera frame.
 
-    Parameters
-    ----------
-    message : bytes
-        Length of the header as little-endian uint32; header in JSON with ``id``, ``width``, ``height`` and ``is_first``;
-        pixels, RGB, uint8, top row first.
-
-    Returns
-    -------
-    message : dict
-        With ``pixels``, (n_y, n_x, 3) uint8.
-
-    Raises
-    ------
-    ParameterError
-        When the message is invalid.
+    ``message``: length of the header as little-endian uint32; header in JSON with ``id``, ``width``, ``height`` and
+    ``is_first``; pixels, RGB, uint8, top row first. Returns ``message``: with ``pixels``, (n_y, n_x, 3) uint8. Raises
+    ParameterError when the message is invalid.
     """
     start = 4 + int.from_bytes(message[:4], "little")
     try:
@@ -69,12 +55,7 @@ class Frames:
     The settings contain a fixed path, :attr:`path`. Its file is written when it is required; simulations read the current frame
     from another file, whose name differs for each frame.
 
-    Parameters
-    ----------
-    uploads : Path
-        Directory of uploaded files.
-    new_path : function of a name
-        Returns an unused path there.
+    ``uploads``: directory of uploaded files. ``new_path``: returns an unused path there.
     """
 
     def __init__(self, uploads: Path, new_path: Callable[[str], Path]) -> None:
@@ -98,15 +79,8 @@ class Frames:
         """
         Open a video file at its first frame.
 
-        Returns
-        -------
-        is_video : bool
-            False for a single frame, which is a picture.
-
-        Raises
-        ------
-        FileError
-            When the file is not a video, is corrupt, or the extra ``video`` is not installed.
+        Returns ``is_video``: False for a single frame, which is a picture. Raises FileError when the file is not a video, is
+        corrupt, or the extra ``video`` is not installed.
         """
         video = SandboxedVideo(path)
         n_frames = video.n_frames
@@ -135,12 +109,7 @@ class Frames:
         """
         Decode a frame of the video.
 
-        Raises
-        ------
-        FileError
-            When the frame is corrupt.
-        ParameterError
-            When there is no video, or it has no such frame.
+        Raises FileError when the frame is corrupt. Raises ParameterError when there is no video, or it has no such frame.
         """
         if self._video is None:
             raise ParameterError("n", "must be the number of a frame of an open video")
@@ -241,10 +210,7 @@ class Frames:
         """
         Write the current frame to a file with its own name, if it is the scene of settings.
 
-        Returns
-        -------
-        files : dict of str to Path
-            The file by the path in the settings; empty if the scene is another one.
+        Returns ``files``: the file by the path in the settings; empty if the scene is another one.
         """
         with self._lock:
             if self.path is None or self._pixels is None or not self._is_used(settings):

@@ -6,8 +6,6 @@ import copy
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["History"]
-
 #: Largest number of undo steps; earlier ones are discarded.
 MAX_STEPS = 1000
 
@@ -18,10 +16,7 @@ class History:
 
     A draft is a state while a control is dragged: it is not an undo step.
 
-    Parameters
-    ----------
-    start : mapping
-        Initial settings.
+    ``start``: initial settings.
     """
 
     def __init__(self, start: Mapping[str, Any]) -> None:

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from foveasim.errors import FileError, FoveasimError, ParameterError, printable
 
-__all__ = ["decode_part", "encode_part", "from_json", "is_answer_to_freeze", "one_line", "to_json"]
-
 #: Alignment of arrays in bytes: typed arrays of JavaScript require offsets that are multiples of their item size.
 ALIGNMENT = 8
 #: Longest message of an error.
@@ -36,19 +34,9 @@ def encode_part(
     """
     Encode a part: the length of the header as little-endian uint32, the header, the arrays.
 
-    Parameters
-    ----------
-    name : str
-    version : int
-        Number of the state that the part belongs to.
-    about : mapping
-        Plain data.
-    arrays : mapping of str to array
-        Of the types in :data:`TYPES`, any shape; each begins at a multiple of 8 bytes.
-    is_preview : bool
-        Whether the data are those of a preview.
-    has_more : bool
-        Whether the page waits for the next part, and shows both in one frame.
+    ``version``: number of the state that the part belongs to. ``about``: plain data. ``arrays``: of the types in
+    :data:`TYPES`, any shape; each begins at a multiple of 8 bytes. ``is_preview``: whether the data are those of a preview.
+    ``has_more``: whether the page waits for the next part, and shows both in one frame.
     """
     described, pieces, offset = [], [], 0
     for key, array in arrays.items():
@@ -79,15 +67,7 @@ def decode_part(message: bytes) -> tuple[dict[str, Any], dict[str, NDArray[Any]]
     """
     Decode a part.
 
-    Returns
-    -------
-    header : dict
-    arrays : dict of str to (n,) array
-
-    Raises
-    ------
-    FileError
-        When the message is truncated.
+    Returns ``arrays``, dict of str to (n,) array. Raises FileError when the message is truncated.
     """
     start = 4 + int.from_bytes(message[:4], "little")
     try:

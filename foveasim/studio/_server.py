@@ -34,8 +34,6 @@ from foveasim.studio._frames import camera_frame
 from foveasim.studio._messages import is_answer_to_freeze, one_line
 from foveasim.studio._session import MAX_SESSION_BYTES, Session, Start
 
-__all__ = ["UNSPECIFIED", "Studio", "host_names", "serve"]
-
 #: Largest uploaded file.
 MAX_FILE_BYTES = 64 << 20
 #: Largest message of a page.
@@ -333,10 +331,7 @@ def _message(received: Any) -> Any:
     """
     Return a message of a page: JSON, or a camera frame in binary; None if it is invalid.
 
-    Raises
-    ------
-    WebSocketDisconnect
-        When the page has closed the connection.
+    Raises WebSocketDisconnect when the page has closed the connection.
     """
     if received["type"] == "websocket.disconnect":
         raise WebSocketDisconnect(received.get("code", 1000))
@@ -417,15 +412,8 @@ def serve(
     """
     Serve the studio until Ctrl-C.
 
-    Parameters
-    ----------
-    studio : Studio
-    listener : socket
-        Bound to the address.
-    announce : function
-        Called when the server accepts requests.
-    started : function, optional
-        Called with the server, whose ``should_exit`` stops it, before it runs.
+    ``listener``: bound to the address. ``announce``: called when the server accepts requests. ``started``: called with the
+    server, whose ``should_exit`` stops it, before it runs.
     """
     import uvicorn
 

@@ -46,8 +46,6 @@ from foveasim.studio._parts import PARTS, summary_of
 from foveasim.studio._variants import with_n_sites
 from foveasim.studio._views import Views
 
-__all__ = ["MAX_SESSION_BYTES", "Session", "Start"]
-
 #: Size limit of all uploaded files.
 MAX_SESSION_BYTES = 512 << 20
 #: Largest number of messages that wait.
@@ -83,13 +81,7 @@ class Session:
     """
     Settings of a page with history, and a thread that simulates them.
 
-    Parameters
-    ----------
-    name : str
-        Identifier.
-    start : Start
-    n_threads : int, optional
-        Number of threads of the simulation.
+    ``name``: identifier. ``n_threads``: number of threads of the simulation.
     """
 
     def __init__(self, name: str, start: Start, *, n_threads: int | None = None) -> None:
@@ -464,16 +456,8 @@ class Session:
         """
         Return the current settings in a text format, or their changes as a difference.
 
-        Parameters
-        ----------
-        what : {"yaml", "python", "notebook", "link", "diff"}
-        exported : tuple, optional
-            As :meth:`exported` returns it, for several texts of the same state.
-
-        Raises
-        ------
-        ParameterError
-            When the format is unknown.
+        ``what``: {"yaml", "python", "notebook", "link", "diff"}. ``exported``: as :meth:`exported` returns it, for several
+        texts of the same state. Raises ParameterError when the format is unknown.
         """
         settings, files = self.exported() if exported is None else exported
         return text_of(what, settings, self.start.settings, self.start.name, list(files))
@@ -484,16 +468,7 @@ class Session:
         """
         Return the current settings with names of uploaded files for their paths, and the files.
 
-        Parameters
-        ----------
-        name_of : function of a path
-            Returns the name of a file.
-
-        Returns
-        -------
-        settings : dict
-        files : dict of str to Path
-            Uploaded files by name, and the current frame of a source.
+        ``name_of``: returns the name of a file. Returns ``files``: uploaded files by name, and the current frame of a source.
         """
         settings = self.history.settings
         return without_directories(settings, self.uploads, self.frames.export(settings), name_of)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["INITIAL", "PER_AREA", "WITHOUT_MOSAIC", "templates"]
-
 #: Initial values of required parameters by name.
 INITIAL: dict[str, Any] = {
     "band_width_nm": 100.0,

@@ -15,8 +15,6 @@ from foveasim.fields import Grid
 from foveasim.layout import LAYOUTS, Layout
 from foveasim.studio._engine import Simulated
 
-__all__ = ["compare", "fovea_um", "with_n_sites"]
-
 #: Side of the compared pictures, pixels.
 N_PIXELS = 160
 #: Half side of the fovea as a fraction of that of the field.
@@ -130,17 +128,8 @@ def with_n_sites(settings: dict[str, Any], n_sites: int, layout: Layout) -> dict
 
     Rasters have the field of the present layout, and other pitches; of other generators, one parameter is solved for.
 
-    Parameters
-    ----------
-    settings : dict
-    n_sites : int
-    layout : Layout
-        Present layout of the settings.
-
-    Raises
-    ------
-    ParameterError
-        When the layout has no generator, or its generator has no such parameter.
+    ``layout``: present layout of the settings. Raises ParameterError when the layout has no generator, or its generator has no
+    such parameter.
     """
     if not _is_generated(settings):
         raise ParameterError("layout", "must have a generator, whose number of photosites can be chosen")

@@ -15,8 +15,6 @@ from foveasim.studio._engine import PICTURE_PIXELS, Simulated
 from foveasim.studio._messages import encode_part
 from foveasim.studio._parts import PARTS
 
-__all__ = ["Views"]
-
 #: Parts that are sent first and together: sites, and their values.
 FIRST = ("sites", "columns")
 #: Limit of the longer side of pictures.
@@ -30,14 +28,8 @@ class Views:
     """
     Selected views, and what was sent of them.
 
-    Parameters
-    ----------
-    send : function of a message
-        Receives parts as bytes, and errors as dicts.
-    line : function of an exception
-        Returns its message in one line.
-    costs : Costs
-        Receives the times of views; slow ones are left out during drags.
+    ``send``: receives parts as bytes, and errors as dicts. ``line``: returns its message in one line. ``costs``: receives the
+    times of views; slow ones are left out during drags.
     """
 
     def __init__(
@@ -58,16 +50,8 @@ class Views:
         """
         Set the views that are sent.
 
-        Parameters
-        ----------
-        names : list of str
-        pixels : int, optional
-            Longer side of pictures.
-
-        Raises
-        ------
-        ParameterError
-            When a name is unknown, or the number of pixels out of range.
+        ``pixels``: longer side of pictures. Raises ParameterError when a name is unknown, or the number of pixels out of
+        range.
         """
         if pixels is not None and (type(pixels) is not int or not 1 <= pixels <= MAX_PIXELS):
             raise ParameterError("pixels", f"must be an integer from 1 to {MAX_PIXELS}")
@@ -95,24 +79,10 @@ class Views:
         """
         Compute and send the views that changed.
 
-        Parameters
-        ----------
-        result : Simulated
-        version : int
-            Number of the result.
-        number : object
-            Number of the message that is answered.
-        key : str, optional
-            Setting that changed.
-        is_dragging : bool
-            Whether slow views are left out.
-        is_interrupted : function
-            Whether newer messages wait: later views are then left to the next call.
-
-        Returns
-        -------
-        times_ms : dict of str to float, ms, or None
-            Times by view, for the message that follows the last one; None after an interruption.
+        ``version``: number of the result. ``number``: number of the message that is answered. ``key``: setting that changed.
+        ``is_dragging``: whether slow views are left out. ``is_interrupted``: whether newer messages wait: later views are then
+        left to the next call. Returns ``times_ms``: times by view, for the message that follows the last one; None after an
+        interruption.
         """
         result = replace(result, picture_pixels=self._pixels)
         times_ms: dict[str, float] = {}

@@ -107,11 +107,6 @@ def saccades(
     GazePath
         Path of ``round(duration_s / frame_s)`` points, the first at 0 s.
 
-    Raises
-    ------
-    ParameterError
-        When a value is out of range.
-
     Examples
     --------
     >>> path = saccades(duration_s=1.0, frame_s=0.01, size_um=(100.0, 50.0), seed=1)
@@ -167,11 +162,6 @@ def shift_sensor(source: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Sce
     Yields
     ------
     source, (x_um, y_um)
-
-    Raises
-    ------
-    ParameterError
-        When an argument is of another class.
     """
     _check_types(("source", source, (Scene, PowerMap)), ("path", path, (GazePath,)))
     return ((source, position_um) for position_um in path_positions(path.xy_um))

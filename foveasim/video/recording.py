@@ -208,10 +208,7 @@ def check_consistent(captures: Iterable[Capture], *, n_before: int = 0) -> Itera
     """
     Yield the captures after checking that they have the same number of sites and bits.
 
-    Raises
-    ------
-    ParameterError
-        When captures differ, or there are neither captures nor ``n_before`` previous ones.
+    Raises ParameterError when captures differ, or there are neither captures nor ``n_before`` previous ones.
     """
     first: tuple[int, int] | None = None
     for capture in captures:

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from foveasim.view.site_colours import Rgb, SiteColours, as_fractions
 
-__all__ = ["Label", "add_strip", "strip_width_px"]
-
 #: Height of text as a fraction of that of the picture, and its smallest number of pixels.
 TEXT_FRACTION, MIN_TEXT_PX = 0.027, 12.0
 #: Widths of a colour bar with its numbers, and of a character, in heights of text.
@@ -51,18 +49,8 @@ def add_strip(
     """
     Return a picture with labels and a colour bar on its right side.
 
-    Parameters
-    ----------
-    picture : (n_y, n_x, 3) uint8
-        Top row first; unchanged in the result.
-    shown : SiteColours, optional
-        With the scale of the colour bar, or the legend.
-    labels : sequence of Label
-    background : (r, g, b)
-
-    Returns
-    -------
-    picture : (n_y, n_x + sum of :func:`strip_width_px`, 3) uint8
+    ``picture`` (n_y, n_x, 3) uint8: top row first; unchanged in the result. ``shown``: with the scale of the colour bar, or
+    the legend. ``background``: (r, g, b). Returns ``picture`` (n_y, n_x + sum of :func:`strip_width_px`, 3) uint8.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable

@@ -20,8 +20,6 @@ from foveasim.view.id_map import SitePixels, site_at
 from foveasim.view.site_colours import BOUNDARY, SiteColours
 from foveasim.view.site_pictures import SiteMeans, cover
 
-__all__ = ["ScaleBar", "SiteImage", "format_length", "nice_length_um"]
-
 #: Samples along a pixel side, fewer in pictures that would have more than 2^26 samples (256 MB).
 N_SAMPLES, MAX_SAMPLES = 3, 2**26
 #: Boundaries are drawn if they take at most this fraction of the samples in every 16th row: sites of 7 pixels.
@@ -36,12 +34,7 @@ class SiteImage(AxesImage):
 
     Pixels are exact area-weighted means, as in :func:`foveasim.view.site_picture`.
 
-    Parameters
-    ----------
-    ax : matplotlib axes
-        With linear scales.
-    layout : Layout
-    colours : SiteColours
+    ``ax``: with linear scales.
     """
 
     def __init__(self, ax: Axes, layout: Layout, colours: SiteColours) -> None:

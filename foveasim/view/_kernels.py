@@ -7,8 +7,6 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = ["blend", "paint_sites", "rows_of_sites"]
-
 _ints = types.Array(types.int64, 1, "C", readonly=True)
 _floats = types.Array(types.float64, 1, "C", readonly=True)
 _points = types.Array(types.float64, 2, "C", readonly=True)

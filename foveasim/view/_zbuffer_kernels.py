@@ -7,8 +7,6 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = ["draw_triangles"]
-
 _points = types.Array(types.float64, 2, "C", readonly=True)
 _triangles = types.Array(types.int32, 2, "C", readonly=True)
 

@@ -141,25 +141,16 @@ def triangulate(layout: Layout) -> Caps:
     """
     Triangulate every photosite exactly, with its own vertices only.
 
-    Parameters
-    ----------
-    layout : Layout
-        With sites that do not intersect themselves.
+    ``layout``: with sites that do not intersect themselves.
 
-    Returns
-    -------
-    Caps
-
-    Notes
-    -----
     A fan from one vertex covers the site when none of its triangles is reversed: the winding numbers of its triangles then sum
     to 1 inside the outline and to 0 outside. Other sites, and those with holes, use the constrained Delaunay triangulation of
     GEOS.
     """
     n_vertices = np.diff(layout.ring_offsets)
     has_hole = np.diff(layout.site_offsets) > 1
-    fans, is_covered = _fans(layout.xy_um, layout.ring_offsets)
-    is_fan = is_covered[layout.site_offsets[:-1]] & ~has_hole
+    fans, smallest = triangle_fans(layout.xy_um, layout.ring_offsets)
+    is_fan = (smallest[layout.site_offsets[:-1]] > DEGENERATE_FRACTION) & ~has_hole
     ring_of_fan = np.repeat(np.arange(n_vertices.size), n_vertices - 2)
     site_of_ring = np.repeat(np.arange(layout.n_sites), np.diff(layout.site_offsets))
     site = site_of_ring[ring_of_fan]
@@ -169,7 +160,7 @@ def triangulate(layout: Layout) -> Caps:
     keep = is_fan[site]
     others = np.flatnonzero(~is_fan)
     pieces = parallel_map(
-        lambda part: _delaunay(layout, part),
+        lambda part: delaunay(layout, part),
         np.split(others, range(SITES_PER_CALL, others.size, SITES_PER_CALL)),
         thread_count(),
     )
@@ -188,22 +179,9 @@ def extrude(
     """
     Extrude photosites to prisms.
 
-    Parameters
-    ----------
-    layout : Layout
-    caps : Caps
-        Triangulation of the same layout.
-    low_um, high_um : number or (n_site,), µm
-        Heights of the bottom and top faces.
-    has_floor : bool
-        Whether the prisms have bottom faces.
-
-    Returns
-    -------
-    points_um : (2 n_vertex, 3) float64, µm
-        Vertices of the layout at the bottom, then at the top.
-    triangles : (n_triangle, 3) int32
-    photosite : (2 n_vertex,) int32
+    ``caps``: triangulation of the same layout. ``low_um``, ``high_um`` (number or (n_site,), µm): heights of the bottom and
+    top faces. ``has_floor``: whether the prisms have bottom faces. Returns ``points_um`` (2 n_vertex, 3) float64, µm: vertices
+    of the layout at the bottom, then at the top. ``triangles`` (n_triangle, 3) int32. ``photosite`` (2 n_vertex,) int32.
     """
     n = layout.xy_um.shape[0]
     vertices_of_site = np.diff(layout.ring_offsets[layout.site_offsets])
@@ -413,15 +391,15 @@ def _turn_sines(xy_um: Floats, ring_offsets: Ints) -> Floats:
     return np.asarray(cross / np.maximum(np.hypot(*into.T) * np.hypot(*out.T), np.finfo(np.float64).tiny))
 
 
-def _fans(xy_um: Floats, ring_offsets: Ints) -> tuple[Ints, Bools]:
+def triangle_fans(xy_um: Floats, ring_offsets: Ints) -> tuple[Ints, Floats]:
     """
-    Return a triangle fan of every ring (sum of n - 2, 3), and whether it is valid.
+    Return a triangle fan of every ring (sum of n - 2, 3), and its smallest triangle.
 
-    A fan is valid when none of its triangles is degenerate or reversed.
+    Twice the area of this triangle as a fraction of the bounding box of the ring; negative when it is reversed.
     """
     counts = np.diff(ring_offsets)
     if counts.size == 0:
-        return np.zeros((0, 3), np.int64), np.zeros(0, bool)
+        return np.zeros((0, 3), np.int64), np.zeros(0)
     starts = ring_offsets[:-1]
     turn = _turn_sines(xy_um, ring_offsets)
     ring = np.repeat(np.arange(counts.size), counts)
@@ -444,18 +422,22 @@ def _fans(xy_um: Floats, ring_offsets: Ints) -> tuple[Ints, Bools]:
     double_um2 = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     ends = np.cumsum(n_triangles) - n_triangles
     box = np.maximum.reduceat(xy_um, starts) - np.minimum.reduceat(xy_um, starts)
-    covered = np.minimum.reduceat(double_um2, ends) > DEGENERATE_FRACTION * box[:, 0] * box[:, 1]
-    return np.stack((first, second, third), axis=1), covered
+    smallest = np.minimum.reduceat(double_um2, ends) / np.maximum(box[:, 0] * box[:, 1], np.finfo(np.float64).tiny)
+    return np.stack((first, second, third), axis=1), smallest
 
 
-def _delaunay(layout: Layout, sites: Ints) -> tuple[Ints, Ints, Ints, Ints]:
+def delaunay(layout: Layout, sites: Ints, *, is_repaired: bool = False) -> tuple[Ints, Ints, Ints, Ints]:
     """
     Triangulate some photosites with GEOS.
 
-    Returns triangles and their sites, the vertices of the photosites, and the representative of each vertex.
+    Returns triangles and their sites, the vertices of the photosites, and the representative of each vertex. An outline that
+    intersects itself raises an error, or is repaired; triangles with other vertices than those of the outline are then missing.
     """
     part = layout[sites]
-    triangles, owner = shapely.get_parts(shapely.constrained_delaunay_triangles(part.polygons()), return_index=True)
+    polygons = part.polygons()
+    if is_repaired:
+        polygons = np.where(shapely.is_valid(polygons), polygons, shapely.buffer(polygons, 0.0))
+    triangles, owner = shapely.get_parts(shapely.constrained_delaunay_triangles(polygons), return_index=True)
     corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     is_clockwise = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] < 0.0
@@ -474,10 +456,12 @@ def _delaunay(layout: Layout, sites: Ints) -> tuple[Ints, Ints, Ints, Ints]:
     representative = np.full(int(is_new.sum()), -1)
     representative[group[: vertices.size][::-1]] = vertices[::-1]
     matched = representative[group]
-    if matched.min(initial=0) < 0:
+    if matched.min(initial=0) < 0 and not is_repaired:
         bad = sites[site[np.flatnonzero(matched < 0)[0]]]
         raise GeometryError(f"site {bad} cannot be triangulated; repair its outline", (int(bad),))
-    return matched[vertices.size :].reshape(-1, 3), sites[owner], vertices, matched[: vertices.size]
+    found = matched[vertices.size :].reshape(-1, 3)
+    is_known = (found >= 0).all(axis=1)
+    return found[is_known], sites[owner[is_known]], vertices, matched[: vertices.size]
 
 
 def _polydata(points_um: Floats, offsets: Indices, corners: Indices) -> PolyData:
@@ -498,9 +482,6 @@ def import_pyvista() -> Any:
     """
     Import and return PyVista.
 
-    Raises
-    ------
-    ParameterError
-        When PyVista is not installed.
+    Raises ParameterError when PyVista is not installed.
     """
     return import_optional("view in 3D", "pyvista")

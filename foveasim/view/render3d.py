@@ -100,11 +100,6 @@ class Viewpoint:
         Point in the centre of the picture; the centre of the scene by default.
     view_deg : float
         Vertical angle of view: small angles flatten the perspective, large angles exaggerate it.
-
-    Raises
-    ------
-    ParameterError
-        When a number is out of range.
     """
 
     azimuth_deg: Annotated[float, FINITE] = -65.0
@@ -192,8 +187,6 @@ def render(
         When the file cannot be written.
     GeometryError
         When the scene is empty.
-    ParameterError
-        When a parameter is out of range.
     SimulationError
         When ``renderer="pyvista"`` and PyVista cannot render on this machine.
     """

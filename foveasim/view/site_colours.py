@@ -93,14 +93,8 @@ class ColourScale:
         """
         Return the colours of values on the scale.
 
-        Parameters
-        ----------
-        values : (...) float64
-            Values outside the scale have the colour of its end, NaN that of no data.
-
-        Returns
-        -------
-        rgb : (..., 3) uint8
+        ``values`` (...) float64: values outside the scale have the colour of its end, NaN that of no data. Returns ``rgb``
+        (..., 3) uint8.
         """
         from matplotlib import colormaps
 

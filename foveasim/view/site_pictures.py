@@ -79,21 +79,9 @@ class SiteMeans:
         """
         Return a picture of coloured sites.
 
-        Parameters
-        ----------
-        colours : SiteColours
-            From :func:`foveasim.view.colours_of`.
-
-        Returns
-        -------
-        picture : (n_y, n_x, 4) uint8
-            Red, green, blue, and the covered fraction as alpha; row 0 is the lowest y. Values on a colour scale are averaged
-            and then mapped to a colour; other colours are averaged in linear light.
-
-        Raises
-        ------
-        ParameterError
-            When there is not one colour per site.
+        ``colours``: from :func:`foveasim.view.colours_of`. Returns ``picture`` (n_y, n_x, 4) uint8: red, green, blue, and the
+        covered fraction as alpha; row 0 is the lowest y. Values on a colour scale are averaged and then mapped to a colour;
+        other colours are averaged in linear light. Raises ParameterError when there is not one colour per site.
         """
         if colours.rgb.shape != (self.n_sites, 3):
             raise ParameterError(
@@ -238,16 +226,8 @@ def cover(under: NDArray[np.uint8], over: NDArray[np.uint8], weight: Floats) -> 
     """
     Return a picture covered by another one in linear light.
 
-    Parameters
-    ----------
-    under, over : (n_y, n_x, 3) uint8
-    weight : (n_y, n_x)
-        From 0 to 1.
-
-    Returns
-    -------
-    picture : (n_y, n_x, 3) uint8
-        Exactly one of the pictures where the weight is 0 or 1.
+    ``under``, ``over``: (n_y, n_x, 3) uint8. ``weight`` (n_y, n_x): from 0 to 1. Returns ``picture`` (n_y, n_x, 3) uint8:
+    exactly one of the pictures where the weight is 0 or 1.
     """
     alpha = weight[..., np.newaxis]
     mixed = encode_light(alpha * decode_light(over) + (1.0 - alpha) * decode_light(under))

@@ -38,6 +38,7 @@ GRID = r"grid\(n_x=None, n_y=None, pitch_um=None, \*, size_um=None, .*\)"
         (lambda: fs.Sensor(SITES, read_noise=2.0), r"^'read_noise' must be an argument of Sensor\(layout, .*, \.\.\.\); did you mean 'read_noise_e'\?$"),
         (lambda: fs.Scene.from_picture("a.png", pitch=3.0), r"of Scene\.from_picture\(picture, .*; did you mean 'pitch_um'\?$"),
         (lambda: SITES.translate(1.0), r"^'dy_um' must be given: Layout\.translate\(dx_um, dy_um\)$"),
+        (lambda: fs.modes.SpikingPixels(fs.Sensor(SITES)).stream([], frame_s=1.0), r"^'seed' must be given: SpikingPixels\.stream\(rates, "),
         (lambda: fs.layout.clip(SITES), r"^'region' must be given: clip\(layout, region, \*, cut='pieces'\)$"),
         (lambda: SITES.plot(xyz=1), r"^'xyz' must be an argument of plot_layout\(layout, by=None, [^;]*\)$"),
     ],

@@ -185,8 +185,8 @@ def _find_problem(call: Callable[..., Any], args: tuple[Any, ...], kwargs: Mappi
     every = list(inspect.signature(call).parameters.values())
     is_bound = bool(every) and every[0].name in BOUND and "." in call.__qualname__
     parameters = every[1:] if is_bound else every
+    name = _name_of(call, args[:is_bound])
     args = args[1:] if is_bound else args
-    name = _name_of(call)
     shown = _format_signature(name, parameters)
     by_position = [p.name for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     by_name = [p.name for p in parameters if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
@@ -215,8 +215,11 @@ def _is_required(parameter: inspect.Parameter) -> bool:
     return parameter.default is parameter.empty and not is_variadic
 
 
-def _name_of(call: Callable[..., Any]) -> str:
+def _name_of(call: Callable[..., Any], owner: tuple[Any, ...]) -> str:
     """Return the name as in a call: ``function``, ``Class``, ``Class.method``."""
+    if owner and call.__name__ != "__init__":  # inherited methods have the name of the object's class
+        kind = owner[0] if isinstance(owner[0], type) else type(owner[0])
+        return f"{kind.__name__}.{call.__name__}"
     return call.__qualname__.rpartition("<locals>.")[2].removesuffix(".__init__")
 
 

@@ -29,8 +29,6 @@ from numpy.typing import ArrayLike
 from foveasim._core.names import did_you_mean, list_names
 from foveasim.errors import ParameterError, type_name, with_article
 
-__all__ = ["Kind", "OwnCheck", "check_kind", "kind_of", "resolve_annotation"]
-
 T = TypeVar("T")
 OWN_CHECK = "checked by the call"
 #: Annotation of a parameter whose call checks the kind of its values itself, with a message of its own.
@@ -65,14 +63,7 @@ class Kind(NamedTuple):
 
 
 def check_kind(name: str, value: Any, kind: Kind) -> None:
-    """
-    Check that a value is of a kind.
-
-    Raises
-    ------
-    ParameterError
-        When it is not.
-    """
+    """Check that a value is of a kind."""
     if not kind.accepts(value):
         if kind.item is not None and _is_sequence(value):
             for k, each in enumerate(value):
@@ -150,17 +141,8 @@ def resolve_annotation(annotation: Any, names: Mapping[str, Any]) -> Any:
     """
     Return the type of an annotation that is a string.
 
-    Parameters
-    ----------
-    annotation : type or str
-    names : mapping
-        Global names of the module of the annotation.
-
-    Returns
-    -------
-    type
-        :data:`~typing.Any` when a name is not known, as in annotations that were inherited from other modules, or when an older
-        version of a library does not have the type.
+    ``names``: global names of the module of the annotation. Returns :data:`~typing.Any` when a name is not known, as in
+    annotations that were inherited from other modules, or when an older version of a library does not have the type.
     """
     if not isinstance(annotation, str):
         return annotation

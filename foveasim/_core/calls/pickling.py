@@ -19,8 +19,6 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["copyable", "make_copyable"]
-
 _Class = TypeVar("_Class", bound=type)
 
 

@@ -42,20 +42,9 @@ def read_raster(
     """
     Run a reader of a format, in the sandbox process if the format requires it.
 
-    Parameters
-    ----------
-    form : FileFormat
-        Format of the file.
-    reader : function
-        Module-level function of the path as a string and ``args``; returns metadata that JSON can represent, and arrays.
-    path : Path
-    **args
-        Keywords of the reader, plain data.
-
-    Raises
-    ------
-    FileError
-        If the file is corrupt, malformed or too large.
+    ``form``: format of the file. ``reader``: module-level function of the path as a string and ``args``; returns metadata that
+    JSON can represent, and arrays. ``**args``: keywords of the reader, plain data. Raises FileError if the file is corrupt,
+    malformed or too large.
     """
     if not form.is_sandboxed:
         return reader(str(path), **args)
@@ -78,10 +67,7 @@ def check_size(shape: Sequence[int], itemsize: int, n_bytes: int) -> None:
     """
     Reject arrays that are too large, before they are decompressed.
 
-    Raises
-    ------
-    FormatError
-        If an array of the shape would exceed the memory limit of a file of ``n_bytes``.
+    Raises FormatError if an array of the shape would exceed the memory limit of a file of ``n_bytes``.
     """
     size = itemsize
     for n in shape:
@@ -98,10 +84,7 @@ def pitch_of_axes(x: Floats, y: Floats) -> tuple[float | None, float | None]:
     """
     Return the signed coordinate steps of two axes; None for an axis with one cell.
 
-    Raises
-    ------
-    FormatError
-        If coordinates are not finite, or their steps are not uniform.
+    Raises FormatError if coordinates are not finite, or their steps are not uniform.
     """
     steps: list[float | None] = []
     for name, along in (("x", x), ("y", y)):
@@ -123,10 +106,7 @@ def as_images(data: NDArray[Any]) -> Images:
     """
     Return floating-point images (n_band, n_y, n_x) in native byte order.
 
-    Raises
-    ------
-    FormatError
-        If the dtype is not real, or the number of dimensions is wrong.
+    Raises FormatError if the dtype is not real, or the number of dimensions is wrong.
     """
     if data.ndim > 3 and all(n == 1 for n in data.shape[:-3]):
         data = data.reshape(data.shape[-3:])

@@ -25,8 +25,6 @@ from foveasim._io.rasters.labels import X, Y
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["HDF5_MAGIC", "NETCDF3_MAGICS", "is_zarr", "open_netcdf", "open_zarr", "select_array"]
-
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 NETCDF3_MAGICS = (b"CDF\x01", b"CDF\x02")
 ZARR_FILES = ("zarr.json", ".zgroup", ".zarray", ".zattrs", ".zmetadata")
@@ -91,23 +89,9 @@ def select_array(
     """
     Return the named array, the one with the default name, or the only possible one.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-    name : str, optional
-    n_bytes : int
-        Size of the file in bytes, which limits the size of the array.
-    default : str
-        Name of the array in files with several.
-    min_ndim : int
-        Number of dimensions of arrays that are selected without a name.
-    what : str
-        Kind of the array, for messages.
-
-    Raises
-    ------
-    FormatError
-        If no array has the name, or several arrays are possible.
+    ``n_bytes``: size of the file in bytes, which limits the size of the array. ``default``: name of the array in files with
+    several. ``min_ndim``: number of dimensions of arrays that are selected without a name. ``what``: kind of the array, for
+    messages. Raises FormatError if no array has the name, or several arrays are possible.
     """
     variable = dataset[_select_name(dataset, name, default, min_ndim, what)]
     for array in (variable, *variable.coords.values()):
@@ -200,10 +184,8 @@ def _check_codecs(metadata: Any) -> None:
     """
     Check the codecs, dtypes, shapes and chunks in zarr metadata.
 
-    Raises
-    ------
-    FormatError
-        If the metadata specify a codec that is not known to be safe, a dtype of Python objects, or an invalid size.
+    Raises FormatError if the metadata specify a codec that is not known to be safe, a dtype of Python objects, or an invalid
+    size.
     """
     stack = [metadata]
     while stack:

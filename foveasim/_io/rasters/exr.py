@@ -16,8 +16,6 @@ from foveasim._io.formats import FormatError
 from foveasim._io.rasters import MAX_BANDS, check_size
 from foveasim._io.rasters.units import length_in_um, round_factor
 
-__all__ = ["MAGIC", "POLARISATION", "ExrHeader", "band_of_channel", "read_channels", "read_header"]
-
 MAGIC = b"\x76\x2f\x31\x01"
 #: Channel of a band: optional layer, wavelength and unit. A layer is not a number: ``550.5nm`` has none.
 CHANNEL = re.compile(
@@ -41,10 +39,7 @@ def read_header(path: Path) -> ExrHeader:
     """
     Read the header of a file with one image.
 
-    Raises
-    ------
-    FormatError
-        If the file contains several images, or is too large.
+    Raises FormatError if the file contains several images, or is too large.
     """
     exr = import_optional(path, "OpenEXR", "maps")
     with exr.File(str(path), header_only=True) as file:
@@ -84,10 +79,7 @@ def read_channels(path: Path, names: Sequence[str]) -> NDArray[Any]:
     """
     Read channels as bands (n_band, n_y, n_x), top row first.
 
-    Raises
-    ------
-    FormatError
-        If a channel is subsampled.
+    Raises FormatError if a channel is subsampled.
     """
     exr = import_optional(path, "OpenEXR", "maps")
     with exr.File(str(path), separate_channels=True) as file:

@@ -14,19 +14,6 @@ from foveasim._io.rasters.units import length_in_um
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = [
-    "BAND",
-    "X",
-    "Y",
-    "coordinate",
-    "in_order",
-    "is_unnamed",
-    "length_of_coordinate",
-    "squeeze",
-    "unit_of_array",
-    "wavelengths_of_array",
-]
-
 #: Accepted names of dimensions; the first is the name that is written.
 X = ("x", "x_um", "col", "cols", "column", "n_x")
 Y = ("y", "y_um", "row", "rows", "n_y")
@@ -51,10 +38,7 @@ def in_order(array: xr.DataArray) -> tuple[xr.DataArray, Hashable | None, tuple[
 
     Those are the dimension of the bands or None, and those of rows and columns.
 
-    Raises
-    ------
-    FormatError
-        If the array is empty, or has other dimensions.
+    Raises FormatError if the array is empty, or has other dimensions.
     """
     if 0 in array.shape:
         raise FormatError(f"contains an empty array of shape {array.shape}")

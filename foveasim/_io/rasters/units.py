@@ -7,8 +7,6 @@ from typing import TypeAlias
 
 import numpy as np
 
-__all__ = ["Powers", "length_in_um", "parse_unit", "round_factor"]
-
 #: Powers of watt, metre, second, photon and steradian.
 Powers: TypeAlias = tuple[int, int, int, int, int]
 _WATT, _METRE, _SECOND, _PHOTON, _STERADIAN = (

@@ -121,11 +121,6 @@ def parse_distribution(path: str, spec: Any) -> Distribution:
     -------
     Distribution
 
-    Raises
-    ------
-    ParameterError
-        When the distribution is invalid.
-
     Examples
     --------
     >>> parse_distribution("sensor.bits", {"choice": [8, 10]}).bounds

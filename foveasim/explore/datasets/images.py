@@ -32,10 +32,7 @@ def check_image_options(name: str, options: Any) -> dict[str, Any] | None:
     """
     Return the options of an image with their defaults, or None.
 
-    Raises
-    ------
-    ParameterError
-        When the options are not a mapping of plain data, or have other names.
+    Raises ParameterError when the options are not a mapping of plain data, or have other names.
     """
     if options is None:
         return None
@@ -60,24 +57,10 @@ def images_of(
     """
     Return the images of a capture.
 
-    Parameters
-    ----------
-    capture : Capture
-    sensor : Sensor
-    options : mapping of str to mapping
-        Options of each image, by its name.
-    n_threads : int
-
-    Returns
-    -------
-    items : dict
-        ``raster`` (n_channel, n_y, n_x) float32, top row first, and ``cortical`` (n_channel, n_ring, n_sector) float32, the
-        innermost ring first; 0 where ``raster_known`` (n_y, n_x) or ``cortical_known`` (n_ring, n_sector) is False.
-
-    Raises
-    ------
-    ParameterError
-        When an option is invalid for the capture; the message contains the name of the image.
+    ``options``: options of each image, by its name. Returns ``items``: ``raster`` (n_channel, n_y, n_x) float32, top row
+    first, and ``cortical`` (n_channel, n_ring, n_sector) float32, the innermost ring first; 0 where ``raster_known`` (n_y,
+    n_x) or ``cortical_known`` (n_ring, n_sector) is False. Raises ParameterError when an option is invalid for the capture;
+    the message contains the name of the image.
     """
     items: dict[str, Any] = {}
     for name, chosen in options.items():

@@ -35,23 +35,10 @@ def read_labels(path: Path, pictures: Sequence[str]) -> list[int] | list[str]:
     """
     Read the classes of pictures from a CSV or array file.
 
-    Parameters
-    ----------
-    path : Path
-        ``.csv``: UTF-8 with the columns ``picture`` and ``label`` in its first line, and lines in any order; other columns are
-        ignored. ``.npy``: array of integers or strings, one per picture in the order of the pictures.
-    pictures : sequence of str
-        Names of the pictures in the file, which may list others too.
-
-    Returns
-    -------
-    labels : list of int or of str
-        Integers if all labels of the file are integers.
-
-    Raises
-    ------
-    FileError
-        When the file cannot be read, or does not contain exactly one class for each picture.
+    ``path``: ``.csv``: UTF-8 with the columns ``picture`` and ``label`` in its first line, and lines in any order; other
+    columns are ignored. ``.npy``: array of integers or strings, one per picture in the order of the pictures. ``pictures``:
+    names of the pictures in the file, which may list others too. Returns ``labels``: integers if all labels of the file are
+    integers. Raises FileError when the file cannot be read, or does not contain exactly one class for each picture.
     """
     content = _content(path)
     if path.suffix.lower() == ".npy":
@@ -107,23 +94,11 @@ def read_boxes(path: Path, pictures: Sequence[str]) -> list[Floats]:
     """
     Read the boxes of pictures from a JSON file in COCO format.
 
-    Parameters
-    ----------
-    path : Path
-        File with ``images`` (``id``, ``file_name``) and ``annotations`` (``image_id``, ``category_id``, ``bbox``: left, top,
-        width, height in pixels). Crowd annotations (``iscrowd``) are ignored.
-    pictures : sequence of str
-        Names of the pictures in the file, which may list others too.
-
-    Returns
-    -------
-    boxes : list of (n_box, 5) float64, pixels
-        For each picture: x0, y0, x1, y1 from its upper left corner, y down, and the category number.
-
-    Raises
-    ------
-    FileError
-        When the file cannot be read, does not list a picture, or a box has no area.
+    ``path``: file with ``images`` (``id``, ``file_name``) and ``annotations`` (``image_id``, ``category_id``, ``bbox``: left,
+    top, width, height in pixels). Crowd annotations (``iscrowd``) are ignored. ``pictures``: names of the pictures in the
+    file, which may list others too. Returns ``boxes``, list of (n_box, 5) float64, pixels: for each picture: x0, y0, x1, y1
+    from its upper left corner, y down, and the category number. Raises FileError when the file cannot be read, does not list a
+    picture, or a box has no area.
     """
     try:
         coco = TypeAdapter(_Coco).validate_json(_content(path))
@@ -153,19 +128,9 @@ def match_label_files(directory: Path, pictures: Sequence[str], extensions: Sequ
     """
     Return the file for each picture, with the same name and another extension.
 
-    Parameters
-    ----------
-    directory : Path
-        Directory with the same subdirectories as that of the pictures.
-    pictures : sequence of str
-        Names of the pictures.
-    extensions : sequence of str
-        Allowed extensions.
-
-    Raises
-    ------
-    FileError
-        When the directory does not exist, or does not contain exactly one file for each picture.
+    ``directory``: directory with the same subdirectories as that of the pictures. ``pictures``: names of the pictures.
+    ``extensions``: allowed extensions. Raises FileError when the directory does not exist, or does not contain exactly one
+    file for each picture.
     """
     if not directory.is_dir():
         raise FileError(directory, missing_path(directory, "directory"))

@@ -84,20 +84,9 @@ def boxes_on_sites(boxes_px: Floats, integrator: Integrator, lens: Lens | None) 
     """
     Map boxes of a picture to the sensor.
 
-    Parameters
-    ----------
-    boxes_px : (n_box, 4) float64, pixels
-        x_min, y_min, x_max, y_max from the upper left corner, y down; pixel k extends from k to k + 1.
-    integrator : Integrator
-        First-order integrator of the sites on the image grid of the picture.
-    lens : lens of foveasim.distortion, optional
+    ``boxes_px`` (n_box, 4) float64, pixels: x_min, y_min, x_max, y_max from the upper left corner, y down; pixel k extends
+    from k to k + 1. ``integrator``: first-order integrator of the sites on the image grid of the picture.
 
-    Returns
-    -------
-    Boxes
-
-    Notes
-    -----
     A pixel on the boundary of a box counts with its fraction inside the box, distributed uniformly over the pixel. Boxes
     aligned with pixels are exact.
     """
@@ -131,21 +120,10 @@ def mask_on_sites(mask: Ints, integrator: Integrator) -> Ints:
     """
     Return the class with the largest area of each site.
 
-    Parameters
-    ----------
-    mask : (n_y, n_x) integers
-        Classes of the pixels of the picture, top row first.
-    integrator : Integrator
-        As for :func:`boxes_on_sites`.
+    ``mask`` (n_y, n_x) integers: classes of the pixels of the picture, top row first. ``integrator``: as for
+    :func:`boxes_on_sites`. Returns ``classes`` (n_site,) int64: :data:`NO_CLASS` where the area outside the picture is at
+    least that of every class. Among classes with equal area, the lowest.
 
-    Returns
-    -------
-    classes : (n_site,) int64
-        :data:`NO_CLASS` where the area outside the picture is at least that of every class. Among classes with equal area, the
-        lowest.
-
-    Notes
-    -----
     Areas are those of the undistorted outlines, from which sites collect light.
     """
     rows = from_file_rows(mask)[0]
@@ -164,16 +142,8 @@ def flow_on_sites(flow_px: Floats, integrator: Integrator, lens: Lens | None) ->
     """
     Map the optical flow of a picture to the photosites.
 
-    Parameters
-    ----------
-    flow_px : (n_y, n_x, 2) float, pixels
-        Displacement of each pixel, x to the right and y down; NaN where it is unknown.
-    integrator, lens
-        As for :func:`boxes_on_sites`.
-
-    Returns
-    -------
-    Flow
+    ``flow_px`` (n_y, n_x, 2) float, pixels: displacement of each pixel, x to the right and y down; NaN where it is unknown.
+    ``integrator``, ``lens``: as for :func:`boxes_on_sites`.
     """
     grid = integrator.grid
     displacement = np.moveaxis(from_file_rows(np.asarray(flow_px, np.float64)), 0, -1) * [
@@ -215,10 +185,7 @@ def validate_boxes(name: str, boxes: Any) -> tuple[Floats, Ints]:
 
     Classes are :data:`NO_CLASS` when ``boxes`` has no column of classes.
 
-    Raises
-    ------
-    ParameterError
-        When ``boxes`` is not an (n, 4) or (n, 5) array of numbers, or a box has no area.
+    Raises ParameterError when ``boxes`` is not an (n, 4) or (n, 5) array of numbers, or a box has no area.
     """
     if np.size(boxes) == 0:
         return np.zeros((0, 4)), np.zeros(0, np.int64)
@@ -242,19 +209,9 @@ def read_mask(mask: Any, name: str, shape: tuple[int, int]) -> Ints:
     """
     Read a mask from a file or an array, top row first.
 
-    Parameters
-    ----------
-    mask : path or (n_y, n_x) array of integers
-        Files with a palette give the indices of its entries.
-    name : str
-        Name of the mask, for messages.
-    shape : (n_y, n_x)
-        Shape of the picture.
-
-    Raises
-    ------
-    FileError, ParameterError
-        When the mask cannot be read, or its shape differs.
+    ``mask`` (path or (n_y, n_x) array of integers): files with a palette give the indices of its entries. ``name``: name of
+    the mask, for messages. ``shape`` (n_y, n_x): shape of the picture. Raises FileError, ParameterError when the mask cannot
+    be read, or its shape differs.
     """
     if isinstance(mask, str | Path):
         name = str(mask)
@@ -291,10 +248,7 @@ def read_flow(flow: Any, name: str, shape: tuple[int, int]) -> Floats:
     """
     Read an optical flow from a ``.npy`` file or an array, top row first.
 
-    Raises
-    ------
-    FileError, ParameterError
-        When the flow cannot be read, or its shape differs.
+    Raises FileError, ParameterError when the flow cannot be read, or its shape differs.
     """
     if isinstance(flow, str | Path):
         name = str(flow)
@@ -314,10 +268,7 @@ def check_per_picture(name: str, given: Any, n: int) -> Sequence[Any]:
     """
     Return a sequence after checking that it has one item per picture.
 
-    Raises
-    ------
-    ParameterError
-        When the object is not a sequence, or has another length.
+    Raises ParameterError when the object is not a sequence, or has another length.
     """
     if isinstance(given, str | bytes) or not (hasattr(given, "__len__") and hasattr(given, "__getitem__")):
         raise ParameterError(name, f"must be a sequence with one item per picture, got {type_name(given)}")

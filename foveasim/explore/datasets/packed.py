@@ -23,13 +23,7 @@ BLOCK = 1 << 14
 
 
 class PackedStrings(Sequence[str]):
-    """
-    Immutable sequence of strings in one buffer.
-
-    Parameters
-    ----------
-    strings : iterable of str
-    """
+    """Immutable sequence of strings in one buffer."""
 
     def __init__(self, strings: Iterable[str]) -> None:
         # File names may contain bytes that are not UTF-8.
@@ -63,11 +57,7 @@ class PackedFiles(Sequence[Path]):
     """
     Immutable sequence of files in one directory and its subdirectories.
 
-    Parameters
-    ----------
-    directory : Path
-    names : iterable of str
-        Paths relative to the directory.
+    ``names``: paths relative to the directory.
     """
 
     def __init__(self, directory: Path, names: Iterable[str]) -> None:
@@ -89,10 +79,7 @@ class PackedBoxes:
     """
     Boxes of all pictures, with their classes.
 
-    Attributes
-    ----------
-    most : int
-        Largest number of boxes of a picture.
+    ``most``: largest number of boxes of a picture.
     """
 
     def __init__(self, boxes_px: Iterable[tuple[Floats, Ints]]) -> None:

@@ -59,12 +59,8 @@ def source_of(pictures: Any) -> Source:
     """
     Create the source of the pictures of a dataset; return a source unchanged.
 
-    Raises
-    ------
-    FileError
-        When the file does not exist, or contains no pictures.
-    ParameterError
-        When the type of ``pictures`` is not supported.
+    Raises FileError when the file does not exist, or contains no pictures. Raises ParameterError when the type of ``pictures``
+    is not supported.
     """
     if isinstance(pictures, Source):
         return pictures

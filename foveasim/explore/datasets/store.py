@@ -364,10 +364,7 @@ class _Shards:
     """
     Base class of stored shards with a fixed number of samples each.
 
-    Attributes
-    ----------
-    version : int
-        Version of the format.
+    ``version``: version of the format.
     """
 
     version: int

@@ -62,20 +62,9 @@ def create_rows(
     """
     Create an array of n rows in a zarr group.
 
-    Parameters
-    ----------
-    group : zarr.Group
-    name : str
-    n, per_shard : int
-        Number of rows, and of rows in each shard.
-    shape : sequence of int
-        Shape of a row.
-    dtype : numpy dtype, or str
-        Strings must be scalars.
-    dimensions : sequence of str
-        Names of the dimensions, with that of the rows.
-    attributes : mapping
-        Attributes of the array, such as its unit.
+    ``n``, ``per_shard``: number of rows, and of rows in each shard. ``shape``: shape of a row. ``dtype`` (numpy dtype, or
+    str): strings must be scalars. ``dimensions``: names of the dimensions, with that of the rows. ``attributes``: attributes
+    of the array, such as its unit.
     """
     from zarr.codecs import ZstdCodec
 
@@ -149,10 +138,7 @@ class RowReader:
         """
         Read row k: an array of the shape of a row, or a string.
 
-        Raises
-        ------
-        OSError, ValueError
-            When the shard of the row is missing, truncated or corrupt.
+        Raises OSError, ValueError when the shard of the row is missing, truncated or corrupt.
         """
         if 0 in self._shape:
             return np.empty(self._shape, self._dtype.newbyteorder("="))

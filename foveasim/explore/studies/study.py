@@ -321,11 +321,8 @@ def _prepare(
     """
     Check that the stored study has the same plan, and register this program as its writer.
 
-    Returns
-    -------
-    trials : list of optuna.Trial
-        Unfinished trials of a batch whose results were only partly stored at an interruption; their settings are sampled
-        already. Trials of a batch without stored results are discarded and sampled again.
+    Returns ``trials``: unfinished trials of a batch whose results were only partly stored at an interruption; their settings
+    are sampled already. Trials of a batch without stored results are discarded and sampled again.
     """
     plan_dict = plan.to_dict()
     stored_plan = optuna_study.user_attrs.get(PLAN)
@@ -356,10 +353,8 @@ def _check_writer(optuna: Any, storage: str | Path | None, trial: optuna.Trial, 
     """
     Check that no other program has started to write the study.
 
-    Raises
-    ------
-    FileError
-        When another program writes the study. The trial is then marked as failed, unless the other program has done so.
+    Raises FileError when another program writes the study. The trial is then marked as failed, unless the other program has
+    done so.
     """
     if trial.study.user_attrs.get(WRITER) == token:
         return
@@ -375,10 +370,7 @@ def _file_lock(storage: str | Path | None, url: str | None) -> Iterator[None]:
 
     Other storages have no lock.
 
-    Raises
-    ------
-    FileError
-        When another program has locked the file.
+    Raises FileError when another program has locked the file.
     """
     file = None if url is None else _sqlite_path(url)
     if file is None:

@@ -398,16 +398,8 @@ def locate_shot(own: Source, shot: str | Path | Mapping[str, Any]) -> tuple[Sour
     """
     Return the settings of a shot, and their origin.
 
-    Parameters
-    ----------
-    own : Source
-        Origin of the sweep, study or dataset; that of a mapping of settings is its key ``shot``.
-    shot : path or mapping
-
-    Raises
-    ------
-    ConfigError
-        When the file does not exist, or is not valid YAML.
+    ``own``: origin of the sweep, study or dataset; that of a mapping of settings is its key ``shot``. Raises ConfigError when
+    the file does not exist, or is not valid YAML.
     """
     if isinstance(shot, Mapping):
         return own.at("shot"), plain_settings(own.at("shot"), shot)
@@ -428,10 +420,7 @@ def put_changes(
 
     The referenced files are appended to ``found``.
 
-    Raises
-    ------
-    ConfigError
-        When a path or a value is not one of settings.
+    Raises ConfigError when a path or a value is not one of settings.
     """
     for path, value in plain_settings(shot_source, changes or {}).items():
         put_setting(shot_source, settings, path, resolve_files(own.directory, value, path, found))
@@ -457,10 +446,7 @@ def with_file_context(path: Path) -> Iterator[None]:
 
     Errors in a referenced shot file are raised with both paths.
 
-    Raises
-    ------
-    ConfigError
-        Instead of any :class:`ParameterError`, or of a :class:`ConfigError` of another file.
+    Raises ConfigError instead of any :class:`ParameterError`, or of a :class:`ConfigError` of another file.
     """
     try:
         yield
@@ -479,10 +465,7 @@ def check_disjoint(source: Source, paths: Iterable[str], verb: str = "vary") -> 
     """
     Check that no setting contains another.
 
-    Raises
-    ------
-    ConfigError
-        With the paths of both settings.
+    Raises ConfigError with the paths of both settings.
     """
     names = list(paths)
     for path in names:

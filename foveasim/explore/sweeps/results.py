@@ -36,17 +36,9 @@ def to_dataset(plan: Plan, records: Mapping[int, Record]) -> xr.Dataset:
     """
     Combine records to an xarray.Dataset, independent of their order.
 
-    Parameters
-    ----------
-    plan : Plan
-    records : mapping of int to Record
-        Records by point number; points without a record have NaN and the error "not done".
-
-    Returns
-    -------
-    xarray.Dataset
-        Dimensions are the varied settings, or ``point``, and ``repeat``. Variables are the metrics, ``seed``, ``error`` (empty
-        without errors) and ``warning``. Unlabelled dimensions are padded with NaN to the longest array.
+    ``records``: records by point number; points without a record have NaN and the error "not done". Dimensions are the
+    varied settings, or ``point``, and ``repeat``. Variables are the metrics, ``seed``, ``error`` (empty without errors) and
+    ``warning``. Unlabelled dimensions are padded with NaN to the longest array.
     """
     xr = import_xarray("sweep")
     shape, dims = plan.shape, plan.dims
@@ -218,10 +210,7 @@ def check_store(path: Path) -> None:
     """
     Check that results can be written to a path before the computation.
 
-    Raises
-    ------
-    FileError
-        When the directory does not exist, or the path contains other data.
+    Raises FileError when the directory does not exist, or the path contains other data.
     """
     if not path.absolute().parent.is_dir():
         raise FileError(path, f"cannot be written: the directory {path.absolute().parent} does not exist")
@@ -233,10 +222,7 @@ def stored_plan(path: Path) -> dict[str, Any] | None:
     """
     Read the plan from a store of results; None if the store does not exist.
 
-    Raises
-    ------
-    FileError
-        When the store is corrupt, or does not contain sweep results.
+    Raises FileError when the store is corrupt, or does not contain sweep results.
     """
     if not path.exists():
         return None
@@ -275,10 +261,7 @@ def write_store(dataset: xr.Dataset, path: Path) -> None:
     """
     Write a zarr store atomically, replacing an existing one.
 
-    Raises
-    ------
-    FileError
-        When the path cannot be written.
+    Raises FileError when the path cannot be written.
     """
     with (
         atomic_directory(path, is_ours=lambda directory: stored_plan(directory) is not None) as new,
@@ -297,10 +280,7 @@ def import_xarray(subject: Path | str) -> Any:
     """
     Import xarray, and zarr, the format of the results.
 
-    Raises
-    ------
-    ParameterError, FileError
-        When one of them is not installed.
+    Raises ParameterError, FileError when one of them is not installed.
     """
     import_optional(subject, "zarr", "explore")
     return import_optional(subject, "xarray", "explore")

@@ -79,10 +79,7 @@ class PowerDiagram:
         """
         Set the centres (n, 2) and weights (n,) of the diagram; weights are equal by default.
 
-        Returns
-        -------
-        bool
-            Whether every centre has a cell. If not, the diagram is unchanged.
+        Returns whether every centre has a cell. If not, the diagram is unchanged.
         """
         points_um = np.concatenate((centres_um, self._auxiliary_um))
         weights = np.zeros(points_um.shape[0])

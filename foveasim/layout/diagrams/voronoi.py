@@ -29,27 +29,11 @@ def voronoi_cells(centres_um: Floats, region: shapely.Polygon) -> tuple[Floats, 
     """
     Compute the Voronoi cells of points, clipped to a region, one per point in their order.
 
-    Parameters
-    ----------
-    centres_um : (n, 2) float64, µm
-        Distinct points inside the region.
-    region : shapely Polygon, µm
-        Convex or concave.
+    ``centres_um`` (n, 2) float64, µm: distinct points inside the region. ``region`` (shapely Polygon, µm): convex or concave.
+    Returns ``xy_um`` (n_vertex, 2) float64, µm: corners, cell after cell, counter-clockwise. Corners that neighbours share are
+    bit-identical. ``ring_offsets`` (n + 1,) int64: cell i has the corners ``ring_offsets[i] : ring_offsets[i + 1]``. Raises
+    GeometryError when a point lies outside, two are equal or too close for float64, or a cell encloses a hole of the region.
 
-    Returns
-    -------
-    xy_um : (n_vertex, 2) float64, µm
-        Corners, cell after cell, counter-clockwise. Corners that neighbours share are bit-identical.
-    ring_offsets : (n + 1,) int64
-        Cell i has the corners ``ring_offsets[i] : ring_offsets[i + 1]``.
-
-    Raises
-    ------
-    GeometryError
-        When a point lies outside, two are equal or too close for float64, or a cell encloses a hole of the region.
-
-    Notes
-    -----
     Cells inside the region are assembled from arrays of corner indices. The few cells at its boundary are the faces of
     their edges and the outline of the region; each intersection is computed once for both neighbours. A part that a notch
     of the region separates from its cell is assigned to the neighbour with which it shares the longest boundary.
@@ -115,18 +99,9 @@ class IncrementalCells:
     Unordered edges are sufficient for areas and masses, and faster to compute than rings. Parts of cells that notches of the
     region separate are assigned to neighbours as in :func:`voronoi_cells`, and have edges of their own.
 
-    Parameters
-    ----------
-    region : shapely Polygon, µm
-        Convex or concave.
-    mass_of : callable, optional
-        Returns the masses (n,) of n polygons from their edges. Of a cell that a notch divides, the heaviest part is then
-        the cell; otherwise the part that contains the centre.
-
-    Attributes
-    ----------
-    centres_um : (n, 2) float64, µm
-        The centres of the last update.
+    ``region`` (shapely Polygon, µm): convex or concave. ``mass_of``: returns the masses (n,) of n polygons from their edges.
+    Of a cell that a notch divides, the heaviest part is then the cell; otherwise the part that contains the centre.
+    ``centres_um`` (n, 2) float64, µm: the centres of the last update.
     """
 
     def __init__(self, region: shapely.Polygon, mass_of: MassOf | None = None) -> None:
@@ -169,15 +144,8 @@ class IncrementalCells:
         """
         Return the last cells as packed rings, like :func:`voronoi_cells`.
 
-        Returns
-        -------
-        xy_um : (n_vertex, 2) float64, µm
-        ring_offsets : (n + 1,) int64
-
-        Raises
-        ------
-        GeometryError
-            When centres are too close for float64, or a cell encloses a hole of the region.
+        Returns ``xy_um`` (n_vertex, 2) float64, µm. ``ring_offsets`` (n + 1,) int64. Raises GeometryError when centres are too
+        close for float64, or a cell encloses a hole of the region.
         """
         diagram = _without_short_edges(self._diagram())
         unclipped = _unclipped_rings(

@@ -43,17 +43,9 @@ def write_lyrdb(report: Report, path: str | Path) -> None:
     """
     Write a report for KLayout's marker browser, atomically.
 
-    Parameters
-    ----------
-    report : Report
-    path : path
-        File with the extension ``.lyrdb``. It contains one category per rule and one item per violation, with the site
-        indices, the measured value, and the marker in µm.
-
-    Raises
-    ------
-    FileError
-        When the extension differs, the library ``klayout`` is not installed, or the file cannot be written.
+    ``path``: file with the extension ``.lyrdb``. It contains one category per rule and one item per violation, with the site
+    indices, the measured value, and the marker in µm. Raises FileError when the extension differs, the library ``klayout`` is
+    not installed, or the file cannot be written.
     """
     target = Path(path)
     if target.suffix != ".lyrdb":
@@ -111,21 +103,9 @@ def read_lyrdb(path: str | Path, n_sites: int) -> Report:
     """
     Read a KLayout report database of :func:`write_lyrdb` or of another program.
 
-    Parameters
-    ----------
-    path : path
-    n_sites : int
-        Number of sites of the checked layout, which the file does not contain.
-
-    Returns
-    -------
-    Report
-        Violations from another program have no sites, and NaN as value and limit. The file does not contain waivers.
-
-    Raises
-    ------
-    FileError
-        When the file is missing, too large, corrupt, not a report, or contains a site index beyond ``n_sites``.
+    ``n_sites``: number of sites of the checked layout, which the file does not contain. Violations from another
+    program have no sites, and NaN as value and limit. The file does not contain waivers. Raises FileError when the file is
+    missing, too large, corrupt, not a report, or contains a site index beyond ``n_sites``.
     """
     from foveasim.layout.drc.rules import Report
 

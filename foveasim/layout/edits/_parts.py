@@ -13,8 +13,6 @@ from foveasim._core.validation import Ints
 from foveasim.errors import GeometryError
 from foveasim.layout.model import Layout
 
-__all__ = ["SLIVER", "concatenate_layouts", "replace_sites", "separate_parts"]
-
 #: Area of a piece, relative to its site, below which it is a rounding artefact of the cut.
 SLIVER = 1e-9
 
@@ -23,18 +21,8 @@ def separate_parts(layout: Layout, shapes: NDArray[Any], parent: Ints) -> tuple[
     """
     Return all polygons of shapes, without slivers.
 
-    Parameters
-    ----------
-    layout : Layout
-    shapes : (n,) geometries, µm
-    parent : (n,) int64
-        Site that each shape belongs to.
-
-    Returns
-    -------
-    polygons : (m,) shapely polygons
-    shape : (m,) int64
-        Index of the shape of each polygon.
+    ``shapes``: (n,) geometries, µm. ``parent`` (n,) int64: site that each shape belongs to. Returns ``polygons`` (m,) shapely
+    polygons. ``shape`` (m,) int64: index of the shape of each polygon.
     """
     parts, shape = shapely.get_parts(shapes, return_index=True)
     is_real = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (
@@ -54,24 +42,11 @@ def replace_sites(
     """
     Return a layout with polygons instead of some sites; the other sites are unchanged.
 
-    Parameters
-    ----------
-    layout : Layout
-    sites : (n,) int64
-        Sites that are removed.
-    polygons : (m,) shapely polygons, or packed rings, µm
-        New sites, as for :meth:`Layout.from_polygons`.
-    parent : (m,) int64
-        Site whose position and columns each new site has; ``layout.n_sites`` is the position after all sites.
-    step : str
-        Step of the provenance.
-    columns : mapping of str to (m,) array, optional
-        Values of the new sites, which replace those of their parents. New sites at the end require all columns.
-
-    Raises
-    ------
-    GeometryError
-        When a polygon is not a valid site.
+    ``sites`` (n,) int64: sites that are removed. ``polygons`` (m,) shapely polygons, or packed rings, µm: new sites, as for
+    :meth:`Layout.from_polygons`. ``parent`` (m,) int64: site whose position and columns each new site has; ``layout.n_sites``
+    is the position after all sites. ``step``: step of the provenance. ``columns`` (mapping of str to (m,) array): values of
+    the new sites, which replace those of their parents. New sites at the end require all columns. Raises GeometryError when a
+    polygon is not a valid site.
     """
     columns = columns or {}
     kept = np.delete(np.arange(layout.n_sites), sites)

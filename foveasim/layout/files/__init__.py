@@ -128,10 +128,7 @@ def check_no_options(**options: object) -> None:
     """
     Reject format options for a file without options.
 
-    Raises
-    ------
-    ParameterError
-        When an option is given.
+    Raises ParameterError when an option is given.
     """
     validate_options(options, (), FORMATS, "read_options")
 

@@ -7,8 +7,6 @@ from pathlib import Path
 from foveasim._core.names import closest_name, missing_path, possible_names
 from foveasim.errors import FileError
 
-__all__ = ["bundled_layouts", "layout_path"]
-
 
 def bundled_layouts() -> dict[str, Path]:
     """Return the files of the bundled layouts by name: real sensors and those of the paper."""

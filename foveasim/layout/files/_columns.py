@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 
 from foveasim._core.validation import Bools, Ints, exact_integers
 
-__all__ = ["CHANNEL", "MAX_COLUMN_BYTES", "column_strings", "linear_text", "parse_columns", "storable_columns"]
-
 #: Column that GDSII and OASIS store as the datatype.
 CHANNEL = "channel"
 #: Maximum number of columns of a file.
@@ -58,24 +56,11 @@ def storable_columns(
     """
     Return the columns that fit into one string per site or array of sites.
 
-    Parameters
-    ----------
-    columns : mapping of str to (n_site,) arrays
-    first : (n,) int64
-        The site, or the first site of the array, of each string.
-    steps : mapping of str to (n, 2) int64
-        Differences of the values of successive columns and rows of an array.
-    max_chars : int or (n,) int64
-        Maximum length of a string.
-    max_strings : int
-        Maximum number of distinct string values of a column.
-
-    Returns
-    -------
-    stored : dict of str to list
-        Values by key: integers, floating-point numbers, and strings.
-    dropped : tuple of str
-        Names of the dropped columns, sorted.
+    ``columns``: mapping of str to (n_site,) arrays. ``first`` (n,) int64: the site, or the first site of the array, of each
+    string. ``steps`` (mapping of str to (n, 2) int64): differences of the values of successive columns and rows of an array.
+    ``max_chars`` (int or (n,) int64): maximum length of a string. ``max_strings``: maximum number of distinct string values of
+    a column. Returns ``stored``: values by key: integers, floating-point numbers, and strings. ``dropped``: names of the
+    dropped columns, sorted.
     """
     stored: dict[str, list[Any]] = {}
     dropped = []
@@ -149,15 +134,8 @@ def parse_columns(lines: bytes) -> dict[str, tuple[NDArray[Any], Ints | None]]:
     """
     Return the columns that every string contains.
 
-    Parameters
-    ----------
-    lines : bytes
-        One string per line, in printable ASCII; untrusted.
-
-    Returns
-    -------
-    columns : dict of str to (values, steps)
-        One value per line, and for integers that change within arrays their steps, (n_line, 2) int64.
+    ``lines``: one string per line, in printable ASCII; untrusted. Returns ``columns``: one value per line, and for integers
+    that change within arrays their steps, (n_line, 2) int64.
     """
     columns: dict[str, tuple[NDArray[Any], Ints | None]] = {}
     for key, values in (_parse_uniform_lines(lines) or _parse_mixed_lines(lines)).items():

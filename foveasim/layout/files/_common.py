@@ -19,22 +19,6 @@ from foveasim._io.formats import FileFormat
 from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.layout.model import Layout
 
-__all__ = [
-    "FORMATS",
-    "WrittenLayout",
-    "check_decompressed",
-    "check_header",
-    "check_site_count",
-    "check_sizes",
-    "header",
-    "layout_from_untrusted",
-    "lossless_report",
-    "max_decompressed_bytes",
-    "restore_column",
-    "rounding_report",
-    "string_column",
-]
-
 #: Formats of layout files. ``read(path, **options)`` returns a :class:`foveasim.Layout`, ``write(layout, path, **options)`` a
 #: :class:`foveasim.layout.WrittenLayout`. Installed packages add formats as entry points of the group ``foveasim.formats``.
 FORMATS: Registry[FileFormat] = Registry("layout format", "foveasim.formats")
@@ -117,10 +101,7 @@ def check_decompressed(path: Path, n_bytes: int) -> None:
     """
     Reject a file that would decompress to too many bytes.
 
-    Raises
-    ------
-    FileError
-        When the size exceeds the limit of the file.
+    Raises FileError when the size exceeds the limit of the file.
     """
     if n_bytes > max_decompressed_bytes(path):
         raise FileError(path, f"would decompress to more than the maximum of {max_decompressed_bytes(path)} bytes")
@@ -130,10 +111,7 @@ def check_site_count(path: Path, n_sites: int) -> None:
     """
     Reject a file with too many sites.
 
-    Raises
-    ------
-    FileError
-        When there are more than ``MAX_SITES``.
+    Raises FileError when there are more than ``MAX_SITES``.
     """
     if n_sites > MAX_SITES:
         raise FileError(path, f"has {n_sites} sites, more than the maximum of {MAX_SITES}")
@@ -145,10 +123,7 @@ def check_sizes(n_rings: NDArray[Any], n_vertices: NDArray[Any]) -> None:
 
     Tests for intersections between them would take minutes.
 
-    Raises
-    ------
-    GeometryError
-        When the number of pairs of rings or vertices exceeds the limit.
+    Raises GeometryError when the number of pairs of rings or vertices exceeds the limit.
     """
     for what, n, at_most, at_most_per_item in (
         ("rings", n_rings, MAX_RING_PAIRS, PAIRS_PER_RING),
@@ -167,10 +142,7 @@ def layout_from_untrusted(
     """
     Return a layout of untrusted outlines, after all checks of :meth:`Layout.from_polygons`.
 
-    Raises
-    ------
-    GeometryError, ParameterError
-        When an outline is not a valid photosite, or a column does not match the sites.
+    Raises GeometryError, ParameterError when an outline is not a valid photosite, or a column does not match the sites.
     """
     if isinstance(polygons, tuple):
         _, ring_offsets, site_offsets = polygons
@@ -194,10 +166,7 @@ def check_header(path: Path, about: Any) -> dict[str, Any]:
     """
     Return the provenance in the metadata of a file.
 
-    Raises
-    ------
-    FileError
-        When the file has another format or version, or no provenance.
+    Raises FileError when the file has another format or version, or no provenance.
     """
     if not isinstance(about, dict) or about.get("format") != FILE_FORMAT:
         got = about.get("format") if isinstance(about, dict) else None
@@ -215,10 +184,7 @@ def plain_columns(layout: Layout, format_name: str) -> dict[str, NDArray[Any]]:
     """
     Return the columns for a format that supports only numbers and strings.
 
-    Raises
-    ------
-    ParameterError
-        When a column has another type.
+    Raises ParameterError when a column has another type.
     """
     for name, column in layout.columns.items():
         if column.dtype.kind not in PLAIN_KINDS or (column.dtype.itemsize > 8 and column.dtype.kind == "f"):

@@ -22,8 +22,6 @@ from foveasim.errors import ParameterError
 from foveasim.layout.files._hierarchy import congruence_classes
 from foveasim.layout.model import Layout
 
-__all__ = ["DERIVED_LAYERS", "LayoutLayer", "PlacedShapes", "shapes_of_layout", "shapes_of_sites"]
-
 #: Corners are extended by at most this multiple of the offset.
 MITRE_LIMIT = 100.0
 #: Vertices are compared in units far below any database unit.
@@ -71,12 +69,8 @@ class PlacedShapes:
     """
     Shapes that are repeated at several positions.
 
-    Attributes
-    ----------
-    polygons : (n,) geometries, µm
-    shape : (m,) int64
-        Index of the polygon at each position.
-    position_um : (m, 2) float64, µm
+    ``polygons``: (n,) geometries, µm. ``shape`` (m,) int64: index of the polygon at each position. ``position_um``: (m, 2)
+    float64, µm.
     """
 
     polygons: NDArray[Any]
@@ -201,10 +195,7 @@ def shapes_of_sites(name: str, layout: Layout, parameters: Mapping[str, Any]) ->
     """
     Return the polygons of a derived layer, one per site.
 
-    Raises
-    ------
-    ParameterError
-        When a parameter is invalid, or the function does not return one geometry per site.
+    Raises ParameterError when a parameter is invalid, or the function does not return one geometry per site.
     """
     polygons = np.asarray(_call(name, layout, parameters))
     if polygons.shape != (layout.n_sites,) or not shapely.is_geometry(polygons).all():
@@ -220,10 +211,7 @@ def shapes_of_layout(name: str, layout: Layout, parameters: Mapping[str, Any]) -
     """
     Return the polygons of a derived layer of the complete layout.
 
-    Raises
-    ------
-    ParameterError
-        When a parameter is invalid, or the function does not return polygons.
+    Raises ParameterError when a parameter is invalid, or the function does not return polygons.
     """
     found = _call(name, layout, parameters)
     if isinstance(found, PlacedShapes):

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["FormatError", "read"]
-
 #: Prefix of cells that KLayout adds for its own metadata.
 KLAYOUT_METADATA = "$$$CONTEXT_INFO$$$"
 #: Number of names in a message.
@@ -122,33 +120,13 @@ def read(
     """
     Read a cell with its complete hierarchy.
 
-    Parameters
-    ----------
-    path : str
-    limit : callable
-        Function that sets limits of memory and processor time. Tighter limits apply while gdstk reads the file.
-    is_oasis : bool
-    layers : list of (layer, datatype), optional
-        Layers of the photosites; a datatype of None stands for all.
-    filters : list of (layer, datatype)
-        Layers of the colour filters.
-    cell : str, optional
-        Cell selected by the user.
-    max_sites, max_memory_bytes, max_text_bytes, max_cpu_s : int
-        Limits of the flattened content.
-
-    Returns
-    -------
-    about : dict
-        Database unit ``dbu_um``, name ``cell``, and ``layers`` of the photosites.
-    arrays : list
-        ``xy`` in database units, ``counts``, ``tags`` (see :class:`Shapes`) of the photosites, the text of their columns, and
-        the same three arrays of the filters without the outline of a photosite.
-
-    Raises
-    ------
-    FormatError
-        When the file is rejected.
+    ``limit``: function that sets limits of memory and processor time. Tighter limits apply while gdstk reads the file.
+    ``layers``: layers of the photosites; a datatype of None stands for all. ``filters``: layers of the colour filters.
+    ``cell``: cell selected by the user. ``max_sites``, ``max_memory_bytes``, ``max_text_bytes``, ``max_cpu_s``: limits of the
+    flattened content. Returns ``about``: database unit ``dbu_um``, name ``cell``, and ``layers`` of the photosites.
+    ``arrays``: ``xy`` in database units, ``counts``, ``tags`` (see :class:`Shapes`) of the photosites, the text of their
+    columns, and the same three arrays of the filters without the outline of a photosite. Raises FormatError when the file is
+    rejected.
     """
     import gdstk
 
@@ -310,14 +288,8 @@ class _Selected:
     A filter with the outline of a photosite in the same cell covers no other photosite. It is not expanded with the
     hierarchy: its index is an attribute of the photosite.
 
-    Attributes
-    ----------
-    polygons, paths : list
-        The filters that are not attributes follow the photosites.
-    filters : list of int
-        Filter of each polygon, -1 for none.
-    copies : list of int
-        Number of repetitions of each polygon.
+    ``polygons``, ``paths``: the filters that are not attributes follow the photosites. ``filters``: filter of each polygon, -1
+    for none. ``copies``: number of repetitions of each polygon.
     """
 
     def __init__(self, cell: Any, is_site: set[tuple[int, int]], filter_of: dict[tuple[int, int], int]) -> None:

@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from foveasim._core.rings import positions_in_runs
 from foveasim._core.validation import Ints
 
-__all__ = ["Arrays", "concatenate", "congruence_classes", "find_arrays", "single_sites"]
-
 #: Maximum number of columns and of rows of an array in GDSII.
 MAX_ARRAY_SIDE = 32767
 #: Integers below this limit are exact as steps of an array; columns with larger ones count as constant.
@@ -88,18 +86,9 @@ def congruence_classes(xy_dbu: Ints, ring_offsets: Ints, site_offsets: Ints) -> 
     """
     Return the congruence class of each site, and the position of each site.
 
-    Parameters
-    ----------
-    xy_dbu : (n_vertex, 2) int64
-    ring_offsets, site_offsets : int64
-        Packed rings, as of a layout.
-
-    Returns
-    -------
-    class_of : (n_site,) int64
-        Classes 0, 1, ... in no particular order.
-    origin_dbu : (n_site, 2) int64
-        Lower left corner of the bounding box; vertices of congruent sites are equal relative to it.
+    ``xy_dbu``: (n_vertex, 2) int64. ``ring_offsets``, ``site_offsets``: packed rings, as of a layout. Returns ``class_of``
+    (n_site,) int64: classes 0, 1, ... in no particular order. ``origin_dbu`` (n_site, 2) int64: lower left corner of the
+    bounding box; vertices of congruent sites are equal relative to it.
     """
     start = ring_offsets[site_offsets[:-1]]
     n_vertices = np.diff(ring_offsets[site_offsets])
@@ -136,18 +125,10 @@ def find_arrays(class_of: Ints, origin_dbu: Ints, columns: Mapping[str, NDArray[
     """
     Divide the sites into arrays.
 
-    Parameters
-    ----------
-    class_of : (n_site,) int64
-        Sites of different classes are in different arrays.
-    origin_dbu : (n_site, 2) int64
-    columns : mapping of str to (n_site,) arrays
-        Columns that the arrays reproduce.
-    max_dbu : int
-        Maximum coordinate, also of the position behind the last column and row.
+    ``class_of`` (n_site,) int64: sites of different classes are in different arrays. ``origin_dbu``: (n_site, 2) int64.
+    ``columns`` (mapping of str to (n_site,) arrays): columns that the arrays reproduce. ``max_dbu``: maximum coordinate, also
+    of the position behind the last column and row.
 
-    Notes
-    -----
     Sites in the order of class, y and x are divided into runs of constant pitch, and runs of equal length, pitch and x into
     arrays. Each step is a sort and a pass, repeated for several periods where a class is not regular.
     """
@@ -196,20 +177,10 @@ def _progressions(rows: Ints, keys: Ints) -> tuple[Ints, Ints, Ints]:
     """
     Divide sorted rows into arithmetic progressions of rows with equal keys.
 
-    Parameters
-    ----------
-    rows : (n, k) int64
-        Sorted by keys.
-    keys : (n, m) int64
-        The first key is the kind. Every n-th row of equal keys is in the same progressions, with the n of :data:`STRIDES` that
-        leads to the fewest progressions for the kind: in a quad Bayer mosaic, the pitch of every second red site is constant.
-
-    Returns
-    -------
-    order : (n,) int64
-        Rows in the order of their progressions.
-    start, size : int64
-        First row of each progression in this order, and number of rows.
+    ``rows`` (n, k) int64: sorted by keys. ``keys`` (n, m) int64: the first key is the kind. Every n-th row of equal keys is in
+    the same progressions, with the n of :data:`STRIDES` that leads to the fewest progressions for the kind: in a quad Bayer
+    mosaic, the pitch of every second red site is constant. Returns ``order`` (n,) int64: rows in the order of their
+    progressions. ``start``, ``size``: first row of each progression in this order, and number of rows.
     """
     from foveasim.layout.files import _kernels
 

@@ -20,8 +20,6 @@ from foveasim._core.validation import Floats, Ints
 from foveasim.layout.files._common import check_sizes
 from foveasim.layout.model import Layout, valid_sites
 
-__all__ = ["hole_free_rings", "without_keyholes"]
-
 Point: TypeAlias = tuple[float, float]
 
 #: Maximum number of vertices after noding an outline with slits, as a multiple of its own.
@@ -35,11 +33,8 @@ def hole_free_rings(layout: Layout, max_vertices: int | None) -> tuple[Ints, Int
     """
     Return hole-free rings of all sites, in their order.
 
-    Returns
-    -------
-    site, part, n_parts : (n_ring,) int64
-        Index of the site, number of the part from 1, and number of parts; 0 and 0 for an undivided site.
-    rings_um : list of (n, 2), µm
+    Returns ``site``, ``part``, ``n_parts`` (n_ring,) int64: index of the site, number of the part from 1, and number of parts;
+    0 and 0 for an undivided site. ``rings_um``, list of (n, 2), µm.
     """
     rings_of_site = np.diff(layout.site_offsets)
     outline = layout.site_offsets[:-1]
@@ -119,8 +114,6 @@ def _hole_free_parts(polygon: Any, max_vertices: int | None) -> list[Floats]:
     """
     Divide a polygon into rings without holes and without additional vertices.
 
-    Notes
-    -----
     Triangles of a constrained Delaunay triangulation are merged as long as each adds a new vertex. Such a part has no
     repeated vertex, and is therefore simple and without holes.
     """

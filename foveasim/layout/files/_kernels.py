@@ -7,8 +7,6 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = ["progressions", "walk_records"]
-
 _bytes = types.Array(types.uint8, 1, "C", readonly=True)
 _flags = types.Array(types.boolean, 1, "C", readonly=True)
 
@@ -18,12 +16,8 @@ def walk_records(data, is_known, last):
     """
     Follow the records up to type ``last``, an invalid record, or the end of the data.
 
-    Returns
-    -------
-    at : int
-        Final position, behind the last record; beyond the data if that record is incomplete.
-    record : int
-        Type of the last record, with its data type; -1 if no valid record begins at ``at``.
+    Returns ``at``: final position, behind the last record; beyond the data if that record is incomplete. ``record``: type of
+    the last record, with its data type; -1 if no valid record begins at ``at``.
     """
     at, record = 0, 0
     while at + 4 <= data.size and record != last:
@@ -46,18 +40,8 @@ def progressions(rows, group, at_most):
 
     Successive rows of a progression have a constant difference, and are in the same group.
 
-    Parameters
-    ----------
-    rows : (n, k) int64
-    group : (n,) int64
-        Rows of different groups are in different progressions.
-    at_most : int
-        Maximum length of a progression.
-
-    Returns
-    -------
-    is_first : (n,) bool
-        Whether a row is the first of its progression.
+    ``rows``: (n, k) int64. ``group`` (n,) int64: rows of different groups are in different progressions. ``at_most``: maximum
+    length of a progression. Returns ``is_first`` (n,) bool: whether a row is the first of its progression.
     """
     n, k = rows.shape
     is_first = np.zeros(n, np.bool_)

@@ -31,18 +31,6 @@ from foveasim._core.validation import check_count
 from foveasim.errors import ConfigError, ParameterError
 from foveasim.layout.files._derived import DERIVED_LAYERS, LayoutLayer
 
-__all__ = [
-    "FILTER_NAMES",
-    "DrawnLayer",
-    "LayerNumber",
-    "layer_options",
-    "parse_channels",
-    "parse_layer",
-    "parse_layer_map",
-    "parse_selection",
-    "read_layer_map",
-]
-
 #: Layer and datatype; None for any datatype.
 LayerNumber: TypeAlias = tuple[int, int | None]
 
@@ -158,18 +146,8 @@ def parse_layer_map(
     """
     Return the layers of a layer map, or of its YAML file.
 
-    Parameters
-    ----------
-    layers : mapping or path
-    filter_names : sequence of str, optional
-        Names of the channels 0, 1, ...
-
-    Raises
-    ------
-    ConfigError
-        When the file is missing or invalid.
-    ParameterError
-        When a name is unknown, a layer is invalid, or two names have the same layer.
+    ``filter_names``: names of the channels 0, 1, ... Raises ConfigError when the file is missing or invalid. Raises
+    ParameterError when a name is unknown, a layer is invalid, or two names have the same layer.
     """
     if isinstance(layers, str | Path):
         path = Path(layers)
@@ -224,10 +202,7 @@ def parse_layer(name: str, value: Any, *, at_most: int = MAX_READ_LAYER) -> Laye
     """
     Return layer and datatype of ``77``, ``(77, 3)``, ``"77"`` or ``"77/3"``.
 
-    Raises
-    ------
-    ParameterError
-        When the value is none of these, or out of range.
+    Raises ParameterError when the value is none of these, or out of range.
     """
     parts: Sequence[Any]
     if isinstance(value, str):
@@ -248,10 +223,7 @@ def parse_selection(value: Any) -> list[LayerNumber]:
     """
     Return the layers to read: one layer, or a list of layers.
 
-    Raises
-    ------
-    ParameterError
-        When a layer is invalid, or there is none.
+    Raises ParameterError when a layer is invalid, or there is none.
     """
     is_pair = isinstance(value, tuple) and len(value) == 2 and all(isinstance(n, int) for n in value)
     if isinstance(value, str) or not isinstance(value, Sequence) or is_pair:
@@ -265,17 +237,8 @@ def parse_channels(channels: Any, filter_names: Sequence[str] | None = None) -> 
     """
     Return the channel of each filter layer.
 
-    Parameters
-    ----------
-    channels : mapping
-        From layers to names or numbers of channels: ``{(10, 0): "R", "11/0": 1}``.
-    filter_names : sequence of str, optional
-        Names of the channels 0, 1, ...
-
-    Raises
-    ------
-    ParameterError
-        When a layer or a channel is invalid.
+    ``channels``: from layers to names or numbers of channels: ``{(10, 0): "R", "11/0": 1}``. ``filter_names``: names of the
+    channels 0, 1, ... Raises ParameterError when a layer or a channel is invalid.
     """
     if not isinstance(channels, Mapping) or not channels:
         raise ParameterError("channels", "must be a mapping of layers to channels, such as {(10, 0): 'R'}", channels)
@@ -287,10 +250,7 @@ def parse_channel(name: str, value: Any, filter_names: Sequence[str]) -> int:
     """
     Return a channel from its number, or from its name.
 
-    Raises
-    ------
-    ParameterError
-        When no channel has this name; the message lists the names.
+    Raises ParameterError when no channel has this name; the message lists the names.
     """
     if isinstance(value, str):
         if value in filter_names:
@@ -310,10 +270,7 @@ def check_filter_names(filter_names: Sequence[str] | None) -> Sequence[str]:
     """
     Return the names of the channels, by default R, G, B, W.
 
-    Raises
-    ------
-    ParameterError
-        When they are not different strings.
+    Raises ParameterError when they are not different strings.
     """
     if filter_names is None:
         return FILTER_NAMES

@@ -145,14 +145,9 @@ def write(
     """
     Write GDSII or OASIS, depending on the extension.
 
-    Raises
-    ------
-    GeometryError
-        When sites or derived shapes vanish, collapse or self-intersect on the database grid.
-    ParameterError
-        When the layer map is invalid, or a layer, a channel or a coordinate exceeds the range of the format.
-    FileError
-        When gdstk is not installed, or the file cannot be written.
+    Raises GeometryError when sites or derived shapes vanish, collapse or self-intersect on the database grid. Raises
+    ParameterError when the layer map is invalid, or a layer, a channel or a coordinate exceeds the range of the format. Raises
+    FileError when gdstk is not installed, or the file cannot be written.
     """
     gdstk = import_optional(path, "gdstk")
     all_drawn = _drawn_layers(layout, layer, layers, filter_names)
@@ -411,14 +406,8 @@ def _draw_layout(
     """
     Draw a layer of the complete layout.
 
-    Returns
-    -------
-    drawing : _Drawing
-        Congruent shapes, a stack each.
-    stack_of : (n,) int64
-        Stack at each position, sorted.
-    origin : (n, 2) int64
-        Positions, in database units; those of a stack in the order of rows and columns.
+    Returns ``drawing``: congruent shapes, a stack each. ``stack_of`` (n,) int64: stack at each position, sorted. ``origin``
+    (n, 2) int64: positions, in database units; those of a stack in the order of rows and columns.
     """
     placed = shapes_of_layout(drawn.name, layout, drawn.parameters)
     rounded = shapely.transform(placed.polygons, lambda xy_um: _to_um(np.rint(xy_um / dbu_um), dbu_um))
@@ -641,13 +630,9 @@ def read(
     The cell hierarchy is flattened, and the sites are ordered by their numbers. Invalid outlines are an error, which lists all
     of them, or are skipped or repaired with a warning.
 
-    Raises
-    ------
-    FileError
-        When gdstk is not installed, or the file is corrupt, truncated, malformed, contains invalid photosites, or photosites
-        without a filter although the channels of filter layers are given.
-    ParameterError
-        When a layer, a channel or ``invalid`` is invalid.
+    Raises FileError when gdstk is not installed, or the file is corrupt, truncated, malformed, contains invalid photosites, or
+    photosites without a filter although the channels of filter layers are given. Raises ParameterError when a layer, a channel
+    or ``invalid`` is invalid.
     """
     import_optional(path, "gdstk")
     check_choice("invalid", invalid, ("error", "skip", "repair"))
@@ -858,14 +843,8 @@ def _group_by_site(path: Path, xy_um: Floats, counts: Ints, tags: Ints) -> tuple
     """
     Sort the polygons of the file by site number, and group the parts of divided sites.
 
-    Returns
-    -------
-    pieces : Layout
-        One unchecked site per polygon.
-    piece : (n_piece,) int64
-        Positions of the polygons in the file.
-    first : (n_site,) int64
-        Index of the first piece of each site.
+    Returns ``pieces``: one unchecked site per polygon. ``piece`` (n_piece,) int64: positions of the polygons in the file.
+    ``first`` (n_site,) int64: index of the first piece of each site.
     """
     if counts.size and counts.min() < 3:
         raise FileError(path, f"contains a polygon with {counts.min()} vertices, expected at least 3")
@@ -904,12 +883,8 @@ def _valid_polygons(path: Path, polygons: NDArray[Any], invalid: str) -> tuple[N
     """
     Return the valid polygons and their indices, repaired ones included.
 
-    Raises
-    ------
-    FileError
-        When a polygon is invalid, and ``invalid`` is ``"error"``, or no valid polygon remains.
-    GeometryError
-        When the layout is invalid for other reasons.
+    Raises FileError when a polygon is invalid, and ``invalid`` is ``"error"``, or no valid polygon remains. Raises
+    GeometryError when the layout is invalid for other reasons.
     """
     check_sizes(np.maximum(shapely.get_num_interior_rings(polygons), 0) + 1, shapely.get_num_coordinates(polygons))
     polygons = polygons.copy()

@@ -57,12 +57,7 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
     """
     Write a GeoJSON FeatureCollection.
 
-    Raises
-    ------
-    ParameterError
-        When a column contains neither numbers nor strings.
-    FileError
-        When the file cannot be written.
+    Raises ParameterError when a column contains neither numbers nor strings. Raises FileError when the file cannot be written.
     """
     columns = plain_columns(layout, "GeoJSON")
     about = {**header(layout), "columns": dtype_strings(layout)}
@@ -101,10 +96,7 @@ def read(path: Path) -> Layout:
     Properties of all features that are all numbers, all booleans or all strings become columns; null is NaN among
     numbers, and an empty string among strings. The provenance of the layout lists the names of other properties.
 
-    Raises
-    ------
-    FileError
-        When the file is corrupt, too large, or contains other geometries than polygons.
+    Raises FileError when the file is corrupt, too large, or contains other geometries than polygons.
     """
     with as_file_error(path, "GeoJSON layout"):
         document = _Document(path)
@@ -127,10 +119,7 @@ class _Document:
 
     As Python objects, all features together would require ten times the memory of their text.
 
-    Attributes
-    ----------
-    members : dict
-        Members of the collection other than the features.
+    ``members``: members of the collection other than the features.
     """
 
     def __init__(self, path: Path) -> None:

@@ -61,12 +61,8 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
     """
     Write a table with one row per site.
 
-    Raises
-    ------
-    ParameterError
-        When a column contains neither numbers nor strings, or has the name of the geometry column.
-    FileError
-        When pyarrow is not installed, or the file cannot be written.
+    Raises ParameterError when a column contains neither numbers nor strings, or has the name of the geometry column. Raises
+    FileError when pyarrow is not installed, or the file cannot be written.
     """
     pa, parquet = _pyarrow(path)
     columns = plain_columns(layout, "GeoParquet")
@@ -100,10 +96,8 @@ def read(path: Path) -> Layout:
     """
     Read a table of polygons, in the order of its rows.
 
-    Raises
-    ------
-    FileError
-        When pyarrow is not installed, or the file is corrupt, too large, or contains other geometries than polygons.
+    Raises FileError when pyarrow is not installed, or the file is corrupt, too large, or contains other geometries than
+    polygons.
     """
     pa, parquet = _pyarrow(path)
     with as_file_error(path, "GeoParquet layout"), parquet.ParquetFile(path, page_checksum_verification=True) as file:

@@ -36,10 +36,7 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
     """
     Write all arrays, columns and the provenance.
 
-    Raises
-    ------
-    FileError
-        When the file cannot be written.
+    Raises FileError when the file cannot be written.
     """
     write_archive(path, header(layout), layout_to_arrays(layout), is_compressed=False)
     return lossless_report(layout, path)
@@ -49,10 +46,7 @@ def read(path: Path) -> Layout:
     """
     Read a file that :func:`write` wrote.
 
-    Raises
-    ------
-    FileError
-        When the file is corrupt, too large, or not a layout.
+    Raises FileError when the file is corrupt, too large, or not a layout.
     """
     with as_file_error(path, "npz layout"):
         about, arrays = read_archive(path, max_bytes=max_decompressed_bytes(path))

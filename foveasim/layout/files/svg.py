@@ -36,12 +36,7 @@ def write(layout: Layout, path: Path, *, colours: Mapping[int, str] | None = Non
     """
     Write the layout as a drawing.
 
-    Raises
-    ------
-    ParameterError
-        When a colour is invalid.
-    FileError
-        When the file cannot be written.
+    Raises ParameterError when a colour is invalid. Raises FileError when the file cannot be written.
     """
     colours = _validate_colours(colours or {})
     x_min, y_min, x_max, y_max = layout.bounds_um if layout.n_sites else (0.0, 0.0, 1.0, 1.0)

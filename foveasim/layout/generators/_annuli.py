@@ -11,8 +11,6 @@ import numpy as np
 
 from foveasim._core.validation import Floats, Ints, read_only
 
-__all__ = ["MIN_SITES_PER_RHO", "Annuli", "Fovea", "Ring", "annuli", "fovea_rings", "ring_outlines"]
-
 #: Minimum number of sites of a ring of the fovea, per unit of its radius.
 MIN_SITES_PER_RHO = 3
 #: Number of circles that are cached: those between rings of equal sectors are of at most two kinds, in alternation.
@@ -50,17 +48,9 @@ def annuli(radii_um: Floats, rings: Sequence[Ring]) -> Annuli:
     """
     Return the sites of concentric rings.
 
-    Parameters
-    ----------
-    radii_um : (n_ring + 1,) float64, µm
-        Increasing radii of the circles between the rings; the first may be 0 for one site or for sectors at the centre.
-    rings : sequence of Ring
-        Only the innermost ring may have a single site.
-
-    Returns
-    -------
-    Annuli
-        Each arc has the corners of the sites on both of its sides, so there are no gaps or overlaps.
+    ``radii_um`` (n_ring + 1,) float64, µm: increasing radii of the circles between the rings; the first may be 0 for one site
+    or for sectors at the centre. ``rings``: only the innermost ring may have a single site. Each arc has the corners
+    of the sites on both of its sides, so there are no gaps or overlaps.
     """
     outlines, n_vertices = [], []
     has_disc = rings[0].n_sites == 1
@@ -92,19 +82,11 @@ def fovea_rings(
 
     Ring 0 is one site with a radius of half a unit; all other rings have a height of one unit.
 
-    Parameters
-    ----------
-    filling : {"rings", "linear"}
-        ``"rings"``: ring ρ has ``n_per_ring · ρ`` sites. ``"linear"``: linear-polar, with sector boundaries of the outer
-        rings; ring ρ has as many sectors as possible with an arc of at least one unit on the centre line.
-    n_rings, n_sectors, n_per_ring, n_chords : int
-        Number of rings in the fovea, sites per ring outside it, increment of sites per ring, chords per arc.
-
-    Returns
-    -------
-    radii : (n_rings + 1,) float64
-        0, 1/2, 3/2, ... in units of the ring height.
-    rings : list of Ring
+    ``filling`` ({"rings", "linear"}): ``"rings"``: ring ρ has ``n_per_ring · ρ`` sites. ``"linear"``: linear-polar, with
+    sector boundaries of the outer rings; ring ρ has as many sectors as possible with an arc of at least one unit on the centre
+    line. ``n_rings``, ``n_sectors``, ``n_per_ring``, ``n_chords``: number of rings in the fovea, sites per ring outside it,
+    increment of sites per ring, chords per arc. Returns ``radii`` (n_rings + 1,) float64: 0, 1/2, 3/2, ... in units of the
+    ring height.
     """
     radii = np.concatenate(([0.0], np.arange(n_rings) + 0.5))
     if filling == "rings":
@@ -126,20 +108,11 @@ def ring_outlines(
     """
     Return the outlines of the sites of a ring between two closed loops of points.
 
-    Parameters
-    ----------
-    outer_um, inner_um : (n_point, 2) float64, µm
-        The loops, counter-clockwise, shared with the adjacent rings.
-    outer_first, outer_last, inner_first, inner_last : (n_site,) int64
-        Positions of the corners of each site on the loops, unwrapped beyond the end of a loop. A site includes the points
-        between its corners, and therefore the corners of its neighbours.
-
-    Returns
-    -------
-    xy_um : (n_vertex, 2) float64, µm
-        Site after site: its part of the outer loop, then its part of the inner loop in reverse.
-    n_vertices : (n_site,) int64
-        Number of vertices of each site.
+    ``outer_um``, ``inner_um`` (n_point, 2) float64, µm: the loops, counter-clockwise, shared with the adjacent rings.
+    ``outer_first``, ``outer_last``, ``inner_first``, ``inner_last`` (n_site,) int64: positions of the corners of each site on
+    the loops, unwrapped beyond the end of a loop. A site includes the points between its corners, and therefore the corners of
+    its neighbours. Returns ``xy_um`` (n_vertex, 2) float64, µm: site after site: its part of the outer loop, then its part of
+    the inner loop in reverse. ``n_vertices`` (n_site,) int64: number of vertices of each site.
     """
     n_outer = outer_last - outer_first + 1
     n_vertices = n_outer + inner_last - inner_first + 1

@@ -142,10 +142,7 @@ def cells_in_field(
     """
     Return columns, rows and pitch of square cells, from their pitch or field.
 
-    Raises
-    ------
-    ParameterError
-        When a number is out of range, or neither or both of pitch and field are given.
+    Raises ParameterError when a number is out of range, or neither or both of pitch and field are given.
     """
     n_x = check_count("n_x", n_x)
     field_um = check_field_um(pitch_um, size_um)
@@ -160,10 +157,7 @@ def check_field_um(pitch_um: float | None, size_um: tuple[float, float] | None) 
     """
     Return the size of a field, or None when the pitch is given instead.
 
-    Raises
-    ------
-    ParameterError
-        When neither or both are given, or a length is out of range.
+    Raises ParameterError when neither or both are given, or a length is out of range.
     """
     if (pitch_um is None) == (size_um is None):
         raise ParameterError("pitch_um", "or 'size_um' must be given, but only one of them")
@@ -182,10 +176,7 @@ def linear_fill_factor(
     """
     Return the photosensitive fraction of the width of a cell; None if sites tile the plane.
 
-    Raises
-    ------
-    ParameterError
-        When more than one parameter is specified, or a value is out of range.
+    Raises ParameterError when more than one parameter is specified, or a value is out of range.
     """
     if sum(x is not None for x in (width_um, trench_um, fill_factor)) > 1:
         raise ParameterError("width_um", "and 'trench_um' and 'fill_factor' exclude each other; give one of them")

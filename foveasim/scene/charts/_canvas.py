@@ -23,18 +23,6 @@ from foveasim.errors import ParameterError, SamplingWarning
 from foveasim.scene._scene import MAX_DISTANCE_M, MAX_PITCH_UM, MAX_RADIANCE, Scene, band_widths_nm
 from foveasim.units import m_from_um
 
-__all__ = [
-    "Canvas",
-    "Fractions",
-    "OneOrMore",
-    "add_rectangle",
-    "check_contrast",
-    "half_plane",
-    "ink_to_white",
-    "interval",
-    "sample_means",
-]
-
 #: A number, or one for each wavelength.
 OneOrMore = float | Sequence[float]
 Fractions = NDArray[np.float32]
@@ -63,11 +51,6 @@ class Canvas:
     wavelength_nm : sequence, nm
     band_width_nm : number or sequence or None, nm
         As for :meth:`Scene.from_picture`.
-
-    Raises
-    ------
-    ParameterError
-        If a value is out of range.
     """
 
     shape: tuple[int, int]
@@ -140,10 +123,7 @@ class Canvas:
         """
         Reject a chart that is larger than the picture.
 
-        Raises
-        ------
-        ParameterError
-            If the chart does not fit; ``name`` is the parameter that determines its size.
+        Raises ParameterError if the chart does not fit; ``name`` is the parameter that determines its size.
         """
         picture_width_mm, picture_height_mm = self.size_mm
         if width_mm > picture_width_mm * (1 + ROUNDING) or height_mm > picture_height_mm * (1 + ROUNDING):
@@ -157,10 +137,7 @@ class Canvas:
         """
         Return the radius of a round chart, by default the largest that fits into the picture.
 
-        Raises
-        ------
-        ParameterError
-            If the radius is not positive, or the chart is larger than the picture.
+        Raises ParameterError if the radius is not positive, or the chart is larger than the picture.
         """
         largest_mm = 0.5 * min(self.size_mm)
         if radius_mm is None:
@@ -183,14 +160,8 @@ class Canvas:
         """
         Return the scene of a chart in black and white.
 
-        Parameters
-        ----------
-        fractions : (n_y, n_x) float32
-            Fraction of white in each pixel; overwritten.
-        contrast : float
-            Michelson contrast.
-        source : str
-            Description of the chart.
+        ``fractions`` (n_y, n_x) float32: fraction of white in each pixel; overwritten. ``contrast``: Michelson contrast.
+        ``source``: description of the chart.
         """
         black = (1.0 - contrast) / (1.0 + contrast)
         fractions *= np.float32(1.0 - black)
@@ -218,10 +189,7 @@ def check_contrast(contrast: float) -> float:
     """
     Return a Michelson contrast after validation.
 
-    Raises
-    ------
-    ParameterError
-        If it is not from 0 to 1.
+    Raises ParameterError if it is not from 0 to 1.
     """
     return check_number("contrast", contrast, at_least=0.0, at_most=1.0)
 
@@ -230,10 +198,7 @@ def ink_to_white(fractions: Fractions, ink: str) -> Fractions:
     """
     Convert fractions of ink to fractions of white, in place.
 
-    Raises
-    ------
-    ParameterError
-        If the ink is neither dark nor bright.
+    Raises ParameterError if the ink is neither dark nor bright.
     """
     if check_choice("ink", ink, ("dark", "bright")) == "dark":
         np.subtract(np.float32(1.0), fractions, out=fractions)
@@ -261,19 +226,9 @@ def half_plane(height: Floats, x: Floats | float, y: Floats | float) -> Floats:
     """
     Return the exact fraction of a square pixel on one side of a straight line.
 
-    Parameters
-    ----------
-    height : (...) float64, pixels
-        Signed distance of the pixel centre from the line, positive on that side.
-    x, y : float, or (...) float64
-        Unit normal of the line.
+    ``height`` (...) float64, pixels: signed distance of the pixel centre from the line, positive on that side. ``x``, ``y``
+    (float, or (...) float64): unit normal of the line. Returns ``fraction`` (...) float64.
 
-    Returns
-    -------
-    fraction : (...) float64
-
-    Notes
-    -----
     The distance of a random point of the square from a line through its centre is the sum of two uniform variables of the
     widths ``|x|`` and ``|y|``, with a trapezoidal density; the fraction is its integral.
     """
@@ -296,19 +251,8 @@ def sample_means(
 
     The error at a sharp edge is at most 1/64.
 
-    Parameters
-    ----------
-    canvas : Canvas
-    is_selected : (n_row, n_x) bool
-        Selected pixels in the rows of a block.
-    rows : slice
-        Rows of the block.
-    function : callable
-        Function that returns the fraction of white at x and y (...), mm.
-
-    Returns
-    -------
-    means : (n_chosen,) float64
+    ``is_selected`` (n_row, n_x) bool: selected pixels in the rows of a block. ``rows``: rows of the block. ``function``:
+    function that returns the fraction of white at x and y (...), mm. Returns ``means`` (n_chosen,) float64.
     """
     i_y, i_x = np.nonzero(is_selected)
     x_mm, y_mm = canvas.x_mm[i_x], canvas.y_mm[rows][i_y]

@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike
 from foveasim._core.validation import Floats, read_only
 from foveasim.scene._illuminants import interpolate_table, read_table
 
-__all__ = ["PATCH_NAMES", "nonnegative_factors", "patch_reflectance"]
-
 #: Names of the patches, row by row from the upper left.
 PATCH_NAMES = (
     *("dark skin", "light skin", "blue sky", "foliage", "blue flower", "bluish green"),
@@ -60,19 +58,9 @@ def nonnegative_factors(n_factors: int) -> tuple[Floats, Floats]:
     """
     Approximate the patch reflectances by nonnegative matrix factorisation.
 
-    Parameters
-    ----------
-    n_factors : int
-        Number of spectra, from 1 to 24; 24 spectra are the patches themselves.
+    ``n_factors``: number of spectra, from 1 to 24; 24 spectra are the patches themselves. Returns ``weights`` (24, n_factors)
+    float64. ``spectra`` (n_factors, 41) float64: spectra at the wavelengths of the table.
 
-    Returns
-    -------
-    weights : (24, n_factors) float64
-    spectra : (n_factors, 41) float64
-        Spectra at the wavelengths of the table.
-
-    Notes
-    -----
     Hierarchical alternating least squares (Cichocki and Phan 2009). The initial spectra are the patches selected by the
     successive projections algorithm (Araújo et al. 2001), the initial weights their nonnegative least-squares fit, so that
     the result is deterministic.

@@ -22,8 +22,6 @@ from foveasim.scene.charts._canvas import (
 )
 from foveasim.scene.registry import chart
 
-__all__ = ["BarElement", "bar_elements", "bars", "checkerboard", "letter_f", "slanted_edge"]
-
 Ink = Literal["dark", "bright"]
 
 #: Elements per group; the ratio of successive frequencies is the sixth root of 2.
@@ -169,11 +167,6 @@ def slanted_edge(
     -------
     scene : Scene
         One basis image.
-
-    Raises
-    ------
-    ParameterError
-        If a value is out of range.
     """
     canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
     contrast = check_contrast(contrast)

@@ -13,8 +13,6 @@ from foveasim.scene.charts._canvas import Canvas, Fractions, OneOrMore, add_rect
 from foveasim.scene.charts._colours import PATCH_NAMES, nonnegative_factors, patch_reflectance
 from foveasim.scene.registry import EXAMPLE_PICTURE, SCENES, chart
 
-__all__ = ["colour_chart", "grey_scale"]
-
 #: Default wavelengths of a colour chart.
 COLOUR_NM = tuple(400.0 + 10.0 * k for k in range(31))
 #: Wavelengths of the tabulated factors.

@@ -12,8 +12,6 @@ from foveasim.scene._scene import GREY_NM, Scene
 from foveasim.scene.charts._canvas import Canvas, OneOrMore
 from foveasim.scene.registry import EXAMPLE_PICTURE, SCENES
 
-__all__ = ["point_grid"]
-
 #: Tolerance of a spacing from an integer number of pixels.
 ROUNDING_PIXELS = 1e-6
 

@@ -12,8 +12,6 @@ from foveasim.scene._scene import GREY_NM, Scene
 from foveasim.scene.charts._canvas import Canvas, OneOrMore, check_contrast, half_plane, sample_means
 from foveasim.scene.registry import chart
 
-__all__ = ["siemens_star", "sine", "zone_plate"]
-
 #: Limit of computing time: the sampled centre of a star with more sectors takes minutes.
 MAX_SPOKES = 1000
 #: Sectors wider than this, more than a pixel diagonal, have at most one edge within a pixel.
@@ -63,11 +61,6 @@ def sine(
     -------
     scene : Scene
         One basis image.
-
-    Raises
-    ------
-    ParameterError
-        If a value is out of range.
 
     Warns
     -----

@@ -24,8 +24,6 @@ from foveasim._io.mapped_files import map_file
 from foveasim.scene.cubes._cube import EXAMPLE_NM, EXAMPLE_UNIT, Cube, Quantity, example_radiance
 from foveasim.scene.cubes._formats import CUBE_FORMATS
 
-__all__ = ["read_envi"]
-
 MAGIC = b"ENVI"
 MAX_HEADER_BYTES = 2**22
 #: dtypes by ``data type``; 6 and 9 are complex.

@@ -21,8 +21,6 @@ from foveasim._io.rasters.exr import MAGIC, POLARISATION, band_of_channel, read_
 from foveasim.scene.cubes._cube import EXAMPLE_NM, Cube, Quantity, example_radiance
 from foveasim.scene.cubes._formats import CUBE_FORMATS
 
-__all__ = ["read_exr"]
-
 FLUORESCENCE = re.compile(r"T\.[^.]+m\.[^.]+m")
 QUANTITIES: dict[str, Quantity] = {"S0": "radiance", "T": "reflectance"}
 

@@ -16,8 +16,6 @@ from foveasim.errors import ParameterError
 from foveasim.scene.cubes._cube import Cube
 from foveasim.scene.cubes._selection import Selection, select
 
-__all__ = ["CUBE_FORMATS", "read_cube"]
-
 #: Formats of hyperspectral cubes. ``read(path, name)`` returns a :class:`foveasim.scene.Cube`. Installed packages add formats
 #: as entry points of the group ``foveasim.cube_formats``.
 CUBE_FORMATS: Registry[FileFormat] = Registry("cube format", "foveasim.cube_formats")

@@ -27,8 +27,6 @@ from foveasim.scene.cubes._formats import CUBE_FORMATS
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["cube_of_array", "read_netcdf", "read_zarr"]
-
 
 def read_netcdf(path: Path, name: str | None) -> Cube:
     """Read the named variable, or the only one of three dimensions."""
@@ -54,10 +52,7 @@ def cube_of_array(array: xr.DataArray, close: Callable[[], None] | None = None) 
     """
     Return the cube of a labelled array; the values are not read.
 
-    Raises
-    ------
-    FormatError
-        If the dimensions are not those of a cube, or the positions are not uniform.
+    Raises FormatError if the dimensions are not those of a cube, or the positions are not uniform.
     """
     array, band, (y, x) = in_order(squeeze(array))
     along_x, along_y = (coordinate(array, d) for d in (x, y))

@@ -34,8 +34,6 @@ from foveasim._io.rasters.mat import (
 from foveasim.scene.cubes._cube import EXAMPLE_NM, EXAMPLE_UNIT, Cube, example_radiance
 from foveasim.scene.cubes._formats import CUBE_FORMATS
 
-__all__ = ["read_mat5", "read_mat73"]
-
 SCENE = ("scene",)
 WAVELENGTHS = (
     *("wavelength_nm", "wavelengths_nm", "wavelengths", "wavelength", "waves", "wave", "wl", "lambda", "lambdas"),

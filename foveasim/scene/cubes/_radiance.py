@@ -19,8 +19,6 @@ from foveasim.scene.cubes._cube import Cube, Quantity
 from foveasim.scene.cubes._selection import interpolation_weights
 from foveasim.units import photon_energy_j
 
-__all__ = ["IlluminantTable", "Radiance", "spectral_radiance"]
-
 #: Table of an illuminant: ``wavelength_nm`` and ``value``.
 IlluminantTable = Mapping[str, Sequence[float]]
 

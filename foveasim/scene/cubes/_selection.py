@@ -29,8 +29,6 @@ from foveasim._io.rasters import MAX_BANDS
 from foveasim.errors import ParameterError
 from foveasim.scene.cubes._cube import Cube
 
-__all__ = ["Invalid", "Selection", "interpolation_weights", "select"]
-
 #: Treatment of NaN, infinite, negative and missing values.
 Invalid: TypeAlias = Literal["raise", "zero"]
 #: Values that are converted at a time.
@@ -96,24 +94,10 @@ def select(cube: Cube, selection: Selection) -> Cube:
     """
     Return the selected part of a cube with its rows and columns in the order of scenes.
 
-    Parameters
-    ----------
-    cube : Cube
-    selection : Selection
-
-    Returns
-    -------
-    cube : Cube
-        Bands with ascending wavelengths in nm, bottom row first, float32 if this represents the values exactly, otherwise
-        float64. The data are a view of a memory map of such values above 1 GiB, unless they are stored by pixel, have an
-        offset, or contain values that are replaced.
-
-    Raises
-    ------
-    FormatError
-        If the cube is not a real array of three dimensions, or contains invalid values or wavelengths.
-    ParameterError
-        If the selection is not within the cube.
+    Returns ``cube``: bands with ascending wavelengths in nm, bottom row first, float32 if this represents the values exactly,
+    otherwise float64. The data are a view of a memory map of such values above 1 GiB, unless they are stored by pixel, have an
+    offset, or contain values that are replaced. Raises FormatError if the cube is not a real array of three dimensions, or
+    contains invalid values or wavelengths. Raises ParameterError if the selection is not within the cube.
     """
     cube = _as_bands(cube)
     n_bands, n_y, n_x = cube.data.shape
@@ -160,10 +144,7 @@ def interpolation_weights(wavelength_nm: Floats, at_nm: Floats) -> Floats:
     """
     Return the weights (n_band, n) of linear interpolation between ascending wavelengths.
 
-    Raises
-    ------
-    ParameterError
-        If a wavelength is outside the bands.
+    Raises ParameterError if a wavelength is outside the bands.
     """
     is_outside = (at_nm < wavelength_nm[0]) | (at_nm > wavelength_nm[-1])
     if is_outside.any():

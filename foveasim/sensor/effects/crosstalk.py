@@ -292,11 +292,6 @@ class Diffusion(_Crosstalk):
             Pitch of the square pixels.
         max_gap_um : float, optional, µm
             As for the class.
-
-        Raises
-        ------
-        ParameterError
-            If a number is out of range.
         """
         from scipy.optimize import brentq
 

@@ -41,13 +41,9 @@ class PoissonTables(NamedTuple):
     """
     Cumulative Poisson distributions of integral means, for the kernels.
 
-    Attributes
-    ----------
-    cumulative_fraction : (n_mean, n_count) float64
-        Probability that a draw with mean ``m`` is at most ``k``.
-    guide : (n_mean, N_GUIDE) uint16
-        Smallest k whose cumulative probability exceeds the lower end of each of ``N_GUIDE`` equal intervals of probability: the
-        search starts there (H. C. Chen and Y. Asau, AIIE Transactions 6, 163, 1974).
+    ``cumulative_fraction`` (n_mean, n_count) float64: probability that a draw with mean ``m`` is at most ``k``. ``guide``
+    (n_mean, N_GUIDE) uint16: smallest k whose cumulative probability exceeds the lower end of each of ``N_GUIDE`` equal
+    intervals of probability: the search starts there (H. C. Chen and Y. Asau, AIIE Transactions 6, 163, 1974).
     """
 
     cumulative_fraction: Floats

@@ -319,10 +319,7 @@ def as_curve(name: str, value: object) -> Curve:
     """
     Return the value as a curve; numbers become constant curves.
 
-    Raises
-    ------
-    ParameterError
-        If the value is neither a function nor a number from 0 to 1; ``name`` is its name in the message.
+    Raises ParameterError if the value is neither a function nor a number from 0 to 1; ``name`` is its name in the message.
     """
     if callable(value):
         return value
@@ -335,12 +332,8 @@ def curve_values(curve: Curve, wavelength_nm: ArrayLike) -> Floats:
 
     A curve that returns a single number is constant.
 
-    Raises
-    ------
-    CurveError
-        If the function raises (its exception is the cause), or does not return one real number per wavelength.
-    ParameterError
-        If a curve of this package rejects a wavelength.
+    Raises CurveError if the function raises (its exception is the cause), or does not return one real number per wavelength.
+    Raises ParameterError if a curve of this package rejects a wavelength.
     """
     called = getattr(curve, "__qualname__", None) or type(curve).__qualname__
     try:
@@ -371,10 +364,7 @@ def check_within(wavelength_nm: ArrayLike, low_nm: float, high_nm: float, domain
     """
     Reject wavelengths outside a range, including NaN.
 
-    Raises
-    ------
-    ParameterError
-        If a wavelength is outside; the message states the first one.
+    Raises ParameterError if a wavelength is outside; the message states the first one.
     """
     waves_nm = as_numbers("wavelength_nm", wavelength_nm)
     outside = waves_nm[~((waves_nm >= low_nm) & (waves_nm <= high_nm))]

@@ -103,8 +103,6 @@ def read_curve(
     FileError
         If the file is missing, too large or not a valid table, or a value is out of range; the message states the line, the
         rule and the value.
-    ParameterError
-        If an option is invalid.
     """
     path = Path(path)
     table = _read(path, wavelength_unit, value_unit)
@@ -142,8 +140,6 @@ def read_filters(
     FileError
         If the file is missing, too large or not a valid table, or a value is out of range; the message states the line, the
         rule and the value.
-    ParameterError
-        If an option is invalid.
     """
     path = Path(path)
     table = _read(path, wavelength_unit, value_unit)

@@ -17,8 +17,6 @@ import numpy as np
 
 from foveasim.errors import format_value, printable
 
-__all__ = ["Html", "facts", "format_cell", "panel", "picture", "table"]
-
 #: Rows of a table; more are counted.
 MAX_ROWS = 60
 #: Characters of a cell.

@@ -32,8 +32,6 @@ from foveasim.view.plots.rasters import cortical_pixels, picture_pixels, power_m
 from foveasim.view.plots.rules import RULE_COLOURS
 from foveasim.view.site_colours import title_of
 
-__all__ = ["html_table", "to_html", "to_png"]
-
 #: Longer side and largest size of the PNG of a picture.
 PNG_PIXELS, MAX_PNG_BYTES = 640, 400_000
 

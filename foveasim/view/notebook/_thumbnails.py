@@ -17,8 +17,6 @@ from foveasim.view.notebook._blocks import Html, picture
 from foveasim.view.plots.rules import MAX_SHOWN, RULE_COLOURS
 from foveasim.view.site_colours import BACKGROUND, BOUNDARY, Rgb, SiteColours, colours_of
 
-__all__ = ["THUMBNAIL_PIXELS", "encode_png", "report_thumbnail", "site_thumbnail", "thumbnail"]
-
 #: Longer side of a thumbnail, and the largest size of its file.
 THUMBNAIL_PIXELS, MAX_BYTES = 280, 45_000
 #: Shorter side of a thumbnail of a narrow layout.
@@ -36,17 +34,8 @@ def encode_png(pixels: NDArray[np.uint8], max_bytes: int = MAX_BYTES) -> tuple[b
     """
     Encode pixels as a PNG file.
 
-    Parameters
-    ----------
-    pixels : (n_y, n_x, n_channel) uint8
-        Top row first: grey, grey with alpha, RGB or RGBA.
-    max_bytes : int
-        Pictures that need more have fewer colours, then fewer pixels.
-
-    Returns
-    -------
-    png : bytes
-    size : (width, height)
+    ``pixels`` (n_y, n_x, n_channel) uint8: top row first: grey, grey with alpha, RGB or RGBA. ``max_bytes``: pictures that
+    need more have fewer colours, then fewer pixels.
     """
     from PIL import Image
 

@@ -11,8 +11,6 @@ from foveasim.layout import Layout, Report
 if TYPE_CHECKING:
     from foveasim.view.web._widget import SitesWidget
 
-__all__ = ["widget"]
-
 
 def widget(
     data: Layout | Capture, *, report: Report | None = None, name: str = "", height_px: int = 600

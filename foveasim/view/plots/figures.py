@@ -30,15 +30,8 @@ def new_axes(figure_inches: float, ratio: float = 1.0) -> Axes:
     """
     Return axes on a new figure.
 
-    Parameters
-    ----------
-    figure_inches : float
-        Longer side of the figure.
-    ratio : float
-        Height over width of the content.
+    ``figure_inches``: longer side of the figure. ``ratio``: height over width of the content.
 
-    Notes
-    -----
     The figure is made by pyplot if a notebook or a window shows it: the backend is that of a notebook (inline, ipympl), or the
     user has imported pyplot and its backend is interactive. Otherwise pyplot is not imported, and the figure is in none of its
     lists.

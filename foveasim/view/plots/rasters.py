@@ -274,16 +274,8 @@ def scene_pixels(scene: Scene, max_pixels: int) -> NDArray[np.uint8]:
     """
     Return approximate colours of a scene.
 
-    Parameters
-    ----------
-    scene : Scene
-    max_pixels : int
-        Pixels along the longer side, at most; larger scenes are averaged.
-
-    Returns
-    -------
-    pixels : (n_y, n_x, 3) uint8
-        sRGB-encoded, top row first; white is the brightest value.
+    ``max_pixels``: pixels along the longer side, at most; larger scenes are averaged. Returns ``pixels`` (n_y, n_x, 3) uint8:
+    sRGB-encoded, top row first; white is the brightest value.
     """
     weights = scene.spectrum_w_m2_sr_nm @ _colour_weights(scene.wavelength_nm)
     basis = scene.basis

@@ -207,11 +207,6 @@ def plot_curves(
     Returns
     -------
     matplotlib axes
-
-    Raises
-    ------
-    ParameterError
-        When ``logarithmic`` is none of these.
     """
     check_choice("logarithmic", logarithmic, ("", "x", "y", "xy"))
     ax = new_axes(7.0, 0.64) if ax is None else ax

@@ -21,8 +21,6 @@ from foveasim.layout import Layout
 from foveasim.view.meshes import Mesh
 from foveasim.view.web._pack import back_references, to_smallest_type
 
-__all__ = ["bodies_of"]
-
 #: Largest number of lattice steps along the longest side of all surfaces: differences are exact in int32.
 MAX_STEPS = 2**30
 #: Smallest number of lattice steps: the resolution of float32.
@@ -37,29 +35,13 @@ def bodies_of(meshes: Sequence[Mesh], layout: Layout) -> tuple[dict[str, Any], d
     """
     Return surfaces as plain data and arrays for ``bodies.js``.
 
-    Parameters
-    ----------
-    meshes : sequence of Mesh
-        Closed surfaces of photosites of the layout; -1 for no photosite.
-    layout : Layout
-
-    Returns
-    -------
-    about : dict
-        ``lattice_um``, ``origin_um``, the bounding box ``low_um`` and ``high_um``, and the ``list`` of surfaces.
-    arrays : dict of str to array
-        ``position_x``, ``position_y``: lattice steps from one position to the next; ``positions``: position of each point, as
-        back references; ``z``: height of each point on the lattice; ``run_sites``: site + 1 of each run of points, with
-        ``run_points``, ``run_triangles``, ``run_colours`` of each run; ``corners``: triangles, as indices relative to the
-        first point of their run; ``tile_runs``: number of runs of each tile.
-
-    Raises
-    ------
-    GeometryError
-        When there are no triangles.
-    ParameterError
-        When a triangle spans several photosites, a photosite is not in the layout, or a part has several colours at a
-        photosite.
+    ``meshes``: closed surfaces of photosites of the layout; -1 for no photosite. Returns ``about``: ``lattice_um``,
+    ``origin_um``, the bounding box ``low_um`` and ``high_um``, and the ``list`` of surfaces. ``arrays``: ``position_x``,
+    ``position_y``: lattice steps from one position to the next; ``positions``: position of each point, as back references;
+    ``z``: height of each point on the lattice; ``run_sites``: site + 1 of each run of points, with ``run_points``,
+    ``run_triangles``, ``run_colours`` of each run; ``corners``: triangles, as indices relative to the first point of their
+    run; ``tile_runs``: number of runs of each tile. Raises GeometryError when there are no triangles. Raises ParameterError
+    when a triangle spans several photosites, a photosite is not in the layout, or a part has several colours at a photosite.
     """
     meshes = [mesh for mesh in meshes if mesh.triangles.size]
     if not meshes:

@@ -31,8 +31,6 @@ from foveasim.view.site_pictures import site_picture
 from foveasim.view.web._pack import back_references, to_smallest_type
 from foveasim.view.web._shapes import shapes_of
 
-__all__ = ["Content", "content_of", "describe_sites", "outlines_of", "rules_of"]
-
 #: Columns of a second capture.
 SECOND = ("picture", "code", "electrons", "expected_e", "snr")
 #: Longer side of the picture.
@@ -81,24 +79,10 @@ def content_of(
     """
     Return the data of a page.
 
-    Parameters
-    ----------
-    data : Layout or Capture
-    report : Report, optional
-        Check of the same layout.
-    second : Capture, optional
-        Capture of the same layout, for comparison.
-    optical_image : PowerMap, optional
-        Shown instead of the picture of the capture or the layout.
-    name : str
-        Heading; by default the generator of the layout.
-
-    Raises
-    ------
-    ParameterError
-        When the data is neither, or the report or the second capture is of another layout.
-    GeometryError
-        When the layout has no sites.
+    ``report``: check of the same layout. ``second``: capture of the same layout, for comparison. ``optical_image``: shown
+    instead of the picture of the capture or the layout. ``name``: heading; by default the generator of the layout. Raises
+    ParameterError when the data is neither, or the report or the second capture is of another layout. Raises GeometryError
+    when the layout has no sites.
     """
     from PIL import Image
 
@@ -131,26 +115,9 @@ def describe_sites(
     """
     Return the data of photosites for all kinds of pages.
 
-    Parameters
-    ----------
-    data : Layout or Capture
-    name : str
-        Heading; by default the generator of the layout.
-    sensor : Sensor, optional
-        The sensor of the capture, as for :meth:`foveasim.Capture.signal_to_noise`.
-
-    Returns
-    -------
-    about : dict
-        Heading, notes, number of sites, bounds, columns, palette.
-    arrays : dict of str to array
-        Arrays of the columns.
-    layout : Layout
-
-    Raises
-    ------
-    ParameterError, GeometryError
-        As for :func:`content_of`.
+    ``name``: heading; by default the generator of the layout. ``sensor``: the sensor of the capture, as for
+    :meth:`foveasim.Capture.signal_to_noise`. Returns ``about``: heading, notes, number of sites, bounds, columns, palette.
+    ``arrays``: arrays of the columns. Raises ParameterError, GeometryError as for :func:`content_of`.
     """
     if not isinstance(data, Layout | Capture):
         raise ParameterError("data", f"must be a Layout or a Capture, got {type_name(data)}")

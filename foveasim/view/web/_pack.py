@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from foveasim._core.validation import Ints
 
-__all__ = ["back_references", "pack", "to_smallest_type"]
-
 #: Higher levels take several times longer and save a few per cent.
 GZIP_LEVEL = 5
 
@@ -21,12 +19,8 @@ def pack(array: NDArray[Any]) -> tuple[dict[str, Any], str]:
     """
     Encode an array for ``unpack.js``.
 
-    Returns
-    -------
-    about : dict
-        Type and number of values.
-    text : str
-        base64 of gzip of all first bytes, all second bytes, and so on: the high bytes of adjacent values are similar.
+    Returns ``about``: type and number of values. ``text``: base64 of gzip of all first bytes, all second bytes, and so on: the
+    high bytes of adjacent values are similar.
     """
     flat = np.ascontiguousarray(array).reshape(-1)
     flat = flat.astype(flat.dtype.newbyteorder("<"), copy=False)
@@ -57,10 +51,7 @@ def back_references(position: Ints) -> Ints:
 
     0 is the next new position; n is the n-th last of the distinct positions so far.
 
-    Parameters
-    ----------
-    position : (n_vertex,) int64
-        Numbered by their first occurrence.
+    ``position`` (n_vertex,) int64: numbered by their first occurrence.
     """
     n_distinct = np.maximum.accumulate(position) + 1
     n_before = np.concatenate(([0], n_distinct[:-1]))

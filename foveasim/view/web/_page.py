@@ -22,8 +22,6 @@ from foveasim.layout import Layout, Report
 from foveasim.view.web._content import Content, content_of
 from foveasim.view.web._pack import pack
 
-__all__ = ["assemble_page", "bundle", "check_page_path", "page_of", "part", "web_page", "write_web_page"]
-
 #: File extensions of pages.
 EXTENSIONS = (".html", ".htm")
 #: Content security policy: only embedded scripts and style, identified by checksums, and embedded pictures.
@@ -137,10 +135,7 @@ def write_page(path: str | Path, page: Callable[[], str]) -> None:
     """
     Write a page atomically; it is created after its path is checked.
 
-    Raises
-    ------
-    FileError
-        When the extension is not that of a page, the directory does not exist, or the file cannot be written.
+    Raises FileError when the extension is not that of a page, the directory does not exist, or the file cannot be written.
     """
     target = check_page_path(path)
     text = page()
@@ -176,16 +171,9 @@ def assemble_page(
     """
     Return one HTML document of its parts.
 
-    Parameters
-    ----------
-    template, styles, script : str
-        Files in this package. The script is the module that imports all others, as :func:`bundle` joins them.
-    about : dict
-        Plain data, for the element ``about``.
-    data : dict of str to base64
-        Encoded arrays, for elements ``data-NAME``.
-    **strings : str
-        Strings of the placeholders in the template, which are escaped.
+    ``template``, ``styles``, ``script``: files in this package. The script is the module that imports all others, as
+    :func:`bundle` joins them. ``about``: plain data, for the element ``about``. ``data``: encoded arrays, for elements
+    ``data-NAME``. ``**strings``: strings of the placeholders in the template, which are escaped.
     """
     style = "".join(map(part, styles))
     script = bundle(script)
@@ -209,16 +197,8 @@ def bundle(name: str) -> str:
 
     A page opened from a file can run scripts, but cannot import modules.
 
-    Parameters
-    ----------
-    name : str
-        A module in this package, such as ``"page.js"``. Modules import names from each other without aliases, at their top, and
-        no two modules have the same names.
-
-    Returns
-    -------
-    text : str
-        Every module once, after its imports, in a closed scope.
+    ``name``: a module in this package, such as ``"page.js"``. Modules import names from each other without aliases, at their
+    top, and no two modules have the same names. Returns ``text``: every module once, after its imports, in a closed scope.
     """
     modules: dict[str, str] = {}
 

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["ReportFigure", "ReportSection", "ReportTable", "drawn_figure", "picture_figure", "report_html"]
-
 #: Colours of lines and text in figures, which the page replaces by those of its light or dark theme.
 INK, FAINT = "#010203", "#040506"
 #: Replacements in the light and the dark theme.

@@ -12,8 +12,6 @@ from pathlib import Path
 from foveasim._core.validation import check_count
 from foveasim.errors import ParameterError
 
-__all__ = ["open_page", "serve_page"]
-
 #: Loopback address: other computers cannot reach it.
 HOST = "127.0.0.1"
 #: Time limit of a connection for its request, and for each piece of the page.

@@ -15,8 +15,6 @@ from foveasim.view.web._content import describe_sites
 from foveasim.view.web._pack import pack
 from foveasim.view.web._page import assemble_page, write_page
 
-__all__ = ["solid_page", "write_solid_page"]
-
 
 def solid_page(data: Layout | Capture, *, solids: Solids | None = None, name: str = "") -> str:
     """

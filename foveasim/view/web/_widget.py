@@ -14,8 +14,6 @@ from foveasim.errors import ParameterError
 from foveasim.view.web._content import Content
 from foveasim.view.web._page import page_of, part
 
-__all__ = ["SitesWidget"]
-
 
 class _Sites(traitlets.TraitType[Ints, Any]):
     """Indices of sites in ascending order, without repetition."""
