@@ -36,7 +36,7 @@ from foveasim._core.validation import check_count, read_only
 from foveasim._io.formats import as_file_error
 from foveasim._io.mapped_files import in_memory
 from foveasim._io.resumable import LOCK, disk_errors, finish, partial_path, resumable_directory
-from foveasim._io.zarr_stores import ZARR, check_codecs
+from foveasim._io.zarr_stores import ZARR, open_group, store_format
 from foveasim.camera import Camera
 from foveasim.camera._clock import Clock
 from foveasim.camera._coverage import Covered, warn_of_coverage
@@ -530,14 +530,7 @@ def _add(arrays: Mapping[str, Any], tile: int, capture: Capture) -> None:
 @contextmanager
 def _open(source: Path, mode: str = "r", *, is_finished: bool = True) -> Iterator[Any]:
     """Open the group of an untrusted store; exceptions of the block become FileErrors."""
-    zarr = import_optional(source, "zarr")
-    with as_file_error(source, "tiled capture", passes=(FileError,)):
-        check_codecs(source, CODECS, "tiled capture")
-        group = zarr.open_group(str(source), mode=mode, use_consolidated=False)
-        if group.attrs.get("format") != FORMAT:
-            raise FileError(source, "is not a tiled capture")
-        if group.attrs.get("version") != VERSION:
-            raise FileError(source, f"has the format version {group.attrs.get('version')}, expected {VERSION}")
+    with open_group(source, "tiled capture", CODECS, FORMAT, VERSION, mode) as group:
         arrays = {name: group[name] for name in ARRAYS} if is_finished else {}
         arrays |= {f"{LAYOUT}/{name}": array for name, array in group[LAYOUT].arrays()}
         for name, array in arrays.items():
@@ -549,11 +542,7 @@ def _open(source: Path, mode: str = "r", *, is_finished: bool = True) -> Iterato
 
 
 def _is_tiles(directory: Path) -> bool:
-    zarr = import_optional(directory, "zarr")
-    try:
-        return zarr.open_group(str(directory), mode="r", use_consolidated=False).attrs.get("format") == FORMAT
-    except Exception:  # noqa: BLE001 -- other data may raise any exception
-        return False
+    return store_format(directory) == FORMAT
 
 
 def _count_complete(directory: Path) -> int:

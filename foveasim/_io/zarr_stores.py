@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.extras import import_optional
 from foveasim._core.names import missing_path
+from foveasim._io.formats import as_file_error
 from foveasim.errors import FileError, format_value
 
 ZARR = ".zarr"
@@ -155,6 +156,22 @@ def open_store(
     except Exception as error:  # noqa: BLE001 -- readers raise arbitrary exceptions on corrupt stores
         reason = " ".join(str(error).split()) or type(error).__name__
         raise FileError(path, f"is corrupt or not a {what} ({reason:.200})") from None
+
+
+@contextmanager
+def open_group(
+    source: Path, what: str, codecs: Collection[str], file_format: str, version: int, mode: str = "r"
+) -> Iterator[Any]:
+    """Open the group of an untrusted store; exceptions of the block become FileErrors."""
+    zarr = import_optional(source, "zarr")
+    with as_file_error(source, what, passes=(FileError,)):
+        check_codecs(source, codecs, what)
+        group = zarr.open_group(str(source), mode=mode, use_consolidated=False)  # consolidated metadata are not checked
+        if group.attrs.get("format") != file_format:
+            raise FileError(source, f"is not a {what}")
+        if group.attrs.get("version") != version:
+            raise FileError(source, f"has the format version {group.attrs.get('version')}, expected {version}")
+        yield group
 
 
 def _metadata(path: Path) -> Any:

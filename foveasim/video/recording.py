@@ -19,9 +19,8 @@ from foveasim._core.names import missing_path
 from foveasim._core.provenance import differences, to_plain_data
 from foveasim._core.validation import Floats, check_count
 from foveasim._io.atomic import atomic_directory
-from foveasim._io.formats import as_file_error
 from foveasim._io.resumable import LOCK, disk_errors, finish, partial_path, resumable_directory
-from foveasim._io.zarr_stores import ZARR, check_codecs
+from foveasim._io.zarr_stores import ZARR, open_group, store_format
 from foveasim.camera._frames import DIGEST_BYTES
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError, type_name
@@ -177,14 +176,7 @@ def count_recorded_frames(path: str | Path) -> int:
 @contextmanager
 def _open_checked(source: Path, mode: str = "r") -> Iterator[Any]:
     """Open the group of an untrusted recording; exceptions of the block become FileErrors."""
-    zarr = import_optional(source, "zarr")
-    with as_file_error(source, "video of captures", passes=(FileError,)):
-        check_codecs(source, CODECS, "video of captures")
-        group = zarr.open_group(str(source), mode=mode, use_consolidated=False)  # consolidated metadata are not checked
-        if group.attrs.get("format") != FORMAT:
-            raise FileError(source, "is not a video of captures")
-        if group.attrs.get("version") != VERSION:
-            raise FileError(source, f"has the format version {group.attrs.get('version')}, expected {VERSION}")
+    with open_group(source, "video of captures", CODECS, FORMAT, VERSION, mode) as group:
         names = (*LAYOUT_ARRAYS, "filter_of_site", *(name for name in FRAME_ARRAYS if name != "code"))
         arrays = [group[name] for name in names if name in group]
         arrays += [array for _, array in group["columns"].arrays()] if "columns" in group else []
@@ -194,11 +186,7 @@ def _open_checked(source: Path, mode: str = "r") -> Iterator[Any]:
 
 
 def _is_recording(directory: Path) -> bool:
-    zarr = import_optional(directory, "zarr")
-    try:
-        return zarr.open_group(str(directory), mode="r", use_consolidated=False).attrs.get("format") == FORMAT
-    except Exception:  # noqa: BLE001 -- other data may raise any exception
-        return False
+    return store_format(directory) == FORMAT
 
 
 # -- writing ----------------------------------------------------------------------------------------------------------
