@@ -47,6 +47,10 @@ def varying(*, side_um: float) -> fs.Layout:
     return fs.Layout.from_rectangles([[0.0, 0.0], [2.0 * side_um, float(next(NUMBERS))]], side_um)
 
 
+def with_fixed_gap(*, side_um: float) -> fs.Layout:
+    return fs.Layout.from_rectangles([[0.0, 0.0], [side_um + 0.5, 0.0]], side_um)
+
+
 def single(*, side_um: float) -> fs.Layout:
     return fs.Layout.from_rectangles([[0.0, 0.0]], side_um)
 
@@ -371,6 +375,7 @@ WRONG = [
     # kind's registry, object, example, expected result, message
     (LAYOUTS, overlapping, {"side_um": 2.0}, None, "has sites that overlap, by up to 0.4 µm²"),
     (LAYOUTS, varying, {"side_um": 2.0}, None, "must return the same layout for the same parameters"),
+    (LAYOUTS, with_fixed_gap, {"side_um": 2.0}, None, "must have twice the coordinates for twice the lengths"),
     (LAYOUTS, single, {"side_um": 2.0}, None, "must record its name in the provenance; decorate it with layout_family"),
     (LAYOUTS, single, {}, None, r"cannot be called with its example \(missing a required argument: 'side_um'\)"),
     (LAYOUTS, lambda: 3, {}, None, "must return a Layout, got int"),

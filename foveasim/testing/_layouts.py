@@ -63,6 +63,7 @@ def check_family(extension: Extension) -> None:
     """Check the sites of a generator, their reproduction, and files."""
     layout = _check_sites(extension.make())
     require(_is_same(extension.make(), layout), "must return the same layout for the same parameters")
+    _check_lengths(extension, layout)
     provenance = layout.provenance
     require(
         provenance.get("generator") == extension.name,
@@ -84,6 +85,19 @@ def check_family(extension: Extension) -> None:
         path = extension.directory / "layout.yaml"
         path.write_text(yaml.safe_dump(settings), encoding="utf-8")
         require(_is_same(read_layout(path), layout), "must be the same in a settings file")
+
+
+def _check_lengths(extension: Extension, layout: Layout) -> None:
+    """Check that the coordinates are proportional to the lengths among the parameters."""
+    defaults = {name: each.default for name, each in inspect.signature(extension.item).parameters.items()}
+    parameters = {name: value for name, value in defaults.items() if isinstance(value, float)} | extension.parameters
+    lengths = {name: value for name, value in parameters.items() if name.endswith("_um") and value is not None}
+    doubled = {name: (2.0 * np.asarray(value, np.float64)).tolist() for name, value in lengths.items()}
+    larger = extension.make(**doubled)
+    is_proportional = larger.xy_um.shape == layout.xy_um.shape and np.allclose(
+        larger.xy_um, 2.0 * layout.xy_um, rtol=0.0, atol=AREA_TOLERANCE * np.abs(layout.xy_um).max()
+    )
+    require(is_proportional, f"must have twice the coordinates for twice the lengths {sorted(lengths)}")
 
 
 @check_of(EDITS)
