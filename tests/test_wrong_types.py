@@ -23,7 +23,7 @@ N_CALLS = 1550
 MAX_RAW_FRACTION = 0.01
 #: Modules and calls that open windows, serve pages or need PyTorch.
 EXCLUDED_MODULES = ("foveasim.learn", "foveasim.studio")
-EXCLUDED = {"compile_kernels", "serve", "show_columns", "show_solids", "show", "widget"}
+EXCLUDED = {"check_all", "compile_kernels", "serve", "show_columns", "show_solids", "show", "widget"}
 
 
 class Undefined(type):

@@ -163,7 +163,9 @@ class Registry(Mapping[str, T], Generic[T]):
         """Return a ``__getattr__`` for a module that looks up registered objects by name."""
 
         def attribute(name: str) -> T:
-            if not name.startswith("_") and name in self:
+            if name.startswith("_"):  # looked up by Python, while packages are imported
+                raise AttributeError(f"module '{module}' has no attribute '{name}'")
+            if name in self:
                 return self[name]
             own = (each for each in vars(sys.modules.get(module, object)) if not each.startswith("_"))
             hint = did_you_mean(name, {*self, *own})

@@ -42,6 +42,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from foveasim._core.calls import publish
 from foveasim._core.names import possible_names
 from foveasim._io.formats import one_line
 from foveasim.errors import ParameterError
@@ -139,3 +140,6 @@ def _check_of(kind: str) -> Check:
     if kind not in CHECKS:
         raise ParameterError("kind", "must be a kind of extension", kind, hint=possible_names(kind, list(CHECKS)))
     return CHECKS[kind]
+
+
+publish(__name__)
