@@ -107,6 +107,8 @@ class Registry(Mapping[str, T], Generic[T]):
             return lambda decorated: self.register(name, decorated, example=example, expected=expected)
         if name in self._objects and _identity(self._objects[name]) != _identity(item):
             raise ParameterError("name", f"must be new: another {self.kind} has this name", name)
+        if name not in self._objects:
+            self._examples.pop(name, None)  # of an object that was removed
         self._objects[name] = item
         if example is not None or expected is not None:  # an entry point has the example of its decorator
             self._examples[name] = _Example({} if example is None else example, expected)

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.slow
 EXTRAS = sorted(set(EXTRA_OF.values()))
 MODULES = (
     "", "compare", "config", "distortion", "explore", "layout", "learn", "maps", "metrics", "modes", "optics", "reconstruct",
-    "scene", "scene.charts", "sensor", "sensor.effects", "studio", "tiles", "units", "video", "view",
+    "scene", "scene.charts", "sensor", "sensor.effects", "studio", "testing", "tiles", "units", "video", "view",
 )  # fmt: skip
 
 
