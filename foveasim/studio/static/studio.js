@@ -415,7 +415,8 @@ function undoByKey(event) {
 
 function listenToKeys() {
   document.addEventListener("keydown", (event) => {
-    const isOpen = document.querySelector("dialog[open]"), { key } = event, target = /** @type {Element} */ (event.target);
+    const isOpen = document.querySelector("dialog[open]"), { key } = event;
+    const target = event.target instanceof Element ? event.target : document.body;
     const isTyped = Boolean(target.closest("input[type='text'], select, .menu"));
     if (!isOpen && !isTyped && editor.key(event)) { event.preventDefault(); return; }
     if ((event.ctrlKey || event.metaKey) && !event.altKey && !isOpen) { undoByKey(event); return; }

@@ -32,6 +32,9 @@ export class Views {
     for (const view of list.filter((each) => each.is_tile)) {
       const tile = make("section", undefined, "tile"), button = make("button", view.label);
       tile.id = "tile-" + view.name;
+      // Tiles scroll, also by keys.
+      tile.tabIndex = 0;
+      tile.setAttribute("aria-label", view.label);
       tile.append(make("h2", view.label));
       button.type = "button";
       button.dataset.tile = view.name;

@@ -72,6 +72,7 @@ class SolidPane {
     const { root } = this, heading = root.querySelector("h2");
     root.className = "pane";
     root.dataset.view = "solid";
+    root.removeAttribute("tabindex");
     root.insertAdjacentHTML("beforeend", PAGE);
     root.querySelector(".bar").prepend(heading);
     this.buttons = [...root.querySelectorAll("[data-solid]")];
