@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from foveasim._core.extras import import_optional
 from foveasim._core.names import possible_names
 from foveasim._core.provenance import copy_plain_data, to_plain_data
 from foveasim._core.rings import same_rings
-from foveasim._core.show import drawn
+from foveasim._core.show import Drawn, drawn
 from foveasim._core.validation import Floats, Ints, check_choice, check_count, own, read_only, unit_of, unmasked
 from foveasim._io.atomic import atomic_directory
 from foveasim._io.npz import open_archive, write_archive
@@ -46,6 +46,8 @@ from foveasim.sensor import Sensor, signal_to_noise
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
+    from matplotlib.axes import Axes
+    from pyvista import PolyData  # noqa: TID251 -- a type alone
 
 __all__ = ["Capture"]
 
@@ -380,9 +382,9 @@ class Capture:
             return estimate_from_code(self.code, electronics, exposure_s)
         return estimate_from_charge(getattr(self, of), electronics, exposure_s)
 
-    to_pyvista = drawn("polydata")
-    plot = drawn("plot_capture")
-    plot3d = drawn("show_columns")
+    to_pyvista: ClassVar[Drawn[PolyData]] = drawn("polydata")
+    plot: ClassVar[Drawn[Axes]] = drawn("plot_capture")
+    plot3d: ClassVar[Drawn[None]] = drawn("show_columns")
     _repr_html_ = drawn("to_html")
 
     def to_xarray(self) -> xr.Dataset:

@@ -32,13 +32,13 @@ FAILED = 1
 #: Exit code after Ctrl-C, by the convention of shells: 128 + SIGINT.
 INTERRUPTED = 130
 
-app = typer.Typer(
+app: typer.Typer = typer.Typer(
     help="Simulate image sensors with polygonal photosites.",
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
 )
-console = PlainConsole()
-error_console = PlainConsole(stderr=True)
+console: PlainConsole = PlainConsole()
+error_console: PlainConsole = PlainConsole(stderr=True)
 
 KINDS = "shot, layout, rules, sweep, study or dataset"
 #: Hint after an interruption that preserves results.

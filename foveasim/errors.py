@@ -65,11 +65,11 @@ class ParameterError(FoveasimError, ValueError):
 
     def __init__(self, name: str, rule: str, value: object = _NO_VALUE, unit: str = "", hint: str = "") -> None:
         self.name = name
-        self.value = None if value is _NO_VALUE else value
+        self.value: Any = None if value is _NO_VALUE else value
         self.unit = unit
         got = f", got {format_value(value)}{' ' + unit if unit else ''}" if value is not _NO_VALUE else ""
         #: The message without the name.
-        self.detail = f"{rule}{got}{'; ' + hint if hint else ''}"
+        self.detail: str = f"{rule}{got}{'; ' + hint if hint else ''}"
         super().__init__(f"'{name}' {self.detail}")
 
 
@@ -89,7 +89,7 @@ class FileError(FoveasimError, ValueError):
     """A file that is missing, corrupt, of another format, or too large."""
 
     def __init__(self, path: str | Path | None, message: str, *, position: tuple[int, int] | None = None) -> None:
-        self.path = None if path is None else Path(path)
+        self.path: Path | None = None if path is None else Path(path)
         #: Line and column of the problem in a text file, from 1.
         self.position = position
         #: The message without the path.

@@ -9,13 +9,13 @@ two orders.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import publish
-from foveasim._core.show import drawn
+from foveasim._core.show import Drawn, drawn
 from foveasim._core.validation import (
     Floats,
     Images,
@@ -30,6 +30,9 @@ from foveasim._core.validation import (
     wavelengths_nm,
 )
 from foveasim.errors import ParameterError, type_name
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = [
     "Grid",
@@ -277,7 +280,7 @@ class PowerMap:
         bands = f"1 band at {low_nm:g} nm" if n_bands == 1 else f"{n_bands} bands from {low_nm:g} to {high_nm:g} nm"
         return f"PowerMap({n_x} x {n_y} cells of {self.grid.pitch_x_um:.4g} x {self.grid.pitch_y_um:.4g} µm, {bands})"
 
-    plot = drawn("plot_power_map")
+    plot: ClassVar[Drawn[Axes]] = drawn("plot_power_map")
     _repr_html_ = drawn("to_html")
 
     @classmethod

@@ -64,7 +64,7 @@ TILE_SITES = 1 << 22
 #: Rows of the map around a tile: gradients of second-order integration need one, rounding of the bounds another.
 MARGIN_ROWS = 2
 #: Arrays of a tile and their types; the last array of a store marks complete tiles.
-ARRAYS = {"expected_e": "f8", "electrons": "i8", "code": None}
+ARRAYS: dict[str, str | None] = {"expected_e": "f8", "electrons": "i8", "code": None}
 COMPLETE = "tile_is_complete"
 LAYOUT = "layout"
 CODECS = ("bytes", "zstd")

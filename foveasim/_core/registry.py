@@ -69,12 +69,13 @@ class Registry(Mapping[str, T], Generic[T]):
     """
 
     def __init__(self, kind: str, group: str) -> None:
-        self.kind, self.group = kind, group
+        self.kind: str = kind
+        self.group: str = group
         self._objects: dict[str, T] = {}
         self._examples: dict[str, _Example] = {}
         self._is_complete = False
         #: Number of registrations so far; data derived from a registry are rebuilt when it changes.
-        self.version = 0
+        self.version: int = 0
 
     @overload
     def register(self, name: str, item: T, *, example: Any = None, expected: Any = None) -> T: ...

@@ -23,7 +23,8 @@ class _OfFunction:
     """Attribute of a method that is derived from its function."""
 
     def __init__(self, of_function: Callable[[Callable[..., Any]], Any], of_class: Any = None) -> None:
-        self.of_function, self.of_class = of_function, of_class
+        self.of_function: Callable[[Callable[..., Any]], Any] = of_function
+        self.of_class: Any = of_class
 
     def __get__(self, method: Drawn[Any] | None, owner: type | None = None) -> Any:
         return self.of_class if method is None else self.of_function(method.function)
@@ -49,13 +50,14 @@ class Drawn(Generic[R]):
         _docstring,
         "Method that is a function of :mod:`foveasim.view`; created by :func:`drawn`.",
     )
-    __signature__ = _OfFunction(
+    __signature__: Any = _OfFunction(
         _signature, inspect.Signature([inspect.Parameter("name", inspect.Parameter.POSITIONAL_OR_KEYWORD)])
     )
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self.__name__ = self.__qualname__ = name
+        self.__name__: str = name
+        self.__qualname__ = name
         self.__module__ = __name__
 
     def __set_name__(self, owner: type, name: str) -> None:

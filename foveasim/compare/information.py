@@ -120,8 +120,8 @@ class SceneCovariance:
     """
 
     def __init__(self, amplitude: ArrayLike, sigma_um: ArrayLike) -> None:
-        self.amplitude = np.ascontiguousarray(finite_array("amplitude", amplitude, ndim=1, at_least=0.0))
-        self.sigma_um = np.ascontiguousarray(finite_array("sigma_um", sigma_um, ndim=1, above=0.0))
+        self.amplitude: Floats = np.ascontiguousarray(finite_array("amplitude", amplitude, ndim=1, at_least=0.0))
+        self.sigma_um: Floats = np.ascontiguousarray(finite_array("sigma_um", sigma_um, ndim=1, above=0.0))
         if self.amplitude.shape != self.sigma_um.shape:
             raise ParameterError(
                 "sigma_um", f"must have one width per amplitude, {self.amplitude.size}, got {self.sigma_um.size}"

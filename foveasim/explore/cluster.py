@@ -31,7 +31,7 @@ SCHEDULER_S = 10.0
 PAUSED_S = 10.0
 #: Memory limits of local workers. A worker that dask pauses may wait forever for memory that a metric occupies; a terminated
 #: worker restarts without it.
-MEMORY_SETTINGS = {
+MEMORY_SETTINGS: dict[str, Any] = {
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
@@ -243,7 +243,7 @@ class WorkerStates:
         self.alive: set[str] = set()
         self.running: set[str] = set()
         self.stuck: set[str] = set()
-        self.n_executing = 0
+        self.n_executing: int = 0
 
     def update(self) -> None:
         """

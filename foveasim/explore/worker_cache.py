@@ -140,9 +140,12 @@ class ShotRunner:
         max_bytes: int = MAX_BYTES,
         check: Callable[[], None] | None = None,
     ) -> None:
-        self.source, self.metrics = source, metrics
+        self.source: Source | Path | None = source
+        self.metrics: Mapping[str, Metric] = metrics
         self.check = check
-        self.is_geometry_varied, self.n_threads, self.max_bytes = is_geometry_varied, n_threads, max_bytes
+        self.is_geometry_varied: bool = is_geometry_varied
+        self.n_threads: int | None = n_threads
+        self.max_bytes: int = max_bytes
         self._cache: WorkerCache | None = None
 
     def __getstate__(self) -> dict[str, Any]:

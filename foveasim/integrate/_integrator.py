@@ -113,10 +113,10 @@ class Integrator:
         if not isinstance(grid, Grid):
             raise ParameterError("grid", f"must be a Grid, got {type_name(grid)}")
         self.grid = grid
-        self.order = check_count(
+        self.order: int = check_count(
             "order", order, at_most=2, hint="use 1 for constant cells, 2 for cells with a gradient"
         )
-        self.n_threads = thread_count(n_threads)
+        self.n_threads: int = thread_count(n_threads)
         check_choice("conserve", conserve, ("flux", "density"))
         outlines: Callable[[int, int], Outlines] = partial(outlines_of, layout)
         if distortion is not None:

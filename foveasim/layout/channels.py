@@ -23,7 +23,7 @@ LATTICE_TOLERANCE = 0.05
 #: Smallest fraction of occupied positions: that of a disc is 0.79, that of staggered rows 0.5.
 MIN_LATTICE_FRACTION = 2 / 3
 #: Named blocks, row 0 lowest. ``rgbw`` is a Bayer block with one green filter replaced by a clear one.
-MOSAICS = {
+MOSAICS: dict[str, tuple[str, ...]] = {
     "bayer": ("RG", "GB"),
     "quad_bayer": ("RRGG", "RRGG", "GGBB", "GGBB"),
     "nona": ("RRRGGG", "RRRGGG", "RRRGGG", "GGGBBB", "GGGBBB", "GGGBBB"),

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
 import shapely
@@ -24,7 +24,7 @@ from foveasim._core.rings import (
     site_bounds_um,
     site_moments,
 )
-from foveasim._core.show import drawn
+from foveasim._core.show import Drawn, drawn
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import (
     MAX_LENGTH_UM,
@@ -45,6 +45,8 @@ from foveasim.errors import GeometryError, ParameterError, printable, type_name
 from foveasim.layout.lattice import RectangleLattice
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from pyvista import PolyData  # noqa: TID251 -- a type alone
     from scipy.sparse import csr_array
 
     from foveasim.layout.drc.repair import Change
@@ -598,9 +600,9 @@ class Layout:
 
         return describe(self, readout)
 
-    to_pyvista = drawn("polydata")
-    plot = drawn("plot_layout")
-    plot3d = drawn("show_columns")
+    to_pyvista: ClassVar[Drawn[PolyData]] = drawn("polydata")
+    plot: ClassVar[Drawn[Axes]] = drawn("plot_layout")
+    plot3d: ClassVar[Drawn[None]] = drawn("show_columns")
     _repr_html_ = drawn("to_html")
 
     # -- neighbours ----------------------------------------------------------------------------------------------

@@ -91,7 +91,7 @@ class Imaging(nn.Module):
             raise ParameterError("optics", f"must be an Optics, got {type_name(optics)}")
         if optics.lateral_colour is not None:
             raise ParameterError("optics", "must have no lateral chromatic aberration for gradients", optics)
-        self.wrt = _check_variables("wrt", wrt, VARIABLES)
+        self.wrt: tuple[str, ...] = _check_variables("wrt", wrt, VARIABLES)
         initial = optics.resolve_oversample(scene)
         self._optics = replace(initial, precision="double")
         if self.wrt and self._optics.zernike is None and self._optics.seidel is None and not self._optics.pupil:

@@ -60,6 +60,7 @@ class Mesh(nn.Module):
     def __init__(self, layout: Layout, boundary: Literal["fixed", "sliding", "free"] = "fixed") -> None:
         super().__init__()
         check_choice("boundary", boundary, ("fixed", "sliding", "free"))
+        self.outlines: Outlines
         self.outlines, points_um = Outlines.from_layout(layout)
         point, direction = _degrees_of_freedom(self.outlines, points_um, boundary)
         self.register_buffer("initial_um", constant(points_um))

@@ -99,15 +99,17 @@ class Model(nn.Module):
             raise ParameterError("camera", f"must be a Camera, got {type_name(camera)}")
         if not isinstance(scene, Scene):
             raise ParameterError("scene", f"must be a Scene, got {type_name(scene)}")
-        self.wrt = _check_variables("wrt", wrt, VARIABLES)
+        self.wrt: tuple[str, ...] = _check_variables("wrt", wrt, VARIABLES)
         self._camera, self._scene = camera, camera.frame(scene)
         sensor = camera.sensor
-        self.imaging = Imaging(camera.optics, self._scene, [name for name in self.wrt if name in LENS_VARIABLES])
-        self.grid = self._sensor_grid()
+        self.imaging: Imaging = Imaging(
+            camera.optics, self._scene, [name for name in self.wrt if name in LENS_VARIABLES]
+        )
+        self.grid: Grid = self._sensor_grid()
         self.order = camera.order(self._scene)
         layout: Any = sensor.layout
         self.mesh = Mesh(layout, boundary).requires_grad_("vertices" in self.wrt)
-        self.readout = Readout(sensor)
+        self.readout: Readout = Readout(sensor)
         wave_nm = self._scene.wavelength_nm
         self.register_buffer("_photons_per_j", constant(1.0 / photon_energy_j(wave_nm)))
         product = sensor.responsivity_e_per_j(wave_nm) * photon_energy_j(wave_nm)

@@ -93,7 +93,12 @@ class PowerCells(nn.Module):
         region = finite_array("region_um", region_um, ndim=1)
         if region.size != 4 or not (region[0] < region[2] and region[1] < region[3]):
             raise ParameterError("region_um", "must be (x_min, y_min, x_max, y_max)", region.tolist(), "µm")
-        self.region_um = (float(region[0]), float(region[1]), float(region[2]), float(region[3]))
+        self.region_um: tuple[float, float, float, float] = (
+            float(region[0]),
+            float(region[1]),
+            float(region[2]),
+            float(region[3]),
+        )
         self.centres_um = nn.Parameter(constant(centres))
         self.weights_um2 = nn.Parameter(constant(weights))
         self.register_buffer("_previous", constant(np.column_stack((centres, weights))), persistent=False)

@@ -199,13 +199,15 @@ class SiteClasses:
         labels = np.zeros(n_sites, np.int64) if classes is None else np.asarray(unmasked("classes", classes))
         if labels.shape != (n_sites,):
             raise ParameterError("classes", f"must have one label for each of the {n_sites} sites, got {labels.shape}")
+        self.labels: Ints
+        self.class_index: Ints
         self.labels, self.class_index = np.unique(labels, return_inverse=True)
-        self.n_sites = np.bincount(self.class_index).astype(np.int64)
+        self.n_sites: Ints = np.bincount(self.class_index).astype(np.int64)
         if self.n_sites.min(initial=n_sites) < 2:
             few = self.labels[self.n_sites < 2].tolist()
             raise ParameterError("classes", "must have at least two sites each", few)
         self._n_blocks = n_blocks
-        self.n_blocks_of_class = np.minimum(max(n_blocks, 1), self.n_sites)
+        self.n_blocks_of_class: Ints = np.minimum(max(n_blocks, 1), self.n_sites)
         order = np.argsort(self.class_index, kind="stable")
         first = np.concatenate(([0], np.cumsum(self.n_sites)))
         rank = np.empty(n_sites, np.int64)

@@ -130,7 +130,8 @@ class Exposure:
         if not isinstance(shutter, Shutter):
             raise ParameterError("shutter", f"must be a foveasim.modes.Shutter, got {type_name(shutter)}")
         exposure_s = EXPOSURE.check("exposure_s", exposure_s)
-        self._shutter, self.exposure_s = shutter, exposure_s
+        self._shutter = shutter
+        self.exposure_s: float = exposure_s
         self._last = shutter.last_frame(exposure_s)
         self._n_added = 0
         self._rate_e_per_s: Floats = np.zeros(1)

@@ -21,7 +21,7 @@ MAX_ALIASES = 128
 
 #: Points of a radial table up to the smallest cut-off; the float32 table fits the L1 cache. The error of linear interpolation
 #: is at most 2.4e-7 of the value at zero frequency in float32 and 3.0e-8 in float64, near the cut-off.
-TABLE_POINTS = {np.float32: 1 << 13, np.float64: 1 << 15}
+TABLE_POINTS: dict[Any, int] = {np.float32: 1 << 13, np.float64: 1 << 15}
 #: Largest number of cached apertures, one per scene distance.
 MAX_CACHED_APERTURES = 4
 #: Memory limit of the tables of all wavelengths, in numbers (128 MiB); beyond it, their step increases.

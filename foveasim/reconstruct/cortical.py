@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.short_repr import short_repr
-from foveasim._core.show import drawn
+from foveasim._core.show import Drawn, drawn
 from foveasim._core.validation import (
     Floats,
     Images,
@@ -35,6 +36,9 @@ from foveasim.errors import ParameterError, type_name
 from foveasim.fields import Grid
 from foveasim.layout import Layout
 from foveasim.reconstruct.picture import Picture
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["CorticalImage", "cortical", "from_cortical", "to_cortical"]
 
@@ -96,7 +100,7 @@ class CorticalImage:
         for name, values in (("data", data), ("radius_um", radius_um), ("start_rad", start_rad)):
             object.__setattr__(self, name, own(values))
 
-    plot = drawn("plot_cortical")
+    plot: ClassVar[Drawn[Axes]] = drawn("plot_cortical")
     _repr_html_ = drawn("to_html")
 
     @property

@@ -6,18 +6,21 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.show import drawn
+from foveasim._core.show import Drawn, drawn
 from foveasim._core.validation import Floats, Images, check_count, finite_array, own, unmasked
 from foveasim._io.encodings import decode, encode_srgb_values
 from foveasim._io.images import picture_format, write_picture
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid, Lattice, PackedRings, to_file_rows
 from foveasim.integrate import Integrator
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["Picture", "coverage_fraction", "raster_grid"]
 
@@ -83,7 +86,7 @@ class Picture:
         pixels = f"{n_x} x {n_y} pixels of {self.grid.pitch_x_um:.4g} x {self.grid.pitch_y_um:.4g} µm"
         return f"Picture({pixels}, {n_channels} channel{'s' * (n_channels != 1)}, {extent})"
 
-    plot = drawn("plot_picture")
+    plot: ClassVar[Drawn[Axes]] = drawn("plot_picture")
     _repr_html_ = drawn("to_html")
     _repr_png_ = drawn("to_png")
 

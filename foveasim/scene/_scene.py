@@ -8,13 +8,13 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import OwnCheck
-from foveasim._core.show import drawn
+from foveasim._core.show import Drawn, drawn
 from foveasim._core.validation import (
     MAX_WAVELENGTH_NM,
     Floats,
@@ -40,6 +40,9 @@ from foveasim.scene._illuminants import Illuminant
 from foveasim.scene.cubes import IlluminantTable, Invalid, Quantity, Selection, read_cube, spectral_radiance
 from foveasim.scene.registry import SCENES
 from foveasim.units import m_from_um, um_from_m
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 #: Framing of a picture on a layout.
 Fit: TypeAlias = Literal["cover", "contain", "width"]
@@ -227,7 +230,7 @@ class Scene:
             f"{self.wavelength_nm.size} wavelengths, from {printable(self.source)[:MAX_SOURCE]})"
         )
 
-    plot = drawn("plot_scene")
+    plot: ClassVar[Drawn[Axes]] = drawn("plot_scene")
     _repr_html_ = drawn("to_html")
 
     @classmethod

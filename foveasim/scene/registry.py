@@ -30,7 +30,7 @@ PICTURE_PARAMETERS = """shape : (n_y, n_x)
 
 
 #: Common parameters of the examples of charts: 80 x 60 pixels of 0.1 mm.
-EXAMPLE_PICTURE = {"shape": (60, 80), "pitch_um": 100.0, "distance_m": 1.0, "band_width_nm": 10.0}
+EXAMPLE_PICTURE: dict[str, Any] = {"shape": (60, 80), "pitch_um": 100.0, "distance_m": 1.0, "band_width_nm": 10.0}
 
 
 def chart(name: str, *, example: Mapping[str, Any], expected: Sequence[str]) -> Callable[[F], F]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from foveasim._core.show import drawn
+from foveasim._core.show import Drawn, drawn
 from foveasim._core.validation import Floats, as_numbers
 from foveasim.errors import ParameterError
 from foveasim.sensor.effects import STANDARD
@@ -16,6 +16,9 @@ from foveasim.sensor.limits import EXPOSURE
 from foveasim.sensor.prediction import MIN_SLOPE
 from foveasim.sensor.sensor import Sensor
 from foveasim.sensor.signal_to_noise import local_step_e
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["FIXED", "TEMPORAL", "NoiseBudget", "noise_budget"]
 
@@ -41,7 +44,7 @@ class NoiseBudget(dict[str, Floats]):
 
     def __init__(self, noise_e: Mapping[str, Floats], temporal: Sequence[str]) -> None:
         super().__init__(noise_e)
-        self.temporal = tuple(temporal)
+        self.temporal: tuple[str, ...] = tuple(temporal)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return NoiseBudget, (dict(self), self.temporal)
@@ -79,7 +82,7 @@ class NoiseBudget(dict[str, Floats]):
             for name, is_temporal, values in (*parts, *sums)
         ]
 
-    plot = drawn("plot_noise_budget")
+    plot: ClassVar[Drawn[Axes]] = drawn("plot_noise_budget")
     _repr_html_ = drawn("to_html")
 
 

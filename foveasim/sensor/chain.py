@@ -52,7 +52,7 @@ class _Deterministic:
     needs_layout = False
 
     def __init__(self, values: Any) -> None:
-        self.values = np.asarray(values)
+        self.values: NDArray[Any] = np.asarray(values)
 
     def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
         """Return the values after the step."""
@@ -88,7 +88,8 @@ class Nonlinearity(_Deterministic):
 
     def __init__(self, fraction: float, v_sat_v: float) -> None:
         super().__init__(fraction)
-        self.fraction, self.v_sat_v = fraction, v_sat_v
+        self.fraction: float = fraction
+        self.v_sat_v: float = v_sat_v
 
     def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
         """Return the voltages after the nonlinearity."""
@@ -108,7 +109,8 @@ class ChargeCheck(_Deterministic):
 
     def __init__(self, name: str, at_least: float) -> None:
         super().__init__(at_least)
-        self.parameter, self.at_least = name, at_least
+        self.parameter: str = name
+        self.at_least: float = at_least
 
     def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
         """Return the values unchanged."""
@@ -149,7 +151,8 @@ class Conversion(_Deterministic):
 
     def __init__(self, code: NDArray[Any], line: NDArray[np.int32], tables: ConversionTables) -> None:
         super().__init__(code)
-        self.line, self.tables = line, tables
+        self.line: NDArray[np.int32] = line
+        self.tables: ConversionTables = tables
 
     def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
         """Return the voltages unchanged."""

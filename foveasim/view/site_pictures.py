@@ -60,9 +60,10 @@ class SiteMeans:
         *,
         n_threads: int | None = None,
     ) -> None:
-        n_y, n_x = self.shape = check_shape("shape", shape)
-        x_min, y_min, x_max, y_max = self.bounds_um = validate_bounds(layout, bounds_um)
-        self.n_sites = layout.site_offsets.size - 1
+        self.shape: tuple[int, int] = check_shape("shape", shape)
+        self.bounds_um: tuple[float, float, float, float] = validate_bounds(layout, bounds_um)
+        (n_y, n_x), (x_min, y_min, x_max, y_max) = self.shape, self.bounds_um
+        self.n_sites: int = layout.site_offsets.size - 1
         pitch_um = ((x_max - x_min) / n_x, (y_max - y_min) / n_y)
         rings = (layout.xy_um, layout.ring_offsets, layout.site_offsets)
         reach_um, has_area = site_bounds_um(*rings), site_area_um2(*rings) > 0.0

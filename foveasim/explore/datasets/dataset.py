@@ -185,15 +185,16 @@ class Dataset:
         source: Source | str | Path | None = None,
         n_threads: int = 1,
     ) -> None:
-        self.cameras = check_count("cameras", cameras, at_most=MAX_REPEATS)
-        self.draws = check_count("draws", draws, at_most=MAX_REPEATS)
-        self.seed = Streams(seed).seed
-        self.fields = tuple(fields)
+        self.cameras: int = check_count("cameras", cameras, at_most=MAX_REPEATS)
+        self.draws: int = check_count("draws", draws, at_most=MAX_REPEATS)
+        self.seed: int = Streams(seed).seed
+        self.fields: tuple[str, ...] = tuple(fields)
         for field in self.fields:
             check_choice("fields", field, FIELDS)
         self._n_threads = check_count("n_threads", n_threads)
         self._pictures = source_of(pictures)
         n = len(self._pictures)
+        self.class_names: list[str] | None
         self._labels, self.class_names = _number_classes(self._pictures.labels() if labels is None else labels, n)
         self._boxes = None
         if boxes is not None:

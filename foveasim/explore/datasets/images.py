@@ -20,7 +20,7 @@ RASTER, CORTICAL = "raster", "cortical"
 #: Default options: pictures for learning are small.
 DEFAULTS: dict[str, dict[str, Any]] = {RASTER: {"max_pixels": 128}, CORTICAL: {"max_pixels": 256}}
 #: Options of :meth:`foveasim.Capture.picture` and :meth:`foveasim.Capture.cortical` that are plain data.
-OPTIONS = {
+OPTIONS: dict[str, Any] = {
     RASTER: ("method", "max_pixels", "of", "per", "mu", "tolerance", "max_steps"),
     CORTICAL: ("of", "per", "n_rings", "n_sectors", "r_min_um", "r_max_um", "centre_um", "max_pixels"),
 }

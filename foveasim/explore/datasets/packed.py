@@ -88,7 +88,7 @@ class PackedBoxes:
         self._offsets = np.concatenate(([0], np.cumsum(counts, dtype=np.int64)))
         self._boxes_px = np.concatenate([np.zeros((0, 4)), *(corners for corners, _ in each)])
         self._classes = np.concatenate([np.zeros(0, np.int64), *(classes for _, classes in each)])
-        self.most = max(counts, default=0)
+        self.most: int = max(counts, default=0)
 
     def __getitem__(self, k: int) -> tuple[Floats, Ints]:
         """Return the boxes (n_box, 4) of a picture in pixels, and their classes (n_box,)."""

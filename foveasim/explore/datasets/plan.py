@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -64,7 +64,7 @@ class DatasetFile:
 class _Distribution(BaseModel):
     """Distribution of a setting: exactly one kind."""
 
-    model_config = ConfigDict(extra="forbid", strict=True)
+    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", strict=True)
     uniform: _Numbers | None = Field(None, description="[low, high]")
     log_uniform: _Numbers | None = Field(None, description="[low, high]")
     integers: list[int] | None = Field(None, description="[low, high], both inclusive")
@@ -76,7 +76,7 @@ class _Distribution(BaseModel):
 class _Raster(BaseModel):
     """Reconstructed picture of each sample."""
 
-    model_config = ConfigDict(extra="forbid", strict=True)
+    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", strict=True)
     method: Literal["cells", "linear", "natural", "least_squares"] | None = Field(
         None, description="reconstruction, cells by default"
     )
@@ -91,7 +91,7 @@ class _Raster(BaseModel):
 class _Cortical(BaseModel):
     """Log-polar image of each sample."""
 
-    model_config = ConfigDict(extra="forbid", strict=True)
+    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", strict=True)
     of: _Values | None = Field(None, description="values of the image, code by default")
     per: _Per | None = Field(None, description="values of a site, by default, or per µm²")
     n_rings: int | None = Field(None, description="rings; by default one pixel per site, on layouts of rings")
@@ -107,7 +107,7 @@ class _Cortical(BaseModel):
 class DatasetSection(BaseModel):
     """Settings of a dataset: pictures, shot, distributions, labels and shards."""
 
-    model_config = ConfigDict(extra="forbid", strict=True)
+    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", strict=True)
     pictures: str | list[str] = Field(description="directory, zip file, array (.npy) or list of files")
     shot: str | dict[str, Any] = Field(description="settings file, relative to this file, or the settings")
     set: dict[str, Any] = Field({}, description="settings that are replaced in all samples, by path")

@@ -263,7 +263,8 @@ class StoredSamples:
     """
 
     def __init__(self, path: Path, about: Mapping[str, Any]) -> None:
-        self.path, self.about = path, about
+        self.path: Path = path
+        self.about: Mapping[str, Any] = about
         self._shards = _shards_class(path)(path, about)
 
     def __repr__(self) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -115,7 +115,7 @@ class StudyPlan:
 class _SearchRange(BaseModel):
     """Search range; integers where the setting accepts only integers."""
 
-    model_config = ConfigDict(extra="forbid", strict=True)
+    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", strict=True)
     low: _Number = Field(alias="from")
     high: _Number = Field(alias="to")
     step: _Number | None = Field(None, description="step of the values; continuous by default")
@@ -125,7 +125,7 @@ class _SearchRange(BaseModel):
 class StudySection(BaseModel):
     """Settings of a study: shot, search ranges, objectives, constraints and trials."""
 
-    model_config = ConfigDict(extra="forbid", strict=True)
+    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", strict=True)
     shot: str | dict[str, Any] = Field(description="settings file, relative to this file, or the settings")
     set: dict[str, Any] = Field({}, description="settings that are replaced in all trials, by path")
     search: dict[str, _SearchRange | list[Any]] = Field(description="ranges or lists of choices, by setting path")

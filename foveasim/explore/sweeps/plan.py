@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -237,7 +237,7 @@ class Plan:
 class _Range(BaseModel):
     """Range of ``n`` values with linear or geometric spacing."""
 
-    model_config = ConfigDict(extra="forbid", strict=True)
+    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", strict=True)
     low: float = Field(alias="from")
     high: float = Field(alias="to")
     n: int = Field(ge=1, le=MAX_POINTS)
@@ -247,7 +247,7 @@ class _Range(BaseModel):
 class SweepSection(BaseModel):
     """Settings of a sweep: shot, varied settings, repeats, seed and metrics."""
 
-    model_config = ConfigDict(extra="forbid", strict=True)
+    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", strict=True)
     shot: str | dict[str, Any] = Field(description="settings file, relative to this file, or the settings")
     set: dict[str, Any] = Field({}, description="settings that are replaced in all points, by path")
     vary: dict[str, list[Any] | _Range] | None = Field(None, description="values or ranges, by setting path")

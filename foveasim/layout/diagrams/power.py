@@ -72,8 +72,10 @@ class PowerDiagram:
         self._auxiliary_um = auxiliary_points_um(low_um, high_um) + self._centre_um
         self._weights_um2 = np.zeros(0)
         self._triangles = self._neighbours = np.zeros((0, 3), np.int64)
-        self.points_um = self.corners_um = np.zeros((0, 2))
-        self.sites = self.ends = np.zeros((0, 2), np.int64)
+        self.points_um: Floats = np.zeros((0, 2))
+        self.corners_um: Floats = np.zeros((0, 2))
+        self.sites: Ints = np.zeros((0, 2), np.int64)
+        self.ends: Ints = np.zeros((0, 2), np.int64)
 
     def update(self, centres_um: Floats, weights_um2: Floats | None = None) -> bool:
         """

@@ -105,10 +105,12 @@ class IncrementalCells:
     """
 
     def __init__(self, region: shapely.Polygon, mass_of: MassOf | None = None) -> None:
-        self.region, self._boundary, self._mass_of = region, region.boundary, mass_of
+        self.region: shapely.Polygon = region
+        self._boundary, self._mass_of = region.boundary, mass_of
         self._power = PowerDiagram(*np.reshape(region.bounds, (2, 2)))
         self._weights_um2: Floats | None = None
-        self.centres_um, self._clearance_um = np.zeros((0, 2)), np.zeros(0)
+        self.centres_um: Floats = np.zeros((0, 2))
+        self._clearance_um = np.zeros(0)
         self._is_inside = np.zeros(0, bool)
         shapely.prepare(self.region)
         shapely.prepare(self._boundary)

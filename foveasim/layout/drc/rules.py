@@ -11,14 +11,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import InitVar, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 
 from foveasim._core.calls import FRACTION, NOT_NEGATIVE, POSITIVE, Limits, OwnCheck, check_declared
 from foveasim._core.names import possible_names
 from foveasim._core.short_repr import short_repr
-from foveasim._core.show import drawn
+from foveasim._core.show import Drawn, drawn
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, check_choice, check_count, check_number, finite_array
 from foveasim.errors import GeometryError, ParameterError, type_name, with_article
@@ -28,6 +28,7 @@ from foveasim.layout.drc.routing import Readout, Routing
 from foveasim.layout.model import Layout
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from rich.table import Table
 
 __all__ = ["RULES", "DesignRules", "Report", "RuleResult", "Violation", "check", "min_width_um"]
@@ -378,7 +379,7 @@ class Report:
             for violation in self.violations
         ]
 
-    plot = drawn("plot_report")
+    plot: ClassVar[Drawn[Axes]] = drawn("plot_report")
     _repr_html_ = drawn("to_html")
 
     def write(self, path: str | Path) -> None:

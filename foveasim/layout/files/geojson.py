@@ -45,7 +45,7 @@ __all__ = ["read", "write"]
 CHUNK = 10_000
 #: JSON has no infinity, but numbers beyond the range of float64 are read as infinity.
 INFINITY = "1e999"
-NUMBER_TYPES = {int, float}
+NUMBER_TYPES: set[type] = {int, float}
 #: Integers up to the first are exact in float64; integers above the second are not supported.
 MAX_EXACT, MAX_FLOAT = 2**53, 2**1023
 #: With more property names, only properties of all features are columns, as names could differ for every feature.
