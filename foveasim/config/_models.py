@@ -72,10 +72,11 @@ def _model(name: str, call: Callable[..., Any], skip: Sequence[str] = (), **type
 def _field(name: str, default: Any, description: str | None, declared: Declaration) -> Any:
     """Return a key with its unit and range, which the call checks: its messages have hints."""
     default = ... if default is inspect.Parameter.empty else default
-    if declared.limits is None:
+    limits = declared.limits
+    if limits is None and declared.usual is None:
         return Field(default, description=description)
-    rule = declared.limits.schema
-    words = " ".join(part for part in (declared.limits.range, unit_of(name)) if part)
+    rule = {} if limits is None else limits.schema
+    words = "" if limits is None else f"{limits.range} {unit_of(name)}".strip()
     note = f"{words[:1].upper()}{words[1:]}{', also per site' * declared.is_per_site}." if words else ""
     extra: dict[str, Any] = {} if Sequence in declared.kinds else dict(rule)
     if declared.is_per_site or Sequence in declared.kinds:

@@ -16,16 +16,11 @@ from foveasim.studio._templates import INITIAL, PER_AREA, WITHOUT_MOSAIC, templa
 
 __all__ = ["chosen_value", "controls_of", "structure_of", "value_at"]
 
-#: Ranges of sliders by parameter: lowest and highest value; logarithmic if the lowest is positive and far below the highest.
+#: Ranges of sliders that annotations do not declare, by parameter: lowest and highest value; logarithmic if the lowest is
+#: positive and far below the highest.
 RANGES: dict[str, tuple[float, float]] = {
-    "depth_um": (0.5, 10.0),
     "distance_m": (0.05, 100.0),
-    "f_number": (1.0, 32.0),
     "field_of_view_deg": (1.0, 120.0),
-    "field_patches": (1.0, 15.0),
-    "focal_length_mm": (1.0, 200.0),
-    "focus_distance_m": (0.05, 100.0),
-    "fwhm_nm": (10.0, 300.0),
     "peak_radiance_w_m2_sr_nm": (1e-5, 1.0),
     "radiance_w_m2_sr_nm": (1e-5, 1.0),
     "rotation_deg": (-180.0, 180.0),

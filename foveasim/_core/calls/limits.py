@@ -292,9 +292,16 @@ def declarations_of(kind: type[Any]) -> Mapping[str, Declaration]:
 
 
 @lru_cache(maxsize=512)
-def _converters_of(kind: type[Any]) -> tuple[tuple[str, Converter], ...]:
-    declared = ((name, each.converter) for name, each in declarations_of(kind).items())  # type: ignore[arg-type]
-    return tuple((name, convert) for name, convert in declared if convert is not None)
+def _checks_of(kind: type[Any]) -> tuple[tuple[str, type, float, float, Converter], ...]:
+    """Return names, a type and range of valid values, and converters of other values."""
+    found = []
+    for name, declared in declarations_of(kind).items():  # type: ignore[arg-type]
+        convert, limits = declared.converter, declared.limits or FINITE
+        if convert is not None:
+            plain = next((each for each in (float, int, bool) if each in declared.kinds), NoneType)
+            low = limits.lowest if limits.above != limits.lowest else math.nextafter(limits.lowest, math.inf)
+            found.append((name, plain, max(low, -sys.float_info.max), min(limits.high, sys.float_info.max), convert))
+    return tuple(found)
 
 
 class Declared:
@@ -324,11 +331,12 @@ def check_declared(instance: Any, *, n_sites: int | None = None) -> None:
     ParameterError
         If a value has another type, is not finite, or is outside the limits.
     """
-    for name, convert in _converters_of(type(instance)):  # type: ignore[arg-type]
+    for name, plain, low, high, convert in _checks_of(type(instance)):  # type: ignore[arg-type]
         value = getattr(instance, name)
-        found = convert(name, value, n_sites)
-        if found is not value:
-            object.__setattr__(instance, name, found)
+        if type(value) is not plain or value is None or not low <= value <= high:  # type: ignore[operator]
+            found = convert(name, value, n_sites)
+            if found is not value:
+                object.__setattr__(instance, name, found)
 
 
 def without_declarations(annotation: Any) -> Any:
