@@ -165,7 +165,7 @@ def test_declared_dataclasses_can_be_copied(kind):
     assert repr(dataclasses.replace(instance)) == repr(instance)
 
 
-@pytest.mark.parametrize("kind", CLASSES.keys() - {ADC}, ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("kind", [kind for kind in CLASSES if kind is not ADC], ids=lambda kind: kind.__name__)
 def test_signatures_show_types_only(kind):
     assert "Annotated" not in str(inspect.signature(kind))
     assert "Limits" not in str(inspect.signature(kind))
