@@ -1,4 +1,4 @@
-"""Views of data that the page has: those of the map, the settings, and the summary of the state."""
+"""Views of data that the page has: of the map, the settings, and the state."""
 
 from __future__ import annotations
 
