@@ -38,8 +38,8 @@ export function create(root, { page, panes, setRange }) {
         item.append(make("dt", name), make("dd", value + (unit && name !== "n" ? " " + unit : "")));
         return item;
       }));
+      // The page draws it with the mark of the photosite.
       chart.use(b.scale, page.frozen && a.scale?.column.key === b.column.key ? a.scale : null);
-      draw();
     },
   };
 }

@@ -15,6 +15,5 @@ export function create(root, { page, panes }) {
       change(heading, { textContent: siteHeading(site, page.pinned) });
       list.replaceChildren(...siteRows(sites, columns, site, 4).flatMap(([label, text]) => [make("dt", label), make("dd", text)]));
     },
-    onValues() { this.onSite(); },
   };
 }
