@@ -208,10 +208,11 @@ def test_tiles_of_lateral_colour_equal_capture(camera, scene):
 
 
 def test_tiles_of_memory_mapped_map_equal_capture(camera, tmp_path):
-    cells = np.random.default_rng(1).random((2, 520, 720), dtype=np.float32)
+    """The cells are twice as high as wide."""
+    cells = np.random.default_rng(1).random((2, 260, 720), dtype=np.float32)
     np.save(tmp_path / "map.npy", cells)
     light, mapped = (
-        fs.PowerMap.from_array(array, pitch_um=PITCH_UM, wavelength_nm=[500.0, 600.0])
+        fs.PowerMap.from_array(array, pitch_um=(PITCH_UM, 2.0 * PITCH_UM), wavelength_nm=[500.0, 600.0])
         for array in (cells, np.load(tmp_path / "map.npy", mmap_mode="r"))
     )
     whole = camera.capture(light, exposure_s=1e-4, seed=0)

@@ -111,6 +111,10 @@ def test_exponents_without_point_are_numbers(shot_file):
             "layout.mosaic=[GR, RG]; sensor.filters={curves: [{kind: gaussian, centre_nm: 550, fwhm_nm: 90}, {kind: constant, value: 0.5}]}",
             lambda s: s.camera.sensor.filter_names == ("0", "1"),
         ),
+        (
+            "sensor.filters={curves: [{kind: constant, value: 0.5}], names: [a=b]}",
+            lambda s: s.camera.sensor.filter_names == ("a=b",),
+        ),
         ("exposure_s=0.5", lambda s: s.exposure_s == 0.5),
     ],
 )

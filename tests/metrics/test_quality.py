@@ -59,9 +59,10 @@ def test_ssim_uses_fully_covered_windows():
 
 
 def test_ssim_matches_scikit_image():
-    expected = structural_similarity(NOISY, TRUTH, win_size=7, data_range=1.0)
+    for n, options in ((7, {}), (3, {"window": 3}), (11, {"window": 11})):
+        expected = structural_similarity(NOISY, TRUTH, win_size=n, data_range=1.0)
 
-    assert ssim(NOISY, TRUTH, 1.0) == pytest.approx(expected, rel=1e-6)
+        assert ssim(NOISY, TRUTH, 1.0, **options) == pytest.approx(expected, rel=1e-6)
 
 
 def test_min_coverage_selects_partly_covered_pixels():

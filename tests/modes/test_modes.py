@@ -81,17 +81,20 @@ def test_scaled_light_gives_same_events():
     assert np.allclose(weak.t_s, strong.t_s, rtol=1e-9)
 
 
-def test_low_pass_is_faster_at_higher_current():
+@pytest.mark.parametrize("polarity", [1, -1])
+def test_low_pass_is_faster_at_higher_current(polarity):
     capacitance_f, contrast = 2e-14, 0.13
     light = np.array([2e5, 8e5])
     tau_s = capacitance_f * BOLTZMANN_J_PER_K * 300.0 / (ELEMENTARY_CHARGE_C**2 * math.e * light)
     frame_s, n = 1e-3, 200
-    pixels = pixels_of(2, contrast_on=contrast, capacitance_f=capacitance_f)
-    events = pixels.events([light, *([math.e * light] * n)], frame_s=frame_s, seed=0)
+    thresholds = dict(zip(("contrast_on", "contrast_off"), (contrast, 0.5)[::polarity], strict=True))
+    pixels = pixels_of(2, **thresholds, capacitance_f=capacitance_f)
+    events = pixels.events([math.exp(1 - polarity) * light, *([math.e * light] * n)], frame_s=frame_s, seed=0)
+    assert set(events.polarity.tolist()) == {polarity}
     for site in (0, 1):
         times_s = events.t_s[events.site == site]
         late = times_s[times_s > frame_s]
-        # After the ramp V = 1 - a exp(-(t - frame) / tau): the time between two levels is tau ln of the ratio of distances to 1.
+        # After the ramp |V| = 1 - a exp(-(t - frame) / tau): the time between two levels is tau ln of the ratio of distances to 1.
         level = 1.0 - contrast * (np.arange(len(times_s))[times_s > frame_s] + 1)
         steps = np.log(level[:-1] / level[1:])
         assert len(times_s) == 7

@@ -47,6 +47,15 @@ def test_budget_entries_match_textbook_values():
         assert noise_e[name] == pytest.approx(np.full(N, size_e), rel=5e-4, abs=1e-9)
 
 
+def test_offsets_are_referred_by_local_slope():
+    """At half the range, a nonlinearity of 10 % lowers the slope to 0.9."""
+    sensor = Sensor(
+        LINE, nonlinearity_fraction=0.1, pixel_fpn_fraction=0.01, capacitance_f=2e4 * scipy.constants.e / 3.0
+    )
+
+    assert noise_budget(sensor, np.full(N, 1e4), 1.0)["pixel_fpn"] == pytest.approx(np.full(N, 200.0 / 0.9))
+
+
 @pytest.mark.parametrize("companding", [{}, {"companding": "root"}, {"companding": "log", "log_strength": 5.0}])
 @pytest.mark.parametrize("bend", [0.0, 0.1])
 def test_temporal_entries_sum_to_code_variance(companding, bend):

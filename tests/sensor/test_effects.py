@@ -95,6 +95,16 @@ def test_draws_moments_and_budget_agree(name):
     check_sensor_effect(name, CASES[name])
 
 
+def test_fixed_patterns_of_effects_are_uncorrelated():
+    """Two effects with the same random numbers would agree with their own moments, but not together."""
+    names = [effect.name for effect in effects.STANDARD if not effect.is_temporal]
+    sensors = {name: make_sensor(name) for name in names}
+    patterns = [e.pattern(sensors[name].sites) for name in names for e in sensors[name].chain if e.name == name]
+
+    assert len(patterns) == 7
+    assert np.abs(np.corrcoef(patterns) - np.eye(7)).max() < 5.0 / np.sqrt(N)
+
+
 @every_effect
 def test_disabled_effect_leaves_other_draws(name):
     everything = {key: value for case in CASES.values() for key, value in case.items()}

@@ -522,6 +522,13 @@ def test_nonlinearity_loss_grows_with_signal():
         assert codes(charge, nonlinearity_fraction=0.04)[0] == pytest.approx(charge * (1 - 0.04 * fraction), abs=1.0)
 
 
+def test_pedestal_is_added_after_nonlinearity():
+    """A quarter of the range loses 1 % of itself; the pedestal of a tenth of the range loses nothing."""
+    code = codes(16_384, nonlinearity_fraction=0.04, pedestal_v=0.3)[0]
+
+    assert code == pytest.approx((0.25 * 0.99 + 0.1) * 65_536, abs=1.0)
+
+
 # -- codes ------------------------------------------------------------------------------------------------------------------
 
 

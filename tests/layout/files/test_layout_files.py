@@ -481,6 +481,16 @@ def test_klayout_keyholes_are_read_as_holes(tmp_path):
     assert np.diff(layout.site_offsets).tolist() == [2]
 
 
+def test_gds_coordinates_in_nanometres_are_converted(tmp_path):
+    library = gdstk.Library(unit=1e-9, precision=1e-9)
+    pixel, top = library.new_cell("PIXEL"), library.new_cell("TOP")
+    pixel.add(gdstk.rectangle((0, 0), (2000, 3000), 1))
+    top.add(gdstk.Reference(pixel, (500, 7000)))
+    library.write_gds(tmp_path / "a.gds")
+
+    assert read_layout(tmp_path / "a.gds").bounds_um == pytest.approx((0.5, 7.0, 2.5, 10.0))
+
+
 @pytest.mark.parametrize("extension", GDSII_OASIS)
 def test_flattened_hierarchy_matches_klayout(tmp_path, extension):
     rng = np.random.default_rng(3)

@@ -393,6 +393,10 @@ def test_closest_sunflower_sites_have_given_spacing(n_sites):
 
     assert nearest_um(centres).min() == pytest.approx(2.0, rel=1e-4)
     assert bool(np.all(shapely.contains_xy(layout.polygons(), centres[:, 0], centres[:, 1])))
+    # No centre is nearer to a corner of a Voronoi cell than its own.
+    own = centres[np.repeat(np.arange(n_sites), np.diff(layout.ring_offsets))]
+    own_um = np.hypot(*(layout.xy_um - own).T)
+    np.testing.assert_allclose(own_um, cKDTree(centres).query(layout.xy_um)[0], rtol=0.0, atol=0.02)
 
 
 def test_published_sunflower_constant_gives_unit_spacing():
