@@ -14,6 +14,7 @@ from foveasim.studio._costs import Costs
 from foveasim.studio._engine import PICTURE_PIXELS, Simulated
 from foveasim.studio._messages import encode_part
 from foveasim.studio._parts import PARTS
+from foveasim.studio._parts.registry import FIRST_TILE
 
 #: Parts that are sent first and together: sites, and their values.
 FIRST = ("sites", "columns")
@@ -89,10 +90,11 @@ class Views:
         self.left_out = []
         drawn_s = time.perf_counter()
         shown = [name for name in self._names if result.frozen is not None or not PARTS[name].is_of_variants]
-        # Sites and their values belong together; the others in the order of their age.
+        # Sites and their values belong together; the others in the order of their age, small ones before images.
         first = [name for name in FIRST if name in shown]
         names = first + sorted(
-            set(shown) - set(first), key=lambda name: (self._version.get(name, -1), shown.index(name))
+            set(shown) - set(first),
+            key=lambda name: (self._version.get(name, -1), PARTS[name].order < FIRST_TILE, shown.index(name)),
         )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # those of the simulation are in the state
