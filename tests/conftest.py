@@ -1,9 +1,9 @@
 """
 Selection of tests, their requirements, kernels, and distribution to processes.
 
-The default run leaves out tests marked ``slow``, except for those that ``keep`` selects: a number of parameter sets of each
-function, spread evenly, or parts of their names. Runs of named files and directories, and those with FOVEASIM_TESTS_ALL=1,
-contain all tests. ``needs("renderer")``, ``"chromium"``, ``"torch"`` mark requirements.
+The default run leaves out tests marked ``slow`` and tests in a browser, except for those that ``slow(keep=...)`` selects: a
+number of parameter sets of each function, spread evenly, or parts of their names. Runs of named files and directories, and
+those with FOVEASIM_TESTS_ALL=1, contain all tests. ``needs("renderer")``, ``"chromium"``, ``"torch"`` mark requirements.
 """
 
 from __future__ import annotations
@@ -72,17 +72,23 @@ def pytest_configure(config):
         compile_kernels()
 
 
+def slow_marker(item):
+    """Return the marker of a slow test, else None."""
+    needs = [what for marker in item.iter_markers("needs") for what in marker.args]
+    return item.get_closest_marker("slow") or (pytest.mark.slow if "chromium" in needs else None)
+
+
 def pytest_collection_modifyitems(config, items):
     """Leave out slow tests, except for those that their markers keep."""
     if os.environ.get("FOVEASIM_TESTS_ALL") == "1":
         return
     of_function = defaultdict(list)
     for item in items:
-        if item.get_closest_marker("slow"):
+        if slow_marker(item):
             of_function[item.parent, item.originalname].append(item)
     dropped = set()
     for k, sets in enumerate(of_function.values()):
-        keep, n = sets[0].get_closest_marker("slow").kwargs.get("keep", 0), len(sets)
+        keep, n = slow_marker(sets[0]).kwargs.get("keep", 0), len(sets)
         if isinstance(keep, int):  # other sets for the next function, so that all occur in a file
             kept = {sets[(k + j * n // keep) % n] for j in range(min(keep, n))}
         else:

@@ -19,8 +19,6 @@ from skimage.data import astronaut
 from foveasim._core.registry import Registry
 from foveasim.sensor import Sensor
 
-pytestmark = pytest.mark.slow
-
 ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 #: Targets of links and pictures, without URLs and sections of the same page.
@@ -81,7 +79,6 @@ def test_code_on_a_page_runs(page, tmp_path, monkeypatch):
         exec(compile(block, str(page), "exec"), vars(main))
 
 
-@pytest.mark.slow(keep=1)
 def test_each_extension_takes_30_lines():
     blocks = BLOCK.findall((ROOT / "docs" / "extending.md").read_text())
 
@@ -89,12 +86,10 @@ def test_each_extension_takes_30_lines():
     assert max(block.count("\n") for block in blocks) <= 30
 
 
-@pytest.mark.slow(keep=1)
 def test_links_lead_to_pages():
     assert list(broken_links(ROOT)) == []
 
 
-@pytest.mark.slow(keep=1)
 def test_all_pages_are_found():
     assert len(pages_of(ROOT)) >= 19
     assert len(PAGES) >= 13
@@ -112,7 +107,6 @@ def write_repository(root, links):
     (root / "docs" / "guides" / "a.md").write_text("\n".join(f"[see]({link})" for link in links))
 
 
-@pytest.mark.slow(keep=7)
 @pytest.mark.parametrize(
     "link",
     [
@@ -131,7 +125,6 @@ def test_good_link_is_accepted(tmp_path, link):
     assert list(broken_links(tmp_path / "gallery")) == []
 
 
-@pytest.mark.slow(keep=8)
 @pytest.mark.parametrize(
     "link",
     [
@@ -154,7 +147,6 @@ def test_broken_link_is_reported(tmp_path, link):
 ROW = re.compile(r"^\| `(\w+)` \|[^|]*\| `([^`]*)` \|", re.MULTILINE)
 
 
-@pytest.mark.slow(keep=1)
 def test_parameter_table_lists_all_defaults():
     table = ROW.findall((ROOT / "docs" / "guides" / "sensor_parameters.md").read_text())
     expected = {field.name: field.default for field in fields(Sensor) if field.name != "layout"}

@@ -13,8 +13,6 @@ from matplotlib.text import Text
 import foveasim
 import foveasim.view
 
-pytestmark = pytest.mark.slow
-
 GALLERY = Path(foveasim.__file__).parents[1] / "gallery"
 SCRIPTS = sorted(GALLERY.glob("*.py"))
 #: Scripts with their requirements; -k torch selects those that require PyTorch.
@@ -57,7 +55,6 @@ def test_script_runs_and_writes_its_pictures(path, tmp_path, monkeypatch):
     assert all(p.name.startswith(path.stem[:3]) and p.stat().st_size > 1000 for p in written)
 
 
-@pytest.mark.slow(keep=1)
 def test_scripts_are_numbered_with_expectations():
     assert [path.name[:3] for path in SCRIPTS] == [f"{k:02d}_" for k in range(1, len(SCRIPTS) + 1)]
     for path in SCRIPTS:

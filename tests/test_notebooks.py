@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.slow
-
 nbformat = pytest.importorskip("nbformat")
 nbclient = pytest.importorskip("nbclient")
 
@@ -42,7 +40,6 @@ def test_notebook_runs_and_shows_results(path, tmp_path, monkeypatch):
     assert shown & {"image/png", "text/html"}
 
 
-@pytest.mark.slow(keep=7)
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_stored_notebook_has_no_outputs(path):
     notebook = nbformat.read(path, 4)

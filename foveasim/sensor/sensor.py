@@ -16,7 +16,7 @@ from foveasim._core.random_streams import Streams
 from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Bools, Floats, Ints, read_only, unmasked
-from foveasim.errors import ParameterError, SimulationError
+from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.sensor.adc import ADC, BITS, DNL, INL, LOG_STRENGTH, Companding, ConversionTables
 from foveasim.sensor.blocks import for_each_block
 from foveasim.sensor.chain import (
@@ -164,7 +164,7 @@ class Sensor:
         If the layout has channels without a filter, or lacks the column ``channel`` or ``readout_line`` where it is required.
     """
 
-    layout: Photosites
+    layout: OwnCheck[Photosites]
     _: KW_ONLY
     qe: Annotated[float | Curve | Sequence[float | Curve], FRACTION] = 1.0
     filters: FilterSet | Literal["rgb"] | None = None
@@ -213,6 +213,8 @@ class Sensor:
     disabled: Iterable[str] = ()
 
     def __post_init__(self) -> None:
+        if not all(hasattr(self.layout, name) for name in ("n_sites", "channel", "columns")):
+            raise ParameterError("layout", f"must be a Layout, got {type_name(self.layout)}")
         check_declared(self, n_sites=self.layout.n_sites)
         if isinstance(self.qe, list | tuple):
             object.__setattr__(self, "qe", tuple(self.qe))

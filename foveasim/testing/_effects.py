@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from foveasim._core.names import possible_names
 from foveasim._core.provenance import to_plain_data
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Floats
+from foveasim.errors import ParameterError
 from foveasim.layout import grid
 from foveasim.sensor import Sensor, noise_budget
 from foveasim.sensor.effects import EFFECTS, Effect
@@ -70,9 +72,14 @@ def check_sensor_effect(name: str, keywords: Mapping[str, Any]) -> None:
     AssertionError
         When draws, moments, prediction or noise budget disagree, when the effect is not that of its device or frame, or
         differs in a part of the sensor.
+    ParameterError
+        When the keywords do not enable the effect.
     """
     sensor = _sensor(keywords)
-    (effect,) = (found for found in sensor.chain if found.name == name)
+    names = [found.name for found in sensor.chain]
+    if name not in names:
+        raise ParameterError("name", "must be an effect of the sensor", name, hint=possible_names(name, names))
+    effect = sensor.chain[names.index(name)]
     _check_reproducible(sensor, effect)
     _check_prediction(sensor, effect)
     if not effect.mixes_means:

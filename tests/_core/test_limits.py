@@ -279,3 +279,8 @@ def test_declarations_are_found_in_unions():
 )
 def test_types_are_extracted_from_annotations(text, plain):
     assert without_declarations(text) == plain
+
+
+def test_limits_contain_numbers():
+    with pytest.raises(ParameterError, match="'at_most' must be at least the lower limit 2, got 1"):
+        Limits(at_least=2.0, at_most=1.0)

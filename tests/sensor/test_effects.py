@@ -467,3 +467,10 @@ def test_public_effects_have_no_long_signatures():
         parts = getattr(effects, name)
         if inspect.isclass(parts) and issubclass(parts, Effect | Sites):
             assert len(inspect.signature(parts).parameters) <= 7
+
+
+def test_disabled_effect_is_not_checked():
+    with pytest.raises(
+        ParameterError, match="'name' must be an effect of the sensor, got 'prnuu'; did you mean 'prnu'"
+    ):
+        check_sensor_effect("prnuu", {"prnu_fraction": 0.1})

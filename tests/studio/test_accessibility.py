@@ -54,6 +54,7 @@ def check(page):
     assert violations(page) == []
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize(
     "make", [capture_page, rules_page, lambda: solid_page(LAYOUT), report], ids=["capture", "rules", "solid", "report"]
@@ -77,6 +78,7 @@ def test_pages_have_no_serious_violations(browser, tmp_path, make, scheme):
     assert found == []
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_studio_has_no_serious_violations(visit, scheme):
     page = visit(width=1800, height=1000, color_scheme=scheme)
@@ -96,6 +98,7 @@ def test_studio_has_no_serious_violations(visit, scheme):
     check(page)
 
 
+@pytest.mark.slow(keep=1)
 def test_violations_are_found(browser):
     page = browser.new_page()
     page.set_content("<p style='color: #ccc; background: #fff'>pale</p><input><img src='data:,'>")

@@ -81,6 +81,7 @@ def test_wrong_data_of_views_are_found(result, name, make, problem):
     assert found.startswith(problem)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.needs("chromium")
 def test_all_views_show_something(visit):
     page = visit(width=1800, height=1000)
@@ -94,6 +95,7 @@ def test_all_views_show_something(visit):
     assert set(page.evaluate("Object.keys(studio.views.made)")) == set(PARTS)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.needs("chromium")
 @pytest.mark.parametrize(
     ("script", "make", "message"),

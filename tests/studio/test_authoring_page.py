@@ -13,7 +13,7 @@ pytest.importorskip("uvicorn")
 
 from studio.page_tools import SHOT, change, set_value, setting, settle, until
 
-pytestmark = [pytest.mark.needs("chromium"), pytest.mark.slow]
+pytestmark = pytest.mark.needs("chromium")
 
 #: 12 x 10 squares of 20 µm around (-140, 320) µm.
 PITCH_UM = 20.0

@@ -28,7 +28,7 @@ from studio.page_tools import (
 
 from foveasim.config import read_shot
 
-pytestmark = [pytest.mark.needs("chromium"), pytest.mark.slow]
+pytestmark = pytest.mark.needs("chromium")
 
 #: A camera that shows a moving picture.
 FAKE_CAMERA = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")

@@ -27,7 +27,7 @@ from studio.page_tools import (
     until,
 )
 
-pytestmark = [pytest.mark.needs("chromium"), pytest.mark.slow]
+pytestmark = pytest.mark.needs("chromium")
 
 # -- views ------------------------------------------------------------------------------------------------------------------
 

@@ -17,7 +17,7 @@ from studio.page_tools import codes, setting
 
 import foveasim as fs
 
-pytestmark = [pytest.mark.needs("chromium"), pytest.mark.slow]
+pytestmark = pytest.mark.needs("chromium")
 
 SCRIPT = Path(fs.__file__).parents[1] / "docs" / "studio_pictures.py"
 

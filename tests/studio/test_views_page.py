@@ -10,7 +10,7 @@ pytest.importorskip("uvicorn")
 
 from studio.page_tools import change, has_picture, set_value, settle, until
 
-pytestmark = [pytest.mark.needs("chromium"), pytest.mark.slow]
+pytestmark = pytest.mark.needs("chromium")
 
 #: Browsers without WebGL.
 WITHOUT_WEBGL = """{ const own = HTMLCanvasElement.prototype.getContext;

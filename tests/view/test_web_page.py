@@ -34,8 +34,6 @@ from foveasim.view.web._content import content_of
 from foveasim.view.web._pack import back_references, pack, to_smallest_type
 from foveasim.view.web._shapes import shapes_of
 
-pytestmark = pytest.mark.slow
-
 #: A frame with an island in it, an L, an arrow that no fan from its first vertex fills, a comb that no fan fills,
 #: two boxes with a common boundary, and two that overlap.
 FRAME = shapely.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)], [[(2, 2), (2, 6), (6, 6), (6, 2)]])
@@ -99,7 +97,6 @@ def triangles_of(shapes):
             yield from ((site, (first, v, v + 1)) for v in range(first + 1, last - 1))
 
 
-@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize(
     ("layout", "n_cut"),
     [
@@ -122,7 +119,6 @@ def test_triangles_fill_exactly_their_site(layout, n_cut):
     assert shapes.cut_sites.size == n_cut
 
 
-@pytest.mark.slow(keep=1)
 def test_shared_vertices_stored_once_and_decoded():
     for layout in (MIXED_LAYOUT, MOSAIC):
         shapes = shapes_of(layout)
@@ -137,7 +133,6 @@ def test_shared_vertices_stored_once_and_decoded():
     assert np.unique(shapes.xy_um, axis=0).shape == (6 * 5, 2)
 
 
-@pytest.mark.slow(keep=8)
 @pytest.mark.parametrize(
     "values",
     [
@@ -167,7 +162,6 @@ def snr_column(capture):
     return page.arrays[names[0]] if names else None
 
 
-@pytest.mark.slow(keep=1)
 def test_page_snr_includes_quantisation():
     expected_e = CAPTURE.expected_e
 
@@ -191,7 +185,6 @@ class Elements(HTMLParser):
         self.found.append((tag, dict(attrs)))
 
 
-@pytest.mark.slow(keep=1)
 def test_page_loads_no_external_resources():
     text = web_page(CAPTURE)
     links = [v for _, attrs in Elements(text).found for k, v in attrs.items() if k in {"src", "href", "action"}]
@@ -204,7 +197,6 @@ def test_page_loads_no_external_resources():
     assert "connect-src" not in policy
 
 
-@pytest.mark.slow(keep=6)
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
@@ -229,7 +221,6 @@ def test_invalid_page_arguments_raise(call, error, message):
         call()
 
 
-@pytest.mark.slow(keep=1)
 def test_page_is_written_atomically(tmp_path, monkeypatch):
     (tmp_path / "page.html").write_text("before")
     monkeypatch.setattr("foveasim.view.web._page.web_page", lambda *_, **__: 1 / 0)
@@ -759,7 +750,6 @@ def test_outlines_sharp_at_extreme_zoom(visit):
     assert colours == [list(FILTER_COLOURS["R"]), list(FILTER_COLOURS["G"])]
 
 
-@pytest.mark.slow(keep=1)
 def test_about_json_names_every_array():
     text = web_page(MIXED_LAYOUT, report=MIXED_LAYOUT.check(fs.DesignRules(min_size_um=2.5)))
     about = json.loads(re.search(r'<script type="application/json" id="about">(.*?)</script>', text)[1])
@@ -878,7 +868,6 @@ def test_solid_page_escapes_names(visit):
     assert page.evaluate("window.hacked") is None
 
 
-@pytest.mark.slow(keep=1)
 def test_solid_page_is_self_contained(tmp_path):
     write_solid_page(MOSAIC, tmp_path / "solid.html")
     text = (tmp_path / "solid.html").read_text()
@@ -958,7 +947,6 @@ def test_packed_surfaces_return_every_triangle(layout, meshes, n_tiles):
     assert about["lattice_um"] <= 0.001
 
 
-@pytest.mark.slow(keep=1)
 def test_unshowable_surfaces_raise_by_name():
     (mesh,) = solids(MOSAIC, SensorStack(trench_width_um=0.0, filter_thickness_um=0.0, lens_height_um=0.0)).meshes
     spotted, crossing = mesh.colours.copy(), mesh.triangles.copy()
@@ -975,7 +963,6 @@ def test_unshowable_surfaces_raise_by_name():
         bodies_of([replace(mesh, triangles=mesh.triangles[:0])], MOSAIC)
 
 
-@pytest.mark.slow(keep=1)
 def test_solid_page_needs_no_trimesh(monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     monkeypatch.setitem(sys.modules, "manifold3d", None)
@@ -984,7 +971,6 @@ def test_solid_page_needs_no_trimesh(monkeypatch):
     assert len(solid_page(CAPTURE)) < 150_000
 
 
-@pytest.mark.slow(keep=1)
 def test_scripts_are_readable_source():
     """Scripts are neither minified nor third-party code."""
     web = files("foveasim.view.web")
@@ -1794,7 +1780,6 @@ def test_second_capture_shares_view_and_scale(visit):
     assert page.locator("#second").is_hidden()
 
 
-@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize(
     ("second", "message"),
     [

@@ -116,7 +116,6 @@ def position(page, frame, x_um, y_um):
     return box["x"] + x, box["y"] + y
 
 
-@pytest.mark.slow
 @pytest.mark.needs("chromium")
 def test_hover_and_pin_reach_python(show):
     widget = fs.view.widget(LAYOUT)
@@ -129,6 +128,7 @@ def test_hover_and_pin_reach_python(show):
     until(frame, lambda: widget.pinned == 41)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.needs("chromium")
 def test_selection_reaches_python_and_back(show):
     widget = fs.view.widget(LAYOUT)

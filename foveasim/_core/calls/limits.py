@@ -67,6 +67,11 @@ class Limits:
         Smallest plausible value besides 0: smaller ones indicate errors of units or digits.
     hint : str
         Reminder of the unit, for error messages.
+
+    Raises
+    ------
+    ParameterError
+        If no number is within the limits.
     """
 
     above: float | None = None
@@ -74,6 +79,10 @@ class Limits:
     at_most: float | None = None
     low: float = 0.0
     hint: str = ""
+
+    def __post_init__(self) -> None:
+        if self.lowest > self.high:
+            raise ParameterError("at_most", f"must be at least the lower limit {self.lowest:g}", self.high)
 
     @property
     def lowest(self) -> float:
