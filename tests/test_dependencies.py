@@ -96,9 +96,13 @@ def only_for_types(tree):
             yield from (inner for statement in node.body for inner in ast.walk(statement))
 
 
+@cache
 def imported_modules(path):
     """Full names of the modules that a file imports, also those given to a function by name."""
-    tree = ast.parse(path.read_text())
+    return tuple(_imports(ast.parse(path.read_text())))
+
+
+def _imports(tree):
     skipped = set(only_for_types(tree))
     for node in ast.walk(tree):
         if node in skipped:
@@ -107,7 +111,10 @@ def imported_modules(path):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.level == 0:
             yield node.module
-        elif isinstance(node, ast.Call) and (name := ast.unparse(node.func).rpartition(".")[2]) in IMPORTING:
+        elif (
+            isinstance(node, ast.Call)
+            and (name := getattr(node.func, "attr", getattr(node.func, "id", ""))) in IMPORTING
+        ):
             args = node.args[1:2] if name == "import_optional" else node.args  # after its subject, before the extra
             yield from (a.value for a in args if isinstance(a, ast.Constant) and isinstance(a.value, str))
 

@@ -409,6 +409,7 @@ def journal_points(store):
     return [json.loads(line.partition(" ")[2])["point"] for line in lines[1:]]
 
 
+@pytest.mark.slow
 def test_killed_worker_loses_at_most_one_task(reference_results, tmp_path):
     plan = plan_200(logging_metric(tmp_path, SLOW_S))
     store = tmp_path / "r.zarr"

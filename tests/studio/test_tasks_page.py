@@ -43,7 +43,6 @@ def table(page):
     )
 
 
-@pytest.mark.slow(keep=1)
 def test_photograph_is_captured(page, tasks):
     gaze_um = np.array(setting(page, "layout.move_um"))
     tasks.photograph(page, Path(str(files("skimage.data") / "coffee.png")))
