@@ -286,81 +286,46 @@ def filter_and_sum(lines, factors, coefficients, first, is_added, out):
                 total[:] = 0.0
 
 
-@njit(allocates=True)
-def _alias_gain(cycles, k, source_cells, is_alternating):
-    """
-    Return ``sinc(f) * sinc(source_cells * f)`` for ``f = cycles + k``, (n_alias, n).
-
-    ``source_cells`` is the side of the source pixels in cells, 0 for points. ``is_alternating`` negates odd aliases.
-    """
-    gain = np.empty((k.size, cycles.size))
-    for a in range(k.size):
-        sign = -1.0 if is_alternating and k[a] % 2 else 1.0
-        for i in range(cycles.size):
-            f = cycles[i] + k[a]
-            gain[a, i] = sign * np.sinc(f) * np.sinc(source_cells * f)
-    return gain
-
-
 @njit(
-    types.complex128[:, ::1](
+    types.void(
         types.Array(types.complex128, 2, "C", readonly=True),
         types.float64,
         _floats,
-        types.int64,
-        types.float64,
-        types.boolean,
+        _in(types.int64, 1),
+        _in(types.float64, 2),
+        types.complex128[:, ::1],
     ),
 )
-def alias_sum_plane(table, per_step, cycles, n_alias, source_cells, is_alternating):
-    """Compute :func:`alias_sum` for a square complex table over (f_y, f_x)."""
-    n = cycles.size
-    k = np.arange(-n_alias, n_alias + 1)
-    gain = _alias_gain(cycles, k, source_cells, is_alternating)
-    total = np.zeros((n, n), np.complex128)
+def add_plane_aliases(table, per_step, cycles, k, gain, total):
+    """Compute :func:`add_aliases` for a square complex table over (f_y, f_x)."""
     for a in range(k.size):
         for b in range(k.size):
             if k[a] == 0 and k[b] == 0:
                 continue
-            for i in range(n):
+            for i in range(cycles.size):
                 v = (cycles[i] + k[a]) * per_step
-                for j in range(n):
+                for j in range(cycles.size):
                     total[i, j] += gain[a, i] * gain[b, j] * _interpolate_plane(table, (cycles[j] + k[b]) * per_step, v)
-    return total
 
 
-@njit(
-    types.float64[:, ::1](
-        types.Array(types.float64, 1, "C", readonly=True),
-        types.float64,
-        _floats,
-        types.int64,
-        types.float64,
-        types.boolean,
-    ),
-)
-def alias_sum(table, per_step, cycles, n_alias, source_cells, is_alternating):
+@njit(types.void(_floats, types.float64, _floats, _in(types.int64, 1), _in(types.float64, 2), types.float64[:, ::1]))
+def add_aliases(table, per_step, cycles, k, gain, total):
     """
-    Sum a radial table over all aliases except ``k = 0``.
+    Add a radial table at all aliases except ``k = 0``.
 
-    The terms are ``table(|f + k|) * gain(f_x + k_x) * gain(f_y + k_y)`` with the factors of :func:`_alias_gain`, evaluated at
-    the frequencies ``cycles`` x ``cycles`` in cycles per cell; ``per_step`` is the number of table steps per cycle per cell.
+    The terms are ``table(|f + k|) * gain(f_x + k_x) * gain(f_y + k_y)`` at the frequencies ``cycles`` x ``cycles`` in cycles
+    per cell; ``per_step`` is the number of table steps per cycle per cell, and ``gain`` is (n_alias, n_frequency).
     """
-    n = cycles.size
     last = table.size - 1
-    k = np.arange(-n_alias, n_alias + 1)
-    gain = _alias_gain(cycles, k, source_cells, is_alternating)
-    total = np.zeros((n, n))
     for a in range(k.size):
         for b in range(k.size):
             if k[a] == 0 and k[b] == 0:
                 continue
-            for i in range(n):
+            for i in range(cycles.size):
                 v = (cycles[i] + k[a]) * per_step
-                for j in range(n):
+                for j in range(cycles.size):
                     u = (cycles[j] + k[b]) * per_step
                     r = np.sqrt(u * u + v * v)
                     if r < last:
-                        at = int(r)
+                        at = np.int64(r)
                         total[i, j] += gain[a, i] * gain[b, j] * (table[at] + (r - at) * (table[at + 1] - table[at]))
-    return total

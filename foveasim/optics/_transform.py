@@ -134,16 +134,13 @@ class Transform:
         if self._n_alias <= DIRECT_ALIASES:
             return np.zeros((0, self._n_columns), table.dtype), np.zeros((0, self._n_rows), table.dtype)
         to_x, to_y = self._from_radial_nodes if is_radial else self._from_plane_nodes
-        sums = self._kernels.alias_sum if is_radial else self._kernels.alias_sum_plane
+        add_aliases = self._kernels.add_aliases if is_radial else self._kernels.add_plane_aliases
         nodes = np.polynomial.chebyshev.chebpts1(to_x.shape[1])
-        at_nodes = sums(
-            table.astype(np.float64 if is_radial else np.complex128),
-            per_step / self._pitch_um,
-            0.25 * (nodes + 1.0) if is_radial else 0.5 * nodes,
-            self._n_alias,
-            self._source_cells,
-            self._is_alternating,
-        )
+        cycles = 0.25 * (nodes + 1.0) if is_radial else 0.5 * nodes
+        k = np.arange(-self._n_alias, self._n_alias + 1)
+        precise = table.astype(np.float64 if is_radial else np.complex128)
+        at_nodes = np.zeros((nodes.size, nodes.size), precise.dtype)
+        add_aliases(precise, per_step / self._pitch_um, cycles, k, self._gain(cycles, k[:, np.newaxis]), at_nodes)
         y_modes, sizes, x_modes = np.linalg.svd(at_nodes)
         zero = table[0] if is_radial else table[table.shape[0] // 2, table.shape[0] // 2]
         rank = int(np.searchsorted(-sizes, -ALIAS_ACCURACY * max(float(zero.real), 0.0)))
@@ -195,10 +192,14 @@ class Transform:
 
         Both are (n_alias, n); frequencies in 1/µm.
         """
-        cycles = cycles + self._aliases
-        sign = np.where(self._is_alternating & (self._aliases % 2 == 1), -1.0, 1.0)
-        gain = sign * np.sinc(cycles) * np.sinc(self._source_cells * cycles)
-        return (cycles / self._pitch_um).astype(self._real), gain.astype(self._real)
+        gain = self._gain(cycles, self._aliases)
+        return ((cycles + self._aliases) / self._pitch_um).astype(self._real), gain.astype(self._real)
+
+    def _gain(self, cycles: Floats, aliases: Ints) -> Floats:
+        """Return the factor of cells and source pixels along one axis, (n_alias, n), for aliases (n_alias, 1)."""
+        f = cycles + aliases
+        sign = np.where(self._is_alternating & (aliases % 2 == 1), -1.0, 1.0)
+        return sign * np.sinc(f) * np.sinc(self._source_cells * f)
 
     def _for_each_block(self, work: Callable[[int, int], None], n: int, n_per_block: int) -> None:
         parallel_map(lambda first: work(first, min(first + n_per_block, n)), range(0, n, n_per_block), self._n_threads)
