@@ -220,7 +220,8 @@ def compile_plan(
     def sort(i: int) -> None:
         t, slots = traced[i], (slot_of_band_0, rows_per_band)
         _kernels.sort_spans(t.spans, t.weights, next_span[i], next_weight[i], *slots, out_spans, out_weights)
-        _kernels.sort_cuts(t.cuts, t.moments, next_cut[i], *slots, out_cuts, out_moments)
+        if t.cuts.size:
+            _kernels.sort_cuts(t.cuts, t.moments, next_cut[i], *slots, out_cuts, out_moments)
 
     parallel_map(sort, range(len(traced)), n_threads)
     area_um2 = np.concatenate([np.zeros(0), *(t.area_um2 for t in traced)])

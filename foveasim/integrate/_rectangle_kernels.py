@@ -41,26 +41,25 @@ def find_rectangles(xy, ring_offsets, site_offsets):
     recognised.
     """
     n_sites = site_offsets.size - 1
-    if ring_offsets.size - 1 != n_sites or xy.shape[0] != 4 * n_sites:
+    n_points = xy.shape[0]
+    if site_offsets[n_sites] != n_sites or ring_offsets[n_sites] != n_points or n_points != 4 * n_sites:
         return np.empty((0, 4))
-    # Most other layouts are recognised by their first sites, before memory is allocated.
-    for n in (min(n_sites, 4), n_sites):
-        out = np.empty((n, 4))
-        for site in range(n):
-            i = ring_offsets[site]
-            if ring_offsets[site + 1] != i + 4:
-                return np.empty((0, 4))
-            if xy[i, 1] != xy[i + 1, 1]:  # the first edge is vertical
-                i += 1
-            a, b, c, d = i, i + 1, i + 2, i + 3
-            d = d if d < ring_offsets[site + 1] else ring_offsets[site]
-            if not (xy[a, 1] == xy[b, 1] and xy[b, 0] == xy[c, 0] and xy[c, 1] == xy[d, 1] and xy[d, 0] == xy[a, 0]):
-                return np.empty((0, 4))
-            width, height = xy[b, 0] - xy[a, 0], xy[c, 1] - xy[b, 1]
-            if not ((width > 0.0 and height > 0.0) or (width < 0.0 and height < 0.0)):
-                return np.empty((0, 4))
-            out[site, 0], out[site, 1] = min(xy[a, 0], xy[c, 0]), min(xy[a, 1], xy[c, 1])
-            out[site, 2], out[site, 3] = max(xy[a, 0], xy[c, 0]), max(xy[a, 1], xy[c, 1])
+    out = np.empty((n_sites, 4))
+    for site in range(n_sites):
+        i = ring_offsets[site]
+        if ring_offsets[site + 1] != i + 4:
+            return np.empty((0, 4))
+        if xy[i, 1] != xy[i + 1, 1]:  # the first edge is vertical
+            i += 1
+        a, b, c, d = i, i + 1, i + 2, i + 3
+        d = d if d < ring_offsets[site + 1] else ring_offsets[site]
+        if not (xy[a, 1] == xy[b, 1] and xy[b, 0] == xy[c, 0] and xy[c, 1] == xy[d, 1] and xy[d, 0] == xy[a, 0]):
+            return np.empty((0, 4))
+        width, height = xy[b, 0] - xy[a, 0], xy[c, 1] - xy[b, 1]
+        if not ((width > 0.0 and height > 0.0) or (width < 0.0 and height < 0.0)):
+            return np.empty((0, 4))
+        out[site, 0], out[site, 1] = min(xy[a, 0], xy[c, 0]), min(xy[a, 1], xy[c, 1])
+        out[site, 2], out[site, 3] = max(xy[a, 0], xy[c, 0]), max(xy[a, 1], xy[c, 1])
     return out
 
 

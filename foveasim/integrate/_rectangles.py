@@ -15,6 +15,8 @@ from foveasim.integrate._coverage import Coverage
 
 #: Sites per work item; results do not depend on it.
 SITES_PER_PIECE = 2**15
+#: Number of sites that decide whether the others may be rectangles.
+FIRST_SITES = 4
 #: Up to this number of sites are integrated by the calling thread.
 FEW_SITES = 2**12
 
@@ -28,8 +30,13 @@ def rectangle_plan(layout: PackedRings, grid: Grid, order: int) -> RectanglePlan
         return LatticePlan(grid, order, lattice, u, v)
     from foveasim.integrate import _rectangle_kernels
 
-    rings = layout.xy_um, layout.ring_offsets, layout.site_offsets
-    bounds_um: Floats = _rectangle_kernels.find_rectangles(*rings)
+    find = _rectangle_kernels.find_rectangles
+    xy_um, ring_offsets, site_offsets = layout.xy_um, layout.ring_offsets, layout.site_offsets
+    n = min(site_offsets.size - 1, FIRST_SITES)
+    # Most other layouts are recognised by their first sites, without compilation.
+    if not find.py_func(xy_um[: ring_offsets[site_offsets[n]]], ring_offsets, site_offsets[: n + 1]).size:
+        return None
+    bounds_um: Floats = find(xy_um, ring_offsets, site_offsets)
     if not bounds_um.size:
         return None
     bounds = to_frame(bounds_um.reshape(-1, 2), grid.origin_um, grid.pitch_xy_um).reshape(-1, 4)
