@@ -4,6 +4,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out
+# Modules are compiled to bytecode when they are imported: most of those of the dependencies never are.
+INSTALL := -m pip install --quiet --no-compile
 # Arguments for pytest in all test targets.
 PYTEST_ARGS ?=
 PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
@@ -76,7 +78,7 @@ bench-torch: $(TORCH_VENV)/.installed
 
 # The same work with other libraries.
 peers: $(VENV)/.installed-dev
-	$(BIN)/python -m pip install --quiet --editable '.[peers]'
+	$(BIN)/python $(INSTALL) --editable '.[peers]'
 	$(BIN)/python benchmarks/peers.py
 
 docs: $(VENV)/.installed-docs
@@ -94,17 +96,17 @@ $(VENV)/.made $(LOWEST)/uv/.made $(TORCH_VENV)/.made:
 
 $(VENV)/.installed: $(VENV)/.made pyproject.toml
 	@echo "installing foveasim into $(VENV) (a minute or so)"
-	$(BIN)/python -m pip install --quiet --editable '.[view]'
+	$(BIN)/python $(INSTALL) --editable '.[view]'
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.made pyproject.toml
 	@echo "installing foveasim and its development tools into $(VENV) (a minute or so)"
-	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	$(BIN)/python $(INSTALL) --editable '.[dev]'
 	touch $@ $(VENV)/.installed
 
 $(VENV)/.installed-docs: $(VENV)/.made pyproject.toml
 	@echo "installing foveasim and its documentation tools into $(VENV) (a minute or so)"
-	$(BIN)/python -m pip install --quiet --editable '.[docs]'
+	$(BIN)/python $(INSTALL) --editable '.[docs]'
 	touch $@ $(VENV)/.installed-dev $(VENV)/.installed
 
 # Pins the oldest build backend, too, since uv selects the newest.
@@ -120,5 +122,5 @@ $(LOWEST)/.installed: $(LOWEST)/uv/.made pyproject.toml
 
 $(TORCH_VENV)/.installed: $(TORCH_VENV)/.made pyproject.toml
 	@echo "installing foveasim and PyTorch into $(TORCH_VENV) (minutes with CUDA)"
-	$(TORCH_VENV)/bin/python -m pip install --quiet --editable '.[explore,layout,learn]' hypothesis ipykernel nbclient pytest pytest-timeout pytest-xdist
+	$(TORCH_VENV)/bin/python $(INSTALL) --editable '.[explore,layout,learn]' hypothesis ipykernel nbclient pytest pytest-timeout pytest-xdist
 	touch $@
