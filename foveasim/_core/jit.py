@@ -290,9 +290,10 @@ def _compile(function: Callable[..., Any], signature: Any, options: dict[str, An
 @contextmanager
 def _no_garbage_collection() -> Iterator[None]:
     """
-    Disable the collector of cyclic garbage, which finds none during a compilation, but takes an eighth of its time.
+    Pause the collector of cyclic garbage.
 
-    The caller holds the lock, so that no other kernel enables it.
+    It finds little during a compilation, and takes an eighth of its time. The caller holds the lock, so that no other kernel
+    enables it.
     """
     if not gc.isenabled():
         yield

@@ -196,7 +196,7 @@ class Transform:
         return ((cycles + self._aliases) / self._pitch_um).astype(self._real), gain.astype(self._real)
 
     def _gain(self, cycles: Floats, aliases: Ints) -> Floats:
-        """Return the factor of cells and source pixels along one axis, (n_alias, n), for aliases (n_alias, 1)."""
+        """Return the factor of cells and source pixels for aliases (n_alias, 1), (n_alias, n)."""
         f = cycles + aliases
         sign = np.where(self._is_alternating & (aliases % 2 == 1), -1.0, 1.0)
         return sign * np.sinc(f) * np.sinc(self._source_cells * f)

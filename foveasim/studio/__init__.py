@@ -17,11 +17,11 @@ import threading
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
+from typing import Annotated
 
-from foveasim._core.calls import publish
+from foveasim._core.calls import PORT, publish
 from foveasim._core.extras import import_optional
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import check_count
 from foveasim.config import check_directory
 from foveasim.errors import FileError, FoveasimWarning, ParameterError
 
@@ -40,7 +40,7 @@ def run_studio(
     *,
     out: str | Path | None = None,
     host: str = "127.0.0.1",
-    port: int = 0,
+    port: Annotated[int, PORT] = 0,
     open_browser: bool = True,
     announce: Callable[[str, bool], None] | None = None,
 ) -> None:
@@ -91,7 +91,6 @@ def run_studio(
 
     if not host:  # a socket would listen at all addresses
         raise ParameterError("host", "must be an address of this computer", host)
-    port = check_count("port", port, at_least=0, at_most=2**16 - 1)
     token = _own_token()
     directory = None if out is None else _writable(out)
     settings, name = start_settings(shot)

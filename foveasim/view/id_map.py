@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import Limits
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import parallel_map, thread_count
-from foveasim._core.validation import Floats, check_count, check_shape, finite_array, read_only, unmasked
+from foveasim._core.validation import Floats, check_shape, finite_array, read_only, unmasked
 from foveasim.errors import ParameterError
 from foveasim.fields import PackedRings
 from foveasim.view.site_colours import BACKGROUND, Rgb, decode_light, encode_light
@@ -122,7 +124,7 @@ class SitePixels:
         shape: tuple[int, int],
         bounds_um: Sequence[float] | Floats | None = None,
         *,
-        n_samples: int = 3,
+        n_samples: Annotated[int, Limits(at_least=1, at_most=16)] = 3,
         n_threads: int | None = None,
     ) -> SitePixels:
         """
@@ -146,10 +148,9 @@ class SitePixels:
             As for :func:`id_map`.
         """
         n_y, n_x = check_shape("shape", shape)
-        n = check_count("n_samples", n_samples, at_most=16)
         bounds = validate_bounds(layout, bounds_um)
-        ids = id_map(layout, (n * n_y, n * n_x), bounds, n_threads=n_threads)
-        return cls(read_only(ids), bounds, n)
+        ids = id_map(layout, (n_samples * n_y, n_samples * n_x), bounds, n_threads=n_threads)
+        return cls(read_only(ids), bounds, n_samples)
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import LENGTH
 from foveasim._core.extras import import_optional
 from foveasim._core.provenance import to_plain_data
 from foveasim._core.rings import next_vertex, positions_in_runs
@@ -23,7 +24,6 @@ from foveasim._core.validation import (
     Floats,
     Ints,
     as_numbers,
-    check_length_um,
     finite_array,
     unit_of,
     unmasked,
@@ -207,7 +207,7 @@ def prisms(
     height: str | ArrayLike | None = None,
     *,
     by: str | ArrayLike | None = None,
-    max_height_um: float | None = None,
+    max_height_um: Annotated[float, LENGTH] | None = None,
     has_floor: bool = False,
 ) -> Mesh:
     """
@@ -255,11 +255,8 @@ def prisms(
     values = finite_array("height", shown.values if shown.values is not None else height, ndim=1, at_least=0.0)
     coloured = shown if by is None else colours_of(data, by)
     x_min, y_min, x_max, y_max = layout.bounds_um
-    max_height_um = (
-        MAX_HEIGHT_FRACTION * max(x_max - x_min, y_max - y_min)
-        if max_height_um is None
-        else check_length_um("max_height_um", max_height_um)
-    )
+    if max_height_um is None:
+        max_height_um = MAX_HEIGHT_FRACTION * max(x_max - x_min, y_max - y_min)
     max_value = float(values.max())
     heights_um = values * (max_height_um / max_value if max_value > 0.0 else 0.0)
     points_um, triangles, photosite = extrude(layout, triangulate(layout), 0.0, heights_um, has_floor=has_floor)

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.calls import FINITE, POSITIVE, Limits, check_declared
 from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import Floats, check_choice, check_count, check_shape, finite_array
+from foveasim._core.validation import Floats, check_count, check_shape, finite_array
 from foveasim._io.images import write_picture
 from foveasim.capture import Capture
 from foveasim.errors import FoveasimWarning, GeometryError, ParameterError, SimulationError
@@ -142,7 +142,7 @@ def render(
     *,
     viewpoint: Viewpoint | None = None,
     size_px: tuple[int, int] = (1600, 1000),
-    oversampling: int | None = None,
+    oversampling: Annotated[int, Limits(at_least=1, at_most=8)] | None = None,
     ambient_occlusion: bool = False,
     background: tuple[int, int, int] = BACKGROUND,
     renderer: Literal["auto", "pyvista", "software"] = "auto",
@@ -192,10 +192,8 @@ def render(
     """
     meshes = _meshes(scene)
     legend = isinstance(scene, Layout | Capture) if legend is None else legend
-    check_choice("renderer", renderer, ("auto", "pyvista", "software"))
     if oversampling is None:
         oversampling = 2 if sum(mesh.triangles.shape[0] for mesh in meshes) <= MAX_OVERSAMPLED_TRIANGLES else 1
-    oversampling = check_count("oversampling", oversampling, at_most=8)
     total_x, n_y = _size(size_px, oversampling)
     shown = next((mesh.shown for mesh in meshes if mesh.shown is not None), None) if legend else None
     texts = [_part_text(mesh) for mesh in meshes] if labels else []

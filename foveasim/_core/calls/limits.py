@@ -37,6 +37,7 @@ __all__ = [
     "FRACTION",
     "LENGTH",
     "NOT_NEGATIVE",
+    "PORT",
     "POSITIVE",
     "Converter",
     "Declaration",
@@ -191,6 +192,8 @@ FINITE = Limits()
 FRACTION = Limits(at_least=0.0, at_most=1.0)
 POSITIVE = Limits(above=0.0)
 NOT_NEGATIVE = Limits(at_least=0.0)
+#: Ports of this computer; 0 for a free one.
+PORT = Limits(at_least=0, at_most=2**16 - 1)
 #: Lengths on a sensor.
 LENGTH = Limits(above=0.0, at_least=MIN_LENGTH_UM, at_most=MAX_LENGTH_UM, hint="lengths on a sensor are in µm")
 

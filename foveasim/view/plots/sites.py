@@ -208,7 +208,6 @@ def plot_curves(
     -------
     matplotlib axes
     """
-    check_choice("logarithmic", logarithmic, ("", "x", "y", "xy"))
     ax = new_axes(7.0, 0.64) if ax is None else ax
     for name, (x, y) in curves.items():
         ax.plot(x, y, marker=marker, label=name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from foveasim._core.calls import publish
 from foveasim.view.web._page import check_page_path, web_page, write_web_page
 from foveasim.view.web._serve import open_page, serve_page
 from foveasim.view.web._solid_page import solid_page, write_solid_page
@@ -15,3 +16,5 @@ __all__ = [
     "write_solid_page",
     "write_web_page",
 ]
+
+publish(__name__)

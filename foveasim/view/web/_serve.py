@@ -8,8 +8,9 @@ import socket
 from collections.abc import Callable
 from http import HTTPStatus
 from pathlib import Path
+from typing import Annotated
 
-from foveasim._core.validation import check_count
+from foveasim._core.calls import PORT
 from foveasim.errors import ParameterError
 
 #: Loopback address: other computers cannot reach it.
@@ -26,7 +27,7 @@ MAX_REQUEST_BYTES = 16_384
 PIECE_BYTES = 65_536
 
 
-def serve_page(page: str, *, port: int = 0, announce: Callable[[str], None]) -> None:
+def serve_page(page: str, *, port: Annotated[int, PORT] = 0, announce: Callable[[str], None]) -> None:
     """
     Serve one page on localhost until the user stops it with Ctrl-C.
 
@@ -49,7 +50,6 @@ def serve_page(page: str, *, port: int = 0, announce: Callable[[str], None]) -> 
     Answers GET and HEAD of ``/``, one request per connection, in one thread. Requests with a ``Host`` other than this computer
     are rejected, which prevents DNS rebinding by other sites.
     """
-    port = check_count("port", port, at_least=0, at_most=2**16 - 1)
     try:
         listener = socket.create_server((HOST, port), backlog=MAX_CONNECTIONS)
     except OSError as error:
