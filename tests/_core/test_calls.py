@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import pickle
+import pkgutil
 import runpy
 from doctest import DocTestFinder
 from importlib import import_module
@@ -21,6 +22,14 @@ from foveasim.layout import LAYOUTS, layout_family
 from foveasim.layout.generators.grid import grid as grid_of_module
 
 MODULES = runpy.run_path(str(Path(__file__).parents[2] / "docs" / "conf.py"))["MODULES"]
+#: Packages inside the documented ones, from which their names can be imported, too.
+PACKAGES = [
+    item.name
+    for module in MODULES
+    if hasattr(import_module(module), "__path__") and module not in ("foveasim", "foveasim.learn")
+    for item in pkgutil.iter_modules(import_module(module).__path__, f"{module}.")
+    if item.ispkg and "._" not in item.name and hasattr(import_module(item.name), "__all__")
+]
 SITES = fs.layout.grid(3, 3, 2.0)
 GRID = r"grid\(n_x=None, n_y=None, pitch_um=None, \*, size_um=None, .*\)"
 
@@ -78,7 +87,7 @@ def test_variadic_arguments_accept_any_name():
 
 def public_functions():
     """Yield public functions, constructors and methods with their names."""
-    for name in MODULES:
+    for name in (*MODULES, *PACKAGES):
         module = import_module(name)
         for public in module.__all__:
             item = getattr(module, public)

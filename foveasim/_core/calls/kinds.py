@@ -211,6 +211,8 @@ def _single_kind(kind: Any) -> Kind | None:
         return _choice(arguments)
     if origin is np.ndarray or kind is np.ndarray:
         scalar = get_args(arguments[1])[0] if arguments else Any
+        if scalar is np.object_:
+            return _class("array of objects", lambda value: isinstance(value, np.ndarray))
         return _NUMBERS if isinstance(scalar, type) and issubclass(scalar, np.number | np.bool_) else _ARRAY
     if origin is tuple and Ellipsis not in arguments:
         return _fixed_sequence(arguments)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from foveasim._core.calls import publish
 from foveasim._core.registry import import_all
 from foveasim.layout.drc.measurements import RULES, Case, Measurement, Rule
 from foveasim.layout.drc.presets import PRESETS, Preset
@@ -30,3 +31,5 @@ __all__ = [
 ]
 
 import_all(__name__, __path__)
+
+publish(__name__)

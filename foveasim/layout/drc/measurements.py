@@ -99,7 +99,7 @@ class Case:
         is_mixed = (site < n) & (box >= n)
         return box[is_mixed] - n, site[is_mixed]
 
-    def sites_at(self, geometries: NDArray[Any], among: Bools, reach_um: float = 0.0) -> tuple[Ints, Ints]:
+    def sites_at(self, geometries: NDArray[np.object_], among: Bools, reach_um: float = 0.0) -> tuple[Ints, Ints]:
         """
         Return pairs (geometry, site) that are at most ``reach_um`` apart.
 

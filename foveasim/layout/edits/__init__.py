@@ -7,6 +7,7 @@ shapely polygons or vertices in µm. Edits are registered in :data:`EDITS`; sett
 
 from __future__ import annotations
 
+from foveasim._core.calls import publish
 from foveasim.layout.edit_registry import EDITS, layout_edit
 from foveasim.layout.edits.all_sites import (
     clip,
@@ -66,3 +67,5 @@ for _edit, _example in (
     (Layout.scale, {"factor": 2.0}),
 ):
     layout_edit(example=_example)(_edit)
+
+publish(__name__)

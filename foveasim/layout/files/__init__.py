@@ -22,7 +22,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from foveasim._core.calls import OwnCheck
+from foveasim._core.calls import OwnCheck, publish
 from foveasim._core.registry import import_all
 from foveasim._io.formats import FileFormat, as_file_error, detect_format, select_writer, validate_options
 from foveasim.errors import FileError, FoveasimError
@@ -216,3 +216,6 @@ def write_layout(
         layout, path, **validate_options(given, found.write_options, FORMATS, "write_options")
     )
     return written
+
+
+publish(__name__)

@@ -17,6 +17,7 @@ returns a :class:`Cube`.
 
 from __future__ import annotations
 
+from foveasim._core.calls import publish
 from foveasim._core.registry import import_all
 from foveasim.scene.cubes._cube import Cube, Quantity
 from foveasim.scene.cubes._formats import CUBE_FORMATS, read_cube
@@ -36,3 +37,5 @@ __all__ = [
 ]
 
 import_all(__name__, __path__)
+
+publish(__name__)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from foveasim._core.calls import publish
 from foveasim._core.registry import import_all
 from foveasim.sensor.spectral.curves import (
     CURVES,
@@ -40,3 +41,5 @@ __all__ = [
 ]
 
 import_all(__name__, __path__)
+
+publish(__name__)

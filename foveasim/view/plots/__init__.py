@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from foveasim._core.calls import publish
 from foveasim.view.plots.figures import hidden_figures
 from foveasim.view.plots.rasters import plot_cortical, plot_image, plot_picture, plot_power_map, plot_scene
 from foveasim.view.plots.rules import plot_report
@@ -29,3 +30,5 @@ __all__ = [
     "save_drawing",
     "save_figure",
 ]
+
+publish(__name__)
