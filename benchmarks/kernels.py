@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from report import Report, best_s
 
-SOURCE = Path(__file__).with_name("gather.c")
+SOURCE = Path(__file__).with_name("kernels.c")
 #: Without contraction to fused multiplications, whose rounding differs.
 FLAGS = ("-O3", "-march=native", "-ffp-contract=off", "-shared", "-fPIC")
 #: Width of the photosites, in cells.
@@ -39,7 +39,7 @@ def bench_kernels(report: Report, n_cells: int) -> None:
     from foveasim.integrate import _rectangle_kernels as ours
 
     with tempfile.TemporaryDirectory() as directory:
-        path = Path(directory) / "gather.so"
+        path = Path(directory) / "kernels.so"
         subprocess.run([compiler, *FLAGS, "-o", str(path), str(SOURCE), "-lm"], check=True)
         theirs = ctypes.CDLL(str(path))
     size, number = ctypes.c_int64, ctypes.c_double

@@ -630,16 +630,56 @@ def sort_cuts(cuts, moments, next_cut, first_slot, rows_per_band, out_cuts, out_
 
 
 @njit()
-def _add_gradients(cells, row, row_cuts, cuts, moments, slots):
-    """Add moment x gradient over the cuts of a row to the slots."""
-    n_y, n_x = cells.shape
-    line, below, above = cells[row], cells[max(row - 1, 0)], cells[min(row + 1, n_y - 1)]
-    for i in range(row_cuts[row], row_cuts[row + 1]):
-        c = cuts[i, COLUMN]
+def _add_gradients(cells, row, cuts, first, last, moments, slots):
+    """Add moment x gradient over the cuts ``first`` to ``last - 1`` of a row to the slots, from unsigned indices."""
+    n_y, n_x = np.uintp(cells.shape[0]), np.uintp(cells.shape[1])
+    below, above = row - ONE if row > ZERO else row, row + ONE if row + ONE < n_y else row
+    for i in range(first, last):
+        c = np.uintp(cuts[i, COLUMN])
+        before, after = c - ONE if c > ZERO else c, c + ONE if c + ONE < n_x else c
         # numpy's type: ``float`` of a float32 is a float32 in numba.
-        along_u = np.float64(line[min(c + 1, n_x - 1)]) - np.float64(line[max(c - 1, 0)])
-        along_v = np.float64(above[c]) - np.float64(below[c])
-        slots[cuts[i, SITE]] += moments[i, 0] * along_u + moments[i, 1] * along_v
+        along_u = np.float64(cells[row, after]) - np.float64(cells[row, before])
+        along_v = np.float64(cells[above, c]) - np.float64(cells[below, c])
+        slots[np.uintp(cuts[i, SITE])] += moments[i, 0] * along_u + moments[i, 1] * along_v
+
+
+@njit()
+def _add_spans(cells, row, spans, first, last, weights, p, where, blocks, slots):
+    """Add weight x cell over the spans ``first`` to ``last - 1`` of a row to the slots, from unsigned indices."""
+    for b in range(np.uintp(blocks.size)):
+        total = 0.0
+        for k in range(EIGHT):
+            total += cells[row, b * EIGHT + k]
+        blocks[b] = total
+    is_chosen = where.size > 0
+    for i in range(first, last):
+        slot, column = np.uintp(spans[i, SITE]), np.uintp(spans[i, COLUMN])
+        n_partial, n_run = np.uintp(spans[i, N_PARTIAL]), np.uintp(spans[i, N_RUN])
+        if is_chosen and not where[slot]:
+            p += n_partial + (ONE if n_run > ZERO else ZERO)
+            continue
+        total = 0.0
+        for _ in range(n_partial):
+            total += weights[p] * cells[row, column]
+            p += ONE
+            column += ONE
+        if n_run > ZERO:
+            end = column + n_run
+            first_block, last_block = (column + SEVEN) // EIGHT, end // EIGHT
+            inside = 0.0
+            if last_block > first_block:
+                while column < first_block * EIGHT:
+                    inside += cells[row, column]
+                    column += ONE
+                for b in range(first_block, last_block):
+                    inside += blocks[b]
+                column = last_block * EIGHT
+            while column < end:
+                inside += cells[row, column]
+                column += ONE
+            total += weights[p] * inside
+            p += ONE
+        slots[slot] += total
 
 
 @njit(
@@ -659,50 +699,15 @@ def gather(cells, first_row, last_row, row_spans, row_weights, spans, weights, r
     The map is read in a single pass: each row is summed in blocks of ``BLOCK`` cells, which the runs of spans use. The four
     neighbours of a cell in ``cuts`` are read again for moment x gradient while they are in the processor cache.
     """
-    n_x = cells.shape[1]
-    blocks = np.empty(n_x // BLOCK + 1, np.float64)
+    blocks = np.empty(cells.shape[1] // BLOCK, np.float64)
     for row in range(first_row, last_row + 2):
         if row >= first_row + 2:  # both adjacent rows have been read
-            _add_gradients(cells, row - 2, row_cuts, cuts, moments, slots)
-        if row >= last_row or row_spans[row] == row_spans[row + 1]:
-            continue
-        line = cells[row]
-        for b in range(n_x // BLOCK):
-            total = 0.0
-            for k in range(BLOCK):
-                total += line[b * BLOCK + k]
-            blocks[b] = total
-        p = row_weights[row]
-        for i in range(row_spans[row], row_spans[row + 1]):
-            column = spans[i, COLUMN]
-            n_partial = spans[i, N_PARTIAL]
-            n_run = spans[i, N_RUN]
-            if where.size > 0 and not where[spans[i, SITE]]:
-                p += n_partial + (1 if n_run > 0 else 0)
-                continue
-            total = 0.0
-            for k in range(n_partial):
-                total += weights[p + k] * line[column + k]
-            p += n_partial
-            if n_run > 0:
-                column += n_partial
-                end = column + n_run
-                first_block = (column + BLOCK - 1) // BLOCK
-                last_block = end // BLOCK
-                inside = 0.0
-                if last_block > first_block:
-                    for k in range(column, first_block * BLOCK):
-                        inside += line[k]
-                    for b in range(first_block, last_block):
-                        inside += blocks[b]
-                    for k in range(last_block * BLOCK, end):
-                        inside += line[k]
-                else:
-                    for k in range(column, end):
-                        inside += line[k]
-                total += weights[p] * inside
-                p += 1
-            slots[spans[i, SITE]] += total
+            first, last = np.uintp(row_cuts[row - 2]), np.uintp(row_cuts[row - 1])
+            _add_gradients(cells, np.uintp(row - 2), cuts, first, last, moments, slots)
+        if row < last_row and row_spans[row] < row_spans[row + 1]:
+            first, last = np.uintp(row_spans[row]), np.uintp(row_spans[row + 1])
+            p = np.uintp(row_weights[row])
+            _add_spans(cells, np.uintp(row), spans, first, last, weights, p, where, blocks, slots)
 
 
 @njit(
