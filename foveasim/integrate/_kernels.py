@@ -24,10 +24,14 @@ is imported; the machine code is cached on disk.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import types
+from numpy.typing import NDArray
 
 from foveasim._core.jit import njit
+from foveasim._core.validation import Floats, Ints
 
 #: Columns of ``spans``. A finished plan is in the order of the rows and has no column ``ROW``; its first column is the index of
 #: the accumulator instead of the site.
@@ -465,7 +469,7 @@ def _clear_row(columns, n_touched, base, i_row, rows, cover, moment):
             moment[cell, 2] = 0.0
 
 
-def accumulators(n_y, n_x, order):
+def accumulators(n_y: int, n_x: int, order: int) -> tuple[NDArray[Any], ...]:
     """Return rows, cover, moment and touched of :func:`_add_edge` for a box of the largest size, and a list of columns."""
     n_rows, n_cells = min(BOX_CELLS, n_y), min(max(BOX_CELLS, n_x + 1), n_y * (n_x + 1))
     return (
@@ -613,7 +617,9 @@ def trace_rows(
     )
 
 
-def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
+def trace_sites(
+    uv: Floats, ring_offsets: Ints, site_offsets: Ints, first_site: int, n_y: int, n_x: int, order: int
+) -> tuple[NDArray[Any], ...]:
     """
     Return the spans of sites on a grid of ``n_y`` rows and ``n_x`` columns.
 
@@ -635,7 +641,7 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
     parts = []
     while progress[0] < n_sites:
         n_cuts = 16 * n_sites + n_x if order == 2 else 0
-        lists = (
+        lists: tuple[NDArray[Any], ...] = (
             np.empty((16 * n_sites + 2 * (n_x + 1), 5), np.int32),
             np.empty(64 * n_sites + MIN_RUN * (n_x + 1)),
             np.empty((n_cuts, 3), np.int32),

@@ -16,8 +16,10 @@ from __future__ import annotations
 
 import numpy as np
 from numba import types
+from numpy.typing import NDArray
 
 from foveasim._core.jit import njit
+from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.integrate._kernels import (
     BOX_CELLS,
     NO_COVERAGE,
@@ -286,7 +288,16 @@ def _integrate_sites(
         out[i_site] = scale * total
 
 
-def integrate_sites(cells, uv, ring_offsets, site_offsets, where, order, scale, out):
+def integrate_sites(
+    cells: NDArray[np.floating],
+    uv: Floats,
+    ring_offsets: Ints,
+    site_offsets: Ints,
+    where: Bools,
+    order: int,
+    scale: float,
+    out: Floats,
+) -> None:
     """
     Write scale x integral of sites, without spans.
 
