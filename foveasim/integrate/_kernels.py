@@ -94,7 +94,7 @@ def _set_bits(words, offset, first, last):
 
 @njit()
 def _touched_columns(touched, offset, n_words, columns):
-    """List the columns whose bits are set in the words from ``offset`` on, in ascending order, and clear the bits."""
+    """List the columns whose bits are set from ``offset`` on, ascending, and clear them."""
     n = ZERO
     for k in range(n_words):
         at = np.uintp(offset + k)
@@ -279,7 +279,7 @@ def _write_cuts(columns, n_touched, left, moment, base, rows, i_row, n_y, n_x, s
 
 @njit()
 def _sum_cells(cells, row, start, end):
-    """Return the sum of the cells ``start`` to ``end - 1`` of a row in float64, from unsigned indices."""
+    """Return the sum of the cells ``start`` to ``end - 1`` of a row, unsigned indices."""
     c = start
     total = 0.0
     if c + TWO_BLOCKS <= end:
@@ -470,7 +470,7 @@ def _clear_row(columns, n_touched, base, i_row, rows, cover, moment):
 
 
 def accumulators(n_y: int, n_x: int, order: int) -> tuple[NDArray[Any], ...]:
-    """Return rows, cover, moment and touched of :func:`_add_edge` for a box of the largest size, and a list of columns."""
+    """Return the arrays of :func:`_add_edge` for the largest box, and a list of columns."""
     n_rows, n_cells = min(BOX_CELLS, n_y), min(max(BOX_CELLS, n_x + 1), n_y * (n_x + 1))
     return (
         np.zeros((n_rows, 3)),
@@ -523,10 +523,10 @@ def trace_rows(
     progress,
 ):
     """
-    Append rows of sites to the lists of :func:`trace_sites`, until all are written or a further row may not fit.
+    Append rows of sites to lists, until all are written or a further row may not fit.
 
-    ``progress``: the site and the row with which a next call continues (-1: the first row), and the numbers of spans, weights
-    and cuts. The other arrays are those of :func:`accumulators`.
+    The lists are those of :func:`trace_sites`, the other arrays those of :func:`accumulators`. ``progress``: the site and the
+    row with which a next call continues (-1: the first row), and the numbers of spans, weights and cuts.
     """
     has_moments = moment.shape[0] > 0
     row, is_added = progress[1], progress[1] >= 0
@@ -702,7 +702,7 @@ def sort_cuts(cuts, moments, next_cut, first_slot, rows_per_band, out_cuts, out_
 
 @njit()
 def _add_gradients(cells, row, cuts, first, last, moments, slots):
-    """Add moment x gradient over the cuts ``first`` to ``last - 1`` of a row to the slots, from unsigned indices."""
+    """Add moment x gradient over cuts of a row to the slots, from unsigned indices."""
     n_y, n_x = np.uintp(cells.shape[0]), np.uintp(cells.shape[1])
     below, above = row - ONE if row > ZERO else row, row + ONE if row + ONE < n_y else row
     for i in range(first, last):
@@ -716,7 +716,7 @@ def _add_gradients(cells, row, cuts, first, last, moments, slots):
 
 @njit()
 def _add_spans(cells, row, spans, first, last, weights, p, where, blocks, slots):
-    """Add weight x cell over the spans ``first`` to ``last - 1`` of a row to the slots, from unsigned indices."""
+    """Add weight x cell over spans of a row to the slots, from unsigned indices."""
     for b in range(np.uintp(blocks.size)):
         total = 0.0
         for k in range(EIGHT):

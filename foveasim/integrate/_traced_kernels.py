@@ -101,7 +101,7 @@ def _sum_between(cells, row, start, stop):
 
 @njit()
 def _sum_gradients_v(cells, row, start, stop):
-    """Return the sum of the changes of the map along v from ``start`` to ``stop`` of a row, signed."""
+    """Return the sum of the changes of the map along v over cells of a row, signed."""
     n_y = cells.shape[0]
     above, below = (
         _sum_between(cells, min(row + 1, n_y - 1), start, stop),
