@@ -128,20 +128,19 @@ def fill_normals(key, batch, words, out):
         a, b, c, d = philox_4x32(key_0, key_1, counter & _LOW, counter >> _32, zero, _NORMALS)
         w0[j], w1[j], w2[j], w3[j] = np.uint32(a), np.uint32(b), np.uint32(c), np.uint32(d)
     # The first half of the words gives radii, the second half angles and signs.
-    x, y, angles = out[:_HALF], out[_HALF:], words[_HALF:].view(np.int32)
-    x_bits = x.view(np.int32)
+    x, y, angles = out[:_HALF], out[_HALF:], words[_HALF:]
     for j in range(_HALF):
         x[j] = np.float32(words[j]) * _ONE_IN_2_32 + _ONE_IN_2_33
     for j in range(_HALF):
-        bits = np.int32(x_bits[j] + (_ONE - _SQRT_HALF))
+        bits = np.int32(np.float32(x[j]).view(np.int32) + (_ONE - _SQRT_HALF))
         y[j] = np.float32(np.int32((bits >> _EXPONENT) - _BIAS))
-        x_bits[j] = (bits & _MANTISSA) + _SQRT_HALF
+        x[j] = np.int32((bits & _MANTISSA) + _SQRT_HALF).view(np.float32)
     for j in range(_HALF):
         # ln m = 2 artanh t, with the mantissa m between sqrt(1/2) and sqrt(2).
         t = (x[j] - _1) / (x[j] + _1)
         z = t * t
         radius = np.sqrt(-(y[j] * _LN_2 + t * (_L1 + z * (_L3 + z * (_L5 + z * (_L7 + z * _L9))))))
-        word = angles[j]
+        word = np.int32(angles[j])
         angle = np.float32(np.int32(word << np.int32(2))) * _QUARTER_PI_IN_2_31
         z = angle * angle
         sine = angle * (_1 + z * (_S3 + z * (_S5 + z * (_S7 + z * _S9))))

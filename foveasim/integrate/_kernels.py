@@ -24,10 +24,14 @@ is imported; the machine code is cached on disk.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import types
+from numpy.typing import NDArray
 
 from foveasim._core.jit import njit
+from foveasim._core.validation import Floats, Ints
 
 #: Columns of ``spans``. A finished plan is in the order of the rows and has no column ``ROW``; its first column is the index of
 #: the accumulator instead of the site.
@@ -46,7 +50,7 @@ MIN_RUN = 12
 #: pieces and increases in proportion to their number.
 NO_COVERAGE = 2e-15
 #: Largest number of cells of a box that are accumulated together; larger boxes are divided into strips of rows.
-BOX_CELLS = 2**16
+BOX_CELLS = 2**14
 #: Multiplication by this sequence maps a power of 2 to a unique value of 6 bits.
 DE_BRUIJN = np.uint64(0x03F79D71B4CB0A89)
 BIT_POSITIONS = np.zeros(64, np.int64)
@@ -85,37 +89,22 @@ def _set_bits(words, offset, first, last):
     ones = ~np.uint64(0)
     for k in range(first >> 6, (last >> 6) + 1):
         low, high = max(first - 64 * k, 0), min(last - 64 * k, 63)
-        words[offset + k] |= (ones >> np.uint64(63 - high + low)) << np.uint64(low)
+        words[np.uintp(offset + k)] |= (ones >> np.uint64(63 - high + low)) << np.uint64(low)
 
 
 @njit()
-def _touched_columns(touched, row, n_words, columns):
-    """List the columns of a row that edges touch, in ascending order, and clear their bits."""
-    n = 0
+def _touched_columns(touched, offset, n_words, columns):
+    """List the columns whose bits are set from ``offset`` on, ascending, and clear them."""
+    n = ZERO
     for k in range(n_words):
-        word = touched[row * n_words + k]
-        touched[row * n_words + k] = np.uint64(0)
-        while word != np.uint64(0):
+        at = np.uintp(offset + k)
+        word = touched[at]
+        touched[at] = ZERO
+        while word != ZERO:
             columns[n] = 64 * k + _lowest_bit(word)
-            n += 1
-            word &= word - np.uint64(1)
-    return n
-
-
-@njit()
-def _add_moments(moment, ua, ub, va, vb, height):
-    """
-    Add the moments of an edge piece of signed ``height`` from (ua, va) to (ub, vb).
-
-    Coordinates are relative to the cell centre. The three elements of ``moment`` are the moment along v of every cell to the
-    left, and the moments along u and along v of the area between the piece and the left boundary of the cell. The moment
-    along u of the cells to the left is 0.
-    """
-    u_mean, v_mean = 0.5 * (ua + ub), 0.5 * (va + vb)
-    spread = (ub - ua) / 12.0
-    moment[0] += height * v_mean
-    moment[1] += 0.5 * height * (u_mean * u_mean + (ub - ua) * spread - 0.25)
-    moment[2] += height * (v_mean * (u_mean + 0.5) + (vb - va) * spread)
+            n += ONE
+            word &= word - ONE
+    return np.int64(n)
 
 
 @njit()
@@ -126,7 +115,9 @@ def _add_edge(ua, va, ub, vb, n_x, bottom, top, left, n_columns, n_words, rows, 
     The box has the rows ``bottom`` to ``top - 1`` and ``n_columns`` columns from ``left`` on.
     ``cover[cell]`` is (height, area): the signed height of the edge pieces in the cell, and the area between them and the left
     boundary of the cell. ``rows[row]`` is (sum of the signed heights, sum of the unsigned heights, number of pieces). At second
-    order ``moment[cell]`` is as in :func:`_add_moments`. A bit of ``touched`` is set for each cell.
+    order ``moment[cell]`` is the moment along v of every cell to the left, and the moments along u and along v of the area
+    between the pieces and the left boundary of the cell, all about the centre of the cell; the moment along u of the cells to
+    the left is 0. A bit of ``touched`` is set for each cell.
     """
     sign = 1.0
     if va > vb:  # always upwards, so that adjacent sites split a shared edge at the same points
@@ -136,11 +127,11 @@ def _add_edge(ua, va, ub, vb, n_x, bottom, top, left, n_columns, n_words, rows, 
         return
     slope = (ub - ua) / (vb - va)
     steepness = (vb - va) / abs(ub - ua) if ub != ua else 0.0
-    if not np.isfinite(steepness):  # vertical up to rounding
+    if not steepness < np.inf:  # vertical up to rounding
         steepness = 0.0
     u_low, u_high = min(ua, ub), max(ua, ub)
     end = min(vb, float(top))
-    row = int(np.floor(max(va, float(bottom))))
+    row = int(max(va, float(bottom)))
     while row < end:
         low = max(va, float(row))
         high = min(vb, row + 1.0)
@@ -159,7 +150,7 @@ def _add_edge(ua, va, ub, vb, n_x, bottom, top, left, n_columns, n_words, rows, 
             climbed = (u - left_u) * steepness
             first = int(min(u, float(n_x)))
             column = first
-            cell = i_row * n_columns + first - left
+            cell = np.uintp(i_row * n_columns + first - left)
             before = climbed
             while True:
                 # An edge right of the map has every cell of the row on its left: it is assigned to column n_x.
@@ -171,43 +162,24 @@ def _add_edge(ua, va, ub, vb, n_x, bottom, top, left, n_columns, n_words, rows, 
                 if column < n_x:
                     cover[cell, 1] += piece * (0.5 * (u + u_next) - column)
                 if moment.shape[0] > 0:
-                    centre = column + 0.5
-                    v, v_next = v_left + direction * climbed, v_left + direction * height
-                    _add_moments(moment[cell], u - centre, u_next - centre, v, v_next, piece)
+                    u_a, u_b = u - (column + 0.5), u_next - (column + 0.5)
+                    v_a, v_b = v_left + direction * climbed, v_left + direction * height
+                    u_mean, v_mean, spread = 0.5 * (u_a + u_b), 0.5 * (v_a + v_b), (u_b - u_a) / 12.0
+                    moment[cell, 0] += piece * v_mean
+                    moment[cell, 1] += 0.5 * piece * (u_mean * u_mean + (u_b - u_a) * spread - 0.25)
+                    moment[cell, 2] += piece * (v_mean * (u_mean + 0.5) + (v_b - v_a) * spread)
                 if is_last:
                     break
                 u = u_next
                 climbed = height
                 column += 1
-                cell += 1
-            rows[i_row, 0] += sign * (rise - before)
-            rows[i_row, 1] += rise
-            rows[i_row, 2] += column - first + 1
+                cell += ONE
+            k = np.uintp(i_row)
+            rows[k, 0] += sign * (rise - before)
+            rows[k, 1] += rise
+            rows[k, 2] += column - first + 1
             _set_bits(touched, i_row * n_words, first - left, column - left)
         row += 1
-
-
-@njit(allocates=True)
-def _grow(array, n_used, n_more):
-    """Return the array, or a longer copy if ``n_more`` further numbers do not fit."""
-    if n_used + n_more <= array.size:
-        return array
-    longer = np.empty(2 * array.size + n_more, array.dtype)
-    for i in range(n_used):
-        longer[i] = array[i]
-    return longer
-
-
-@njit(allocates=True)
-def _grow_rows(array, n_used, n_more):
-    """Return the array, or a longer copy if ``n_more`` further rows do not fit."""
-    if n_used + n_more <= array.shape[0]:
-        return array
-    longer = np.empty((2 * array.shape[0] + n_more, array.shape[1]), array.dtype)
-    for i in range(n_used):
-        for k in range(array.shape[1]):
-            longer[i, k] = array[i, k]
-    return longer
 
 
 @njit()
@@ -224,45 +196,44 @@ def _write_row(columns, n_touched, left, cover, base, rows, i_row, n_x, site, ro
     covered = 0.0
     column = 0  # the next column to be written
     is_open = False  # whether the last span can be extended
-    for k in range(n_touched):
-        at = columns[k]
-        n_between = left + at - column
-        is_run = n_between >= MIN_RUN
-        for is_touched in (False, True):
-            if is_touched:
-                column = left + at
-                n_cells = 1 if column < n_x else 0
-                weight = cover[base + at, 1] + (winding - cover[base + at, 0])
-            else:
-                n_cells = n_between
-                weight = winding
+    i_span, i_weight = np.uintp(n_spans), np.uintp(n_weights)
+    for k in range(np.uintp(n_touched)):
+        at = left + columns[k]
+        cell = np.uintp(base + columns[k])
+        height = cover[cell, 0]
+        is_run = at - column >= MIN_RUN
+        n_cells, weight = at - column, winding
+        for part in range(2):  # the cells before the touched one; the touched one
+            if part == 1:
+                column = at
+                n_cells = 1 if at < n_x else 0
+                weight = cover[cell, 1] + (winding - height)
             if n_cells == 0:
                 continue
             if abs(weight) <= rounding:
                 is_open = False
                 continue
             if not is_open:
-                spans[n_spans, SITE] = site
-                spans[n_spans, ROW] = row
-                spans[n_spans, COLUMN] = column
-                spans[n_spans, N_PARTIAL] = 0
-                spans[n_spans, N_RUN] = 0
-                n_spans += 1
+                spans[i_span, SITE] = site
+                spans[i_span, ROW] = row
+                spans[i_span, COLUMN] = column
+                spans[i_span, N_PARTIAL] = 0
+                spans[i_span, N_RUN] = 0
+                i_span += ONE
             covered += weight * n_cells
-            if is_run and not is_touched:
-                spans[n_spans - 1, N_RUN] = n_cells
-                weights[n_weights] = weight
-                n_weights += 1
-                is_open = False
-            else:
-                spans[n_spans - 1, N_PARTIAL] += n_cells
+            is_open = part == 1 or not is_run
+            if is_open:
+                spans[i_span - ONE, N_PARTIAL] += n_cells
                 for _ in range(n_cells):
-                    weights[n_weights] = weight
-                    n_weights += 1
-                is_open = True
-        winding -= cover[base + at, 0]
-        column = left + at + 1
-    return n_spans, n_weights, covered
+                    weights[i_weight] = weight
+                    i_weight += ONE
+            else:
+                spans[i_span - ONE, N_RUN] = n_cells
+                weights[i_weight] = weight
+                i_weight += ONE
+        winding -= height
+        column = at + 1
+    return np.int64(i_span), np.int64(i_weight), covered
 
 
 @njit()
@@ -277,38 +248,39 @@ def _gradient_scale(index, n):
 def _write_cuts(columns, n_touched, left, moment, base, rows, i_row, n_y, n_x, site, row, cuts, moments, n_cuts):
     """Append the cuts of one row of one site; return their new number."""
     tilt = 0.0  # moment along v of the cells before the next touched cell
-    for k in range(n_touched):
-        tilt += moment[base + columns[k], 0]
+    for k in range(np.uintp(n_touched)):
+        tilt += moment[np.uintp(base + columns[k]), 0]
     rounding = _rounding(rows, i_row)
     column = 0  # the next column to be written
-    for k in range(n_touched):
-        at = columns[k]
-        cell = left + at
+    along_v = _gradient_scale(row, n_y)
+    i_cut = np.uintp(n_cuts)
+    for k in range(np.uintp(n_touched)):
+        at = left + columns[k]
+        cell = np.uintp(base + columns[k])
         if abs(tilt) <= rounding:
-            column = cell
-        for c in range(column, min(cell + 1, n_x)):
+            column = at
+        for c in range(column, min(at + 1, n_x)):
             u_moment, v_moment = 0.0, tilt
-            if c == cell:
-                u_moment, v_moment = moment[base + at, 1], moment[base + at, 2] + (tilt - moment[base + at, 0])
+            if c == at:
+                u_moment, v_moment = moment[cell, 1], moment[cell, 2] + (tilt - moment[cell, 0])
             u_moment = u_moment if abs(u_moment) > rounding else 0.0
             v_moment = v_moment if abs(v_moment) > rounding else 0.0
             if u_moment != 0.0 or v_moment != 0.0:
-                cuts[n_cuts, SITE] = site
-                cuts[n_cuts, CUT_ROW] = row
-                cuts[n_cuts, COLUMN] = c
-                moments[n_cuts, 0] = u_moment * _gradient_scale(c, n_x)
-                moments[n_cuts, 1] = v_moment * _gradient_scale(row, n_y)
-                n_cuts += 1
-        tilt -= moment[base + at, 0]
-        column = cell + 1
-    return n_cuts
+                cuts[i_cut, SITE] = site
+                cuts[i_cut, CUT_ROW] = row
+                cuts[i_cut, COLUMN] = c
+                moments[i_cut, 0] = u_moment * _gradient_scale(c, n_x)
+                moments[i_cut, 1] = v_moment * along_v
+                i_cut += ONE
+        tilt -= moment[cell, 0]
+        column = at + 1
+    return np.int64(i_cut)
 
 
 @njit()
-def _sum_cells(cells, row, start, stop):
-    """Return the sum of the cells ``start`` to ``stop - 1`` of a row in float64."""
-    # Signed indices would be checked for negative ones at each cell.
-    row, c, end = np.uintp(row), np.uintp(start), np.uintp(stop)
+def _sum_cells(cells, row, start, end):
+    """Return the sum of the cells ``start`` to ``end - 1`` of a row, unsigned indices."""
+    c = start
     total = 0.0
     if c + TWO_BLOCKS <= end:
         a0, a1, a2, a3, a4, a5, a6, a7 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -337,16 +309,17 @@ def _sum_row(columns, n_touched, left, cover, base, rows, i_row, cells, row):
     rounding = _rounding(rows, i_row)
     total = 0.0
     column = 0
-    for k in range(n_touched):
-        at = columns[k]
-        cell = left + at
-        if cell > column and abs(winding) > rounding:
-            total += winding * _sum_cells(cells, row, column, cell)
-        weight = cover[base + at, 1] + (winding - cover[base + at, 0])
-        if cell < n_x and abs(weight) > rounding:
-            total += weight * cells[row, cell]
-        winding -= cover[base + at, 0]
-        column = cell + 1
+    for k in range(np.uintp(n_touched)):
+        at = left + columns[k]
+        cell = np.uintp(base + columns[k])
+        height = cover[cell, 0]
+        if at > column and abs(winding) > rounding:
+            total += winding * _sum_cells(cells, np.uintp(row), np.uintp(column), np.uintp(at))
+        weight = cover[cell, 1] + (winding - height)
+        if at < n_x and abs(weight) > rounding:
+            total += weight * cells[np.uintp(row), np.uintp(at)]
+        winding -= height
+        column = at + 1
     return total
 
 
@@ -354,28 +327,31 @@ def _sum_row(columns, n_touched, left, cover, base, rows, i_row, cells, row):
 def _sum_gradients(columns, n_touched, left, moment, base, rows, i_row, cells, row):
     """Return the sum of moment x gradient over one row of one site; as :func:`_write_cuts`."""
     n_y, n_x = cells.shape
-    below, above = max(row - 1, 0), min(row + 1, n_y - 1)
+    below, above = np.uintp(max(row - 1, 0)), np.uintp(min(row + 1, n_y - 1))
     along_v = _gradient_scale(row, n_y)
     tilt = 0.0
-    for k in range(n_touched):
-        tilt += moment[base + columns[k], 0]
+    for k in range(np.uintp(n_touched)):
+        tilt += moment[np.uintp(base + columns[k]), 0]
     rounding = _rounding(rows, i_row)
     total = 0.0
     column = 0
-    for k in range(n_touched):
-        at = columns[k]
-        cell = left + at
-        if cell > column and abs(tilt) > rounding:
-            total += along_v * tilt * (_sum_cells(cells, above, column, cell) - _sum_cells(cells, below, column, cell))
-        if cell < n_x:
-            u_moment, v_moment = moment[base + at, 1], moment[base + at, 2] + (tilt - moment[base + at, 0])
+    for k in range(np.uintp(n_touched)):
+        at = left + columns[k]
+        cell = np.uintp(base + columns[k])
+        if at > column and abs(tilt) > rounding:
+            start, end = np.uintp(column), np.uintp(at)
+            total += along_v * tilt * (_sum_cells(cells, above, start, end) - _sum_cells(cells, below, start, end))
+        if at < n_x:
+            u_moment, v_moment = moment[cell, 1], moment[cell, 2] + (tilt - moment[cell, 0])
             if abs(u_moment) > rounding:
-                step = np.float64(cells[row, min(cell + 1, n_x - 1)]) - np.float64(cells[row, max(cell - 1, 0)])
-                total += _gradient_scale(cell, n_x) * u_moment * step
+                before, after = np.uintp(max(at - 1, 0)), np.uintp(min(at + 1, n_x - 1))
+                step = np.float64(cells[np.uintp(row), after]) - np.float64(cells[np.uintp(row), before])
+                total += _gradient_scale(at, n_x) * u_moment * step
             if abs(v_moment) > rounding:
-                total += along_v * v_moment * (np.float64(cells[above, cell]) - np.float64(cells[below, cell]))
-        tilt -= moment[base + at, 0]
-        column = cell + 1
+                c = np.uintp(at)
+                total += along_v * v_moment * (np.float64(cells[above, c]) - np.float64(cells[below, c]))
+        tilt -= moment[cell, 0]
+        column = at + 1
     return total
 
 
@@ -478,13 +454,13 @@ def _add_rings(
 
 
 @njit()
-def _clear_row(columns, n_touched, i_row, n_columns, rows, cover, moment):
+def _clear_row(columns, n_touched, base, i_row, rows, cover, moment):
     """Set the accumulators of a row to 0."""
     rows[i_row, 0] = 0.0
     rows[i_row, 1] = 0.0
     rows[i_row, 2] = 0.0
-    for k in range(n_touched):
-        cell = i_row * n_columns + columns[k]
+    for k in range(np.uintp(n_touched)):
+        cell = np.uintp(base + columns[k])
         cover[cell, 0] = 0.0
         cover[cell, 1] = 0.0
         if moment.shape[0] > 0:
@@ -493,12 +469,157 @@ def _clear_row(columns, n_touched, i_row, n_columns, rows, cover, moment):
             moment[cell, 2] = 0.0
 
 
+def accumulators(n_y: int, n_x: int, order: int) -> tuple[NDArray[Any], ...]:
+    """Return the arrays of :func:`_add_edge` for the largest box, and a list of columns."""
+    n_rows, n_cells = min(BOX_CELLS, n_y), min(max(BOX_CELLS, n_x + 1), n_y * (n_x + 1))
+    return (
+        np.zeros((n_rows, 3)),
+        np.zeros((n_cells, 2)),
+        np.zeros((n_cells if order == 2 else 0, 3)),
+        np.zeros(n_rows + n_cells // 64 + 1, np.uint64),
+        np.empty(n_x + 1, np.int64),
+    )
+
+
 @njit(
-    types.Tuple((_span_list, _float_list, _cut_list, _moment_list, _float_list))(
-        _points, _ints, _ints, _count, _count, _count, _count
+    types.void(
+        _points,
+        _ints,
+        _ints,
+        _count,
+        _count,
+        _count,
+        _moment_list,
+        _moment_list,
+        _moment_list,
+        types.uint64[::1],
+        _int_list,
+        _float_list,
+        _span_list,
+        _float_list,
+        _cut_list,
+        _moment_list,
+        _int_list,
     ),
+    allocates=False,
 )
-def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
+def trace_rows(
+    uv,
+    ring_offsets,
+    site_offsets,
+    first_site,
+    n_y,
+    n_x,
+    rows,
+    cover,
+    moment,
+    touched,
+    columns,
+    covered,
+    spans,
+    weights,
+    cuts,
+    moments,
+    progress,
+):
+    """
+    Append rows of sites to lists, until all are written or a further row may not fit.
+
+    The lists are those of :func:`trace_sites`, the other arrays those of :func:`accumulators`. ``progress``: the site and the
+    row with which a next call continues (-1: the first row), and the numbers of spans, weights and cuts.
+    """
+    has_moments = moment.shape[0] > 0
+    row, is_added = progress[1], progress[1] >= 0
+    n_spans, n_weights, n_cuts = np.int64(0), np.int64(0), np.int64(0)  # a literal 0 would be a further type
+    for i_site in range(progress[0], site_offsets.size - 1):
+        first_ring, last_ring = site_offsets[i_site], site_offsets[i_site + 1]
+        first_row, last_row, left, n_columns = _box(uv, ring_offsets[first_ring], ring_offsets[last_ring], n_y, n_x)
+        n_words = (n_columns + 63) >> 6
+        step = max(1, BOX_CELLS // max(n_columns, 1))
+        if not is_added:
+            row = first_row
+        while row < last_row:
+            bottom = first_row + (row - first_row) // step * step
+            top = min(bottom + step, last_row)
+            if not is_added:
+                _add_rings(
+                    uv,
+                    ring_offsets,
+                    first_ring,
+                    last_ring,
+                    n_x,
+                    bottom,
+                    top,
+                    left,
+                    n_columns,
+                    rows,
+                    cover,
+                    moment,
+                    touched,
+                )
+            is_added = False
+            while row < top:
+                # A touched cell adds at most two spans, its own weight, and one weight of a run or the weights of a short run.
+                is_full = n_spans + 2 * n_columns > spans.shape[0] or n_weights + MIN_RUN * n_columns > weights.size
+                if is_full or (has_moments and n_cuts + n_x > cuts.shape[0]):
+                    progress[0], progress[1], progress[2], progress[3], progress[4] = (
+                        i_site,
+                        row,
+                        n_spans,
+                        n_weights,
+                        n_cuts,
+                    )
+                    return
+                i_row, base = np.uintp(row - bottom), (row - bottom) * n_columns
+                n_touched = _touched_columns(touched, (row - bottom) * n_words, n_words, columns)
+                n_spans, n_weights, area = _write_row(
+                    columns,
+                    n_touched,
+                    left,
+                    cover,
+                    base,
+                    rows,
+                    i_row,
+                    n_x,
+                    first_site + i_site,
+                    row,
+                    spans,
+                    n_spans,
+                    weights,
+                    n_weights,
+                )
+                covered[i_site] += area
+                if has_moments:
+                    n_cuts = _write_cuts(
+                        columns,
+                        n_touched,
+                        left,
+                        moment,
+                        base,
+                        rows,
+                        i_row,
+                        n_y,
+                        n_x,
+                        first_site + i_site,
+                        row,
+                        cuts,
+                        moments,
+                        n_cuts,
+                    )
+                _clear_row(columns, n_touched, base, i_row, rows, cover, moment)
+                row += 1
+    progress[0], progress[1], progress[2], progress[3], progress[4] = (
+        site_offsets.size - 1,
+        -1,
+        n_spans,
+        n_weights,
+        n_cuts,
+    )
+
+
+def trace_sites(
+    uv: Floats, ring_offsets: Ints, site_offsets: Ints, first_site: int, n_y: int, n_x: int, order: int
+) -> tuple[NDArray[Any], ...]:
     """
     Return the spans of sites on a grid of ``n_y`` rows and ``n_x`` columns.
 
@@ -514,71 +635,21 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
     (n_site,) float64, cells: area of each site on the grid.
     """
     n_sites = site_offsets.size - 1
-    covered = np.zeros(n_sites, np.float64)
-    spans = np.empty((4 * n_sites + 64, 5), np.int32)
-    weights = np.empty(16 * n_sites + 64, np.float64)
-    has_moments = order == 2
-    cuts = np.empty((8 * n_sites + n_x if has_moments else 0, 3), np.int32)
-    moments = np.empty((cuts.shape[0], 2), np.float64)
-    n_spans, n_weights, n_cuts = np.int64(0), np.int64(0), np.int64(0)  # a literal 0 would be a further type
-    # Accumulators of a box of cells; all are 0 between boxes.
-    rows = np.zeros((64, 3))
-    cover = np.zeros((1024, 2))
-    moment = np.zeros((1024 if has_moments else 0, 3))
-    touched = np.zeros(64, np.uint64)
-    columns = np.empty(n_x + 1, np.int64)
-
-    for i_site in range(n_sites):
-        site = first_site + i_site
-        first_ring, last_ring = site_offsets[i_site], site_offsets[i_site + 1]
-        first_row, last_row, left, n_columns = _box(uv, ring_offsets[first_ring], ring_offsets[last_ring], n_y, n_x)
-        n_words = (n_columns + 63) >> 6
-        step = max(1, BOX_CELLS // max(n_columns, 1))
-        for bottom in range(first_row, last_row, step):
-            top = min(bottom + step, last_row)
-            if rows.shape[0] < top - bottom:
-                rows = np.zeros((2 * (top - bottom), 3))
-            if touched.size < (top - bottom) * n_words:
-                touched = np.zeros(2 * (top - bottom) * n_words, np.uint64)
-            if cover.shape[0] < (top - bottom) * n_columns:
-                cover = np.zeros((2 * (top - bottom) * n_columns, 2))
-                moment = np.zeros((cover.shape[0] if has_moments else 0, 3))
-            _add_rings(
-                uv, ring_offsets, first_ring, last_ring, n_x, bottom, top, left, n_columns, rows, cover, moment, touched
-            )
-            for row in range(bottom, top):
-                i_row = row - bottom
-                n_touched = _touched_columns(touched, i_row, n_words, columns)
-                base = i_row * n_columns
-                # A touched cell adds at most two spans, its own weight, and one weight of a run or the weights of a short run.
-                spans = _grow_rows(spans, n_spans, 2 * n_touched)
-                weights = _grow(weights, n_weights, MIN_RUN * n_touched)
-                n_spans, n_weights, area = _write_row(
-                    columns,
-                    n_touched,
-                    left,
-                    cover,
-                    base,
-                    rows,
-                    i_row,
-                    n_x,
-                    site,
-                    row,
-                    spans,
-                    n_spans,
-                    weights,
-                    n_weights,
-                )
-                covered[i_site] += area
-                if has_moments:
-                    if n_cuts + n_x > cuts.shape[0]:
-                        cuts = _grow_rows(cuts, n_cuts, n_x)
-                        moments = _grow_rows(moments, n_cuts, n_x)
-                    n_cuts = _write_cuts(
-                        columns, n_touched, left, moment, base, rows, i_row, n_y, n_x, site, row, cuts, moments, n_cuts
-                    )
-                _clear_row(columns, n_touched, i_row, n_columns, rows, cover, moment)
-    return spans[:n_spans].copy(), weights[:n_weights].copy(), cuts[:n_cuts], moments[:n_cuts], covered
+    covered = np.zeros(n_sites)
+    boxes = accumulators(n_y, n_x, order)
+    progress = np.array([0, -1, 0, 0, 0])
+    parts = []
+    while progress[0] < n_sites:
+        n_cuts = 16 * n_sites + n_x if order == 2 else 0
+        lists: tuple[NDArray[Any], ...] = (
+            np.empty((16 * n_sites + 2 * (n_x + 1), 5), np.int32),
+            np.empty(64 * n_sites + MIN_RUN * (n_x + 1)),
+            np.empty((n_cuts, 3), np.int32),
+            np.empty((n_cuts, 2)),
+        )
+        trace_rows(uv, ring_offsets, site_offsets, first_site, n_y, n_x, *boxes, covered, *lists, progress)
+        parts.append([array[:n] for array, n in zip(lists, progress[[2, 3, 4, 4]], strict=True)])
+    return *map(np.concatenate, zip(*parts, strict=True)), covered
 
 
 @njit(
@@ -630,16 +701,56 @@ def sort_cuts(cuts, moments, next_cut, first_slot, rows_per_band, out_cuts, out_
 
 
 @njit()
-def _add_gradients(cells, row, row_cuts, cuts, moments, slots):
-    """Add moment x gradient over the cuts of a row to the slots."""
-    n_y, n_x = cells.shape
-    line, below, above = cells[row], cells[max(row - 1, 0)], cells[min(row + 1, n_y - 1)]
-    for i in range(row_cuts[row], row_cuts[row + 1]):
-        c = cuts[i, COLUMN]
+def _add_gradients(cells, row, cuts, first, last, moments, slots):
+    """Add moment x gradient over cuts of a row to the slots, from unsigned indices."""
+    n_y, n_x = np.uintp(cells.shape[0]), np.uintp(cells.shape[1])
+    below, above = row - ONE if row > ZERO else row, row + ONE if row + ONE < n_y else row
+    for i in range(first, last):
+        c = np.uintp(cuts[i, COLUMN])
+        before, after = c - ONE if c > ZERO else c, c + ONE if c + ONE < n_x else c
         # numpy's type: ``float`` of a float32 is a float32 in numba.
-        along_u = np.float64(line[min(c + 1, n_x - 1)]) - np.float64(line[max(c - 1, 0)])
-        along_v = np.float64(above[c]) - np.float64(below[c])
-        slots[cuts[i, SITE]] += moments[i, 0] * along_u + moments[i, 1] * along_v
+        along_u = np.float64(cells[row, after]) - np.float64(cells[row, before])
+        along_v = np.float64(cells[above, c]) - np.float64(cells[below, c])
+        slots[np.uintp(cuts[i, SITE])] += moments[i, 0] * along_u + moments[i, 1] * along_v
+
+
+@njit()
+def _add_spans(cells, row, spans, first, last, weights, p, where, blocks, slots):
+    """Add weight x cell over spans of a row to the slots, from unsigned indices."""
+    for b in range(np.uintp(blocks.size)):
+        total = 0.0
+        for k in range(EIGHT):
+            total += cells[row, b * EIGHT + k]
+        blocks[b] = total
+    is_chosen = where.size > 0
+    for i in range(first, last):
+        slot, column = np.uintp(spans[i, SITE]), np.uintp(spans[i, COLUMN])
+        n_partial, n_run = np.uintp(spans[i, N_PARTIAL]), np.uintp(spans[i, N_RUN])
+        if is_chosen and not where[slot]:
+            p += n_partial + (ONE if n_run > ZERO else ZERO)
+            continue
+        total = 0.0
+        for _ in range(n_partial):
+            total += weights[p] * cells[row, column]
+            p += ONE
+            column += ONE
+        if n_run > ZERO:
+            end = column + n_run
+            first_block, last_block = (column + SEVEN) // EIGHT, end // EIGHT
+            inside = 0.0
+            if last_block > first_block:
+                while column < first_block * EIGHT:
+                    inside += cells[row, column]
+                    column += ONE
+                for b in range(first_block, last_block):
+                    inside += blocks[b]
+                column = last_block * EIGHT
+            while column < end:
+                inside += cells[row, column]
+                column += ONE
+            total += weights[p] * inside
+            p += ONE
+        slots[slot] += total
 
 
 @njit(
@@ -659,50 +770,15 @@ def gather(cells, first_row, last_row, row_spans, row_weights, spans, weights, r
     The map is read in a single pass: each row is summed in blocks of ``BLOCK`` cells, which the runs of spans use. The four
     neighbours of a cell in ``cuts`` are read again for moment x gradient while they are in the processor cache.
     """
-    n_x = cells.shape[1]
-    blocks = np.empty(n_x // BLOCK + 1, np.float64)
+    blocks = np.empty(cells.shape[1] // BLOCK, np.float64)
     for row in range(first_row, last_row + 2):
         if row >= first_row + 2:  # both adjacent rows have been read
-            _add_gradients(cells, row - 2, row_cuts, cuts, moments, slots)
-        if row >= last_row or row_spans[row] == row_spans[row + 1]:
-            continue
-        line = cells[row]
-        for b in range(n_x // BLOCK):
-            total = 0.0
-            for k in range(BLOCK):
-                total += line[b * BLOCK + k]
-            blocks[b] = total
-        p = row_weights[row]
-        for i in range(row_spans[row], row_spans[row + 1]):
-            column = spans[i, COLUMN]
-            n_partial = spans[i, N_PARTIAL]
-            n_run = spans[i, N_RUN]
-            if where.size > 0 and not where[spans[i, SITE]]:
-                p += n_partial + (1 if n_run > 0 else 0)
-                continue
-            total = 0.0
-            for k in range(n_partial):
-                total += weights[p + k] * line[column + k]
-            p += n_partial
-            if n_run > 0:
-                column += n_partial
-                end = column + n_run
-                first_block = (column + BLOCK - 1) // BLOCK
-                last_block = end // BLOCK
-                inside = 0.0
-                if last_block > first_block:
-                    for k in range(column, first_block * BLOCK):
-                        inside += line[k]
-                    for b in range(first_block, last_block):
-                        inside += blocks[b]
-                    for k in range(last_block * BLOCK, end):
-                        inside += line[k]
-                else:
-                    for k in range(column, end):
-                        inside += line[k]
-                total += weights[p] * inside
-                p += 1
-            slots[spans[i, SITE]] += total
+            first, last = np.uintp(row_cuts[row - 2]), np.uintp(row_cuts[row - 1])
+            _add_gradients(cells, np.uintp(row - 2), cuts, first, last, moments, slots)
+        if row < last_row and row_spans[row] < row_spans[row + 1]:
+            first, last = np.uintp(row_spans[row]), np.uintp(row_spans[row + 1])
+            p = np.uintp(row_weights[row])
+            _add_spans(cells, np.uintp(row), spans, first, last, weights, p, where, blocks, slots)
 
 
 @njit(

@@ -16,8 +16,10 @@ from __future__ import annotations
 
 import numpy as np
 from numba import types
+from numpy.typing import NDArray
 
 from foveasim._core.jit import njit
+from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.integrate._kernels import (
     BOX_CELLS,
     NO_COVERAGE,
@@ -29,10 +31,13 @@ from foveasim.integrate._kernels import (
     _sum_gradients,
     _sum_row,
     _touched_columns,
+    accumulators,
 )
 
 #: Cells of float32 in a cache line.
 LINE_CELLS = 16
+#: Larger boxes are not read ahead.
+PREFETCH_CELLS = 2**16
 #: A sum of cells that does not occur.
 NEVER = 1.2345678e300
 
@@ -72,35 +77,37 @@ def _ends(uv, start, stop):
 def _gradient_u(cells, row, column):
     """Return the change of the map per cell along u at a cell."""
     n_x = cells.shape[1]
-    after, before = np.float64(cells[row, min(column + 1, n_x - 1)]), np.float64(cells[row, max(column - 1, 0)])
-    return _gradient_scale(column, n_x) * (after - before)
+    before, after = np.uintp(max(column - 1, 0)), np.uintp(min(column + 1, n_x - 1))
+    row = np.uintp(row)
+    return _gradient_scale(column, n_x) * (np.float64(cells[row, after]) - np.float64(cells[row, before]))
 
 
 @njit()
 def _gradient_v(cells, row, column):
     """Return the change of the map per cell along v at a cell."""
     n_y = cells.shape[0]
-    above, below = np.float64(cells[min(row + 1, n_y - 1), column]), np.float64(cells[max(row - 1, 0), column])
-    return _gradient_scale(row, n_y) * (above - below)
+    below, above = np.uintp(max(row - 1, 0)), np.uintp(min(row + 1, n_y - 1))
+    column = np.uintp(column)
+    return _gradient_scale(row, n_y) * (np.float64(cells[above, column]) - np.float64(cells[below, column]))
+
+
+@njit()
+def _sum_between(cells, row, start, stop):
+    """Return the sum of the cells from ``start`` to ``stop`` of a row, signed."""
+    first, end = np.uintp(min(start, stop)), np.uintp(max(start, stop))
+    total = _sum_cells(cells, np.uintp(row), first, end)
+    return total if stop >= start else -total
 
 
 @njit()
 def _sum_gradients_v(cells, row, start, stop):
-    """Return the sum of the changes of the map along v, over the cells of a row."""
+    """Return the sum of the changes of the map along v over cells of a row, signed."""
     n_y = cells.shape[0]
     above, below = (
-        _sum_cells(cells, min(row + 1, n_y - 1), start, stop),
-        _sum_cells(cells, max(row - 1, 0), start, stop),
+        _sum_between(cells, min(row + 1, n_y - 1), start, stop),
+        _sum_between(cells, max(row - 1, 0), start, stop),
     )
     return _gradient_scale(row, n_y) * (above - below)
-
-
-@njit()
-def _between(sum_of, cells, row, start, stop):
-    """Return a sum from ``start`` to ``stop``, signed."""
-    if stop >= start:
-        return sum_of(cells, row, start, stop)
-    return -sum_of(cells, row, stop, start)
 
 
 @njit()
@@ -114,12 +121,14 @@ def _integrate_chain(cells, uv, start, stop, first, last, is_right, bottom, orde
     total = 0.0
     i = first
     while i != last:
-        ua, va = uv[i, 0], uv[i, 1]
+        k = np.uintp(i)
+        ua, va = uv[k, 0], uv[k, 1]
         if is_right:
             i = i + 1 if i + 1 < stop else start
         else:
             i = i - 1 if i > start else stop - 1
-        ub, vb = uv[i, 0], uv[i, 1]
+        k = np.uintp(i)
+        ub, vb = uv[k, 0], uv[k, 1]
         if va == vb:
             continue
         slope = (ub - ua) / (vb - va)
@@ -139,28 +148,29 @@ def _integrate_chain(cells, uv, start, stop, first, last, is_right, bottom, orde
                 v_first, v_last = v_last, v_first
             rise = high - low
             column = min(int(left_u), n_x - 1)
-            r = reference[row - bottom]
+            i_row = np.uintp(row - bottom)
+            r = reference[i_row]
             if not is_right:
                 new = min(int(right_u), n_x - 1) + 1
                 if low == row or va == uv[first, 1]:
                     r = new
                 elif new > r:  # the chain has been integrated from r up to here
                     below = low - max(uv[first, 1], float(row))
-                    total -= below * _sum_cells(cells, row, r, new)
+                    total -= below * _sum_between(cells, row, r, new)
                     if order == 2:
                         v_mean = 0.5 * (low + max(uv[first, 1], float(row))) - (row + 0.5)
                         total -= below * v_mean * _sum_gradients_v(cells, row, r, new)
                     r = new
-                reference[row - bottom] = r
-            before = _between(_sum_cells, cells, row, r, column)
+                reference[i_row] = r
+            before = _sum_between(cells, row, r, column)
             before_v = 0.0
             if order == 2:
                 v_mean = 0.5 * (v_first + v_last)
                 if v_mean != 0.0:
-                    total += rise * v_mean * _between(_sum_gradients_v, cells, row, r, column)
+                    total += rise * v_mean * _sum_gradients_v(cells, row, r, column)
             u, climbed = left_u, 0.0
             while True:
-                value = np.float64(cells[row, column])
+                value = np.float64(cells[np.uintp(row), np.uintp(column)])
                 is_last = right_u <= column + 1.0 or column == n_x - 1
                 u_next = right_u if is_last else column + 1.0
                 climbed_next = rise if is_last else (u_next - left_u) * steepness
@@ -215,25 +225,32 @@ def _is_within(uv, start, stop, n_y, n_x):
 
 @njit(
     [
-        types.void(_input(cell, 2), _points, _ints, _ints, _flags, types.int64, types.float64, types.float64[::1])
+        types.void(
+            _input(cell, 2),
+            _points,
+            _ints,
+            _ints,
+            _flags,
+            types.float64,
+            types.float64[:, ::1],
+            types.float64[:, ::1],
+            types.float64[:, ::1],
+            types.uint64[::1],
+            types.int64[::1],
+            types.int64[::1],
+            types.float64[::1],
+        )
         for cell in (types.float32, types.float64)
     ],
+    allocates=False,
 )
-def integrate_sites(cells, uv, ring_offsets, site_offsets, where, order, scale, out):
-    """
-    Write scale x integral of sites, without spans.
-
-    Sites where ``where`` is False are not computed; an empty array stands for all True. Outlines are traced as by
-    :func:`trace_sites`, and the cells of a row are summed as soon as it has been traced.
-    """
+def _integrate_sites(
+    cells, uv, ring_offsets, site_offsets, where, scale, rows, cover, moment, touched, columns, references, out
+):
+    """Write scale x integral of sites; see :func:`integrate_sites`."""
     n_y, n_x = cells.shape
-    has_moments = order == 2
-    rows = np.zeros((64, 3))
-    cover = np.zeros((1024, 2))
-    moment = np.zeros((1024 if has_moments else 0, 3))
-    touched = np.zeros(64, np.uint64)
-    columns = np.empty(n_x + 1, np.int64)
-    references = np.empty(64, np.int64)
+    has_moments = moment.shape[0] > 0
+    order = 2 if has_moments else 1
     for i_site in range(site_offsets.size - 1):
         if where.size > 0 and not where[i_site]:
             continue
@@ -246,33 +263,48 @@ def integrate_sites(cells, uv, ring_offsets, site_offsets, where, order, scale, 
         if last_row > first_row and last_ring - first_ring == 1 and _is_within(uv, start, stop, n_y, n_x):
             lowest, highest, is_monotone = _ends(uv, start, stop)
             if is_monotone:
-                if references.size < last_row - first_row:
-                    references = np.empty(2 * (last_row - first_row), np.int64)
-                if (last_row - first_row) * n_columns <= BOX_CELLS:
+                if (last_row - first_row) * n_columns <= PREFETCH_CELLS:
                     total += _prefetch(cells, first_row, last_row, left, min(left + n_columns, n_x))
-                total -= _integrate_chain(cells, uv, start, stop, lowest, highest, False, first_row, order, references)
-                total += _integrate_chain(cells, uv, start, stop, lowest, highest, True, first_row, order, references)
+                for side in range(2):  # a constant would be a further type
+                    along = _integrate_chain(
+                        cells, uv, start, stop, lowest, highest, side == 1, first_row, order, references
+                    )
+                    total += along if side == 1 else -along
                 out[i_site] = scale * total
                 continue
         for bottom in range(first_row, last_row, step):
             top = min(bottom + step, last_row)
-            if rows.shape[0] < top - bottom:
-                rows = np.zeros((2 * (top - bottom), 3))
-            if touched.size < (top - bottom) * n_words:
-                touched = np.zeros(2 * (top - bottom) * n_words, np.uint64)
-            if cover.shape[0] < (top - bottom) * n_columns:
-                cover = np.zeros((2 * (top - bottom) * n_columns, 2))
-                moment = np.zeros((cover.shape[0] if has_moments else 0, 3))
             total += _prefetch(cells, bottom, top, left, min(left + n_columns, n_x))
             _add_rings(
                 uv, ring_offsets, first_ring, last_ring, n_x, bottom, top, left, n_columns, rows, cover, moment, touched
             )
             for row in range(bottom, top):
-                i_row = row - bottom
-                n_touched = _touched_columns(touched, i_row, n_words, columns)
-                base = i_row * n_columns
+                i_row, base = np.uintp(row - bottom), (row - bottom) * n_columns
+                n_touched = _touched_columns(touched, (row - bottom) * n_words, n_words, columns)
                 total += _sum_row(columns, n_touched, left, cover, base, rows, i_row, cells, row)
                 if has_moments:
                     total += _sum_gradients(columns, n_touched, left, moment, base, rows, i_row, cells, row)
-                _clear_row(columns, n_touched, i_row, n_columns, rows, cover, moment)
+                _clear_row(columns, n_touched, base, i_row, rows, cover, moment)
         out[i_site] = scale * total
+
+
+def integrate_sites(
+    cells: NDArray[np.floating],
+    uv: Floats,
+    ring_offsets: Ints,
+    site_offsets: Ints,
+    where: Bools,
+    order: int,
+    scale: float,
+    out: Floats,
+) -> None:
+    """
+    Write scale x integral of sites, without spans.
+
+    Sites where ``where`` is False are not computed; an empty array stands for all True. Outlines are traced as by
+    :func:`trace_sites`, and the cells of a row are summed as soon as it has been traced.
+    """
+    n_y, n_x = cells.shape
+    references = np.empty(n_y, np.int64)
+    boxes = accumulators(n_y, n_x, order)
+    _integrate_sites(cells, uv, ring_offsets, site_offsets, where, scale, *boxes, references, out)

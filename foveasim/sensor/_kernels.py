@@ -37,8 +37,8 @@ MAX_DRAW_SIGMAS, MAX_DRAW_MARGIN_E = 12.0, 40
 RANGE_SIGMAS = 9.0
 #: Maximum number of nodes of a discrete charge distribution; smallest probability included; tolerance of integer charges.
 MAX_NODES, MIN_PROBABILITY, INTEGER_TOLERANCE = 2048, 1e-18, 1e-6
-#: Sites per pass through all readout steps: their buffers fit the L1 cache.
-PIECE = 1024
+#: Sites per pass of :func:`convert`: its buffers and the table of quantiles fit the L1 cache.
+PIECE = 512
 #: Bisections that determine a float64 to its last bit.
 BISECTIONS = 60
 SQRT_HALF, SQRT_TWO_PI = math.sqrt(0.5), math.sqrt(2.0 * math.pi)
@@ -196,12 +196,24 @@ def _index(position):
 
 
 @njit()
+def _interpolate(values, cell, fraction):
+    """Interpolate between two values linearly."""
+    return values[cell] + fraction * (values[cell + np.uint32(1)] - values[cell])
+
+
+@njit()
+def _inl_position(value, n_codes, inl):
+    """Return the fractional index into the INL for an unquantised code."""
+    # The number of codes is a power of 2: its inverse is exact.
+    return min(value * (1.0 / n_codes), 1.0) * (inl.size - 1)
+
+
+@njit()
 def _add_inl(value, n_codes, inl):
     """Add the integral nonlinearity to an unquantised code."""
-    # The number of codes is a power of 2: its inverse is exact.
-    position = min(value * (1.0 / n_codes), 1.0) * (inl.size - 1)
+    position = _inl_position(value, n_codes, inl)
     k = _index(min(position, inl.size - 2.0))
-    return value + (inl[k] + (position - k) * (inl[k + 1] - inl[k]))
+    return value + _interpolate(inl, k, position - k)
 
 
 @njit()
@@ -221,16 +233,11 @@ def _dnl_position(key, line, code, n_quantiles):
 
 
 @njit()
-def _interpolate(quantiles, position):
-    """Interpolate quantiles linearly."""
-    k = _index(position)
-    return quantiles[k] + (position - k) * (quantiles[k + 1] - quantiles[k])
-
-
-@njit()
 def _dnl_normal(key, line, code, quantiles):
     """Return the standard Gaussian DNL number of a readout line and a code."""
-    return _interpolate(quantiles, _dnl_position(key, line, code, quantiles.size))
+    position = _dnl_position(key, line, code, quantiles.size)
+    k = _index(position)
+    return _interpolate(quantiles, k, position - k)
 
 
 @njit()
@@ -302,8 +309,8 @@ def convert(voltage_v, line, adc, code):
     ``adc.dnl_dn`` is the standard deviation, in codes, of the Gaussian offset of each code transition in each readout line.
     """
     # One short loop per step over buffers that fit the cache. The compiler vectorises the loops because numpy's error model
-    # does not check divisions.
-    value, position = np.empty(PIECE), np.empty(PIECE)
+    # does not check divisions; those that look up a table, which it does not vectorise, do nothing else.
+    value, fraction, cell = np.empty(PIECE), np.empty(PIECE), np.empty(PIECE, np.uint32)
     n_codes, inl, dnl, quantiles = adc.n_codes, adc.inl, adc.dnl_dn, adc.quantiles
     log_range = math.log1p(adc.log_strength)
     for first in range(0, voltage_v.size, PIECE):
@@ -325,14 +332,22 @@ def convert(voltage_v, line, adc, code):
             value[j] *= n_codes
         if inl.size > 1:
             for j in range(n):
-                value[j] = _add_inl(value[j], n_codes, inl)
+                position = _inl_position(value[j], n_codes, inl)
+                cell[j] = _index(min(position, inl.size - 2.0))
+                fraction[j] = position - cell[j]
+            for j in range(n):
+                value[j] += _interpolate(inl, cell[j], fraction[j])
         for j in range(n):
             codes[j] = np.int32(_quantise(value[j], n_codes))
         if dnl > 0.0:
             for j in range(n):
-                position[j] = _dnl_position(adc.dnl_key, lines[j], codes[j], quantiles.size)
+                position = _dnl_position(adc.dnl_key, lines[j], codes[j], quantiles.size)
+                cell[j] = _index(position)
+                fraction[j] = position - cell[j]
             for j in range(n):
-                codes[j] = np.int32(_quantise(value[j] + dnl * _interpolate(quantiles, position[j]), n_codes))
+                value[j] += dnl * _interpolate(quantiles, cell[j], fraction[j])
+            for j in range(n):
+                codes[j] = np.int32(_quantise(value[j], n_codes))
 
 
 @njit()
