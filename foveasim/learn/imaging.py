@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from foveasim._core.names import possible_names
 from foveasim._core.validation import Floats, Ints
 from foveasim._io.mapped_files import in_memory
-from foveasim.errors import ParameterError, type_name
+from foveasim.errors import ParameterError
 from foveasim.fields import Grid, SceneLike
 from foveasim.learn._tensors import check_tensor, constant
 from foveasim.optics import Optics, PupilImage, Seidel, Zernike, zernike
@@ -74,10 +74,9 @@ class Imaging(nn.Module):
 
     Notes
     -----
-    Padding, and the sampling of the aperture, are those of the initial lens: start with aberrations of the size that
-    you expect,
-    or set ``padding_cells``. Variations of a lens whose initial OTF is that of the clear circle use the sampled aperture, whose
-    OTF is accurate to 7e-4.
+    Padding, and the sampling of the aperture, are those of the initial lens: start with aberrations of the size that you
+    expect, or set ``padding_cells``. Variations of a lens whose initial OTF is that of the clear circle use the sampled
+    aperture, whose OTF is accurate to 7e-4.
     """
 
     zernike: nn.Parameter
@@ -87,8 +86,6 @@ class Imaging(nn.Module):
 
     def __init__(self, optics: Optics, scene: SceneLike, wrt: Iterable[str] = ()) -> None:
         super().__init__()
-        if not isinstance(optics, Optics):
-            raise ParameterError("optics", f"must be an Optics, got {type_name(optics)}")
         if optics.lateral_colour is not None:
             raise ParameterError("optics", "must have no lateral chromatic aberration for gradients", optics)
         self.wrt: tuple[str, ...] = _check_variables("wrt", wrt, VARIABLES)

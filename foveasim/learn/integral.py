@@ -1,9 +1,8 @@
 """
 Integrals over sites as differentiable functions of the vertices and the maps.
 
-The operations form a closed set: the derivatives of integrals are moments along edges and the adjoint of the
-integrator, and the
-derivatives of these are again moments and integrals. All but the third derivatives therefore exist as code.
+The operations form a closed set: the derivatives of integrals are moments along edges and the adjoint of the integrator, and
+the derivatives of these are again moments and integrals. All but the third derivatives therefore exist as code.
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ import torch
 from torch import Tensor
 
 from foveasim._core.threads import thread_count
-from foveasim._core.validation import Floats, Ints, check_count
-from foveasim.errors import GeometryError, ParameterError, type_name
+from foveasim._core.validation import Floats, Ints
+from foveasim.errors import GeometryError
 from foveasim.fields import Grid
 from foveasim.integrate import EdgeMoments, Integrator
 from foveasim.learn._tensors import as_array, check_tensor
@@ -89,15 +88,10 @@ def site_power(
     """
     if isinstance(outlines, Mesh):
         outlines = outlines.outlines
-    if not isinstance(outlines, Outlines):
-        raise ParameterError("outlines", f"must be Outlines or a Mesh, got {type_name(outlines)}")
-    if not isinstance(grid, Grid):
-        raise ParameterError("grid", f"must be a Grid, got {type_name(grid)}")
     points = outlines.check_points(points)
     if not isinstance(maps, Tensor) or maps.ndim < 2:
         check_tensor("maps", maps, grid.shape, " or (..., n_y, n_x)")
     flat = check_tensor("maps", maps.reshape(-1, *maps.shape[-2:]), (None, *grid.shape), ", as the grid")
-    check_count("order", order, at_most=2)
     integral = Integral(outlines, grid, 2 if order == 2 else 1, thread_count(n_threads))
     return _SitePower.apply(points, flat, integral).reshape(*maps.shape[:-2], outlines.n_sites)  # type: ignore[no-any-return, no-untyped-call]
 

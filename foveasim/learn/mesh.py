@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from foveasim._core.validation import Bools, Floats, Ints, check_choice
+from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.layout import Layout
 from foveasim.learn._tensors import constant
 from foveasim.learn.outlines import Outlines
@@ -59,7 +59,6 @@ class Mesh(nn.Module):
 
     def __init__(self, layout: Layout, boundary: Literal["fixed", "sliding", "free"] = "fixed") -> None:
         super().__init__()
-        check_choice("boundary", boundary, ("fixed", "sliding", "free"))
         self.outlines: Outlines
         self.outlines, points_um = Outlines.from_layout(layout)
         point, direction = _degrees_of_freedom(self.outlines, points_um, boundary)
@@ -114,9 +113,8 @@ class Mesh(nn.Module):
         """
         Shorten the last step of an optimiser such that all outlines stay valid.
 
-        The step is the displacement since the previous call, or since the mesh was created. Only vertices of invalid
-        sites and their
-        coordinates are affected: their steps are halved until the sites are valid, and cancelled after 8 times.
+        The step is the displacement since the previous call, or since the mesh was created. Only vertices of invalid sites
+        and their coordinates are affected: their steps are halved until the sites are valid, and cancelled after 8 times.
 
         Returns
         -------

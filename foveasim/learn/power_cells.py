@@ -240,16 +240,10 @@ class _Corners:
     Mirror images of the centres across the four sides make the sides edges of the diagram, so that each corner is a point of
     equal power from three centres or images.
 
-    Attributes
-    ----------
-    centre, side : (n_point, 3) int64
-        Centres, and the sides across which their images lie; side 0 for the centre itself.
-    on_side : (n_point,) int64
-        Side on which a corner between two cells lies, otherwise 0; it depends on the first two centres only.
-    at : (n_point, 2) int64
-        Vertical and horizontal side of the corners of the region, otherwise 0.
-    vertex, ring_offsets : (n_vertex,), (n_site + 1,) int64
-        Corners of each cell, counter-clockwise.
+    ``centre``, ``side`` (n_point, 3): centres, and the sides across which their images lie; side 0 for the centre itself.
+    ``on_side`` (n_point,): side on which a corner between two cells lies, otherwise 0; it depends on the first two centres
+    only. ``at`` (n_point, 2): vertical and horizontal side of the corners of the region, otherwise 0. ``vertex`` (n_vertex,),
+    ``ring_offsets`` (n_site + 1,): corners of each cell, counter-clockwise.
     """
 
     def __init__(self, centre: Ints, side: Ints, cell: Ints, corner: Ints) -> None:

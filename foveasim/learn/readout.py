@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from foveasim._core.validation import check_choice
-from foveasim.errors import ParameterError, type_name
+from foveasim.errors import ParameterError
 from foveasim.learn._tensors import check_tensor, constant
 from foveasim.sensor import Sensor
 
@@ -43,8 +42,6 @@ class Readout:
     """
 
     def __init__(self, sensor: Sensor) -> None:
-        if not isinstance(sensor, Sensor):
-            raise ParameterError("sensor", f"must be a Sensor, got {type_name(sensor)}")
         self.sensor = sensor
         self._n_sites = sensor.layout.n_sites
         self._response = constant(np.broadcast_to(sensor.response, self._n_sites))
@@ -190,7 +187,6 @@ class Readout:
         (..., n_site) tensor, DN
             DNL is not included.
         """
-        check_choice("adc", adc, ("straight_through", "linear"))
         fraction = self.voltage(charge_e) / self.sensor.v_sat_v
         levels = constant(self.sensor.adc.transition_levels).to(fraction.dtype)
         n_codes = self.sensor.adc.n_codes
