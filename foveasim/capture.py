@@ -17,7 +17,7 @@ from foveasim._core.names import possible_names
 from foveasim._core.provenance import copy_plain_data, to_plain_data
 from foveasim._core.rings import same_rings
 from foveasim._core.show import Drawn, drawn
-from foveasim._core.validation import Floats, Ints, check_choice, check_count, own, read_only, unit_of, unmasked
+from foveasim._core.validation import Floats, Ints, check_count, own, read_only, unit_of, unmasked
 from foveasim._io.atomic import atomic_directory
 from foveasim._io.npz import open_archive, write_archive
 from foveasim._io.zarr_stores import ZARR, Variable, free_name, open_store, store_format, write_variables
@@ -53,6 +53,9 @@ __all__ = ["Capture"]
 
 FILE_FORMAT = "foveasim capture"
 FILE_VERSION = 1
+#: Functions of :mod:`foveasim.reconstruct`, and the values that they reconstruct.
+Method = Literal["cells", "linear", "natural", "least_squares"]
+Quantity = Literal["code", "electrons", "expected_e", "light_e"]
 #: Arrays of a capture file, in addition to those of the layout.
 ARRAYS = ("code", "electrons", "expected_e", "filter_of_site")
 #: Units of variables whose names do not end in one.
@@ -141,11 +144,11 @@ class Capture:
 
     def picture(
         self,
-        method: Literal["cells", "linear", "natural", "least_squares"] = "cells",
+        method: Method = "cells",
         *,
         max_pixels: int = 1024,
         grid: Grid | None = None,
-        of: Literal["code", "electrons", "expected_e", "light_e"] = "code",
+        of: Quantity = "code",
         per: Literal["site", "um2"] = "site",
         sensor: Sensor | None = None,
         **options: Any,
@@ -196,9 +199,6 @@ class Capture:
         it is scaled to a site of mean response. The ``variance`` is by default that of shot noise, and for codes also that
         of reset, read, RTS and quantisation noise.
         """
-        check_choice("method", method, ("cells", "linear", "natural", "least_squares"))
-        check_choice("of", of, ("code", "electrons", "expected_e", "light_e"))
-        check_choice("per", per, ("site", "um2"))
         known = {"n_threads"} | (
             {"mu", "blur", "tolerance", "max_steps", "variance"} if method == "least_squares" else set()
         )
@@ -244,7 +244,7 @@ class Capture:
     def cortical(
         self,
         *,
-        of: Literal["code", "electrons", "expected_e", "light_e"] = "code",
+        of: Quantity = "code",
         per: Literal["site", "um2"] = "site",
         n_rings: int | None = None,
         n_sectors: int | None = None,
@@ -285,8 +285,6 @@ class Capture:
         ParameterError
             When the layout does not have such rings and no shape is given, or as for :meth:`picture`.
         """
-        check_choice("of", of, ("code", "electrons", "expected_e", "light_e"))
-        check_choice("per", per, ("site", "um2"))
         self._check_sensor(sensor)
         if n_rings is None and n_sectors is None:
             for name, value in (("r_min_um", r_min_um), ("r_max_um", r_max_um), ("centre_um", centre_um)):
@@ -564,12 +562,10 @@ class Capture:
         if source.is_dir() or (source.suffix.lower() == ZARR and not source.exists()):
             return cls._load_store(source)
         with open_archive(source, "foveasim capture", FILE_FORMAT, FILE_VERSION) as (about, arrays):
+            values: dict[str, Any] = {name: arrays[name] for name in ARRAYS}
             return cls(
                 layout=layout_from_arrays(arrays, about["provenance"]),
-                code=arrays["code"],
-                electrons=arrays["electrons"],
-                expected_e=arrays["expected_e"],
-                filter_of_site=arrays["filter_of_site"],
+                **values,
                 filter_names=tuple(about["filter_names"]),
                 bits=int(about["bits"]),
                 white_dn=np.asarray(about["white_dn"], dtype=np.float64),

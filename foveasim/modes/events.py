@@ -6,16 +6,16 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.calls import OwnCheck
+from foveasim._core.calls import FINITE, POSITIVE, OwnCheck
 from foveasim._core.extras import import_optional
 from foveasim._core.provenance import to_plain_data
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import Floats, Ints, as_numbers, check_number, finite_array, own, read_only
+from foveasim._core.validation import Floats, Ints, as_numbers, finite_array, own, read_only
 from foveasim._io.atomic import atomic_write, check_free_space
 from foveasim._io.formats import as_file_error
 from foveasim._io.npz import open_archive, write_archive
@@ -39,6 +39,8 @@ MAX_COUNTS = 1 << 30
 #: Relative rounding error of distances between neighbours.
 ROUNDING = 1e-9
 POLARITIES = (1, -1)
+#: Pitch of a raster; None for the default.
+Pitch = Annotated[float | None, POSITIVE]
 ARRAYS = ("t_s", "site", "polarity")
 
 
@@ -70,8 +72,6 @@ class Events:
     layout: Layout
 
     def __post_init__(self) -> None:
-        if not isinstance(self.layout, Layout):
-            raise ParameterError("layout", f"must be a foveasim.Layout, got {type_name(self.layout)}")
         t_s, site, polarity = (as_numbers(name, getattr(self, name), keep_type=True) for name in ARRAYS)
         for name, values, kind in (
             ("t_s", t_s, np.float64),
@@ -151,9 +151,8 @@ class Events:
             raise ParameterError("polarity", "must be 1 or -1", polarity)
         return np.asarray(self.polarity == polarity)
 
-    def between(self, start_s: float, stop_s: float) -> Events:
+    def between(self, start_s: Annotated[float, FINITE], stop_s: Annotated[float, FINITE]) -> Events:
         """Return the events with ``start_s <= t_s < stop_s``."""
-        start_s, stop_s = check_number("start_s", start_s), check_number("stop_s", stop_s)
         part = slice(*np.searchsorted(self.t_s, (start_s, stop_s)))
         return Events(self.t_s[part], self.site[part], self.polarity[part], self.layout)
 
@@ -175,7 +174,7 @@ class Events:
         polarity: ArrayLike,
         layout: Layout,
         *,
-        pitch_um: float | None = None,
+        pitch_um: Pitch = None,
     ) -> Events:
         """
         Create events from column and row addresses: the inverse of :meth:`addresses`.
@@ -193,10 +192,6 @@ class Events:
             pixels.
         pitch_um : float, optional, µm
             As in :meth:`addresses`.
-
-        Returns
-        -------
-        Events
 
         Raises
         ------
@@ -226,7 +221,7 @@ class Events:
             raise ParameterError("layout", f"must have one site at each address (x, y), got {n} at {address}")
         return cls(t_s, order[first].astype(np.int32), polarity, layout)  # type: ignore[arg-type]
 
-    def addresses(self, pitch_um: float | None = None) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
+    def addresses(self, pitch_um: Pitch = None) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
         """
         Return column and row of every site on a raster, for tools that require pixel addresses.
 
@@ -258,7 +253,7 @@ class Events:
             )
         return addresses[0].astype(np.uint16), addresses[1].astype(np.uint16)
 
-    def to_structured_array(self, *, pitch_um: float | None = None) -> NDArray[Any]:
+    def to_structured_array(self, *, pitch_um: Pitch = None) -> NDArray[Any]:
         """
         Return the events as a structured array for event tools such as Tonic.
 
@@ -290,7 +285,7 @@ class Events:
         events["t"], events["p"] = _to_us(self.t_s), self.polarity > 0
         return events
 
-    def save(self, path: str | Path, *, pitch_um: float | None = None) -> None:
+    def save(self, path: str | Path, *, pitch_um: Pitch = None) -> None:
         """
         Write the events to a file atomically.
 
@@ -352,7 +347,7 @@ class Events:
             return cls(arrays["t_s"], arrays["site"], arrays["polarity"], layout)
 
 
-def write_events(batches: OwnCheck[Iterable[Events]], path: str | Path, *, pitch_um: float | None = None) -> int:
+def write_events(batches: OwnCheck[Iterable[Events]], path: str | Path, *, pitch_um: Pitch = None) -> int:
     """
     Write batches of events to an HDF5 file incrementally and atomically.
 
@@ -476,7 +471,6 @@ def _addresses_on_raster(layout: Layout, pitch_um: float | None) -> tuple[Ints, 
         nearest_um = float(distance_um[distance_um > 0.0].min(initial=np.inf))
         finest_um = float((high_um - low_um).max()) / MAX_ADDRESS
         pitch_um = max((1.0 - ROUNDING) * nearest_um, finest_um) if np.isfinite(nearest_um) else 1.0
-    pitch_um = check_number("pitch_um", pitch_um, above=0.0)
     column = np.floor((centroid_um[:, 0] - low_um[0]) / pitch_um + 0.5)
     row = np.floor((high_um[1] - centroid_um[:, 1]) / pitch_um + 0.5)
     if max(column.max(), row.max()) > MAX_ADDRESS:

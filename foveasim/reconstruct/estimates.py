@@ -7,15 +7,16 @@ Estimates use the nominal electronics of the sensor, without the deviations of a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats, finite_array
-from foveasim.errors import ParameterError
 from foveasim.sensor import Sensor, linearise
 from foveasim.sensor.limits import EXPOSURE
+from foveasim.sensor.per_site import check_per_site
 from foveasim.units import volts_to_electrons
 
 __all__ = ["SiteEstimates", "electrons_per_code", "estimate_from_charge", "estimate_from_code"]
@@ -49,7 +50,7 @@ def electrons_per_code(sensor: Sensor) -> Floats:
     return np.broadcast_to(step_e, (sensor.layout.n_sites,))
 
 
-def estimate_from_charge(charge_e: ArrayLike, sensor: Sensor, exposure_s: float) -> SiteEstimates:
+def estimate_from_charge(charge_e: ArrayLike, sensor: Sensor, exposure_s: Annotated[float, EXPOSURE]) -> SiteEstimates:
     """
     Estimate photoelectrons from charges before readout, with shot noise only.
 
@@ -59,14 +60,8 @@ def estimate_from_charge(charge_e: ArrayLike, sensor: Sensor, exposure_s: float)
     sensor : Sensor
         Nominal sensor: its fixed patterns are not used.
     exposure_s : float, s
-
-    Raises
-    ------
-    ParameterError
-        When a charge is not finite, there is not one charge per site of the sensor, or the exposure is negative.
     """
     charge = _per_site("charge_e", charge_e, sensor)
-    exposure_s = EXPOSURE.check("exposure_s", exposure_s)
     shot = sensor.shot
     _, variance_e2 = shot.moments(np.maximum(charge, 0.0), np.full(charge.size, float(shot.is_drawn)))
     return SiteEstimates(
@@ -76,7 +71,7 @@ def estimate_from_charge(charge_e: ArrayLike, sensor: Sensor, exposure_s: float)
     )
 
 
-def estimate_from_code(code: ArrayLike, sensor: Sensor, exposure_s: float) -> SiteEstimates:
+def estimate_from_code(code: ArrayLike, sensor: Sensor, exposure_s: Annotated[float, EXPOSURE]) -> SiteEstimates:
     """
     Estimate photoelectrons from codes.
 
@@ -87,11 +82,6 @@ def estimate_from_code(code: ArrayLike, sensor: Sensor, exposure_s: float) -> Si
     code : (n_site,), DN
     sensor, exposure_s
         As for :func:`estimate_from_charge`.
-
-    Raises
-    ------
-    ParameterError
-        When a code is out of the sensor's range, there is not one code per site, or the exposure is negative.
 
     Notes
     -----
@@ -116,9 +106,4 @@ def estimate_from_code(code: ArrayLike, sensor: Sensor, exposure_s: float) -> Si
 
 
 def _per_site(name: str, values: ArrayLike, sensor: Sensor) -> Floats:
-    found = finite_array(name, values, ndim=1)
-    if found.size != sensor.layout.n_sites:
-        raise ParameterError(
-            name, f"must have one value for each of the {sensor.layout.n_sites} sites, got {found.size}"
-        )
-    return found
+    return check_per_site(name, finite_array(name, values), sensor.layout.n_sites)

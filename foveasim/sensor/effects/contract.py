@@ -359,7 +359,6 @@ class Effect(ABC):
 
         None for effects with other distributions.
         """
-        _ = sites
         return None
 
 
@@ -384,7 +383,6 @@ class FixedFactor(_FixedPattern):
 
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
         """Return the values times the pattern."""
-        _ = rng
         values *= sites.pattern(self, self.pattern)
         return values
 
@@ -402,7 +400,6 @@ class FixedOffset(_FixedPattern):
 
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
         """Return the values plus the pattern."""
-        _ = rng
         values += sites.pattern(self, self.pattern)
         return values
 

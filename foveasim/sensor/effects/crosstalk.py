@@ -8,9 +8,10 @@ capacitance (IPC) mixes drawn charges: neighbours become correlated.
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,21 +19,16 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.calls import LENGTH, NOT_NEGATIVE, Declared, Limits, OwnCheck
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import (
-    Floats,
-    Ints,
-    as_numbers,
-    check_pitch_um,
-    finite_array,
-)
+from foveasim._core.validation import Floats, Ints, as_numbers, check_pitch_um, finite_array
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.sensor.blocks import for_each_block
-from foveasim.sensor.effects.contract import Effect, Sites, Stage
+from foveasim.sensor.effects.contract import Effect, Photosites, Sites, Stage
+from foveasim.sensor.per_site import check_per_site
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-__all__ = ["CrosstalkOperator", "Diffusion", "InterPixelCapacitance", "KernelCrosstalk", "Neighbourhood"]
+__all__ = ["CrosstalkOperator", "Diffusion", "InterPixelCapacitance", "KernelCrosstalk"]
 
 #: Maximum fraction of charge that a site loses in one step; larger fractions would make the exchange oscillate.
 MAX_STEP_FRACTION = 0.5
@@ -53,25 +49,6 @@ AREA_ROUNDING = 0.02
 POSITION_ROUNDING = 0.05
 #: Maximum difference between coordinates in the same row or column, relative to the side of a site.
 SAME_LINE = 0.02
-
-
-class Neighbourhood(Protocol):
-    """Protocol of photosite layouts for crosstalk, implemented by :class:`foveasim.Layout`."""
-
-    @property
-    def n_sites(self) -> int:
-        """Number of sites."""
-
-    @property
-    def area_um2(self) -> Floats:
-        """Area of each site, (n_site,) µm²."""
-
-    @property
-    def centroid_um(self) -> Floats:
-        """Centroid of each site, (n_site, 2) µm."""
-
-    def adjacency(self, *, max_gap_um: float | None = None) -> csr_array[Any]:
-        """Return the lengths of shared edges, (n_site, n_site) µm, symmetric, empty diagonal."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -110,11 +87,6 @@ class CrosstalkOperator:
         Returns
         -------
         charge_e : (..., n_site) float64, e-
-
-        Raises
-        ------
-        ParameterError
-            If the last dimension is not the number of sites.
 
         Notes
         -----
@@ -161,8 +133,6 @@ class CrosstalkOperator:
 
         Raises
         ------
-        ParameterError
-            If the last dimension is not the number of sites.
         SimulationError
             If the operator has several steps, as for diffusion, which mixes expectations rather than variances.
         """
@@ -181,13 +151,7 @@ class CrosstalkOperator:
         return self.matrix.power(2)
 
     def _per_site(self, name: str, values: ArrayLike) -> Floats:
-        array = as_numbers(name, values)
-        n_sites = self.matrix.shape[0]
-        if array.ndim == 0 or array.shape[-1] != n_sites:
-            raise ParameterError(
-                name, f"must have one value for each of the {n_sites} sites, got the shape {array.shape}"
-            )
-        return array
+        return check_per_site(name, as_numbers(name, values), self.matrix.shape[0], or_rows=True)
 
 
 class _Crosstalk(Declared, Effect):
@@ -196,9 +160,13 @@ class _Crosstalk(Declared, Effect):
     is_temporal: ClassVar[bool] = False
     is_local: ClassVar[bool] = False
 
+    @abstractmethod
+    def compile(self, layout: OwnCheck[Photosites]) -> CrosstalkOperator:
+        """Compile the crosstalk for a layout."""
+
     def compile_for(self, sites: Sites) -> CrosstalkOperator:
         """Return the operator for all sites of the layout."""
-        raise NotImplementedError
+        return self.compile(sites.layout)
 
     def _operator(self, sites: Sites) -> CrosstalkOperator:
         """Return the operator, which all devices share."""
@@ -206,7 +174,6 @@ class _Crosstalk(Declared, Effect):
 
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
         """Return the charges after crosstalk, (n_site,)."""
-        _ = rng
         return self._operator(sites).apply(values, n_threads=sites.n_threads)
 
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
@@ -271,13 +238,13 @@ class Diffusion(_Crosstalk):
     spread_um: Annotated[float, Limits(at_least=0.0, at_most=MAX_SPREAD_UM)]
     max_gap_um: Annotated[float | None, NOT_NEGATIVE] = None
 
-    def compile_for(self, sites: Sites) -> CrosstalkOperator:
-        """Return the operator for all sites of the layout."""
-        return self.compile(sites.layout)
-
     @classmethod
     def from_neighbour_fraction(
-        cls, neighbour_fraction: float, *, pitch_um: float, max_gap_um: float | None = None
+        cls,
+        neighbour_fraction: Annotated[float, NEIGHBOUR_FRACTION],
+        *,
+        pitch_um: Annotated[float, LENGTH],
+        max_gap_um: float | None = None,
     ) -> Diffusion:
         """
         Create the diffusion that corresponds to crosstalk measured on square pixels.
@@ -295,13 +262,13 @@ class Diffusion(_Crosstalk):
         """
         from scipy.optimize import brentq
 
-        fraction = NEIGHBOUR_FRACTION.check("neighbour_fraction", neighbour_fraction)
-        pitch_um = LENGTH.check("pitch_um", pitch_um)
         # Upper bracket: with a spread equal to the pitch a pixel loses far more than half.
-        steps = float(brentq(lambda s: 2.0 * float(_mean_square_steps(np.array(s))) - fraction, 0.0, 1.0, xtol=1e-15))
+        steps = float(
+            brentq(lambda s: 2.0 * float(_mean_square_steps(np.array(s))) - neighbour_fraction, 0.0, 1.0, xtol=1e-15)
+        )
         return cls(spread_um=steps * pitch_um, max_gap_um=max_gap_um)
 
-    def compile(self, layout: OwnCheck[Neighbourhood], *, shared_um: csr_array[Any] | None = None) -> CrosstalkOperator:
+    def compile(self, layout: OwnCheck[Photosites], *, shared_um: csr_array[Any] | None = None) -> CrosstalkOperator:
         """
         Compile the diffusion for a layout.
 
@@ -310,10 +277,6 @@ class Diffusion(_Crosstalk):
         layout : Layout
         shared_um : csr_array (n_site, n_site), optional, µm
             Precomputed lengths of shared edges; ``layout.adjacency()`` by default, which is most of the cost.
-
-        Returns
-        -------
-        CrosstalkOperator
 
         Raises
         ------
@@ -394,10 +357,6 @@ class KernelCrosstalk(_Crosstalk):
 
     __repr__ = short_repr
 
-    def compile_for(self, sites: Sites) -> CrosstalkOperator:
-        """Return the operator for all sites of the layout."""
-        return self.compile(sites.layout)
-
     def __post_init__(self) -> None:
         kernel = finite_array("kernel", self.kernel, ndim=2, at_least=0.0)
         if any(n % 2 == 0 for n in kernel.shape):
@@ -409,7 +368,7 @@ class KernelCrosstalk(_Crosstalk):
         if self.pitch_um is not None:
             object.__setattr__(self, "pitch_um", check_pitch_um("pitch_um", self.pitch_um))
 
-    def compile(self, layout: OwnCheck[Neighbourhood]) -> CrosstalkOperator:
+    def compile(self, layout: OwnCheck[Photosites]) -> CrosstalkOperator:
         """
         Compile the convolution for a layout of grid sites, in any order and with gaps.
 
@@ -417,14 +376,8 @@ class KernelCrosstalk(_Crosstalk):
         ----------
         layout : Layout
 
-        Returns
-        -------
-        CrosstalkOperator
-
         Raises
         ------
-        ParameterError
-            If the argument is not a layout.
         SimulationError
             If the sites are not part of a grid parallel to the axes.
         """
@@ -523,7 +476,7 @@ class InterPixelCapacitance(_Crosstalk):
 
     def compile(
         self,
-        layout: OwnCheck[Neighbourhood],
+        layout: OwnCheck[Photosites],
         *,
         capacitance_f: ArrayLike | None = None,
         shared_um: csr_array[Any] | None = None,
@@ -540,10 +493,6 @@ class InterPixelCapacitance(_Crosstalk):
         shared_um : csr_array (n_site, n_site), optional, µm
             Precomputed lengths of shared edges; ``layout.adjacency()`` by default.
 
-        Returns
-        -------
-        CrosstalkOperator
-
         Raises
         ------
         ParameterError
@@ -559,11 +508,7 @@ class InterPixelCapacitance(_Crosstalk):
         ratio = np.ones(layout.n_sites)
         if capacitance_f is not None and layout.n_sites:
             node_f = finite_array("capacitance_f", capacitance_f, above=0.0)
-            if node_f.shape not in ((), (layout.n_sites,)):
-                raise ParameterError(
-                    "capacitance_f",
-                    f"must be one number, or one for each of the {layout.n_sites} sites, got the shape {node_f.shape}",
-                )
+            check_per_site("capacitance_f", node_f, layout.n_sites, or_one=True)
             ratio = np.median(node_f) / np.broadcast_to(node_f, layout.n_sites)
         matrix = _with_values(
             shared_um, shared_um.data * (self.neighbour_fraction / edge_um) * ratio[shared_um.indices]
@@ -591,7 +536,7 @@ def _require_layout(layout: object) -> None:
         raise ParameterError("layout", f"must be a Layout, got {type_name(layout)}")
 
 
-def _shared_um(layout: Neighbourhood, shared_um: csr_array[Any] | None, max_gap_um: float | None) -> csr_array[Any]:
+def _shared_um(layout: Photosites, shared_um: csr_array[Any] | None, max_gap_um: float | None) -> csr_array[Any]:
     """Return checked lengths of shared edges, with int32 indices if possible."""
     from scipy.sparse import csr_array, issparse
 
@@ -656,7 +601,7 @@ def _add_remainder(matrix: csr_array[Any], fraction: Floats, n_steps: int) -> cs
     return csr_array(matrix / n_steps + diags_array(1.0 - fraction / n_steps))
 
 
-def _grid_positions(layout: Neighbourhood, pitch_um: Any) -> tuple[Ints, Ints]:
+def _grid_positions(layout: Photosites, pitch_um: Any) -> tuple[Ints, Ints]:
     """Return column and row of each site in the underlying grid, from 0."""
     n_sites = layout.n_sites
     if n_sites == 0:
