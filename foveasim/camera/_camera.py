@@ -256,10 +256,6 @@ class Camera:
         """
         Return the image of a scene's pixel grid without distortion, in the sensor frame.
 
-        Parameters
-        ----------
-        scene : Scene
-
         Returns
         -------
         Grid
@@ -275,10 +271,6 @@ class Camera:
     def power_map(self, scene: Scene) -> PowerMap:
         """
         Compute the image irradiance of a scene without distortion, in the sensor frame.
-
-        Parameters
-        ----------
-        scene : Scene
 
         Returns
         -------
@@ -617,11 +609,6 @@ class Camera:
         """
         Return mean and variance of every site's code analytically.
 
-        Parameters
-        ----------
-        light : Scene or PowerMap
-        exposure_s : float, s
-
         Returns
         -------
         mean_dn, variance_dn2 : (n_site,) float64, DN and DN²
@@ -666,11 +653,6 @@ class Camera:
     def noise_budget(self, light: Scene | PowerMap, *, exposure_s: float) -> NoiseBudget:
         """
         Return the noise of every site by source: :func:`foveasim.sensor.noise_budget`.
-
-        Parameters
-        ----------
-        light : Scene or PowerMap
-        exposure_s : float, s
 
         Returns
         -------

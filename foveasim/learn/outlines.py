@@ -62,10 +62,6 @@ class Outlines:
         Vertices of neighbours at the same position, within 1e-6 µm, become one point. Vertices on an edge of a neighbour are
         inserted there first (:func:`foveasim.layout.node`), so that displacements open no gaps.
 
-        Parameters
-        ----------
-        layout : Layout
-
         Returns
         -------
         outlines : Outlines

@@ -26,10 +26,6 @@ class Readout:
     Fixed patterns are those of the device. Quantities per site that depend on the area, such as a capacitance per µm²,
     remain those of the layout of the sensor.
 
-    Parameters
-    ----------
-    sensor : Sensor
-
     Raises
     ------
     ParameterError

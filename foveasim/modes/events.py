@@ -73,11 +73,7 @@ class Events:
 
     def __post_init__(self) -> None:
         t_s, site, polarity = (as_numbers(name, getattr(self, name), keep_type=True) for name in ARRAYS)
-        for name, values, kind in (
-            ("t_s", t_s, np.float64),
-            ("site", site, np.int64),
-            ("polarity", polarity, np.int64),
-        ):
+        for name, values, kind in zip(ARRAYS, (t_s, site, polarity), (np.float64, np.int64, np.int64), strict=True):
             if values.ndim != 1 or values.size != t_s.size:
                 raise ParameterError(name, f"must be one number for each of {t_s.size} times, got {values.shape}")
             if values.size and not np.can_cast(values.dtype, kind, "same_kind"):
@@ -274,12 +270,7 @@ class Events:
         """
         x, y = self.addresses(pitch_um)
         if max(x.max(initial=0), y.max(initial=0)) > MAX_SIGNED_ADDRESS:
-            raise ParameterError(
-                "pitch_um",
-                f"must give at most {MAX_SIGNED_ADDRESS + 1} columns and rows, the range of int16 addresses",
-                pitch_um,
-                "µm",
-            )
+            raise _too_many_addresses(pitch_um, MAX_SIGNED_ADDRESS, "int16")
         events = np.empty(len(self), STRUCTURE)
         events["x"], events["y"] = x[self.site], y[self.site]
         events["t"], events["p"] = _to_us(self.t_s), self.polarity > 0
@@ -474,13 +465,13 @@ def _addresses_on_raster(layout: Layout, pitch_um: float | None) -> tuple[Ints, 
     column = np.floor((centroid_um[:, 0] - low_um[0]) / pitch_um + 0.5)
     row = np.floor((high_um[1] - centroid_um[:, 1]) / pitch_um + 0.5)
     if max(column.max(), row.max()) > MAX_ADDRESS:
-        raise ParameterError(
-            "pitch_um",
-            f"must give at most {MAX_ADDRESS + 1} columns and rows, the range of uint16 addresses",
-            pitch_um,
-            "µm",
-        )
+        raise _too_many_addresses(pitch_um, MAX_ADDRESS, "uint16")
     return column.astype(np.int64), row.astype(np.int64)
+
+
+def _too_many_addresses(pitch_um: float | None, limit: int, kind: str) -> ParameterError:
+    rule = f"must give at most {limit + 1} columns and rows, the range of {kind} addresses"
+    return ParameterError("pitch_um", rule, pitch_um, "µm")
 
 
 def _to_us(t_s: Floats) -> Ints:

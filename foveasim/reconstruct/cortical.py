@@ -12,7 +12,7 @@ angles increase in the same direction. It samples at the corners of pixels, at a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
@@ -245,14 +245,7 @@ def to_cortical(
         weights = map_coordinates(is_known.astype(np.float64), (y, x), order=1, mode="constant", cval=0.0)
         sums = map_coordinates(np.where(is_known, plane, 0.0), (y, x), order=1, mode="constant", cval=0.0)
         channel[:] = np.divide(sums, weights, out=np.full(sums.shape, np.nan), where=weights >= MIN_KNOWN)
-    return CorticalImage(
-        data=data,
-        radius_um=edges_um,
-        start_rad=image.start_rad,
-        centre_um=centre,
-        offset_um=offset_um,
-        white=picture.white,
-    )
+    return replace(image, data=data, white=picture.white)
 
 
 def from_cortical(image: CorticalImage, grid: Grid, *, method: Literal["linear", "nearest"] = "linear") -> Picture:

@@ -7,8 +7,7 @@ temporal dark noise, defect pixels. All quantities refer to linear codes: compan
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -16,12 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import FRACTION, POSITIVE, Limits, OwnCheck
 from foveasim._core.random_streams import Streams
-from foveasim._core.validation import Bools, Floats, as_numbers, check_number, finite_array, own, unmasked
+from foveasim._core.validation import Bools, Floats, as_numbers, check_number, finite_array
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.sensor.adc import QUANTISATION_DN2
 from foveasim.sensor.effects import Photosites
 from foveasim.sensor.limits import CHARGE, DURATION, EXPOSURE, RATIO
-from foveasim.sensor.per_site import check_per_site
+from foveasim.sensor.per_site import check_per_site, own_arrays
 from foveasim.sensor.sensor import Sensor
 from foveasim.units import volts_to_electrons
 
@@ -136,10 +135,7 @@ class Calibration:
     linear_dn: Floats | None = None
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            values = getattr(self, field.name)
-            if isinstance(values, np.ndarray):
-                object.__setattr__(self, field.name, own(np.asarray(unmasked(field.name, values))))
+        own_arrays(self)
 
     def __repr__(self) -> str:
         return f"Calibration({self.n_sites} sites, {int(self.defective.sum())} defective, {int(self.clipped.sum())} clipped)"
@@ -217,17 +213,20 @@ class Calibration:
         signal. The robust standard deviation is 1.4826 times the median absolute deviation, and at least that of rounding.
         """
         table = None if linear_dn is None else finite_array("linear_dn", linear_dn, ndim=1)
-        stacks = {"dark": _Frames(highest_dn, table), "flat": _Frames(highest_dn, table)}
-        for name, frames, at_least in (("dark", dark, 2), ("flat", flat, 1)):
-            stacks[name].add_all(name, _validate_frames(name, frames, at_least))
-        stack_long = None
-        if dark_long is not None:
-            stack_long = _Frames(highest_dn, table)
-            stack_long.add_all("dark_long", _validate_frames("dark_long", dark_long, 1))
+
+        def stack(name: str, frames: ArrayLike, at_least: int) -> _Frames:
+            found = _Frames(highest_dn, table)
+            for frame in _validate_frames(name, frames, at_least):
+                try:
+                    found.add(frame)
+                except ParameterError as error:
+                    raise ParameterError(name, error.detail) from None
+            return found
+
         return _calibration(
-            stacks["dark"],
-            stacks["flat"],
-            stack_long,
+            stack("dark", dark, 2),
+            stack("flat", flat, 1),
+            None if dark_long is None else stack("dark_long", dark_long, 1),
             exposure_s=exposure_s,
             long_exposure_s=long_exposure_s,
             expected_dn=expected_dn,
@@ -475,13 +474,6 @@ class _Frames:
         self.n_lowest += code <= 0
         if self.highest_dn is not None:
             self.n_highest += code >= self.highest_dn
-
-    def add_all(self, name: str, frames: Iterable[NDArray[Any]]) -> None:
-        for frame in frames:
-            try:
-                self.add(frame)
-            except ParameterError as error:
-                raise ParameterError(name, error.detail) from None
 
 
 def _calibration(

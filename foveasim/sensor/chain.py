@@ -19,22 +19,6 @@ from foveasim.sensor.adc import ConversionTables
 from foveasim.sensor.blocks import for_each_block
 from foveasim.sensor.effects import STAGES, STANDARD, Effect, FixedFactor, FixedOffset, Sites
 
-__all__ = [
-    "ChargeCheck",
-    "Conversion",
-    "Factor",
-    "FullWell",
-    "Nonlinearity",
-    "Offset",
-    "Save",
-    "Step",
-    "check_effects",
-    "check_names",
-    "merge_steps",
-    "run_steps",
-    "sort_by_stage",
-]
-
 #: Stages before collection, which have no random stream.
 FIXED_STAGES = ("photo", "dark", "expected")
 #: Names of the effects that keywords build.

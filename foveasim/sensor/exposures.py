@@ -7,7 +7,7 @@ common to all reads; weights from individual reads would favour those that are l
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.random_streams import Streams
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, Ints, as_numbers, own, unmasked
+from foveasim._core.validation import Floats, Ints, as_numbers
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.sensor.calibration import Calibration, linearise, nominal_e_per_dn
 from foveasim.sensor.effects.shot import MAX_CHARGE_E, ROUNDING_E2
 from foveasim.sensor.limits import DURATION, EXPOSURE, RATE
-from foveasim.sensor.per_site import check_per_site
+from foveasim.sensor.per_site import check_per_site, own_arrays
 from foveasim.sensor.sensor import Sensor
 
 __all__ = ["Ramp", "Rates", "fit_ramp", "merge_exposures", "non_destructive_reads"]
@@ -59,7 +59,7 @@ class Rates:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        _make_read_only(self)
+        own_arrays(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ class Ramp:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        _make_read_only(self)
+        own_arrays(self)
 
 
 # -- HDR merge --------------------------------------------------------------------------------------------------------
@@ -361,12 +361,6 @@ def fit_ramp(
 
 
 # -- helpers ----------------------------------------------------------------------------------------------------------
-
-
-def _make_read_only(instance: Any) -> None:
-    for field in fields(instance):
-        values = unmasked(field.name, getattr(instance, field.name))
-        object.__setattr__(instance, field.name, own(np.asarray(values)))
 
 
 def _check_increasing(name: str, times_s: ArrayLike) -> Floats:

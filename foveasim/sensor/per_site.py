@@ -1,14 +1,15 @@
-"""Arrays with one value for each photosite."""
+"""Arrays with one value for each photosite, and objects with such arrays."""
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any, TypeVar
 
+import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.validation import own, unmasked
 from foveasim.errors import ParameterError
-
-__all__ = ["check_per_site"]
 
 _Array = TypeVar("_Array", bound=NDArray[Any])
 
@@ -25,3 +26,11 @@ def check_per_site(name: str, values: _Array, n_sites: int, *, or_one: bool = Fa
         return values
     rule = "be one number, or one for each" if or_one else "have one value for each"
     raise ParameterError(name, f"must {rule} of the {n_sites} sites, got the shape {shape}")
+
+
+def own_arrays(instance: Any) -> None:
+    """Replace the arrays of a frozen dataclass by read-only ones, independent of the caller's."""
+    for field in fields(instance):
+        values = unmasked(field.name, getattr(instance, field.name))
+        if isinstance(values, np.ndarray | list | tuple):
+            object.__setattr__(instance, field.name, own(np.asarray(values)))

@@ -15,17 +15,6 @@ from foveasim.sensor.effects.contract import Effect, Sites, Stage
 if TYPE_CHECKING:
     from foveasim.sensor.sensor import Sensor
 
-__all__ = [
-    "ChargeDistributions",
-    "Quadrature",
-    "ReadoutModel",
-    "Transfer",
-    "apply_nonlinearity",
-    "clipped_gaussian_moments",
-    "quadrature",
-    "readout_model",
-]
-
 #: Number of quadrature nodes for charges clipped at the full well.
 QUADRATURE_NODES = 96
 #: Minimum slope of a nonlinear response, relative to the slope at zero signal.

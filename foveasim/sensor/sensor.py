@@ -58,12 +58,13 @@ from foveasim.sensor.per_site import check_per_site
 from foveasim.sensor.prediction import (
     ChargeDistributions,
     ReadoutModel,
+    Transfer,
     clipped_gaussian_moments,
     quadrature,
     readout_model,
 )
-from foveasim.sensor.spectral.curves import CurveError
-from foveasim.sensor.spectral.response import ConstantCurve, Curve, FilterSet, rgb_filters
+from foveasim.sensor.spectral.curves import ConstantCurve, Curve, CurveError
+from foveasim.sensor.spectral.response import FilterSet, rgb_filters
 from foveasim.units import electrons_to_volts, photon_energy_j
 
 if TYPE_CHECKING:
@@ -822,28 +823,24 @@ class Sensor:
             # Mixed charges, after clipping at the full well, are approximated as Gaussian.
             drawn_e, drawn_e2 = model.mean_e, model.variance_e2
             is_drawn, well_e = False, np.array([np.inf])
-        sigma_e, transfer = np.sqrt(model.gaussian_e2), model.transfer
+        charges = ChargeDistributions(
+            mean_e=drawn_e,
+            variance_e2=drawn_e2,
+            well_e=well_e,
+            sigma_e=np.sqrt(model.gaussian_e2),
+            half_step_e=model.half_step_e,
+            poisson_below_e=self.gaussian_above_e,
+            is_drawn=is_drawn,
+        )
 
         def block(_: int, sites: slice) -> None:
-            def part(values: NDArray[Any]) -> NDArray[Any]:
-                return read_only(self.sites.block(sites).select(values).view())
+            def part(values: Any) -> Any:
+                is_array = isinstance(values, np.ndarray)
+                return read_only(self.sites.block(sites).select(values).view()) if is_array else values
 
             _kernels.predict_codes(
-                ChargeDistributions(
-                    mean_e=part(drawn_e),
-                    variance_e2=part(drawn_e2),
-                    well_e=part(well_e),
-                    sigma_e=part(sigma_e),
-                    half_step_e=part(model.half_step_e),
-                    poisson_below_e=self.gaussian_above_e,
-                    is_drawn=is_drawn,
-                ),
-                transfer._replace(
-                    v_per_e=part(transfer.v_per_e),
-                    sense_v=part(transfer.sense_v),
-                    scale=part(transfer.scale),
-                    output_v=part(transfer.output_v),
-                ),
+                ChargeDistributions(*map(part, charges)),
+                Transfer(*map(part, model.transfer)),
                 part(self._line),
                 self._tables,
                 quadrature(),

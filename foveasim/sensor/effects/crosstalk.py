@@ -286,7 +286,7 @@ class Diffusion(_Crosstalk):
             If no two sites share an edge.
         """
         shared_um = _shared_um(layout, shared_um, self.max_gap_um)
-        site, neighbour = shared_um.indices, _rows(shared_um)
+        site, neighbour = shared_um.indices, np.repeat(np.arange(layout.n_sites), np.diff(shared_um.indptr))
         centre_um = layout.centroid_um
         distance_um = np.hypot(*np.moveaxis(centre_um[site] - centre_um[neighbour], -1, 0))
         if distance_um.size:
@@ -295,9 +295,7 @@ class Diffusion(_Crosstalk):
             depth_um = layout.area_um2 / np.where(edges_um > 0.0, edges_um, 1.0)
             distance_um = np.maximum(distance_um, 0.5 * (depth_um[site] + depth_um[neighbour]))
         width_um = 0.5 * distance_um * _mean_square_steps(self.spread_um / distance_um)
-        matrix = _with_values(shared_um, shared_um.data * width_um / layout.area_um2[site])
-        loss = _column_sums(matrix)
-        largest = float(loss.max(initial=0.0))
+        matrix, loss, largest = _exchange(shared_um, shared_um.data * width_um / layout.area_um2[site])
         if not largest <= MAX_STEP_FRACTION * MAX_STEPS:
             smallest = int(np.argmax(loss))
             raise ParameterError(
@@ -372,10 +370,6 @@ class KernelCrosstalk(_Crosstalk):
         """
         Compile the convolution for a layout of grid sites, in any order and with gaps.
 
-        Parameters
-        ----------
-        layout : Layout
-
         Raises
         ------
         SimulationError
@@ -398,7 +392,7 @@ class KernelCrosstalk(_Crosstalk):
             raise SimulationError(
                 f"the layout is not a grid: site {duplicate} has the same position as another site; {_ALTERNATIVE}"
             )
-        source, target, fraction = [], [], []
+        source, target, fraction = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0)]
         retained = np.zeros(n_sites)
         for j, i in np.argwhere(kernel > 0.0):
             wanted_position = ordered + (j - half_y) * stride + (i - half_x)
@@ -409,14 +403,9 @@ class KernelCrosstalk(_Crosstalk):
             fraction.append(np.full(source[-1].size, kernel[j, i]))
             retained[order[~is_there]] += kernel[j, i]
         if self.border == "kept":
-            is_retained = np.flatnonzero(retained)
-            source, target, fraction = (
-                [*source, is_retained],
-                [*target, is_retained],
-                [*fraction, retained[is_retained]],
-            )
-        if not source:
-            return CrosstalkOperator(coo_array((n_sites, n_sites)).tocsr())
+            source.append(np.flatnonzero(retained))
+            target.append(source[-1])
+            fraction.append(retained[source[-1]])
         pairs = (np.concatenate(target).astype(np.int32), np.concatenate(source).astype(np.int32))
         return CrosstalkOperator(coo_array((np.concatenate(fraction), pairs), shape=(n_sites, n_sites)).tocsr())
 
@@ -510,11 +499,8 @@ class InterPixelCapacitance(_Crosstalk):
             node_f = finite_array("capacitance_f", capacitance_f, above=0.0)
             check_per_site("capacitance_f", node_f, layout.n_sites, or_one=True)
             ratio = np.median(node_f) / np.broadcast_to(node_f, layout.n_sites)
-        matrix = _with_values(
-            shared_um, shared_um.data * (self.neighbour_fraction / edge_um) * ratio[shared_um.indices]
-        )
-        loss = _column_sums(matrix)
-        largest = float(loss.max(initial=0.0))
+        fraction = shared_um.data * (self.neighbour_fraction / edge_um) * ratio[shared_um.indices]
+        matrix, loss, largest = _exchange(shared_um, fraction)
         if largest > MAX_STEP_FRACTION * (1.0 + KERNEL_ROUNDING):
             raise ParameterError(
                 "neighbour_fraction",
@@ -579,19 +565,13 @@ def _mean_square_steps(spread: Floats) -> Floats:
     return steps
 
 
-def _rows(matrix: csr_array[Any]) -> Ints:
-    """Return the row of each stored entry, (nnz,)."""
-    return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
-
-
-def _with_values(matrix: csr_array[Any], values: Floats) -> csr_array[Any]:
+def _exchange(shared_um: csr_array[Any], fraction: Floats) -> tuple[csr_array[Any], Floats, float]:
+    """Return the matrix of exchanged fractions, the loss of each site, and the largest loss."""
     from scipy.sparse import csr_array
 
-    return csr_array((values, matrix.indices, matrix.indptr), shape=matrix.shape)
-
-
-def _column_sums(matrix: csr_array[Any]) -> Floats:
-    return np.bincount(matrix.indices, weights=matrix.data, minlength=matrix.shape[0]).astype(np.float64)
+    loss = np.bincount(shared_um.indices, weights=fraction, minlength=shared_um.shape[0]).astype(np.float64)
+    matrix = csr_array((fraction, shared_um.indices, shared_um.indptr), shape=shared_um.shape)
+    return matrix, loss, float(loss.max(initial=0.0))
 
 
 def _add_remainder(matrix: csr_array[Any], fraction: Floats, n_steps: int) -> csr_array[Any]:

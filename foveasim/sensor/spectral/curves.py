@@ -22,22 +22,6 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, as_numbers, check_number
 from foveasim.errors import FoveasimError, ParameterError
 
-__all__ = [
-    "BandMean",
-    "ConstantCurve",
-    "Curve",
-    "CurveBase",
-    "CurveError",
-    "Factor",
-    "GaussianCurve",
-    "PassBand",
-    "ProductCurve",
-    "SiliconQE",
-    "as_curve",
-    "check_within",
-    "curve_values",
-]
-
 
 class CurveError(ParameterError):
     """Error of a user-defined curve: it raises, or does not return one number per wavelength."""

@@ -12,7 +12,6 @@ from foveasim._core.validation import Floats
 from foveasim.errors import ParameterError
 from foveasim.sensor.spectral.curves import (
     BandMean,
-    ConstantCurve,
     Curve,
     Factor,
     GaussianCurve,
@@ -21,7 +20,7 @@ from foveasim.sensor.spectral.curves import (
     curve_values,
 )
 
-__all__ = ["ConstantCurve", "Curve", "FilterSet", "rgb_filters"]
+__all__ = ["FilterSet", "rgb_filters"]
 
 
 @dataclass(frozen=True)
