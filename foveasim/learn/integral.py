@@ -93,7 +93,7 @@ def site_power(
         check_tensor("maps", maps, grid.shape, " or (..., n_y, n_x)")
     flat = check_tensor("maps", maps.reshape(-1, *maps.shape[-2:]), (None, *grid.shape), ", as the grid")
     integral = Integral(outlines, grid, 2 if order == 2 else 1, thread_count(n_threads))
-    return _SitePower.apply(points, flat, integral).reshape(*maps.shape[:-2], outlines.n_sites)  # type: ignore[no-any-return, no-untyped-call]
+    return _Power.apply(points, flat, integral, False).reshape(*maps.shape[:-2], outlines.n_sites)  # type: ignore[no-any-return, no-untyped-call]
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,51 +184,30 @@ class Integral:
         along = points[end] - points[begin]
         normal = torch.stack((along[:, 1], -along[:, 0]), dim=1)
         sums = (moments * self.edge_weights(weights).to(moments.dtype)[:, :, None]).sum(dim=0)
-        gradient = torch.zeros_like(points)
-        gradient = gradient.index_add(0, begin, normal * sums[:, 0:1].to(points.dtype))
+        gradient = torch.zeros_like(points).index_add(0, begin, normal * sums[:, 0:1].to(points.dtype))
         return gradient.index_add(0, end, normal * sums[:, 1:2].to(points.dtype))
 
 
-def _point_gradient(ctx: Any, points: Tensor, maps: Tensor, weights: Tensor) -> Tensor | None:
-    """Return the gradient of ``sum weights * power`` by the points, if it is needed."""
-    if not ctx.needs_input_grad[0]:
-        return None
-    moments = _Moments.apply(points, maps, ctx.integral)
-    return ctx.integral.contract(points, moments, weights)  # type: ignore[no-any-return]
-
-
-class _SitePower(torch.autograd.Function):
-    """Integrals of maps over sites."""
+class _Power(torch.autograd.Function):
+    """Integrals of maps over sites, or the adjoint: maps from weights of the sites."""
 
     @staticmethod
-    def forward(ctx: Any, points: Tensor, maps: Tensor, integral: Integral) -> Tensor:
-        ctx.save_for_backward(points, maps)
-        ctx.integral = integral
-        return integral.power(points, maps)
+    def forward(ctx: Any, points: Tensor, values: Tensor, integral: Integral, is_adjoint: bool) -> Tensor:
+        ctx.save_for_backward(points, values)
+        ctx.integral, ctx.is_adjoint = integral, is_adjoint
+        return integral.spread(points, values) if is_adjoint else integral.power(points, values)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
-        (weights,) = gradients
-        points, maps = ctx.saved_tensors
-        of_maps = _Spread.apply(points, weights, ctx.integral).to(maps.dtype) if ctx.needs_input_grad[1] else None
-        return _point_gradient(ctx, points, maps, weights), of_maps, None
-
-
-class _Spread(torch.autograd.Function):
-    """Adjoint of the integrals: maps from weights of the sites."""
-
-    @staticmethod
-    def forward(ctx: Any, points: Tensor, weights: Tensor, integral: Integral) -> Tensor:
-        ctx.save_for_backward(points, weights)
-        ctx.integral = integral
-        return integral.spread(points, weights)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
-        (maps,) = gradients
-        points, weights = ctx.saved_tensors
-        of_weights = _SitePower.apply(points, maps, ctx.integral).to(weights.dtype) if ctx.needs_input_grad[1] else None
-        return _point_gradient(ctx, points, maps, weights), of_weights, None
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
+        (gradient,) = gradients
+        points, values = ctx.saved_tensors
+        of_points = of_values = None
+        if ctx.needs_input_grad[0]:
+            maps, weights = (gradient, values) if ctx.is_adjoint else (values, gradient)
+            of_points = ctx.integral.contract(points, _Moments.apply(points, maps, ctx.integral), weights)
+        if ctx.needs_input_grad[1]:
+            of_values = _Power.apply(points, gradient, ctx.integral, not ctx.is_adjoint).to(values.dtype)
+        return of_points, of_values, None, None
 
 
 class _Moments(torch.autograd.Function):

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.layout import Layout
-from foveasim.learn._tensors import constant
+from foveasim.learn._tensors import constant, shorten_steps
 from foveasim.learn.outlines import Outlines
 
 __all__ = ["Mesh"]
@@ -19,8 +19,6 @@ __all__ = ["Mesh"]
 STRAIGHT_RAD = 1e-6
 #: Edges below this length are points.
 MIN_EDGE_UM = 1e-9
-#: Number of times that a displacement is halved before it is cancelled.
-MAX_HALVINGS = 8
 
 
 class Mesh(nn.Module):
@@ -129,22 +127,13 @@ class Mesh(nn.Module):
             optimiser.step()
             mesh.limit_step()
         """
-        target, start = self.displacement_um.detach().clone(), self._previous_um
-        target = torch.where(torch.isfinite(target), target, start)
-        fraction = torch.ones_like(target)
-        while True:
-            self.displacement_um.copy_(start + fraction * (target - start))
+
+        def find_invalid(displacement_um: Tensor) -> Tensor | None:
+            self.displacement_um.copy_(displacement_um)
             invalid = self.invalid_sites()
-            if not invalid.size:
-                break
-            is_blocked = torch.from_numpy(self._touches(invalid))[self._point]
-            if not bool((fraction[is_blocked] > 0.0).any()):
-                # The neighbours that moved further are the cause.
-                is_blocked = torch.ones_like(is_blocked)
-                if not bool((fraction > 0.0).any()):
-                    break
-            halved = 0.5 * fraction
-            fraction = torch.where(is_blocked, torch.where(halved < 0.5**MAX_HALVINGS, 0.0, halved), fraction)
+            return torch.from_numpy(self._touches(invalid))[self._point] if invalid.size else None
+
+        fraction = shorten_steps(self._previous_um, self.displacement_um.detach().clone(), find_invalid)
         self._previous_um.copy_(self.displacement_um)
         return float(fraction.min()) if fraction.numel() else 1.0
 

@@ -15,7 +15,7 @@ from foveasim.errors import GeometryError, ParameterError, type_name
 from foveasim.fields import Grid
 from foveasim.layout import Layout
 from foveasim.layout._noding import merge_coincident_points
-from foveasim.learn._tensors import as_array, check_tensor, constant
+from foveasim.learn._tensors import as_array, check_tensor, constant, shorten_steps
 from foveasim.learn.integral import site_power
 from foveasim.learn.outlines import Outlines
 
@@ -25,8 +25,6 @@ __all__ = ["PowerCells"]
 N_SIDES = 4
 #: Difference between the total area of all cells and the area of the region that rounding may cause, relative to it.
 AREA_ROUNDING = 1e-9
-#: Number of times that a step is halved before it is cancelled.
-MAX_HALVINGS = 8
 
 
 class PowerCells(nn.Module):
@@ -93,12 +91,8 @@ class PowerCells(nn.Module):
         region = finite_array("region_um", region_um, ndim=1)
         if region.size != 4 or not (region[0] < region[2] and region[1] < region[3]):
             raise ParameterError("region_um", "must be (x_min, y_min, x_max, y_max)", region.tolist(), "µm")
-        self.region_um: tuple[float, float, float, float] = (
-            float(region[0]),
-            float(region[1]),
-            float(region[2]),
-            float(region[3]),
-        )
+        x0, y0, x1, y1 = map(float, region)
+        self.region_um: tuple[float, float, float, float] = x0, y0, x1, y1
         self.centres_um = nn.Parameter(constant(centres))
         self.weights_um2 = nn.Parameter(constant(weights))
         self.register_buffer("_previous", constant(np.column_stack((centres, weights))), persistent=False)
@@ -190,27 +184,22 @@ class PowerCells(nn.Module):
         fraction : float
             Smallest fraction of its step that a centre was moved; 1 if the complete step was valid.
         """
-        target, start = torch.column_stack((self.centres_um, self.weights_um2)), self._previous
-        target = torch.where(torch.isfinite(target), target, start)
-        fraction = torch.ones(self.n_sites, 1, dtype=target.dtype)
-        while True:
-            found = start + fraction * (target - start)
-            self.centres_um.copy_(found[:, :2])
-            self.weights_um2.copy_(found[:, 2])
+
+        def find_invalid(state: Tensor) -> Tensor | None:
+            self.centres_um.copy_(state[:, :2])
+            self.weights_um2.copy_(state[:, 2])
             try:
                 self.cells()
             except GeometryError as error:
-                if not bool(fraction.any()):
+                if torch.equal(state, self._previous):
                     raise
                 is_blocked = torch.zeros(self.n_sites, 1, dtype=torch.bool)
                 is_blocked[list(error.site_ids)] = True
-                if not bool((fraction[is_blocked] > 0.0).any()):
-                    is_blocked = ~is_blocked
-                halved = 0.5 * fraction
-                fraction = torch.where(is_blocked, torch.where(halved < 0.5**MAX_HALVINGS, 0.0, halved), fraction)
-            else:
-                break
-        self._previous.copy_(found)
+                return is_blocked
+            return None
+
+        fraction = shorten_steps(self._previous, torch.column_stack((self.centres_um, self.weights_um2)), find_invalid)
+        self._previous.copy_(torch.column_stack((self.centres_um, self.weights_um2)))
         return float(fraction.min())
 
     @torch.no_grad()
