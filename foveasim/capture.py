@@ -28,7 +28,6 @@ from foveasim.layout.packed import layout_from_arrays, layout_to_arrays
 from foveasim.reconstruct import (
     CorticalImage,
     Picture,
-    SiteEstimates,
     cells,
     cortical,
     electrons_per_code,
@@ -318,11 +317,6 @@ class Capture:
         Returns
         -------
         ratio : (n_site,) float64
-
-        Raises
-        ------
-        ParameterError
-            When the sensor's parameters are not known, or the sensor has another layout.
         """
         self._check_sensor(sensor)
         known = self._electronics(sensor)
@@ -353,7 +347,11 @@ class Capture:
         response = self.layout.area_um2 * electronics.sensitivity * (np.mean(e_per_dn) / e_per_dn)
         if not is_estimated:
             return values, response, None
-        estimates = self._estimates(electronics, of)
+        exposure_s = float(self.settings.get("exposure_s", 0.0))
+        if of in ("code", "light_e"):
+            estimates = estimate_from_code(self.code, electronics, exposure_s)
+        else:
+            estimates = estimate_from_charge(getattr(self, of), electronics, exposure_s)
         values = estimates.light_e / e_per_dn
         if is_fitted:
             values[estimates.is_saturated] = np.nan
@@ -374,12 +372,6 @@ class Capture:
                 )
         return known
 
-    def _estimates(self, electronics: Sensor, of: str) -> SiteEstimates:
-        exposure_s = float(self.settings.get("exposure_s", 0.0))
-        if of in ("code", "light_e"):
-            return estimate_from_code(self.code, electronics, exposure_s)
-        return estimate_from_charge(getattr(self, of), electronics, exposure_s)
-
     to_pyvista: ClassVar[Drawn[PolyData]] = drawn("polydata")
     plot: ClassVar[Drawn[Axes]] = drawn("plot_capture")
     plot3d: ClassVar[Drawn[None]] = drawn("show_columns")
@@ -397,11 +389,6 @@ class Capture:
             ``x_um`` and ``y_um``, ``area_um2``, names of the filters, and all columns of the layout. Every variable has
             its ``units``, ``"1"`` when dimensionless. Attributes: ``bits``, ``seed``, ``exposure_s``, and
             ``settings``, ``versions``, ``provenance`` as JSON strings.
-
-        Raises
-        ------
-        ParameterError
-            When xarray is missing.
 
         Notes
         -----
@@ -427,11 +414,6 @@ class Capture:
             Index ``site``. Columns ``x_um``, ``y_um``, ``area_um2``, ``filter_name``, ``filter_of_site``, ``code``,
             ``electrons``, ``expected_e``, and the columns of the layout, named as in :meth:`to_xarray`. ``attrs`` contains the
             attributes of :meth:`to_xarray`.
-
-        Raises
-        ------
-        ParameterError
-            When pandas is missing.
 
         Examples
         --------

@@ -39,10 +39,8 @@ from foveasim._io.resumable import LOCK, disk_errors, finish, partial_path, resu
 from foveasim._io.zarr_stores import ZARR, open_group, store_format
 from foveasim.camera import Camera
 from foveasim.camera._clock import Clock
-from foveasim.camera._coverage import Covered, warn_of_coverage
-from foveasim.camera._lens_scale import warn_of_focal_length
-from foveasim.camera._sampling import warn_of_coarse_cells
 from foveasim.camera._steps import WeightedMap, capture_settings, expose, integrate_maps, to_sensor_frame, white_dn
+from foveasim.camera._warnings import Covered, warn_of_coarse_cells, warn_of_coverage, warn_of_focal_length
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Grid, PowerMap
@@ -169,10 +167,9 @@ def _tiles(
         coverages.append(Covered.by(smallest))
         rate_e_per_s = integrate_maps(sensor, light, _maps(sensor, light, images, strips, clock), integrators, clock)
         # Arrays per site are those of all sites, as in a stored capture.
-        about = capture_settings(camera, light, exposure_s, streams)
-        about["tile"] = {"first_site": first, "n_sites": layout.n_sites}
+        about = {"first_site": first, "n_sites": layout.n_sites}
         part_streams = Streams(streams.seed, streams.frame, first // BLOCK_SITES)
-        yield expose(sensor, light, rate_e_per_s, exposure_s, part_streams, clock, about, camera.n_threads)
+        yield expose(camera, sensor, light, rate_e_per_s, exposure_s, part_streams, clock, tile=about)
     if coverages:
         smallest_image = min((image.grid for image in images), key=lambda grid: grid.cell_area_um2)
         warn_of_coverage(source, Covered.union(smallest_image.bounds_um, coverages), layout.n_sites)

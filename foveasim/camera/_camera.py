@@ -24,11 +24,16 @@ from foveasim._core.threads import cached_property, in_order, thread_count
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, finite_array, read_only
 from foveasim.camera._clock import Clock
-from foveasim.camera._coverage import Covered, format_point, size_um, warn_of_coverage
 from foveasim.camera._frames import Frame, ImageCache, Position, Task, check_frames, position_settings, tasks
-from foveasim.camera._lens_scale import warn_of_focal_length
-from foveasim.camera._sampling import warn_of_coarse_cells
-from foveasim.camera._steps import WeightedMap, capture_settings, expose, integrate_maps, to_sensor_frame, white_dn
+from foveasim.camera._steps import WeightedMap, expose, integrate_maps, to_sensor_frame, white_dn
+from foveasim.camera._warnings import (
+    Covered,
+    format_point,
+    size_um,
+    warn_of_coarse_cells,
+    warn_of_coverage,
+    warn_of_focal_length,
+)
 from foveasim.capture import Capture
 from foveasim.distortion import Lens
 from foveasim.errors import FoveasimWarning, ParameterError, type_name
@@ -260,11 +265,6 @@ class Camera:
         -------
         Grid
             :meth:`Optics.grid`, centred on the principal point of the distortion model.
-
-        Raises
-        ------
-        ParameterError
-            When the scene is not a Scene, or its distance is at most the focal length.
         """
         return to_sensor_frame(self._distortion, self._optics.grid(self.frame(scene)))
 
@@ -409,20 +409,7 @@ class Camera:
         else:
             photo_e_per_s = finite_array("photo_e_per_s", photo_e_per_s, at_least=0.0)
             check_per_site("photo_e_per_s", photo_e_per_s, self._layout.n_sites)
-        return self._expose(light, photo_e_per_s, exposure_s, streams, clock)
-
-    def _expose(
-        self,
-        light: Scene | PowerMap,
-        photo_e_per_s: Floats,
-        exposure_s: float,
-        streams: Streams,
-        clock: Clock,
-        **settings: Any,
-    ) -> Capture:
-        """Simulate the sensor for photoelectron rates."""
-        about = capture_settings(self, light, exposure_s, streams) | settings
-        return expose(self._sensor, light, photo_e_per_s, exposure_s, streams, clock, about, self._n_threads)
+        return expose(self, self._sensor, light, photo_e_per_s, exposure_s, streams, clock)
 
     def rates(self, frames: OwnCheck[Iterable[Frame]], *, ahead: Annotated[int, NOT_NEGATIVE] = 0) -> Iterator[Floats]:
         """
@@ -438,11 +425,6 @@ class Camera:
         ------
         photo_e_per_s : (n_site,) float64, e-/s
             As :meth:`photoelectrons_per_s` returns it. Read-only: repeated frames share one array.
-
-        Raises
-        ------
-        ParameterError, SimulationError
-            On the call, when an argument is out of range; during iteration, as for :meth:`capture`.
         """
         check_frames(frames)
         return (rate_e_per_s for _, rate_e_per_s in self._frame_rates(frames, Clock(), ahead))
@@ -549,7 +531,8 @@ class Camera:
         for k, (task, rate_e_per_s) in enumerate(self._frame_rates(frames, clock, ahead)):
             number = Streams(streams.seed, streams.frame + k)
             exposure_s = float(exposures_s[number.frame % exposures_s.size])
-            yield self._expose(task.light, rate_e_per_s, exposure_s, number, clock.take(), **position_settings(task))
+            settings = position_settings(task)
+            yield expose(self, self._sensor, task.light, rate_e_per_s, exposure_s, number, clock.take(), **settings)
 
     def _rolling(
         self, frames: Iterable[Frame], exposures_s: Floats, streams: Streams, shutter: Shutter, every: int, ahead: int
@@ -563,7 +546,8 @@ class Camera:
             k, task, exposure = in_progress.popleft()
             number = Streams(streams.seed, streams.frame + k)
             mean_e_per_s, settings = exposure.mean_e_per_s(last_e_per_s), times | position_settings(task, every)
-            return self._expose(task.light, mean_e_per_s, exposure.exposure_s, number, clock.take(), **settings)
+            arguments = task.light, mean_e_per_s, exposure.exposure_s, number, clock.take()
+            return expose(self, self._sensor, *arguments, **settings)
 
         rate_e_per_s = np.zeros(1)
         for n, (task, rate_e_per_s) in enumerate(self._frame_rates(frames, clock, ahead)):

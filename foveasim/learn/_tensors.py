@@ -52,7 +52,7 @@ def constant(values: Any) -> Tensor:
 
 def shorten_steps(start: Tensor, target: Tensor, find_invalid: Callable[[Tensor], Tensor | None]) -> Tensor:
     """
-    Return the largest fraction of the step of each row, (n, 1) or (n,), at which a state is valid, by halving.
+    Return the fraction of the step of each row that gives a valid state, (n, 1) or (n,).
 
     ``find_invalid`` sets a state, and returns the rows whose steps make it invalid, as a mask, or None. Their steps are halved,
     and cancelled after 8 times; then those of all others, which moved further.

@@ -95,8 +95,6 @@ def undistort(lens: Lens, points: Tensor, coefficients: Tensor | None = None, na
 
     Raises
     ------
-    ParameterError
-        If a name is not that of a coefficient.
     GeometryError
         If a point lies outside the image circle.
 

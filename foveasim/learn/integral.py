@@ -66,8 +66,6 @@ def site_power(
 
     Raises
     ------
-    ParameterError
-        If a tensor has another shape, is not of a floating-point type, or is not on the CPU.
     GeometryError
         If the outline of a site is clockwise; :meth:`Mesh.limit_step` prevents it.
 

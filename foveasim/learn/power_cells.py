@@ -122,11 +122,6 @@ class PowerCells(nn.Module):
             Corners as differentiable functions of the centres and the weights.
         outlines : Outlines
             Topology: site i is the cell of centre i. It may differ between calls.
-
-        Raises
-        ------
-        GeometryError
-            When a centre lies outside the region, or its cell is empty; the message specifies its index.
         """
         centres = check_tensor("centres_um", self.centres_um, (None, 2))
         weights = check_tensor("weights_um2", self.weights_um2, (centres.shape[0],))
@@ -204,14 +199,7 @@ class PowerCells(nn.Module):
 
     @torch.no_grad()
     def layout(self) -> Layout:
-        """
-        Return the layout of the current cells, with corners at equal positions merged.
-
-        Raises
-        ------
-        GeometryError
-            As :meth:`cells`.
-        """
+        """Return the layout of the current cells, with corners at equal positions merged."""
         points, outlines = self.cells()
         merged, group = merge_coincident_points(as_array(points).astype(np.float64))
         vertex = group[outlines.vertex]

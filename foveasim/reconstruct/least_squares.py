@@ -110,6 +110,8 @@ def least_squares(
 
     Solved by conjugate gradients with bounds (see ``_bounded``) and a multilevel preconditioner.
     """
+    from scipy import fft
+
     integrator = Integrator(layout, grid, n_threads=n_threads)
     channels = site_values(values, integrator.n_sites)
     n_channels, n_sites = channels.shape
@@ -120,7 +122,7 @@ def least_squares(
     coverage = coverage_fraction(integrator)
     kernel_of = _kernels_of(blur, n_channels)
     pad = tuple(n // 2 for n in kernel_of[0].shape) if kernel_of else (0, 0)
-    shape = tuple(_fast_length(n + 2 * p) if p else n for n, p in zip(grid.shape, pad, strict=True))
+    shape = tuple(fft.next_fast_len(n + 2 * p, real=True) if p else n for n, p in zip(grid.shape, pad, strict=True))
     overlaps = _padded_overlaps(integrator, pad, shape)
     covered_um2 = np.asarray(overlaps.sum(axis=1)).ravel()
     area_um2 = covered_um2 + integrator.uncovered_um2
@@ -351,13 +353,6 @@ def _noise(variance: ArrayLike | None, gain: Floats, shape: tuple[int, int]) -> 
         raise ParameterError(
             "variance", f"must be one number, or have the shape (..., {shape[1]}), got {values.shape}"
         ) from None
-
-
-def _fast_length(n: int) -> int:
-    """Return the next length for which Fourier transforms are fast."""
-    from scipy import fft
-
-    return int(fft.next_fast_len(n, real=True))
 
 
 def _scale_rows(matrix: Any, weight: Floats) -> Any:

@@ -358,14 +358,7 @@ class Sensor:
             raise ParameterError(name, error.detail) from error.__cause__
 
     def filter_transmission(self, wavelength_nm: Floats) -> Floats:
-        """
-        Compute filter transmissions without quantum efficiency, (n_filter, n_wavelength).
-
-        Raises
-        ------
-        ParameterError
-            If a curve is undefined at a wavelength.
-        """
+        """Compute filter transmissions without quantum efficiency, (n_filter, n_wavelength)."""
         return self._filter_set.transmission(wavelength_nm)
 
     def responsivity_e_per_j(self, wavelength_nm: Floats) -> Floats:
@@ -403,14 +396,7 @@ class Sensor:
     @cached_property
     def adc(self) -> ADC:
         """Analogue-to-digital converter (ADC)."""
-        return ADC(
-            bits=self.bits,
-            companding=self.companding,
-            log_strength=self.log_strength,
-            companding_table=self.companding_table,
-            inl_dn=self.inl_dn,
-            dnl_dn=self.dnl_dn,
-        )
+        return ADC(**{each.name: getattr(self, each.name) for each in fields(ADC)})
 
     @cached_property
     def device(self) -> Device:

@@ -92,7 +92,7 @@ class CrosstalkOperator:
         -----
         The cost is one sparse product per step, 5 ns per site for hexagons.
         """
-        charges = self._per_site("charge_e", charge_e)
+        charges = check_per_site("charge_e", as_numbers("charge_e", charge_e), self.matrix.shape[0], or_rows=True)
         mixed = np.ascontiguousarray(charges, np.float64).reshape(math.prod(charges.shape[:-1]), charges.shape[-1])
         for _ in range(self.n_steps):
             mixed = self._step(mixed, n_threads)
@@ -141,7 +141,7 @@ class CrosstalkOperator:
                 f"variances are defined for operators of one step, and this operator has {self.n_steps}; diffusion acts "
                 "before the draw"
             )
-        values = self._per_site("variance", variance)
+        values = check_per_site("variance", as_numbers("variance", variance), self.matrix.shape[0], or_rows=True)
         columns = np.moveaxis(values, -1, 0)
         mixed = self._squared_matrix @ columns.reshape(columns.shape[0], -1)
         return np.ascontiguousarray(np.moveaxis(mixed.reshape(columns.shape), 0, -1))
@@ -149,9 +149,6 @@ class CrosstalkOperator:
     @cached_property
     def _squared_matrix(self) -> csr_array[Any]:
         return self.matrix.power(2)
-
-    def _per_site(self, name: str, values: ArrayLike) -> Floats:
-        return check_per_site(name, as_numbers(name, values), self.matrix.shape[0], or_rows=True)
 
 
 class _Crosstalk(Declared, Effect):
@@ -268,15 +265,9 @@ class Diffusion(_Crosstalk):
         )
         return cls(spread_um=steps * pitch_um, max_gap_um=max_gap_um)
 
-    def compile(self, layout: OwnCheck[Photosites], *, shared_um: csr_array[Any] | None = None) -> CrosstalkOperator:
+    def compile(self, layout: OwnCheck[Photosites]) -> CrosstalkOperator:
         """
         Compile the diffusion for a layout.
-
-        Parameters
-        ----------
-        layout : Layout
-        shared_um : csr_array (n_site, n_site), optional, µm
-            Precomputed lengths of shared edges; ``layout.adjacency()`` by default, which is most of the cost.
 
         Raises
         ------
@@ -285,7 +276,7 @@ class Diffusion(_Crosstalk):
         SimulationError
             If no two sites share an edge.
         """
-        shared_um = _shared_um(layout, shared_um, self.max_gap_um)
+        shared_um = _shared_um(layout, self.max_gap_um)
         site, neighbour = shared_um.indices, np.repeat(np.arange(layout.n_sites), np.diff(shared_um.indptr))
         centre_um = layout.centroid_um
         distance_um = np.hypot(*np.moveaxis(centre_um[site] - centre_um[neighbour], -1, 0))
@@ -468,7 +459,6 @@ class InterPixelCapacitance(_Crosstalk):
         layout: OwnCheck[Photosites],
         *,
         capacitance_f: ArrayLike | None = None,
-        shared_um: csr_array[Any] | None = None,
     ) -> CrosstalkOperator:
         """
         Compile the coupling for a layout.
@@ -479,8 +469,6 @@ class InterPixelCapacitance(_Crosstalk):
         capacitance_f : number or (n_site,), optional, F
             Capacitance of each node, if they differ. ``neighbour_fraction`` then refers to a node with the median
             capacitance; nodes with smaller capacitances couple more of their charge. The sum of measured charges is conserved.
-        shared_um : csr_array (n_site, n_site), optional, µm
-            Precomputed lengths of shared edges; ``layout.adjacency()`` by default.
 
         Raises
         ------
@@ -490,7 +478,7 @@ class InterPixelCapacitance(_Crosstalk):
         SimulationError
             If no two sites share an edge.
         """
-        shared_um = _shared_um(layout, shared_um, self.max_gap_um)
+        shared_um = _shared_um(layout, self.max_gap_um)
         edge_um = self.edge_um
         if edge_um is None:
             edge_um = float(np.median(shared_um.data)) if shared_um.nnz else 1.0
@@ -522,19 +510,13 @@ def _require_layout(layout: object) -> None:
         raise ParameterError("layout", f"must be a Layout, got {type_name(layout)}")
 
 
-def _shared_um(layout: Photosites, shared_um: csr_array[Any] | None, max_gap_um: float | None) -> csr_array[Any]:
-    """Return checked lengths of shared edges, with int32 indices if possible."""
-    from scipy.sparse import csr_array, issparse
+def _shared_um(layout: Photosites, max_gap_um: float | None) -> csr_array[Any]:
+    """Return the lengths of shared edges, with int32 indices if possible."""
+    from scipy.sparse import csr_array
 
     _require_layout(layout)
     n_sites = layout.n_sites
-    if shared_um is None:
-        shared_um = layout.adjacency(max_gap_um=max_gap_um)
-    elif not issparse(shared_um) or shared_um.shape != (n_sites, n_sites):
-        raise ParameterError(
-            "shared_um", f"must be a sparse array of shape {(n_sites, n_sites)}, as from layout.adjacency()"
-        )
-    shared_um = csr_array(shared_um)
+    shared_um = csr_array(layout.adjacency(max_gap_um=max_gap_um))
     if n_sites > 1 and shared_um.nnz == 0:
         raise SimulationError(
             "no two sites of the layout share an edge, so there is no crosstalk; for sites separated by trenches, set "

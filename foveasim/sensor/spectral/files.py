@@ -134,12 +134,6 @@ def read_filters(
     -------
     FilterSet
         Filters in the order of the columns, which corresponds to the channels of a layout.
-
-    Raises
-    ------
-    FileError
-        If the file is missing, too large or not a valid table, or a value is out of range; the message states the line, the
-        rule and the value.
     """
     path = Path(path)
     table = _read(path, wavelength_unit, value_unit)
