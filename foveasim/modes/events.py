@@ -39,8 +39,6 @@ MAX_COUNTS = 1 << 30
 #: Relative rounding error of distances between neighbours.
 ROUNDING = 1e-9
 POLARITIES = (1, -1)
-#: Pitch of a raster; None for the default.
-Pitch = Annotated[float | None, POSITIVE]
 ARRAYS = ("t_s", "site", "polarity")
 
 
@@ -170,7 +168,7 @@ class Events:
         polarity: ArrayLike,
         layout: Layout,
         *,
-        pitch_um: Pitch = None,
+        pitch_um: Annotated[float | None, POSITIVE] = None,
     ) -> Events:
         """
         Create events from column and row addresses: the inverse of :meth:`addresses`.
@@ -217,7 +215,9 @@ class Events:
             raise ParameterError("layout", f"must have one site at each address (x, y), got {n} at {address}")
         return cls(t_s, order[first].astype(np.int32), polarity, layout)  # type: ignore[arg-type]
 
-    def addresses(self, pitch_um: Pitch = None) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
+    def addresses(
+        self, pitch_um: Annotated[float | None, POSITIVE] = None
+    ) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
         """
         Return column and row of every site on a raster, for tools that require pixel addresses.
 
@@ -249,7 +249,7 @@ class Events:
             )
         return addresses[0].astype(np.uint16), addresses[1].astype(np.uint16)
 
-    def to_structured_array(self, *, pitch_um: Pitch = None) -> NDArray[Any]:
+    def to_structured_array(self, *, pitch_um: Annotated[float | None, POSITIVE] = None) -> NDArray[Any]:
         """
         Return the events as a structured array for event tools such as Tonic.
 
@@ -276,7 +276,7 @@ class Events:
         events["t"], events["p"] = _to_us(self.t_s), self.polarity > 0
         return events
 
-    def save(self, path: str | Path, *, pitch_um: Pitch = None) -> None:
+    def save(self, path: str | Path, *, pitch_um: Annotated[float | None, POSITIVE] = None) -> None:
         """
         Write the events to a file atomically.
 
@@ -338,7 +338,9 @@ class Events:
             return cls(arrays["t_s"], arrays["site"], arrays["polarity"], layout)
 
 
-def write_events(batches: OwnCheck[Iterable[Events]], path: str | Path, *, pitch_um: Pitch = None) -> int:
+def write_events(
+    batches: OwnCheck[Iterable[Events]], path: str | Path, *, pitch_um: Annotated[float | None, POSITIVE] = None
+) -> int:
     """
     Write batches of events to an HDF5 file incrementally and atomically.
 
