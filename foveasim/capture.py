@@ -17,7 +17,7 @@ from foveasim._core.names import possible_names
 from foveasim._core.provenance import copy_plain_data, to_plain_data
 from foveasim._core.rings import same_rings
 from foveasim._core.show import Drawn, drawn
-from foveasim._core.validation import Floats, Ints, check_choice, check_count, own, read_only, unit_of, unmasked
+from foveasim._core.validation import Floats, Ints, check_count, own, read_only, unit_of, unmasked
 from foveasim._io.atomic import atomic_directory
 from foveasim._io.npz import open_archive, write_archive
 from foveasim._io.zarr_stores import ZARR, Variable, free_name, open_store, store_format, write_variables
@@ -28,7 +28,6 @@ from foveasim.layout.packed import layout_from_arrays, layout_to_arrays
 from foveasim.reconstruct import (
     CorticalImage,
     Picture,
-    SiteEstimates,
     cells,
     cortical,
     electrons_per_code,
@@ -53,6 +52,9 @@ __all__ = ["Capture"]
 
 FILE_FORMAT = "foveasim capture"
 FILE_VERSION = 1
+#: Functions of :mod:`foveasim.reconstruct`, and the values that they reconstruct.
+Method = Literal["cells", "linear", "natural", "least_squares"]
+Quantity = Literal["code", "electrons", "expected_e", "light_e"]
 #: Arrays of a capture file, in addition to those of the layout.
 ARRAYS = ("code", "electrons", "expected_e", "filter_of_site")
 #: Units of variables whose names do not end in one.
@@ -141,11 +143,11 @@ class Capture:
 
     def picture(
         self,
-        method: Literal["cells", "linear", "natural", "least_squares"] = "cells",
+        method: Method = "cells",
         *,
         max_pixels: int = 1024,
         grid: Grid | None = None,
-        of: Literal["code", "electrons", "expected_e", "light_e"] = "code",
+        of: Quantity = "code",
         per: Literal["site", "um2"] = "site",
         sensor: Sensor | None = None,
         **options: Any,
@@ -196,9 +198,6 @@ class Capture:
         it is scaled to a site of mean response. The ``variance`` is by default that of shot noise, and for codes also that
         of reset, read, RTS and quantisation noise.
         """
-        check_choice("method", method, ("cells", "linear", "natural", "least_squares"))
-        check_choice("of", of, ("code", "electrons", "expected_e", "light_e"))
-        check_choice("per", per, ("site", "um2"))
         known = {"n_threads"} | (
             {"mu", "blur", "tolerance", "max_steps", "variance"} if method == "least_squares" else set()
         )
@@ -244,7 +243,7 @@ class Capture:
     def cortical(
         self,
         *,
-        of: Literal["code", "electrons", "expected_e", "light_e"] = "code",
+        of: Quantity = "code",
         per: Literal["site", "um2"] = "site",
         n_rings: int | None = None,
         n_sectors: int | None = None,
@@ -285,8 +284,6 @@ class Capture:
         ParameterError
             When the layout does not have such rings and no shape is given, or as for :meth:`picture`.
         """
-        check_choice("of", of, ("code", "electrons", "expected_e", "light_e"))
-        check_choice("per", per, ("site", "um2"))
         self._check_sensor(sensor)
         if n_rings is None and n_sectors is None:
             for name, value in (("r_min_um", r_min_um), ("r_max_um", r_max_um), ("centre_um", centre_um)):
@@ -320,11 +317,6 @@ class Capture:
         Returns
         -------
         ratio : (n_site,) float64
-
-        Raises
-        ------
-        ParameterError
-            When the sensor's parameters are not known, or the sensor has another layout.
         """
         self._check_sensor(sensor)
         known = self._electronics(sensor)
@@ -355,7 +347,11 @@ class Capture:
         response = self.layout.area_um2 * electronics.sensitivity * (np.mean(e_per_dn) / e_per_dn)
         if not is_estimated:
             return values, response, None
-        estimates = self._estimates(electronics, of)
+        exposure_s = float(self.settings.get("exposure_s", 0.0))
+        if of in ("code", "light_e"):
+            estimates = estimate_from_code(self.code, electronics, exposure_s)
+        else:
+            estimates = estimate_from_charge(getattr(self, of), electronics, exposure_s)
         values = estimates.light_e / e_per_dn
         if is_fitted:
             values[estimates.is_saturated] = np.nan
@@ -376,12 +372,6 @@ class Capture:
                 )
         return known
 
-    def _estimates(self, electronics: Sensor, of: str) -> SiteEstimates:
-        exposure_s = float(self.settings.get("exposure_s", 0.0))
-        if of in ("code", "light_e"):
-            return estimate_from_code(self.code, electronics, exposure_s)
-        return estimate_from_charge(getattr(self, of), electronics, exposure_s)
-
     to_pyvista: ClassVar[Drawn[PolyData]] = drawn("polydata")
     plot: ClassVar[Drawn[Axes]] = drawn("plot_capture")
     plot3d: ClassVar[Drawn[None]] = drawn("show_columns")
@@ -399,11 +389,6 @@ class Capture:
             ``x_um`` and ``y_um``, ``area_um2``, names of the filters, and all columns of the layout. Every variable has
             its ``units``, ``"1"`` when dimensionless. Attributes: ``bits``, ``seed``, ``exposure_s``, and
             ``settings``, ``versions``, ``provenance`` as JSON strings.
-
-        Raises
-        ------
-        ParameterError
-            When xarray is missing.
 
         Notes
         -----
@@ -429,11 +414,6 @@ class Capture:
             Index ``site``. Columns ``x_um``, ``y_um``, ``area_um2``, ``filter_name``, ``filter_of_site``, ``code``,
             ``electrons``, ``expected_e``, and the columns of the layout, named as in :meth:`to_xarray`. ``attrs`` contains the
             attributes of :meth:`to_xarray`.
-
-        Raises
-        ------
-        ParameterError
-            When pandas is missing.
 
         Examples
         --------
@@ -564,12 +544,10 @@ class Capture:
         if source.is_dir() or (source.suffix.lower() == ZARR and not source.exists()):
             return cls._load_store(source)
         with open_archive(source, "foveasim capture", FILE_FORMAT, FILE_VERSION) as (about, arrays):
+            values: dict[str, Any] = {name: arrays[name] for name in ARRAYS}
             return cls(
                 layout=layout_from_arrays(arrays, about["provenance"]),
-                code=arrays["code"],
-                electrons=arrays["electrons"],
-                expected_e=arrays["expected_e"],
-                filter_of_site=arrays["filter_of_site"],
+                **values,
                 filter_names=tuple(about["filter_names"]),
                 bits=int(about["bits"]),
                 white_dn=np.asarray(about["white_dn"], dtype=np.float64),

@@ -20,13 +20,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.calls import publish
+from foveasim._core.calls import Limits, publish
 from foveasim._core.extras import import_optional
 from foveasim._core.names import missing_path
 from foveasim._core.provenance import differences, to_plain_data
@@ -39,12 +39,10 @@ from foveasim._io.resumable import LOCK, disk_errors, finish, partial_path, resu
 from foveasim._io.zarr_stores import ZARR, open_group, store_format
 from foveasim.camera import Camera
 from foveasim.camera._clock import Clock
-from foveasim.camera._coverage import Covered, warn_of_coverage
-from foveasim.camera._lens_scale import warn_of_focal_length
-from foveasim.camera._sampling import warn_of_coarse_cells
 from foveasim.camera._steps import WeightedMap, capture_settings, expose, integrate_maps, to_sensor_frame, white_dn
+from foveasim.camera._warnings import Covered, warn_of_coarse_cells, warn_of_coverage, warn_of_focal_length
 from foveasim.capture import Capture
-from foveasim.errors import FileError, ParameterError, type_name
+from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Grid, PowerMap
 from foveasim.integrate import Integrator, outline_bounds_um
 from foveasim.layout import Layout
@@ -86,10 +84,10 @@ def capture_tiles(
     camera: Camera,
     light: Scene | PowerMap,
     *,
-    exposure_s: float,
+    exposure_s: Annotated[float, EXPOSURE],
     seed: int,
     frame: int = 0,
-    tile_sites: int = TILE_SITES,
+    tile_sites: Annotated[int, Limits(at_least=1)] = TILE_SITES,
     first_tile: int = 0,
 ) -> Iterator[Capture]:
     """
@@ -127,12 +125,7 @@ def capture_tiles(
     FoveasimWarning
         Before the first tile, when the lens model contradicts the focal length of the optics, as for a capture.
     """
-    if not isinstance(camera, Camera):
-        raise ParameterError("camera", f"must be a Camera, got {type_name(camera)}")
-    if not isinstance(light, Scene | PowerMap):
-        raise ParameterError("light", f"must be a Scene or a PowerMap, got {type_name(light)}")
     streams = Streams(seed, frame)
-    exposure_s = EXPOSURE.check("exposure_s", exposure_s)
     tile_sites = _whole_blocks(tile_sites)
     n_tiles = -(-camera.layout.n_sites // tile_sites)
     first_tile = check_count("first_tile", first_tile, at_least=0, at_most=n_tiles)
@@ -141,7 +134,6 @@ def capture_tiles(
 
 
 def _whole_blocks(tile_sites: int) -> int:
-    tile_sites = check_count("tile_sites", tile_sites, at_least=1)
     return -(-tile_sites // BLOCK_SITES) * BLOCK_SITES
 
 
@@ -175,10 +167,9 @@ def _tiles(
         coverages.append(Covered.by(smallest))
         rate_e_per_s = integrate_maps(sensor, light, _maps(sensor, light, images, strips, clock), integrators, clock)
         # Arrays per site are those of all sites, as in a stored capture.
-        about = capture_settings(camera, light, exposure_s, streams)
-        about["tile"] = {"first_site": first, "n_sites": layout.n_sites}
+        about = {"first_site": first, "n_sites": layout.n_sites}
         part_streams = Streams(streams.seed, streams.frame, first // BLOCK_SITES)
-        yield expose(sensor, light, rate_e_per_s, exposure_s, part_streams, clock, about, camera.n_threads)
+        yield expose(camera, sensor, light, rate_e_per_s, exposure_s, part_streams, clock, tile=about)
     if coverages:
         smallest_image = min((image.grid for image in images), key=lambda grid: grid.cell_area_um2)
         warn_of_coverage(source, Covered.union(smallest_image.bounds_um, coverages), layout.n_sites)
@@ -304,8 +295,6 @@ class TiledCapture:
 
         Raises
         ------
-        ParameterError
-            When there is no such tile.
         FileError
             When the store is corrupt.
         """
@@ -338,10 +327,6 @@ class TiledCapture:
         max_pixels : int
             Pixels along the longer side. A site belongs to the pixel that contains its centroid; pixels without sites are NaN.
             For pixels that are smaller than sites, use ``tile(number).picture()``.
-
-        Returns
-        -------
-        Picture
         """
         grid = raster_grid(self.layout, max_pixels)
         n_y, n_x = grid.shape
@@ -364,10 +349,10 @@ def write_tiles(
     camera: Camera,
     light: Scene | PowerMap,
     *,
-    exposure_s: float,
+    exposure_s: Annotated[float, EXPOSURE],
     seed: int,
     frame: int = 0,
-    tile_sites: int = TILE_SITES,
+    tile_sites: Annotated[int, Limits(at_least=1)] = TILE_SITES,
     progress: bool = False,
 ) -> TiledCapture:
     """
@@ -384,10 +369,6 @@ def write_tiles(
         As for :func:`capture_tiles`.
     progress : bool
         Whether to show a progress bar with the remaining time.
-
-    Returns
-    -------
-    TiledCapture
 
     Raises
     ------
@@ -469,13 +450,11 @@ def _plan(
     camera: Camera, light: Scene | PowerMap, exposure_s: float, streams: Streams, tile_sites: int
 ) -> dict[str, Any]:
     """Return plain data that identify a tiled capture; arrays of the light as checksums."""
-    settings = capture_settings(camera, light, EXPOSURE.check("exposure_s", exposure_s), streams)
-    arrays = [light.data] if isinstance(light, PowerMap) else [light.basis]
+    settings = capture_settings(camera, light, exposure_s, streams)
     checksum = 0
-    for array in arrays:
-        for plane in array:
-            for first in range(0, plane.shape[0], 256):
-                checksum = crc32(np.ascontiguousarray(in_memory(plane[first : first + 256])).data, checksum)
+    for plane in light.data if isinstance(light, PowerMap) else light.basis:
+        for first in range(0, plane.shape[0], 256):
+            checksum = crc32(np.ascontiguousarray(in_memory(plane[first : first + 256])).data, checksum)
     n_sites = camera.layout.n_sites
     plan = {"settings": settings, "light_crc32": checksum, "n_sites": n_sites, "tile_sites": tile_sites}
     found: dict[str, Any] = json.loads(json.dumps(plan))

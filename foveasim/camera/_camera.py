@@ -11,31 +11,32 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from threading import Lock
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.calls import OwnCheck
+from foveasim._core.calls import NOT_NEGATIVE, Limits, OwnCheck
 from foveasim._core.provenance import copy_plain_data, to_plain_data
 from foveasim._core.random_streams import Streams
 from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property, in_order, thread_count
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import Bools, Floats, check_count, finite_array, read_only
+from foveasim._core.validation import Bools, Floats, finite_array, read_only
 from foveasim.camera._clock import Clock
-from foveasim.camera._coverage import Covered, format_point, size_um, warn_of_coverage
 from foveasim.camera._frames import Frame, ImageCache, Position, Task, check_frames, position_settings, tasks
-from foveasim.camera._lens_scale import warn_of_focal_length
-from foveasim.camera._sampling import warn_of_coarse_cells
-from foveasim.camera._steps import WeightedMap, capture_settings, expose, integrate_maps, to_sensor_frame, white_dn
+from foveasim.camera._steps import WeightedMap, expose, integrate_maps, to_sensor_frame, white_dn
+from foveasim.camera._warnings import (
+    Covered,
+    format_point,
+    size_um,
+    warn_of_coarse_cells,
+    warn_of_coverage,
+    warn_of_focal_length,
+)
 from foveasim.capture import Capture
 from foveasim.distortion import Lens
-from foveasim.errors import (
-    FoveasimWarning,
-    ParameterError,
-    type_name,
-)
+from foveasim.errors import FoveasimWarning, ParameterError, type_name
 from foveasim.fields import Grid, PowerMap
 from foveasim.integrate import Integrator, outline_bounds_um
 from foveasim.layout import Layout
@@ -46,6 +47,7 @@ from foveasim.reconstruct.rasters import sum_of_images
 from foveasim.scene import Scene
 from foveasim.sensor import NoiseBudget, Sensor, noise_budget
 from foveasim.sensor.limits import EXPOSURE
+from foveasim.sensor.per_site import check_per_site
 from foveasim.units import um_from_nm, w_from_w_m2_um2
 
 #: Margin of a picture that covers undistorted outlines: their edges are curves of limited accuracy.
@@ -110,22 +112,12 @@ class Camera:
         order: Literal[1, 2] | None = None,
         n_threads: int | None = None,
     ) -> None:
-        for name, part, kind in (("optics", optics, Optics), ("sensor", sensor, Sensor)):
-            if not isinstance(part, kind):
-                raise ParameterError(name, f"must be a foveasim.{kind.__name__}, got {type_name(part)}")
         if not isinstance(sensor.layout, Layout):
             raise ParameterError("sensor", f"must have a foveasim.Layout, got {type_name(sensor.layout)}")
-        if distortion is not None and not isinstance(distortion, Lens):
-            raise ParameterError(
-                "distortion",
-                f"must be a lens model with distort, undistort, focal_um and centre_um, got {type_name(distortion)}",
-            )
         self._optics = optics
         self._sensor = sensor
         self._distortion = distortion
-        self._order: Literal[1, 2] | None = order
-        if order is not None:
-            self._order = 2 if check_count("order", order, at_most=2) == 2 else 1
+        self._order: Literal[1, 2] | None = None if order is None else 2 if order == 2 else 1
         self._layout = sensor.layout
         self._n_threads = thread_count(n_threads)
         self._integrators: dict[tuple[Grid, int, Position, bool], Integrator] = {}
@@ -223,8 +215,6 @@ class Camera:
             When the layout has no photosites in the image circle, or for ``"contain"`` the optical axis is outside its
             bounding box; when the distance of the scene is at most the focal length.
         """
-        if not isinstance(scene, Scene):
-            raise ParameterError("scene", f"must be a Scene, got {type_name(scene)}")
         if scene.pitch_um is not None:
             return scene
         framed = self._framed
@@ -271,29 +261,16 @@ class Camera:
         """
         Return the image of a scene's pixel grid without distortion, in the sensor frame.
 
-        Parameters
-        ----------
-        scene : Scene
-
         Returns
         -------
         Grid
             :meth:`Optics.grid`, centred on the principal point of the distortion model.
-
-        Raises
-        ------
-        ParameterError
-            When the scene is not a Scene, or its distance is at most the focal length.
         """
         return to_sensor_frame(self._distortion, self._optics.grid(self.frame(scene)))
 
     def power_map(self, scene: Scene) -> PowerMap:
         """
         Compute the image irradiance of a scene without distortion, in the sensor frame.
-
-        Parameters
-        ----------
-        scene : Scene
 
         Returns
         -------
@@ -407,7 +384,7 @@ class Camera:
         self,
         light: Scene | PowerMap,
         *,
-        exposure_s: float,
+        exposure_s: Annotated[float, EXPOSURE],
         seed: int,
         frame: int = 0,
         photo_e_per_s: Floats | None = None,
@@ -424,43 +401,17 @@ class Camera:
             Seed and frame number of the noise. Equal ones give bit-identical captures.
         photo_e_per_s : (n_site,) float64, optional, e-/s
             Result of :meth:`photoelectrons_per_s` for the same ``light``, which is then not computed again.
-
-        Returns
-        -------
-        Capture
-
-        Raises
-        ------
-        ParameterError, SimulationError
-            When a value is out of range, or the parts are incompatible.
         """
         streams = Streams(seed, frame)
-        exposure_s = EXPOSURE.check("exposure_s", exposure_s)
         clock = Clock()
         if photo_e_per_s is None:
             photo_e_per_s = self._photoelectrons_per_s(light, clock)
         else:
-            photo_e_per_s = finite_array("photo_e_per_s", photo_e_per_s, ndim=1, at_least=0.0)
-            if photo_e_per_s.size != self._layout.n_sites:
-                raise ParameterError(
-                    "photo_e_per_s", f"must be {self._layout.n_sites} numbers, one per site, got {photo_e_per_s.size}"
-                )
-        return self._expose(light, photo_e_per_s, exposure_s, streams, clock)
+            photo_e_per_s = finite_array("photo_e_per_s", photo_e_per_s, at_least=0.0)
+            check_per_site("photo_e_per_s", photo_e_per_s, self._layout.n_sites)
+        return expose(self, self._sensor, light, photo_e_per_s, exposure_s, streams, clock)
 
-    def _expose(
-        self,
-        light: Scene | PowerMap,
-        photo_e_per_s: Floats,
-        exposure_s: float,
-        streams: Streams,
-        clock: Clock,
-        **settings: Any,
-    ) -> Capture:
-        """Simulate the sensor for photoelectron rates."""
-        about = capture_settings(self, light, exposure_s, streams) | settings
-        return expose(self._sensor, light, photo_e_per_s, exposure_s, streams, clock, about, self._n_threads)
-
-    def rates(self, frames: OwnCheck[Iterable[Frame]], *, ahead: int = 0) -> Iterator[Floats]:
+    def rates(self, frames: OwnCheck[Iterable[Frame]], *, ahead: Annotated[int, NOT_NEGATIVE] = 0) -> Iterator[Floats]:
         """
         Yield the expected photoelectrons of every site per second, frame by frame.
 
@@ -474,14 +425,8 @@ class Camera:
         ------
         photo_e_per_s : (n_site,) float64, e-/s
             As :meth:`photoelectrons_per_s` returns it. Read-only: repeated frames share one array.
-
-        Raises
-        ------
-        ParameterError, SimulationError
-            On the call, when an argument is out of range; during iteration, as for :meth:`capture`.
         """
         check_frames(frames)
-        ahead = check_count("ahead", ahead, at_least=0)
         return (rate_e_per_s for _, rate_e_per_s in self._frame_rates(frames, Clock(), ahead))
 
     def video(
@@ -493,9 +438,9 @@ class Camera:
         first_frame: int = 0,
         frame_s: float | None = None,
         line_s: float = 0.0,
-        every: int = 1,
+        every: Annotated[int, Limits(at_least=1)] = 1,
         between: Between = "hold",
-        ahead: int = 0,
+        ahead: Annotated[int, NOT_NEGATIVE] = 0,
     ) -> Iterator[Capture]:
         """
         Yield captures of a sequence of frames, each computed on demand.
@@ -524,10 +469,6 @@ class Camera:
             Number of frames to compute in advance, each in one thread. This can be faster than one frame in all threads for
             frames that are slow to read, or with many cores; on two cores it is slower. Only for frames that do not depend on
             earlier captures.
-
-        Yields
-        ------
-        Capture
 
         Raises
         ------
@@ -571,7 +512,6 @@ class Camera:
             name = "line_s" if line_s else "between" if between != "hold" else "every"
             raise ParameterError(name, "requires 'frame_s', the frame period")
         streams = Streams(seed, first_frame)
-        every, ahead = check_count("every", every), check_count("ahead", ahead, at_least=0)
         if frame_s is None:
             return self._separate(frames, exposures_s, streams, ahead)
         shutter = Shutter(self._layout, frame_s, line_s, between)
@@ -591,7 +531,8 @@ class Camera:
         for k, (task, rate_e_per_s) in enumerate(self._frame_rates(frames, clock, ahead)):
             number = Streams(streams.seed, streams.frame + k)
             exposure_s = float(exposures_s[number.frame % exposures_s.size])
-            yield self._expose(task.light, rate_e_per_s, exposure_s, number, clock.take(), **position_settings(task))
+            settings = position_settings(task)
+            yield expose(self, self._sensor, task.light, rate_e_per_s, exposure_s, number, clock.take(), **settings)
 
     def _rolling(
         self, frames: Iterable[Frame], exposures_s: Floats, streams: Streams, shutter: Shutter, every: int, ahead: int
@@ -605,7 +546,8 @@ class Camera:
             k, task, exposure = in_progress.popleft()
             number = Streams(streams.seed, streams.frame + k)
             mean_e_per_s, settings = exposure.mean_e_per_s(last_e_per_s), times | position_settings(task, every)
-            return self._expose(task.light, mean_e_per_s, exposure.exposure_s, number, clock.take(), **settings)
+            arguments = task.light, mean_e_per_s, exposure.exposure_s, number, clock.take()
+            return expose(self, self._sensor, *arguments, **settings)
 
         rate_e_per_s = np.zeros(1)
         for n, (task, rate_e_per_s) in enumerate(self._frame_rates(frames, clock, ahead)):
@@ -651,25 +593,15 @@ class Camera:
         """
         Return mean and variance of every site's code analytically.
 
-        Parameters
-        ----------
-        light : Scene or PowerMap
-        exposure_s : float, s
-
         Returns
         -------
         mean_dn, variance_dn2 : (n_site,) float64, DN and DN²
             Over the temporal noise of this device; its fixed patterns are part of the mean.
-
-        Raises
-        ------
-        ParameterError, SimulationError
-            As for :meth:`capture`.
         """
         expected_e = self._sensor.expected_electrons(self._photoelectrons_per_s(light, Clock()), exposure_s)
         return self._sensor.predict(expected_e, n_threads=self._n_threads)
 
-    def reference(self, light: Scene | PowerMap, grid: Grid, *, exposure_s: float) -> Picture:
+    def reference(self, light: Scene | PowerMap, grid: Grid, *, exposure_s: Annotated[float, EXPOSURE]) -> Picture:
         """
         Return the picture of an ideal raster sensor, as ground truth for reconstructions.
 
@@ -686,15 +618,7 @@ class Camera:
             Exact means over the pixels, e-/µm², one channel per filter, without noise and dark signal; NaN outside the image.
             With the white balance of captures. With lateral chromatic aberration, the sum of the images of all sizes, each on
             its own cells, as in captures.
-
-        Raises
-        ------
-        ParameterError, SimulationError
-            As for :meth:`capture`.
         """
-        exposure_s = EXPOSURE.check("exposure_s", exposure_s)
-        if not isinstance(light, Scene | PowerMap):
-            raise ParameterError("light", f"must be a Scene or a PowerMap, got {type_name(light)}")
         joules_per_w_m2 = float(w_from_w_m2_um2(exposure_s))
         weights = self._sensor.responsivity_e_per_j(light.wavelength_nm) * joules_per_w_m2
         if isinstance(light, PowerMap):
@@ -714,20 +638,10 @@ class Camera:
         """
         Return the noise of every site by source: :func:`foveasim.sensor.noise_budget`.
 
-        Parameters
-        ----------
-        light : Scene or PowerMap
-        exposure_s : float, s
-
         Returns
         -------
         NoiseBudget
             Standard deviation by source, a dict of str to (n_site,) float64, e-.
-
-        Raises
-        ------
-        ParameterError, SimulationError
-            As for :meth:`capture`.
         """
         return noise_budget(self._sensor, self._photoelectrons_per_s(light, Clock()), exposure_s)
 

@@ -13,7 +13,7 @@ from foveasim._core.provenance import to_plain_data, versions
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Bools, Floats, read_only
 from foveasim.camera._clock import Clock
-from foveasim.camera._sampling import warn_of_negative
+from foveasim.camera._warnings import warn_of_negative
 from foveasim.capture import Capture
 from foveasim.distortion import Lens
 from foveasim.errors import SimulationError
@@ -102,18 +102,21 @@ def _check_rates(light: Scene | PowerMap, rate_e_per_s: Floats, order: int) -> N
 
 
 def expose(
+    camera: Camera,
     sensor: Sensor,
     light: Scene | PowerMap,
     photo_e_per_s: Floats,
     exposure_s: float,
     streams: Streams,
     clock: Clock,
-    settings: dict[str, Any],
-    n_threads: int,
+    **settings: Any,
 ) -> Capture:
-    """Simulate a sensor for photoelectron rates."""
+    """Simulate the sensor of a camera, or a part of it, for photoelectron rates."""
+    about = capture_settings(camera, light, exposure_s, streams) | settings
     with clock.stage("sensor"):
-        expected_e, electrons, code = sensor.expose(photo_e_per_s, exposure_s, streams=streams, n_threads=n_threads)
+        expected_e, electrons, code = sensor.expose(
+            photo_e_per_s, exposure_s, streams=streams, n_threads=camera.n_threads
+        )
     assert isinstance(sensor.layout, Layout)  # as in every camera
     return Capture(
         layout=sensor.layout,
@@ -124,7 +127,7 @@ def expose(
         filter_names=sensor.filter_names,
         bits=sensor.bits,
         white_dn=white_dn(sensor, light),
-        settings=settings,
+        settings=about,
         stage_s=clock.stage_s,
     )
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from foveasim._core.names import possible_names
 from foveasim._core.validation import Floats
 from foveasim.distortion import Lens
-from foveasim.errors import GeometryError, ParameterError, type_name
+from foveasim.errors import GeometryError, ParameterError
 from foveasim.learn._tensors import as_array, check_tensor
 
 __all__ = ["coefficient_names", "coefficient_values", "undistort", "with_coefficients"]
@@ -95,8 +95,6 @@ def undistort(lens: Lens, points: Tensor, coefficients: Tensor | None = None, na
 
     Raises
     ------
-    ParameterError
-        If a name is not that of a coefficient.
     GeometryError
         If a point lies outside the image circle.
 
@@ -105,8 +103,6 @@ def undistort(lens: Lens, points: Tensor, coefficients: Tensor | None = None, na
     Derivatives are central differences of fourth order of the lens model, which is smooth on the scale of its focal
     length. Their relative error is about 1e-9.
     """
-    if not isinstance(lens, Lens):
-        raise ParameterError("lens", f"must be a lens model of foveasim.distortion, got {type_name(lens)}")
     points = check_tensor("points", points, (None, 2))
     names = tuple(names)
     known = coefficient_names(lens)

@@ -22,11 +22,11 @@ from torch import Tensor, nn
 from foveasim._core.names import possible_names
 from foveasim._core.validation import Floats, Ints
 from foveasim._io.mapped_files import in_memory
-from foveasim.errors import ParameterError, type_name
+from foveasim.errors import ParameterError
 from foveasim.fields import Grid, SceneLike
 from foveasim.learn._tensors import check_tensor, constant
 from foveasim.optics import Optics, PupilImage, Seidel, Zernike, zernike
-from foveasim.optics._aperture import Aperture, overlaps
+from foveasim.optics._aperture import PUPIL_POINTS, Aperture, overlaps
 from foveasim.optics._imaging import PatchExtent
 from foveasim.units import um_from_nm
 
@@ -74,10 +74,9 @@ class Imaging(nn.Module):
 
     Notes
     -----
-    Padding, and the sampling of the aperture, are those of the initial lens: start with aberrations of the size that
-    you expect,
-    or set ``padding_cells``. Variations of a lens whose initial OTF is that of the clear circle use the sampled aperture, whose
-    OTF is accurate to 7e-4.
+    Padding, and the sampling of the aperture, are those of the initial lens: start with aberrations of the size that you
+    expect, or set ``padding_cells``. Variations of a lens whose initial OTF is that of the clear circle use the sampled
+    aperture, whose OTF is accurate to 7e-4.
     """
 
     zernike: nn.Parameter
@@ -87,8 +86,6 @@ class Imaging(nn.Module):
 
     def __init__(self, optics: Optics, scene: SceneLike, wrt: Iterable[str] = ()) -> None:
         super().__init__()
-        if not isinstance(optics, Optics):
-            raise ParameterError("optics", f"must be an Optics, got {type_name(optics)}")
         if optics.lateral_colour is not None:
             raise ParameterError("optics", "must have no lateral chromatic aberration for gradients", optics)
         self.wrt: tuple[str, ...] = _check_variables("wrt", wrt, VARIABLES)
@@ -336,7 +333,7 @@ class Imaging(nn.Module):
         """Return amplitude and relative transmittance of the current pupil."""
         n = samples.shape[0]
         # The shape of the aperture without the picture: the unit disc.
-        n_fine = self._aperture._sample_pupil(wave_nm, max(_pupil_points(), n)).shape[0]  # noqa: SLF001
+        n_fine = self._aperture._sample_pupil(wave_nm, max(PUPIL_POINTS, n)).shape[0]  # noqa: SLF001
         position = (np.arange(n_fine) + 0.5) * (2.0 / n_fine) - 1.0
         disc = constant(position**2 + position[:, np.newaxis] ** 2 <= 1.0)
         n_pixels = self.pupil.shape[0]
@@ -423,12 +420,6 @@ def _bilinear(tables: Tensor, v: Floats, u: Floats) -> Tensor:
     rows = tables[:, j] * (1.0 - wv)[:, None] + tables[:, j + 1] * wv[:, None]
     found = rows[..., i] * (1.0 - wu) + rows[..., i + 1] * wu
     return found * (in_v[:, None] * in_u)
-
-
-def _pupil_points() -> int:
-    from foveasim.optics._aperture import PUPIL_POINTS
-
-    return PUPIL_POINTS
 
 
 def _osa(n: int, m: int) -> int:

@@ -1,9 +1,8 @@
 """
 Integrals over sites as differentiable functions of the vertices and the maps.
 
-The operations form a closed set: the derivatives of integrals are moments along edges and the adjoint of the
-integrator, and the
-derivatives of these are again moments and integrals. All but the third derivatives therefore exist as code.
+The operations form a closed set: the derivatives of integrals are moments along edges and the adjoint of the integrator, and
+the derivatives of these are again moments and integrals. All but the third derivatives therefore exist as code.
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ import torch
 from torch import Tensor
 
 from foveasim._core.threads import thread_count
-from foveasim._core.validation import Floats, Ints, check_count
-from foveasim.errors import GeometryError, ParameterError, type_name
+from foveasim._core.validation import Floats, Ints
+from foveasim.errors import GeometryError
 from foveasim.fields import Grid
 from foveasim.integrate import EdgeMoments, Integrator
 from foveasim.learn._tensors import as_array, check_tensor
@@ -67,8 +66,6 @@ def site_power(
 
     Raises
     ------
-    ParameterError
-        If a tensor has another shape, is not of a floating-point type, or is not on the CPU.
     GeometryError
         If the outline of a site is clockwise; :meth:`Mesh.limit_step` prevents it.
 
@@ -89,17 +86,12 @@ def site_power(
     """
     if isinstance(outlines, Mesh):
         outlines = outlines.outlines
-    if not isinstance(outlines, Outlines):
-        raise ParameterError("outlines", f"must be Outlines or a Mesh, got {type_name(outlines)}")
-    if not isinstance(grid, Grid):
-        raise ParameterError("grid", f"must be a Grid, got {type_name(grid)}")
     points = outlines.check_points(points)
     if not isinstance(maps, Tensor) or maps.ndim < 2:
         check_tensor("maps", maps, grid.shape, " or (..., n_y, n_x)")
     flat = check_tensor("maps", maps.reshape(-1, *maps.shape[-2:]), (None, *grid.shape), ", as the grid")
-    check_count("order", order, at_most=2)
     integral = Integral(outlines, grid, 2 if order == 2 else 1, thread_count(n_threads))
-    return _SitePower.apply(points, flat, integral).reshape(*maps.shape[:-2], outlines.n_sites)  # type: ignore[no-any-return, no-untyped-call]
+    return _Power.apply(points, flat, integral, False).reshape(*maps.shape[:-2], outlines.n_sites)  # type: ignore[no-any-return, no-untyped-call]
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,51 +182,30 @@ class Integral:
         along = points[end] - points[begin]
         normal = torch.stack((along[:, 1], -along[:, 0]), dim=1)
         sums = (moments * self.edge_weights(weights).to(moments.dtype)[:, :, None]).sum(dim=0)
-        gradient = torch.zeros_like(points)
-        gradient = gradient.index_add(0, begin, normal * sums[:, 0:1].to(points.dtype))
+        gradient = torch.zeros_like(points).index_add(0, begin, normal * sums[:, 0:1].to(points.dtype))
         return gradient.index_add(0, end, normal * sums[:, 1:2].to(points.dtype))
 
 
-def _point_gradient(ctx: Any, points: Tensor, maps: Tensor, weights: Tensor) -> Tensor | None:
-    """Return the gradient of ``sum weights * power`` by the points, if it is needed."""
-    if not ctx.needs_input_grad[0]:
-        return None
-    moments = _Moments.apply(points, maps, ctx.integral)
-    return ctx.integral.contract(points, moments, weights)  # type: ignore[no-any-return]
-
-
-class _SitePower(torch.autograd.Function):
-    """Integrals of maps over sites."""
+class _Power(torch.autograd.Function):
+    """Integrals of maps over sites, or the adjoint: maps from weights of the sites."""
 
     @staticmethod
-    def forward(ctx: Any, points: Tensor, maps: Tensor, integral: Integral) -> Tensor:
-        ctx.save_for_backward(points, maps)
-        ctx.integral = integral
-        return integral.power(points, maps)
+    def forward(ctx: Any, points: Tensor, values: Tensor, integral: Integral, is_adjoint: bool) -> Tensor:
+        ctx.save_for_backward(points, values)
+        ctx.integral, ctx.is_adjoint = integral, is_adjoint
+        return integral.spread(points, values) if is_adjoint else integral.power(points, values)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
-        (weights,) = gradients
-        points, maps = ctx.saved_tensors
-        of_maps = _Spread.apply(points, weights, ctx.integral).to(maps.dtype) if ctx.needs_input_grad[1] else None
-        return _point_gradient(ctx, points, maps, weights), of_maps, None
-
-
-class _Spread(torch.autograd.Function):
-    """Adjoint of the integrals: maps from weights of the sites."""
-
-    @staticmethod
-    def forward(ctx: Any, points: Tensor, weights: Tensor, integral: Integral) -> Tensor:
-        ctx.save_for_backward(points, weights)
-        ctx.integral = integral
-        return integral.spread(points, weights)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
-        (maps,) = gradients
-        points, weights = ctx.saved_tensors
-        of_weights = _SitePower.apply(points, maps, ctx.integral).to(weights.dtype) if ctx.needs_input_grad[1] else None
-        return _point_gradient(ctx, points, maps, weights), of_weights, None
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
+        (gradient,) = gradients
+        points, values = ctx.saved_tensors
+        of_points = of_values = None
+        if ctx.needs_input_grad[0]:
+            maps, weights = (gradient, values) if ctx.is_adjoint else (values, gradient)
+            of_points = ctx.integral.contract(points, _Moments.apply(points, maps, ctx.integral), weights)
+        if ctx.needs_input_grad[1]:
+            of_values = _Power.apply(points, gradient, ctx.integral, not ctx.is_adjoint).to(values.dtype)
+        return of_points, of_values, None, None
 
 
 class _Moments(torch.autograd.Function):

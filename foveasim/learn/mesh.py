@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from foveasim._core.validation import Bools, Floats, Ints, check_choice
+from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.layout import Layout
-from foveasim.learn._tensors import constant
+from foveasim.learn._tensors import constant, shorten_steps
 from foveasim.learn.outlines import Outlines
 
 __all__ = ["Mesh"]
@@ -19,8 +19,6 @@ __all__ = ["Mesh"]
 STRAIGHT_RAD = 1e-6
 #: Edges below this length are points.
 MIN_EDGE_UM = 1e-9
-#: Number of times that a displacement is halved before it is cancelled.
-MAX_HALVINGS = 8
 
 
 class Mesh(nn.Module):
@@ -59,7 +57,6 @@ class Mesh(nn.Module):
 
     def __init__(self, layout: Layout, boundary: Literal["fixed", "sliding", "free"] = "fixed") -> None:
         super().__init__()
-        check_choice("boundary", boundary, ("fixed", "sliding", "free"))
         self.outlines: Outlines
         self.outlines, points_um = Outlines.from_layout(layout)
         point, direction = _degrees_of_freedom(self.outlines, points_um, boundary)
@@ -114,9 +111,8 @@ class Mesh(nn.Module):
         """
         Shorten the last step of an optimiser such that all outlines stay valid.
 
-        The step is the displacement since the previous call, or since the mesh was created. Only vertices of invalid
-        sites and their
-        coordinates are affected: their steps are halved until the sites are valid, and cancelled after 8 times.
+        The step is the displacement since the previous call, or since the mesh was created. Only vertices of invalid sites
+        and their coordinates are affected: their steps are halved until the sites are valid, and cancelled after 8 times.
 
         Returns
         -------
@@ -131,22 +127,13 @@ class Mesh(nn.Module):
             optimiser.step()
             mesh.limit_step()
         """
-        target, start = self.displacement_um.detach().clone(), self._previous_um
-        target = torch.where(torch.isfinite(target), target, start)
-        fraction = torch.ones_like(target)
-        while True:
-            self.displacement_um.copy_(start + fraction * (target - start))
+
+        def find_invalid(displacement_um: Tensor) -> Tensor | None:
+            self.displacement_um.copy_(displacement_um)
             invalid = self.invalid_sites()
-            if not invalid.size:
-                break
-            is_blocked = torch.from_numpy(self._touches(invalid))[self._point]
-            if not bool((fraction[is_blocked] > 0.0).any()):
-                # The neighbours that moved further are the cause.
-                is_blocked = torch.ones_like(is_blocked)
-                if not bool((fraction > 0.0).any()):
-                    break
-            halved = 0.5 * fraction
-            fraction = torch.where(is_blocked, torch.where(halved < 0.5**MAX_HALVINGS, 0.0, halved), fraction)
+            return torch.from_numpy(self._touches(invalid))[self._point] if invalid.size else None
+
+        fraction = shorten_steps(self._previous_um, self.displacement_um.detach().clone(), find_invalid)
         self._previous_um.copy_(self.displacement_um)
         return float(fraction.min()) if fraction.numel() else 1.0
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from foveasim.camera import Camera
-from foveasim.errors import ParameterError, type_name
+from foveasim.errors import ParameterError
 from foveasim.fields import Grid
 from foveasim.integrate import UndistortedOutlines
 from foveasim.learn._tensors import constant
@@ -95,10 +95,6 @@ class Model(nn.Module):
         boundary: Literal["fixed", "sliding", "free"] = "fixed",
     ) -> None:
         super().__init__()
-        if not isinstance(camera, Camera):
-            raise ParameterError("camera", f"must be a Camera, got {type_name(camera)}")
-        if not isinstance(scene, Scene):
-            raise ParameterError("scene", f"must be a Scene, got {type_name(scene)}")
         self.wrt: tuple[str, ...] = _check_variables("wrt", wrt, VARIABLES)
         self._camera, self._scene = camera, camera.frame(scene)
         sensor = camera.sensor
@@ -265,11 +261,6 @@ def capture(
     expected_e : (n_site,) float64 tensor, e-
     model : Model
         With the variables as parameters.
-
-    Raises
-    ------
-    ParameterError
-        As for :class:`Model`.
     """
     model = Model(camera, scene, wrt, exposure_s=exposure_s, **options)
     return model(), model

@@ -15,7 +15,7 @@ from torch import Tensor
 from foveasim._core.rings import positions_in_runs
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, Ints, read_only
-from foveasim.errors import GeometryError, ParameterError, type_name
+from foveasim.errors import GeometryError, ParameterError
 from foveasim.integrate import SharedEdges
 from foveasim.layout import Layout, node
 from foveasim.layout._noding import merge_coincident_points
@@ -62,10 +62,6 @@ class Outlines:
         Vertices of neighbours at the same position, within 1e-6 µm, become one point. Vertices on an edge of a neighbour are
         inserted there first (:func:`foveasim.layout.node`), so that displacements open no gaps.
 
-        Parameters
-        ----------
-        layout : Layout
-
         Returns
         -------
         outlines : Outlines
@@ -74,10 +70,8 @@ class Outlines:
         Raises
         ------
         ParameterError
-            When the argument is not a Layout, or has no sites.
+            When the layout has no sites.
         """
-        if not isinstance(layout, Layout):
-            raise ParameterError("layout", f"must be a Layout, got {type_name(layout)}")
         if not layout.n_sites:
             raise ParameterError("layout", "must have at least one site", layout)
         noded = node(layout)

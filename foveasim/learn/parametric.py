@@ -91,8 +91,6 @@ def generated(generator: str | Callable[..., Layout], parameters: Mapping[str, A
     Outlines(28 sites, 41 points)
     """
     name, function = _find_generator(generator)
-    if not isinstance(parameters, Mapping):
-        raise ParameterError("parameters", f"must be a mapping of names to values, got {type_name(parameters)}")
     signature = inspect.signature(function).parameters
     variables = {}
     plain: dict[str, Any] = {}
@@ -140,14 +138,10 @@ class _Vertices(torch.autograd.Function):
         return None, None, *parts
 
 
-def _find_generator(generator: object) -> tuple[str, Callable[..., Layout]]:
+def _find_generator(generator: str | Callable[..., Layout]) -> tuple[str, Callable[..., Layout]]:
     """Return the name and the function of a generator."""
     if isinstance(generator, str):
         return generator, LAYOUTS.find("generator", generator)
-    if not callable(generator):
-        raise ParameterError(
-            "generator", f"must be the name of a layout family or a function, got {type_name(generator)}"
-        )
     return getattr(generator, "__name__", "the function"), generator
 
 

@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import shapely
 import torch
 from torch import Tensor
 
+from foveasim._core.calls import POSITIVE, Limits
 from foveasim._core.rings import positions_in_runs
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import Bools, Floats, Ints, check_number
-from foveasim.errors import ParameterError, type_name
+from foveasim._core.validation import Bools, Floats, Ints
+from foveasim.errors import ParameterError
 from foveasim.layout import DesignRules
 from foveasim.layout.drc import RULES
 from foveasim.learn._tensors import as_array
@@ -39,9 +41,9 @@ def barrier(
     outlines: Outlines | Mesh,
     rules: DesignRules,
     *,
-    weight: float = 1.0,
-    margin_fraction: float = 0.1,
-    quadratic_fraction: float = 0.05,
+    weight: Annotated[float, POSITIVE] = 1.0,
+    margin_fraction: Annotated[float, POSITIVE] = 0.1,
+    quadratic_fraction: Annotated[float, Limits(above=0.0, at_most=1.0)] = 0.05,
     convex: bool = False,
 ) -> Tensor:
     """
@@ -106,27 +108,20 @@ def barrier(
     """
     if isinstance(outlines, Mesh):
         outlines = outlines.outlines
-    if not isinstance(outlines, Outlines):
-        raise ParameterError("outlines", f"must be Outlines or a Mesh, got {type_name(outlines)}")
     points = outlines.check_points(points)
     limits = _limits(rules)
-    weight = check_number("weight", weight, above=0.0)
-    margin = check_number("margin_fraction", margin_fraction, above=0.0)
-    start = check_number("quadratic_fraction", quadratic_fraction, above=0.0, at_most=1.0)
     shape = _Shape(points, outlines)
     penalty = points.new_zeros(())
     for name, limit in limits.items():
-        for clearance, factor in MEASURES[name](shape, limit, margin):
-            penalty = penalty + (factor * _smooth_log(clearance / margin, start)).sum()
+        for clearance, factor in MEASURES[name](shape, limit, margin_fraction):
+            penalty = penalty + (factor * _smooth_log(clearance / margin_fraction, quadratic_fraction)).sum()
     if convex:
-        penalty = penalty + _smooth_log(shape.turning_sines() / margin, start).sum()
+        penalty = penalty + _smooth_log(shape.turning_sines() / margin_fraction, quadratic_fraction).sum()
     return weight * penalty
 
 
-def _limits(rules: object) -> dict[str, float]:
+def _limits(rules: DesignRules) -> dict[str, float]:
     """Return the limits of the supported rules, if no others are set."""
-    if not isinstance(rules, DesignRules):
-        raise ParameterError("rules", f"must be DesignRules, got {type_name(rules)}")
     limits = {}
     for name, limit in rules.limits().items():
         if name in (rules.waivers or {}) or name in CONSTANT_RULES:

@@ -15,7 +15,7 @@ from foveasim.errors import GeometryError, ParameterError, type_name
 from foveasim.fields import Grid
 from foveasim.layout import Layout
 from foveasim.layout._noding import merge_coincident_points
-from foveasim.learn._tensors import as_array, check_tensor, constant
+from foveasim.learn._tensors import as_array, check_tensor, constant, shorten_steps
 from foveasim.learn.integral import site_power
 from foveasim.learn.outlines import Outlines
 
@@ -25,8 +25,6 @@ __all__ = ["PowerCells"]
 N_SIDES = 4
 #: Difference between the total area of all cells and the area of the region that rounding may cause, relative to it.
 AREA_ROUNDING = 1e-9
-#: Number of times that a step is halved before it is cancelled.
-MAX_HALVINGS = 8
 
 
 class PowerCells(nn.Module):
@@ -93,12 +91,8 @@ class PowerCells(nn.Module):
         region = finite_array("region_um", region_um, ndim=1)
         if region.size != 4 or not (region[0] < region[2] and region[1] < region[3]):
             raise ParameterError("region_um", "must be (x_min, y_min, x_max, y_max)", region.tolist(), "µm")
-        self.region_um: tuple[float, float, float, float] = (
-            float(region[0]),
-            float(region[1]),
-            float(region[2]),
-            float(region[3]),
-        )
+        x0, y0, x1, y1 = map(float, region)
+        self.region_um: tuple[float, float, float, float] = x0, y0, x1, y1
         self.centres_um = nn.Parameter(constant(centres))
         self.weights_um2 = nn.Parameter(constant(weights))
         self.register_buffer("_previous", constant(np.column_stack((centres, weights))), persistent=False)
@@ -128,11 +122,6 @@ class PowerCells(nn.Module):
             Corners as differentiable functions of the centres and the weights.
         outlines : Outlines
             Topology: site i is the cell of centre i. It may differ between calls.
-
-        Raises
-        ------
-        GeometryError
-            When a centre lies outside the region, or its cell is empty; the message specifies its index.
         """
         centres = check_tensor("centres_um", self.centres_um, (None, 2))
         weights = check_tensor("weights_um2", self.weights_um2, (centres.shape[0],))
@@ -190,39 +179,27 @@ class PowerCells(nn.Module):
         fraction : float
             Smallest fraction of its step that a centre was moved; 1 if the complete step was valid.
         """
-        target, start = torch.column_stack((self.centres_um, self.weights_um2)), self._previous
-        target = torch.where(torch.isfinite(target), target, start)
-        fraction = torch.ones(self.n_sites, 1, dtype=target.dtype)
-        while True:
-            found = start + fraction * (target - start)
-            self.centres_um.copy_(found[:, :2])
-            self.weights_um2.copy_(found[:, 2])
+
+        def find_invalid(state: Tensor) -> Tensor | None:
+            self.centres_um.copy_(state[:, :2])
+            self.weights_um2.copy_(state[:, 2])
             try:
                 self.cells()
             except GeometryError as error:
-                if not bool(fraction.any()):
+                if torch.equal(state, self._previous):
                     raise
                 is_blocked = torch.zeros(self.n_sites, 1, dtype=torch.bool)
                 is_blocked[list(error.site_ids)] = True
-                if not bool((fraction[is_blocked] > 0.0).any()):
-                    is_blocked = ~is_blocked
-                halved = 0.5 * fraction
-                fraction = torch.where(is_blocked, torch.where(halved < 0.5**MAX_HALVINGS, 0.0, halved), fraction)
-            else:
-                break
-        self._previous.copy_(found)
+                return is_blocked
+            return None
+
+        fraction = shorten_steps(self._previous, torch.column_stack((self.centres_um, self.weights_um2)), find_invalid)
+        self._previous.copy_(torch.column_stack((self.centres_um, self.weights_um2)))
         return float(fraction.min())
 
     @torch.no_grad()
     def layout(self) -> Layout:
-        """
-        Return the layout of the current cells, with corners at equal positions merged.
-
-        Raises
-        ------
-        GeometryError
-            As :meth:`cells`.
-        """
+        """Return the layout of the current cells, with corners at equal positions merged."""
         points, outlines = self.cells()
         merged, group = merge_coincident_points(as_array(points).astype(np.float64))
         vertex = group[outlines.vertex]
@@ -240,16 +217,10 @@ class _Corners:
     Mirror images of the centres across the four sides make the sides edges of the diagram, so that each corner is a point of
     equal power from three centres or images.
 
-    Attributes
-    ----------
-    centre, side : (n_point, 3) int64
-        Centres, and the sides across which their images lie; side 0 for the centre itself.
-    on_side : (n_point,) int64
-        Side on which a corner between two cells lies, otherwise 0; it depends on the first two centres only.
-    at : (n_point, 2) int64
-        Vertical and horizontal side of the corners of the region, otherwise 0.
-    vertex, ring_offsets : (n_vertex,), (n_site + 1,) int64
-        Corners of each cell, counter-clockwise.
+    ``centre``, ``side`` (n_point, 3): centres, and the sides across which their images lie; side 0 for the centre itself.
+    ``on_side`` (n_point,): side on which a corner between two cells lies, otherwise 0; it depends on the first two centres
+    only. ``at`` (n_point, 2): vertical and horizontal side of the corners of the region, otherwise 0. ``vertex`` (n_vertex,),
+    ``ring_offsets`` (n_site + 1,): corners of each cell, counter-clockwise.
     """
 
     def __init__(self, centre: Ints, side: Ints, cell: Ints, corner: Ints) -> None:

@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from foveasim._core.validation import check_choice
-from foveasim.errors import ParameterError, type_name
+from foveasim.errors import ParameterError
 from foveasim.learn._tensors import check_tensor, constant
 from foveasim.sensor import Sensor
 
@@ -27,10 +26,6 @@ class Readout:
     Fixed patterns are those of the device. Quantities per site that depend on the area, such as a capacitance per µm²,
     remain those of the layout of the sensor.
 
-    Parameters
-    ----------
-    sensor : Sensor
-
     Raises
     ------
     ParameterError
@@ -43,12 +38,9 @@ class Readout:
     """
 
     def __init__(self, sensor: Sensor) -> None:
-        if not isinstance(sensor, Sensor):
-            raise ParameterError("sensor", f"must be a Sensor, got {type_name(sensor)}")
         self.sensor = sensor
         self._n_sites = sensor.layout.n_sites
-        self._response = constant(np.broadcast_to(sensor.response, self._n_sites))
-        self._dark = constant(np.broadcast_to(sensor.dark_rate_e_per_s, self._n_sites))
+        self._response, self._dark = self._per_site(sensor.response), self._per_site(sensor.dark_rate_e_per_s)
         self._diffusion: list[Tensor] = []
         self._coupling: list[Tensor] = []
         names: list[str] = []
@@ -117,8 +109,7 @@ class Readout:
         expected_e = self._check("expected_e", expected_e)
         shot = expected_e if self.sensor.shot.is_drawn else torch.zeros_like(expected_e)
         squares = [matrix * matrix for matrix in self._coupling]
-        noise = constant(np.broadcast_to(self._model(expected_e).noise_e2, self._n_sites)).to(shot.dtype)
-        return _mix(shot, squares) + noise
+        return _mix(shot, squares) + self._per_site(self._model(expected_e).noise_e2, shot)
 
     def draw(self, expected_e: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """
@@ -142,9 +133,13 @@ class Readout:
         deviation = torch.sqrt(self.variance_e2(expected_e).clamp_min(1e-12))
         return self._limited(_mix(expected_e, self._coupling) + deviation * noise)
 
+    def _per_site(self, values: Any, like: Tensor | None = None) -> Tensor:
+        """Return numbers, or one number, as a tensor (n_site,)."""
+        found = constant(np.broadcast_to(values, self._n_sites))
+        return found if like is None else found.to(like.dtype)
+
     def _limited(self, charge_e: Tensor) -> Tensor:
-        well = constant(np.broadcast_to(self.sensor.well_e, self._n_sites)).to(charge_e.dtype)
-        return torch.minimum(charge_e, well)
+        return torch.minimum(charge_e, self._per_site(self.sensor.well_e, charge_e))
 
     def voltage(self, charge_e: Tensor) -> Tensor:
         """
@@ -166,7 +161,7 @@ class Readout:
         """Return the voltages of charges, and the derivatives of the voltages."""
         transfer = self._model(charge_e).transfer
         gain, sense, scale, output = (
-            constant(np.broadcast_to(part, self._n_sites)).to(charge_e.dtype)
+            self._per_site(part, charge_e)
             for part in (transfer.v_per_e, transfer.sense_v, transfer.scale, transfer.output_v)
         )
         volts = charge_e * gain + sense
@@ -190,7 +185,6 @@ class Readout:
         (..., n_site) tensor, DN
             DNL is not included.
         """
-        check_choice("adc", adc, ("straight_through", "linear"))
         fraction = self.voltage(charge_e) / self.sensor.v_sat_v
         levels = constant(self.sensor.adc.transition_levels).to(fraction.dtype)
         n_codes = self.sensor.adc.n_codes

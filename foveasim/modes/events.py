@@ -6,16 +6,16 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.calls import OwnCheck
+from foveasim._core.calls import FINITE, POSITIVE, OwnCheck
 from foveasim._core.extras import import_optional
 from foveasim._core.provenance import to_plain_data
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import Floats, Ints, as_numbers, check_number, finite_array, own, read_only
+from foveasim._core.validation import Floats, Ints, as_numbers, finite_array, own, read_only
 from foveasim._io.atomic import atomic_write, check_free_space
 from foveasim._io.formats import as_file_error
 from foveasim._io.npz import open_archive, write_archive
@@ -70,14 +70,8 @@ class Events:
     layout: Layout
 
     def __post_init__(self) -> None:
-        if not isinstance(self.layout, Layout):
-            raise ParameterError("layout", f"must be a foveasim.Layout, got {type_name(self.layout)}")
         t_s, site, polarity = (as_numbers(name, getattr(self, name), keep_type=True) for name in ARRAYS)
-        for name, values, kind in (
-            ("t_s", t_s, np.float64),
-            ("site", site, np.int64),
-            ("polarity", polarity, np.int64),
-        ):
+        for name, values, kind in zip(ARRAYS, (t_s, site, polarity), (np.float64, np.int64, np.int64), strict=True):
             if values.ndim != 1 or values.size != t_s.size:
                 raise ParameterError(name, f"must be one number for each of {t_s.size} times, got {values.shape}")
             if values.size and not np.can_cast(values.dtype, kind, "same_kind"):
@@ -151,9 +145,8 @@ class Events:
             raise ParameterError("polarity", "must be 1 or -1", polarity)
         return np.asarray(self.polarity == polarity)
 
-    def between(self, start_s: float, stop_s: float) -> Events:
+    def between(self, start_s: Annotated[float, FINITE], stop_s: Annotated[float, FINITE]) -> Events:
         """Return the events with ``start_s <= t_s < stop_s``."""
-        start_s, stop_s = check_number("start_s", start_s), check_number("stop_s", stop_s)
         part = slice(*np.searchsorted(self.t_s, (start_s, stop_s)))
         return Events(self.t_s[part], self.site[part], self.polarity[part], self.layout)
 
@@ -175,7 +168,7 @@ class Events:
         polarity: ArrayLike,
         layout: Layout,
         *,
-        pitch_um: float | None = None,
+        pitch_um: Annotated[float | None, POSITIVE] = None,
     ) -> Events:
         """
         Create events from column and row addresses: the inverse of :meth:`addresses`.
@@ -193,10 +186,6 @@ class Events:
             pixels.
         pitch_um : float, optional, µm
             As in :meth:`addresses`.
-
-        Returns
-        -------
-        Events
 
         Raises
         ------
@@ -226,7 +215,9 @@ class Events:
             raise ParameterError("layout", f"must have one site at each address (x, y), got {n} at {address}")
         return cls(t_s, order[first].astype(np.int32), polarity, layout)  # type: ignore[arg-type]
 
-    def addresses(self, pitch_um: float | None = None) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
+    def addresses(
+        self, pitch_um: Annotated[float | None, POSITIVE] = None
+    ) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
         """
         Return column and row of every site on a raster, for tools that require pixel addresses.
 
@@ -258,7 +249,7 @@ class Events:
             )
         return addresses[0].astype(np.uint16), addresses[1].astype(np.uint16)
 
-    def to_structured_array(self, *, pitch_um: float | None = None) -> NDArray[Any]:
+    def to_structured_array(self, *, pitch_um: Annotated[float | None, POSITIVE] = None) -> NDArray[Any]:
         """
         Return the events as a structured array for event tools such as Tonic.
 
@@ -279,18 +270,13 @@ class Events:
         """
         x, y = self.addresses(pitch_um)
         if max(x.max(initial=0), y.max(initial=0)) > MAX_SIGNED_ADDRESS:
-            raise ParameterError(
-                "pitch_um",
-                f"must give at most {MAX_SIGNED_ADDRESS + 1} columns and rows, the range of int16 addresses",
-                pitch_um,
-                "µm",
-            )
+            raise _too_many_addresses(pitch_um, MAX_SIGNED_ADDRESS, "int16")
         events = np.empty(len(self), STRUCTURE)
         events["x"], events["y"] = x[self.site], y[self.site]
         events["t"], events["p"] = _to_us(self.t_s), self.polarity > 0
         return events
 
-    def save(self, path: str | Path, *, pitch_um: float | None = None) -> None:
+    def save(self, path: str | Path, *, pitch_um: Annotated[float | None, POSITIVE] = None) -> None:
         """
         Write the events to a file atomically.
 
@@ -352,7 +338,9 @@ class Events:
             return cls(arrays["t_s"], arrays["site"], arrays["polarity"], layout)
 
 
-def write_events(batches: OwnCheck[Iterable[Events]], path: str | Path, *, pitch_um: float | None = None) -> int:
+def write_events(
+    batches: OwnCheck[Iterable[Events]], path: str | Path, *, pitch_um: Annotated[float | None, POSITIVE] = None
+) -> int:
     """
     Write batches of events to an HDF5 file incrementally and atomically.
 
@@ -476,17 +464,16 @@ def _addresses_on_raster(layout: Layout, pitch_um: float | None) -> tuple[Ints, 
         nearest_um = float(distance_um[distance_um > 0.0].min(initial=np.inf))
         finest_um = float((high_um - low_um).max()) / MAX_ADDRESS
         pitch_um = max((1.0 - ROUNDING) * nearest_um, finest_um) if np.isfinite(nearest_um) else 1.0
-    pitch_um = check_number("pitch_um", pitch_um, above=0.0)
     column = np.floor((centroid_um[:, 0] - low_um[0]) / pitch_um + 0.5)
     row = np.floor((high_um[1] - centroid_um[:, 1]) / pitch_um + 0.5)
     if max(column.max(), row.max()) > MAX_ADDRESS:
-        raise ParameterError(
-            "pitch_um",
-            f"must give at most {MAX_ADDRESS + 1} columns and rows, the range of uint16 addresses",
-            pitch_um,
-            "µm",
-        )
+        raise _too_many_addresses(pitch_um, MAX_ADDRESS, "uint16")
     return column.astype(np.int64), row.astype(np.int64)
+
+
+def _too_many_addresses(pitch_um: float | None, limit: int, kind: str) -> ParameterError:
+    rule = f"must give at most {limit + 1} columns and rows, the range of {kind} addresses"
+    return ParameterError("pitch_um", rule, pitch_um, "µm")
 
 
 def _to_us(t_s: Floats) -> Ints:

@@ -17,16 +17,17 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.calls import Limits, OwnCheck, check_declared
+from foveasim._core.calls import NOT_NEGATIVE, Limits, OwnCheck, check_declared
 from foveasim._core.random_streams import fixed_pattern_key
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property, parallel_map, thread_count
-from foveasim._core.validation import Floats, Ints, check_count, finite_array, read_only
+from foveasim._core.validation import Floats, Ints, finite_array, read_only
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.layout import Layout
 from foveasim.modes.events import Events
 from foveasim.sensor import Sensor
 from foveasim.sensor.limits import CHARGE, DURATION, EXPOSURE, RATE, SPREAD, TEMPERATURE, WIDE_SPREAD
+from foveasim.sensor.per_site import check_per_site
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
 
 __all__ = ["EventPixels", "SpikingPixels"]
@@ -59,9 +60,9 @@ class _Pixels:
         self,
         rates: OwnCheck[Iterable[ArrayLike]],
         *,
-        frame_s: float,
-        seed: int,
-        batch: int = 32,
+        frame_s: Annotated[float, DURATION],
+        seed: Annotated[int, NOT_NEGATIVE],
+        batch: Annotated[int, Limits(at_least=1)] = 32,
         n_threads: int | None = None,
     ) -> Iterator[Events]:
         """
@@ -93,9 +94,7 @@ class _Pixels:
             When the events do not fit in memory, or the current of a site of :class:`EventPixels` is zero.
         """
         _check_rates(rates)
-        frame_s = DURATION.check("frame_s", frame_s)
-        batch = check_count("batch", batch)
-        key = fixed_pattern_key(check_count("seed", seed, at_least=0), self._noise_name)
+        key = fixed_pattern_key(seed, self._noise_name)
         return self._stream(rates, frame_s, key, batch, thread_count(n_threads))
 
     def events(
@@ -278,11 +277,6 @@ class SpikingPixels(_Pixels):
     refractory_s : float, s
         Refractory time after a spike, during which charge is lost.
 
-    Raises
-    ------
-    ParameterError
-        When a value is out of range, or an array does not have one value per site.
-
     Notes
     -----
     Without noise, the spike rate is ``1 / (N_th / I + refractory)`` for a current of I electrons per second. With noise, the
@@ -380,9 +374,7 @@ def _batches(sensor: Sensor, rates: Iterable[ArrayLike], batch: int) -> Iterator
     while rows := list(islice(remaining, batch)):
         current = np.empty((len(rows), n_sites))
         for k, row in enumerate(rows):
-            rate = finite_array("rates", row, at_least=0.0)
-            if rate.shape != (n_sites,):
-                raise ParameterError("rates", f"must have one number for each of the {n_sites} sites, got {rate.shape}")
+            rate = check_per_site("rates", finite_array("rates", row, at_least=0.0), n_sites)
             current[k] = sensor.expected_electrons(rate, 1.0)
         yield current
 

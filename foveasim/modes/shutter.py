@@ -12,12 +12,13 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from foveasim._core.calls import check_declared
+from foveasim._core.calls import NOT_NEGATIVE, check_declared
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, check_count, finite_array
-from foveasim.errors import ParameterError, SimulationError, type_name
+from foveasim._core.validation import Floats, finite_array
+from foveasim.errors import SimulationError
 from foveasim.layout import Layout
 from foveasim.sensor.limits import DURATION, EXPOSURE
+from foveasim.sensor.per_site import check_per_site
 
 __all__ = ["Between", "Exposure", "Shutter"]
 
@@ -45,8 +46,6 @@ class Shutter:
 
     Raises
     ------
-    ParameterError
-        When a time is out of range, or ``layout`` is not a Layout.
     SimulationError
         When ``line_s`` is not 0 and the layout has no column ``readout_order``.
 
@@ -84,14 +83,12 @@ class Shutter:
         order = np.asarray(self.layout.columns["readout_order"], np.float64)
         return self.line_s * (order - order.min(initial=np.inf))
 
-    def overlap_fraction(self, frame: int, exposure_s: float) -> Floats:
+    def overlap_fraction(self, frame: Annotated[int, NOT_NEGATIVE], exposure_s: Annotated[float, EXPOSURE]) -> Floats:
         """
         Return the weight of a frame in the exposure of each site, (n_site,) or (1,).
 
         Frame 0 begins with the first line.
         """
-        frame = check_count("frame", frame, at_least=0)
-        exposure_s = EXPOSURE.check("exposure_s", exposure_s)
         delay_s = self.delay_s
         if not exposure_s:  # instantaneous exposure
             return np.where((delay_s >= frame * self.frame_s) & (delay_s < (frame + 1) * self.frame_s), 1.0, 0.0)
@@ -101,9 +98,8 @@ class Shutter:
         begin, end = (_hat_integral(t_s / self.frame_s - frame) for t_s in (delay_s, delay_s + exposure_s))
         return np.asarray((end - begin) * (self.frame_s / exposure_s))
 
-    def last_frame(self, exposure_s: float) -> int:
+    def last_frame(self, exposure_s: Annotated[float, EXPOSURE]) -> int:
         """Return the last frame that overlaps the exposure of any site."""
-        exposure_s = EXPOSURE.check("exposure_s", exposure_s)
         end = (float(self.delay_s.max(initial=0.0)) + exposure_s) / self.frame_s
         frames = int(np.ceil(end - TIME_ROUNDING))
         return max(frames - 1, 0) if self.between == "hold" else frames
@@ -119,17 +115,9 @@ class Exposure:
         Exposure timing.
     exposure_s : float, s
         Exposure time; 0 for an instantaneous exposure.
-
-    Raises
-    ------
-    ParameterError
-        When the time is out of range, or rates are not finite numbers >= 0, one per site.
     """
 
-    def __init__(self, shutter: Shutter, exposure_s: float) -> None:
-        if not isinstance(shutter, Shutter):
-            raise ParameterError("shutter", f"must be a foveasim.modes.Shutter, got {type_name(shutter)}")
-        exposure_s = EXPOSURE.check("exposure_s", exposure_s)
+    def __init__(self, shutter: Shutter, exposure_s: Annotated[float, EXPOSURE]) -> None:
         self._shutter = shutter
         self.exposure_s: float = exposure_s
         self._last = shutter.last_frame(exposure_s)
@@ -166,10 +154,7 @@ class Exposure:
         return self._rate_e_per_s + (1.0 - self._weight) * last_e_per_s
 
     def _validate_rate(self, name: str, rate_e_per_s: Floats) -> Floats:
-        rate, n_sites = finite_array(name, rate_e_per_s, at_least=0.0), self._shutter.layout.n_sites
-        if rate.shape != (n_sites,):
-            raise ParameterError(name, f"must have one number for each of the {n_sites} sites, got {rate.shape}")
-        return rate
+        return check_per_site(name, finite_array(name, rate_e_per_s, at_least=0.0), self._shutter.layout.n_sites)
 
 
 def _hat_integral(x: Floats) -> Floats:

@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, TypeGuard
+from typing import Annotated, Any, TypeGuard
 
 import numpy as np
 
+from foveasim._core.calls import Limits
 from foveasim._core.rings import TIE_FRACTION, site_moments
-from foveasim._core.validation import (
-    Floats,
-    Ints,
-    as_numbers,
-    check_count,
-    check_memory,
-    finite_array,
-    read_only,
-)
-from foveasim.errors import ParameterError
+from foveasim._core.validation import Floats, Ints, as_numbers, check_memory, finite_array, read_only
 from foveasim.fields import Grid, PackedRings
 from foveasim.integrate import Integrator
 from foveasim.layout import Layout
 from foveasim.reconstruct.picture import Picture, coverage_fraction
+from foveasim.sensor.per_site import check_per_site
 
 __all__ = ["cells", "fill_channels"]
 
@@ -31,8 +24,6 @@ MAX_CACHED, MAX_CACHED_SITES = 2, 1 << 18
 NEIGHBOURS = 4
 #: Smallest distance that determines a weight: coincident sites have a finite one.
 MIN_DISTANCE_UM = 1e-12
-#: Largest number of channels of a picture; more indicate an error.
-MAX_CHANNELS = 65_536
 
 
 def cells(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | None = None) -> Picture:
@@ -62,7 +53,9 @@ def cells(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | N
     return Picture(read_only(data.astype(np.float32)), read_only(coverage.astype(np.float32)), grid)
 
 
-def fill_channels(layout: PackedRings, values: Floats, channel: Ints, n_channels: int) -> Floats:
+def fill_channels(
+    layout: PackedRings, values: Floats, channel: Ints, n_channels: Annotated[int, Limits(at_least=1, at_most=65_536)]
+) -> Floats:
     """
     Interpolate every channel at every site of a colour mosaic.
 
@@ -79,20 +72,11 @@ def fill_channels(layout: PackedRings, values: Floats, channel: Ints, n_channels
         The site's value in its own channel; in other channels the mean of the four nearest sites of that channel, weighted by
         inverse distance. Further sites at the distance of the fourth are included, so that the result does not depend on the
         order of the sites. NaN for a channel without sites.
-
-    Raises
-    ------
-    ParameterError
-        When there is not one value and one channel per site, or ``n_channels`` exceeds the channels of layouts.
     """
-    n_channels = check_count("n_channels", n_channels, at_most=MAX_CHANNELS)
     values = as_numbers("values", values)
     n_sites = layout.site_offsets.size - 1
-    for name, array in (("values", values), ("channel", np.asarray(channel))):
-        if array.shape != (n_sites,):
-            raise ParameterError(
-                name, f"must have one value for each of the {n_sites} sites, got the shape {array.shape}"
-            )
+    check_per_site("values", values, n_sites)
+    check_per_site("channel", np.asarray(channel), n_sites)
     check_memory("n_channels", 8 * n_channels * n_sites, n_channels, "take fewer channels")
     arguments = np.asarray(channel, np.int64).tobytes(), n_channels
     neighbours = _neighbours_once(layout, *arguments) if _is_cached(layout) else _neighbours(layout, *arguments)

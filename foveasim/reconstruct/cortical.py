@@ -12,27 +12,17 @@ angles increase in the same direction. It samples at the corners of pixels, at a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import FINITE, NOT_NEGATIVE, POSITIVE, Limits
 from foveasim._core.short_repr import short_repr
 from foveasim._core.show import Drawn, drawn
-from foveasim._core.validation import (
-    Floats,
-    Images,
-    Ints,
-    as_numbers,
-    check_choice,
-    check_count,
-    check_number,
-    finite_array,
-    own,
-    read_only,
-)
-from foveasim.errors import ParameterError, type_name
+from foveasim._core.validation import Floats, Images, Ints, as_numbers, check_count, finite_array, own, read_only
+from foveasim.errors import ParameterError
 from foveasim.fields import Grid
 from foveasim.layout import Layout
 from foveasim.reconstruct.picture import Picture
@@ -46,7 +36,7 @@ __all__ = ["CorticalImage", "cortical", "from_cortical", "to_cortical"]
 RING_ROUNDING, SECTOR_ROUNDING = 1e-6, 0.05
 #: Fraction of valid neighbours below which an interpolated value is unknown.
 MIN_KNOWN = 0.5
-MAX_SIDE = 2**15
+SIDE = Limits(at_least=1, at_most=2**15)
 #: Hint for layouts without rings of equal sectors.
 RESAMPLE = "resample a picture instead, with 'n_rings' and 'n_sectors'"
 
@@ -147,17 +137,11 @@ def cortical(layout: Layout, values: ArrayLike) -> CorticalImage:
         many sectors as the outermost one; sites of a filled fovea are not part of it.
     values : (n_site,) or (n_channel, n_site)
 
-    Returns
-    -------
-    CorticalImage
-
     Raises
     ------
     ParameterError
         When the layout does not have two or more concentric rings of equal sectors, or there is not one value per site.
     """
-    if not isinstance(layout, Layout):
-        raise ParameterError("layout", f"must be a foveasim.Layout, got {type_name(layout)}")
     channels = np.atleast_2d(as_numbers("values", values, missing_is_nan=True))
     if channels.ndim != 2 or channels.shape[1] != layout.n_sites:
         raise ParameterError("values", f"must have the shape (..., {layout.n_sites}), got {np.shape(values)}")
@@ -202,13 +186,13 @@ def cortical(layout: Layout, values: ArrayLike) -> CorticalImage:
 def to_cortical(
     picture: Picture,
     *,
-    n_rings: int,
-    n_sectors: int,
-    r_max_um: float,
-    r_min_um: float | None = None,
+    n_rings: Annotated[int, SIDE],
+    n_sectors: Annotated[int, SIDE],
+    r_max_um: Annotated[float, POSITIVE],
+    r_min_um: Annotated[float | None, NOT_NEGATIVE] = None,
     centre_um: tuple[float, float] = (0.0, 0.0),
-    start_rad: float = 0.0,
-    offset_um: float = 0.0,
+    start_rad: Annotated[float, FINITE] = 0.0,
+    offset_um: Annotated[float, NOT_NEGATIVE] = 0.0,
 ) -> CorticalImage:
     """
     Resample a picture to a log-polar image by bilinear interpolation.
@@ -232,25 +216,12 @@ def to_cortical(
     -------
     CorticalImage
         NaN where the picture has no data.
-
-    Raises
-    ------
-    ParameterError
-        When a number is out of range, or the radii do not increase.
     """
     from scipy.ndimage import map_coordinates
 
-    if not isinstance(picture, Picture):
-        raise ParameterError("picture", f"must be a foveasim.Picture, got {type_name(picture)}")
-    n_rings = check_count("n_rings", n_rings, at_most=MAX_SIDE)
-    n_sectors = check_count("n_sectors", n_sectors, at_most=MAX_SIDE)
     centre = _centre(centre_um)
-    r_max_um = check_number("r_max_um", r_max_um, above=0.0)
-    offset_um = check_number("offset_um", offset_um, at_least=0.0)
-    start_rad = check_number("start_rad", start_rad)
     if r_min_um is None:
         r_min_um = max(0.0, (r_max_um + offset_um) * math.exp(-2.0 * math.pi * n_rings / n_sectors) - offset_um)
-    r_min_um = check_number("r_min_um", r_min_um, at_least=0.0)
     if not 0.0 < r_min_um + offset_um < r_max_um + offset_um:
         raise ParameterError("r_min_um", f"must be > 0 and < {r_max_um:g}, the outer radius", r_min_um, "µm")
     ratio = (r_max_um + offset_um) / (r_min_um + offset_um)
@@ -274,17 +245,10 @@ def to_cortical(
         weights = map_coordinates(is_known.astype(np.float64), (y, x), order=1, mode="constant", cval=0.0)
         sums = map_coordinates(np.where(is_known, plane, 0.0), (y, x), order=1, mode="constant", cval=0.0)
         channel[:] = np.divide(sums, weights, out=np.full(sums.shape, np.nan), where=weights >= MIN_KNOWN)
-    return CorticalImage(
-        data=data,
-        radius_um=edges_um,
-        start_rad=image.start_rad,
-        centre_um=centre,
-        offset_um=offset_um,
-        white=picture.white,
-    )
+    return replace(image, data=data, white=picture.white)
 
 
-def from_cortical(image: CorticalImage, grid: Grid, *, method: str = "linear") -> Picture:
+def from_cortical(image: CorticalImage, grid: Grid, *, method: Literal["linear", "nearest"] = "linear") -> Picture:
     """
     Map a log-polar image to a raster picture.
 
@@ -302,9 +266,6 @@ def from_cortical(image: CorticalImage, grid: Grid, *, method: str = "linear") -
     Picture
         NaN outside the rings, and where the image is unknown.
     """
-    if not isinstance(image, CorticalImage):
-        raise ParameterError("image", f"must be a CorticalImage, got {type_name(image)}")
-    check_choice("method", method, ("linear", "nearest"))
     x_um, y_um = np.meshgrid(grid.x_um - image.centre_um[0], grid.y_um - image.centre_um[1])
     r_um, angle_rad = np.hypot(x_um, y_um), np.arctan2(y_um, x_um)
     n_channels, n_rings, n_sectors = image.data.shape

@@ -7,16 +7,17 @@ Estimates use the nominal electronics of the sensor, without the deviations of a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats, finite_array
-from foveasim.errors import ParameterError
 from foveasim.sensor import Sensor, linearise
+from foveasim.sensor.calibration import nominal_e_per_dn
 from foveasim.sensor.limits import EXPOSURE
-from foveasim.units import volts_to_electrons
+from foveasim.sensor.per_site import check_per_site
 
 __all__ = ["SiteEstimates", "electrons_per_code", "estimate_from_charge", "estimate_from_code"]
 
@@ -45,11 +46,10 @@ class SiteEstimates:
 
 def electrons_per_code(sensor: Sensor) -> Floats:
     """Return the electrons per linear code of the nominal sensor, (n_site,) e-/DN."""
-    step_e = volts_to_electrons(sensor.v_sat_v / 2.0**sensor.bits, sensor.capacitance_f)
-    return np.broadcast_to(step_e, (sensor.layout.n_sites,))
+    return np.broadcast_to(nominal_e_per_dn(sensor), sensor.layout.n_sites)
 
 
-def estimate_from_charge(charge_e: ArrayLike, sensor: Sensor, exposure_s: float) -> SiteEstimates:
+def estimate_from_charge(charge_e: ArrayLike, sensor: Sensor, exposure_s: Annotated[float, EXPOSURE]) -> SiteEstimates:
     """
     Estimate photoelectrons from charges before readout, with shot noise only.
 
@@ -59,14 +59,8 @@ def estimate_from_charge(charge_e: ArrayLike, sensor: Sensor, exposure_s: float)
     sensor : Sensor
         Nominal sensor: its fixed patterns are not used.
     exposure_s : float, s
-
-    Raises
-    ------
-    ParameterError
-        When a charge is not finite, there is not one charge per site of the sensor, or the exposure is negative.
     """
-    charge = _per_site("charge_e", charge_e, sensor)
-    exposure_s = EXPOSURE.check("exposure_s", exposure_s)
+    charge = check_per_site("charge_e", finite_array("charge_e", charge_e), sensor.layout.n_sites)
     shot = sensor.shot
     _, variance_e2 = shot.moments(np.maximum(charge, 0.0), np.full(charge.size, float(shot.is_drawn)))
     return SiteEstimates(
@@ -76,7 +70,7 @@ def estimate_from_charge(charge_e: ArrayLike, sensor: Sensor, exposure_s: float)
     )
 
 
-def estimate_from_code(code: ArrayLike, sensor: Sensor, exposure_s: float) -> SiteEstimates:
+def estimate_from_code(code: ArrayLike, sensor: Sensor, exposure_s: Annotated[float, EXPOSURE]) -> SiteEstimates:
     """
     Estimate photoelectrons from codes.
 
@@ -88,17 +82,12 @@ def estimate_from_code(code: ArrayLike, sensor: Sensor, exposure_s: float) -> Si
     sensor, exposure_s
         As for :func:`estimate_from_charge`.
 
-    Raises
-    ------
-    ParameterError
-        When a code is out of the sensor's range, there is not one code per site, or the exposure is negative.
-
     Notes
     -----
     Crosstalk, inter-pixel capacitance, differential nonlinearity and fixed patterns are not corrected. For fixed patterns
     see :meth:`foveasim.sensor.Calibration.correct`.
     """
-    codes = _per_site("code", code, sensor)
+    codes = check_per_site("code", finite_array("code", code), sensor.layout.n_sites)
     fraction = (linearise(codes, sensor) + 0.5) / 2.0**sensor.bits - sensor.pedestal_v / sensor.v_sat_v
     nonlinearity = sensor.nonlinearity_fraction
     slope = np.ones(codes.size)
@@ -113,12 +102,3 @@ def estimate_from_code(code: ArrayLike, sensor: Sensor, exposure_s: float) -> Si
     noise_e2 = readout.noise_e2 + step_e**2 * sensor.adc.noise_dn2
     is_saturated = read_e.is_saturated | (codes >= 2**sensor.bits - 1)
     return SiteEstimates(light_e=read_e.light_e, variance_e2=read_e.variance_e2 + noise_e2, is_saturated=is_saturated)
-
-
-def _per_site(name: str, values: ArrayLike, sensor: Sensor) -> Floats:
-    found = finite_array(name, values, ndim=1)
-    if found.size != sensor.layout.n_sites:
-        raise ParameterError(
-            name, f"must have one value for each of the {sensor.layout.n_sites} sites, got {found.size}"
-        )
-    return found

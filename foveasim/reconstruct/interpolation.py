@@ -73,11 +73,6 @@ def natural(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int |
     -------
     Picture
         As for :func:`linear`, but with a continuous gradient except at the centroids.
-
-    Raises
-    ------
-    ParameterError
-        As for :func:`linear`.
     """
     return _interpolate(layout, values, grid, n_threads, is_smooth=True)
 

@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from foveasim._core.calls import POSITIVE, Limits
 from foveasim._core.threads import cached_property, parallel_map, thread_count
-from foveasim._core.validation import Floats, check_choice, check_count, check_number, finite_array, read_only
+from foveasim._core.validation import Floats, finite_array, read_only
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PackedRings
 from foveasim.integrate import Integrator
@@ -50,8 +51,8 @@ def least_squares(
     response: ArrayLike | None = None,
     mu: float | Literal["roughness", "discrepancy"] = "roughness",
     blur: ArrayLike | None = None,
-    tolerance: float = 1e-4,
-    max_steps: int = 5000,
+    tolerance: Annotated[float, Limits(above=0.0, at_most=0.1)] = 1e-4,
+    max_steps: Annotated[int, Limits(at_least=1)] = 5000,
     n_threads: int | None = None,
 ) -> Picture:
     """
@@ -94,8 +95,6 @@ def least_squares(
 
     Raises
     ------
-    ParameterError
-        When an array has a wrong shape, a value is out of range, or a rule for ``mu`` is given without the variance.
     SimulationError
         When the iteration does not converge within ``max_steps``.
 
@@ -111,19 +110,19 @@ def least_squares(
 
     Solved by conjugate gradients with bounds (see ``_bounded``) and a multilevel preconditioner.
     """
+    from scipy import fft
+
     integrator = Integrator(layout, grid, n_threads=n_threads)
     channels = site_values(values, integrator.n_sites)
     n_channels, n_sites = channels.shape
     if not isinstance(mu, str):
-        mu = check_number("mu", mu, above=0.0)
-    elif check_choice("mu", mu, ("roughness", "discrepancy")) and variance is None:
+        mu = POSITIVE.check("mu", mu)
+    elif variance is None:
         raise ParameterError("mu", "must be a number without 'variance', as both rules depend on the noise")
-    tolerance = check_number("tolerance", tolerance, above=0.0, at_most=0.1)
-    max_steps = check_count("max_steps", max_steps)
     coverage = coverage_fraction(integrator)
     kernel_of = _kernels_of(blur, n_channels)
     pad = tuple(n // 2 for n in kernel_of[0].shape) if kernel_of else (0, 0)
-    shape = tuple(_fast_length(n + 2 * p) if p else n for n, p in zip(grid.shape, pad, strict=True))
+    shape = tuple(fft.next_fast_len(n + 2 * p, real=True) if p else n for n, p in zip(grid.shape, pad, strict=True))
     overlaps = _padded_overlaps(integrator, pad, shape)
     covered_um2 = np.asarray(overlaps.sum(axis=1)).ravel()
     area_um2 = covered_um2 + integrator.uncovered_um2
@@ -165,19 +164,9 @@ class _Problem:
     """
     Least-squares problem of one channel, in units of its noise.
 
-    Attributes
-    ----------
-    overlaps : csr_array (n_value, n_pixel)
-        Contribution of each pixel to each value, divided by the noise of the value.
-    right : (n_value,)
-        Values divided by their noise.
-    shape : (n_y, n_x)
-    weights : (along x, along y)
-        Weights of the squared differences of neighbours: 1 for square pixels.
-    transfer : (n_y, n_x // 2 + 1) complex, optional
-        Transfer function of the blur.
-    tolerance : float
-    max_steps : int
+    ``overlaps`` (n_value, n_pixel), sparse: contribution of each pixel to each value, divided by the noise of the value.
+    ``right`` (n_value,): values divided by their noise. ``weights`` (along x, along y): of the squared differences of
+    neighbours, 1 for square pixels. ``transfer`` (n_y, n_x // 2 + 1): transfer function of the blur.
     """
 
     overlaps: Any
@@ -364,13 +353,6 @@ def _noise(variance: ArrayLike | None, gain: Floats, shape: tuple[int, int]) -> 
         raise ParameterError(
             "variance", f"must be one number, or have the shape (..., {shape[1]}), got {values.shape}"
         ) from None
-
-
-def _fast_length(n: int) -> int:
-    """Return the next length for which Fourier transforms are fast."""
-    from scipy import fft
-
-    return int(fft.next_fast_len(n, real=True))
 
 
 def _scale_rows(matrix: Any, weight: Floats) -> Any:

@@ -6,11 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.calls import Limits
 from foveasim._core.show import Drawn, drawn
 from foveasim._core.validation import Floats, Images, check_count, finite_array, own, unmasked
 from foveasim._io.encodings import decode, encode_srgb_values
@@ -95,7 +96,7 @@ class Picture:
         white: float | Floats | None = None,
         *,
         encode_srgb: bool = False,
-        bits: int = 8,
+        bits: Literal[8, 16] = 8,
         background: Colour | None = None,
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
         """
@@ -127,8 +128,6 @@ class Picture:
         """
         if self.data.shape[0] not in (1, 3):
             raise ParameterError("data", f"must have 1 or 3 channels to be shown, got {self.data.shape[0]}")
-        if bits not in (8, 16):
-            raise ParameterError("bits", "must be 8 or 16", bits)
         if white is None:
             balance = np.ones(1) if self.white is None else self.white
             white = balance * (float(np.nanmax(self.data / self._levels(balance), initial=0.0)) or 1.0)
@@ -149,7 +148,7 @@ class Picture:
         white: float | Floats | None = None,
         *,
         encode_srgb: bool = False,
-        bits: int | None = None,
+        bits: Literal[8, 16, 32] | None = None,
         background: Colour | None = None,
     ) -> None:
         """
@@ -180,14 +179,12 @@ class Picture:
             :meth:`to_image`.
         """
         chosen = picture_format(path)
-        if bits is None:
-            bits = np.dtype(chosen.types[0]).itemsize * 8
-        if bits not in (8, 16, 32):
-            raise ParameterError("bits", "must be 8, 16 or 32", bits)
+        if bits is None and np.dtype(chosen.types[0]).itemsize == 4:
+            bits = 32
         if bits != 32:
             if background is None and not chosen.has_alpha:
                 background = NO_DATA_COLOUR
-            write_picture(path, self.to_image(white, encode_srgb=encode_srgb, bits=bits, background=background))
+            write_picture(path, self.to_image(white, encode_srgb=encode_srgb, bits=bits or 8, background=background))
             return
         if encode_srgb:
             raise ParameterError("encode_srgb", "must be False for floating-point files, which store linear values")
@@ -230,9 +227,8 @@ def _channels(colour: Colour, n_channels: int) -> Floats:
     return np.array(rgb[:1] if is_grey else rgb, np.float64).reshape(-1, 1, 1) / 255.0
 
 
-def raster_grid(layout: PackedRings, max_pixels: int) -> Grid:
+def raster_grid(layout: PackedRings, max_pixels: Annotated[int, Limits(at_least=1, at_most=2**15)]) -> Grid:
     """Return a grid of square pixels over the layout, ``max_pixels`` along its longer side."""
-    max_pixels = check_count("max_pixels", max_pixels, at_most=2**15)
     lattice: Lattice | None = getattr(layout, "lattice", None)
     if lattice is None and layout.xy_um.size == 0:
         raise GeometryError("the layout has no sites; a picture needs at least one")

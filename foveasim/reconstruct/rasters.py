@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from foveasim._core.validation import Floats, check_count, finite_array, read_only
-from foveasim.errors import ParameterError, type_name
+from foveasim._core.calls import Limits
+from foveasim._core.validation import Floats, finite_array, read_only
+from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PowerMap
 from foveasim.optics import Optics
 from foveasim.reconstruct.picture import Picture
@@ -41,11 +42,6 @@ def reference(power_map: PowerMap, grid: Grid, *, weights: Floats | None = None)
     -------
     Picture
         NaN outside the map; the coverage is the fraction of a pixel on the map.
-
-    Raises
-    ------
-    ParameterError
-        When the shape of ``weights`` does not match the bands.
     """
     channel_weights = (
         np.eye(power_map.wavelength_nm.size) if weights is None else finite_array("weights", weights, ndim=2)
@@ -83,7 +79,7 @@ def blur_kernel(
     *,
     wavelength_nm: float,
     distance_m: float | None = None,
-    radius: int | None = None,
+    radius: Annotated[int | None, Limits(at_least=0, at_most=MAX_RADIUS)] = None,
 ) -> Floats:
     """
     Compute the blur of a uniform pixel by a lens, the ``blur`` of :func:`least_squares`.
@@ -110,14 +106,11 @@ def blur_kernel(
     On the optical axis: field-dependent aberrations are those of the field centre. The PSF is sampled at λN/4 or finer, and
     averaged exactly over both the emitting and the receiving pixel.
     """
-    if not isinstance(optics, Optics):
-        raise ParameterError("optics", f"must be a foveasim.Optics, got {type_name(optics)}")
     shorter_um = min(grid.pitch_x_um, grid.pitch_y_um)
     if radius is None:
         radii = np.arange(1, MAX_RADIUS + 1)
         energy = optics.encircled_energy((radii + 0.5) * shorter_um, wavelength_nm, distance_m=distance_m)
         radius = int(radii[min(int(np.searchsorted(energy, DEFAULT_ENERGY_FRACTION)), MAX_RADIUS - 1)])
-    radius = check_count("radius", radius, at_least=0, at_most=MAX_RADIUS)
     finest_um = 8.0 * SAMPLE_LAMBDA_N * optics.psf(wavelength_nm, distance_m=distance_m, n_points=1).grid.pitch_x_um
     step_um = shorter_um / (int(np.ceil(shorter_um / finest_um)) | 1)
     n_points = int(np.ceil((2 * radius + 3) * max(grid.pitch_x_um, grid.pitch_y_um) / step_um - 1e-9)) | 1

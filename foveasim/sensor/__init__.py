@@ -14,25 +14,19 @@ from foveasim.sensor.exposures import Ramp, Rates, fit_ramp, merge_exposures, no
 from foveasim.sensor.presets import PRESETS
 from foveasim.sensor.sensor import Sensor
 from foveasim.sensor.signal_to_noise import SiteSignals, signal_to_noise
-from foveasim.sensor.spectral import (
+from foveasim.sensor.spectral.curves import (
     BandMean,
     ConstantCurve,
     Curve,
-    FilterSet,
     GaussianCurve,
     PassBand,
-    PolynomialCurve,
     ProductCurve,
     SiliconQE,
-    SplineCurve,
-    StepCurve,
-    TableCurve,
-    camera_filters,
-    ccd_qe,
-    read_curve,
-    read_filters,
-    rgb_filters,
 )
+from foveasim.sensor.spectral.files import read_curve, read_filters
+from foveasim.sensor.spectral.measured import camera_filters, ccd_qe
+from foveasim.sensor.spectral.response import FilterSet, rgb_filters
+from foveasim.sensor.spectral.tables import PolynomialCurve, SplineCurve, StepCurve, TableCurve
 
 __all__ = [
     "FIXED",

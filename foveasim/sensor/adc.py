@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +19,7 @@ __all__ = ["ADC", "QUANTISATION_DN2", "Companding", "ConversionTables"]
 
 #: Transfer functions from fraction of the voltage range to fraction of the code range.
 Companding = Literal["linear", "root", "log", "table"]
-COMPANDINGS: tuple[Companding, ...] = ("linear", "root", "log", "table")
+COMPANDINGS: tuple[Companding, ...] = get_args(Companding)
 BITS = Limits(at_least=1, at_most=16)
 LOG_STRENGTH = Limits(above=0.0, at_most=1e9)
 DNL = Limits(at_least=0.0, at_most=2.0**16, hint="deviations are in codes")
@@ -99,11 +99,6 @@ class ADC:
         """Number of codes."""
         return int(2**self.bits)
 
-    @property
-    def companding_index(self) -> int:
-        """Number of the companding in the kernels."""
-        return COMPANDINGS.index(self.companding)
-
     @cached_property
     def curve(self) -> Floats:
         """Companding table; a single 0 without a table."""
@@ -172,7 +167,7 @@ class ADC:
         """Return the kernel arguments for a full range in V and a device's DNL key."""
         return ConversionTables(
             v_sat_v=v_sat_v,
-            companding_index=self.companding_index,
+            companding_index=COMPANDINGS.index(self.companding),
             log_strength=self.log_strength,
             curve=self.curve,
             n_codes=self.n_codes,

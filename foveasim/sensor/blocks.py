@@ -6,8 +6,6 @@ from collections.abc import Callable
 
 from foveasim._core.threads import parallel_map, thread_count
 
-__all__ = ["BLOCK_SITES", "for_each_block"]
-
 #: Number of sites per block, fixed so that draws do not depend on the number of threads. An array of this length (512 KiB)
 #: fits the L2 cache, and the interpreter overhead per site, which threads cannot parallelise, is below 2 ns with all effects.
 BLOCK_SITES = 1 << 16

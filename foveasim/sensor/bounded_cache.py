@@ -7,8 +7,6 @@ from typing import Any
 
 from foveasim._core.threads import ForkSafeLock
 
-__all__ = ["BoundedCache"]
-
 
 class BoundedCache:
     """

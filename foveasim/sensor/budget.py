@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 
 from foveasim._core.show import Drawn, drawn
 from foveasim._core.validation import Floats, as_numbers
-from foveasim.errors import ParameterError
 from foveasim.sensor.effects import STANDARD
 from foveasim.sensor.limits import EXPOSURE
-from foveasim.sensor.prediction import MIN_SLOPE
+from foveasim.sensor.per_site import check_per_site
+from foveasim.sensor.prediction import apply_nonlinearity
 from foveasim.sensor.sensor import Sensor
 from foveasim.sensor.signal_to_noise import local_step_e
 
@@ -86,7 +86,7 @@ class NoiseBudget(dict[str, Floats]):
     _repr_html_ = drawn("to_html")
 
 
-def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> NoiseBudget:
+def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: Annotated[float, EXPOSURE]) -> NoiseBudget:
     """
     Compute the standard deviation of a site's charge due to each effect alone.
 
@@ -106,31 +106,19 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> No
         ``sqrt(12)``, and differential nonlinearity. Without clipping, the squares of temporal entries add up to the temporal
         variance of a site, and the squares of fixed entries to the variance between identical sites.
 
-    Raises
-    ------
-    ParameterError
-        If the number of rates is not the number of sites, or the exposure is negative.
-
     Notes
     -----
     An entry is the root mean square deviation from the nominal value: ``sqrt(variance + (mean - nominal)²)`` from
     :meth:`~foveasim.sensor.effects.Effect.moments`, for fixed patterns over all devices. Crosstalk and inter-pixel
     capacitance, which mix sites, are not included.
     """
-    exposure_s = EXPOSURE.check("exposure_s", exposure_s)
-    photo_e_per_s = as_numbers("photo_e_per_s", photo_e_per_s)
     n_sites = sensor.layout.n_sites
-    if photo_e_per_s.shape != (n_sites,):
-        raise ParameterError(
-            "photo_e_per_s", f"must have one value for each of the {n_sites} sites, got the shape {photo_e_per_s.shape}"
-        )
-    photo = photo_e_per_s * sensor.sensitivity
+    rates = check_per_site("photo_e_per_s", as_numbers("photo_e_per_s", photo_e_per_s), n_sites)
+    photo = rates * sensor.sensitivity
     dark = np.broadcast_to(sensor.nominal_dark_e_per_s, n_sites)
     charge_e = (photo + dark) * exposure_s
     volts = charge_e * sensor.v_per_e
-    fraction = np.clip(volts / sensor.v_sat_v, 0.0, 1.0)
-    nonlinearity = sensor.nonlinearity_fraction
-    slope = np.maximum(1.0 - 2.0 * nonlinearity * fraction, MIN_SLOPE)
+    output_v, slope = apply_nonlinearity(sensor, volts)
     # Nominal values at each stage, and the number of electrons per unit of that stage.
     nominal = {
         "photo": (photo, exposure_s),
@@ -138,9 +126,9 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> No
         "expected": (charge_e, 1.0),
         "charge": (charge_e, 1.0),
         "sense_node": (volts, 1.0 / sensor.v_per_e),
-        "output": (volts * (1.0 - nonlinearity * fraction) + sensor.pedestal_v, 1.0 / (sensor.v_per_e * slope)),
+        "output": (output_v, 1.0 / (sensor.v_per_e * slope)),
     }
-    step_e = local_step_e(sensor, charge_e, sensor.v_per_e, np.full(1, sensor.pedestal_v))
+    step_e = local_step_e(sensor, charge_e, sensor.v_per_e, output_v=sensor.pedestal_v)
     temporal = dict.fromkeys(TEMPORAL, np.zeros(1))
     fixed = dict.fromkeys(FIXED, np.zeros(1))
     temporal["quantisation"] = math.sqrt(sensor.adc.noise_dn2) * step_e

@@ -7,20 +7,20 @@ temporal dark noise, defect pixels. All quantities refer to linear codes: compan
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.calls import FRACTION
+from foveasim._core.calls import FRACTION, POSITIVE, Limits, OwnCheck
 from foveasim._core.random_streams import Streams
-from foveasim._core.validation import Bools, Floats, as_numbers, check_count, check_number, finite_array, own, unmasked
-from foveasim.errors import ParameterError, SimulationError, type_name
+from foveasim._core.validation import Bools, Floats, as_numbers, check_number, finite_array
+from foveasim.errors import ParameterError, SimulationError
 from foveasim.sensor.adc import QUANTISATION_DN2
-from foveasim.sensor.effects.crosstalk import Neighbourhood
+from foveasim.sensor.effects import Photosites
 from foveasim.sensor.limits import CHARGE, DURATION, EXPOSURE, RATIO
+from foveasim.sensor.per_site import check_per_site, own_arrays
 from foveasim.sensor.sensor import Sensor
 from foveasim.units import volts_to_electrons
 
@@ -35,6 +35,7 @@ SIGMA_PER_MAD = 1.482602218505602
 FALSE_ALARM_PROBABILITY = 1e-6
 #: Maximum distance, in steps of adjacency, of the neighbours that replace a defective site.
 MAX_FILL_STEPS = 3
+NOISY_RATIO = replace(RATIO, at_least=1.0)
 
 
 # -- inversion of the ADC transfer function ---------------------------------------------------------------------------
@@ -56,11 +57,6 @@ def linearise(code: ArrayLike, sensor: Sensor) -> Floats:
     linear_dn : (...) float64, DN
         Centre of the voltage interval of each code, in linear codes; equal to the code for a linear ADC.
 
-    Raises
-    ------
-    ParameterError
-        If a code is out of the sensor's range, or ``sensor`` is not a Sensor.
-
     Notes
     -----
     A linear code ``y`` corresponds to the voltage ``(y + 1/2) * v_sat_v / 2**bits``. Differential nonlinearity is not
@@ -74,7 +70,6 @@ def linearise(code: ArrayLike, sensor: Sensor) -> Floats:
     >>> linearise([0, 128, 255], sensor).round(2).tolist()
     [-0.5, 64.0, 254.5]
     """
-    _require_sensor(sensor)
     return _interpolate(code, sensor.adc.linear_dn, 2.0**sensor.bits - 1.0)
 
 
@@ -140,10 +135,7 @@ class Calibration:
     linear_dn: Floats | None = None
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            values = getattr(self, field.name)
-            if isinstance(values, np.ndarray):
-                object.__setattr__(self, field.name, own(np.asarray(unmasked(field.name, values))))
+        own_arrays(self)
 
     def __repr__(self) -> str:
         return f"Calibration({self.n_sites} sites, {int(self.defective.sum())} defective, {int(self.clipped.sum())} clipped)"
@@ -165,17 +157,17 @@ class Calibration:
         flat: ArrayLike,
         *,
         dark_long: ArrayLike | None = None,
-        exposure_s: float | None = None,
-        long_exposure_s: float | None = None,
+        exposure_s: Annotated[float | None, EXPOSURE] = None,
+        long_exposure_s: Annotated[float | None, DURATION] = None,
         expected_dn: ArrayLike = 1.0,
         expected_dark_dn_per_s: ArrayLike = 0.0,
         expected_noise_dn: ArrayLike = 1.0,
-        highest_dn: float | None = None,
+        highest_dn: Annotated[float | None, POSITIVE] = None,
         linear_dn: ArrayLike | None = None,
-        hot_sigmas: float = 6.0,
-        dead_fraction: float = 0.5,
-        noisy_ratio: float = 3.0,
-        max_clipped_fraction: float = 0.005,
+        hot_sigmas: Annotated[float, RATIO] = 6.0,
+        dead_fraction: Annotated[float, FRACTION] = 0.5,
+        noisy_ratio: Annotated[float, NOISY_RATIO] = 3.0,
+        max_clipped_fraction: Annotated[float, FRACTION] = 0.005,
     ) -> Calibration:
         """
         Compute a calibration from measured or simulated frames.
@@ -208,14 +200,8 @@ class Calibration:
         max_clipped_fraction : float
             Maximum fraction of the frames in which a site may be clipped.
 
-        Returns
-        -------
-        Calibration
-
         Raises
         ------
-        ParameterError
-            If frames differ in their number of sites, are too few, or a value is out of range.
         SimulationError
             If the flat signal is not above the dark signal, more than half of the sites are saturated, or no site is free of
             defects.
@@ -227,17 +213,20 @@ class Calibration:
         signal. The robust standard deviation is 1.4826 times the median absolute deviation, and at least that of rounding.
         """
         table = None if linear_dn is None else finite_array("linear_dn", linear_dn, ndim=1)
-        stacks = {"dark": _Frames(highest_dn, table), "flat": _Frames(highest_dn, table)}
-        for name, frames, at_least in (("dark", dark, 2), ("flat", flat, 1)):
-            stacks[name].add_all(name, _validate_frames(name, frames, at_least))
-        stack_long = None
-        if dark_long is not None:
-            stack_long = _Frames(highest_dn, table)
-            stack_long.add_all("dark_long", _validate_frames("dark_long", dark_long, 1))
+
+        def stack(name: str, frames: ArrayLike, at_least: int) -> _Frames:
+            found = _Frames(highest_dn, table)
+            for frame in _validate_frames(name, frames, at_least):
+                try:
+                    found.add(frame)
+                except ParameterError as error:
+                    raise ParameterError(name, error.detail) from None
+            return found
+
         return _calibration(
-            stacks["dark"],
-            stacks["flat"],
-            stack_long,
+            stack("dark", dark, 2),
+            stack("flat", flat, 1),
+            None if dark_long is None else stack("dark_long", dark_long, 1),
             exposure_s=exposure_s,
             long_exposure_s=long_exposure_s,
             expected_dn=expected_dn,
@@ -249,7 +238,7 @@ class Calibration:
             max_clipped_fraction=max_clipped_fraction,
         )
 
-    def offset_at(self, exposure_s: float | None = None) -> Floats:
+    def offset_at(self, exposure_s: Annotated[float | None, EXPOSURE] = None) -> Floats:
         """
         Return the dark signal of an exposure time, (n_site,) DN.
 
@@ -257,14 +246,11 @@ class Calibration:
 
         Raises
         ------
-        ParameterError
-            If the exposure time is negative.
         SimulationError
             If the exposure time differs from that of the calibration, and the dark rate is unknown.
         """
         if exposure_s is None:
             return self.offset_dn
-        exposure_s = EXPOSURE.check("exposure_s", exposure_s)
         if exposure_s == self.exposure_s:
             return self.offset_dn
         if self.dark_rate_dn_per_s is None or self.exposure_s is None:
@@ -279,7 +265,7 @@ class Calibration:
         code: ArrayLike,
         *,
         exposure_s: float | None = None,
-        fill: Neighbourhood | None = None,
+        fill: OwnCheck[Photosites | None] = None,
         kind: ArrayLike | None = None,
         max_gap_um: float | None = None,
     ) -> Floats:
@@ -309,12 +295,10 @@ class Calibration:
 
         Raises
         ------
-        ParameterError
-            If the number of codes is not the number of sites, or a code is out of range.
         SimulationError
             If no two sites of the layout are neighbours, or the dark signal of the exposure time is unknown.
         """
-        codes = _per_site("code", code, self.n_sites)
+        codes = check_per_site("code", as_numbers("code", code), self.n_sites, or_rows=True)
         linear_dn = codes if self.linear_dn is None else _interpolate(codes, self.linear_dn, self.linear_dn.size - 1.0)
         is_usable = np.broadcast_to(self.gain > 0.0, codes.shape)
         if self.highest_dn is not None:
@@ -326,14 +310,12 @@ class Calibration:
         return self._replace_defects(values.reshape(-1, self.n_sites), fill, kind, max_gap_um).reshape(codes.shape)
 
     def _replace_defects(
-        self, values: Floats, layout: Neighbourhood, kind: ArrayLike | None, max_gap_um: float | None
+        self, values: Floats, layout: Photosites, kind: ArrayLike | None, max_gap_um: float | None
     ) -> Floats:
         """Replace defective sites in frames (n_frame, n_site) by their nearest good neighbours."""
         if not hasattr(layout, "adjacency") or layout.n_sites != self.n_sites:
             raise ParameterError("fill", f"must be the layout of these {self.n_sites} sites", layout)
-        kinds = None if kind is None else finite_array("kind", kind, ndim=1)
-        if kinds is not None and kinds.size != self.n_sites:
-            raise ParameterError("kind", f"must have one value for each of the {self.n_sites} sites, got {kinds.size}")
+        kinds = None if kind is None else check_per_site("kind", finite_array("kind", kind), self.n_sites)
         bad = np.flatnonzero(self.defective)
         if bad.size == 0:
             return values
@@ -365,15 +347,15 @@ class Calibration:
 def calibrate(
     sensor: Sensor,
     *,
-    exposure_s: float,
+    exposure_s: Annotated[float, DURATION],
     flat_e: ArrayLike,
-    n_frames: int,
+    n_frames: Annotated[int, Limits(at_least=2)],
     seed: int,
-    long_exposure_s: float | None = None,
-    hot_sigmas: float = 6.0,
-    dead_fraction: float = 0.5,
-    noisy_ratio: float = 3.0,
-    max_clipped_fraction: float = 0.005,
+    long_exposure_s: Annotated[float | None, DURATION] = None,
+    hot_sigmas: Annotated[float, RATIO] = 6.0,
+    dead_fraction: Annotated[float, FRACTION] = 0.5,
+    noisy_ratio: Annotated[float, NOISY_RATIO] = 3.0,
+    max_clipped_fraction: Annotated[float, FRACTION] = 0.005,
     n_threads: int | None = None,
 ) -> Calibration:
     """
@@ -406,8 +388,6 @@ def calibrate(
 
     Raises
     ------
-    ParameterError
-        If a value is out of range, or ``flat_e`` does not match the number of sites.
     SimulationError
         If the flat frames saturate more than half of the sites, or no site is free of defects.
 
@@ -425,9 +405,6 @@ def calibrate(
     >>> bool(np.abs(calibration.gain * sensor.response.mean() / sensor.response - 1.0).max() < 0.01)
     True
     """
-    _require_sensor(sensor)
-    exposure_s = DURATION.check("exposure_s", exposure_s)
-    n_frames = check_count("n_frames", n_frames, at_least=2)
     n_sites = sensor.layout.n_sites
     flat = np.ascontiguousarray(_one_or_per_site("flat_e", CHARGE.check_array("flat_e", flat_e), n_sites, above=0.0))
     nominal = sensor.nominal()
@@ -454,7 +431,7 @@ def calibrate(
         return stack
 
     if long_exposure_s is not None:
-        long_exposure_s = replace(DURATION, above=exposure_s).check("long_exposure_s", long_exposure_s)
+        check_number("long_exposure_s", long_exposure_s, above=exposure_s)
     return _calibration(
         frames(zero_e, exposure_s, 0),
         frames(flat, exposure_s, 1),
@@ -478,7 +455,7 @@ class _Frames:
     """Running mean, variance (Welford's algorithm) and clipping counts of linear codes."""
 
     def __init__(self, highest_dn: float | None, linear_dn: Floats | None) -> None:
-        self.highest_dn = None if highest_dn is None else check_number("highest_dn", highest_dn, above=0.0)
+        self.highest_dn = highest_dn
         self.linear_dn = linear_dn
         self.n_frames = 0
         self.mean_dn = self.squares_dn2 = np.zeros(0)
@@ -497,13 +474,6 @@ class _Frames:
         self.n_lowest += code <= 0
         if self.highest_dn is not None:
             self.n_highest += code >= self.highest_dn
-
-    def add_all(self, name: str, frames: Iterable[NDArray[Any]]) -> None:
-        for frame in frames:
-            try:
-                self.add(frame)
-            except ParameterError as error:
-                raise ParameterError(name, error.detail) from None
 
 
 def _calibration(
@@ -525,16 +495,10 @@ def _calibration(
     for name, stack in (("flat", flat), ("dark_long", dark_long)):
         if stack is not None and stack.mean_dn.size != n_sites:
             raise ParameterError(name, f"must have the {n_sites} sites of the dark frames, got {stack.mean_dn.size}")
-    hot_sigmas = RATIO.check("hot_sigmas", hot_sigmas)
-    dead_fraction = FRACTION.check("dead_fraction", dead_fraction)
-    noisy_ratio = replace(RATIO, at_least=1.0).check("noisy_ratio", noisy_ratio)
-    max_clipped_fraction = FRACTION.check("max_clipped_fraction", max_clipped_fraction)
     expected = _one_or_per_site("expected_dn", expected_dn, n_sites, above=0.0)
     expected_rate = _one_or_per_site("expected_dark_dn_per_s", expected_dark_dn_per_s, n_sites, above=None)
     expected_noise = _one_or_per_site("expected_noise_dn", expected_noise_dn, n_sites, above=0.0)
-    if exposure_s is not None:
-        exposure_s = EXPOSURE.check("exposure_s", exposure_s)
-    elif dark_long is not None or expected_rate.any():
+    if exposure_s is None and (dark_long is not None or expected_rate.any()):
         raise ParameterError("exposure_s", "must be given with 'dark_long' or 'expected_dark_dn_per_s'", None)
     if (dark_long is None) != (long_exposure_s is None):
         raise ParameterError("long_exposure_s", "must be given if and only if 'dark_long' is", long_exposure_s)
@@ -627,16 +591,9 @@ def _validate_frames(name: str, frames: ArrayLike, at_least: int) -> Floats:
 
 def _one_or_per_site(name: str, values: ArrayLike, n_sites: int, *, above: float | None) -> Floats:
     array = finite_array(name, values, above=above)
-    if array.shape not in ((), (1,), (n_sites,)):
-        raise ParameterError(name, f"must be one number, or one for each of the {n_sites} sites, got {array.shape}")
+    if array.shape != (1,):
+        check_per_site(name, array, n_sites, or_one=True)
     return np.broadcast_to(array, n_sites)
-
-
-def _per_site(name: str, values: ArrayLike, n_sites: int) -> Floats:
-    array = as_numbers(name, values)
-    if array.ndim == 0 or array.shape[-1] != n_sites:
-        raise ParameterError(name, f"must have one value for each of the {n_sites} sites, got the shape {array.shape}")
-    return array
 
 
 def _sparsity_pattern(matrix: Any) -> csr_array[Any]:
@@ -646,8 +603,3 @@ def _sparsity_pattern(matrix: Any) -> csr_array[Any]:
     out = csr_array(matrix)
     out.data = np.ones_like(out.data, dtype=np.float64)
     return out
-
-
-def _require_sensor(sensor: object) -> None:
-    if not isinstance(sensor, Sensor):
-        raise ParameterError("sensor", f"must be a foveasim.Sensor, got {type_name(sensor)}")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from itertools import groupby
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.names import possible_names
 from foveasim._core.random_streams import Streams
@@ -17,23 +19,6 @@ from foveasim.sensor.adc import ConversionTables
 from foveasim.sensor.blocks import for_each_block
 from foveasim.sensor.effects import STAGES, STANDARD, Effect, FixedFactor, FixedOffset, Sites
 
-__all__ = [
-    "ChargeCheck",
-    "Conversion",
-    "Factor",
-    "FullWell",
-    "Nonlinearity",
-    "Offset",
-    "Save",
-    "Step",
-    "apply_steps",
-    "check_effects",
-    "check_names",
-    "merge_steps",
-    "run_steps",
-    "sort_by_stage",
-]
-
 #: Stages before collection, which have no random stream.
 FIXED_STAGES = ("photo", "dark", "expected")
 #: Names of the effects that keywords build.
@@ -42,7 +27,7 @@ BUILTIN_NAMES = frozenset({"crosstalk", "ipc", "shot", *(cls.name for cls in STA
 RESERVED_NAMES = ("photon_shot", "dark_shot", "quantisation")
 
 
-class _Deterministic:
+class _Deterministic(ABC):
     """Deterministic step of the chain between effects."""
 
     name = ""
@@ -51,34 +36,50 @@ class _Deterministic:
     is_drawn_at_reset = False
     needs_layout = False
 
-    def __init__(self, values: Any) -> None:
-        self.values: NDArray[Any] = np.asarray(values)
-
+    @abstractmethod
     def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
         """Return the values after the step."""
-        raise NotImplementedError
 
 
-class Factor(_Deterministic):
-    """Multiplication by an array (n_site,) or a number."""
+class _Arithmetic(_Deterministic):
+    """Operation with an array (n_site,) or a number; a single neutral value changes nothing."""
+
+    operation: ClassVar[np.ufunc]
+    neutral = 0.0
+
+    def __init__(self, values: ArrayLike) -> None:
+        self.values: NDArray[Any] = np.asarray(values)
+
+    @property
+    def is_neutral(self) -> bool:
+        """Whether the step changes nothing."""
+        return self.values.size == 1 and bool(self.values == self.neutral)
 
     def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
-        """Return the product."""
-        _ = rng
-        values *= sites.select(self.values)
-        return values
+        """Return the result of the operation."""
+        found: Floats = self.operation(values, sites.select(self.values), out=values)
+        return found
 
 
-class Offset(_Deterministic):
-    """Addition of an array (n_site,) or a number."""
+class Factor(_Arithmetic):
+    """Multiplication."""
 
-    def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
-        """Return the sum."""
-        _ = rng
-        values += sites.select(self.values)
-        return values
+    operation, neutral = np.multiply, 1.0
 
 
+class Offset(_Arithmetic):
+    """Addition."""
+
+    operation = np.add
+
+
+class FullWell(_Arithmetic):
+    """Upper limit of the charge."""
+
+    operation, neutral = np.minimum, np.inf
+
+
+@dataclass(eq=False)
 class Nonlinearity(_Deterministic):
     """
     Quadratic response nonlinearity.
@@ -86,20 +87,18 @@ class Nonlinearity(_Deterministic):
     ``fraction`` is the relative signal loss at full range; the loss grows with the square of the voltage.
     """
 
-    def __init__(self, fraction: float, v_sat_v: float) -> None:
-        super().__init__(fraction)
-        self.fraction: float = fraction
-        self.v_sat_v: float = v_sat_v
+    fraction: float
+    v_sat_v: float
 
     def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
         """Return the voltages after the nonlinearity."""
         from foveasim.sensor import _kernels
 
-        _ = sites, rng
         _kernels.apply_nonlinearity(values, self.fraction, self.v_sat_v)
         return values
 
 
+@dataclass(eq=False)
 class ChargeCheck(_Deterministic):
     """
     Check that charges are at least a limit, in e-, and not NaN.
@@ -107,33 +106,21 @@ class ChargeCheck(_Deterministic):
     Raises ParameterError with the name of the charges and the smallest one of the block.
     """
 
-    def __init__(self, name: str, at_least: float) -> None:
-        super().__init__(at_least)
-        self.parameter: str = name
-        self.at_least: float = at_least
+    parameter: str
+    at_least: float
 
     def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
         """Return the values unchanged."""
-        _ = sites, rng
         if values.size and not (smallest := float(np.min(values))) >= self.at_least:
             raise ParameterError(self.parameter, f"must be >= {self.at_least:g} everywhere", smallest, "e-")
         return values
-
-
-class FullWell(_Deterministic):
-    """Upper limit of the charge, an array (n_site,) or a number."""
-
-    def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
-        """Return the values, at most the limit."""
-        _ = rng
-        return np.minimum(values, sites.select(self.values), out=values)
 
 
 class Save(_Deterministic):
     """Copy of the values of all sites to ``values``, an array (n_site,) of any type."""
 
     def __init__(self, dtype: type = np.float64) -> None:
-        super().__init__(np.empty(0, dtype))
+        self.values: NDArray[Any] = np.empty(0, dtype)
 
     def allocate(self, n_sites: int) -> None:
         """Allocate the array; elements are undefined."""
@@ -141,25 +128,23 @@ class Save(_Deterministic):
 
     def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
         """Return the values unchanged."""
-        _ = rng
         self.values[sites.index] = values
         return values
 
 
+@dataclass(eq=False)
 class Conversion(_Deterministic):
     """Conversion of voltages to codes, which are written to an array (n_site,)."""
 
-    def __init__(self, code: NDArray[Any], line: NDArray[np.int32], tables: ConversionTables) -> None:
-        super().__init__(code)
-        self.line: NDArray[np.int32] = line
-        self.tables: ConversionTables = tables
+    code: NDArray[Any]
+    line: NDArray[np.int32]
+    tables: ConversionTables
 
     def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
         """Return the voltages unchanged."""
         from foveasim.sensor import _kernels
 
-        _ = rng
-        _kernels.convert(values, sites.select(self.line), self.tables, self.values[sites.index])
+        _kernels.convert(values, sites.select(self.line), self.tables, self.code[sites.index])
         return values
 
 
@@ -182,19 +167,11 @@ def merge_steps(steps: Iterable[Step], sites: Sites) -> tuple[Step, ...]:
         elif isinstance(step, FixedOffset):
             current = Offset(sites.of(step).pattern(step, step.pattern))
         previous = steps_merged[-1] if steps_merged else None
-        if isinstance(current, Factor) and isinstance(previous, Factor):
-            steps_merged[-1] = Factor(previous.values * current.values)
-        elif isinstance(current, Offset) and isinstance(previous, Offset):
-            steps_merged[-1] = Offset(previous.values + current.values)
+        if isinstance(current, _Arithmetic) and type(previous) is type(current):
+            steps_merged[-1] = type(current)(current.operation(previous.values, current.values))
         else:
             steps_merged.append(current)
-    return tuple(step for step in steps_merged if not _is_neutral(step))
-
-
-def _is_neutral(step: Step) -> bool:
-    """Whether the step is a factor of 1 or an offset of 0."""
-    neutral = 1.0 if isinstance(step, Factor) else 0.0 if isinstance(step, Offset) else None
-    return neutral is not None and isinstance(step, _Deterministic) and step.values.size == 1 and step.values == neutral
+    return tuple(step for step in steps_merged if not (isinstance(step, _Arithmetic) and step.is_neutral))
 
 
 def sort_by_stage(effects: Iterable[Effect]) -> tuple[Effect, ...]:
@@ -253,25 +230,6 @@ def check_names(names: Any, effects: Iterable[Effect]) -> tuple[str, ...]:
             hint = possible_names(name, known)
             raise ParameterError("disabled", "must contain names of effects", name, hint=hint)
     return names
-
-
-def apply_steps(
-    steps: Iterable[Step],
-    values: Any,
-    *,
-    sites: Sites,
-    streams: Streams | None = None,
-    reset_streams: Streams | None = None,
-    n_threads: int | None = None,
-) -> Floats:
-    """
-    Return the values of all sites after steps of the chain, (n_site,) float64.
-
-    ``steps``, ``values``, ``sites``, ``streams``, ``reset_streams``, ``n_threads``: as for :func:`run_steps`.
-    """
-    result = Save()
-    run_steps((*steps, result), values, sites=sites, streams=streams, reset_streams=reset_streams, n_threads=n_threads)
-    return result.values
 
 
 def run_steps(

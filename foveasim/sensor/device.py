@@ -24,8 +24,6 @@ from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, Ints
 from foveasim.fields import PackedRings
 
-__all__ = ["Device"]
-
 Words = NDArray[np.uint64]
 #: Words of the sites of each layout.
 _words: WeakKeyDictionary[Any, Words] = WeakKeyDictionary()

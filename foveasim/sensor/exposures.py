@@ -7,7 +7,7 @@ common to all reads; weights from individual reads would favour those that are l
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.random_streams import Streams
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, Ints, as_numbers, own, unmasked
-from foveasim.errors import ParameterError, SimulationError, type_name
+from foveasim._core.validation import Floats, Ints, as_numbers
+from foveasim.errors import ParameterError, SimulationError
 from foveasim.sensor.calibration import Calibration, linearise, nominal_e_per_dn
 from foveasim.sensor.effects.shot import MAX_CHARGE_E, ROUNDING_E2
 from foveasim.sensor.limits import DURATION, EXPOSURE, RATE
+from foveasim.sensor.per_site import check_per_site, own_arrays
 from foveasim.sensor.sensor import Sensor
 
 __all__ = ["Ramp", "Rates", "fit_ramp", "merge_exposures", "non_destructive_reads"]
@@ -58,7 +59,7 @@ class Rates:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        _make_read_only(self)
+        own_arrays(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +83,7 @@ class Ramp:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        _make_read_only(self)
+        own_arrays(self)
 
 
 # -- HDR merge --------------------------------------------------------------------------------------------------------
@@ -106,14 +107,8 @@ def merge_exposures(
         Calibration for the correction of offsets, dark signal and gain differences. Without one, a linear code y corresponds
         to a charge of ``y + 1/2`` codes, the dark signal is part of the rate, and offsets of the sensor are errors.
 
-    Returns
-    -------
-    Rates
-
     Raises
     ------
-    ParameterError
-        If codes, exposure times and sensor do not match, or a value is out of range.
     SimulationError
         If the calibration does not contain the dark signal of an exposure time.
 
@@ -228,14 +223,8 @@ def non_destructive_reads(
     n_threads : int, optional
         Number of threads; all cores by default. Draws do not depend on it.
 
-    Returns
-    -------
-    Ramp
-
     Raises
     ------
-    ParameterError
-        If the times do not increase, or the number of rates is not the number of sites.
     SimulationError
         If an effect lets the expected charge decrease with time.
 
@@ -257,15 +246,9 @@ def non_destructive_reads(
     [[100, 300], [200, 500], [300, 500]]
     """
     times = _check_increasing("times_s", times_s)
-    if not isinstance(sensor, Sensor):
-        raise ParameterError("sensor", f"must be a foveasim.Sensor, got {type_name(sensor)}")
     n_sites = sensor.layout.n_sites
     photo = RATE.check_array("photo_e_per_s", photo_e_per_s)
-    if photo.shape not in ((), (n_sites,)):
-        raise ParameterError(
-            "photo_e_per_s", f"must be one number, or one for each of the {n_sites} sites, got the shape {photo.shape}"
-        )
-    photo = np.broadcast_to(photo, n_sites)
+    photo = np.broadcast_to(check_per_site("photo_e_per_s", photo, n_sites, or_one=True), n_sites)
     well_e = np.minimum(sensor.well_e, MAX_CHARGE_E).astype(np.int64)
     electrons = np.empty((times.size, n_sites), np.int64)
     codes = []
@@ -319,11 +302,6 @@ def fit_ramp(
     Rates
         The dark signal is part of the rate. NaN for fewer than two usable reads.
 
-    Raises
-    ------
-    ParameterError
-        If codes, times and sensor do not match, or a value is out of range.
-
     Notes
     -----
     Differences of consecutive reads contain neither offset nor reset noise. Their covariance matrix is tridiagonal with
@@ -360,10 +338,7 @@ def fit_ramp(
         rate = _estimate_collected(sensor, np.maximum(rate, 0.0) * longest_s) / longest_s
     else:
         rate = replace(RATE, at_least=None, low=-RATE.high).check_array("weight_rate_e_per_s", weight_rate_e_per_s)
-        if rate.shape not in ((), (n_sites,)):
-            raise ParameterError(
-                "weight_rate_e_per_s", f"must be one number, or one for each of the {n_sites} sites, got {rate.shape}"
-            )
+        check_per_site("weight_rate_e_per_s", rate, n_sites, or_one=True)
     if not sensor.shot.is_drawn:
         rate = np.zeros(1)
     dt_s = np.where(is_used[1:], np.diff(times)[:, None], 0.0)
@@ -386,12 +361,6 @@ def fit_ramp(
 
 
 # -- helpers ----------------------------------------------------------------------------------------------------------
-
-
-def _make_read_only(instance: Any) -> None:
-    for field in fields(instance):
-        values = unmasked(field.name, getattr(instance, field.name))
-        object.__setattr__(instance, field.name, own(np.asarray(values)))
 
 
 def _check_increasing(name: str, times_s: ArrayLike) -> Floats:

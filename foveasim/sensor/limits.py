@@ -10,22 +10,6 @@ from dataclasses import replace
 
 from foveasim._core.calls import FRACTION, Limits
 
-__all__ = [
-    "CHARGE",
-    "DURATION",
-    "EXPOSURE",
-    "NOISE",
-    "OFFSET",
-    "RATE",
-    "RATIO",
-    "SHARE",
-    "SPREAD",
-    "TEMPERATURE",
-    "VOLTS",
-    "WIDE_SPREAD",
-    "Limits",
-]
-
 _ELECTRONS = "charges are in electrons: 1 fC is 6242 e-"
 _SECONDS = "times are in seconds: 1 ms is 1e-3"
 

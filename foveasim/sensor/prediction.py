@@ -4,22 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from foveasim._core.validation import Floats, read_only
-from foveasim.sensor.effects.contract import Effect, Sites
+from foveasim.sensor.effects.contract import Effect, Sites, Stage
 
-__all__ = [
-    "ChargeDistributions",
-    "Quadrature",
-    "ReadoutModel",
-    "Transfer",
-    "clipped_gaussian_moments",
-    "quadrature",
-    "readout_model",
-]
+if TYPE_CHECKING:
+    from foveasim.sensor.sensor import Sensor
 
 #: Number of quadrature nodes for charges clipped at the full well.
 QUADRATURE_NODES = 96
@@ -123,53 +117,37 @@ class _LinearModel:
 
 
 def readout_model(
-    charge: Iterable[Effect],
-    sense_node: Iterable[Effect],
-    output: Iterable[Effect],
-    *,
-    mean_e: Floats,
-    variance_e2: Floats,
-    sites: Sites,
-    v_per_e: Floats,
-    nonlinearity_fraction: float,
-    v_sat_v: float,
-    pedestal_v: float,
-    is_reset: bool = True,
+    sensor: Sensor, mean_e: ArrayLike, variance_e2: ArrayLike, sites: Sites, *, is_reset: bool
 ) -> ReadoutModel:
     """
     Compute the first-order readout model at the mean collected charges.
 
-    ``charge``, ``sense_node``, ``output``: effects of these stages, in order. ``mean_e``, ``variance_e2`` (..., n_site) or
-    (1,), e- and e-²: moments of collected charges. ``sites``: all sites, with a device or without. ``v_per_e`` (n_site,) or
-    (1,), V/e-: nominal conversion gain. ``nonlinearity_fraction``: response nonlinearity: relative signal loss at full range.
-    ``v_sat_v``, ``pedestal_v``: float, V. ``is_reset``: whether to include the noise of effects that are drawn at the reset.
+    ``mean_e``, ``variance_e2`` (..., n_site) or number, e- and e-²: moments of collected charges. ``sites``: all sites, with a
+    device or without. ``is_reset``: whether to include the noise of effects that are drawn at the reset.
     """
+    mean_e, variance_e2 = (np.atleast_1d(np.asarray(part, np.float64)) for part in (mean_e, variance_e2))
+    v_per_e, v_sat_v, pedestal_v = sensor.v_per_e, sensor.v_sat_v, sensor.pedestal_v
+
+    def linear(effects: Iterable[Effect], mean: Floats, variance: Floats) -> _LinearModel:
+        return _LinearModel(effects, mean, variance, sites, is_reset=is_reset)
+
+    def at(stage: Stage) -> Iterable[Effect]:
+        return (effect for effect in sensor.chain if effect.stage == stage)
+
     is_mixed = False
     local: list[Effect] = []
-    for effect in charge:
+    for effect in at("charge"):
         if not effect.mixes_means:
             local.append(effect)
             continue
-        before = _LinearModel(local, mean_e, variance_e2, sites, is_reset=is_reset)
+        before = linear(local, mean_e, variance_e2)
         mean_e, variance_e2 = effect.validate_moments(before.mean, before.variance + before.half_step2, sites)
         is_mixed, local = True, []
-    charges = _LinearModel(local, mean_e, variance_e2, sites, is_reset=is_reset)
-    sense = _LinearModel(
-        sense_node,
-        charges.mean * v_per_e,
-        (charges.variance + charges.half_step2) * v_per_e**2,
-        sites,
-        is_reset=is_reset,
-    )
-    fraction = np.clip(sense.mean / v_sat_v, 0.0, 1.0)
-    slope = np.maximum(1.0 - 2.0 * nonlinearity_fraction * fraction, MIN_SLOPE)
-    last = _LinearModel(
-        output,
-        sense.mean * (1.0 - nonlinearity_fraction * fraction) + pedestal_v,
-        sense.variance * slope**2,
-        sites,
-        is_reset=is_reset,
-    )
+    charges = linear(local, mean_e, variance_e2)
+    variance_v2 = (charges.variance + charges.half_step2) * v_per_e**2
+    sense = linear(at("sense_node"), charges.mean * v_per_e, variance_v2)
+    output_v, slope = apply_nonlinearity(sensor, sense.mean)
+    last = linear(at("output"), output_v, sense.variance * slope**2)
     total_v_per_e = charges.factor * v_per_e * sense.factor
     per_v2 = np.divide(1.0, total_v_per_e**2, out=np.zeros(np.shape(total_v_per_e)), where=total_v_per_e != 0.0)
     noise_v2 = charges.noise * (v_per_e * sense.factor) ** 2 + sense.noise
@@ -185,12 +163,19 @@ def readout_model(
             sense_v=charges.offset * v_per_e * sense.factor + sense.offset,
             scale=last.factor,
             output_v=pedestal_v * last.factor + last.offset,
-            nonlinearity_fraction=nonlinearity_fraction,
+            nonlinearity_fraction=sensor.nonlinearity_fraction,
             v_sat_v=v_sat_v,
         ),
         gaussian_e2=(noise_v2 + last.noise * per_output2) * per_v2,
         half_step_e=np.sqrt((half_step_v2 + last.half_step2 * per_output2) * per_v2),
     )
+
+
+def apply_nonlinearity(sensor: Sensor, sense_v: Floats) -> tuple[Floats, Floats]:
+    """Return voltages after nonlinearity and pedestal, and the slope of the nonlinearity."""
+    fraction = np.clip(sense_v / sensor.v_sat_v, 0.0, 1.0)
+    slope = np.maximum(1.0 - 2.0 * sensor.nonlinearity_fraction * fraction, MIN_SLOPE)
+    return sense_v * (1.0 - sensor.nonlinearity_fraction * fraction) + sensor.pedestal_v, slope
 
 
 @cache

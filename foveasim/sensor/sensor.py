@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -28,7 +28,6 @@ from foveasim.sensor.chain import (
     Offset,
     Save,
     Step,
-    apply_steps,
     check_effects,
     check_names,
     merge_steps,
@@ -36,10 +35,12 @@ from foveasim.sensor.chain import (
     sort_by_stage,
 )
 from foveasim.sensor.device import Device
-from foveasim.sensor.effects import EFFECTS, STANDARD, DarkLaw, Effect, Photosites, Sites, dark_current_factor
+from foveasim.sensor.effects import EFFECTS, Effect, Photosites, Sites
 from foveasim.sensor.effects.contract import CompleteSites, FixedFactor, FixedOffset
 from foveasim.sensor.effects.crosstalk import Diffusion, InterPixelCapacitance, KernelCrosstalk
-from foveasim.sensor.effects.dark import ACTIVATION, DOUBLING
+from foveasim.sensor.effects.dark import ACTIVATION, DOUBLING, DarkLaw, DarkSignal, HotSites, dark_current_factor
+from foveasim.sensor.effects.fixed_pattern import ColumnOffset, DeadSites, PhotoResponse, PixelGain, PixelOffset
+from foveasim.sensor.effects.readout import ReadNoise, ResetNoise, TelegraphNoise
 from foveasim.sensor.effects.shot import GAUSSIAN_ABOVE, ShotChoice, ShotNoise
 from foveasim.sensor.limits import (
     CHARGE,
@@ -53,15 +54,17 @@ from foveasim.sensor.limits import (
     VOLTS,
     WIDE_SPREAD,
 )
+from foveasim.sensor.per_site import check_per_site
 from foveasim.sensor.prediction import (
     ChargeDistributions,
     ReadoutModel,
+    Transfer,
     clipped_gaussian_moments,
     quadrature,
     readout_model,
 )
-from foveasim.sensor.spectral.curves import CurveError
-from foveasim.sensor.spectral.response import ConstantCurve, Curve, FilterSet, rgb_filters
+from foveasim.sensor.spectral.curves import ConstantCurve, Curve, CurveError
+from foveasim.sensor.spectral.response import FilterSet, rgb_filters
 from foveasim.units import electrons_to_volts, photon_energy_j
 
 if TYPE_CHECKING:
@@ -355,14 +358,7 @@ class Sensor:
             raise ParameterError(name, error.detail) from error.__cause__
 
     def filter_transmission(self, wavelength_nm: Floats) -> Floats:
-        """
-        Compute filter transmissions without quantum efficiency, (n_filter, n_wavelength).
-
-        Raises
-        ------
-        ParameterError
-            If a curve is undefined at a wavelength.
-        """
+        """Compute filter transmissions without quantum efficiency, (n_filter, n_wavelength)."""
         return self._filter_set.transmission(wavelength_nm)
 
     def responsivity_e_per_j(self, wavelength_nm: Floats) -> Floats:
@@ -400,14 +396,7 @@ class Sensor:
     @cached_property
     def adc(self) -> ADC:
         """Analogue-to-digital converter (ADC)."""
-        return ADC(
-            bits=self.bits,
-            companding=self.companding,
-            log_strength=self.log_strength,
-            companding_table=self.companding_table,
-            inl_dn=self.inl_dn,
-            dnl_dn=self.dnl_dn,
-        )
+        return ADC(**{each.name: getattr(self, each.name) for each in fields(ADC)})
 
     @cached_property
     def device(self) -> Device:
@@ -420,7 +409,7 @@ class Sensor:
     def chain(self) -> tuple[Effect, ...]:
         """All enabled effects of the sensor, in the order in which they act."""
         standard = [
-            *(effect for cls in STANDARD if (effect := cls.from_sensor(self)) is not None),
+            *self._keyword_effects(),
             *(effect for effect in (self.crosstalk, self.coupling) if effect is not None),
             ShotNoise("off" if ShotNoise.name in self.disabled else self.shot_noise, self.gaussian_above_e),
         ]
@@ -428,6 +417,29 @@ class Sensor:
         standard.sort(key=lambda effect: effect.is_local)
         chain = sort_by_stage((*standard, *self.effects))
         return tuple(effect for effect in chain if effect.name not in self.disabled or effect.stage == "collection")
+
+    def _keyword_effects(self) -> Iterator[Effect]:
+        """Yield the effects that numbers and switches specify, in the order of the chain."""
+        if self.prnu_fraction:
+            yield PhotoResponse(self.prnu_fraction)
+        if self.dead_fraction:
+            yield DeadSites(self.dead_fraction)
+        if self.dsnu_fraction:
+            yield DarkSignal(self.dsnu_fraction)
+        if self.hot_fraction and self.hot_e_per_s:
+            yield HotSites(self.hot_fraction, self.hot_e_per_s * self.dark_current_ratio)
+        if self.ktc_noise and not self.cds:
+            yield ResetNoise(self.temperature_k)
+        if np.any(self.read_noise_e):
+            yield ReadNoise(self.read_noise_e)
+        if self.rts_fraction and self.rts_e:
+            yield TelegraphNoise(self.rts_fraction, self.rts_e)
+        if self.gain_fpn_fraction:
+            yield PixelGain(self.gain_fpn_fraction)
+        if self.pixel_fpn_fraction and not self.cds:
+            yield PixelOffset(self.v_sat_v * self.pixel_fpn_fraction)
+        if self.line_fpn_fraction:
+            yield ColumnOffset(self.v_sat_v * self.line_fpn_fraction)
 
     def without(self, *names: str) -> Sensor:
         """
@@ -437,11 +449,6 @@ class Sensor:
         ----------
         *names : str
             Names of effects, as in :attr:`chain`: ``sensor.without("read", "prnu")``.
-
-        Raises
-        ------
-        ParameterError
-            If a name is not that of an effect.
         """
         return replace(self, disabled=tuple(dict.fromkeys((*self.disabled, *names))))
 
@@ -565,7 +572,9 @@ class Sensor:
         effects, values = self._effects_at(stage), np.atleast_1d(np.asarray(values, np.float64))
         if not effects:
             return read_only(values.copy())
-        return read_only(apply_steps(effects, np.broadcast_to(values, self.layout.n_sites), sites=self.sites))
+        result = Save()
+        run_steps((*effects, result), np.broadcast_to(values, self.layout.n_sites), sites=self.sites)
+        return read_only(result.values)
 
     @property
     def dark_current_ratio(self) -> float:
@@ -608,19 +617,18 @@ class Sensor:
             steps.append(Offset(self.pedestal_v))
         return merge_steps((*steps, *self._effects_at("output")), self.sites)
 
-    def expected_electrons(self, photo_e_per_s: Floats, exposure_s: float, *, n_threads: int | None = None) -> Floats:
+    def expected_electrons(
+        self, photo_e_per_s: Floats, exposure_s: Annotated[float, EXPOSURE], *, n_threads: int | None = None
+    ) -> Floats:
         """
         Compute the expected charge of each site for an exposure, (n_site,) e-.
 
         The charge consists of photoelectrons and dark signal, after charge diffusion.
-
-        Raises
-        ------
-        ParameterError
-            If the exposure is negative or implausible.
         """
         photo, steps = self._exposure(photo_e_per_s, exposure_s)
-        return apply_steps(steps, photo, sites=self.sites, n_threads=n_threads)
+        expected_e = Save()
+        run_steps((*steps, expected_e), photo, sites=self.sites, n_threads=n_threads)
+        return expected_e.values
 
     def collect(self, expected_e: Floats, *, streams: Streams, n_threads: int | None = None) -> Ints:
         """Draw the collected charge, (n_site,) int64 e-: shot noise, then full well."""
@@ -650,10 +658,15 @@ class Sensor:
         conversion = self._conversion()
         steps = (ChargeCheck("electrons", -np.inf), *self._after_collection, conversion)
         run_steps(steps, electrons, sites=self.sites, streams=streams, reset_streams=reset_streams, n_threads=n_threads)
-        return conversion.values
+        return conversion.code
 
     def expose(
-        self, photo_e_per_s: Floats, exposure_s: float, *, streams: Streams, n_threads: int | None = None
+        self,
+        photo_e_per_s: Floats,
+        exposure_s: Annotated[float, EXPOSURE],
+        *,
+        streams: Streams,
+        n_threads: int | None = None,
     ) -> tuple[Floats, Ints, NDArray[Any]]:
         """
         Simulate an exposure in one pass over the sites.
@@ -677,11 +690,6 @@ class Sensor:
         electrons : (n_site,) int64, e-
             Collected charge.
         code : (n_site,) uint8 or uint16, DN
-
-        Raises
-        ------
-        ParameterError
-            If the exposure is negative or implausible, or an expected charge is negative.
         """
         photo, steps = self._exposure(photo_e_per_s, exposure_s)
         expected_e, electrons, conversion = Save(), Save(np.int64), self._conversion()
@@ -692,15 +700,15 @@ class Sensor:
             streams=streams,
             n_threads=n_threads,
         )
-        return expected_e.values, electrons.values, conversion.values
+        return expected_e.values, electrons.values, conversion.code
 
     def _exposure(self, photo_e_per_s: Floats, exposure_s: float) -> tuple[Floats, tuple[Step, ...]]:
         """Return the rates of all sites, and the steps from them to the expected charges."""
-        exposure_s = EXPOSURE.check("exposure_s", exposure_s)
         photo = np.asarray(unmasked("photo_e_per_s", photo_e_per_s))
-        if photo.shape not in ((), (1,)):
-            photo = self._check_size("photo_e_per_s", photo)
-        photo = np.broadcast_to(photo, self.layout.n_sites)
+        n_sites = self.layout.n_sites
+        if photo.shape != (1,):
+            check_per_site("photo_e_per_s", photo, n_sites, or_one=True)
+        photo = np.broadcast_to(photo, n_sites)
         return photo, (*self._before_exposure, Factor(exposure_s), *self._effects_at("expected"))
 
     @cached_property
@@ -726,22 +734,10 @@ class Sensor:
         return self.adc.tables(self.v_sat_v, self.device.key("dnl")[0])
 
     def _check_size(self, name: str, charge_e: ArrayLike) -> NDArray[Any]:
-        charges = np.asarray(unmasked(name, charge_e))
-        if charges.shape != (self.layout.n_sites,):
-            raise ParameterError(
-                name, f"must have one value for each of the {self.layout.n_sites} sites, got the shape {charges.shape}"
-            )
-        return charges
+        return check_per_site(name, np.asarray(unmasked(name, charge_e)), self.layout.n_sites)
 
     def validate_charges(self, name: str, charge_e: ArrayLike) -> Floats:
-        """
-        Return charges as an array (n_site,) float64, e-, after validation.
-
-        Raises
-        ------
-        ParameterError
-            If the number of charges is not the number of sites, or a charge is negative.
-        """
+        """Return charges as an array (n_site,) float64, e-, after validation."""
         charges = np.ascontiguousarray(self._check_size(name, charge_e), np.float64)
         return ChargeCheck(name, 0.0).apply(charges, sites=self.sites, rng=None)
 
@@ -773,20 +769,8 @@ class Sensor:
         is_device_known : bool
             Whether the fixed patterns of the device are known; otherwise means over all devices are used instead.
         """
-        mean_e, variance_e2 = (np.atleast_1d(np.asarray(part, np.float64)) for part in (mean_e, variance_e2))
-        return readout_model(
-            self._effects_at("charge"),
-            self._effects_at("sense_node"),
-            self._effects_at("output"),
-            mean_e=mean_e,
-            variance_e2=variance_e2,
-            sites=self.sites if is_device_known else self.sites.without_device(),
-            v_per_e=self.v_per_e,
-            nonlinearity_fraction=self.nonlinearity_fraction,
-            v_sat_v=self.v_sat_v,
-            pedestal_v=self.pedestal_v,
-            is_reset=is_reset,
-        )
+        sites = self.sites if is_device_known else self.sites.without_device()
+        return readout_model(self, mean_e, variance_e2, sites, is_reset=is_reset)
 
     def predict(self, expected_e: Floats, *, n_threads: int | None = None) -> tuple[Floats, Floats]:
         """
@@ -803,11 +787,6 @@ class Sensor:
         -------
         mean_dn, variance_dn2 : (n_site,) float64, DN and DN²
             Moments of the codes, including quantisation, clipping and the nonlinearities of the ADC.
-
-        Raises
-        ------
-        ParameterError
-            If the number of charges is not the number of sites, or a charge is negative.
 
         Notes
         -----
@@ -830,28 +809,24 @@ class Sensor:
             # Mixed charges, after clipping at the full well, are approximated as Gaussian.
             drawn_e, drawn_e2 = model.mean_e, model.variance_e2
             is_drawn, well_e = False, np.array([np.inf])
-        sigma_e, transfer = np.sqrt(model.gaussian_e2), model.transfer
+        charges = ChargeDistributions(
+            mean_e=drawn_e,
+            variance_e2=drawn_e2,
+            well_e=well_e,
+            sigma_e=np.sqrt(model.gaussian_e2),
+            half_step_e=model.half_step_e,
+            poisson_below_e=self.gaussian_above_e,
+            is_drawn=is_drawn,
+        )
 
         def block(_: int, sites: slice) -> None:
-            def part(values: NDArray[Any]) -> NDArray[Any]:
-                return read_only(self.sites.block(sites).select(values).view())
+            def part(values: Any) -> Any:
+                is_array = isinstance(values, np.ndarray)
+                return read_only(self.sites.block(sites).select(values).view()) if is_array else values
 
             _kernels.predict_codes(
-                ChargeDistributions(
-                    mean_e=part(drawn_e),
-                    variance_e2=part(drawn_e2),
-                    well_e=part(well_e),
-                    sigma_e=part(sigma_e),
-                    half_step_e=part(model.half_step_e),
-                    poisson_below_e=self.gaussian_above_e,
-                    is_drawn=is_drawn,
-                ),
-                transfer._replace(
-                    v_per_e=part(transfer.v_per_e),
-                    sense_v=part(transfer.sense_v),
-                    scale=part(transfer.scale),
-                    output_v=part(transfer.output_v),
-                ),
+                ChargeDistributions(*map(part, charges)),
+                Transfer(*map(part, model.transfer)),
                 part(self._line),
                 self._tables,
                 quadrature(),
@@ -869,11 +844,6 @@ class SensorPart(Sensor):
     Some of the sites of a sensor, such as a tile.
 
     Their fixed patterns and effects are those that they have in the complete sensor. Created by :meth:`Sensor.part`.
-
-    Raises
-    ------
-    ParameterError
-        If the device or the number of sites is not that of the part, or effects connect its sites with others.
     """
 
     #: Sensor with all sites, whose layout the effects use, and indices of the sites of the part.

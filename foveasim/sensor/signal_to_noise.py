@@ -66,15 +66,6 @@ def signal_to_noise(sensor: Sensor, expected_e: ArrayLike, dark_e: ArrayLike) ->
     dark_e : (n_site,) float64, e-
         Expected charge of a dark frame with the same exposure.
 
-    Returns
-    -------
-    SiteSignals
-
-    Raises
-    ------
-    ParameterError
-        If the number of charges is not the number of sites, or a charge is negative.
-
     Notes
     -----
     For an expected charge N, which includes a dark signal D, and a system gain K in codes per electron,
@@ -147,28 +138,21 @@ def signal_to_noise(sensor: Sensor, expected_e: ArrayLike, dark_e: ArrayLike) ->
     )
 
 
-def local_step_e(sensor: Sensor, charge_e: Floats, volts_per_e: Floats, offset_v: Floats) -> Floats:
+def local_step_e(
+    sensor: Sensor,
+    charge_e: Floats,
+    v_per_e: Floats,
+    *,
+    sense_v: Floats | float = 0.0,
+    scale: Floats | float = 1.0,
+    output_v: Floats | float = 0.0,
+) -> Floats:
     """
     Compute the code width at each site's mean charge, (n_site,) e-.
 
-    The width is the inverse of the local gain of the complete chain.
-
-    ``sensor``: its ADC and response nonlinearity are used. ``charge_e`` (n_site,) float64, e-: mean charge. ``volts_per_e``,
-    ``offset_v`` (n_site,) or (1,) float64, V: conversion gain and offset, of the device or nominal.
+    The width is the inverse of the local gain of the complete chain; ``v_per_e`` and the following parameters are those of
+    :class:`~foveasim.sensor.prediction.Transfer`, of the device or nominal.
     """
-    offset = np.asarray(offset_v, np.float64)
-    return _local_step_e(sensor, charge_e, volts_per_e, np.zeros(1), np.ones(1), offset)
-
-
-def _step_e(sensor: Sensor, charge_e: Floats, model: ReadoutModel) -> Floats:
-    """Compute the code width at given charges on this device, e-."""
-    transfer = model.transfer
-    return _local_step_e(sensor, charge_e, transfer.v_per_e, transfer.sense_v, transfer.scale, transfer.output_v)
-
-
-def _local_step_e(
-    sensor: Sensor, charge_e: Floats, v_per_e: Floats, sense_v: Floats, scale: Floats, output_v: Floats
-) -> Floats:
     with np.errstate(divide="ignore"):
         fraction = np.clip((charge_e * v_per_e + sense_v) / sensor.v_sat_v, 0.0, 1.0)
         nonlinearity = sensor.nonlinearity_fraction
@@ -176,6 +160,12 @@ def _local_step_e(
         slope_v_per_e = v_per_e * scale * np.maximum(1.0 - 2.0 * nonlinearity * fraction, MIN_SLOPE)
         step_v = sensor.adc.width_at_dn(after_offset) * sensor.v_sat_v / 2.0**sensor.bits
         return np.asarray(step_v / slope_v_per_e)
+
+
+def _step_e(sensor: Sensor, charge_e: Floats, model: ReadoutModel) -> Floats:
+    """Compute the code width at given charges on this device, e-."""
+    v_per_e, sense_v, scale, output_v, *_ = model.transfer
+    return local_step_e(sensor, charge_e, v_per_e, sense_v=sense_v, scale=scale, output_v=output_v)
 
 
 def _top_e(sensor: Sensor, model: ReadoutModel) -> Floats:

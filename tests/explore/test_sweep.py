@@ -922,7 +922,7 @@ def test_camera_reuses_images_and_compiled_layout():
         np.testing.assert_array_equal(again, taken)
     grid = shot.camera.optics.grid(shot.scene)
     assert camera.replace(optics=shot.camera.optics).integrator(grid) is camera.integrator(grid)
-    with pytest.raises(ParameterError, match="'photo_e_per_s' must be 64 numbers, one per site, got 3"):
+    with pytest.raises(ParameterError, match="'photo_e_per_s' must have one value for each of the 64 sites"):
         camera.capture(shot.scene, exposure_s=0.01, seed=1, photo_e_per_s=known[:3])
 
 

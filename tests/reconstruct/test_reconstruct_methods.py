@@ -708,7 +708,7 @@ def test_float_file_is_relative_to_white(tmp_path):
 @pytest.mark.parametrize(
     ("n_channels", "name", "options", "error", "message"),
     [
-        (1, "p.png", {"bits": 12}, ParameterError, "'bits' must be 8, 16 or 32"),
+        (1, "p.png", {"bits": 12}, ParameterError, "'bits' must be one of 8, 16, 32"),
         (1, "p.png", {"bits": 32}, fs.errors.FileError, "only 1 to 4 channels of uint8 or uint16"),
         (1, "p.exr", {"bits": 16}, fs.errors.FileError, "only 1 to 4 channels of float32"),
         (1, "p.jpg", {"bits": 16}, fs.errors.FileError, "only 1 to 4 channels of uint8"),
@@ -853,7 +853,7 @@ def test_unknown_picture_format_lists_formats(tmp_path, name, message):
 
 
 def test_image_of_three_bits_raises():
-    with pytest.raises(ParameterError, match="'bits' must be 8 or 16, got 3"):
+    with pytest.raises(ParameterError, match="'bits' must be one of 8, 16, got 3"):
         asymmetric(1).to_image(bits=3)
 
 

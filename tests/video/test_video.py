@@ -603,7 +603,7 @@ def test_invalid_shutter_arguments_are_rejected():
         (lambda: Exposure(None, 1.0), "shutter"),
         (
             lambda: Exposure(shutter, 1.0).add(np.ones(3)),
-            "rate_e_per_s' must have one number for each of the 120 sites",
+            "rate_e_per_s' must have one value for each of the 120 sites",
         ),
         (lambda: Exposure(shutter, 1.0).add(np.full(120, np.nan)), "rate_e_per_s"),
         (lambda: Exposure(shutter, 1.0).mean_e_per_s(-np.ones(120)), "last_e_per_s"),

@@ -25,9 +25,8 @@ from foveasim.sensor.effects.contract import (
 )
 from foveasim.sensor.effects.crosstalk import CrosstalkOperator, Diffusion, InterPixelCapacitance, KernelCrosstalk
 from foveasim.sensor.effects.dark import DarkLaw, DarkSignal, HotSites, dark_current_factor
-from foveasim.sensor.effects.fixed_pattern import ColumnOffset, PixelGain, PixelOffset
+from foveasim.sensor.effects.fixed_pattern import ColumnOffset, DeadSites, PhotoResponse, PixelGain, PixelOffset
 from foveasim.sensor.effects.readout import ReadNoise, ResetNoise, TelegraphNoise
-from foveasim.sensor.effects.response import DeadSites, PhotoResponse
 from foveasim.sensor.effects.shot import ShotNoise, draw_shot_noise
 
 __all__ = [
@@ -61,8 +60,7 @@ __all__ = [
     "draw_shot_noise",
 ]
 
-#: Effects of a sensor's keywords, in the order of the chain; ``from_sensor`` returns None for an effect that is off, and
-#: ``example`` contains keywords that enable it.
+#: Effects of a sensor's keywords, in the order of the chain; ``example`` contains keywords that enable an effect.
 STANDARD: tuple[Any, ...] = (
     PhotoResponse,
     DeadSites,

@@ -226,8 +226,6 @@ class Sites:
 
         Raises
         ------
-        ParameterError
-            If the key does not start with an effect, or a value is not hashable.
         SimulationError
             If the array has another shape, or a number is not finite.
         """
@@ -236,17 +234,15 @@ class Sites:
         def compute_array(sites: Sites) -> Floats:
             array = np.atleast_1d(np.asarray(compute(sites), np.float64))
             if array.shape not in ((1,), (sites.n_sites,)):
-                raise SimulationError(
-                    f"the effect '{parts[0].name}' must return one finite number, or one for each of the {sites.n_sites} "
-                    f"sites, got an array of shape {array.shape}"
-                )
-            if not (is_finite := np.isfinite(array)).all():
-                site = int(np.argmin(is_finite))
-                raise SimulationError(
-                    f"the effect '{parts[0].name}' must return one finite number, or one for each of the {sites.n_sites} "
-                    f"sites, got {array[site]} at site {site}"
-                )
-            return read_only(array.copy())
+                problem = f"an array of shape {array.shape}"
+            elif (is_finite := np.isfinite(array)).all():
+                return read_only(array.copy())
+            else:
+                problem = f"{array[np.argmin(is_finite)]} at site {np.argmin(is_finite)}"
+            raise SimulationError(
+                f"the effect '{parts[0].name}' must return one finite number, or one for each of the {sites.n_sites} sites, "
+                f"got {problem}"
+            )
 
         return self.select(self.cached((*parts, "pattern", getattr(compute, "__qualname__", "")), compute_array))
 
@@ -332,14 +328,7 @@ class Effect(ABC):
         """
 
     def validate_moments(self, mean: Floats, variance: Floats, sites: Sites) -> tuple[Floats, Floats]:
-        """
-        Return the result of :meth:`moments` after checking its shape.
-
-        Raises
-        ------
-        SimulationError
-            If the result is not a mean and a variance of the shape of the values.
-        """
+        """Return the result of :meth:`moments` after checking its shape."""
         sites = sites.of(self)
         found = self.moments(mean, variance, sites=sites)
         shape = np.broadcast_shapes(np.shape(mean), np.shape(variance), (sites.n_sites,))
@@ -359,7 +348,6 @@ class Effect(ABC):
 
         None for effects with other distributions.
         """
-        _ = sites
         return None
 
 
@@ -384,7 +372,6 @@ class FixedFactor(_FixedPattern):
 
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
         """Return the values times the pattern."""
-        _ = rng
         values *= sites.pattern(self, self.pattern)
         return values
 
@@ -402,7 +389,6 @@ class FixedOffset(_FixedPattern):
 
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
         """Return the values plus the pattern."""
-        _ = rng
         values += sites.pattern(self, self.pattern)
         return values
 

@@ -8,9 +8,10 @@ capacitance (IPC) mixes drawn charges: neighbours become correlated.
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,21 +19,16 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.calls import LENGTH, NOT_NEGATIVE, Declared, Limits, OwnCheck
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import (
-    Floats,
-    Ints,
-    as_numbers,
-    check_pitch_um,
-    finite_array,
-)
+from foveasim._core.validation import Floats, Ints, as_numbers, check_pitch_um, finite_array
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.sensor.blocks import for_each_block
-from foveasim.sensor.effects.contract import Effect, Sites, Stage
+from foveasim.sensor.effects.contract import Effect, Photosites, Sites, Stage
+from foveasim.sensor.per_site import check_per_site
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-__all__ = ["CrosstalkOperator", "Diffusion", "InterPixelCapacitance", "KernelCrosstalk", "Neighbourhood"]
+__all__ = ["CrosstalkOperator", "Diffusion", "InterPixelCapacitance", "KernelCrosstalk"]
 
 #: Maximum fraction of charge that a site loses in one step; larger fractions would make the exchange oscillate.
 MAX_STEP_FRACTION = 0.5
@@ -53,25 +49,6 @@ AREA_ROUNDING = 0.02
 POSITION_ROUNDING = 0.05
 #: Maximum difference between coordinates in the same row or column, relative to the side of a site.
 SAME_LINE = 0.02
-
-
-class Neighbourhood(Protocol):
-    """Protocol of photosite layouts for crosstalk, implemented by :class:`foveasim.Layout`."""
-
-    @property
-    def n_sites(self) -> int:
-        """Number of sites."""
-
-    @property
-    def area_um2(self) -> Floats:
-        """Area of each site, (n_site,) µm²."""
-
-    @property
-    def centroid_um(self) -> Floats:
-        """Centroid of each site, (n_site, 2) µm."""
-
-    def adjacency(self, *, max_gap_um: float | None = None) -> csr_array[Any]:
-        """Return the lengths of shared edges, (n_site, n_site) µm, symmetric, empty diagonal."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -111,16 +88,11 @@ class CrosstalkOperator:
         -------
         charge_e : (..., n_site) float64, e-
 
-        Raises
-        ------
-        ParameterError
-            If the last dimension is not the number of sites.
-
         Notes
         -----
         The cost is one sparse product per step, 5 ns per site for hexagons.
         """
-        charges = self._per_site("charge_e", charge_e)
+        charges = check_per_site("charge_e", as_numbers("charge_e", charge_e), self.matrix.shape[0], or_rows=True)
         mixed = np.ascontiguousarray(charges, np.float64).reshape(math.prod(charges.shape[:-1]), charges.shape[-1])
         for _ in range(self.n_steps):
             mixed = self._step(mixed, n_threads)
@@ -161,8 +133,6 @@ class CrosstalkOperator:
 
         Raises
         ------
-        ParameterError
-            If the last dimension is not the number of sites.
         SimulationError
             If the operator has several steps, as for diffusion, which mixes expectations rather than variances.
         """
@@ -171,7 +141,7 @@ class CrosstalkOperator:
                 f"variances are defined for operators of one step, and this operator has {self.n_steps}; diffusion acts "
                 "before the draw"
             )
-        values = self._per_site("variance", variance)
+        values = check_per_site("variance", as_numbers("variance", variance), self.matrix.shape[0], or_rows=True)
         columns = np.moveaxis(values, -1, 0)
         mixed = self._squared_matrix @ columns.reshape(columns.shape[0], -1)
         return np.ascontiguousarray(np.moveaxis(mixed.reshape(columns.shape), 0, -1))
@@ -180,15 +150,6 @@ class CrosstalkOperator:
     def _squared_matrix(self) -> csr_array[Any]:
         return self.matrix.power(2)
 
-    def _per_site(self, name: str, values: ArrayLike) -> Floats:
-        array = as_numbers(name, values)
-        n_sites = self.matrix.shape[0]
-        if array.ndim == 0 or array.shape[-1] != n_sites:
-            raise ParameterError(
-                name, f"must have one value for each of the {n_sites} sites, got the shape {array.shape}"
-            )
-        return array
-
 
 class _Crosstalk(Declared, Effect):
     """Crosstalk in the chain, compiled for the sites at first use."""
@@ -196,9 +157,13 @@ class _Crosstalk(Declared, Effect):
     is_temporal: ClassVar[bool] = False
     is_local: ClassVar[bool] = False
 
+    @abstractmethod
+    def compile(self, layout: OwnCheck[Photosites]) -> CrosstalkOperator:
+        """Compile the crosstalk for a layout."""
+
     def compile_for(self, sites: Sites) -> CrosstalkOperator:
         """Return the operator for all sites of the layout."""
-        raise NotImplementedError
+        return self.compile(sites.layout)
 
     def _operator(self, sites: Sites) -> CrosstalkOperator:
         """Return the operator, which all devices share."""
@@ -206,7 +171,6 @@ class _Crosstalk(Declared, Effect):
 
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
         """Return the charges after crosstalk, (n_site,)."""
-        _ = rng
         return self._operator(sites).apply(values, n_threads=sites.n_threads)
 
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
@@ -271,13 +235,13 @@ class Diffusion(_Crosstalk):
     spread_um: Annotated[float, Limits(at_least=0.0, at_most=MAX_SPREAD_UM)]
     max_gap_um: Annotated[float | None, NOT_NEGATIVE] = None
 
-    def compile_for(self, sites: Sites) -> CrosstalkOperator:
-        """Return the operator for all sites of the layout."""
-        return self.compile(sites.layout)
-
     @classmethod
     def from_neighbour_fraction(
-        cls, neighbour_fraction: float, *, pitch_um: float, max_gap_um: float | None = None
+        cls,
+        neighbour_fraction: Annotated[float, NEIGHBOUR_FRACTION],
+        *,
+        pitch_um: Annotated[float, LENGTH],
+        max_gap_um: float | None = None,
     ) -> Diffusion:
         """
         Create the diffusion that corresponds to crosstalk measured on square pixels.
@@ -295,25 +259,15 @@ class Diffusion(_Crosstalk):
         """
         from scipy.optimize import brentq
 
-        fraction = NEIGHBOUR_FRACTION.check("neighbour_fraction", neighbour_fraction)
-        pitch_um = LENGTH.check("pitch_um", pitch_um)
         # Upper bracket: with a spread equal to the pitch a pixel loses far more than half.
-        steps = float(brentq(lambda s: 2.0 * float(_mean_square_steps(np.array(s))) - fraction, 0.0, 1.0, xtol=1e-15))
+        steps = float(
+            brentq(lambda s: 2.0 * float(_mean_square_steps(np.array(s))) - neighbour_fraction, 0.0, 1.0, xtol=1e-15)
+        )
         return cls(spread_um=steps * pitch_um, max_gap_um=max_gap_um)
 
-    def compile(self, layout: OwnCheck[Neighbourhood], *, shared_um: csr_array[Any] | None = None) -> CrosstalkOperator:
+    def compile(self, layout: OwnCheck[Photosites]) -> CrosstalkOperator:
         """
         Compile the diffusion for a layout.
-
-        Parameters
-        ----------
-        layout : Layout
-        shared_um : csr_array (n_site, n_site), optional, µm
-            Precomputed lengths of shared edges; ``layout.adjacency()`` by default, which is most of the cost.
-
-        Returns
-        -------
-        CrosstalkOperator
 
         Raises
         ------
@@ -322,8 +276,8 @@ class Diffusion(_Crosstalk):
         SimulationError
             If no two sites share an edge.
         """
-        shared_um = _shared_um(layout, shared_um, self.max_gap_um)
-        site, neighbour = shared_um.indices, _rows(shared_um)
+        shared_um = _shared_um(layout, self.max_gap_um)
+        site, neighbour = shared_um.indices, np.repeat(np.arange(layout.n_sites), np.diff(shared_um.indptr))
         centre_um = layout.centroid_um
         distance_um = np.hypot(*np.moveaxis(centre_um[site] - centre_um[neighbour], -1, 0))
         if distance_um.size:
@@ -332,9 +286,7 @@ class Diffusion(_Crosstalk):
             depth_um = layout.area_um2 / np.where(edges_um > 0.0, edges_um, 1.0)
             distance_um = np.maximum(distance_um, 0.5 * (depth_um[site] + depth_um[neighbour]))
         width_um = 0.5 * distance_um * _mean_square_steps(self.spread_um / distance_um)
-        matrix = _with_values(shared_um, shared_um.data * width_um / layout.area_um2[site])
-        loss = _column_sums(matrix)
-        largest = float(loss.max(initial=0.0))
+        matrix, loss, largest = _exchange(shared_um, shared_um.data * width_um / layout.area_um2[site])
         if not largest <= MAX_STEP_FRACTION * MAX_STEPS:
             smallest = int(np.argmax(loss))
             raise ParameterError(
@@ -394,10 +346,6 @@ class KernelCrosstalk(_Crosstalk):
 
     __repr__ = short_repr
 
-    def compile_for(self, sites: Sites) -> CrosstalkOperator:
-        """Return the operator for all sites of the layout."""
-        return self.compile(sites.layout)
-
     def __post_init__(self) -> None:
         kernel = finite_array("kernel", self.kernel, ndim=2, at_least=0.0)
         if any(n % 2 == 0 for n in kernel.shape):
@@ -409,22 +357,12 @@ class KernelCrosstalk(_Crosstalk):
         if self.pitch_um is not None:
             object.__setattr__(self, "pitch_um", check_pitch_um("pitch_um", self.pitch_um))
 
-    def compile(self, layout: OwnCheck[Neighbourhood]) -> CrosstalkOperator:
+    def compile(self, layout: OwnCheck[Photosites]) -> CrosstalkOperator:
         """
         Compile the convolution for a layout of grid sites, in any order and with gaps.
 
-        Parameters
-        ----------
-        layout : Layout
-
-        Returns
-        -------
-        CrosstalkOperator
-
         Raises
         ------
-        ParameterError
-            If the argument is not a layout.
         SimulationError
             If the sites are not part of a grid parallel to the axes.
         """
@@ -445,7 +383,7 @@ class KernelCrosstalk(_Crosstalk):
             raise SimulationError(
                 f"the layout is not a grid: site {duplicate} has the same position as another site; {_ALTERNATIVE}"
             )
-        source, target, fraction = [], [], []
+        source, target, fraction = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0)]
         retained = np.zeros(n_sites)
         for j, i in np.argwhere(kernel > 0.0):
             wanted_position = ordered + (j - half_y) * stride + (i - half_x)
@@ -456,14 +394,9 @@ class KernelCrosstalk(_Crosstalk):
             fraction.append(np.full(source[-1].size, kernel[j, i]))
             retained[order[~is_there]] += kernel[j, i]
         if self.border == "kept":
-            is_retained = np.flatnonzero(retained)
-            source, target, fraction = (
-                [*source, is_retained],
-                [*target, is_retained],
-                [*fraction, retained[is_retained]],
-            )
-        if not source:
-            return CrosstalkOperator(coo_array((n_sites, n_sites)).tocsr())
+            source.append(np.flatnonzero(retained))
+            target.append(source[-1])
+            fraction.append(retained[source[-1]])
         pairs = (np.concatenate(target).astype(np.int32), np.concatenate(source).astype(np.int32))
         return CrosstalkOperator(coo_array((np.concatenate(fraction), pairs), shape=(n_sites, n_sites)).tocsr())
 
@@ -523,10 +456,9 @@ class InterPixelCapacitance(_Crosstalk):
 
     def compile(
         self,
-        layout: OwnCheck[Neighbourhood],
+        layout: OwnCheck[Photosites],
         *,
         capacitance_f: ArrayLike | None = None,
-        shared_um: csr_array[Any] | None = None,
     ) -> CrosstalkOperator:
         """
         Compile the coupling for a layout.
@@ -537,12 +469,6 @@ class InterPixelCapacitance(_Crosstalk):
         capacitance_f : number or (n_site,), optional, F
             Capacitance of each node, if they differ. ``neighbour_fraction`` then refers to a node with the median
             capacitance; nodes with smaller capacitances couple more of their charge. The sum of measured charges is conserved.
-        shared_um : csr_array (n_site, n_site), optional, µm
-            Precomputed lengths of shared edges; ``layout.adjacency()`` by default.
-
-        Returns
-        -------
-        CrosstalkOperator
 
         Raises
         ------
@@ -552,24 +478,17 @@ class InterPixelCapacitance(_Crosstalk):
         SimulationError
             If no two sites share an edge.
         """
-        shared_um = _shared_um(layout, shared_um, self.max_gap_um)
+        shared_um = _shared_um(layout, self.max_gap_um)
         edge_um = self.edge_um
         if edge_um is None:
             edge_um = float(np.median(shared_um.data)) if shared_um.nnz else 1.0
         ratio = np.ones(layout.n_sites)
         if capacitance_f is not None and layout.n_sites:
             node_f = finite_array("capacitance_f", capacitance_f, above=0.0)
-            if node_f.shape not in ((), (layout.n_sites,)):
-                raise ParameterError(
-                    "capacitance_f",
-                    f"must be one number, or one for each of the {layout.n_sites} sites, got the shape {node_f.shape}",
-                )
+            check_per_site("capacitance_f", node_f, layout.n_sites, or_one=True)
             ratio = np.median(node_f) / np.broadcast_to(node_f, layout.n_sites)
-        matrix = _with_values(
-            shared_um, shared_um.data * (self.neighbour_fraction / edge_um) * ratio[shared_um.indices]
-        )
-        loss = _column_sums(matrix)
-        largest = float(loss.max(initial=0.0))
+        fraction = shared_um.data * (self.neighbour_fraction / edge_um) * ratio[shared_um.indices]
+        matrix, loss, largest = _exchange(shared_um, fraction)
         if largest > MAX_STEP_FRACTION * (1.0 + KERNEL_ROUNDING):
             raise ParameterError(
                 "neighbour_fraction",
@@ -591,19 +510,13 @@ def _require_layout(layout: object) -> None:
         raise ParameterError("layout", f"must be a Layout, got {type_name(layout)}")
 
 
-def _shared_um(layout: Neighbourhood, shared_um: csr_array[Any] | None, max_gap_um: float | None) -> csr_array[Any]:
-    """Return checked lengths of shared edges, with int32 indices if possible."""
-    from scipy.sparse import csr_array, issparse
+def _shared_um(layout: Photosites, max_gap_um: float | None) -> csr_array[Any]:
+    """Return the lengths of shared edges, with int32 indices if possible."""
+    from scipy.sparse import csr_array
 
     _require_layout(layout)
     n_sites = layout.n_sites
-    if shared_um is None:
-        shared_um = layout.adjacency(max_gap_um=max_gap_um)
-    elif not issparse(shared_um) or shared_um.shape != (n_sites, n_sites):
-        raise ParameterError(
-            "shared_um", f"must be a sparse array of shape {(n_sites, n_sites)}, as from layout.adjacency()"
-        )
-    shared_um = csr_array(shared_um)
+    shared_um = csr_array(layout.adjacency(max_gap_um=max_gap_um))
     if n_sites > 1 and shared_um.nnz == 0:
         raise SimulationError(
             "no two sites of the layout share an edge, so there is no crosstalk; for sites separated by trenches, set "
@@ -634,19 +547,13 @@ def _mean_square_steps(spread: Floats) -> Floats:
     return steps
 
 
-def _rows(matrix: csr_array[Any]) -> Ints:
-    """Return the row of each stored entry, (nnz,)."""
-    return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
-
-
-def _with_values(matrix: csr_array[Any], values: Floats) -> csr_array[Any]:
+def _exchange(shared_um: csr_array[Any], fraction: Floats) -> tuple[csr_array[Any], Floats, float]:
+    """Return the matrix of exchanged fractions, the loss of each site, and the largest loss."""
     from scipy.sparse import csr_array
 
-    return csr_array((values, matrix.indices, matrix.indptr), shape=matrix.shape)
-
-
-def _column_sums(matrix: csr_array[Any]) -> Floats:
-    return np.bincount(matrix.indices, weights=matrix.data, minlength=matrix.shape[0]).astype(np.float64)
+    loss = np.bincount(shared_um.indices, weights=fraction, minlength=shared_um.shape[0]).astype(np.float64)
+    matrix = csr_array((fraction, shared_um.indices, shared_um.indptr), shape=shared_um.shape)
+    return matrix, loss, float(loss.max(initial=0.0))
 
 
 def _add_remainder(matrix: csr_array[Any], fraction: Floats, n_steps: int) -> csr_array[Any]:
@@ -656,7 +563,7 @@ def _add_remainder(matrix: csr_array[Any], fraction: Floats, n_steps: int) -> cs
     return csr_array(matrix / n_steps + diags_array(1.0 - fraction / n_steps))
 
 
-def _grid_positions(layout: Neighbourhood, pitch_um: Any) -> tuple[Ints, Ints]:
+def _grid_positions(layout: Photosites, pitch_um: Any) -> tuple[Ints, Ints]:
     """Return column and row of each site in the underlying grid, from 0."""
     n_sites = layout.n_sites
     if n_sites == 0:

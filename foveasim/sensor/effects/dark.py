@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
@@ -14,9 +14,6 @@ from foveasim._core.validation import Floats
 from foveasim.sensor.effects.contract import FixedFactor, FixedOffset, Sites, Stage
 from foveasim.sensor.limits import SHARE, TEMPERATURE
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
-
-if TYPE_CHECKING:
-    from foveasim.sensor.sensor import Sensor
 
 __all__ = ["DarkLaw", "DarkSignal", "HotSites", "dark_current_factor"]
 
@@ -65,11 +62,6 @@ def dark_current_factor(
     -------
     factor : float
         At least 0; infinite on overflow.
-
-    Raises
-    ------
-    ParameterError
-        If the law is unknown, or a value is out of range.
 
     Notes
     -----
@@ -121,18 +113,12 @@ class DarkSignal(FixedFactor):
 
     dsnu_fraction: float
 
-    @classmethod
-    def from_sensor(cls, sensor: Sensor) -> Self | None:
-        """Return the effect that a sensor's keywords specify, or None."""
-        return cls(sensor.dsnu_fraction) if sensor.dsnu_fraction else None
-
     def pattern(self, sites: Sites) -> Floats:
         """Return the factors, (n,)."""
         return sites.device.log_normals(self.name, self.dsnu_fraction)
 
     def pattern_moments(self, sites: Sites) -> tuple[float, float]:
         """Return 1 and the square of ``dsnu_fraction``."""
-        _ = sites
         return 1.0, self.dsnu_fraction**2
 
 
@@ -157,18 +143,11 @@ class HotSites(FixedOffset):
     hot_fraction: float
     hot_e_per_s: float
 
-    @classmethod
-    def from_sensor(cls, sensor: Sensor) -> Self | None:
-        """Return the effect that a sensor's keywords specify, or None."""
-        is_on = sensor.hot_fraction and sensor.hot_e_per_s
-        return cls(sensor.hot_fraction, sensor.hot_e_per_s * sensor.dark_current_ratio) if is_on else None
-
     def pattern(self, sites: Sites) -> Floats:
         """Return the additional dark current, (n,) e-/s."""
         return np.where(sites.device.uniforms(self.name) < self.hot_fraction, self.hot_e_per_s, 0.0)
 
     def pattern_moments(self, sites: Sites) -> tuple[float, float]:
         """Return the moments of a Bernoulli distribution times the additional current."""
-        _ = sites
         probability = self.hot_fraction
         return probability * self.hot_e_per_s, probability * (1.0 - probability) * self.hot_e_per_s**2

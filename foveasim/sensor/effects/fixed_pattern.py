@@ -1,53 +1,91 @@
-"""Fixed-pattern noise (FPN) of the readout: pixel gain, pixel offset and column offset."""
+"""Fixed patterns: photo response (PRNU), dead sites, and fixed-pattern noise (FPN)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 
 from foveasim._core.validation import Floats
 from foveasim.sensor.effects.contract import FixedFactor, FixedOffset, Sites, Stage
 
-if TYPE_CHECKING:
-    from foveasim.sensor.sensor import Sensor
-
-__all__ = ["ColumnOffset", "PixelGain", "PixelOffset"]
+__all__ = ["ColumnOffset", "DeadSites", "PhotoResponse", "PixelGain", "PixelOffset"]
 
 
 @dataclass(frozen=True)
-class PixelGain(FixedFactor):
+class _GaussianFactor(FixedFactor):
+    """Gaussian factors of mean 1, clipped at 0, of the standard deviation ``fraction``."""
+
+    needs_layout: ClassVar[bool] = False
+
+    fraction: float
+
+    def pattern(self, sites: Sites) -> Floats:
+        """Return the factors, (n,)."""
+        return np.maximum(1.0 + self.fraction * sites.device.normals(self.name), 0.0)
+
+    def pattern_moments(self, sites: Sites) -> tuple[float, float]:
+        """Return 1 and the square of ``fraction``."""
+        return 1.0, self.fraction**2
+
+
+class PhotoResponse(_GaussianFactor):
+    """
+    Photo-response non-uniformity (PRNU): Gaussian factors of mean 1, clipped at 0.
+
+    Parameters
+    ----------
+    fraction : float
+        Standard deviation.
+    """
+
+    example: ClassVar[Mapping[str, Any]] = {"prnu_fraction": 0.02}
+    name: ClassVar[str] = "prnu"
+    stage: ClassVar[Stage] = "photo"
+
+
+class PixelGain(_GaussianFactor):
     """
     Gain FPN: Gaussian factors of mean 1 on the conversion gain, clipped at 0.
 
     Parameters
     ----------
-    gain_fpn_fraction : float
+    fraction : float
         Standard deviation.
     """
 
     example: ClassVar[Mapping[str, Any]] = {"gain_fpn_fraction": 0.02}
     name: ClassVar[str] = "gain_fpn"
     stage: ClassVar[Stage] = "sense_node"
+
+
+@dataclass(frozen=True)
+class DeadSites(FixedFactor):
+    """
+    Dead sites: sites without photo response.
+
+    Parameters
+    ----------
+    fraction : float
+        Probability that a site is dead.
+    """
+
+    example: ClassVar[Mapping[str, Any]] = {"dead_fraction": 0.1}
+    name: ClassVar[str] = "dead"
+    stage: ClassVar[Stage] = "photo"
     needs_layout: ClassVar[bool] = False
 
-    gain_fpn_fraction: float
-
-    @classmethod
-    def from_sensor(cls, sensor: Sensor) -> Self | None:
-        """Return the effect that a sensor's keywords specify, or None."""
-        return cls(sensor.gain_fpn_fraction) if sensor.gain_fpn_fraction else None
+    fraction: float
 
     def pattern(self, sites: Sites) -> Floats:
-        """Return the factors, (n,)."""
-        return np.maximum(1.0 + self.gain_fpn_fraction * sites.device.normals(self.name), 0.0)
+        """Return 0 for dead sites and 1 for others, (n,)."""
+        return np.where(sites.device.uniforms(self.name) < self.fraction, 0.0, 1.0)
 
     def pattern_moments(self, sites: Sites) -> tuple[float, float]:
-        """Return 1 and the square of ``gain_fpn_fraction``."""
-        _ = sites
-        return 1.0, self.gain_fpn_fraction**2
+        """Return the moments of a Bernoulli distribution."""
+        return 1.0 - self.fraction, self.fraction * (1.0 - self.fraction)
 
 
 @dataclass(frozen=True)
@@ -68,24 +106,16 @@ class PixelOffset(FixedOffset):
 
     offset_v: float
 
-    @classmethod
-    def from_sensor(cls, sensor: Sensor) -> Self | None:
-        """Return the effect that a sensor's keywords specify, or None."""
-        is_on = sensor.pixel_fpn_fraction and not sensor.cds
-        return cls(sensor.v_sat_v * sensor.pixel_fpn_fraction) if is_on else None
-
     def pattern(self, sites: Sites) -> Floats:
         """Return the offsets, (n,) V."""
         return self.offset_v * sites.device.normals(self.name)
 
     def pattern_moments(self, sites: Sites) -> tuple[float, float]:
         """Return 0 and the square of ``offset_v``."""
-        _ = sites
         return 0.0, self.offset_v**2
 
 
-@dataclass(frozen=True)
-class ColumnOffset(FixedOffset):
+class ColumnOffset(PixelOffset):
     """
     Column FPN: Gaussian offsets, the same for all sites of a readout line.
 
@@ -97,22 +127,8 @@ class ColumnOffset(FixedOffset):
 
     example: ClassVar[Mapping[str, Any]] = {"line_fpn_fraction": 1e-3}
     name: ClassVar[str] = "column_fpn"
-    stage: ClassVar[Stage] = "output"
-    needs_layout: ClassVar[bool] = False
-
-    offset_v: float
-
-    @classmethod
-    def from_sensor(cls, sensor: Sensor) -> Self | None:
-        """Return the effect that a sensor's keywords specify, or None."""
-        return cls(sensor.v_sat_v * sensor.line_fpn_fraction) if sensor.line_fpn_fraction else None
 
     def pattern(self, sites: Sites) -> Floats:
         """Return the offset of each site's readout line, (n,) V."""
         lines, line_of_site = np.unique(sites.layout.readout_line, return_inverse=True)
         return (self.offset_v * sites.device.line_normals(self.name, lines))[line_of_site]
-
-    def pattern_moments(self, sites: Sites) -> tuple[float, float]:
-        """Return 0 and the square of ``offset_v``."""
-        _ = sites
-        return 0.0, self.offset_v**2

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
@@ -12,9 +12,6 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats
 from foveasim.sensor.effects.contract import AdditiveNoise, Effect, Sites, Stage
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
-
-if TYPE_CHECKING:
-    from foveasim.sensor.sensor import Sensor
 
 __all__ = ["ReadNoise", "ResetNoise", "TelegraphNoise"]
 
@@ -36,11 +33,6 @@ class ResetNoise(AdditiveNoise):
     needs_layout: ClassVar[bool] = False
 
     temperature_k: float
-
-    @classmethod
-    def from_sensor(cls, sensor: Sensor) -> Self | None:
-        """Return the effect that a sensor's keywords specify, or None; CDS removes it."""
-        return cls(sensor.temperature_k) if sensor.ktc_noise and not sensor.cds else None
 
     def deviation(self, sites: Sites) -> Floats:
         """Return ``sqrt(k T C) / q``, (n,) or (1,) e-."""
@@ -67,14 +59,8 @@ class ReadNoise(AdditiveNoise):
 
     __repr__ = short_repr
 
-    @classmethod
-    def from_sensor(cls, sensor: Sensor) -> Self | None:
-        """Return the effect that a sensor's keywords specify, or None."""
-        return cls(sensor.read_noise_e) if np.any(sensor.read_noise_e) else None
-
     def deviation(self, sites: Sites) -> float | Floats:
         """Return the standard deviation, (n,) or one number, e-."""
-        _ = sites
         return self.read_noise_e
 
 
@@ -105,11 +91,6 @@ class TelegraphNoise(Effect):
 
     rts_fraction: float
     rts_e: float
-
-    @classmethod
-    def from_sensor(cls, sensor: Sensor) -> Self | None:
-        """Return the effect that a sensor's keywords specify, or None."""
-        return cls(sensor.rts_fraction, sensor.rts_e) if sensor.rts_fraction and sensor.rts_e else None
 
     def half_step(self, sites: Sites) -> Floats:
         """Return half the difference between the states, 0 on other sites, (n,) e-."""

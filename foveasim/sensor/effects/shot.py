@@ -112,7 +112,6 @@ class ShotNoise(Declared, Effect):
         """Return the drawn charges, (n,) e-, in whole electrons."""
         from foveasim.sensor import _kernels
 
-        _ = sites
         if self.how == "auto":
             tables = poisson_tables(int(self.gaussian_above_e))
             _kernels.draw_poisson(values, self.gaussian_above_e, tables, random_key(rng))
@@ -124,7 +123,6 @@ class ShotNoise(Declared, Effect):
 
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites | None = None) -> tuple[Floats, Floats]:
         """Return the mean, and the variance plus shot noise, or plus rounding if not drawn."""
-        _ = sites
         return mean, variance + (np.maximum(mean, 0.0) if self.is_drawn else ROUNDING_E2)
 
 
@@ -148,11 +146,6 @@ def draw_shot_noise(
     -------
     electrons : (n_site,) int64, e-
         Non-negative.
-
-    Raises
-    ------
-    ParameterError
-        If an expectation is negative or NaN, or ``gaussian_above_e`` is out of range.
     """
     expected_e = np.ascontiguousarray(unmasked("expected_e", expected_e), np.float64)
     if expected_e.size and not (smallest := float(np.min(expected_e))) >= 0.0:

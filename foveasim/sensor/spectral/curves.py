@@ -22,22 +22,6 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, as_numbers, check_number
 from foveasim.errors import FoveasimError, ParameterError
 
-__all__ = [
-    "BandMean",
-    "ConstantCurve",
-    "Curve",
-    "CurveBase",
-    "CurveError",
-    "Factor",
-    "GaussianCurve",
-    "PassBand",
-    "ProductCurve",
-    "SiliconQE",
-    "as_curve",
-    "check_within",
-    "curve_values",
-]
-
 
 class CurveError(ParameterError):
     """Error of a user-defined curve: it raises, or does not return one number per wavelength."""
@@ -61,9 +45,13 @@ class CurveBase(Declared, ABC):
     #: Makes numpy scalars defer multiplication to the curve.
     __array_ufunc__ = None
 
-    @abstractmethod
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
         """Return the values at the wavelengths, of the same shape."""
+        return self._at(as_numbers("wavelength_nm", wavelength_nm))
+
+    @abstractmethod
+    def _at(self, waves_nm: Floats) -> Floats:
+        """Return the values at wavelengths of any shape."""
 
     def __mul__(self, other: Factor) -> ProductCurve:
         """Return the product with another curve, or with a number from 0 to 1."""
@@ -93,9 +81,8 @@ class ConstantCurve(CurveBase):
 
     value: Annotated[float, FRACTION] = 1.0
 
-    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Return the values at the wavelengths, of the same shape."""
-        return np.full(np.shape(wavelength_nm), float(self.value))
+    def _at(self, waves_nm: Floats) -> Floats:
+        return np.full(waves_nm.shape, self.value)
 
 
 @CURVES.register(
@@ -118,9 +105,8 @@ class GaussianCurve(CurveBase):
     fwhm_nm: Annotated[float, POSITIVE, Usual(10.0, 300.0)]
     peak: Annotated[float, PEAK] = 1.0
 
-    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Return the values at the wavelengths, of the same shape."""
-        offset = (as_numbers("wavelength_nm", wavelength_nm) - self.centre_nm) / self.fwhm_nm
+    def _at(self, waves_nm: Floats) -> Floats:
+        offset = (waves_nm - self.centre_nm) / self.fwhm_nm
         return np.asarray(self.peak * np.exp(-4.0 * np.log(2.0) * offset**2))
 
 
@@ -173,9 +159,7 @@ class PassBand(CurveBase):
         if self.from_nm is not None and self.to_nm is not None:
             check_number("to_nm", self.to_nm, above=self.from_nm)
 
-    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Return the values at the wavelengths, of the same shape."""
-        waves_nm = as_numbers("wavelength_nm", wavelength_nm)
+    def _at(self, waves_nm: Floats) -> Floats:
         begun = 1.0 if self.from_nm is None else self._step(waves_nm - self.from_nm)
         ended = 0.0 if self.to_nm is None else self._step(waves_nm - self.to_nm)
         return np.asarray(self.peak * np.maximum(begun - ended, 0.0))
@@ -220,12 +204,9 @@ class SiliconQE(CurveBase):
     depth_um: Annotated[float, Limits(above=0.0, at_most=1e5), Usual(0.5, 10.0)]
     transmission: Annotated[float, PEAK] = 1.0
 
-    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Return the values at the wavelengths, of the same shape."""
-        check_within(wavelength_nm, SILICON_NM[0], SILICON_NM[-1], "the absorption table of silicon")
-        length_um = np.exp(
-            np.interp(as_numbers("wavelength_nm", wavelength_nm), SILICON_NM, np.log(SILICON_ABSORPTION_UM))
-        )
+    def _at(self, waves_nm: Floats) -> Floats:
+        check_within(waves_nm, SILICON_NM[0], SILICON_NM[-1], "the absorption table of silicon")
+        length_um = np.exp(np.interp(waves_nm, SILICON_NM, np.log(SILICON_ABSORPTION_UM)))
         return np.asarray(self.transmission * -np.expm1(-self.depth_um / length_um))
 
 
@@ -260,11 +241,8 @@ class ProductCurve(CurveBase):
             flat += [as_curve("curves", c) for c in curve.curves] if isinstance(curve, ProductCurve) else [curve]
         object.__setattr__(self, "curves", tuple(flat))
 
-    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Return the values at the wavelengths, of the same shape."""
-        return np.asarray(
-            reduce(np.multiply, (curve_values(as_curve("curves", c), wavelength_nm) for c in self.curves))
-        )
+    def _at(self, waves_nm: Floats) -> Floats:
+        return np.asarray(reduce(np.multiply, (curve_values(as_curve("curves", c), waves_nm) for c in self.curves)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -300,9 +278,8 @@ class BandMean(CurveBase):
 
     __repr__ = short_repr
 
-    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Return the values at the wavelengths, of the same shape."""
-        centre_nm = as_numbers("wavelength_nm", wavelength_nm)[..., np.newaxis]
+    def _at(self, waves_nm: Floats) -> Floats:
+        centre_nm = waves_nm[..., np.newaxis]
         if np.any(centre_nm <= 0.5 * self.band_width_nm):
             raise ParameterError(
                 "wavelength_nm",
@@ -360,13 +337,12 @@ def curve_values(curve: Curve, wavelength_nm: ArrayLike) -> Floats:
     return np.broadcast_to(values.astype(np.float64, copy=False), np.shape(wavelength_nm))
 
 
-def check_within(wavelength_nm: ArrayLike, low_nm: float, high_nm: float, domain: str, hint: str = "") -> None:
+def check_within(waves_nm: Floats, low_nm: float, high_nm: float, domain: str, hint: str = "") -> None:
     """
     Reject wavelengths outside a range, including NaN.
 
     Raises ParameterError if a wavelength is outside; the message states the first one.
     """
-    waves_nm = as_numbers("wavelength_nm", wavelength_nm)
     outside = waves_nm[~((waves_nm >= low_nm) & (waves_nm <= high_nm))]
     if outside.size:
         raise ParameterError(

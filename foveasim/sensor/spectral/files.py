@@ -13,12 +13,12 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
 from foveasim._core.names import missing_path, possible_names
-from foveasim._core.validation import MAX_WAVELENGTH_NM, MIN_WAVELENGTH_NM, Floats, check_choice
+from foveasim._core.validation import MAX_WAVELENGTH_NM, MIN_WAVELENGTH_NM, Floats
 from foveasim.errors import FileError
 from foveasim.sensor.spectral.curves import CURVES
 from foveasim.sensor.spectral.response import FilterSet
@@ -134,12 +134,6 @@ def read_filters(
     -------
     FilterSet
         Filters in the order of the columns, which corresponds to the channels of a layout.
-
-    Raises
-    ------
-    FileError
-        If the file is missing, too large or not a valid table, or a value is out of range; the message states the line, the
-        rule and the value.
     """
     path = Path(path)
     table = _read(path, wavelength_unit, value_unit)
@@ -148,7 +142,6 @@ def read_filters(
 
 
 def _curve(table: _Table, k: int, source: str, between: Between, beyond: Beyond) -> TableCurve | SplineCurve:
-    check_choice("between", between, get_args(Between))
     kind = TableCurve if between == "lines" else SplineCurve
     values, waves_nm = table.values[:, k].tolist(), table.wavelength_nm.tolist()
     return kind(wavelength_nm=waves_nm, value=values, beyond=beyond, source=source)
@@ -166,10 +159,6 @@ def _position(path: Path, table: _Table, column: str | int) -> int:
 
 
 def _read(path: Path, wavelength_unit: WavelengthUnit | None, value_unit: ValueUnit | None) -> _Table:
-    if wavelength_unit is not None:
-        check_choice("wavelength_unit", wavelength_unit, get_args(WavelengthUnit))
-    if value_unit is not None:
-        check_choice("value_unit", value_unit, get_args(ValueUnit))
     rows = list(_rows(path, _read_string(path)))
     if not rows:
         raise FileError(path, "contains no table, only comments and empty lines")

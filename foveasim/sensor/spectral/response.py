@@ -12,7 +12,6 @@ from foveasim._core.validation import Floats
 from foveasim.errors import ParameterError
 from foveasim.sensor.spectral.curves import (
     BandMean,
-    ConstantCurve,
     Curve,
     Factor,
     GaussianCurve,
@@ -21,7 +20,7 @@ from foveasim.sensor.spectral.curves import (
     curve_values,
 )
 
-__all__ = ["ConstantCurve", "Curve", "FilterSet", "rgb_filters"]
+__all__ = ["FilterSet", "rgb_filters"]
 
 
 @dataclass(frozen=True)
@@ -38,11 +37,6 @@ class FilterSet:
         Transmissions, with or without quantum efficiency.
     names : sequence of str, optional
         One name per curve; "0", "1", ... by default.
-
-    Raises
-    ------
-    ParameterError
-        If there is no curve, or the numbers of names and curves differ.
     """
 
     curves: Sequence[Curve]
@@ -82,14 +76,7 @@ class FilterSet:
     __rmul__ = __mul__
 
     def over_bands(self, band_width_nm: float) -> FilterSet:
-        """
-        Return the set of the filters' band means: :class:`foveasim.sensor.BandMean`.
-
-        Raises
-        ------
-        ParameterError
-            If the width is not positive.
-        """
+        """Return the set of the filters' band means: :class:`foveasim.sensor.BandMean`."""
         return FilterSet([BandMean(curve=curve, band_width_nm=band_width_nm) for curve in self.curves], self.names)
 
     def transmission(self, wavelength_nm: Floats) -> Floats:

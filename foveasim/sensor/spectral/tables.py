@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import Floats, as_numbers, check_count, finite_array, wavelengths_nm
+from foveasim._core.validation import Floats, check_count, finite_array, wavelengths_nm
 from foveasim.errors import ParameterError
 from foveasim.sensor.spectral.curves import CURVES, CurveBase, check_within
 
@@ -61,32 +62,14 @@ class PolynomialCurve(CurveBase):
     def _fit(self) -> np.polynomial.Polynomial:
         return np.polynomial.Polynomial.fit(self.wavelength_nm, self.value, self.degree)
 
-    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Return the values at the wavelengths, of the same shape."""
-        check_within(wavelength_nm, self.wavelength_nm[0], self.wavelength_nm[-1], "the table of the fit")
-        return np.clip(self._fit(as_numbers("wavelength_nm", wavelength_nm)), 0.0, 1.0)
+    def _at(self, waves_nm: Floats) -> Floats:
+        check_within(waves_nm, self.wavelength_nm[0], self.wavelength_nm[-1], "the table of the fit")
+        return np.clip(self._fit(waves_nm), 0.0, 1.0)
 
 
-@CURVES.register("table", example=TABLE, expected={450.0: 0.4, 600.0: 0.5})
 @dataclass(frozen=True, kw_only=True)
-class TableCurve(CurveBase):
-    """
-    Table with linear interpolation.
-
-    Parameters
-    ----------
-    wavelength_nm, value : sequences of the same length
-        Table, in any order. Values from 0 to 1.
-    beyond : {"raise", "zero", "hold"}
-        Behaviour outside the table: raise an error, return 0, or return the value at the end.
-    source : str
-        Source of the data; stored with the results.
-
-    Raises
-    ------
-    ParameterError
-        If the table is invalid; when called, if a wavelength is outside the table and ``beyond`` is "raise".
-    """
+class _Table(CurveBase):
+    """Table with an interpolation."""
 
     wavelength_nm: Sequence[float]
     value: Sequence[float]
@@ -98,15 +81,36 @@ class TableCurve(CurveBase):
     def __post_init__(self) -> None:
         _set_table(self)
 
-    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Return the values at the wavelengths, of the same shape."""
-        waves_nm, is_known = _clip_to_table(wavelength_nm, self.wavelength_nm, self.beyond)
-        return np.where(is_known, np.interp(waves_nm, self.wavelength_nm, self.value), 0.0)
+    @abstractmethod
+    def _interpolate(self, waves_nm: Floats) -> Floats:
+        """Return the values at wavelengths within the table."""
+
+    def _at(self, waves_nm: Floats) -> Floats:
+        inside_nm, is_known = _clip_to_table(waves_nm, self.wavelength_nm, self.beyond)
+        return np.where(is_known, self._interpolate(inside_nm), 0.0)
+
+
+@CURVES.register("table", example=TABLE, expected={450.0: 0.4, 600.0: 0.5})
+class TableCurve(_Table):
+    """
+    Table with linear interpolation.
+
+    Parameters
+    ----------
+    wavelength_nm, value : sequences of the same length
+        Table, in any order. Values from 0 to 1.
+    beyond : {"raise", "zero", "hold"}
+        Behaviour outside the table: raise an error, return 0, or return the value at the end.
+    source : str
+        Source of the data; stored with the results.
+    """
+
+    def _interpolate(self, waves_nm: Floats) -> Floats:
+        return np.interp(waves_nm, self.wavelength_nm, self.value)
 
 
 @CURVES.register("spline", example=TABLE, expected={500.0: 0.6, 700.0: 0.4})
-@dataclass(frozen=True, kw_only=True)
-class SplineCurve(CurveBase):
+class SplineCurve(_Table):
     """
     Table with shape-preserving (monotone) cubic interpolation.
 
@@ -119,26 +123,11 @@ class SplineCurve(CurveBase):
     source : str
         Source of the data; stored with the results.
 
-    Raises
-    ------
-    ParameterError
-        If the table is invalid; when called, if a wavelength is outside the table and ``beyond`` is "raise".
-
     Notes
     -----
     Cubic pieces with the slopes of Fritsch and Butland (SIAM J. Sci. Stat. Comput. 5, 1984): the curve is monotonic between
     adjacent values, and therefore stays within 0 to 1. As with linear interpolation, a peak between two values is lost.
     """
-
-    wavelength_nm: Sequence[float]
-    value: Sequence[float]
-    beyond: Beyond = "raise"
-    source: str = field(default="", compare=False)
-
-    __repr__ = short_repr
-
-    def __post_init__(self) -> None:
-        _set_table(self)
 
     @cached_property
     def _interpolator(self) -> Any:
@@ -146,10 +135,8 @@ class SplineCurve(CurveBase):
 
         return PchipInterpolator(self.wavelength_nm, self.value)
 
-    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Return the values at the wavelengths, of the same shape."""
-        waves_nm, is_known = _clip_to_table(wavelength_nm, self.wavelength_nm, self.beyond)
-        return np.where(is_known, np.clip(self._interpolator(waves_nm), 0.0, 1.0), 0.0)
+    def _interpolate(self, waves_nm: Floats) -> Floats:
+        return np.clip(self._interpolator(waves_nm), 0.0, 1.0)
 
 
 @CURVES.register(
@@ -170,12 +157,6 @@ class StepCurve(CurveBase):
         Behaviour outside the edges: raise an error, return 0, or return the value at the end.
     source : str
         Source of the data; stored with the results.
-
-    Raises
-    ------
-    ParameterError
-        If the edges do not ascend, or a value is out of range; when called, if a wavelength is outside the edges and
-        ``beyond`` is "raise".
     """
 
     edge_nm: Sequence[float]
@@ -197,10 +178,9 @@ class StepCurve(CurveBase):
         object.__setattr__(self, "edge_nm", tuple(edges_nm.tolist()))
         object.__setattr__(self, "value", tuple(values.tolist()))
 
-    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Return the values at the wavelengths, of the same shape."""
-        waves_nm, is_known = _clip_to_table(wavelength_nm, self.edge_nm, self.beyond)
-        step = np.minimum(np.searchsorted(self.edge_nm, waves_nm, side="right") - 1, len(self.value) - 1)
+    def _at(self, waves_nm: Floats) -> Floats:
+        inside_nm, is_known = _clip_to_table(waves_nm, self.edge_nm, self.beyond)
+        step = np.minimum(np.searchsorted(self.edge_nm, inside_nm, side="right") - 1, len(self.value) - 1)
         return np.where(is_known, np.asarray(self.value)[step], 0.0)
 
 
@@ -212,7 +192,7 @@ def _check_fractions(value: ArrayLike) -> Floats:
     return values
 
 
-def _set_table(curve: PolynomialCurve | TableCurve | SplineCurve) -> None:
+def _set_table(curve: PolynomialCurve | _Table) -> None:
     """Validate the table of a curve, and store it in ascending order as tuples."""
     waves_nm = finite_array("wavelength_nm", curve.wavelength_nm, ndim=1, above=0.0)
     values = _check_fractions(curve.value)
@@ -226,10 +206,9 @@ def _set_table(curve: PolynomialCurve | TableCurve | SplineCurve) -> None:
     object.__setattr__(curve, "value", tuple(values[order].tolist()))
 
 
-def _clip_to_table(wavelength_nm: ArrayLike, table_nm: Sequence[float], beyond: Beyond) -> tuple[Floats, Any]:
+def _clip_to_table(waves_nm: Floats, table_nm: Sequence[float], beyond: Beyond) -> tuple[Floats, Any]:
     """Return wavelengths clipped to the table, and the mask of those that are not set to 0."""
     low_nm, high_nm = table_nm[0], table_nm[-1]
-    waves_nm = as_numbers("wavelength_nm", wavelength_nm)
     if beyond == "raise":
         check_within(waves_nm, low_nm, high_nm, "the table", BEYOND_HINT)
     check_within(waves_nm, 0.0, np.finfo(np.float64).max, "the spectrum")

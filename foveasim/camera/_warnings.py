@@ -1,0 +1,180 @@
+"""Warnings of captures: photosites outside the image, focal lengths, coarse cells."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from foveasim._core.user_warnings import warn
+from foveasim._core.validation import Bools, Floats
+from foveasim.distortion import Lens
+from foveasim.errors import CoverageWarning, FoveasimWarning, SamplingWarning
+from foveasim.fields import PowerMap
+from foveasim.integrate import Integrator
+from foveasim.layout import Layout
+from foveasim.optics import Optics
+from foveasim.scene import Scene
+from foveasim.units import um_from_m, um_from_nm
+
+#: Cameras warn when the layout measures less than this fraction of the width of a photograph.
+MIN_PICTURE_FRACTION = 0.25
+#: Cameras warn when the focal length of the lens model differs from the image distance by more than this fraction.
+MAX_FOCAL_DIFFERENCE = 0.02
+#: Error of photosites above which a limited automatic oversampling causes a warning.
+MAX_AUTO_ERROR = 1e-3
+
+
+class Covered(NamedTuple):
+    """
+    Numbers of sites beyond an image, among them those outside the image circle.
+
+    ``image_um`` and ``layout_um`` are bounds (x_min, y_min, x_max, y_max), µm.
+    """
+
+    image_um: tuple[float, float, float, float]
+    layout_um: tuple[float, float, float, float]
+    n_uncovered: int
+    n_outside: int
+
+    @classmethod
+    def by(cls, integrator: Integrator) -> Covered:
+        """Return the coverage of an integrator's sites by its grid."""
+        n_outside = integrator.sites_outside_image_circle.size
+        return cls(integrator.grid.bounds_um, integrator.bounds_um, integrator.n_uncovered, n_outside)
+
+    @classmethod
+    def union(cls, image_um: tuple[float, float, float, float], parts: Sequence[Covered]) -> Covered:
+        """Return the coverage of the sites of all parts by an image."""
+        bounds_um = np.array([part.layout_um for part in parts])
+        x0, y0 = np.fmin.reduce(bounds_um[:, :2])
+        x1, y1 = np.fmax.reduce(bounds_um[:, 2:])
+        n_uncovered, n_outside = (sum(part.n_uncovered for part in parts), sum(part.n_outside for part in parts))
+        return cls(image_um, (float(x0), float(y0), float(x1), float(y1)), n_uncovered, n_outside)
+
+
+def warn_of_coverage(source: Scene | PowerMap, covered: Covered, n_sites: int, *, is_moving: bool = False) -> None:
+    """
+    Warn of sites outside the image, and of a layout that measures a small part of it.
+
+    Sites outside are dark whatever the scene is.
+    """
+    if covered.n_outside:
+        warn(
+            f"{covered.n_outside:,} of {n_sites:,} photosites lie outside the image circle of the lens and "
+            "are dark; shrink or move the layout, or use a lens model with a larger field",
+            CoverageWarning,
+        )
+    is_photograph = isinstance(source, Scene) and source.is_picture
+    fit = source.fit if isinstance(source, Scene) else None
+    if fit in ("contain", "width"):
+        return
+    image_um, layout_um = covered.image_um, covered.layout_um
+    n_uncovered = covered.n_uncovered - covered.n_outside
+    if n_uncovered:
+        remedy = (
+            "use fit='cover', or a larger pitch_um or field_of_view_deg"
+            if is_photograph
+            else "enlarge the scene (pitch_um)"
+        )
+        warn(
+            f"{n_uncovered:,} of {n_sites:,} photosites lie partly or completely outside the image, where "
+            f"irradiance is 0: the image measures {_format_extent(image_um)}, the layout {_format_extent(layout_um)}; "
+            f"{remedy}, or shrink or move the layout",
+            CoverageWarning,
+        )
+    elif is_photograph and fit is None and not is_moving:
+        fraction = size_um(layout_um)[0] / size_um(image_um)[0]
+        if fraction < MIN_PICTURE_FRACTION:
+            warn(
+                f"the layout measures only {100.0 * fraction:.2g} % of the width of the picture: the image measures "
+                f"{_format_extent(image_um)}, the layout {_format_extent(layout_um)}; use fit='cover', or a smaller "
+                "pitch_um or field_of_view_deg",
+                CoverageWarning,
+            )
+
+
+def size_um(bounds_um: Sequence[float]) -> tuple[float, float]:
+    """Return width and height of a bounding box."""
+    x0_um, y0_um, x1_um, y1_um = bounds_um
+    return x1_um - x0_um, y1_um - y0_um
+
+
+def format_point(xy_um: Sequence[float] | Floats) -> str:
+    return f"({xy_um[0]:.4g}, {xy_um[1]:.4g})"
+
+
+def _format_extent(bounds_um: Sequence[float]) -> str:
+    """Return size and position of a bounding box, for messages."""
+    width_um, height_um = size_um(bounds_um)
+    return (
+        f"{width_um:.5g} x {height_um:.5g} µm, from {format_point(bounds_um[:2])} to {format_point(bounds_um[2:])} µm"
+    )
+
+
+def warn_of_focal_length(optics: Optics, lens: Lens | None, scene: Scene) -> None:
+    """
+    Warn when the focal length of a lens model differs from the image distance.
+
+    A lens model maps directions, which are ideal positions over its focal length. Those of the optics are over the image
+    distance, which equals their focal length for a distant scene in focus. For unequal axes, the geometric mean is compared,
+    which preserves areas.
+    """
+    if lens is None:
+        return
+    image_um = optics.magnification(scene.distance_m) * float(um_from_m(scene.distance_m))
+    focal_um = math.sqrt(np.broadcast_to(np.asarray(lens.focal_um, np.float64), (2,)).prod())
+    if abs(focal_um / image_um - 1.0) <= MAX_FOCAL_DIFFERENCE:
+        return
+    focus_m = scene.distance_m if optics.focus_distance_m is None else optics.focus_distance_m
+    focus_um = float(um_from_m(focus_m))
+    # The thin lens with the image distance of the lens model: 1 / f = 1 / D + 1 / H.
+    focal_length_mm = optics.focal_length_mm * focal_um / image_um * (image_um + focus_um) / (focal_um + focus_um)
+    warn(
+        f"the focal length of the lens model is {focal_um:,.5g} µm, but the image distance of the optics {image_um:,.5g} µm "
+        f"({optics.focal_length_mm:g} mm, focused at {focus_m:g} m): the image is distorted for wrong field angles; use "
+        f"focal_um={image_um:.5g}, or focal_length_mm={focal_length_mm:.5g}",
+        FoveasimWarning,
+    )
+
+
+def warn_of_coarse_cells(optics: Optics, scene: Scene, layout: Layout) -> None:
+    """Warn when automatic oversampling is limited, and photosites have an error above 1e-3."""
+    if optics.oversample != "auto":
+        return
+    error = optics.auto_oversample_error(scene)  # of sites of side λN, an upper limit for wider ones
+    if error <= MAX_AUTO_ERROR:
+        return
+    lambda_n_um = float(um_from_nm(scene.wavelength_nm.min())) * optics.working_f_number(scene.distance_m)
+    side_um = math.sqrt(float(layout.area_um2.min(initial=np.inf)))
+    # Wider photosites have proportionally fewer cells at their edges.
+    error *= min(1.0, lambda_n_um / side_um)
+    k, pixel_um = optics.auto_oversample(scene), optics.grid(scene).pitch_x_um
+    is_lattice = optics.source_pixel == "point" and pixel_um > lambda_n_um
+    # Point emitters farther apart than λN have no limit for small cells; they represent a continuous scene for sites > λN.
+    if error <= MAX_AUTO_ERROR or (is_lattice and side_um > lambda_n_um):
+        return
+    reason, cure = (
+        ("source pixels are points farther apart than λN", 'use source_pixel="square"')
+        if is_lattice
+        else ("more would exceed its limits", "set Optics(oversample=...), or use a smaller picture")
+    )
+    warn(
+        f"automatic oversampling chooses {k} x {k} cells of {pixel_um / k:.3g} µm per source pixel, since {reason}: "
+        f"photosites of {side_um:.3g} µm then have errors up to {100.0 * error:.2g} % (λN = {lambda_n_um:.3g} µm); {cure}, "
+        "or Optics(oversample=1) to accept them",
+        SamplingWarning,
+    )
+
+
+def warn_of_negative(rate_e_per_s: Floats, is_negative: Bools) -> None:
+    """Warn when gradients of coarse cells give negative photoelectrons."""
+    fraction = -float(rate_e_per_s[is_negative].sum()) / float(np.abs(rate_e_per_s).sum())
+    warn(
+        f"second-order integration makes the photoelectrons of {int(is_negative.sum()):,} of {rate_e_per_s.size:,} "
+        f"photosites negative, {100.0 * fraction:.3g} % of all, and they are set to 0: the image is too sharp for cells of "
+        "this size; use order=1, or smaller cells (Optics(oversample=...))",
+        SamplingWarning,
+    )
