@@ -67,7 +67,7 @@ def check_arguments(call: Callable[P, R], *, converts: bool = True) -> Callable[
         __tracebackhide__ = True  # in the tracebacks of IPython and pytest
         nonlocal kinds, converters
         if kinds is None:
-            kinds = find_kinds(call)
+            kinds = find_kinds(call, annotations)
             if converts:
                 converters = find_converters(call, annotations)
         by_position, by_name, rest, every = kinds
@@ -90,10 +90,7 @@ def check_arguments(call: Callable[P, R], *, converts: bool = True) -> Callable[
                 kwargs[name] = convert(name, kwargs[name], None)
         try:
             return call(*args, **kwargs)
-        except TypeError as error:
-            # Without a deeper frame, the call itself failed; other errors are those of its code.
-            if error.__traceback__ is None or error.__traceback__.tb_next is not None:
-                raise
+        except TypeError:
             problem = find_problem(call, args, kwargs)
             if problem is None:
                 raise
@@ -108,16 +105,16 @@ def check_arguments(call: Callable[P, R], *, converts: bool = True) -> Callable[
     return cast("Callable[P, R]", found)
 
 
-def _find_kinds(call: Callable[..., Any]) -> _Kinds:
+def _find_kinds(call: Callable[..., Any], annotations: Mapping[str, Any]) -> _Kinds:
     """Return the kinds of parameters, by position and by name, and of other arguments."""
     names = getattr(inspect.unwrap(call), "__globals__", {})
     by_position: list[tuple[str, Kind | None]] = []
     by_name: dict[str, Kind | None] = {}
     rest, every = None, None
     for k, parameter in enumerate(inspect.signature(call).parameters.values()):
-        annotation = parameter.annotation
         is_bound = k == 0 and parameter.name in BOUND
-        known = None if annotation is parameter.empty or is_bound else kind_of(resolve_annotation(annotation, names))
+        annotation = annotations.get(parameter.name, Any)
+        known = None if is_bound else kind_of(resolve_annotation(annotation, names))
         if parameter.kind is parameter.VAR_KEYWORD:
             every = known
         elif parameter.kind is parameter.VAR_POSITIONAL:

@@ -207,6 +207,8 @@ def _either(kinds: list[Kind]) -> Kind:
 def _single_kind(kind: Any) -> Kind | None:
     """Return the kind of a type that is not a union."""
     origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return kind_of(kind)
     if origin is Literal:
         return _choice(arguments)
     if origin is np.ndarray or kind is np.ndarray:

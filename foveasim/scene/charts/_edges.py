@@ -4,23 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal, Unpack
 
 import numpy as np
 
-from foveasim._core.validation import Floats, check_count, check_number, check_shape
+from foveasim._core.calls import FRACTION, POSITIVE
+from foveasim._core.validation import Floats, check_count, check_shape
 from foveasim.errors import ParameterError
-from foveasim.scene._scene import GREY_NM, Scene
+from foveasim.scene._scene import Scene
 from foveasim.scene.charts._canvas import (
+    HALF_TURN,
     Canvas,
-    OneOrMore,
+    Picture,
     add_rectangle,
-    check_contrast,
+    chart,
     half_plane,
     ink_to_white,
     interval,
 )
-from foveasim.scene.registry import chart
 
 Ink = Literal["dark", "bright"]
 
@@ -71,15 +72,10 @@ class BarElement:
 )
 def checkerboard(
     *,
-    square_mm: float,
+    square_mm: Annotated[float, POSITIVE],
     n_squares: tuple[int, int] | None = None,
-    contrast: float = 1.0,
-    shape: tuple[int, int],
-    pitch_um: float,
-    distance_m: float,
-    radiance_w_m2_sr_nm: OneOrMore,
-    wavelength_nm: Sequence[float] = GREY_NM,
-    band_width_nm: OneOrMore | None = None,
+    contrast: Annotated[float, FRACTION] = 1.0,
+    **picture: Unpack[Picture],
 ) -> Scene:
     """
     Return a checkerboard, for lens calibration and moiré. Exact.
@@ -110,9 +106,7 @@ def checkerboard(
     SamplingWarning
         If a square is smaller than a pixel.
     """
-    canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
-    contrast = check_contrast(contrast)
-    square_mm = check_number("square_mm", square_mm, above=0.0)
+    canvas = Canvas(**picture)
     edges_mm = canvas.y_edges_mm, canvas.x_edges_mm
     inside: list[Floats] = [np.ones(n) for n in canvas.shape]
     first_mm = [0.0, 0.0]
@@ -141,14 +135,9 @@ def checkerboard(
 )
 def slanted_edge(
     *,
-    angle_deg: float = 5.0,
-    contrast: float = 0.6,
-    shape: tuple[int, int],
-    pitch_um: float,
-    distance_m: float,
-    radiance_w_m2_sr_nm: OneOrMore,
-    wavelength_nm: Sequence[float] = GREY_NM,
-    band_width_nm: OneOrMore | None = None,
+    angle_deg: Annotated[float, HALF_TURN] = 5.0,
+    contrast: Annotated[float, FRACTION] = 0.6,
+    **picture: Unpack[Picture],
 ) -> Scene:
     """
     Return a slanted edge through the centre, for the MTF of ISO 12233. Exact.
@@ -168,9 +157,8 @@ def slanted_edge(
     scene : Scene
         One basis image.
     """
-    canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
-    contrast = check_contrast(contrast)
-    angle = np.deg2rad(check_number("angle_deg", angle_deg, at_least=-180.0, at_most=180.0))
+    canvas = Canvas(**picture)
+    angle = np.deg2rad(angle_deg)
     across_x, across_y = float(np.cos(angle)), float(np.sin(angle))
     x = across_x * canvas.x_mm / canvas.pitch_mm
     y = across_y * canvas.y_mm / canvas.pitch_mm
@@ -187,13 +175,8 @@ def bars(
     *,
     groups: Sequence[int],
     ink: Ink = "dark",
-    contrast: float = 1.0,
-    shape: tuple[int, int],
-    pitch_um: float,
-    distance_m: float,
-    radiance_w_m2_sr_nm: OneOrMore,
-    wavelength_nm: Sequence[float] = GREY_NM,
-    band_width_nm: OneOrMore | None = None,
+    contrast: Annotated[float, FRACTION] = 1.0,
+    **picture: Unpack[Picture],
 ) -> Scene:
     """
     Return a three-bar target with the frequencies of the USAF 1951 chart. Exact.
@@ -229,8 +212,7 @@ def bars(
     the spiral of the standard: each group is a column with its first element on top, the coarsest group is on the left, and
     vertical bars are left of horizontal bars. :func:`bar_elements` returns the positions.
     """
-    canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
-    contrast = check_contrast(contrast)
+    canvas = Canvas(**picture)
     elements = bar_elements(groups)
     canvas.check_fits(
         "groups",
@@ -318,15 +300,10 @@ def bar_elements(groups: Sequence[int]) -> tuple[BarElement, ...]:
 )
 def letter_f(
     *,
-    height_mm: float,
+    height_mm: Annotated[float, POSITIVE],
     ink: Ink = "dark",
-    contrast: float = 1.0,
-    shape: tuple[int, int],
-    pitch_um: float,
-    distance_m: float,
-    radiance_w_m2_sr_nm: OneOrMore,
-    wavelength_nm: Sequence[float] = GREY_NM,
-    band_width_nm: OneOrMore | None = None,
+    contrast: Annotated[float, FRACTION] = 1.0,
+    **picture: Unpack[Picture],
 ) -> Scene:
     """
     Return a centred letter F, which has no rotation or mirror symmetry. Exact.
@@ -356,9 +333,7 @@ def letter_f(
     SamplingWarning
         If a stroke is narrower than a pixel.
     """
-    canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
-    contrast = check_contrast(contrast)
-    height_mm = check_number("height_mm", height_mm, above=0.0)
+    canvas = Canvas(**picture)
     unit_mm = height_mm / F_HEIGHT
     canvas.check_fits("height_mm", F_WIDTH * unit_mm, height_mm)
     canvas.warn_if_fine("height_mm", 2.0 * unit_mm)
