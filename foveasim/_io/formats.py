@@ -81,19 +81,8 @@ def as_file_error(path: Path, what: str, *, passes: tuple[type[FoveasimError], .
     """
     Convert exceptions of readers of malformed files to a FileError with a one-line message.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    what : str
-        Expected kind of the file, for messages: ``"power map"``.
-    passes : tuple of exception types
-        Exceptions that are raised unchanged.
-
-    Raises
-    ------
-    FileError
-        When the block raises another exception.
+    ``what``: expected kind of the file, for messages: ``"power map"``. ``passes``: types of exceptions that are raised
+    unchanged.
     """
     try:
         yield
@@ -143,10 +132,7 @@ def detect_format(path: Path, formats: Mapping[str, FileFormat], what: str) -> t
     """
     Return the name and the entry of a file's format in a table, detected by content.
 
-    Raises
-    ------
-    FileError
-        When the file cannot be read, or no readable format of the table matches.
+    Raises FileError when the file cannot be read, or no readable format of the table matches.
     """
     head = b"" if path.is_dir() else read_head(path)
     for name, found in formats.items():
@@ -162,14 +148,7 @@ def detect_format(path: Path, formats: Mapping[str, FileFormat], what: str) -> t
 
 
 def select_writer(path: Path, formats: Mapping[str, FileFormat]) -> FileFormat:
-    """
-    Return the format that has a file's extension.
-
-    Raises
-    ------
-    FileError
-        When no writable format of the table has this extension.
-    """
+    """Return the writable format of a table that has a file's extension, or raise a FileError."""
     by_suffix = {suffix: found for found in formats.values() if found.write is not None for suffix in found.suffixes}
     try:
         return by_suffix[path.suffix.lower()]
@@ -182,23 +161,10 @@ def validate_options(
     options: Mapping[str, Any], known: tuple[str, ...], formats: Mapping[str, FileFormat], of: str
 ) -> dict[str, Any]:
     """
-    Return the options that are not None.
+    Return the options, by name, that are not None; raise a ParameterError for unknown ones.
 
-    Parameters
-    ----------
-    options : mapping
-        Options of the user by name.
-    known : tuple of str
-        Names of the options of the file's format.
-    formats : mapping
-        Table of all formats, for messages.
-    of : {"read_options", "write_options"}
-        Attribute of the formats that lists the options, for messages.
-
-    Raises
-    ------
-    ParameterError
-        When the format does not have an option.
+    ``known``: names of the options of the file's format. ``formats``, ``of``: table of all formats and their attribute with
+    names of options, ``"read_options"`` or ``"write_options"``, for messages.
     """
     given = {name: value for name, value in options.items() if value is not None}
     for name, value in given.items():

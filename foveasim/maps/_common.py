@@ -89,12 +89,8 @@ def to_power_map(found: Found, given: Given) -> PowerMap:
     """
     Return the validated map in W/m² per band.
 
-    Raises
-    ------
-    FormatError
-        If the data are not an irradiance, or metadata are missing.
-    ParameterError
-        If passed metadata are inconsistent with the data.
+    Raises FormatError if the data are not an irradiance, or metadata are missing, and ParameterError if passed metadata are
+    inconsistent with the data.
     """
     images = as_images(found.data)
     pitch_um = _pitch_um(found, given)

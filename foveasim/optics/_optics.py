@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from foveasim.optics._imaging import Imaging, MapRows
     from foveasim.optics._transform import Factor, Transform
 
-__all__ = ["Optics"]
-
 FOCAL_LENGTH = Limits(above=0.0, at_least=0.01, at_most=1e6, hint="check the unit: focal lengths are in mm")
 F_NUMBER = Limits(above=0.0, at_least=0.5, at_most=1e4, hint="f/0.5 is the limit for a lens in air")
 #: Fraction of the PSF energy outside the default padding radius.
@@ -59,7 +57,6 @@ CELL_ERROR, CELL_ERROR_POWER, LARGEST_CELL_ERROR = 0.16, -3.1, 0.2
 MAX_CELLS = 1 << 32
 #: Memory limit of a map with automatic oversampling: 512 MiB in single precision.
 MAX_AUTO_CELLS = 1 << 27
-PADDINGS = ("reflect", "edge", "zero", "periodic")
 
 
 def _pitch_um(scene: SceneLike) -> float:

@@ -103,16 +103,9 @@ def joined(parts: Sequence[PupilEdges]) -> PupilEdges:
 @dataclass(frozen=True, eq=False)
 class Nodes:
     """
-    Nodes of a block of rows.
+    Nodes of a block of rows, with the index of the first node of each row.
 
-    Attributes
-    ----------
-    row_y : (n_row,)
-    first : (n_row + 1,)
-        Index of the first node of each row.
-    x, y, weight : (n_node,)
-    column_x : (n_column,), optional
-        Positions of the nodes, if they are the same in all rows.
+    ``column_x``: positions of the nodes, if they are the same in all rows.
     """
 
     row_y: Floats
@@ -125,21 +118,11 @@ class Nodes:
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """
-    Edges of an integrand over the intersection of unit discs.
+    """Edges of an integrand over the intersection of unit discs."""
 
-    Attributes
-    ----------
-    segments : (n_segment, 4)
-        x and y of the first end, and of the second end.
-    circles : (n_circle, 3)
-        x and y of the centre, and the radius.
-    lines_x, lines_y : (n_line,)
-    discs : (n_disc, 3)
-        Discs whose intersection is the domain.
-    """
-
+    # x and y of the first and of the second end, (n_segment, 4).
     segments: Floats
+    # x and y of the centre, and the radius, (n_circle, 3); of discs whose intersection is the domain, (n_disc, 3).
     circles: Floats
     lines_x: Floats
     lines_y: Floats

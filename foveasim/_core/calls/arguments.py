@@ -22,8 +22,6 @@ from foveasim._core.calls.limits import Converter, Declaration, without_declarat
 from foveasim._core.names import did_you_mean
 from foveasim.errors import ArgumentError
 
-__all__ = ["check_arguments", "check_public_calls"]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 #: Characters of a signature in a message; optional parameters beyond are replaced by "...".
@@ -44,16 +42,9 @@ def check_arguments(call: Callable[P, R], *, converts: bool = True) -> Callable[
     """
     Return a function that rejects arguments outside its signature or declared limits.
 
-    Parameters
-    ----------
-    call : function
-    converts : bool
-        Whether arguments with declared limits are checked and converted, to floats and integers; dataclasses do so themselves.
-
-    Notes
-    -----
-    A valid call takes 1 to 2 µs longer, and lists of numbers a time in proportion to their length; the annotations are read at
-    the first call.
+    ``converts``: whether arguments with declared limits are checked and converted, to floats and integers; dataclasses do
+    so themselves. A valid call takes 1 to 2 µs longer, and lists of numbers a time in proportion to their length; the
+    annotations are read at the first call.
     """
     if not isinstance(call, FunctionType) or hasattr(call, CHECKED):
         return call

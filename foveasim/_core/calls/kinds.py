@@ -41,17 +41,9 @@ class Kind(NamedTuple):
     """
     Values that a parameter accepts.
 
-    Attributes
-    ----------
-    accepts : function of a value
-    one, many : str
-        Names of one value and of several, for messages.
-    choices : tuple of str
-        Possible strings, if they are few.
-    is_class : bool
-        Whether values are identified by their class, which messages show instead of the value.
-    item : Kind, optional
-        Kind of the items of a collection, or of the values of a mapping.
+    ``one`` and ``many`` are names of one value and of several, ``choices`` the possible strings, if they are few. Messages
+    about objects that are identified by their class (``is_class``) show the class. ``item`` is the kind of the items of a
+    collection.
     """
 
     accepts: Callable[[Any], bool]

@@ -18,7 +18,7 @@ import numpy as np
 
 from foveasim._core.extras import import_optional
 from foveasim._core.names import possible_names
-from foveasim._io.formats import FormatError
+from foveasim._io.formats import FileFormat, FormatError
 from foveasim._io.rasters import check_size
 from foveasim._io.rasters.labels import X, Y
 
@@ -81,6 +81,19 @@ def open_zarr(path: Path) -> Iterator[tuple[xr.Dataset, int]]:
 def is_zarr(path: Path) -> bool:
     """Return whether a directory is a zarr group or array."""
     return path.is_dir() and any((path / name).is_file() for name in ZARR_FILES[:3])
+
+
+#: Formats without readers and writers.
+NETCDF = FileFormat(
+    title="netCDF", suffixes=(".nc", ".nc4"), signatures=(HDF5_MAGIC, *NETCDF3_MAGICS), is_sandboxed=True
+)
+ZARR = FileFormat(
+    title="zarr",
+    suffixes=(".zarr",),
+    matches=lambda path, _head: is_zarr(path),
+    is_sandboxed=True,
+    is_directory=True,
+)
 
 
 def select_array(

@@ -40,17 +40,7 @@ MAX_REFLECTANCE = 1.01
 
 @dataclass(frozen=True, kw_only=True)
 class Radiance:
-    """
-    Spectra of the bands of a cube, as for :class:`foveasim.Scene`.
-
-    Attributes
-    ----------
-    spectrum_w_m2_sr_nm : (n_band, n_wavelength), W/(m² sr nm)
-        Spectral radiance of the value 1 in each band.
-    wavelength_nm : (n_wavelength,), nm
-    max_fraction : float
-        Largest reflectance; 0 for radiance.
-    """
+    """Spectra of the bands of a cube, as those of a scene, and the largest reflectance or 0."""
 
     spectrum_w_m2_sr_nm: Floats
     wavelength_nm: Floats
@@ -79,12 +69,8 @@ def spectral_radiance(
     """
     Return the spectra of a cube; parameters as for :meth:`foveasim.Scene.from_cube`.
 
-    Raises
-    ------
-    FormatError
-        If the cube does not specify its quantity or unit, or the unit is not supported.
-    ParameterError
-        If an argument is invalid, or inconsistent with the quantity.
+    Raises FormatError if the cube does not specify its quantity or unit, or the unit is not supported, and ParameterError
+    if an argument is invalid, or inconsistent with the quantity.
     """
     bands_nm = np.asarray(cube.wavelength, np.float64)
     kind, factor = _quantity(cube, bands_nm, quantity, unit)

@@ -39,14 +39,7 @@ MAX_COPIED_BYTES = 2**30
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """
-    Selected part of a cube; parameters as for :meth:`foveasim.Scene.from_cube`.
-
-    Raises
-    ------
-    ParameterError
-        If a value is invalid for any cube.
-    """
+    """Selected part of a cube; parameters as for :meth:`foveasim.Scene.from_cube`."""
 
     wavelength_nm: Sequence[float] | None = None
     bands: Sequence[int] | None = None
