@@ -10,35 +10,30 @@ from foveasim.errors import FileError, ParameterError
 
 #: Smallest extra that installs each optional module.
 EXTRA_OF = {
-    "OpenEXR": "pictures",
-    "anywidget": "notebook",
-    "astropy": "maps",
-    "av": "video",
-    "cloudpickle": "explore",
-    "cryptography": "explore",
-    "dask": "explore",
-    "distributed": "explore",
-    "gdstk": "layout",
-    "h5netcdf": "maps",
-    "h5py": "video",
-    "imagecodecs": "pictures",
-    "klayout": "klayout",
-    "lxml": "view",
-    "networkx": "view",
-    "numcodecs": "explore",
-    "optuna": "explore",
-    "pandas": "maps",
-    "pyarrow": "parquet",
-    "pyvista": "view",
-    "sqlalchemy": "explore",
-    "starlette": "studio",
-    "torch": "learn",
-    "traitlets": "notebook",
-    "uvicorn": "studio",
-    "vtkmodules": "view",
-    "websockets": "studio",
-    "xarray": "explore",
-    "zarr": "video",
+    module: extra
+    for extra, modules in {
+        "explore": (
+            "cloudpickle",
+            "cryptography",
+            "dask",
+            "distributed",
+            "numcodecs",
+            "optuna",
+            "sqlalchemy",
+            "xarray",
+        ),
+        "klayout": ("klayout",),
+        "layout": ("gdstk",),
+        "learn": ("torch",),
+        "maps": ("astropy", "h5netcdf", "pandas"),
+        "notebook": ("anywidget", "traitlets"),
+        "parquet": ("pyarrow",),
+        "pictures": ("OpenEXR", "imagecodecs"),
+        "studio": ("starlette", "uvicorn", "websockets"),
+        "video": ("av", "h5py", "zarr"),
+        "view": ("lxml", "networkx", "pyvista", "vtkmodules"),
+    }.items()
+    for module in modules
 }
 
 

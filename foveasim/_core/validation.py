@@ -258,6 +258,15 @@ def _has_mask(value: object) -> bool:
     return any(issubclass(kind, np.ma.MaskedArray | list | tuple) for kind in kinds) and any(map(_has_mask, value))
 
 
+def as_any_array(name: str, value: Any) -> NDArray[Any]:
+    """Return the value, without masks, as an array of any type."""
+    value = unmasked(name, value)
+    try:
+        return np.asarray(value)
+    except ValueError:  # ragged
+        raise ParameterError(name, "must be an array of numbers", value) from None
+
+
 def as_numbers(name: str, value: ArrayLike, *, keep_type: bool = False, missing_is_nan: bool = False) -> NDArray[Any]:
     """
     Return the value as an array of real numbers: float64, or its own dtype (``keep_type``).
@@ -354,6 +363,29 @@ def wavelengths_nm(name: str, value: ArrayLike) -> Floats:
             "wavelengths are in nm",
         )
     return read_only(waves_nm.copy())
+
+
+def band_widths_nm(wavelength_nm: Floats, band_width_nm: ArrayLike | None) -> Floats:
+    """Return the specified widths of bands; by default they extend halfway to their neighbours."""
+    if band_width_nm is not None:
+        widths = finite_array("band_width_nm", band_width_nm, above=0.0, at_most=MAX_WAVELENGTH_NM)
+        if widths.ndim > 1 or widths.size not in (1, wavelength_nm.size):
+            raise ParameterError(
+                "band_width_nm", f"must be one number, or one for each of the {wavelength_nm.size} wavelengths"
+            )
+        return np.broadcast_to(widths, wavelength_nm.shape).astype(np.float64)
+    if wavelength_nm.size == 1:
+        raise ParameterError(
+            "band_width_nm", "must be given for a single wavelength, which has no adjacent wavelengths"
+        )
+    order = np.argsort(wavelength_nm)
+    steps = np.diff(wavelength_nm[order])
+    if np.any(steps <= 0):
+        raise ParameterError("wavelength_nm", "must be unique", wavelength_nm.tolist(), "nm")
+    # The outermost bands are symmetric about their wavelengths.
+    widths = np.empty(wavelength_nm.size)
+    widths[order] = 0.5 * (np.concatenate((steps[:1], steps)) + np.concatenate((steps, steps[-1:])))
+    return widths
 
 
 def read_only(array: _Array) -> _Array:

@@ -10,7 +10,7 @@ from typing import Any
 
 from foveasim._core.names import did_you_mean, missing_path, possible_names
 from foveasim._core.short_repr import short_repr
-from foveasim.errors import FileError, FoveasimError, ParameterError
+from foveasim.errors import FileError, FoveasimError, ParameterError, format_value
 
 #: Size limit of files that are read.
 MAX_FILE_BYTES = 8 * 2**30
@@ -97,6 +97,14 @@ def as_file_error(path: Path, what: str, *, passes: tuple[type[FoveasimError], .
     except Exception as error:  # noqa: BLE001 -- readers raise arbitrary exceptions on malformed files
         reason = one_line(str(error), MAX_REASON_LENGTH) or type(error).__name__
         raise FileError(path, f"is corrupt or not a valid {what} ({reason})") from None
+
+
+def check_version(path: Path, about: Any, what: str, file_format: str, version: int) -> None:
+    """Check the values of ``format`` and ``version`` in the metadata of a file of the package."""
+    if not isinstance(about, Mapping) or about.get("format") != file_format:
+        raise FileError(path, f"is not a valid {what}")
+    if about.get("version") != version:
+        raise FileError(path, f"has the format version {format_value(about.get('version'))}, expected {version}")
 
 
 def one_line(text: str, max_characters: int) -> str:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.calls import OwnCheck
 from foveasim._core.rings import next_vertex, to_frame
 from foveasim._core.threads import cached_property, parallel_map, thread_count
-from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_count, finite_array, read_only
+from foveasim._core.validation import Bools, Floats, Ints, as_numbers, finite_array, read_only
 from foveasim.errors import ParameterError, type_name
 from foveasim.fields import Grid, PackedRings
 
@@ -238,9 +238,6 @@ def vertex_gradient(
     """
     if edges is None:
         edges = SharedEdges.from_layout(layout)
-    if not isinstance(grid, Grid):
-        raise ParameterError("grid", f"must be a Grid, got {type_name(grid)}")
-    check_count("order", order, at_most=2)
     cells = as_numbers("power_map", power_map, keep_type=True)
     if cells.ndim < 2 or cells.shape[-2:] != grid.shape:
         raise ParameterError(

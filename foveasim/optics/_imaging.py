@@ -158,18 +158,7 @@ class Imaging:
 
     def transform(self, rows: Ints, columns: Ints, shape: tuple[int, int]) -> Transform:
         """Return the Fourier transforms of padded pictures of one size."""
-        return Transform(
-            shape=shape,
-            rows=rows,
-            columns=columns,
-            pitch_um=self.grid.pitch_x_um,
-            f_max_per_um=self.f_max_per_um,
-            blur_cells=self.blur_cells,
-            is_square_source=self.is_square_source,
-            oversample=self.oversample,
-            real=self.real,
-            n_threads=self.n_threads,
-        )
+        return Transform(self, rows, columns, shape)
 
     def maps(self, table_of: Tables) -> Iterator[MapRows]:
         """Yield maps with the same PSF over the whole field; their rows are computed on demand."""

@@ -25,7 +25,7 @@ from foveasim._core.validation import (
     read_only,
     wavelengths_nm,
 )
-from foveasim.errors import ParameterError, SamplingWarning, type_name
+from foveasim.errors import ParameterError, SamplingWarning
 from foveasim.fields import Grid, PowerMap, SceneLike
 from foveasim.optics._aperture import Aperture, Wavefront, overlaps
 from foveasim.optics._point_images import Point, PointImages
@@ -264,8 +264,6 @@ class Optics(PointImages):
 
     def grid(self, scene: SceneLike) -> Grid:
         """Return the sensor-plane grid of the scene pixels, upright and centred on the axis."""
-        if not hasattr(scene, "spectrum_w_m2_sr_nm"):
-            raise ParameterError("scene", f"must be a Scene, got {type_name(scene)}")
         shape = scene.basis.shape
         return Grid.centred((shape[1], shape[2]), _pitch_um(scene) * self.magnification(scene.distance_m))
 

@@ -8,7 +8,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,8 +19,9 @@ from foveasim._core.validation import (
     MAX_WAVELENGTH_NM,
     Floats,
     Images,
+    as_any_array,
     as_numbers,
-    check_choice,
+    band_widths_nm,
     check_number,
     check_shape,
     finite_array,
@@ -289,12 +290,11 @@ class Scene:
             raise _framing_conflict("field_of_view_deg", field_of_view_deg, "pitch_um")
         if pitch_um is None and field_of_view_deg is None and fit is None:
             fit = "cover"
-        check_choice("encoding", encoding, get_args(Encoding))
         peak = RADIANCE.check("peak_radiance_w_m2_sr_nm", peak_radiance_w_m2_sr_nm)
         if isinstance(picture, os.PathLike):
             picture = Path(picture)
         is_file = isinstance(picture, str | Path)
-        pixels = read_picture(picture) if is_file else _picture_array(picture)  # type: ignore[arg-type]
+        pixels = read_picture(picture) if is_file else as_any_array("picture", picture)  # type: ignore[arg-type]
         if (
             pixels.ndim not in (2, 3)
             or 0 in pixels.shape
@@ -588,14 +588,6 @@ def _framing_conflict(name: str, value: object, other: str) -> ParameterError:
     )
 
 
-def _picture_array(picture: ArrayLike) -> NDArray[Any]:
-    picture = unmasked("picture", picture)
-    try:
-        return np.asarray(picture)
-    except ValueError:
-        raise ParameterError("picture", "must be a file or an array of numbers", picture) from None
-
-
 def _relative_radiance(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Images:
     """Return the relative radiance (n_channel, n_y, n_x) float32, multiplied by alpha."""
     pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
@@ -630,29 +622,6 @@ def _relative_radiance(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: b
     if alpha is not None:
         radiance *= alpha
     return radiance
-
-
-def band_widths_nm(wavelength_nm: Floats, band_width_nm: float | Sequence[float] | Floats | None) -> Floats:
-    """Return the specified widths, or widths that extend halfway to the adjacent wavelengths."""
-    if band_width_nm is not None:
-        widths = finite_array("band_width_nm", band_width_nm, above=0.0, at_most=MAX_WAVELENGTH_NM)
-        if widths.ndim > 1 or (widths.ndim == 1 and widths.size != wavelength_nm.size):
-            raise ParameterError(
-                "band_width_nm", f"must be one number, or one for each of the {wavelength_nm.size} wavelengths"
-            )
-        return np.broadcast_to(widths, wavelength_nm.shape).astype(np.float64)
-    if wavelength_nm.size == 1:
-        raise ParameterError(
-            "band_width_nm", "must be given for a single wavelength, which has no adjacent wavelengths"
-        )
-    order = np.argsort(wavelength_nm)
-    steps = np.diff(wavelength_nm[order])
-    if np.any(steps <= 0):
-        raise ParameterError("wavelength_nm", "must be unique", wavelength_nm.tolist(), "nm")
-    # The outermost bands are symmetric about their wavelengths.
-    widths = np.empty(wavelength_nm.size)
-    widths[order] = 0.5 * (np.concatenate((steps[:1], steps)) + np.concatenate((steps, steps[-1:])))
-    return widths
 
 
 #: Common parameters of the examples: the size of pixels, the distance, and one band.

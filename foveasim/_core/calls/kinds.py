@@ -234,7 +234,8 @@ def _choice(values: tuple[Any, ...]) -> Kind:
     def accepts(value: Any) -> bool:
         if isinstance(value, np.generic | np.ndarray) and value.ndim == 0:
             value = value.item()
-        return isinstance(value, str | int | float | None) and value in values
+        is_plain = isinstance(value, str | int | float | None)
+        return is_plain and any(value == each and isinstance(value, bool) == isinstance(each, bool) for each in values)
 
     return Kind(accepts, f"one of {shown}", f"names among {shown}", names)
 

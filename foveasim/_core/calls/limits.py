@@ -51,11 +51,6 @@ class Limits:
         Smallest plausible value besides 0: smaller ones indicate errors of units or digits.
     hint : str
         Reminder of the unit, for error messages.
-
-    Raises
-    ------
-    ParameterError
-        If no number is within the limits.
     """
 
     above: float | None = None

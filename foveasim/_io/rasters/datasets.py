@@ -30,6 +30,7 @@ NETCDF3_MAGICS = (b"CDF\x01", b"CDF\x02")
 ZARR_FILES = ("zarr.json", ".zgroup", ".zarray", ".zattrs", ".zmetadata")
 #: Keys of zarr metadata that name codecs for the chunks, and the safe codecs, which only encode numbers.
 ZARR_CODEC_KEYS = ("codecs", "index_codecs", "filters", "compressor", "storage_transformers")
+COMPRESSORS = ("zlib", "zstd", "blosc", "lz4", "bz2", "lzma", "gzip", "shuffle")
 ZARR_CODECS = frozenset(
     {
         "bytes",
@@ -37,16 +38,9 @@ ZARR_CODECS = frozenset(
         "transpose",
         "crc32c",
         "sharding_indexed",
-        "gzip",
-        "zlib",
-        "zstd",
-        "blosc",
-        "lz4",
-        "bz2",
-        "lzma",
+        *COMPRESSORS,
+        *(f"numcodecs.{c}" for c in COMPRESSORS),
     }
-    | {"numcodecs." + name for name in ("zlib", "zstd", "blosc", "lz4", "bz2", "lzma", "gzip", "shuffle")}
-    | {"shuffle"}
 )
 #: Maximum number of groups, arrays and links in a file.
 MAX_OBJECTS = 1000

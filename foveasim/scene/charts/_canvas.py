@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from foveasim._core.calls import Limits, check_arguments, check_declared, without_declarations
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import Bools, Floats, check_shape, freeze, wavelengths_nm
+from foveasim._core.validation import Bools, Floats, band_widths_nm, check_shape, freeze, wavelengths_nm
 from foveasim.errors import ParameterError, SamplingWarning
-from foveasim.scene._scene import DISTANCE, GREY_NM, PITCH, RADIANCE, Scene, band_widths_nm
+from foveasim.scene._scene import DISTANCE, GREY_NM, PITCH, RADIANCE, Scene
 from foveasim.scene.registry import SCENES
 from foveasim.units import m_from_um
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from foveasim._core.calls import NOT_NEGATIVE, POSITIVE, Limits
 from foveasim._core.validation import Floats
-from foveasim.scene._illuminants import Illuminant, illuminant_spectrum
+from foveasim.scene._illuminants import Illuminant
+from foveasim.scene._illuminants import illuminant as cie_illuminant
 from foveasim.scene._scene import RADIANCE, Scene
 from foveasim.scene.charts._canvas import Canvas, Fractions, Picture, Raster, add_rectangle, chart
 from foveasim.scene.charts._colours import PATCH_NAMES, nonnegative_factors, patch_reflectance
@@ -140,7 +141,7 @@ def colour_chart(
     canvas.check_fits("patch_mm", N_COLUMNS * step_mm - gap_mm, N_ROWS * step_mm - gap_mm)
     canvas.warn_if_fine("patch_mm", 2.0 * patch_mm)
     weights, spectra = _patch_spectra(np.asarray(canvas.wavelength_nm), n_basis)
-    illumination = radiance_w_m2_sr_nm * illuminant_spectrum(illuminant, np.asarray(canvas.wavelength_nm))
+    illumination = radiance_w_m2_sr_nm * cie_illuminant(illuminant, np.asarray(canvas.wavelength_nm))
     return canvas.scene_of(_patches(canvas, weights, patch_mm, step_mm), spectra * illumination, "a colour chart")
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import Floats, check_choice, check_number, finite_array, wavelengths_nm
+from foveasim._core.validation import Floats, check_number, finite_array, wavelengths_nm
 from foveasim._io.formats import FormatError
 from foveasim._io.mapped_files import value_range
 from foveasim._io.rasters.units import Powers, parse_unit, round_factor
@@ -95,8 +95,6 @@ def spectral_radiance(
 
 def _quantity(cube: Cube, bands_nm: Floats, quantity: Quantity | None, unit: str | None) -> tuple[Quantity, Floats]:
     """Return the quantity, and the factors to reflectance or W/(m² sr nm), (n_band,)."""
-    if quantity is not None:
-        check_choice("quantity", quantity, ("radiance", "reflectance"))
     text = unit if unit is not None else cube.unit
     expected = quantity if quantity is not None else cube.quantity
     if text is None and expected == "reflectance":
@@ -150,8 +148,6 @@ def _illumination(
     try:
         return white * cie_illuminant(illuminant or "D65", waves_nm)
     except ParameterError as error:
-        if error.name == "illuminant":
-            raise
         raise ParameterError(
             "illuminant",
             f"'{illuminant or 'D65'}' {error.detail}; select range_nm=, or pass 'A', 'E', or a table "

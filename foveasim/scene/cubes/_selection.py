@@ -15,7 +15,6 @@ from foveasim._core.validation import (
     Floats,
     Images,
     Ints,
-    check_choice,
     check_count,
     finite_array,
     freeze,
@@ -50,7 +49,6 @@ class Selection:
     invalid: str = "raise"
 
     def __post_init__(self) -> None:
-        check_choice("invalid", self.invalid, ("raise", "zero"))
         plain: dict[str, Any] = {}
         for name in ("wavelength_nm", "resample_nm"):
             if getattr(self, name) is not None:
