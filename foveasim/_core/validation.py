@@ -366,7 +366,7 @@ def wavelengths_nm(name: str, value: ArrayLike) -> Floats:
 
 
 def band_widths_nm(wavelength_nm: Floats, band_width_nm: ArrayLike | None) -> Floats:
-    """Return the specified widths of bands; by default they extend halfway to their neighbours."""
+    """Return the specified widths of bands, or widths halfway to the adjacent wavelengths."""
     if band_width_nm is not None:
         widths = finite_array("band_width_nm", band_width_nm, above=0.0, at_most=MAX_WAVELENGTH_NM)
         if widths.ndim > 1 or widths.size not in (1, wavelength_nm.size):

@@ -17,14 +17,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.show import drawn
 from foveasim._core.threads import thread_count
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import (
-    Bools,
-    Floats,
-    check_number,
-    finite_array,
-    read_only,
-    wavelengths_nm,
-)
+from foveasim._core.validation import Bools, Floats, check_number, finite_array, read_only, wavelengths_nm
 from foveasim.errors import ParameterError, SamplingWarning
 from foveasim.fields import Grid, PowerMap, SceneLike
 from foveasim.optics._aperture import Aperture, Wavefront, overlaps

@@ -19,13 +19,7 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.calls import Declared, Limits, check_declared
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import (
-    Floats,
-    as_numbers,
-    check_broadcast,
-    finite_array,
-    wavelengths_nm,
-)
+from foveasim._core.validation import Floats, as_numbers, check_broadcast, finite_array, wavelengths_nm
 from foveasim.errors import ParameterError
 from foveasim.units import um_from_nm
 

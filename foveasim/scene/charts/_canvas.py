@@ -51,6 +51,7 @@ PARAMETERS = {
     "band_width_nm": "band_width_nm : number or sequence, optional, nm\n"
     "        Widths of the bands; by default bands extend halfway to the adjacent wavelengths. Required for one wavelength.",
 }
+RETURNS = "\n\n    Returns\n    -------\n    scene : Scene\n        One basis image."
 
 
 class Raster(TypedDict):
@@ -205,7 +206,8 @@ def chart(name: str, *, example: Mapping[str, Any], expected: Sequence[str]) -> 
     """
     Register a chart whose last parameter, ``**picture``, are parameters of the canvas.
 
-    They replace it in the signature, and ``{picture}`` in the docstring. The example is completed by :data:`EXAMPLE_PICTURE`.
+    They replace it in the signature, and ``{picture}`` in the docstring, followed by the usual result if there is no other.
+    The example is completed by :data:`EXAMPLE_PICTURE`.
     """
 
     def decorate(function: F) -> F:
@@ -219,8 +221,8 @@ def chart(name: str, *, example: Mapping[str, Any], expected: Sequence[str]) -> 
         types = get_type_hints(Canvas, include_extras=True)
         function.__signature__ = signature  # type: ignore[attr-defined]
         function.__annotations__ = {**{each.name: types[each.name] for each in common}, **hints}
-        described = "\n    ".join(PARAMETERS[each.name] for each in common)
-        function.__doc__ = (function.__doc__ or "").replace("{picture}", described)
+        described, text = "\n    ".join(PARAMETERS[each.name] for each in common), function.__doc__ or ""
+        function.__doc__ = text.replace("{picture}", described if "Returns\n" in text else described + RETURNS)
         complete = {key: value for key, value in EXAMPLE_PICTURE.items() if key in signature.parameters} | {**example}
         return SCENES.register(name, check_arguments(function), example=complete, expected=expected)  # type: ignore[return-value]
 

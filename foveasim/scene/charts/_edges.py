@@ -91,11 +91,6 @@ def checkerboard(
         (white - black) / (white + black).
     {picture}
 
-    Returns
-    -------
-    scene : Scene
-        One basis image.
-
     Raises
     ------
     ParameterError
@@ -151,11 +146,6 @@ def slanted_edge(
     contrast : float
         (white - black) / (white + black); 0.6 by default, a ratio of 4 between white and black, as in ISO 12233.
     {picture}
-
-    Returns
-    -------
-    scene : Scene
-        One basis image.
     """
     canvas = Canvas(**picture)
     angle = np.deg2rad(angle_deg)
@@ -190,11 +180,6 @@ def bars(
     contrast : float
         (white - black) / (white + black).
     {picture}
-
-    Returns
-    -------
-    scene : Scene
-        One basis image.
 
     Raises
     ------
@@ -317,11 +302,6 @@ def letter_f(
     contrast : float
         (white - black) / (white + black).
     {picture}
-
-    Returns
-    -------
-    scene : Scene
-        One basis image.
 
     Raises
     ------

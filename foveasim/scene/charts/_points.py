@@ -45,11 +45,6 @@ def point_grid(
         Wavelengths; the intensity is the same at all of them.
     {picture}
 
-    Returns
-    -------
-    scene : Scene
-        One basis image.
-
     Raises
     ------
     ParameterError

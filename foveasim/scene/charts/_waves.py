@@ -51,11 +51,6 @@ def sine(
         (white - black) / (white + black) of the ideal wave; the contrast of the pixel means is slightly lower.
     {picture}
 
-    Returns
-    -------
-    scene : Scene
-        One basis image.
-
     Warns
     -----
     SamplingWarning
@@ -99,11 +94,6 @@ def zone_plate(
     contrast : float
         (white - black) / (white + black).
     {picture}
-
-    Returns
-    -------
-    scene : Scene
-        One basis image.
 
     Raises
     ------
@@ -171,11 +161,6 @@ def siemens_star(
     contrast : float
         (white - black) / (white + black).
     {picture}
-
-    Returns
-    -------
-    scene : Scene
-        One basis image.
 
     Raises
     ------
