@@ -10,7 +10,7 @@ from typing import Annotated, Any, NotRequired, TypedDict, TypeVar, get_args, ge
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.calls import Limits, check_arguments, check_declared, without_declarations
+from foveasim._core.calls import FRACTION, Limits, check_arguments, check_declared, without_declarations
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, band_widths_nm, check_shape, freeze, wavelengths_nm
 from foveasim.errors import ParameterError, SamplingWarning
@@ -42,6 +42,7 @@ EXAMPLE_PICTURE = {
 }
 #: Documentation of the parameters of the canvas.
 PARAMETERS = {
+    "contrast": "contrast : float\n        (white - black) / (white + black).",
     "shape": "shape : (n_y, n_x)\n        Number of pixels.",
     "pitch_um": "pitch_um : float, µm\n        Pixel pitch in the scene.",
     "distance_m": "distance_m : float, m\n        Distance of the scene from the lens.",
@@ -70,10 +71,17 @@ class Picture(Raster):
     wavelength_nm: NotRequired[Sequence[float]]
 
 
+class Pattern(Picture):
+    """Parameters of charts with a contrast that is 1 by default."""
+
+    contrast: NotRequired[float]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Canvas:
-    """Raster of a chart and radiance of white."""
+    """Raster of a chart, radiance of white, and Michelson contrast."""
 
+    contrast: Annotated[float, FRACTION] = 1.0
     shape: tuple[int, int]
     pitch_um: Annotated[float, PITCH]
     distance_m: Annotated[float, DISTANCE]
@@ -166,14 +174,13 @@ class Canvas:
                 SamplingWarning,
             )
 
-    def scene(self, fractions: Fractions, contrast: float, source: str) -> Scene:
+    def scene(self, fractions: Fractions, source: str) -> Scene:
         """
         Return the scene of a chart in black and white.
 
-        ``fractions`` (n_y, n_x) float32: fraction of white in each pixel; overwritten. ``contrast``: Michelson contrast.
-        ``source``: description of the chart.
+        ``fractions`` (n_y, n_x) float32: fraction of white in each pixel; overwritten. ``source``: description of the chart.
         """
-        black = (1.0 - contrast) / (1.0 + contrast)
+        black = (1.0 - self.contrast) / (1.0 + self.contrast)
         fractions *= np.float32(1.0 - black)
         fractions += np.float32(black)
         return self.scene_of(fractions[np.newaxis], np.asarray(self.radiance_w_m2_sr_nm)[np.newaxis], source)
@@ -204,7 +211,7 @@ def ink_to_white(fractions: Fractions, ink: str) -> Fractions:
 
 def chart(name: str, *, example: Mapping[str, Any], expected: Sequence[str]) -> Callable[[F], F]:
     """
-    Register a chart whose last parameter, ``**picture``, are parameters of the canvas.
+    Register a chart whose last parameter, such as ``**picture``, are parameters of the canvas.
 
     They replace it in the signature, and ``{picture}`` in the docstring, followed by the usual result if there is no other.
     The example is completed by :data:`EXAMPLE_PICTURE`.

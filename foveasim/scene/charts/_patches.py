@@ -73,7 +73,7 @@ def grey_scale(
         left_mm = (k - 0.5 * n_steps) * patch_mm
         x_mm, y_mm = (left_mm, left_mm + patch_mm), (-0.5 * patch_mm, 0.5 * patch_mm)
         add_rectangle(fractions, canvas, x_mm, y_mm, float(np.exp(-k * np.log(ratio))))
-    return canvas.scene(fractions, 1.0, "a grey scale")
+    return canvas.scene(fractions, "a grey scale")
 
 
 @chart(

@@ -9,7 +9,7 @@ import numpy as np
 from foveasim._core.calls import FRACTION, POSITIVE, Limits
 from foveasim._core.validation import Floats
 from foveasim.scene._scene import Scene
-from foveasim.scene.charts._canvas import HALF_TURN, Canvas, Picture, chart, half_plane, sample_means
+from foveasim.scene.charts._canvas import HALF_TURN, Canvas, Pattern, Picture, chart, half_plane, sample_means
 
 #: Limit of computing time: the sampled centre of a star with more sectors takes minutes.
 MAX_SPOKES = 1000
@@ -56,7 +56,7 @@ def sine(
     SamplingWarning
         If a period is shorter than two pixels.
     """
-    canvas = Canvas(**picture)
+    canvas = Canvas(contrast=contrast, **picture)
     angle, phase = np.deg2rad(angle_deg), np.deg2rad(phase_deg)
     canvas.warn_if_fine("line_pairs_per_mm", 1.0 / line_pairs_per_mm)
     along_x, along_y = line_pairs_per_mm * np.cos(angle), line_pairs_per_mm * np.sin(angle)
@@ -67,7 +67,7 @@ def sine(
     fractions = canvas.fill(
         lambda rows: 0.5 + np.multiply.outer(y.real[rows], x.real) - np.multiply.outer(y.imag[rows], x.imag)
     )
-    return canvas.scene(fractions, contrast, "a sine wave")
+    return canvas.scene(fractions, "a sine wave")
 
 
 @chart(
@@ -79,8 +79,7 @@ def zone_plate(
     *,
     line_pairs_per_mm: Annotated[float, POSITIVE],
     radius_mm: Annotated[float, POSITIVE] | None = None,
-    contrast: Annotated[float, FRACTION] = 1.0,
-    **picture: Unpack[Picture],
+    **pattern: Unpack[Pattern],
 ) -> Scene:
     """
     Return a sinusoidal zone plate, for aliasing at all frequencies and directions.
@@ -91,8 +90,6 @@ def zone_plate(
         Spatial frequency at the rim, in the scene.
     radius_mm : float, optional, mm
         Radius of the rim; by default the largest that fits into the picture.
-    contrast : float
-        (white - black) / (white + black).
     {picture}
 
     Raises
@@ -111,7 +108,7 @@ def zone_plate(
     ``f r / R``. The background outside the rim is the mean of black and white. The means are exact (Fresnel integrals),
     except in pixels on the rim, which are sampled at 32 x 32 points.
     """
-    canvas = Canvas(**picture)
+    canvas = Canvas(**pattern)
     radius_mm = canvas.radius_mm(radius_mm)
     canvas.warn_if_fine("line_pairs_per_mm", 1.0 / line_pairs_per_mm)
     # Fresnel integrals are integrals of cos(π t² / 2): t is this factor times a length.
@@ -130,7 +127,7 @@ def zone_plate(
         rings[is_rim] = sample_means(canvas, is_rim, rows, ideal)
         return rings
 
-    return canvas.scene(canvas.fill(block), contrast, "a zone plate")
+    return canvas.scene(canvas.fill(block), "a zone plate")
 
 
 @chart(
@@ -143,8 +140,7 @@ def siemens_star(
     n_spokes: Annotated[int, Limits(at_least=2, at_most=MAX_SPOKES)] = 36,
     radius_mm: Annotated[float, POSITIVE] | None = None,
     profile: Literal["square", "sine"] = "square",
-    contrast: Annotated[float, FRACTION] = 1.0,
-    **picture: Unpack[Picture],
+    **pattern: Unpack[Pattern],
 ) -> Scene:
     """
     Return a Siemens star, for resolution and aliasing in all directions.
@@ -158,8 +154,6 @@ def siemens_star(
         Radius of the star; by default the largest that fits into the picture.
     profile : {"square", "sine"}
         Profile across the sectors: black and white, or sinusoidal (as the star of ISO 12233:2014 with 144 sectors).
-    contrast : float
-        (white - black) / (white + black).
     {picture}
 
     Raises
@@ -178,7 +172,7 @@ def siemens_star(
     square profile are exact and means of the sinusoidal profile are accurate to 1e-4. Pixels nearer to the centre and pixels
     on the rim are sampled at 32 x 32 points.
     """
-    canvas = Canvas(**picture)
+    canvas = Canvas(**pattern)
     radius_mm = canvas.radius_mm(radius_mm)
     canvas.warn_if_fine("n_spokes", 2.0 * np.pi * radius_mm / n_spokes)
     mean_of_spokes = _mean_of_edges if profile == "square" else _mean_of_waves
@@ -198,7 +192,7 @@ def siemens_star(
         spokes[is_sampled] = sample_means(canvas, is_sampled, rows, ideal)
         return spokes
 
-    return canvas.scene(canvas.fill(block), contrast, "a Siemens star")
+    return canvas.scene(canvas.fill(block), "a Siemens star")
 
 
 def _mean_of_edges(x: Floats, y: Floats, n_spokes: int) -> Floats:
