@@ -211,7 +211,7 @@ def ink_to_white(fractions: Fractions, ink: str) -> Fractions:
 
 def chart(name: str, *, example: Mapping[str, Any], expected: Sequence[str]) -> Callable[[F], F]:
     """
-    Register a chart whose last parameter, such as ``**picture``, are parameters of the canvas.
+    Register a chart with parameters of the canvas, such as ``**picture``, the last ones.
 
     They replace it in the signature, and ``{picture}`` in the docstring, followed by the usual result if there is no other.
     The example is completed by :data:`EXAMPLE_PICTURE`.
