@@ -150,21 +150,7 @@ DISK_ERRNOS = frozenset(
 
 
 def format_value(value: Any, *, at_most: int = MAX_VALUE_LENGTH) -> str:
-    """
-    Return a value as one short line for a message.
-
-    Parameters
-    ----------
-    value : object
-        Object of any size and depth.
-    at_most : int
-        Maximum number of characters.
-
-    Returns
-    -------
-    text : str
-        Printable characters only; ``...`` replaces the characters above the limit.
-    """
+    """Return a value as one line of printable characters, shortened with ``...``."""
     try:
         text = printable(" ".join(_REPR.repr(value).split()))
     except Exception:  # noqa: BLE001 -- the repr of any object may raise, and Python rejects very long integers

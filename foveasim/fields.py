@@ -20,6 +20,7 @@ from foveasim._core.validation import (
     Floats,
     Images,
     Ints,
+    as_any_array,
     as_numbers,
     check_number,
     check_pitch_um,
@@ -29,7 +30,7 @@ from foveasim._core.validation import (
     unmasked,
     wavelengths_nm,
 )
-from foveasim.errors import ParameterError, type_name
+from foveasim.errors import ParameterError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -262,8 +263,6 @@ class PowerMap:
             raise ParameterError("data", f"must have real numbers, got the type {data.dtype}")
         if data.dtype not in (np.float32, np.float64):
             data = read_only(data.astype(np.float64))
-        if not isinstance(self.grid, Grid):
-            raise ParameterError("grid", f"must be a Grid, got {type_name(self.grid)}")
         wavelength_nm = wavelengths_nm("wavelength_nm", self.wavelength_nm)
         if data.shape != (wavelength_nm.size, *self.grid.shape):
             raise ParameterError(
@@ -324,11 +323,7 @@ class PowerMap:
         >>> spot.data[0, 1].tolist(), spot.grid.origin_um
         ([0.0, 1.0], (-2.0, -2.0))
         """
-        data = unmasked("data", data)
-        try:
-            images = np.asarray(data)
-        except ValueError:
-            raise ParameterError("data", "must be an array of numbers", data) from None
+        images = as_any_array("data", data)
         if images.ndim not in (2, 3) or 0 in images.shape:
             raise ParameterError("data", f"must have the shape (n_y, n_x) or (n_band, n_y, n_x), got {images.shape}")
         images = images.reshape(-1, *images.shape[-2:])

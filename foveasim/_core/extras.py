@@ -10,35 +10,30 @@ from foveasim.errors import FileError, ParameterError
 
 #: Smallest extra that installs each optional module.
 EXTRA_OF = {
-    "OpenEXR": "pictures",
-    "anywidget": "notebook",
-    "astropy": "maps",
-    "av": "video",
-    "cloudpickle": "explore",
-    "cryptography": "explore",
-    "dask": "explore",
-    "distributed": "explore",
-    "gdstk": "layout",
-    "h5netcdf": "maps",
-    "h5py": "video",
-    "imagecodecs": "pictures",
-    "klayout": "klayout",
-    "lxml": "view",
-    "networkx": "view",
-    "numcodecs": "explore",
-    "optuna": "explore",
-    "pandas": "maps",
-    "pyarrow": "parquet",
-    "pyvista": "view",
-    "sqlalchemy": "explore",
-    "starlette": "studio",
-    "torch": "learn",
-    "traitlets": "notebook",
-    "uvicorn": "studio",
-    "vtkmodules": "view",
-    "websockets": "studio",
-    "xarray": "explore",
-    "zarr": "video",
+    module: extra
+    for extra, modules in {
+        "explore": (
+            "cloudpickle",
+            "cryptography",
+            "dask",
+            "distributed",
+            "numcodecs",
+            "optuna",
+            "sqlalchemy",
+            "xarray",
+        ),
+        "klayout": ("klayout",),
+        "layout": ("gdstk",),
+        "learn": ("torch",),
+        "maps": ("astropy", "h5netcdf", "pandas"),
+        "notebook": ("anywidget", "traitlets"),
+        "parquet": ("pyarrow",),
+        "pictures": ("OpenEXR", "imagecodecs"),
+        "studio": ("starlette", "uvicorn", "websockets"),
+        "video": ("av", "h5py", "zarr"),
+        "view": ("lxml", "networkx", "pyvista", "vtkmodules"),
+    }.items()
+    for module in modules
 }
 
 
@@ -49,29 +44,13 @@ def needs(module: str, extra: str | None = None) -> str:
 
 def import_optional(subject: Path | str, module: str, extra: str | None = None) -> Any:
     """
-    Import an optional module, with the command that installs it as error message.
+    Import an optional module, or raise an error with the command that installs it.
 
     Other imports of optional modules are of those that this function has imported before.
 
-    Parameters
-    ----------
-    subject : Path or str
-        What requires the module, for the message: the path of a file, or the name of a function or an argument.
-    module : str
-        Name of the module, such as ``"h5py"`` or ``"astropy.io.fits"``.
-    extra : str, optional
-        Extra that installs everything that the subject requires; by default the smallest one with the module.
-
-    Returns
-    -------
-    module
-
-    Raises
-    ------
-    FileError
-        When the module is not installed or cannot be imported, and the subject is a path.
-    ParameterError
-        The same for other subjects.
+    ``subject``: what requires the module, for the message: the path of a file (FileError), or the name of a function or an
+    argument (ParameterError). ``module``: such as ``"astropy.io.fits"``. ``extra``: extra that installs everything that the
+    subject requires; by default the smallest one with the module.
     """
     name = module.partition(".")[0]
     try:

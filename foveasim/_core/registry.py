@@ -14,8 +14,6 @@ from typing import Any, Generic, NamedTuple, TypeVar, overload
 from foveasim._core.names import did_you_mean, possible_names
 from foveasim.errors import ParameterError, with_article
 
-__all__ = ["Registry", "import_all"]
-
 
 def import_all(package: str, path: Iterable[str], *, skip: str = "_kernels") -> None:
     """

@@ -25,35 +25,6 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.names import did_you_mean, list_names
 from foveasim.errors import ParameterError
 
-__all__ = [
-    "MAX_LENGTH_UM",
-    "MAX_SITES",
-    "UNIT_SUFFIXES",
-    "Bools",
-    "Floats",
-    "Images",
-    "Ints",
-    "as_numbers",
-    "check_broadcast",
-    "check_choice",
-    "check_count",
-    "check_length_um",
-    "check_memory",
-    "check_number",
-    "check_pitch_um",
-    "check_shape",
-    "check_sites",
-    "exact_integers",
-    "finite_array",
-    "freeze",
-    "memory_bytes",
-    "own",
-    "read_only",
-    "unit_of",
-    "unmasked",
-    "wavelengths_nm",
-]
-
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -131,14 +102,7 @@ def check_number(
     at_most: float | None = None,
     hint: str = "",
 ) -> float:
-    """
-    Return the value as a finite float within bounds.
-
-    Raises
-    ------
-    ParameterError
-        When the value is not a number, not finite, or out of bounds.
-    """
+    """Return the value as a finite float within bounds, or raise a ParameterError."""
     is_plain = type(value) is float or type(value) is int  # most numbers are
     value = value if is_plain else unmasked(name, value)
     try:
@@ -163,14 +127,7 @@ def check_number(
 
 
 def check_count(name: str, value: object, *, at_least: int = 1, at_most: int | None = None, hint: str = "") -> int:
-    """
-    Return the value as an integer within bounds.
-
-    Raises
-    ------
-    ParameterError
-        When the value is not an integer, or out of bounds.
-    """
+    """Return the value as an integer within bounds, or raise a ParameterError."""
     if isinstance(value, int | np.integer) and not isinstance(value, bool):
         number = int(value)  # not through float: seeds may have more digits
     else:
@@ -189,10 +146,8 @@ def check_shape(name: str, value: object) -> tuple[int, int]:
     """
     Return the value as the shape (n_y, n_x) of a picture or grid.
 
-    Raises
-    ------
-    ParameterError
-        When the value is not a pair of integers of at least 1, or float32 arrays of this shape do not fit in memory.
+    Raises ParameterError when it is not a pair of integers of at least 1, or float32 arrays of this shape do not fit in
+    memory.
     """
     if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or len(value) != 2:
         raise ParameterError(name, "must be two integers (n_y, n_x)", value)
@@ -205,23 +160,8 @@ def check_memory(name: str, n_bytes: int, value: object, hint: str = "") -> None
     """
     Check that an array and the arrays computed from it fit in memory.
 
-    Otherwise the operating system may kill the process.
-
-    Parameters
-    ----------
-    name : str
-        Name of the parameter that determines the size.
-    n_bytes : int
-        Size of one array; every computation needs at least three arrays of this size.
-    value : object
-        Value of the parameter, for the message.
-    hint : str
-        Hint of the message; by default to take fewer pixels.
-
-    Raises
-    ------
-    ParameterError
-        When three such arrays exceed the memory of this machine.
+    Otherwise the operating system may kill the process. ``name``, ``value``: the parameter that determines the size.
+    ``n_bytes``: size of one array; every computation needs at least three arrays of this size.
     """
     memory = memory_bytes()
     if ARRAYS_IN_FLIGHT * n_bytes > memory:
@@ -247,14 +187,7 @@ def memory_bytes() -> int:
 
 
 def check_length_um(name: str, value: object, *, at_most: float | None = None, hint: str = "") -> float:
-    """
-    Return the value as a length on a sensor, in µm.
-
-    Raises
-    ------
-    ParameterError
-        When the value is not a positive number, or outside the range of lengths on a sensor or the given limit.
-    """
+    """Return the value as a positive length on a sensor, in µm, up to a limit."""
     length_um = check_number(name, value, above=0.0, at_most=at_most, hint=hint)
     return check_number(
         name, length_um, at_least=MIN_LENGTH_UM, at_most=MAX_LENGTH_UM, hint=hint or "lengths on a sensor are in µm"
@@ -262,14 +195,7 @@ def check_length_um(name: str, value: object, *, at_most: float | None = None, h
 
 
 def check_pitch_um(name: str, value: object) -> tuple[float, float]:
-    """
-    Return the value as cell pitches along x and y, in µm.
-
-    Raises
-    ------
-    ParameterError
-        When the value is neither one length nor a pair of lengths (along x, along y).
-    """
+    """Return one length, or a pair of lengths (along x, along y), as cell pitches in µm."""
     value = unmasked(name, value)
     if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or getattr(value, "ndim", 1) == 0:
         pitch_um = check_length_um(name, value)
@@ -281,26 +207,12 @@ def check_pitch_um(name: str, value: object) -> tuple[float, float]:
 
 
 def check_sites(n_sites: int, *, at_most: int = MAX_SITES) -> int:
-    """
-    Return the number of sites that a generator is about to create.
-
-    Raises
-    ------
-    ParameterError
-        When the number exceeds the limit.
-    """
+    """Return the number of sites that a generator is about to create, within the limit."""
     return check_count("n_sites", n_sites, at_most=at_most, hint="take fewer or larger photosites")
 
 
 def check_choice(name: str, value: object, choices: Collection[str]) -> str:
-    """
-    Return the value if it is one of the choices.
-
-    Raises
-    ------
-    ParameterError
-        When the value is not one of the choices; the message lists them, with the closest one.
-    """
+    """Return the value if it is one of the choices; the message lists them with the closest."""
     if not isinstance(value, str) or value not in choices:
         rule = f"must be one of {list_names(choices, value)}"
         raise ParameterError(name, rule, value, hint=did_you_mean(value, choices) if isinstance(value, str) else "")
@@ -311,19 +223,8 @@ def unmasked(name: str, value: Any, *, missing_is_nan: bool = False) -> Any:
     """
     Return the value without masks of numpy, which ``np.asarray`` would drop silently.
 
-    Parameters
-    ----------
-    name : str
-        Name of the parameter, for the message.
-    value : any
-        Masked arrays, also in lists, are converted; other objects are returned unchanged.
-    missing_is_nan : bool
-        Whether masked values become NaN (float64 unless the array is floating-point already); by default they are rejected.
-
-    Raises
-    ------
-    ParameterError
-        When values are masked and ``missing_is_nan`` is not set.
+    Masked arrays, also in lists, are converted; other objects are returned unchanged. Masked values raise a ParameterError,
+    or become NaN with ``missing_is_nan`` (float64 unless the array is floating-point already).
     """
     if not _has_mask(value):
         return value
@@ -357,14 +258,20 @@ def _has_mask(value: object) -> bool:
     return any(issubclass(kind, np.ma.MaskedArray | list | tuple) for kind in kinds) and any(map(_has_mask, value))
 
 
+def as_any_array(name: str, value: Any) -> NDArray[Any]:
+    """Return the value, without masks, as an array of any type."""
+    value = unmasked(name, value)
+    try:
+        return np.asarray(value)
+    except ValueError:  # ragged
+        raise ParameterError(name, "must be an array of numbers", value) from None
+
+
 def as_numbers(name: str, value: ArrayLike, *, keep_type: bool = False, missing_is_nan: bool = False) -> NDArray[Any]:
     """
     Return the value as an array of real numbers: float64, or its own dtype (``keep_type``).
 
-    Raises
-    ------
-    ParameterError
-        When the value is ragged, contains data other than real numbers, or is masked and ``missing_is_nan`` is not set.
+    Raises ParameterError when it is ragged, contains other data, or is masked and ``missing_is_nan`` is not set.
     """
     value = unmasked(name, value, missing_is_nan=missing_is_nan)
     try:
@@ -387,13 +294,9 @@ def finite_array(
     hint: str = "",
 ) -> Floats:
     """
-    Return the value as a float64 array of finite numbers.
+    Return the value as a float64 array of finite numbers within bounds.
 
-    Raises
-    ------
-    ParameterError
-        When the value is not numeric, has another number of dimensions, or contains a number that is not finite or out of
-        bounds; the message gives the index of the first such number.
+    The message of the ParameterError gives the index of the first other number.
     """
     array = as_numbers(name, value)
     if ndim is not None and array.ndim != ndim:
@@ -422,14 +325,7 @@ def finite_array(
 
 
 def check_broadcast(**arrays: NDArray[Any]) -> tuple[int, ...]:
-    """
-    Return the common shape of arrays, by the names of their parameters.
-
-    Raises
-    ------
-    ParameterError
-        When the shapes cannot be broadcast together.
-    """
+    """Return the common shape of arrays, by the names of their parameters."""
     names = list(arrays)
     for n in range(2, len(names) + 1):
         try:
@@ -455,14 +351,7 @@ def exact_integers(values: Sequence[int]) -> NDArray[Any] | None:
 
 
 def wavelengths_nm(name: str, value: ArrayLike) -> Floats:
-    """
-    Return the value as a read-only array of wavelengths, (n,) nm.
-
-    Raises
-    ------
-    ParameterError
-        When the value is not a list of numbers, is empty, or contains a number outside the range of wavelengths in nm.
-    """
+    """Return the value as a read-only array of wavelengths within the range in nm, (n,)."""
     waves_nm = finite_array(name, np.atleast_1d(as_numbers(name, value)), ndim=1, above=0.0)
     is_outside = (waves_nm < MIN_WAVELENGTH_NM) | (waves_nm > MAX_WAVELENGTH_NM)
     if waves_nm.size == 0 or is_outside.any():
@@ -474,6 +363,29 @@ def wavelengths_nm(name: str, value: ArrayLike) -> Floats:
             "wavelengths are in nm",
         )
     return read_only(waves_nm.copy())
+
+
+def band_widths_nm(wavelength_nm: Floats, band_width_nm: ArrayLike | None) -> Floats:
+    """Return the specified widths of bands, or widths halfway to the adjacent wavelengths."""
+    if band_width_nm is not None:
+        widths = finite_array("band_width_nm", band_width_nm, above=0.0, at_most=MAX_WAVELENGTH_NM)
+        if widths.ndim > 1 or widths.size not in (1, wavelength_nm.size):
+            raise ParameterError(
+                "band_width_nm", f"must be one number, or one for each of the {wavelength_nm.size} wavelengths"
+            )
+        return np.broadcast_to(widths, wavelength_nm.shape).astype(np.float64)
+    if wavelength_nm.size == 1:
+        raise ParameterError(
+            "band_width_nm", "must be given for a single wavelength, which has no adjacent wavelengths"
+        )
+    order = np.argsort(wavelength_nm)
+    steps = np.diff(wavelength_nm[order])
+    if np.any(steps <= 0):
+        raise ParameterError("wavelength_nm", "must be unique", wavelength_nm.tolist(), "nm")
+    # The outermost bands are symmetric about their wavelengths.
+    widths = np.empty(wavelength_nm.size)
+    widths[order] = 0.5 * (np.concatenate((steps[:1], steps)) + np.concatenate((steps, steps[-1:])))
+    return widths
 
 
 def read_only(array: _Array) -> _Array:

@@ -25,13 +25,9 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     """
     Yield a temporary path that replaces the target if the block succeeds.
 
-    If the block fails, the temporary file is removed. The temporary path is in the same directory and has the same extension as
-    the target, because libraries choose the format by extension.
-
-    Raises
-    ------
-    FileError
-        When the directory does not exist, or writing fails, for example on a full disk.
+    If the block fails, the temporary file is removed. The temporary path is in the same directory and has the same
+    extension as the target, because libraries choose the format by extension. Raises FileError when the directory does not
+    exist, or writing fails, for example on a full disk.
     """
     target = Path(path)
     temporary = target.with_name(f".foveasim-{secrets.token_hex(8)}{target.suffix}")

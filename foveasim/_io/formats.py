@@ -10,7 +10,7 @@ from typing import Any
 
 from foveasim._core.names import did_you_mean, missing_path, possible_names
 from foveasim._core.short_repr import short_repr
-from foveasim.errors import FileError, FoveasimError, ParameterError
+from foveasim.errors import FileError, FoveasimError, ParameterError, format_value
 
 #: Size limit of files that are read.
 MAX_FILE_BYTES = 8 * 2**30
@@ -81,19 +81,8 @@ def as_file_error(path: Path, what: str, *, passes: tuple[type[FoveasimError], .
     """
     Convert exceptions of readers of malformed files to a FileError with a one-line message.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    what : str
-        Expected kind of the file, for messages: ``"power map"``.
-    passes : tuple of exception types
-        Exceptions that are raised unchanged.
-
-    Raises
-    ------
-    FileError
-        When the block raises another exception.
+    ``what``: expected kind of the file, for messages: ``"power map"``. ``passes``: types of exceptions that are raised
+    unchanged.
     """
     try:
         yield
@@ -108,6 +97,14 @@ def as_file_error(path: Path, what: str, *, passes: tuple[type[FoveasimError], .
     except Exception as error:  # noqa: BLE001 -- readers raise arbitrary exceptions on malformed files
         reason = one_line(str(error), MAX_REASON_LENGTH) or type(error).__name__
         raise FileError(path, f"is corrupt or not a valid {what} ({reason})") from None
+
+
+def check_version(path: Path, about: Any, what: str, file_format: str, version: int) -> None:
+    """Check the values of ``format`` and ``version`` in the metadata of a file of the package."""
+    if not isinstance(about, Mapping) or about.get("format") != file_format:
+        raise FileError(path, f"is not a valid {what}")
+    if about.get("version") != version:
+        raise FileError(path, f"has the format version {format_value(about.get('version'))}, expected {version}")
 
 
 def one_line(text: str, max_characters: int) -> str:
@@ -143,10 +140,7 @@ def detect_format(path: Path, formats: Mapping[str, FileFormat], what: str) -> t
     """
     Return the name and the entry of a file's format in a table, detected by content.
 
-    Raises
-    ------
-    FileError
-        When the file cannot be read, or no readable format of the table matches.
+    Raises FileError when the file cannot be read, or no readable format of the table matches.
     """
     head = b"" if path.is_dir() else read_head(path)
     for name, found in formats.items():
@@ -162,14 +156,7 @@ def detect_format(path: Path, formats: Mapping[str, FileFormat], what: str) -> t
 
 
 def select_writer(path: Path, formats: Mapping[str, FileFormat]) -> FileFormat:
-    """
-    Return the format that has a file's extension.
-
-    Raises
-    ------
-    FileError
-        When no writable format of the table has this extension.
-    """
+    """Return the writable format of a table that has a file's extension, or raise a FileError."""
     by_suffix = {suffix: found for found in formats.values() if found.write is not None for suffix in found.suffixes}
     try:
         return by_suffix[path.suffix.lower()]
@@ -182,23 +169,10 @@ def validate_options(
     options: Mapping[str, Any], known: tuple[str, ...], formats: Mapping[str, FileFormat], of: str
 ) -> dict[str, Any]:
     """
-    Return the options that are not None.
+    Return the options, by name, that are not None; raise a ParameterError for unknown ones.
 
-    Parameters
-    ----------
-    options : mapping
-        Options of the user by name.
-    known : tuple of str
-        Names of the options of the file's format.
-    formats : mapping
-        Table of all formats, for messages.
-    of : {"read_options", "write_options"}
-        Attribute of the formats that lists the options, for messages.
-
-    Raises
-    ------
-    ParameterError
-        When the format does not have an option.
+    ``known``: names of the options of the file's format. ``formats``, ``of``: table of all formats and their attribute with
+    names of options, ``"read_options"`` or ``"write_options"``, for messages.
     """
     given = {name: value for name, value in options.items() if value is not None}
     for name, value in given.items():

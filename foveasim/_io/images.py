@@ -61,15 +61,7 @@ ORIENTATION_TAG = 274
 TIFF_EXTENSIONS = (".tif", ".tiff")
 #: Extensions of picture files in directories.
 PICTURE_EXTENSIONS = (
-    ".bmp",
-    ".exr",
-    ".hdr",
-    ".jp2",
-    ".jpeg",
-    ".jpg",
-    ".png",
-    ".ppm",
-    ".tga",
+    *(".bmp", ".exr", ".hdr", ".jp2", ".jpeg", ".jpg", ".png", ".ppm", ".tga"),
     *TIFF_EXTENSIONS,
     ".webp",
 )
@@ -356,22 +348,9 @@ def _read_with_openexr(name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
 
 def _apply_orientation(picture: NDArray[Any], orientation: object) -> NDArray[Any]:
     """Apply the orientation tag 274 of EXIF and TIFF; values other than 2 to 8 mean upright."""
-    match orientation:
-        case 2:
-            return picture[:, ::-1]
-        case 3:
-            return picture[::-1, ::-1]
-        case 4:
-            return picture[::-1]
-        case 5:
-            return picture.swapaxes(0, 1)
-        case 6:
-            return np.rot90(picture, -1)
-        case 7:
-            return picture[::-1, ::-1].swapaxes(0, 1)
-        case 8:
-            return np.rot90(picture)
-    return picture
+    if orientation in (5, 6, 7, 8):
+        picture = picture.swapaxes(0, 1)
+    return picture[:: -1 if orientation in (3, 4, 7, 8) else 1, :: -1 if orientation in (2, 3, 6, 7) else 1]
 
 
 def check_picture_size(path: Path, width: int, height: int) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from foveasim._core.names import missing_path
 from foveasim._core.validation import MAX_SITES
 from foveasim._io.atomic import atomic_write
-from foveasim._io.formats import as_file_error
+from foveasim._io.formats import as_file_error, check_version
 from foveasim.errors import FileError
 
 #: Name of the array that contains the metadata as JSON.
@@ -88,10 +88,7 @@ def open_archive(
         raise FileError(source, missing_path(source))
     with as_file_error(source, what, passes=(FileError,)):
         about, arrays = read_archive(source)
-        if not isinstance(about, dict) or about.get("format") != file_format:
-            raise FileError(source, f"is not a valid {what}")
-        if about.get("version") != version:
-            raise FileError(source, f"has the format version {about.get('version')!r:.40}, expected {version}")
+        check_version(source, about, what, file_format, version)
         yield about, arrays
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.extras import import_optional
 from foveasim._core.names import missing_path
-from foveasim._io.formats import as_file_error
+from foveasim._io.formats import as_file_error, check_version
 from foveasim.errors import FileError, format_value
 
 ZARR = ".zarr"
@@ -129,33 +129,19 @@ def open_store(
     attributes of the root. ``arrays``: arrays by path, such as ``"code"`` and ``"layout/xy_um"``; all chunks are complete.
     Raises FileError when zarr is not installed, or the store is missing, corrupt, incomplete or of another format.
     """
-    zarr = import_optional(path, "zarr")
+    import_optional(path, "zarr")
     if not path.is_dir():
         raise FileError(path, missing_path(path, "zarr store"))
-    try:
-        check_codecs(path, ("bytes",), what)
+    with open_group(path, what, ("bytes",), file_format, version) as group:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            group = zarr.open_group(str(path), mode="r", use_consolidated=False)
-            attributes = dict(group.attrs)
-            if attributes.get("format") != file_format:
-                raise FileError(path, f"is not a {what}")
-            if attributes.get("version") != version:
-                raise FileError(
-                    path, f"has the format version {format_value(attributes.get('version'))}, expected {version}"
-                )
             arrays: dict[str, Any] = dict(group.arrays())
             for name, subgroup in group.groups():
                 arrays |= {f"{name}/{key}": array for key, array in subgroup.arrays()}
             for name, array in arrays.items():
                 if array.nbytes != _chunk_bytes(path / name):
                     raise FileError(path, f"is corrupt: '{name}' is incomplete")
-        yield attributes, arrays
-    except FileError:
-        raise
-    except Exception as error:  # noqa: BLE001 -- readers raise arbitrary exceptions on corrupt stores
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise FileError(path, f"is corrupt or not a {what} ({reason:.200})") from None
+        yield dict(group.attrs), arrays
 
 
 @contextmanager
@@ -167,10 +153,7 @@ def open_group(
     with as_file_error(source, what, passes=(FileError,)):
         check_codecs(source, codecs, what)
         group = zarr.open_group(str(source), mode=mode, use_consolidated=False)  # consolidated metadata are not checked
-        if group.attrs.get("format") != file_format:
-            raise FileError(source, f"is not a {what}")
-        if group.attrs.get("version") != version:
-            raise FileError(source, f"has the format version {group.attrs.get('version')}, expected {version}")
+        check_version(source, group.attrs, what, file_format, version)
         yield group
 
 

@@ -11,13 +11,14 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from foveasim._core.calls import POSITIVE
 from foveasim._core.names import possible_names
-from foveasim._core.validation import Floats, check_count, check_number, finite_array
+from foveasim._core.validation import Floats, check_count, finite_array
 from foveasim.distortion._brown_conrady import BrownConrady
 from foveasim.distortion._fisheye import PolynomialFisheye, Scaramuzza
 from foveasim.distortion._lens import Lens
@@ -39,7 +40,7 @@ def from_opencv(
     coefficients: ArrayLike,
     *,
     image_size: tuple[int, int],
-    pixel_um: float,
+    pixel_um: Annotated[float, POSITIVE],
     fisheye: bool = False,
 ) -> BrownConrady | PolynomialFisheye:
     """
@@ -76,7 +77,6 @@ def from_opencv(
     allowed = (4,) if fisheye else (4, 5, 8)
     if k.size not in allowed:
         raise ParameterError("coefficients", f"must be {', '.join(map(str, allowed))} numbers", k.tolist())
-    pixel_um = check_number("pixel_um", pixel_um, above=0.0)
     position: dict[str, Any] = {
         "focal_um": (matrix[0, 0] * pixel_um, matrix[1, 1] * pixel_um),
         "centre_um": _centre_um((matrix[0, 2], matrix[1, 2]), image_size, pixel_um),
@@ -90,7 +90,7 @@ def from_opencv(
 
 
 def to_opencv(
-    lens: BrownConrady | PolynomialFisheye, *, image_size: tuple[int, int], pixel_um: float
+    lens: BrownConrady | PolynomialFisheye, *, image_size: tuple[int, int], pixel_um: Annotated[float, POSITIVE]
 ) -> tuple[Floats, Floats]:
     """
     Convert a lens to an OpenCV camera matrix and distortion coefficients.
@@ -102,9 +102,6 @@ def to_opencv(
     ParameterError
         If OpenCV has no equivalent of the lens model.
     """
-    if not isinstance(lens, BrownConrady | PolynomialFisheye):
-        raise ParameterError("lens", "must be a BrownConrady or a PolynomialFisheye", lens)
-    pixel_um = check_number("pixel_um", pixel_um, above=0.0)
     width, height = _size(image_size)
     fx, fy = np.broadcast_to(np.asarray(lens.focal_um), (2,)) / pixel_um
     cx = lens.centre_um[0] / pixel_um + 0.5 * (width - 1)
@@ -120,7 +117,7 @@ def to_opencv(
 def read_calibration(
     path: str | Path,
     *,
-    pixel_um: float,
+    pixel_um: Annotated[float, POSITIVE],
     focal_um: float | None = None,
     image_size: tuple[int, int] | None = None,
 ) -> Lens:
@@ -148,7 +145,6 @@ def read_calibration(
 
     path = Path(path)
     text = read_text(path)
-    pixel_um = check_number("pixel_um", pixel_um, above=0.0)
     try:
         if text.lstrip().startswith("#polynomial"):
             return _from_ocamcalib(path, text, pixel_um, focal_um)

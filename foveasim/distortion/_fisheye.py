@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -18,6 +18,13 @@ from foveasim.distortion._solve import invert_monotonic, smallest_roots
 from foveasim.errors import ParameterError
 
 Projection = Literal["equidistant", "equisolid", "stereographic", "orthographic"]
+#: Image height as a function of the angle, and its inverse.
+PROJECTIONS: dict[Projection, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]]] = {
+    "equidistant": (lambda theta_rad: theta_rad, lambda height: height),
+    "equisolid": (lambda theta_rad: 2.0 * np.sin(0.5 * theta_rad), lambda height: 2.0 * np.arcsin(0.5 * height)),
+    "stereographic": (lambda theta_rad: 2.0 * np.tan(0.5 * theta_rad), lambda height: 2.0 * np.arctan(0.5 * height)),
+    "orthographic": (np.sin, np.arcsin),
+}
 #: Points within this normalised radius are scaled linearly, which avoids a division by 0.
 MIN_RADIUS = 1e-12
 #: Margin below 90° in radians, where the pinhole projection diverges.
@@ -111,26 +118,10 @@ class Fisheye(_AngularLens):
     centre_um: tuple[float, float] = (0.0, 0.0)
 
     def _height(self, theta_rad: Floats) -> Floats:
-        match self.projection:
-            case "equidistant":
-                return theta_rad
-            case "equisolid":
-                return 2.0 * np.sin(0.5 * theta_rad)
-            case "stereographic":
-                return 2.0 * np.tan(0.5 * theta_rad)
-            case _:
-                return np.sin(theta_rad)
+        return PROJECTIONS[self.projection][0](theta_rad)
 
     def _theta_rad(self, height: Floats) -> Floats:
-        match self.projection:
-            case "equidistant":
-                return height
-            case "equisolid":
-                return 2.0 * np.arcsin(0.5 * height)
-            case "stereographic":
-                return 2.0 * np.arctan(0.5 * height)
-            case _:
-                return np.arcsin(height)
+        return PROJECTIONS[self.projection][1](height)
 
     def _max_theta_rad(self) -> float:
         return 0.5 * math.pi - ANGLE_MARGIN_RAD
@@ -303,8 +294,4 @@ class Scaramuzza(_AngularLens):
         return np.asarray(super()._forward(xy) @ self._matrix.T)
 
     def _backward(self, xy: Floats) -> Floats:
-        plain = xy @ np.linalg.inv(self._matrix).T
-        radius = np.hypot(plain[:, 0], plain[:, 1])
-        is_inside = radius <= self._max_image_height
-        theta_rad = self._theta_rad(np.where(is_inside, radius, 0.0))
-        return _scale_radially(plain, radius, np.where(is_inside, np.tan(theta_rad), np.nan), 1.0 / self._slope())
+        return super()._backward(xy @ np.linalg.inv(self._matrix).T)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal, Protocol, TypeAlias, get_args, runtime_checkable
+from typing import Literal, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.calls import check_declared
 from foveasim._core.rings import from_frame, to_frame
-from foveasim._core.validation import Floats, check_choice, check_length_um, finite_array
+from foveasim._core.validation import Floats, check_length_um, finite_array
 from foveasim.errors import GeometryError, ParameterError
 
 #: Treatment of points outside the valid radius of a lens: raise an error, or return NaN.
@@ -115,7 +115,6 @@ class LensBase:
         raise NotImplementedError
 
     def _map_points(self, xy_um: ArrayLike, function: object, which: int, outside: Outside) -> Floats:
-        check_choice("outside", outside, get_args(Outside))
         points = finite_array("xy_um", xy_um)
         if points.ndim == 0 or points.shape[-1] != 2:
             raise ParameterError("xy_um", f"must have the shape (..., 2), got {points.shape}")

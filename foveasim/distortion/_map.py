@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.calls import OwnCheck
-from foveasim._core.validation import Floats, Images, check_choice, check_count, read_only
-from foveasim.errors import ParameterError, type_name
+from foveasim._core.calls import Limits, OwnCheck
+from foveasim._core.validation import Floats, Images, read_only
+from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PointMap, PowerMap
 
 #: Conserved quantity: the power on an area of the image, or the power per area.
@@ -35,7 +35,7 @@ def distort_map(
     *,
     grid: Grid | None = None,
     conserve: Conserve = "flux",
-    order: int = 1,
+    order: Annotated[int, Limits(at_least=0, at_most=MAX_ORDER)] = 1,
 ) -> PowerMap:
     """
     Distort the power map of an ideal lens.
@@ -83,16 +83,10 @@ def distort_map(
     >>> round(float(distort_map(flat, barrel, conserve="density").data.max()), 12)
     1.0
     """
-    if not isinstance(power_map, PowerMap):
-        raise ParameterError("power_map", f"must be a PowerMap, got {type_name(power_map)}")
     if not (hasattr(lens, "undistort") and (grid is not None or hasattr(lens, "distort"))):
         raise ParameterError("lens", "must be a lens of foveasim.distortion", lens)
-    check_choice("conserve", conserve, get_args(Conserve))
-    order = check_count("order", order, at_least=0, at_most=MAX_ORDER)
     if grid is None:
         grid = _bounding_grid(power_map.grid, lens)
-    elif not isinstance(grid, Grid):
-        raise ParameterError("grid", f"must be a Grid, got {type_name(grid)}")
     if math.prod(grid.shape) > MAX_CELLS:
         raise ParameterError("grid", f"must have at most {MAX_CELLS} cells", grid.shape, hint="reduce its shape")
     coefficients = [_spline(band, order) for band in power_map.data]

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from foveasim._core.calls import OwnCheck
 from foveasim._core.rings import site_area_um2
 from foveasim._core.threads import cached_property, thread_count
-from foveasim._core.validation import Floats, Ints, check_choice, check_count, finite_array, unmasked
+from foveasim._core.validation import Floats, Ints, as_any_array, finite_array
 from foveasim.errors import GeometryError, ParameterError, type_name
 from foveasim.fields import Grid, PackedRings, PointMap
 from foveasim.integrate._outlines import Outlines, UndistortedOutlines, outlines_of
@@ -113,11 +113,8 @@ class Integrator:
         if not isinstance(grid, Grid):
             raise ParameterError("grid", f"must be a Grid, got {type_name(grid)}")
         self.grid = grid
-        self.order: int = check_count(
-            "order", order, at_most=2, hint="use 1 for constant cells, 2 for cells with a gradient"
-        )
+        self.order: int = int(order)
         self.n_threads: int = thread_count(n_threads)
-        check_choice("conserve", conserve, ("flux", "density"))
         outlines: Callable[[int, int], Outlines] = partial(outlines_of, layout)
         if distortion is not None:
             if not hasattr(distortion, "undistort"):
@@ -220,11 +217,7 @@ class Integrator:
         ParameterError
             When an array has another shape or type.
         """
-        power_map = unmasked("power_map", power_map)
-        try:
-            cells = np.asarray(power_map)
-        except ValueError:
-            raise ParameterError("power_map", "must be an array of numbers", power_map) from None
+        cells = as_any_array("power_map", power_map)
         if cells.dtype.hasobject:
             raise ParameterError(
                 "power_map",

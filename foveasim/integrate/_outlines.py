@@ -56,19 +56,12 @@ class UndistortedOutlines:
     """
     Outlines of photosites undistorted into the plane of an ideal lens.
 
-    Parameters
-    ----------
-    layout : packed rings
-        Outlines in the sensor plane.
-    lens : object with ``undistort(xy_um, outside="mask")``
-        Lens that returns NaN for points outside its image circle.
-    pitch_um : float, µm
-        Shorter side of the cells of the map: edges are split until the chord error is at most 0.1 % of this length.
+    ``lens``: object with ``undistort(xy_um, outside="mask")``, which returns NaN for points outside its image circle.
+    ``pitch_um``: shorter side of the cells of the map: edges are split until the chord error is at most 0.1 % of this
+    length.
 
-    Notes
-    -----
-    Sites with a vertex outside the image circle are marked as lost and remain in the sensor plane. Edges shared by two sites
-    are split at identical points, so that tilings have no gaps or overlaps after the transformation.
+    Sites with a vertex outside the image circle are marked as lost and remain in the sensor plane. Edges shared by two
+    sites are split at identical points, so that tilings have no gaps or overlaps after the transformation.
     """
 
     def __init__(self, layout: PackedRings, lens: PointMap, pitch_um: float) -> None:
@@ -156,19 +149,10 @@ def _undistort(outlines: Outlines, lens: PointMap, chord_um: float) -> Outlines:
 
 def outline_bounds_um(layout: PackedRings, distortion: PointMap | None = None) -> tuple[float, float, float, float]:
     """
-    Return the bounding box of all outlines, undistorted if a lens is given.
+    Return the bounding box (x_min, y_min, x_max, y_max) of all outlines, µm.
 
-    Parameters
-    ----------
-    layout : packed rings
-        Outlines in the sensor plane.
-    distortion : object with ``undistort(xy_um, outside="mask")``, optional
-        A lens of :mod:`foveasim.distortion`; sites outside its image circle do not count.
-
-    Returns
-    -------
-    x_min, y_min, x_max, y_max : float, µm
-        NaN if there are no sites. With a lens, curved edges are within 1e-6 of the larger side of the layout.
+    It is NaN without sites. With a lens, the outlines are undistorted, sites outside its image circle do not count, and
+    curved edges are within 1e-6 of the larger side of the layout.
     """
     lattice: Lattice | None = getattr(layout, "lattice", None)
     if lattice is not None and distortion is None:

@@ -31,41 +31,23 @@ SMALL_MAP = 1 << 16
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """
-    Spans of cells in the order of the rows of a map (see ``_kernels``).
-
-    Attributes
-    ----------
-    grid : Grid
-    n_sites : int
-    row_spans, row_weights : (n_y + 1,) int64
-        Index of the first span and the first weight of each row.
-    spans : (n_span, 4) int32
-    weights : (n_weight,) float64
-    row_cuts : (n_y + 1,) int64
-        Index of the first cut of each row.
-    cuts : (n_cut, 2) int32
-        Cells that an outline cuts; empty at first order.
-    moments : (n_cut, 2) float64
-        Weights of the differences of the neighbours along x and along y.
-    rows_per_band : int
-        Height of the bands of rows that are summed separately.
-    first_slot : (n_site + 1,) int64
-        Site s has the slots ``first_slot[s] : first_slot[s + 1]``, one per band.
-    coverage : Coverage
-        Position of the sites relative to the grid and the image circle.
-    """
+    """Spans of cells in the order of the rows of a map (see ``_kernels``)."""
 
     grid: Grid
     n_sites: int
+    # Index of the first span, and of the first weight, of each row, (n_y + 1,).
     row_spans: Ints
     row_weights: Ints
     spans: NDArray[np.int32]
     weights: Floats
+    # Cells that an outline cuts, empty at first order; index of the first one of each row, (n_y + 1,).
     row_cuts: Ints
     cuts: NDArray[np.int32]
+    # Weights of the differences of the neighbours along x and along y, (n_cut, 2).
     moments: Floats
+    # Height of the bands of rows that are summed separately.
     rows_per_band: int
+    # Site s has the slots ``first_slot[s] : first_slot[s + 1]``, one per band.
     first_slot: Ints
     coverage: Coverage
 
@@ -82,17 +64,10 @@ class Plan:
 
     def gather(self, cells: NDArray[np.floating], out: Floats, scale: float, where: Bools, n_threads: int) -> None:
         """
-        Write scale x sum of weight x cell for every site.
+        Write scale x sum of weight x cell for every site into ``out`` (n_site,).
 
-        Parameters
-        ----------
-        cells : (n_y, n_x) float32 or float64
-            C-contiguous map.
-        out : (n_site,) float64
-        scale : float
-        where : (n_site,) or (0,) bool
-            Sites that are computed; other elements of ``out`` are unchanged. Empty for all sites.
-        n_threads : int
+        ``cells`` (n_y, n_x): C-contiguous map, float32 or float64. ``where`` (n_site,): sites that are computed; other
+        elements of ``out`` are unchanged. Empty for all sites.
         """
         from foveasim.integrate import _kernels
 

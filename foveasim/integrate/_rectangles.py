@@ -45,17 +45,7 @@ def rectangle_plan(layout: PackedRings, grid: Grid, order: int) -> RectanglePlan
 
 @dataclass(frozen=True, eq=False)
 class RectanglePlan:
-    """
-    Rectangles in any order.
-
-    Attributes
-    ----------
-    grid : Grid
-    order : int
-    bounds : (n_site, 4) float64, cells
-        u_min, v_min, u_max, v_max.
-    coverage : Coverage
-    """
+    """Rectangles in any order; bounds u_min, v_min, u_max, v_max (n_site, 4) in cells."""
 
     grid: Grid
     order: int
@@ -81,16 +71,9 @@ class RectanglePlan:
 @dataclass(frozen=True, eq=False)
 class LatticePlan:
     """
-    Rectangles in rows and columns.
+    Rectangles in rows and columns, with the lower and upper ends of each in cells.
 
-    Attributes
-    ----------
-    grid : Grid
-    order : int
-    lattice : Lattice
-    u, v : (n_column, 2), (n_row, 2) float64, cells
-        Lower and upper ends of the columns and of the rows.
-    coverage : Coverage
+    ``u`` (n_column, 2), ``v`` (n_row, 2).
     """
 
     grid: Grid

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.calls import OwnCheck
 from foveasim._core.rings import next_vertex, to_frame
 from foveasim._core.threads import cached_property, parallel_map, thread_count
-from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_count, finite_array, read_only
+from foveasim._core.validation import Bools, Floats, Ints, as_numbers, finite_array, read_only
 from foveasim.errors import ParameterError, type_name
 from foveasim.fields import Grid, PackedRings
 
@@ -26,25 +26,9 @@ class SharedEdges:
     """
     Edges of outlines, each shared edge once.
 
-    Parameters
-    ----------
-    ring_offsets, site_offsets : (n_ring + 1,), (n_site + 1,) int64
-        As those of a layout.
-    point : (n_vertex,) int64
-        Identity of each vertex: vertices of the same number have the same position.
-
-    Attributes
-    ----------
-    after, before : (n_vertex,) int64
-        Index of the next and of the previous vertex in the ring of each vertex.
-    site : (n_vertex,) int64
-        Site of each vertex.
-    edge : (n_vertex,) int64
-        Number of the edge from each vertex to the next.
-    is_reversed : (n_vertex,) bool
-        Whether this edge is stored in the opposite direction.
-    begin, end : (n_edge,) int64
-        Vertices at the ends of each edge, from the lower to the higher number of the point.
+    ``point`` (n_vertex,): identity of each vertex: vertices of the same number have the same position. The properties have
+    one element per vertex, except the vertices ``begin`` and ``end`` of each edge, from the lower to the higher number of
+    the point.
     """
 
     ring_offsets: Ints
@@ -121,17 +105,9 @@ class SharedEdges:
 @dataclass(frozen=True, eq=False)
 class EdgeMoments:
     """
-    Moments of maps along edges, with their derivatives.
+    Moments of maps along edges ``begin_um`` to ``end_um`` (n_edge, 2), with derivatives.
 
     The moments of an edge from a to b are the integrals of ``(1 - τ) P`` and ``τ P`` over the points ``a + τ (b - a)``.
-
-    Parameters
-    ----------
-    grid : Grid
-    begin_um, end_um : (n_edge, 2) float64, µm
-    order : {1, 2}
-    n_threads : int
-        Results are bit-identical for any number.
     """
 
     grid: Grid
@@ -177,16 +153,9 @@ class EdgeMoments:
 
     def differentiate(self, cells: NDArray[np.floating[Any]], weights: Floats) -> tuple[Floats, Floats]:
         """
-        Return the gradients of ``sum weights * moments`` by both ends of the edges.
+        Return the gradients of ``sum weights * moments`` by both ends of edges, (n_edge, 2).
 
-        Parameters
-        ----------
-        cells : (n_map, n_y, n_x)
-        weights : (n_map, n_edge, 2)
-
-        Returns
-        -------
-        begin, end : (n_edge, 2) float64, unit of weights x maps over µm
+        ``cells`` (n_map, n_y, n_x), ``weights`` (n_map, n_edge, 2). The unit is that of weights x maps over µm.
         """
         from foveasim.integrate import _shape_kernels
 
@@ -269,9 +238,6 @@ def vertex_gradient(
     """
     if edges is None:
         edges = SharedEdges.from_layout(layout)
-    if not isinstance(grid, Grid):
-        raise ParameterError("grid", f"must be a Grid, got {type_name(grid)}")
-    check_count("order", order, at_most=2)
     cells = as_numbers("power_map", power_map, keep_type=True)
     if cells.ndim < 2 or cells.shape[-2:] != grid.shape:
         raise ParameterError(

@@ -24,16 +24,8 @@ class TracedOutlines:
     """
     Outlines that are traced and summed in one pass.
 
-    A call takes up to twice as long as with a plan, which must be compiled first.
-
-    Attributes
-    ----------
-    outlines : callable
-        ``outlines(first, last)`` returns the outlines of the sites ``first`` to ``last - 1``.
-    n_sites : int
-    grid : Grid
-    order : int
-    n_threads : int
+    A call takes up to twice as long as with a plan, which must be compiled first. ``outlines(first, last)`` returns the
+    outlines of the sites ``first`` to ``last - 1``.
     """
 
     outlines: Callable[[int, int], Outlines]

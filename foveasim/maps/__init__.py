@@ -30,7 +30,7 @@ from foveasim._core.registry import import_all
 from foveasim._core.validation import freeze
 from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import as_file_error, detect_format, select_writer
-from foveasim.errors import FileError, ParameterError, type_name
+from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Pitch, PowerMap
 from foveasim.maps._common import Found, Given, to_power_map
 from foveasim.maps._formats import MAP_FORMATS, read_found
@@ -138,8 +138,6 @@ def write_power_map(power_map: PowerMap, path: str | Path) -> None:
     --------
     >>> write_power_map(power_map, "map.fits")  # doctest: +SKIP
     """
-    if not isinstance(power_map, PowerMap):
-        raise ParameterError("power_map", f"must be a PowerMap, got {type_name(power_map)}")
     path = Path(path)
     form = select_writer(path, MAP_FORMATS)
     assert form.write is not None

@@ -13,7 +13,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import (
     Floats,
     Images,
-    check_choice,
+    band_widths_nm,
     check_pitch_um,
     finite_array,
     read_only,
@@ -79,8 +79,6 @@ class Given:
             wavelengths_nm("wavelength_nm", self.wavelength_nm)
         if self.band_width_nm is not None:
             finite_array("band_width_nm", self.band_width_nm, above=0.0)
-        if self.unit is not None:
-            check_choice("unit", self.unit, UNITS)
         if self.origin_um is not None:
             Grid((1, 1), 1.0, self.origin_um)
 
@@ -89,12 +87,8 @@ def to_power_map(found: Found, given: Given) -> PowerMap:
     """
     Return the validated map in W/m² per band.
 
-    Raises
-    ------
-    FormatError
-        If the data are not an irradiance, or metadata are missing.
-    ParameterError
-        If passed metadata are inconsistent with the data.
+    Raises FormatError if the data are not an irradiance, or metadata are missing, and ParameterError if passed metadata are
+    inconsistent with the data.
     """
     images = as_images(found.data)
     pitch_um = _pitch_um(found, given)
@@ -174,23 +168,14 @@ def _parse_unit(text: str | None) -> tuple[Unit, float]:
 
 def _band_widths_nm(waves_nm: Floats, found: Found, given: Given) -> Floats:
     """Return the specified widths, or widths that extend halfway to the adjacent wavelengths."""
-    specified_nm = given.band_width_nm if given.band_width_nm is not None else found.band_width_nm
-    if specified_nm is not None:
-        width_nm = np.asarray(specified_nm, dtype=np.float64)
-        if width_nm.shape not in ((), (1,), waves_nm.shape) or not np.all((width_nm > 0.0) & np.isfinite(width_nm)):
-            rule = f"must be one positive number, or one for each of the {waves_nm.size} bands"
-            if given.band_width_nm is None:
-                raise FormatError(f"contains invalid band widths, which {rule}")
-            raise ParameterError("band_width_nm", rule, given.band_width_nm, "nm")
-        return np.array(np.broadcast_to(width_nm, waves_nm.shape))
-    order = np.argsort(waves_nm)
-    steps = np.diff(waves_nm[order])
-    if steps.size == 0 or np.any(steps <= 0.0):
-        raise FormatError("has a unit per nm and does not specify the band widths; pass band_width_nm=...")
-    # The outermost bands are symmetric about their wavelengths.
-    width_nm = np.empty_like(waves_nm)
-    width_nm[order] = 0.5 * (np.concatenate((steps[:1], steps)) + np.concatenate((steps, steps[-1:])))
-    return width_nm
+    if given.band_width_nm is not None:
+        return band_widths_nm(waves_nm, given.band_width_nm)
+    try:
+        return band_widths_nm(waves_nm, found.band_width_nm)
+    except ParameterError as error:
+        if found.band_width_nm is not None:
+            raise FormatError(f"contains invalid band widths ({error})") from None
+        raise FormatError("has a unit per nm and does not specify the band widths; pass band_width_nm=...") from None
 
 
 def check_numbers(data: Images) -> None:

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from foveasim._core.extras import import_optional
 from foveasim._io.atomic import atomic_directory, check_free_space
-from foveasim._io.formats import FileFormat
-from foveasim._io.rasters.datasets import HDF5_MAGIC, NETCDF3_MAGICS, is_zarr, open_netcdf, open_zarr, select_array
+from foveasim._io.rasters.datasets import NETCDF, ZARR, is_zarr, open_netcdf, open_zarr, select_array
 from foveasim.fields import PowerMap
 from foveasim.maps._common import Found
 from foveasim.maps._formats import MAP_FORMATS
 from foveasim.maps._xarray import NAME, found_in_array, to_xarray
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 #: Upper bound of the size of headers and attributes in a netCDF file written here, without data and coordinates.
 NETCDF_BYTES = 2**16
@@ -47,38 +53,13 @@ def write_zarr(power_map: PowerMap, path: Path) -> None:
 # -- reading ----------------------------------------------------------------------------------------------------------
 
 
-def read_netcdf(path: Path, name: str | None) -> Found:
-    """Read the named variable, or ``irradiance``, or the only variable that is a map."""
-    with open_netcdf(path) as (dataset, n_bytes):
-        return found_in_array(select_array(dataset, name, n_bytes, default=NAME))
-
-
-def read_zarr(path: Path, name: str | None) -> Found:
+def _read(
+    open_dataset: Callable[[Path], AbstractContextManager[tuple[xr.Dataset, int]]], path: Path, name: str | None
+) -> Found:
     """Read the named array, or ``irradiance``, or the only array that is a map."""
-    with open_zarr(path) as (dataset, n_bytes):
+    with open_dataset(path) as (dataset, n_bytes):
         return found_in_array(select_array(dataset, name, n_bytes, default=NAME))
 
 
-MAP_FORMATS.register(
-    "netcdf",
-    FileFormat(
-        title="netCDF",
-        suffixes=(".nc", ".nc4"),
-        signatures=(HDF5_MAGIC, *NETCDF3_MAGICS),
-        read=read_netcdf,
-        write=write_netcdf,
-        is_sandboxed=True,
-    ),
-)
-MAP_FORMATS.register(
-    "zarr",
-    FileFormat(
-        title="zarr",
-        suffixes=(".zarr",),
-        matches=lambda path, _head: is_zarr(path),
-        read=read_zarr,
-        write=write_zarr,
-        is_sandboxed=True,
-        is_directory=True,
-    ),
-)
+MAP_FORMATS.register("netcdf", replace(NETCDF, read=partial(_read, open_netcdf), write=write_netcdf))
+MAP_FORMATS.register("zarr", replace(ZARR, read=partial(_read, open_zarr), write=write_zarr))

@@ -24,18 +24,8 @@ def read_found(path: Path, kind: str, name: str | None) -> Found:
     """
     Read data and metadata of a file, in the sandbox process if the format requires it.
 
-    Parameters
-    ----------
-    path : Path
-    kind : str
-        Name in :data:`MAP_FORMATS`.
-    name : str, optional
-        Name of the array, if there are several.
-
-    Raises
-    ------
-    FileError
-        If the file is corrupt, malformed, too large, or not a map.
+    ``kind``: name in :data:`MAP_FORMATS`. ``name``: name of the array, if there are several. Raises FileError if the file
+    is corrupt, malformed, too large, or not a map.
     """
     metadata, (data,) = read_raster(MAP_FORMATS[kind], _read, path, format_name=kind, name=name)
     about: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in metadata.items()}

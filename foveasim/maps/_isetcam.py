@@ -10,24 +10,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from foveasim._io.formats import FileFormat
-from foveasim._io.rasters.mat import (
-    MAT5_MAGIC,
-    MAT73_MAGIC,
-    IsetStruct,
-    MatFile,
-    find_struct,
-    open_mat5,
-    open_mat73,
-    write_mat5,
-    write_mat73,
-)
+from foveasim._io.rasters.mat import IsetStruct, MatFile, find_struct, register_mat
 from foveasim.fields import PowerMap, from_file_rows
 from foveasim.maps._common import Found
 from foveasim.maps._formats import MAP_FORMATS
@@ -35,18 +23,6 @@ from foveasim.units import photon_energy_j
 
 #: Names of the struct in files of scripts and of vcExportObject.
 NAMES = ("oi", "opticalimage", "opticalImage")
-
-
-def read_mat5(path: Path, name: str | None) -> Found:
-    """Read a MAT file of version 5 to 7."""
-    with open_mat5(path) as file:
-        return _read(file, name)
-
-
-def read_mat73(path: Path, name: str | None) -> Found:
-    """Read a MAT file of version 7.3."""
-    with open_mat73(path) as file:
-        return _read(file, name)
 
 
 def _read(file: MatFile, name: str | None) -> Found:
@@ -84,12 +60,4 @@ def _example(write: Callable[[Path, Mapping[str, Any]], None], path: Path) -> Po
     return PowerMap.from_array(data_w_m2, pitch_um=2.0, wavelength_nm=waves_nm)
 
 
-for _name, _magic, _reader, _writer in (
-    ("mat73", MAT73_MAGIC, read_mat73, write_mat73),
-    ("mat", MAT5_MAGIC, read_mat5, write_mat5),
-):
-    MAP_FORMATS.register(
-        _name,
-        FileFormat(title="MAT", suffixes=(".mat",), signatures=(_magic,), read=_reader, is_sandboxed=True),
-        example=partial(_example, _writer),
-    )
+register_mat(MAP_FORMATS, _read, _example)

@@ -20,7 +20,7 @@ from foveasim._io.rasters.labels import (
     unit_of_array,
     wavelengths_of_array,
 )
-from foveasim.errors import ParameterError, type_name
+from foveasim.errors import ParameterError
 from foveasim.fields import Grid, Pitch, PowerMap
 from foveasim.maps._common import Found, Given, to_power_map
 from foveasim.maps._units import Unit
@@ -54,8 +54,6 @@ def to_xarray(power_map: PowerMap) -> xr.DataArray:
     ParameterError
         If ``power_map`` is not a PowerMap, or xarray is missing.
     """
-    if not isinstance(power_map, PowerMap):
-        raise ParameterError("power_map", f"must be a PowerMap, got {type_name(power_map)}")
     xr = import_optional("xarray", "xarray", "maps")
     grid = power_map.grid
     return xr.DataArray(
@@ -104,9 +102,6 @@ def from_xarray(
     ParameterError
         If the array has other dimensions or invalid values, or metadata are missing.
     """
-    xr = import_optional("xarray", "xarray", "maps")
-    if not isinstance(data_array, xr.DataArray):
-        raise ParameterError("data_array", f"must be an xarray.DataArray, got {type_name(data_array)}")
     given = Given(
         pitch_um=pitch_um, wavelength_nm=wavelength_nm, band_width_nm=band_width_nm, unit=unit, origin_um=origin_um
     )

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Bools, Floats
 from foveasim.errors import ParameterError, type_name
-from foveasim.optics._quadrature import Nodes, PupilEdges, joined, overlap_nodes, plane_waves, pupil_nodes
+from foveasim.optics._quadrature import Nodes, PupilEdges, joined, plane_waves, pupil_nodes
 from foveasim.optics.pupils import Annulus, Blades, Pupil, PupilImage, Slit, Spider
 from foveasim.units import um_from_nm
 
@@ -444,10 +444,6 @@ class Aperture:
 
         transmission = partial(self._transmission, wavelength_nm=wavelength_nm)
         amplitude = partial(self._amplitude, wavelength_nm=wavelength_nm, field_um=field_um)
-        return sum(
-            (
-                complex(nodes.weight @ product(amplitude, nodes.x, nodes.y))
-                for nodes in overlap_nodes(self._edges, partial(product, transmission), shift, radians)
-            ),
-            0.0j,
-        )
+        copies = (shift, (-shift[0], -shift[1]))
+        every = pupil_nodes(self._edges, partial(product, transmission), radians, copies)
+        return sum((complex(nodes.weight @ product(amplitude, nodes.x, nodes.y)) for nodes in every), 0.0j)

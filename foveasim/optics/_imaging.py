@@ -79,53 +79,30 @@ class Group:
 
 @dataclass(frozen=True, kw_only=True)
 class Imaging:
-    """
-    Inputs of the computation of power maps.
-
-    Attributes
-    ----------
-    basis : (n_basis, n_y, n_x)
-    irradiance_w_m2 : (n_basis, n_wavelength)
-        On-axis irradiance in each band for an image value of 1, W/m².
-    weights : (n_output, n_wavelength)
-    tangent2_x, tangent2_y : (n_x,), (n_y,)
-        Squared tangents of the angles to the axis.
-    falloff_power : int
-        Exponent of the cosine.
-    grid : Grid
-        Images of the source pixels.
-    padding : str
-    pad : int
-        Minimum number of padding cells on each side.
-    f_max_per_um : float
-        Highest cut-off frequency.
-    blur_cells : float
-        Largest geometric ray displacement.
-    guard : int
-        Cells around an isoplanatic patch that its PSF reaches.
-    is_square_source : bool
-        Whether source pixels are uniform squares instead of points at their centres.
-    oversample : int
-        Map cells along a side of a source pixel.
-    real : float32 or float64
-    n_threads : int
-    cached_factor : callable
-        Look-up of transfer functions.
-    """
+    """Inputs of the computation of power maps."""
 
     basis: Images
+    # On-axis irradiance in each band for an image value of 1, (n_basis, n_wavelength).
     irradiance_w_m2: Floats
+    # Weights of the outputs, (n_output, n_wavelength).
     weights: Floats
+    # Squared tangents of the angles to the axis, (n_x,) and (n_y,), and exponent of the cosine.
     tangent2_x: Floats
     tangent2_y: Floats
     falloff_power: int
+    # Images of the source pixels.
     grid: Grid
     padding: str
+    # Minimum number of padding cells on each side.
     pad: int
+    # Highest cut-off frequency.
     f_max_per_um: float
+    # Largest geometric ray displacement.
     blur_cells: float
+    # Cells around an isoplanatic patch that its PSF reaches.
     guard: int
     is_square_source: bool
+    # Map cells along a side of a source pixel.
     oversample: int
     real: type[np.floating[Any]]
     n_threads: int
@@ -181,18 +158,7 @@ class Imaging:
 
     def transform(self, rows: Ints, columns: Ints, shape: tuple[int, int]) -> Transform:
         """Return the Fourier transforms of padded pictures of one size."""
-        return Transform(
-            shape=shape,
-            rows=rows,
-            columns=columns,
-            pitch_um=self.grid.pitch_x_um,
-            f_max_per_um=self.f_max_per_um,
-            blur_cells=self.blur_cells,
-            is_square_source=self.is_square_source,
-            oversample=self.oversample,
-            real=self.real,
-            n_threads=self.n_threads,
-        )
+        return Transform(self, rows, columns, shape)
 
     def maps(self, table_of: Tables) -> Iterator[MapRows]:
         """Yield maps with the same PSF over the whole field; their rows are computed on demand."""

@@ -17,15 +17,8 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.show import drawn
 from foveasim._core.threads import thread_count
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import (
-    Bools,
-    Floats,
-    check_number,
-    finite_array,
-    read_only,
-    wavelengths_nm,
-)
-from foveasim.errors import ParameterError, SamplingWarning, type_name
+from foveasim._core.validation import Bools, Floats, check_number, finite_array, read_only, wavelengths_nm
+from foveasim.errors import ParameterError, SamplingWarning
 from foveasim.fields import Grid, PowerMap, SceneLike
 from foveasim.optics._aperture import Aperture, Wavefront, overlaps
 from foveasim.optics._point_images import Point, PointImages
@@ -37,8 +30,6 @@ from foveasim.units import m_from_mm, m_from_um, um_from_m, um_from_nm
 if TYPE_CHECKING:
     from foveasim.optics._imaging import Imaging, MapRows
     from foveasim.optics._transform import Factor, Transform
-
-__all__ = ["Optics"]
 
 FOCAL_LENGTH = Limits(above=0.0, at_least=0.01, at_most=1e6, hint="check the unit: focal lengths are in mm")
 F_NUMBER = Limits(above=0.0, at_least=0.5, at_most=1e4, hint="f/0.5 is the limit for a lens in air")
@@ -59,7 +50,6 @@ CELL_ERROR, CELL_ERROR_POWER, LARGEST_CELL_ERROR = 0.16, -3.1, 0.2
 MAX_CELLS = 1 << 32
 #: Memory limit of a map with automatic oversampling: 512 MiB in single precision.
 MAX_AUTO_CELLS = 1 << 27
-PADDINGS = ("reflect", "edge", "zero", "periodic")
 
 
 def _pitch_um(scene: SceneLike) -> float:
@@ -267,8 +257,6 @@ class Optics(PointImages):
 
     def grid(self, scene: SceneLike) -> Grid:
         """Return the sensor-plane grid of the scene pixels, upright and centred on the axis."""
-        if not hasattr(scene, "spectrum_w_m2_sr_nm"):
-            raise ParameterError("scene", f"must be a Scene, got {type_name(scene)}")
         shape = scene.basis.shape
         return Grid.centred((shape[1], shape[2]), _pitch_um(scene) * self.magnification(scene.distance_m))
 

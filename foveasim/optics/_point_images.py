@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import FINITE, POSITIVE, Limits
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, check_count, check_number, finite_array
+from foveasim._core.validation import Floats, finite_array
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid
 from foveasim.optics._aperture import Aperture
@@ -157,8 +159,8 @@ class PointImages:
         *,
         distance_m: float | None = None,
         field_um: tuple[float, float] = (0.0, 0.0),
-        pitch_um: float | None = None,
-        n_points: int = PSF_POINTS,
+        pitch_um: Annotated[float, POSITIVE] | None = None,
+        n_points: Annotated[int, Limits(at_least=1, at_most=8192)] = PSF_POINTS,
     ) -> PointSpread:
         """
         Compute the point spread function.
@@ -189,11 +191,7 @@ class PointImages:
         ``edges()`` that returns :class:`foveasim.optics.PupilEdges`; others are sampled, with an error up to 1e-3 of the peak.
         """
         point = self._point(wavelength_nm, distance_m, field_um)
-        pitch_um = (
-            PSF_LAMBDA_N * point.lambda_n_um if pitch_um is None else check_number("pitch_um", pitch_um, above=0.0)
-        )
-        n_points = check_count("n_points", n_points, at_most=8192)
-        grid = Grid.centred((n_points, n_points), pitch_um)
+        grid = Grid.centred((n_points, n_points), PSF_LAMBDA_N * point.lambda_n_um if pitch_um is None else pitch_um)
         return PointSpread(
             psf_per_um2=point.psf_per_um2(grid.x_um, grid.y_um), grid=grid, wavelength_nm=point.wavelength_nm
         )
@@ -203,7 +201,7 @@ class PointImages:
         frequency_per_mm: ArrayLike,
         wavelength_nm: float,
         *,
-        angle_deg: float = 0.0,
+        angle_deg: Annotated[float, FINITE] = 0.0,
         distance_m: float | None = None,
         field_um: tuple[float, float] = (0.0, 0.0),
     ) -> NDArray[np.complex128]:
@@ -233,7 +231,7 @@ class PointImages:
         """
         point = self._point(wavelength_nm, distance_m, field_um)
         s = finite_array("frequency_per_mm", frequency_per_mm) * 1e-3 * point.lambda_n_um
-        angle = math.radians(check_number("angle_deg", angle_deg))
+        angle = math.radians(angle_deg)
         return point.compute_otf(s * math.cos(angle), s * math.sin(angle))
 
     def mtf(
@@ -241,7 +239,7 @@ class PointImages:
         frequency_per_mm: ArrayLike,
         wavelength_nm: float,
         *,
-        angle_deg: float = 0.0,
+        angle_deg: Annotated[float, FINITE] = 0.0,
         distance_m: float | None = None,
         field_um: tuple[float, float] = (0.0, 0.0),
     ) -> Floats:

@@ -103,16 +103,9 @@ def joined(parts: Sequence[PupilEdges]) -> PupilEdges:
 @dataclass(frozen=True, eq=False)
 class Nodes:
     """
-    Nodes of a block of rows.
+    Nodes of a block of rows, with the index of the first node of each row.
 
-    Attributes
-    ----------
-    row_y : (n_row,)
-    first : (n_row + 1,)
-        Index of the first node of each row.
-    x, y, weight : (n_node,)
-    column_x : (n_column,), optional
-        Positions of the nodes, if they are the same in all rows.
+    ``column_x``: positions of the nodes, if they are the same in all rows.
     """
 
     row_y: Floats
@@ -125,21 +118,11 @@ class Nodes:
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """
-    Edges of an integrand over the intersection of unit discs.
+    """Edges of an integrand over the intersection of unit discs."""
 
-    Attributes
-    ----------
-    segments : (n_segment, 4)
-        x and y of the first end, and of the second end.
-    circles : (n_circle, 3)
-        x and y of the centre, and the radius.
-    lines_x, lines_y : (n_line,)
-    discs : (n_disc, 3)
-        Discs whose intersection is the domain.
-    """
-
+    # x and y of the first and of the second end, (n_segment, 4).
     segments: Floats
+    # x and y of the centre, and the radius, (n_circle, 3); of discs whose intersection is the domain, (n_disc, 3).
     circles: Floats
     lines_x: Floats
     lines_y: Floats
@@ -425,27 +408,21 @@ def _block(curves: Curves, segments: Floats, rows: list[Floats], radians: float)
     return Nodes(y[:, 0], np.searchsorted(row, np.arange(y.size + 1)), x, y[row, 0], weight * row_weight[row, 0])
 
 
-def pupil_nodes(edges: PupilEdges, transmission: Amplitude, radians: float) -> Iterator[Nodes]:
-    """Yield the nodes of a quadrature over a pupil; parameters as for :func:`nodes_of`."""
-    discs = np.array([[0.0, 0.0, 1.0]])
-    yield from nodes_of(_curves(edges, [(0.0, 0.0)], discs), transmission, radians)
-
-
-def overlap_nodes(
-    edges: PupilEdges, transmission: Amplitude, shift: tuple[float, float], radians: float
+def pupil_nodes(
+    edges: PupilEdges,
+    transmission: Amplitude,
+    radians: float,
+    centres: Sequence[tuple[float, float]] = ((0.0, 0.0),),
 ) -> Iterator[Nodes]:
     """
-    Yield the nodes of a quadrature over the overlap of two displaced copies of a pupil.
+    Yield the nodes of a quadrature over a pupil, or over the overlap of several copies.
 
-    The copies are displaced by ``shift`` and its negative. Other parameters are those of :func:`nodes_of`; ``transmission``
-    is that of the product of both copies.
+    ``centres``: centres of the copies. ``transmission``: that of their product. Others are as for :func:`nodes_of`.
     """
-    centres = [shift, (-shift[0], -shift[1])]
-    discs = np.array([[x, y, 1.0] for x, y in centres])
-    yield from nodes_of(_curves(edges, centres, discs), transmission, radians)
+    yield from nodes_of(_curves(edges, centres), transmission, radians)
 
 
-def _curves(edges: PupilEdges, centres: Sequence[tuple[float, float]], discs: Floats) -> Curves:
+def _curves(edges: PupilEdges, centres: Sequence[tuple[float, float]]) -> Curves:
     """Return the edges of copies of a pupil around given centres."""
     segments, radii, lines_x, lines_y = (
         np.asarray(part) for part in (edges.segments, edges.radii, edges.lines_x, edges.lines_y)
@@ -455,7 +432,7 @@ def _curves(edges: PupilEdges, centres: Sequence[tuple[float, float]], discs: Fl
         np.array([[x, y, r] for x, y in centres for r in radii if 0.0 < r < 1.0]).reshape(-1, 3),
         np.unique(np.concatenate([lines_x + x for x, _ in centres])),
         np.unique(np.concatenate([lines_y + y for _, y in centres])),
-        discs,
+        np.array([[x, y, 1.0] for x, y in centres]),
     )
 
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import scipy.fft
@@ -29,6 +29,9 @@ from foveasim._core.validation import Floats, Images, Ints
 from foveasim._core.work_arrays import work_array
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.optics.otf import MAX_ALIASES
+
+if TYPE_CHECKING:
+    from foveasim.optics._imaging import Imaging
 
 #: Callable of (first, last) that returns the columns of a transfer function, (last - first, n): real with the rows of
 #: frequencies >= 0 along y, or complex with all rows.
@@ -74,36 +77,25 @@ class Transform:
     """
     Fourier transforms of padded pictures of one size.
 
+    ``rows``, ``columns``: indices of the picture rows and columns in the padded picture; ``shape``: that of the picture.
     Padding rows are copies of picture rows, so they are not transformed separately, and the padded picture is never stored.
     """
 
-    def __init__(
-        self,
-        *,
-        shape: tuple[int, int],
-        rows: Ints,
-        columns: Ints,
-        pitch_um: float,
-        f_max_per_um: float,
-        blur_cells: float,
-        is_square_source: bool,
-        oversample: int,
-        real: type[np.floating[Any]],
-        n_threads: int,
-    ) -> None:
+    def __init__(self, imaging: Imaging, rows: Ints, columns: Ints, shape: tuple[int, int]) -> None:
         from foveasim.optics import _kernels
 
+        oversample = imaging.oversample
         self._picture_shape, self._rows, self._columns = shape, rows, columns
-        self._real, self._n_threads, self._oversample = real, n_threads, oversample
+        self._real, self._n_threads, self._oversample = imaging.real, imaging.n_threads, oversample
         self._kernels = _kernels  # imported before threads start
         self._n_rows = oversample * rows.size
-        self._pitch_um = pitch_um / oversample
-        f_max = f_max_per_um * self._pitch_um
+        self._pitch_um = imaging.grid.pitch_x_um / oversample
+        f_max = imaging.f_max_per_um * self._pitch_um
         self._n_alias = min(MAX_ALIASES, max(0, math.ceil(f_max - 0.5)))
-        self._source_cells = float(oversample) if is_square_source else 0.0
+        self._source_cells = float(oversample) if imaging.is_square_source else 0.0
         # For even oversampling, the half-cell shift of the origin changes the sign of odd aliases.
         self._is_alternating = oversample % 2 == 0
-        self._n_plane_nodes = 2 * ALIAS_NODES + math.ceil(NODES_PER_CELL * blur_cells * oversample)
+        self._n_plane_nodes = 2 * ALIAS_NODES + math.ceil(NODES_PER_CELL * imaging.blur_cells * oversample)
         n_near = self._n_alias if self._n_alias <= DIRECT_ALIASES else 0
         self._aliases = np.arange(-n_near, n_near + 1)[:, np.newaxis]
         self._cycles_x = scipy.fft.rfftfreq(oversample * columns.size)

@@ -19,14 +19,7 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.calls import Declared, Limits, check_declared
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import (
-    Floats,
-    as_numbers,
-    check_broadcast,
-    check_count,
-    finite_array,
-    wavelengths_nm,
-)
+from foveasim._core.validation import Floats, as_numbers, check_broadcast, finite_array, wavelengths_nm
 from foveasim.errors import ParameterError
 from foveasim.units import um_from_nm
 
@@ -39,7 +32,7 @@ MAX_PATH = 1e5
 PATH = Limits(at_least=-MAX_PATH, at_most=MAX_PATH)
 
 
-def noll_to_nm(j: int) -> tuple[int, int]:
+def noll_to_nm(j: Annotated[int, Limits(at_least=1, at_most=MAX_INDEX)]) -> tuple[int, int]:
     """
     Convert a Noll index to the orders (n, m) of a Zernike polynomial.
 
@@ -53,7 +46,6 @@ def noll_to_nm(j: int) -> tuple[int, int]:
     >>> noll_to_nm(4), noll_to_nm(7), noll_to_nm(11)
     ((2, 0), (3, -1), (4, 0))
     """
-    j = check_count("j", j, at_least=1, at_most=MAX_INDEX)
     n = (math.isqrt(8 * j - 7) - 1) // 2
     # |m| increases in steps of two within a radial order; even j are cosines.
     k = j - n * (n + 1) // 2
@@ -61,7 +53,7 @@ def noll_to_nm(j: int) -> tuple[int, int]:
     return n, m if j % 2 == 0 else -m
 
 
-def osa_to_nm(j: int) -> tuple[int, int]:
+def osa_to_nm(j: Annotated[int, Limits(at_least=0, at_most=MAX_INDEX)]) -> tuple[int, int]:
     """
     Convert an OSA/ANSI index to the orders (n, m) of a Zernike polynomial.
 
@@ -75,7 +67,6 @@ def osa_to_nm(j: int) -> tuple[int, int]:
     >>> osa_to_nm(4), osa_to_nm(7), osa_to_nm(12)
     ((2, 0), (3, -1), (4, 0))
     """
-    j = check_count("j", j, at_least=0, at_most=MAX_INDEX)
     n = (math.isqrt(8 * j + 1) - 1) // 2
     return n, 2 * j - n * (n + 2)
 

@@ -19,13 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.calls import FINITE, FRACTION, Declared, Limits
 from foveasim._core.registry import Registry
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import (
-    Bools,
-    Floats,
-    as_numbers,
-    finite_array,
-    read_only,
-)
+from foveasim._core.validation import Bools, Floats, as_numbers, finite_array, read_only
 from foveasim._io.images import read_picture, write_picture
 from foveasim.errors import ParameterError
 from foveasim.fields import from_file_rows

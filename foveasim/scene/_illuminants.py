@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim._core.validation import Floats, check_choice, read_only, wavelengths_nm
+from foveasim._core.validation import Floats, read_only, wavelengths_nm
 from foveasim.errors import ParameterError
 
 Illuminant = Literal["A", "D50", "D55", "D65", "D75", "E"]
@@ -53,7 +53,6 @@ def illuminant(name: Illuminant, wavelength_nm: ArrayLike) -> Floats:
     interpolated linearly between steps of 10 nm. The published tables of D50, D55, D65 and D75 in steps of 5 nm agree to
     1e-5 of the value at 560 nm.
     """
-    check_choice("illuminant", name, (*DAYLIGHTS_K, "A", "E"))
     waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
     if name == "E":
         return np.ones(waves_nm.size)
@@ -66,11 +65,6 @@ def illuminant(name: Illuminant, wavelength_nm: ArrayLike) -> Floats:
     return np.asarray(
         _daylight_weights(DAYLIGHTS_K[name]) @ interpolate_table(read_table("cie_daylight"), waves_nm) / 100.0
     )
-
-
-def illuminant_spectrum(name: Illuminant, wavelength_nm: ArrayLike) -> Floats:
-    """Return :func:`illuminant`; for functions with a parameter of that name."""
-    return illuminant(name, wavelength_nm)
 
 
 def _daylight_weights(temperature_k: float) -> Floats:

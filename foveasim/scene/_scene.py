@@ -8,19 +8,20 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.calls import OwnCheck
+from foveasim._core.calls import Limits, OwnCheck, check_declared
 from foveasim._core.show import Drawn, drawn
 from foveasim._core.validation import (
     MAX_WAVELENGTH_NM,
     Floats,
     Images,
+    as_any_array,
     as_numbers,
-    check_choice,
+    band_widths_nm,
     check_number,
     check_shape,
     finite_array,
@@ -55,11 +56,12 @@ GREY_NM = (550.0,)
 #: Larger encoded floating-point values indicate a picture in the range 0 to 255 instead of 0 to 1.
 MAX_ENCODED = 16.0
 #: Larger values are errors of units: 1e9 m is the distance and width of an astronomical scene.
-MAX_PITCH_UM, MAX_DISTANCE_M = 1e15, 1e9
+PITCH, DISTANCE = Limits(above=0.0, at_most=1e15), Limits(above=0.0, at_most=1e9)
 #: Tolerance of a pitch that is given together with the field of view: rounding errors.
 PITCH_ROUNDING = 1e-9
 #: Spectral radiance above that of any source, W/(m² sr nm); that of the sun is about 2e4.
 MAX_RADIANCE = 1e24
+RADIANCE = Limits(at_least=0.0, at_most=MAX_RADIANCE)
 #: Characters of the source in the representation.
 MAX_SOURCE = 100
 #: Weights of red, green and blue in the luminance of a colour (Rec. ITU-R BT.709).
@@ -129,14 +131,15 @@ class Scene:
     spectrum_w_m2_sr_nm: Floats
     wavelength_nm: Floats
     band_width_nm: Floats
-    pitch_um: float | None
-    distance_m: float
+    pitch_um: Annotated[float, PITCH] | None
+    distance_m: Annotated[float, DISTANCE]
     source: str = field(default="arrays", kw_only=True)
     fit: Fit | None = field(default=None, kw_only=True)
     field_of_view_deg: float | None = field(default=None, kw_only=True)
     is_picture: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
+        check_declared(self)
         basis = np.asarray(unmasked("basis", self.basis))
         if basis.dtype not in (np.float32, np.float64):
             basis = read_only(as_numbers("basis", basis))
@@ -151,9 +154,7 @@ class Scene:
         width_nm = finite_array(
             "band_width_nm", np.atleast_1d(self.band_width_nm), ndim=1, above=0.0, at_most=MAX_WAVELENGTH_NM
         )
-        spectrum = finite_array(
-            "spectrum_w_m2_sr_nm", self.spectrum_w_m2_sr_nm, ndim=2, at_least=0.0, at_most=MAX_RADIANCE
-        )
+        spectrum = RADIANCE.check_array("spectrum_w_m2_sr_nm", self.spectrum_w_m2_sr_nm, ndim=2)
         brightest = highest * float(spectrum.max(initial=0.0))
         if not brightest <= MAX_RADIANCE:
             raise ParameterError(
@@ -172,21 +173,16 @@ class Scene:
         object.__setattr__(self, "spectrum_w_m2_sr_nm", read_only(spectrum.copy()))
         object.__setattr__(self, "wavelength_nm", wavelength_nm)
         object.__setattr__(self, "band_width_nm", read_only(width_nm.copy()))
-        distance_m = check_number("distance_m", self.distance_m, above=0.0, at_most=MAX_DISTANCE_M)
-        object.__setattr__(self, "distance_m", distance_m)
         object.__setattr__(self, "pitch_um", self._checked_pitch_um())
 
     def _checked_pitch_um(self) -> float | None:
         """Return the given pitch or that of the field of view; None with ``fit``."""
         if self.fit is not None:
-            check_choice("fit", self.fit, get_args(Fit))
             for name in ("pitch_um", "field_of_view_deg"):
                 if getattr(self, name) is not None:
                     raise _framing_conflict("fit", self.fit, name)
             return None
-        given_um = None
-        if self.pitch_um is not None:
-            given_um = check_number("pitch_um", self.pitch_um, above=0.0, at_most=MAX_PITCH_UM)
+        given_um = self.pitch_um
         if self.field_of_view_deg is None:
             if given_um is None:
                 raise ParameterError("pitch_um", "must be given, or 'fit' or 'field_of_view_deg' instead")
@@ -196,7 +192,7 @@ class Scene:
             raise ParameterError("field_of_view_deg", "must be < 180", angle_deg, "degrees", "a scene is a plane")
         object.__setattr__(self, "field_of_view_deg", angle_deg)
         width_um = 2.0 * float(um_from_m(self.distance_m)) * math.tan(math.radians(0.5 * angle_deg))
-        pitch_um = check_number("pitch_um", width_um / self.basis.shape[2], above=0.0, at_most=MAX_PITCH_UM)
+        pitch_um = PITCH.check("pitch_um", width_um / self.basis.shape[2])
         if given_um is not None and not math.isclose(given_um, pitch_um, rel_tol=PITCH_ROUNDING):
             raise _framing_conflict("field_of_view_deg", angle_deg, "pitch_um")
         return pitch_um
@@ -217,8 +213,11 @@ class Scene:
         """
         # Not dataclasses.replace, which would check all pixels again.
         scene = copy.copy(self)
-        pitch_um = check_number("pitch_um", pitch_um, above=0.0, at_most=MAX_PITCH_UM)
-        for name, value in {"pitch_um": pitch_um, "fit": None, "field_of_view_deg": None}.items():
+        for name, value in {
+            "pitch_um": PITCH.check("pitch_um", pitch_um),
+            "fit": None,
+            "field_of_view_deg": None,
+        }.items():
             object.__setattr__(scene, name, value)
         return scene
 
@@ -291,12 +290,11 @@ class Scene:
             raise _framing_conflict("field_of_view_deg", field_of_view_deg, "pitch_um")
         if pitch_um is None and field_of_view_deg is None and fit is None:
             fit = "cover"
-        check_choice("encoding", encoding, get_args(Encoding))
-        peak = check_number("peak_radiance_w_m2_sr_nm", peak_radiance_w_m2_sr_nm, at_least=0.0, at_most=MAX_RADIANCE)
+        peak = RADIANCE.check("peak_radiance_w_m2_sr_nm", peak_radiance_w_m2_sr_nm)
         if isinstance(picture, os.PathLike):
             picture = Path(picture)
         is_file = isinstance(picture, str | Path)
-        pixels = read_picture(picture) if is_file else _picture_array(picture)  # type: ignore[arg-type]
+        pixels = read_picture(picture) if is_file else as_any_array("picture", picture)  # type: ignore[arg-type]
         if (
             pixels.ndim not in (2, 3)
             or 0 in pixels.shape
@@ -507,7 +505,7 @@ class Scene:
             As for :meth:`from_picture`.
         radiance_w_m2_sr_nm : float, W/(m² sr nm)
         """
-        radiance = check_number("radiance_w_m2_sr_nm", radiance_w_m2_sr_nm, at_least=0.0, at_most=MAX_RADIANCE)
+        radiance = RADIANCE.check("radiance_w_m2_sr_nm", radiance_w_m2_sr_nm)
         waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
         return cls(
             freeze(np.ones((1, *check_shape("shape", shape)), np.float32)),
@@ -590,14 +588,6 @@ def _framing_conflict(name: str, value: object, other: str) -> ParameterError:
     )
 
 
-def _picture_array(picture: ArrayLike) -> NDArray[Any]:
-    picture = unmasked("picture", picture)
-    try:
-        return np.asarray(picture)
-    except ValueError:
-        raise ParameterError("picture", "must be a file or an array of numbers", picture) from None
-
-
 def _relative_radiance(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Images:
     """Return the relative radiance (n_channel, n_y, n_x) float32, multiplied by alpha."""
     pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
@@ -632,29 +622,6 @@ def _relative_radiance(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: b
     if alpha is not None:
         radiance *= alpha
     return radiance
-
-
-def band_widths_nm(wavelength_nm: Floats, band_width_nm: float | Sequence[float] | Floats | None) -> Floats:
-    """Return the specified widths, or widths that extend halfway to the adjacent wavelengths."""
-    if band_width_nm is not None:
-        widths = finite_array("band_width_nm", band_width_nm, above=0.0, at_most=MAX_WAVELENGTH_NM)
-        if widths.ndim > 1 or (widths.ndim == 1 and widths.size != wavelength_nm.size):
-            raise ParameterError(
-                "band_width_nm", f"must be one number, or one for each of the {wavelength_nm.size} wavelengths"
-            )
-        return np.broadcast_to(widths, wavelength_nm.shape).astype(np.float64)
-    if wavelength_nm.size == 1:
-        raise ParameterError(
-            "band_width_nm", "must be given for a single wavelength, which has no adjacent wavelengths"
-        )
-    order = np.argsort(wavelength_nm)
-    steps = np.diff(wavelength_nm[order])
-    if np.any(steps <= 0):
-        raise ParameterError("wavelength_nm", "must be unique", wavelength_nm.tolist(), "nm")
-    # The outermost bands are symmetric about their wavelengths.
-    widths = np.empty(wavelength_nm.size)
-    widths[order] = 0.5 * (np.concatenate((steps[:1], steps)) + np.concatenate((steps, steps[-1:])))
-    return widths
 
 
 #: Common parameters of the examples: the size of pixels, the distance, and one band.

@@ -19,8 +19,6 @@ from foveasim.sensor.effects import EFFECTS, Effect
 from foveasim.testing._extension import Extension, check_of, require, shot_with
 from foveasim.units import ELEMENTARY_CHARGE_C
 
-__all__ = ["check_effect", "check_sensor_effect"]
-
 #: Standard errors by which sample means may differ.
 SIGMAS = 5.0
 #: Sites, and frames (temporal effects) or devices (fixed patterns).

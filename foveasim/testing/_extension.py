@@ -16,8 +16,6 @@ from foveasim._core.threads import cached_property
 from foveasim.config import Shot, build_shot
 from foveasim.layout import Layout, grid
 
-__all__ = ["Check", "Extension", "check_of", "require", "shot_with", "square_grid"]
-
 #: Settings of a shot of 4 x 4 squares, to which the section of an extension is added.
 SETTINGS: dict[str, Any] = {
     "scene": {

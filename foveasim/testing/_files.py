@@ -17,8 +17,6 @@ from foveasim.maps import MAP_FORMATS, read_power_map, write_power_map
 from foveasim.scene import CUBE_FORMATS, Scene
 from foveasim.testing._extension import Extension, check_of, require
 
-__all__ = ["check_cube_format", "check_layout_format", "check_map_format"]
-
 #: Tolerances of coordinates, µm, and of relative values in files.
 POSITION_UM, RELATIVE = 1e-3, 1e-6
 #: Fractions of a file that truncated files have.

@@ -15,8 +15,6 @@ from foveasim.layout import DERIVED_LAYERS, EDITS, LAYOUTS, RULES, DesignRules, 
 from foveasim.layout.files._derived import shapes_of_layout, shapes_of_sites
 from foveasim.testing._extension import Extension, check_of, require, shot_with, square_grid
 
-__all__ = ["check_derived_layer", "check_edit", "check_family", "check_rule"]
-
 #: Relative tolerance of areas.
 AREA_TOLERANCE = 1e-9
 #: Displacement by which derived layers are compared, µm: coordinates of the grid remain exact.

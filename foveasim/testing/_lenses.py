@@ -16,8 +16,6 @@ from foveasim.optics import PUPILS, Optics, PupilEdges
 from foveasim.sensor.spectral import CURVES
 from foveasim.testing._extension import Extension, check_of, require, shot_with
 
-__all__ = ["check_curve", "check_lens", "check_pupil"]
-
 #: Points across the pupil, and the smallest jump of the amplitude between neighbours that requires an edge.
 N_ACROSS, JUMP = 401, 0.5
 #: Tolerance of powers that are sampled at these points.

@@ -12,8 +12,6 @@ from foveasim.explore import METRICS
 from foveasim.scene import Scene
 from foveasim.testing._extension import Extension, check_of, require, shot_with
 
-__all__ = ["check_metric"]
-
 
 @check_of(METRICS)
 def check_metric(extension: Extension) -> None:

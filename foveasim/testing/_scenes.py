@@ -12,8 +12,6 @@ from foveasim._core.validation import Floats
 from foveasim.scene import SCENES, Scene
 from foveasim.testing._extension import Extension, check_of, require
 
-__all__ = ["check_scene"]
-
 #: Factors between pixel pitches, and the tolerance of means over finer pixels relative to white; charts whose summary contains
 #: "Exact." have that of float32.
 FACTORS, SAMPLED = (2, 5), 1.0 / 64.0 + 1e-6

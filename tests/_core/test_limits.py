@@ -39,6 +39,10 @@ EXAMPLES = {
     "a": (1.0, 0.0, 0.0, 0.0),
     "projection": "equidistant",
     "custom": {},
+    "basis": np.ones((1, 2, 2)),
+    "spectrum_w_m2_sr_nm": [[1.0]],
+    "wavelength_nm": [550.0],
+    "band_width_nm": 10.0,
 }
 #: Parameters that others require.
 COMPANIONS = {

@@ -871,7 +871,7 @@ def test_read_rejects_invalid_irradiance(tmp_path, array, message):
         ),
         (
             {"unit": "w_m2_nm", "band_width_nm": [1, 2]},
-            r"'band_width_nm' must be one positive number, or one for each",
+            r"'band_width_nm' must be one number, or one for each",
             ParameterError,
         ),
         ({"band_width_nm": -1}, r"'band_width_nm' must be > 0", ParameterError),

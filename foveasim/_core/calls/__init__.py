@@ -17,6 +17,7 @@ from foveasim._core.calls.limits import (
     Usual,
     check_declared,
     declarations_of,
+    without_declarations,
 )
 from foveasim._core.calls.pickling import copyable, make_copyable
 
@@ -38,6 +39,7 @@ __all__ = [
     "copyable",
     "declarations_of",
     "publish",
+    "without_declarations",
 ]
 
 

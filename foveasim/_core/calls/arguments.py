@@ -22,8 +22,6 @@ from foveasim._core.calls.limits import Converter, Declaration, without_declarat
 from foveasim._core.names import did_you_mean
 from foveasim.errors import ArgumentError
 
-__all__ = ["check_arguments", "check_public_calls"]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 #: Characters of a signature in a message; optional parameters beyond are replaced by "...".
@@ -44,21 +42,14 @@ def check_arguments(call: Callable[P, R], *, converts: bool = True) -> Callable[
     """
     Return a function that rejects arguments outside its signature or declared limits.
 
-    Parameters
-    ----------
-    call : function
-    converts : bool
-        Whether arguments with declared limits are checked and converted, to floats and integers; dataclasses do so themselves.
-
-    Notes
-    -----
-    A valid call takes 1 to 2 µs longer, and lists of numbers a time in proportion to their length; the annotations are read at
-    the first call.
+    ``converts``: whether arguments with declared limits are checked and converted, to floats and integers; dataclasses do
+    so themselves. A valid call takes 1 to 2 µs longer, and lists of numbers a time in proportion to their length; the
+    annotations are read at the first call.
     """
     if not isinstance(call, FunctionType) or hasattr(call, CHECKED):
         return call
     # Not globals of the function below.
-    find_problem, find_kinds, find_converters, check = _find_problem, _find_kinds, _find_converters, check_kind
+    find_problem, find_checks, check = _find_problem, _find_checks, check_kind
     kinds: _Kinds | None = None
     converters: _Converters = [], {}
     annotations = call.__annotations__
@@ -67,9 +58,9 @@ def check_arguments(call: Callable[P, R], *, converts: bool = True) -> Callable[
         __tracebackhide__ = True  # in the tracebacks of IPython and pytest
         nonlocal kinds, converters
         if kinds is None:
-            kinds = find_kinds(call)
-            if converts:
-                converters = find_converters(call, annotations)
+            found, found_converters = find_checks(call, annotations)
+            converters = found_converters if converts else converters
+            kinds = found  # last: another thread then has the converters, too
         by_position, by_name, rest, every = kinds
         for (name, kind), value in zip(by_position, args):  # noqa: B905 -- surplus arguments are reported below
             if kind is not None and not kind.accepts(value):
@@ -90,10 +81,7 @@ def check_arguments(call: Callable[P, R], *, converts: bool = True) -> Callable[
                 kwargs[name] = convert(name, kwargs[name], None)
         try:
             return call(*args, **kwargs)
-        except TypeError as error:
-            # Without a deeper frame, the call itself failed; other errors are those of its code.
-            if error.__traceback__ is None or error.__traceback__.tb_next is not None:
-                raise
+        except TypeError:
             problem = find_problem(call, args, kwargs)
             if problem is None:
                 raise
@@ -108,40 +96,31 @@ def check_arguments(call: Callable[P, R], *, converts: bool = True) -> Callable[
     return cast("Callable[P, R]", found)
 
 
-def _find_kinds(call: Callable[..., Any]) -> _Kinds:
-    """Return the kinds of parameters, by position and by name, and of other arguments."""
+def _find_checks(call: Callable[..., Any], annotations: Mapping[str, Any]) -> tuple[_Kinds, _Converters]:
+    """Return kinds of all arguments, and converters of parameters by position and by name."""
     names = getattr(inspect.unwrap(call), "__globals__", {})
     by_position: list[tuple[str, Kind | None]] = []
     by_name: dict[str, Kind | None] = {}
+    converters: _Converters = [], {}
     rest, every = None, None
-    for k, parameter in enumerate(inspect.signature(call).parameters.values()):
-        annotation = parameter.annotation
-        is_bound = k == 0 and parameter.name in BOUND
-        known = None if annotation is parameter.empty or is_bound else kind_of(resolve_annotation(annotation, names))
+    for k, (name, parameter) in enumerate(inspect.signature(call).parameters.items()):
+        annotation = resolve_annotation(annotations.get(name, Any), names)
+        known = None if k == 0 and name in BOUND else kind_of(annotation)
         if parameter.kind is parameter.VAR_KEYWORD:
             every = known
         elif parameter.kind is parameter.VAR_POSITIONAL:
-            rest = None if known is None else (parameter.name, known)
+            rest = None if known is None else (name, known)
         else:
-            by_name[parameter.name] = known
+            declared = Declaration.of(annotation)
+            convert = None if declared.limits is None else declared.converter
+            by_name[name] = known
+            if convert is not None:
+                converters[1][name] = convert
             if parameter.kind is not parameter.KEYWORD_ONLY:
-                by_position.append((parameter.name, known))
-    return by_position, by_name, rest, every
-
-
-def _find_converters(call: Callable[..., Any], annotations: Mapping[str, Any]) -> _Converters:
-    """Return the converters of parameters with limits, by position and by name."""
-    names = getattr(inspect.unwrap(call), "__globals__", {})
-    by_position: list[tuple[int, str, Converter]] = []
-    by_name: dict[str, Converter] = {}
-    for k, (name, parameter) in enumerate(inspect.signature(call).parameters.items()):
-        declared = Declaration.of(resolve_annotation(annotations.get(name), names))
-        if declared.limits is None or (convert := declared.converter) is None:
-            continue
-        by_name[name] = convert
-        if parameter.kind is not parameter.KEYWORD_ONLY:
-            by_position.append((k, name, convert))
-    return by_position, by_name
+                by_position.append((name, known))
+                if convert is not None:
+                    converters[0].append((k, name, convert))
+    return (by_position, by_name, rest, every), converters
 
 
 def check_public_calls(module_name: str) -> None:

@@ -41,17 +41,9 @@ class Kind(NamedTuple):
     """
     Values that a parameter accepts.
 
-    Attributes
-    ----------
-    accepts : function of a value
-    one, many : str
-        Names of one value and of several, for messages.
-    choices : tuple of str
-        Possible strings, if they are few.
-    is_class : bool
-        Whether values are identified by their class, which messages show instead of the value.
-    item : Kind, optional
-        Kind of the items of a collection, or of the values of a mapping.
+    ``one`` and ``many`` are names of one value and of several, ``choices`` the possible strings, if they are few. Messages
+    about objects that are identified by their class (``is_class``) show the class. ``item`` is the kind of the items of a
+    collection.
     """
 
     accepts: Callable[[Any], bool]
@@ -207,6 +199,8 @@ def _either(kinds: list[Kind]) -> Kind:
 def _single_kind(kind: Any) -> Kind | None:
     """Return the kind of a type that is not a union."""
     origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return kind_of(kind)
     if origin is Literal:
         return _choice(arguments)
     if origin is np.ndarray or kind is np.ndarray:
@@ -240,7 +234,8 @@ def _choice(values: tuple[Any, ...]) -> Kind:
     def accepts(value: Any) -> bool:
         if isinstance(value, np.generic | np.ndarray) and value.ndim == 0:
             value = value.item()
-        return isinstance(value, str | int | float | None) and value in values
+        is_plain = isinstance(value, str | int | float | None)
+        return is_plain and any(value == each and isinstance(value, bool) == isinstance(each, bool) for each in values)
 
     return Kind(accepts, f"one of {shown}", f"names among {shown}", names)
 

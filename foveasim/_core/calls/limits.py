@@ -32,23 +32,6 @@ from foveasim._core.validation import (
 )
 from foveasim.errors import ParameterError
 
-__all__ = [
-    "FINITE",
-    "FRACTION",
-    "LENGTH",
-    "NOT_NEGATIVE",
-    "PORT",
-    "POSITIVE",
-    "Converter",
-    "Declaration",
-    "Declared",
-    "Limits",
-    "Usual",
-    "check_declared",
-    "declarations_of",
-    "without_declarations",
-]
-
 #: Returns the valid value of a parameter: its name, a value, and the number of sites of the object.
 Converter = Callable[[str, Any, int | None], Any]
 
@@ -68,11 +51,6 @@ class Limits:
         Smallest plausible value besides 0: smaller ones indicate errors of units or digits.
     hint : str
         Reminder of the unit, for error messages.
-
-    Raises
-    ------
-    ParameterError
-        If no number is within the limits.
     """
 
     above: float | None = None
@@ -121,14 +99,7 @@ class Limits:
         return low | ({} if self.at_most is None else {"maximum": self.at_most})
 
     def check(self, name: str, value: object) -> float:
-        """
-        Return a value as a float.
-
-        Raises
-        ------
-        ParameterError
-            If the value is not one finite number within the limits; the message states rule, unit and hint.
-        """
+        """Return a value as a float, or raise a ParameterError with rule, unit and hint."""
         if type(value) is float and self._contains(value):
             return value
         at_most = None if self.low else self.at_most
@@ -138,14 +109,7 @@ class Limits:
         return number
 
     def check_array(self, name: str, value: Any, *, ndim: int | None = None) -> Floats:
-        """
-        Return values as a float64 array.
-
-        Raises
-        ------
-        ParameterError
-            If a value is not finite, or outside the limits; the message states the index of the first such value.
-        """
+        """Return values as a float64 array; a ParameterError has the index of the first wrong one."""
         at_most = None if self.low else self.at_most
         array = finite_array(
             name, value, ndim=ndim, above=self.above, at_least=self.at_least, at_most=at_most, hint=self.hint
@@ -160,14 +124,7 @@ class Limits:
         return array
 
     def check_count(self, name: str, value: object) -> int:
-        """
-        Return a value as an integer.
-
-        Raises
-        ------
-        ParameterError
-            If the value is not an integer within the limits.
-        """
+        """Return a value as an integer within the limits."""
         low, high = (None if limit is None else math.floor(limit) for limit in (self.at_least, self.at_most))
         return check_count(name, value, at_least=-sys.maxsize if low is None else low, at_most=high, hint=self.hint)
 
@@ -199,18 +156,7 @@ LENGTH = Limits(above=0.0, at_least=MIN_LENGTH_UM, at_most=MAX_LENGTH_UM, hint="
 
 
 class Declaration(NamedTuple):
-    """
-    Declaration of a parameter.
-
-    Attributes
-    ----------
-    kinds : dict
-        Types of values, without None, with their arguments.
-    limits : Limits, optional
-    usual : Usual, optional
-    is_optional : bool
-        Whether the value may be None.
-    """
+    """Declaration of a parameter: types of values, without None, with their arguments; ranges."""
 
     kinds: dict[Any, tuple[Any, ...]]
     limits: Limits | None = None
@@ -329,19 +275,8 @@ def check_declared(instance: Any, *, n_sites: int | None = None) -> None:
     """
     Validate and convert the fields of a dataclass as their annotations declare.
 
-    Numbers become floats or integers, sequences with limits tuples, arrays per site read-only copies. :class:`Declared` is
-    the base of classes without further rules.
-
-    Parameters
-    ----------
-    instance : dataclass
-    n_sites : int, optional
-        Length of arrays per site.
-
-    Raises
-    ------
-    ParameterError
-        If a value has another type, is not finite, or is outside the limits.
+    Numbers become floats or integers, sequences with limits tuples, arrays per site, of the length ``n_sites``, read-only
+    copies. :class:`Declared` is the base of classes without further rules.
     """
     for name, plain, low, high, convert in _checks_of(type(instance)):  # type: ignore[arg-type]
         value = getattr(instance, name)

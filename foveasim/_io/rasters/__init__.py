@@ -18,16 +18,6 @@ from foveasim._core.validation import Floats, Images, read_only
 from foveasim._io import sandbox
 from foveasim._io.formats import FileFormat, FormatError
 
-__all__ = [
-    "MAX_BANDS",
-    "STEP_TOLERANCE",
-    "as_images",
-    "check_size",
-    "max_decompressed_bytes",
-    "pitch_of_axes",
-    "read_raster",
-]
-
 MAX_DECOMPRESSED_BYTES = 8 * 2**30
 #: Limit of the decompressed size: a constant plus a factor of the file size.
 MIN_DECOMPRESSED_BYTES, DECOMPRESSED_PER_BYTE = 2**28, 256

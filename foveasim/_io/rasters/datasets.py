@@ -18,7 +18,7 @@ import numpy as np
 
 from foveasim._core.extras import import_optional
 from foveasim._core.names import possible_names
-from foveasim._io.formats import FormatError
+from foveasim._io.formats import FileFormat, FormatError
 from foveasim._io.rasters import check_size
 from foveasim._io.rasters.labels import X, Y
 
@@ -30,6 +30,7 @@ NETCDF3_MAGICS = (b"CDF\x01", b"CDF\x02")
 ZARR_FILES = ("zarr.json", ".zgroup", ".zarray", ".zattrs", ".zmetadata")
 #: Keys of zarr metadata that name codecs for the chunks, and the safe codecs, which only encode numbers.
 ZARR_CODEC_KEYS = ("codecs", "index_codecs", "filters", "compressor", "storage_transformers")
+COMPRESSORS = ("zlib", "zstd", "blosc", "lz4", "bz2", "lzma", "gzip", "shuffle")
 ZARR_CODECS = frozenset(
     {
         "bytes",
@@ -37,16 +38,9 @@ ZARR_CODECS = frozenset(
         "transpose",
         "crc32c",
         "sharding_indexed",
-        "gzip",
-        "zlib",
-        "zstd",
-        "blosc",
-        "lz4",
-        "bz2",
-        "lzma",
+        *COMPRESSORS,
+        *(f"numcodecs.{c}" for c in COMPRESSORS),
     }
-    | {"numcodecs." + name for name in ("zlib", "zstd", "blosc", "lz4", "bz2", "lzma", "gzip", "shuffle")}
-    | {"shuffle"}
 )
 #: Maximum number of groups, arrays and links in a file.
 MAX_OBJECTS = 1000
@@ -81,6 +75,19 @@ def open_zarr(path: Path) -> Iterator[tuple[xr.Dataset, int]]:
 def is_zarr(path: Path) -> bool:
     """Return whether a directory is a zarr group or array."""
     return path.is_dir() and any((path / name).is_file() for name in ZARR_FILES[:3])
+
+
+#: Formats without readers and writers.
+NETCDF = FileFormat(
+    title="netCDF", suffixes=(".nc", ".nc4"), signatures=(HDF5_MAGIC, *NETCDF3_MAGICS), is_sandboxed=True
+)
+ZARR = FileFormat(
+    title="zarr",
+    suffixes=(".zarr",),
+    matches=lambda path, _head: is_zarr(path),
+    is_sandboxed=True,
+    is_directory=True,
+)
 
 
 def select_array(

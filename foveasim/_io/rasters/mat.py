@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Any
@@ -21,22 +22,11 @@ from numpy.typing import NDArray
 
 from foveasim._core.extras import import_optional
 from foveasim._core.names import possible_names
-from foveasim._io.formats import FormatError
+from foveasim._core.registry import Registry
+from foveasim._io.formats import FileFormat, FormatError
 from foveasim._io.rasters import check_size, max_decompressed_bytes
 
-__all__ = [
-    "MAT5_MAGIC",
-    "MAT73_MAGIC",
-    "IsetStruct",
-    "MatFile",
-    "find_struct",
-    "open_mat5",
-    "open_mat73",
-    "write_mat5",
-    "write_mat73",
-]
-
-MAT5_MAGIC, MAT73_MAGIC = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
+_MAT5_MAGIC, _MAT73_MAGIC = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
 #: Fields of ISETCam structs with photons and wavelengths.
 PHOTONS, WAVES = ("data/photons", "photons"), ("spectrum/wave", "wave", "data/wave")
 #: Sizes of the elements of plain arrays by MATLAB class, bytes.
@@ -53,15 +43,9 @@ class MatFile:
     """
     An open MAT file.
 
-    Attributes
-    ----------
-    names : list of str
-        Variables.
-    shapes : dict
-        Shapes of the variables that are plain numeric arrays, in the order of MATLAB.
-    read : function
-        Function that returns a variable, or a field such as ``oi/optics/focalLength``; None if it is missing or not an array of
-        numbers or text.
+    ``names``: variables. ``shapes``: shapes, in the order of MATLAB, of those that are plain numeric arrays. ``read``:
+    function that returns a variable, or a field such as ``oi/optics/focalLength``; None if it is missing or not an array of
+    numbers or text.
     """
 
     names: list[str]
@@ -70,7 +54,7 @@ class MatFile:
 
 
 @contextmanager
-def open_mat5(path: Path) -> Iterator[MatFile]:
+def _open_mat5(path: Path) -> Iterator[MatFile]:
     """Open a MAT file of version 5 to 7."""
     from scipy.io import loadmat, whosmat
 
@@ -104,7 +88,7 @@ def open_mat5(path: Path) -> Iterator[MatFile]:
 
 
 @contextmanager
-def open_mat73(path: Path) -> Iterator[MatFile]:
+def _open_mat73(path: Path) -> Iterator[MatFile]:
     """Open a MAT file of version 7.3."""
     h5py = import_optional(path, "h5py", "maps")
     n_bytes = path.stat().st_size
@@ -143,14 +127,9 @@ class IsetStruct:
     """
     An optical image or a scene of ISETCam.
 
-    Attributes
-    ----------
-    photons : (n_row, n_column[, n_wave])
-        Photon rates per nm, top row first.
-    wavelength_nm, band_width_nm : list of float, nm
-        None if missing. A single wavelength has a band width of 1 nm, as ISETCam's ``bin width``.
-    field : function
-        Function that returns a field by its path, as :attr:`MatFile.read`.
+    ``photons`` (n_row, n_column[, n_wave]): photon rates per nm, top row first. ``wavelength_nm``, ``band_width_nm``: None
+    if missing; a single wavelength has a band width of 1 nm, as ISETCam's ``bin width``. ``field``: as
+    :attr:`MatFile.read`.
     """
 
     photons: NDArray[Any]
@@ -170,23 +149,11 @@ class IsetStruct:
 
 def find_struct(file: MatFile, name: str | None, known: tuple[str, ...], what: str, cure: str) -> IsetStruct:
     """
-    Return the named struct, or one with a known name.
+    Return the named struct, or one with a known name; the first one is the usual name.
 
-    Without either, the variables ``data`` and ``photons`` are its fields.
-
-    Parameters
-    ----------
-    file : MatFile
-    name : str, optional
-    known : tuple of str
-        Names in files of ISETCam; the first one is the usual name.
-    what, cure : str
-        Kind of the struct and the function that computes it, for messages.
-
-    Raises
-    ------
-    FormatError
-        If the file does not contain the struct, or its photons are invalid.
+    Without either, the variables ``data`` and ``photons`` are its fields. ``what``, ``cure``: kind of the struct and the
+    function that computes it, for messages. Raises FormatError if the file does not contain the struct, or its photons are
+    invalid.
     """
     struct = next((one for one in (known if name is None else (name,)) if one in file.names), None)
     if struct is None and (name is not None or not {"data", "photons"} & set(file.names)):
@@ -290,4 +257,45 @@ def write_mat73(path: Path, tree: Mapping[str, Any]) -> None:
     with h5py.File(path, "w", userblock_size=512) as file:
         fill(file, tree)
     with path.open("r+b") as binary:
-        binary.write((MAT73_MAGIC + b", Platform: GLNXA64").ljust(124) + b"\x00\x02IM")
+        binary.write((_MAT73_MAGIC + b", Platform: GLNXA64").ljust(124) + b"\x00\x02IM")
+
+
+# -- registration -------------------------------------------------------------------------------------------------------
+
+#: Signature of files of each version, and functions that open and write them.
+_VERSIONS = {
+    "mat73": (_MAT73_MAGIC, _open_mat73, write_mat73),
+    "mat": (_MAT5_MAGIC, _open_mat5, write_mat5),
+}
+
+
+def register_mat(
+    formats: Registry[FileFormat],
+    read: Callable[[MatFile, str | None], Any],
+    example: Callable[[Callable[[Path, Mapping[str, Any]], None], Path], Any],
+) -> None:
+    """
+    Register the versions of MAT files as formats.
+
+    ``read``: function of an open file and the name of a variable. ``example``: function that writes an example with the given
+    function to a path.
+    """
+    for name, (magic, open_file, write) in _VERSIONS.items():
+        form = FileFormat(
+            title="MAT",
+            suffixes=(".mat",),
+            signatures=(magic,),
+            read=partial(_read, open_file, read),
+            is_sandboxed=True,
+        )
+        formats.register(name, form, example=partial(example, write))
+
+
+def _read(
+    open_file: Callable[[Path], AbstractContextManager[MatFile]],
+    read: Callable[[MatFile, str | None], Any],
+    path: Path,
+    name: str | None,
+) -> Any:
+    with open_file(path) as file:
+        return read(file, name)

@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import inspect
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated, Any, NotRequired, TypedDict, TypeVar, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.calls import FRACTION, Limits, check_arguments, check_declared, without_declarations
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import (
-    Bools,
-    Floats,
-    check_choice,
-    check_number,
-    check_shape,
-    finite_array,
-    freeze,
-    wavelengths_nm,
-)
+from foveasim._core.validation import Bools, Floats, band_widths_nm, check_shape, freeze, wavelengths_nm
 from foveasim.errors import ParameterError, SamplingWarning
-from foveasim.scene._scene import MAX_DISTANCE_M, MAX_PITCH_UM, MAX_RADIANCE, Scene, band_widths_nm
+from foveasim.scene._scene import DISTANCE, GREY_NM, PITCH, RADIANCE, Scene
+from foveasim.scene.registry import SCENES
 from foveasim.units import m_from_um
 
+F = TypeVar("F", bound=Callable[..., Scene])
 #: A number, or one for each wavelength.
 OneOrMore = float | Sequence[float]
 Fractions = NDArray[np.float32]
 
+HALF_TURN = Limits(at_least=-180.0, at_most=180.0)
 #: Pixels per block: a few float64 arrays of this size fit into the processor cache.
 BLOCK_PIXELS = 2**18
 #: Samples along each side of a pixel without a closed-form mean.
@@ -35,42 +32,73 @@ SAMPLES = 32
 MIN_PIXELS_PER_PERIOD = 2.0
 #: Relative tolerance of sizes: rounding errors.
 ROUNDING = 1e-9
+#: Common part of the examples of charts: 80 x 60 pixels of 0.1 mm.
+EXAMPLE_PICTURE = {
+    "shape": (60, 80),
+    "pitch_um": 100.0,
+    "distance_m": 1.0,
+    "radiance_w_m2_sr_nm": 2.0,
+    "band_width_nm": 10.0,
+}
+#: Documentation of the parameters of the canvas.
+PARAMETERS = {
+    "contrast": "contrast : float\n        (white - black) / (white + black).",
+    "shape": "shape : (n_y, n_x)\n        Number of pixels.",
+    "pitch_um": "pitch_um : float, µm\n        Pixel pitch in the scene.",
+    "distance_m": "distance_m : float, m\n        Distance of the scene from the lens.",
+    "radiance_w_m2_sr_nm": "radiance_w_m2_sr_nm : number, or one per wavelength, W/(m² sr nm)\n"
+    "        Spectral radiance of white.",
+    "wavelength_nm": "wavelength_nm : sequence, nm\n        Wavelengths.",
+    "band_width_nm": "band_width_nm : number or sequence, optional, nm\n"
+    "        Widths of the bands; by default bands extend halfway to the adjacent wavelengths. Required for one wavelength.",
+}
+RETURNS = "\n\n    Returns\n    -------\n    scene : Scene\n        One basis image."
 
 
-@dataclass(frozen=True, slots=True)
-class Canvas:
-    """
-    Raster of a chart and radiance of white.
-
-    Parameters
-    ----------
-    shape : (n_y, n_x)
-    pitch_um : float, µm
-    distance_m : float, m
-    radiance_w_m2_sr_nm : number, or one per wavelength, W/(m² sr nm)
-    wavelength_nm : sequence, nm
-    band_width_nm : number or sequence or None, nm
-        As for :meth:`Scene.from_picture`.
-    """
+class Raster(TypedDict):
+    """Parameters of all charts, as in :class:`Canvas`."""
 
     shape: tuple[int, int]
     pitch_um: float
     distance_m: float
+    band_width_nm: NotRequired[OneOrMore | None]
+
+
+class Picture(Raster):
+    """Parameters of charts with a radiance of white."""
+
     radiance_w_m2_sr_nm: OneOrMore
-    wavelength_nm: Sequence[float] | Floats
-    band_width_nm: OneOrMore | Floats | None
+    wavelength_nm: NotRequired[Sequence[float]]
+
+
+class Pattern(Picture):
+    """Parameters of charts with a contrast that is 1 by default."""
+
+    contrast: NotRequired[float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Canvas:
+    """Raster of a chart, radiance of white, and Michelson contrast."""
+
+    contrast: Annotated[float, FRACTION] = 1.0
+    shape: tuple[int, int]
+    pitch_um: Annotated[float, PITCH]
+    distance_m: Annotated[float, DISTANCE]
+    radiance_w_m2_sr_nm: OneOrMore
+    wavelength_nm: Sequence[float] = GREY_NM
+    band_width_nm: OneOrMore | None = None
 
     def __post_init__(self) -> None:
+        check_declared(self)
         waves_nm = wavelengths_nm("wavelength_nm", self.wavelength_nm)
-        radiance = finite_array("radiance_w_m2_sr_nm", self.radiance_w_m2_sr_nm, at_least=0.0, at_most=MAX_RADIANCE)
+        radiance = RADIANCE.check_array("radiance_w_m2_sr_nm", self.radiance_w_m2_sr_nm)
         if radiance.ndim > 1 or radiance.size not in (1, waves_nm.size):
             raise ParameterError(
                 "radiance_w_m2_sr_nm", f"must be one number, or one for each of the {waves_nm.size} wavelengths"
             )
         for name, value in {
             "shape": check_shape("shape", self.shape),
-            "pitch_um": check_number("pitch_um", self.pitch_um, above=0.0, at_most=MAX_PITCH_UM),
-            "distance_m": check_number("distance_m", self.distance_m, above=0.0, at_most=MAX_DISTANCE_M),
             "radiance_w_m2_sr_nm": np.broadcast_to(radiance, waves_nm.shape),
             "wavelength_nm": waves_nm,
             "band_width_nm": band_widths_nm(waves_nm, self.band_width_nm),
@@ -120,11 +148,7 @@ class Canvas:
         return fractions
 
     def check_fits(self, name: str, width_mm: float, height_mm: float) -> None:
-        """
-        Reject a chart that is larger than the picture.
-
-        Raises ParameterError if the chart does not fit; ``name`` is the parameter that determines its size.
-        """
+        """Reject a chart, whose size the parameter ``name`` determines, beyond the picture."""
         picture_width_mm, picture_height_mm = self.size_mm
         if width_mm > picture_width_mm * (1 + ROUNDING) or height_mm > picture_height_mm * (1 + ROUNDING):
             raise ParameterError(
@@ -134,15 +158,9 @@ class Canvas:
             )
 
     def radius_mm(self, radius_mm: float | None) -> float:
-        """
-        Return the radius of a round chart, by default the largest that fits into the picture.
-
-        Raises ParameterError if the radius is not positive, or the chart is larger than the picture.
-        """
-        largest_mm = 0.5 * min(self.size_mm)
+        """Return the radius of a round chart, by default the largest that fits."""
         if radius_mm is None:
-            return largest_mm
-        radius_mm = check_number("radius_mm", radius_mm, above=0.0)
+            return 0.5 * min(self.size_mm)
         self.check_fits("radius_mm", 2.0 * radius_mm, 2.0 * radius_mm)
         return radius_mm
 
@@ -156,14 +174,13 @@ class Canvas:
                 SamplingWarning,
             )
 
-    def scene(self, fractions: Fractions, contrast: float, source: str) -> Scene:
+    def scene(self, fractions: Fractions, source: str) -> Scene:
         """
         Return the scene of a chart in black and white.
 
-        ``fractions`` (n_y, n_x) float32: fraction of white in each pixel; overwritten. ``contrast``: Michelson contrast.
-        ``source``: description of the chart.
+        ``fractions`` (n_y, n_x) float32: fraction of white in each pixel; overwritten. ``source``: description of the chart.
         """
-        black = (1.0 - contrast) / (1.0 + contrast)
+        black = (1.0 - self.contrast) / (1.0 + self.contrast)
         fractions *= np.float32(1.0 - black)
         fractions += np.float32(black)
         return self.scene_of(fractions[np.newaxis], np.asarray(self.radiance_w_m2_sr_nm)[np.newaxis], source)
@@ -185,24 +202,38 @@ class Canvas:
         )
 
 
-def check_contrast(contrast: float) -> float:
-    """
-    Return a Michelson contrast after validation.
-
-    Raises ParameterError if it is not from 0 to 1.
-    """
-    return check_number("contrast", contrast, at_least=0.0, at_most=1.0)
-
-
 def ink_to_white(fractions: Fractions, ink: str) -> Fractions:
-    """
-    Convert fractions of ink to fractions of white, in place.
-
-    Raises ParameterError if the ink is neither dark nor bright.
-    """
-    if check_choice("ink", ink, ("dark", "bright")) == "dark":
+    """Convert fractions of ink to fractions of white, in place."""
+    if ink == "dark":
         np.subtract(np.float32(1.0), fractions, out=fractions)
     return fractions
+
+
+def chart(name: str, *, example: Mapping[str, Any], expected: Sequence[str]) -> Callable[[F], F]:
+    """
+    Register a chart with parameters of the canvas, such as ``**picture``, the last ones.
+
+    They replace it in the signature, and ``{picture}`` in the docstring, followed by the usual result if there is no other.
+    The example is completed by :data:`EXAMPLE_PICTURE`.
+    """
+
+    def decorate(function: F) -> F:
+        hints, signature = get_type_hints(function, include_extras=True), inspect.signature(function)
+        *own, rest = signature.parameters.values()
+        names = get_args(hints.pop(rest.name))[0].__annotations__
+        common = [each for each in inspect.signature(Canvas).parameters.values() if each.name in names]
+        signature = signature.replace(
+            parameters=[each.replace(annotation=without_declarations(each.annotation)) for each in (*own, *common)]
+        )
+        types = get_type_hints(Canvas, include_extras=True)
+        function.__signature__ = signature  # type: ignore[attr-defined]
+        function.__annotations__ = {**{each.name: types[each.name] for each in common}, **hints}
+        described, text = "\n    ".join(PARAMETERS[each.name] for each in common), function.__doc__ or ""
+        function.__doc__ = text.replace("{picture}", described if "Returns\n" in text else described + RETURNS)
+        complete = {key: value for key, value in EXAMPLE_PICTURE.items() if key in signature.parameters} | {**example}
+        return SCENES.register(name, check_arguments(function), example=complete, expected=expected)  # type: ignore[return-value]
+
+    return decorate
 
 
 def interval(edges_mm: Floats, low_mm: float, high_mm: float) -> Floats:

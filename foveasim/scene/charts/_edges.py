@@ -4,23 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal, Unpack
 
 import numpy as np
 
-from foveasim._core.validation import Floats, check_count, check_number, check_shape
+from foveasim._core.calls import FRACTION, POSITIVE
+from foveasim._core.validation import Floats, check_count, check_shape
 from foveasim.errors import ParameterError
-from foveasim.scene._scene import GREY_NM, Scene
+from foveasim.scene._scene import Scene
 from foveasim.scene.charts._canvas import (
+    HALF_TURN,
     Canvas,
-    OneOrMore,
+    Pattern,
+    Picture,
     add_rectangle,
-    check_contrast,
+    chart,
     half_plane,
     ink_to_white,
     interval,
 )
-from foveasim.scene.registry import chart
 
 Ink = Literal["dark", "bright"]
 
@@ -71,15 +73,9 @@ class BarElement:
 )
 def checkerboard(
     *,
-    square_mm: float,
+    square_mm: Annotated[float, POSITIVE],
     n_squares: tuple[int, int] | None = None,
-    contrast: float = 1.0,
-    shape: tuple[int, int],
-    pitch_um: float,
-    distance_m: float,
-    radiance_w_m2_sr_nm: OneOrMore,
-    wavelength_nm: Sequence[float] = GREY_NM,
-    band_width_nm: OneOrMore | None = None,
+    **pattern: Unpack[Pattern],
 ) -> Scene:
     """
     Return a checkerboard, for lens calibration and moiré. Exact.
@@ -91,14 +87,7 @@ def checkerboard(
     n_squares : (n_y, n_x), optional
         Number of squares of a centred board on white, with a black lower left square. By default the squares fill the
         picture, a corner of four squares is at the centre, and the square to its upper right is black.
-    contrast : float
-        (white - black) / (white + black).
     {picture}
-
-    Returns
-    -------
-    scene : Scene
-        One basis image.
 
     Raises
     ------
@@ -110,9 +99,7 @@ def checkerboard(
     SamplingWarning
         If a square is smaller than a pixel.
     """
-    canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
-    contrast = check_contrast(contrast)
-    square_mm = check_number("square_mm", square_mm, above=0.0)
+    canvas = Canvas(**pattern)
     edges_mm = canvas.y_edges_mm, canvas.x_edges_mm
     inside: list[Floats] = [np.ones(n) for n in canvas.shape]
     first_mm = [0.0, 0.0]
@@ -131,7 +118,7 @@ def checkerboard(
     fractions = canvas.fill(
         lambda rows: 1.0 - 0.5 * (np.multiply.outer(inside[0][rows], inside[1]) + np.multiply.outer(y[rows], x))
     )
-    return canvas.scene(fractions, contrast, "a checkerboard")
+    return canvas.scene(fractions, "a checkerboard")
 
 
 @chart(
@@ -141,14 +128,9 @@ def checkerboard(
 )
 def slanted_edge(
     *,
-    angle_deg: float = 5.0,
-    contrast: float = 0.6,
-    shape: tuple[int, int],
-    pitch_um: float,
-    distance_m: float,
-    radiance_w_m2_sr_nm: OneOrMore,
-    wavelength_nm: Sequence[float] = GREY_NM,
-    band_width_nm: OneOrMore | None = None,
+    angle_deg: Annotated[float, HALF_TURN] = 5.0,
+    contrast: Annotated[float, FRACTION] = 0.6,
+    **picture: Unpack[Picture],
 ) -> Scene:
     """
     Return a slanted edge through the centre, for the MTF of ISO 12233. Exact.
@@ -162,20 +144,14 @@ def slanted_edge(
     contrast : float
         (white - black) / (white + black); 0.6 by default, a ratio of 4 between white and black, as in ISO 12233.
     {picture}
-
-    Returns
-    -------
-    scene : Scene
-        One basis image.
     """
-    canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
-    contrast = check_contrast(contrast)
-    angle = np.deg2rad(check_number("angle_deg", angle_deg, at_least=-180.0, at_most=180.0))
+    canvas = Canvas(contrast=contrast, **picture)
+    angle = np.deg2rad(angle_deg)
     across_x, across_y = float(np.cos(angle)), float(np.sin(angle))
     x = across_x * canvas.x_mm / canvas.pitch_mm
     y = across_y * canvas.y_mm / canvas.pitch_mm
     fractions = canvas.fill(lambda rows: half_plane(np.add.outer(y[rows], x), across_x, across_y))
-    return canvas.scene(fractions, contrast, "a slanted edge")
+    return canvas.scene(fractions, "a slanted edge")
 
 
 @chart(
@@ -187,13 +163,7 @@ def bars(
     *,
     groups: Sequence[int],
     ink: Ink = "dark",
-    contrast: float = 1.0,
-    shape: tuple[int, int],
-    pitch_um: float,
-    distance_m: float,
-    radiance_w_m2_sr_nm: OneOrMore,
-    wavelength_nm: Sequence[float] = GREY_NM,
-    band_width_nm: OneOrMore | None = None,
+    **pattern: Unpack[Pattern],
 ) -> Scene:
     """
     Return a three-bar target with the frequencies of the USAF 1951 chart. Exact.
@@ -204,14 +174,7 @@ def bars(
         Group numbers. A group has six elements of ``2**(group + (element - 1) / 6)`` line pairs per mm in the scene.
     ink : {"dark", "bright"}
         Black bars on white, or white bars on black.
-    contrast : float
-        (white - black) / (white + black).
     {picture}
-
-    Returns
-    -------
-    scene : Scene
-        One basis image.
 
     Raises
     ------
@@ -229,8 +192,7 @@ def bars(
     the spiral of the standard: each group is a column with its first element on top, the coarsest group is on the left, and
     vertical bars are left of horizontal bars. :func:`bar_elements` returns the positions.
     """
-    canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
-    contrast = check_contrast(contrast)
+    canvas = Canvas(**pattern)
     elements = bar_elements(groups)
     canvas.check_fits(
         "groups",
@@ -246,7 +208,7 @@ def bars(
             across, along = (left, left + e.side_mm / BAR_LENGTH), (low, high)
             x, y = (across, along) if e.direction == "vertical" else (along, across)
             add_rectangle(fractions, canvas, (e.x_mm + x[0], e.x_mm + x[1]), (e.y_mm + y[0], e.y_mm + y[1]))
-    return canvas.scene(ink_to_white(fractions, ink), contrast, "bars")
+    return canvas.scene(ink_to_white(fractions, ink), "bars")
 
 
 def bar_elements(groups: Sequence[int]) -> tuple[BarElement, ...]:
@@ -318,15 +280,9 @@ def bar_elements(groups: Sequence[int]) -> tuple[BarElement, ...]:
 )
 def letter_f(
     *,
-    height_mm: float,
+    height_mm: Annotated[float, POSITIVE],
     ink: Ink = "dark",
-    contrast: float = 1.0,
-    shape: tuple[int, int],
-    pitch_um: float,
-    distance_m: float,
-    radiance_w_m2_sr_nm: OneOrMore,
-    wavelength_nm: Sequence[float] = GREY_NM,
-    band_width_nm: OneOrMore | None = None,
+    **pattern: Unpack[Pattern],
 ) -> Scene:
     """
     Return a centred letter F, which has no rotation or mirror symmetry. Exact.
@@ -337,14 +293,7 @@ def letter_f(
         Height of the letter; the stroke width is a fifth of it, the width of the letter three fifths.
     ink : {"dark", "bright"}
         Black letter on white, or white letter on black.
-    contrast : float
-        (white - black) / (white + black).
     {picture}
-
-    Returns
-    -------
-    scene : Scene
-        One basis image.
 
     Raises
     ------
@@ -356,9 +305,7 @@ def letter_f(
     SamplingWarning
         If a stroke is narrower than a pixel.
     """
-    canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
-    contrast = check_contrast(contrast)
-    height_mm = check_number("height_mm", height_mm, above=0.0)
+    canvas = Canvas(**pattern)
     unit_mm = height_mm / F_HEIGHT
     canvas.check_fits("height_mm", F_WIDTH * unit_mm, height_mm)
     canvas.warn_if_fine("height_mm", 2.0 * unit_mm)
@@ -367,7 +314,7 @@ def letter_f(
         x_mm = ((x0 - 0.5 * F_WIDTH) * unit_mm, (x1 - 0.5 * F_WIDTH) * unit_mm)
         y_mm = ((y0 - 0.5 * F_HEIGHT) * unit_mm, (y1 - 0.5 * F_HEIGHT) * unit_mm)
         add_rectangle(fractions, canvas, x_mm, y_mm)
-    return canvas.scene(ink_to_white(fractions, ink), contrast, "a letter F")
+    return canvas.scene(ink_to_white(fractions, ink), "a letter F")
 
 
 def _integral_of_square_wave_mm(x_mm: Floats, half_mm: float) -> Floats:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Annotated, Unpack
 
 import numpy as np
 
-from foveasim._core.validation import Floats, check_count, check_number
-from foveasim.scene._illuminants import Illuminant, illuminant_spectrum
-from foveasim.scene._scene import GREY_NM, MAX_RADIANCE, Scene
-from foveasim.scene.charts._canvas import Canvas, Fractions, OneOrMore, add_rectangle
+from foveasim._core.calls import NOT_NEGATIVE, POSITIVE, Limits
+from foveasim._core.validation import Floats
+from foveasim.scene._illuminants import Illuminant
+from foveasim.scene._illuminants import illuminant as cie_illuminant
+from foveasim.scene._scene import RADIANCE, Scene
+from foveasim.scene.charts._canvas import Canvas, Fractions, Picture, Raster, add_rectangle, chart
 from foveasim.scene.charts._colours import PATCH_NAMES, nonnegative_factors, patch_reflectance
-from foveasim.scene.registry import EXAMPLE_PICTURE, SCENES, chart
 
 #: Default wavelengths of a colour chart.
 COLOUR_NM = tuple(400.0 + 10.0 * k for k in range(31))
@@ -28,15 +30,10 @@ MAX_STEPS = 1000
 )
 def grey_scale(
     *,
-    n_steps: int = 12,
-    ratio: float = 2.0,
-    patch_mm: float,
-    shape: tuple[int, int],
-    pitch_um: float,
-    distance_m: float,
-    radiance_w_m2_sr_nm: OneOrMore,
-    wavelength_nm: Sequence[float] = GREY_NM,
-    band_width_nm: OneOrMore | None = None,
+    n_steps: Annotated[int, Limits(at_least=1, at_most=MAX_STEPS)] = 12,
+    ratio: Annotated[float, Limits(at_least=1.0)] = 2.0,
+    patch_mm: Annotated[float, POSITIVE],
+    **picture: Unpack[Picture],
 ) -> Scene:
     """
     Return a grey scale on black, for response curves and dynamic range. Exact.
@@ -68,10 +65,7 @@ def grey_scale(
     SamplingWarning
         If a patch is smaller than a pixel.
     """
-    canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
-    n_steps = check_count("n_steps", n_steps, at_most=MAX_STEPS)
-    ratio = check_number("ratio", ratio, at_least=1.0)
-    patch_mm = check_number("patch_mm", patch_mm, above=0.0)
+    canvas = Canvas(**picture)
     canvas.check_fits("patch_mm", n_steps * patch_mm, patch_mm)
     canvas.warn_if_fine("patch_mm", 2.0 * patch_mm)
     fractions = np.zeros(canvas.shape, np.float32)
@@ -79,26 +73,23 @@ def grey_scale(
         left_mm = (k - 0.5 * n_steps) * patch_mm
         x_mm, y_mm = (left_mm, left_mm + patch_mm), (-0.5 * patch_mm, 0.5 * patch_mm)
         add_rectangle(fractions, canvas, x_mm, y_mm, float(np.exp(-k * np.log(ratio))))
-    return canvas.scene(fractions, 1.0, "a grey scale")
+    return canvas.scene(fractions, "a grey scale")
 
 
-@SCENES.register(
+@chart(
     "colour_chart",
-    example={**EXAMPLE_PICTURE, "radiance_w_m2_sr_nm": 2.0, "patch_mm": 1.03, "gap_mm": 0.11},
+    example={"patch_mm": 1.03, "gap_mm": 0.11},
     expected=("........", ".. ..  .", ". . .  .", "....#  .", " ## ....", "........"),
 )
 def colour_chart(
     *,
-    patch_mm: float,
-    gap_mm: float = 0.0,
+    patch_mm: Annotated[float, POSITIVE],
+    gap_mm: Annotated[float, NOT_NEGATIVE] = 0.0,
     illuminant: Illuminant = "D65",
-    n_basis: int = 12,
-    shape: tuple[int, int],
-    pitch_um: float,
-    distance_m: float,
-    radiance_w_m2_sr_nm: float,
+    n_basis: Annotated[int, Limits(at_least=1, at_most=len(PATCH_NAMES))] = 12,
+    radiance_w_m2_sr_nm: Annotated[float, RADIANCE],
     wavelength_nm: Sequence[float] = COLOUR_NM,
-    band_width_nm: OneOrMore | None = None,
+    **raster: Unpack[Raster],
 ) -> Scene:
     """
     Return the Macbeth ColorChecker on black under an illuminant. Exact.
@@ -115,18 +106,11 @@ def colour_chart(
         CIE illuminant of the chart.
     n_basis : int
         Number of basis images, at most 24. The computing time of the optics is proportional to it; see the notes.
-    shape : (n_y, n_x)
-        Number of pixels.
-    pitch_um : float, µm
-        Pixel pitch in the scene.
-    distance_m : float, m
-        Distance of the scene from the lens.
     radiance_w_m2_sr_nm : float, W/(m² sr nm)
         Spectral radiance at 560 nm of a white with reflectance 1.
     wavelength_nm : sequence, nm
         Wavelengths from 380 to 780; by default 400 to 700 in steps of 10.
-    band_width_nm : number or sequence, optional, nm
-        Widths of the bands; by default bands extend halfway to the adjacent wavelengths. Required for one wavelength.
+    {picture}
 
     Returns
     -------
@@ -152,16 +136,12 @@ def colour_chart(
     sums of ``n_basis`` spectra, with a mean and maximum colour difference of 0.1 and 0.5 CIELAB units for 12 basis images,
     0.3 and 1.3 for 10, 0.8 and 2.5 for 8.
     """
-    canvas = Canvas(shape, pitch_um, distance_m, 1.0, wavelength_nm, band_width_nm)
-    radiance = check_number("radiance_w_m2_sr_nm", radiance_w_m2_sr_nm, at_least=0.0, at_most=MAX_RADIANCE)
-    patch_mm = check_number("patch_mm", patch_mm, above=0.0)
-    gap_mm = check_number("gap_mm", gap_mm, at_least=0.0)
-    n_basis = check_count("n_basis", n_basis, at_most=len(PATCH_NAMES))
+    canvas = Canvas(radiance_w_m2_sr_nm=1.0, wavelength_nm=wavelength_nm, **raster)
     step_mm = patch_mm + gap_mm
     canvas.check_fits("patch_mm", N_COLUMNS * step_mm - gap_mm, N_ROWS * step_mm - gap_mm)
     canvas.warn_if_fine("patch_mm", 2.0 * patch_mm)
     weights, spectra = _patch_spectra(np.asarray(canvas.wavelength_nm), n_basis)
-    illumination = radiance * illuminant_spectrum(illuminant, np.asarray(canvas.wavelength_nm))
+    illumination = radiance_w_m2_sr_nm * cie_illuminant(illuminant, np.asarray(canvas.wavelength_nm))
     return canvas.scene_of(_patches(canvas, weights, patch_mm, step_mm), spectra * illumination, "a colour chart")
 
 

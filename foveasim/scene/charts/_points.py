@@ -3,34 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Annotated, Unpack
 
 import numpy as np
 
-from foveasim._core.validation import check_number, check_shape
+from foveasim._core.calls import NOT_NEGATIVE, POSITIVE
+from foveasim._core.validation import check_shape
 from foveasim.errors import ParameterError
 from foveasim.scene._scene import GREY_NM, Scene
-from foveasim.scene.charts._canvas import Canvas, OneOrMore
-from foveasim.scene.registry import EXAMPLE_PICTURE, SCENES
+from foveasim.scene.charts._canvas import Canvas, Raster, chart
 
 #: Tolerance of a spacing from an integer number of pixels.
 ROUNDING_PIXELS = 1e-6
 
 
-@SCENES.register(
+@chart(
     "point_grid",
-    example={**EXAMPLE_PICTURE, "spacing_mm": 2.0, "n_points": (2, 3), "intensity_w_sr_nm": 3e-6},
+    example={"spacing_mm": 2.0, "n_points": (2, 3), "intensity_w_sr_nm": 3e-6},
     expected=("........", "..#.#.#.", "........", "..#.#.#.", "........", "........"),
 )
 def point_grid(
     *,
-    spacing_mm: float,
+    spacing_mm: Annotated[float, POSITIVE],
     n_points: tuple[int, int] | None = None,
-    intensity_w_sr_nm: float,
-    shape: tuple[int, int],
-    pitch_um: float,
-    distance_m: float,
+    intensity_w_sr_nm: Annotated[float, NOT_NEGATIVE],
     wavelength_nm: Sequence[float] = GREY_NM,
-    band_width_nm: OneOrMore | None = None,
+    **raster: Unpack[Raster],
 ) -> Scene:
     """
     Return a grid of point sources on black, for field-dependent PSFs and distortion.
@@ -43,21 +41,9 @@ def point_grid(
         Number of rows and columns of points; by default the largest odd numbers that fit into the picture.
     intensity_w_sr_nm : float, W/(sr nm)
         Spectral radiant intensity of each point.
-    shape : (n_y, n_x)
-        Number of pixels.
-    pitch_um : float, µm
-        Pixel pitch in the scene.
-    distance_m : float, m
-        Distance of the scene from the lens.
     wavelength_nm : sequence, nm
         Wavelengths; the intensity is the same at all of them.
-    band_width_nm : number or sequence, optional, nm
-        Widths of the bands; by default bands extend halfway to the adjacent wavelengths. Required for one wavelength.
-
-    Returns
-    -------
-    scene : Scene
-        One basis image.
+    {picture}
 
     Raises
     ------
@@ -75,8 +61,7 @@ def point_grid(
     right or upper pixel: if the centre of the picture is such a boundary, the grid is shifted by half a pixel to the right
     or up.
     """
-    canvas = Canvas(shape, pitch_um, distance_m, 1.0, wavelength_nm, band_width_nm)
-    spacing_mm = check_number("spacing_mm", spacing_mm, above=0.0)
+    canvas = Canvas(radiance_w_m2_sr_nm=1.0, wavelength_nm=wavelength_nm, **raster)
     step = round(spacing_mm / canvas.pitch_mm)
     if step < 1 or abs(spacing_mm / canvas.pitch_mm - step) > ROUNDING_PIXELS:
         raise ParameterError(
@@ -102,9 +87,9 @@ def point_grid(
     return Scene.point_sources(
         shape=canvas.shape,
         pixels=pixels,  # type: ignore[arg-type]
-        intensity_w_sr_nm=check_number("intensity_w_sr_nm", intensity_w_sr_nm, at_least=0.0),
+        intensity_w_sr_nm=intensity_w_sr_nm,
         pitch_um=canvas.pitch_um,
         distance_m=canvas.distance_m,
-        wavelength_nm=canvas.wavelength_nm,  # type: ignore[arg-type]
-        band_width_nm=canvas.band_width_nm,  # type: ignore[arg-type]
+        wavelength_nm=canvas.wavelength_nm,
+        band_width_nm=canvas.band_width_nm,
     )

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal
+from typing import Annotated, Literal, Unpack
 
 import numpy as np
 
-from foveasim._core.validation import Floats, check_choice, check_count, check_number
-from foveasim.scene._scene import GREY_NM, Scene
-from foveasim.scene.charts._canvas import Canvas, OneOrMore, check_contrast, half_plane, sample_means
-from foveasim.scene.registry import chart
+from foveasim._core.calls import FRACTION, POSITIVE, Limits
+from foveasim._core.validation import Floats
+from foveasim.scene._scene import Scene
+from foveasim.scene.charts._canvas import HALF_TURN, Canvas, Pattern, Picture, chart, half_plane, sample_means
 
 #: Limit of computing time: the sampled centre of a star with more sectors takes minutes.
 MAX_SPOKES = 1000
@@ -31,16 +30,11 @@ GAUSS = ((-0.5 * np.sqrt(0.6), 5.0 / 18.0), (0.0, 8.0 / 18.0), (0.5 * np.sqrt(0.
 )
 def sine(
     *,
-    line_pairs_per_mm: float,
-    angle_deg: float = 0.0,
-    phase_deg: float = 0.0,
-    contrast: float = 1.0,
-    shape: tuple[int, int],
-    pitch_um: float,
-    distance_m: float,
-    radiance_w_m2_sr_nm: OneOrMore,
-    wavelength_nm: Sequence[float] = GREY_NM,
-    band_width_nm: OneOrMore | None = None,
+    line_pairs_per_mm: Annotated[float, POSITIVE],
+    angle_deg: Annotated[float, HALF_TURN] = 0.0,
+    phase_deg: Annotated[float, Limits(at_least=-360.0, at_most=360.0)] = 0.0,
+    contrast: Annotated[float, FRACTION] = 1.0,
+    **picture: Unpack[Picture],
 ) -> Scene:
     """
     Return a sine wave of one frequency and direction, for direct MTF measurements. Exact.
@@ -57,23 +51,15 @@ def sine(
         (white - black) / (white + black) of the ideal wave; the contrast of the pixel means is slightly lower.
     {picture}
 
-    Returns
-    -------
-    scene : Scene
-        One basis image.
-
     Warns
     -----
     SamplingWarning
         If a period is shorter than two pixels.
     """
-    canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
-    contrast = check_contrast(contrast)
-    per_mm = check_number("line_pairs_per_mm", line_pairs_per_mm, above=0.0)
-    angle = np.deg2rad(check_number("angle_deg", angle_deg, at_least=-180.0, at_most=180.0))
-    phase = np.deg2rad(check_number("phase_deg", phase_deg, at_least=-360.0, at_most=360.0))
-    canvas.warn_if_fine("line_pairs_per_mm", 1.0 / per_mm)
-    along_x, along_y = per_mm * np.cos(angle), per_mm * np.sin(angle)
+    canvas = Canvas(contrast=contrast, **picture)
+    angle, phase = np.deg2rad(angle_deg), np.deg2rad(phase_deg)
+    canvas.warn_if_fine("line_pairs_per_mm", 1.0 / line_pairs_per_mm)
+    along_x, along_y = line_pairs_per_mm * np.cos(angle), line_pairs_per_mm * np.sin(angle)
     # The mean of a wave over a pixel is its value at the centre times a sinc along each side.
     height = 0.5 * np.sinc(along_x * canvas.pitch_mm) * np.sinc(along_y * canvas.pitch_mm)
     x = np.exp(2j * np.pi * along_x * canvas.x_mm - 1j * phase)
@@ -81,7 +67,7 @@ def sine(
     fractions = canvas.fill(
         lambda rows: 0.5 + np.multiply.outer(y.real[rows], x.real) - np.multiply.outer(y.imag[rows], x.imag)
     )
-    return canvas.scene(fractions, contrast, "a sine wave")
+    return canvas.scene(fractions, "a sine wave")
 
 
 @chart(
@@ -91,15 +77,9 @@ def sine(
 )
 def zone_plate(
     *,
-    line_pairs_per_mm: float,
-    radius_mm: float | None = None,
-    contrast: float = 1.0,
-    shape: tuple[int, int],
-    pitch_um: float,
-    distance_m: float,
-    radiance_w_m2_sr_nm: OneOrMore,
-    wavelength_nm: Sequence[float] = GREY_NM,
-    band_width_nm: OneOrMore | None = None,
+    line_pairs_per_mm: Annotated[float, POSITIVE],
+    radius_mm: Annotated[float, POSITIVE] | None = None,
+    **pattern: Unpack[Pattern],
 ) -> Scene:
     """
     Return a sinusoidal zone plate, for aliasing at all frequencies and directions.
@@ -110,14 +90,7 @@ def zone_plate(
         Spatial frequency at the rim, in the scene.
     radius_mm : float, optional, mm
         Radius of the rim; by default the largest that fits into the picture.
-    contrast : float
-        (white - black) / (white + black).
     {picture}
-
-    Returns
-    -------
-    scene : Scene
-        One basis image.
 
     Raises
     ------
@@ -135,13 +108,11 @@ def zone_plate(
     ``f r / R``. The background outside the rim is the mean of black and white. The means are exact (Fresnel integrals),
     except in pixels on the rim, which are sampled at 32 x 32 points.
     """
-    canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
-    contrast = check_contrast(contrast)
-    per_mm = check_number("line_pairs_per_mm", line_pairs_per_mm, above=0.0)
+    canvas = Canvas(**pattern)
     radius_mm = canvas.radius_mm(radius_mm)
-    canvas.warn_if_fine("line_pairs_per_mm", 1.0 / per_mm)
+    canvas.warn_if_fine("line_pairs_per_mm", 1.0 / line_pairs_per_mm)
     # Fresnel integrals are integrals of cos(π t² / 2): t is this factor times a length.
-    scale_per_mm = float(np.sqrt(2.0 * per_mm / radius_mm))
+    scale_per_mm = float(np.sqrt(2.0 * line_pairs_per_mm / radius_mm))
     (cos_x, sin_x), (cos_y, sin_y) = (_mean_chirp(e, scale_per_mm) for e in (canvas.x_edges_mm, canvas.y_edges_mm))
 
     def ideal(x: Floats, y: Floats) -> Floats:
@@ -156,7 +127,7 @@ def zone_plate(
         rings[is_rim] = sample_means(canvas, is_rim, rows, ideal)
         return rings
 
-    return canvas.scene(canvas.fill(block), contrast, "a zone plate")
+    return canvas.scene(canvas.fill(block), "a zone plate")
 
 
 @chart(
@@ -166,16 +137,10 @@ def zone_plate(
 )
 def siemens_star(
     *,
-    n_spokes: int = 36,
-    radius_mm: float | None = None,
+    n_spokes: Annotated[int, Limits(at_least=2, at_most=MAX_SPOKES)] = 36,
+    radius_mm: Annotated[float, POSITIVE] | None = None,
     profile: Literal["square", "sine"] = "square",
-    contrast: float = 1.0,
-    shape: tuple[int, int],
-    pitch_um: float,
-    distance_m: float,
-    radiance_w_m2_sr_nm: OneOrMore,
-    wavelength_nm: Sequence[float] = GREY_NM,
-    band_width_nm: OneOrMore | None = None,
+    **pattern: Unpack[Pattern],
 ) -> Scene:
     """
     Return a Siemens star, for resolution and aliasing in all directions.
@@ -189,14 +154,7 @@ def siemens_star(
         Radius of the star; by default the largest that fits into the picture.
     profile : {"square", "sine"}
         Profile across the sectors: black and white, or sinusoidal (as the star of ISO 12233:2014 with 144 sectors).
-    contrast : float
-        (white - black) / (white + black).
     {picture}
-
-    Returns
-    -------
-    scene : Scene
-        One basis image.
 
     Raises
     ------
@@ -214,10 +172,7 @@ def siemens_star(
     square profile are exact and means of the sinusoidal profile are accurate to 1e-4. Pixels nearer to the centre and pixels
     on the rim are sampled at 32 x 32 points.
     """
-    canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
-    contrast = check_contrast(contrast)
-    n_spokes = check_count("n_spokes", n_spokes, at_least=2, at_most=MAX_SPOKES)
-    check_choice("profile", profile, ("square", "sine"))
+    canvas = Canvas(**pattern)
     radius_mm = canvas.radius_mm(radius_mm)
     canvas.warn_if_fine("n_spokes", 2.0 * np.pi * radius_mm / n_spokes)
     mean_of_spokes = _mean_of_edges if profile == "square" else _mean_of_waves
@@ -237,7 +192,7 @@ def siemens_star(
         spokes[is_sampled] = sample_means(canvas, is_sampled, rows, ideal)
         return spokes
 
-    return canvas.scene(canvas.fill(block), contrast, "a Siemens star")
+    return canvas.scene(canvas.fill(block), "a Siemens star")
 
 
 def _mean_of_edges(x: Floats, y: Floats, n_spokes: int) -> Floats:

@@ -14,8 +14,6 @@ from foveasim._io.formats import FormatError
 from foveasim._io.rasters.units import length_in_um
 from foveasim.errors import ParameterError
 
-__all__ = ["EXAMPLE_NM", "EXAMPLE_UNIT", "Cube", "Quantity", "example_radiance"]
-
 #: Wavelengths and unit of the cubes of examples.
 EXAMPLE_NM, EXAMPLE_UNIT = (500.0, 600.0), "W m-2 sr-1 nm-1"
 #: Physical quantity of the values of a cube.

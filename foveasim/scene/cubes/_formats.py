@@ -27,24 +27,8 @@ def read_cube(path: Path, name: str | None, selection: Selection) -> Cube:
     """
     Read the selected part of a cube, in the sandbox process if the format requires it.
 
-    Parameters
-    ----------
-    path : Path
-    name : str, optional
-        Name of the variable, if there are several.
-    selection : Selection
-
-    Returns
-    -------
-    cube : Cube
-        As :func:`select` returns it.
-
-    Raises
-    ------
-    FileError
-        If the file is corrupt, malformed, too large, or not a cube.
-    ParameterError
-        If the selection is inconsistent with the file.
+    ``name``: name of the variable, if there are several. Returns the cube as :func:`select` does. Raises FileError if the
+    file is corrupt, malformed, too large, or not a cube, and ParameterError if the selection is inconsistent with it.
     """
     kind, form = detect_format(path, CUBE_FORMATS, "hyperspectral cube")
     if not form.is_sandboxed:

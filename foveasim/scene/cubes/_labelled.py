@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from contextlib import AbstractContextManager, ExitStack
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,9 +19,8 @@ import numpy as np
 
 from foveasim._core.extras import import_optional
 from foveasim._core.validation import Floats
-from foveasim._io.formats import FileFormat
 from foveasim._io.rasters import pitch_of_axes
-from foveasim._io.rasters.datasets import HDF5_MAGIC, NETCDF3_MAGICS, is_zarr, open_netcdf, open_zarr, select_array
+from foveasim._io.rasters.datasets import NETCDF, ZARR, open_netcdf, open_zarr, select_array
 from foveasim._io.rasters.labels import BAND, coordinate, in_order, length_of_coordinate, squeeze, unit_of_array
 from foveasim.scene.cubes._cube import EXAMPLE_NM, EXAMPLE_UNIT, Cube, example_radiance
 from foveasim.scene.cubes._formats import CUBE_FORMATS
@@ -28,19 +29,10 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-def read_netcdf(path: Path, name: str | None) -> Cube:
-    """Read the named variable, or the only one of three dimensions."""
-    return _read(open_netcdf, path, name)
-
-
-def read_zarr(path: Path, name: str | None) -> Cube:
-    """Read the named array, or the only one of three dimensions."""
-    return _read(open_zarr, path, name)
-
-
 def _read(
     open_dataset: Callable[[Path], AbstractContextManager[tuple[xr.Dataset, int]]], path: Path, name: str | None
 ) -> Cube:
+    """Read the named array, or the only one of three dimensions."""
     with ExitStack() as stack:
         dataset, n_bytes = stack.enter_context(open_dataset(path))
         array = select_array(dataset, name, n_bytes, min_ndim=3, what="the cube")
@@ -106,24 +98,7 @@ def _example(path: Path) -> Floats:
 
 CUBE_FORMATS.register(
     "netcdf",
-    FileFormat(
-        title="netCDF",
-        suffixes=(".nc", ".nc4", ".h5"),
-        signatures=(HDF5_MAGIC, *NETCDF3_MAGICS),
-        read=read_netcdf,
-        is_sandboxed=True,
-    ),
+    replace(NETCDF, suffixes=(*NETCDF.suffixes, ".h5"), read=partial(_read, open_netcdf)),
     example=_example,
 )
-CUBE_FORMATS.register(
-    "zarr",
-    FileFormat(
-        title="zarr",
-        suffixes=(".zarr",),
-        matches=lambda path, _head: is_zarr(path),
-        read=read_zarr,
-        is_sandboxed=True,
-        is_directory=True,
-    ),
-    example=_example,
-)
+CUBE_FORMATS.register("zarr", replace(ZARR, read=partial(_read, open_zarr)), example=_example)

@@ -11,8 +11,7 @@ bands. A variable ``unit`` or ``units`` contains the unit.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +19,8 @@ import numpy as np
 
 from foveasim._core.names import possible_names
 from foveasim._core.validation import Floats
-from foveasim._io.formats import FileFormat, FormatError
-from foveasim._io.rasters.mat import (
-    MAT5_MAGIC,
-    MAT73_MAGIC,
-    MatFile,
-    find_struct,
-    open_mat5,
-    open_mat73,
-    write_mat5,
-    write_mat73,
-)
+from foveasim._io.formats import FormatError
+from foveasim._io.rasters.mat import MatFile, find_struct, register_mat
 from foveasim.scene.cubes._cube import EXAMPLE_NM, EXAMPLE_UNIT, Cube, example_radiance
 from foveasim.scene.cubes._formats import CUBE_FORMATS
 
@@ -41,18 +31,6 @@ WAVELENGTHS = (
 )
 UNITS = ("unit", "units")
 ISET_UNIT = "photons s-1 m-2 sr-1 nm-1"
-
-
-def read_mat5(path: Path, name: str | None) -> Cube:
-    """Read a MAT file of version 5 to 7."""
-    with open_mat5(path) as file:
-        return _read(file, name)
-
-
-def read_mat73(path: Path, name: str | None) -> Cube:
-    """Read a MAT file of version 7.3."""
-    with open_mat73(path) as file:
-        return _read(file, name)
 
 
 def _read(file: MatFile, name: str | None) -> Cube:
@@ -107,19 +85,11 @@ def _bands_first(data: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     return np.moveaxis(data, 2, 0) if data.ndim == 3 else data
 
 
-def _example(write: Callable[[Path, dict[str, Any]], None], path: Path) -> Floats:
+def _example(write: Callable[[Path, Mapping[str, Any]], None], path: Path) -> Floats:
     """Write an array (row, column, band), top row first."""
     radiance = example_radiance()
     write(path, {"cube": np.moveaxis(radiance[:, ::-1], 0, 2), "wave": np.array(EXAMPLE_NM), "unit": EXAMPLE_UNIT})
     return radiance
 
 
-for _name, _magic, _reader, _writer in (
-    ("mat73", MAT73_MAGIC, read_mat73, write_mat73),
-    ("mat", MAT5_MAGIC, read_mat5, write_mat5),
-):
-    CUBE_FORMATS.register(
-        _name,
-        FileFormat(title="MAT", suffixes=(".mat",), signatures=(_magic,), read=_reader, is_sandboxed=True),
-        example=partial(_example, _writer),
-    )
+register_mat(CUBE_FORMATS, _read, _example)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import Floats, check_choice, check_number, finite_array, wavelengths_nm
+from foveasim._core.validation import Floats, check_number, finite_array, wavelengths_nm
 from foveasim._io.formats import FormatError
 from foveasim._io.mapped_files import value_range
 from foveasim._io.rasters.units import Powers, parse_unit, round_factor
@@ -40,17 +40,7 @@ MAX_REFLECTANCE = 1.01
 
 @dataclass(frozen=True, kw_only=True)
 class Radiance:
-    """
-    Spectra of the bands of a cube, as for :class:`foveasim.Scene`.
-
-    Attributes
-    ----------
-    spectrum_w_m2_sr_nm : (n_band, n_wavelength), W/(m² sr nm)
-        Spectral radiance of the value 1 in each band.
-    wavelength_nm : (n_wavelength,), nm
-    max_fraction : float
-        Largest reflectance; 0 for radiance.
-    """
+    """Spectra of the bands of a cube, as those of a scene, and the largest reflectance or 0."""
 
     spectrum_w_m2_sr_nm: Floats
     wavelength_nm: Floats
@@ -79,12 +69,8 @@ def spectral_radiance(
     """
     Return the spectra of a cube; parameters as for :meth:`foveasim.Scene.from_cube`.
 
-    Raises
-    ------
-    FormatError
-        If the cube does not specify its quantity or unit, or the unit is not supported.
-    ParameterError
-        If an argument is invalid, or inconsistent with the quantity.
+    Raises FormatError if the cube does not specify its quantity or unit, or the unit is not supported, and ParameterError
+    if an argument is invalid, or inconsistent with the quantity.
     """
     bands_nm = np.asarray(cube.wavelength, np.float64)
     kind, factor = _quantity(cube, bands_nm, quantity, unit)
@@ -109,8 +95,6 @@ def spectral_radiance(
 
 def _quantity(cube: Cube, bands_nm: Floats, quantity: Quantity | None, unit: str | None) -> tuple[Quantity, Floats]:
     """Return the quantity, and the factors to reflectance or W/(m² sr nm), (n_band,)."""
-    if quantity is not None:
-        check_choice("quantity", quantity, ("radiance", "reflectance"))
     text = unit if unit is not None else cube.unit
     expected = quantity if quantity is not None else cube.quantity
     if text is None and expected == "reflectance":
@@ -164,8 +148,6 @@ def _illumination(
     try:
         return white * cie_illuminant(illuminant or "D65", waves_nm)
     except ParameterError as error:
-        if error.name == "illuminant":
-            raise
         raise ParameterError(
             "illuminant",
             f"'{illuminant or 'D65'}' {error.detail}; select range_nm=, or pass 'A', 'E', or a table "

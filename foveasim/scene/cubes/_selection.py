@@ -15,7 +15,6 @@ from foveasim._core.validation import (
     Floats,
     Images,
     Ints,
-    check_choice,
     check_count,
     finite_array,
     freeze,
@@ -39,14 +38,7 @@ MAX_COPIED_BYTES = 2**30
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """
-    Selected part of a cube; parameters as for :meth:`foveasim.Scene.from_cube`.
-
-    Raises
-    ------
-    ParameterError
-        If a value is invalid for any cube.
-    """
+    """Selected part of a cube; parameters as for :meth:`foveasim.Scene.from_cube`."""
 
     wavelength_nm: Sequence[float] | None = None
     bands: Sequence[int] | None = None
@@ -57,7 +49,6 @@ class Selection:
     invalid: str = "raise"
 
     def __post_init__(self) -> None:
-        check_choice("invalid", self.invalid, ("raise", "zero"))
         plain: dict[str, Any] = {}
         for name in ("wavelength_nm", "resample_nm"):
             if getattr(self, name) is not None:
