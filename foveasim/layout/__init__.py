@@ -12,30 +12,20 @@ from foveasim.layout.drc.presets import PRESETS, Preset
 from foveasim.layout.drc.repair import Change, enforce, repair
 from foveasim.layout.drc.routing import Readout, Routing, track_demand
 from foveasim.layout.drc.rules import DesignRules, Report, RuleResult, Violation, min_width_um
-from foveasim.layout.edits import (
-    EDITS,
-    clip,
+from foveasim.layout.edit_registry import EDITS, layout_edit
+from foveasim.layout.edits.all_sites import clip, cut_out, inset, merge, merge_small, node, snap, split, union
+from foveasim.layout.edits.at_points import (
     cut_along,
-    cut_out,
-    draw,
-    inset,
-    layout_edit,
-    merge,
     merge_at,
-    merge_small,
     move_sites,
     move_vertices,
-    node,
-    overlay,
     remove_at,
     remove_vertices,
     set_channel,
     sites_at,
-    snap,
-    split,
     split_at,
-    union,
 )
+from foveasim.layout.edits.layers import draw, overlay
 from foveasim.layout.families import LAYOUTS, layout_family
 from foveasim.layout.files import (
     DERIVED_LAYERS,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from foveasim._core.validation import MAX_LENGTH_UM, as_numbers, check_length_um, finite_array
+from foveasim._core.validation import MAX_LENGTH_UM, check_length_um, finite_array
 from foveasim.errors import ParameterError, printable, type_name
 
 #: Vertices of a polygonal disc, by default: its area is that of the circle within 7 ppm.
@@ -22,14 +22,11 @@ def parse_region(*, size_um: Any = None, radius_um: float | None = None, region:
     Return the specified region as a shapely Polygon or MultiPolygon in µm.
 
     ``size_um`` (width, height), µm: rectangle around the optical axis. ``radius_um`` (float, µm): disc around the optical
-    axis. ``region``: shapely polygon or (n, 2) vertices, µm. Raises ParameterError when not exactly one is specified, or it is
-    not a valid region.
+    axis. ``region``: shapely polygon or (n, 2) vertices, µm.
     """
     if sum(x is not None for x in (size_um, radius_um, region)) != 1:
         raise ParameterError("region", "or 'size_um' or 'radius_um' must be given, but only one of them")
     if size_um is not None:
-        if as_numbers("size_um", size_um).shape != (2,):
-            raise ParameterError("size_um", "must be two numbers (width, height)", size_um, "µm")
         x_um, y_um = (0.5 * check_length_um(f"size_um[{i}]", x) for i, x in enumerate(size_um))
         return shapely.box(-x_um, -y_um, x_um, y_um)
     if radius_um is not None:
@@ -42,8 +39,6 @@ def as_region(name: str, region: Any) -> Any:
     Return a region as a shapely Polygon or MultiPolygon with a positive area.
 
     The region is such a polygon, its well-known text (WKT), or an (n, 2) array of vertices in µm.
-
-    Raises ParameterError when it is none of these, crosses itself, is empty, or lies too far from the origin.
     """
     outline = region
     if isinstance(region, str):
@@ -68,12 +63,3 @@ def disc(radius_um: float, n_chords: int) -> shapely.Polygon:
     """Return a disc around the axis as a regular inscribed polygon, first vertex at angle 0."""
     angle_rad = 2.0 * math.pi * np.arange(n_chords) / n_chords
     return shapely.Polygon(radius_um * np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1))
-
-
-def region_as_plain_data(region: Any) -> Any:
-    """Convert a region to plain data: its vertices, or the well-known text of a geometry."""
-    if isinstance(region, str):
-        return region
-    if isinstance(region, shapely.Geometry):
-        return shapely.to_wkt(region, rounding_precision=-1)
-    return np.asarray(region, dtype=np.float64).tolist()

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import shapely
 
+from foveasim._core.calls import NOT_NEGATIVE
 from foveasim._core.rings import next_vertex
-from foveasim._core.validation import check_number
 from foveasim.layout.model import Layout
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ __all__ = ["TOUCHING_UM", "adjacency"]
 TOUCHING_UM = 1e-6
 
 
-def adjacency(layout: Layout, *, max_gap_um: float = TOUCHING_UM) -> csr_array[Any]:
+def adjacency(layout: Layout, *, max_gap_um: Annotated[float, NOT_NEGATIVE] = TOUCHING_UM) -> csr_array[Any]:
     """
     Compute the lengths of the edges that photosites share.
 
@@ -58,7 +58,6 @@ def adjacency(layout: Layout, *, max_gap_um: float = TOUCHING_UM) -> csr_array[A
 
     from foveasim.layout import _kernels
 
-    max_gap_um = check_number("max_gap_um", max_gap_um, at_least=0.0)
     box = layout.site_bounds_um
     reach = box + max(max_gap_um, TOUCHING_UM) * np.array([-0.5, -0.5, 0.5, 0.5])
     boxes = shapely.box(*reach.T)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import NOT_NEGATIVE, Limits
 from foveasim._core.random_streams import Streams
-from foveasim._core.validation import Ints, check_count, finite_array, freeze
+from foveasim._core.validation import Ints, finite_array, freeze
 from foveasim.errors import ParameterError
 from foveasim.layout.adjacency import adjacency
 from foveasim.layout.edit_registry import layout_edit
-from foveasim.layout.model import Layout
+from foveasim.layout.model import Layout, derived
 
 __all__ = ["MOSAICS", "graph_colouring", "mosaic", "random_channels"]
 
@@ -72,10 +74,8 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
     position = (row % n_rows).astype(np.int32)
     position *= n_columns
     position += column % n_columns
-    return layout._with_columns(  # noqa: SLF001 -- of the same subpackage
-        {"channel": freeze(channels.ravel()[position])},
-        f"mosaic {' '.join(rows)} of {names}",
-    )
+    columns = {**layout.columns, "channel": freeze(channels.ravel()[position])}
+    return derived(layout, f"mosaic {' '.join(rows)} of {names}", columns=columns)
 
 
 def _indices(layout: Layout) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
@@ -141,7 +141,12 @@ def random_channels(layout: Layout, fractions: ArrayLike, *, seed: int) -> Layou
 
 
 @layout_edit(example={"n_channels": 3})
-def graph_colouring(layout: Layout, n_channels: int, *, max_gap_um: float | None = None) -> Layout:
+def graph_colouring(
+    layout: Layout,
+    n_channels: Annotated[int, Limits(at_least=1, at_most=64)],
+    *,
+    max_gap_um: Annotated[float | None, NOT_NEGATIVE] = None,
+) -> Layout:
     """
     Return the layout with colour filters that differ between neighbours where possible.
 
@@ -167,7 +172,6 @@ def graph_colouring(layout: Layout, n_channels: int, *, max_gap_um: float | None
     """
     from foveasim.layout import _kernels
 
-    n_channels = check_count("n_channels", n_channels, at_most=64)
     shared_um = adjacency(layout) if max_gap_um is None else adjacency(layout, max_gap_um=max_gap_um)
     channel = _kernels.colour_greedily(
         shared_um.indptr.astype(np.int64), shared_um.indices.astype(np.int64), shared_um.data, n_channels

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
+from foveasim._core.calls import check_arguments
 from foveasim._core.registry import Registry
 from foveasim.layout.model import Layout
 
@@ -36,7 +37,8 @@ def layout_edit(*, example: Mapping[str, Any], name: str | None = None) -> Calla
     """
 
     def register(edit: E) -> E:
-        EDITS.register(name or edit.__name__, edit, example=example)
-        return edit
+        checked = cast("E", check_arguments(edit))
+        EDITS.register(name or edit.__name__, checked, example=example)
+        return checked
 
     return register

@@ -10,16 +10,21 @@ from typing import Any, ParamSpec
 import numpy as np
 import shapely
 
-from foveasim._core.calls import check_arguments
+from foveasim._core.calls import Limits, check_arguments
 from foveasim._core.provenance import to_plain_data
 from foveasim._core.registry import Registry
+from foveasim._core.validation import MAX_SITES
 from foveasim.errors import SimulationError, type_name
 from foveasim.layout.model import Layout
 from foveasim.layout.site_counts import SolveFor, layout_with_n_sites, select_unknown
 
-__all__ = ["LAYOUTS", "layout_family"]
+__all__ = ["COUNT", "LAYOUTS", "SITES", "layout_family"]
 
 P = ParamSpec("P")
+
+#: Numbers of sites, rows, columns and rings.
+COUNT = Limits(at_least=1)
+SITES = Limits(at_least=1, at_most=MAX_SITES, hint="take fewer or larger photosites")
 
 #: Layout generators by their name in settings files and in :mod:`foveasim.layout`. Installed packages register more as entry
 #: points of the group ``foveasim.layouts``.
@@ -63,7 +68,7 @@ def layout_family(
 
         def generate(parameters: Mapping[str, Any]) -> Layout:
             given = inspect.BoundArguments(signature, dict(parameters))
-            return generator(*given.args, **given.kwargs)
+            return checked(*given.args, **given.kwargs)
 
         @functools.wraps(checked)
         def family(*args: P.args, **kwargs: P.kwargs) -> Layout:
@@ -98,4 +103,4 @@ def _to_plain(value: Any) -> Any:
         return shapely.to_wkt(value, rounding_precision=-1)
     if isinstance(value, np.ndarray):
         return value.tolist()
-    return to_plain_data(value)
+    return [_to_plain(item) for item in value] if isinstance(value, list | tuple) else to_plain_data(value)

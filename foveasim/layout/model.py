@@ -6,13 +6,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, cast
 
 import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.calls import OwnCheck
+from foveasim._core.calls import FINITE, POSITIVE, OwnCheck
 from foveasim._core.names import possible_names
 from foveasim._core.provenance import copy_plain_data
 from foveasim._core.rings import (
@@ -33,7 +33,6 @@ from foveasim._core.validation import (
     Floats,
     Ints,
     as_numbers,
-    check_number,
     exact_integers,
     finite_array,
     freeze,
@@ -134,16 +133,6 @@ class Layout:
         for ring_name, array in zip(RINGS, self.lattice.rings(), strict=True):
             object.__setattr__(self, ring_name, freeze(array))
         return getattr(self, name)
-
-    @classmethod
-    def _from_checked(cls, *fields: Any) -> Layout:
-        """Build a layout without hole checks, from sites selected or mapped from a checked layout."""
-        layout = object.__new__(cls)
-        names = ("xy_um", "ring_offsets", "site_offsets", "columns", "provenance")
-        for name, value in zip(names, fields, strict=True):
-            object.__setattr__(layout, name, value)
-        layout._store()
-        return layout
 
     def with_provenance(self, provenance: Mapping[str, Any]) -> Layout:
         """Return the layout with another provenance record of plain data."""
@@ -336,21 +325,13 @@ class Layout:
         rounding_um2 = ZERO_AREA_FRACTION * np.maximum(box_um2, np.finfo(np.float64).tiny)
         is_line = ring_unsigned_area_um2(xy_um, ring_offsets) <= rounding_um2
         _require(np.logical_or.reduceat(is_line, site_offsets[:-1]), "has a ring with zero area")
-        _require_valid(Layout._from_checked(xy_um, ring_offsets, site_offsets, {}, {}))
-        area_um2, _ = ring_moments(xy_um, ring_offsets)
-        is_outline = np.zeros(area_um2.size, bool)
-        is_outline[site_offsets[:-1]] = True
-        xy_um = _reverse_rings(xy_um, ring_offsets, (area_um2 > 0) != is_outline)
+        _require_valid(layout_of(xy_um, ring_offsets, site_offsets))
+        xy_um = _reverse_rings(xy_um, ring_offsets, winding_um2(xy_um, ring_offsets, site_offsets) < 0.0)
         for name, values in (("channel", channel), ("readout_line", readout_line)):
             if values is not None:
                 columns = {name: values, **columns}
-        return cls._from_checked(
-            xy_um,
-            ring_offsets,
-            site_offsets,
-            {name: _column(name, values) for name, values in columns.items()},
-            provenance or {"made_by": "from_polygons"},
-        )
+        columns = {name: _column(name, values) for name, values in columns.items()}
+        return layout_of(xy_um, ring_offsets, site_offsets, columns, provenance or {"made_by": "from_polygons"})
 
     # -- properties ----------------------------------------------------------------------------------------------
 
@@ -358,6 +339,11 @@ class Layout:
     def n_sites(self) -> int:
         """Number of photosites."""
         return self.site_offsets.size - 1 if self.lattice is None else self.lattice.n_sites
+
+    @property
+    def rings_um(self) -> tuple[Floats, Ints, Ints]:
+        """Packed rings (xy_um, ring_offsets, site_offsets), as for :meth:`from_polygons`."""
+        return self.xy_um, self.ring_offsets, self.site_offsets
 
     def __len__(self) -> int:
         return self.n_sites
@@ -367,7 +353,7 @@ class Layout:
         data = dict(self.columns), dict(self.provenance)
         if self.lattice is not None:
             return Layout.from_lattice, (self.lattice, *data)
-        return Layout._from_checked, (self.xy_um, self.ring_offsets, self.site_offsets, *data)
+        return layout_of, (*self.rings_um, *data)
 
     def __repr__(self) -> str:
         origin = self.provenance.get("generator", self.provenance.get("made_by", "packed rings"))
@@ -415,7 +401,7 @@ class Layout:
         if self.lattice is not None:
             area_um2, centroid_um = self.lattice.moments()
         else:
-            area_um2, centroid_um = site_moments(self.xy_um, self.ring_offsets, self.site_offsets)
+            area_um2, centroid_um = site_moments(*self.rings_um)
         return read_only(area_um2), read_only(centroid_um)
 
     @property
@@ -433,7 +419,7 @@ class Layout:
         """Bounding box (x_min, y_min, x_max, y_max) of each site, (n_site, 4) µm."""
         if self.lattice is not None:
             return read_only(self.lattice.site_bounds_um())
-        return read_only(site_bounds_um(self.xy_um, self.ring_offsets, self.site_offsets))
+        return read_only(site_bounds_um(*self.rings_um))
 
     @cached_property
     def bounds_um(self) -> tuple[float, float, float, float]:
@@ -468,13 +454,11 @@ class Layout:
             raise ParameterError("selection", f"must be a mask, a slice or a list of sites, got {ids.ndim} dimensions")
         rings = _ranges(self.site_offsets[ids], self.site_offsets[ids + 1])
         vertices = _ranges(self.ring_offsets[rings], self.ring_offsets[rings + 1])
-        return Layout._from_checked(
-            self.xy_um[vertices],
-            np.concatenate(([0], np.cumsum(np.diff(self.ring_offsets)[rings]))),
-            np.concatenate(([0], np.cumsum(np.diff(self.site_offsets)[ids]))),
-            {name: column[ids] for name, column in self.columns.items()},
-            self._extend_provenance(f"selected {ids.size} of {self.n_sites} sites"),
-        )
+        ring_offsets = np.concatenate(([0], np.cumsum(np.diff(self.ring_offsets)[rings])))
+        site_offsets = np.concatenate(([0], np.cumsum(np.diff(self.site_offsets)[ids])))
+        columns = {name: column[ids] for name, column in self.columns.items()}
+        step = f"selected {ids.size} of {self.n_sites} sites"
+        return derived(self, step, (self.xy_um[vertices], ring_offsets, site_offsets), columns)
 
     def _range(self, first: int, last: int) -> Layout:
         """Return the sites ``first`` to ``last - 1``."""
@@ -486,11 +470,8 @@ class Layout:
             ring_offsets = self.ring_offsets[site_offsets[0] : site_offsets[-1] + 1]
             xy_um = self.xy_um[ring_offsets[0] : ring_offsets[-1]]
             rings = xy_um.copy(), ring_offsets - ring_offsets[0], site_offsets - site_offsets[0]
-        return Layout._from_checked(
-            *rings,
-            {name: column[first:last].copy() for name, column in self.columns.items()},
-            self._extend_provenance(f"selected {last - first} of {self.n_sites} sites"),
-        )
+        columns = {name: column[first:last].copy() for name, column in self.columns.items()}
+        return derived(self, f"selected {last - first} of {self.n_sites} sites", rings, columns)
 
     def sort_by(self, *keys: str | ArrayLike, descending: bool = False) -> Layout:
         """
@@ -533,60 +514,37 @@ class Layout:
             raise ParameterError("keys", "must be one or more columns or arrays")
         names = ", ".join(key if isinstance(key, str) else "values" for key in keys)
         ordered = self[np.lexsort(values[::-1])]
-        return Layout._from_checked(
-            ordered.xy_um,
-            ordered.ring_offsets,
-            ordered.site_offsets,
-            ordered.columns,
-            self._extend_provenance(f"sorted by {names}"),
-        )
+        return derived(self, f"sorted by {names}", ordered.rings_um, ordered.columns)
 
     def with_columns(self, **columns: OwnCheck[ArrayLike]) -> Layout:
         """Return the layout with columns added or replaced."""
-        return self._with_columns(columns, f"columns {', '.join(columns)} set")
+        return derived(self, f"columns {', '.join(columns)} set", columns={**self.columns, **columns})
 
-    def _with_columns(self, columns: Mapping[str, ArrayLike], step: str) -> Layout:
-        layout = self.with_provenance(self._extend_provenance(step))
-        object.__setattr__(layout, "columns", {**self.columns, **columns})
-        layout._store_columns()  # noqa: SLF001 -- of the same class
-        return layout
-
-    def translate(self, dx_um: float, dy_um: float) -> Layout:
+    def translate(self, dx_um: Annotated[float, FINITE], dy_um: Annotated[float, FINITE]) -> Layout:
         """Translate the layout by (dx, dy) in µm."""
-        shift_um = np.array([check_number("dx_um", dx_um), check_number("dy_um", dy_um)])
+        shift_um = np.array([dx_um, dy_um])
         step = f"translated by ({dx_um:g}, {dy_um:g}) µm"
         if self.lattice is not None:
-            return Layout.from_lattice(self.lattice.scaled(1.0, shift_um), self.columns, self._extend_provenance(step))
-        return self._with_vertices(self.xy_um + shift_um, step)
+            return derived(self, step, self.lattice.scaled(1.0, shift_um))
+        return derived(self, step, (self.xy_um + shift_um, self.ring_offsets, self.site_offsets))
 
-    def rotate(self, angle_deg: float, origin_um: tuple[float, float] = (0.0, 0.0)) -> Layout:
+    def rotate(self, angle_deg: Annotated[float, FINITE], origin_um: tuple[float, float] = (0.0, 0.0)) -> Layout:
         """Rotate counter-clockwise about a point; multiples of 90° about the origin are exact."""
-        angle_deg = check_number("angle_deg", angle_deg)
         quarters, rest = divmod(angle_deg, 90.0)
         exact = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarters) % 4]
         c, s = exact if rest == 0.0 else (np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg)))
-        centre = _point("origin_um", origin_um)
+        centre = finite_array("origin_um", origin_um)
         # (A @ xy) row by row: x' = c x - s y, y' = s x + c y
         rotated = (self.xy_um - centre) @ np.array([[c, s], [-s, c]]) + centre
-        return self._with_vertices(rotated, f"rotated by {angle_deg:g} degrees")
+        return derived(self, f"rotated by {angle_deg:g} degrees", (rotated, self.ring_offsets, self.site_offsets))
 
-    def scale(self, factor: float, origin_um: tuple[float, float] = (0.0, 0.0)) -> Layout:
+    def scale(self, factor: Annotated[float, POSITIVE], origin_um: tuple[float, float] = (0.0, 0.0)) -> Layout:
         """Scale the layout about a point."""
-        factor = check_number("factor", factor, above=0.0)
-        centre = _point("origin_um", origin_um)
+        centre = finite_array("origin_um", origin_um)
         step = f"scaled by {factor:g}"
         if self.lattice is not None:
-            about = self.lattice.scaled(1.0, -centre).scaled(factor, centre)
-            return Layout.from_lattice(about, self.columns, self._extend_provenance(step))
-        return self._with_vertices((self.xy_um - centre) * factor + centre, step)
-
-    def _with_vertices(self, xy_um: Floats, step: str) -> Layout:
-        return Layout._from_checked(
-            xy_um, self.ring_offsets, self.site_offsets, self.columns, self._extend_provenance(step)
-        )
-
-    def _extend_provenance(self, step: str) -> dict[str, Any]:
-        return {**self.provenance, "steps": [*self.provenance.get("steps", []), step]}
+            return derived(self, step, self.lattice.scaled(1.0, -centre).scaled(factor, centre))
+        return derived(self, step, ((self.xy_um - centre) * factor + centre, self.ring_offsets, self.site_offsets))
 
     def write(self, path: str | Path, **options: Any) -> WrittenLayout:
         """Write to a file, format by extension; see :func:`foveasim.layout.write_layout`."""
@@ -628,6 +586,53 @@ class Layout:
         from foveasim.layout.drc.repair import enforce
 
         return enforce(self, rules, repair=repair)
+
+
+# -- layouts from other layouts ----------------------------------------------------------------------------------
+
+
+def layout_of(
+    xy_um: Floats,
+    ring_offsets: Ints,
+    site_offsets: Ints | None = None,
+    columns: Mapping[str, Any] | None = None,
+    provenance: Mapping[str, Any] | None = None,
+) -> Layout:
+    """Return a layout of valid sites, by default of one ring each, without checks of holes."""
+    site_offsets = np.arange(ring_offsets.size) if site_offsets is None else site_offsets
+    layout = object.__new__(Layout)
+    fields = (xy_um, ring_offsets, site_offsets, columns or {}, provenance or {})
+    for name, value in zip((*RINGS, "columns", "provenance"), fields, strict=True):
+        object.__setattr__(layout, name, value)
+    layout._store()
+    return layout
+
+
+def derived(
+    layout: Layout,
+    step: str,
+    rings_um: tuple[Floats, Ints, Ints] | RectangleLattice | None = None,
+    columns: Mapping[str, Any] | None = None,
+) -> Layout:
+    """Return a layout with other rings or columns, and with a further step in its provenance."""
+    provenance = {**layout.provenance, "steps": [*layout.provenance.get("steps", []), step]}
+    columns = layout.columns if columns is None else columns
+    if isinstance(rings_um, RectangleLattice):
+        return Layout.from_lattice(rings_um, columns, provenance)
+    if rings_um is not None:
+        return layout_of(*rings_um, columns, provenance)
+    found = layout.with_provenance(provenance)
+    object.__setattr__(found, "columns", columns)
+    found._store_columns()  # noqa: SLF001 -- of the same module
+    return found
+
+
+def winding_um2(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> Floats:
+    """Return the area of each ring, negative if its winding order is wrong."""
+    area_um2, _ = ring_moments(xy_um, ring_offsets)
+    area_um2 *= -1.0  # of holes
+    area_um2[site_offsets[:-1]] *= -1.0
+    return area_um2
 
 
 # -- validation of input polygons --------------------------------------------------------------------------------
@@ -680,13 +685,6 @@ def _require_indices(name: str, column: NDArray[Any]) -> None:
         worst = int(column.min()) if column.min() < 0 else int(column.max())
         if not 0 <= worst <= MAX_SITES:
             raise ParameterError(name, f"must contain integers from 0 to {MAX_SITES}", worst)
-
-
-def _point(name: str, value: ArrayLike) -> Floats:
-    point = finite_array(name, value, ndim=1)
-    if point.size != 2:
-        raise ParameterError(name, "must be two numbers (x, y)", value, "µm")
-    return point
 
 
 def _check_packed(xy_um: ArrayLike, ring_offsets: ArrayLike, site_offsets: ArrayLike) -> tuple[Floats, Ints, Ints]:
@@ -746,10 +744,8 @@ def _require_valid_holes(layout: Layout) -> None:
     if layout.ring_offsets.size == layout.site_offsets.size:
         return
     has_holes = np.diff(layout.site_offsets) > 1
-    area_um2, _ = ring_moments(layout.xy_um, layout.ring_offsets)
-    area_um2[layout.site_offsets[:-1]] *= -1.0  # so that valid outlines and holes have the same sign
     _require(
-        has_holes & np.logical_or.reduceat(area_um2 >= 0.0, layout.site_offsets[:-1]),
+        has_holes & np.logical_or.reduceat(winding_um2(*layout.rings_um) <= 0.0, layout.site_offsets[:-1]),
         "has a hole that is wound the wrong way, or has no area",
     )
     sites = np.flatnonzero(has_holes)

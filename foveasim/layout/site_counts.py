@@ -69,9 +69,9 @@ class SolveFor:
     """
 
     name: str
-    is_integer: bool
-    is_increasing: bool
     guess: Guess
+    is_integer: bool = True
+    is_increasing: bool = True
     count: Count | None = None
     needs: tuple[str, ...] = ()
     is_optional: bool = False
@@ -79,11 +79,7 @@ class SolveFor:
 
 
 def select_unknown(family: str, unknowns: Sequence[SolveFor], parameters: Mapping[str, Any]) -> SolveFor | None:
-    """
-    Return the parameter to solve for, or None when ``n_sites`` is not given.
-
-    Raises ParameterError when a required parameter is missing, or nothing is left to solve for.
-    """
+    """Return the parameter to solve for, or None when ``n_sites`` is not given."""
     free = [unknown for unknown in unknowns if parameters[unknown.name] is None]
     if parameters.get("n_sites") is None:
         for unknown in free:

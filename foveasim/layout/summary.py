@@ -11,7 +11,6 @@ import shapely
 
 from foveasim._core.show import drawn
 from foveasim._core.validation import Floats, Ints
-from foveasim.errors import ParameterError
 from foveasim.layout.drc.routing import Readout
 from foveasim.layout.model import Layout
 
@@ -150,11 +149,7 @@ def describe(layout: Layout, readout: Readout | None = None) -> Summary:
     ------
     GeometryError
         When the layout has no sites.
-    ParameterError
-        When ``readout`` is not a Readout.
     """
-    if readout is not None and not isinstance(readout, Readout):
-        raise ParameterError("readout", "must be a Readout", readout)
     bounds_um = layout.bounds_um
     hull_um2 = float(shapely.MultiPoint(layout.xy_um).convex_hull.area)
     size_um = np.sqrt(layout.area_um2)

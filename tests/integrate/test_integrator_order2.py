@@ -15,6 +15,7 @@ from reference.polygons import POLYGONS, polygons
 import foveasim as fs
 from foveasim.distortion import BrownConrady
 from foveasim.errors import ParameterError
+from foveasim.layout.model import layout_of
 
 SHAPE = (7, 9)
 GRID = fs.Grid(SHAPE, 1.0)
@@ -164,7 +165,7 @@ def test_overlapping_rings_count_twice():
     a, b = shapely.box(1.2, 1.3, 5.4, 4.6), shapely.Polygon([(3.1, 2.2), (7.7, 2.9), (4.2, 6.4)])
     rings = fs.Layout.from_polygons([a, b])
     # Two outlines as one site: the constructor would reject the second, which is not a hole.
-    both = fs.Layout._from_checked(rings.xy_um, rings.ring_offsets, np.array([0, 2]), {}, {})
+    both = layout_of(rings.xy_um, rings.ring_offsets, np.array([0, 2]))
 
     got = fs.Integrator(both, GRID, order=2)(linear_means())[0]
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 import foveasim as fs
 from foveasim.errors import ParameterError
+from foveasim.layout.model import layout_of
 
 TILINGS = {
     "grid": fs.layout.grid(n_x=7, n_y=5, pitch_um=1.7),
@@ -111,7 +112,7 @@ def test_corners_overlapping_by_rounding_share_nothing():
 def test_edges_without_length_share_nothing():
     square = np.array([[0, 0], [2, 0], [2, 2], [0, 2]], float)
     xy_um = np.concatenate((square[[0, 1, 1, 2, 3]], square + np.array([2.0, 0.0])))
-    layout = fs.Layout._from_checked(xy_um, np.array([0, 5, 9]), np.arange(3), {}, {})
+    layout = layout_of(xy_um, np.array([0, 5, 9]), np.arange(3))
 
     assert layout.adjacency().toarray().tolist() == [[0.0, 2.0], [2.0, 0.0]]
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import foveasim as fs
 from foveasim.errors import GeometryError, ParameterError
-from foveasim.layout.edits import clip, cut_out, inset, merge, node, snap, split, union
+from foveasim.layout import clip, cut_out, inset, merge, node, snap, split, union
 
 GRID = fs.layout.grid(n_x=10, n_y=8, pitch_um=2.0)
 RINGS = fs.layout.log_polar(n_sectors=24, r_min_um=4.0, r_max_um=33.0, stagger=True, chords_per_arc=2)

@@ -146,7 +146,7 @@ def test_removed_vertex_is_removed_from_neighbours():
         ("draw", {"outlines_um": [[[0.0, 0.0], [9.0, 9.0], [9.0, 0.0], [0.0, 9.0]]]}, r"'outlines_um\[0\]' must be a valid polygon"),
         ("draw", {"outlines_um": []}, "'outlines_um' must be a list of one or more"),
         ("draw", {"outlines_um": [[[1.0, 1.0], [4.0, 1.0], [2.0, 4.0]]], "overlap": "fill"}, "must contain an area outside"),
-        ("overlay", {"layer": "grid"}, "'layer' must be a layout"),
+        ("overlay", {"layer": "grid"}, "'layer' must be a Layout"),
         ("overlay", {"layer": GRID, "operation": "cut_out"}, "must leave at least one site"),
         ("overlay", {"layer": GRID, "operation": "cut"}, "'operation' must be"),
         ("overlay", {"layer": GRID, "region": [[90, 90], [99, 90], [99, 99]]}, "'region' must contain a part of the layer"),

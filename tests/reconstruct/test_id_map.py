@@ -12,6 +12,7 @@ from reference.polygons import POLYGONS
 
 import foveasim as fs
 from foveasim.errors import ParameterError
+from foveasim.layout.model import layout_of
 from foveasim.view import SitePixels, id_map, site_at
 
 L = fs.layout
@@ -41,12 +42,10 @@ def lattice_sites(draw):
     sites = draw(st.lists(st.lists(st.lists(corner, min_size=3, max_size=7), min_size=1, max_size=3), max_size=4))
     rings = [ring for site in sites for ring in site]
     # The constructor would reject them.
-    return fs.Layout._from_checked(
+    return layout_of(
         np.array([p for ring in rings for p in ring], float).reshape(-1, 2),
         np.cumsum([0, *map(len, rings)]),
         np.cumsum([0, *map(len, sites)]),
-        {},
-        {},
     )
 
 

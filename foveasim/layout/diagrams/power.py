@@ -44,24 +44,11 @@ class PowerDiagram:
     centre, and the diagram is the Voronoi diagram. Three centres whose cells meet in a corner form a triangle of the regular
     triangulation (the Delaunay triangulation for equal weights), which is stored between updates.
 
-    Parameters
-    ----------
-    low_um, high_um : (2,) float64, µm
-        Corners of a box that contains all centres.
+    ``low_um``, ``high_um`` (2,): corners of a box that contains all centres. ``points_um`` (n + N_AUXILIARY, 2): the centres,
+    then the auxiliary points around the box. ``corners_um`` (n_corner, 2): points in which cells meet. ``sites`` (n_edge, 2):
+    the points on both sides of each edge, at least one of them a centre. ``ends`` (n_edge, 2): first and last corner of each
+    edge, counter-clockwise around the first of its two points.
 
-    Attributes
-    ----------
-    points_um : (n + N_AUXILIARY, 2) float64, µm
-        The centres, then the auxiliary points around the box.
-    corners_um : (n_corner, 2) float64, µm
-        Points in which cells meet.
-    sites : (n_edge, 2) int64
-        The points on both sides of each edge, at least one of them a centre.
-    ends : (n_edge, 2) int64
-        First and last corner of each edge, counter-clockwise around the first of its two points.
-
-    Notes
-    -----
     The triangles are the lower hull of the points lifted to ``z = x² + y² - weight`` (Aurenhammer 1987). Updates flip
     the diagonals of pairs of triangles (Lawson 1977). If no triangle is inverted while its corners move, and all edges have
     the correct direction after the flips, the triangles are those of the hull. Otherwise the hull is computed again.

@@ -51,17 +51,9 @@ class CellEdges:
     """
     Edges of all cells, each with the orientation that is counter-clockwise around its cell.
 
-    Parameters
-    ----------
-    cell : (n_edge,) int64
-        Index of the cell.
-    owner : (n_edge,) int64
-        The centre nearest to the part of the cell at this edge: another one than the cell's own where a notch of the
-        region separates the part.
-    start_um, stop_um : (n_edge, 2) float64, µm
-        End points.
-    n_twins : int
-        The first ``n_twins`` edges are equal to the next ``n_twins`` ones, with the opposite orientation.
+    ``cell`` (n_edge,): index of the cell. ``owner`` (n_edge,): the centre nearest to the part of the cell at this edge, another
+    one than the cell's own where a notch of the region separates the part. ``start_um``, ``stop_um`` (n_edge, 2): end points.
+    ``n_twins``: number of first edges that are equal to as many next ones, with the opposite orientation.
     """
 
     cell: Ints

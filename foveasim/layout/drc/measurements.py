@@ -41,16 +41,9 @@ class Contacts:
     """
     Pairs of nearby sites and their distances, ordered by the first site, then the second.
 
-    Attributes
-    ----------
-    first, second : (n_pair,) int64
-        Indices of the sites, first < second.
-    distance_um : (n_pair,) float64, µm
-        0 for overlapping sites, infinite beyond the requested distance.
-    is_non_overlapping : (n_pair,) bool
-        Whether the two certainly do not overlap, apart from rounding.
-    is_shared : (n_vertex,) bool
-        Whether the edge that begins at a vertex is also, bit for bit, an edge of another site.
+    ``first`` < ``second`` (n_pair,). ``distance_um`` (n_pair,): 0 for overlapping sites, infinite beyond the requested
+    distance. ``is_non_overlapping`` (n_pair,): whether the two certainly do not overlap, apart from rounding. ``is_shared``
+    (n_vertex,): whether the edge that begins at a vertex is also, bit for bit, an edge of another site.
     """
 
     first: Ints
@@ -248,16 +241,16 @@ class Rule:
         return values - limit if self.is_upper else limit - values
 
 
-def _sizes(case: Case) -> Measurement:
-    return Measurement(np.sqrt(case.layout.area_um2))
+def _sizes(case: Case) -> Floats:
+    return np.asarray(np.sqrt(case.layout.area_um2))
 
 
-def _areas(case: Case) -> Measurement:
-    return Measurement(case.layout.area_um2)
+def _areas(case: Case) -> Floats:
+    return case.layout.area_um2
 
 
-def _widths(case: Case) -> Measurement:
-    return Measurement(min_width_um(case.layout))
+def _widths(case: Case) -> Floats:
+    return min_width_um(case.layout)
 
 
 def _holes(case: Case) -> Measurement:
@@ -491,12 +484,13 @@ def _neighbour_ratios(case: Case) -> Measurement:
 
 
 def _counts(case: Case) -> Measurement:
-    return Measurement(np.array([float(case.layout.n_sites)]), lambda _k: [()], lambda _k: [_bounding_box(case)])
+    return _of_layout(case, case.layout.n_sites)
 
 
-def _bounding_box(case: Case) -> Any:
-    """Return the bounding box of all sites."""
-    return shapely.box(*(case.layout.bounds_um if case.layout.n_sites else (0.0, 0.0, 0.0, 0.0)))
+def _of_layout(case: Case, value: float) -> Measurement:
+    """Return the value of a complete layout, whose marker is the bounding box of all sites."""
+    box = shapely.box(*(case.layout.bounds_um if case.layout.n_sites else (0.0, 0.0, 0.0, 0.0)))
+    return Measurement(np.array([float(value)]), lambda _k: [()], lambda _k: [box])
 
 
 def _densities(case: Case) -> Measurement:
@@ -534,11 +528,7 @@ def _filled_um2(layout: Layout, x_um: Floats, y_um: Floats) -> Floats:
 
 def _data_rates(case: Case) -> Measurement:
     assert case.rules.readout is not None
-    return Measurement(
-        np.array([case.rules.readout.gbit_per_s(case.layout.n_sites)]),
-        lambda _k: [()],
-        lambda _k: [_bounding_box(case)],
-    )
+    return _of_layout(case, case.rules.readout.gbit_per_s(case.layout.n_sites))
 
 
 def _track_utilisations(case: Case) -> Measurement:
@@ -579,113 +569,91 @@ _HOLLOW = _rectangles(
 )
 _WINDOWS = {"layout": _SPACED, "density_window_um": 10.0, "die_um": (-1.0, -1.0, 39.0, 39.0)}
 
-for _name, _rule, _satisfied, _violated, _further in (
-    (
-        "min_size_um",
-        Rule("the size of a site, the square root of its area, is at least the limit", "µm", _sizes, repair="merge"),
-        10.0, 10.1, {},
-    ),
-    (
-        "max_size_um",
-        Rule("the size of a site, the square root of its area, is at most the limit", "µm", _sizes, is_upper=True),
-        10.0, 9.9, {},
-    ),
-    ("min_area_um2", Rule("the area of a site is at least the limit", "µm²", _areas, repair="merge"), 100.0, 101.0, {}),
-    ("min_hole_um2", Rule("the area of a hole in a site is at least the limit", "µm²", _holes), 4.0, 4.1, {"layout": _frame}),
-    ("min_width_um", Rule("the width of a site is at least the limit", "µm", _widths, repair="merge"), 10.0, 10.1, {}),
-    (
-        "min_space_um",
-        Rule("the space between sites that do not touch is at least the limit", "µm", _spaces),
-        2.0, 2.1, {"layout": _SPACED},
-    ),
-    (
-        "max_aspect_ratio",
-        Rule("the aspect ratio of a site is at most the limit", "", _aspect_ratios, is_upper=True),
-        2.0, 1.9, {"layout": _rectangles((0.0, 0.0, 10.0, 20.0))},
-    ),
-    ("min_angle_deg", Rule("the interior angle of a corner is at least the limit", "degrees", _corner_angles), 90.0, 91.0, {}),
-    (
-        "edge_angle_step_deg",
-        Rule(
-            "edge angles are multiples of the limit", "degrees", _edge_angles,
-            is_upper=True, is_deviation=True, rounding=1e-4,
-        ),
-        90.0, 50.0, {},
-    ),
-    (
-        "grid_um",
-        Rule("vertices lie on the manufacturing grid", "µm", _grid_deviations, is_upper=True, is_deviation=True),
-        10.0, 3.0, {},
-    ),
-    (
-        "max_overlap_um2",
-        Rule("the overlap of two sites is at most the limit", "µm²", _overlaps, is_upper=True, rounding=0.0),
-        4.0, 3.9, {"layout": _rectangles((0.0, 0.0, 10.0, 10.0), (8.0, 8.0, 20.0, 20.0))},
-    ),
-    (
-        "max_gap_um2",
-        Rule("the area of a gap is at most the limit", "µm²", _gaps, is_upper=True, rounding=0.0, repair=None),
-        101.0, 99.0, {"layout": _HOLLOW},
-    ),
-    (
-        "die_um",
-        Rule("sites lie within the die", "µm", _reach_beyond_die, is_upper=True, is_deviation=True),
-        (-20.0, -20.0, 20.0, 20.0), (-20.0, -20.0, 20.0, 19.0), {},
-    ),
-    (
-        "min_growth",
-        Rule("the size ratio of successive rings is at least the limit", "", _growths, repair=None),
-        2.0, 2.1, {"layout": _GROWING},
-    ),
-    (
-        "max_growth",
-        Rule("the size ratio of successive rings is at most the limit", "", _growths, is_upper=True, repair=None),
-        2.0, 1.9, {"layout": _GROWING},
-    ),
-    (
-        "max_neighbour_ratio",
-        Rule(
-            "the size ratio of neighbouring sites is at most the limit", "", _neighbour_ratios,
-            is_upper=True, rounding=1e-9, repair=None,
-        ),
-        2.0, 1.9, {"layout": _GROWING},
-    ),
-    (
-        "max_sites",
-        Rule("the number of sites is at most the limit", "", _counts, is_upper=True, rounding=0.0, repair=None),
-        16, 15, {},
-    ),
-    (
-        "min_density",
-        Rule("the fill factor of every window is at least the limit", "", _densities, rounding=AREA_ROUNDING, repair=None),
-        0.63, 0.65, _WINDOWS,
-    ),
-    (
-        "max_density",
-        Rule(
-            "the fill factor of every window is at most the limit", "", _densities,
-            is_upper=True, rounding=AREA_ROUNDING, repair=None,
-        ),
-        0.65, 0.63, _WINDOWS,
-    ),
-    (
-        "max_data_rate_gbit_per_s",
-        Rule(
-            "the data rate of a lane is at most the limit", "Gbit/s", _data_rates,
-            is_upper=True, rounding=0.0, repair=None,
-        ),
-        0.161, 0.159, {"readout": Readout(frames_per_s=1e6, bits=10)},
-    ),
-    (
-        "max_track_utilisation",
-        Rule(
-            "the number of readout lines per track is at most the limit", "", _track_utilisations,
-            is_upper=True, rounding=0.0, repair=None,
-        ),
-        0.5, 0.4, {"routing": Routing(width_um=3.0, space_um=2.0, direction="upwards")},
-    ),
-):  # fmt: skip
-    RULES.register(_name, _rule, example={"satisfied": _satisfied, "violated": _violated, **_further})
+
+def _register(
+    name: str,
+    description: str,
+    unit: str,
+    measure: Any,
+    satisfied: Any,
+    violated: Any,
+    example: Any = None,
+    **options: Any,
+) -> None:
+    """Register a rule with limits that its example satisfies and violates."""
+    rule = Rule(description, unit, measure, is_upper=not name.startswith("min_"), **options)
+    RULES.register(name, rule, example={"satisfied": satisfied, "violated": violated, **(example or {})})
+
+
+_SIZE = "the size of a site, the square root of its area, is at"
+_register("min_size_um", f"{_SIZE} least the limit", "µm", _sizes, 10.0, 10.1, repair="merge")
+_register("max_size_um", f"{_SIZE} most the limit", "µm", _sizes, 10.0, 9.9)
+_register(
+    "min_area_um2", "the area of a site is at least the limit", "µm²", _areas, 100.0, 101.0, repair="merge"
+)  # fmt: skip
+_register(
+    "min_hole_um2", "the area of a hole in a site is at least the limit", "µm²", _holes, 4.0, 4.1, {"layout": _frame}
+)
+_register(
+    "min_width_um", "the width of a site is at least the limit", "µm", _widths, 10.0, 10.1, repair="merge"
+)  # fmt: skip
+_register(
+    "min_space_um", "the space between sites that do not touch is at least the limit", "µm", _spaces, 2.0, 2.1,
+    {"layout": _SPACED},
+)  # fmt: skip
+_register(
+    "max_aspect_ratio", "the aspect ratio of a site is at most the limit", "", _aspect_ratios, 2.0, 1.9,
+    {"layout": _rectangles((0.0, 0.0, 10.0, 20.0))},
+)  # fmt: skip
+_register(
+    "min_angle_deg", "the interior angle of a corner is at least the limit", "degrees", _corner_angles, 90.0, 91.0
+)
+_register(
+    "edge_angle_step_deg", "edge angles are multiples of the limit", "degrees", _edge_angles, 90.0, 50.0,
+    is_deviation=True, rounding=1e-4,
+)  # fmt: skip
+_register("grid_um", "vertices lie on the manufacturing grid", "µm", _grid_deviations, 10.0, 3.0, is_deviation=True)
+_register(
+    "max_overlap_um2", "the overlap of two sites is at most the limit", "µm²", _overlaps, 4.0, 3.9,
+    {"layout": _rectangles((0.0, 0.0, 10.0, 10.0), (8.0, 8.0, 20.0, 20.0))}, rounding=0.0,
+)  # fmt: skip
+_register(
+    "max_gap_um2", "the area of a gap is at most the limit", "µm²", _gaps, 101.0, 99.0, {"layout": _HOLLOW},
+    rounding=0.0, repair=None,
+)  # fmt: skip
+_register(
+    "die_um", "sites lie within the die", "µm", _reach_beyond_die, (-20.0, -20.0, 20.0, 20.0), (-20.0, -20.0, 20.0, 19.0),
+    is_deviation=True,
+)  # fmt: skip
+_register(
+    "min_growth", "the size ratio of successive rings is at least the limit", "", _growths, 2.0, 2.1, {"layout": _GROWING},
+    repair=None,
+)  # fmt: skip
+_register(
+    "max_growth", "the size ratio of successive rings is at most the limit", "", _growths, 2.0, 1.9, {"layout": _GROWING},
+    repair=None,
+)  # fmt: skip
+_register(
+    "max_neighbour_ratio", "the size ratio of neighbouring sites is at most the limit", "", _neighbour_ratios, 2.0, 1.9,
+    {"layout": _GROWING}, rounding=1e-9, repair=None,
+)  # fmt: skip
+_register("max_sites", "the number of sites is at most the limit", "", _counts, 16, 15, rounding=0.0, repair=None)
+_register(
+    "min_density", "the fill factor of every window is at least the limit", "", _densities, 0.63, 0.65, _WINDOWS,
+    rounding=AREA_ROUNDING, repair=None,
+)  # fmt: skip
+_register(
+    "max_density", "the fill factor of every window is at most the limit", "", _densities, 0.65, 0.63, _WINDOWS,
+    rounding=AREA_ROUNDING, repair=None,
+)  # fmt: skip
+_register(
+    "max_data_rate_gbit_per_s", "the data rate of a lane is at most the limit", "Gbit/s", _data_rates, 0.161, 0.159,
+    {"readout": Readout(frames_per_s=1e6, bits=10)}, rounding=0.0, repair=None,
+)  # fmt: skip
+_register(
+    "max_track_utilisation", "the number of readout lines per track is at most the limit", "", _track_utilisations,
+    0.5, 0.4, {"routing": Routing(width_um=3.0, space_um=2.0, direction="upwards")}, rounding=0.0, repair=None,
+)  # fmt: skip
 
 
 def is_below_size(area_um2: Floats, min_size_um: float) -> Bools:

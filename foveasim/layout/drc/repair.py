@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias
 
 import numpy as np
 import shapely
 
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Bools, Ints, check_choice
+from foveasim._core.validation import Bools, Ints
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout.drc.rules import RULES, DesignRules, Report, RuleResult
 from foveasim.layout.edit_registry import layout_edit
-from foveasim.layout.edits import joining_groups, merge, union
+from foveasim.layout.edits.all_sites import joining_groups, merge, union
 from foveasim.layout.generators.tiling import fill
-from foveasim.layout.model import Layout
+from foveasim.layout.model import Layout, derived
 
 __all__ = ["Change", "enforce", "repair"]
 
@@ -82,7 +82,6 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> t
     >>> rings.n_sites, legal.n_sites, changes[0].action
     (512, 352, 'dropped')
     """
-    check_choice("repair", repair, get_args(Repair))
     waivers = rules.waivers or {}
     active = rules.only(lambda name: RULES[name].repair is not None and name not in waivers)
     current_index = np.arange(layout.n_sites)  # current index of each input site, -1 for dropped sites
@@ -111,10 +110,6 @@ def repair(layout: Layout, *, rules: DesignRules | None = None, method: Repair =
         Required in Python. In settings files, those of the layout by default.
     method : {"drop", "merge", "refill"}
         As ``repair`` of :func:`enforce`.
-
-    Returns
-    -------
-    Layout
 
     Raises
     ------
@@ -168,13 +163,7 @@ def _refill(layout: Layout, original: Layout, rules: DesignRules, changes: list[
     for k, (change, small) in enumerate(zip(changes, is_small, strict=True)):
         if small:
             changes[k] = replace(change, action="replaced")
-    return Layout(
-        layout.xy_um,
-        layout.ring_offsets,
-        layout.site_offsets,
-        layout.columns,
-        original._extend_provenance("refilled by rules"),  # noqa: SLF001
-    )
+    return derived(original, "refilled by rules", layout.rings_um, layout.columns)
 
 
 def _smallest_size_um(rules: DesignRules) -> float:

@@ -44,8 +44,7 @@ def write_lyrdb(report: Report, path: str | Path) -> None:
     Write a report for KLayout's marker browser, atomically.
 
     ``path``: file with the extension ``.lyrdb``. It contains one category per rule and one item per violation, with the site
-    indices, the measured value, and the marker in µm. Raises FileError when the extension differs, the library ``klayout`` is
-    not installed, or the file cannot be written.
+    indices, the measured value, and the marker in µm.
     """
     target = Path(path)
     if target.suffix != ".lyrdb":
@@ -104,8 +103,7 @@ def read_lyrdb(path: str | Path, n_sites: int) -> Report:
     Read a KLayout report database of :func:`write_lyrdb` or of another program.
 
     ``n_sites``: number of sites of the checked layout, which the file does not contain. Violations from another
-    program have no sites, and NaN as value and limit. The file does not contain waivers. Raises FileError when the file is
-    missing, too large, corrupt, not a report, or contains a site index beyond ``n_sites``.
+    program have no sites, and NaN as value and limit. The file does not contain waivers.
     """
     from foveasim.layout.drc.rules import Report
 

@@ -21,7 +21,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.show import Drawn, drawn
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, check_choice, check_count, check_number, finite_array
-from foveasim.errors import GeometryError, ParameterError, type_name, with_article
+from foveasim.errors import GeometryError, ParameterError, type_name
 from foveasim.layout.drc.measurements import RULES, Case, Measurement, Rule, min_width_um
 from foveasim.layout.drc.presets import PRESETS
 from foveasim.layout.drc.routing import Readout, Routing
@@ -35,12 +35,12 @@ __all__ = ["RULES", "DesignRules", "Report", "RuleResult", "Violation", "check",
 
 
 ANGLE = Limits(at_least=0.0, above=0.0, at_most=180.0)
-#: Further parameter that a rule requires, and its type.
-REQUIRED: dict[str, tuple[str, type | None]] = {
-    "min_density": ("density_window_um", None),
-    "max_density": ("density_window_um", None),
-    "max_data_rate_gbit_per_s": ("readout", Readout),
-    "max_track_utilisation": ("routing", Routing),
+#: Further parameter that a rule requires.
+REQUIRED = {
+    "min_density": "density_window_um",
+    "max_density": "density_window_um",
+    "max_data_rate_gbit_per_s": "readout",
+    "max_track_utilisation": "routing",
 }
 
 
@@ -151,19 +151,14 @@ class DesignRules:
                 if getattr(self, name) is None:
                     object.__setattr__(self, name, limit)
         check_declared(self)
-        for name, (required, kind) in REQUIRED.items():
-            value = getattr(self, required)
-            if value is None and getattr(self, name) is not None:
+        for name, required in REQUIRED.items():
+            if getattr(self, required) is None and getattr(self, name) is not None:
                 raise ParameterError(required, f"must be given for '{name}'")
-            if kind is not None and value is not None and not isinstance(value, kind):
-                raise ParameterError(required, f"must be {with_article(kind.__name__)}", value)
         if self.die_um is not None:
             die = finite_array("die_um", self.die_um, ndim=1)
             if die.size != 4 or not (die[0] < die[2] and die[1] < die[3]):
                 raise ParameterError("die_um", "must be (x_min, y_min, x_max, y_max)", self.die_um, "µm")
             object.__setattr__(self, "die_um", tuple(float(x) for x in die))
-        if self.custom is not None and not isinstance(self.custom, Mapping):
-            raise ParameterError("custom", "must be a mapping of rule name to limit", self.custom)
         custom = {}
         for name, limit in dict(self.custom or {}).items():
             RULES.find("custom", name)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.validation import Ints
 from foveasim.errors import GeometryError
-from foveasim.layout.model import Layout
+from foveasim.layout.model import Layout, derived, layout_of
 
 #: Area of a piece, relative to its site, below which it is a rounding artefact of the cut.
 SLIVER = 1e-9
@@ -64,8 +64,8 @@ def replace_sites(
         ).astype(column.dtype if name not in columns else np.result_type(column, columns[name]), copy=False)
         for name, column in layout.columns.items()
     }
-    joined = Layout._from_checked(xy_um, ring_offsets, site_offsets, values, layout.provenance)  # noqa: SLF001
-    return joined[order].with_provenance(layout._extend_provenance(step))  # noqa: SLF001
+    joined = layout_of(xy_um, ring_offsets, site_offsets, values)[order]
+    return derived(layout, step, joined.rings_um, joined.columns)
 
 
 def concatenate_layouts(layouts: list[Layout]) -> tuple[NDArray[Any], Ints, Ints]:

@@ -8,24 +8,15 @@ polygons in µm.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import LENGTH, Limits
 from foveasim._core.rings import positions_in_runs
-from foveasim._core.validation import (
-    MAX_LENGTH_UM,
-    Bools,
-    Ints,
-    check_choice,
-    check_count,
-    check_length_um,
-    check_sites,
-    finite_array,
-    unmasked,
-)
+from foveasim._core.validation import Bools, Ints, check_sites, finite_array, unmasked
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout._noding import insert_points
 from foveasim.layout._regions import as_region
@@ -33,9 +24,11 @@ from foveasim.layout.adjacency import TOUCHING_UM, adjacency
 from foveasim.layout.drc.measurements import is_below_size
 from foveasim.layout.edit_registry import layout_edit
 from foveasim.layout.edits._parts import SLIVER, concatenate_layouts, replace_sites, separate_parts
-from foveasim.layout.model import INTEGER_RANGES, Layout
+from foveasim.layout.model import INTEGER_RANGES, Layout, derived, layout_of
 
 __all__ = ["clip", "cut_out", "inset", "joining_groups", "merge", "merge_small", "node", "snap", "split", "union"]
+
+PARTS = Limits(at_least=1, at_most=64)
 
 
 def union(layouts: Iterable[Layout]) -> Layout:
@@ -61,7 +54,7 @@ def union(layouts: Iterable[Layout]) -> Layout:
         raise ParameterError("layouts", "must be one or more layouts", layouts)
     check_sites(sum(layout.n_sites for layout in layouts) or 1)
     names = set.intersection(*(set(layout.columns) for layout in layouts))
-    return Layout._from_checked(  # noqa: SLF001 -- of the same subpackage
+    return layout_of(
         *concatenate_layouts(layouts),
         {name: _concatenate_columns(name, [layout.columns[name] for layout in layouts]) for name in sorted(names)},
         {"made_by": "union", "parts": [dict(layout.provenance) for layout in layouts]},
@@ -80,10 +73,6 @@ def clip(layout: Layout, region: Any, *, cut: Literal["pieces", "drop"] = "piece
         A die, a zone, an image circle.
     cut : {"pieces", "drop"}
         Result for sites that the boundary cuts: their pieces inside, each a separate site; or none.
-
-    Returns
-    -------
-    Layout
 
     Raises
     ------
@@ -121,10 +110,6 @@ def inset(layout: Layout, margin_um: ArrayLike) -> Layout:
     layout : Layout
     margin_um : number or (n_site,), µm
         Inward offset of the boundary. Corners remain sharp.
-
-    Returns
-    -------
-    Layout
 
     Raises
     ------
@@ -203,7 +188,7 @@ def _has_slivers(shapes: NDArray[Any]) -> Bools:
 
 
 @layout_edit(example={"min_size_um": 12.0})
-def merge_small(layout: Layout, *, min_size_um: float) -> Layout:
+def merge_small(layout: Layout, *, min_size_um: Annotated[float, LENGTH]) -> Layout:
     """
     Merge each site below a size with the neighbour of the longest shared edge, repeatedly.
 
@@ -224,7 +209,6 @@ def merge_small(layout: Layout, *, min_size_um: float) -> Layout:
     ParameterError
         When the size is not positive.
     """
-    min_size_um = check_length_um("min_size_um", min_size_um)
     while True:
         small = np.flatnonzero(is_below_size(layout.area_um2, min_size_um))
         groups = joining_groups(layout, small[np.argsort(layout.area_um2[small], kind="stable")])
@@ -258,7 +242,7 @@ def joining_groups(layout: Layout, small: Ints) -> Ints:
 
 
 @layout_edit(example={"n_x": 2})
-def split(layout: Layout, *, n_x: int = 2, n_y: int = 1) -> Layout:
+def split(layout: Layout, *, n_x: Annotated[int, PARTS] = 2, n_y: Annotated[int, PARTS] = 1) -> Layout:
     """
     Split each site into ``n_x`` by ``n_y`` parts, for dual pixels and quad pixels.
 
@@ -280,7 +264,6 @@ def split(layout: Layout, *, n_x: int = 2, n_y: int = 1) -> Layout:
     ParameterError
         When a number is below 1.
     """
-    n_x, n_y = check_count("n_x", n_x, at_most=64), check_count("n_y", n_y, at_most=64)
     check_sites(max(1, layout.n_sites * n_x * n_y))
     box = layout.site_bounds_um[:, np.newaxis, :]
     iy, ix = np.divmod(np.arange(n_x * n_y), n_x)
@@ -312,17 +295,11 @@ def node(layout: Layout) -> Layout:
         a GDSII file do not open gaps there.
     """
     xy_um, ring_offsets, _ = insert_points(layout.xy_um, layout.ring_offsets, np.unique(layout.xy_um, axis=0))
-    return Layout._from_checked(  # noqa: SLF001 -- of the same subpackage
-        xy_um,
-        ring_offsets,
-        layout.site_offsets,
-        layout.columns,
-        layout._extend_provenance("noded"),  # noqa: SLF001 -- of the same subpackage
-    )
+    return derived(layout, "noded", (xy_um, ring_offsets, layout.site_offsets))
 
 
 @layout_edit(example={"grid_um": 0.5})
-def snap(layout: Layout, grid_um: float) -> Layout:
+def snap(layout: Layout, grid_um: Annotated[float, LENGTH]) -> Layout:
     """
     Snap each vertex to a manufacturing grid.
 
@@ -345,17 +322,10 @@ def snap(layout: Layout, grid_um: float) -> Layout:
     ParameterError
         When the grid is not positive.
     """
-    grid_um = check_length_um("grid_um", grid_um, at_most=MAX_LENGTH_UM)
     noded = node(layout)
     xy_um = np.round(noded.xy_um / grid_um) * grid_um
     snapped = Layout.from_polygons((xy_um, noded.ring_offsets, noded.site_offsets))
-    return Layout(
-        snapped.xy_um,
-        snapped.ring_offsets,
-        snapped.site_offsets,
-        layout.columns,
-        layout._extend_provenance(f"snapped to {grid_um:g} µm"),  # noqa: SLF001 -- of the same subpackage
-    )
+    return derived(layout, f"snapped to {grid_um:g} µm", snapped.rings_um)
 
 
 # -- parts ---------------------------------------------------------------------------------------------------------------
@@ -373,7 +343,6 @@ def _concatenate_columns(name: str, parts: Sequence[NDArray[Any]]) -> NDArray[An
 
 
 def _clip_sites(layout: Layout, region: Any, operation: Any, predicate: Any, cut: str, step: str) -> Layout:
-    check_choice("cut", cut, ("pieces", "drop"))
     shapely.prepare(region)
     polygons = layout.polygons()
     changed = np.flatnonzero(~predicate(region, polygons))
@@ -385,7 +354,5 @@ def _clip_sites(layout: Layout, region: Any, operation: Any, predicate: Any, cut
 
 def _rebuild(layout: Layout, polygons: NDArray[Any], parent: Ints, step: str) -> Layout:
     """Return the layout of these polygons, each with the columns of its parent site."""
-    rings = Layout.from_polygons(polygons)
     columns = {name: values[parent] for name, values in layout.columns.items()}
-    provenance = layout._extend_provenance(step)  # noqa: SLF001
-    return Layout._from_checked(rings.xy_um, rings.ring_offsets, rings.site_offsets, columns, provenance)  # noqa: SLF001
+    return derived(layout, step, Layout.from_polygons(polygons).rings_um, columns)

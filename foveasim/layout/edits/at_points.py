@@ -6,26 +6,20 @@ Points address sites, so that an edit is valid for every layout with sites at th
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import shapely
 from numpy.typing import ArrayLike
 
-from foveasim._core.validation import (
-    MAX_LENGTH_UM,
-    Floats,
-    Ints,
-    check_count,
-    check_length_um,
-    finite_array,
-)
+from foveasim._core.calls import LENGTH, NOT_NEGATIVE
+from foveasim._core.validation import MAX_LENGTH_UM, Floats, Ints, finite_array
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout._noding import insert_points
 from foveasim.layout.edit_registry import layout_edit
 from foveasim.layout.edits._parts import replace_sites, separate_parts
-from foveasim.layout.edits.all_sites import merge, split
-from foveasim.layout.model import Layout
+from foveasim.layout.edits.all_sites import PARTS, merge, split
+from foveasim.layout.model import Layout, layout_of
 
 __all__ = [
     "cut_along",
@@ -85,10 +79,6 @@ def remove_at(layout: Layout, points_um: ArrayLike) -> Layout:
     points_um : (n, 2), µm
         One point in each site.
 
-    Returns
-    -------
-    Layout
-
     Raises
     ------
     ParameterError
@@ -133,7 +123,9 @@ def merge_at(layout: Layout, points_um: ArrayLike) -> Layout:
 
 
 @layout_edit(example={"points_um": [[-5.0, 5.0]], "n_x": 2})
-def split_at(layout: Layout, points_um: ArrayLike, *, n_x: int = 2, n_y: int = 1) -> Layout:
+def split_at(
+    layout: Layout, points_um: ArrayLike, *, n_x: Annotated[int, PARTS] = 2, n_y: Annotated[int, PARTS] = 1
+) -> Layout:
     """
     Split the sites at points into ``n_x`` by ``n_y`` parts.
 
@@ -209,7 +201,7 @@ def cut_along(layout: Layout, line_um: ArrayLike, *, points_um: ArrayLike | None
 
 
 @layout_edit(example={"points_um": [[15.0, 15.0]], "by_um": [1.0, 2.0]})
-def move_sites(layout: Layout, points_um: ArrayLike, by_um: ArrayLike) -> Layout:
+def move_sites(layout: Layout, points_um: ArrayLike, by_um: tuple[float, float]) -> Layout:
     """
     Move the sites at points.
 
@@ -231,15 +223,14 @@ def move_sites(layout: Layout, points_um: ArrayLike, by_um: ArrayLike) -> Layout
         When a point lies outside all sites.
     """
     sites = np.unique(sites_at(layout, points_um))
-    by = finite_array("by_um", by_um, ndim=1)
-    if by.shape != (2,):
-        raise ParameterError("by_um", "must be two numbers (dx, dy)", by_um, "µm")
-    moved = layout[sites].translate(*by.tolist())
+    moved = layout[sites].translate(*finite_array("by_um", by_um).tolist())
     return replace_sites(layout, sites, moved.polygons(), sites, f"{sites.size} sites moved")
 
 
 @layout_edit(example={"from_um": [[0.0, 0.0], [5.0, 10.0]], "to_um": [[2.0, 1.0], [5.0, 12.0]]})
-def move_vertices(layout: Layout, from_um: ArrayLike, to_um: ArrayLike, *, tolerance_um: float = VERTEX_UM) -> Layout:
+def move_vertices(
+    layout: Layout, from_um: ArrayLike, to_um: ArrayLike, *, tolerance_um: Annotated[float, LENGTH] = VERTEX_UM
+) -> Layout:
     """
     Move vertices; neighbours that share them remain without gaps and overlaps.
 
@@ -253,10 +244,6 @@ def move_vertices(layout: Layout, from_um: ArrayLike, to_um: ArrayLike, *, toler
     tolerance_um : float, µm
         Distance within which a point is a vertex or lies on an edge.
 
-    Returns
-    -------
-    Layout
-
     Raises
     ------
     GeometryError
@@ -267,7 +254,6 @@ def move_vertices(layout: Layout, from_um: ArrayLike, to_um: ArrayLike, *, toler
     from_um, to_um = _points("from_um", from_um), _points("to_um", to_um)
     if from_um.shape != to_um.shape:
         raise ParameterError("to_um", f"must have one point for each of the {from_um.shape[0]} points of 'from_um'")
-    tolerance_um = check_length_um("tolerance_um", tolerance_um, at_most=MAX_LENGTH_UM)
     sites, part = _with_vertices_at(layout, from_um, tolerance_um)
     point, vertex = _vertices_at(part, from_um, tolerance_um)
     xy_um = part.xy_um.copy()
@@ -277,7 +263,9 @@ def move_vertices(layout: Layout, from_um: ArrayLike, to_um: ArrayLike, *, toler
 
 
 @layout_edit(example={"points_um": [[20.0, 20.0]]})
-def remove_vertices(layout: Layout, points_um: ArrayLike, *, tolerance_um: float = VERTEX_UM) -> Layout:
+def remove_vertices(
+    layout: Layout, points_um: ArrayLike, *, tolerance_um: Annotated[float, LENGTH] = VERTEX_UM
+) -> Layout:
     """
     Remove vertices from all sites that share them.
 
@@ -288,10 +276,6 @@ def remove_vertices(layout: Layout, points_um: ArrayLike, *, tolerance_um: float
     tolerance_um : float, µm
         Distance within which a point is a vertex.
 
-    Returns
-    -------
-    Layout
-
     Raises
     ------
     GeometryError
@@ -300,7 +284,6 @@ def remove_vertices(layout: Layout, points_um: ArrayLike, *, tolerance_um: float
         When there is no vertex at a point.
     """
     points_um = _points("points_um", points_um)
-    tolerance_um = check_length_um("tolerance_um", tolerance_um, at_most=MAX_LENGTH_UM)
     sites = _near(layout, points_um, tolerance_um)
     part = layout[sites]
     point, vertex = _vertices_at(part, points_um, tolerance_um)
@@ -317,7 +300,7 @@ def remove_vertices(layout: Layout, points_um: ArrayLike, *, tolerance_um: float
 
 
 @layout_edit(example={"points_um": [[-5.0, 5.0]], "channel": 2})
-def set_channel(layout: Layout, points_um: ArrayLike, channel: int) -> Layout:
+def set_channel(layout: Layout, points_um: ArrayLike, channel: Annotated[int, NOT_NEGATIVE]) -> Layout:
     """
     Set the colour filter of the sites at points.
 
@@ -329,17 +312,13 @@ def set_channel(layout: Layout, points_um: ArrayLike, channel: int) -> Layout:
     channel : int
         Index of the colour filter.
 
-    Returns
-    -------
-    Layout
-
     Raises
     ------
     ParameterError
         When a point lies outside all sites, or the index is negative.
     """
     channels = layout.channel.copy()
-    channels[sites_at(layout, points_um)] = check_count("channel", channel, at_least=0)
+    channels[sites_at(layout, points_um)] = channel
     return layout.with_columns(channel=channels)
 
 
@@ -384,9 +363,7 @@ def _with_vertices_at(layout: Layout, points_um: Floats, tolerance_um: float) ->
     exact_um[found] = part.xy_um[vertex]
     xy_um, ring_offsets, point = insert_points(part.xy_um, part.ring_offsets, exact_um, tolerance_um)
     _require_all("from_um", points_um, np.concatenate((found, point)), "must be a vertex or a point on an edge")
-    return sites, Layout._from_checked(  # noqa: SLF001 -- of the same subpackage
-        xy_um, ring_offsets, part.site_offsets, part.columns, part.provenance
-    )
+    return sites, layout_of(xy_um, ring_offsets, part.site_offsets)
 
 
 def _require_all(name: str, points_um: Floats, found: Ints, rule: str) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from foveasim._core.validation import MAX_LENGTH_UM, Ints, check_choice, check_count, check_number, check_sites
+from foveasim._core.calls import NOT_NEGATIVE, Limits
+from foveasim._core.validation import MAX_LENGTH_UM, Ints, check_sites
 from foveasim.errors import ParameterError
 from foveasim.layout._regions import as_region
 from foveasim.layout.adjacency import TOUCHING_UM
@@ -26,7 +27,7 @@ def draw(
     layout: Layout,
     outlines_um: Sequence[Any],
     *,
-    channel: int | None = None,
+    channel: Annotated[int | None, NOT_NEGATIVE] = None,
     overlap: Literal["cut", "fill", "keep"] = "cut",
 ) -> Layout:
     """
@@ -52,7 +53,6 @@ def draw(
     ParameterError
         When an outline is not a valid polygon, or no area of the outlines remains.
     """
-    check_choice("overlap", overlap, ("cut", "fill", "keep"))
     if isinstance(outlines_um, str) or not isinstance(outlines_um, Sequence | np.ndarray) or len(outlines_um) == 0:
         raise ParameterError("outlines_um", "must be a list of one or more outlines")
     check_sites(layout.n_sites + len(outlines_um))
@@ -67,7 +67,7 @@ def draw(
     drawn = Layout.from_polygons(shapes)
     if channel is not None:
         layout = layout if "channel" in layout.columns else layout.with_columns(channel=layout.channel)
-        drawn = drawn.with_columns(channel=np.full(drawn.n_sites, check_count("channel", channel, at_least=0)))
+        drawn = drawn.with_columns(channel=np.full(drawn.n_sites, channel))
     return _append(layout, drawn, f"{drawn.n_sites} sites drawn")
 
 
@@ -79,7 +79,7 @@ def overlay(
     layer: Layout,
     *,
     operation: Literal["replace", "fill", "union", "clip", "cut_out"] = "replace",
-    margin_um: float = 0.0,
+    margin_um: Annotated[float, Limits(at_least=0.0, at_most=MAX_LENGTH_UM)] = 0.0,
     region: Any = None,
 ) -> Layout:
     """
@@ -110,9 +110,7 @@ def overlay(
     ParameterError
         When the layer has no sites, also in the region, or no site remains.
     """
-    check_choice("operation", operation, ("replace", "fill", "union", "clip", "cut_out"))
-    margin_um = check_number("margin_um", margin_um, at_least=0.0, at_most=MAX_LENGTH_UM)
-    if not isinstance(layer, Layout) or layer.n_sites == 0:
+    if layer.n_sites == 0:
         raise ParameterError("layer", "must be a layout with sites", layer)
     if region is not None:
         layer = clip(layer, region)

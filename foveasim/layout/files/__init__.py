@@ -20,9 +20,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
-from foveasim._core.calls import OwnCheck, publish
+from foveasim._core.calls import Limits, OwnCheck, publish
 from foveasim._core.registry import import_all
 from foveasim._io.formats import FileFormat, as_file_error, detect_format, select_writer, validate_options
 from foveasim.errors import FileError, FoveasimError
@@ -125,11 +125,7 @@ def read_layout(
 
 
 def check_no_options(**options: object) -> None:
-    """
-    Reject format options for a file without options.
-
-    Raises ParameterError when an option is given.
-    """
+    """Reject format options for a file without options."""
     validate_options(options, (), FORMATS, "read_options")
 
 
@@ -140,7 +136,7 @@ def write_layout(
     layer: OwnCheck[LayerChoice | None] = None,
     layers: Mapping[str, Any] | str | Path | None = None,
     filter_names: Sequence[str] | None = None,
-    dbu_um: float | None = None,
+    dbu_um: Annotated[float | None, Limits(at_least=1e-9, at_most=1e3)] = None,
     hierarchy: bool | None = None,
     colours: Mapping[int, str] | None = None,
     **options: Any,

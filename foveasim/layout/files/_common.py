@@ -17,7 +17,7 @@ from foveasim._core.rings import site_area_um2
 from foveasim._core.validation import MAX_SITES, Floats
 from foveasim._io.formats import FileFormat
 from foveasim.errors import FileError, GeometryError, ParameterError
-from foveasim.layout.model import Layout
+from foveasim.layout.model import Layout, layout_of
 
 #: Formats of layout files. ``read(path, **options)`` returns a :class:`foveasim.Layout`, ``write(layout, path, **options)`` a
 #: :class:`foveasim.layout.WrittenLayout`. Installed packages add formats as entry points of the group ``foveasim.formats``.
@@ -58,20 +58,9 @@ class WrittenLayout:
 
     path: Path
     n_sites: int
-    max_displacement_um: float
-    worst_area_error: float
-    dropped_columns: tuple[str, ...]
-
-
-def lossless_report(layout: Layout, path: Path, dropped_columns: tuple[str, ...] = ()) -> WrittenLayout:
-    """Return the report of a lossless format."""
-    return WrittenLayout(
-        path=path,
-        n_sites=layout.n_sites,
-        max_displacement_um=0.0,
-        worst_area_error=0.0,
-        dropped_columns=dropped_columns,
-    )
+    max_displacement_um: float = 0.0
+    worst_area_error: float = 0.0
+    dropped_columns: tuple[str, ...] = ()
 
 
 def rounding_report(
@@ -79,7 +68,7 @@ def rounding_report(
 ) -> WrittenLayout:
     """Return the report of a format with rounded vertices and dropped columns."""
     if layout.n_sites == 0:
-        return lossless_report(layout, path, dropped_columns)
+        return WrittenLayout(path=path, n_sites=0, dropped_columns=dropped_columns)
     displacement_um = np.hypot(*(rounded_um - layout.xy_um).T)
     area_um2 = layout.area_um2
     error = site_area_um2(rounded_um, layout.ring_offsets, layout.site_offsets) / area_um2 - 1.0
@@ -98,21 +87,13 @@ def max_decompressed_bytes(path: Path) -> int:
 
 
 def check_decompressed(path: Path, n_bytes: int) -> None:
-    """
-    Reject a file that would decompress to too many bytes.
-
-    Raises FileError when the size exceeds the limit of the file.
-    """
+    """Reject a file that would decompress to too many bytes."""
     if n_bytes > max_decompressed_bytes(path):
         raise FileError(path, f"would decompress to more than the maximum of {max_decompressed_bytes(path)} bytes")
 
 
 def check_site_count(path: Path, n_sites: int) -> None:
-    """
-    Reject a file with too many sites.
-
-    Raises FileError when there are more than ``MAX_SITES``.
-    """
+    """Reject a file with too many sites."""
     if n_sites > MAX_SITES:
         raise FileError(path, f"has {n_sites} sites, more than the maximum of {MAX_SITES}")
 
@@ -122,8 +103,6 @@ def check_sizes(n_rings: NDArray[Any], n_vertices: NDArray[Any]) -> None:
     Reject sites with too many rings or vertices.
 
     Tests for intersections between them would take minutes.
-
-    Raises GeometryError when the number of pairs of rings or vertices exceeds the limit.
     """
     for what, n, at_most, at_most_per_item in (
         ("rings", n_rings, MAX_RING_PAIRS, PAIRS_PER_RING),
@@ -139,18 +118,13 @@ def layout_from_untrusted(
     columns: Mapping[str, NDArray[Any]],
     provenance: Mapping[str, Any],
 ) -> Layout:
-    """
-    Return a layout of untrusted outlines, after all checks of :meth:`Layout.from_polygons`.
-
-    Raises GeometryError, ParameterError when an outline is not a valid photosite, or a column does not match the sites.
-    """
+    """Return a layout of untrusted outlines, after all checks of :meth:`Layout.from_polygons`."""
     if isinstance(polygons, tuple):
         _, ring_offsets, site_offsets = polygons
         check_sizes(np.diff(site_offsets), np.diff(ring_offsets[site_offsets]))
     else:
         check_sizes(shapely.get_num_interior_rings(polygons) + 1, shapely.get_num_coordinates(polygons))
-    bare = Layout.from_polygons(polygons)
-    return Layout._from_checked(bare.xy_um, bare.ring_offsets, bare.site_offsets, columns, provenance)  # noqa: SLF001
+    return layout_of(*Layout.from_polygons(polygons).rings_um, columns, provenance)
 
 
 # -- provenance and types of columns in the file ----------------------------------------------------------------------
@@ -162,12 +136,13 @@ def header(layout: Layout) -> dict[str, Any]:
     return {"format": FILE_FORMAT, "version": FILE_VERSION, "unit": "um", "provenance": provenance}
 
 
-def check_header(path: Path, about: Any) -> dict[str, Any]:
-    """
-    Return the provenance in the metadata of a file.
+def table_header(layout: Layout) -> dict[str, Any]:
+    """Return the metadata of a table, with the types of the columns, such as ``<i8``."""
+    return {**header(layout), "columns": {name: column.dtype.str for name, column in layout.columns.items()}}
 
-    Raises FileError when the file has another format or version, or no provenance.
-    """
+
+def check_header(path: Path, about: Any) -> dict[str, Any]:
+    """Return the provenance in the metadata of a file."""
     if not isinstance(about, dict) or about.get("format") != FILE_FORMAT:
         got = about.get("format") if isinstance(about, dict) else None
         hint = "; load it with Capture.load and use its attribute layout" if got == "foveasim capture" else ""
@@ -180,12 +155,16 @@ def check_header(path: Path, about: Any) -> dict[str, Any]:
     return provenance
 
 
-def plain_columns(layout: Layout, format_name: str) -> dict[str, NDArray[Any]]:
-    """
-    Return the columns for a format that supports only numbers and strings.
+def check_table_header(path: Path, about: Any, title: str) -> tuple[dict[str, Any], Mapping[str, Any]]:
+    """Return provenance and types of columns of a table; its metadata may be None."""
+    if about is None:
+        return {"made_by": "read_layout", "file": path.name, "format": title}, {}
+    provenance, types = check_header(path, about), about.get("columns")
+    return provenance, types if isinstance(types, dict) else {}
 
-    Raises ParameterError when a column has another type.
-    """
+
+def plain_columns(layout: Layout, format_name: str) -> dict[str, NDArray[Any]]:
+    """Return the columns for a format that supports only numbers and strings."""
     for name, column in layout.columns.items():
         if column.dtype.kind not in PLAIN_KINDS or (column.dtype.itemsize > 8 and column.dtype.kind == "f"):
             raise ParameterError(
@@ -194,11 +173,6 @@ def plain_columns(layout: Layout, format_name: str) -> dict[str, NDArray[Any]]:
                 hint="write a .npz file",
             )
     return dict(layout.columns)
-
-
-def dtype_strings(layout: Layout) -> dict[str, str]:
-    """Return the type of each column as a string, such as ``<i8``."""
-    return {name: column.dtype.str for name, column in layout.columns.items()}
 
 
 def restore_column(values: NDArray[Any], dtype: object) -> NDArray[Any]:

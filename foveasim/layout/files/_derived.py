@@ -192,11 +192,7 @@ def _translate(polygons: NDArray[Any], by_um: Floats) -> NDArray[Any]:
 
 
 def shapes_of_sites(name: str, layout: Layout, parameters: Mapping[str, Any]) -> NDArray[Any]:
-    """
-    Return the polygons of a derived layer, one per site.
-
-    Raises ParameterError when a parameter is invalid, or the function does not return one geometry per site.
-    """
+    """Return the polygons of a derived layer, one per site."""
     polygons = np.asarray(_call(name, layout, parameters))
     if polygons.shape != (layout.n_sites,) or not shapely.is_geometry(polygons).all():
         raise ParameterError(
@@ -208,11 +204,7 @@ def shapes_of_sites(name: str, layout: Layout, parameters: Mapping[str, Any]) ->
 
 
 def shapes_of_layout(name: str, layout: Layout, parameters: Mapping[str, Any]) -> PlacedShapes:
-    """
-    Return the polygons of a derived layer of the complete layout.
-
-    Raises ParameterError when a parameter is invalid, or the function does not return polygons.
-    """
+    """Return the polygons of a derived layer of the complete layout."""
     found = _call(name, layout, parameters)
     if isinstance(found, PlacedShapes):
         return found

@@ -9,12 +9,11 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+import numpy as np
+from numpy.typing import NDArray
 
 #: Prefix of cells that KLayout adds for its own metadata.
 KLAYOUT_METADATA = "$$$CONTEXT_INFO$$$"
@@ -42,33 +41,23 @@ class FormatError(Exception):
     """The file is rejected; the message follows its path."""
 
 
-class Shapes:
+class Shapes(NamedTuple):
     """
     Polygons of a flattened cell.
 
-    Attributes
-    ----------
-    xy : (n_vertex, 2) float64, in database units
-    counts : (n,) int64
-        Vertices of each polygon.
-    tags : (n, 9) int64
-        Layer, datatype, photosite (-1: unknown), part and number of parts (0: undivided), placement of the cell, line of
-        its columns in the text of all columns (-1: none), index in its array (column + 2^32 row), filter with the outline of
-        the photosite (index in the list of filters, -1: none).
-    n_placements : int
-        Number of placements of the cell.
+    ``xy`` (n_vertex, 2), in database units. ``counts`` (n,): vertices of each polygon. ``tags`` (n, 9): layer, datatype,
+    photosite (-1: unknown), part and number of parts (0: undivided), placement of the cell, line of its columns in the text of
+    all columns (-1: none), index in its array (column + 2^32 row), filter with the outline of the photosite (index in the list
+    of filters, -1: none). ``n_placements``: number of placements of the cell.
     """
 
-    def __init__(self, xy: NDArray[np.float64], counts: NDArray[np.int64], tags: NDArray[np.int64], n: int) -> None:
-        self.xy = xy
-        self.counts = counts
-        self.tags = tags
-        self.n_placements = n
+    xy: NDArray[np.float64]
+    counts: NDArray[np.int64]
+    tags: NDArray[np.int64]
+    n_placements: int
 
     def place(self, matrix: NDArray[np.float64], offsets: NDArray[np.float64]) -> Shapes:
         """Return copies at all offsets, transformed by the matrix."""
-        import numpy as np
-
         k = len(offsets)
         transformed = self.xy @ matrix.T
         xy = (transformed[np.newaxis] + offsets[:, np.newaxis]).reshape(-1, 2)
@@ -80,14 +69,12 @@ class Shapes:
         self, matrix: NDArray[np.float64], offsets: NDArray[np.float64], identity: NDArray[np.int64]
     ) -> Shapes:
         """Return copies that are sites: photosite, line and index in the array, (n, 3)."""
-        import numpy as np
-
         copies = self.place(matrix, offsets)
         copies.tags[:, 5] = 0
         own = np.repeat(identity, len(self.tags), axis=0)
         copies.tags[:, 2] = np.where(copies.tags[:, 2] < 0, -1, own[:, 0])
         copies.tags[:, 6:8] = own[:, 1:]
-        return Shapes(copies.xy, copies.counts, copies.tags, 0)
+        return copies._replace(n_placements=0)
 
     def is_site(self) -> bool:
         """Return whether the shapes are those of one site, so that copies are numbered."""
@@ -95,8 +82,6 @@ class Shapes:
 
     def select(self, chosen: NDArray[np.bool_]) -> Shapes:
         """Return the chosen shapes."""
-        import numpy as np
-
         if chosen.all():
             return self
         return Shapes(
@@ -125,8 +110,7 @@ def read(
     ``cell``: cell selected by the user. ``max_sites``, ``max_memory_bytes``, ``max_text_bytes``, ``max_cpu_s``: limits of the
     flattened content. Returns ``about``: database unit ``dbu_um``, name ``cell``, and ``layers`` of the photosites.
     ``arrays``: ``xy`` in database units, ``counts``, ``tags`` (see :class:`Shapes`) of the photosites, the text of their
-    columns, and the same three arrays of the filters without the outline of a photosite. Raises FormatError when the file is
-    rejected.
+    columns, and the same three arrays of the filters without the outline of a photosite.
     """
     import gdstk
 
@@ -159,8 +143,10 @@ def read(
         for child in _children(cells, name):
             if last_use[child] == name:
                 del flat[child]
-    is_one = _is_on(flat[top].tags, is_site)
-    sites, covers = flat[top].select(is_one), flat[top].select(~is_one)
+    is_on_site_layer = np.isin(
+        flat[top].tags[:, 0] << 32 | flat[top].tags[:, 1], [n << 32 | kind for n, kind in is_site]
+    )
+    sites, covers = flat[top].select(is_on_site_layer), flat[top].select(~is_on_site_layer)
     text = _column_lines(sites, lines, max_text_bytes)
     about = {"dbu_um": dbu_um, "cell": top, "layers": layers}
     return about, [sites.xy, sites.counts, sites.tags, text, covers.xy, covers.counts, covers.tags]
@@ -175,16 +161,6 @@ def _last_match(key: tuple[int, int], layers: list[tuple[int, int | None]]) -> i
     return max(
         (k for k, (number, kind) in enumerate(layers) if number == layer and kind in (None, datatype)), default=-1
     )
-
-
-def _is_on(tags: NDArray[np.int64], layers: set[tuple[int, int]]) -> NDArray[np.bool_]:
-    """Return which shapes are on the layers."""
-    import numpy as np
-
-    is_chosen = np.zeros(len(tags), bool)
-    for number, kind in layers:
-        is_chosen |= (tags[:, 0] == number) & (tags[:, 1] == kind)
-    return is_chosen
 
 
 def _layers_with_shapes(cells: dict[str, Any], order: list[str]) -> dict[tuple[int, int], bool]:
@@ -225,9 +201,7 @@ def _layers_of_sites(
 
 
 def _format_layers(found: Any) -> str:
-    shown = sorted(found)
-    texts = [f"{number}/{kind}" for number, kind in shown[:MAX_LISTED]]
-    return ", ".join(texts) + (", ..." if len(shown) > MAX_LISTED else "") if shown else "none"
+    return _format_names(f"{number}/{kind}" for number, kind in sorted(found)) or "none"
 
 
 # -- cells ------------------------------------------------------------------------------------------------------------
@@ -241,16 +215,16 @@ def _top_cell(cells: dict[str, Any], wanted: str | None) -> str:
 
             closest = get_close_matches(wanted, cells, n=1)
             hint = f"did you mean {closest[0]!r}? " if closest else ""
-            raise FormatError(f"has no cell {wanted!r}; {hint}possible: {_format_names(cells)}")
+            raise FormatError(f"has no cell {wanted!r}; {hint}possible: {_format_names(f'{n!r:.40}' for n in cells)}")
         return wanted
     below = {reference.cell_name for cell in cells.values() for reference in cell.references}
     tops = [n for n, c in cells.items() if n not in below and not n.startswith(KLAYOUT_METADATA)]
     if len(tops) > 1:
-        tops = [name for name in tops if _has_shapes(cells[name]) or cells[name].references] or tops[:1]
+        tops = [n for n in tops if cells[n].polygons or cells[n].paths or cells[n].references] or tops[:1]
     if not tops:
         raise FormatError("has no top cell: it is empty, or its cells contain each other")
     if len(tops) > 1:
-        raise FormatError(f"has several top cells, {_format_names(tops)}; select one with cell=")
+        raise FormatError(f"has several top cells, {_format_names(f'{n!r:.40}' for n in tops)}; select one with cell=")
     return tops[0]
 
 
@@ -374,16 +348,12 @@ def _n_copies(element: Any) -> int:
     return max(1, repetition.size if columns is None else columns * repetition.rows)
 
 
-def _format_names(names: Any) -> str:
+def _format_names(names: Iterable[str]) -> str:
     shown = list(names)
-    return ", ".join(f"{n!r:.40}" for n in shown[:MAX_LISTED]) + (", ..." if len(shown) > MAX_LISTED else "")
+    return ", ".join(shown[:MAX_LISTED]) + ", ..." * (len(shown) > MAX_LISTED)
 
 
 # -- shapes -----------------------------------------------------------------------------------------------------------
-
-
-def _has_shapes(cell: Any) -> bool:
-    return bool(cell.polygons or cell.paths)
 
 
 def _flatten(
@@ -394,8 +364,6 @@ def _flatten(
 
     The column strings of the polygons and of numbered references are appended to ``lines``.
     """
-    import numpy as np
-
     parts = [_own_shapes(own, lines, unit_um, dbu_um)]
     n_placements = 1
     groups: dict[tuple[Any, ...], list[NDArray[np.float64]]] = {}
@@ -425,19 +393,13 @@ def _flatten(
         parts.append(flat[name].place_sites(_matrix(*transformation), offsets, np.concatenate(identities)))
     parts = [p for p in parts if p.counts.size] or parts[:1]
     if len(parts) == 1:
-        return Shapes(parts[0].xy, parts[0].counts, parts[0].tags, n_placements)
-    return Shapes(
-        np.concatenate([p.xy for p in parts]),
-        np.concatenate([p.counts for p in parts]),
-        np.concatenate([p.tags for p in parts]),
-        n_placements,
-    )
+        return parts[0]._replace(n_placements=n_placements)
+    xy, counts, tags = (np.concatenate([getattr(p, name) for p in parts]) for name in ("xy", "counts", "tags"))
+    return Shapes(xy, counts, tags, n_placements)
 
 
 def _matrix(angle_rad: float, magnification: float, is_mirrored: bool) -> NDArray[np.float64]:
     """Return the matrix of a reference: mirrored at the x axis, magnified, rotated."""
-    import numpy as np
-
     return _rotation(angle_rad) @ np.diag([magnification, -magnification if is_mirrored else magnification])
 
 
@@ -448,8 +410,6 @@ def _site_numbers(reference: Any, offsets: NDArray[np.float64], line: int) -> ND
     These are photosite, line of the columns and index in the array, (n, 3). Columns and rows follow from the offsets, as
     programs store arrays in different orders. An array that another program changed has no numbers.
     """
-    import numpy as np
-
     number = _array_number(reference)
     if number is None:
         return None
@@ -482,8 +442,6 @@ def _array_number(reference: Any) -> tuple[int, int, int, int, int] | None:
 
 def _rotation(angle_rad: float) -> NDArray[np.float64]:
     """Return the matrix of a counter-clockwise rotation, exact for multiples of 90°."""
-    import numpy as np
-
     quarters = angle_rad / (0.5 * math.pi)
     is_quarter = abs(quarters - round(quarters)) < 1e-9
     exact = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[round(quarters) % 4]
@@ -493,8 +451,6 @@ def _rotation(angle_rad: float) -> NDArray[np.float64]:
 
 def _own_shapes(own: _Selected, lines: list[str], unit_um: float, dbu_um: float) -> Shapes:
     """Return the polygons of one cell, with paths as polygons and repetitions expanded."""
-    import numpy as np
-
     polygons, filters = list(own.polygons), list(own.filters)
     for i, n in enumerate(own.copies):
         if n > 1:
@@ -524,8 +480,6 @@ def _own_shapes(own: _Selected, lines: list[str], unit_um: float, dbu_um: float)
 
 def _sites(polygons: list[Any]) -> Any:
     """Return photosite, part and number of parts of each polygon, (n, 3)."""
-    import numpy as np
-
     texts = [_property(p, NUMBER_PROPERTY) for p in polygons]
     known = [text for text in texts if text is not None]
     if len(known) == len(texts):
@@ -587,8 +541,6 @@ def _column_lines(shapes: Shapes, lines: list[str], max_bytes: int) -> NDArray[n
 
     The tags of the shapes are renumbered accordingly. The result is empty if a shape has no columns.
     """
-    import numpy as np
-
     used, tags = np.unique(shapes.tags[:, 6], return_inverse=True)
     shapes.tags[:, 6] = tags
     if used.size == 0 or used[0] < 0:

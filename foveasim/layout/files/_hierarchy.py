@@ -31,23 +31,17 @@ STRIDES = (1, 2, 3, 4, 6, 8)
 _MIX = tuple(np.uint64(c) for c in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB, 0xD6E8FEB86659FD93))
 
 
+ARRAY_FIELDS = ("first", "n_x", "n_y", "pitch", "number_steps")
+
+
 @dataclass(frozen=True)
 class Arrays:
     """
     Arrays of congruent sites; single sites are arrays of 1 x 1.
 
-    Attributes
-    ----------
-    first : (n,) int64
-        Index of the site in column 0, row 0.
-    n_x, n_y : (n,) int64
-        Numbers of columns and rows.
-    pitch : (n, 2) int64
-        Pitch of the columns in x and of the rows in y, in database units.
-    number_steps : (n, 2) int64
-        Steps of the site index from column to column, and from row to row.
-    column_steps : mapping of str to (n, 2) int64
-        The same for integer columns.
+    ``first`` (n,): index of the site in column 0, row 0. ``n_x``, ``n_y`` (n,): numbers of columns and rows. ``pitch`` (n, 2):
+    pitch of the columns in x and of the rows in y, in database units. ``number_steps`` (n, 2): steps of the site index from
+    column to column, and from row to row. ``column_steps``: the same for integer columns.
     """
 
     first: Ints
@@ -59,14 +53,8 @@ class Arrays:
 
     def select(self, chosen: Any) -> Arrays:
         """Return some of the arrays."""
-        return Arrays(
-            self.first[chosen],
-            self.n_x[chosen],
-            self.n_y[chosen],
-            self.pitch[chosen],
-            self.number_steps[chosen],
-            {name: steps[chosen] for name, steps in self.column_steps.items()},
-        )
+        first, n_x, n_y, pitch, steps = (getattr(self, name)[chosen] for name in ARRAY_FIELDS)
+        return Arrays(first, n_x, n_y, pitch, steps, {name: steps[chosen] for name, steps in self.column_steps.items()})
 
     def sites(self) -> Ints:
         """Return the sites of all arrays, array after array."""
@@ -223,14 +211,11 @@ def _steps(rows: Ints, start: Ints, size: Ints) -> Ints:
 
 def concatenate(*parts: Arrays) -> Arrays:
     """Return the arrays of all parts."""
-    return Arrays(
-        np.concatenate([part.first for part in parts]),
-        np.concatenate([part.n_x for part in parts]),
-        np.concatenate([part.n_y for part in parts]),
-        np.concatenate([part.pitch for part in parts]),
-        np.concatenate([part.number_steps for part in parts]),
-        {name: np.concatenate([part.column_steps[name] for part in parts]) for name in parts[0].column_steps},
+    first, n_x, n_y, pitch, number_steps = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ARRAY_FIELDS
     )
+    steps = {name: np.concatenate([part.column_steps[name] for part in parts]) for name in parts[0].column_steps}
+    return Arrays(first, n_x, n_y, pitch, number_steps, steps)
 
 
 def _is_linear(column: NDArray[Any]) -> bool:

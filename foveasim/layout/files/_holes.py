@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from foveasim._core.rings import positions_in_runs, ring_moments
 from foveasim._core.validation import Floats, Ints
 from foveasim.layout.files._common import check_sizes
-from foveasim.layout.model import Layout, valid_sites
+from foveasim.layout.model import Layout, layout_of, valid_sites
 
 Point: TypeAlias = tuple[float, float]
 
@@ -89,13 +89,8 @@ def _halves(layout: Layout, sites: Ints, max_vertices: int | None) -> dict[int, 
     inner = position - n_outer[half]
     on_outer = start[site] + (anchor.ravel()[half] + position) % n[site]
     on_hole = hole_start[site] + (nearest[::-1].ravel()[half] + inner) % n_hole[site]
-    rings = Layout._from_checked(  # noqa: SLF001 -- of the same subpackage
-        layout.xy_um[np.where(inner < 0, on_outer, on_hole)],
-        np.concatenate(([0], np.cumsum(size))),
-        np.arange(size.size + 1),
-        {},
-        {},
-    )
+    xy_um, ring_offsets = layout.xy_um[np.where(inner < 0, on_outer, on_hole)], np.concatenate(([0], np.cumsum(size)))
+    rings = layout_of(xy_um, ring_offsets, np.arange(size.size + 1))
     polygons = layout[sites].polygons()
     is_divided = (nearest[0] != nearest[1]) & valid_sites(rings).reshape(2, -1).all(axis=0)
     if max_vertices is not None:
@@ -103,7 +98,7 @@ def _halves(layout: Layout, sites: Ints, max_vertices: int | None) -> dict[int, 
     for k in (0, 1):
         ends = np.stack((layout.xy_um[start + anchor[k]], layout.xy_um[hole_start + nearest[k]]), axis=1)
         is_divided &= shapely.covers(polygons, shapely.linestrings(ends))
-    xy_um, offsets = rings.xy_um, rings.ring_offsets.tolist()
+    offsets = ring_offsets.tolist()
     return {
         int(sites[i]): [xy_um[offsets[k] : offsets[k + 1]] for k in (i, i + sites.size)]
         for i in np.flatnonzero(is_divided).tolist()

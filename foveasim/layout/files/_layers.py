@@ -54,16 +54,8 @@ class DrawnLayer:
     """
     A layer of a file, and its shapes.
 
-    Attributes
-    ----------
-    name : str
-        Name in the layer map.
-    layer, datatype : int
-        A datatype of None stands for the channel of each site.
-    channel : int, optional
-        Channel of the sites of a filter layer.
-    parameters : dict
-        Keywords of the function of a derived layer.
+    A datatype of None stands for the channel of each site. ``channel``: that of the sites of a filter layer. ``parameters``:
+    keywords of the function of a derived layer.
     """
 
     name: str
@@ -199,11 +191,7 @@ def _drawn_layer(name: str, value: Any, filter_names: Sequence[str]) -> DrawnLay
 
 
 def parse_layer(name: str, value: Any, *, at_most: int = MAX_READ_LAYER) -> LayerNumber:
-    """
-    Return layer and datatype of ``77``, ``(77, 3)``, ``"77"`` or ``"77/3"``.
-
-    Raises ParameterError when the value is none of these, or out of range.
-    """
+    """Return layer and datatype of ``77``, ``(77, 3)``, ``"77"`` or ``"77/3"``."""
     parts: Sequence[Any]
     if isinstance(value, str):
         match = _NUMBERS.fullmatch(value.strip())
@@ -220,11 +208,7 @@ def parse_layer(name: str, value: Any, *, at_most: int = MAX_READ_LAYER) -> Laye
 
 
 def parse_selection(value: Any) -> list[LayerNumber]:
-    """
-    Return the layers to read: one layer, or a list of layers.
-
-    Raises ParameterError when a layer is invalid, or there is none.
-    """
+    """Return the layers to read: one layer, or a list of layers."""
     is_pair = isinstance(value, tuple) and len(value) == 2 and all(isinstance(n, int) for n in value)
     if isinstance(value, str) or not isinstance(value, Sequence) or is_pair:
         return [parse_layer("layer", value)]
@@ -238,7 +222,7 @@ def parse_channels(channels: Any, filter_names: Sequence[str] | None = None) -> 
     Return the channel of each filter layer.
 
     ``channels``: from layers to names or numbers of channels: ``{(10, 0): "R", "11/0": 1}``. ``filter_names``: names of the
-    channels 0, 1, ... Raises ParameterError when a layer or a channel is invalid.
+    channels 0, 1, ...
     """
     if not isinstance(channels, Mapping) or not channels:
         raise ParameterError("channels", "must be a mapping of layers to channels, such as {(10, 0): 'R'}", channels)
@@ -247,11 +231,7 @@ def parse_channels(channels: Any, filter_names: Sequence[str] | None = None) -> 
 
 
 def parse_channel(name: str, value: Any, filter_names: Sequence[str]) -> int:
-    """
-    Return a channel from its number, or from its name.
-
-    Raises ParameterError when no channel has this name; the message lists the names.
-    """
+    """Return a channel from its number, or from its name."""
     if isinstance(value, str):
         if value in filter_names:
             return list(filter_names).index(value)
@@ -267,11 +247,7 @@ def parse_channel(name: str, value: Any, filter_names: Sequence[str]) -> int:
 
 
 def check_filter_names(filter_names: Sequence[str] | None) -> Sequence[str]:
-    """
-    Return the names of the channels, by default R, G, B, W.
-
-    Raises ParameterError when they are not different strings.
-    """
+    """Return the names of the channels, by default R, G, B, W."""
     if filter_names is None:
         return FILTER_NAMES
     names = list(filter_names) if isinstance(filter_names, Sequence) else []

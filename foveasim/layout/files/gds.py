@@ -41,13 +41,14 @@ import shapely
 from numpy.typing import NDArray
 
 from foveasim._core.extras import import_optional
-from foveasim._core.rings import SITE_ID, positions_in_runs, ring_moments, site_ids
+from foveasim._core.rings import SITE_ID, positions_in_runs, site_ids
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import MAX_SITES, Floats, Ints, check_choice, check_number
+from foveasim._core.validation import MAX_SITES, Floats, Ints
 from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import FileFormat, as_file_error
 from foveasim._io.sandbox import WALL_TIME_FACTOR, run_in_sandbox
 from foveasim.errors import FileError, GeometryError, LayoutWarning, ParameterError
+from foveasim.layout.files import _gdstk
 from foveasim.layout.files._columns import (
     CHANNEL,
     MAX_COLUMN_BYTES,
@@ -77,7 +78,7 @@ from foveasim.layout.files._layers import (
     parse_layer_map,
     parse_selection,
 )
-from foveasim.layout.model import Layout, valid_sites
+from foveasim.layout.model import Layout, layout_of, valid_sites, winding_um2
 
 __all__ = ["GDS_MAGIC", "OASIS_MAGIC", "read", "write"]
 
@@ -152,13 +153,11 @@ def write(
     gdstk = import_optional(path, "gdstk")
     all_drawn = _drawn_layers(layout, layer, layers, filter_names)
     drawn = [d for d in all_drawn if not d.is_of_layout]
-    dbu_um = check_number("dbu_um", dbu_um, at_least=1e-9, at_most=1e3)
-    if not isinstance(hierarchy, bool):
-        raise ParameterError("hierarchy", "must be True or False", hierarchy)
     is_oasis = path.suffix.lower() in (".oas", ".oasis")
     xy_dbu, snapped = _snap_to_grid(layout, dbu_um)
     report = rounding_report(layout, snapped.xy_um, path)
-    _warn_of_rounding(layout, snapped, dbu_um)
+    if 1e3 * report.max_displacement_um > ROUNDING_TOLERANCE_NM:
+        _warn_of_rounding(layout, snapped, dbu_um)
     stack_of, origin = congruence_classes(xy_dbu, snapped.ring_offsets, snapped.site_offsets)
     if any(d.datatype is None or d.channel is not None for d in drawn):
         stack_of = stack_of * (MAX_LAYER + 1) + layout.channel
@@ -176,17 +175,14 @@ def write(
     elements += compress(polygons, is_site.tolist())
     numbers += drawing.numbers(ring[is_site], flat.first[owner[is_site]])
     array = np.concatenate((np.arange(references.first.size), references.first.size + owner[is_site]))
-    set_properties = _set_oasis_properties if is_oasis else _set_gds_properties
-    dropped = set_properties(elements, numbers, array, concatenate(references, flat), columns)
+    dropped = _set_properties(elements, numbers, array, concatenate(references, flat), columns, is_oasis=is_oasis)
 
     library = gdstk.Library("FOVEASIM", unit=1e-6, precision=dbu_um * 1e-6)
     shapes = list(compress(polygons, (~is_site).tolist()))
     all_cells = list(cells.values())
     for d in all_drawn:
         if d.is_of_layout:
-            complete = Layout._from_checked(  # noqa: SLF001 -- of the same subpackage
-                snapped.xy_um, snapped.ring_offsets, snapped.site_offsets, layout.columns, layout.provenance
-            )
+            complete = layout_of(*snapped.rings_um, layout.columns, layout.provenance)
             drawing, stack_of, origin = _draw_layout(complete, d, dbu_um, max_vertices)
             references, flat = _divide(drawing, stack_of, origin, {}, hierarchy=hierarchy)
             cells = _cells(gdstk, drawing, stack_of[references.first], dbu_um, all_cells, d.name, is_oasis=is_oasis)
@@ -292,6 +288,13 @@ class _Drawing:
     part: Ints
     is_site: NDArray[np.bool_]
 
+    @classmethod
+    def of(cls, rings_um: list[Floats], dbu_um: float, *table: NDArray[Any]) -> _Drawing:
+        """Return the drawing of rings, with the other fields."""
+        xy_um = np.concatenate(rings_um) if rings_um else np.zeros((0, 2))
+        ring_offsets = np.concatenate(([0], np.cumsum(list(map(len, rings_um)), dtype=np.int64)))
+        return cls(np.rint(xy_um / dbu_um).astype(np.int64), ring_offsets, *table)
+
     @property
     def n_vertices(self) -> Ints:
         """Vertices of each stack."""
@@ -339,9 +342,7 @@ def _draw(
     models = snapped[first]
     owner = np.repeat(np.arange(first.size), np.diff(models.ring_offsets[models.site_offsets]))
     xy_um = models.xy_um - _to_um(origin[first], dbu_um)[owner]
-    models = Layout._from_checked(  # noqa: SLF001 -- of the same subpackage
-        _to_um(np.rint(xy_um / dbu_um), dbu_um), models.ring_offsets, models.site_offsets, {}, {}
-    )
+    models = layout_of(_to_um(np.rint(xy_um / dbu_um), dbu_um), models.ring_offsets, models.site_offsets)
     channel = layout.channel[first] if any(d.datatype is None or d.channel is not None for d in drawn) else None
     outlines = hole_free_rings(models, max_vertices)
     tables, rings_um = [], []
@@ -365,15 +366,8 @@ def _draw(
     order = np.lexsort((table[:, 1], table[:, 0]))
     table = table[order]
     rings_um = [rings_um[k] for k in order.tolist()]
-    xy_um = np.concatenate(rings_um) if rings_um else np.zeros((0, 2))
-    return _Drawing(
-        np.rint(xy_um / dbu_um).astype(np.int64),
-        np.concatenate(([0], np.cumsum(list(map(len, rings_um)), dtype=np.int64))),
-        np.searchsorted(table[:, 0], np.arange(first.size + 1)),
-        table[:, 2:4],
-        table[:, 4:6],
-        table[:, 6].astype(bool),
-    )
+    stacks = np.searchsorted(table[:, 0], np.arange(first.size + 1))
+    return _Drawing.of(rings_um, dbu_um, stacks, table[:, 2:4], table[:, 4:6], table[:, 6].astype(bool))
 
 
 def _derived_rings(
@@ -424,19 +418,15 @@ def _draw_layout(
     _, first, stack = np.unique(stack, return_index=True, return_inverse=True)
     models = snapped[first]
     vertex_owner = np.repeat(first, np.diff(models.ring_offsets[models.site_offsets]))
-    at_origin = Layout._from_checked(  # noqa: SLF001 -- of the same subpackage
-        models.xy_um - _to_um(part_origin[vertex_owner], dbu_um), models.ring_offsets, models.site_offsets, {}, {}
-    )
+    relative_um = models.xy_um - _to_um(part_origin[vertex_owner], dbu_um)
+    at_origin = layout_of(relative_um, models.ring_offsets, models.site_offsets)
     owner, _, _, rings_um = hole_free_rings(at_origin, max_vertices)
-    xy_um = np.concatenate(rings_um) if rings_um else np.zeros((0, 2))
-    drawing = _Drawing(
-        np.rint(xy_um / dbu_um).astype(np.int64),
-        np.concatenate(([0], np.cumsum(list(map(len, rings_um)), dtype=np.int64))),
-        np.searchsorted(owner, np.arange(first.size + 1)),
+    stacks = np.searchsorted(owner, np.arange(first.size + 1))
+    number, part = (
         np.tile(np.array([drawn.layer, drawn.datatype]), (owner.size, 1)),
         np.zeros((owner.size, 2), np.int64),
-        np.zeros(owner.size, bool),
     )
+    drawing = _Drawing.of(rings_um, dbu_um, stacks, number, part, np.zeros(owner.size, bool))
     # Each position of a shape is one of all of its parts.
     n_parts = np.bincount(shape, minlength=len(placed.polygons))
     offset = np.cumsum(n_parts) - n_parts
@@ -496,46 +486,36 @@ def _references(
 # -- properties -------------------------------------------------------------------------------------------------------
 
 
-def _set_gds_properties(
+def _set_properties(
     elements: list[Any],
     numbers: list[tuple[int, ...]],
     array: Ints,
     arrays: Arrays,
     columns: Mapping[str, NDArray[Any]],
+    *,
+    is_oasis: bool,
 ) -> tuple[str, ...]:
     """Set the numbers and columns of sites and arrays; return the dropped columns."""
-    texts = [f"photosite {number[0]}" if len(number) == 1 else _number_text(number) for number in numbers]
-    n_chars = np.fromiter(map(len, texts), np.int64, len(texts))
-    longest = np.zeros(arrays.first.size, np.int64)
-    np.maximum.at(longest, array, n_chars + n_chars % 2)
-    room = np.minimum(MAX_GDS_STRING, MAX_GDS_PROPERTIES - longest)
-    stored, dropped = storable_columns(columns, arrays.first, arrays.column_steps, room)
-    strings = column_strings(stored)
-    if strings:
-        # gdstk writes properties in reverse order of setting.
-        for element, k in zip(elements, array.tolist(), strict=True):
-            element.set_gds_property(2, strings[k])
-    for element, text in zip(elements, texts, strict=True):
-        element.set_gds_property(1, text)
-    return dropped
-
-
-def _set_oasis_properties(
-    elements: list[Any],
-    numbers: list[tuple[int, ...]],
-    array: Ints,
-    arrays: Arrays,
-    columns: Mapping[str, NDArray[Any]],
-) -> tuple[str, ...]:
-    """Set the numbers and columns of sites and arrays; return the dropped columns."""
-    max_strings = int(OASIS_STRING_COMPARISONS // max(len(elements), 1))
-    stored, dropped = storable_columns(columns, arrays.first, arrays.column_steps, MAX_OASIS_STRING, max_strings)
-    rows = list(zip(*chain.from_iterable((repeat(key), values) for key, values in stored.items()), strict=False))
-    if rows:
-        for element, k in zip(elements, array.tolist(), strict=True):
+    rows: Sequence[Any]
+    if is_oasis:
+        max_strings = int(OASIS_STRING_COMPARISONS // max(len(elements), 1))
+        stored, dropped = storable_columns(columns, arrays.first, arrays.column_steps, MAX_OASIS_STRING, max_strings)
+        rows = list(zip(*chain.from_iterable((repeat(key), values) for key, values in stored.items()), strict=False))
+    else:
+        n_chars = np.fromiter(map(len, map(_number_text, numbers)), np.int64, len(numbers))
+        longest = np.zeros(arrays.first.size, np.int64)
+        np.maximum.at(longest, array, n_chars + n_chars % 2)
+        room = np.minimum(MAX_GDS_STRING, MAX_GDS_PROPERTIES - longest)
+        stored, dropped = storable_columns(columns, arrays.first, arrays.column_steps, room)
+        rows = column_strings(stored)
+    # gdstk writes properties in reverse order of setting.
+    for element, k in zip(elements, array.tolist(), strict=True) if rows else ():
+        if is_oasis:
             element.set_property("columns", rows[k])
+        else:
+            element.set_gds_property(2, rows[k])
     for element, number in zip(elements, numbers, strict=True):
-        _set_number(element, number, is_oasis=True)
+        _set_number(element, number, is_oasis=is_oasis)
     return dropped
 
 
@@ -564,18 +544,15 @@ def _to_um(xy_dbu: NDArray[Any], dbu_um: float) -> Floats:
 
 
 def _warn_of_rounding(layout: Layout, snapped: Layout, dbu_um: float) -> None:
-    """Warn where rounding displaces a vertex by more than the tolerance."""
-    if layout.n_sites == 0:
-        return
+    """Warn that rounding displaces a vertex by more than the tolerance."""
     displacement_nm = 1e3 * np.hypot(*(snapped.xy_um - layout.xy_um).T)
     vertex = int(np.argmax(displacement_nm))
-    if displacement_nm[vertex] > ROUNDING_TOLERANCE_NM:
-        site = int(np.searchsorted(layout.ring_offsets[layout.site_offsets], vertex, side="right")) - 1
-        warn(
-            f"rounding to the database unit of {1e3 * dbu_um:g} nm moves a vertex of site {site} by "
-            f"{displacement_nm[vertex]:.3g} nm, more than {ROUNDING_TOLERANCE_NM:g} nm; use dbu_um={DEFAULT_DBU_UM:g}",
-            LayoutWarning,
-        )
+    site = int(np.searchsorted(layout.ring_offsets[layout.site_offsets], vertex, side="right")) - 1
+    warn(
+        f"rounding to the database unit of {1e3 * dbu_um:g} nm moves a vertex of site {site} by "
+        f"{displacement_nm[vertex]:.3g} nm, more than {ROUNDING_TOLERANCE_NM:g} nm; use dbu_um={DEFAULT_DBU_UM:g}",
+        LayoutWarning,
+    )
 
 
 def _snap_to_grid(layout: Layout, dbu_um: float) -> tuple[Ints, Layout]:
@@ -586,12 +563,9 @@ def _snap_to_grid(layout: Layout, dbu_um: float) -> tuple[Ints, Layout]:
             "dbu_um", f"must be >= {np.abs(layout.xy_um).max() / MAX_DBU:.3g} for this layout", dbu_um, "µm"
         )
     # The holes are checked below.
-    snapped = Layout._from_checked(_to_um(xy_dbu, dbu_um), layout.ring_offsets, layout.site_offsets, {}, {})  # noqa: SLF001
+    snapped = layout_of(_to_um(xy_dbu, dbu_um), layout.ring_offsets, layout.site_offsets)
     if layout.n_sites:
-        area_um2 = ring_moments(snapped.xy_um, snapped.ring_offsets)[0]
-        is_hole = np.ones(area_um2.size, bool)
-        is_hole[layout.site_offsets[:-1]] = False
-        is_flat = np.where(is_hole, area_um2 >= 0.0, area_um2 <= 0.0)
+        is_flat = winding_um2(*snapped.rings_um) <= 0.0
         is_bad = np.logical_or.reduceat(is_flat, layout.site_offsets[:-1]) | ~valid_sites(snapped)
         if is_bad.any():
             bad = np.flatnonzero(is_bad)
@@ -629,27 +603,21 @@ def read(
 
     The cell hierarchy is flattened, and the sites are ordered by their numbers. Invalid outlines are an error, which lists all
     of them, or are skipped or repaired with a warning.
-
-    Raises FileError when gdstk is not installed, or the file is corrupt, truncated, malformed, contains invalid photosites, or
-    photosites without a filter although the channels of filter layers are given. Raises ParameterError when a layer, a channel
-    or ``invalid`` is invalid.
     """
     import_optional(path, "gdstk")
-    check_choice("invalid", invalid, ("error", "skip", "repair"))
-    kind = "GDSII or OASIS"
     wanted, filters = _selection(layer, layers, channels, filter_names)
-    with as_file_error(path, f"{kind} layout"):
+    with as_file_error(path, "GDSII or OASIS layout"):
         data = path.read_bytes()
         is_oasis = data.startswith(OASIS_MAGIC)
         (_check_oasis if is_oasis else _check_records)(path, data)
         n_bytes = len(data)
         del data
-        answer, shapes, covers = _read_in_sandbox(path, is_oasis, wanted, list(filters), cell, n_bytes)
+        answer, shapes, covers, lines = _read_in_sandbox(path, is_oasis, wanted, list(filters), cell, n_bytes)
         counts, tags = shapes.counts, shapes.tags
         check_site_count(path, counts.size)
-        xy_um = _to_um(shapes.xy_dbu, answer["dbu_um"])
+        xy_um = _to_um(shapes.xy, answer["dbu_um"])
         pieces, piece, first = _group_by_site(path, xy_um, counts, tags)
-        columns = _columns(shapes.lines, tags[piece], first)
+        columns = _columns(lines, tags[piece], first)
         columns = _with_channel(columns, tags[piece[first], 1:3], wanted)
         about = {
             "made_by": "read_layout",
@@ -660,10 +628,11 @@ def read(
         }
         check_sizes(np.ones(counts.size), counts)
         is_undivided = first.size == piece.size
-        packed = (pieces.xy_um, pieces.ring_offsets, pieces.site_offsets)
         kept = np.arange(first.size)
         try:
-            layout = layout_from_untrusted(packed if is_undivided else _merge_parts(pieces, first), columns, about)
+            layout = layout_from_untrusted(
+                pieces.rings_um if is_undivided else _merge_parts(pieces, first), columns, about
+            )
         except GeometryError:
             polygons, kept = _valid_polygons(path, without_keyholes(_merge_parts(pieces, first)), invalid)
             layout = layout_from_untrusted(polygons, {name: c[kept] for name, c in columns.items()}, about)
@@ -674,7 +643,7 @@ def read(
             number = tags[piece, 8]
             is_filter = (number >= 0) & (site >= 0)
             equal = np.stack((site[is_filter], number[is_filter]))
-            covers_um = _to_um(covers.xy_dbu, answer["dbu_um"])
+            covers_um = _to_um(covers.xy, answer["dbu_um"])
             channel = _covering_channels(path, layout, equal, covers_um, covers, filters)
             layout = layout.with_columns(channel=channel).with_provenance(about)
         return layout
@@ -716,7 +685,7 @@ def _with_channel(
 
 
 def _covering_channels(
-    path: Path, layout: Layout, filters: Ints, xy_um: Floats, covers: _Shapes, channels: Mapping[LayerNumber, int]
+    path: Path, layout: Layout, filters: Ints, xy_um: Floats, covers: _gdstk.Shapes, channels: Mapping[LayerNumber, int]
 ) -> Ints:
     """
     Return the channel of the filter that covers each site.
@@ -794,16 +763,6 @@ def _check_oasis(path: Path, data: bytes) -> None:
         raise FileError(path, "is corrupt: its CRC-32 does not match its content")
 
 
-@dataclass(frozen=True)
-class _Shapes:
-    """Shapes from the sandbox process: see :class:`foveasim.layout.files._gdstk.Shapes`."""
-
-    xy_dbu: NDArray[Any]
-    counts: Ints
-    tags: Ints
-    lines: bytes
-
-
 def _read_in_sandbox(
     path: Path,
     is_oasis: bool,
@@ -811,10 +770,8 @@ def _read_in_sandbox(
     filters: list[LayerNumber],
     cell: str | None,
     n_bytes: int,
-) -> tuple[dict[str, Any], _Shapes, _Shapes]:
+) -> tuple[dict[str, Any], _gdstk.Shapes, _gdstk.Shapes, bytes]:
     """Read the file with gdstk in the sandbox process, which a malformed file may crash."""
-    from foveasim.layout.files import _gdstk
-
     max_cpu_s = MAX_CPU_S + n_bytes // BYTES_PER_S
     max_memory_bytes = min(MIN_MEMORY_BYTES + MEMORY_PER_BYTE * n_bytes, MAX_MEMORY_BYTES)
     args = {
@@ -827,7 +784,7 @@ def _read_in_sandbox(
         "max_text_bytes": max(MIN_STRING_BYTES, STRING_BYTES_PER_BYTE * n_bytes),
         "max_cpu_s": WALL_TIME_FACTOR * max_cpu_s,
     }
-    answer, (xy_dbu, counts, tags, lines, *covers) = run_in_sandbox(
+    answer, (xy, counts, tags, lines, *covers) = run_in_sandbox(
         _gdstk.read,
         path,
         args,
@@ -836,7 +793,12 @@ def _read_in_sandbox(
         max_bytes=min(MIN_READING_BYTES + READING_PER_BYTE * n_bytes, max_memory_bytes),
         is_standalone=True,
     )
-    return answer, _Shapes(xy_dbu, counts, tags, lines.tobytes()), _Shapes(covers[0], covers[1], covers[2], b"")
+    return (
+        answer,
+        _gdstk.Shapes(xy, counts, tags, 1),
+        _gdstk.Shapes(covers[0], covers[1], covers[2], 1),
+        lines.tobytes(),
+    )
 
 
 def _group_by_site(path: Path, xy_um: Floats, counts: Ints, tags: Ints) -> tuple[Layout, Ints, Ints]:

@@ -8,10 +8,9 @@ member ``foveasim``, which other programs ignore, contains the unit, the provena
 from __future__ import annotations
 
 import json
-import re
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -27,15 +26,13 @@ from foveasim.errors import FileError
 from foveasim.layout.files._common import (
     FORMATS,
     WrittenLayout,
-    check_header,
     check_site_count,
-    dtype_strings,
-    header,
+    check_table_header,
     layout_from_untrusted,
-    lossless_report,
     plain_columns,
     restore_column,
     string_column,
+    table_header,
 )
 from foveasim.layout.model import Layout
 
@@ -50,24 +47,18 @@ NUMBER_TYPES: set[type] = {int, float}
 MAX_EXACT, MAX_FLOAT = 2**53, 2**1023
 #: With more property names, only properties of all features are columns, as names could differ for every feature.
 MAX_NAMES = 256
-_BLANK = re.compile(r"[ \t\r\n]*")
 
 
 def write(layout: Layout, path: Path) -> WrittenLayout:
-    """
-    Write a GeoJSON FeatureCollection.
-
-    Raises ParameterError when a column contains neither numbers nor strings. Raises FileError when the file cannot be written.
-    """
+    """Write a GeoJSON FeatureCollection."""
     columns = plain_columns(layout, "GeoJSON")
-    about = {**header(layout), "columns": dtype_strings(layout)}
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
-        file.write(f'{{"type": "FeatureCollection", "foveasim": {json.dumps(about)}, "features": [')
+        file.write(f'{{"type": "FeatureCollection", "foveasim": {json.dumps(table_header(layout))}, "features": [')
         for start in range(0, layout.n_sites, CHUNK):
             file.write(",\n" if start else "\n")
             file.write(",\n".join(_features(layout[start : start + CHUNK], columns, start)))
         file.write("\n]}\n")
-    return lossless_report(layout, path)
+    return WrittenLayout(path=path, n_sites=layout.n_sites)
 
 
 def _features(layout: Layout, columns: Mapping[str, NDArray[Any]], start: int) -> Iterator[str]:
@@ -95,19 +86,12 @@ def read(path: Path) -> Layout:
 
     Properties of all features that are all numbers, all booleans or all strings become columns; null is NaN among
     numbers, and an empty string among strings. The provenance of the layout lists the names of other properties.
-
-    Raises FileError when the file is corrupt, too large, or contains other geometries than polygons.
     """
     with as_file_error(path, "GeoJSON layout"):
         document = _Document(path)
         polygons = document.outlines()
-        types: Any = {}
-        provenance: dict[str, Any] = {"made_by": "read_layout", "file": path.name, "format": "GeoJSON"}
-        about = document.members.get("foveasim")
-        if about is not None:
-            provenance = check_header(path, about)
-            types = about.get("columns")
-        columns, dropped = document.columns(types if isinstance(types, dict) else {})
+        provenance, types = check_table_header(path, document.members.get("foveasim"), "GeoJSON")
+        columns, dropped = document.columns(types)
         if dropped:
             provenance = {**provenance, "left_out_properties": dropped}
         return layout_from_untrusted(polygons, columns, provenance)
@@ -124,22 +108,26 @@ class _Document:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.members: dict[str, Any] = {}
         self._rows: list[dict[str, Any]] = []
         self._rings_of_site = array("q")
         self._vertices_of_ring = array("q")
         self._xy = array("d")
-        text = path.read_text(encoding="utf-8-sig")
-        for key, value in _members(text, self._add):
-            self.members[key] = value
-        if self.members.get("type") != "FeatureCollection" or "features" not in self.members:
+        document = json.loads(path.read_text(encoding="utf-8-sig"), object_hook=self._take)
+        features = document.get("features") if isinstance(document, dict) else None
+        if not isinstance(features, list) or document.get("type") != "FeatureCollection":
             raise FileError(path, "is not a GeoJSON FeatureCollection")
+        for i, number in enumerate(features):
+            if number != i:
+                raise FileError(path, f"feature {i} must be one polygon in a Feature; write one feature per site")
+        self.members = document
 
-    def _add(self, feature: Any) -> None:
-        """Add the outline and the properties of a feature."""
+    def _take(self, item: dict[str, Any]) -> Any:
+        """Add a feature and return its number; return other objects as they are."""
+        if item.get("type") != "Feature" or "geometry" not in item:
+            return item
         i = len(self._rows)
         check_site_count(self.path, i + 1)
-        geometry = feature.get("geometry") if isinstance(feature, dict) else None
+        geometry = item["geometry"]
         kind = geometry.get("type") if isinstance(geometry, dict) else None
         rings = geometry.get("coordinates") if isinstance(geometry, dict) else None
         if kind == "MultiPolygon" and isinstance(rings, list) and len(rings) == 1:
@@ -163,8 +151,9 @@ class _Document:
                     raise FileError(self.path, f"feature {i} has a position that is not two or three numbers")
                 self._xy.append(position[0])
                 self._xy.append(position[1])
-        properties = feature.get("properties")
+        properties = item.get("properties")
         self._rows.append(properties if isinstance(properties, dict) else {})
+        return i
 
     def outlines(self) -> tuple[Floats, Ints, Ints]:
         """Return the packed rings of all features, unchecked."""
@@ -185,44 +174,6 @@ class _Document:
             else:
                 columns[name] = column
         return columns, dropped
-
-
-def _members(text: str, add: Callable[[Any], None]) -> Iterator[tuple[str, Any]]:
-    """Yield the members of a JSON object; pass elements of ``features`` to ``add`` instead."""
-    decode = json.JSONDecoder().raw_decode
-
-    def after(at: int, expected: str) -> int:
-        at = _BLANK.match(text, at).end()  # type: ignore[union-attr]
-        if at >= len(text) or text[at] not in expected:
-            raise ValueError(f"expected one of {' '.join(expected)} at character {at}")
-        return at + 1
-
-    at, key = after(0, "{"), ""
-    while True:
-        at = after(at, '"') - 1
-        key, at = decode(text, at)
-        at = _BLANK.match(text, after(at, ":")).end()  # type: ignore[union-attr]
-        if key == "features":
-            yield key, None
-            at = after(at, "[")
-            end = _BLANK.match(text, at).end()  # type: ignore[union-attr]
-            if text[end : end + 1] == "]":
-                at = end + 1
-            else:
-                while True:
-                    feature, at = decode(text, _BLANK.match(text, at).end())  # type: ignore[union-attr]
-                    add(feature)
-                    at = after(at, ",]")
-                    if text[at - 1] == "]":
-                        break
-        else:
-            value, at = decode(text, at)
-            yield key, value
-        at = after(at, ",}")
-        if text[at - 1] == "}":
-            break
-    if text[at:].strip():
-        raise ValueError(f"unexpected data after the end at character {at}")
 
 
 def _is_exact(value: Any) -> bool:

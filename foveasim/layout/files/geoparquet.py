@@ -23,16 +23,14 @@ from foveasim.layout.files._common import (
     FORMATS,
     WrittenLayout,
     check_decompressed,
-    check_header,
     check_site_count,
-    dtype_strings,
-    header,
+    check_table_header,
     layout_from_untrusted,
-    lossless_report,
     max_decompressed_bytes,
     plain_columns,
     restore_column,
     string_column,
+    table_header,
 )
 from foveasim.layout.model import Layout
 
@@ -80,25 +78,19 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
     if layout.n_sites:
         column["bbox"] = list(layout.bounds_um)
     geo = {"version": VERSION, "primary_column": GEOMETRY, "columns": {GEOMETRY: column}}
-    about = {**header(layout), "columns": dtype_strings(layout)}
     outlines = pa.array(shapely.to_wkb(layout.polygons(), byte_order=1), type=pa.binary())
     # Arrow supports only the native byte order; numpy's fixed-width strings have no null.
     native = {name: values.astype(values.dtype.newbyteorder("=")) for name, values in columns.items()}
     table = pa.table({GEOMETRY: outlines, **{name: pa.array(values) for name, values in native.items()}})
-    table = table.replace_schema_metadata({"geo": json.dumps(geo), "foveasim": json.dumps(about)})
+    table = table.replace_schema_metadata({"geo": json.dumps(geo), "foveasim": json.dumps(table_header(layout))})
     with atomic_write(path) as temporary:
         # Outlines are distinct, so that a dictionary would not reduce their size.
         parquet.write_table(table, temporary, compression="zstd", use_dictionary=[*columns], write_page_checksum=True)
-    return lossless_report(layout, path)
+    return WrittenLayout(path=path, n_sites=layout.n_sites)
 
 
 def read(path: Path) -> Layout:
-    """
-    Read a table of polygons, in the order of its rows.
-
-    Raises FileError when pyarrow is not installed, or the file is corrupt, too large, or contains other geometries than
-    polygons.
-    """
+    """Read a table of polygons, in the order of its rows."""
     pa, parquet = _pyarrow(path)
     with as_file_error(path, "GeoParquet layout"), parquet.ParquetFile(path, page_checksum_verification=True) as file:
         check_site_count(path, file.metadata.num_rows)
@@ -120,13 +112,7 @@ def read(path: Path) -> Layout:
             )
         table.validate(full=True)
         polygons = _polygons(path, table.column(name).to_numpy(zero_copy_only=False))
-        types: Any = {}
-        provenance: dict[str, Any] = {"made_by": "read_layout", "file": path.name, "format": "GeoParquet"}
-        if b"foveasim" in metadata:
-            about = json.loads(metadata[b"foveasim"])
-            provenance = check_header(path, about)
-            types = about.get("columns")
-        types = types if isinstance(types, dict) else {}
+        provenance, types = check_table_header(path, json.loads(metadata.get(b"foveasim", "null")), "GeoParquet")
         columns, dropped = {}, []
         for other in table.column_names:
             kind = table.schema.field(other).type
@@ -135,10 +121,9 @@ def read(path: Path) -> Layout:
             is_number = pa.types.is_boolean(kind) or pa.types.is_integer(kind) or pa.types.is_floating(kind)
             is_string = pa.types.is_string(kind) or pa.types.is_large_string(kind)
             has_null = table.column(other).null_count > 0
-            if not (is_number or is_string) or (has_null and not pa.types.is_floating(kind)):
-                dropped.append(other)
-                continue
-            values = string_column(table.column(other).to_pylist()) if is_string else table.column(other).to_numpy()
+            values = None
+            if (is_number or is_string) and not (has_null and not pa.types.is_floating(kind)):
+                values = string_column(table.column(other).to_pylist()) if is_string else table.column(other).to_numpy()
             if values is None:
                 dropped.append(other)
             else:

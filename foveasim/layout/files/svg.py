@@ -33,11 +33,7 @@ CHUNK = 10_000
 
 
 def write(layout: Layout, path: Path, *, colours: Mapping[int, str] | None = None) -> WrittenLayout:
-    """
-    Write the layout as a drawing.
-
-    Raises ParameterError when a colour is invalid. Raises FileError when the file cannot be written.
-    """
+    """Write the layout as a drawing."""
     colours = _validate_colours(colours or {})
     x_min, y_min, x_max, y_max = layout.bounds_um if layout.n_sites else (0.0, 0.0, 1.0, 1.0)
     width_um, height_um = x_max - x_min, y_max - y_min

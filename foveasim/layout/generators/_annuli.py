@@ -9,8 +9,11 @@ from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
+from foveasim._core.calls import Limits
 from foveasim._core.validation import Floats, Ints, read_only
 
+#: Chords per arc.
+CHORDS = Limits(at_least=1, at_most=1000)
 #: Minimum number of sites of a ring of the fovea, per unit of its radius.
 MIN_SITES_PER_RHO = 3
 #: Number of circles that are cached: those between rings of equal sectors are of at most two kinds, in alternation.

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 import numpy as np
 
-from foveasim._core.validation import (
-    MAX_LENGTH_UM,
-    MAX_SITES,
-    Floats,
-    Ints,
-    check_count,
-    check_length_um,
-    check_number,
-    check_sites,
-)
+from foveasim._core.calls import LENGTH, Limits
+from foveasim._core.validation import MAX_LENGTH_UM, MAX_SITES, Floats, Ints, check_count, check_sites
 from foveasim.errors import ParameterError
 from foveasim.layout.families import layout_family
 from foveasim.layout.generators._annuli import ring_outlines
-from foveasim.layout.model import Layout
+from foveasim.layout.model import Layout, layout_of
 from foveasim.layout.site_counts import SolveFor
 
 __all__ = ["foveal_cartesian"]
@@ -35,18 +28,16 @@ CORNER_ROUNDING = 1e-12
     solve_for=(
         SolveFor(
             name="n_rings",
-            is_integer=True,
-            is_increasing=True,
             guess=lambda n_sites, _: 0.5 * (math.sqrt(n_sites) + 1.0),
             count=lambda parameters: float((2 * parameters["n_rings"] - 1) ** 2),
         ),
     ),
 )
 def foveal_cartesian(
-    n_rings: int | None = None,
+    n_rings: Annotated[int | None, Limits(at_least=1, at_most=MAX_SITES)] = None,
     *,
-    ring_ratio: float,
-    pitch_um: float,
+    ring_ratio: Annotated[float, Limits(above=1.0 + RATIO_ROUNDING)],
+    pitch_um: Annotated[float, LENGTH],
     n_fovea: int = 1,
     n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
 ) -> Layout:
@@ -107,10 +98,8 @@ def foveal_cartesian(
     >>> foveal_cartesian(n_rings=32, ring_ratio=1.2, pitch_um=2.2, n_fovea=8).n_sites
     3969
     """
-    n_rings = check_count("n_rings", n_rings, at_most=MAX_SITES)
+    assert n_rings is not None
     check_sites((2 * n_rings - 1) ** 2)
-    ring_ratio = check_number("ring_ratio", ring_ratio, above=1.0 + RATIO_ROUNDING)
-    pitch_um = check_length_um("pitch_um", pitch_um)
     n_fovea = check_count("n_fovea", n_fovea, at_most=n_rings, hint="the upper limit is 'n_rings'")
     n_growing = n_rings - n_fovea
     if math.log((n_fovea - 0.5) * pitch_um) + n_growing * math.log(ring_ratio) > math.log(MAX_LENGTH_UM):
@@ -125,12 +114,8 @@ def foveal_cartesian(
     ring = np.repeat(np.arange(n_rings), n_sectors)
     sector = np.arange(ring.size) - (np.cumsum(n_sectors) - n_sectors)[ring]
     row, column = (n_rings - 1 + index for index in _row_and_column(ring, sector))
-    return Layout(
-        xy_um,
-        np.concatenate(([0], np.cumsum(n_vertices))),
-        np.arange(n_vertices.size + 1),
-        {"ring": ring, "sector": sector, "row": row, "column": column, "readout_line": column},
-    )
+    columns = {"ring": ring, "sector": sector, "row": row, "column": column, "readout_line": column}
+    return layout_of(xy_um, np.concatenate(([0], np.cumsum(n_vertices))), columns=columns)
 
 
 def _row_and_column(ring: Ints, sector: Ints) -> tuple[Ints, Ints]:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from foveasim._core.calls import LENGTH, Limits
 from foveasim._core.rings import positions_in_runs
-from foveasim._core.validation import Floats, Ints, check_count, check_length_um, check_sites
+from foveasim._core.validation import Floats, Ints, check_count, check_sites
 from foveasim.errors import ParameterError
 from foveasim.layout._regions import disc
 from foveasim.layout.diagrams.voronoi import voronoi_cells
 from foveasim.layout.families import layout_family
-from foveasim.layout.model import Layout
+from foveasim.layout.model import Layout, layout_of
 from foveasim.layout.site_counts import SolveFor
 
 __all__ = ["fovi"]
@@ -42,8 +43,6 @@ def _guess_rings(n_sites: int, parameters: Mapping[str, Any]) -> float:
     solve_for=(
         SolveFor(
             name="n_rings",
-            is_integer=True,
-            is_increasing=True,
             guess=_guess_rings,
             count=_count_sites,
             needs=("a_um",),
@@ -51,7 +50,6 @@ def _guess_rings(n_sites: int, parameters: Mapping[str, Any]) -> float:
         SolveFor(
             name="a_um",
             is_integer=False,
-            is_increasing=True,
             guess=lambda _, parameters: 0.1 * parameters["fov_um"],
             count=_count_sites,
             needs=("n_rings",),
@@ -59,10 +57,10 @@ def _guess_rings(n_sites: int, parameters: Mapping[str, Any]) -> float:
     ),
 )
 def fovi(
-    fov_um: float,
+    fov_um: Annotated[float, LENGTH],
     *,
-    a_um: float | None = None,
-    n_rings: int | None = None,
+    a_um: Annotated[float | None, LENGTH] = None,
+    n_rings: Annotated[int | None, Limits(at_least=1, at_most=MAX_RINGS)] = None,
     n_chords: int | None = None,
     n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
 ) -> Layout:
@@ -116,8 +114,8 @@ def fovi(
     >>> layout.n_sites, layout.columns["ring"][:4].tolist()
     (568, [0, 1, 1, 1])
     """
-    fov_um, a_um = check_length_um("fov_um", fov_um), check_length_um("a_um", a_um)
-    n_rings = check_count("n_rings", n_rings, at_most=MAX_RINGS)
+    assert a_um is not None
+    assert n_rings is not None
     r_um = _radii_um(fov_um, a_um, n_rings)
     counts = _sites_per_ring(r_um)
     check_sites(int(counts.sum()))
@@ -132,15 +130,8 @@ def fovi(
     else:
         n_sides = check_count("n_chords", n_chords, at_least=_min_chords(0.5 * fov_um, radius_um), at_most=10**6)
     xy_um, offsets = voronoi_cells(centres_um, disc(radius_um, n_sides))
-    return Layout(
-        xy_um,
-        offsets,
-        np.arange(offsets.size),
-        {"ring": ring, "sector": sector, "readout_line": ring},
-        {
-            "radius_um": radius_um,
-        },
-    )
+    columns = {"ring": ring, "sector": sector, "readout_line": ring}
+    return layout_of(xy_um, offsets, None, columns, {"radius_um": radius_um})
 
 
 def _step(fov_um: float, a_um: float, n_rings: int) -> float:

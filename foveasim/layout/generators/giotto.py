@@ -10,25 +10,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, get_args
+from typing import Annotated, Any
 
 import numpy as np
 
-from foveasim._core.validation import MAX_LENGTH_UM, MAX_SITES, check_choice, check_count, check_length_um, check_sites
+from foveasim._core.calls import Limits
+from foveasim._core.validation import MAX_LENGTH_UM, MAX_SITES, check_count, check_length_um, check_sites
 from foveasim.errors import ParameterError
-from foveasim.layout.families import layout_family
-from foveasim.layout.generators._annuli import MIN_SITES_PER_RHO, Fovea, Ring, annuli, fovea_rings
+from foveasim.layout.families import COUNT, layout_family
+from foveasim.layout.generators._annuli import CHORDS, MIN_SITES_PER_RHO, Fovea, Ring, annuli, fovea_rings
 from foveasim.layout.generators.tiling import with_hexagons
-from foveasim.layout.model import Layout
+from foveasim.layout.model import Layout, layout_of
 from foveasim.layout.site_counts import SolveFor
 
 __all__ = ["giotto", "giotto_ratio"]
 
+RINGS, ACROSS = Limits(at_least=2, at_most=MAX_SITES), Limits(at_least=1, at_most=2**53)
 #: Absolute tolerance of log λ; the ratio itself then has fifteen significant digits.
 LOG_RATIO_ROUNDING = 1e-16
 
 
-def giotto_ratio(*, n_rho: int, n_fovea: int, n_across: int) -> float:
+def giotto_ratio(
+    *, n_rho: Annotated[int, RINGS], n_fovea: Annotated[int, COUNT], n_across: Annotated[int, ACROSS]
+) -> float:
     """
     Compute the ratio λ of the heights of adjacent rings outside the fovea.
 
@@ -67,8 +71,6 @@ def _count_sites(parameters: Mapping[str, Any]) -> float | None:
     solve_for=(
         SolveFor(
             name="n_theta",
-            is_integer=True,
-            is_increasing=True,
             guess=lambda n_sites, parameters: n_sites / parameters["n_rho"],
             count=_count_sites,
             at_least=3,
@@ -77,14 +79,14 @@ def _count_sites(parameters: Mapping[str, Any]) -> float | None:
 )
 def giotto(
     *,
-    n_rho: int,
-    n_fovea: int,
-    n_across: int,
+    n_rho: Annotated[int, RINGS],
+    n_fovea: Annotated[int, COUNT],
+    n_across: Annotated[int, ACROSS],
     unit_um: float,
-    n_theta: int | None = None,
+    n_theta: Annotated[int | None, Limits(at_least=3, at_most=MAX_SITES)] = None,
     fovea: Fovea = "rings",
     stagger: bool = True,
-    chords_per_arc: int = 1,
+    chords_per_arc: Annotated[int, CHORDS] = 1,
     n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
 ) -> Layout:
     """
@@ -156,11 +158,8 @@ def giotto(
     (32887, 5167)
     """
     log_ratio = _log_ratio(n_rho, n_fovea, n_across)
-    n_rho, n_fovea, n_across = int(n_rho), int(n_fovea), int(n_across)
-    n_theta = check_count("n_theta", n_theta, at_least=3, at_most=MAX_SITES)
+    assert n_theta is not None
     unit_um = check_length_um("unit_um", unit_um, at_most=2.0 * MAX_LENGTH_UM / n_across)
-    check_choice("fovea", fovea, get_args(Fovea))
-    chords_per_arc = check_count("chords_per_arc", chords_per_arc, at_most=1000)
     has_rings = fovea in {"rings", "linear"}
     if has_rings and n_theta < MIN_SITES_PER_RHO * n_fovea:
         raise ParameterError(
@@ -190,32 +189,23 @@ def giotto(
 
     xy_um, offsets, ring, sector = annuli(radii * unit_um, rings)
     per_ring = np.array([r.n_sites for r in rings])
-    provenance = {
-        "ring_ratio": math.exp(log_ratio),
-    }
+    provenance = {"ring_ratio": math.exp(log_ratio)}
     if not has_rings:
         provenance["blind_radius_um"] = float(radii[0] * unit_um)
-    layout = Layout(
-        xy_um,
-        offsets,
-        np.arange(offsets.size),
-        {"ring": first + ring, "sector": sector, "readout_line": sector * n_theta // per_ring[ring]},
-        provenance,
-    )
+    columns = {"ring": first + ring, "sector": sector, "readout_line": sector * n_theta // per_ring[ring]}
+    layout = layout_of(xy_um, offsets, None, columns, provenance)
     return with_hexagons(layout, unit_um, n_theta) if fovea == "hexagons" else layout
 
 
 def _log_ratio(n_rho: int, n_fovea: int, n_across: int) -> float:
     from scipy.optimize import brentq
 
-    n_rho = check_count("n_rho", n_rho, at_least=2, at_most=MAX_SITES)
     n_fovea = check_count(
         "n_fovea",
         n_fovea,
         at_most=n_rho - 1,
         hint="'n_rho' includes the rings of the fovea and at least one around them",
     )
-    n_across = check_count("n_across", n_across, at_most=2**53)
     if n_across < 2 * n_rho:
         raise ParameterError(
             "n_across",

@@ -4,22 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from foveasim._core.validation import (
-    MAX_SITES,
-    Floats,
-    check_count,
-    check_length_um,
-    check_number,
-    check_sites,
-    finite_array,
-    freeze,
-)
+from foveasim._core.calls import LENGTH, NOT_NEGATIVE, Limits
+from foveasim._core.validation import MAX_SITES, Floats, check_length_um, check_sites, freeze
 from foveasim.errors import ParameterError
-from foveasim.layout.families import layout_family
+from foveasim.layout.families import COUNT, layout_family
 from foveasim.layout.lattice import RectangleLattice
 from foveasim.layout.model import Layout
 from foveasim.layout.site_counts import SolveFor
@@ -30,6 +22,7 @@ __all__ = ["grid"]
 MAX_LATTICE_SITES = 1_000_000_000
 #: Rows that exceed the height of a field by rounding fit in it.
 FIT_ROUNDING = 1.0 + 1e-9
+FILL_FACTOR = Limits(above=0.0, at_most=1.0)
 
 
 def _count_cells(parameters: Mapping[str, Any]) -> float:
@@ -48,18 +41,18 @@ def guess_columns(n_sites: int, parameters: Mapping[str, Any]) -> float:
 
 @layout_family(
     example={"n_x": 14, "n_y": 14, "pitch_um": 2.0, "trench_um": 0.3, "stagger": True},
-    solve_for=(SolveFor(name="n_x", is_integer=True, is_increasing=True, guess=guess_columns, count=_count_cells),),
+    solve_for=(SolveFor(name="n_x", guess=guess_columns, count=_count_cells),),
 )
 def grid(
-    n_x: int | None = None,
-    n_y: int | None = None,
-    pitch_um: float | None = None,
+    n_x: Annotated[int | None, COUNT] = None,
+    n_y: Annotated[int | None, COUNT] = None,
+    pitch_um: Annotated[float | None, LENGTH] = None,
     *,
     size_um: tuple[float, float] | None = None,
-    pitch_y_um: float | None = None,
+    pitch_y_um: Annotated[float | None, LENGTH] = None,
     width_um: float | None = None,
-    trench_um: float | None = None,
-    fill_factor: float | None = None,
+    trench_um: Annotated[float | None, NOT_NEGATIVE] = None,
+    fill_factor: Annotated[float | None, FILL_FACTOR] = None,
     stagger: bool = False,
     n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
 ) -> Layout:
@@ -113,10 +106,8 @@ def grid(
     (13924, 11.695)
     """
     n_x, n_y, pitch_um = cells_in_field(n_x, n_y, pitch_um, size_um)
-    if pitch_y_um is not None:
-        pitch_y_um = check_length_um("pitch_y_um", pitch_y_um)
-        if width_um is not None:
-            raise ParameterError("width_um", "must be replaced by 'trench_um' if 'pitch_y_um' is given", width_um)
+    if pitch_y_um is not None and width_um is not None:
+        raise ParameterError("width_um", "must be replaced by 'trench_um' if 'pitch_y_um' is given", width_um)
     pitches_um = pitch_um, pitch_um if pitch_y_um is None else pitch_y_um
     fractions = [linear_fill_factor(p_um, width_um, trench_um, fill_factor) for p_um in pitches_um]
     check_sites(n_x * n_y, at_most=MAX_SITES if stagger else MAX_LATTICE_SITES)
@@ -139,58 +130,39 @@ def grid(
 def cells_in_field(
     n_x: int | None, n_y: int | None, pitch_um: float | None, size_um: tuple[float, float] | None
 ) -> tuple[int, int, float]:
-    """
-    Return columns, rows and pitch of square cells, from their pitch or field.
-
-    Raises ParameterError when a number is out of range, or neither or both of pitch and field are given.
-    """
-    n_x = check_count("n_x", n_x)
+    """Return columns, rows and pitch of square cells, from their pitch or field."""
+    assert n_x is not None
     field_um = check_field_um(pitch_um, size_um)
     if field_um is None:
-        return n_x, n_x if n_y is None else check_count("n_y", n_y), check_length_um("pitch_um", pitch_um)
+        assert pitch_um is not None
+        return n_x, n_y or n_x, pitch_um
     pitch_um = field_um[0] / n_x
-    n_fitting = max(1, math.floor(field_um[1] / pitch_um * FIT_ROUNDING))
-    return n_x, n_fitting if n_y is None else check_count("n_y", n_y), pitch_um
+    return n_x, n_y or max(1, math.floor(field_um[1] / pitch_um * FIT_ROUNDING)), pitch_um
 
 
 def check_field_um(pitch_um: float | None, size_um: tuple[float, float] | None) -> tuple[float, float] | None:
-    """
-    Return the size of a field, or None when the pitch is given instead.
-
-    Raises ParameterError when neither or both are given, or a length is out of range.
-    """
+    """Return the size of a field, or None when the pitch is given instead."""
     if (pitch_um is None) == (size_um is None):
         raise ParameterError("pitch_um", "or 'size_um' must be given, but only one of them")
     if size_um is None:
         return None
-    size = finite_array("size_um", size_um, ndim=1)
-    if size.shape != (2,):
-        raise ParameterError("size_um", "must be two numbers (width, height)", size_um, "µm")
-    width_um, height_um = (check_length_um("size_um", float(length)) for length in size)
+    width_um, height_um = (check_length_um("size_um", length_um) for length_um in size_um)
     return width_um, height_um
 
 
 def linear_fill_factor(
     pitch_um: float, width_um: float | None, trench_um: float | None, fill_factor: float | None
 ) -> float | None:
-    """
-    Return the photosensitive fraction of the width of a cell; None if sites tile the plane.
-
-    Raises ParameterError when more than one parameter is specified, or a value is out of range.
-    """
+    """Return the photosensitive fraction of the width of a cell; None if sites tile the plane."""
     if sum(x is not None for x in (width_um, trench_um, fill_factor)) > 1:
         raise ParameterError("width_um", "and 'trench_um' and 'fill_factor' exclude each other; give one of them")
     if width_um is not None:
         return check_length_um("width_um", width_um, at_most=pitch_um, hint="the upper limit is 'pitch_um'") / pitch_um
     if trench_um is not None:
-        trench_um = check_number("trench_um", trench_um, at_least=0.0)
         if not trench_um < pitch_um:
             raise ParameterError("trench_um", f"must be < {pitch_um:g}, the pitch", trench_um, "µm")
         return 1.0 - trench_um / pitch_um if trench_um > 0.0 else None
-    if fill_factor is not None:
-        fill_factor = check_number("fill_factor", fill_factor, above=0.0, at_most=1.0)
-        return math.sqrt(fill_factor) if fill_factor < 1.0 else None
-    return None
+    return math.sqrt(fill_factor) if fill_factor is not None and fill_factor < 1.0 else None
 
 
 def cell_interval(fraction: float | None) -> Floats:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from foveasim._core.validation import check_choice, check_count, check_length_um, check_sites
-from foveasim.layout.families import layout_family
-from foveasim.layout.generators.grid import FIT_ROUNDING, check_field_um, linear_fill_factor
+from foveasim._core.calls import LENGTH, NOT_NEGATIVE
+from foveasim._core.validation import check_sites
+from foveasim.layout.families import COUNT, layout_family
+from foveasim.layout.generators.grid import FILL_FACTOR, FIT_ROUNDING, check_field_um, linear_fill_factor
 from foveasim.layout.model import Layout
 from foveasim.layout.site_counts import SolveFor
 
@@ -37,19 +38,17 @@ def _guess_columns(n_sites: int, parameters: Mapping[str, Any]) -> float:
 
 @layout_family(
     example={"n_columns": 14, "n_rows": 16, "pitch_um": 2.0},
-    solve_for=(
-        SolveFor(name="n_columns", is_integer=True, is_increasing=True, guess=_guess_columns, count=_count_cells),
-    ),
+    solve_for=(SolveFor(name="n_columns", guess=_guess_columns, count=_count_cells),),
 )
 def hexagonal(
-    n_columns: int | None = None,
-    n_rows: int | None = None,
-    pitch_um: float | None = None,
+    n_columns: Annotated[int | None, COUNT] = None,
+    n_rows: Annotated[int | None, COUNT] = None,
+    pitch_um: Annotated[float | None, LENGTH] = None,
     *,
     size_um: tuple[float, float] | None = None,
     width_um: float | None = None,
-    trench_um: float | None = None,
-    fill_factor: float | None = None,
+    trench_um: Annotated[float | None, NOT_NEGATIVE] = None,
+    fill_factor: Annotated[float | None, FILL_FACTOR] = None,
     orientation: Literal["pointy", "flat"] = "pointy",
     n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
 ) -> Layout:
@@ -95,7 +94,6 @@ def hexagonal(
     ParameterError
         When a number is out of range, the width exceeds the pitch, or the width is specified twice.
     """
-    check_choice("orientation", orientation, ("pointy", "flat"))
     n_columns, n_rows, pitch_um = _cells_in_field(n_columns, n_rows, pitch_um, size_um, orientation)
     fraction = linear_fill_factor(pitch_um, width_um, trench_um, fill_factor)
     check_sites(n_columns * n_rows)
@@ -108,10 +106,7 @@ def hexagonal(
     rings_um = ((centre - layout_centre)[:, np.newaxis] + (1.0 if fraction is None else fraction) * corners) * half_um
     if orientation == "flat":
         rings_um = np.stack((-rings_um[..., 1], rings_um[..., 0]), axis=-1)
-    return Layout.from_equal_rings(
-        rings_um,
-        {"row": row, "column": column, "readout_line": column},
-    )
+    return Layout.from_equal_rings(rings_um, {"row": row, "column": column, "readout_line": column})
 
 
 def _cells_in_field(
@@ -122,16 +117,14 @@ def _cells_in_field(
     orientation: str,
 ) -> tuple[int, int, float]:
     """Return hexagons per row, rows and pitch, from the pitch or the field."""
-    n_columns = check_count("n_columns", n_columns)
+    assert n_columns is not None
     field_um = check_field_um(pitch_um, size_um)
     if field_um is None:
-        pitch_um = check_length_um("pitch_um", pitch_um)
+        assert pitch_um is not None
         across = n_columns + 0.5
     else:
         width_um, height_um = field_um if orientation == "pointy" else field_um[::-1]
         # Every second row is shifted by half a pitch; a single row ends half a pitch before the end of the field.
         pitch_um = width_um / (n_columns + 0.5)
         across = height_um / pitch_um
-    if n_rows is not None:
-        return n_columns, check_count("n_rows", n_rows), pitch_um
-    return n_columns, max(1, math.floor((across - HEIGHT) / ROW_PITCH * FIT_ROUNDING) + 1), pitch_um
+    return n_columns, n_rows or max(1, math.floor((across - HEIGHT) / ROW_PITCH * FIT_ROUNDING) + 1), pitch_um

@@ -4,27 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
+from foveasim._core.calls import LENGTH, Limits
 from foveasim._core.rings import ring_moments
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import (
-    MAX_SITES,
-    Floats,
-    Ints,
-    check_choice,
-    check_count,
-    check_length_um,
-    check_number,
-    check_sites,
-)
+from foveasim._core.validation import MAX_SITES, Floats, Ints, check_count, check_length_um, check_sites
 from foveasim.errors import LayoutWarning, ParameterError
 from foveasim.layout.families import layout_family
-from foveasim.layout.generators._annuli import MIN_SITES_PER_RHO, Annuli, Fovea, Ring, annuli, fovea_rings
+from foveasim.layout.generators._annuli import CHORDS, MIN_SITES_PER_RHO, Annuli, Fovea, Ring, annuli, fovea_rings
 from foveasim.layout.generators.tiling import with_hexagons
-from foveasim.layout.model import Layout, valid_sites
+from foveasim.layout.model import Layout, layout_of, valid_sites
 from foveasim.layout.site_counts import SolveFor
 
 __all__ = ["log_polar", "square_ring_ratio"]
@@ -35,11 +27,12 @@ SITES_PER_RHO = 6
 RATIO_ROUNDING = 1e-12
 #: Rounding error of a coordinate, relative to the radius (angle, cosine and product); that of a side is twice as large.
 COORDINATE_ROUNDING = 4.0 * np.finfo(np.float64).eps
+SECTORS = Limits(at_least=3, at_most=MAX_SITES)
 #: Fraction of ``r_max_um`` below which the outermost ring leaves a fifth of the field uncovered, which causes a warning.
 MIN_REACH = 0.9
 
 
-def square_ring_ratio(n_sectors: int) -> float:
+def square_ring_ratio(n_sectors: Annotated[int, SECTORS]) -> float:
     """
     Compute the ratio of outer to inner ring radius for sites as high as wide.
 
@@ -48,7 +41,7 @@ def square_ring_ratio(n_sectors: int) -> float:
     Height ``r_c * 2 (q - 1) / (q + 1)`` equal to the chord ``2 r_c sin(π / n)`` on the centre line gives
     ``q = (1 + sin(π / n)) / (1 - sin(π / n))``.
     """
-    s = math.sin(math.pi / check_count("n_sectors", n_sectors, at_least=3))
+    s = math.sin(math.pi / n_sectors)
     return (1.0 + s) / (1.0 - s)
 
 
@@ -73,8 +66,6 @@ def _count_sites(parameters: Mapping[str, Any]) -> float | None:
     solve_for=(
         SolveFor(
             name="n_sectors",
-            is_integer=True,
-            is_increasing=True,
             guess=lambda n_sites, _: math.sqrt(math.pi * n_sites),
             count=_count_sites,
             at_least=3,
@@ -91,16 +82,16 @@ def _count_sites(parameters: Mapping[str, Any]) -> float | None:
     ),
 )
 def log_polar(
-    n_sectors: int | None = None,
+    n_sectors: Annotated[int | None, SECTORS] = None,
     *,
-    r_max_um: float,
+    r_max_um: Annotated[float, LENGTH],
     min_size_um: float | None = None,
     r_min_um: float | None = None,
     n_rings: int | None = None,
-    ring_ratio: float | None = None,
+    ring_ratio: Annotated[float | None, Limits(above=1.0 + RATIO_ROUNDING)] = None,
     fovea: Fovea = "none",
     stagger: bool = False,
-    chords_per_arc: int = 1,
+    chords_per_arc: Annotated[int, CHORDS] = 1,
     n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
 ) -> Layout:
     """
@@ -175,9 +166,7 @@ def log_polar(
     >>> layout.n_sites, layout.provenance["parameters"]["n_sectors"]
     (14060, 190)
     """
-    n_sectors = check_count("n_sectors", n_sectors, at_least=3, at_most=MAX_SITES)
-    check_choice("fovea", fovea, get_args(Fovea))
-    chords_per_arc = check_count("chords_per_arc", chords_per_arc, at_most=1000)
+    assert n_sectors is not None
     n_chords = chords_per_arc * (2 if stagger and chords_per_arc % 2 else 1)
     radii_um, ratio = _rings(n_sectors, r_max_um, min_size_um, r_min_um, n_rings, ring_ratio, fovea, n_chords)
     _warn_of_reach(radii_um, ratio, r_max_um)
@@ -188,16 +177,10 @@ def log_polar(
         )
     else:
         sites, per_ring = annuli(radii_um, rings), np.full(len(rings), n_sectors)
-    provenance: dict[str, Any] = {}
-    if fovea == "none":
-        provenance["blind_radius_um"] = float(radii_um[0])
-    layout = Layout(
-        sites.xy_um,
-        sites.ring_offsets,
-        np.arange(sites.ring_offsets.size),
-        {"ring": sites.ring, "sector": sites.sector, "readout_line": sites.sector * n_sectors // per_ring[sites.ring]},
-        provenance,
-    )
+    line = sites.sector * n_sectors // per_ring[sites.ring]
+    columns = {"ring": sites.ring, "sector": sites.sector, "readout_line": line}
+    provenance = {"blind_radius_um": float(radii_um[0])} if fovea == "none" else {}
+    layout = layout_of(sites.xy_um, sites.ring_offsets, None, columns, provenance)
     if fovea == "hexagons":
         size_um = math.sqrt(layout.area_um2[:n_sectors].min()) if min_size_um is None else min_size_um
         return with_hexagons(layout, size_um, n_sectors)
@@ -222,7 +205,6 @@ def _rings(
     n_chords: int,
 ) -> _Rings:
     """Return the rings of :func:`log_polar`, for a final number of chords per arc."""
-    r_max_um = check_length_um("r_max_um", r_max_um)
     for name, length_um in (("min_size_um", min_size_um), ("r_min_um", r_min_um)):
         if length_um is not None:
             check_length_um(name, length_um, at_most=r_max_um, hint="the upper limit is 'r_max_um'")
@@ -239,10 +221,8 @@ def _rings(
             raise ParameterError(
                 "r_min_um", f"must leave {n_rings} rings a positive width below 'r_max_um'", r_min_um, "µm"
             )
-    elif ring_ratio is not None:
-        ratio = check_number("ring_ratio", ring_ratio, above=1.0 + RATIO_ROUNDING)
     else:
-        ratio = square_ring_ratio(n_sectors)
+        ratio = square_ring_ratio(n_sectors) if ring_ratio is None else ring_ratio
 
     smallest_um = 0.0
     if min_size_um is not None:
@@ -283,8 +263,7 @@ def _are_valid_sites(sites: Annuli, min_size_um: float) -> bool:
     area_um2, _ = ring_moments(sites.xy_um, sites.ring_offsets)
     if area_um2.min() <= 0.0 or math.sqrt(area_um2.min()) < min_size_um:
         return False
-    layout = Layout(sites.xy_um, sites.ring_offsets, np.arange(sites.ring_offsets.size))
-    return bool(valid_sites(layout).all())
+    return bool(valid_sites(layout_of(sites.xy_um, sites.ring_offsets)).all())
 
 
 def _radius_per_size(n_sectors: int, ratio: float, n_chords: int, fovea: Fovea, *, is_given: bool) -> float:

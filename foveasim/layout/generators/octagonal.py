@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from foveasim._core.validation import Bools, Ints, check_choice, check_length_um, check_sites
-from foveasim.layout.families import layout_family
+from foveasim._core.calls import LENGTH
+from foveasim._core.validation import Bools, Ints, check_length_um, check_sites
+from foveasim.layout.families import COUNT, layout_family
 from foveasim.layout.generators.grid import cells_in_field, guess_columns
-from foveasim.layout.model import Layout
+from foveasim.layout.model import Layout, layout_of
 from foveasim.layout.site_counts import SolveFor
 
 __all__ = ["octagonal"]
@@ -37,17 +38,15 @@ def _count_cells(parameters: Mapping[str, Any]) -> float:
     solve_for=(
         SolveFor(
             name="n_x",
-            is_integer=True,
-            is_increasing=True,
             guess=lambda n_sites, parameters: guess_columns(n_sites // 2, parameters),
             count=_count_cells,
         ),
     ),
 )
 def octagonal(
-    n_x: int | None = None,
-    n_y: int | None = None,
-    pitch_um: float | None = None,
+    n_x: Annotated[int | None, COUNT] = None,
+    n_y: Annotated[int | None, COUNT] = None,
+    pitch_um: Annotated[float | None, LENGTH] = None,
     *,
     size_um: tuple[float, float] | None = None,
     diamond_um: float | None = None,
@@ -116,7 +115,6 @@ def octagonal(
             at_most=(1.0 - TOUCHING_ROUNDING) * pitch_um / math.sqrt(2.0),
             hint="diamonds with a side of pitch_um / √2 would touch",
         )
-    check_choice("border", border, ("whole", "cut"))
     check_sites(n_x * n_y + (n_x + 1) * (n_y + 1))
     half_um = (REGULAR_SIDE * pitch_um if diamond_um is None else diamond_um) / math.sqrt(2.0)
     # Corners lie on cell boundaries, or half a diamond away from them, so shared corners are bit-identical.
@@ -131,17 +129,14 @@ def octagonal(
     diamond, is_corner = _clip_diamonds(diamond, n_x, n_y)
     corner = np.concatenate((octagon.reshape(-1, 2), diamond[is_corner]))
     n_vertices = np.concatenate((np.full(row.size, len(OCTAGON)), np.count_nonzero(is_corner, axis=1)))
-    return Layout(
-        np.stack((x_um[corner[:, 0]], y_um[corner[:, 1]]), axis=1),
-        np.concatenate(([0], np.cumsum(n_vertices))),
-        np.arange(n_vertices.size + 1),
-        {
-            "kind": np.repeat([0, 1], [row.size, diamond_row.size]),
-            "row": np.concatenate((row, diamond_row)),
-            "column": np.concatenate((column, diamond_column)),
-            "readout_line": np.concatenate((column, n_x + diamond_column)),
-        },
-    )
+    columns = {
+        "kind": np.repeat([0, 1], [row.size, diamond_row.size]),
+        "row": np.concatenate((row, diamond_row)),
+        "column": np.concatenate((column, diamond_column)),
+        "readout_line": np.concatenate((column, n_x + diamond_column)),
+    }
+    xy_um = np.stack((x_um[corner[:, 0]], y_um[corner[:, 1]]), axis=1)
+    return layout_of(xy_um, np.concatenate(([0], np.cumsum(n_vertices))), columns=columns)
 
 
 def _row_and_column(n_rows: int, n_columns: int) -> tuple[Ints, Ints]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
-from foveasim._core.validation import MAX_SITES, Bools, Floats, Ints, check_choice, check_length_um
+from foveasim._core.calls import LENGTH
+from foveasim._core.validation import MAX_SITES, Bools, Floats, Ints
 from foveasim.errors import ParameterError
 from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
@@ -44,9 +45,9 @@ DECAGON_INRADIUS_RATIO = math.cos(math.pi / 10.0)
     ),
 )
 def penrose(
-    side_um: float | None = None,
+    side_um: Annotated[float | None, LENGTH] = None,
     *,
-    size_um: float,
+    size_um: Annotated[float, LENGTH],
     shape: Literal["disc", "square"] = "disc",
     n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
 ) -> Layout:
@@ -96,18 +97,14 @@ def penrose(
     >>> n_thick, layout.n_sites - n_thick
     (2640, 1640)
     """
-    side_um, size_um = check_length_um("side_um", side_um), check_length_um("size_um", size_um)
-    check_choice("shape", shape, ("disc", "square"))
+    assert side_um is not None
     n_expected = (0.25 * math.pi if shape == "disc" else 1.0) * (size_um / side_um) ** 2 / MEAN_AREA
     if n_expected > MAX_SITES:
         raise ParameterError("side_um", f"must give at most {MAX_SITES} sites", side_um, "µm", "take larger rhombs")
     rings_um, is_thick = _rhombs(side_um, size_um, shape == "disc")
     if is_thick.size == 0:
         raise ParameterError("size_um", "must enclose the centre of at least one rhomb", size_um, "µm", "enlarge it")
-    return Layout.from_equal_rings(
-        rings_um,
-        {"is_thick": is_thick.astype(np.int64)},
-    )
+    return Layout.from_equal_rings(rings_um, {"is_thick": is_thick.astype(np.int64)})
 
 
 def _side_um(n_sites: int, size_um: float, is_disc: bool) -> float:

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim._core.validation import (
-    Bools,
-    Floats,
-    Ints,
-    check_choice,
-    check_count,
-    check_length_um,
-    check_number,
-    finite_array,
-)
+from foveasim._core.calls import LENGTH, NOT_NEGATIVE, Limits
+from foveasim._core.validation import Bools, Floats, Ints, finite_array
 from foveasim.errors import ParameterError
 from foveasim.layout.families import layout_family
-from foveasim.layout.model import Layout
+from foveasim.layout.model import Layout, layout_of
 from foveasim.layout.site_counts import SolveFor
 
 __all__ = ["quadtree"]
@@ -48,9 +40,9 @@ MAX_LEVELS = 15
 def quadtree(
     importance: ArrayLike,
     *,
-    pitch_um: float,
-    n_levels: int,
-    limit: float | None = None,
+    pitch_um: Annotated[float, LENGTH],
+    n_levels: Annotated[int, Limits(at_least=0, at_most=MAX_LEVELS)],
+    limit: Annotated[float | None, NOT_NEGATIVE] = None,
     measure: Literal["sum", "peak"] = "sum",
     n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
 ) -> Layout:
@@ -114,15 +106,12 @@ def quadtree(
     ([0, 3, 3, 4], 256.0)
     """
     picture = finite_array("importance", importance, ndim=2, at_least=0.0)
-    n_levels = check_count("n_levels", n_levels, at_least=0, at_most=MAX_LEVELS)
+    assert limit is not None
     block = 2**n_levels
     if 0 in picture.shape or picture.shape[0] % block or picture.shape[1] % block:
         raise ParameterError(
             "importance", f"must have sides that are multiples of {block}, 2 to the 'n_levels', got {picture.shape}"
         )
-    pitch_um = check_length_um("pitch_um", pitch_um)
-    limit = check_number("limit", limit, at_least=0.0)
-    check_choice("measure", measure, ("sum", "peak"))
     splits = [*_split_masks(picture, limit, n_levels, measure), np.zeros(picture.shape, bool)]
     level, row, column, has_midpoint = _leaves(splits)
 
@@ -134,15 +123,10 @@ def quadtree(
     is_vertex = np.ones((level.size, 8), bool)
     is_vertex[:, 1::2] = has_midpoint
     centre = 0.5 * np.array(picture.shape[::-1])
-    return Layout(
-        (steps[is_vertex] - centre) * pitch_um,
-        np.concatenate(([0], np.cumsum(is_vertex.sum(axis=1)))),
-        np.arange(level.size + 1),
-        {"level": level, "row": row, "column": column, "readout_line": column},
-        {
-            "parameters": {"importance": f"picture of {picture.shape} pixels"},
-        },
-    )
+    offsets = np.concatenate(([0], np.cumsum(is_vertex.sum(axis=1))))
+    columns = {"level": level, "row": row, "column": column, "readout_line": column}
+    parameters = {"importance": f"picture of {picture.shape} pixels"}
+    return layout_of((steps[is_vertex] - centre) * pitch_um, offsets, None, columns, {"parameters": parameters})
 
 
 def _blocks(values: Floats | Bools) -> Floats | Bools:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 import numpy as np
 
-from foveasim._core.validation import Floats, Ints, check_count, check_length_um, check_sites
+from foveasim._core.calls import LENGTH
+from foveasim._core.validation import Floats, Ints, check_count, check_length_um
 from foveasim.layout._regions import disc
 from foveasim.layout.diagrams.voronoi import voronoi_cells
-from foveasim.layout.families import layout_family
-from foveasim.layout.model import Layout
+from foveasim.layout.families import SITES, layout_family
+from foveasim.layout.model import Layout, layout_of
 
 __all__ = ["sunflower"]
 
@@ -23,7 +25,9 @@ MIN_CHORDS = 64
 
 
 @layout_family(example={"n_sites": 300, "spacing_um": 1.6})
-def sunflower(n_sites: int, spacing_um: float, *, n_chords: int | None = None) -> Layout:
+def sunflower(
+    n_sites: Annotated[int, SITES], spacing_um: Annotated[float, LENGTH], *, n_chords: int | None = None
+) -> Layout:
     """
     Generate Voronoi cells of approximately equal area on a golden spiral.
 
@@ -65,8 +69,6 @@ def sunflower(n_sites: int, spacing_um: float, *, n_chords: int | None = None) -
     >>> sunflower(n_sites=500, spacing_um=2.0).n_sites
     500
     """
-    n_sites = check_sites(check_count("n_sites", n_sites))
-    spacing_um = check_length_um("spacing_um", spacing_um)
     k = np.arange(1, n_sites + 1)
     radius_um = check_length_um(
         "radius_um", SPIRAL_FACTOR * spacing_um * math.sqrt(n_sites + 0.5), hint="take fewer sites"
@@ -78,15 +80,8 @@ def sunflower(n_sites: int, spacing_um: float, *, n_chords: int | None = None) -
     else:
         n_sides = check_count("n_chords", n_chords, at_least=min_chords, at_most=10**6)
     xy_um, offsets = voronoi_cells(_spiral_um(k, spacing_um), disc(radius_um, n_sides))
-    return Layout(
-        xy_um,
-        offsets,
-        np.arange(offsets.size),
-        {"turn": np.floor(k * (GOLDEN_ANGLE_RAD / (2.0 * math.pi))).astype(np.int64)},
-        {
-            "radius_um": radius_um,
-        },
-    )
+    turn = np.floor(k * (GOLDEN_ANGLE_RAD / (2.0 * math.pi))).astype(np.int64)
+    return layout_of(xy_um, offsets, None, {"turn": turn}, {"radius_um": radius_um})
 
 
 def _spiral_um(k: Ints, spacing_um: float) -> Floats:

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 import shapely
 
+from foveasim._core.calls import LENGTH
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import Floats, check_choice, check_length_um, check_sites, finite_array
+from foveasim._core.validation import Floats, check_sites, finite_array
 from foveasim.errors import GeometryError, LayoutWarning, ParameterError
-from foveasim.layout._regions import as_region, parse_region, region_as_plain_data
+from foveasim.layout._regions import as_region, parse_region
 from foveasim.layout.drc.measurements import is_below_size
-from foveasim.layout.edits import clip, merge_small, union
+from foveasim.layout.edits.all_sites import clip, merge_small, union
 from foveasim.layout.families import layout_family
-from foveasim.layout.model import Layout
+from foveasim.layout.model import Layout, derived
 from foveasim.layout.site_counts import SolveFor
 
 __all__ = ["Cells", "fill", "tiling", "with_hexagons"]
@@ -47,14 +48,14 @@ def _guess_pitch_um(n_sites: int, parameters: Mapping[str, Any]) -> float:
     solve_for=(SolveFor(name="pitch_um", is_integer=False, is_increasing=False, guess=_guess_pitch_um),),
 )
 def tiling(
-    pitch_um: float | None = None,
+    pitch_um: Annotated[float | None, LENGTH] = None,
     *,
     cells: Cells = "hexagons",
     size_um: tuple[float, float] | None = None,
     radius_um: float | None = None,
     region: Any = None,
     border: Border = "merge",
-    min_size_um: float | None = None,
+    min_size_um: Annotated[float | None, LENGTH] = None,
     origin_um: tuple[float, float] = (0.0, 0.0),
     n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
 ) -> Layout:
@@ -118,22 +119,11 @@ def tiling(
     (571, 7853.9, 7.0)
     """
     outline = parse_region(size_um=size_um, radius_um=radius_um, region=region)
-    pitch_um = check_length_um("pitch_um", pitch_um)
-    check_choice("cells", cells, get_args(Cells))
-    check_choice("border", border, get_args(Border))
-    origin = finite_array("origin_um", origin_um, ndim=1)
-    if origin.shape != (2,):
-        raise ParameterError("origin_um", "must be two numbers (x, y)", origin_um, "µm")
-    if min_size_um is not None:
-        min_size_um = check_length_um("min_size_um", min_size_um)
-        if border == "cut":
-            raise ParameterError(
-                "min_size_um",
-                "must be omitted with border='cut', which retains all pieces",
-                min_size_um,
-                "µm",
-                "take border='merge'",
-            )
+    assert pitch_um is not None
+    origin = finite_array("origin_um", origin_um)
+    if min_size_um is not None and border == "cut":
+        rule = "must be omitted with border='cut', which retains all pieces"
+        raise ParameterError("min_size_um", rule, min_size_um, "µm", "take border='merge'")
     lattice = _lattice(outline.bounds, pitch_um, cells, origin)
     if border == "drop" and min_size_um is not None and is_below_size(lattice.area_um2, min_size_um).any():
         raise ParameterError(
@@ -158,21 +148,10 @@ def tiling(
     if layout.n_sites == 0:
         raise GeometryError("the region is too small for a single site; enlarge it, or take a smaller pitch")
     row, column = (layout.columns[name] - layout.columns[name].min() for name in ("row", "column"))
-    return Layout(
-        layout.xy_um,
-        layout.ring_offsets,
-        layout.site_offsets,
-        {"row": row, "column": column, "readout_line": column},
-        {
-            "parameters": {
-                "region": None if region is None else region_as_plain_data(region),
-                "origin_um": origin.tolist(),
-            },
-        },
-    )
+    return Layout(*layout.rings_um, {"row": row, "column": column, "readout_line": column})
 
 
-def fill(layout: Layout, region: Any, *, size_um: float, columns_of: Layout | None = None) -> Layout:
+def fill(layout: Layout, region: Any, *, size_um: Annotated[float, LENGTH], columns_of: Layout | None = None) -> Layout:
     """
     Fill the uncovered part of a region of a layout, such as a blind spot, with hexagons.
 
@@ -198,7 +177,6 @@ def fill(layout: Layout, region: Any, *, size_um: float, columns_of: Layout | No
     ParameterError
         When the region is not a valid polygon, or the size is out of range.
     """
-    size_um = check_length_um("size_um", size_um)
     open_region = _uncovered_part(layout, as_region("region", region))
     if open_region.is_empty:
         return layout
@@ -216,18 +194,10 @@ def with_hexagons(layout: Layout, size_um: float, n_lines: int) -> Layout:
     angle_rad = np.arctan2(hexagons.centroid_um[:, 1], hexagons.centroid_um[:, 0]) % (2.0 * math.pi)
     line = np.floor(angle_rad * n_lines / (2.0 * math.pi)).astype(np.int64) % n_lines
     shift = 1 if first == 0 else 0
-    inside = Layout(
-        hexagons.xy_um,
-        hexagons.ring_offsets,
-        hexagons.site_offsets,
-        {
-            "ring": np.full(hexagons.n_sites, first - 1 + shift),
-            "sector": np.arange(hexagons.n_sites),
-            "readout_line": line,
-        },
+    inside = hexagons.with_columns(
+        ring=np.full(hexagons.n_sites, first - 1 + shift), sector=np.arange(hexagons.n_sites), readout_line=line
     )
-    both = union([inside, layout.with_columns(ring=ring + shift)])
-    return Layout(both.xy_um, both.ring_offsets, both.site_offsets, both.columns, layout.provenance)
+    return union([inside, layout.with_columns(ring=ring + shift)]).with_provenance(layout.provenance)
 
 
 def _hexagons(region: Any, size_um: float) -> Layout:
@@ -277,7 +247,7 @@ def _append_sites(layout: Layout, new: Layout, source: Layout, size_um: float) -
     if new.n_sites and source.n_sites:
         nearest = np.asarray(cKDTree(source.centroid_um).query(new.centroid_um)[1], dtype=np.int64)
         columns = {name: source.columns[name][nearest] for name in layout.columns}
-        new = Layout(new.xy_um, new.ring_offsets, new.site_offsets, columns)
+        new = Layout(*new.rings_um, columns)
     both = union([layout, new])
     step = f"filled with {new.n_sites} sites of at least {size_um:g} µm"
-    return Layout(both.xy_um, both.ring_offsets, both.site_offsets, both.columns, layout._extend_provenance(step))  # noqa: SLF001 -- of the same subpackage
+    return derived(layout, step, both.rings_um, both.columns)

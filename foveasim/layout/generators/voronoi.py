@@ -5,29 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 import shapely
 from numpy.typing import ArrayLike
 
+from foveasim._core.calls import Limits
 from foveasim._core.random_streams import Streams
 from foveasim._core.rings import positions_in_runs
-from foveasim._core.validation import (
-    Floats,
-    Ints,
-    as_numbers,
-    check_choice,
-    check_count,
-    check_sites,
-    finite_array,
-)
+from foveasim._core.validation import Floats, Ints, as_numbers, finite_array
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid
 from foveasim.layout._regions import parse_region
 from foveasim.layout.diagrams.voronoi import CellEdges, IncrementalCells, ring_edges
-from foveasim.layout.families import layout_family
-from foveasim.layout.model import Layout
+from foveasim.layout.families import SITES, layout_family
+from foveasim.layout.model import Layout, layout_of
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -73,13 +66,13 @@ REGULARISATION_FACTOR, N_REGULARISATIONS = 0.25, 16
 
 @layout_family(example={"n_sites": 200, "size_um": (32.0, 32.0), "n_iterations": 20}, picture="density")
 def voronoi(
-    n_sites: int,
+    n_sites: Annotated[int, SITES],
     *,
     density: Density | None = None,
     density_grid: Grid | None = None,
     size_um: tuple[float, float] | None = None,
     region: Any = None,
-    n_iterations: int = 20,
+    n_iterations: Annotated[int, Limits(at_least=0, at_most=10_000)] = 20,
     capacity: Literal["free", "equal"] = "free",
     seed: int = 0,
 ) -> Layout:
@@ -151,10 +144,8 @@ def voronoi(
     >>> layout.n_sites, round(float(layout.area_um2.sum()), 6)
     (200, 2400.0)
     """
-    n_sites = check_sites(check_count("n_sites", n_sites))
-    n_iterations = check_count("n_iterations", n_iterations, at_least=0, at_most=10_000)
     outline = _region(size_um, region, density_grid)
-    is_equal = check_choice("capacity", capacity, ("free", "equal")) == "equal"
+    is_equal = capacity == "equal"
     field, table, grid = _density(density, density_grid, outline)
     centres_um = _first_centres(n_sites, table, grid, outline, seed)
     cells = IncrementalCells(outline, (lambda edges, n: _moments(edges, n, field)[0]) if is_equal else None)
@@ -172,19 +163,12 @@ def voronoi(
     relative_mass = mass * (n_sites / mass.sum())
     if is_equal:
         _require_equal(float(np.abs(relative_mass - 1.0).max()))
-    return Layout(
-        xy_um,
-        offsets,
-        np.arange(offsets.size),
-        {"share": relative_mass},
-        {
-            "parameters": {
-                "density": _describe_density(density),
-                "density_grid": None if density_grid is None else asdict(density_grid),
-                "region": None if region is None else _rings_um(outline),
-            },
-        },
-    )
+    parameters = {
+        "density": _describe_density(density),
+        "density_grid": None if density_grid is None else asdict(density_grid),
+        "region": None if region is None else _rings_um(outline),
+    }
+    return layout_of(xy_um, offsets, None, {"share": relative_mass}, {"parameters": parameters})
 
 
 def _describe_density(density: Density | None) -> str | None:

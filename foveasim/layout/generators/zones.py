@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import Any, get_args
+from typing import Annotated, Any
 
 import numpy as np
 import shapely
 
-from foveasim._core.validation import MAX_LENGTH_UM, Floats, Ints, check_choice, check_count, finite_array
+from foveasim._core.calls import Limits
+from foveasim._core.validation import MAX_LENGTH_UM, Floats, Ints, finite_array
 from foveasim.errors import ParameterError
-from foveasim.layout._regions import as_region, region_as_plain_data
-from foveasim.layout.edits import union
+from foveasim.layout._regions import as_region
+from foveasim.layout.edits.all_sites import union
 from foveasim.layout.families import layout_family
 from foveasim.layout.generators.grid import square_corners_um
 from foveasim.layout.generators.tiling import Cells, tiling
@@ -54,8 +55,6 @@ def _count_cells(parameters: Mapping[str, Any]) -> float | None:
     solve_for=(
         SolveFor(
             name="n_fovea",
-            is_integer=True,
-            is_increasing=True,
             guess=lambda n_sites, parameters: (n_sites / _sites_per_pixel2(parameters)) ** 0.5,
             count=_count_cells,
             is_optional=True,
@@ -66,7 +65,7 @@ def zones(
     pitch_um: Sequence[float] | None = None,
     side_um: Sequence[float] | None = None,
     *,
-    n_fovea: int | None = None,
+    n_fovea: Annotated[int | None, Limits(at_least=1, at_most=MAX_PIXELS)] = None,
     outlines_um: Sequence[Any] | None = None,
     cells: Cells | Sequence[Cells] = "squares",
     n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
@@ -127,8 +126,6 @@ def zones(
         raise ParameterError("side_um", "or 'outlines_um' must be given, but only one of them")
     pitches_um = _pitches_um(pitch_um, n_fovea, side_um, outlines_um)
     shapes = [cells] * pitches_um.size if isinstance(cells, str) else list(cells)
-    for i, shape in enumerate(shapes):
-        check_choice("cells" if isinstance(cells, str) else f"cells[{i}]", shape, get_args(Cells))
     if len(shapes) != pitches_um.size:
         raise ParameterError(
             "cells", f"must be one shape, or one for each of the {pitches_um.size} zones, got {len(shapes)}"
@@ -136,19 +133,11 @@ def zones(
     outlines = None if outlines_um is None else _outlines(outlines_um, pitches_um.size)
     sides_um = None if side_um is None else _sides(side_um, pitches_um)
     if sides_um is not None and all(shape == "squares" for shape in shapes):
-        corners, columns = _squares(sides_um, pitches_um)
-        layout = Layout.from_equal_rings(corners, columns)
-    else:
-        if outlines is None:
-            outlines = [
-                shapely.box(-0.5 * s, -0.5 * s, 0.5 * s, 0.5 * s) for s in (() if sides_um is None else sides_um)
-            ]
-        layout = _tile_zones(outlines, pitches_um, shapes)
-    if outlines_um is None:
-        return layout
-    return layout.with_provenance(
-        {"parameters": {"outlines_um": [region_as_plain_data(outline) for outline in outlines_um]}}
-    )
+        return Layout.from_equal_rings(*_squares(sides_um, pitches_um))
+    if outlines is None:
+        outlines = [shapely.box(-0.5 * s, -0.5 * s, 0.5 * s, 0.5 * s) for s in (() if sides_um is None else sides_um)]
+    layout = _tile_zones(outlines, pitches_um, shapes)
+    return layout if outlines_um is None else layout.with_provenance({})
 
 
 def _pitches_um(
@@ -161,7 +150,7 @@ def _pitches_um(
         raise ParameterError("pitch_um", "or 'n_fovea' must be given, but only one of them")
     if pitch_um is not None:
         return finite_array("pitch_um", pitch_um, ndim=1, above=0.0)
-    n_fovea = check_count("n_fovea", n_fovea, at_most=MAX_PIXELS)
+    assert n_fovea is not None
     widths_um = (side_um or ()) if outlines_um is None else [_width_um(as_region("outlines_um[0]", outlines_um[0]))]
     fovea_um = finite_array("side_um", widths_um, ndim=1, above=0.0)
     n_zones = len(fovea_um if outlines_um is None else outlines_um)

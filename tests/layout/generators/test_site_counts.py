@@ -152,7 +152,7 @@ def test_user_family_solves_for_parameter(monkeypatch):
 
     @layout_family(
         example={"n": 4},
-        solve_for=(SolveFor(name="n", is_integer=True, is_increasing=True, guess=lambda n_sites, _: n_sites**0.5),),
+        solve_for=(SolveFor(name="n", guess=lambda n_sites, _: n_sites**0.5),),
     )
     def triangle_of_squares(*, n: int | None = None, n_sites: int | None = None) -> fs.Layout:
         """Return 1 + 2 + ... + n squares."""
