@@ -409,6 +409,16 @@ def journal_points(store):
     return [json.loads(line.partition(" ")[2])["point"] for line in lines[1:]]
 
 
+def test_plan_is_unchanged_by_list_items():
+    shot = SHOT | {"layout": SHOT["layout"] | {"move_um": [0.0, 0.0]}}
+    plan = explore.plan_sweep(shot, {"layout.move_um.0": [1.0, 2.0]})
+    before = json.dumps(plan.to_dict())
+
+    assert plan.settings_of(0)["layout"]["move_um"] == [1.0, 0.0]
+    assert json.dumps(plan.to_dict()) == before
+    assert plan.settings["layout"]["move_um"] == [0.0, 0.0]
+
+
 @pytest.mark.slow
 def test_killed_worker_loses_at_most_one_task(reference_results, tmp_path):
     plan = plan_200(logging_metric(tmp_path, SLOW_S))

@@ -245,11 +245,7 @@ def _palette_numbers(path: Path) -> NDArray[Any] | None:
 
 
 def read_flow(flow: Any, name: str, shape: tuple[int, int]) -> Floats:
-    """
-    Read an optical flow from a ``.npy`` file or an array, top row first.
-
-    Raises FileError, ParameterError when the flow cannot be read, or its shape differs.
-    """
+    """Read an optical flow from a ``.npy`` file or an array, top row first."""
     if isinstance(flow, str | Path):
         name = str(flow)
         try:
@@ -265,11 +261,7 @@ def read_flow(flow: Any, name: str, shape: tuple[int, int]) -> Floats:
 
 
 def check_per_picture(name: str, given: Any, n: int) -> Sequence[Any]:
-    """
-    Return a sequence after checking that it has one item per picture.
-
-    Raises ParameterError when the object is not a sequence, or has another length.
-    """
+    """Return a sequence after checking that it has one item per picture."""
     if isinstance(given, str | bytes) or not (hasattr(given, "__len__") and hasattr(given, "__getitem__")):
         raise ParameterError(name, f"must be a sequence with one item per picture, got {type_name(given)}")
     if len(given) != n:

@@ -56,12 +56,7 @@ class Source(Protocol):
 
 
 def source_of(pictures: Any) -> Source:
-    """
-    Create the source of the pictures of a dataset; return a source unchanged.
-
-    Raises FileError when the file does not exist, or contains no pictures. Raises ParameterError when the type of ``pictures``
-    is not supported.
-    """
+    """Create the source of the pictures of a dataset; return a source unchanged."""
     if isinstance(pictures, Source):
         return pictures
     if isinstance(pictures, str | Path):

@@ -14,21 +14,22 @@ from array import array
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
+from foveasim._core.calls import Limits
 from foveasim._core.extras import import_optional
 from foveasim._core.names import missing_path
 from foveasim._core.threads import thread_count
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import Ints, check_count
+from foveasim._core.validation import Ints
 from foveasim._io.atomic import atomic_directory, atomic_write
 from foveasim.errors import FileError, FoveasimWarning, ParameterError, SimulationError
 from foveasim.explore.datasets.dataset import Dataset
 from foveasim.explore.datasets.items import flatten, unflatten
 from foveasim.explore.datasets.zarr_rows import RowReader, create_rows
-from foveasim.explore.executor import KILLED, executor
+from foveasim.explore.executor import KILLED, WORKERS, executor
 
 __all__ = ["StoredSamples", "open_dataset", "write_dataset"]
 
@@ -60,8 +61,8 @@ def write_dataset(
     dataset: Dataset,
     path: str | Path,
     *,
-    per_shard: int | None = None,
-    workers: int | None = 1,
+    per_shard: Annotated[int | None, Limits(at_least=1)] = None,
+    workers: Annotated[int | None, WORKERS] = 1,
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> StoredSamples:
@@ -111,9 +112,6 @@ def write_dataset(
         Once, when samples have warnings; the item ``warning`` of a sample contains its own.
     """
     target = Path(path).absolute()
-    workers = None if workers is None else check_count("workers", workers, at_most=1024)
-    if per_shard is not None:
-        per_shard = check_count("per_shard", per_shard)
     kind = _shards_class(target)
     if kind is _ZarrShards:
         if dataset.is_layout_varied:
