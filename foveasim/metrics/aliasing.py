@@ -285,9 +285,7 @@ def aliasing_spectrum(
     different aliases: these are spread over many frequencies, so that ``alias_fraction`` is far below that of each region, and
     the median Nyquist frequency is far above that of the outer sites.
     """
-    wave = finite_array("wave_per_mm", wave_per_mm, ndim=1)
-    if wave.size != 2:
-        raise ParameterError("wave_per_mm", "must be two numbers (fx, fy)", wave_per_mm, "1/mm")
+    wave = finite_array("wave_per_mm", wave_per_mm)
     region = _region(layout, centre_um, radius_um)
     weight = region.weight * layout.area_um2[region.sites]
     weight /= weight.sum()

@@ -16,7 +16,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, check_number, check_shape, finite_array, read_only
 from foveasim.camera import Camera
 from foveasim.camera._frames import PathPosition, path_digests, path_positions
-from foveasim.errors import ParameterError, type_name, with_article
+from foveasim.errors import ParameterError
 from foveasim.fields import PowerMap
 from foveasim.optics import Optics
 from foveasim.scene import Scene
@@ -159,7 +159,6 @@ def shift_sensor(source: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Sce
     ------
     source, (x_um, y_um)
     """
-    _check_types(("source", source, (Scene, PowerMap)), ("path", path, (GazePath,)))
     return ((source, position_um) for position_um in path_positions(path.xy_um))
 
 
@@ -194,7 +193,6 @@ def pan_camera(
         Immediately when an argument is of another class, the part is larger than the scene, or a scene with ``fit`` is given
         without a camera; during iteration when the part extends beyond the scene.
     """
-    _check_types(("scene", scene, (Scene,)), ("path", path, (GazePath,)), ("optics", optics, (Optics, Camera)))
     n_y, n_x = check_shape("shape", shape)
     if n_y > scene.basis.shape[1] or n_x > scene.basis.shape[2]:
         raise ParameterError("shape", f"must not exceed the shape of the scene, {scene.basis.shape[1:]}", (n_y, n_x))
@@ -246,10 +244,3 @@ def _parts(
             for at_um, at, free in zip(position_um, (left, bottom), (free_x, free_y), strict=True)
         )
         yield part, PathPosition((x_um, y_um), (position_um[0], position_um[1]), digests, k)
-
-
-def _check_types(*arguments: tuple[str, object, tuple[type, ...]]) -> None:
-    for name, value, types in arguments:
-        if not isinstance(value, types):
-            class_names = " or ".join(with_article(type_.__name__) for type_ in types)
-            raise ParameterError(name, f"must be {class_names}, got {type_name(value)}")

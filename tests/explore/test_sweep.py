@@ -321,7 +321,8 @@ def test_worker_cache_uses_quarter_of_memory(scheduler):
         from distributed import get_worker
 
         (shared,) = (value for value in get_worker().data.values() if hasattr(value, "function"))
-        return shared.function()._runner.cache.max_bytes
+        _, runner = shared.function().args
+        return runner.cache.max_bytes
 
     found = explore.sweep(SHOT, {"sensor.bits": [8]}, metrics=[cache_bytes], scheduler=scheduler[0])
 

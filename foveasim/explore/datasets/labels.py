@@ -14,7 +14,8 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats, Ints, finite_array
 from foveasim._io.images import read_picture
 from foveasim.distortion import Lens
-from foveasim.errors import FileError, ParameterError, type_name
+from foveasim.errors import ParameterError, type_name
+from foveasim.explore._files import load_array
 from foveasim.fields import Grid, from_file_rows
 from foveasim.integrate import Integrator
 
@@ -248,10 +249,7 @@ def read_flow(flow: Any, name: str, shape: tuple[int, int]) -> Floats:
     """Read an optical flow from a ``.npy`` file or an array, top row first."""
     if isinstance(flow, str | Path):
         name = str(flow)
-        try:
-            flow = np.load(flow, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise FileError(name, f"is not a readable array ({error})") from None
+        flow = load_array(flow)
     displacement = np.asarray(flow)
     if displacement.shape != (*shape, 2) or displacement.dtype.kind not in "iuf":
         raise ParameterError(

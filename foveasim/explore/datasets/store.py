@@ -13,6 +13,7 @@ import warnings
 from array import array
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -191,7 +192,7 @@ def _write_each(
     dataset: Dataset, shards: _Shards, missing: Sequence[int], scheduler: str | None, workers: int | None
 ) -> Generator[tuple[int, _Warnings], None, None]:
     """Write shards, and yield each with the warnings of its samples."""
-    write = _ShardWriter(dataset, shards)
+    write = partial(_write_shard, dataset, shards)
     start_s = time.monotonic()
     n_done = 0
     if scheduler is None and workers in (None, 1):
@@ -222,26 +223,21 @@ class _Warnings(NamedTuple):
     first: str
 
 
-class _ShardWriter:
-    """Function that simulates and writes a shard, and returns the warnings of its samples."""
-
-    def __init__(self, dataset: Dataset, shards: _Shards) -> None:
-        self._dataset, self._shards = dataset, shards
-
-    def __call__(self, k: int) -> _Warnings:
-        input_digest = self._dataset.digest(self._shards.samples(k))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # summarised at the end
-            samples = [self._dataset[index] for index in self._shards.samples(k)]
-        try:
-            self._shards.write(k, samples, input_digest)
-        except OSError as error:
-            raise FileError(
-                self._shards.directory,
-                f"cannot be written: {error.strerror or error}; complete shards remain, and the same call resumes",
-            ) from None
-        found = [f"sample {sample['index']}: {sample['warning']}" for sample in samples if sample["warning"]]
-        return _Warnings(len(found), min(found, default=""))
+def _write_shard(dataset: Dataset, shards: _Shards, k: int) -> _Warnings:
+    """Simulate and write a shard, and return the warnings of its samples."""
+    input_digest = dataset.digest(shards.samples(k))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # summarised at the end
+        samples = [dataset[index] for index in shards.samples(k)]
+    try:
+        shards.write(k, samples, input_digest)
+    except OSError as error:
+        raise FileError(
+            shards.directory,
+            f"cannot be written: {error.strerror or error}; complete shards remain, and the same call resumes",
+        ) from None
+    found = [f"sample {sample['index']}: {sample['warning']}" for sample in samples if sample["warning"]]
+    return _Warnings(len(found), min(found, default=""))
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------

@@ -544,6 +544,6 @@ def _overlaps(path: str, parts: tuple[str, ...]) -> bool:
 
 def copy_settings(data: Any) -> Any:
     """Return a copy of settings with new mappings and lists, in which values can be put."""
-    if isinstance(data, Mapping):
+    if isinstance(data, dict):
         return {key: copy_settings(value) for key, value in data.items()}
     return [copy_settings(value) for value in data] if isinstance(data, list) else data

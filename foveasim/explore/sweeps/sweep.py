@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -186,7 +187,11 @@ def _run(
     cuts = (np.cumsum(is_pending) - is_pending)[changes]
     try:
         with executor(
-            _Points(replace(plan), runner), what="the metrics", users=users, scheduler=scheduler, workers=n_workers
+            partial(_record, replace(plan), runner),
+            what="the metrics",
+            users=users,
+            scheduler=scheduler,
+            workers=n_workers,
         ) as run:
             if progress is not None:
                 progress(n_done, plan.n_points)
@@ -201,11 +206,6 @@ def _run(
         ) from None
 
 
-class _Points:
-    """Function that computes the record of a point from its number."""
-
-    def __init__(self, plan: Plan, runner: ShotRunner) -> None:
-        self._plan, self._runner = plan, runner
-
-    def __call__(self, point: int) -> Record:
-        return self._runner.record(point, self._plan.settings_of(point))
+def _record(plan: Plan, runner: ShotRunner, point: int) -> Record:
+    """Compute the record of a point from its number."""
+    return runner.record(point, plan.settings_of(point))
