@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats, Ints, check_number
-from foveasim.errors import ParameterError, type_name
+from foveasim.errors import ParameterError
 from foveasim.fields import Grid
 from foveasim.metrics.quality import ssim_map
 from foveasim.reconstruct import Picture
@@ -78,9 +78,6 @@ def quality_by_eccentricity(
     ParameterError
         When the grids or channels differ, or no pixel can be compared.
     """
-    for name, given in (("picture", picture), ("reference", reference)):
-        if not isinstance(given, Picture):
-            raise ParameterError(name, f"must be a foveasim.Picture, got {type_name(given)}")
     if picture.grid != reference.grid:
         raise ParameterError(
             "reference",

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Annotated
 
 import numpy as np
 
-from foveasim._core.validation import check_choice, check_number
+from foveasim._core.calls import POSITIVE
+from foveasim._core.validation import check_choice
 from foveasim.camera import Camera
-from foveasim.errors import ParameterError, format_value, type_name
+from foveasim.errors import ParameterError, format_value
 
 __all__ = ["BUDGETS", "Budget", "budget_of", "check_equal_budgets"]
 
@@ -51,7 +53,7 @@ BUDGETS = {
 assert {attribute for attribute, _, _ in BUDGETS.values()} == {field.name for field in fields(Budget)}
 
 
-def budget_of(camera: Camera, frames_per_s: float) -> Budget:
+def budget_of(camera: Camera, frames_per_s: Annotated[float, POSITIVE]) -> Budget:
     """
     Return the budget of a camera.
 
@@ -60,9 +62,6 @@ def budget_of(camera: Camera, frames_per_s: float) -> Budget:
     camera : Camera
     frames_per_s : float, 1/s
     """
-    if not isinstance(camera, Camera):
-        raise ParameterError("camera", f"must be a foveasim.Camera, got {type_name(camera)}")
-    frames_per_s = check_number("frames_per_s", frames_per_s, above=0.0)
     sensor = camera.sensor
     n_sites = sensor.layout.n_sites
     return Budget(
@@ -82,7 +81,6 @@ def check_equal_budgets(budgets: Mapping[str, Budget], budget: str | None, toler
     check. ``tolerance``: largest relative difference from the first camera. Raises ParameterError when the budget of a camera
     differs by more.
     """
-    tolerance = check_number("tolerance", tolerance, at_least=0.0)
     if budget is None:
         return
     attribute, title, unit = BUDGETS[check_choice("budget", budget, tuple(BUDGETS))]

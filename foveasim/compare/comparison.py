@@ -7,14 +7,15 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.calls import NOT_NEGATIVE, POSITIVE, Limits
 from foveasim._core.extras import import_optional
 from foveasim._core.provenance import copy_plain_data, to_plain_data, versions
-from foveasim._core.validation import Floats, Images, check_count, check_number, finite_array, read_only
+from foveasim._core.validation import Floats, Images, check_number, finite_array, read_only
 from foveasim.camera import Camera
 from foveasim.compare.annuli import PictureQuality, quality_by_eccentricity
 from foveasim.compare.budgets import BUDGETS, Budget, budget_of, check_equal_budgets
@@ -30,7 +31,7 @@ from foveasim.compare.measure import (
     size_records,
 )
 from foveasim.compare.setup import DEFAULT_EXPOSURE_S, cameras_of, field_um, photograph_scenes
-from foveasim.errors import ParameterError, format_value, type_name
+from foveasim.errors import ParameterError, format_value
 from foveasim.fields import Grid, PowerMap
 from foveasim.layout import Layout
 from foveasim.optics import Optics
@@ -276,14 +277,14 @@ def cameras(
     cameras: Mapping[str, Camera],
     scenes: Mapping[str, Scene | PowerMap] | None = None,
     *,
-    exposure_s: float,
-    seed: int = 0,
+    exposure_s: Annotated[float, POSITIVE],
+    seed: Annotated[int, Limits(at_least=0)] = 0,
     budget: str | None = "n_sites",
-    tolerance: float = 0.02,
+    tolerance: Annotated[float, NOT_NEGATIVE] = 0.02,
     frames_per_s: float | Mapping[str, float] | None = None,
     centre_um: tuple[float, float] = (0.0, 0.0),
-    n_annuli: int = 8,
-    max_pixels: int = 256,
+    n_annuli: Annotated[int, Limits(at_least=1, at_most=1000)] = 8,
+    max_pixels: Annotated[int, Limits(at_least=16, at_most=4096)] = 256,
     method: Method = "cells",
     progress: Callable[[int, int], None] | None = None,
 ) -> Comparison:
@@ -330,21 +331,14 @@ def cameras(
     camera. One gain per picture is fitted. Pictures are compared where all cameras cover at least half of a pixel.
     """
     named = _check_cameras(cameras)
-    exposure_s = check_number("exposure_s", exposure_s, above=0.0)
-    seed = check_count("seed", seed, at_least=0)
-    n_annuli = check_count("n_annuli", n_annuli, at_most=1000)
-    max_pixels = check_count("max_pixels", max_pixels, at_least=16, at_most=4096)
-    centre = finite_array("centre_um", centre_um, ndim=1)
-    if centre.size != 2:
-        raise ParameterError("centre_um", "must be two numbers (x, y)", centre_um, "µm")
-    fixation = float(centre[0]), float(centre[1])
+    fixation: tuple[float, float] = tuple(finite_array("centre_um", centre_um).tolist())
     budgets = {name: budget_of(camera, _rate(frames_per_s, name, exposure_s)) for name, camera in named.items()}
     check_equal_budgets(budgets, budget, tolerance)
     all_layouts = [layout_of(camera) for camera in named.values()]
     first_name, first = next(iter(named.items()))
     if scenes is None:
         scenes = photograph_scenes(field_um(all_layouts), first.optics)
-    if not isinstance(scenes, Mapping) or not scenes:
+    if not scenes:
         raise ParameterError("scenes", "must be a mapping of names to at least one scene", scenes)
     n_steps = len(named) * (len(scenes) + 1)
     n_done = 0
@@ -473,9 +467,7 @@ def _simulate(
     shots = {name: _Shots([], [], []) for name in named}
     irradiance: list[Images] = []
     first = next(iter(named.values()))
-    for scene_name, light in scenes.items():
-        if not isinstance(light, Scene | PowerMap):
-            raise ParameterError("scenes", f"must be scenes or power maps, got {type_name(light)}", scene_name)
+    for light in scenes.values():
         power_map = first.power_map(light) if isinstance(light, Scene) else light
         irradiance.append(first.reference(power_map, field.covariance_grid, exposure_s=exposure_s).data.mean(axis=0))
         for name, camera in named.items():
@@ -566,23 +558,13 @@ def layouts(
         square = fs.layout.grid(n_sites=14_000, size_um=(1223.0, 1223.0))
         fs.compare.layouts({"foveal": foveal, "square": square}).write("report.html")
     """
-    if not isinstance(layouts, Mapping):
-        raise ParameterError("layouts", f"must be a mapping of names to layouts, got {type_name(layouts)}")
-    for name, layout in layouts.items():
-        if not isinstance(layout, Layout):
-            raise ParameterError("layouts", f"must be layouts, got {type_name(layout)} for {format_value(name)}")
     return cameras(cameras_of(layouts, optics, sensor), scenes, exposure_s=exposure_s, **options)
 
 
 def _check_cameras(cameras: Mapping[str, Camera]) -> dict[str, Camera]:
-    if not isinstance(cameras, Mapping):
-        raise ParameterError("cameras", f"must be a mapping of names to cameras, got {type_name(cameras)}")
     if len(cameras) < 2:
         raise ParameterError("cameras", "must be at least two", len(cameras))
     named = {str(name): camera for name, camera in cameras.items()}
-    for name, camera in named.items():
-        if not isinstance(camera, Camera):
-            raise ParameterError("cameras", f"must be cameras, got {type_name(camera)} for {format_value(name)}")
     (first_name, first), *others = named.items()
     for name, camera in others:
         pair = f"{format_value(first_name)} and {format_value(name)}"
@@ -600,8 +582,8 @@ def _rate(frames_per_s: float | Mapping[str, float] | None, name: str, exposure_
     if isinstance(frames_per_s, Mapping):
         if name not in frames_per_s:
             raise ParameterError("frames_per_s", f"must have a rate for {format_value(name)}", list(frames_per_s))
-        return frames_per_s[name]
-    return frames_per_s
+        frames_per_s = frames_per_s[name]
+    return check_number("frames_per_s", frames_per_s, above=0.0)
 
 
 def _grid(low: NDArray[np.float64], high: NDArray[np.float64], max_pixels: int) -> Grid:

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_count, check_number, finite_array
+from foveasim._core.calls import POSITIVE, Limits
+from foveasim._core.validation import Bools, Floats, Ints, as_numbers, finite_array
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
 
@@ -136,7 +137,7 @@ class SceneCovariance:
         return np.asarray((self.amplitude * np.exp(-0.5 * d2 / self.sigma_um**2)).sum(axis=-1))
 
 
-def scene_covariance(images: ArrayLike, pitch_um: float) -> SceneCovariance:
+def scene_covariance(images: ArrayLike, pitch_um: Annotated[float, POSITIVE]) -> SceneCovariance:
     """
     Fit an isotropic covariance of points to images of pixel means.
 
@@ -168,7 +169,6 @@ def scene_covariance(images: ArrayLike, pitch_um: float) -> SceneCovariance:
     stack = as_numbers("images", images, keep_type=True, missing_is_nan=True)
     if stack.ndim != 3 or not stack.size:
         raise ParameterError("images", "must have the shape (n_image, n_y, n_x)", list(stack.shape))
-    pitch_um = check_number("pitch_um", pitch_um, above=0.0)
     spectrum = _RadialSpectrum(stack)
     n_widths = max(1, math.ceil(math.log(0.5 * max(stack.shape[1:]) / MIN_WIDTH_PIXELS, WIDTH_RATIO)))
     sigma = MIN_WIDTH_PIXELS * WIDTH_RATIO ** np.arange(n_widths + 1, dtype=np.float64)
@@ -290,7 +290,7 @@ def site_information_bits(
     gain: ArrayLike,
     noise_variance: ArrayLike,
     *,
-    n_conditions: int = N_CONDITIONS,
+    n_conditions: Annotated[int, Limits(at_least=0)] = N_CONDITIONS,
 ) -> Floats:
     """
     Compute the information of each site given its preceding neighbours.
@@ -333,7 +333,6 @@ def site_information_bits(
     order, starts = _blocks(xy_um)
     position = np.empty(n, np.int64)
     position[order] = np.arange(n)
-    n_conditions = check_count("n_conditions", n_conditions, at_least=0)
     scale = finite_array("gain", gain, ndim=1)
     noise = finite_array("noise_variance", noise_variance, ndim=2, above=0.0)
     for name, values in (("gain", scale), ("noise_variance", noise)):

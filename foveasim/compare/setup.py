@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.validation import check_number
+from foveasim._core.calls import POSITIVE
 from foveasim._io.images import read_picture
 from foveasim.camera import Camera
 from foveasim.errors import ParameterError
@@ -58,7 +59,7 @@ def field_um(layouts: Iterable[Layout]) -> float:
 
 
 def photograph_scenes(
-    width_um: float,
+    width_um: Annotated[float, POSITIVE],
     optics: Optics | None = None,
     *,
     pictures: Sequence[str | Path] | Mapping[str, NDArray[np.uint8]] | None = None,
@@ -92,7 +93,6 @@ def photograph_scenes(
     FileError
         When a picture cannot be read.
     """
-    width_um = check_number("width_um", width_um, above=0.0)
     optics = default_optics() if optics is None else optics
     if pictures is None:
         directory = files("skimage.data")

@@ -36,7 +36,7 @@ from foveasim.sensor.effects import EFFECTS
 from foveasim.sensor.limits import EXPOSURE
 from foveasim.sensor.spectral import CURVES
 
-__all__ = ["FILE_OPTIONS", "LayerSection", "Models", "PerArea", "call_of", "models"]
+__all__ = ["FILE_OPTIONS", "LayerSection", "Models", "PerArea", "Section", "call_of", "models"]
 
 #: The function or class of each section.
 _CALLS: dict[type[BaseModel], Callable[..., Any]] = {}
@@ -46,13 +46,13 @@ _REGISTRIES: tuple[Registry[Any], ...] = (LAYOUTS, EDITS, RULES, SCENES, LENSES,
 _log = logging.getLogger("foveasim")
 
 
-class _Section(BaseModel):
+class Section(BaseModel):
     """Base of all sections: unknown keys and other types are errors."""
 
     model_config = ConfigDict(extra="forbid", strict=True, protected_namespaces=())
 
 
-def _model(name: str, call: Callable[..., Any], skip: Sequence[str] = (), **types: Any) -> type[_Section]:
+def _model(name: str, call: Callable[..., Any], skip: Sequence[str] = (), **types: Any) -> type[Section]:
     """Return a model with the parameters of a call, with file types for some."""
     hints = get_type_hints(call, include_extras=True)
     summary, descriptions = _documentation(call)
@@ -64,7 +64,7 @@ def _model(name: str, call: Callable[..., Any], skip: Sequence[str] = (), **type
         for p in inspect.signature(call).parameters.values()
         if p.name not in skip
     }
-    model = create_model(name, __base__=_Section, __doc__=summary, **keys)
+    model = create_model(name, __base__=Section, __doc__=summary, **keys)
     _CALLS[model] = call
     return model
 
@@ -105,7 +105,7 @@ def _documentation(call: Callable[..., Any]) -> tuple[str, dict[str, str]]:
     return text.split("\n\n")[0].replace("\n", " "), descriptions
 
 
-def _union_of(tag: str, models: Mapping[str, type[_Section]]) -> Any:
+def _union_of(tag: str, models: Mapping[str, type[Section]]) -> Any:
     """Return a union of sections with a discriminating key."""
     tagged = []
     for name, model in models.items():
@@ -114,13 +114,13 @@ def _union_of(tag: str, models: Mapping[str, type[_Section]]) -> Any:
     return Annotated[Union[tuple(tagged)], Field(discriminator=tag)]  # noqa: UP007 -- a union of a list
 
 
-class PerArea(_Section):
+class PerArea(Section):
     """A value per site that is proportional to its area."""
 
     per_um2: float
 
 
-class LayerSection(_Section):
+class LayerSection(Section):
     """Base of the sections of layouts, and of layouts that are layers of another one."""
 
 
@@ -184,7 +184,7 @@ def models() -> Models:
 
 def _registered_sections(
     registry: Registry[Any], skip: Sequence[str] = (), title: str = "{}", **types: Any
-) -> dict[str, type[_Section]]:
+) -> dict[str, type[Section]]:
     """Return sections of registered calls; warn of types that files cannot contain."""
     sections = {}
     for name, call in registry.items():
@@ -230,10 +230,10 @@ def _models(_versions: tuple[int, ...]) -> Models:
         ),
     }
     summary = "A shot: scene or power map, optics, distortion, layout, sensor, exposure."
-    return Models(create_model("ShotSection", __base__=_Section, __doc__=summary, **fields), layout, rules)
+    return Models(create_model("ShotSection", __base__=Section, __doc__=summary, **fields), layout, rules)
 
 
-def _rules() -> type[_Section]:
+def _rules() -> type[Section]:
     """Return the model of design rules; its schema lists presets and registered rules."""
     own = set(inspect.signature(DesignRules).parameters)
 
@@ -251,7 +251,7 @@ def _rules() -> type[_Section]:
     )
 
 
-def _sensor() -> type[_Section]:
+def _sensor() -> type[Section]:
     curves = _registered_sections(CURVES, path=str)
     factor = float | _union_of("kind", curves)
     product = _model("product", ProductCurve, curves=list[factor])  # type: ignore[valid-type]
@@ -290,7 +290,7 @@ def _layout_kind(section: Any) -> str | None:
     return "layout file" if "file" in section else "layout generator" if "generator" in section else None
 
 
-def _layout(rules: type[_Section]) -> Any:
+def _layout(rules: type[Section]) -> Any:
     """Return the union of the sections of all layout generators."""
     fields: dict[str, Any] = {
         "mosaic": (
@@ -313,7 +313,7 @@ def _layout(rules: type[_Section]) -> Any:
     return _layout_union("layout", create_model("_LayoutSection", __base__=LayerSection, **fields), parameters)
 
 
-def _layout_union(title: str, base: type[LayerSection], parameters: Mapping[str, type[_Section]]) -> Any:
+def _layout_union(title: str, base: type[LayerSection], parameters: Mapping[str, type[Section]]) -> Any:
     """Return the union of the sections of a layout, a generator or a file, over a base."""
     base.__doc__ = (
         "A layout: a generator and its parameters, colour filters, edits in the order of the keys, design rules."

@@ -5,10 +5,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
 
 from foveasim._io.yaml_files import read_yaml
 from foveasim.config import YAML_EXTENSIONS, resolve_files
-from foveasim.errors import ConfigError
+from foveasim.errors import ConfigError, FileError
 
 
 def digests(files: Iterable[Path]) -> dict[str, str]:
@@ -29,6 +32,14 @@ def digests(files: Iterable[Path]) -> dict[str, str]:
         if file.suffix.lower() in YAML_EXTENSIONS and file.is_file():
             pending += _referenced_files(file)
     return digest_by_path
+
+
+def load_array(path: str | Path, *, mmap_mode: Literal["r"] | None = None) -> Any:
+    """Read a ``.npy`` file of untrusted content."""
+    try:
+        return np.load(path, mmap_mode=mmap_mode, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise FileError(path, f"is not a readable array ({error})") from None
 
 
 def _referenced_files(file: Path) -> list[Path]:

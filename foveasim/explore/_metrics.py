@@ -59,11 +59,7 @@ def import_metric(name: str) -> Metric:
 
 
 def resolve_metrics(metrics: Iterable[str | Metric] | Mapping[str, Metric] | None) -> dict[str, Metric]:
-    """
-    Return metrics by the names of their results.
-
-    Raises ParameterError when a name is not in :data:`METRICS` or occurs twice, or a metric is not a function.
-    """
+    """Return metrics by the names of their results."""
     if metrics is None:
         metrics = DEFAULT_METRICS
     if isinstance(metrics, str) or callable(metrics):

@@ -52,11 +52,7 @@ class Record:
 
 
 def to_values(name: str, given: Any) -> dict[str, Scalar | Value]:
-    """
-    Convert the result of a metric to values by variable name.
-
-    Raises ParameterError when the result is not a number, string, mapping, array or labelled array, or cannot be stored.
-    """
+    """Convert the result of a metric to values by variable name."""
     if isinstance(given, Mapping):
         found: dict[str, Scalar | Value] = {}
         for key, item in given.items():
@@ -78,11 +74,7 @@ def to_values(name: str, given: Any) -> dict[str, Scalar | Value]:
 
 
 def check_unique(found: Collection[str], names: Iterable[str]) -> None:
-    """
-    Check that the names of new variables are not used yet.
-
-    Raises ParameterError with the repeated name.
-    """
+    """Check that the names of new variables are not used yet."""
     repeated = next((name for name in names if name in found), None)
     if repeated is not None:
         raise ParameterError(repeated, "must be a unique result name, got two results")
@@ -270,11 +262,7 @@ def _is_truncated_header(text: bytes) -> bool:
 
 
 def _check_same(path: Path, found: Any, header: Mapping[str, Any]) -> None:
-    """
-    Check that a journal belongs to a plan.
-
-    Raises FileError when it belongs to another plan.
-    """
+    """Check that a journal belongs to a plan."""
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise FileError(path, "is not a sweep journal; move it, or write the results elsewhere")
     if found.get("version") != VERSION:
@@ -283,11 +271,7 @@ def _check_same(path: Path, found: Any, header: Mapping[str, Any]) -> None:
 
 
 def check_same_plan(path: Path, found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    """
-    Check that results belong to a plan.
-
-    Raises FileError when they belong to another plan.
-    """
+    """Check that results belong to a plan."""
     expected = json.loads(json.dumps(expected))
     different = next(differences(found, expected), None)
     if different is not None:

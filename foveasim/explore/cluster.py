@@ -45,11 +45,7 @@ NO_HTTP: dict[str, list[str]] = {"distributed.scheduler.http.routes": [], "distr
 
 
 def check_installed() -> None:
-    """
-    Check that the libraries for worker processes are installed.
-
-    Raises ParameterError when one is missing.
-    """
+    """Check that the libraries for worker processes are installed."""
     for module in ("distributed", "dask", "cloudpickle", "cryptography"):
         import_optional("workers", module)
 
@@ -246,11 +242,7 @@ class WorkerStates:
         self.n_executing: int = 0
 
     def update(self) -> None:
-        """
-        Read the worker states from the scheduler.
-
-        Raises SimulationError when the scheduler does not answer.
-        """
+        """Read the worker states from the scheduler."""
         try:
             if self._client.cluster is not None:
                 # Dask restarts an ended worker, but not a worker that ends again during its start.

@@ -17,6 +17,7 @@ from functools import partial
 from threading import Lock
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from foveasim._core.calls import Limits
 from foveasim._core.provenance import find_user_module, versions
 from foveasim.errors import FoveasimError, SimulationError
 from foveasim.explore.cluster import WorkerStates, check_installed, open_client
@@ -24,7 +25,7 @@ from foveasim.explore.cluster import WorkerStates, check_installed, open_client
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-__all__ = ["KILLED", "MAX_DEATHS", "Run", "executor"]
+__all__ = ["KILLED", "MAX_DEATHS", "WORKERS", "Run", "executor"]
 
 #: Result of an item whose worker ended in every attempt.
 KILLED: Any = object()
@@ -40,6 +41,8 @@ MAX_DEATHS = 3
 NO_WORKER_TIMEOUT_S = 60.0
 #: Interval between updates of the worker list, seconds.
 POLL_S = 1.0
+#: Limits of the number of local processes.
+WORKERS = Limits(at_least=1, at_most=1024)
 
 #: Computes items and yields each with its result, or with KILLED, in order of completion. The second argument contains the
 #: positions, in ascending order, at which costly shared components of the items change.

@@ -10,25 +10,23 @@ blue-noise points leave low frequencies free of it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.calls import POSITIVE, Limits
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import (
     Floats,
-    check_choice,
-    check_count,
     check_length_um,
-    check_number,
     finite_array,
     read_only,
 )
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
 from foveasim.metrics.pixel_mtf import polygon_otf
-from foveasim.metrics.sampling import nyquist_per_mm, require_layout
+from foveasim.metrics.sampling import nyquist_per_mm
 from foveasim.units import per_mm_from_per_um, per_um_from_per_mm
 
 if TYPE_CHECKING:
@@ -102,7 +100,9 @@ class SamplingSpectrum:
         labels = "frequency / (line pairs per mm)", "mean power"
         return plot_curves({"": (frequency_per_mm, power)}, *labels, logarithmic="y", ax=ax)
 
-    def radial(self, n_bins: int = 64) -> tuple[Floats, Floats, Floats]:
+    def radial(
+        self, n_bins: Annotated[int, Limits(at_least=1, at_most=MAX_FREQUENCIES)] = 64
+    ) -> tuple[Floats, Floats, Floats]:
         """
         Compute the radial mean and the anisotropy of the power.
 
@@ -122,7 +122,6 @@ class SamplingSpectrum:
         ParameterError
             When ``n_bins`` is not an integer from 1 to 4096.
         """
-        n_bins = check_count("n_bins", n_bins, at_most=MAX_FREQUENCIES)
         f = self.frequency_per_mm
         r = np.hypot(f, f[:, np.newaxis]).ravel()
         edges = np.linspace(0.0, f[-1], n_bins + 1)
@@ -199,7 +198,7 @@ def sampling_spectrum(
     *,
     centre_um: tuple[float, float] | None = None,
     radius_um: float | None = None,
-    max_per_mm: float | None = None,
+    max_per_mm: Annotated[float | None, POSITIVE] = None,
     weights: Literal["sites", "area"] = "sites",
 ) -> SamplingSpectrum:
     """
@@ -234,7 +233,6 @@ def sampling_spectrum(
     step is half the inverse diameter, so that no peak is missed. The sum over sites is a nonuniform fast Fourier transform with
     an error of 1e-7 of the largest amplitude.
     """
-    check_choice("weights", weights, ("sites", "area"))
     region = _region(layout, centre_um, radius_um)
     weight = region.weight * (layout.area_um2[region.sites] if weights == "area" else 1.0)
     nyquist = _median_nyquist_per_mm(layout, region)
@@ -255,7 +253,7 @@ def aliasing_spectrum(
     *,
     centre_um: tuple[float, float] | None = None,
     radius_um: float | None = None,
-    max_per_mm: float | None = None,
+    max_per_mm: Annotated[float | None, POSITIVE] = None,
 ) -> AliasingSpectrum:
     """
     Compute the contrast of a sine wave at its own and at alias frequencies.
@@ -287,9 +285,7 @@ def aliasing_spectrum(
     different aliases: these are spread over many frequencies, so that ``alias_fraction`` is far below that of each region, and
     the median Nyquist frequency is far above that of the outer sites.
     """
-    wave = finite_array("wave_per_mm", wave_per_mm, ndim=1)
-    if wave.size != 2:
-        raise ParameterError("wave_per_mm", "must be two numbers (fx, fy)", wave_per_mm, "1/mm")
+    wave = finite_array("wave_per_mm", wave_per_mm)
     region = _region(layout, centre_um, radius_um)
     weight = region.weight * layout.area_um2[region.sites]
     weight /= weight.sum()
@@ -326,15 +322,12 @@ def aliasing_spectrum(
 
 
 def _region(layout: Layout, centre_um: tuple[float, float] | None, radius_um: float | None) -> _Region:
-    require_layout(layout)
     if layout.n_sites == 0:
         raise ParameterError("layout", "must have at least one site")
     x_min, y_min, x_max, y_max = layout.bounds_um
     centre = np.array([0.5 * (x_min + x_max), 0.5 * (y_min + y_max)])
     if centre_um is not None:
-        centre = finite_array("centre_um", centre_um, ndim=1)
-        if centre.size != 2:
-            raise ParameterError("centre_um", "must be two numbers (x, y)", centre_um, "µm")
+        centre = finite_array("centre_um", centre_um)
     radius_um = 0.5 * min(x_max - x_min, y_max - y_min) if radius_um is None else radius_um
     radius_um = check_length_um("radius_um", radius_um)
     xy_um = layout.centroid_um - centre
@@ -360,9 +353,7 @@ def _peak_per_mm(region: _Region) -> float:
 
 def _frequencies_per_mm(region: _Region, limit_per_mm: float, max_per_mm: float | None) -> Floats:
     """Return equally spaced frequencies from -max to max, including 0."""
-    highest = (
-        DEFAULT_MAX_NYQUISTS * limit_per_mm if max_per_mm is None else check_number("max_per_mm", max_per_mm, above=0.0)
-    )
+    highest = DEFAULT_MAX_NYQUISTS * limit_per_mm if max_per_mm is None else max_per_mm
     step = float(per_mm_from_per_um(1.0 / (STEPS_PER_INVERSE_DIAMETER * 2.0 * region.radius_um)))
     n = int(np.ceil(highest / step * (1.0 - 1e-12)))
     if 2 * n + 1 > MAX_FREQUENCIES:

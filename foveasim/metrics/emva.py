@@ -294,7 +294,8 @@ def emva1288(
     # Without a dark level below the quantisation, the noise and the threshold have only upper limits.
     jackknife = Jackknife(groups.n_blocks_of_class)
     limits = {name: jackknife.interval(values) for name, values in subsets.items()}
-    limits |= {name: jackknife.interval_of_root(values) for name, values in squares.items()}
+    # The interval of a square begins at 0 if it contains 0.
+    limits |= {name: np.sqrt(jackknife.interval(values)) for name, values in squares.items()}
     is_limited = estimates["is_quantisation_limited"]
     for name in ("dark_noise_dn", "dark_noise_e"):
         limits[name][is_limited, 0] = 0.0

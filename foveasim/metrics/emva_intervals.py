@@ -121,14 +121,6 @@ class Jackknife:
         half = self.quantile() * self.error(values)
         return np.maximum(np.stack((values[0] - half, values[0] + half), axis=-1), 0.0)
 
-    def interval_of_root(self, values: Floats) -> Floats:
-        """
-        Return the limits, (n_class, 2), of the square root of a parameter.
-
-        The interval is that of the square, which may be estimated as negative, and begins at 0 if it contains 0.
-        """
-        return np.sqrt(self.interval(values))
-
     def interval_of_extremes(self, values: Floats, is_used: Bools) -> tuple[Floats, Floats]:
         """
         Return the limits, (n_class, 2) each, of the smallest and the largest of several values.

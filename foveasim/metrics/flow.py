@@ -8,10 +8,12 @@ integral of the image gradient over the site.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import NOT_NEGATIVE, Limits
 from foveasim._core.short_repr import short_repr
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import (
@@ -19,8 +21,6 @@ from foveasim._core.validation import (
     Floats,
     Ints,
     as_numbers,
-    check_count,
-    check_number,
     finite_array,
     read_only,
 )
@@ -28,7 +28,6 @@ from foveasim.errors import CoverageWarning, ParameterError
 from foveasim.fields import Grid
 from foveasim.integrate import Integrator
 from foveasim.layout import Layout
-from foveasim.metrics.sampling import require_layout
 
 __all__ = ["FlowBound", "FlowEstimate", "estimate_flow", "flow_bound", "site_gradients_e_per_um"]
 
@@ -134,7 +133,6 @@ def site_gradients_e_per_um(
     CoverageWarning
         When sites lie partly or entirely off the map.
     """
-    require_layout(layout)
     cells = _validate_map(map_e_per_um2, grid)
     integrator = Integrator(layout, grid, order=2, n_threads=n_threads)
     is_on = _is_on_map(integrator, layout)
@@ -190,8 +188,8 @@ def estimate_flow(
     *,
     variance_e2: ArrayLike,
     regions: ArrayLike | None = None,
-    n_steps: int = 10,
-    tolerance_um: float = 1e-6,
+    n_steps: Annotated[int, Limits(at_least=1)] = 10,
+    tolerance_um: Annotated[float, NOT_NEGATIVE] = 1e-6,
     n_threads: int | None = None,
 ) -> FlowEstimate:
     """
@@ -235,13 +233,10 @@ def estimate_flow(
     iterations converge to the nearest minimum; for large displacements, start with a blurred image. Sites whose displaced
     outlines lie partly or entirely off the map are excluded, because their expected value is unknown.
     """
-    require_layout(layout)
     cells = _validate_map(map_e_per_um2, grid)
     maps = np.concatenate((cells[np.newaxis], _gradients(cells, grid)))
     values = _per_site("values_e", finite_array("values_e", values_e), layout.n_sites)
     variance = _per_site("variance_e2", finite_array("variance_e2", variance_e2, above=0.0), layout.n_sites)
-    n_steps = check_count("n_steps", n_steps)
-    tolerance_um = check_number("tolerance_um", tolerance_um, at_least=0.0)
     groups = _Regions(regions, layout.n_sites)
     vertices_of_site = np.diff(layout.ring_offsets[layout.site_offsets])
     flow_um = np.zeros((groups.labels.size, 2))

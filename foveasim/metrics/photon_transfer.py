@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.calls import OwnCheck
+from foveasim._core.calls import Limits, OwnCheck
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import (
     Floats,
@@ -248,9 +248,9 @@ def draw_frames(
     sensor: Sensor,
     expected_e: ArrayLike,
     *,
-    n_frames: int = 2,
+    n_frames: Annotated[int, Limits(at_least=1)] = 2,
     seed: int,
-    first_frame: int = 0,
+    first_frame: Annotated[int, Limits(at_least=0)] = 0,
     n_threads: int | None = None,
 ) -> NDArray[Any]:
     """
@@ -276,9 +276,8 @@ def draw_frames(
         When a number is out of range, or ``expected_e`` does not have one value per site.
     """
     level_e = _level("expected_e", expected_e, sensor.layout.n_sites)
-    first_frame = check_count("first_frame", first_frame, at_least=0)
     codes = []
-    for k in range(check_count("n_frames", n_frames)):
+    for k in range(n_frames):
         streams = Streams(seed, first_frame + k)
         codes.append(
             sensor.read(

@@ -9,7 +9,6 @@ from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Floats, finite_array
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
-from foveasim.metrics.sampling import require_layout
 from foveasim.units import per_um_from_per_mm
 
 __all__ = ["polygon_mtf", "polygon_otf", "wave_vectors_per_mm"]
@@ -82,7 +81,6 @@ def polygon_otf(layout: Layout, wave_per_mm: ArrayLike, *, n_threads: int | None
     """
     from foveasim.metrics import _kernels
 
-    require_layout(layout)
     waves = finite_array("wave_per_mm", wave_per_mm, ndim=2)
     if waves.shape[1] != 2:
         raise ParameterError("wave_per_mm", f"must have shape (n_wave, 2), got {waves.shape}")

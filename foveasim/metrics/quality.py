@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.validation import Bools, Floats, as_numbers, check_count, check_number
+from foveasim._core.calls import FRACTION, POSITIVE, Limits
+from foveasim._core.validation import Bools, Floats, as_numbers
 from foveasim.errors import ParameterError
 from foveasim.reconstruct import Picture
 
@@ -20,9 +22,9 @@ DEFAULT_MIN_COVERAGE = 0.5
 def psnr_db(
     picture: Picture | ArrayLike,
     reference: Picture | ArrayLike,
-    data_range: float | None = None,
+    data_range: Annotated[float | None, POSITIVE] = None,
     *,
-    min_coverage: float = DEFAULT_MIN_COVERAGE,
+    min_coverage: Annotated[float, FRACTION] = DEFAULT_MIN_COVERAGE,
 ) -> float:
     """
     Compute the peak signal-to-noise ratio (PSNR).
@@ -60,10 +62,10 @@ def psnr_db(
 def ssim(
     picture: Picture | ArrayLike,
     reference: Picture | ArrayLike,
-    data_range: float | None = None,
+    data_range: Annotated[float | None, POSITIVE] = None,
     *,
-    min_coverage: float = DEFAULT_MIN_COVERAGE,
-    window: int = 7,
+    min_coverage: Annotated[float, FRACTION] = DEFAULT_MIN_COVERAGE,
+    window: Annotated[int, Limits(at_least=3)] = 7,
 ) -> float:
     """
     Compute the mean structural similarity (SSIM).
@@ -88,7 +90,6 @@ def ssim(
         As for :func:`psnr_db`; when the window is even, or no window fits.
     """
     one, other, is_compared = _prepare_comparison(picture, reference, min_coverage)
-    window = check_count("window", window, at_least=3)
     if window % 2 == 0:
         raise ParameterError("window", "must be odd", window)
     peak = _data_range(other[:, is_compared], data_range)
@@ -127,7 +128,6 @@ def _prepare_comparison(
     picture: Picture | ArrayLike, reference: Picture | ArrayLike, min_coverage: float
 ) -> tuple[Floats, Floats, Bools]:
     """Return both images as (n_channel, n_y, n_x), and the mask of compared pixels."""
-    min_coverage = check_number("min_coverage", min_coverage, at_least=0.0, at_most=1.0)
     planes, covered = [], []
     for name, one in (("picture", picture), ("reference", reference)):
         is_picture = isinstance(one, Picture)
@@ -163,7 +163,7 @@ def _prepare_comparison(
 
 def _data_range(values: Floats, data_range: float | None) -> float:
     if data_range is not None:
-        return check_number("data_range", data_range, above=0.0)
+        return data_range
     peak = float(np.ptp(values))
     if peak == 0.0:
         raise ParameterError("data_range", "must be given for a constant reference")

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.calls import Limits
 from foveasim._core.rings import TIE_FRACTION
-from foveasim._core.validation import Bools, Floats, Ints, check_choice, check_count, finite_array, read_only
-from foveasim.errors import ParameterError, type_name
+from foveasim._core.validation import Bools, Floats, Ints, finite_array, read_only
+from foveasim.errors import ParameterError
 from foveasim.layout import Layout
 from foveasim.units import per_mm_from_per_um
 
@@ -22,7 +23,6 @@ __all__ = [
     "neighbour_spacing_um",
     "nyquist_per_mm",
     "nyquist_vs_eccentricity",
-    "require_layout",
 ]
 
 #: Sine of the minimum angle (30 degrees) between the directions of both neighbours; it is 60 degrees or more in the reduced
@@ -70,8 +70,7 @@ def nyquist_per_mm(
     >>> np.unique(nyquist_per_mm(hexagonal(n_columns=4, n_rows=4, pitch_um=2.0)).round(3))
     array([288.675])
     """
-    require_layout(layout)
-    if check_choice("by", by, ("neighbours", "area")) == "area":
+    if by == "area":
         if per_channel:
             raise ParameterError(
                 "per_channel", "must be False with by='area'; use by='neighbours' for one filter of a mosaic"
@@ -100,7 +99,6 @@ def neighbour_spacing_um(layout: Layout, *, per_channel: bool = False) -> tuple[
         Distances between centroids; their product is the cell area of a lattice. NaN without such a neighbour; coincident
         sites have a distance of 0 and NaN for the row.
     """
-    require_layout(layout)
     nearest_um, row_um = np.full(layout.n_sites, np.nan), np.full(layout.n_sites, np.nan)
     channel = layout.channel if per_channel else np.zeros(layout.n_sites, np.int64)
     for c in np.unique(channel):
@@ -249,7 +247,7 @@ def nyquist_vs_eccentricity(
     layout: Layout,
     centre_um: tuple[float, float] = (0.0, 0.0),
     *,
-    n_bins: int = 24,
+    n_bins: Annotated[int, Limits(at_least=1, at_most=100_000)] = 24,
     by: Literal["neighbours", "area"] = "neighbours",
     per_channel: bool = False,
 ) -> EccentricityTable:
@@ -275,11 +273,7 @@ def nyquist_vs_eccentricity(
     ParameterError
         When an argument is out of range, or the layout has no sites.
     """
-    require_layout(layout)
-    centre = finite_array("centre_um", centre_um, ndim=1)
-    if centre.size != 2:
-        raise ParameterError("centre_um", "must be two numbers (x, y)", centre_um, "µm")
-    n_bins = check_count("n_bins", n_bins, at_most=100_000)
+    centre = finite_array("centre_um", centre_um)
     if layout.n_sites == 0:
         raise ParameterError("layout", "must have at least one site")
     nyquist = nyquist_per_mm(layout, by=by, per_channel=per_channel)
@@ -306,16 +300,6 @@ def nyquist_vs_eccentricity(
         size_at_centre_um=at_centre_um,
         growth_fraction=slope,
     )
-
-
-def require_layout(layout: object) -> None:
-    """
-    Validate that an argument is a layout.
-
-    Raises ParameterError when it is not a :class:`foveasim.Layout`.
-    """
-    if not isinstance(layout, Layout):
-        raise ParameterError("layout", f"must be a foveasim.Layout, got {type_name(layout)}")
 
 
 def _min_median_max(values: Floats, position: NDArray[np.intp], n_bins: int) -> tuple[Floats, Floats, Floats]:

@@ -18,7 +18,6 @@ from foveasim._core.validation import (
     Floats,
     Ints,
     as_numbers,
-    check_choice,
     check_length_um,
     check_number,
     finite_array,
@@ -27,7 +26,6 @@ from foveasim._core.validation import (
 )
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
-from foveasim.metrics.sampling import require_layout
 from foveasim.units import per_mm_from_per_um, per_um_from_per_mm
 
 if TYPE_CHECKING:
@@ -198,14 +196,12 @@ def slanted_edge_mtf(
     ----------
     ISO 12233:2023, Photography: Electronic still picture imaging: Resolution and spatial frequency responses, annex D (e-SFR).
     """
-    require_layout(layout)
     site_values = as_numbers("values", values, missing_is_nan=True)
     if site_values.shape != (layout.n_sites,):
         raise ParameterError(
             "values", f"must have one value for each of the {layout.n_sites} sites, got shape {site_values.shape}"
         )
     is_used = np.isfinite(site_values) & _mask(where, layout.n_sites)
-    check_choice("window", window, ("tukey", "hamming", "none"))
     n_used = int(np.count_nonzero(is_used))
     if n_used < MIN_SITES:
         raise ParameterError("where", f"must select at least {MIN_SITES} sites", n_used)

@@ -8,19 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.validation import Bools, Floats, Ints, check_count, check_number, finite_array, read_only
+from foveasim._core.calls import POSITIVE, Limits
+from foveasim._core.validation import Bools, Floats, Ints, finite_array, read_only
 from foveasim.camera import Camera
 from foveasim.capture import Capture
-from foveasim.errors import ParameterError, type_name
+from foveasim.errors import ParameterError
 from foveasim.fields import PowerMap
 from foveasim.layout import Layout
 from foveasim.metrics.photon_transfer import SiteClasses, codes_of
-from foveasim.metrics.sampling import require_layout
 from foveasim.scene import Scene
 from foveasim.sensor import Sensor, SiteSignals, signal_to_noise
 from foveasim.sensor.adc import ADC, QUANTISATION_DN2
@@ -140,7 +140,7 @@ class SnrTable:
         )
 
 
-def size_classes_um(layout: Layout, n_classes: int = 6) -> Floats:
+def size_classes_um(layout: Layout, n_classes: Annotated[int, Limits(at_least=1)] = 6) -> Floats:
     """
     Assign each site to a size class, with logarithmically spaced class limits.
 
@@ -160,8 +160,6 @@ def size_classes_um(layout: Layout, n_classes: int = 6) -> Floats:
     ParameterError
         When ``n_classes`` is below 1, or the layout has no sites.
     """
-    require_layout(layout)
-    n_classes = check_count("n_classes", n_classes)
     if layout.n_sites == 0:
         raise ParameterError("layout", "must have at least one site")
     size_um = np.sqrt(layout.area_um2)
@@ -210,7 +208,12 @@ def snr_by_class(
 
 
 def relative_exposure_at_snr_fraction(
-    camera: Camera, light: Scene | PowerMap, *, exposure_s: float, snr: float = 1.0, classes: ArrayLike | None = None
+    camera: Camera,
+    light: Scene | PowerMap,
+    *,
+    exposure_s: float,
+    snr: Annotated[float, POSITIVE] = 1.0,
+    classes: ArrayLike | None = None,
 ) -> Floats:
     """
     Return the relative exposure at which each class of sites reaches a given SNR.
@@ -243,7 +246,6 @@ def relative_exposure_at_snr_fraction(
     The relative exposure is found by iteration over predictions as in :func:`snr_by_class`.
     """
     exposure_s = EXPOSURE.check("exposure_s", exposure_s)
-    snr = check_number("snr", snr, above=0.0)
     sensor, layout = _sensor_and_layout(camera)
     groups = SiteClasses(size_classes_um(layout) if classes is None else classes, layout.n_sites)
     full_e = sensor.expected_electrons(camera.photoelectrons_per_s(light), exposure_s)
@@ -300,7 +302,7 @@ def measured_snr_by_class(
     frames: Any,
     dark: Any,
     *,
-    bits: int | None = None,
+    bits: Annotated[int | None, Limits(at_least=1, at_most=16)] = None,
     full_well_e: ArrayLike | None = None,
     classes: ArrayLike | None = None,
 ) -> SnrTable:
@@ -337,14 +339,12 @@ def measured_snr_by_class(
     companded codes). If the noise exceeds one code, the result agrees with :func:`snr_by_class`. Within one code, frames do not
     resolve the noise, and the SNR is an upper bound. Response nonlinearity is not corrected.
     """
-    require_layout(layout)
     captures = frames if isinstance(frames, Sequence) and all(isinstance(frame, Capture) for frame in frames) else ()
     if bits is None:
         first = frames[0] if isinstance(frames, Sequence) and len(frames) else None
         bits = getattr(first, "bits", None)
         if bits is None:
             raise ParameterError("bits", "must be given for frames that are not captures")
-    bits = check_count("bits", bits, at_most=16)
     codes, dark_codes = codes_of("frames", frames), codes_of("dark", dark)
     for name, some in (("frames", codes), ("dark", dark_codes)):
         if some.shape[1] != layout.n_sites:
@@ -370,8 +370,6 @@ def _build_adc(captures: Sequence[Capture], bits: int) -> ADC:
 
 
 def _sensor_and_layout(camera: Camera) -> tuple[Sensor, Layout]:
-    if not isinstance(camera, Camera):
-        raise ParameterError("camera", f"must be a foveasim.Camera, got {type_name(camera)}")
     assert isinstance(camera.sensor.layout, Layout)  # guaranteed by Camera
     return camera.sensor, camera.sensor.layout
 

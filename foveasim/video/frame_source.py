@@ -10,13 +10,13 @@ from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from foveasim._core.calls import POSITIVE, Limits
 from foveasim._core.names import missing_path, possible_names
-from foveasim._core.validation import check_count, check_number
 from foveasim._io.images import PICTURE_EXTENSIONS, picture_names
 from foveasim._io.videos import VideoFile, frame_pixels
 from foveasim.errors import FileError, ParameterError, type_name
@@ -28,6 +28,7 @@ __all__ = ["FrameSource", "list_pictures"]
 GREY_NM, COLOUR_NM = (550.0,), (620.0, 550.0, 450.0)
 #: Upper limit of frame indices.
 MAX_FRAMES = 2**31
+FRAMES = Limits(at_least=0, at_most=MAX_FRAMES)
 
 
 class FrameSource:
@@ -74,15 +75,13 @@ class FrameSource:
         self,
         source: str | Path | Iterable[str | Path | ArrayLike],
         *,
-        start: int = 0,
-        stop: int | None = None,
-        step: int = 1,
-        frame_s: float | None = None,
+        start: Annotated[int, FRAMES] = 0,
+        stop: Annotated[int | None, FRAMES] = None,
+        step: Annotated[int, Limits(at_least=1, at_most=MAX_FRAMES)] = 1,
+        frame_s: Annotated[float | None, POSITIVE] = None,
         template: Scene | None = None,
         **scene: Any,
     ) -> None:
-        if template is not None and not isinstance(template, Scene):
-            raise ParameterError("template", f"must be a Scene, got {type_name(template)}")
         if template is not None and template.basis.shape[0] not in (1, 3):
             raise ParameterError("template", f"must have 1 or 3 basis images, got {template.basis.shape[0]}")
         if template is not None and set(scene) - {"encoding"}:
@@ -92,9 +91,7 @@ class FrameSource:
         if template is None:
             _check_settings(scene)
         self._template = template
-        self._start = check_count("start", start, at_least=0, at_most=MAX_FRAMES)
-        self._stop = None if stop is None else check_count("stop", stop, at_least=0, at_most=MAX_FRAMES)
-        self._step = check_count("step", step, at_most=MAX_FRAMES)
+        self._start, self._stop, self._step = start, stop, step
         self._scene = scene
         self._source: Iterable[Any]
         self._n_source: int | None = None
@@ -115,7 +112,7 @@ class FrameSource:
         else:
             raise ParameterError("source", f"must be a path or an iterable of pictures, got {type_name(source)}")
         if frame_s is not None:
-            period_s = check_number("frame_s", frame_s, above=0.0)
+            period_s = frame_s
         self._frame_s = None if period_s is None else period_s * (self._step if frame_s is None else 1)
         self._may_be_empty = False
         # The frame count of video files is an estimate.
@@ -139,7 +136,7 @@ class FrameSource:
             range(self._start, min(self._n_source, self._n_source if self._stop is None else self._stop), self._step)
         )
 
-    def from_frame(self, n: int) -> FrameSource:
+    def from_frame(self, n: Annotated[int, FRAMES]) -> FrameSource:
         """
         Return a source without the first ``n`` frames, which are not converted to scenes.
 
@@ -158,7 +155,7 @@ class FrameSource:
             When ``n`` is negative or not an integer.
         """
         source = copy.copy(self)
-        source._start += check_count("n", n, at_least=0, at_most=MAX_FRAMES) * self._step  # noqa: SLF001 -- same class
+        source._start += n * self._step  # noqa: SLF001 -- same class
         source._may_be_empty = True  # noqa: SLF001
         return source
 

@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from foveasim._core.calls import NOT_NEGATIVE, POSITIVE
 from foveasim._core.random_streams import Streams
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, check_number, check_shape, finite_array, read_only
 from foveasim.camera import Camera
 from foveasim.camera._frames import PathPosition, path_digests, path_positions
-from foveasim.errors import ParameterError, type_name, with_article
+from foveasim.errors import ParameterError
 from foveasim.fields import PowerMap
 from foveasim.optics import Optics
 from foveasim.scene import Scene
@@ -75,13 +77,13 @@ class GazePath:
 
 def saccades(
     *,
-    duration_s: float,
-    frame_s: float,
+    duration_s: Annotated[float, POSITIVE],
+    frame_s: Annotated[float, POSITIVE],
     size_um: tuple[float, float],
     seed: int,
     fixation_s: float = 0.3,
-    saccade_s: float = 0.05,
-    drift_um_per_root_s: float = 0.0,
+    saccade_s: Annotated[float, NOT_NEGATIVE] = 0.05,
+    drift_um_per_root_s: Annotated[float, NOT_NEGATIVE] = 0.0,
 ) -> GazePath:
     """
     Generate a random gaze path of saccades, and fixations with drift.
@@ -113,21 +115,15 @@ def saccades(
     >>> path.xy_um.shape, path.xy_um[0].tolist()
     ((100, 2), [0.0, 0.0])
     """
-    frame_s = check_number("frame_s", frame_s, above=0.0)
-    duration_s = check_number("duration_s", duration_s, above=0.0)
     n = round(min(duration_s / frame_s, 2.0 * MAX_POINTS))
     if not 1 <= n <= MAX_POINTS:
         raise ParameterError("duration_s", f"must be 1 to {MAX_POINTS:,} frames of {frame_s:g} s", duration_s, "s")
-    half_um = 0.5 * finite_array("size_um", size_um, ndim=1, at_least=0.0)
-    if half_um.size != 2:
-        raise ParameterError("size_um", "must be two numbers (width, height)", size_um, "µm")
+    half_um = 0.5 * finite_array("size_um", size_um, at_least=0.0)
     fixation_s = check_number("fixation_s", fixation_s, at_least=frame_s)
-    saccade_s = check_number("saccade_s", saccade_s, at_least=0.0)
-    drift = check_number("drift_um_per_root_s", drift_um_per_root_s, at_least=0.0)
     streams = Streams(seed)
     fixations, targets, walk = (streams.of(f"gaze {name}") for name in ("rests", "targets", "drift"))
     t_s = frame_s * np.arange(n)
-    steps_um = drift * math.sqrt(frame_s) * walk.standard_normal((n, 2))
+    steps_um = drift_um_per_root_s * math.sqrt(frame_s) * walk.standard_normal((n, 2))
     xy_um = np.zeros((n, 2))
     begin_s, position_um = 0.0, np.zeros(2)
     while begin_s < t_s[-1] or begin_s == 0.0:
@@ -163,7 +159,6 @@ def shift_sensor(source: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Sce
     ------
     source, (x_um, y_um)
     """
-    _check_types(("source", source, (Scene, PowerMap)), ("path", path, (GazePath,)))
     return ((source, position_um) for position_um in path_positions(path.xy_um))
 
 
@@ -198,7 +193,6 @@ def pan_camera(
         Immediately when an argument is of another class, the part is larger than the scene, or a scene with ``fit`` is given
         without a camera; during iteration when the part extends beyond the scene.
     """
-    _check_types(("scene", scene, (Scene,)), ("path", path, (GazePath,)), ("optics", optics, (Optics, Camera)))
     n_y, n_x = check_shape("shape", shape)
     if n_y > scene.basis.shape[1] or n_x > scene.basis.shape[2]:
         raise ParameterError("shape", f"must not exceed the shape of the scene, {scene.basis.shape[1:]}", (n_y, n_x))
@@ -250,10 +244,3 @@ def _parts(
             for at_um, at, free in zip(position_um, (left, bottom), (free_x, free_y), strict=True)
         )
         yield part, PathPosition((x_um, y_um), (position_um[0], position_um[1]), digests, k)
-
-
-def _check_types(*arguments: tuple[str, object, tuple[type, ...]]) -> None:
-    for name, value, types in arguments:
-        if not isinstance(value, types):
-            class_names = " or ".join(with_article(type_.__name__) for type_ in types)
-            raise ParameterError(name, f"must be {class_names}, got {type_name(value)}")

@@ -193,11 +193,7 @@ def _is_recording(directory: Path) -> bool:
 
 
 def check_consistent(captures: Iterable[Capture], *, n_before: int = 0) -> Iterator[Capture]:
-    """
-    Yield the captures after checking that they have the same number of sites and bits.
-
-    Raises ParameterError when captures differ, or there are neither captures nor ``n_before`` previous ones.
-    """
+    """Yield the captures after checking that they have the same number of sites and bits."""
     first: tuple[int, int] | None = None
     for capture in captures:
         if not isinstance(capture, Capture):

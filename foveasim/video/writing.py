@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.calls import POSITIVE, Limits
 from foveasim._core.extras import import_optional
-from foveasim._core.validation import check_count, check_number
 from foveasim._io.atomic import atomic_directory, atomic_write
 from foveasim._io.images import write_picture
 from foveasim._io.zarr_stores import ZARR
@@ -35,8 +35,8 @@ def write_video(
     captures: Iterable[Capture],
     path: str | Path,
     *,
-    frame_s: float = 1.0 / 25.0,
-    max_pixels: int = 512,
+    frame_s: Annotated[float, POSITIVE] = 1.0 / 25.0,
+    max_pixels: Annotated[int, Limits(at_least=2)] = 512,
     n_frames: int | None = None,
     progress: bool = False,
     resume: bool = False,
@@ -105,8 +105,6 @@ def write_video(
         frames = itertools.islice(shift_sensor(scene, path), n, None)
     """
     target = Path(path)
-    frame_s = check_number("frame_s", frame_s, above=0.0)
-    max_pixels = check_count("max_pixels", max_pixels, at_least=2)
     extension = target.suffix.lower()
     if extension != ZARR and (resume or plan is not None):
         raise ParameterError(

@@ -321,7 +321,8 @@ def test_worker_cache_uses_quarter_of_memory(scheduler):
         from distributed import get_worker
 
         (shared,) = (value for value in get_worker().data.values() if hasattr(value, "function"))
-        return shared.function()._runner.cache.max_bytes
+        _, runner = shared.function().args
+        return runner.cache.max_bytes
 
     found = explore.sweep(SHOT, {"sensor.bits": [8]}, metrics=[cache_bytes], scheduler=scheduler[0])
 
@@ -407,6 +408,16 @@ def test_point_seed_depends_on_seed_and_number():
 def journal_points(store):
     lines = journal_path(store).read_text().splitlines() if journal_path(store).exists() else []
     return [json.loads(line.partition(" ")[2])["point"] for line in lines[1:]]
+
+
+def test_plan_is_unchanged_by_list_items():
+    shot = SHOT | {"layout": SHOT["layout"] | {"move_um": [0.0, 0.0]}}
+    plan = explore.plan_sweep(shot, {"layout.move_um.0": [1.0, 2.0]})
+    before = json.dumps(plan.to_dict())
+
+    assert plan.settings_of(0)["layout"]["move_um"] == [1.0, 0.0]
+    assert json.dumps(plan.to_dict()) == before
+    assert plan.settings["layout"]["move_um"] == [0.0, 0.0]
 
 
 @pytest.mark.slow

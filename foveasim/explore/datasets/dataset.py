@@ -12,12 +12,12 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.calls import OwnCheck
+from foveasim._core.calls import Limits, OwnCheck
 from foveasim._core.provenance import versions
 from foveasim._core.random_streams import Streams
 from foveasim._core.threads import cached_property
@@ -50,11 +50,10 @@ from foveasim.explore.datasets.labels import (
 )
 from foveasim.explore.datasets.packed import PackedBoxes
 from foveasim.explore.datasets.pictures import digest_of, is_lazy, source_of
-from foveasim.explore.sweeps.plan import VARY, check_disjoint, locate_shot, put_changes, with_changes
+from foveasim.explore.sweeps.plan import VARY, check_disjoint, copy_settings, locate_shot, put_changes, with_changes
 from foveasim.explore.worker_cache import rate_settings
 from foveasim.layout import Layout
 from foveasim.scene import Scene
-from foveasim.scene._scene import Fit
 
 __all__ = ["FIELDS", "Dataset"]
 
@@ -64,8 +63,8 @@ FIELDS = ("code", "electrons", "expected_e", "expected_dn")
 MAX_CACHED = 4
 #: Largest number of values of each setting that are checked before the first sample.
 CHECKED_VALUES = 64
-#: Upper limit of cameras and draws, beyond any feasible computation.
-MAX_REPEATS = 10**9
+#: Limits of cameras and draws; the upper one is beyond any feasible computation.
+REPEATS = Limits(at_least=1, at_most=10**9)
 #: Settings that ``fit`` replaces.
 FRAMING = ("scene.pitch_um", "scene.fit", "scene.field_of_view_deg")
 #: Setting that determines the photosites.
@@ -170,8 +169,8 @@ class Dataset:
         shot: OwnCheck[str | Path | Mapping[str, Any]],
         vary: OwnCheck[Mapping[str, Any] | None] = None,
         *,
-        cameras: int = 1,
-        draws: int = 1,
+        cameras: Annotated[int, REPEATS] = 1,
+        draws: Annotated[int, REPEATS] = 1,
         seed: int = 0,
         fields: Sequence[str] = ("code", "electrons"),
         labels: OwnCheck[Sequence[int | str] | None] = None,
@@ -183,15 +182,15 @@ class Dataset:
         fit: Literal["cover", "contain", "width"] | None = None,
         changes: Mapping[str, Any] | None = None,
         source: Source | str | Path | None = None,
-        n_threads: int = 1,
+        n_threads: Annotated[int, Limits(at_least=1)] = 1,
     ) -> None:
-        self.cameras: int = check_count("cameras", cameras, at_most=MAX_REPEATS)
-        self.draws: int = check_count("draws", draws, at_most=MAX_REPEATS)
+        self.cameras: int = cameras
+        self.draws: int = draws
         self.seed: int = Streams(seed).seed
         self.fields: tuple[str, ...] = tuple(fields)
         for field in self.fields:
             check_choice("fields", field, FIELDS)
-        self._n_threads = check_count("n_threads", n_threads)
+        self._n_threads = n_threads
         self._pictures = source_of(pictures)
         n = len(self._pictures)
         self.class_names: list[str] | None
@@ -204,8 +203,6 @@ class Dataset:
         self._flows = None if flows is None else check_per_picture("flows", flows, n)
         images = {RASTER: check_image_options(RASTER, raster), CORTICAL: check_image_options(CORTICAL, cortical)}
         self._images = {name: options for name, options in images.items() if options is not None}
-        if fit is not None:
-            check_choice("fit", fit, get_args(Fit))
         self._fit = fit
         self._files: list[Path] = []
         own = Source.of(source)
@@ -393,7 +390,7 @@ class Dataset:
 
     def _settings_with(self, index: int, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the settings with the given values and the picture of a sample."""
-        data = _copy(self._settings)
+        data: dict[str, Any] = copy_settings(self._settings)
         data["scene"]["picture"] = self._name_of(index)
         for path, value in values.items():
             put_setting(self._source, data, path, value)
@@ -624,8 +621,3 @@ def _record_warnings() -> Iterator[list[warnings.WarningMessage]]:
 
 def _as_warning(message: Warning | str) -> Warning:
     return message if isinstance(message, Warning) else FoveasimWarning(message)
-
-
-def _copy(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a copy of settings with new mappings; lists are shared."""
-    return {key: _copy(value) if isinstance(value, Mapping) else value for key, value in data.items()}

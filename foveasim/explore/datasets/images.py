@@ -29,11 +29,7 @@ UNITS = {"code": "DN", "electrons": "e-", "expected_e": "e-", "light_e": "e-"}
 
 
 def check_image_options(name: str, options: Any) -> dict[str, Any] | None:
-    """
-    Return the options of an image with their defaults, or None.
-
-    Raises ParameterError when the options are not a mapping of plain data, or have other names.
-    """
+    """Return the options of an image with their defaults, or None."""
     if options is None:
         return None
     known = OPTIONS[name]

@@ -11,11 +11,12 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from foveasim._core.names import missing_path
 from foveasim._core.validation import Floats
 from foveasim.errors import FileError
+from foveasim.explore._files import load_array
 from foveasim.explore.datasets.packed import PackedFiles
 
 __all__ = ["FLOW_EXTENSIONS", "MASK_EXTENSIONS", "match_label_files", "read_boxes", "read_labels"]
@@ -69,13 +70,11 @@ def read_labels(path: Path, pictures: Sequence[str]) -> list[int] | list[str]:
 
 
 class _CocoImage(BaseModel):
-    model_config = ConfigDict(extra="ignore")
     id: int | str
     file_name: str
 
 
 class _CocoAnnotation(BaseModel):
-    model_config = ConfigDict(extra="ignore")
     image_id: int | str
     category_id: int
     bbox: _Box
@@ -85,7 +84,6 @@ class _CocoAnnotation(BaseModel):
 class _Coco(BaseModel):
     """Keys that are read from a COCO file; others, such as outlines and licences, are ignored."""
 
-    model_config = ConfigDict(extra="ignore")
     images: list[_CocoImage]
     annotations: list[_CocoAnnotation]
 
@@ -173,10 +171,7 @@ def _content(path: Path) -> bytes:
 
 
 def _array(path: Path) -> NDArray[np.generic]:
-    try:
-        array: NDArray[np.generic] = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise FileError(path, f"is not a readable array ({error})") from None
+    array: NDArray[np.generic] = load_array(path)
     if not isinstance(array, np.ndarray) or array.ndim != 1 or array.dtype.kind not in "iuU":
         raise FileError(path, "must be a one-dimensional array of integers or strings")
     return array

@@ -14,7 +14,8 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats, Ints, finite_array
 from foveasim._io.images import read_picture
 from foveasim.distortion import Lens
-from foveasim.errors import FileError, ParameterError, type_name
+from foveasim.errors import ParameterError, type_name
+from foveasim.explore._files import load_array
 from foveasim.fields import Grid, from_file_rows
 from foveasim.integrate import Integrator
 
@@ -245,17 +246,10 @@ def _palette_numbers(path: Path) -> NDArray[Any] | None:
 
 
 def read_flow(flow: Any, name: str, shape: tuple[int, int]) -> Floats:
-    """
-    Read an optical flow from a ``.npy`` file or an array, top row first.
-
-    Raises FileError, ParameterError when the flow cannot be read, or its shape differs.
-    """
+    """Read an optical flow from a ``.npy`` file or an array, top row first."""
     if isinstance(flow, str | Path):
         name = str(flow)
-        try:
-            flow = np.load(flow, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise FileError(name, f"is not a readable array ({error})") from None
+        flow = load_array(flow)
     displacement = np.asarray(flow)
     if displacement.shape != (*shape, 2) or displacement.dtype.kind not in "iuf":
         raise ParameterError(
@@ -265,11 +259,7 @@ def read_flow(flow: Any, name: str, shape: tuple[int, int]) -> Floats:
 
 
 def check_per_picture(name: str, given: Any, n: int) -> Sequence[Any]:
-    """
-    Return a sequence after checking that it has one item per picture.
-
-    Raises ParameterError when the object is not a sequence, or has another length.
-    """
+    """Return a sequence after checking that it has one item per picture."""
     if isinstance(given, str | bytes) or not (hasattr(given, "__len__") and hasattr(given, "__getitem__")):
         raise ParameterError(name, f"must be a sequence with one item per picture, got {type_name(given)}")
     if len(given) != n:

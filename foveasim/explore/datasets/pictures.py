@@ -7,9 +7,10 @@ import os
 import sys
 import tempfile
 import zipfile
-from collections.abc import Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from foveasim._core.names import missing_path
 from foveasim._io.images import PICTURE_EXTENSIONS, picture_names, pixels_of_image, read_picture
 from foveasim.errors import FileError, ParameterError, type_name
-from foveasim.explore._files import digests
+from foveasim.explore._files import digests, load_array
 from foveasim.explore.datasets.packed import PackedFiles, PackedStrings
 
 __all__ = ["Source", "digest_of", "is_lazy", "source_of"]
@@ -26,42 +27,44 @@ __all__ = ["Source", "digest_of", "is_lazy", "source_of"]
 MAX_DECOMPRESSED_BYTES = 2**30
 
 
-@runtime_checkable
-class Source(Protocol):
+class Source(ABC):
     """Sequence of pictures with names and optional classes."""
 
+    @abstractmethod
     def __len__(self) -> int: ...
 
+    @abstractmethod
     def name(self, k: int) -> str:
         """Return the name of a picture for messages."""
 
     def key(self, k: int) -> str:
         """Return the name of a picture in label files: relative path, or index."""
+        return str(k)
 
+    @abstractmethod
     def picture(self, k: int) -> NDArray[Any]:
         """Read a picture as :func:`foveasim._io.images.read_picture`, top row first."""
 
     def labels(self) -> list[Any] | None:
         """Return the class of every picture if the source contains classes, else None."""
+        return None
 
+    @abstractmethod
     def to_dict(self) -> dict[str, Any]:
         """Return plain data that identifies the source, without the contents of its pictures."""
 
     @property
     def is_lazy(self) -> bool:
         """Whether the items of the source may be computed on access."""
+        return False
 
+    @abstractmethod
     def digest(self, k: int) -> str:
         """Return a checksum of the contents of a picture, without decompressing it."""
 
 
 def source_of(pictures: Any) -> Source:
-    """
-    Create the source of the pictures of a dataset; return a source unchanged.
-
-    Raises FileError when the file does not exist, or contains no pictures. Raises ParameterError when the type of ``pictures``
-    is not supported.
-    """
+    """Create the source of the pictures of a dataset; return a source unchanged."""
     if isinstance(pictures, Source):
         return pictures
     if isinstance(pictures, str | Path):
@@ -109,73 +112,74 @@ def digest_of(item: Any) -> str:
     return digest.hexdigest()
 
 
-class _Directory:
-    """Pictures of a directory and its subdirectories, in natural order of their names."""
+class _Files(Source):
+    """Picture files in natural order of their names."""
 
-    is_lazy = False
+    kind: ClassVar[str]
+
+    def __init__(self, path: Path, names: Iterable[str]) -> None:
+        self._path, self._names = path, PackedStrings(picture_names(names))
+        if not self._names:
+            raise FileError(path, f"contains no pictures ({', '.join(PICTURE_EXTENSIONS)})")
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def key(self, k: int) -> str:
+        return self._names[k]
+
+    def labels(self) -> list[Any] | None:
+        """Return the top-level directory of each picture; None if a picture is in none."""
+        directories = [PurePosixPath(name).parts[0] if "/" in name else None for name in self._names]
+        return directories if all(directory is not None for directory in directories) else None
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"kind": self.kind, **_names_digest(self._names)}
+
+
+class _Directory(_Files):
+    """Pictures of a directory and its subdirectories."""
+
+    kind = "folder"
 
     def __init__(self, directory: Path) -> None:
-        self._directory = directory
         found = (
             f"{prefix}{name}"
             for root, _, names in os.walk(directory, onerror=_raise_error)
             for prefix in [f"{Path(root).relative_to(directory).as_posix()}/".removeprefix("./")]
             for name in names
         )
-        self._names = PackedStrings(picture_names(found))
-        if not self._names:
-            raise FileError(directory, f"contains no pictures ({', '.join(PICTURE_EXTENSIONS)})")
-
-    def __len__(self) -> int:
-        return len(self._names)
+        super().__init__(directory, found)
 
     def name(self, k: int) -> str:
-        return str(self._directory / self._names[k])
-
-    def key(self, k: int) -> str:
-        return self._names[k]
+        return str(self._path / self._names[k])
 
     def picture(self, k: int) -> NDArray[Any]:
-        return read_picture(self._directory / self._names[k])
-
-    def labels(self) -> list[Any] | None:
-        return _directory_labels(self._names)
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"kind": "folder", **_names_digest(self._names)}
+        return read_picture(self._path / self._names[k])
 
     def digest(self, k: int) -> str:
-        return digest_of(self._directory / self._names[k])
+        return digest_of(self._path / self._names[k])
 
 
-class _Zip:
+class _Zip(_Files):
     """Pictures of a zip file, which every process opens separately."""
 
-    is_lazy = False
+    kind = "zip"
 
     def __init__(self, path: Path) -> None:
-        self._path = path
         try:
             with zipfile.ZipFile(path) as archive:
                 names = [item.filename for item in archive.infolist() if not item.is_dir()]
         except (OSError, zipfile.BadZipFile) as error:
             raise FileError(path, f"is corrupt ({error})") from None
-        self._names = PackedStrings(picture_names(names))
-        if not self._names:
-            raise FileError(path, f"contains no pictures ({', '.join(PICTURE_EXTENSIONS)})")
+        super().__init__(path, names)
         self._opened: tuple[int, zipfile.ZipFile] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_opened": None}
 
-    def __len__(self) -> int:
-        return len(self._names)
-
     def name(self, k: int) -> str:
         return f"{self._path}!{self._names[k]}"
-
-    def key(self, k: int) -> str:
-        return self._names[k]
 
     def picture(self, k: int) -> NDArray[Any]:
         archive, name = self._archive(), self._names[k]
@@ -193,17 +197,11 @@ class _Zip:
             except FileError as error:
                 raise FileError(self.name(k), str(error).removeprefix(f"{file}: ")) from None
 
-    def labels(self) -> list[Any] | None:
-        return _directory_labels(self._names)
-
     def _archive(self) -> zipfile.ZipFile:
         # A forked process shares the file position of its parent.
         if self._opened is None or self._opened[0] != os.getpid():
             self._opened = os.getpid(), zipfile.ZipFile(self._path)
         return self._opened[1]
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"kind": "zip", **_names_digest(self._names)}
 
     def digest(self, k: int) -> str:
         # Decompressed data are checked against this CRC.
@@ -211,10 +209,8 @@ class _Zip:
         return f"{item.file_size} bytes, {item.CRC:08x}"
 
 
-class _Array:
+class _Array(Source):
     """Array of pictures (n, n_y, n_x) or (n, n_y, n_x, n_channel) in memory."""
-
-    is_lazy = False
 
     def __init__(self, pictures: NDArray[Any]) -> None:
         _check_stack("pictures", pictures)
@@ -226,14 +222,8 @@ class _Array:
     def name(self, k: int) -> str:
         return f"picture {k}"
 
-    def key(self, k: int) -> str:
-        return str(k)
-
     def picture(self, k: int) -> NDArray[Any]:
         return self._pictures[k]
-
-    def labels(self) -> list[Any] | None:
-        return None
 
     def to_dict(self) -> dict[str, Any]:
         return {"kind": "array", "shape": list(self._pictures.shape), "dtype": str(self._pictures.dtype)}
@@ -242,10 +232,8 @@ class _Array:
         return digest_of(self._pictures[k])
 
 
-class _ArrayFile:
+class _ArrayFile(Source):
     """Memory-mapped ``.npy`` file of pictures."""
-
-    is_lazy = False
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -257,10 +245,7 @@ class _ArrayFile:
 
     def _array(self) -> NDArray[Any]:
         if self._pictures is None:
-            try:
-                pictures = np.load(self._path, mmap_mode="r", allow_pickle=False)
-            except (OSError, ValueError, EOFError) as error:
-                raise FileError(self._path, f"is not a readable array ({error})") from None
+            pictures = load_array(self._path, mmap_mode="r")
             _check_stack(str(self._path), pictures)
             self._pictures = pictures
         return self._pictures
@@ -271,14 +256,8 @@ class _ArrayFile:
     def name(self, k: int) -> str:
         return f"{self._path}[{k}]"
 
-    def key(self, k: int) -> str:
-        return str(k)
-
     def picture(self, k: int) -> NDArray[Any]:
         return np.array(self._array()[k])
-
-    def labels(self) -> list[Any] | None:
-        return None
 
     def to_dict(self) -> dict[str, Any]:
         array = self._array()
@@ -288,7 +267,7 @@ class _ArrayFile:
         return digest_of(self._array()[k])
 
 
-class _Items:
+class _Items(Source):
     """Sequence of files, arrays or Pillow images, or of pairs of these with their classes."""
 
     def __init__(self, items: Sequence[Any]) -> None:
@@ -382,9 +361,3 @@ def _check_stack(name: str, pictures: NDArray[Any]) -> None:
         raise ParameterError(
             name, f"must have the shape (n, n_y, n_x) or (n, n_y, n_x, 1 to 4 channels), got {pictures.shape}"
         )
-
-
-def _directory_labels(names: Sequence[str]) -> list[Any] | None:
-    """Return the top-level directory of each picture; None if a picture is in none."""
-    directories = [PurePosixPath(name).parts[0] if "/" in name else None for name in names]
-    return directories if all(directory is not None for directory in directories) else None

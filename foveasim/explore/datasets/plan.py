@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from foveasim._core.short_repr import short_repr
 from foveasim._io.yaml_files import read_yaml
 from foveasim.config import Source, picture_path, resolve_files, validate
+from foveasim.config._models import Section
 from foveasim.explore.datasets.dataset import Dataset
 from foveasim.explore.datasets.images import CORTICAL, RASTER
 from foveasim.explore.datasets.label_files import (
@@ -61,10 +62,9 @@ class DatasetFile:
     __repr__ = short_repr
 
 
-class _Distribution(BaseModel):
+class _Distribution(Section):
     """Distribution of a setting: exactly one kind."""
 
-    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", strict=True)
     uniform: _Numbers | None = Field(None, description="[low, high]")
     log_uniform: _Numbers | None = Field(None, description="[low, high]")
     integers: list[int] | None = Field(None, description="[low, high], both inclusive")
@@ -73,10 +73,9 @@ class _Distribution(BaseModel):
     weights: _Numbers | None = Field(None, description="relative probabilities of the values of a choice")
 
 
-class _Raster(BaseModel):
+class _Raster(Section):
     """Reconstructed picture of each sample."""
 
-    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", strict=True)
     method: Literal["cells", "linear", "natural", "least_squares"] | None = Field(
         None, description="reconstruction, cells by default"
     )
@@ -88,10 +87,9 @@ class _Raster(BaseModel):
     max_steps: int | None = Field(None, description="maximum number of steps of least_squares")
 
 
-class _Cortical(BaseModel):
+class _Cortical(Section):
     """Log-polar image of each sample."""
 
-    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", strict=True)
     of: _Values | None = Field(None, description="values of the image, code by default")
     per: _Per | None = Field(None, description="values of a site, by default, or per µm²")
     n_rings: int | None = Field(None, description="rings; by default one pixel per site, on layouts of rings")
@@ -104,10 +102,9 @@ class _Cortical(BaseModel):
     )
 
 
-class DatasetSection(BaseModel):
+class DatasetSection(Section):
     """Settings of a dataset: pictures, shot, distributions, labels and shards."""
 
-    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", strict=True)
     pictures: str | list[str] = Field(description="directory, zip file, array (.npy) or list of files")
     shot: str | dict[str, Any] = Field(description="settings file, relative to this file, or the settings")
     set: dict[str, Any] = Field({}, description="settings that are replaced in all samples, by path")

@@ -13,22 +13,24 @@ import warnings
 from array import array
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
+from foveasim._core.calls import Limits
 from foveasim._core.extras import import_optional
 from foveasim._core.names import missing_path
 from foveasim._core.threads import thread_count
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import Ints, check_count
+from foveasim._core.validation import Ints
 from foveasim._io.atomic import atomic_directory, atomic_write
 from foveasim.errors import FileError, FoveasimWarning, ParameterError, SimulationError
 from foveasim.explore.datasets.dataset import Dataset
 from foveasim.explore.datasets.items import flatten, unflatten
 from foveasim.explore.datasets.zarr_rows import RowReader, create_rows
-from foveasim.explore.executor import KILLED, executor
+from foveasim.explore.executor import KILLED, WORKERS, executor
 
 __all__ = ["StoredSamples", "open_dataset", "write_dataset"]
 
@@ -60,8 +62,8 @@ def write_dataset(
     dataset: Dataset,
     path: str | Path,
     *,
-    per_shard: int | None = None,
-    workers: int | None = 1,
+    per_shard: Annotated[int | None, Limits(at_least=1)] = None,
+    workers: Annotated[int | None, WORKERS] = 1,
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> StoredSamples:
@@ -111,9 +113,6 @@ def write_dataset(
         Once, when samples have warnings; the item ``warning`` of a sample contains its own.
     """
     target = Path(path).absolute()
-    workers = None if workers is None else check_count("workers", workers, at_most=1024)
-    if per_shard is not None:
-        per_shard = check_count("per_shard", per_shard)
     kind = _shards_class(target)
     if kind is _ZarrShards:
         if dataset.is_layout_varied:
@@ -193,7 +192,7 @@ def _write_each(
     dataset: Dataset, shards: _Shards, missing: Sequence[int], scheduler: str | None, workers: int | None
 ) -> Generator[tuple[int, _Warnings], None, None]:
     """Write shards, and yield each with the warnings of its samples."""
-    write = _ShardWriter(dataset, shards)
+    write = partial(_write_shard, dataset, shards)
     start_s = time.monotonic()
     n_done = 0
     if scheduler is None and workers in (None, 1):
@@ -224,26 +223,21 @@ class _Warnings(NamedTuple):
     first: str
 
 
-class _ShardWriter:
-    """Function that simulates and writes a shard, and returns the warnings of its samples."""
-
-    def __init__(self, dataset: Dataset, shards: _Shards) -> None:
-        self._dataset, self._shards = dataset, shards
-
-    def __call__(self, k: int) -> _Warnings:
-        input_digest = self._dataset.digest(self._shards.samples(k))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # summarised at the end
-            samples = [self._dataset[index] for index in self._shards.samples(k)]
-        try:
-            self._shards.write(k, samples, input_digest)
-        except OSError as error:
-            raise FileError(
-                self._shards.directory,
-                f"cannot be written: {error.strerror or error}; complete shards remain, and the same call resumes",
-            ) from None
-        found = [f"sample {sample['index']}: {sample['warning']}" for sample in samples if sample["warning"]]
-        return _Warnings(len(found), min(found, default=""))
+def _write_shard(dataset: Dataset, shards: _Shards, k: int) -> _Warnings:
+    """Simulate and write a shard, and return the warnings of its samples."""
+    input_digest = dataset.digest(shards.samples(k))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # summarised at the end
+        samples = [dataset[index] for index in shards.samples(k)]
+    try:
+        shards.write(k, samples, input_digest)
+    except OSError as error:
+        raise FileError(
+            shards.directory,
+            f"cannot be written: {error.strerror or error}; complete shards remain, and the same call resumes",
+        ) from None
+    found = [f"sample {sample['index']}: {sample['warning']}" for sample in samples if sample["warning"]]
+    return _Warnings(len(found), min(found, default=""))
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------

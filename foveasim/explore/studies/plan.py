@@ -8,9 +8,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from foveasim._core.calls import OwnCheck
 from foveasim._core.names import did_you_mean, possible_names
@@ -18,12 +18,14 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import check_count
 from foveasim._io.yaml_files import read_yaml
 from foveasim.config import Source, check_settings, put_setting, resolve_files, validate
+from foveasim.config._models import Section
 from foveasim.errors import ConfigError, ParameterError
 from foveasim.explore._metrics import METRICS, OTHER_METRICS, Metric, add_metrics, has_result, resolve_metrics
 from foveasim.explore.sweeps.plan import (
     MAX_POINTS,
     Plan,
     check_disjoint,
+    copy_settings,
     plan_sweep,
     with_file_context,
 )
@@ -94,11 +96,11 @@ class StudyPlan:
 
     def settings_of(self, trial: optuna.Trial) -> dict[str, Any]:
         """Return all settings of a trial; the seed, and so the noise, is equal in all trials."""
-        settings = json.loads(json.dumps(dict(self.base.settings))) | {"seed": self.base.seed}
+        settings: dict[str, Any] = copy_settings(self.base.settings) | {"seed": self.base.seed}
         for path, search_range in self.search.items():
             value = resolve_files(self.directory, _suggest(trial, path, search_range), path)
             put_setting(self.base.source, settings, path, value)
-        return dict(settings)
+        return settings
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything that determines the trials as plain data; resuming requires equality."""
@@ -112,20 +114,18 @@ class StudyPlan:
         }
 
 
-class _SearchRange(BaseModel):
+class _SearchRange(Section):
     """Search range; integers where the setting accepts only integers."""
 
-    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", strict=True)
     low: _Number = Field(alias="from")
     high: _Number = Field(alias="to")
     step: _Number | None = Field(None, description="step of the values; continuous by default")
     spacing: Literal["linear", "geometric"] | None = Field(None, description="linear by default; excludes step")
 
 
-class StudySection(BaseModel):
+class StudySection(Section):
     """Settings of a study: shot, search ranges, objectives, constraints and trials."""
 
-    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", strict=True)
     shot: str | dict[str, Any] = Field(description="settings file, relative to this file, or the settings")
     set: dict[str, Any] = Field({}, description="settings that are replaced in all trials, by path")
     search: dict[str, _SearchRange | list[Any]] = Field(description="ranges or lists of choices, by setting path")
@@ -355,7 +355,7 @@ def _typed_range(plan: Plan, path: str, search_range: Search) -> Search:
     low, *others = _bounds(path, search_range)
     if isinstance(search_range, list) or not all(isinstance(bound, int) for bound in (low, *others)):
         return search_range
-    settings = json.loads(json.dumps(dict(plan.settings)))
+    settings: dict[str, Any] = copy_settings(plan.settings)
     put_setting(plan.source, settings, path, low + 0.5)
     try:
         check_settings(plan.source, settings)

@@ -13,18 +13,17 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from foveasim._core.calls import OwnCheck
 from foveasim._core.extras import import_optional
 from foveasim._core.names import possible_names
 from foveasim._core.random_streams import derive_seed
-from foveasim._core.validation import check_count
 from foveasim._io.atomic import lock
 from foveasim.errors import FileError, FoveasimError, printable
 from foveasim.explore._metrics import Metric
 from foveasim.explore._records import WORKER_LOST, Record, Value, check_same_plan
-from foveasim.explore.executor import KILLED, executor
+from foveasim.explore.executor import KILLED, WORKERS, executor
 from foveasim.explore.studies.plan import Limits, Search, StudyPlan, plan_study
 from foveasim.explore.studies.trials import ERROR, INTERRUPTED, PLAN, completed_trials, with_typed_params
 from foveasim.explore.worker_cache import ShotRunner
@@ -131,7 +130,7 @@ def run_study(
     *,
     storage: str | Path | None = None,
     scheduler: str | None = None,
-    workers: int | None = None,
+    workers: Annotated[int | None, WORKERS] = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> optuna.Study:
     """
@@ -158,7 +157,7 @@ def run_study(
         When the scheduler or all workers are lost. Finished trials are stored.
     """
     if workers is not None:
-        workers = min(check_count("workers", workers, at_most=1024), plan.batch)
+        workers = min(workers, plan.batch)
     optuna = import_optional("study", "optuna")
     url = _url(storage)
     with _file_lock(storage, url), _without_empty_file(url):

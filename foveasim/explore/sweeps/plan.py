@@ -9,18 +9,18 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from foveasim._core.calls import OwnCheck
 from foveasim._core.provenance import identify, versions
 from foveasim._core.random_streams import derive_seed
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import Ints, check_choice, check_count
+from foveasim._core.validation import Ints, check_count
 from foveasim._io.yaml_files import position_of, read_yaml
 from foveasim.config import (
     Source,
@@ -31,6 +31,7 @@ from foveasim.config import (
     resolve_files,
     validate,
 )
+from foveasim.config._models import Section
 from foveasim.errors import ConfigError, ParameterError
 from foveasim.explore._files import digests
 from foveasim.explore._metrics import Metric, add_metrics, resolve_metrics
@@ -41,6 +42,7 @@ __all__ = [
     "SweepSection",
     "check_disjoint",
     "coordinate",
+    "copy_settings",
     "locate_shot",
     "plan_sweep",
     "put_changes",
@@ -192,7 +194,7 @@ class Plan:
         return np.stack(columns, axis=1)
 
     def _settings_with(self, chosen: Mapping[str, Any]) -> dict[str, Any]:
-        data = _copy(self.settings)
+        data: dict[str, Any] = copy_settings(self.settings)
         for path, value in chosen.items():
             put_setting(self.source, data, path, value)
         return data
@@ -234,20 +236,18 @@ class Plan:
         return self.source.with_replaced(replaced)
 
 
-class _Range(BaseModel):
+class _Range(Section):
     """Range of ``n`` values with linear or geometric spacing."""
 
-    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", strict=True)
     low: float = Field(alias="from")
     high: float = Field(alias="to")
     n: int = Field(ge=1, le=MAX_POINTS)
     spacing: Literal["linear", "geometric"] = "linear"
 
 
-class SweepSection(BaseModel):
+class SweepSection(Section):
     """Settings of a sweep: shot, varied settings, repeats, seed and metrics."""
 
-    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", strict=True)
     shot: str | dict[str, Any] = Field(description="settings file, relative to this file, or the settings")
     set: dict[str, Any] = Field({}, description="settings that are replaced in all points, by path")
     vary: dict[str, list[Any] | _Range] | None = Field(None, description="values or ranges, by setting path")
@@ -357,7 +357,6 @@ def plan_sweep(
     ParameterError, ConfigError
         When nothing varies, a path or a value is invalid, or there are too many points.
     """
-    check_choice("mode", mode, ("product", "zip"))
     own = Source.of(source)
     shot_source, data = locate_shot(own, shot)
     if own.file is not None and not isinstance(vary, Mapping):
@@ -462,11 +461,7 @@ def with_file_context(path: Path) -> Iterator[None]:
 
 
 def check_disjoint(source: Source, paths: Iterable[str], verb: str = "vary") -> None:
-    """
-    Check that no setting contains another.
-
-    Raises ConfigError with the paths of both settings.
-    """
+    """Check that no setting contains another."""
     names = list(paths)
     for path in names:
         nested = next((other for other in names if other.startswith(path + ".")), None)
@@ -547,6 +542,8 @@ def _overlaps(path: str, parts: tuple[str, ...]) -> bool:
     return any(path == part or path.startswith(part + ".") or part.startswith(path + ".") for part in parts)
 
 
-def _copy(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a copy of settings with new mappings; lists are shared."""
-    return {key: _copy(value) if isinstance(value, dict) else value for key, value in data.items()}
+def copy_settings(data: Any) -> Any:
+    """Return a copy of settings with new mappings and lists, in which values can be put."""
+    if isinstance(data, dict):
+        return {key: copy_settings(value) for key, value in data.items()}
+    return [copy_settings(value) for value in data] if isinstance(data, list) else data

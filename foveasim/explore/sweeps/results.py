@@ -207,11 +207,7 @@ def _stack(
 
 
 def check_store(path: Path) -> None:
-    """
-    Check that results can be written to a path before the computation.
-
-    Raises FileError when the directory does not exist, or the path contains other data.
-    """
+    """Check that results can be written to a path before the computation."""
     if not path.absolute().parent.is_dir():
         raise FileError(path, f"cannot be written: the directory {path.absolute().parent} does not exist")
     if path.exists() and not (path / "zarr.json").is_file():
@@ -219,11 +215,7 @@ def check_store(path: Path) -> None:
 
 
 def stored_plan(path: Path) -> dict[str, Any] | None:
-    """
-    Read the plan from a store of results; None if the store does not exist.
-
-    Raises FileError when the store is corrupt, or does not contain sweep results.
-    """
+    """Read the plan from a store of results; None if the store does not exist."""
     if not path.exists():
         return None
     try:
@@ -258,11 +250,7 @@ def open_results(path: str | Path) -> xr.Dataset:
 
 
 def write_store(dataset: xr.Dataset, path: Path) -> None:
-    """
-    Write a zarr store atomically, replacing an existing one.
-
-    Raises FileError when the path cannot be written.
-    """
+    """Write a zarr store atomically, replacing an existing one."""
     with (
         atomic_directory(path, is_ours=lambda directory: stored_plan(directory) is not None) as new,
         warnings.catch_warnings(),
@@ -277,10 +265,6 @@ def write_store(dataset: xr.Dataset, path: Path) -> None:
 
 
 def import_xarray(subject: Path | str) -> Any:
-    """
-    Import xarray, and zarr, the format of the results.
-
-    Raises ParameterError, FileError when one of them is not installed.
-    """
+    """Import xarray, and zarr, the format of the results."""
     import_optional(subject, "zarr", "explore")
     return import_optional(subject, "xarray", "explore")

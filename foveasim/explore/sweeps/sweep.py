@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 
 from foveasim._core.calls import OwnCheck
 from foveasim._core.threads import thread_count
-from foveasim._core.validation import check_count
 from foveasim.errors import SimulationError
 from foveasim.explore._metrics import Metric
 from foveasim.explore._records import WORKER_LOST, Journal, Record, check_same_plan, journal_path
-from foveasim.explore.executor import KILLED, executor
+from foveasim.explore.executor import KILLED, WORKERS, executor
 from foveasim.explore.sweeps.plan import Plan, plan_sweep
 from foveasim.explore.sweeps.results import (
     check_store,
@@ -91,7 +91,7 @@ def run_sweep(
     *,
     out: str | Path | None = None,
     scheduler: str | None = None,
-    workers: int | None = None,
+    workers: Annotated[int | None, WORKERS] = None,
     retry: bool = False,
     progress: Progress | None = None,
 ) -> xr.Dataset:
@@ -135,8 +135,6 @@ def run_sweep(
     computes points with the same layout and optical image, and caches layouts, scenes, images, compiled layouts and the power
     on the sites.
     """
-    if workers is not None:
-        workers = check_count("workers", workers, at_most=1024)
     import_xarray("sweep")  # before hours of work
     if out is None:
         records: dict[int, Record] = {}
@@ -189,7 +187,11 @@ def _run(
     cuts = (np.cumsum(is_pending) - is_pending)[changes]
     try:
         with executor(
-            _Points(replace(plan), runner), what="the metrics", users=users, scheduler=scheduler, workers=n_workers
+            partial(_record, replace(plan), runner),
+            what="the metrics",
+            users=users,
+            scheduler=scheduler,
+            workers=n_workers,
         ) as run:
             if progress is not None:
                 progress(n_done, plan.n_points)
@@ -204,11 +206,6 @@ def _run(
         ) from None
 
 
-class _Points:
-    """Function that computes the record of a point from its number."""
-
-    def __init__(self, plan: Plan, runner: ShotRunner) -> None:
-        self._plan, self._runner = plan, runner
-
-    def __call__(self, point: int) -> Record:
-        return self._runner.record(point, self._plan.settings_of(point))
+def _record(plan: Plan, runner: ShotRunner, point: int) -> Record:
+    """Compute the record of a point from its number."""
+    return runner.record(point, plan.settings_of(point))
