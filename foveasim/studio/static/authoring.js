@@ -23,13 +23,28 @@ const INK = "#d6006c", HALO = "#ffffff", WRONG = "#d3261b";
 const WIDTH_FRACTION = 0.5;
 
 export class Editor {
-  pane; button; studio; isOn = false; at = null; raw = null; shift = [0, 0]; ghost = null; pending = null;
-  base = null; kept = null; error = ""; rejected = ""; highlighted = null; trail = new Map(); known = ""; isByKeys = false;
-  isPlaced = true;
+  pane; button; studio; isOn = false; error = ""; rejected = ""; known = ""; nudged = ""; name = "select";
+  isByKeys = false; isPlaced = true; isSpace = false; isDragged = false;
+  modifiers = { isStraight: false, isFree: false };
+  // The position of the pointer, snapped and not.
+  /** @type {Snapped | null} */ at = null;
+  /** @type {Placed | null} */ raw = null;
+  // Outlines that stay until the sites arrive.
+  /** @type {Outline[] | null} */ ghost = null;
+  // Edits on their way to the server with the number of their message; those before a preview, and the sites before it.
+  /** @type {{ edits: Settings[], before: string, id: number | null } | null} */ pending = null;
+  /** @type {{ edits: Settings[], isAbsent: boolean } | null} */ kept = null;
+  /** @type {Sites | null} */ base = null;
+  /** @type {number[]} */ shift = [0, 0];
+  /** @type {{ index: number, text: string } | null} */ highlighted = null;
+  // Selections by the edits, and positions in the selected sites.
+  /** @type {Map<string, Point[]>} */ trail = new Map();
+  /** @type {Point[] | null} */ _points = [];
+  /** @type {() => Point[]} */ followed = () => [];
 
   // studio: the page through functions; see studio.js.
   constructor(pane, section, button, studio) {
-    Object.assign(this, { pane, button, studio, points: [] });
+    Object.assign(this, { pane, button, studio });
     this.canvas = make("canvas", undefined, "ghost");
     this.canvas.setAttribute("aria-hidden", "true");
     pane.root.append(this.canvas);
@@ -63,7 +78,7 @@ export class Editor {
   // Step of the grid in µm: that of the user, of the settings, or a round one that is visible.
   get step() {
     const chosen = this.bar.number("grid"), { snap_um: snapped, rules } = this.layout;
-    if (chosen > 0) return chosen;
+    if (chosen && chosen > 0) return chosen;
     return snapped || rules?.grid_um || roundStep(GRID_PIXELS / (this.map?.scale || 1));
   }
 
@@ -112,7 +127,7 @@ export class Editor {
       }
     }
     const text = JSON.stringify(this.edits);
-    if (text !== this.known && this.trail.has(text)) this.points = this.trail.get(text);
+    if (text !== this.known && this.trail.has(text)) this._points = this.trail.get(text) || [];
     this.known = text;
     const choices = this.studio.generators();
     this.bar.fill("generator", choices.map(({ label }) => [label, label]));
@@ -221,7 +236,8 @@ export class Editor {
     this.known = text;
     this.trail.delete(text);
     this.trail.set(text, this.points);
-    if (this.trail.size > MOST_REMEMBERED) this.trail.delete(this.trail.keys().next().value);
+    const [oldest] = this.trail.keys();
+    if (this.trail.size > MOST_REMEMBERED) this.trail.delete(oldest);
   }
 
   // Vertices on a manufacturing grid differ from those before.
@@ -289,7 +305,9 @@ export class Editor {
   // Listens before the map does, which pans where the tool does not use the pointer.
   _listen() {
     const { root } = this.pane, isOurs = (event) => this.isOn && this.map && event.target === this.pane.marks;
-    let start = null, isUsed = false;
+    /** @type {Point | null} */
+    let start = null;
+    let isUsed = false;
     const consume = (event) => event.stopPropagation();
     root.addEventListener("pointerdown", (event) => {
       if (!isOurs(event) || event.button !== 0 || this.isSpace) return;
@@ -304,13 +322,13 @@ export class Editor {
     }, true);
     root.addEventListener("pointermove", (event) => {
       if (!isOurs(event)) return;
-      this._track(event);
+      const { x, y } = this._track(event);
       if (start && isUsed) {
         if (Math.hypot(event.clientX - start[0], event.clientY - start[1]) >= CLICK_PIXELS || this.isDragged) {
           this.isDragged = true;
           if (this.tool.isHeld) this.tool.drag(this.at);
         }
-        this.studio.hover(this.raw.x, this.raw.y);
+        this.studio.hover(x, y);
         consume(event);
       } else if (this.tool.isHeld) this.tool.drag(this.at);
       this.studio.redraw();
@@ -341,10 +359,12 @@ export class Editor {
 
   _track(event) {
     const box = this.pane.marks.getBoundingClientRect(), { map } = this;
-    this.raw = { x: map.fromX(event.clientX - box.left), y: map.fromY(event.clientY - box.top) };
+    const raw = { x: map.fromX(event.clientX - box.left), y: map.fromY(event.clientY - box.top) };
+    this.raw = raw;
     this.modifiers = { isStraight: event.shiftKey, isFree: event.ctrlKey || event.metaKey };
     this.isByKeys = false;
     this._resnap();
+    return raw;
   }
 
   // Snaps the position of the pointer.
@@ -415,23 +435,24 @@ export class Editor {
   }
 
   _startKeys() {
-    if (this.isByKeys) return;
-    const { map, step } = this, start = this.at || { x: onGrid(map.x, step), y: onGrid(map.y, step), kind: "grid" };
-    this.at = { ...start };
-    this.raw = { x: this.at.x, y: this.at.y };
+    const { map, step } = this, at = { ...this.at || { x: onGrid(map.x, step), y: onGrid(map.y, step), kind: "grid" } };
+    if (this.isByKeys && this.at) return this.at;
+    this.at = at;
+    this.raw = { x: at.x, y: at.y };
     this.isByKeys = true;
+    return at;
   }
 
   _arrow(direction, factor) {
     const { map, tool, step, name } = this;
     if (name === "select") return false;
     if (name === "move" && !tool.isHeld && this.selected.length) { this.nudge(direction, factor); return true; }
-    this._startKeys();
+    const at = this._startKeys();
     this.isPlaced = false;
     const next = name === "vertex" && !tool.isHeld && this.sites
-      ? nextVertex(this.at, direction, this.sites, 0.5 * (map.width / map.scale)) : null;
-    this._moveTo(next || { x: onGrid(this.at.x + direction[0] * step * factor, step),
-      y: onGrid(this.at.y + direction[1] * step * factor, step), kind: "grid", isExact: true });
+      ? nextVertex(at, direction, this.sites, 0.5 * (map.width / map.scale)) : null;
+    this._moveTo(next || { x: onGrid(at.x + direction[0] * step * factor, step),
+      y: onGrid(at.y + direction[1] * step * factor, step), kind: "grid", isExact: true });
     return true;
   }
 
@@ -510,7 +531,7 @@ export class Editor {
     else if (this.isByKeys && this.at) this._drawMarker(context, { ...this.at, kind: "grid" });
     const active = this.tool.paths.filter((path) => !path.isFaint);
     const box = active.length ? boxOf(active.flatMap((path) => path.points)) : null;
-    if (this.at && this.tool.snaps) this._drawTag(context, this.kept ? this.violationsIn(box) : [], active);
+    if (this.at && this.tool.snaps) this._drawTag(context, this.at, this.kept ? this.violationsIn(box) : [], active);
     this._describe();
   }
 
@@ -553,6 +574,7 @@ export class Editor {
   }
 
   // Square: vertex; triangle: midpoint; circle: edge; cross: grid.
+  /** @param {CanvasRenderingContext2D} context @param {Snapped} at */
   _drawMarker(context, { x, y, kind }) {
     const { map } = this, px = map.toX(x), py = map.toY(y);
     outline(context, () => {
@@ -569,8 +591,8 @@ export class Editor {
   }
 
   // Coordinates, distances and violations next to the cursor.
-  _drawTag(context, violations, active) {
-    const { map, at, tool } = this, { origin } = tool, figure = (value) => positionText(value, map.scale);
+  _drawTag(context, at, violations, active) {
+    const { map, tool } = this, { origin } = tool, figure = (value) => positionText(value, map.scale);
     const lines = [this._positionOf(at) + " µm"];
     if (origin) {
       const dx = at.x - origin.x, dy = at.y - origin.y, angle = (Math.atan2(dy, dx) * 180) / Math.PI;

@@ -249,12 +249,16 @@ function valueAt({ x, y }, at) {
 // Histogram of a column along its scale; dragging selects a range of values. Heights are square roots of counts, so that
 // a few sites among many are visible.
 export class Histogram {
+  // Range and value of the last drawing; the left end of the scale and its width in CSS pixels.
+  /** @type {[Interval?, number?]} */ drawn = [];
+  left = 0; wide = 1;
+
   constructor(root, onRange) {
     this.canvas = make("canvas");
     this.canvas.setAttribute("role", "img");
     this.root = root;
     root.append(this.canvas);
-    watchSize(this.canvas, () => this.draw(...(this.drawn || [])));
+    watchSize(this.canvas, () => this.draw(...this.drawn));
     const fractionOf = (event) => (event.clientX - this.canvas.getBoundingClientRect().left - this.left) / this.wide;
     listenToRange(this.canvas, () => this.scale, fractionOf, onRange);
   }

@@ -13,14 +13,19 @@ const PATIENCE_MS = 4000;
 
 // What the page remembers in this tab, such as its session.
 export const memory = {
+  /** @param {string} name */
   get(name) { try { return sessionStorage.getItem("foveasim-studio-" + name); } catch { return null; } },
+  /** @param {string} name @param {string} text */
   set(name, text) { try { sessionStorage.setItem("foveasim-studio-" + name, text); } catch { /* not kept */ } },
 };
 
 // Returns the header and the arrays of a part; arrays are views of its buffer.
+/** @type {(buffer: ArrayBuffer) => Part} */
 export function readPart(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
+  /** @type {PartHeader} */
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
+  /** @type {Arrays} */
   const arrays = {};
   for (const { name, type, size, offset } of header.arrays) arrays[name] = new TYPES[type](buffer, 4 + length + offset, size);
   return { part: header.part, version: header.version, is_preview: Boolean(header.is_preview), hasMore: Boolean(header.has_more),
@@ -29,12 +34,15 @@ export function readPart(buffer) {
 
 // Messages of one connection: their numbers, which of them wait for an answer, and the views that the page asked for.
 export class Requests {
-  lastId; doneId; nDone = 0; lastMs = NaN; isBusy = false; isPreview = false; sentAt = new Map(); waiting = [];
-  draftId = null; nextDraft = null; views = ""; pixels = 0;
+  lastId; doneId = 0; nDone = 0; lastMs = NaN; isBusy = false; isPreview = false;
+  /** @type {Map<number, number>} */ sentAt = new Map();
+  /** @type {{ id: number, resolve: (isDone: boolean) => void }[]} */ waiting = [];
+  views = ""; pixels = 0;
+  // The change of a slider that is on its way, and the one after it.
+  /** @type {number | null} */ draftId = null;
+  /** @type {{ key: string, value: unknown } | null} */ nextDraft = null;
 
-  constructor(lastId = 0) {
-    Object.assign(this, { lastId });
-  }
+  constructor(lastId = 0) { this.lastId = lastId; }
 
   // Returns the number of a new message.
   next() {
@@ -43,16 +51,18 @@ export class Requests {
   }
 
   // Resolves to whether the message with this number succeeded; without a number it failed.
+  /** @type {(id: number | null) => Promise<boolean>} */
   answered(id) { return id === null ? Promise.resolve(false) : new Promise((resolve) => { this.waiting.push({ id, resolve }); }); }
 
   // Messages up to this number are answered; only the last one can have failed.
+  /** @param {number} id @param {boolean} isFailed */
   settle(id, isFailed) {
-    const isAnswered = (one) => id >= one.id;
-    for (const one of this.waiting.filter(isAnswered)) one.resolve(!isFailed || (one.id !== id && id !== Infinity));
-    this.waiting = this.waiting.filter((one) => !isAnswered(one));
+    for (const one of this.waiting.filter((each) => id >= each.id)) one.resolve(!isFailed || (one.id !== id && id !== Infinity));
+    this.waiting = this.waiting.filter((one) => id < one.id);
   }
 
   // A result is shown: measures the time since its message.
+  /** @param {number} id */
   show(id) {
     const start = this.sentAt.get(id);
     for (const old of this.sentAt.keys()) if (old <= id) this.sentAt.delete(old);
@@ -62,8 +72,18 @@ export class Requests {
 }
 
 export class Connection {
-  // Callbacks: hello(message, { isSame: whether the token is that of an earlier connection }), message(message), part(part),
-  // status("open" | "lost" | "denied").
+  /** @type {WebSocket | null} */ socket = null;
+  // Final values that were set without a connection.
+  /** @type {Map<string, unknown>} */ unsent = new Map();
+
+  // isSame: whether the token is that of an earlier connection; isFailed: whether a message of the page failed.
+  /**
+   * @typedef {{
+   *   hello: (message: Hello, about: { isSame: boolean }) => void, message: (message: ServerMessage, about: { isFailed: boolean }) => void,
+   *   part: (part: Part) => void, status: (status: "open" | "lost" | "denied") => void,
+   * }} Listeners
+   * @param {Listeners} on
+   */
   constructor(on) {
     this.on = on;
     // Settings of a link may follow.
@@ -71,7 +91,6 @@ export class Connection {
     this.requests = new Requests();
     this.delay = FIRST_DELAY_MS;
     this.isOpen = false;
-    this.unsent = new Map();
     const now = () => { if (!this.socket && !this.isDenied) this.open(); };
     addEventListener("online", now);
     addEventListener("focus", now);
@@ -93,6 +112,7 @@ export class Connection {
     socket.addEventListener("close", ({ code }) => this._close(socket, code));
   }
 
+  /** @param {WebSocket} socket @param {number} code */
   _close(socket, code) {
     if (socket !== this.socket) return;
     this.socket = null;
@@ -107,9 +127,10 @@ export class Connection {
     this.delay = Math.min(LONGEST_DELAY_MS, 2 * this.delay);
   }
 
+  /** @param {Hello | ServerMessage} message */
   _receive(message) {
-    const { requests } = this, { kind, id } = message;
-    if (kind === "hello") {
+    const { requests } = this;
+    if (message.kind === "hello") {
       const isSame = memory.get("token") === this.token;
       this.isOpen = true;
       this.delay = FIRST_DELAY_MS;
@@ -121,15 +142,18 @@ export class Connection {
       this.unsent.clear();
       return;
     }
-    const isFailed = (kind === "error" && !message.part) || (kind === "state" && Object.keys(message.errors || {}).length > 0);
-    if (kind === "busy") requests.isBusy = true;
-    else if (kind === "done" || kind === "error" || isFailed) requests.isBusy = false;
-    if (kind === "done") {
+    const isFailed = (message.kind === "error" && !message.part) || (message.kind === "state" && Object.keys(message.errors).length > 0);
+    const isDone = message.kind === "done";
+    if (message.kind === "busy") requests.isBusy = true;
+    else if (isDone || message.kind === "error" || isFailed) requests.isBusy = false;
+    if (message.kind === "done") {
       requests.nDone++;
       requests.isPreview = Boolean(message.is_preview);
     }
     this.on.message(message, { isFailed });
-    if (kind !== "done" && !isFailed) return;
+    if (!isDone && !isFailed) return;
+    // The answer to no message has no number.
+    const id = message.id ?? 0;
     requests.settle(id, isFailed);
     if (requests.draftId !== null && id >= requests.draftId) this._sendDraft();
   }
@@ -143,14 +167,16 @@ export class Connection {
   }
 
   // Returns the number of the message, or null without a connection.
+  /** @param {Change} message */
   send(message) {
-    if (!this.isOpen) return null;
+    if (!this.isOpen || !this.socket) return null;
     const id = this.requests.next();
     this.socket.send(JSON.stringify({ ...message, id }));
     return id;
   }
 
   // Asks for the data of views, and for pictures of this size, unless they are those of the last time.
+  /** @param {string[]} names @param {number} pixels */
   askFor(names, pixels) {
     const views = JSON.stringify({ do: "views", names, pixels });
     if (!this.isOpen || views === this.requests.views) return;
@@ -160,8 +186,9 @@ export class Connection {
   }
 
   // Sends a frame of the camera: its header with the number of the message, and its pixels. Returns the number, or null.
+  /** @param {FrameHeader} header @param {Uint8Array} pixels */
   sendFrame(header, pixels) {
-    if (!this.isOpen) return null;
+    if (!this.isOpen || !this.socket) return null;
     const id = this.requests.next(), text = new TextEncoder().encode(JSON.stringify({ ...header, id }));
     const message = new Uint8Array(4 + text.length + pixels.length);
     new DataView(message.buffer).setUint32(0, text.length, true);
@@ -172,6 +199,7 @@ export class Connection {
   }
 
   // Sets a value. Drafts wait until the one before is answered, and the newest wins; final values are sent at once.
+  /** @param {string} key @param {unknown} value @param {boolean} isFinal */
   set(key, value, isFinal) {
     const { requests } = this;
     if (!this.isOpen) {
@@ -191,6 +219,7 @@ export class Connection {
   }
 
   // Removes a value, with its default after that.
+  /** @param {string} key */
   remove(key) {
     this.requests.nextDraft = null;
     return this.send({ do: "delete", key });
@@ -199,6 +228,7 @@ export class Connection {
   get headers() { return { Authorization: "Bearer " + this.token, "X-Session": memory.get("session") || "" }; }
 
   // Sends a file to the server; returns { path } or { error }.
+  /** @type {(file: File) => Promise<{ path?: string, error?: string }>} */
   async upload(file) {
     try {
       const answer = await fetch("/file?name=" + encodeURIComponent(file.name), { method: "POST", headers: this.headers, body: file });
@@ -210,6 +240,7 @@ export class Connection {
   }
 
   // Returns the file of the current state as { blob } or { error }.
+  /** @type {(what: string) => Promise<{ blob?: Blob, error?: string }>} */
   async fetchFile(what) {
     try {
       const answer = await fetch("/download?what=" + what, { headers: this.headers });

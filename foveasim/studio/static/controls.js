@@ -99,8 +99,18 @@ function shapeOf(control) {
 
 let made = 0;
 
+function fillTrack(slider) {
+  slider.style.setProperty("--filled", (100 * Number(slider.value)) / Math.max(1, Number(slider.max)) + "%");
+}
+
 // A row with one control. send(value, isFinal), reset() and remove() are called by the user.
 class Row {
+  /** @type {HTMLInputElement | HTMLSelectElement | undefined} */ field;
+  /** @type {HTMLInputElement | undefined} */ slider;
+  // Of rows with a slider.
+  /** @type {NonNullable<ReturnType<typeof sliderOf>>} */ range;
+  /** @type {Choice[]} */ choices = [];
+
   constructor(control, on) {
     this.control = control;
     this.on = on;
@@ -128,7 +138,8 @@ class Row {
     if (control.kind === "group") this._buildHeading();
     else if (control.kind === "sections") this._buildAdder();
     else this._build();
-    for (const input of [this.field, this.slider].filter(Boolean)) {
+    for (const input of [this.field, this.slider]) {
+      if (!input) continue;
       input.setAttribute("aria-describedby", this.error.id);
       if (control.help) input.title = control.help;
     }
@@ -136,69 +147,74 @@ class Row {
     this.words = [control.label, control.key, control.help, control.section].join(" ").toLowerCase().replaceAll("_", " ");
   }
 
-  _build() {
+  _makeField() {
     const { control } = this, { kind } = control;
     if (kind === "choice") {
-      this.field = make("select");
+      const field = make("select");
       this.choices = choicesOf(control);
       this.choices.forEach(({ label, value }, i) => {
         const option = make("option", String(label ?? fieldText(value)).replaceAll("_", " "));
-        option.value = i;
-        this.field.append(option);
+        option.value = String(i);
+        field.append(option);
       });
-      this.field.addEventListener("change", () => {
-        const choice = this.choices[this.field.value];
+      field.addEventListener("change", () => {
+        const choice = this.choices[Number(field.value)];
         if (choice) this._send(choice.value, true);
       });
-    } else if (kind === "boolean") {
-      const box = make("input");
-      this.field = box;
-      box.type = "checkbox";
-      box.addEventListener("change", () => this._send(box.checked, true));
-    } else {
-      this.field = make("input");
-      this.field.type = "text";
-      this.field.autocomplete = "off";
-      this.field.spellcheck = false;
-      if (kind === "number" || kind === "integer") this.field.inputMode = "decimal";
-      if (control.default !== undefined && control.default !== null) this.field.placeholder = fieldText(control.default);
-      this.field.addEventListener("input", () => { this.isDirty = true; this.isCurrent = false; });
-      this.field.addEventListener("change", () => this._commit());
-      this.field.addEventListener("keydown", (event) => this._key(event));
+      return field;
     }
-    this.field.id = this.id;
-    const line = make("div", undefined, "line");
-    line.append(this.label, this.reset, this.field, this.unit);
-    this.root.append(line);
-    if (kind === "number" || kind === "integer") this._buildSlider();
+    const field = make("input");
+    if (kind === "boolean") {
+      field.type = "checkbox";
+      field.addEventListener("change", () => this._send(field.checked, true));
+      return field;
+    }
+    field.type = "text";
+    field.autocomplete = "off";
+    field.spellcheck = false;
+    if (kind === "number" || kind === "integer") field.inputMode = "decimal";
+    if (control.default !== undefined && control.default !== null) field.placeholder = fieldText(control.default);
+    field.addEventListener("input", () => { this.isDirty = true; this.isCurrent = false; });
+    field.addEventListener("change", () => this._commit(field));
+    field.addEventListener("keydown", (event) => this._key(event, field));
+    return field;
   }
 
-  _buildSlider() {
-    const range = sliderOf(this.control, NaN);
-    if (!range) return;
-    this.slider = make("input");
-    this.slider.type = "range";
-    this.slider.min = "0";
-    this.slider.step = "1";
-    this.slider.setAttribute("aria-label", this.control.label + " slider");
-    const value = () => this.range.toValue(Number(this.slider.value));
+  _build() {
+    const field = this._makeField(), line = make("div", undefined, "line"), { kind } = this.control;
+    this.field = field;
+    field.id = this.id;
+    line.append(this.label, this.reset, field, this.unit);
+    this.root.append(line);
+    if (kind === "number" || kind === "integer") this._buildSlider(field);
+  }
+
+  _buildSlider(field) {
+    if (!sliderOf(this.control, NaN)) return;
+    const slider = make("input");
+    this.slider = slider;
+    slider.type = "range";
+    slider.min = "0";
+    slider.step = "1";
+    slider.setAttribute("aria-label", this.control.label + " slider");
+    const value = () => this.range.toValue(Number(slider.value));
     const release = () => {
       if (!this.isHeld) return;
       this.isHeld = false;
       this._send(value(), true);
     };
-    this.slider.addEventListener("input", () => {
+    slider.addEventListener("input", () => {
       this.isHeld = true;
       this.isCurrent = false;
       // No change is reported when the slider returns to its start.
       for (const type of ["pointerup", "pointercancel"]) addEventListener(type, release, { once: true });
-      this.field.value = fieldText(value());
-      this._fill();
+      field.value = fieldText(value());
+      fillTrack(slider);
       this._send(value(), false);
     });
-    for (const type of ["change", "blur"]) this.slider.addEventListener(type, release);
-    this._place(NaN);
-    this.root.append(this.slider);
+    for (const type of ["change", "blur"]) slider.addEventListener(type, release);
+    this._place(slider, NaN);
+    this.root.append(slider);
   }
 
   // Heading of a section; one of a list can be removed.
@@ -225,7 +241,7 @@ class Row {
       adder.append(option);
     });
     adder.addEventListener("change", () => {
-      const choice = this.choices[adder.value];
+      const choice = this.choices[Number(adder.value)];
       adder.value = "-1";
       if (choice) this._send([...(this.value || []), choice.value], true);
     });
@@ -243,40 +259,39 @@ class Row {
   }
 
   // Moves the slider to a value.
-  _place(value) {
-    this.range = sliderOf(this.control, value);
-    this.slider.max = String(this.range.steps);
-    const base = Number.isFinite(value) ? value : typeof this.control.default === "number" ? this.control.default : this.range.toValue(0);
-    this.slider.value = String(this.range.toStep(base));
-    this.slider.setAttribute("aria-valuetext", fieldText(base) + " " + (this.control.unit || ""));
-    this._fill();
+  _place(slider, value) {
+    const range = sliderOf(this.control, value) || this.range;
+    this.range = range;
+    slider.max = String(range.steps);
+    const base = Number.isFinite(value) ? value : typeof this.control.default === "number" ? this.control.default : range.toValue(0);
+    slider.value = String(range.toStep(base));
+    slider.setAttribute("aria-valuetext", fieldText(base) + " " + (this.control.unit || ""));
+    fillTrack(slider);
   }
 
-  _fill() { this.slider.style.setProperty("--filled", (100 * Number(this.slider.value)) / Math.max(1, Number(this.slider.max)) + "%"); }
-
-  _key(event) {
+  _key(event, field) {
     const { kind } = this.control;
     if (event.key === "Escape" && this.isDirty) {
       this._show();
       event.stopPropagation();
     }
-    const sign = { ArrowUp: 1, ArrowDown: -1 }[event.key], value = Number(this.field.value);
-    if (!sign || (kind !== "number" && kind !== "integer") || this.field.value.trim() === "" || !Number.isFinite(value)) return;
+    const sign = { ArrowUp: 1, ArrowDown: -1 }[event.key], value = Number(field.value);
+    if (!sign || (kind !== "number" && kind !== "integer") || field.value.trim() === "" || !Number.isFinite(value)) return;
     event.preventDefault();
     // A step of the second digit, or ten times that with Shift.
     const step = kind === "integer" ? 1 : this.range?.unit || 10 ** (Math.floor(Math.log10(Math.abs(value) || 1)) - 1);
     const { minimum, maximum } = this.control;
     const next = clamp(value + sign * step * (event.shiftKey ? 10 : 1), minimum ?? -Infinity, maximum ?? Infinity);
-    this.field.value = fieldText(Number(next.toPrecision(9)));
+    field.value = fieldText(Number(next.toPrecision(9)));
     this.isDirty = true;
     this.isCurrent = false;
-    this._commit();
+    this._commit(field);
   }
 
-  _commit() {
+  _commit(field) {
     if (!this.isDirty) return;
     this.isDirty = false;
-    const { kind } = this.control, text = this.field.value;
+    const { kind } = this.control, text = field.value;
     if (text === fieldText(this.value) && this.error.hidden) return;
     if (text.trim() === "" && kind !== "text") this.on.remove();
     else this._send(kind === "list" ? listOf(text) : kind === "text" ? text : asNumber(text), true);
@@ -307,18 +322,19 @@ class Row {
   }
 
   _show() {
-    const { control, value } = this;
+    const { control, value, field, slider } = this;
+    if (!field) return;
     this.isDirty = false;
     this.isCurrent = true;
     if (control.kind === "choice") {
       const chosen = chosenOf({ ...control, choices: this.choices }, value ?? control.default);
-      const other = this.field.querySelector("option[value='-1']");
-      if (chosen < 0 && !other) this.field.prepend(new Option("–", "-1"));
+      const other = field.querySelector("option[value='-1']");
+      if (chosen < 0 && !other) field.prepend(new Option("–", "-1"));
       else if (chosen >= 0) other?.remove();
-      this.field.value = chosen;
-    } else if (control.kind === "boolean") Object.assign(this.field, { checked: Boolean(value ?? control.default) });
-    else if (this.field.value !== fieldText(value)) this.field.value = fieldText(value);
-    if (this.slider) this._place(typeof value === "number" ? value : NaN);
+      field.value = String(chosen);
+    } else if (control.kind === "boolean") Object.assign(field, { checked: Boolean(value ?? control.default) });
+    else if (field.value !== fieldText(value)) field.value = fieldText(value);
+    if (slider) this._place(slider, typeof value === "number" ? value : NaN);
   }
 }
 

@@ -20,7 +20,8 @@ export class Files {
     Object.assign(this, { connection, on });
     this._listenToDrops();
     $("chosen-file").addEventListener("change", () => {
-      if ($("chosen-file").files[0]) this.upload($("chosen-file").files[0]);
+      const file = $("chosen-file").files?.[0];
+      if (file) this.upload(file);
       $("chosen-file").value = "";
     });
     listenToMenu($("file"), $("file-menu"));
@@ -50,10 +51,11 @@ export class Files {
     document.addEventListener("drop", (event) => {
       depth = 0;
       $("drop").hidden = true;
-      if (!hasFile(event)) return;
+      const { dataTransfer } = event;
+      if (!dataTransfer || !hasFile(event)) return;
       event.preventDefault();
-      const [file] = event.dataTransfer.files;
-      if (!this.on.dropped(event.dataTransfer) && file) this.upload(file);
+      const [file] = dataTransfer.files;
+      if (!this.on.dropped(dataTransfer) && file) this.upload(file);
     });
   }
 
@@ -72,7 +74,7 @@ export class Files {
     else if (file) {
       const { blob, error } = await connection.fetchFile(file);
       if (error) notice(error);
-      else download(blob, document.title.split(" – ")[0], extension);
+      else download(blob, document.title.split(" – ")[0], extension ?? "txt");
     }
   }
 

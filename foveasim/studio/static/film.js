@@ -4,19 +4,27 @@
 const PICTURE_S = 0.5;
 
 export class Film {
-  count; n; frameS; isSkipping; show; changed;
+  /** @type {[number, boolean] | null} */ wanted = null;
 
   // show(n, isFinal) shows a frame, and resolves to false when it failed; changed() is called when the state changes.
-  /** @param {{ count: number, frameS?: number, isSkipping: boolean, show: Function, changed: Function, n?: number }} options */
+  /**
+   * @param {{ count: number, frameS?: number | null, isSkipping: boolean, n?: number,
+   *   show: (n: number, isFinal: boolean) => Promise<boolean>, changed: () => void }} options
+   */
   constructor({ count, frameS, isSkipping, show, changed, n = 0 }) {
-    Object.assign(this, { count, n, frameS: frameS || PICTURE_S, isSkipping, show, changed });
+    this.count = count;
+    this.n = n;
+    this.frameS = frameS || PICTURE_S;
+    this.isSkipping = isSkipping;
+    this.show = show;
+    this.changed = changed;
     this.isPlaying = false;
     this.isBusy = false;
-    this.wanted = null;
     this.rate = new Rate();
   }
 
   // Shows a frame; while another is computed, only the newest is shown next.
+  /** @type {(n: number, isFinal?: boolean) => Promise<boolean>} */
   async go(n, isFinal = true) {
     const to = Math.max(0, Math.min(this.count - 1, n));
     if (this.isBusy) {
@@ -36,6 +44,7 @@ export class Film {
     return next ? this.go(...next) : isShown;
   }
 
+  /** @param {number} by */
   step(by) {
     this.pause();
     return this.go((this.wanted ? this.wanted[0] : this.n) + by);
@@ -75,7 +84,7 @@ export class Film {
 
 // Frames per second over the last second or two.
 export class Rate {
-  constructor() { this.times = []; }
+  /** @type {number[]} */ times = [];
 
   count() {
     const now = performance.now();
@@ -84,6 +93,6 @@ export class Rate {
 
   get perS() {
     const { times } = this;
-    return times.length > 2 ? ((times.length - 1) * 1000) / (times.at(-1) - times[0]) : NaN;
+    return times.length > 2 ? ((times.length - 1) * 1000) / (times[times.length - 1] - times[0]) : NaN;
   }
 }

@@ -3,6 +3,7 @@
 // Browsers may draw no frame for a long time, for example after their graphics process was busy: the work is then done anyway.
 const LATE_MS = 1000;
 
+/** @param {() => void} work */
 export function inNextFrame(work) {
   let isDone = false;
   const once = () => {
@@ -18,6 +19,7 @@ export function inNextFrame(work) {
 const sizes = new WeakMap();
 const observer = new ResizeObserver((entries) => { for (const { target } of entries) measure(target); });
 
+/** @param {Element} element */
 function measure(element) {
   const size = { width: element.clientWidth, height: element.clientHeight };
   sizes.set(element, size);
@@ -26,6 +28,7 @@ function measure(element) {
 
 // Size of an element in CSS pixels, as of the last layout of the page: reading it from the element would cause another layout.
 // An element that was hidden until now is measured.
+/** @type {(element: Element) => { width: number, height: number }} */
 export function sizeOf(element) {
   const known = sizes.get(element);
   if (known && (known.width > 0 || element.closest("[hidden]"))) return known;

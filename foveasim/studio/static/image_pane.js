@@ -1,6 +1,6 @@
 // A picture on the sensor: the reconstructed picture or the optical image, with the cursor and the view of the map.
 
-import { pixelRatio } from "/web/gl.js";
+import { context2d, pixelRatio } from "/web/gl.js";
 import { drawCross, drawView, outline } from "/web/marks.js";
 import { make } from "/web/page_parts.js";
 import { ARROWS } from "/web/shell.js";
@@ -26,19 +26,24 @@ export class ImagePane {
     this.image.setAttribute("aria-hidden", "true");
     root.append(this.image, this.marks);
     this.pixels = make("canvas");
+    /** @type {number[] | null} */
     this.bounds = null;
     this.follows = false;
+    /** @type {Point} */
     this.offset = [0, 0];
     this._listen();
   }
 
   _listen() {
     const { marks, on } = this;
+    /** @type {(event: MouseEvent) => Point} */
     const at = (event) => {
       const box = marks.getBoundingClientRect(), view = this.view();
       return [view.fromX(event.clientX - box.left), view.fromY(event.clientY - box.top)];
     };
-    let start = null, isMoving = false;
+    /** @type {Point | null} */
+    let start = null;
+    let isMoving = false;
     marks.addEventListener("pointerdown", (event) => {
       if (!this.bounds || event.button !== 0) return;
       start = at(event);
@@ -89,9 +94,8 @@ export class ImagePane {
     this.frame = frame || null;
     this.pixels.width = width;
     this.pixels.height = height;
-    this.pixels.getContext("2d",
-      { willReadFrequently: true }).putImageData(new ImageData(new Uint8ClampedArray(rgba.buffer, rgba.byteOffset, rgba.length),
-        width, height), 0, 0);
+    const context = context2d(this.pixels, { willReadFrequently: true });
+    context.putImageData(new ImageData(new Uint8ClampedArray(rgba.buffer, rgba.byteOffset, rgba.length), width, height), 0, 0);
   }
 
   // Conversions between µm on the sensor and CSS pixels: the complete picture, or the view of a map.
@@ -121,7 +125,7 @@ export class ImagePane {
   get isShown() { return Boolean(this.bounds) && sizeOf(this.root).width > 0; }
 
   draw() {
-    if (!this.isShown) return;
+    if (!this.bounds || !this.isShown) return;
     const { context } = fitted(this.image), view = this.view(), [x0, y0, x1, y1] = this.bounds;
     const wide = (x1 - x0) * view.perUm, tall = (y1 - y0) * view.perUm;
     // Pixels of several screen pixels have sharp edges.

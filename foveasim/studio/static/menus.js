@@ -49,10 +49,10 @@ export function showText(title, text) {
 export function listenToDialogs() {
   $("text-copy").addEventListener("click", async () => {
     try {
-      await navigator.clipboard.writeText($("text").textContent);
+      await navigator.clipboard.writeText($("text").textContent || "");
       $("text-copy").textContent = "Copied";
     } catch {
-      getSelection().selectAllChildren($("text"));
+      getSelection()?.selectAllChildren($("text"));
     }
     setTimeout(() => { $("text-copy").textContent = "Copy"; }, 1500);
   });

@@ -17,6 +17,12 @@ const ENCODED = Uint8Array.from({ length: LEVELS }, (_, i) => {
 });
 
 export class RasterMap extends MapView {
+  // Sides of the smallest site in µm; given by use().
+  /** @type {number} */ smallest;
+  // Numbers of the sites at all samples, and colours by these numbers.
+  /** @type {Uint16Array<ArrayBuffer> | Uint32Array<ArrayBuffer>} */ owner;
+  table = new Uint32Array(0);
+
   constructor(canvas, sites) {
     super(canvas);
     this.context = canvas.getContext("2d", { alpha: false, willReadFrequently: true });
@@ -49,7 +55,7 @@ export class RasterMap extends MapView {
       this.mixed = n === 1 ? null : mixedPixels(this.owner, width, height, n);
       if (!this.picture || this.picture.width !== width
         || this.picture.height !== height) this.picture = this.context.createImageData(width, height);
-      if (this.table?.length !== this.sites.n + 1) this.table = new Uint32Array(this.sites.n + 1);
+      if (this.table.length !== this.sites.n + 1) this.table = new Uint32Array(this.sites.n + 1);
       this.drawn = view;
     }
     const pixels = new Uint32Array(this.picture.data.buffer), { table, owner, mixed } = this;

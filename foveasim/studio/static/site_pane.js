@@ -2,7 +2,7 @@
 
 import { Scale, bytesOfHex } from "/web/colours.js";
 import { listenToPointers } from "/web/gestures.js";
-import { fitCanvas, pixelRatio } from "/web/gl.js";
+import { context2d, fitCanvas, pixelRatio } from "/web/gl.js";
 import { drawRamp, kindsOf, swatchItem, tickLabels, titleOf } from "/web/legend.js";
 import { SensorMap } from "/web/map.js";
 import { drawCross, drawOutlines, drawSelected, drawTrace, ringSites } from "/web/marks.js";
@@ -23,13 +23,21 @@ export function useSoftware(isSoftware) { isSlow = isSoftware; }
 export function fitted(canvas) {
   const ratio = pixelRatio(), { width, height } = sizeOf(canvas);
   fitCanvas(canvas, width, height);
-  const context = canvas.getContext("2d", { willReadFrequently: isSlow });
+  const context = context2d(canvas, { willReadFrequently: isSlow });
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   context.clearRect(0, 0, width, height);
   return { context, width, height };
 }
 
 export class SitePane {
+  /** @type {Sites | null} */ sites = null;
+  /** @type {SensorMap | RasterMap | null} */ map = null;
+  /** @type {Column[]} */ columns = [];
+  /** @type {Column} */ column;
+  /** @type {Numbers | null} */ filterOf = null;
+  /** @type {Palette} */ palette;
+  /** @type {Scale | null} */ scale = null;
+  /** @type {Overview | null} */ overview = null;
   // Whether the sites are edited; violations of a view: their version, their markers, and the chosen one.
   isEdited = false; violations = () => null; drawViolations = (_context, _map) => {}; trace = () => null;
 
@@ -58,10 +66,8 @@ export class SitePane {
     this.kinds = make("ul");
     this.legend.append(this.title, this.ramp, this.ticks, this.kinds);
     root.append(this.legend);
-    this.sites = null;
-    this.map = null;
-    this.columns = [];
-    let held = null;
+    /** @type {Point} */
+    let held = [0, 0];
     listenToPointers(this.marks, {
       press: (px, py) => { if (this.map) held = [this.map.fromX(px), this.map.fromY(py)]; },
       drag: (dx, dy, { px, py, isSecond }) => {
@@ -89,14 +95,14 @@ export class SitePane {
     this.sites = sites;
     this.palette = palette;
     this.generation = (this.generation || 0) + 1;
-    if (isNew) this._createMap(sites);
-    else this.map.use(sites);
+    this.map?.use(sites);
+    const map = this.map ||= this._createMap(sites);
     // The raster map averages small sites itself.
     clearTimeout(this.overview?.resting);
-    this.overview = this.map instanceof SensorMap ? new Overview(this.overviewCanvas, sites) : null;
+    this.overview = map instanceof SensorMap ? new Overview(this.overviewCanvas, sites) : null;
     if (isNew) this.resize();
     if (isWhole) this.fit();
-    else this.map.set(this.map.x, this.map.y, this.map.scale);
+    else map.set(map.x, map.y, map.scale);
     this.scale = null;
   }
 
@@ -105,16 +111,15 @@ export class SitePane {
     if (this.renderer && !this.renderer.isSlow) {
       const map = new SensorMap(this.cells, sites, this.renderer);
       if (map.gl) {
-        this.map = map;
         this.cells.addEventListener("webglcontextlost", (event) => event.preventDefault());
         this.cells.addEventListener("webglcontextrestored", () => { map.restore(); this.draw(); });
-        return;
+        return map;
       }
       const fresh = make("canvas", undefined, "cells");
       this.cells.replaceWith(fresh);
       this.cells = fresh;
     }
-    this.map = new RasterMap(this.cells, sites);
+    return new RasterMap(this.cells, sites);
   }
 
   useColumns(columns, filterOf) {
@@ -124,10 +129,13 @@ export class SitePane {
 
   get isWhole() {
     const { map } = this;
-    return Boolean(map) && Math.abs(map.scale / map.fitScale() - 1) < 1e-6 && map.x === map.middle[0] && map.y === map.middle[1];
+    return map !== null && Math.abs(map.scale / map.fitScale() - 1) < 1e-6 && map.x === map.middle[0] && map.y === map.middle[1];
   }
 
-  fit() { this.map.set(this.map.middle[0], this.map.middle[1], this.map.fitScale()); }
+  fit() {
+    const { map } = this;
+    map?.set(map.middle[0], map.middle[1], map.fitScale());
+  }
 
   // Takes the view of another pane, also beyond the limits of these sites.
   follow(other) {
@@ -145,15 +153,16 @@ export class SitePane {
   }
 
   paint(range) {
-    if (!this.scale) return;
+    const { map, scale } = this;
+    if (!map || !scale) return;
     this.range = range;
-    this.scale.paint(this.map.colours, range, groundColour());
-    this.map.sendColours();
-    this._drawLegend();
+    scale.paint(map.colours, range, groundColour());
+    map.sendColours();
+    this._drawLegend(scale);
   }
 
-  _drawLegend() {
-    const { scale, column } = this, isKinds = column.kind === "kinds";
+  _drawLegend(scale) {
+    const { column } = scale, isKinds = column.kind === "kinds";
     change(this.title, { textContent: titleOf(column) + (scale.isLog ? ", log" : "") });
     for (const element of [this.ramp, this.ticks]) change(element, { hidden: isKinds });
     change(this.kinds, { hidden: !isKinds });
@@ -178,19 +187,18 @@ export class SitePane {
   get isShown() { return Boolean(this.map && this.scale) && sizeOf(this.root).width > 0; }
 
   draw() {
-    if (!this.isShown) return;
     const { map } = this;
+    if (!map || !this.isShown) return;
     map.draw(groundColour());
     this.overview?.update(map, this.scale, this.range);
     // Layers are drawn again only when they change: each costs time to compose the page.
-    if (!this._isNew("lines", [this.viewState, this.violations()])) return;
+    if (!this._isNew("lines", [this._viewState(map), this.violations()])) return;
     const { context, width, height } = fitted(this.lines);
     drawOutlines(context, map, width, height);
     this.drawViolations(context, map);
   }
 
-  get viewState() {
-    const { x, y, scale, width, height } = this.map;
+  _viewState({ x, y, scale, width, height }) {
     return [x, y, scale, width, height, pixelRatio(), this.generation].join();
   }
 
@@ -204,12 +212,13 @@ export class SitePane {
 
   // Draws marks: { cursor, hovered, pinned, rectangle, selected, trace }.
   drawMarks({ cursor, hovered, pinned, rectangle, selected, trace }) {
-    if (!this.isShown) return;
+    const { map } = this;
+    if (!map || !this.isShown) return;
     const isAt = cursor && cursor.from !== this, state = [hovered, pinned, rectangle, selected.length, selected[0],
       trace && [...trace.box], isAt && [cursor.x, cursor.y]];
     const isEmpty = hovered < 0 && pinned < 0 && !rectangle && !selected.length && !trace && !isAt;
-    if (!this._isNew("marks", isEmpty ? [this.map.width, this.map.height] : [this.viewState, state])) return;
-    const { map } = this, { context } = fitted(this.marks);
+    if (!this._isNew("marks", isEmpty ? [map.width, map.height] : [this._viewState(map), state])) return;
+    const { context } = fitted(this.marks);
     if (trace) drawTrace(context, map, trace);
     drawSelected(context, map, rectangle, selected);
     ringSites(context, map, pinned, hovered);

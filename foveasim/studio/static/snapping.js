@@ -91,7 +91,9 @@ function alongDirection(x, y, from, step, vertex) {
 
 // Returns the nearest vertex in a direction [ux, uy] from a position, for the arrow keys, or null.
 export function nextVertex({ x, y }, [ux, uy], sites, reach) {
-  let found = null, best = Infinity;
+  /** @type {Snapped | null} */
+  let found = null;
+  let best = Infinity;
   for (const site of sites.within(x - reach, y - reach, x + reach, y + reach, 10 * MOST_SITES) || []) {
     eachEdge(sites, site, (ax, ay) => {
       const dx = ax - x, dy = ay - y, along = dx * ux + dy * uy, across = Math.abs(dx * uy - dy * ux);

@@ -13,13 +13,28 @@ const MAX_PICTURES = 500;
 
 export const isVideo = (name) => VIDEO.test(name);
 
+/** @typedef {{ file: File, path: string | null, address: string | null }} PictureFile */
+
 export class Sources {
+  /** @type {Film | null} */ film = null;
+  /** @type {PictureFile[] | null} */ folder = null;
+  /** @type {"video" | "camera" | "folder" | null} */ kind = null;
+  /** @type {FilmAbout | null} */ about = null;
+  /** @type {Rate} */ rate;
+  // Elements.
+  /** @type {{ [name: string]: HTMLButtonElement }} */ buttons;
+  /** @type {HTMLElement} */ menu;
+  /** @type {HTMLInputElement} */ directory;
+  /** @type {HTMLElement} */ row;
+  /** @type {HTMLElement} */ strip;
+  /** @type {HTMLInputElement} */ slider;
+  /** @type {HTMLSelectElement} */ size;
+  /** @type {HTMLElement} */ label;
+
   // Callbacks: connection(), state(), charts() (choices of the scene), choose() (a file).
   constructor(pane, on) {
     this.pane = pane;
     this.on = on;
-    this.film = null;
-    this.folder = null;
     this.camera = new Camera();
     this._build();
   }
@@ -88,7 +103,7 @@ export class Sources {
       if (chosen) this._choose(chosen.dataset);
     });
     this.directory.addEventListener("change", () => {
-      this.openFolder([...this.directory.files].filter((file) => file.webkitRelativePath.split("/").length <= 2));
+      this.openFolder([...this.directory.files || []].filter((file) => file.webkitRelativePath.split("/").length <= 2));
       this.directory.value = "";
     });
   }
@@ -129,21 +144,23 @@ export class Sources {
     if (this.camera.isOn) this.stopCamera();
   }
 
+  /** @param {State} state */
   use({ film, settings }) {
-    const picture = settings.scene?.picture, k = this.folder ? this.folder.findIndex(({ path }) => path && path === picture) : -1;
+    const before = this.film, picture = settings.scene?.picture;
+    const k = this.folder ? this.folder.findIndex(({ path }) => path && path === picture) : -1;
     if (film?.kind === "video") {
-      if (this.kind !== "video" || this.shownName !== film.name || this.film.count !== film.n_frames) {
-        this.film?.pause();
-        this.film = new Film({ count: film.n_frames, n: film.n, frameS: film.frame_s, isSkipping: true,
+      if (this.kind !== "video" || this.shownName !== film.name || before?.count !== film.n_frames) {
+        before?.pause();
+        this.film = new Film({ count: film.n_frames ?? 1, n: film.n, frameS: film.frame_s, isSkipping: true,
           show: (n) => this._shown(this.on.connection().send({ do: "frame", n })), changed: () => this._show() });
-      } else if (!this.film.isBusy) this.film.n = film.n;
+      } else if (!before.isBusy) before.n = film.n;
       this.shownName = film.name;
     } else if (film?.kind === "camera") {
       this.film?.pause();
       this.film = null;
     } else if (k >= 0) {
-      if (this.kind !== "folder") this.film = this._folderFilm(k);
-      else if (!this.film.isBusy) this.film.n = k;
+      if (this.kind !== "folder" || !before) this.film = this._folderFilm(k);
+      else if (!before.isBusy) before.n = k;
     } else if (this.film && !(this.kind === "folder" && this.film.isBusy)) {
       this.film.pause();
       this.film = null;
@@ -157,7 +174,8 @@ export class Sources {
   // -- display ------------------------------------------------------------------------------------------------------------------
 
   _show() {
-    const { film, kind, camera } = this, isCamera = kind === "camera" || camera.isOn, rate = (isCamera ? this.rate : film?.rate)?.perS;
+    const { film, kind, camera } = this, isCamera = kind === "camera" || camera.isOn;
+    const rate = (isCamera ? this.rate : film?.rate)?.perS ?? NaN;
     const { back, play, forward, camera: stop } = this.buttons;
     this.row.hidden = !film && !isCamera;
     this.strip.hidden = !(this.folder && (kind === "folder"));
@@ -174,9 +192,10 @@ export class Sources {
       this.label.textContent = camera.isOn ? ["live", size, perS].filter(Boolean).join(" · ") : "camera stopped, last frame";
       return;
     }
+    if (!film) return;
     const total = String(film.count);
     this.slider.max = String(film.count - 1);
-    if (film.isPlaying || !film.isBusy) this.slider.value = film.n;
+    if (film.isPlaying || !film.isBusy) this.slider.value = String(film.n);
     this.slider.setAttribute("aria-valuetext", "Frame " + (film.n + 1) + " of " + total);
     play.textContent = film.isPlaying ? "❚❚" : "▶";
     play.title = film.isPlaying ? "Pause" : "Play";
@@ -184,7 +203,7 @@ export class Sources {
     play.disabled = film.count < 2;
     back.disabled = film.n <= 0;
     forward.disabled = film.n >= film.count - 1;
-    const name = kind === "folder" ? this.folder[film.n]?.file.name : this.about?.name;
+    const name = kind === "folder" ? this.folder?.[film.n]?.file.name : this.about?.name;
     this.label.textContent = String(film.n + 1).padStart(total.length, "\u2007") + " / " + total + (perS ? " · " + perS : "");
     this.label.title = name || "";
     if (kind === "folder") [...this.strip.children].forEach((cell, k) => {
@@ -233,8 +252,10 @@ export class Sources {
     if (pictures.length > MAX_PICTURES) notice("The first " + MAX_PICTURES + " of " + pictures.length + " pictures are used");
     this._forgetFolder();
     this.film?.pause();
-    this.folder = pictures.slice(0, MAX_PICTURES).map((file) => ({ file, path: null, address: null }));
-    this.strip.replaceChildren(...this.folder.map((item, k) => {
+    /** @type {PictureFile[]} */
+    const folder = pictures.slice(0, MAX_PICTURES).map((file) => ({ file, path: null, address: null }));
+    this.folder = folder;
+    this.strip.replaceChildren(...folder.map((item, k) => {
       const cell = make("button");
       cell.type = "button";
       cell.title = item.file.name;
@@ -248,13 +269,14 @@ export class Sources {
       cell.addEventListener("click", () => { this.film?.pause(); this.film?.go(k); });
       return cell;
     }));
-    this.film = this._folderFilm(0);
+    const film = this._folderFilm(0);
+    this.film = film;
     this.kind = "folder";
-    this.film.go(0);
+    film.go(0);
   }
 
   _folderFilm(n) {
-    return new Film({ count: this.folder.length, n, isSkipping: false, show: (k, isFinal) => this._showPicture(k, isFinal),
+    return new Film({ count: this.folder?.length ?? 0, n, isSkipping: false, show: (k, isFinal) => this._showPicture(k, isFinal),
       changed: () => this._show() });
   }
 
@@ -298,7 +320,9 @@ export class Sources {
         await new Promise((resolve) => { document.addEventListener("visibilitychange", resolve, { once: true }); });
         continue;
       }
-      const { width, height, pixels } = this.camera.frame();
+      const frame = this.camera.frame();
+      if (!frame) break;
+      const { width, height, pixels } = frame;
       const isShown = await this._shown(this.on.connection().sendFrame({ width, height, is_first: isFirst }, pixels));
       if (!isShown) break;
       this.isLive = true;

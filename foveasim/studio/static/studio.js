@@ -22,23 +22,63 @@ const SIZE_DELAY_MS = 250;
 const HOLD_MS = 100;
 const PICTURE_SIZES = [256, 320, 384, 512, 768, 1024], SMALLER = 0.85;
 
-const page = {
-  state: null, frozen: null, cursor: null, hovered: -1, pinned: -1, rectangle: null, selected: [], range: null, key: null,
-  wantsLog: undefined, sizeTimer: 0, isSelecting: false, asked: null, held: { states: [], parts: [] }, holdTimer: 0, gazeAt: null,
-  boundary: null,
-};
-let connection, controls, panes, editor, sources, files, views;
+// Variant A: whether the server has answered, whether its result is kept, the number of its message, and what it showed.
+/** @typedef {{ isAnswered: boolean, isKept: boolean, id?: number | null, summary?: Summary } & Partial<Kept>} Frozen */
+/** @typedef {{ sites: Sites, columns: Column[], filterOf: Numbers | null, parts: { [name: string]: Part } }} Kept */
+
+class StudioPage {
+  /** @type {State | null} */ state = null;
+  // Settings of an earlier session that the page offers to restore.
+  /** @type {Settings | undefined} */ offered;
+  /** @type {Frozen | null} */ frozen = null;
+  /** @type {Cursor | null} */ cursor = null;
+  /** @type {Rectangle | null} */ rectangle = null;
+  /** @type {number[]} */ selected = [];
+  /** @type {Interval | null} */ range = null;
+  /** @type {boolean | undefined} */ wantsLog = undefined;
+  // Names of the panes that the next frame draws.
+  /** @type {Set<PaneName> | null} */ asked = null;
+  // Messages that are shown together.
+  /** @type {{ states: State[], parts: Part[] }} */ held = { states: [], parts: [] };
+  // Position of the layout at the start of a drag.
+  /** @type {Point | null} */ gazeAt = null;
+  /** @type {Boundary | null} */ boundary = null;
+  key = ""; hovered = -1; pinned = -1; isSelecting = false; sizeTimer = 0; holdTimer = 0; busyTimer = 0; drawnAt = 0;
+}
+
+const page = new StudioPage();
+/** @type {Connection} */
+let connection;
+/** @type {Controls} */
+let controls;
+/** @type {{ a: SitePane, b: SitePane, picture: ImagePane, pictureA: ImagePane, scene: ImagePane }} */
+let panes;
+/** @type {Editor} */
+let editor;
+/** @type {Sources} */
+let sources;
+/** @type {Files} */
+let files;
+/** @type {Views} */
+let views;
 
 // -- drawing ------------------------------------------------------------------------------------------------------------
 
-const MAPS = ["b", "a"], IMAGES = ["picture", "pictureA", "scene"];
-const PANES = { map: [...MAPS, ...IMAGES], maps: MAPS, marks: [] };
+/** @type {("a" | "b")[]} */
+const MAPS = ["b", "a"];
+/** @type {("picture" | "pictureA" | "scene")[]} */
+const IMAGES = ["picture", "pictureA", "scene"];
+/** @typedef {"a" | "b" | "picture" | "pictureA" | "scene"} PaneName */
+/** @type {{ [name: string]: PaneName[] }} */
+const GROUPS = { map: [...MAPS, ...IMAGES], maps: MAPS, marks: [] };
 
 // Draws panes in the next frame: "map" for all, "maps", "marks" for none, or one by its name. All marks are drawn in every frame.
+/** @param {"map" | "maps" | "marks" | PaneName} what */
 function ask(what) {
   const isAsked = page.asked !== null;
-  page.asked = page.asked || new Set();
-  for (const name of PANES[what] || [what]) page.asked.add(name);
+  const asked = page.asked ||= new Set();
+  if (what === "map" || what === "maps" || what === "marks") for (const name of GROUPS[what]) asked.add(name);
+  else asked.add(what);
   if (!isAsked) inNextFrame(drawAsked);
 }
 
@@ -86,8 +126,8 @@ function recolour() {
   b.colourBy(page.key, { wantsLog, alsoValues: other?.values });
   if (page.frozen) a.colourBy(page.key, { wantsLog, alsoValues: b.column.values });
   paint();
-  $("log").closest("label").hidden = !b.scale.canLog;
-  $("log").checked = b.scale.isLog;
+  $("log-label").hidden = !b.scale?.canLog;
+  $("log").checked = Boolean(b.scale?.isLog);
   views.tell("onValues");
   tellSite();
 }
@@ -95,15 +135,17 @@ function recolour() {
 // -- messages of the server -----------------------------------------------------------------------------------------------
 
 // A state is shown with the values that follow it, and parts of a group together: each frame takes the browser tens of milliseconds.
+/** @param {Part} part */
 function receivePart(part) {
   // While the server computes the values.
   views.prepare(part);
-  hold("parts", part);
+  hold(page.held.parts, part);
   if (!part.hasMore) showHeld();
 }
 
-function hold(kind, message) {
-  page.held[kind].push(message);
+/** @type {<T>(messages: T[], message: T) => void} */
+function hold(messages, message) {
+  messages.push(message);
   page.holdTimer ||= setTimeout(showHeld, HOLD_MS);
 }
 
@@ -116,20 +158,22 @@ function showHeld() {
   for (const part of parts) views.use(part);
 }
 
+/** @param {ServerMessage} message @param {{ isFailed: boolean }} about */
 function receive(message, { isFailed }) {
-  const { kind, id, text } = message, { requests } = connection;
+  const { kind } = message, { requests } = connection;
   if (kind !== "state" && kind !== "busy") showHeld();
   if (kind === "state") {
-    hold("states", message);
-    if (isFailed && requests.waiting.some((one) => one.id === id)) notice(Object.values(message.errors)[0]);
+    hold(page.held.states, message);
+    if (isFailed && requests.waiting.some((one) => one.id === message.id)) notice(Object.values(message.errors)[0]);
   } else if (kind === "controls") controls.describe(message.controls);
   else if (kind === "done") finish(message);
-  else if (kind === "error") notice(text);
+  else if (kind === "error") notice(message.text);
   else if (kind === "text") files.receiveText(message);
   else if (kind === "saved") notice("Saved as " + message.path);
   showBusy(requests.isBusy);
 }
 
+/** @param {boolean} isBusy */
 function showBusy(isBusy) {
   clearTimeout(page.busyTimer);
   // Short work is not announced: each change of the page costs a frame.
@@ -138,14 +182,16 @@ function showBusy(isBusy) {
   else document.body.classList.remove("busy");
 }
 
+/** @param {string} text */
 function showStatus(text) { change($("status").lastElementChild, { textContent: text }); }
 
-function finish({ id }) {
-  const { frozen } = page, { requests } = connection;
+/** @param {Done} message */
+function finish(message) {
+  const { frozen } = page, { requests } = connection, id = message.id ?? 0;
   editor.finish();
-  if (frozen && !frozen.isKept && id >= frozen.id) {
+  if (frozen && !frozen.isKept && id >= (frozen.id ?? 0)) {
     frozen.isKept = true;
-    keepVariant();
+    keepVariant(frozen);
     recolour();
   }
   // The time to the frame that shows the result.
@@ -158,6 +204,7 @@ function finish({ id }) {
   else inNextFrame(showTime);
 }
 
+/** @param {State} message */
 function showState(message) {
   const errors = { ...message.errors }, state = { ...message, errors }, { frozen } = page;
   // The buttons show where the history ends.
@@ -182,10 +229,11 @@ function showState(message) {
   sources.use(message);
 }
 
+/** @param {Hello} message @param {{ isSame: boolean }} about */
 function hello(message, { isSame }) {
   document.title = (message.name ? message.name + " – " : "") + "foveasim studio";
   controls.describe(message.controls);
-  fillPresets(message.presets || []);
+  fillPresets(message.presets);
   $("save").hidden = !message.can_save;
   views.describe(message.views);
   const stored = message.is_new ? memory.get("settings") : null;
@@ -198,19 +246,21 @@ function hello(message, { isSame }) {
   files.openLink(location.hash);
 }
 
+/** @param {Preset[]} presets */
 function fillPresets(presets) {
   const kinds = [...new Set(presets.map(({ kind }) => kind || ""))], nodes = kinds.flatMap((wanted) => {
     const members = presets.filter(({ kind }) => (kind || "") === wanted);
     const options = members.map(({ name, label }) => new Option((label || name).replaceAll("_", " "), name));
     if (!wanted) return options;
     const group = make("optgroup");
-    group.label = { shot: "Shots", layout: "Layouts" }[wanted] || wanted;
+    group.label = wanted === "shot" ? "Shots" : wanted === "layout" ? "Layouts" : wanted;
     group.append(...options);
     return [group];
   });
   $("preset").replaceChildren(new Option("Preset…", ""), ...nodes);
 }
 
+/** @param {"open" | "lost" | "denied"} status */
 function showConnection(status) {
   const isOpen = status === "open";
   if (!isOpen) sources.lost();
@@ -230,7 +280,7 @@ function showConnection(status) {
 // Longer side of pictures in pixels of the screen, in a few steps, a little smaller at most; more when they are enlarged.
 function pictureSize() {
   const needed = Math.max(...IMAGES.map((name) => panes[name].neededPixels()));
-  return PICTURE_SIZES.find((size) => size >= SMALLER * needed) || PICTURE_SIZES.at(-1);
+  return PICTURE_SIZES.find((size) => size >= SMALLER * needed) || PICTURE_SIZES[PICTURE_SIZES.length - 1];
 }
 
 // Asks for pictures of another size, not for each step of a zoom.
@@ -266,6 +316,7 @@ function tellSite() {
   speak(site < 0 || !sites ? null : () => spokenSite(columns, site, sites.area));
 }
 
+/** @param {number} site */
 function pin(site) {
   page.pinned = site === page.pinned ? -1 : site;
   if (page.pinned >= 0) views.show("site", true);
@@ -273,6 +324,7 @@ function pin(site) {
   ask("marks");
 }
 
+/** @param {Interval | null} range */
 function setRange(range) {
   page.range = range;
   paint();
@@ -282,14 +334,23 @@ function setRange(range) {
 
 // -- navigation -----------------------------------------------------------------------------------------------------------
 
+/** @param {number} x @param {number} y @param {number} scale */
 function fly(x, y, scale) { if (panes.b.map) flyTo(panes.b.map, [x, y, scale], () => ask("map")); }
 
-function zoomBy(factor) { fly(panes.b.map.x, panes.b.map.y, factor * panes.b.map.scale); }
+/** @param {number} factor */
+function zoomBy(factor) {
+  const { map } = panes.b;
+  if (map) fly(map.x, map.y, factor * map.scale);
+}
 
-function fit() { fly(...panes.b.map.middle, panes.b.map.fitScale()); }
+function fit() {
+  const { map } = panes.b;
+  if (map) fly(...map.middle, map.fitScale());
+}
 
 // -- selection --------------------------------------------------------------------------------------------------------------
 
+/** @param {boolean} isOn */
 function useSelection(isOn) {
   page.isSelecting = isOn;
   $("select").setAttribute("aria-pressed", String(isOn));
@@ -317,11 +378,14 @@ function gazeKey() {
 }
 
 // Moves the layout by a distance from its position at the start of the drag.
+/** @param {number} dx @param {number} dy @param {boolean} isFinal */
 function gaze(dx, dy, isFinal) {
   const key = gazeKey(), { map } = panes.b;
   if (!key) return;
-  page.gazeAt = page.gazeAt || valueAt(page.state.settings, key) || [0, 0];
-  const digits = clamp(Math.ceil(Math.log10(map ? map.scale : 1)) + 1, 1, 4), [x, y] = page.gazeAt;
+  /** @type {Point} */
+  const from = page.gazeAt || valueAt(page.state?.settings, key) || [0, 0];
+  page.gazeAt = from;
+  const digits = clamp(Math.ceil(Math.log10(map ? map.scale : 1)) + 1, 1, 4), [x, y] = from;
   connection.set(key, [x + dx, y + dy].map((v) => Number(v.toFixed(digits))), isFinal);
   if (isFinal) page.gazeAt = null;
   ask("marks");
@@ -332,16 +396,17 @@ function gaze(dx, dy, isFinal) {
 function freeze() {
   if (!panes.b.sites || !page.state) return;
   page.frozen = { isAnswered: false, isKept: false };
-  keepVariant();
+  keepVariant(page.frozen);
   page.frozen.id = connection.send({ do: "freeze" });
   views.show("comparison", true);
   showVariants();
 }
 
 // Keeps what is shown as A: at the click, and again when the server has frozen its result, which may be newer.
-function keepVariant() {
+/** @param {Frozen} frozen */
+function keepVariant(frozen) {
   const { b, a } = panes, { sites, columns, filterOf } = b, { picture } = views.parts;
-  Object.assign(page.frozen, { sites, columns, filterOf, parts: { ...views.parts }, summary: page.state.summary });
+  Object.assign(frozen, { sites, columns, filterOf, parts: { ...views.parts }, summary: page.state?.summary });
   if (a.sites !== sites) a.useSites(sites, b.palette);
   a.useColumns(columns, filterOf);
   if (picture) panes.pictureA.use(picture.about, picture.arrays.rgba);
@@ -372,7 +437,8 @@ function listenToButtons() {
     $(id).setAttribute("aria-pressed", String(isOn));
     return isOn;
   };
-  for (const name of ["undo", "redo"]) press(name, () => connection.send({ do: name }));
+  press("undo", () => connection.send({ do: "undo" }));
+  press("redo", () => connection.send({ do: "redo" }));
   $("preset").addEventListener("change", () => {
     if ($("preset").value) connection.send({ do: "preset", name: $("preset").value });
     $("preset").value = "";
@@ -394,9 +460,9 @@ function listenToButtons() {
   press("farther", () => zoomBy(0.5));
   press("fit", fit);
   press("select", () => useSelection(!page.isSelecting));
-  for (const [name, chosen] of [["picture", [panes.picture, panes.pictureA]], ["scene", [panes.scene]]]) {
-    press("follow-" + name, () => {
-      const follows = toggle("follow-" + name);
+  for (const [id, ...chosen] of /** @type {const} */ ([["follow-picture", panes.picture, panes.pictureA], ["follow-scene", panes.scene]])) {
+    press(id, () => {
+      const follows = toggle(id);
       for (const pane of chosen) pane.follows = follows;
       ask("map");
     });
@@ -404,11 +470,13 @@ function listenToButtons() {
   press("help", () => $("keys").showModal());
 }
 
+/** @param {KeyboardEvent} event */
 function undoByKey(event) {
-  const key = event.key.toLowerCase(), isRedo = (key === "z" && event.shiftKey) || key === "y", { target } = event;
+  const key = event.key.toLowerCase(), isRedo = (key === "z" && event.shiftKey) || key === "y";
+  const target = event.target instanceof Element ? event.target : document.body;
   // A text that is being typed has its own undo.
   const isDirty = () => target.id === "search" || [...controls.rows.values()].some((row) => row.field === target && row.isDirty);
-  if ((key !== "z" && !isRedo) || (target.matches?.("input[type='text']") && isDirty())) return;
+  if ((key !== "z" && !isRedo) || (target.matches("input[type='text']") && isDirty())) return;
   event.preventDefault();
   if (!$(isRedo ? "redo" : "undo").disabled) connection.send({ do: isRedo ? "redo" : "undo" });
 }
@@ -465,7 +533,7 @@ function createEditor() {
     send: (key, value, isFinal) => connection.set(key, value, isFinal),
     remove: (key) => connection.remove(key),
     undo: () => connection.send({ do: "undo" }),
-    redraw: (what = "marks") => ask(what),
+    redraw: (/** @type {"map" | "marks"} */ what = "marks") => ask(what),
     hover: (x, y) => hover(x, y, panes.b),
     generators: () => (controls.rows.get("layout")?.choices || []).filter(({ value }) => value?.generator),
     violations: () => studio.rules?.violations,
@@ -479,6 +547,7 @@ function createEditor() {
   });
 }
 
+/** @param {number | null} index */
 function flyToStep(index) {
   const { map } = panes.b, box = index === null ? null : editor.boxOf(editor.edits[index]);
   editor.toggle(true);
@@ -501,6 +570,7 @@ function showTheme() {
 
 function chosenRenderer() {
   // "raster" in the storage of this address draws maps without WebGL, "webgl" also with software rendering.
+  /** @type {string | null} */
   let wanted = null;
   try { wanted = localStorage.getItem("foveasim-studio-map"); } catch { /* the default */ }
   const renderer = wanted === "raster" ? null : findRenderer();

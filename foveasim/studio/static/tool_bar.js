@@ -74,6 +74,16 @@ function textField(label, { size, value = "", mode = "decimal", placeholder = ""
 }
 
 export class ToolBar {
+  // Elements of the options.
+  /** @type {{ [name: string]: HTMLInputElement | HTMLSelectElement } & { at: HTMLInputElement, grid: HTMLInputElement }} */ fields;
+  /** @type {HTMLButtonElement} */ applyButton;
+  /** @type {HTMLButtonElement} */ rulesButton;
+  /** @type {HTMLElement} */ hint;
+  /** @type {HTMLElement} */ problem;
+  // Options with the tools that have them.
+  /** @type {[string[], HTMLElement][]} */ parts = [];
+  usual = "";
+
   // Callbacks: use(tool), act(action), apply(), typed(text), grid(), rules().
   constructor(pane, on) {
     const stage = pane.querySelector(".stage");
@@ -84,9 +94,10 @@ export class ToolBar {
     this.strip.setAttribute("aria-orientation", "vertical");
     this.buttons = new Map(TOOLS.map(([name, key, title, path]) =>
       [name, this._button(name, title + " (" + key.toUpperCase() + ")", path, () => on.use(name))]));
-    this.actions = new Map(ACTIONS.map(([name, , title, path]) => [name, this._button(name, title, path, () => on.act(name))]));
+    const [remove, repair] = ACTIONS.map(([name, , title, path]) => this._button(name, title, path, () => on.act(name)));
+    this.actions = { remove, repair };
     for (const button of this.buttons.values()) button.setAttribute("aria-pressed", "false");
-    this.strip.append(...this.buttons.values(), make("hr"), ...this.actions.values());
+    this.strip.append(...this.buttons.values(), make("hr"), remove, repair);
     this.strip.addEventListener("keydown", (event) => {
       const step = { ArrowDown: 1, ArrowRight: 1, ArrowUp: -1, ArrowLeft: -1 }[event.key];
       const all = [...this.strip.querySelectorAll("button")].filter((button) => !button.disabled);
@@ -137,7 +148,6 @@ export class ToolBar {
       this.parts.push([tools, span]);
       return span;
     };
-    this.parts = [];
     const { fields } = this, note = make("div", undefined, "tool-note");
     note.append(this.hint, this.problem, this.rulesButton);
     this.row.append(
@@ -169,7 +179,7 @@ export class ToolBar {
 
   use(tool) {
     for (const [name, button] of this.buttons) button.setAttribute("aria-pressed", String(name === tool));
-    const [, , title, , hint] = TOOLS.find(([name]) => name === tool);
+    const [, , title, , hint] = TOOLS.find(([name]) => name === tool) || TOOLS[0];
     this.usual = title.replace("…", "") + ": " + hint[0].toLowerCase() + hint.slice(1);
     for (const [tools, span] of this.parts) span.hidden = !tools.includes(tool);
     this.applyButton.hidden = !APPLY[tool];
@@ -192,11 +202,11 @@ export class ToolBar {
     write(this.problem, error || "");
     this.problem.hidden = !error;
     this.applyButton.disabled = !isReady;
-    this.actions.get("remove").disabled = !isSelected;
+    this.actions.remove.disabled = !isSelected;
     write(this.rulesButton, rules.text);
     this.rulesButton.title = rules.title;
     this.rulesButton.classList.toggle("wrong", rules.isWrong);
-    this.actions.get("repair").disabled = !rules.exist;
+    this.actions.repair.disabled = !rules.exist;
     if (!this.isTyping && this.fields.at.value !== position) this.fields.at.value = position;
     this.fields.grid.placeholder = String(step);
   }

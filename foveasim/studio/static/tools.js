@@ -15,25 +15,33 @@ const MOST_MOVED = 2000;
 const isSame = (a, b, distance) => Math.hypot(a.x - b.x, a.y - b.y) <= distance;
 
 class Tool {
-  constructor(editor) {
-    this.editor = editor;
-    this.isHeld = false;
-  }
+  isHeld = false;
+
+  constructor(editor) { this.editor = editor; }
 
   // Whether positions snap; the position from which directions are measured; own vertices; what else to snap to; distance from the cursor.
   get snaps() { return true; }
+  /** @returns {Placed | null} */
   get origin() { return null; }
   get snapping() { return {}; }
+  /** @returns {Point | null} */
   get offset() { return null; }
   // Whether enter() has something to end or to apply.
   get isReady() { return false; }
   // Outlines to draw, in µm: { points, isClosed }.
+  /** @returns {Outline[]} */
   get paths() { return []; }
 
   // press() returns whether the tool uses the pointer; otherwise the map moves, and click() follows if the pointer does not move.
   press() { return false; }
   drag() {}
   release() {}
+  // Begins or ends a drag; returns whether the pointer is used.
+  hold(isHeld = true) {
+    this.isHeld = isHeld;
+    return true;
+  }
+
   // tap() ends a press without a drag.
   tap() { this.cancel(); }
   click() {}
@@ -106,6 +114,7 @@ class PathTool extends Tool {
   preview() {}
 
   // The edit of a path; of subclasses.
+  /** @returns {Settings | null} */
   edit(_path) { return null; }
 
   enter() {
@@ -163,6 +172,8 @@ export class CutTool extends PathTool {
 
 // Two corners, by a drag or by two clicks.
 export class RectangleTool extends Tool {
+  /** @type {Placed} */ corner = { x: 0, y: 0 };
+
   get origin() { return this.isHeld ? this.corner : null; }
 
   _corners(at) {
@@ -178,8 +189,7 @@ export class RectangleTool extends Tool {
   press(at) {
     if (this.isHeld) { this.release(at); return true; }
     this.corner = at;
-    this.isHeld = true;
-    return true;
+    return this.hold();
   }
 
   _isEmpty(at) { return at.x === this.corner.x || at.y === this.corner.y; }
@@ -188,7 +198,7 @@ export class RectangleTool extends Tool {
   release(at) {
     if (!this.isHeld || this._isEmpty(at)) return;
     const { paths } = this, corners = this._corners(at);
-    this.isHeld = false;
+    this.hold(false);
     this.editor.commit(this.editor.drawing(corners), paths);
   }
 
@@ -199,6 +209,13 @@ export class RectangleTool extends Tool {
 
 // Moves a site, or all selected ones with it.
 export class MoveTool extends Tool {
+  // The sites that move and their outlines; positions in them before; the position that snaps, and its distance from the pointer.
+  /** @type {Set<number>} */ moved = new Set();
+  /** @type {number[][][]} */ rings = [];
+  /** @type {Point[]} */ from = [];
+  /** @type {Placed} */ handle = { x: 0, y: 0 };
+  /** @type {Point} */ distance = [0, 0];
+
   get origin() { return this.isHeld ? this.handle : null; }
   get offset() { return this.isHeld ? this.distance : null; }
   get snapping() { return { isExcluded: (site) => this.isHeld && this.moved.has(site) }; }
@@ -225,9 +242,8 @@ export class MoveTool extends Tool {
     this.handle = vertex || { x: onGrid(raw.x, editor.step), y: onGrid(raw.y, editor.step) };
     this.distance = [this.handle.x - raw.x, this.handle.y - raw.y];
     this.rings = editor.selected.slice(0, MOST_MOVED).flatMap((one) => ringsOf(sites, one));
-    this.isHeld = true;
     editor.at = { ...this.handle };
-    return true;
+    return this.hold();
   }
 
   _edit(at) { return { kind: "move_sites", points_um: this.from, by_um: this.editor.rounded(this.by(at)) }; }
@@ -240,7 +256,7 @@ export class MoveTool extends Tool {
   release(at) {
     if (!this.isHeld) return;
     const { paths } = this, by = this.by(at), edit = this._edit(at);
-    this.isHeld = false;
+    this.hold(false);
     if (by[0] || by[1]) this.editor.commit(edit, paths, by);
     else this.editor.revert();
   }
@@ -248,6 +264,9 @@ export class MoveTool extends Tool {
 
 // Moves vertices that sites have in common, makes new ones on edges, and removes them.
 export class VertexTool extends Tool {
+  /** @type {Placed} */ from = { x: 0, y: 0 };
+  /** @type {{ points: number[][], indices: Set<number> }[]} */ rings = [];
+
   get origin() { return this.isHeld ? this.from : null; }
   // A vertex that is moved neither snaps to itself nor to its edges.
   get snapping() { return this.isHeld ? { kinds: ["vertex"], isSkipped: (x, y) => isSame({ x, y }, this.from, VERTEX_UM) } : {}; }
@@ -269,8 +288,7 @@ export class VertexTool extends Tool {
     if (event?.altKey && at.kind === "vertex") { this.remove(); return true; }
     this.from = at;
     this.rings = this._ringsAt(at);
-    this.isHeld = true;
-    return true;
+    return this.hold();
   }
 
   // Rings through a position, with the indices of their vertices there; on an edge, with a new vertex.
@@ -299,7 +317,7 @@ export class VertexTool extends Tool {
   release(at) {
     if (!this.isHeld) return;
     const { paths } = this;
-    this.isHeld = false;
+    this.hold(false);
     if (isSame(at, this.from, 0)) this.editor.revert();
     else this.editor.commit(this._edit(at), paths);
   }
@@ -323,12 +341,12 @@ export class LayerTool extends RectangleTool {
   }
 
   drag() {}
-  tap(at) { this.isHeld = false; this.editor.addLayer(at); }
+  tap(at) { this.hold(false); this.editor.addLayer(at); }
   enter() { this.editor.addLayer(); }
 
   release(at) {
     if (!this.isHeld || this._isEmpty(at)) return;
-    this.isHeld = false;
+    this.hold(false);
     this.editor.addLayer(null, this._corners(at));
   }
 }

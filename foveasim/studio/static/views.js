@@ -1,6 +1,6 @@
 // Views: the server lists them; each is a module in views/, which is imported when its view is first needed.
 
-import { $, make, notice } from "/web/page_parts.js";
+import { $, find, make, notice } from "/web/page_parts.js";
 
 // From this width, all tiles are shown at first that cost little.
 const WIDE = 1800;
@@ -13,21 +13,32 @@ const WIDE = 1800;
 const FOLLOWED = ["onState", "onValues", "onSite", "onSelection", "onMap", "draw"];
 
 export class Views {
-  studio; changed; list = []; made = {}; parts = {}; shown = new Set(); needed = new Set(); nLoading = 0;
+  nLoading = 0;
+  /** @type {ViewAbout[]} */ list = [];
+  // Modules and data by the names of views; null for a module that is loading.
+  /** @type {{ [name: string]: any }} */ made = {};
+  /** @type {{ [name: string]: Part }} */ parts = {};
+  /** @type {Set<string>} */ shown = new Set();
+  /** @type {Set<string>} */ needed = new Set();
 
   // changed() is called when other views are shown.
+  /** @param {any} studio @param {() => void} changed */
   constructor(studio, changed) {
-    Object.assign(this, { studio, changed });
+    this.studio = studio;
+    this.changed = changed;
   }
 
-  // Uses the list of the server: { name, label, is_tile, is_first, is_costly, has_data }.
+  // Uses the list of the server.
+  /** @param {ViewAbout[]} list */
   describe(list) {
     // A server that was started again counts from the beginning.
     for (const part of Object.values(this.parts)) part.version = -1;
     if (this.list.length) return;
     this.list = list;
-    let chosen = null;
-    try { chosen = JSON.parse(localStorage.getItem("foveasim-studio-tiles")); } catch { /* the first ones */ }
+    /** @type {unknown} */
+    let chosen;
+    try { chosen = JSON.parse(localStorage.getItem("foveasim-studio-tiles") || "null"); } catch { /* the first ones */ }
+    /** @type {(view: ViewAbout) => boolean} */
     const isFirst = innerWidth >= WIDE ? (view) => !view.is_costly : (view) => view.is_first;
     for (const view of list.filter((each) => each.is_tile)) {
       const tile = make("section", undefined, "tile"), button = make("button", view.label);
@@ -54,9 +65,11 @@ export class Views {
       && this.made[name]?.wantsData !== false).map(({ name }) => name);
   }
 
+  /** @param {string} name */
   _isNeeded(name) { return this.needed.has(name) || this.shown.has(name); }
 
   // Resolves when the view is loaded.
+  /** @type {(name: string, isShown: boolean) => Promise<void>} */
   show(name, isShown) {
     if (isShown === this.shown.has(name)) return Promise.resolve();
     if (isShown) this.shown.add(name);
@@ -71,6 +84,7 @@ export class Views {
   }
 
   // Data that are needed although their tile is hidden.
+  /** @param {string} name @param {boolean} isNeeded */
   need(name, isNeeded) {
     if (isNeeded) this.needed.add(name);
     else this.needed.delete(name);
@@ -78,9 +92,10 @@ export class Views {
     this.changed();
   }
 
+  /** @param {string} name */
   _mark(name) {
     $("tile-" + name).hidden = !this.shown.has(name);
-    document.querySelector(`#tabs button[data-tile="${name}"]`).setAttribute("aria-pressed", String(this.shown.has(name)));
+    find(document, `#tabs button[data-tile="${name}"]`).setAttribute("aria-pressed", String(this.shown.has(name)));
     this._call(name, "onShown", this.shown.has(name));
   }
 
@@ -91,7 +106,7 @@ export class Views {
     const modules = await Promise.allSettled(names.map((name) => import("./views/" + name + ".js")));
     this.nLoading--;
     names.forEach((name, i) => {
-      const result = modules[i], root = $("tile-" + name);
+      const result = modules[i], root = document.getElementById("tile-" + name);
       try {
         if (result.status === "rejected") throw result.reason;
         this.made[name] = result.value.create(root, this.studio);
@@ -104,21 +119,26 @@ export class Views {
     });
   }
 
+  /** @param {string} name @param {unknown} error */
   _explain(name, error) {
-    const { label } = this.list.find((view) => view.name === name), text = label + " cannot be shown: " + error.message;
+    const label = this.list.find((view) => view.name === name)?.label, why = error instanceof Error ? error.message : error;
+    const text = label + " cannot be shown: " + why;
     console.error(text);
     notice(text);
   }
 
   // Calls a method of a view if it has that; an error in one view leaves the others.
+  /** @param {string} name @param {string} method @param {unknown[]} values */
   _call(name, method, ...values) {
     const view = this.made[name];
     if (!view?.[method]) return;
     try { view[method](...values); } catch (error) { this._explain(name, error); }
   }
 
+  /** @param {string} method @param {unknown[]} values */
   tell(method, ...values) { for (const name of this.shown) this._call(name, method, ...values); }
 
+  /** @param {string} name */
   _refresh(name) {
     if (this.parts[name]) this._use(this.parts[name]);
     if (this.shown.has(name) && this.studio.state) for (const method of FOLLOWED) this._call(name, method);
@@ -127,14 +147,17 @@ export class Views {
   // Shows all again, after variant A came or went.
   refresh() { for (const { name } of this.list) if (name !== "sites" && name !== "columns") this._refresh(name); }
 
+  /** @param {Part} part */
   prepare(part) { this._call(part.part, "prepare", part); }
 
+  /** @param {Part} part */
   use(part) {
     if (this.parts[part.part]?.version > part.version) return;
     this.parts[part.part] = part;
     this._use(part);
   }
 
+  /** @param {Part} part */
   _use(part) {
     const before = this.studio.page.frozen?.parts?.[part.part];
     this._call(part.part, "use", part, before && before !== part ? before : null);

@@ -31,6 +31,8 @@ POLICY = (
 )
 #: Import and export statements of modules: without aliases.
 IMPORT = re.compile(r'^import \{[\w$,\s]+\} from "\./(\w+\.js)";\n', re.MULTILINE)
+#: Types for the checker, which browsers do not need.
+TYPE = re.compile(r" */\*\*(?:(?!\*/).)*\*/\n?", re.DOTALL)
 EXPORT = re.compile(r"^export (?=(?:async )?function |class |const )", re.MULTILINE)
 
 
@@ -207,7 +209,7 @@ def bundle(name: str) -> str:
             text = part(module)
             for imported in IMPORT.findall(text):
                 add(imported)
-            modules[module] = EXPORT.sub("", IMPORT.sub("", text))
+            modules[module] = TYPE.sub("", EXPORT.sub("", IMPORT.sub("", text)))
 
     add(name)
     return '(() => {\n"use strict";\n' + "\n".join(modules.values()) + "\n})();\n"

@@ -1,4 +1,5 @@
 // Colour maps of matplotlib, perceptually uniform and legible with all common forms of colour blindness: 256 colours of three bytes.
+/** @type {{ [name: string]: string }} */
 const TABLES = {
   viridis: [
     "44015444025645045745055946075a46085c460a5d460b5e470d60470e61471063471164471365481467481668481769",
@@ -42,6 +43,7 @@ const TABLES = {
 export const COLOUR_MAPS = [...Object.keys(TABLES), "grey"];
 
 // Returns the colour of a colour map at a fraction from 0 to 1.
+/** @param {string} name @param {number} fraction */
 export function mapColour(name, fraction) {
   const step = Math.round(255 * fraction);
   return name === "grey" ? [step, step, step] : [0, 2, 4].map((i) => parseInt(TABLES[name].slice(6 * step + i, 6 * step + i + 2), 16));

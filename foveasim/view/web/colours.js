@@ -2,15 +2,20 @@
 
 import { COLOUR_MAPS, mapColour } from "./colour_maps.js";
 
+/** @type {(x: number, low: number, high: number) => number} */
 export const clamp = (x, low, high) => Math.min(high, Math.max(low, x));
+/** @param {number[]} colour */
 const packedColour = ([r, g, b]) => (255 << 24 | b << 16 | g << 8 | r) >>> 0;
+/** @param {(fraction: number) => number[]} colourOf */
 const table = (colourOf) => Array.from({ length: 256 }, (_, i) => colourOf(i / 255));
 
+/** @param {string} hex */
 export function bytesOfHex(hex) {
   return [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16));
 }
 
 // Displayed colour of a signal: a fraction of white through a filter, with gamma so that dark sites are distinguishable.
+/** @param {number} fraction @param {number[]} colour @param {Palette} palette */
 function lit(fraction, colour, palette) {
   const level = fraction ** palette.gamma;
   return colour.map((c) => Math.round(c * level));
@@ -24,6 +29,8 @@ function lit(fraction, colour, palette) {
 // alsoValues are other values that the scale includes.
 export class Scale {
   column; values; filterOf; palette;
+  // Colours of 256 steps, for each filter.
+  /** @type {number[][][]} */ tables = [];
 
   /** @typedef {{ wantsLog?: boolean, wantedMap?: string | null, alsoValues?: ArrayLike<number> | null }} ScaleOptions */
   constructor(column, values, filterOf, palette, /** @type {ScaleOptions} */ { wantsLog, wantedMap, alsoValues } = {}) {
@@ -52,21 +59,24 @@ export class Scale {
     this.nKinds = column.colours ? column.colours.length : palette.kinds.length;
     // Signals are grey levels unless another colour map is chosen.
     this.canMap = column.kind === "linear" || column.kind === "grey";
-    this.map = COLOUR_MAPS.includes(wantedMap) ? wantedMap : column.kind === "grey" ? "grey" : COLOUR_MAPS[0];
+    this.map = wantedMap && COLOUR_MAPS.includes(wantedMap) ? wantedMap : column.kind === "grey" ? "grey" : COLOUR_MAPS[0];
     if (column.kind === "grey" && this.map === "grey") this.tables = [table((fraction) => lit(fraction, [255, 255, 255], palette))];
     else if (this.canMap) this.tables = [table((fraction) => mapColour(this.map, fraction))];
     else if (column.kind === "lit") this.tables = column.colours.map((c) => table((fraction) => lit(fraction, bytesOfHex(c), palette)));
   }
 
+  /** @param {number} value */
   fraction(value) {
     if (this.isLog) return Math.log(value / this.from) / Math.log(this.to / this.from);
     return (value - this.from) / (this.to - this.from);
   }
 
+  /** @param {number} fraction */
   value(fraction) {
     return this.isLog ? this.from * (this.to / this.from) ** fraction : this.from + fraction * (this.to - this.from);
   }
 
+  /** @param {number} site */
   colour(site) {
     const value = this.values[site];
     if (this.column.kind === "kinds") return this.kindColour(value);
@@ -75,19 +85,22 @@ export class Scale {
   }
 
   // Colour of a number, on a mosaic that of a filter.
+  /** @param {number} value */
   shade(value, filter = 0) { return this.tables[filter][Math.round(255 * clamp(this.fraction(value), 0, 1))]; }
 
+  /** @param {number} kind */
   kindColour(kind) {
     const own = this.column.colours && this.column.colours[kind];
     return bytesOfHex(own || this.palette.kinds[kind % this.palette.kinds.length]);
   }
 
   // Colours of all sites for the map; sites outside a range of values fade into the background.
+  /** @param {Uint32Array} out @param {Interval | null} range @param {number[]} ground */
   paint(out, range, ground) {
     const { values, column, filterOf } = this;
     const fade = (colour) => packedColour(colour.map((c, i) => Math.round(0.12 * c + 0.88 * ground[i])));
     const both = (colours) => [colours.map(packedColour), colours.map(fade)];
-    const tables = (this.tables || []).map(both), nothing = both([bytesOfHex(this.palette.no_data)]);
+    const tables = this.tables.map(both), nothing = both([bytesOfHex(this.palette.no_data)]);
     const kinds = column.kind === "kinds" ? both(Array.from({ length: this.nKinds }, (_, k) => this.kindColour(k))) : null;
     const [from, to] = range || [-Infinity, Infinity];
     for (let site = 0; site < values.length; site++) {
@@ -99,6 +112,7 @@ export class Scale {
   }
 
   // Round values along the scale.
+  /** @param {number} count */
   ticks(count) {
     if (this.isLog) {
       const ratio = this.to / this.from, steps = ratio > 200 ? [1] : ratio > 20 ? [1, 3] : [1, 2, 5], ticks = [];
@@ -118,6 +132,7 @@ export class Scale {
   }
 
   // Number of sites in each of n steps along the scale.
+  /** @param {number} most */
   histogram(most) {
     const { values } = this, span = this.to - this.from;
     const isCounted = this.column.is_integer && !this.isLog && span < most;
@@ -132,6 +147,7 @@ export class Scale {
 }
 
 // The next of 1, 2, 5, 10, ... at or above a length.
+/** @param {number} length @param {boolean} [isWhole] */
 export function roundStep(length, isWhole) {
   if (!(length > 0)) return 1;
   const power = 10 ** Math.floor(Math.log10(length)), lead = length / power;
@@ -140,6 +156,7 @@ export function roundStep(length, isWhole) {
 }
 
 // Formats a length in nm, µm or mm.
+/** @param {number} length */
 export function formatLength(length) {
   return length >= 1000 ? length / 1000 + " mm" : length >= 0.1 ? Number(length.toPrecision(3)) + " µm"
     : Number((1000 * length).toPrecision(3)) + " nm";
@@ -149,6 +166,7 @@ export function formatLength(length) {
 const WHOLE = new Intl.NumberFormat("en-US"), SIX_DIGITS = new Intl.NumberFormat("en-US", { maximumSignificantDigits: 6 });
 
 // Formats integers exactly, other numbers with six significant digits.
+/** @param {number} value */
 export function shown(value) {
   if (Number.isNaN(value)) return "no value";
   if (!Number.isFinite(value)) return value > 0 ? "infinite" : "minus infinite";
@@ -158,6 +176,7 @@ export function shown(value) {
 }
 
 // Formats a site's value of a column with its unit, using the site areas in µm²; "…" while the column is not loaded.
+/** @param {Column} column @param {number} site @param {Numbers} areas */
 export function textOf(column, site, areas) {
   if (column.of) return shown(column.of === "size" ? Math.sqrt(areas[site]) : areas[site]) + " " + column.unit;
   if (!column.values) return "…";
@@ -167,6 +186,7 @@ export function textOf(column, site, areas) {
 }
 
 // Short number format for axes.
+/** @param {number} value */
 export function brief(value) {
   const size = Math.abs(value);
   if (size >= 1e6 || (size < 1e-3 && size > 0)) return value.toExponential(0).replace("e+", "e");

@@ -8,9 +8,12 @@ const CLICK_PIXELS = 4;
 // Calls the callbacks that are given: press(px, py), drag(dx, dy, { px, py, isSecond, isMiddle }), pinch(factor, px, py),
 // wheel(factor, px, py), click(px, py), move(px, py, isHeld), leave(). Factors above 1 zoom in. isSecond: with
 // two fingers, the right button, or Shift, Ctrl or Meta.
+/** @param {HTMLElement} canvas @param {PointerCallbacks} on */
 export function listenToPointers(canvas, on) {
+  /** @type {Map<number, Point>} */
   const pointers = new Map();
   let travelled = 0, pinch = 0, isSecond = false, isMiddle = false;
+  /** @type {(event: MouseEvent) => Point} */
   const at = (event) => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
   const apart = () => {
     const [a, b] = [...pointers.values()];
@@ -48,6 +51,7 @@ export function listenToPointers(canvas, on) {
     }
     on.move(px, py, pointers.size > 0);
   });
+  /** @param {PointerEvent} event */
   const release = (event) => {
     pointers.delete(event.pointerId);
     pinch = apart();

@@ -25,6 +25,14 @@ export function fitCanvas(canvas, width, height) {
   return true;
 }
 
+// The 2D context of a canvas.
+/** @param {HTMLCanvasElement} canvas @param {CanvasRenderingContext2DSettings} [options] */
+export function context2d(canvas, options) {
+  const context = canvas.getContext("2d", options);
+  if (!context) throw new Error("the browser has no memory for a canvas");
+  return context;
+}
+
 // Calls back when the size of an element changes, or the device pixel ratio of its window.
 export function watchSize(element, onChange) {
   new ResizeObserver(onChange).observe(element);

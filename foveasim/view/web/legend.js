@@ -1,6 +1,7 @@
 // Legend of a colour scale: its colours with round values, or the categories with their counts; pictures with a legend.
 
 import { brief, clamp, shown } from "./colours.js";
+import { context2d } from "./gl.js";
 import { inkOf, make } from "./page_parts.js";
 
 // More categories than this are not listed.
@@ -16,7 +17,7 @@ export function drawRamp(context, scale, width, height) {
   const rows = scale.tables.length, strip = make("canvas");
   strip.width = 256;
   strip.height = rows;
-  const stripContext = strip.getContext("2d", { willReadFrequently: true }), image = stripContext.createImageData(256, rows);
+  const stripContext = context2d(strip, { willReadFrequently: true }), image = stripContext.createImageData(256, rows);
   scale.tables.forEach((shades, row) => shades.forEach((shade, i) => image.data.set([...shade, 255], 4 * (256 * row + i))));
   stripContext.putImageData(image, 0, 0);
   context.imageSmoothingEnabled = false;
@@ -74,7 +75,7 @@ export function summaryOf(scale) {
 // Returns a picture of views side by side, each of layers on top of each other, above a foot with the scale bar
 // { text, width }, the titles and colours of scales, and items { colours, text }. Lengths are CSS pixels.
 export function pictureOf(views, { width, height, bar, scales, items }) {
-  const picture = document.createElement("canvas"), context = picture.getContext("2d"), ratio = views[0][0].height / height;
+  const picture = document.createElement("canvas"), context = context2d(picture), ratio = views[0][0].height / height;
   context.font = FONT;
   const boxes = footOf(context, width - 2 * MARGIN, bar, scales, items);
   let x = MARGIN, y = height, row = 0;

@@ -28,6 +28,15 @@ const DEEPEST = 1e7;
 
 // The visible part of a sensor on a canvas: its centre in µm, and the scale in CSS pixels per µm.
 export class MapView {
+  // Given by use().
+  /** @type {Sites} */ sites;
+  /** @type {Point} */ middle;
+  /** @type {Uint32Array<ArrayBuffer>} */ colours;
+  /** @type {number} */ extent;
+  /** @type {number} */ x;
+  /** @type {number} */ y;
+
+  /** @param {HTMLCanvasElement} canvas */
   constructor(canvas) {
     this.canvas = canvas;
     this.scale = 1;
@@ -35,6 +44,7 @@ export class MapView {
   }
 
   // Shows sites, at first with their centre in the middle.
+  /** @param {Sites} sites */
   use(sites) {
     const [x0, y0, x1, y1] = sites.bounds;
     this.sites = sites;
@@ -45,11 +55,16 @@ export class MapView {
   }
 
   // Conversion from µm on the sensor to CSS pixels of the map, and back; y points up on the sensor.
+  /** @param {number} x */
   toX(x) { return 0.5 * this.width + (x - this.x) * this.scale; }
+  /** @param {number} y */
   toY(y) { return 0.5 * this.height - (y - this.y) * this.scale; }
+  /** @param {number} px */
   fromX(px) { return this.x + (px - 0.5 * this.width) / this.scale; }
+  /** @param {number} py */
   fromY(py) { return this.y - (py - 0.5 * this.height) / this.scale; }
 
+  /** @param {number} width @param {number} height */
   resize(width, height) {
     this.width = Math.max(1, width);
     this.height = Math.max(1, height);
@@ -62,6 +77,7 @@ export class MapView {
     return 0.94 * Math.min(this.width / (x1 - x0), this.height / (y1 - y0));
   }
 
+  /** @param {number} x @param {number} y @param {number} scale */
   set(x, y, scale) {
     const [x0, y0, x1, y1] = this.sites.bounds, fit = this.fitScale();
     this.scale = clamp(scale, 0.5 * fit, DEEPEST * fit);
@@ -70,6 +86,7 @@ export class MapView {
   }
 
   // Zooms by a factor about a pixel.
+  /** @param {number} factor @param {number} px @param {number} py */
   zoom(factor, px, py) {
     const x = this.fromX(px), y = this.fromY(py), fit = this.fitScale();
     const scale = clamp(this.scale * factor, 0.5 * fit, DEEPEST * fit);
@@ -78,12 +95,18 @@ export class MapView {
 }
 
 export class SensorMap extends MapView {
+  // Given by use().
+  /** @type {number} */ perUm;
+  /** @type {{ reach: number[], from: number, to: number }[]} */ tiles;
+
+  /** @param {HTMLCanvasElement} canvas @param {Sites} sites @param {Renderer} renderer */
   constructor(canvas, sites, renderer) {
     super(canvas);
     this.gl = canvas.getContext("webgl2", { antialias: !renderer.isSlow, alpha: false, depth: false, powerPreference: "high-performance" });
     this.use(sites);
   }
 
+  /** @param {Sites} sites */
   use(sites) {
     super.use(sites);
     this.perUm = LATTICE / this.extent;
@@ -94,6 +117,7 @@ export class SensorMap extends MapView {
 
   _load() {
     const { gl, sites } = this;
+    if (!gl) return;
     this.built = this.built || buildProgram(gl, VERTEX_SHADER, FRAGMENT_SHADER, ["position", "site"]);
     gl.useProgram(this.built.program);
     this.at = this.built.at;
@@ -117,8 +141,9 @@ export class SensorMap extends MapView {
 
   // Frees the GPU resources of the sites before.
   _free() {
-    if (!this.loaded) return;
-    const { gl } = this, { outlines, buffers, lookup } = this.loaded;
+    const { gl } = this;
+    if (!gl || !this.loaded) return;
+    const { outlines, buffers, lookup } = this.loaded;
     gl.deleteVertexArray(outlines);
     for (const buffer of buffers) gl.deleteBuffer(buffer);
     gl.deleteTexture(lookup);
@@ -134,8 +159,10 @@ export class SensorMap extends MapView {
     this.sendColours();
   }
 
+  /** @param {number[]} ground */
   draw(ground) {
     const { gl, canvas } = this;
+    if (!gl) return;
     gl.viewport(0, 0, canvas.width, canvas.height);
     gl.clearColor(ground[0] / 255, ground[1] / 255, ground[2] / 255, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);

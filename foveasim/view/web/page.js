@@ -1,16 +1,16 @@
 // The page: controls, the photosite under the mouse, colours, design rules, picture, links.
 
 import { connect, hasAddress, report } from "./bridge.js";
-import { Scale, bytesOfHex, clamp, shown } from "./colours.js";
+import { Scale, bytesOfHex, clamp, formatLength, shown } from "./colours.js";
 import { COLOUR_MAPS } from "./colour_maps.js";
 import { listenToPointers } from "./gestures.js";
-import { findRenderer, fitCanvas, pixelRatio, watchSize } from "./gl.js";
+import { context2d, findRenderer, fitCanvas, pixelRatio, watchSize } from "./gl.js";
 import { drawRamp, kindsOf, pictureOf, summaryOf, swatchItem, tickLabels, titleOf } from "./legend.js";
 import { SensorMap } from "./map.js";
 import { drawCross, drawOutlines, drawSelected, drawTrace, drawView, outline, positionText, ringSites } from "./marks.js";
 import { downloadTable, lengthText, sitesIn, statisticsRows, tableOf } from "./measure.js";
 import { Overview } from "./overview.js";
-import { $, downloadPicture, inkOf, isForPage, listenToHelp, make, notice, speak, startTheme, stayingNotice,
+import { $, downloadPicture, find, inkOf, isForPage, listenToHelp, make, notice, speak, startTheme, stayingNotice,
   useTheme } from "./page_parts.js";
 import { RulesList, VIOLATION_ARRAYS } from "./rules_list.js";
 import { drawScaleBar, flyTo, listenToRange, panByKey, siteHeading, siteRows, spokenSite, stopFlight, zoomByKey } from "./shell.js";
@@ -20,11 +20,38 @@ import { unpack } from "./unpack.js";
 const about = JSON.parse($("about").textContent);
 const STEPS = 72;
 
-const state = {
-  sites: null, map: null, columns: [], scale: null, column: null, range: null, wantsLog: undefined,
-  hovered: -1, others: [], pinned: -1, cursor: null, rules: null, drawn: 0, drawMs: 0, loaded: false, isSlow: false,
-  wantedMap: null, second: null, secondMap: null, tool: null, start: null, ruler: null, selection: null, selected: [],
-};
+/** @typedef {{ map: SensorMap, overview: Overview }} SecondMap */
+
+class PageState {
+  // Given by open().
+  /** @type {Sites} */ sites;
+  /** @type {SensorMap} */ map;
+  /** @type {Overview} */ overview;
+  /** @type {Renderer} */ renderer;
+  /** @type {Column} */ column;
+  /** @type {Scale} */ scale;
+  /** @type {Fitted} */ lines;
+  /** @type {Fitted} */ marks;
+  /** @type {{ length: number, width: number }} */ scaleBar;
+  /** @type {RulesList | null} */ rules = null;
+  /** @type {boolean | undefined} */ wantsLog = undefined;
+  /** @type {string | null} */ wantedMap = null;
+  /** @type {Interval | null} */ range = null;
+  /** @type {string[]} */ rangeTexts = [];
+  /** @type {Uint32Array | null} */ histogram = null;
+  /** @type {SecondMap & { column: Column, scale: Scale } | null} */ second = null;
+  /** @type {SecondMap | null} */ secondMap = null;
+  /** @type {Cursor | null} */ cursor = null;
+  /** @type {"ruler" | "select" | null} */ tool = null;
+  /** @type {Point | null} */ start = null;
+  /** @type {Rectangle | null} */ ruler = null;
+  /** @type {Rectangle | null} */ selection = null;
+  /** @type {number[]} */ selected = [];
+  /** @type {number[]} */ others = [];
+  hovered = -1; pinned = -1; drawn = 0; drawMs = 0; loaded = false; isSlow = false;
+}
+
+const state = new PageState();
 const asks = { map: false, marks: false };
 
 const array = (name) => unpack(name, about.arrays[name]);
@@ -40,6 +67,7 @@ async function valuesOf(column) {
   return column.values;
 }
 
+/** @param {string} key @param {Interval | null} range */
 async function colourBy(key, range = null) {
   const column = about.columns.find((c) => c.key === key) || about.columns[0];
   await valuesOf(column);
@@ -77,7 +105,7 @@ function repaint() {
 
 // Shows another column in a map next to the first one, with the same view; an empty key hides it.
 async function showSecond(key) {
-  const column = about.columns.find((one) => one.key === key), main = document.querySelector("main"), wasShown = Boolean(state.second);
+  const column = about.columns.find((one) => one.key === key), main = find(document, "main"), wasShown = Boolean(state.second);
   $("second-column").value = column ? key : "";
   $("second").hidden = !column;
   main.classList.toggle("two-maps", Boolean(column));
@@ -111,8 +139,8 @@ function createSecond() {
   return { map, overview };
 }
 
-function drawSecond() {
-  const { map, overview, scale } = state.second, first = state.map;
+function drawSecond({ map, overview, scale }) {
+  const first = state.map;
   map.set(first.x, first.y, first.scale);
   map.draw(groundColour());
   overview.update(map, scale, null);
@@ -126,7 +154,7 @@ function fitted(canvas) {
   const ratio = pixelRatio(), width = canvas.clientWidth, height = canvas.clientHeight;
   fitCanvas(canvas, width, height);
   // With software rendering, drawing without WebGL is twenty times faster.
-  const context = canvas.getContext("2d", { willReadFrequently: state.isSlow });
+  const context = context2d(canvas, { willReadFrequently: state.isSlow });
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   return { context, width, height };
 }
@@ -176,9 +204,9 @@ function drawHistogram() {
   }
 }
 
-function setRange(from, to) {
-  const isAll = from === null;
-  state.range = isAll ? null : [Math.min(from, to), Math.max(from, to)];
+/** @param {Interval | null} range */
+function setRange(range) {
+  state.range = range && [Math.min(...range), Math.max(...range)];
   fillRange();
   repaint();
   drawHistogram();
@@ -198,14 +226,14 @@ function listenToHistogram() {
   listenToRange(canvas, () => state.scale, (event) => {
     const box = canvas.getBoundingClientRect();
     return (event.clientX - box.left) / box.width;
-  }, (range) => setRange(...(range || [null])));
+  }, setRange);
   for (const id of ["range-from", "range-to"]) {
     $(id).addEventListener("change", () => {
       // An unchanged bound keeps its full precision, which its field does not show.
       const [low, high] = state.range || [state.scale.lowest, state.scale.highest], [lowText, highText] = state.rangeTexts;
       const from = $("range-from").value === lowText ? low : Number($("range-from").value);
       const to = $("range-to").value === highText ? high : Number($("range-to").value);
-      if (Number.isFinite(from) && Number.isFinite(to)) setRange(from, to);
+      if (Number.isFinite(from) && Number.isFinite(to)) setRange([from, to]);
       else fillRange();
     });
   }
@@ -240,7 +268,7 @@ function drawMap() {
   const start = performance.now();
   state.map.draw(groundColour());
   state.overview.update(state.map, state.scale, state.range);
-  if (state.second) drawSecond();
+  if (state.second) drawSecond(state.second);
   drawLines();
   state.scaleBar = drawScaleBar($("scale-bar"), state.map);
   state.drawn++;
@@ -269,7 +297,7 @@ function drawMarks() {
     if (cursor && cursor.from !== "second") drawCross(other, second.map.toX(cursor.x), second.map.toY(cursor.y));
   }
   drawSelected(context, map, selection, selection ? [] : selected);
-  if (state.ruler) drawRuler(context);
+  if (state.ruler) drawRuler(context, state.ruler);
   drawPictureMarks();
 }
 
@@ -310,9 +338,9 @@ function listenToPicture() {
     fly(...at, Math.max(state.map.scale, 4 * state.map.fitScale()));
   });
   $("enlarge").addEventListener("click", () => {
-    const main = document.querySelector("main"), isSideBySide = main.classList.toggle("side-by-side");
+    const main = find(document, "main"), isSideBySide = main.classList.toggle("side-by-side");
     if (isSideBySide) main.insertBefore(frame, document.querySelector("aside"));
-    else $("picture-heading").closest("section").append(frame);
+    else $("picture-heading").closest("section")?.append(frame);
     $("enlarge").setAttribute("aria-pressed", String(isSideBySide));
     resize();
   });
@@ -339,7 +367,7 @@ function leave() {
   ask("marks");
 }
 
-let announcedSite = null;
+let announcedSite = "";
 
 function tellSite() {
   const site = state.hovered >= 0 ? state.hovered : state.pinned;
@@ -413,7 +441,8 @@ function resize() {
 
 function listenToMap() {
   const canvas = $("marks"), { map } = state;
-  let held = null;
+  /** @type {Point} */
+  let held = [0, 0];
   listenToPointers(canvas, {
     press: (px, py) => { stopFlight(); held = [map.fromX(px), map.fromY(py)]; },
     drag: (dx, dy, { px, py, isSecond }) => {
@@ -491,6 +520,7 @@ function extend(from, to) {
 
 // With the keyboard: the first point at the centre of the view; the arrows move the second one, Enter ends.
 function setPoint() {
+  /** @type {Point} */
   const at = [state.map.x, state.map.y];
   if (state.start) extend(state.start, at);
   else notice("First point set; the arrows move the second one, Enter ends");
@@ -524,8 +554,8 @@ function showSelection() {
   rememberView();
 }
 
-function drawRuler(context) {
-  const { map, ruler } = state;
+function drawRuler(context, ruler) {
+  const { map } = state;
   const [[x0, y0], [x1, y1]] = ruler.map(([x, y]) => [map.toX(x), map.toY(y)]), length = Math.hypot(x1 - x0, y1 - y0) || 1;
   const [u, v] = [(-6 * (y1 - y0)) / length, (6 * (x1 - x0)) / length];
   const line = () => {
@@ -557,12 +587,13 @@ async function loadRules() {
   if (!about.rules.length) return;
   const arrays = Object.fromEntries(await Promise.all(VIOLATION_ARRAYS.map(async (name) => [name, await array(name)])));
   const elements = { select: $("rule"), note: $("rule-description"), list: $("violations"), more: $("more") };
-  state.rules = new RulesList(elements, (i) => {
-    const at = state.rules.frameOf(i, state.map);
+  const rules = new RulesList(elements, (i) => {
+    const at = rules.frameOf(i, state.map);
     if (at) fly(...at);
     else notice("The report has no position for this violation");
   });
-  state.rules.use(about.rules, arrays, state.sites);
+  rules.use(about.rules, arrays, state.sites);
+  state.rules = rules;
   $("rules").hidden = false;
   $("rule").addEventListener("change", () => ask("map"));
 }
@@ -593,6 +624,7 @@ function viewHash() {
 }
 
 // Restores the view of a link, as far as it is valid.
+/** @returns {{ key: string | null, range: Interval | null }} */
 function readHash() {
   const words = new URLSearchParams(location.hash.slice(1)), { map, sites } = state;
   const [x, y, width] = ["x", "y", "width"].map((name) => (words.has(name) ? Number(words.get(name)) : NaN));
@@ -600,9 +632,9 @@ function readHash() {
   const site = words.has("site") ? Number(words.get("site")) : -1;
   if (Number.isInteger(site) && site >= 0 && site < sites.n) state.pinned = site;
   const range = (words.get("range") || "").split(" ").map(Number), box = (words.get("select") || "").split(" ").map(Number);
-  state.wantedMap = COLOUR_MAPS.includes(words.get("map")) ? words.get("map") : null;
-  if (box.length === 4 && box.every(Number.isFinite)) select([box.slice(0, 2), box.slice(2)]);
-  return [words.get("by"), range.length === 2 && range.every(Number.isFinite) ? range : null];
+  state.wantedMap = COLOUR_MAPS.find((name) => name === words.get("map")) ?? null;
+  if (box.length === 4 && box.every(Number.isFinite)) select([[box[0], box[1]], [box[2], box[3]]]);
+  return { key: words.get("by"), range: range.length === 2 && range.every(Number.isFinite) ? [range[0], range[1]] : null };
 }
 
 async function copyLink() {
@@ -620,11 +652,11 @@ function viewAsPicture() {
   const { map, scale, second, scaleBar } = state, visible = (names) => names.map($).filter((layer) => !layer.hidden);
   map.draw(groundColour());
   if (state.overview.isNeeded(map)) state.overview.draw(map, scale, state.range);
-  if (second) drawSecond();
+  if (second) drawSecond(second);
   // The second map may be below the first, and of another height.
   const views = [visible(["cells", "overview", "lines", "marks"]),
     ...(second ? [visible(["second-cells", "second-overview", "second-marks"])] : [])];
-  const bar = { text: $("scale-bar").querySelector("span").textContent, width: scaleBar.width };
+  const bar = { text: formatLength(scaleBar.length), width: scaleBar.width };
   const hasOwnScale = second && second.column.key.replace(/^second-/, "") !== state.column.key;
   return pictureOf(views, { width: map.width + (second ? second.map.width : 0), height: map.height, bar,
     scales: [scale, ...(hasOwnScale ? [second.scale] : [])], items: [] });
@@ -643,7 +675,7 @@ function listenToTools() {
     else notice("Photosites are numbered from 0 to " + shown(state.sites.n - 1));
   });
   window.addEventListener("hashchange", async () => {
-    const [key, range] = readHash();
+    const { key, range } = readHash();
     await colourBy(key || state.column.key, range);
     tellSite();
     moved();
@@ -708,7 +740,7 @@ async function open() {
   state.lines = fitted($("lines"));
   state.marks = fitted($("marks"));
   state.map.set(state.map.middle[0], state.map.middle[1], state.map.fitScale());
-  const [key, range] = readHash();
+  const { key, range } = readHash();
   await loadRules();
   await colourBy(key || (about.kind === "layout" && !about.filter ? "size_um" : about.columns[0].key), range);
   listenToMap();
@@ -747,8 +779,8 @@ const connected = connect(
 
 const handle = {
   nSites: about.n_sites,
-  ready: null,
-  complete: null,
+  ready: Promise.resolve(),
+  complete: Promise.resolve(),
   readyMs: NaN,
   pick: (x, y) => { const all = state.sites.pickAll(x, y); return all.length ? all[all.length - 1] : -1; },
   pickAll: (x, y) => state.sites.pickAll(x, y),
@@ -774,21 +806,21 @@ const handle = {
   get table() { return tableOf(state.sites, about.columns, state.selected); },
   get colourMap() { return state.scale.map; },
   get second() { return state.second && state.second.column.key; },
-  get secondView() { const { x, y, scale, width, height } = state.second.map; return { x, y, scale, width, height }; },
-  secondColour: (site) => state.second.scale.colour(site),
+  get secondView() { const { x, y, scale, width, height } = state.second?.map || state.map; return { x, y, scale, width, height }; },
+  secondColour: (site) => state.second?.scale.colour(site),
   get hasOverview() { return !$("overview").hidden; },
   // Colours of the overview as drawn, (r, g, b, a) of all pixels, top row first.
   overview: () => {
     const canvas = $("overview");
     state.overview.draw(state.map, state.scale, state.range);
     return { width: canvas.width, height: canvas.height,
-      data: [...canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data] };
+      data: [...context2d(canvas).getImageData(0, 0, canvas.width, canvas.height).data] };
   },
   // Colours of the drawn pixels of the map, (r, g, b, a) at a position on the sensor.
   pixel: (x, y) => {
     const { map } = state, { gl } = map, ratio = map.canvas.width / map.width, bytes = new Uint8Array(4);
     map.draw(groundColour());
-    gl.readPixels(Math.floor(map.toX(x) * ratio), map.canvas.height - 1 - Math.floor(map.toY(y) * ratio), 1, 1, gl.RGBA,
+    gl?.readPixels(Math.floor(map.toX(x) * ratio), map.canvas.height - 1 - Math.floor(map.toY(y) * ratio), 1, 1, gl.RGBA,
       gl.UNSIGNED_BYTE, bytes);
     return [...bytes];
   },

@@ -2,8 +2,21 @@
 
 /** @typedef {HTMLInputElement & HTMLSelectElement & HTMLDialogElement & HTMLCanvasElement} PageElement */
 
+// The element with an id.
 /** @type {(id: string) => PageElement} */
-export const $ = (id) => /** @type {any} */ (document.getElementById(id));
+export function $(id) {
+  const found = document.getElementById(id);
+  if (!found) throw new Error("the page has no element " + id);
+  return /** @type {PageElement} */ (found);
+}
+
+// The first element of a selector in another one.
+/** @type {(root: ParentNode, selector: string) => HTMLElement} */
+export function find(root, selector) {
+  const found = root.querySelector(selector);
+  if (!(found instanceof HTMLElement)) throw new Error("the page has no element " + selector);
+  return found;
+}
 
 /**
  * @template {keyof HTMLElementTagNameMap} Tag
@@ -20,6 +33,7 @@ export function make(tag, text, className) {
 }
 
 // Sets properties of an element that differ: the page is laid out again after each change.
+/** @param {any} element @param {{ [name: string]: unknown }} properties */
 export function change(element, properties) {
   for (const [name, value] of Object.entries(properties)) if (element[name] !== value) element[name] = value;
 }
@@ -27,6 +41,7 @@ export function change(element, properties) {
 const inks = new Map();
 
 // Colour of the theme by the name of its variable.
+/** @type {(name: string) => string} */
 export function inkOf(name) {
   if (!inks.has(name)) inks.set(name, getComputedStyle(document.documentElement).getPropertyValue(name).trim());
   return inks.get(name);
@@ -34,9 +49,12 @@ export function inkOf(name) {
 
 // -- themes ---------------------------------------------------------------------------------------------------------------
 
-let chosenTheme = null, themeChanged = () => {};
+/** @type {string | null} */
+let chosenTheme = null;
+let themeChanged = () => {};
 
 // Shows a theme, "dark" or "light", unless the user has chosen one.
+/** @param {string} theme */
 export function useTheme(theme) {
   if (chosenTheme || document.documentElement.dataset.theme === theme) return;
   document.documentElement.dataset.theme = theme;
@@ -45,6 +63,7 @@ export function useTheme(theme) {
 }
 
 // Uses the theme chosen on an earlier page, else that of the system; onChange is called when the theme changes.
+/** @param {() => void} onChange */
 export function startTheme(onChange) {
   const root = document.documentElement, system = matchMedia("(prefers-color-scheme: dark)");
   themeChanged = onChange;
@@ -65,6 +84,7 @@ export function startTheme(onChange) {
 
 let noticing = 0, speaking = 0;
 
+/** @param {string} text */
 export function notice(text) {
   $("notice").textContent = text;
   $("notice").hidden = false;
@@ -73,6 +93,7 @@ export function notice(text) {
 }
 
 // Shows a notice until it is null.
+/** @param {string | null} text */
 export function stayingNotice(text) {
   clearTimeout(noticing);
   $("notice").hidden = text === null;
@@ -80,6 +101,7 @@ export function stayingNotice(text) {
 }
 
 // Announces a text to screen readers after a short delay; null for none.
+/** @param {(() => string) | null} textOrNull */
 export function speak(textOrNull) {
   clearTimeout(speaking);
   if (textOrNull) speaking = setTimeout(() => { $("live").textContent = textOrNull(); }, 300);
@@ -87,6 +109,7 @@ export function speak(textOrNull) {
 
 // -- files ------------------------------------------------------------------------------------------------------------------
 
+/** @param {Blob} blob @param {string} name @param {string} extension */
 export function download(blob, name, extension) {
   const link = document.createElement("a");
   link.href = URL.createObjectURL(blob);
@@ -95,8 +118,10 @@ export function download(blob, name, extension) {
   setTimeout(() => URL.revokeObjectURL(link.href), 5000);
 }
 
-export function downloadPicture(canvas, name) { canvas.toBlob((blob) => download(blob, name, "png")); }
+/** @param {HTMLCanvasElement} canvas @param {string} name */
+export function downloadPicture(canvas, name) { canvas.toBlob((blob) => { if (blob) download(blob, name, "png"); }); }
 
+/** @param {string} text @param {string} name @param {string} extension @param {string} type */
 export function downloadText(text, name, extension, type) {
   download(new Blob([text], { type: type + ";charset=utf-8" }), name, extension);
 }
@@ -104,9 +129,10 @@ export function downloadText(text, name, extension, type) {
 // -- keys -------------------------------------------------------------------------------------------------------------------
 
 // Whether a key event is for the page: no text input, no selection, no open dialog, no modifier key.
+/** @param {KeyboardEvent} event */
 export function isForPage(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || $("keys").open) return false;
-  return !event.target.closest("input[type='text'], select");
+  return !(event.target instanceof Element && event.target.closest("input[type='text'], select"));
 }
 
 // The list of keys opens by its button and by "?", and closes by "?", Escape and a click outside.

@@ -10,13 +10,13 @@ export const VIOLATION_ARRAYS = [
 ];
 
 export class RulesList {
-  select; note; list; more; fly;
+  select; note; list; more; fly; listed = 0;
+  /** @type {Violations | null} */ violations = null;
+  /** @type {number | null} */ chosen = null;
 
   // Elements: a choice of rules, a note, the list, a button for more of it. fly(i) is called when a violation is chosen.
   constructor({ select, note, list, more }, fly) {
     Object.assign(this, { select, note, list, more, fly });
-    this.violations = null;
-    this.chosen = null;
     this.rules = [];
     this.select.addEventListener("change", () => { this.choose(null); this._list(true); });
     this.more.addEventListener("click", () => this._list(false));
@@ -49,7 +49,7 @@ export class RulesList {
     if (isNew) { this.listed = 0; this.list.replaceChildren(); }
     if (violations) for (let i = 0; i < violations.n; i++) if (rule < 0 || violations.rule[i] === rule) of.push(i);
     const next = of.slice(this.listed, this.listed + AT_A_TIME);
-    this.list.append(...next.map((i) => this._item(i)));
+    if (violations) this.list.append(...next.map((i) => this._item(violations, i)));
     this.listed += next.length;
     this.more.hidden = this.listed >= of.length;
     this.note.textContent = rules.length ? this._describe() : "The settings have no design rules.";
@@ -68,8 +68,8 @@ export class RulesList {
     return description + bound + "." + (waiver ? " Waived: " + waiver + "." : "") + rest;
   }
 
-  _item(i) {
-    const { rule, sites, value } = this.violations.describe(i);
+  _item(violations, i) {
+    const { rule, sites, value } = violations.describe(i);
     const item = make("li"), button = make("button");
     button.type = "button";
     button.dataset.violation = i;
@@ -90,6 +90,7 @@ export class RulesList {
 
   // Position and scale at which a map shows a violation, or null.
   frameOf(i, map) {
+    if (!this.violations) return null;
     const [a, b, c, d] = this.violations.boxes.subarray(4 * i, 4 * i + 4), wide = this.violations.widthOf(i, this.sites) || 1;
     return Number.isFinite(a) ? [0.5 * (a + c), 0.5 * (b + d), (0.3 * Math.min(map.width, map.height)) / wide] : null;
   }

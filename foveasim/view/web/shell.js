@@ -2,12 +2,14 @@
 
 import { clamp, formatLength, roundStep, shown, textOf } from "./colours.js";
 import { pathBetween } from "./marks.js";
+import { find } from "./page_parts.js";
 
 const FLIGHT_MS = 400;
 // Steps of the arrow keys in CSS pixels, and factor of the zoom by keys.
 const KEY_PIXELS = 60, KEY_ZOOM = 1.4;
 // Length of the scale bar in CSS pixels, before it is rounded.
 const BAR_PIXELS = 45;
+/** @type {{ [key: string]: [number, number] }} */
 export const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 const reducesMotion = matchMedia("(prefers-reduced-motion: reduce)");
 
@@ -18,6 +20,7 @@ let flight = 0;
 export function stopFlight() { cancelAnimationFrame(flight); }
 
 // Moves a map to a position and scale, within its limits; moved() is called after each step.
+/** @param {MapView} map @param {[number, number, number]} view @param {() => void} moved */
 export function flyTo(map, [x, y, scale], moved) {
   const from = { x: map.x, y: map.y, scale: map.scale };
   map.set(x, y, scale);
@@ -35,6 +38,7 @@ export function flyTo(map, [x, y, scale], moved) {
 }
 
 // Zooms a map by a key; returns whether it did.
+/** @param {MapView} map @param {string} key */
 export function zoomByKey(map, key) {
   const power = { "+": 1, "=": 1, "-": -1, _: -1 }[key];
   if (power) map.zoom(KEY_ZOOM ** power, 0.5 * map.width, 0.5 * map.height);
@@ -42,6 +46,7 @@ export function zoomByKey(map, key) {
 }
 
 // Pans a map by an arrow key; returns whether it did.
+/** @param {MapView} map @param {string} key */
 export function panByKey(map, key) {
   const step = ARROWS[key];
   if (step) map.set(map.x + (KEY_PIXELS / map.scale) * step[0], map.y + (KEY_PIXELS / map.scale) * step[1], map.scale);
@@ -49,10 +54,11 @@ export function panByKey(map, key) {
 }
 
 // Draws the scale bar of a map; returns its length in µm and its width in CSS pixels.
+/** @param {HTMLElement} bar @param {{ scale: number }} map */
 export function drawScaleBar(bar, map) {
   const length = roundStep(BAR_PIXELS / map.scale), width = length * map.scale;
-  bar.querySelector("span").textContent = formatLength(length);
-  bar.querySelector("i").style.width = width + "px";
+  find(bar, "span").textContent = formatLength(length);
+  find(bar, "i").style.width = width + "px";
   return { length, width };
 }
 
@@ -61,21 +67,26 @@ export function drawScaleBar(bar, map) {
 const PINNED = "pinned";
 
 // Heading of the values of a photosite, -1 for none.
+/** @param {number} site @param {number} pinned @param {string[]} notes */
 export function siteHeading(site, pinned, notes = []) {
   const all = [...notes, ...(site === pinned ? [PINNED] : [])];
   return site < 0 ? "Photosite" : "Photosite " + site.toLocaleString("en-US") + (all.length ? " (" + all.join(", ") + ")" : "");
 }
 
+/** @param {Column[]} columns */
 const listed = (columns) => columns.filter((column) => !column.is_repeat);
 
 // Rows [label, text, column] of the values of a photosite, and its centre with some decimals.
+/** @type {(sites: Sites, columns: Column[], site: number, digits: number) => [string, string, Column?][]} */
 export function siteRows(sites, columns, site, digits) {
+  /** @type {[string, string, Column?][]} */
   const rows = listed(columns).map((column) => [column.label, site < 0 ? "–" : textOf(column, site, sites.area), column]);
   const centre = site < 0 ? "–" : sites.centre(site).map((v) => shown(Math.round(10 ** digits * v) / 10 ** digits + 0)).join(", ");
   return [...rows, ["centre / µm", centre]];
 }
 
 // Sentence on a photosite for screen readers.
+/** @param {Column[]} columns @param {number} site @param {Numbers} area */
 export function spokenSite(columns, site, area) {
   return "Photosite " + site + ": " + listed(columns).map((column) => column.label + " " + textOf(column, site, area)).join(", ");
 }

@@ -3,8 +3,16 @@
 import { offsetsOf, positionsOf } from "./unpack.js";
 
 export class Sites {
-  _sizes;
+  /** @type {Float64Array | undefined} */ _sizes;
+  // Boxes in µm, and areas in µm².
+  /** @type {Float64Array} */ box;
+  /** @type {Float64Array} */ area;
+  // Bins: columns, rows, both per µm, and the sites of all bins.
+  nx = 1; ny = 1; perX = 1; perY = 1;
+  /** @type {Uint32Array} */ binOffsets;
+  /** @type {Uint32Array} */ inBin;
 
+  /** @param {Arrays} arrays @param {SitesAbout} about */
   constructor(arrays, about) {
     this.n = about.n_sites;
     this.bounds = about.bounds_um;
@@ -23,7 +31,9 @@ export class Sites {
     return this._sizes;
   }
 
+  /** @param {number} site */
   firstRing(site) { return this.siteOffsets ? this.siteOffsets[site] : site; }
+  /** @param {number} site */
   firstVertex(site) { return this.ringOffsets[this.firstRing(site)]; }
 
   // Boxes and areas of all sites; holes have the opposite winding, so that their areas subtract.
@@ -78,6 +88,7 @@ export class Sites {
       }
       if (total <= 16 * n + 4096 || wanted < 1) break;
     }
+    /** @param {(bin: number, site: number) => void} visit */
     const eachBin = (visit) => {
       for (let site = 0; site < n; site++) {
         const last = spans[4 * site + 2], top = spans[4 * site + 3];
@@ -94,13 +105,18 @@ export class Sites {
     eachBin((bin, site) => { this.inBin[next[bin]++] = site; });
   }
 
+  /** @param {number} x */
   _column(x) { return Math.min(this.nx - 1, Math.max(0, Math.floor((x - this.bounds[0]) * this.perX))); }
+  /** @param {number} y */
   _row(y) { return Math.min(this.ny - 1, Math.max(0, Math.floor((y - this.bounds[1]) * this.perY))); }
 
   // All sites that contain a point, in ascending order. A point on a boundary belongs to the site on its +x side,
   // on a horizontal boundary to the site on its +y side.
+  /** @type {(x: number, y: number) => number[]} */
   pickAll(x, y) {
-    const found = [], [x0, y0, x1, y1] = this.bounds;
+    /** @type {number[]} */
+    const found = [];
+    const [x0, y0, x1, y1] = this.bounds;
     if (!(x >= x0 && x <= x1 && y >= y0 && y <= y1)) return found;
     const bin = this._row(y) * this.nx + this._column(x);
     for (let i = this.binOffsets[bin]; i < this.binOffsets[bin + 1]; i++) {
@@ -109,6 +125,7 @@ export class Sites {
     return found;
   }
 
+  /** @param {number} site @param {number} x @param {number} y */
   holds(site, x, y) {
     const { box, xy, position, ringOffsets } = this, at = 4 * site;
     if (x < box[at] || y < box[at + 1] || x > box[at + 2] || y > box[at + 3]) return false;
@@ -131,6 +148,7 @@ export class Sites {
   }
 
   // Sites whose boxes intersect a rectangle, or null when there are more than a limit.
+  /** @type {(x0: number, y0: number, x1: number, y1: number, limit: number) => Set<number> | null} */
   within(x0, y0, x1, y1, limit) {
     const a = this._column(x0), b = this._row(y0), c = this._column(x1), d = this._row(y1), { box } = this;
     const found = new Set();
@@ -147,6 +165,7 @@ export class Sites {
     return found;
   }
 
+  /** @type {(site: number) => Point} */
   centre(site) {
     const { xy, position, ringOffsets } = this;
     const a = 2 * position[this.firstVertex(site)], ax = xy[a], ay = xy[a + 1];
@@ -213,6 +232,7 @@ export class Sites {
   }
 
   // Traces the rings of a site on a canvas, through a function from µm to pixels.
+  /** @param {CanvasRenderingContext2D} context @param {number} site @param {View} view */
   trace(context, site, view) {
     const { xy, position, ringOffsets } = this;
     for (let ring = this.firstRing(site); ring < this.firstRing(site + 1); ring++) {

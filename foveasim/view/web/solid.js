@@ -2,46 +2,57 @@
 
 import { Bodies } from "./bodies.js";
 import { COLOUR_MAPS } from "./colour_maps.js";
-import { Scale, bytesOfHex, clamp, formatLength, roundStep, shown, textOf } from "./colours.js";
-import { listenToPointers } from "./gestures.js";
-import { findRenderer, fitCanvas, pixelRatio, textureSize, watchSize } from "./gl.js";
+import { Scale, bytesOfHex, clamp, formatLength, shown, textOf } from "./colours.js";
+import { context2d, findRenderer, fitCanvas, pixelRatio, textureSize, watchSize } from "./gl.js";
 import { drawRamp, kindsOf, pictureOf, summaryOf, swatchItem, swatchesOf, tickLabels, titleOf } from "./legend.js";
 import { Orbit } from "./orbit.js";
-import { $, downloadPicture, inkOf, isForPage, listenToHelp, make, notice, speak, startTheme, stayingNotice } from "./page_parts.js";
+import { ABOVE, ASIDE, OrbitGestures } from "./orbit_gestures.js";
+import { $, downloadPicture, find, inkOf, isForPage, listenToHelp, make, notice, speak, startTheme, stayingNotice } from "./page_parts.js";
+import { drawScaleBar, siteHeading, spokenSite } from "./shell.js";
 import { SolidView } from "./solid_view.js";
 import { unpack } from "./unpack.js";
 
 const about = JSON.parse($("about").textContent);
 const ARRAYS = ["position_x", "position_y", "positions", "z", "corners", "run_sites", "run_points", "run_triangles", "run_colours",
   "tile_runs"];
-const state = { view: null, area: null, pinned: -1, part: -1, pinnedPart: -1, pointer: null, anchor: null, isAsked: false, scale: null };
+class SolidState {
+  // Given by open().
+  /** @type {SolidView} */ view;
+  /** @type {Float64Array} */ area;
+  /** @type {Scale | null} */ scale = null;
+  scaleBar = { length: 1, width: 0 };
+  pinned = -1; part = -1; pinnedPart = -1; isAsked = false;
+}
+
+const state = new SolidState();
+const gestures = new OrbitGestures($("solid"), () => state.view, {
+  ask,
+  pin: ({ site, part }, isByKey) => {
+    if (site < 0 && isByKey) notice("No photosite in the centre of the view");
+    pin(site, part);
+  },
+});
 // Steps of the position of the cut.
 const CUT_STEPS = 200;
 // Parts of more colours have no swatches.
 const MOST_SWATCHES = 4;
-const ASIDE = [Math.atan2(-0.9, 0.35), Math.atan2(0.75, Math.hypot(0.35, 0.9))], ABOVE = [-0.5 * Math.PI, 0.5 * Math.PI];
 
 // -- the photosite --------------------------------------------------------------------------------------------------------
 
 function showSite() {
   const { view, pinned } = state, hovered = view.hovered, site = hovered >= 0 ? hovered : pinned;
-  const part = hovered >= 0 ? state.part : pinned >= 0 ? state.pinnedPart : -1, isPinned = site >= 0 && site === pinned;
+  const part = hovered >= 0 ? state.part : pinned >= 0 ? state.pinnedPart : -1;
   const columns = about.columns.filter((column) => !column.is_repeat);
-  const notes = [part >= 0 ? view.parts[part].name : "", isPinned ? "pinned" : ""].filter(Boolean).join(", ");
   $("site").classList.toggle("empty", site < 0);
   $("unpin").hidden = pinned < 0;
-  $("site-heading").textContent = site < 0 ? "Photosite" : "Photosite " + site.toLocaleString("en-US") + (notes ? " (" + notes + ")" : "");
+  $("site-heading").textContent = siteHeading(site, pinned, part >= 0 ? [view.parts[part].name] : []);
   $("values").replaceChildren(...columns.flatMap((column) =>
     [make("dt", column.label), make("dd", site < 0 ? "–" : textOf(column, site, state.area))]));
-  speak(site < 0 ? null
-    : () => "Photosite " + site + ": " + columns.map((column) => column.label + " " + textOf(column, site, state.area)).join(", "));
+  speak(site < 0 ? null : () => spokenSite(columns, site, state.area));
 }
 
-// The site and part of the nearest surface under the pointer; the surface stays under it during zoom.
 function hover() {
-  const { view, pointer } = state, found = pointer ? view.pick(pointer[0], pointer[1]) : null;
-  const site = found ? found.site : -1, part = found ? found.part : -1;
-  if (pointer && !state.anchor) state.anchor = view.orbit.pointAt(pointer[0], pointer[1], found.depth, new Float64Array(3));
+  const { view } = state, { site, part } = gestures.under() || { site: -1, part: -1 };
   if (site === view.hovered && part === state.part) return;
   view.hovered = site;
   state.part = part;
@@ -72,16 +83,12 @@ function drawFrame() {
   if (view.gl.isContextLost()) return;
   if (!wasMoving) hover();
   view.draw();
-  drawScaleBar();
+  showScale();
   if (wasMoving) ask();
 }
 
 // Lengths at the centre of the view; nearer parts appear larger.
-function drawScaleBar() {
-  const perUm = state.view.orbit.pixelsPerUm(), length = roundStep(45 / perUm), bar = $("scale-bar");
-  bar.querySelector("span").textContent = formatLength(length);
-  bar.querySelector("i").style.width = length * perUm + "px";
-}
+function showScale() { state.scaleBar = drawScaleBar($("scale-bar"), { scale: state.view.orbit.pixelsPerUm() }); }
 
 // -- colours and cut ------------------------------------------------------------------------------------------------------
 
@@ -94,7 +101,7 @@ async function colourBy(key) {
   if (column) {
     const filterOf = about.filter && column.kind === "lit" ? await unpack(about.filter, about.arrays[about.filter]) : null;
     state.scale = new Scale(column, await valuesOf(column), filterOf, about.palette, { wantedMap: $("colour-map").value });
-    drawLegend();
+    drawLegend(state.scale);
   }
   for (const part of view.parts) view.setColours(part, state.scale && siteBytes(state.scale));
   ask();
@@ -112,8 +119,9 @@ function siteBytes(scale) {
   return new Uint8Array(words.buffer);
 }
 
-function drawLegend() {
-  const { scale } = state, isKinds = scale.column.kind === "kinds";
+/** @param {Scale} scale */
+function drawLegend(scale) {
+  const isKinds = scale.column.kind === "kinds";
   $("bar").hidden = isKinds;
   $("kinds").hidden = !isKinds;
   $("map-label").hidden = !scale.canMap;
@@ -126,7 +134,7 @@ function drawLegend() {
   }
   const ramp = $("ramp"), ratio = pixelRatio();
   fitCanvas(ramp, ramp.clientWidth, ramp.clientHeight);
-  const context = ramp.getContext("2d");
+  const context = context2d(ramp);
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   drawRamp(context, scale, ramp.clientWidth, ramp.clientHeight);
   $("ticks").replaceChildren(...tickLabels(scale));
@@ -137,37 +145,11 @@ function drawLegend() {
 function cutAt() {
   const words = { x: [0, 1], "-x": [0, -1], y: [1, 1], "-y": [1, -1], z: [2, 1] }[$("cut").value], { low, high } = state.view.bodies;
   $("cut-position").hidden = $("cut-text").hidden = !words;
-  if (!words) { state.view.setCut(null); moved(); return; }
+  if (!words) { state.view.setCut(null); gestures.moved(); return; }
   const [axis, sign] = words, position = low[axis] + ((high[axis] - low[axis]) * Number($("cut-position").value)) / CUT_STEPS;
   $("cut-text").textContent = "xyz"[axis] + (sign > 0 ? " above " : " below ") + Number(position.toPrecision(4)) + " µm is removed";
   state.view.setCut({ axis, sign, position });
-  moved();
-}
-
-// The view has changed, by more than a zoom about the pointer.
-function moved() {
-  state.anchor = null;
-  changed();
-}
-
-function changed() {
-  state.view.change();
-  ask();
-}
-
-function look(direction) {
-  state.view.orbit.look(...direction);
-  moved();
-}
-
-function turn(aside, up) {
-  state.view.orbit.turn(aside, up);
-  moved();
-}
-
-function approach(factor) {
-  state.view.orbit.zoom(1 / factor);
-  moved();
+  gestures.moved();
 }
 
 function showTheme() {
@@ -178,55 +160,15 @@ function showTheme() {
 function resize() {
   const { width, height } = $("map").getBoundingClientRect();
   state.view.resize(width, height);
-  moved();
+  gestures.moved();
 }
 
 // -- mouse, touch and keys ------------------------------------------------------------------------------------------------
 
-function listenToCanvas() {
-  const canvas = $("solid"), { orbit } = state.view, point = new Float64Array(3);
-  // Point of the pointer on a surface, cached since it arrived there; else in front of the target.
-  const under = (px, py) => state.anchor || orbit.pointAt(px, py, 1, point);
-  const depthOf = (position) => {
-    let depth = 1;
-    for (let i = 0; i < 3; i++) depth -= (orbit.toEye[i] * (position[i] - orbit.target[i])) / orbit.distance;
-    return Math.max(depth, 0.05);
-  };
-  let held = 1;
-  listenToPointers(canvas, {
-    takesRightButton: true,
-    press: () => { held = state.anchor ? depthOf(state.anchor) : 1; },
-    drag: (dx, dy, { isSecond, isMiddle }) => {
-      if (isMiddle) orbit.zoom(Math.exp(0.005 * dy));
-      else if (isSecond) orbit.pan(dx, dy, held);
-      else orbit.turn((-2 * Math.PI * dx) / orbit.tall, (2 * Math.PI * dy) / orbit.tall);
-      moved();
-    },
-    pinch: (factor, px, py) => { orbit.zoom(1 / factor, orbit.pointAt(px, py, 1, point)); moved(); },
-    wheel: (factor, px, py) => { orbit.zoom(1 / factor, under(px, py)); changed(); },
-    click: (px, py) => { const found = state.view.pick(px, py); pin(found.site, found.part); },
-    move: (px, py, isHeld) => { state.pointer = isHeld ? null : [px, py]; state.anchor = null; ask(); },
-    leave: () => { state.pointer = null; state.anchor = null; ask(); },
-  });
-  canvas.addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
-    const way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
-    if (way && event.shiftKey) { orbit.pan(-60 * way[0], 60 * way[1]); moved(); }
-    else if (way) turn(0.12 * way[0], 0.1 * way[1]);
-    else if (event.key === "Enter" || event.key === " ") {
-      const found = state.view.pick(0.5 * orbit.width, 0.5 * orbit.tall);
-      if (found.site < 0) notice("No photosite in the centre of the view");
-      pin(found.site, found.part);
-    } else return;
-    event.preventDefault();
-  });
+function listenToKeys() {
   document.addEventListener("keydown", (event) => {
-    if (!isForPage(event)) return;
-    if (event.key === "+" || event.key === "=") approach(1.3);
-    else if (event.key === "-" || event.key === "_") approach(1 / 1.3);
-    else if (event.key === "0") look(ASIDE);
-    else if (event.key === "t" || event.key === "T") look(ABOVE);
-    else if (event.key === "c" || event.key === "C") nextCut();
+    if (!isForPage(event) || gestures.key(event)) return;
+    if (event.key === "c" || event.key === "C") nextCut();
     else if (event.key === "[" || event.key === "]") moveCut(event.key === "]" ? 5 : -5);
     else if (event.key === "Escape") pin(-1, -1);
   });
@@ -256,28 +198,28 @@ function listenToTools() {
   $("colour-map").addEventListener("change", () => colourBy($("colouring").value));
   $("cut").addEventListener("change", cutAt);
   $("cut-position").addEventListener("input", cutAt);
-  $("nearer").addEventListener("click", () => approach(1.5));
-  $("farther").addEventListener("click", () => approach(1 / 1.5));
-  $("fit").addEventListener("click", () => look(ASIDE));
-  $("above").addEventListener("click", () => look(ABOVE));
+  $("nearer").addEventListener("click", () => gestures.approach(1.5));
+  $("farther").addEventListener("click", () => gestures.approach(1 / 1.5));
+  $("fit").addEventListener("click", () => gestures.look(ASIDE));
+  $("above").addEventListener("click", () => gestures.look(ABOVE));
   $("unpin").addEventListener("click", () => pin(-1, -1));
   $("height").addEventListener("input", () => {
     const factor = 2 ** Number($("height").value);
     $("height-scale").textContent = "× " + Number(factor.toPrecision(2));
     state.view.setHeight(factor);
-    moved();
+    gestures.moved();
   });
   $("save").addEventListener("click", () => downloadPicture(viewAsPicture(), about.name));
 }
 
 // Returns the displayed view with its scale bar, and the legend of its colours or of the visible parts.
 function viewAsPicture() {
-  const { view, scale } = state, { width, tall } = view.orbit, bar = $("scale-bar");
+  const { view, scale, scaleBar } = state, { width, tall } = view.orbit;
   const items = view.parts.filter((part) => part.isVisible).map((part) => ({ colours: coloursOf(part), text: part.name }));
   view.draw();
   return pictureOf([[$("solid")]], {
     width, height: tall, scales: scale ? [scale] : [], items: scale ? [] : items,
-    bar: { text: bar.querySelector("span").textContent, width: bar.querySelector("i").getBoundingClientRect().width },
+    bar: { text: formatLength(scaleBar.length), width: scaleBar.width },
   });
 }
 
@@ -291,7 +233,7 @@ function partItem(part) {
   const item = make("li"), label = make("label"), box = make("input");
   box.type = "checkbox";
   box.checked = true;
-  box.addEventListener("change", () => { state.view.setVisible(part, box.checked); moved(); });
+  box.addEventListener("change", () => { state.view.setVisible(part, box.checked); gestures.moved(); });
   label.append(box, ...swatchesOf(coloursOf(part)), make("span", part.name + " · " + shown(part.nTriangles) + " triangles"));
   item.append(label);
   return item;
@@ -309,7 +251,7 @@ function listenToLosses() {
   canvas.addEventListener("webglcontextrestored", () => {
     state.view.load();
     stayingNotice(null);
-    moved();
+    gestures.moved();
   });
 }
 
@@ -331,16 +273,16 @@ async function open() {
   state.view = new SolidView($("solid"), bodies, orbit, about.n_sites, renderer);
   $("parts").append(...state.view.parts.map(partItem));
   resize();
-  orbit.look(...ASIDE);
+  orbit.look(ASIDE[0], ASIDE[1]);
   showTheme();
-  listenToCanvas();
+  listenToKeys();
   listenToTools();
   listenToLosses();
   watchSize($("map"), resize);
   showSite();
   if (about.colouring) await colourBy(about.colouring);
   state.view.draw();
-  drawScaleBar();
+  showScale();
   $("opening").hidden = true;
 }
 
@@ -353,22 +295,22 @@ async function openRest() {
 
 const handle = {
   nSites: about.n_sites,
-  ready: null,
-  complete: null,
+  ready: Promise.resolve(),
+  complete: Promise.resolve(),
   readyMs: NaN,
   // Site and part at a position in the window, in CSS pixels.
   pick: (px, py) => {
     const box = $("solid").getBoundingClientRect(), { site, part } = state.view.pick(px - box.left, py - box.top);
     return { site, part: part < 0 ? null : state.view.parts[part].name };
   },
-  lookDown: () => look(ABOVE),
+  lookDown: () => gestures.look(ABOVE),
   draw: () => state.view.draw(),
   picture: () => viewAsPicture().toDataURL("image/png"),
   get hovered() { return state.view.hovered; },
   get pinned() { return state.pinned; },
   get parts() { return state.view.parts.map((part) => part.name); },
   get cut() { return state.view.cut; },
-  get scaleBarUm() { return $("scale-bar").querySelector("i").getBoundingClientRect().width / state.view.orbit.pixelsPerUm(); },
+  get scaleBarUm() { return find($("scale-bar"), "i").getBoundingClientRect().width / state.view.orbit.pixelsPerUm(); },
   // Colours of a site on the scale in use, (r, g, b).
   colour: (site) => state.scale && state.scale.colour(site),
   get counts() { return { ...state.view.counts }; },

@@ -91,8 +91,16 @@ const SAMPLES = 4;
 const MAX_PARTS = 254;
 // Distance of the plane of a cut from its position, as a fraction of the extent along its axis.
 const CUT_INSET = 1e-4;
+/** @type {{ width: number, height: number, buffers: WebGLRenderbuffer[], textures: WebGLTexture[], frames: WebGLFramebuffer[] }} */
+const NO_TARGETS = { width: 0, height: 0, buffers: [], textures: [], frames: [] };
 
 export class SolidView {
+  // Given by load().
+  /** @type {ReturnType<typeof buildProgram>} */ image;
+  /** @type {ReturnType<typeof buildProgram>} */ id;
+  /** @type {ReturnType<typeof buildProgram>} */ screen;
+  targets = NO_TARGETS;
+
   // Takes the canvas, Bodies, an Orbit around them, the number of sites, and findRenderer().
   constructor(canvas, bodies, orbit, nSites, renderer) {
     this.canvas = canvas;
@@ -145,7 +153,7 @@ export class SolidView {
     this.id = buildProgram(gl, VERTEX_SHADER, ID_SHADER, ATTRIBUTES);
     this.screen = buildProgram(gl, SCREEN_SHADER, COMPOSE_SHADER);
     this.nothing = gl.createVertexArray();
-    this.targets = null;
+    this.targets = NO_TARGETS;
     this._loadParts();
   }
 
@@ -172,11 +180,9 @@ export class SolidView {
   // Buffers of the canvas's size: samples and depths, the image, ids and their depths.
   _resizeTargets() {
     const { gl, canvas: { width, height } } = this;
-    if (this.targets) {
-      for (const one of this.targets.buffers) gl.deleteRenderbuffer(one);
-      for (const one of this.targets.textures) gl.deleteTexture(one);
-      for (const one of this.targets.frames) gl.deleteFramebuffer(one);
-    }
+    for (const one of this.targets.buffers) gl.deleteRenderbuffer(one);
+    for (const one of this.targets.textures) gl.deleteTexture(one);
+    for (const one of this.targets.frames) gl.deleteFramebuffer(one);
     const kinds = gl.getInternalformatParameter(gl.RENDERBUFFER, gl.RGBA8, gl.SAMPLES) || [];
     const samples = Math.min(this.wantedSamples, kinds.length ? kinds[0] : 0);
     const buffer = (format, n) => {
@@ -269,7 +275,7 @@ export class SolidView {
   draw() {
     const { gl } = this;
     if (gl.isContextLost()) return;
-    if (!this.targets || this.targets.width !== this.canvas.width || this.targets.height !== this.canvas.height) this._resizeTargets();
+    if (this.targets.width !== this.canvas.width || this.targets.height !== this.canvas.height) this._resizeTargets();
     if (this.isImageStale) this._drawImage();
     this.counts.screen++;
     const { program, at } = this.screen;
@@ -399,7 +405,7 @@ export class SolidView {
   updateIds() {
     const { gl, canvas } = this;
     if (gl.isContextLost() || !this.areIdsStale) return;
-    if (!this.targets || this.targets.width !== canvas.width || this.targets.height !== canvas.height) this._resizeTargets();
+    if (this.targets.width !== canvas.width || this.targets.height !== canvas.height) this._resizeTargets();
     this._drawIds();
   }
 

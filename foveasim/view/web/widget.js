@@ -5,7 +5,7 @@ const SHARED = ["by", "pinned", "selected"];
 
 // Whether the notebook is dark, by the colour of its text.
 function isDark(element) {
-  const [r, g, b] = getComputedStyle(element).color.match(/[\d.]+/g).map(Number);
+  const [r, g, b] = (getComputedStyle(element).color.match(/[\d.]+/g) || []).map(Number);
   return 0.2126 * r + 0.7152 * g + 0.0722 * b > 127;
 }
 

@@ -1,5 +1,6 @@
 // Outlines of the photosites on their map.
 
+import { $ } from "/web/page_parts.js";
 import { Sites } from "/web/sites.js";
 import { boundaryOf } from "../boundary.js";
 
@@ -14,7 +15,7 @@ export function create(root, { page, panes, editor, ask }) {
     use(part) {
       if (!part.sites) prepare(part);
       const { sites } = part;
-      if (!b.map) document.getElementById("views").classList.add("loaded");
+      if (!b.map) $("views").classList.add("loaded");
       b.useSites(sites, part.about.palette);
       page.boundary = part.boundary;
       page.hovered = -1;

@@ -1,0 +1,132 @@
+// Data of the pages for the checker of JavaScript: messages of the studio's server (foveasim/studio) and contents of pages
+// (foveasim/view/web/_content.py, _bodies.py). Names without imports, for @type comments; browsers never load this file.
+
+type Sites = import("./foveasim/view/web/sites.js").Sites;
+type Scale = import("./foveasim/view/web/colours.js").Scale;
+type MapView = import("./foveasim/view/web/map.js").MapView;
+type RulesList = import("./foveasim/view/web/rules_list.js").RulesList;
+type SensorMap = import("./foveasim/view/web/map.js").SensorMap;
+type SolidView = import("./foveasim/view/web/solid_view.js").SolidView;
+type Overview = import("./foveasim/view/web/overview.js").Overview;
+type RasterMap = import("./foveasim/studio/static/raster_map.js").RasterMap;
+type SitePane = import("./foveasim/studio/static/site_pane.js").SitePane;
+type ImagePane = import("./foveasim/studio/static/image_pane.js").ImagePane;
+type Film = import("./foveasim/studio/static/film.js").Film;
+type Rate = import("./foveasim/studio/static/film.js").Rate;
+
+// -- geometry and values ------------------------------------------------------------------------------------------------
+
+type Numbers = Uint8Array | Int8Array | Uint16Array | Int16Array | Uint32Array | Int32Array | Float32Array | Float64Array;
+type Point = [number, number];
+type Interval = [number, number];
+type Rectangle = [Point, Point];
+// Plain data of settings, whose schema is that of foveasim.schema().
+type Settings = { [name: string]: any };
+interface Placed { x: number; y: number }
+interface Snapped extends Placed { kind?: string; isExact?: boolean; distance?: number; segment?: number[] }
+interface Outline { points: number[][]; isClosed?: boolean; isBox?: boolean; isFaint?: boolean; marks?: number[][]; site?: number }
+// Conversions between µm and CSS pixels.
+interface View { toX(x: number): number; toY(y: number): number; fromX(px: number): number; fromY(py: number): number }
+interface Cursor extends Placed { from: unknown }
+interface Renderer { isSlow: boolean }
+interface Fitted { context: CanvasRenderingContext2D; width: number; height: number }
+
+// -- contents of pages ----------------------------------------------------------------------------------------------------
+
+interface Column {
+  key: string; label: string; unit: string; kind: "linear" | "grey" | "lit" | "kinds";
+  array?: string; of?: "area" | "size"; names?: string[]; colours?: string[]; note?: string;
+  is_integer?: boolean; is_repeat?: boolean;
+  values: Numbers;  // from arrays, when they are decoded
+}
+interface Palette { kinds: string[]; no_data: string; gamma: number }
+interface Rule {
+  name: string; description: string; limit: number | null; unit: string; count: number; listed: number; waiver: string | null;
+}
+interface SitesAbout { n_sites: number; bounds_um: number[]; palette: Palette }
+interface ColumnsAbout { columns: Column[]; filter: string | null; notes: string[] }
+interface BodiesAbout {
+  lattice_um: number; origin_um: number[]; low_um: number[]; high_um: number[]; list: { name: string; n_runs: number; n_tiles: number }[];
+}
+interface PictureAbout { width: number; height: number; bounds_um: number[]; frame_um?: number[] }
+type Arrays = { [name: string]: any };
+
+// -- messages of the server -----------------------------------------------------------------------------------------------
+
+interface Preset { name: string; label: string; kind: string }
+interface ViewAbout { name: string; label: string; is_tile: boolean; is_first: boolean; is_costly: boolean; has_data: boolean }
+interface Choice { label: string; value: any }
+interface Control {
+  key: string; id: string; label: string; unit: string; help: string; section: string;
+  kind: "number" | "integer" | "boolean" | "text" | "list" | "choice" | "sections" | "group";
+  default?: any; is_required?: boolean; is_optional?: boolean; is_item?: boolean;
+  minimum?: number | null; maximum?: number | null; suggested?: number[]; scale?: "log" | "linear";
+  choices?: Choice[]; selected?: number | null; length?: number | null;
+  is_value?: boolean;  // set by the page: the value after the choice of its form
+}
+interface FilmAbout {
+  kind: "camera" | "video"; name: string; n: number; n_frames: number | null; frame_s: number | null; width: number; height: number;
+}
+type Summary = { [name: string]: number };
+interface Hello {
+  kind: "hello"; session: string; version: string; is_new: boolean; presets: Preset[]; name: string; can_save: boolean;
+  settings: Settings; controls: Control[]; views: ViewAbout[];
+}
+interface Busy { kind: "busy" }
+interface ControlsMessage { kind: "controls"; controls: Control[] }
+interface State {
+  kind: "state"; id: number | null; version: number; settings: Settings; changed: string[]; can_undo: boolean; can_redo: boolean;
+  errors: { [key: string]: string }; warnings: string[]; summary: Summary; frozen: { summary: Summary; settings: Settings } | null;
+  film: FilmAbout | null; is_preview: boolean;
+}
+interface Done {
+  kind: "done"; id: number | null; version: number; ms: { [view: string]: number }; is_preview: boolean; is_freeze: boolean;
+}
+interface Failure { kind: "error"; id: number | null; text: string; part?: string }
+interface TextMessage { kind: "text"; id: number; what: string; text: string; files: string[] }
+interface Saved { kind: "saved"; id: number; path: string }
+type ServerMessage = Busy | ControlsMessage | State | Done | Failure | TextMessage | Saved;
+
+// Binary messages: a header and arrays; as readPart returns them.
+interface PartHeader {
+  part: string; version: number; about: any; is_preview?: boolean; has_more?: boolean;
+  arrays: { name: string; type: ArrayType; size: number; offset: number }[];
+}
+type ArrayType = "uint8" | "int8" | "uint16" | "int16" | "uint32" | "int32" | "float32" | "float64";
+interface Part {
+  part: string; version: number; is_preview: boolean; hasMore: boolean; about: any; arrays: Arrays;
+  sites?: Sites; boundary?: Boundary;  // of views, prepared while the server computes
+}
+type Boundary = (context: CanvasRenderingContext2D, toX: (x: number) => number, toY: (y: number) => number) => void;
+
+// -- messages to the server; Connection.send adds their numbers -------------------------------------------------------------
+
+type Change =
+  | { do: "undo" | "redo" | "match" }
+  | { do: "set"; key: string; value: unknown; final: boolean }
+  | { do: "reset" | "delete"; key: string }
+  | { do: "preset" | "save"; name: string }
+  | { do: "restore"; settings: Settings | undefined }
+  | { do: "file"; path: string | undefined; as: string }
+  | { do: "video"; path: string | undefined }
+  | { do: "frame"; n: number }
+  | { do: "views"; names: string[]; pixels: number }
+  | { do: "freeze" | "unfreeze" }
+  | { do: "text"; what: string };
+interface FrameHeader { width: number; height: number; is_first: boolean }
+
+// -- parts of pages -----------------------------------------------------------------------------------------------------------
+
+interface ArrayAbout { type: ArrayType; size: number }
+interface Trace { path: (context: CanvasRenderingContext2D, map: MapView) => void; box: Float64Array }
+interface HostMessage { foveasim: string; name: string; value: unknown }
+interface PointerCallbacks {
+  takesRightButton?: boolean;
+  press?(px: number, py: number): void;
+  drag(dx: number, dy: number, about: { px: number; py: number; isSecond: boolean; isMiddle: boolean }): void;
+  pinch(factor: number, px: number, py: number): void;
+  wheel(factor: number, px: number, py: number): void;
+  click(px: number, py: number): void;
+  move(px: number, py: number, isHeld: boolean): void;
+  leave(): void;
+}
