@@ -31,7 +31,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from foveasim._core.jit import njit
-from foveasim._core.validation import Floats, Ints
+from foveasim._core.validation import Ints
 
 #: Columns of ``spans``. A finished plan is in the order of the rows and has no column ``ROW``; its first column is the index of
 #: the accumulator instead of the site.
@@ -618,7 +618,7 @@ def trace_rows(
 
 
 def trace_sites(
-    uv: Floats, ring_offsets: Ints, site_offsets: Ints, first_site: int, n_y: int, n_x: int, order: int
+    uv: NDArray[Any], ring_offsets: Ints, site_offsets: Ints, first_site: int, n_y: int, n_x: int, order: int
 ) -> tuple[NDArray[Any], ...]:
     """
     Return the spans of sites on a grid of ``n_y`` rows and ``n_x`` columns.

@@ -14,12 +14,14 @@ cells as by :func:`foveasim.integrate._kernels.trace_sites`.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
 from foveasim._core.jit import njit
-from foveasim._core.validation import Bools, Floats, Ints
+from foveasim._core.validation import Bools, Ints
 from foveasim.integrate._kernels import (
     BOX_CELLS,
     NO_COVERAGE,
@@ -290,13 +292,13 @@ def _integrate_sites(
 
 def integrate_sites(
     cells: NDArray[np.floating],
-    uv: Floats,
+    uv: NDArray[Any],
     ring_offsets: Ints,
     site_offsets: Ints,
     where: Bools,
     order: int,
     scale: float,
-    out: Floats,
+    out: NDArray[Any],
 ) -> None:
     """
     Write scale x integral of sites, without spans.
