@@ -470,6 +470,7 @@ def _range(name: str, option: Mapping[str, Any], value: Any, started: Any) -> di
             low, high = min(low, float(x)), max(high, float(x))
     if minimum is not None:
         low = max(low, minimum)
+        high = high if high > low else low + max(abs(low), 1.0)
     if maximum is not None:
         high = min(high, maximum)
     if option["type"] == "integer":

@@ -235,7 +235,7 @@ def test_picture_rejects_sensor_of_other_layout(options):
 def test_estimates_reject_wrong_number_of_values(estimate, name):
     sensor = fs.Sensor(fs.layout.grid(n_x=2, n_y=2, pitch_um=2.0))
 
-    with pytest.raises(ParameterError, match=f"'{name}' must have one value for each of the 4 sites, got 3"):
+    with pytest.raises(ParameterError, match=f"'{name}' must have one value for each of the 4 sites, got the shape"):
         getattr(fs.reconstruct, estimate)(np.ones(3), sensor, 0.1)
 
 
