@@ -295,9 +295,19 @@ def _sum_cells(cells, row, start, end):
             a7 += cells[row, c + SEVEN]
             c += EIGHT
         total = ((a0 + a1) + (a2 + a3)) + ((a4 + a5) + (a6 + a7))
-    while c < end:
+    # The first cells of a short rest without a loop, which the compiler would unroll, with a test for each number of cells.
+    if c < end:
         total += cells[row, c]
         c += ONE
+        if c < end:
+            total += cells[row, c]
+            c += ONE
+            if c < end:
+                total += cells[row, c]
+                c += ONE
+                while c < end:
+                    total += cells[row, c]
+                    c += ONE
     return total
 
 

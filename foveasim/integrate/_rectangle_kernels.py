@@ -215,24 +215,28 @@ def gather_lattice(cells, u, v, first_row, last_row, where, scale, order, out):
         w_first[i], w_last[i] = weights[i, 0], weights[i, 1]
     along = np.empty(n_columns)
     done = -1  # the row of the map in ``along``
-    chosen = np.empty(n_columns, np.uintp)
+    chosen, n_chosen = np.arange(n_columns, dtype=np.uintp), n_columns
     for j in range(first_row, last_row):
         covered = _covered_cells(v[j, 0], v[j, 1], n_y)
         bottom, top, w_bottom, w_top = covered[:4]
         start = j * n_columns
         sums = out[start : start + n_columns]
-        n_chosen = 0
-        for i in range(n_columns):
-            chosen[n_chosen] = np.uintp(i)
-            n_chosen += 1 if where.size == 0 or where[start + i] else 0
+        if where.size > 0:
+            n_chosen = 0
+            for i in range(n_columns):
+                chosen[n_chosen] = np.uintp(i)
+                n_chosen += 1 if where[start + i] else 0
         if order == 2:
             for k in range(n_chosen):
                 i = chosen[k]
                 interval = (columns[i, 0], columns[i, 1], weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3])
                 sums[i] = scale * _integral(cells, interval, covered, order)
             continue
-        for k in range(n_chosen):
-            sums[chosen[k]] = 0.0
+        if n_chosen < n_columns:
+            for k in range(n_chosen):
+                sums[chosen[k]] = 0.0
+        else:
+            sums[:] = 0.0
         for row in range(bottom, top + 1):
             line = cells[row]
             weight = scale * (w_bottom if row == bottom else (w_top if row == top else 1.0))

@@ -19,6 +19,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from foveasim._core.rings import positions_in_runs
 from foveasim._core.validation import Floats, Ints, exact_integers
 from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import FileFormat, as_file_error
@@ -97,50 +98,64 @@ def read(path: Path) -> Layout:
         return layout_from_untrusted(polygons, columns, provenance)
 
 
+class _Number(int):
+    """Number of a feature in the order in which features of a document end."""
+
+
 class _Document:
     """
     FeatureCollection, decoded feature by feature.
 
     As Python objects, all features together would require ten times the memory of their text.
 
-    ``members``: members of the collection other than the features.
+    ``members``: members of the collection other than the features. ``rows``: properties of the features.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self._rows: list[dict[str, Any]] = []
-        self._rings_of_site = array("q")
-        self._vertices_of_ring = array("q")
-        self._xy = array("d")
+        self._properties: list[dict[str, Any]] = []
+        self._problems: dict[int, str] = {}
+        self._n_rings, self._n_vertices, self._xy = array("q"), array("q"), array("d")
         document = json.loads(path.read_text(encoding="utf-8-sig"), object_hook=self._take)
-        features = document.get("features") if isinstance(document, dict) else None
+        features = document.pop("features", None) if isinstance(document, dict) else None
         if not isinstance(features, list) or document.get("type") != "FeatureCollection":
             raise FileError(path, "is not a GeoJSON FeatureCollection")
-        for i, number in enumerate(features):
-            if number != i:
-                raise FileError(path, f"feature {i} must be one polygon in a Feature; write one feature per site")
+        check_site_count(path, len(features))
+        numbers = [each if type(each) is _Number else self._add(each) for each in features]
+        for i, number in enumerate(numbers):
+            if number in self._problems:
+                raise FileError(path, f"feature {i} {self._problems[number]}")
         self.members = document
+        self.rows = [self._properties[number] for number in numbers]
+        self._numbers = np.array(numbers, np.int64)
 
     def _take(self, item: dict[str, Any]) -> Any:
         """Add a feature and return its number; return other objects as they are."""
-        if item.get("type") != "Feature" or "geometry" not in item:
-            return item
-        i = len(self._rows)
-        check_site_count(self.path, i + 1)
-        geometry = item["geometry"]
-        kind = geometry.get("type") if isinstance(geometry, dict) else None
-        rings = geometry.get("coordinates") if isinstance(geometry, dict) else None
+        return self._add(item) if item.get("type") == "Feature" and "geometry" in item else item
+
+    def _add(self, feature: Any) -> _Number:
+        """Add the outline and the properties of a feature, or its problem."""
+        number = _Number(len(self._properties))
+        properties = feature.get("properties") if isinstance(feature, dict) else None
+        self._properties.append(properties if isinstance(properties, dict) else {})
+        n_rings = len(self._n_vertices)
+        problem = self._add_outline(feature.get("geometry") if isinstance(feature, dict) else None)
+        if problem:
+            self._problems[number] = problem
+        self._n_rings.append(len(self._n_vertices) - n_rings)
+        return number
+
+    def _add_outline(self, geometry: Any) -> str:
+        """Add the rings of a geometry; return why it is invalid."""
+        kind, rings = (
+            (geometry.get("type"), geometry.get("coordinates")) if isinstance(geometry, dict) else (None, None)
+        )
         if kind == "MultiPolygon" and isinstance(rings, list) and len(rings) == 1:
             kind, rings = "Polygon", rings[0]
         if kind != "Polygon" or not isinstance(rings, list) or not rings:
-            raise FileError(
-                self.path, f"feature {i} must be one polygon, got {str(kind)[:40]}; write one feature per site"
-            )
-        self._rings_of_site.append(len(rings))
+            return f"must be one polygon, got {str(kind)[:40]}; write one feature per site"
         for ring in rings:
             if not isinstance(ring, list) or len(ring) < 4:
-                raise FileError(self.path, f"feature {i} has a ring of fewer than 4 positions")
-            self._vertices_of_ring.append(len(ring))
+                return "has a ring of fewer than 4 positions"
             for position in ring:
                 # type() instead of isinstance(), as booleans are integers in Python.
                 if (
@@ -148,32 +163,38 @@ class _Document:
                     or not 2 <= len(position) <= 3
                     or not {*map(type, position)} <= NUMBER_TYPES
                 ):
-                    raise FileError(self.path, f"feature {i} has a position that is not two or three numbers")
+                    return "has a position that is not two or three numbers"
+            for position in ring:
                 self._xy.append(position[0])
                 self._xy.append(position[1])
-        properties = item.get("properties")
-        self._rows.append(properties if isinstance(properties, dict) else {})
-        return i
+            self._n_vertices.append(len(ring))
+        return ""
 
     def outlines(self) -> tuple[Floats, Ints, Ints]:
-        """Return the packed rings of all features, unchecked."""
-        ring_offsets = np.concatenate(([0], np.cumsum(np.array(self._vertices_of_ring, np.int64))))
-        site_offsets = np.concatenate(([0], np.cumsum(np.array(self._rings_of_site, np.int64))))
-        return np.array(self._xy, np.float64).reshape(-1, 2), ring_offsets, site_offsets
+        """Return the packed rings of the features, unchecked, without those of other members."""
+        rings, site_offsets = _runs(np.array(self._n_rings, np.int64), self._numbers)
+        points, ring_offsets = _runs(np.array(self._n_vertices, np.int64), rings)
+        return np.array(self._xy, np.float64).reshape(-1, 2)[points], ring_offsets, site_offsets
 
     def columns(self, types: Mapping[str, Any]) -> tuple[dict[str, NDArray[Any]], list[str]]:
         """Return the columns of the properties, and the names of unsupported properties."""
-        n_rows = Counter(chain.from_iterable(self._rows))
+        n_rows = Counter(chain.from_iterable(self.rows))
         names = dict.fromkeys(chain(types, n_rows))
         columns, dropped = {}, []
         for name in names:
-            is_candidate = len(names) <= MAX_NAMES or n_rows[name] == len(self._rows)
-            column = _column([row.get(name) for row in self._rows], types.get(name)) if is_candidate else None
+            is_candidate = len(names) <= MAX_NAMES or n_rows[name] == len(self.rows)
+            column = _column([row.get(name) for row in self.rows], types.get(name)) if is_candidate else None
             if column is None:
                 dropped.append(name)
             else:
                 columns[name] = column
         return columns, dropped
+
+
+def _runs(counts: Ints, chosen: Ints) -> tuple[Ints, Ints]:
+    """Return the positions of the elements of some runs, and the offsets of these runs."""
+    starts, sizes = (np.cumsum(counts) - counts)[chosen], counts[chosen]
+    return np.repeat(starts, sizes) + positions_in_runs(sizes), np.concatenate(([0], np.cumsum(sizes)))
 
 
 def _is_exact(value: Any) -> bool:

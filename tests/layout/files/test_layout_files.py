@@ -577,6 +577,23 @@ def test_foreign_geojson_reports_omitted_properties(tmp_path):
     assert layout.provenance["left_out_properties"] == ["note"]
 
 
+def test_features_inside_properties_are_not_sites(tmp_path):
+    squares = [
+        {"type": "Polygon", "coordinates": [[[x, 0], [x + w, 0], [x + w, w], [x, w], [x, 0]]]}
+        for x, w in ((0, 1), (4, 2))
+    ]
+    inner = {"type": "Feature", "properties": {}, "geometry": {"type": "Point", "coordinates": [9, 9]}}
+    features = [{"type": "Feature", "properties": {"n": i, "of": inner}, "geometry": g} for i, g in enumerate(squares)]
+    document = {"type": "FeatureCollection", "other": features[0], "features": features, "more": inner}
+    (tmp_path / "a.geojson").write_text(json.dumps(document))
+
+    layout = read_layout(tmp_path / "a.geojson")
+
+    assert layout.area_um2.tolist() == [1.0, 4.0]
+    assert layout.columns["n"].tolist() == [0, 1]
+    assert layout.provenance["left_out_properties"] == ["of"]
+
+
 def test_geoparquet_metadata_follows_standard(zoo, tmp_path):
     write_layout(zoo, tmp_path / "a.parquet")
     table = pq.read_table(tmp_path / "a.parquet")
