@@ -11,6 +11,7 @@ import argparse
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from report import Report, best_s
@@ -21,7 +22,7 @@ from foveasim._core.provenance import versions
 from foveasim.explore import executor as executor_module
 from foveasim.explore.cluster import open_client
 from foveasim.explore.executor import _compute, _Dispatch, _pickle, _Results, _Shared, executor
-from foveasim.explore.sweeps.sweep import _Points
+from foveasim.explore.sweeps.sweep import _record
 from foveasim.explore.worker_cache import ShotRunner
 
 N_TASKS, N_REPEATS = 3000, 20
@@ -99,7 +100,7 @@ def bench_exploring(report: Report, n_layouts: int) -> None:
         SHOT, {"layout.parameters.n_sectors": list(range(100, 100 + n_layouts)), "sensor.bits": [8, 10, 12, 14]}
     )
     points, changes = (each.tolist() for each in plan.order())
-    ours, queue = (_Points(plan, ShotRunner(plan.source, plan.metrics, n_threads=1)) for _ in range(2))
+    ours, queue = (partial(_record, plan, ShotRunner(plan.source, plan.metrics, n_threads=1)) for _ in range(2))
     with open_client(None, 2) as client, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         shared = client.submit(_Shared, _pickle(queue, "the metrics", ()), versions(), pure=False)

@@ -235,9 +235,10 @@ def bench_distortion(report: Report, shape: tuple[int, int]) -> None:
     report.slower_than("distorted mono capture", times["bent"], "the same undistorted", times["plain"], 1.1)
     report.faster_than("distorted frame", times["frame"], "cv2.remap + undistorted frame", times["remap"], 3)
     report.slower_than("compiling a distorted layout", compiling["bent"], "undistorted", compiling["plain"], 2)
-    # Worst case: squares are the simplest outlines, distorted ones are not. Upright squares are not compiled.
+    # Worst case: squares are the simplest outlines, which are traced fastest; distorted ones are not. Upright squares are not
+    # compiled.
     what = f"compiling {squares.n_sites:,} distorted squares"
-    report.slower_than(what, compiling["squares bent"], "turned by 1°", compiling["squares"], 2)
+    report.slower_than(what, compiling["squares bent"], "turned by 1°", compiling["squares"], 2.5)
 
 
 def bench_sensor(report: Report, n_side: int) -> None:

@@ -9,6 +9,8 @@ import subprocess
 import sys
 from collections import Counter
 from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -256,3 +258,17 @@ def test_cached_properties_have_no_lock():
     }
 
     assert using == {"_core/calls/pickling.py"}  # recognises both
+
+
+def test_names_imported_by_benchmarks_exist():
+    missing = [
+        f"{path.name}: {node.module}.{item.name}"
+        for path in sorted((PACKAGE.parent / "benchmarks").glob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == PACKAGE.name
+        if not node.module.startswith("foveasim.learn")  # requires PyTorch
+        for item in node.names
+        if not hasattr(import_module(node.module), item.name) and find_spec(f"{node.module}.{item.name}") is None
+    ]
+
+    assert missing == []
