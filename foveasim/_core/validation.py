@@ -15,6 +15,7 @@ import mmap
 import os
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
+from dataclasses import fields
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -386,6 +387,28 @@ def band_widths_nm(wavelength_nm: Floats, band_width_nm: ArrayLike | None) -> Fl
     widths = np.empty(wavelength_nm.size)
     widths[order] = 0.5 * (np.concatenate((steps[:1], steps)) + np.concatenate((steps, steps[-1:])))
     return widths
+
+
+def check_per_site(name: str, values: _Array, n_sites: int, *, or_one: bool = False, or_rows: bool = False) -> _Array:
+    """
+    Return an array after checking that its shape is (n_site,).
+
+    With ``or_one``, it may also be one number; with ``or_rows``, have further axes before, (..., n_site). Raises ParameterError
+    for other shapes.
+    """
+    shape = values.shape
+    if (shape[-1:] == (n_sites,) and (or_rows or values.ndim == 1)) or (or_one and shape == ()):
+        return values
+    rule = "be one number, or one for each" if or_one else "have one value for each"
+    raise ParameterError(name, f"must {rule} of the {n_sites} sites, got the shape {shape}")
+
+
+def own_arrays(instance: Any) -> None:
+    """Replace the arrays of a frozen dataclass by read-only ones, independent of the caller's."""
+    for field in fields(instance):
+        values = unmasked(field.name, getattr(instance, field.name))
+        if isinstance(values, np.ndarray | list | tuple):
+            object.__setattr__(instance, field.name, own(np.asarray(values)))
 
 
 def read_only(array: _Array) -> _Array:

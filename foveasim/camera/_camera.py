@@ -22,7 +22,7 @@ from foveasim._core.random_streams import Streams
 from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property, in_order, thread_count
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import Bools, Floats, finite_array, read_only
+from foveasim._core.validation import Bools, Floats, check_per_site, finite_array, read_only
 from foveasim.camera._clock import Clock
 from foveasim.camera._frames import Frame, ImageCache, Position, Task, check_frames, position_settings, tasks
 from foveasim.camera._steps import WeightedMap, expose, integrate_maps, to_sensor_frame, white_dn
@@ -47,7 +47,6 @@ from foveasim.reconstruct.rasters import sum_of_images
 from foveasim.scene import Scene
 from foveasim.sensor import NoiseBudget, Sensor, noise_budget
 from foveasim.sensor.limits import EXPOSURE
-from foveasim.sensor.per_site import check_per_site
 from foveasim.units import um_from_nm, w_from_w_m2_um2
 
 #: Margin of a picture that covers undistorted outlines: their edges are curves of limited accuracy.

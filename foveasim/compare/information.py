@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import POSITIVE, Limits
-from foveasim._core.validation import Bools, Floats, Ints, as_numbers, finite_array
+from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_per_site, finite_array
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
 
@@ -336,8 +336,7 @@ def site_information_bits(
     scale = finite_array("gain", gain, ndim=1)
     noise = finite_array("noise_variance", noise_variance, ndim=2, above=0.0)
     for name, values in (("gain", scale), ("noise_variance", noise)):
-        if values.shape[-1] != n:
-            raise ParameterError(name, f"must have one value for each of the {n} sites, got {values.shape[-1]}")
+        check_per_site(name, values, n, or_rows=True)
     apertures = _Apertures(layout, covariance)
     tree = cKDTree(xy_um)
     bits = np.empty(noise.shape)

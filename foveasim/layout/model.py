@@ -33,6 +33,7 @@ from foveasim._core.validation import (
     Floats,
     Ints,
     as_numbers,
+    check_per_site,
     exact_integers,
     finite_array,
     freeze,
@@ -165,11 +166,7 @@ class Layout:
         """Check columns and provenance, and store them as read-only data."""
         columns = {}
         for name, values in self.columns.items():
-            column = _column(name, values)
-            if column.shape != (self.n_sites,):
-                raise ParameterError(
-                    name, f"must have one value for each of the {self.n_sites} sites, got the shape {column.shape}"
-                )
+            column = check_per_site(name, _column(name, values), self.n_sites)
             if name in INDEX_NAMES:
                 _require_indices(name, column)
             columns[name] = column
@@ -503,12 +500,8 @@ class Layout:
                 hint = possible_names(key, sorted(self.columns))
                 raise ParameterError("keys", "must be values or columns of the layout", key, hint=hint)
             value = self.columns[key] if isinstance(key, str) else np.asarray(unmasked("keys", key))
-            if value.shape != (self.n_sites,):
-                raise ParameterError(
-                    "keys", f"must have one value for each of the {self.n_sites} sites, got {value.shape}"
-                )
             # Ranks, because strings cannot be negated for descending order.
-            rank = np.unique(value, return_inverse=True)[1]
+            rank = np.unique(check_per_site("keys", value, self.n_sites), return_inverse=True)[1]
             values.append(-rank if descending else rank)
         if not values:
             raise ParameterError("keys", "must be one or more columns or arrays")

@@ -21,6 +21,7 @@ from foveasim._core.validation import (
     Floats,
     Ints,
     as_numbers,
+    check_per_site,
     finite_array,
     read_only,
 )
@@ -363,6 +364,4 @@ def _inverse(information_per_um2: Floats) -> Floats:
 
 
 def _per_site(name: str, values: NDArray[np.float64], n_sites: int) -> Floats:
-    if values.shape not in ((), (n_sites,)):
-        raise ParameterError(name, f"must have one value for each of the {n_sites} sites, got shape {values.shape}")
-    return np.broadcast_to(values, (n_sites,))
+    return np.broadcast_to(check_per_site(name, values, n_sites, or_one=True), (n_sites,))

@@ -24,7 +24,7 @@ from foveasim._core.validation import (
     Ints,
     as_numbers,
     check_count,
-    check_number,
+    check_per_site,
     finite_array,
     own,
     read_only,
@@ -197,8 +197,7 @@ class SiteClasses:
 
     def __init__(self, classes: ArrayLike | None, n_sites: int, n_blocks: int = 0) -> None:
         labels = np.zeros(n_sites, np.int64) if classes is None else np.asarray(unmasked("classes", classes))
-        if labels.shape != (n_sites,):
-            raise ParameterError("classes", f"must have one label for each of the {n_sites} sites, got {labels.shape}")
+        check_per_site("classes", labels, n_sites)
         self.labels: Ints
         self.class_index: Ints
         self.labels, self.class_index = np.unique(labels, return_inverse=True)
@@ -454,12 +453,8 @@ def _transfer(
 
 def _level(name: str, expected_e: ArrayLike, n_sites: int) -> Floats:
     """Return the expected charge of one level at every site."""
-    if np.ndim(expected_e) == 0:
-        return np.full(n_sites, check_number(name, expected_e, at_least=0.0))
-    level_e = finite_array(name, expected_e, ndim=1, at_least=0.0)
-    if level_e.size != n_sites:
-        raise ParameterError(name, f"must be one number, or one for each of the {n_sites} sites, got {level_e.size}")
-    return level_e
+    level_e = finite_array(name, expected_e, at_least=0.0)
+    return np.broadcast_to(check_per_site(name, level_e, n_sites, or_one=True), n_sites)
 
 
 def _levels(expected_e: Sequence[ArrayLike] | Floats, n_sites: int) -> list[Floats]:

@@ -20,6 +20,7 @@ from foveasim._core.validation import (
     as_numbers,
     check_length_um,
     check_number,
+    check_per_site,
     finite_array,
     read_only,
     unmasked,
@@ -196,11 +197,7 @@ def slanted_edge_mtf(
     ----------
     ISO 12233:2023, Photography: Electronic still picture imaging: Resolution and spatial frequency responses, annex D (e-SFR).
     """
-    site_values = as_numbers("values", values, missing_is_nan=True)
-    if site_values.shape != (layout.n_sites,):
-        raise ParameterError(
-            "values", f"must have one value for each of the {layout.n_sites} sites, got shape {site_values.shape}"
-        )
+    site_values = check_per_site("values", as_numbers("values", values, missing_is_nan=True), layout.n_sites)
     is_used = np.isfinite(site_values) & _mask(where, layout.n_sites)
     n_used = int(np.count_nonzero(is_used))
     if n_used < MIN_SITES:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import POSITIVE, Limits
-from foveasim._core.validation import Bools, Floats, Ints, finite_array, read_only
+from foveasim._core.validation import Bools, Floats, Ints, check_per_site, finite_array, read_only
 from foveasim.camera import Camera
 from foveasim.capture import Capture
 from foveasim.errors import ParameterError
@@ -390,10 +390,7 @@ def _full_well_e(captures: Sequence[Capture], full_well_e: ArrayLike | None, n_s
         raise ParameterError(
             "full_well_e", "must not be given without captures; codes alone do not determine the charge"
         )
-    well_e = finite_array("full_well_e", full_well_e, above=0.0)
-    if well_e.shape not in ((), (n_sites,)):
-        raise ParameterError("full_well_e", f"must be one number, or one for each of the {n_sites} sites", well_e.shape)
-    return well_e
+    return check_per_site("full_well_e", finite_array("full_well_e", full_well_e, above=0.0), n_sites, or_one=True)
 
 
 def _is_near(value: Floats, variance: Floats, limit: Floats | float) -> Bools:

@@ -21,13 +21,12 @@ from foveasim._core.calls import NOT_NEGATIVE, Limits, OwnCheck, check_declared
 from foveasim._core.random_streams import fixed_pattern_key
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property, parallel_map, thread_count
-from foveasim._core.validation import Floats, Ints, finite_array, read_only
+from foveasim._core.validation import Floats, Ints, check_per_site, finite_array, read_only
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.layout import Layout
 from foveasim.modes.events import Events
 from foveasim.sensor import Sensor
 from foveasim.sensor.limits import CHARGE, DURATION, EXPOSURE, RATE, SPREAD, TEMPERATURE, WIDE_SPREAD
-from foveasim.sensor.per_site import check_per_site
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
 
 __all__ = ["EventPixels", "SpikingPixels"]

@@ -14,11 +14,10 @@ import numpy as np
 
 from foveasim._core.calls import NOT_NEGATIVE, check_declared
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, finite_array
+from foveasim._core.validation import Floats, check_per_site, finite_array
 from foveasim.errors import SimulationError
 from foveasim.layout import Layout
 from foveasim.sensor.limits import DURATION, EXPOSURE
-from foveasim.sensor.per_site import check_per_site
 
 __all__ = ["Between", "Exposure", "Shutter"]
 

@@ -9,12 +9,11 @@ import numpy as np
 
 from foveasim._core.calls import Limits
 from foveasim._core.rings import TIE_FRACTION, site_moments
-from foveasim._core.validation import Floats, Ints, as_numbers, check_memory, finite_array, read_only
+from foveasim._core.validation import Floats, Ints, as_numbers, check_memory, check_per_site, finite_array, read_only
 from foveasim.fields import Grid, PackedRings
 from foveasim.integrate import Integrator
 from foveasim.layout import Layout
 from foveasim.reconstruct.picture import Picture, coverage_fraction
-from foveasim.sensor.per_site import check_per_site
 
 __all__ = ["cells", "fill_channels"]
 

@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Bools, Floats, finite_array
+from foveasim._core.validation import Bools, Floats, check_per_site, finite_array
 from foveasim.sensor import Sensor, linearise
 from foveasim.sensor.calibration import nominal_e_per_dn
 from foveasim.sensor.limits import EXPOSURE
-from foveasim.sensor.per_site import check_per_site
 
 __all__ = ["SiteEstimates", "electrons_per_code", "estimate_from_charge", "estimate_from_code"]
 

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 
 from foveasim._core.show import Drawn, drawn
-from foveasim._core.validation import Floats, as_numbers
+from foveasim._core.validation import Floats, as_numbers, check_per_site
 from foveasim.sensor.effects import STANDARD
 from foveasim.sensor.limits import EXPOSURE
-from foveasim.sensor.per_site import check_per_site
 from foveasim.sensor.prediction import apply_nonlinearity
 from foveasim.sensor.sensor import Sensor
 from foveasim.sensor.signal_to_noise import local_step_e

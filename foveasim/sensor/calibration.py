@@ -15,12 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import FRACTION, POSITIVE, Limits, OwnCheck
 from foveasim._core.random_streams import Streams
-from foveasim._core.validation import Bools, Floats, as_numbers, check_number, finite_array
+from foveasim._core.validation import Bools, Floats, as_numbers, check_number, check_per_site, finite_array, own_arrays
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.sensor.adc import QUANTISATION_DN2
 from foveasim.sensor.effects import Photosites
 from foveasim.sensor.limits import CHARGE, DURATION, EXPOSURE, RATIO
-from foveasim.sensor.per_site import check_per_site, own_arrays
 from foveasim.sensor.sensor import Sensor
 from foveasim.units import volts_to_electrons
 

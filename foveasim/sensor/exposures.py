@@ -15,12 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.random_streams import Streams
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, Ints, as_numbers
+from foveasim._core.validation import Floats, Ints, as_numbers, check_per_site, own_arrays
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.sensor.calibration import Calibration, linearise, nominal_e_per_dn
 from foveasim.sensor.effects.shot import MAX_CHARGE_E, ROUNDING_E2
 from foveasim.sensor.limits import DURATION, EXPOSURE, RATE
-from foveasim.sensor.per_site import check_per_site, own_arrays
 from foveasim.sensor.sensor import Sensor
 
 __all__ = ["Ramp", "Rates", "fit_ramp", "merge_exposures", "non_destructive_reads"]

@@ -15,7 +15,7 @@ from foveasim._core.provenance import is_digest
 from foveasim._core.random_streams import Streams
 from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import Bools, Floats, Ints, read_only, unmasked
+from foveasim._core.validation import Bools, Floats, Ints, check_per_site, read_only, unmasked
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.sensor.adc import ADC, BITS, DNL, INL, LOG_STRENGTH, Companding, ConversionTables
 from foveasim.sensor.blocks import for_each_block
@@ -54,7 +54,6 @@ from foveasim.sensor.limits import (
     VOLTS,
     WIDE_SPREAD,
 )
-from foveasim.sensor.per_site import check_per_site
 from foveasim.sensor.prediction import (
     ChargeDistributions,
     ReadoutModel,

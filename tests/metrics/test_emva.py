@@ -678,7 +678,7 @@ def test_photon_transfer_accepts_captures():
         (lambda: photon_transfer([np.full((2, 5), np.nan)]), "finite"),
         (lambda: photon_transfer([np.zeros((2, 5)), np.zeros((2, 6))]), "5 sites"),
         (lambda: photon_transfer([np.zeros((2, 5))], classes=[0, 1, 1, 1, 1]), "two sites each"),
-        (lambda: photon_transfer([np.zeros((2, 5))], classes=[0, 1]), "one label for each"),
+        (lambda: photon_transfer([np.zeros((2, 5))], classes=[0, 1]), "one value for each"),
         (lambda: photon_transfer([np.zeros((2, 5))], seed=1), "must not be given with frames"),
         (lambda: photon_transfer([3, 4]), "list of frames"),
         (lambda: emva1288(5, [np.ones((2, 4))], [1.0]), "'frames' must be a list of levels, got an int"),

@@ -206,7 +206,7 @@ def test_invalid_flow_arguments_raise():
         estimate_flow(None, values, map_e, GRID, variance_e2=1.0)
     with pytest.raises(ParameterError, match=r"'layout' must be a Layout, got a list"):
         site_gradients_e_per_um([FOVEAL], map_e, GRID)
-    with pytest.raises(ParameterError, match="'values_e' must have one value for each of the"):
+    with pytest.raises(ParameterError, match="'values_e' must be one number, or one for each of the"):
         estimate_flow(FOVEAL, values[:5], map_e, GRID, variance_e2=1.0)
     with pytest.raises(ParameterError, match="'map_e_per_um2' must have the grid's shape"):
         estimate_flow(FOVEAL, values, map_e[:50], GRID, variance_e2=1.0)

@@ -401,7 +401,7 @@ def test_invalid_snr_arguments_raise():
         measured_snr_by_class(ZONES, frames, frames)
     with pytest.raises(ParameterError, match="'dark' must have the 4000 sites of the layout"):
         measured_snr_by_class(ZONES, frames, frames[:, :7], bits=12)
-    with pytest.raises(ParameterError, match="'classes' must have one label for each"):
+    with pytest.raises(ParameterError, match="'classes' must have one value for each"):
         snr_by_class(camera(), flat(), exposure_s=EXPOSURE_S, classes=[1, 2])
     with pytest.raises(ParameterError, match=r"'camera' must be a Camera, got a NoneType"):
         snr_by_class(None, None, exposure_s=1.0)

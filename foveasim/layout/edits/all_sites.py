@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import LENGTH, Limits
 from foveasim._core.rings import positions_in_runs
-from foveasim._core.validation import Bools, Ints, check_sites, finite_array, unmasked
+from foveasim._core.validation import Bools, Ints, check_per_site, check_sites, finite_array, unmasked
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout._noding import insert_points
 from foveasim.layout._regions import as_region
@@ -119,8 +119,7 @@ def inset(layout: Layout, margin_um: ArrayLike) -> Layout:
         When a margin is negative.
     """
     margins_um = finite_array("margin_um", margin_um, at_least=0.0)
-    if margins_um.ndim > 1 or (margins_um.ndim == 1 and margins_um.size != layout.n_sites):
-        raise ParameterError("margin_um", f"must be one number, or one for each of the {layout.n_sites} sites")
+    check_per_site("margin_um", margins_um, layout.n_sites, or_one=True)
     shrunk = shapely.buffer(layout.polygons(), -margins_um, join_style="mitre", mitre_limit=100.0)
     bad = np.flatnonzero(shapely.is_empty(shrunk) | (shapely.get_type_id(shrunk) != shapely.GeometryType.POLYGON))
     if bad.size:

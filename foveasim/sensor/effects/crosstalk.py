@@ -19,11 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.calls import LENGTH, NOT_NEGATIVE, Declared, Limits, OwnCheck
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import Floats, Ints, as_numbers, check_pitch_um, finite_array
+from foveasim._core.validation import Floats, Ints, as_numbers, check_per_site, check_pitch_um, finite_array
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.sensor.blocks import for_each_block
 from foveasim.sensor.effects.contract import Effect, Photosites, Sites, Stage
-from foveasim.sensor.per_site import check_per_site
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim._core.validation import Floats, check_choice, unmasked
+from foveasim._core.validation import Floats, check_choice, check_per_site, unmasked
 from foveasim._io.atomic import atomic_write
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
@@ -157,8 +157,7 @@ def plot_noise_budget(
         raise ParameterError("noise_e", "must contain at least one source of noise")
     n_sites = next(iter(noise_e.values())).size
     labels = np.zeros(n_sites, np.int64) if classes is None else np.asarray(unmasked("classes", classes))
-    if labels.shape != (n_sites,):
-        raise ParameterError("classes", f"must have one value for each of the {n_sites} sites, got {labels.shape}")
+    check_per_site("classes", labels, n_sites)
     shown = {name: values for name, values in noise_e.items() if np.any(values > 0.0)}
     groups = np.unique(labels)
     for k, group in enumerate(groups):
