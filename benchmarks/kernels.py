@@ -229,5 +229,5 @@ def bench_first_capture(report: Report) -> None:
 
         cold_s, _ = first()
         warm_s = min(first()[1] for _ in range(5))
-    report.add("first capture of the demo, new machine", "", "seconds of processor time", "", cold_s, 9)
-    report.add("first capture of a process, compiled", "", "seconds of processor time after imports", "", warm_s, 0.8)
+    report.seconds("first capture of the demo, new machine", cold_s, 9.0, "seconds of processor time")
+    report.seconds("first capture of a process, compiled", warm_s, 0.8, "seconds of processor time after imports")

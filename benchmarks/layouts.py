@@ -77,7 +77,7 @@ def _seconds(report: Report, side: int, hexagons: Layout, rings: Layout) -> None
         }
         for name, (call, at_most, repeats) in calls.items():
             s = best_s({name: call}, repeats)[name]
-            report.add(f"{name}, {n} sites", f"{s:.3g} s", "seconds", "", s, at_most)
+            report.seconds(f"{name}, {n} sites", s, at_most)
 
 
 def _fresh(layout: Layout) -> Layout:

@@ -49,7 +49,7 @@ def _bench_flat(report: Report, n_sites: int, path: Path) -> None:
         times = best_s({"ours": lambda: ours(layout, values), "peer": lambda: peer(layout, values)}, 2)  # noqa: B023
         what = f"a picture of {n:,} sites, 1600 px"
         report.faster_than(what, times["ours"], "matplotlib's PolyCollection", times["peer"], 3)
-        report.add("the same", f"{times['ours']:.3g} s", "seconds", "", times["ours"], bound_s)
+        report.seconds("the same", times["ours"], bound_s)
 
 
 def _bench_columns(report: Report, n_sites: int, path: Path) -> None:
@@ -73,5 +73,5 @@ def _bench_columns(report: Report, n_sites: int, path: Path) -> None:
     if renderer:
         what = f"a picture of {n_sites:,} columns"
         report.faster_than(what, times["ours"], "PyVista's default, equal heights", times["defaults"])
-        report.add("the same", f"{times['ours']:.3g} s", "seconds", "", times["ours"], COLUMNS_S)
+        report.seconds("the same", times["ours"], COLUMNS_S)
         report.slower_than("the same without OpenGL", times["software"], "with it", times["ours"])

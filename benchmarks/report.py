@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import importlib.util
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 from rich.table import Table
+
+#: Modules of Python whose compilation to bytecode measures the speed of the machine.
+MODULES = ("_pydecimal", "argparse", "doctest", "inspect", "tarfile", "typing")
+#: Their processor time on the machine for which bounds in seconds hold: 1/1.6 of that measured on a second machine, with the
+#: median ratio of five start-up times of the package on both.
+REFERENCE_S = 0.058
 
 
 def best_s(
@@ -25,6 +33,18 @@ def best_s(
     return seconds
 
 
+def compile_modules_s() -> float:
+    """Return the processor time in which Python compiles :data:`MODULES`, without reading them."""
+    paths = [spec.origin for spec in map(importlib.util.find_spec, MODULES) if spec is not None and spec.origin]
+    sources = [Path(path).read_text("utf-8") for path in paths]
+
+    def call() -> None:
+        for source in sources:
+            compile(source, "", "exec")
+
+    return best_s({"compile": call}, 5, time.process_time)["compile"]
+
+
 class Report:
     """Table of ratios, and the number of missed bounds."""
 
@@ -42,6 +62,10 @@ class Report:
     def faster_than(self, what: str, s: float, against: str, s_against: float, at_least: float | None = None) -> None:
         """Add a speed-up over another library, with a lower bound."""
         self.add(what, f"{s:.4g} s", against, f"{s_against:.4g} s", s_against / s, at_least, is_lower_bound=True)
+
+    def seconds(self, what: str, s: float, at_most: float, of: str = "seconds") -> None:
+        """Add a time with an upper bound in seconds; the figure is scaled by the speed of the machine."""
+        self.add(what, f"{s:.3g} s", of + ", scaled", "", s * REFERENCE_S / compile_modules_s(), at_most)
 
     def add(
         self,

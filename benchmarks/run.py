@@ -374,7 +374,7 @@ def bench_import(report: Report) -> None:
     ):
         start(code)()  # writes the bytecode
         times = best_s({"bare": bare, "ours": start(code)}, 5)
-        report.add(label, "", "seconds after the start of Python", "", times["ours"] - times["bare"], bound_s)
+        report.seconds(label, times["ours"] - times["bare"], bound_s, "seconds after the start of Python")
 
 
 def main() -> int:
