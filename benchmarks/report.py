@@ -63,9 +63,9 @@ class Report:
         """Add a speed-up over another library, with a lower bound."""
         self.add(what, f"{s:.4g} s", against, f"{s_against:.4g} s", s_against / s, at_least, is_lower_bound=True)
 
-    def seconds(self, what: str, s: float, at_most: float, of: str = "seconds") -> None:
-        """Add a time with an upper bound in seconds; the figure is scaled by the speed of the machine."""
-        self.add(what, f"{s:.3g} s", of + ", scaled", "", s * REFERENCE_S / compile_modules_s(), at_most)
+    def seconds(self, what: str, s: float, at_most: float, of: str = "seconds", *, unit_s: float = 1.0) -> None:
+        """Add a time with an upper bound in a unit of time; the figure is scaled by the speed of the machine."""
+        self.add(what, f"{s:.3g} s", of + ", scaled", "", s / unit_s * REFERENCE_S / compile_modules_s(), at_most)
 
     def add(
         self,

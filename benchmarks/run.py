@@ -312,7 +312,7 @@ def bench_shot_and_read_noise(report: Report, n_side: int) -> None:
 
 def add_per_site(report: Report, what: str, s: float, n_sites: int, at_most_ns: float) -> None:
     """Add the processor time per site, with its bound."""
-    report.add(what, f"{s:.4g} s", "processor time, ns per site", "", 1e9 * s / n_sites, at_most_ns)
+    report.seconds(what, s, at_most_ns, "processor time, ns per site", unit_s=1e-9 * n_sites)
 
 
 def gaussian_numbers(n_sites: int, n_effects: int) -> Callable[[], object]:
