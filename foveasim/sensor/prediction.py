@@ -97,13 +97,12 @@ class _LinearModel:
         self.noise, self.half_step2 = np.zeros(1), np.zeros(1)
         self.mean, self.variance = mean, variance
         for effect in effects:
-            mean, variance = effect.validate_moments(self.mean, self.variance, sites)
-            factor = effect.validate_moments(self.mean + 1.0, self.variance, sites)[0] - mean
+            mean, factor, spread2 = effect.validate_linear(self.mean, self.variance, sites)
             # Draws at the reset are constants in differences of reads.
             is_drawn = effect.is_temporal and (is_reset or not effect.is_drawn_at_reset)
             added, half_step = np.zeros(1), None
             if is_drawn:
-                added = np.maximum(variance - factor**2 * self.variance, 0.0)
+                added = spread2
                 half_step = effect.half_step(sites.of(effect)) if sites.known_device is not None else None
             self.half_step2 = factor**2 * self.half_step2
             if half_step is not None:

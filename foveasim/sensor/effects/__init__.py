@@ -22,6 +22,7 @@ from foveasim.sensor.effects.contract import (
     Photosites,
     Sites,
     Stage,
+    StepModel,
 )
 from foveasim.sensor.effects.crosstalk import CrosstalkOperator, Diffusion, InterPixelCapacitance, KernelCrosstalk
 from foveasim.sensor.effects.dark import DarkLaw, DarkSignal, HotSites, dark_current_factor
@@ -55,6 +56,7 @@ __all__ = [
     "ShotNoise",
     "Sites",
     "Stage",
+    "StepModel",
     "TelegraphNoise",
     "dark_current_factor",
     "draw_shot_noise",

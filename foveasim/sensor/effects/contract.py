@@ -2,7 +2,8 @@
 Base classes of effects: noise sources, fixed patterns and crosstalk.
 
 The sensor chain is an ordered tuple of effects. All results of a sensor (random draws, predictions, the noise budget, the
-weights of reconstructions and HDR merges) use only :meth:`Effect.apply` and :meth:`Effect.moments`.
+weights of reconstructions and HDR merges) use only :meth:`Effect.apply`, :meth:`Effect.moments` and :meth:`Effect.linearise`,
+which follows from the moments by default.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar
 
@@ -25,9 +27,22 @@ from foveasim.fields import PackedRings
 from foveasim.sensor.bounded_cache import BoundedCache
 from foveasim.sensor.device import Device
 
-__all__ = ["EFFECTS", "STAGES", "AdditiveNoise", "Effect", "FixedFactor", "FixedOffset", "Photosites", "Sites", "Stage"]
+__all__ = [
+    "EFFECTS",
+    "STAGES",
+    "AdditiveNoise",
+    "Effect",
+    "FixedFactor",
+    "FixedOffset",
+    "Photosites",
+    "Sites",
+    "Stage",
+    "StepModel",
+]
 
 T = TypeVar("T")
+#: Slope of an effect that adds something, and variance of one that adds no noise.
+UNCHANGED, NOTHING = read_only(np.ones(1)), read_only(np.zeros(1))
 #: Cached values of a sensor: several times those of all standard effects.
 MAX_CACHED = 64
 #: Stage of the chain at which an effect acts.
@@ -44,6 +59,30 @@ STAGES: Mapping[Stage, str] = MappingProxyType(
         "output": "V",  # after the nonlinearity, before clipping and conversion
     }
 )
+
+
+#: Difference of means, relative to the mean, from which slopes are computed, and the smallest mean to which it is relative. A
+#: power of 2 has no rounding of its own; that of the slope of a proportional effect is below 1e-12.
+SLOPE_STEP, SMALLEST_MEAN = 2.0**-10, MappingProxyType({"e-/s": 1.0, "e-": 1.0, "V": 1e-6})
+
+
+class StepModel(NamedTuple):
+    """
+    First-order model of an effect at the mean of each site.
+
+    Attributes
+    ----------
+    mean : (..., n) or (1,), unit of the stage
+        Mean after the effect.
+    slope : (..., n) or (1,)
+        Derivative of this mean with respect to the mean before the effect.
+    variance : (..., n) or (1,), square of the unit of the stage
+        Variance that the effect adds.
+    """
+
+    mean: Floats
+    slope: Floats
+    variance: Floats
 
 
 class Photosites(PackedRings, Protocol):
@@ -327,20 +366,56 @@ class Effect(ABC):
             With a device, its fixed patterns are known constants; without one, moments are over all devices.
         """
 
-    def validate_moments(self, mean: Floats, variance: Floats, sites: Sites) -> tuple[Floats, Floats]:
-        """Return the result of :meth:`moments` after checking its shape."""
+    def linearise(self, mean: Floats, variance: Floats, *, sites: Sites) -> StepModel:
+        """
+        Compute mean, slope and added variance at the mean of each site.
+
+        Effects that mix sites do not need it. The default follows from :meth:`moments`, with a central difference that is
+        small relative to the mean, so that it does not depend on the unit of the stage. A class that redefines :meth:`moments`
+        alone has the default.
+
+        Parameters
+        ----------
+        mean, variance : (..., n) or (1,) float64, unit of the stage and its square
+            Moments before the effect; the added variance may depend on both.
+        sites : Sites
+            As for :meth:`moments`.
+        """
+        after, spread2 = self.validate_moments(mean, variance, sites)
+        step = SLOPE_STEP * np.maximum(np.abs(mean), SMALLEST_MEAN[STAGES[self.stage]])
+        ahead, behind = mean + step, mean - step
+        means = (self.validate_moments(at, variance, sites)[0] for at in (ahead, behind))
+        slope = np.subtract(*means) / (ahead - behind)
+        return StepModel(after, slope, np.maximum(spread2 - slope**2 * variance, 0.0))
+
+    def validate_linear(self, mean: Floats, variance: Floats, sites: Sites) -> StepModel:
+        """Return the result of :meth:`linearise` after checking its shapes."""
         sites = sites.of(self)
-        found = self.moments(mean, variance, sites=sites)
+        definers = (_definer(type(self), name) for name in ("linearise", "moments"))
+        linearise = self.linearise if issubclass(*definers) else partial(Effect.linearise, self)
         shape = np.broadcast_shapes(np.shape(mean), np.shape(variance), (sites.n_sites,))
+        found = linearise(mean, variance, sites=sites)
+        return StepModel(*self._validate_shapes(found, 3, shape, "a mean, a slope and a variance", "linearise"))
+
+    def validate_moments(self, mean: Floats, variance: Floats, sites: Sites) -> tuple[Floats, Floats]:
+        """Return the result of :meth:`moments` after checking its shapes."""
+        sites = sites.of(self)
+        shape = np.broadcast_shapes(np.shape(mean), np.shape(variance), (sites.n_sites,))
+        found = self.moments(mean, variance, sites=sites)
+        after, spread2 = self._validate_shapes(found, 2, shape, "a mean and a variance", "moments")
+        return after, spread2
+
+    def _validate_shapes(self, found: Any, n: int, shape: tuple[int, ...], what: str, method: str) -> list[Floats]:
+        """Return the arrays that a method returned, if they can be broadcast to a shape."""
         try:
-            after, spread2 = (np.asarray(part, np.float64) for part in found)
-            if np.broadcast_shapes(after.shape, spread2.shape, shape) != shape:
+            arrays = [np.asarray(part, np.float64) for part in found]
+            if len(arrays) != n or np.broadcast_shapes(*(part.shape for part in arrays), shape) != shape:
                 raise ValueError
         except (TypeError, ValueError):
             raise SimulationError(
-                f"the effect '{self.name}' must return a mean and a variance of shape {shape}; check its moments()"
+                f"the effect '{self.name}' must return {what} of shape {shape}; check its {method}()"
             ) from None
-        return after, spread2
+        return arrays
 
     def half_step(self, sites: Sites) -> Floats | None:
         """
@@ -349,6 +424,11 @@ class Effect(ABC):
         None for effects with other distributions.
         """
         return None
+
+
+def _definer(cls: type, name: str) -> type:
+    """Return the class that defines a method of a class."""
+    return next(each for each in cls.__mro__ if name in vars(each))
 
 
 class _FixedPattern(Effect):
@@ -366,6 +446,11 @@ class _FixedPattern(Effect):
         """
         return self.pattern(sites), 0.0
 
+    def _of_devices(self, sites: Sites) -> tuple[Floats, Floats]:
+        """Return the moments of the pattern at the sites."""
+        centre, spread2 = (sites.select(part) for part in self.pattern_moments(replace(sites, index=slice(None))))
+        return np.atleast_1d(centre), np.atleast_1d(spread2)
+
 
 class FixedFactor(_FixedPattern):
     """Multiplicative fixed pattern; subclasses define :meth:`pattern`."""
@@ -380,8 +465,16 @@ class FixedFactor(_FixedPattern):
         if sites.known_device is not None:
             factor = sites.pattern(self, self.pattern)
             return mean * factor, variance * factor**2
-        centre, spread2 = (sites.select(part) for part in self.pattern_moments(replace(sites, index=slice(None))))
+        centre, spread2 = self._of_devices(sites)
         return mean * centre, variance * (centre**2 + spread2) + mean**2 * spread2
+
+    def linearise(self, mean: Floats, variance: Floats, *, sites: Sites) -> StepModel:
+        """Return the mean, the factor, and the variance of the factor times the second moment."""
+        if sites.known_device is not None:
+            factor = sites.pattern(self, self.pattern)
+            return StepModel(mean * factor, factor, NOTHING)
+        centre, spread2 = self._of_devices(sites)
+        return StepModel(mean * centre, centre, (variance + mean**2) * spread2)
 
 
 class FixedOffset(_FixedPattern):
@@ -396,8 +489,15 @@ class FixedOffset(_FixedPattern):
         """Compute the moments of a sum of independent terms."""
         if sites.known_device is not None:
             return mean + sites.pattern(self, self.pattern), variance
-        centre, spread2 = (sites.select(part) for part in self.pattern_moments(replace(sites, index=slice(None))))
+        centre, spread2 = self._of_devices(sites)
         return mean + centre, variance + spread2
+
+    def linearise(self, mean: Floats, variance: Floats, *, sites: Sites) -> StepModel:
+        """Return the mean, 1, and the variance of the offset."""
+        if sites.known_device is not None:
+            return StepModel(mean + sites.pattern(self, self.pattern), UNCHANGED, NOTHING)
+        centre, spread2 = self._of_devices(sites)
+        return StepModel(mean + centre, UNCHANGED, spread2)
 
 
 class AdditiveNoise(Effect):
@@ -419,6 +519,10 @@ class AdditiveNoise(Effect):
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
         """Return the mean and the sum of the variances."""
         return mean, variance + sites.pattern(self, self.deviation) ** 2
+
+    def linearise(self, mean: Floats, variance: Floats, *, sites: Sites) -> StepModel:
+        """Return the mean, 1, and the square of the standard deviation."""
+        return StepModel(mean, UNCHANGED, sites.pattern(self, self.deviation) ** 2)
 
 
 #: Additional effects by their names in settings files. Classes are registered with ``@EFFECTS.register("name")``, or by entry
