@@ -344,7 +344,8 @@ class Capture:
             return values, np.ones(values.size), None
         electronics = self._electronics(sensor)
         e_per_dn = electrons_per_code(electronics) if of == "code" else np.ones(values.size)
-        response = self.layout.area_um2 * electronics.sensitivity * (np.mean(e_per_dn) / e_per_dn)
+        light_response = electronics.light_response(is_device_known=False)
+        response = self.layout.area_um2 * light_response * (np.mean(e_per_dn) / e_per_dn)
         if not is_estimated:
             return values, response, None
         exposure_s = float(self.settings.get("exposure_s", 0.0))

@@ -499,12 +499,13 @@ def _camera_values(
         annuli[key] = [one.annuli[key] for one in shots.measures]
     channel_e_per_um2 = np.nanmean([picture.data for picture in shots.ideal], axis=(0, 2, 3))
     filter_of_site = shots.measures[0].capture.filter_of_site
-    response = channel_e_per_um2[filter_of_site] / mean_e_per_um2 * camera.sensor.sensitivity
-    noise_e = [one.signals.noise_e for one in shots.measures]
+    response = channel_e_per_um2[filter_of_site] / mean_e_per_um2 * camera.sensor.light_response()
     distance_m = float(light.distance_m) if isinstance(light, Scene) else None
     wavelength_nm = float(np.mean(light.wavelength_nm))
     for total, by_annulus in (
-        information_by_annulus(camera, covariance, response, noise_e, field.centre_um, field.edges_um),
+        information_by_annulus(
+            camera, covariance, response, [one.signals for one in shots.measures], field.centre_um, field.edges_um
+        ),
         layout_measures(camera, wavelength_nm, distance_m, field.centre_um, field.edges_um, wave_per_mm),
     ):
         totals.update(total)

@@ -300,8 +300,8 @@ def site_information_bits(
     layout : Layout
     covariance : SceneCovariance
         Covariance of the irradiance.
-    gain : (n_site,)
-        Mean reading of a site for an irradiance of 1: its area times its sensitivity.
+    gain : (n_site,) or (n_scene, n_site)
+        Mean reading of a site for an irradiance of 1: its area times its sensitivity; 0 for dead and saturated sites.
     noise_variance : (n_scene, n_site)
         Noise variance of the readings, in squared units of the readings.
     n_conditions : int
@@ -333,21 +333,24 @@ def site_information_bits(
     order, starts = _blocks(xy_um)
     position = np.empty(n, np.int64)
     position[order] = np.arange(n)
-    scale = finite_array("gain", gain, ndim=1)
+    scale = np.atleast_2d(finite_array("gain", gain))
     noise = finite_array("noise_variance", noise_variance, ndim=2, above=0.0)
     for name, values in (("gain", scale), ("noise_variance", noise)):
         check_per_site(name, values, n, or_rows=True)
+    if scale.shape[0] not in (1, noise.shape[0]):
+        raise ParameterError("gain", f"must have one row, or one per scene, {noise.shape[0]}", scale.shape[0])
+    scale = np.broadcast_to(scale, noise.shape)
     apertures = _Apertures(layout, covariance)
     tree = cKDTree(xy_um)
     bits = np.empty(noise.shape)
     for start, stop in pairwise(starts):
         block = order[start:stop]
         members = np.concatenate((_preceding(xy_um, tree, block, position, start, n_conditions), block))
-        signal = apertures.covariance(members) * (scale[members][:, np.newaxis] * scale[members])
+        signal = apertures.covariance(members)
         for k, variance in enumerate(noise[:, members]):
             # In units of the noise, for a good condition.
-            root = np.sqrt(variance)
-            total = signal / (root[:, np.newaxis] * root)
+            ratio = scale[k, members] / np.sqrt(variance)
+            total = signal * (ratio[:, np.newaxis] * ratio)
             total[np.diag_indices_from(total)] += 1.0
             try:
                 cholesky = np.linalg.cholesky(total)

@@ -186,6 +186,7 @@ def scene_measures(
     counts = np.bincount(annulus[annulus >= 0], minlength=n)
     ratio = np.divide(sums, counts, out=np.full(n, np.nan), where=counts > 0)
     gradient = _shift_gradients_e_per_um(camera, image, exposure_s)
+    gradient[signals.is_saturated] = 0.0
     variance_e2 = np.square(signals.noise_e)
     everything = flow_bound(gradient, variance_e2)
     parts = flow_bound(gradient, variance_e2, regions=annulus)
@@ -235,17 +236,18 @@ def information_by_annulus(
     camera: Camera,
     covariance: SceneCovariance,
     response: NDArray[np.float64],
-    noise_e: list[Floats],
+    signals: list[SiteSignals],
     centre_um: tuple[float, float],
     edges_um: Floats,
 ) -> tuple[dict[str, Floats], dict[str, Floats]]:
     """
     Return the information per site and per mm², (n_scene,) and (n_scene, n_annulus).
 
-    ``response`` is the ratio of each site's irradiance in electrons to that of the covariance.
+    ``response`` is the ratio of each site's irradiance in electrons to that of the covariance. Saturated sites do not respond.
     """
     layout = layout_of(camera)
-    bits = site_information_bits(layout, covariance, layout.area_um2 * response, np.square(noise_e))
+    gain = [np.where(one.is_saturated, 0.0, layout.area_um2 * response) for one in signals]
+    bits = site_information_bits(layout, covariance, gain, np.square([one.noise_e for one in signals]))
     annulus = annulus_of(layout.centroid_um, centre_um, edges_um)
     n, inside = edges_um.size - 1, annulus >= 0
     sums = np.stack([np.bincount(annulus[inside], row[inside], minlength=n) for row in bits])

@@ -36,7 +36,7 @@ from foveasim.sensor.chain import (
 )
 from foveasim.sensor.device import Device
 from foveasim.sensor.effects import EFFECTS, Effect, Photosites, Sites
-from foveasim.sensor.effects.contract import CompleteSites, FixedFactor, FixedOffset
+from foveasim.sensor.effects.contract import NOTHING, CompleteSites, FixedFactor, FixedOffset
 from foveasim.sensor.effects.crosstalk import Diffusion, InterPixelCapacitance, KernelCrosstalk
 from foveasim.sensor.effects.dark import ACTIVATION, DOUBLING, DarkLaw, DarkSignal, HotSites, dark_current_factor
 from foveasim.sensor.effects.fixed_pattern import ColumnOffset, DeadSites, PhotoResponse, PixelGain, PixelOffset
@@ -551,6 +551,32 @@ class Sensor:
         Includes sensitivity, PRNU, dead sites and additional effects.
         """
         return self._fixed(self.sensitivity, "photo")
+
+    def light_response(self, *, is_device_known: bool = True) -> Floats:
+        """
+        Compute the expected charge of each site per photoelectron of uniform light.
+
+        Includes sensitivity and all effects before collection, crosstalk among them; not the dark signal.
+
+        Parameters
+        ----------
+        is_device_known : bool
+            Whether fixed patterns are those of the device; otherwise means over all devices, without defects.
+
+        Returns
+        -------
+        response : (n_site,) float64
+        """
+        sites = self.sites if is_device_known else self.sites.without_device()
+        effects = [e for e in self._effects_at("photo", "expected") if is_device_known or not e.is_defect]
+
+        def charge(light: float) -> Floats:
+            mean = np.broadcast_to(light * np.asarray(self.sensitivity, np.float64), self.layout.n_sites)
+            for effect in effects:
+                mean = effect.validate_moments(mean, NOTHING, sites)[0]
+            return mean
+
+        return charge(1.0) - charge(0.0)
 
     @cached_property
     def dark_rate_e_per_s(self) -> Floats:

@@ -103,7 +103,7 @@ def public_objects(directory):
         sensor.Calibration(**dict.fromkeys(("offset_dn", "gain", "read_noise_dn", "expected_dn"), MANY), **dict.fromkeys(("hot", "dead", "noisy", "clipped"), MANY < 0.0)),
         effects.ColumnOffset(0.1), effects.DarkSignal(0.1), effects.DeadSites(0.1), effects.HotSites(0.1, 10.0), effects.PhotoResponse(0.1),
         effects.PixelGain(0.1), effects.PixelOffset(0.1), effects.ReadNoise(MANY), effects.ResetNoise(300.0), effects.ShotNoise(), SENSOR.sites,
-        effects.TelegraphNoise(0.1, 2.0),
+        effects.StepModel(MANY, MANY, MANY), effects.TelegraphNoise(0.1, 2.0),
         reconstruct.SiteEstimates(light_e=MANY, variance_e2=MANY, is_saturated=MANY > 0.5),
         video.FrameSource([np.zeros((8, 8), np.uint8)] * 3, frame_s=0.1, pitch_um=50.0, distance_m=0.5, peak_radiance_w_m2_sr_nm=0.05, band_width_nm=10.0),
         video.GazePath(np.arange(100.0), np.zeros((100, 2))),

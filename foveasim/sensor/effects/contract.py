@@ -84,6 +84,8 @@ class StepModel(NamedTuple):
     slope: Floats
     variance: Floats
 
+    __repr__ = short_repr
+
 
 class Photosites(PackedRings, Protocol):
     """Protocol of photosite layouts for sensors, implemented by :class:`foveasim.Layout`."""
@@ -322,6 +324,8 @@ class Effect(ABC):
         common to a row of sites, :meth:`apply` is called with all sites at once.
     is_drawn_at_reset : bool
         Whether all reads between two resets share one draw.
+    is_defect : bool
+        Whether the effect changes few sites only, which a calibration marks as defective. Nominal values exclude defects.
     needs_layout : bool
         Whether the effect on a site depends on its position or index in the layout, on other sites, or on an array per site. If
         not, the effect on part of a sensor, such as a tile, is computed for its sites alone, which takes less memory.
@@ -332,6 +336,7 @@ class Effect(ABC):
     is_temporal: ClassVar[bool]
     is_local: ClassVar[bool] = True
     is_drawn_at_reset: ClassVar[bool] = False
+    is_defect: ClassVar[bool] = False
     needs_layout: ClassVar[bool] = True
 
     @property

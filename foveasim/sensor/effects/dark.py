@@ -138,6 +138,7 @@ class HotSites(FixedOffset):
     example: ClassVar[Mapping[str, Any]] = {"hot_fraction": 0.05, "hot_e_per_s": 3000.0}
     name: ClassVar[str] = "hot"
     stage: ClassVar[Stage] = "dark"
+    is_defect: ClassVar[bool] = True
     needs_layout: ClassVar[bool] = False
 
     hot_fraction: float

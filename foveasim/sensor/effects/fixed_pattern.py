@@ -75,6 +75,7 @@ class DeadSites(FixedFactor):
     example: ClassVar[Mapping[str, Any]] = {"dead_fraction": 0.1}
     name: ClassVar[str] = "dead"
     stage: ClassVar[Stage] = "photo"
+    is_defect: ClassVar[bool] = True
     needs_layout: ClassVar[bool] = False
 
     fraction: float

@@ -86,6 +86,7 @@ class TelegraphNoise(Effect):
     example: ClassVar[Mapping[str, Any]] = {"rts_fraction": 0.3, "rts_e": 60.0}
     name: ClassVar[str] = "rts"
     stage: ClassVar[Stage] = "charge"
+    is_defect: ClassVar[bool] = True
     is_temporal: ClassVar[bool] = True
     needs_layout: ClassVar[bool] = False
 

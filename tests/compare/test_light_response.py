@@ -1,0 +1,154 @@
+"""Effects on light before the collection, dead and saturated sites, in comparisons and pictures per area."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+import foveasim as fs
+from foveasim import Camera, Optics, Sensor
+from foveasim.compare import SceneCovariance, site_information_bits
+from foveasim.errors import ParameterError
+from foveasim.layout import grid
+from foveasim.sensor import Diffusion
+from foveasim.sensor.effects import Effect, FixedFactor
+
+LAYOUT = grid(n_x=24, n_y=24, pitch_um=4.0)
+ELECTRONICS = {"bits": 12, "v_sat_v": 1.0, "capacitance_f": 3.2e-15, "read_noise_e": 2.0, "pedestal_v": 0.01}
+OPTICS = Optics(focal_length_mm=8.0, f_number=2.8)
+EXPOSURE_S = 0.002
+
+
+def loss_of(layout):
+    """Return a transmission that falls from 1 at the centre to 0.1 in the corner."""
+    radius_um = np.hypot(*(layout.centroid_um - LAYOUT.centroid_um.mean(axis=0)).T)
+    return 1.0 - 0.9 * radius_um / np.hypot(*(LAYOUT.centroid_um - LAYOUT.centroid_um.mean(axis=0)).T).max()
+
+
+@dataclass(frozen=True)
+class CornerLoss(FixedFactor):
+    """Test effect: the transmission of each site."""
+
+    name: ClassVar[str] = "corner_loss"
+    stage: ClassVar[str] = "photo"
+
+    def pattern(self, sites):
+        return loss_of(sites.layout)
+
+
+@dataclass(frozen=True)
+class Glow(Effect):
+    """Test effect: 30 % more charge, and 7 e- of light from the electronics, before the draw."""
+
+    name: ClassVar[str] = "glow"
+    stage: ClassVar[str] = "expected"
+    is_temporal: ClassVar[bool] = False
+
+    def apply(self, values, *, sites, rng):
+        return 1.3 * values + 7.0
+
+    def moments(self, mean, variance, *, sites):
+        return 1.3 * mean + 7.0, 1.69 * variance
+
+
+def camera(**keywords):
+    return Camera(optics=OPTICS, sensor=Sensor(LAYOUT, **{**ELECTRONICS, **keywords}))
+
+
+def compare(cameras):
+    return fs.compare.cameras(cameras, exposure_s=EXPOSURE_S, max_pixels=64)
+
+
+EVERYTHING = {
+    "prnu_fraction": 0.02,
+    "gain_fpn_fraction": 0.01,
+    "dark_e_per_s": 50.0,
+    "crosstalk": Diffusion(spread_um=0.5),
+}
+
+
+@pytest.mark.parametrize("keywords", [{}, EVERYTHING], ids=["plain", "everything"])
+def test_effect_and_sensitivity_have_equal_measures(keywords):
+    comparison = compare({
+        "effect": camera(effects=[CornerLoss()], **keywords),
+        "sensitivity": camera(sensitivity=loss_of(LAYOUT), **keywords),
+        "without": camera(**keywords),
+    })  # fmt: skip
+
+    for name in ("information_bit_per_site", "shift_sigma_um", "snr_db"):
+        effect, sensitivity, without = comparison.values[name]
+        assert effect == pytest.approx(sensitivity, rel=1e-10)
+        assert np.all((effect > without) if name == "shift_sigma_um" else (effect < without))
+
+
+def test_picture_per_area_corrects_effects_on_light():
+    """A uniform scene has a uniform picture per area, whether the corner is dark by an effect or by a sensitivity."""
+    cameras = (camera(effects=[CornerLoss()]), camera(sensitivity=loss_of(LAYOUT)))
+    lit = fs.PowerMap(np.ones((1, 96, 96), np.float32), fs.Grid((96, 96), 1.0, tuple(LAYOUT.bounds_um[:2])), [550.0])
+
+    pictures = []
+    for each in cameras:
+        capture = each.capture(lit, exposure_s=EXPOSURE_S, seed=1)
+        pictures.append(capture.picture("cells", of="expected_e", per="um2", sensor=each.sensor).data)
+
+    assert pictures[0] == pytest.approx(pictures[1], rel=1e-6)
+    assert np.nanmax(pictures[0]) / np.nanmin(pictures[0]) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_dead_sites_reduce_information_in_proportion():
+    """Without correlation between sites, information is that of the living sites."""
+    covariance = SceneCovariance([4.0], [0.05])
+    is_dead = np.random.default_rng(1).random(LAYOUT.n_sites) < 0.3
+    noise = np.full((1, LAYOUT.n_sites), 9.0)
+
+    living = site_information_bits(LAYOUT, covariance, np.full(LAYOUT.n_sites, 16.0), noise)[0]
+    some = site_information_bits(LAYOUT, covariance, np.where(is_dead, 0.0, 16.0), noise)[0]
+
+    assert np.all(some[is_dead] == 0.0)
+    assert some[~is_dead] == pytest.approx(living[~is_dead], rel=1e-3)
+
+
+def test_information_falls_with_dead_and_saturated_sites():
+    comparison = compare({"all": camera(), "dead": camera(dead_fraction=0.3), "full": camera(full_well_e=20.0)})
+    information = np.asarray(comparison.values["information_bit_per_site"])
+    shift_um = np.asarray(comparison.values["shift_sigma_um"])
+
+    assert np.all(information[1] < 0.9 * information[0])
+    assert np.all(information[1] > 0.6 * information[0])
+    assert np.all(shift_um[1] > 1.1 * shift_um[0])
+    # All sites are within two standard deviations of the full well of 20 e-.
+    assert information[2] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_gains_of_other_scenes_are_errors():
+    with pytest.raises(ParameterError, match="one per scene, 3"):
+        site_information_bits(
+            LAYOUT, SceneCovariance([1.0], [5.0]), np.ones((2, LAYOUT.n_sites)), np.ones((3, LAYOUT.n_sites))
+        )
+
+
+@pytest.mark.parametrize("is_device_known", [True, False])
+def test_light_response_is_slope_of_expected_charge(is_device_known):
+    sensor = Sensor(
+        LAYOUT,
+        sensitivity=0.8,
+        dead_fraction=0.2,
+        prnu_fraction=0.05,
+        dark_e_per_s=100.0,
+        effects=[CornerLoss(), Glow()],
+    )
+    factor = 0.8 * 1.3 * loss_of(LAYOUT)
+    if is_device_known:
+        factor = factor * sensor.pattern("prnu") * sensor.pattern("dead")
+
+    assert sensor.light_response(is_device_known=is_device_known) == pytest.approx(factor, rel=1e-12)
+
+
+def test_light_response_conserves_charge_of_crosstalk():
+    sensor = Sensor(LAYOUT, crosstalk=Diffusion(spread_um=1.0))
+    patterned = replace(sensor, sensitivity=loss_of(LAYOUT))
+
+    assert sensor.light_response() == pytest.approx(1.0, rel=1e-12)
+    assert patterned.light_response().sum() == pytest.approx(loss_of(LAYOUT).sum(), rel=1e-12)
+    assert patterned.light_response() != pytest.approx(loss_of(LAYOUT), rel=1e-3)
