@@ -84,7 +84,8 @@ class StepModel(NamedTuple):
     slope: Floats
     variance: Floats
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 class Photosites(PackedRings, Protocol):
