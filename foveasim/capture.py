@@ -17,6 +17,7 @@ from foveasim._core.names import possible_names
 from foveasim._core.provenance import copy_plain_data, to_plain_data
 from foveasim._core.rings import same_rings
 from foveasim._core.show import Drawn, drawn
+from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, Ints, check_count, own, read_only, unit_of, unmasked
 from foveasim._io.atomic import atomic_directory
 from foveasim._io.npz import open_archive, write_archive
@@ -171,8 +172,8 @@ class Capture:
             dark signal.
         per : {"site", "um2"}
             ``"site"``: the values themselves, so that larger sites are brighter. ``"um2"``: values divided by the site's area
-            in µm² and its relative sensitivity (and, for codes, relative conversion gain), so that a uniform scene gives a
-            uniform picture.
+            in µm² and its light response (and, for codes, relative conversion gain), so that a uniform scene gives a uniform
+            picture. The response is that of :meth:`Sensor.light_response` over devices.
         sensor : Sensor, optional
             The sensor of the capture, with the same sites in the same order. Required when its parameters differ between the
             sites of a layout with more than 64 sites: ``settings`` does not contain such arrays.
@@ -319,7 +320,7 @@ class Capture:
         ratio : (n_site,) float64
         """
         self._check_sensor(sensor)
-        known = self._electronics(sensor)
+        known = self._electronics if sensor is None else sensor
         dark_e = known.expected_electrons(np.zeros(self.layout.n_sites), float(self.settings.get("exposure_s", 0.0)))
         return signal_to_noise(known, self.expected_e, np.broadcast_to(dark_e, self.expected_e.shape)).ratio
 
@@ -342,7 +343,7 @@ class Capture:
         values = np.asarray(self.code if of == "light_e" else getattr(self, of), dtype=np.float64)
         if not is_estimated and per != "um2":
             return values, np.ones(values.size), None
-        electronics = self._electronics(sensor)
+        electronics = self._electronics if sensor is None else sensor
         e_per_dn = electrons_per_code(electronics) if of == "code" else np.ones(values.size)
         light_response = electronics.light_response(is_device_known=False)
         response = self.layout.area_um2 * light_response * (np.mean(e_per_dn) / e_per_dn)
@@ -358,10 +359,9 @@ class Capture:
             values[estimates.is_saturated] = np.nan
         return values, response, estimates.variance_e2 / e_per_dn**2
 
-    def _electronics(self, sensor: Sensor | None) -> Sensor:
-        """Return the given sensor, or the one in the settings."""
-        if sensor is not None:
-            return sensor
+    @cached_property
+    def _electronics(self) -> Sensor:
+        """Sensor of the settings, without filters and quantum efficiency."""
         known = Sensor.from_settings(self.layout, self.settings.get("sensor", {}))
         if "tile" in self.settings:
             unknown = [effect.name for effect in known.effects if effect.needs_layout]

@@ -301,7 +301,7 @@ def site_information_bits(
     covariance : SceneCovariance
         Covariance of the irradiance.
     gain : (n_site,) or (n_scene, n_site)
-        Mean reading of a site for an irradiance of 1: its area times its sensitivity; 0 for dead and saturated sites.
+        Mean reading of a site for an irradiance of 1: its area times its response to light; 0 for dead and saturated sites.
     noise_variance : (n_scene, n_site)
         Noise variance of the readings, in squared units of the readings.
     n_conditions : int

@@ -410,12 +410,10 @@ def calibrate(
     zero_e = np.zeros(n_sites)
     dark_e = nominal.expected_electrons(zero_e, exposure_s)
     signal_e = nominal.expected_electrons(flat / exposure_s, exposure_s) - dark_e
-    # RTS noise counts as a defect (noisy site), so the nominal noise excludes it.
-    without_rts = nominal.without(
-        *(effect.name for effect in nominal.chain if effect.half_step(nominal.sites.of(effect)) is not None)
-    )
+    # Noisy sites are those with more noise than sites without defects.
+    intact = nominal.without(*(effect.name for effect in nominal.chain if effect.is_defect))
     dark_e2 = dark_e if sensor.shot.is_drawn else np.zeros(1)
-    noise_e2 = dark_e2 + without_rts.readout_model(dark_e).noise_e2
+    noise_e2 = dark_e2 + intact.readout_model(dark_e).noise_e2
     signal_e, dark_e = (nominal.readout_model(part).mean_e for part in (signal_e, dark_e))
     e_per_dn = nominal_e_per_dn(sensor)
     table = None if sensor.companding == "linear" and not sensor.inl_dn else sensor.adc.linear_dn

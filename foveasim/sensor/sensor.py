@@ -561,7 +561,8 @@ class Sensor:
         Parameters
         ----------
         is_device_known : bool
-            Whether fixed patterns are those of the device; otherwise means over all devices, without defects.
+            Whether fixed patterns are those of the device; otherwise the response is the mean over all devices, without
+            defects.
 
         Returns
         -------

@@ -1,10 +1,12 @@
 """Effects on light before the collection, dead and saturated sites, in comparisons and pictures per area."""
 
+import pickle
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 import pytest
+from reference.own_effects import CornerLoss
 
 import foveasim as fs
 from foveasim import Camera, Optics, Sensor
@@ -12,29 +14,18 @@ from foveasim.compare import SceneCovariance, site_information_bits
 from foveasim.errors import ParameterError
 from foveasim.layout import grid
 from foveasim.sensor import Diffusion
-from foveasim.sensor.effects import Effect, FixedFactor
+from foveasim.sensor.effects import Effect
 
+HALF_DIAGONAL_UM = 48.0 * np.sqrt(2.0)
 LAYOUT = grid(n_x=24, n_y=24, pitch_um=4.0)
 ELECTRONICS = {"bits": 12, "v_sat_v": 1.0, "capacitance_f": 3.2e-15, "read_noise_e": 2.0, "pedestal_v": 0.01}
 OPTICS = Optics(focal_length_mm=8.0, f_number=2.8)
 EXPOSURE_S = 0.002
 
 
-def loss_of(layout):
-    """Return a transmission that falls from 1 at the centre to 0.1 in the corner."""
-    radius_um = np.hypot(*(layout.centroid_um - LAYOUT.centroid_um.mean(axis=0)).T)
-    return 1.0 - 0.9 * radius_um / np.hypot(*(LAYOUT.centroid_um - LAYOUT.centroid_um.mean(axis=0)).T).max()
-
-
-@dataclass(frozen=True)
-class CornerLoss(FixedFactor):
-    """Test effect: the transmission of each site."""
-
-    name: ClassVar[str] = "corner_loss"
-    stage: ClassVar[str] = "photo"
-
-    def pattern(self, sites):
-        return loss_of(sites.layout)
+#: A transmission that falls from 1 at the centre to 0.1 in the corners, as an effect and as an array.
+CORNER_LOSS = CornerLoss(0.9, HALF_DIAGONAL_UM)
+TRANSMISSION = 1.0 - 0.9 * (LAYOUT.centroid_um**2).sum(axis=1) / HALF_DIAGONAL_UM**2
 
 
 @dataclass(frozen=True)
@@ -71,8 +62,8 @@ EVERYTHING = {
 @pytest.mark.parametrize("keywords", [{}, EVERYTHING], ids=["plain", "everything"])
 def test_effect_and_sensitivity_have_equal_measures(keywords):
     comparison = compare({
-        "effect": camera(effects=[CornerLoss()], **keywords),
-        "sensitivity": camera(sensitivity=loss_of(LAYOUT), **keywords),
+        "effect": camera(effects=[CORNER_LOSS], **keywords),
+        "sensitivity": camera(sensitivity=TRANSMISSION, **keywords),
         "without": camera(**keywords),
     })  # fmt: skip
 
@@ -84,7 +75,7 @@ def test_effect_and_sensitivity_have_equal_measures(keywords):
 
 def test_picture_per_area_corrects_effects_on_light():
     """A uniform scene has a uniform picture per area, whether the corner is dark by an effect or by a sensitivity."""
-    cameras = (camera(effects=[CornerLoss()]), camera(sensitivity=loss_of(LAYOUT)))
+    cameras = (camera(effects=[CORNER_LOSS]), camera(sensitivity=TRANSMISSION))
     lit = fs.PowerMap(np.ones((1, 96, 96), np.float32), fs.Grid((96, 96), 1.0, tuple(LAYOUT.bounds_um[:2])), [550.0])
 
     pictures = []
@@ -136,9 +127,9 @@ def test_light_response_is_slope_of_expected_charge(is_device_known):
         dead_fraction=0.2,
         prnu_fraction=0.05,
         dark_e_per_s=100.0,
-        effects=[CornerLoss(), Glow()],
+        effects=[CORNER_LOSS, Glow()],
     )
-    factor = 0.8 * 1.3 * loss_of(LAYOUT)
+    factor = 0.8 * 1.3 * TRANSMISSION
     if is_device_known:
         factor = factor * sensor.pattern("prnu") * sensor.pattern("dead")
 
@@ -147,8 +138,19 @@ def test_light_response_is_slope_of_expected_charge(is_device_known):
 
 def test_light_response_conserves_charge_of_crosstalk():
     sensor = Sensor(LAYOUT, crosstalk=Diffusion(spread_um=1.0))
-    patterned = replace(sensor, sensitivity=loss_of(LAYOUT))
+    patterned = replace(sensor, sensitivity=TRANSMISSION)
 
     assert sensor.light_response() == pytest.approx(1.0, rel=1e-12)
-    assert patterned.light_response().sum() == pytest.approx(loss_of(LAYOUT).sum(), rel=1e-12)
-    assert patterned.light_response() != pytest.approx(loss_of(LAYOUT), rel=1e-3)
+    assert patterned.light_response().sum() == pytest.approx(TRANSMISSION.sum(), rel=1e-12)
+    assert patterned.light_response() != pytest.approx(TRANSMISSION, rel=1e-3)
+
+
+def test_part_has_light_response_of_its_sites():
+    sensor = Sensor(
+        LAYOUT, sensitivity=TRANSMISSION, prnu_fraction=0.05, dead_fraction=0.2, effects=[CORNER_LOSS, Glow()]
+    )
+    complete = sensor.light_response()
+
+    for chosen in (slice(100, 300), np.array([5, 570, 5, 17])):
+        assert np.array_equal(sensor.part(chosen).light_response(), complete[chosen])
+    assert np.array_equal(pickle.loads(pickle.dumps(sensor)).light_response(), complete)

@@ -326,7 +326,7 @@ class Effect(ABC):
     is_drawn_at_reset : bool
         Whether all reads between two resets share one draw.
     is_defect : bool
-        Whether the effect changes few sites only, which a calibration marks as defective. Nominal values exclude defects.
+        Whether the effect changes few sites only, as dead, hot and RTS sites. Means over devices exclude it.
     needs_layout : bool
         Whether the effect on a site depends on its position or index in the layout, on other sites, or on an array per site. If
         not, the effect on part of a sensor, such as a tile, is computed for its sites alone, which takes less memory.
@@ -397,8 +397,8 @@ class Effect(ABC):
     def validate_linear(self, mean: Floats, variance: Floats, sites: Sites) -> StepModel:
         """Return the result of :meth:`linearise` after checking its shapes."""
         sites = sites.of(self)
-        definers = (_definer(type(self), name) for name in ("linearise", "moments"))
-        linearise = self.linearise if issubclass(*definers) else partial(Effect.linearise, self)
+        definer = next(each for each in type(self).__mro__ if not {"linearise", "moments"}.isdisjoint(vars(each)))
+        linearise = self.linearise if "linearise" in vars(definer) else partial(Effect.linearise, self)
         shape = np.broadcast_shapes(np.shape(mean), np.shape(variance), (sites.n_sites,))
         found = linearise(mean, variance, sites=sites)
         return StepModel(*self._validate_shapes(found, 3, shape, "a mean, a slope and a variance", "linearise"))
@@ -430,11 +430,6 @@ class Effect(ABC):
         None for effects with other distributions.
         """
         return None
-
-
-def _definer(cls: type, name: str) -> type:
-    """Return the class that defines a method of a class."""
-    return next(each for each in cls.__mro__ if name in vars(each))
 
 
 class _FixedPattern(Effect):
