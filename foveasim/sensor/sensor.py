@@ -571,8 +571,8 @@ class Sensor:
         sites = self.sites if is_device_known else self.sites.without_device()
         effects = [e for e in self._effects_at("photo", "expected") if is_device_known or not e.is_defect]
 
-        def charge(light: float) -> Floats:
-            mean = np.broadcast_to(light * np.asarray(self.sensitivity, np.float64), self.layout.n_sites)
+        def charge(photo_e: float) -> Floats:
+            mean = np.broadcast_to(photo_e * np.asarray(self.sensitivity, np.float64), self.layout.n_sites)
             for effect in effects:
                 mean = effect.validate_moments(mean, NOTHING, sites)[0]
             return mean
