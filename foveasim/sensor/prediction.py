@@ -97,7 +97,9 @@ class _LinearModel:
         self.noise, self.half_step2 = np.zeros(1), np.zeros(1)
         self.mean, self.variance = mean, variance
         for effect in effects:
-            mean, factor, spread2 = effect.validate_linear(self.mean, self.variance, sites)
+            mean, slope, deviation, _ = effect.validate_linear(self.mean, sites)
+            factor = np.ones(1) if slope is None else slope
+            spread2 = np.zeros(1) if deviation is None else deviation**2
             # Draws at the reset are constants in differences of reads.
             is_drawn = effect.is_temporal and (is_reset or not effect.is_drawn_at_reset)
             added, half_step = np.zeros(1), None

@@ -46,10 +46,10 @@ def test_default_slope_is_derivative(stage, exponent):
     effect = Power(scale=50.0, exponent=exponent, stage=stage)
     wide = MEANS[MEANS >= 1.0]
 
-    found = effect.validate_linear(wide, wide, SITES.block(slice(0, wide.size)))
+    found = effect.validate_linear(wide, SITES.block(slice(0, wide.size)))
 
     assert found.slope == pytest.approx(exponent * (wide / 50.0) ** (exponent - 1.0), rel=1e-6)
-    assert np.all(found.variance <= 1e-5 * found.slope**2 * wide)
+    assert found.deviation is None
 
 
 @pytest.mark.parametrize("factor", [1e-9, 0.3, 1.0, 7.0])
@@ -60,19 +60,16 @@ def test_proportional_effects_have_exact_slope(factor):
         def moments(self, mean, variance, *, sites):
             return mean * factor, variance * factor**2
 
-    found = Gain().validate_linear(MEANS, MEANS, SITES)
+    found = Gain().validate_linear(MEANS, SITES)
 
     assert found.slope == pytest.approx(factor, rel=1e-12)
     assert found.mean == pytest.approx(MEANS * factor, rel=1e-15)
 
 
-def test_multiplicative_noise_scales_with_second_moment():
-    """For a factor of mean 1 and variance s², the variance of the product is s² (mean² + variance) + variance."""
-    mean, variance = np.full(40, 3.0), np.full(40, 4.0)
+def test_multiplicative_noise_is_proportional_to_mean():
+    found = Power(spread=0.5).validate_linear(np.full(40, 3.0), SITES)
 
-    found = Power(spread=0.5).validate_linear(mean, variance, SITES)
-
-    assert found.variance == pytest.approx(0.25 * (9.0 + 4.0), rel=1e-9)
+    assert found.deviation == pytest.approx(0.5 * 3.0, rel=1e-12)
 
 
 def test_redefined_moments_replace_inherited_model():
@@ -87,28 +84,27 @@ def test_redefined_moments_replace_inherited_model():
             return 0.5 * mean, 0.25 * variance + mean
 
     class Again(SignalDependent):
-        def linearise(self, mean, variance, *, sites):
+        def linearise(self, mean, *, sites):
             return StepModel(mean, np.full(1, 3.0), np.full(1, 5.0))
 
-    slopes, variances = zip(
-        *((found.slope[0], found.variance[0]) for found in (
-            effect().validate_linear(np.full(40, 8.0), np.ones(40), SITES) for effect in (Shifted, SignalDependent, Again)
-        )), strict=True,
-    )  # fmt: skip
+    shifted, dependent, again = (
+        effect().validate_linear(np.full(40, 8.0), SITES) for effect in (Shifted, SignalDependent, Again)
+    )
 
-    assert slopes == pytest.approx((1.0, 0.5, 3.0))
-    assert variances == pytest.approx((4.0, 8.0, 5.0))
+    assert shifted.slope is None
+    assert (dependent.slope[0], again.slope[0]) == pytest.approx((0.5, 3.0))
+    assert (shifted.deviation[0], dependent.deviation[0], again.deviation[0]) == pytest.approx((2.0, 8.0**0.5, 5.0))
 
 
 def test_wrong_shapes_name_the_method():
     class Wrong(Power):
-        def linearise(self, mean, variance, *, sites):
+        def linearise(self, mean, *, sites):
             return mean, np.ones(7)
 
     with pytest.raises(
-        SimulationError, match=r"'power' must return a mean, a slope and a variance .*check its linearise"
+        SimulationError, match=r"'power' must return a mean, a slope and a deviation .*check its linearise"
     ):
-        Wrong().validate_linear(MEANS, MEANS, SITES)
+        Wrong().validate_linear(MEANS, SITES)
 
 
 def test_factor_without_device_adds_its_spread():
@@ -121,14 +117,14 @@ def test_factor_without_device_adds_its_spread():
         def pattern_moments(self, sites):
             return 1.2, 0.01
 
-    mean, variance = np.full(40, 30.0), np.full(40, 5.0)
-    unknown = Gain().validate_linear(mean, variance, SITES.without_device())
-    known = Gain().validate_linear(mean, variance, SITES)
+    mean = np.full(40, 30.0)
+    unknown = Gain().validate_linear(mean, SITES.without_device())
+    known = Gain().validate_linear(mean, SITES)
 
     assert unknown.slope == pytest.approx(1.2)
-    assert unknown.variance == pytest.approx(0.01 * (900.0 + 5.0))
+    assert unknown.deviation == pytest.approx(3.0)
     assert known.slope == pytest.approx(Gain().pattern(SITES))
-    assert np.all(known.variance == 0.0)
+    assert known.deviation is None
 
 
 @dataclass(frozen=True)

@@ -41,8 +41,8 @@ __all__ = [
 ]
 
 T = TypeVar("T")
-#: Slope of an effect that adds something, and variance of one that adds no noise.
-UNCHANGED, NOTHING = read_only(np.ones(1)), read_only(np.zeros(1))
+#: Variance of values without noise.
+NOTHING = read_only(np.zeros(1))
 #: Cached values of a sensor: several times those of all standard effects.
 MAX_CACHED = 64
 #: Stage of the chain at which an effect acts.
@@ -66,6 +66,19 @@ STAGES: Mapping[Stage, str] = MappingProxyType(
 SLOPE_STEP, SMALLEST_MEAN = 2.0**-10, MappingProxyType({"e-/s": 1.0, "e-": 1.0, "V": 1e-6})
 
 
+class Operator(Protocol):
+    """Linear map between values of all sites, implemented by :class:`foveasim.sensor.effects.CrosstalkOperator`."""
+
+    def apply(self, values: ArrayLike, *, n_threads: int | None = None) -> Floats:
+        """Return the map of values (..., n_site)."""
+
+    def transpose(self) -> Operator:
+        """Return the transposed map."""
+
+    def rows(self, sites: Any) -> Any:
+        """Return the rows of some sites, (n, n_site) sparse, or those of a sparse matrix (n, n_site) times the map."""
+
+
 class StepModel(NamedTuple):
     """
     First-order model of an effect at the mean of each site.
@@ -74,15 +87,18 @@ class StepModel(NamedTuple):
     ----------
     mean : (..., n) or (1,), unit of the stage
         Mean after the effect.
-    slope : (..., n) or (1,)
-        Derivative of this mean with respect to the mean before the effect.
-    variance : (..., n) or (1,), square of the unit of the stage
-        Variance that the effect adds.
+    slope : None, (..., n), (1,), or Operator
+        Derivative of this mean with respect to the mean before the effect; None for 1, an operator for effects that mix sites.
+    deviation : None, (..., n) or (1,), unit of the stage
+        Standard deviation that the effect adds; None for 0.
+    groups : None or (n,) int
+        Label of the draw of each site, for effects whose draws are common to groups of sites; None for a draw per site.
     """
 
     mean: Floats
-    slope: Floats
-    variance: Floats
+    slope: Floats | Operator | None = None
+    deviation: Floats | None = None
+    groups: Ints | None = None
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -155,6 +171,8 @@ class Sites:
         All photosites: of the complete layout, also in tiles, for effects that need it (:attr:`Effect.needs_layout`).
     known_device : Device or None
         Device with its fixed patterns. With None, moments are over all devices of the kind.
+    exposure_s : float or None, s
+        Exposure time, for collections that need it; None if it is unknown. Cached results do not depend on it.
     capacitance_f : (n_site,) or (1,) float64, F
         Capacitance of the sense nodes of all photosites.
     index : slice or (n,) int64
@@ -168,6 +186,7 @@ class Sites:
     capacitance_f: Floats
     index: slice | Ints = field(default_factory=lambda: slice(None))
     n_threads: int | None = None
+    exposure_s: float | None = None
     _complete: CompleteSites | None = field(default=None, repr=False)
     _cache: BoundedCache = field(default_factory=lambda: BoundedCache(MAX_CACHED), repr=False)
 
@@ -193,12 +212,17 @@ class Sites:
         if self._complete is None or not effect.needs_layout:
             return self
         sites, selection = self._complete
-        found = sites.block(_compose(selection, self.index, sites.layout.n_sites), n_threads=self.n_threads).of(effect)
+        index = _compose(selection, self.index, sites.layout.n_sites)
+        found = sites.block(index, n_threads=self.n_threads).during(self.exposure_s).of(effect)
         return found if self.known_device is not None else found.without_device()
 
     def without_device(self) -> Sites:
         """Return the same sites without a device, for moments over all devices of the kind."""
         return replace(self, known_device=None)
+
+    def during(self, exposure_s: float | None) -> Sites:
+        """Return the same sites with an exposure time."""
+        return replace(self, exposure_s=exposure_s)
 
     @property
     def device(self) -> Device:
@@ -372,36 +396,44 @@ class Effect(ABC):
             With a device, its fixed patterns are known constants; without one, moments are over all devices.
         """
 
-    def linearise(self, mean: Floats, variance: Floats, *, sites: Sites) -> StepModel:
+    def linearise(self, mean: Floats, *, sites: Sites) -> StepModel:
         """
-        Compute mean, slope and added variance at the mean of each site.
+        Compute mean, slope and added standard deviation at the mean of each site.
 
-        Effects that mix sites do not need it. The default follows from :meth:`moments`, with a central difference that is
-        small relative to the mean, so that it does not depend on the unit of the stage. A class that redefines :meth:`moments`
-        alone has the default.
+        The default follows from :meth:`moments`, with a central difference that is small relative to the mean, so that it does
+        not depend on the unit of the stage. A class that redefines :meth:`moments` alone has the default.
 
         Parameters
         ----------
-        mean, variance : (..., n) or (1,) float64, unit of the stage and its square
-            Moments before the effect; the added variance may depend on both.
+        mean : (..., n) or (1,) float64, unit of the stage
+            Mean before the effect.
         sites : Sites
             As for :meth:`moments`.
         """
-        after, spread2 = self.validate_moments(mean, variance, sites)
+        after, added = self.validate_moments(mean, NOTHING, sites)
         step = SLOPE_STEP * np.maximum(np.abs(mean), SMALLEST_MEAN[STAGES[self.stage]])
         ahead, behind = mean + step, mean - step
-        means = (self.validate_moments(at, variance, sites)[0] for at in (ahead, behind))
+        means = (self.validate_moments(at, NOTHING, sites)[0] for at in (ahead, behind))
         slope = np.subtract(*means) / (ahead - behind)
-        return StepModel(after, slope, np.maximum(spread2 - slope**2 * variance, 0.0))
+        return StepModel(after, slope, np.sqrt(np.maximum(added, 0.0)) if np.any(added) else None)
 
-    def validate_linear(self, mean: Floats, variance: Floats, sites: Sites) -> StepModel:
+    def validate_linear(self, mean: Floats, sites: Sites) -> StepModel:
         """Return the result of :meth:`linearise` after checking its shapes."""
         sites = sites.of(self)
         definer = next(each for each in type(self).__mro__ if not {"linearise", "moments"}.isdisjoint(vars(each)))
         linearise = self.linearise if "linearise" in vars(definer) else partial(Effect.linearise, self)
-        shape = np.broadcast_shapes(np.shape(mean), np.shape(variance), (sites.n_sites,))
-        found = linearise(mean, variance, sites=sites)
-        return StepModel(*self._validate_shapes(found, 3, shape, "a mean, a slope and a variance", "linearise"))
+        found = linearise(mean, sites=sites)
+        shape = np.broadcast_shapes(np.shape(mean), (sites.n_sites,))
+        what = "a mean, a slope and a deviation"
+        if not isinstance(found, StepModel):
+            found = StepModel(*found) if isinstance(found, tuple) and 0 < len(found) <= len(StepModel._fields) else None
+        if found is None:
+            raise SimulationError(f"the effect '{self.name}' must return a StepModel; check its linearise()")
+        is_array = [part is not None and not hasattr(part, "apply") for part in found]
+        arrays = self._validate_shapes([part for part, chosen in zip(found, is_array, strict=True) if chosen],
+                                       sum(is_array), shape, what, "linearise")  # fmt: skip
+        parts = iter(arrays)
+        return StepModel(*(next(parts) if chosen else part for part, chosen in zip(found, is_array, strict=True)))
 
     def validate_moments(self, mean: Floats, variance: Floats, sites: Sites) -> tuple[Floats, Floats]:
         """Return the result of :meth:`moments` after checking its shapes."""
@@ -469,13 +501,13 @@ class FixedFactor(_FixedPattern):
         centre, spread2 = self._of_devices(sites)
         return mean * centre, variance * (centre**2 + spread2) + mean**2 * spread2
 
-    def linearise(self, mean: Floats, variance: Floats, *, sites: Sites) -> StepModel:
-        """Return the mean, the factor, and the variance of the factor times the second moment."""
+    def linearise(self, mean: Floats, *, sites: Sites) -> StepModel:
+        """Return the mean, the factor, and the mean times its standard deviation."""
         if sites.known_device is not None:
             factor = sites.pattern(self, self.pattern)
-            return StepModel(mean * factor, factor, NOTHING)
+            return StepModel(mean * factor, factor)
         centre, spread2 = self._of_devices(sites)
-        return StepModel(mean * centre, centre, (variance + mean**2) * spread2)
+        return StepModel(mean * centre, centre, np.abs(mean) * np.sqrt(spread2))
 
 
 class FixedOffset(_FixedPattern):
@@ -493,12 +525,12 @@ class FixedOffset(_FixedPattern):
         centre, spread2 = self._of_devices(sites)
         return mean + centre, variance + spread2
 
-    def linearise(self, mean: Floats, variance: Floats, *, sites: Sites) -> StepModel:
-        """Return the mean, 1, and the variance of the offset."""
+    def linearise(self, mean: Floats, *, sites: Sites) -> StepModel:
+        """Return the mean, and the standard deviation of the offset."""
         if sites.known_device is not None:
-            return StepModel(mean + sites.pattern(self, self.pattern), UNCHANGED, NOTHING)
+            return StepModel(mean + sites.pattern(self, self.pattern))
         centre, spread2 = self._of_devices(sites)
-        return StepModel(mean + centre, UNCHANGED, spread2)
+        return StepModel(mean + centre, None, np.sqrt(spread2))
 
 
 class AdditiveNoise(Effect):
@@ -521,9 +553,9 @@ class AdditiveNoise(Effect):
         """Return the mean and the sum of the variances."""
         return mean, variance + sites.pattern(self, self.deviation) ** 2
 
-    def linearise(self, mean: Floats, variance: Floats, *, sites: Sites) -> StepModel:
-        """Return the mean, 1, and the square of the standard deviation."""
-        return StepModel(mean, UNCHANGED, sites.pattern(self, self.deviation) ** 2)
+    def linearise(self, mean: Floats, *, sites: Sites) -> StepModel:
+        """Return the mean and the standard deviation."""
+        return StepModel(mean, None, sites.pattern(self, self.deviation))
 
 
 #: Additional effects by their names in settings files. Classes are registered with ``@EFFECTS.register("name")``, or by entry

@@ -10,7 +10,7 @@ import numpy as np
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats
-from foveasim.sensor.effects.contract import UNCHANGED, AdditiveNoise, Effect, Sites, Stage, StepModel
+from foveasim.sensor.effects.contract import AdditiveNoise, Effect, Sites, Stage, StepModel
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
 
 __all__ = ["ReadNoise", "ResetNoise", "TelegraphNoise"]
@@ -113,9 +113,9 @@ class TelegraphNoise(Effect):
         """Return the mean and the sum of the variances."""
         return mean, variance + self._variance(sites)
 
-    def linearise(self, mean: Floats, variance: Floats, *, sites: Sites) -> StepModel:
-        """Return the mean, 1, and the variance of the two states."""
-        return StepModel(mean, UNCHANGED, np.atleast_1d(self._variance(sites)))
+    def linearise(self, mean: Floats, *, sites: Sites) -> StepModel:
+        """Return the mean, and the standard deviation of the two states."""
+        return StepModel(mean, None, np.atleast_1d(np.sqrt(self._variance(sites))))
 
     def _variance(self, sites: Sites) -> float | Floats:
         if sites.known_device is None:
