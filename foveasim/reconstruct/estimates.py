@@ -6,7 +6,7 @@ Estimates use the nominal electronics of the sensor, without the deviations of a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats, check_per_site, finite_array
-from foveasim.sensor import Sensor, linearise
+from foveasim.sensor import Sensor
 from foveasim.sensor.calibration import nominal_e_per_dn
 from foveasim.sensor.limits import EXPOSURE
 
@@ -63,7 +63,7 @@ def estimate_from_charge(charge_e: ArrayLike, sensor: Sensor, exposure_s: Annota
     shot = sensor.shot
     _, variance_e2 = shot.moments(np.maximum(charge, 0.0), np.full(charge.size, float(shot.is_drawn)))
     return SiteEstimates(
-        light_e=charge - sensor.nominal_dark_e_per_s * exposure_s,
+        light_e=charge - sensor.dark_response(exposure_s),
         variance_e2=variance_e2,
         is_saturated=np.asarray(charge >= sensor.well_e),
     )
@@ -86,18 +86,6 @@ def estimate_from_code(code: ArrayLike, sensor: Sensor, exposure_s: Annotated[fl
     Crosstalk, inter-pixel capacitance, differential nonlinearity and fixed patterns are not corrected. For fixed patterns
     see :meth:`foveasim.sensor.Calibration.correct`.
     """
-    codes = check_per_site("code", finite_array("code", code), sensor.layout.n_sites)
-    fraction = (linearise(codes, sensor) + 0.5) / 2.0**sensor.bits - sensor.pedestal_v / sensor.v_sat_v
-    nonlinearity = sensor.nonlinearity_fraction
-    slope = np.ones(codes.size)
-    if nonlinearity:
-        slope = np.sqrt(np.maximum(1.0 - 4.0 * nonlinearity * fraction, 1e-6))
-        fraction = (1.0 - slope) / (2.0 * nonlinearity)
-    full_e = electrons_per_code(sensor) * 2.0**sensor.bits
-    charge = fraction * full_e
-    read_e = estimate_from_charge(charge, sensor, exposure_s)
-    step_e = sensor.adc.width_of_code_dn(codes) / slope * electrons_per_code(sensor)
-    readout = sensor.readout_model(np.maximum(charge, 0.0), is_device_known=False)
-    noise_e2 = readout.noise_e2 + step_e**2 * sensor.adc.noise_dn2
-    is_saturated = read_e.is_saturated | (codes >= 2**sensor.bits - 1)
-    return SiteEstimates(light_e=read_e.light_e, variance_e2=read_e.variance_e2 + noise_e2, is_saturated=is_saturated)
+    found = sensor.invert(check_per_site("code", finite_array("code", code), sensor.layout.n_sites))
+    light = estimate_from_charge(found.charge_e, sensor, exposure_s)
+    return replace(light, variance_e2=light.variance_e2 + found.noise_e2, is_saturated=found.is_saturated)

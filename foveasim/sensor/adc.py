@@ -99,6 +99,11 @@ class ADC:
         """Number of codes."""
         return int(2**self.bits)
 
+    @property
+    def is_linear(self) -> bool:
+        """Whether all codes have the same width on average: no companding and no INL."""
+        return self.companding == "linear" and not self.inl_dn
+
     @cached_property
     def curve(self) -> Floats:
         """Companding table; a single 0 without a table."""
@@ -134,6 +139,21 @@ class ADC:
     def linear_dn(self) -> Floats:
         """Linear code of each code, (n_codes,) DN: the centre of its voltage interval."""
         return read_only(0.5 * (self.transition_levels[:-1] + self.transition_levels[1:]) * self.n_codes - 0.5)
+
+    def linear_of_code_dn(self, code: ArrayLike) -> Floats:
+        """
+        Interpolate the linear code at given codes, (...) DN.
+
+        Raises
+        ------
+        ParameterError
+            If a code is out of range.
+        """
+        return interpolate_codes(code, self.linear_dn)
+
+    def fraction_of_code(self, code: ArrayLike) -> Floats:
+        """Interpolate the fraction of the voltage range at the centre of given codes, (...)."""
+        return (self.linear_of_code_dn(code) + 0.5) / self.n_codes
 
     @cached_property
     def widths_dn(self) -> Floats:
@@ -183,6 +203,14 @@ class ADC:
         from scipy.special import ndtri
 
         return read_only(np.asarray(ndtri((np.arange(N_QUANTILES) + 0.5) / N_QUANTILES)))
+
+
+def interpolate_codes(code: ArrayLike, linear_dn: Floats) -> Floats:
+    """Interpolate the linear codes (n_codes,) at given codes, (...) DN, after validation."""
+    values, highest = finite_array("code", code, at_least=0.0), linear_dn.size - 1.0
+    if values.size and values.max() > highest:
+        raise ParameterError("code", f"must be <= {highest:g} everywhere", float(values.max()), "DN")
+    return np.interp(values, np.arange(linear_dn.size), linear_dn)
 
 
 def _invert_piecewise_linear(values: Floats, at_fraction: Floats, wanted_fraction: Floats) -> Floats:

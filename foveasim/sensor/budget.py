@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -12,9 +11,8 @@ from foveasim._core.show import Drawn, drawn
 from foveasim._core.validation import Floats, as_numbers, check_per_site
 from foveasim.sensor.effects import STANDARD
 from foveasim.sensor.limits import EXPOSURE
-from foveasim.sensor.prediction import apply_nonlinearity
+from foveasim.sensor.linearisation import DARK_SHOT, PHOTON_SHOT, QUANTISATION
 from foveasim.sensor.sensor import Sensor
-from foveasim.sensor.signal_to_noise import local_step_e
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,12 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["FIXED", "TEMPORAL", "NoiseBudget", "noise_budget"]
 
 #: Standard entries of the budget: temporal noise and fixed patterns.
-TEMPORAL = (
-    "photon_shot",
-    "dark_shot",
-    *(effect.name for effect in STANDARD if effect.is_temporal),
-    "quantisation",
-)
+TEMPORAL = (PHOTON_SHOT, DARK_SHOT, *(effect.name for effect in STANDARD if effect.is_temporal), QUANTISATION)
 FIXED = tuple(effect.name for effect in STANDARD if not effect.is_temporal)
 
 
@@ -100,48 +93,31 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: Annotated[fl
     -------
     NoiseBudget
         A dict of (n_site,) float64, e-. Entries by name: :data:`TEMPORAL`, further temporal effects of the sensor,
-        :data:`FIXED`, further fixed effects; 0 for effects that the sensor does not have. Effects on voltages are referred to
-        the charge by the slope of the complete chain at the site's mean, as is conversion noise: the step divided by
-        ``sqrt(12)``, and differential nonlinearity. Without clipping, the squares of temporal entries add up to the temporal
-        variance of a site, and the squares of fixed entries to the variance between identical sites.
+        :data:`FIXED`, further fixed effects; 0 for effects that the sensor does not have. Noise is referred to the charge at
+        the sense node, after effects that mix sites, by the slope of the complete chain at the site's mean; so is conversion
+        noise: 1/12 DN² and differential nonlinearity.
 
     Notes
     -----
-    An entry is the root mean square deviation from the nominal value: ``sqrt(variance + (mean - nominal)²)`` from
-    :meth:`~foveasim.sensor.effects.Effect.moments`, for fixed patterns over all devices. Crosstalk and inter-pixel
-    capacitance, which mix sites, are not included.
+    Temporal entries are those of this device. The variance of the collection is divided between ``photon_shot`` and
+    ``dark_shot`` by the mean charges of light and dark signal. Without clipping, the squares of the temporal entries add up to
+    the variance of :meth:`foveasim.Sensor.predict`, referred to the charge.
+
+    Fixed entries are standard deviations over all devices of the kind, at their mean: the sum of squares is the variance of a
+    site's mean over devices, to first order. Crosstalk and inter-pixel capacitance reduce them, as they mix sites.
     """
-    n_sites = sensor.layout.n_sites
-    rates = check_per_site("photo_e_per_s", as_numbers("photo_e_per_s", photo_e_per_s), n_sites)
-    photo = rates * sensor.sensitivity
-    dark = np.broadcast_to(sensor.nominal_dark_e_per_s, n_sites)
-    charge_e = (photo + dark) * exposure_s
-    volts = charge_e * sensor.v_per_e
-    output_v, slope = apply_nonlinearity(sensor, volts)
-    # Nominal values at each stage, and the number of electrons per unit of that stage.
-    nominal = {
-        "photo": (photo, exposure_s),
-        "dark": (dark, exposure_s),
-        "expected": (charge_e, 1.0),
-        "charge": (charge_e, 1.0),
-        "sense_node": (volts, 1.0 / sensor.v_per_e),
-        "output": (output_v, 1.0 / (sensor.v_per_e * slope)),
-    }
-    step_e = local_step_e(sensor, charge_e, sensor.v_per_e, output_v=sensor.pedestal_v)
-    temporal = dict.fromkeys(TEMPORAL, np.zeros(1))
-    fixed = dict.fromkeys(FIXED, np.zeros(1))
-    temporal["quantisation"] = math.sqrt(sensor.adc.noise_dn2) * step_e
-    any_device = sensor.sites.without_device()
-    for effect in sensor.chain:
-        if effect.stage == "collection":
-            if sensor.shot.is_drawn:
-                for name, values in (("photon_shot", photo), ("dark_shot", dark)):
-                    temporal[name] = np.sqrt(effect.moments(values * exposure_s, np.zeros(1), sites=any_device)[1])
-        elif effect.is_temporal or effect.is_local:
-            values, e_per_unit = nominal[effect.stage]
-            sites = sensor.sites if effect.is_temporal else any_device
-            mean, variance = effect.validate_moments(values, np.zeros(1), sites)
-            entries = temporal if effect.is_temporal else fixed
-            entries[effect.name] = np.sqrt(variance + (mean - values) ** 2) * e_per_unit
-    noise_e = {name: np.broadcast_to(entry, n_sites).copy() for name, entry in (temporal | fixed).items()}
-    return NoiseBudget(noise_e, tuple(temporal))
+    rates = check_per_site("photo_e_per_s", as_numbers("photo_e_per_s", photo_e_per_s), sensor.layout.n_sites)
+    known, of_devices = (
+        sensor.linearise(photo_e_per_s=rates, exposure_s=exposure_s, is_device_known=is_known)
+        for is_known in (True, False)
+    )
+    noise_e = dict.fromkeys((*TEMPORAL, *FIXED), np.zeros(1))
+    temporal = list(TEMPORAL)
+    for model, is_temporal in ((known, True), (of_devices, False)):
+        names = [name for name, kind in model.sources.items() if (kind != "fixed") is is_temporal]
+        if not sensor.shot.is_drawn and is_temporal:
+            names.remove(sensor.shot.name)  # rounding to whole electrons
+        noise_e |= {name: np.sqrt(model.variance_e2([name])) for name in names}
+        temporal += [name for name in names if is_temporal and name not in temporal]
+    names = [*temporal, *(name for name in noise_e if name not in temporal)]
+    return NoiseBudget({name: np.broadcast_to(noise_e[name], rates.size).copy() for name in names}, temporal)

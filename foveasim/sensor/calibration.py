@@ -17,11 +17,10 @@ from foveasim._core.calls import FRACTION, POSITIVE, Limits, OwnCheck
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Bools, Floats, as_numbers, check_number, check_per_site, finite_array, own_arrays
 from foveasim.errors import ParameterError, SimulationError
-from foveasim.sensor.adc import QUANTISATION_DN2
+from foveasim.sensor.adc import QUANTISATION_DN2, interpolate_codes
 from foveasim.sensor.effects import Photosites
 from foveasim.sensor.limits import CHARGE, DURATION, EXPOSURE, RATIO
 from foveasim.sensor.sensor import Sensor
-from foveasim.units import volts_to_electrons
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -69,19 +68,12 @@ def linearise(code: ArrayLike, sensor: Sensor) -> Floats:
     >>> linearise([0, 128, 255], sensor).round(2).tolist()
     [-0.5, 64.0, 254.5]
     """
-    return _interpolate(code, sensor.adc.linear_dn, 2.0**sensor.bits - 1.0)
+    return sensor.adc.linear_of_code_dn(code)
 
 
 def nominal_e_per_dn(sensor: Sensor) -> Floats:
-    """Return the nominal number of electrons per linear code, (n_site,) or (1,) e-/DN."""
-    return np.atleast_1d(volts_to_electrons(sensor.v_sat_v / 2.0**sensor.bits, np.asarray(sensor.capacitance_f)))
-
-
-def _interpolate(code: ArrayLike, linear_dn: Floats, highest_dn: float) -> Floats:
-    values = finite_array("code", code, at_least=0.0)
-    if values.size and values.max() > highest_dn:
-        raise ParameterError("code", f"must be <= {highest_dn:g} everywhere", float(values.max()), "DN")
-    return np.interp(values, np.arange(linear_dn.size), linear_dn)
+    """Return the number of electrons per linear code at no charge, mean over devices, (n_site,) or (1,) e-/DN."""
+    return np.asarray(1.0 / sensor.linearise(0.0, is_device_known=False).linear_gain_dn_per_e)
 
 
 # -- calibration ------------------------------------------------------------------------------------------------------
@@ -298,7 +290,7 @@ class Calibration:
             If no two sites of the layout are neighbours, or the dark signal of the exposure time is unknown.
         """
         codes = check_per_site("code", as_numbers("code", code), self.n_sites, or_rows=True)
-        linear_dn = codes if self.linear_dn is None else _interpolate(codes, self.linear_dn, self.linear_dn.size - 1.0)
+        linear_dn = codes if self.linear_dn is None else interpolate_codes(codes, self.linear_dn)
         is_usable = np.broadcast_to(self.gain > 0.0, codes.shape)
         if self.highest_dn is not None:
             is_usable = is_usable & (codes < self.highest_dn)
@@ -382,8 +374,9 @@ def calibrate(
     Returns
     -------
     Calibration
-        The gain is relative to the nominal response to ``flat_e``: capacitances, crosstalk and inter-pixel capacitance of the
-        sensor's settings are part of the expectation, and remain in corrected codes.
+        The gain is relative to the mean response of all devices to ``flat_e``, without defects: sensitivities, capacitances,
+        crosstalk, inter-pixel capacitance and other effects common to all devices are part of the expectation, and remain in
+        corrected codes.
 
     Raises
     ------
@@ -406,17 +399,11 @@ def calibrate(
     """
     n_sites = sensor.layout.n_sites
     flat = np.ascontiguousarray(_one_or_per_site("flat_e", CHARGE.check_array("flat_e", flat_e), n_sites, above=0.0))
-    nominal = sensor.nominal()
     zero_e = np.zeros(n_sites)
-    dark_e = nominal.expected_electrons(zero_e, exposure_s)
-    signal_e = nominal.expected_electrons(flat / exposure_s, exposure_s) - dark_e
     # Noisy sites are those with more noise than sites without defects.
-    intact = nominal.without(*(effect.name for effect in nominal.chain if effect.is_defect))
-    dark_e2 = dark_e if sensor.shot.is_drawn else np.zeros(1)
-    noise_e2 = dark_e2 + intact.readout_model(dark_e).noise_e2
-    signal_e, dark_e = (nominal.readout_model(part).mean_e for part in (signal_e, dark_e))
-    e_per_dn = nominal_e_per_dn(sensor)
-    table = None if sensor.companding == "linear" and not sensor.inl_dn else sensor.adc.linear_dn
+    dark, lit = (sensor.linearise_intact(photo_e / exposure_s, exposure_s) for photo_e in (zero_e, flat))
+    dn_per_e = dark.linear_gain_dn_per_e
+    table = None if sensor.adc.is_linear else sensor.adc.linear_dn
 
     def frames(photo_e: Floats, exposure_s: float, kind: int) -> _Frames:
         stack = _Frames(2.0**sensor.bits - 1.0, table)
@@ -435,9 +422,9 @@ def calibrate(
         None if long_exposure_s is None else frames(zero_e, long_exposure_s, 2),
         exposure_s=exposure_s,
         long_exposure_s=long_exposure_s,
-        expected_dn=signal_e / e_per_dn,
-        expected_dark_dn_per_s=dark_e / e_per_dn / exposure_s,
-        expected_noise_dn=np.sqrt(noise_e2 / e_per_dn**2 + QUANTISATION_DN2),
+        expected_dn=(lit.node_e - dark.node_e) * dn_per_e,
+        expected_dark_dn_per_s=dark.node_e * dn_per_e / exposure_s,
+        expected_noise_dn=np.sqrt(dark.variance_e2()) * dn_per_e,
         hot_sigmas=hot_sigmas,
         dead_fraction=dead_fraction,
         noisy_ratio=noisy_ratio,
@@ -464,7 +451,7 @@ class _Frames:
             self.n_lowest, self.n_highest = np.zeros(code.size, np.int64), np.zeros(code.size, np.int64)
         self.n_frames += 1
         table = self.linear_dn
-        linear_dn = code.astype(np.float64) if table is None else _interpolate(code, table, table.size - 1.0)
+        linear_dn = code.astype(np.float64) if table is None else interpolate_codes(code, table)
         off_dn = linear_dn - self.mean_dn
         self.mean_dn += off_dn / self.n_frames
         self.squares_dn2 += off_dn * (linear_dn - self.mean_dn)

@@ -1,19 +1,13 @@
-"""Analytic sensor chain: moments of charges, and a first-order model of the readout."""
+"""Analytic sensor chain: moments of charges, and arguments of the kernels for predictions."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from functools import cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from foveasim._core.validation import Floats, read_only
-from foveasim.sensor.effects.contract import Effect, Sites, Stage
-
-if TYPE_CHECKING:
-    from foveasim.sensor.sensor import Sensor
 
 #: Number of quadrature nodes for charges clipped at the full well.
 QUADRATURE_NODES = 96
@@ -85,98 +79,6 @@ class ReadoutModel(NamedTuple):
     def noise_e2(self) -> Floats:
         """Variance of the total temporal noise of the readout, referred to the charge, e-²."""
         return np.asarray(self.gaussian_e2 + self.half_step_e**2)
-
-
-class _LinearModel:
-    """First-order model of a stage: ``factor * value + offset``, Gaussian and RTS noise."""
-
-    def __init__(
-        self, effects: Iterable[Effect], mean: Floats, variance: Floats, sites: Sites, *, is_reset: bool
-    ) -> None:
-        self.factor, self.offset = np.ones(1), np.zeros(1)
-        self.noise, self.half_step2 = np.zeros(1), np.zeros(1)
-        self.mean, self.variance = mean, variance
-        for effect in effects:
-            mean, slope, deviation, _ = effect.validate_linear(self.mean, sites)
-            factor = np.ones(1) if slope is None else slope
-            spread2 = np.zeros(1) if deviation is None else deviation**2
-            # Draws at the reset are constants in differences of reads.
-            is_drawn = effect.is_temporal and (is_reset or not effect.is_drawn_at_reset)
-            added, half_step = np.zeros(1), None
-            if is_drawn:
-                added = spread2
-                half_step = effect.half_step(sites.of(effect)) if sites.known_device is not None else None
-            self.half_step2 = factor**2 * self.half_step2
-            if half_step is not None:
-                self.half_step2 = self.half_step2 + half_step**2
-                added = np.maximum(added - half_step**2, 0.0)
-            self.offset = mean - factor * (self.mean - self.offset)
-            self.factor = factor * self.factor
-            self.noise = factor**2 * self.noise + added
-            # Without a device, fixed patterns are unknown, but do not contribute to temporal noise.
-            self.mean, self.variance = mean, factor**2 * self.variance + added
-
-
-def readout_model(
-    sensor: Sensor, mean_e: ArrayLike, variance_e2: ArrayLike, sites: Sites, *, is_reset: bool
-) -> ReadoutModel:
-    """
-    Compute the first-order readout model at the mean collected charges.
-
-    ``mean_e``, ``variance_e2`` (..., n_site) or number, e- and e-²: moments of collected charges. ``sites``: all sites, with a
-    device or without. ``is_reset``: whether to include the noise of effects that are drawn at the reset.
-    """
-    mean_e, variance_e2 = (np.atleast_1d(np.asarray(part, np.float64)) for part in (mean_e, variance_e2))
-    v_per_e, v_sat_v, pedestal_v = sensor.v_per_e, sensor.v_sat_v, sensor.pedestal_v
-
-    def linear(effects: Iterable[Effect], mean: Floats, variance: Floats) -> _LinearModel:
-        return _LinearModel(effects, mean, variance, sites, is_reset=is_reset)
-
-    def at(stage: Stage) -> Iterable[Effect]:
-        return (effect for effect in sensor.chain if effect.stage == stage)
-
-    is_mixed = False
-    local: list[Effect] = []
-    for effect in at("charge"):
-        if not effect.mixes_means:
-            local.append(effect)
-            continue
-        before = linear(local, mean_e, variance_e2)
-        mean_e, variance_e2 = effect.validate_moments(before.mean, before.variance + before.half_step2, sites)
-        is_mixed, local = True, []
-    charges = linear(local, mean_e, variance_e2)
-    variance_v2 = (charges.variance + charges.half_step2) * v_per_e**2
-    sense = linear(at("sense_node"), charges.mean * v_per_e, variance_v2)
-    output_v, slope = apply_nonlinearity(sensor, sense.mean)
-    last = linear(at("output"), output_v, sense.variance * slope**2)
-    total_v_per_e = charges.factor * v_per_e * sense.factor
-    per_v2 = np.divide(1.0, total_v_per_e**2, out=np.zeros(np.shape(total_v_per_e)), where=total_v_per_e != 0.0)
-    noise_v2 = charges.noise * (v_per_e * sense.factor) ** 2 + sense.noise
-    half_step_v2 = charges.half_step2 * (v_per_e * sense.factor) ** 2 + sense.half_step2
-    output_slope2 = (slope * last.factor) ** 2
-    per_output2 = np.divide(1.0, output_slope2, out=np.zeros(np.shape(output_slope2)), where=output_slope2 != 0.0)
-    return ReadoutModel(
-        mean_e=mean_e,
-        variance_e2=variance_e2,
-        is_mixed=is_mixed,
-        transfer=Transfer(
-            v_per_e=total_v_per_e,
-            sense_v=charges.offset * v_per_e * sense.factor + sense.offset,
-            scale=last.factor,
-            output_v=pedestal_v * last.factor + last.offset,
-            nonlinearity_fraction=sensor.nonlinearity_fraction,
-            v_sat_v=v_sat_v,
-        ),
-        gaussian_e2=(noise_v2 + last.noise * per_output2) * per_v2,
-        half_step_e=np.sqrt((half_step_v2 + last.half_step2 * per_output2) * per_v2),
-    )
-
-
-def apply_nonlinearity(sensor: Sensor, sense_v: Floats) -> tuple[Floats, Floats]:
-    """Return voltages after nonlinearity and pedestal, and the slope of the nonlinearity."""
-    fraction = np.clip(sense_v / sensor.v_sat_v, 0.0, 1.0)
-    slope = np.maximum(1.0 - 2.0 * sensor.nonlinearity_fraction * fraction, MIN_SLOPE)
-    return sense_v * (1.0 - sensor.nonlinearity_fraction * fraction) + sensor.pedestal_v, slope
 
 
 @cache

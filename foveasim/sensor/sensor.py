@@ -15,7 +15,7 @@ from foveasim._core.provenance import is_digest
 from foveasim._core.random_streams import Streams
 from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import Bools, Floats, Ints, check_per_site, read_only, unmasked
+from foveasim._core.validation import Bools, Floats, Ints, check_per_site, finite_array, read_only, unmasked
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.sensor.adc import ADC, BITS, DNL, INL, LOG_STRENGTH, Companding, ConversionTables
 from foveasim.sensor.blocks import for_each_block
@@ -36,7 +36,7 @@ from foveasim.sensor.chain import (
 )
 from foveasim.sensor.device import Device
 from foveasim.sensor.effects import EFFECTS, Effect, Photosites, Sites
-from foveasim.sensor.effects.contract import NOTHING, CompleteSites, FixedFactor, FixedOffset
+from foveasim.sensor.effects.contract import CompleteSites, FixedFactor, FixedOffset
 from foveasim.sensor.effects.crosstalk import Diffusion, InterPixelCapacitance, KernelCrosstalk
 from foveasim.sensor.effects.dark import ACTIVATION, DOUBLING, DarkLaw, DarkSignal, HotSites, dark_current_factor
 from foveasim.sensor.effects.fixed_pattern import ColumnOffset, DeadSites, PhotoResponse, PixelGain, PixelOffset
@@ -54,13 +54,21 @@ from foveasim.sensor.limits import (
     VOLTS,
     WIDE_SPREAD,
 )
+from foveasim.sensor.linearisation import (
+    Inverse,
+    Linearisation,
+    Record,
+    invert,
+    light_records,
+    linearise,
+    readout_model,
+)
 from foveasim.sensor.prediction import (
     ChargeDistributions,
     ReadoutModel,
     Transfer,
     clipped_gaussian_moments,
     quadrature,
-    readout_model,
 )
 from foveasim.sensor.spectral.curves import ConstantCurve, Curve, CurveError
 from foveasim.sensor.spectral.response import FilterSet, rgb_filters
@@ -489,10 +497,6 @@ class Sensor:
                 hint=f"switch them off: sensor.without({connecting})",
             )
 
-    def nominal(self) -> Sensor:
-        """Return the sensor without the fixed patterns of its device."""
-        return self.without(*(e.name for e in self.chain if e.is_local and not e.is_temporal))
-
     @property
     def shot(self) -> ShotNoise:
         """Shot-noise draw from expected to collected charge."""
@@ -568,16 +572,32 @@ class Sensor:
         -------
         response : (n_site,) float64
         """
-        sites = self.sites if is_device_known else self.sites.without_device()
-        effects = [e for e in self._effects_at("photo", "expected") if is_device_known or not e.is_defect]
+        response = np.ones(self.layout.n_sites)
+        for record in self._light_records(is_device_known):
+            response = response if record.branch == "dark" else record.map(response)
+        return response
 
-        def charge(photo_e: float) -> Floats:
-            mean = np.broadcast_to(photo_e * np.asarray(self.sensitivity, np.float64), self.layout.n_sites)
-            for effect in effects:
-                mean = effect.validate_moments(mean, NOTHING, sites)[0]
-            return mean
+    def dark_response(self, exposure_s: Annotated[float, EXPOSURE]) -> Floats:
+        """
+        Compute the expected charge of each site without light, as the mean over all devices, without defects.
 
-        return charge(1.0) - charge(0.0)
+        Returns
+        -------
+        dark_e : (n_site,) float64, e-
+        """
+        return self._light_records(False, exposure_s)[-1].mean
+
+    def _light_records(self, is_device_known: bool, exposure_s: float = 1.0) -> list[Record]:
+        """Return the records from light to expected charge, without light."""
+        zero = np.zeros(self.layout.n_sites)
+        if is_device_known:
+            return light_records(self, self.chain, self.sites, zero, exposure_s)
+        return light_records(self, self._intact_chain, self.sites.without_device(), zero, exposure_s)
+
+    @property
+    def _intact_chain(self) -> tuple[Effect, ...]:
+        """Effects of sites without defects."""
+        return tuple(effect for effect in self.chain if not effect.is_defect)
 
     @cached_property
     def dark_rate_e_per_s(self) -> Floats:
@@ -798,6 +818,74 @@ class Sensor:
         sites = self.sites if is_device_known else self.sites.without_device()
         return readout_model(self, mean_e, variance_e2, sites, is_reset=is_reset)
 
+    def linearise(
+        self,
+        expected_e: ArrayLike | None = None,
+        *,
+        photo_e_per_s: ArrayLike | None = None,
+        exposure_s: Annotated[float | None, EXPOSURE] = None,
+        is_device_known: bool = True,
+    ) -> Linearisation:
+        """
+        Compute a first-order statistical model of the sensor at the mean of each site.
+
+        Parameters
+        ----------
+        expected_e : (..., n_site), optional, e-
+            Expected charge from :meth:`expected_electrons`. With ``exposure_s``, derivatives with respect to the light are
+            known, too.
+        photo_e_per_s : (n_site,) or number, optional, e-/s
+            Photoelectron rate of each site, instead of the charge; requires ``exposure_s``.
+        exposure_s : float, optional, s
+        is_device_known : bool
+            Whether the fixed patterns of the device are known constants; otherwise they are sources of noise over all devices
+            of the kind, around their mean.
+
+        Raises
+        ------
+        ParameterError
+            Unless the charge or the rate is given; if a charge or a rate is negative.
+        """
+        sites = self.sites if is_device_known else self.sites.without_device()
+        if (expected_e is None) == (photo_e_per_s is None):
+            raise ParameterError("expected_e", "must be given, or 'photo_e_per_s', but not both")
+        if photo_e_per_s is not None and exposure_s is None:
+            raise ParameterError("exposure_s", "must be given with 'photo_e_per_s'")
+        charges = [
+            None if values is None else _means(name, values, self.layout.n_sites)
+            for name, values in (("expected_e", expected_e), ("photo_e_per_s", photo_e_per_s))
+        ]
+        return linearise(self, self.chain, sites, *charges, exposure_s)
+
+    def linearise_intact(self, photo_e_per_s: Floats, exposure_s: float) -> Linearisation:
+        """Compute :meth:`linearise` over all devices, without defects."""
+        sites = self.sites.without_device()
+        return linearise(self, self._intact_chain, sites, None, photo_e_per_s, exposure_s)
+
+    def invert(self, code: ArrayLike) -> Inverse:
+        """
+        Estimate the charge at the sense node of each site from codes, for the nominal sensor.
+
+        Companding, INL, response nonlinearity and effects on voltages and charges are inverted at their mean over devices;
+        effects that mix sites, the collection and differential nonlinearity are not.
+
+        Parameters
+        ----------
+        code : (..., n_site), DN
+
+        Returns
+        -------
+        Inverse
+            Charges, with the variance of readout and conversion, and saturation.
+
+        Raises
+        ------
+        ParameterError
+            If a code is out of range.
+        """
+        codes = check_per_site("code", finite_array("code", code), self.layout.n_sites, or_rows=True)
+        return invert(self, self.sites.without_device(), codes, self.adc.fraction_of_code(codes))
+
     def predict(self, expected_e: Floats, *, n_threads: int | None = None) -> tuple[Floats, Floats]:
         """
         Compute mean and temporal variance of each site's code analytically, for this device.
@@ -898,6 +986,16 @@ class SensorPart(Sensor):
     @property
     def _complete_sites(self) -> CompleteSites:
         return CompleteSites(self._complete.sites, self._selection)
+
+
+def _means(name: str, values: ArrayLike, n_sites: int) -> Floats:
+    """Return charges or rates (..., n_site) or (1,) after validation."""
+    array = np.atleast_1d(np.asarray(unmasked(name, values), np.float64))
+    if array.shape != (1,):
+        check_per_site(name, array, n_sites, or_rows=True)
+    if array.size and not (smallest := float(array.min())) >= 0.0:
+        raise ParameterError(name, "must be >= 0 everywhere", smallest)
+    return np.broadcast_to(array, (n_sites,)) if array.shape == (1,) else array
 
 
 def _is_range(selection: slice) -> bool:

@@ -14,14 +14,9 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats
-from foveasim.sensor.prediction import MIN_SLOPE, ReadoutModel
 from foveasim.sensor.sensor import Sensor
 
-__all__ = ["SiteSignals", "local_step_e", "signal_to_noise"]
-
-#: Noise is clipped within this number of standard deviations of the full well or the highest code. Its variance decreases from
-#: there on, which is the saturation criterion of EMVA 1288.
-CLIPPING_SIGMAS = 2.0
+__all__ = ["SiteSignals", "signal_to_noise"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -108,77 +103,14 @@ def signal_to_noise(sensor: Sensor, expected_e: ArrayLike, dark_e: ArrayLike) ->
     >>> signal_to_noise(sensor, [400.0], [0.0]).ratio.round(2).tolist()
     [11.39]
     """
-    n_sites = sensor.layout.n_sites
     charge_e, dark = (
         sensor.validate_charges(name, values) for name, values in (("expected_e", expected_e), ("dark_e", dark_e))
     )
-    shot, well_e = sensor.shot, sensor.well_e
-    is_saturated = charge_e + CLIPPING_SIGMAS * np.sqrt(charge_e * shot.is_drawn) >= well_e
-    charge_e, dark = np.minimum(charge_e, well_e), np.minimum(dark, well_e)
-    model = sensor.readout_model(*shot.moments(charge_e, np.zeros(n_sites)))
-    charge_e, shot_e2 = (np.broadcast_to(part, n_sites) for part in (model.mean_e, model.variance_e2))
-    dark = sensor.readout_model(dark).mean_e
-
-    top_e = _top_e(sensor, model)
-    step_e = _step_e(sensor, charge_e, model)
-    noise_e = np.sqrt(shot_e2 + model.noise_e2 + step_e**2 * sensor.adc.noise_dn2)
-    is_saturated |= charge_e + CLIPPING_SIGMAS * noise_e >= top_e
-    is_complete = charge_e > top_e
-    # Sites above their range have the SNR of the end of the range.
-    part = np.divide(top_e, charge_e, out=np.ones(n_sites), where=is_complete)
-    charge_e, dark = np.minimum(charge_e, top_e), np.minimum(dark, top_e)
-    step_e = np.where(is_complete, _step_e(sensor, charge_e, model), step_e)
-    noise_e = np.sqrt(shot_e2 * (part if shot.is_drawn else 1.0) + model.noise_e2 + step_e**2 * sensor.adc.noise_dn2)
-    gain_v_per_e = model.transfer.v_per_e * model.transfer.scale
+    model = sensor.linearise(charge_e)
+    dark_node_e = np.minimum(sensor.linearise(dark).node_e, model.top_e)
     return SiteSignals(
-        signal_e=np.maximum(charge_e - dark, 0.0),
-        noise_e=np.broadcast_to(noise_e, (n_sites,)),
-        gain_dn_per_e=np.asarray(gain_v_per_e / sensor.v_sat_v * 2.0**sensor.bits),
-        is_saturated=np.asarray(is_saturated),
+        signal_e=np.maximum(model.node_e - dark_node_e, 0.0),
+        noise_e=np.broadcast_to(np.sqrt(model.variance_e2()), charge_e.shape),
+        gain_dn_per_e=model.linear_gain_dn_per_e,
+        is_saturated=model.is_saturated,
     )
-
-
-def local_step_e(
-    sensor: Sensor,
-    charge_e: Floats,
-    v_per_e: Floats,
-    *,
-    sense_v: Floats | float = 0.0,
-    scale: Floats | float = 1.0,
-    output_v: Floats | float = 0.0,
-) -> Floats:
-    """
-    Compute the code width at each site's mean charge, (n_site,) e-.
-
-    The width is the inverse of the local gain of the complete chain; ``v_per_e`` and the following parameters are those of
-    :class:`~foveasim.sensor.prediction.Transfer`, of the device or nominal.
-    """
-    with np.errstate(divide="ignore"):
-        fraction = np.clip((charge_e * v_per_e + sense_v) / sensor.v_sat_v, 0.0, 1.0)
-        nonlinearity = sensor.nonlinearity_fraction
-        after_offset = np.clip(fraction * (1.0 - nonlinearity * fraction) * scale + output_v / sensor.v_sat_v, 0.0, 1.0)
-        slope_v_per_e = v_per_e * scale * np.maximum(1.0 - 2.0 * nonlinearity * fraction, MIN_SLOPE)
-        step_v = sensor.adc.width_at_dn(after_offset) * sensor.v_sat_v / 2.0**sensor.bits
-        return np.asarray(step_v / slope_v_per_e)
-
-
-def _step_e(sensor: Sensor, charge_e: Floats, model: ReadoutModel) -> Floats:
-    """Compute the code width at given charges on this device, e-."""
-    v_per_e, sense_v, scale, output_v, *_ = model.transfer
-    return local_step_e(sensor, charge_e, v_per_e, sense_v=sense_v, scale=scale, output_v=output_v)
-
-
-def _top_e(sensor: Sensor, model: ReadoutModel) -> Floats:
-    """Compute the lowest charge with the highest code, at least 0; infinite if none has it."""
-    transfer = model.transfer
-    with np.errstate(divide="ignore", invalid="ignore"):
-        fraction = np.maximum(
-            (sensor.adc.transition_levels[-2] - transfer.output_v / sensor.v_sat_v) / transfer.scale, 0.0
-        )
-        nonlinearity = sensor.nonlinearity_fraction
-        if nonlinearity:
-            is_within = fraction < 1.0 - nonlinearity
-            relative = 0.5 * (1.0 - np.sqrt(np.maximum(1.0 - 4.0 * nonlinearity * fraction, 0.0))) / nonlinearity
-            fraction = np.where(is_within, relative, fraction / (1.0 - nonlinearity))
-        top_v = np.maximum(fraction * sensor.v_sat_v - transfer.sense_v, 0.0)
-        return np.where(transfer.v_per_e > 0.0, top_v / transfer.v_per_e, np.inf)

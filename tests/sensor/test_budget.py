@@ -33,7 +33,7 @@ def test_budget_entries_match_textbook_values():
 
     assert tuple(noise_e) == (*TEMPORAL, *FIXED)
     expected = {
-        "photon_shot": 200.0,
+        "photon_shot": 200.0 * np.sqrt(sensor.response),  # of this device
         "dark_shot": 30.0,
         "reset": 127.0,
         "read": 4.0,
@@ -44,7 +44,7 @@ def test_budget_entries_match_textbook_values():
         "rts": 0.0,
     }
     for name, size_e in expected.items():
-        assert noise_e[name] == pytest.approx(np.full(N, size_e), rel=5e-4, abs=1e-9)
+        assert noise_e[name] == pytest.approx(np.broadcast_to(size_e, N), rel=5e-4, abs=1e-9)
 
 
 def test_offsets_are_referred_by_local_slope():
@@ -131,12 +131,14 @@ def test_budget_lists_sums_and_draws_bars():
     rows = {row["effect"]: row for row in budget.records()}
     bars = budget.plot()
 
-    # Shot noise of 1600 e- is 40 e-; its RMS over the four sites is 40 / sqrt(2).
+    # Shot noise of 1600 e- times the response of the device, on two of four sites.
+    charge_e = 1600.0 * sensor.response[:2]
     assert rows["photon_shot"] == {
-        "effect": "photon_shot", "kind": "temporal", "rms_e": pytest.approx(40.0 / np.sqrt(2.0)), "min_e": 0.0, "max_e": pytest.approx(40.0)
+        "effect": "photon_shot", "kind": "temporal", "rms_e": pytest.approx(np.sqrt(charge_e.sum() / 4.0)), "min_e": 0.0,
+        "max_e": pytest.approx(np.sqrt(charge_e.max())),
     }  # fmt: skip
     step_e = 3.0 * 1e-15 / scipy.constants.e / 2**14
-    assert rows["all temporal"]["max_e"] == pytest.approx(np.sqrt(1600.0 + 100.0 + 9.0 + step_e**2 / 12.0))
+    assert rows["all temporal"]["max_e"] == pytest.approx(np.sqrt(charge_e.max() + 100.0 + 9.0 + step_e**2 / 12.0))
     assert rows["all fixed"]["max_e"] == pytest.approx(0.02 * 1600.0)
     assert "reset" not in rows
     assert set(budget) == {*TEMPORAL, *FIXED}

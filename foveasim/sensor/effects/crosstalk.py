@@ -22,7 +22,7 @@ from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, Ints, as_numbers, check_per_site, check_pitch_um, finite_array
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.sensor.blocks import for_each_block
-from foveasim.sensor.effects.contract import Effect, Photosites, Sites, Stage
+from foveasim.sensor.effects.contract import Effect, Photosites, Sites, Stage, StepModel
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -171,6 +171,12 @@ class _Crosstalk(Declared, Effect):
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
         """Return the charges after crosstalk, (n_site,)."""
         return self._operator(sites).apply(values, n_threads=sites.n_threads)
+
+    def linearise(self, mean: Floats, *, sites: Sites) -> StepModel:
+        """Return the mean and the operator."""
+        operator = self._operator(sites)
+        mean = np.broadcast_to(mean, np.broadcast_shapes(np.shape(mean), (sites.n_sites,)))
+        return StepModel(operator.apply(mean), operator)
 
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
         """Compute the moments of independent charges after crosstalk, (..., n_site)."""

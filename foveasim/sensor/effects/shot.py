@@ -16,7 +16,7 @@ from foveasim._core.random_streams import Streams, random_key
 from foveasim._core.validation import Floats, Ints, read_only, unmasked
 from foveasim.errors import ParameterError
 from foveasim.sensor.blocks import for_each_block
-from foveasim.sensor.effects.contract import Effect, Sites, Stage
+from foveasim.sensor.effects.contract import NOTHING, Effect, Sites, Stage, StepModel
 
 __all__ = ["MAX_CHARGE_E", "PoissonTables", "ShotChoice", "ShotNoise", "draw_shot_noise"]
 
@@ -124,6 +124,10 @@ class ShotNoise(Declared, Effect):
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites | None = None) -> tuple[Floats, Floats]:
         """Return the mean, and the variance plus shot noise, or plus rounding if not drawn."""
         return mean, variance + (np.maximum(mean, 0.0) if self.is_drawn else ROUNDING_E2)
+
+    def linearise(self, mean: Floats, *, sites: Sites | None = None) -> StepModel:
+        """Return the mean, and the standard deviation of shot noise, or of rounding if not drawn."""
+        return StepModel(mean, None, np.sqrt(self.moments(mean, NOTHING)[1]))
 
 
 def draw_shot_noise(
