@@ -32,7 +32,7 @@ class Budget:
     area_um2 : float, µm²
         Total area of the sites.
     read_noise_e2 : float, e-²
-        Sum of the variances of the read noise over all sites.
+        Sum of the variances of the readout over all sites, without quantisation: read, reset and RTS noise, further effects.
     """
 
     n_sites: int
@@ -69,7 +69,7 @@ def budget_of(camera: Camera, frames_per_s: Annotated[float, POSITIVE]) -> Budge
         data_rate_bit_per_s=n_sites * sensor.bits * frames_per_s,
         readout_steps=int(np.unique(sensor.layout.readout_line, return_counts=True)[1].max(initial=0)),
         area_um2=float(sensor.layout.area_um2.sum()),
-        read_noise_e2=float(np.square(np.broadcast_to(sensor.read_noise_e, (n_sites,))).sum()),
+        read_noise_e2=float(np.broadcast_to(sensor.readout_model(0.0).noise_e2, n_sites).sum()),
     )
 
 

@@ -504,7 +504,7 @@ def _camera_values(
     wavelength_nm = float(np.mean(light.wavelength_nm))
     for total, by_annulus in (
         information_by_annulus(
-            camera, covariance, response, [one.signals for one in shots.measures], field.centre_um, field.edges_um
+            camera, covariance, response, [one.model for one in shots.measures], field.centre_um, field.edges_um
         ),
         layout_measures(camera, wavelength_nm, distance_m, field.centre_um, field.edges_um, wave_per_mm),
     ):

@@ -8,6 +8,7 @@ form; for other scenes, the entropy of a Gaussian of the same covariance is an u
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,6 +19,7 @@ from foveasim._core.calls import POSITIVE, Limits
 from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_per_site, finite_array
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
+from foveasim.sensor.linearisation import Linearisation
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -288,7 +290,7 @@ def site_information_bits(
     layout: Layout,
     covariance: SceneCovariance,
     gain: ArrayLike,
-    noise_variance: ArrayLike,
+    noise: ArrayLike | Sequence[Linearisation],
     *,
     n_conditions: Annotated[int, Limits(at_least=0)] = N_CONDITIONS,
 ) -> Floats:
@@ -302,8 +304,9 @@ def site_information_bits(
         Covariance of the irradiance.
     gain : (n_site,) or (n_scene, n_site)
         Mean reading of a site for an irradiance of 1: its area times its response to light; 0 for dead and saturated sites.
-    noise_variance : (n_scene, n_site)
-        Noise variance of the readings, in squared units of the readings.
+    noise : (n_scene, n_site), or sequence of Linearisation
+        Noise variance of the readings, in squared units of the readings; or the model of the sensor for each scene, with
+        readings in codes, whose noise may be correlated.
     n_conditions : int
         Number of preceding sites on which a block of sites is conditioned.
 
@@ -316,7 +319,7 @@ def site_information_bits(
     Raises
     ------
     ParameterError
-        When an array has another shape, a noise variance is not positive, or the covariance is singular within rounding.
+        When an array has another shape, a variance is not positive, or the covariance is singular within rounding.
 
     Notes
     -----
@@ -334,30 +337,40 @@ def site_information_bits(
     position = np.empty(n, np.int64)
     position[order] = np.arange(n)
     scale = np.atleast_2d(finite_array("gain", gain))
-    noise = finite_array("noise_variance", noise_variance, ndim=2, above=0.0)
-    for name, values in (("gain", scale), ("noise_variance", noise)):
+    is_model = isinstance(noise, list | tuple) and all(isinstance(one, Linearisation) for one in noise)
+    models = list(noise) if is_model else []
+    variances = [np.broadcast_to(one.variance_dn2(), n) for one in models] if is_model else noise
+    variance = finite_array("noise", variances, ndim=2, above=0.0)
+    for name, values in (("gain", scale), ("noise", variance)):
         check_per_site(name, values, n, or_rows=True)
-    if scale.shape[0] not in (1, noise.shape[0]):
-        raise ParameterError("gain", f"must have one row, or one per scene, {noise.shape[0]}", scale.shape[0])
-    scale = np.broadcast_to(scale, noise.shape)
+    if scale.shape[0] not in (1, variance.shape[0]):
+        raise ParameterError("gain", f"must have one row, or one per scene, {variance.shape[0]}", scale.shape[0])
+    scale = np.broadcast_to(scale, variance.shape)
     apertures = _Apertures(layout, covariance)
     tree = cKDTree(xy_um)
-    bits = np.empty(noise.shape)
+    bits = np.empty(variance.shape)
     for start, stop in pairwise(starts):
         block = order[start:stop]
         members = np.concatenate((_preceding(xy_um, tree, block, position, start, n_conditions), block))
         signal = apertures.covariance(members)
-        for k, variance in enumerate(noise[:, members]):
+        for k, own in enumerate(variance[:, members]):
             # In units of the noise, for a good condition.
-            ratio = scale[k, members] / np.sqrt(variance)
+            deviation = np.sqrt(own)
+            ratio = scale[k, members] / deviation
             total = signal * (ratio[:, np.newaxis] * ratio)
-            total[np.diag_indices_from(total)] += 1.0
+            entropy: Floats | float = 0.0
+            if is_model and models[k].is_correlated:
+                correlation = models[k].covariance_matrix_dn2(members) / (deviation[:, np.newaxis] * deviation)
+                entropy = np.log2(np.diagonal(np.linalg.cholesky(correlation))[-block.size :])
+                total += correlation
+            else:
+                total[np.diag_indices_from(total)] += 1.0
             try:
                 cholesky = np.linalg.cholesky(total)
             except np.linalg.LinAlgError:
                 rule = "must not be so small that the covariance is singular within rounding"
-                raise ParameterError("noise_variance", rule, float(variance.min())) from None
-            bits[k, block] = np.log2(np.diagonal(cholesky)[-block.size :])
+                raise ParameterError("noise", rule, float(own.min())) from None
+            bits[k, block] = np.log2(np.diagonal(cholesky)[-block.size :]) - entropy
     return bits
 
 

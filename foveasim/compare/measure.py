@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Any
@@ -27,8 +27,8 @@ from foveasim.metrics import (
     polygon_mtf,
     size_classes_um,
 )
-from foveasim.sensor import signal_to_noise
-from foveasim.sensor.signal_to_noise import SiteSignals
+from foveasim.sensor.linearisation import Linearisation
+from foveasim.sensor.signal_to_noise import site_signals
 from foveasim.units import per_mm_from_per_um
 
 __all__ = [
@@ -99,10 +99,10 @@ MEASURES = {
 
 @dataclass(frozen=True, eq=False)
 class SceneMeasures:
-    """Signals of a capture, and measures of its sites; NaN for an annulus without sites."""
+    """Statistical model of a capture, and measures of its sites; NaN for an annulus without sites."""
 
     capture: Capture
-    signals: SiteSignals
+    model: Linearisation
     totals: Mapping[str, Any]
     annuli: Mapping[str, Any]
 
@@ -179,23 +179,22 @@ def scene_measures(
     sensor, layout = camera.sensor, layout_of(camera)
     exposure_s = float(capture.settings["exposure_s"])
     dark_e = sensor.expected_electrons(np.zeros(layout.n_sites), exposure_s)
-    signals = signal_to_noise(sensor, capture.expected_e, dark_e)
+    model = sensor.linearise(capture.expected_e)
+    signals = site_signals(model, dark_e)
     annulus = annulus_of(layout.centroid_um, centre_um, edges_um)
     n = edges_um.size - 1
     sums = np.bincount(annulus[annulus >= 0], signals.ratio[annulus >= 0], minlength=n)
     counts = np.bincount(annulus[annulus >= 0], minlength=n)
     ratio = np.divide(sums, counts, out=np.full(n, np.nan), where=counts > 0)
     gradient = _shift_gradients_e_per_um(camera, image, exposure_s)
-    gradient[signals.is_saturated] = 0.0
-    variance_e2 = np.square(signals.noise_e)
-    everything = flow_bound(gradient, variance_e2)
-    parts = flow_bound(gradient, variance_e2, regions=annulus)
+    everything = flow_bound(gradient, model)
+    parts = flow_bound(gradient, model, regions=annulus)
     sigma_um = np.full(n, np.nan)
     sigma_um[parts.regions] = _rms(parts.sigma_um)
     with np.errstate(divide="ignore"):
         return SceneMeasures(
             capture,
-            signals,
+            model,
             {
                 "snr_db": float(20.0 * np.log10(signals.ratio.mean())),
                 "shift_sigma_um": float(_rms(everything.sigma_um)[0]),
@@ -236,18 +235,18 @@ def information_by_annulus(
     camera: Camera,
     covariance: SceneCovariance,
     response: NDArray[np.float64],
-    signals: list[SiteSignals],
+    models: Sequence[Linearisation],
     centre_um: tuple[float, float],
     edges_um: Floats,
 ) -> tuple[dict[str, Floats], dict[str, Floats]]:
     """
     Return the information per site and per mm², (n_scene,) and (n_scene, n_annulus).
 
-    ``response`` is the ratio of each site's irradiance in electrons to that of the covariance. Saturated sites do not respond.
+    ``response`` is the ratio of each site's expected charge per area to the irradiance of the covariance.
     """
     layout = layout_of(camera)
-    gain = [np.where(one.is_saturated, 0.0, layout.area_um2 * response) for one in signals]
-    bits = site_information_bits(layout, covariance, gain, np.square([one.noise_e for one in signals]))
+    gain = [layout.area_um2 * model.forward(response) for model in models]
+    bits = site_information_bits(layout, covariance, gain, models)
     annulus = annulus_of(layout.centroid_um, centre_um, edges_um)
     n, inside = edges_um.size - 1, annulus >= 0
     sums = np.stack([np.bincount(annulus[inside], row[inside], minlength=n) for row in bits])

@@ -7,6 +7,7 @@ integral of the image gradient over the site.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -29,6 +30,7 @@ from foveasim.errors import CoverageWarning, ParameterError
 from foveasim.fields import Grid
 from foveasim.integrate import Integrator
 from foveasim.layout import Layout
+from foveasim.sensor.linearisation import Linearisation
 
 __all__ = ["FlowBound", "FlowEstimate", "estimate_flow", "flow_bound", "site_gradients_e_per_um"]
 
@@ -147,7 +149,9 @@ def site_gradients_e_per_um(
     return np.where(is_on[:, np.newaxis], gradient, 0.0)
 
 
-def flow_bound(gradient_e_per_um: ArrayLike, variance_e2: ArrayLike, *, regions: ArrayLike | None = None) -> FlowBound:
+def flow_bound(
+    gradient_e_per_um: ArrayLike, variance_e2: ArrayLike | Linearisation, *, regions: ArrayLike | None = None
+) -> FlowBound:
     """
     Compute the Cramér–Rao bound of the flow.
 
@@ -155,8 +159,9 @@ def flow_bound(gradient_e_per_um: ArrayLike, variance_e2: ArrayLike, *, regions:
     ----------
     gradient_e_per_um : (n_site, 2), e-/µm
         Result of :func:`site_gradients_e_per_um`; or in DN/µm, with variances in DN².
-    variance_e2 : (n_site,) or number, e-²
-        Noise variance of each site: expected charge plus squared read noise, or the variance of :meth:`Camera.predict`.
+    variance_e2 : (n_site,) or number, e-², or Linearisation
+        Noise variance of each site, such as expected charge plus squared read noise; or the model of a sensor at the expected
+        charge (:meth:`foveasim.Sensor.linearise`), with all its noise, correlated noise included, and its saturation.
     regions : (n_site,) integers, optional
         Region label of each site; negative labels are excluded. A single region by default.
 
@@ -177,8 +182,9 @@ def flow_bound(gradient_e_per_um: ArrayLike, variance_e2: ArrayLike, *, regions:
     gradient = finite_array("gradient_e_per_um", gradient_e_per_um, ndim=2)
     if gradient.shape[1] != 2:
         raise ParameterError("gradient_e_per_um", f"must have shape (n_site, 2), got {gradient.shape}")
-    variance = _per_site("variance_e2", finite_array("variance_e2", variance_e2, above=0.0), len(gradient))
-    return _bound(gradient, variance, _Regions(regions, len(gradient)), np.ones(len(gradient), bool))
+    groups = _Regions(regions, len(gradient))
+    weigh = _weights(variance_e2, groups, len(gradient))
+    return _bound(gradient, weigh, groups, np.ones(len(gradient), bool))
 
 
 def estimate_flow(
@@ -187,7 +193,7 @@ def estimate_flow(
     map_e_per_um2: ArrayLike,
     grid: Grid,
     *,
-    variance_e2: ArrayLike,
+    variance_e2: ArrayLike | Linearisation,
     regions: ArrayLike | None = None,
     n_steps: Annotated[int, Limits(at_least=1)] = 10,
     tolerance_um: Annotated[float, NOT_NEGATIVE] = 1e-6,
@@ -207,8 +213,8 @@ def estimate_flow(
         Image before the displacement, cell means: the true image, or a reconstruction from an earlier frame.
     grid : Grid
         Cells of the map.
-    variance_e2 : (n_site,) or number, e-²
-        Noise variance of each site.
+    variance_e2 : (n_site,) or number, e-², or Linearisation
+        Noise variance of each site, or the model of a sensor, as for :func:`flow_bound`.
     regions : (n_site,) integers, optional
         Region label of each site; negative labels are excluded. A single region by default.
     n_steps : int
@@ -237,8 +243,8 @@ def estimate_flow(
     cells = _validate_map(map_e_per_um2, grid)
     maps = np.concatenate((cells[np.newaxis], _gradients(cells, grid)))
     values = _per_site("values_e", finite_array("values_e", values_e), layout.n_sites)
-    variance = _per_site("variance_e2", finite_array("variance_e2", variance_e2, above=0.0), layout.n_sites)
     groups = _Regions(regions, layout.n_sites)
+    weigh = _weights(variance_e2, groups, layout.n_sites)
     vertices_of_site = np.diff(layout.ring_offsets[layout.site_offsets])
     flow_um = np.zeros((groups.labels.size, 2))
     for step in range(n_steps + 1):
@@ -250,10 +256,11 @@ def estimate_flow(
         expected, *gradient = integrator(maps)
         slope = np.where(is_on[:, np.newaxis], np.stack(gradient, axis=1), 0.0)
         residual = np.where(is_on, values - expected, 0.0)
-        bound = _bound(slope, variance, groups, is_on)
+        bound = _bound(slope, weigh, groups, is_on)
         if step == n_steps:
             break
-        score = -groups.sums(slope * (residual / variance)[:, np.newaxis])
+        weighted = weigh(residual)
+        score = -groups.sums(slope * weighted[:, np.newaxis])
         is_observable = np.isfinite(bound.covariance_um2).all(axis=(1, 2))
         change_um = np.zeros_like(flow_um)
         change_um[is_observable] = np.einsum("rij,rj->ri", bound.covariance_um2[is_observable], score[is_observable])
@@ -261,7 +268,7 @@ def estimate_flow(
         if n_steps > 1 and np.abs(change_um).max(initial=0.0) <= tolerance_um:
             break
     flow_um[~np.isfinite(bound.covariance_um2).all(axis=(1, 2))] = np.nan
-    misfit = groups.sums((residual**2 / variance)[:, np.newaxis])[:, 0] / np.maximum(bound.n_sites, 1)
+    misfit = groups.sums((residual * weigh(residual))[:, np.newaxis])[:, 0] / np.maximum(bound.n_sites, 1)
     return FlowEstimate(
         regions=bound.regions,
         flow_um=read_only(flow_um),
@@ -280,6 +287,10 @@ class _Regions:
         self._n_all = n_sites
         self._used = np.flatnonzero(labels >= 0)
         self.labels, self._position = np.unique(labels[self._used].astype(np.int64), return_inverse=True)
+
+    def sites(self) -> list[Ints]:
+        """Return the indices of the sites of each region."""
+        return [self._used[self._position == k] for k in range(self.labels.size)]
 
     def counts(self, is_counted: Bools) -> Ints:
         """Count the selected sites of each region, (n_region,)."""
@@ -330,11 +341,31 @@ def _is_on_map(integrator: Integrator, layout: Layout) -> Bools:
     return np.asarray(integrator.uncovered_um2 <= MAX_UNCOVERED_FRACTION * layout.area_um2)
 
 
-def _bound(gradient: Floats, variance_e2: Floats, groups: _Regions, is_counted: Bools) -> FlowBound:
+def _weights(noise: ArrayLike | Linearisation, groups: _Regions, n_sites: int) -> Callable[[Floats], Floats]:
+    """Return a function that divides changes of charges (..., n_site) by their variance, within each region."""
+    if not isinstance(noise, Linearisation):
+        variance = _per_site("variance_e2", finite_array("variance_e2", noise, above=0.0), n_sites)
+        return lambda values: values / variance
+    if noise.n_sites != n_sites:
+        raise ParameterError("variance_e2", f"must be the model of a sensor of {n_sites} sites, got {noise.n_sites}")
+    if not noise.is_correlated:
+        return noise.weigh
+
+    def weigh(values: Floats) -> Floats:
+        total = np.zeros_like(values)
+        for own in groups.sites():
+            moved = np.zeros_like(values)
+            moved[..., own] = values[..., own]
+            total += noise.weigh(moved, sites=own)
+        return total
+
+    return weigh
+
+
+def _bound(gradient: Floats, weigh: Callable[[Floats], Floats], groups: _Regions, is_counted: Bools) -> FlowBound:
     gx, gy = np.moveaxis(gradient, 1, 0)
-    xx, xy, yy = np.moveaxis(
-        groups.sums(np.stack((gx * gx, gx * gy, gy * gy), axis=1) / variance_e2[:, np.newaxis]), 1, 0
-    )
+    wx, wy = weigh(np.stack((gx, gy)))
+    xx, xy, yy = np.moveaxis(groups.sums(np.stack((gx * wx, gx * wy, gy * wy), axis=1)), 1, 0)
     information = np.stack((np.stack((xx, xy), axis=1), np.stack((xy, yy), axis=1)), axis=1)
     return FlowBound(
         regions=read_only(groups.labels),

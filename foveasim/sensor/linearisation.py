@@ -8,7 +8,7 @@ predictions, the noise budget, signal-to-noise ratios, weights of estimates, cov
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
@@ -280,32 +280,31 @@ def _propagate_rows(
         single = [record.of(index) for record in records]
         for first in range(0, n_sites, BLOCK_ROWS):
             sites = np.arange(first, min(first + BLOCK_ROWS, n_sites))
-            out[index][sites] = row_products(single, n_sites, sites, sites, is_used)
+            factors = row_factors(single, n_sites, sites, is_used)
+            out[index][sites] = sum(np.asarray(factor.power(2).sum(axis=1)).ravel() for factor in factors)
     return out
 
 
-def row_products(
-    records: Iterable[Record], n_sites: int, sites: Ints, others: Ints, is_used: Callable[[Record], bool]
-) -> Floats:
-    """Return the covariance of pairs of sites after the last step, from the chosen sources, (n_pair,)."""
+def row_factors(
+    records: Iterable[Record], n_sites: int, sites: Ints, is_used: Callable[[Record], bool]
+) -> Iterator[csr_array[Any]]:
+    """
+    Yield the rows of some sites of a factor F of the covariance F Fᵀ after the last step, for each chosen source.
+
+    The rows are (n, n_site) or (n, n_group), sparse.
+    """
     from scipy.sparse import csr_array
 
-    def select(index: Ints) -> csr_array[Any]:
-        return csr_array((np.ones(index.size), index, np.arange(index.size + 1)), shape=(index.size, n_sites))
-
-    ends = [select(sites)] if sites is others else [select(sites), select(others)]
-    joined: list[Any] | None = None
+    rows = csr_array((np.ones(sites.size), sites, np.arange(sites.size + 1)), shape=(sites.size, n_sites))
+    joined: csr_array[Any] | None = None
     branch: Branch = ""
-    total = np.zeros(sites.size)
     for record in reversed(list(records)):
         if record.branch != branch:
-            joined = ends if joined is None else joined
-            ends, branch = joined, record.branch
+            joined = rows if joined is None else joined
+            rows, branch = joined, record.branch
         if record.deviation is not None and is_used(record):
-            spread = [record.spread(end) for end in ends]
-            total += np.asarray(spread[0].multiply(spread[-1]).sum(axis=1)).ravel()
-        ends = [record.rows(end) for end in ends]
-    return total
+            yield record.spread(rows)
+        rows = record.rows(rows)
 
 
 def readout_model(
@@ -519,17 +518,24 @@ class Linearisation:
         -------
         covariance : (..., n_pair) float64, DN²
         """
-        pairs = [self._check_sites(name, index) for name, index in (("sites", sites), ("others", others))]
-        if pairs[0].size != pairs[1].size:
-            raise ParameterError(
-                "others", f"must have as many elements as 'sites', {pairs[0].size}, got {pairs[1].size}"
-            )
-        shape = np.shape(self.node_e)[:-1]
-        out = np.empty((*shape, pairs[0].size))
-        for index in np.ndindex(shape):
-            records = [record.of(index) for record in self._records]
-            out[index] = row_products(records, self.n_sites, *pairs, self._chosen(None, True))
-        return out
+        index, other = (self._check_sites(name, pair) for name, pair in (("sites", sites), ("others", others)))
+        if index.size != other.size:
+            raise ParameterError("others", f"must have as many elements as 'sites', {index.size}, got {other.size}")
+        self._check_single()
+        pairs = (row_factors(self._records, self.n_sites, each, self._chosen(None, True)) for each in (index, other))
+        products = (np.asarray(a.multiply(b).sum(axis=1)).ravel() for a, b in zip(*pairs, strict=True))
+        return np.asarray(sum(products, np.zeros(index.size)))
+
+    def covariance_matrix_dn2(self, sites: ArrayLike) -> Floats:
+        """
+        Compute the temporal covariance of the codes of some sites, (n, n) DN².
+
+        ``sites`` (n,) int: indices of the sites.
+        """
+        self._check_single()
+        index = self._check_sites("sites", sites)
+        factors = row_factors(self._records, self.n_sites, index, self._chosen(None, True))
+        return np.asarray(sum(((a @ a.T).toarray() for a in factors), np.zeros((index.size, index.size))))
 
     def apply_covariance(self, values: ArrayLike) -> Floats:
         """Apply the temporal covariance of the codes to values (..., n_site); the result is in DN² times their unit."""
@@ -546,17 +552,30 @@ class Linearisation:
                 total = total + record.correlate(at)
         return total
 
-    def solve_covariance(self, values: ArrayLike) -> Floats:
+    @cached_property
+    def is_correlated(self) -> bool:
+        """Whether the temporal noise of different sites is correlated."""
+        chosen = self._chosen(None, True)
+        sources = [k for k, record in enumerate(self._records) if record.deviation is not None and chosen(record)]
+        return any(
+            self._records[k].groups is not None or any(later.operator is not None for later in self._records[k + 1 :])
+            for k in sources
+        )
+
+    def solve_covariance(self, values: ArrayLike, sites: ArrayLike | None = None) -> Floats:
         """
-        Apply the inverse of the temporal covariance of the codes.
+        Apply the inverse of the temporal covariance of the codes of all sites, or of some of them.
 
         Parameters
         ----------
         values : (n, n_site) or (n_site,)
+        sites : (n,) int, optional
+            Indices of the sites whose codes are known; the values of others are not used.
 
         Returns
         -------
         solution : (n, n_site) or (n_site,) float64
+            0 at sites whose codes are not known.
 
         Notes
         -----
@@ -564,38 +583,41 @@ class Linearisation:
         noise is mixed, conjugate gradients are used, with the variances as preconditioner.
         """
         values = self._check("values", values)
-        records, chosen = self._records[self._starts["charge"] :], self._chosen(None, True)
-        grouped = [k for k, r in enumerate(records) if r.deviation is not None and r.groups is not None and chosen(r)]
+        self._check_single()
         variance = np.broadcast_to(self.variance_dn2(), self.n_sites)
-        if any(record.operator is not None for record in records):
-            return np.stack([self._conjugate_gradients(row, variance) for row in np.atleast_2d(values)]).reshape(
-                values.shape
-            )
-        if not grouped:
-            return values / variance
-        from scipy.sparse import csr_array, dia_array, eye_array, hstack
-        from scipy.sparse.linalg import splu
+        known = np.arange(self.n_sites) if sites is None else self._check_sites("sites", sites)
+        rows = np.atleast_2d(values)[:, known]
+        if not self.is_correlated:
+            found = rows / variance[known]
+        elif any(record.operator is not None for record in self._records[self._starts["charge"] :]):
+            found = np.stack([self._conjugate_gradients(row, variance, known) for row in rows])
+        else:
+            found = self._woodbury(rows, known)
+        solution = np.zeros((len(rows), self.n_sites))
+        solution[:, known] = found
+        return solution.reshape(values.shape)
 
-        independent = np.broadcast_to(
-            propagate(records, self.n_sites, lambda r: chosen(r) and r.groups is None), self.n_sites
-        )
-        columns = []
-        for k in grouped:
-            label = np.unique(records[k].groups, return_inverse=True)[1].ravel()
-            slope = np.broadcast_to(np.asarray(records[k].deviation), self.n_sites)
-            for record in records[k + 1 :]:
-                slope = record.map(slope)
-            columns.append(
-                csr_array((slope, label, np.arange(self.n_sites + 1)), shape=(self.n_sites, label.max() + 1))
-            )
-        factor = csr_array(hstack(columns))
-        inverse = dia_array(((1.0 / independent)[np.newaxis], [0]), shape=(self.n_sites, self.n_sites))
-        inner = eye_array(factor.shape[1]) + factor.T @ inverse @ factor
-        weighted = values / independent
-        correction = factor @ splu(inner.tocsc()).solve(np.ascontiguousarray(factor.T @ weighted.T))
-        return weighted - correction.T / independent
+    def weigh(self, changes: ArrayLike, start: Start = "charge", sites: ArrayLike | None = None) -> Floats:
+        """
+        Apply the Fisher information of the codes about the light or the charges of all sites.
 
-    def information(self, patterns: ArrayLike, start: Start = "charge") -> Floats:
+        Parameters
+        ----------
+        changes : (n, n_site) or (n_site,)
+            Changes of light or charges, as for :meth:`forward`.
+        start : {"light", "charge", "node"}
+        sites : (n,) int, optional
+            Indices of the sites whose codes are known.
+
+        Returns
+        -------
+        weighted : (n, n_site) or (n_site,) float64
+            ``Jᵀ C⁻¹ J`` times the changes, with the derivatives J of the codes and their covariance C. Without correlations it
+            is the change over the variance, both referred to the charge.
+        """
+        return self.backward(self.solve_covariance(self.forward(changes, start), sites), start)
+
+    def information(self, patterns: ArrayLike, start: Start = "charge", sites: ArrayLike | None = None) -> Floats:
         """
         Compute the Fisher information of the codes about amplitudes of patterns.
 
@@ -604,6 +626,8 @@ class Linearisation:
         patterns : (n_pattern, n_site)
             Changes of light or charge per unit of each parameter, as for :meth:`forward`.
         start : {"light", "charge", "node"}
+        sites : (n,) int, optional
+            Indices of the sites whose codes are known.
 
         Returns
         -------
@@ -612,15 +636,36 @@ class Linearisation:
             inverse is the Cramér–Rao bound.
         """
         derivatives = np.atleast_2d(self.forward(patterns, start))
-        return np.asarray(derivatives @ self.solve_covariance(derivatives).T)
+        return np.asarray(derivatives @ self.solve_covariance(derivatives, sites).T)
 
-    def _conjugate_gradients(self, row: Floats, variance: Floats) -> Floats:
-        """Solve a system with the covariance."""
+    def _woodbury(self, rows: Floats, known: Ints) -> Floats:
+        """Solve systems with the covariance of known sites, (n, n_known), for noise that groups share and nothing mixes."""
+        from scipy.sparse import csr_array, dia_array, eye_array, hstack
+        from scipy.sparse.linalg import splu
+
+        chosen = self._chosen(None, True)
+        records = self._records[self._starts["charge"] :]
+        variance = propagate(records, self.n_sites, lambda record: chosen(record) and record.groups is None)
+        independent = np.broadcast_to(variance, self.n_sites)[known]
+        factors = row_factors(records, self.n_sites, known, lambda record: chosen(record) and record.groups is not None)
+        factor = csr_array(hstack(list(factors)))
+        inverse = dia_array(((1.0 / independent)[np.newaxis], [0]), shape=(known.size, known.size))
+        inner = splu((eye_array(factor.shape[1]) + factor.T @ inverse @ factor).tocsc())
+        weighted = rows / independent
+        return weighted - (factor @ inner.solve(np.ascontiguousarray(factor.T @ weighted.T))).T / independent
+
+    def _conjugate_gradients(self, row: Floats, variance: Floats, known: Ints) -> Floats:
+        """Solve a system with the covariance of known sites, (n_known,)."""
         from scipy.sparse.linalg import LinearOperator, cg
 
-        shape = (self.n_sites, self.n_sites)
-        matrix = LinearOperator(shape, matvec=self.apply_covariance, dtype=np.float64)
-        inverse = LinearOperator(shape, matvec=lambda values: values / variance, dtype=np.float64)
+        def apply(values: Floats) -> Floats:
+            all_values = np.zeros(self.n_sites)
+            all_values[known] = np.ravel(values)
+            return self.apply_covariance(all_values)[known]
+
+        shape = (known.size, known.size)
+        matrix = LinearOperator(shape, matvec=apply, dtype=np.float64)
+        inverse = LinearOperator(shape, matvec=lambda values: np.ravel(values) / variance[known], dtype=np.float64)
         solution, _ = cg(matrix, row, rtol=RESIDUAL, maxiter=MAX_ITERATIONS, M=inverse)
         return np.asarray(solution)
 
@@ -649,6 +694,13 @@ class Linearisation:
                 hint="pass exposure_s to Sensor.linearise",
             )
         return [record for record in self._records[self._starts[start] :] if record.branch != "dark"]
+
+    def _check_single(self) -> None:
+        """Raise unless the model is that of a single charge per site."""
+        if np.ndim(self.node_e) > 1:
+            raise ParameterError(
+                "expected_e", f"must be one charge per site for covariances, got {np.shape(self.node_e)}"
+            )
 
     def _check(self, name: str, values: ArrayLike) -> Floats:
         array = np.asarray(as_numbers(name, values), np.float64)

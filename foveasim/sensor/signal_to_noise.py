@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats
+from foveasim.sensor.linearisation import Linearisation
 from foveasim.sensor.sensor import Sensor
 
 __all__ = ["SiteSignals", "signal_to_noise"]
@@ -106,8 +107,13 @@ def signal_to_noise(sensor: Sensor, expected_e: ArrayLike, dark_e: ArrayLike) ->
     charge_e, dark = (
         sensor.validate_charges(name, values) for name, values in (("expected_e", expected_e), ("dark_e", dark_e))
     )
-    model = sensor.linearise(charge_e)
-    dark_node_e = np.minimum(sensor.linearise(dark).node_e, model.top_e)
+    return site_signals(sensor.linearise(charge_e), dark)
+
+
+def site_signals(model: Linearisation, dark_e: Floats) -> SiteSignals:
+    """Return signal and noise of :func:`signal_to_noise` for a model at the expected charge."""
+    charge_e = model.node_e
+    dark_node_e = np.minimum(model.sensor.linearise(dark_e).node_e, model.top_e)
     return SiteSignals(
         signal_e=np.maximum(model.node_e - dark_node_e, 0.0),
         noise_e=np.broadcast_to(np.sqrt(model.variance_e2()), charge_e.shape),
