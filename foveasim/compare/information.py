@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -337,9 +337,8 @@ def site_information_bits(
     position = np.empty(n, np.int64)
     position[order] = np.arange(n)
     scale = np.atleast_2d(finite_array("gain", gain))
-    is_model = isinstance(noise, list | tuple) and all(isinstance(one, Linearisation) for one in noise)
-    models = list(noise) if is_model else []
-    variances = [np.broadcast_to(one.variance_dn2(), n) for one in models] if is_model else noise
+    models = [one for one in noise if isinstance(one, Linearisation)] if isinstance(noise, list | tuple) else []
+    variances: Any = [np.broadcast_to(one.variance_dn2(), n) for one in models] or noise
     variance = finite_array("noise", variances, ndim=2, above=0.0)
     for name, values in (("gain", scale), ("noise", variance)):
         check_per_site(name, values, n, or_rows=True)
@@ -359,7 +358,7 @@ def site_information_bits(
             ratio = scale[k, members] / deviation
             total = signal * (ratio[:, np.newaxis] * ratio)
             entropy: Floats | float = 0.0
-            if is_model and models[k].is_correlated:
+            if models and models[k].is_correlated:
                 correlation = models[k].covariance_matrix_dn2(members) / (deviation[:, np.newaxis] * deviation)
                 entropy = np.log2(np.diagonal(np.linalg.cholesky(correlation))[-block.size :])
                 total += correlation

@@ -42,6 +42,7 @@ from foveasim.sensor.effects.dark import ACTIVATION, DOUBLING, DarkLaw, DarkSign
 from foveasim.sensor.effects.fixed_pattern import ColumnOffset, DeadSites, PhotoResponse, PixelGain, PixelOffset
 from foveasim.sensor.effects.readout import ReadNoise, ResetNoise, TelegraphNoise
 from foveasim.sensor.effects.shot import GAUSSIAN_ABOVE, ShotChoice, ShotNoise
+from foveasim.sensor.inversion import Inverse, invert
 from foveasim.sensor.limits import (
     CHARGE,
     EXPOSURE,
@@ -54,15 +55,7 @@ from foveasim.sensor.limits import (
     VOLTS,
     WIDE_SPREAD,
 )
-from foveasim.sensor.linearisation import (
-    Inverse,
-    Linearisation,
-    Record,
-    invert,
-    light_records,
-    linearise,
-    readout_model,
-)
+from foveasim.sensor.linearisation import Linearisation, linearise
 from foveasim.sensor.prediction import (
     ChargeDistributions,
     ReadoutModel,
@@ -70,6 +63,7 @@ from foveasim.sensor.prediction import (
     clipped_gaussian_moments,
     quadrature,
 )
+from foveasim.sensor.records import Record, light_records, readout_model
 from foveasim.sensor.spectral.curves import ConstantCurve, Curve, CurveError
 from foveasim.sensor.spectral.response import FilterSet, rgb_filters
 from foveasim.units import electrons_to_volts, photon_energy_j
@@ -851,11 +845,11 @@ class Sensor:
             raise ParameterError("expected_e", "must be given, or 'photo_e_per_s', but not both")
         if photo_e_per_s is not None and exposure_s is None:
             raise ParameterError("exposure_s", "must be given with 'photo_e_per_s'")
-        charges = [
+        expected, photo = (
             None if values is None else _means(name, values, self.layout.n_sites)
             for name, values in (("expected_e", expected_e), ("photo_e_per_s", photo_e_per_s))
-        ]
-        return linearise(self, self.chain, sites, *charges, exposure_s)
+        )
+        return linearise(self, self.chain, sites, expected, photo, exposure_s)
 
     def linearise_intact(self, photo_e_per_s: Floats, exposure_s: float) -> Linearisation:
         """Compute :meth:`linearise` over all devices, without defects."""
@@ -884,7 +878,7 @@ class Sensor:
             If a code is out of range.
         """
         codes = check_per_site("code", finite_array("code", code), self.layout.n_sites, or_rows=True)
-        return invert(self, self.sites.without_device(), codes, self.adc.fraction_of_code(codes))
+        return invert(self, self.sites.without_device(), codes)
 
     def predict(self, expected_e: Floats, *, n_threads: int | None = None) -> tuple[Floats, Floats]:
         """

@@ -75,6 +75,9 @@ class Operator(Protocol):
     def transpose(self) -> Operator:
         """Return the transposed map."""
 
+    def variance(self, variance: ArrayLike) -> Floats:
+        """Return the variances (..., n_site) of mapped values of independent sites."""
+
     def rows(self, sites: Any) -> Any:
         """Return the rows of some sites, (n, n_site) sparse, or those of a sparse matrix (n, n_site) times the map."""
 
@@ -424,16 +427,15 @@ class Effect(ABC):
         linearise = self.linearise if "linearise" in vars(definer) else partial(Effect.linearise, self)
         found = linearise(mean, sites=sites)
         shape = np.broadcast_shapes(np.shape(mean), (sites.n_sites,))
+        try:
+            model = StepModel(*found)
+        except TypeError:
+            raise SimulationError(f"the effect '{self.name}' must return a StepModel; check its linearise()") from None
+        names = [name for name, part in zip(StepModel._fields, model, strict=True) if isinstance(part, np.ndarray)]
         what = "a mean, a slope and a deviation"
-        if not isinstance(found, StepModel):
-            found = StepModel(*found) if isinstance(found, tuple) and 0 < len(found) <= len(StepModel._fields) else None
-        if found is None:
-            raise SimulationError(f"the effect '{self.name}' must return a StepModel; check its linearise()")
-        is_array = [part is not None and not hasattr(part, "apply") for part in found]
-        arrays = self._validate_shapes([part for part, chosen in zip(found, is_array, strict=True) if chosen],
-                                       sum(is_array), shape, what, "linearise")  # fmt: skip
-        parts = iter(arrays)
-        return StepModel(*(next(parts) if chosen else part for part, chosen in zip(found, is_array, strict=True)))
+        parts: list[Any] = [getattr(model, name) for name in names]
+        checked: list[Any] = self._validate_shapes(parts, len(names), shape, what, "linearise")
+        return model._replace(**dict(zip(names, checked, strict=True)))
 
     def validate_moments(self, mean: Floats, variance: Floats, sites: Sites) -> tuple[Floats, Floats]:
         """Return the result of :meth:`moments` after checking its shapes."""
@@ -446,7 +448,9 @@ class Effect(ABC):
     def _validate_shapes(self, found: Any, n: int, shape: tuple[int, ...], what: str, method: str) -> list[Floats]:
         """Return the arrays that a method returned, if they can be broadcast to a shape."""
         try:
-            arrays = [np.asarray(part, np.float64) for part in found]
+            arrays = [
+                part if part.dtype.kind in "iu" else np.asarray(part, np.float64) for part in map(np.asarray, found)
+            ]
             if len(arrays) != n or np.broadcast_shapes(*(part.shape for part in arrays), shape) != shape:
                 raise ValueError
         except (TypeError, ValueError):

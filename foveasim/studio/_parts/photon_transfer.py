@@ -27,8 +27,8 @@ def photon_transfer(result: Simulated) -> PartData:
     site = median_site(capture.expected_e)
     copies = copies_of(sensor, site, N_LEVELS)
     range_e = full_range_e(copies)
-    sensitivity = float(np.broadcast_to(copies.sensitivity, N_LEVELS)[0]) or 1.0
-    photo_e_per_s = np.geomspace(LOWEST_E, HIGHEST * range_e, N_LEVELS) / (exposure_s * sensitivity)
+    response = float(copies.light_response()[0]) or 1.0
+    photo_e_per_s = np.geomspace(LOWEST_E, HIGHEST * range_e, N_LEVELS) / (exposure_s * response)
     dark_e = copies.expected_electrons(np.zeros(N_LEVELS), exposure_s)
     found = signal_to_noise(copies, copies.expected_electrons(photo_e_per_s, exposure_s), dark_e)
     budget = noise_budget(copies, photo_e_per_s, exposure_s)
@@ -73,5 +73,4 @@ def copies_of(sensor: Sensor, site: int, n: int) -> Sensor:
 
 def full_range_e(sensor: Sensor) -> float:
     """Return the charge of full well or highest code, whichever is smaller, e-."""
-    top_e = (sensor.v_sat_v - sensor.pedestal_v) / sensor.v_per_e
-    return float(np.minimum(np.broadcast_to(top_e, sensor.layout.n_sites), sensor.well_e)[0])
+    return float(sensor.linearise(0.0).saturation_e[0])

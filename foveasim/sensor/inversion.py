@@ -1,0 +1,67 @@
+"""Inversion of the nominal sensor: charges from codes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from foveasim._core.short_repr import short_repr
+from foveasim._core.validation import Bools, Floats
+from foveasim.sensor.effects.contract import Sites
+from foveasim.sensor.records import node_records, readout_model
+
+if TYPE_CHECKING:
+    from foveasim.sensor.sensor import Sensor
+
+__all__ = ["Inverse"]
+
+#: Relative step at which Newton's method ends, and maximum number of steps: a double root halves the error in each.
+INVERSION_ROUNDING, MAX_INVERSIONS = 1e-14, 60
+
+
+class Inverse(NamedTuple):
+    """
+    Charges at the sense nodes that codes correspond to, on the nominal sensor.
+
+    Attributes
+    ----------
+    charge_e : (..., n_site) float64, e-
+        Charge whose voltage is at the centre of the code.
+    noise_e2 : (..., n_site) float64, e-²
+        Temporal variance of readout and conversion, without that of the collection.
+    is_saturated : (..., n_site) bool
+        Whether a code is the highest one, or the charge is the full well.
+    """
+
+    charge_e: Floats
+    noise_e2: Floats
+    is_saturated: Bools
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+
+def invert(sensor: Sensor, sites: Sites, codes: Floats) -> Inverse:
+    """
+    Invert the chain from the charge at the sense node to codes: see :meth:`foveasim.Sensor.invert`.
+
+    Newton's method starts at no charge: for a response
+    that bends towards saturation it converges from below.
+    """
+    target_v = sensor.adc.fraction_of_code(codes) * sensor.v_sat_v
+    charge_e: Floats = np.zeros(np.broadcast_shapes(target_v.shape, (sites.n_sites,)))
+    slope = np.ones(1)
+    for _ in range(MAX_INVERSIONS):
+        records = node_records(sensor, sensor.chain, sites, charge_e)
+        slope = np.ones(1)
+        for record in records:
+            slope = record.map(slope)
+        step_e = np.divide(target_v - records[-1].mean, slope, out=np.zeros_like(charge_e), where=slope != 0.0)
+        charge_e = charge_e + step_e
+        if np.all(np.abs(step_e) <= INVERSION_ROUNDING * (1.0 + np.abs(charge_e))):
+            break
+    readout = readout_model(sensor, np.maximum(charge_e, 0.0), 0.0, sites, is_reset=True)
+    step_v = sensor.adc.width_of_code_dn(codes) * sensor.v_sat_v / 2.0**sensor.bits
+    noise_e2 = readout.noise_e2 + np.square(step_v / slope) * sensor.adc.noise_dn2
+    return Inverse(charge_e, noise_e2, (charge_e >= sensor.well_e) | (codes >= 2.0**sensor.bits - 1.0))

@@ -1,0 +1,332 @@
+"""Records of the steps of the sensor chain: slopes and sources of noise at the mean of each site, and their propagation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from foveasim._core.validation import Floats, Ints
+from foveasim.sensor.effects.contract import NOTHING, Effect, Operator, Sites, Stage
+from foveasim.sensor.prediction import MIN_SLOPE, ReadoutModel, Transfer
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+    from foveasim.sensor.sensor import Sensor
+
+#: Sites per block where rows of mixing operators are multiplied: bounds the memory.
+BLOCK_ROWS = 4096
+#: Source of noise: drawn for each frame, drawn at the reset, or different between devices.
+Kind: TypeAlias = Literal["temporal", "reset", "fixed"]
+Branch: TypeAlias = Literal["photo", "dark", ""]
+
+
+class Record(NamedTuple):
+    """
+    Step of the chain at the mean of each site.
+
+    The fields from ``mean`` to ``groups`` are those of :class:`foveasim.sensor.effects.StepModel`. ``branch`` is that of the
+    light or of the dark current before both are added, else empty. ``half_step`` is half the difference between two states.
+    """
+
+    name: str
+    mean: Floats
+    slope: Floats | Operator | None = None
+    deviation: Floats | None = None
+    groups: Ints | None = None
+    kind: Kind = "temporal"
+    branch: Branch = ""
+    half_step: Floats | None = None
+
+    @property
+    def labels(self) -> Ints:
+        """Indices of the groups of the sites, (n_site,)."""
+        return np.unique(np.asarray(self.groups), return_inverse=True)[1].ravel()
+
+    @property
+    def operator(self) -> Operator | None:
+        """Slope of a step that mixes sites."""
+        return None if self.slope is None or isinstance(self.slope, np.ndarray) else self.slope
+
+    @property
+    def factor(self) -> Floats | None:
+        """Slope of a step that does not mix sites; None for 1."""
+        return self.slope if isinstance(self.slope, np.ndarray) else None
+
+    def map(self, values: Floats) -> Floats:
+        """Return the derivative of the mean times values (..., n_site)."""
+        if self.slope is None:
+            return values
+        return values * self.slope if isinstance(self.slope, np.ndarray) else self.slope.apply(values)
+
+    def map_back(self, values: Floats) -> Floats:
+        """Return the transposed derivative times values (..., n_site)."""
+        return self.map(values) if self.operator is None else self.operator.transpose().apply(values)
+
+    def correlate(self, values: Floats) -> Floats:
+        """Return the covariance of the added noise times values (..., n_site)."""
+        assert self.deviation is not None
+        weighted = values * self.deviation
+        if self.groups is not None:
+            label = self.labels
+            sums = [np.bincount(label, row)[label] for row in np.atleast_2d(weighted)]
+            weighted = np.asarray(np.stack(sums).reshape(weighted.shape), np.float64)
+        return weighted * self.deviation
+
+    def spread(self, rows: csr_array[Any]) -> csr_array[Any]:
+        """Return rows (n, n_site) times the factor F of the covariance F Fᵀ of the added noise."""
+        from scipy.sparse import csr_array
+
+        assert self.deviation is not None
+        if self.groups is None:
+            return scale_columns(rows, self.deviation)
+        n_sites, label = rows.shape[1], self.labels
+        deviation = np.broadcast_to(self.deviation, n_sites)
+        return csr_array(rows @ csr_array((deviation, label, np.arange(n_sites + 1)), shape=(n_sites, label.max() + 1)))
+
+    def rows(self, rows: csr_array[Any]) -> csr_array[Any]:
+        """Return rows (n, n_site) times the derivative of the mean."""
+        if self.operator is not None:
+            found: csr_array[Any] = self.operator.rows(rows)
+            return found
+        return rows if self.factor is None else scale_columns(rows, self.factor)
+
+    def of(self, index: tuple[int, ...]) -> Record:
+        """Return the step of one of several charges."""
+        parts = {name: getattr(self, name) for name in ("mean", "slope", "deviation")}
+        return self._replace(
+            **{name: part[index] for name, part in parts.items() if isinstance(part, np.ndarray) and part.ndim > 1}
+        )
+
+
+def scale_columns(rows: csr_array[Any], factor: Floats) -> csr_array[Any]:
+    """Return a sparse matrix with scaled columns."""
+    from scipy.sparse import csr_array
+
+    data = rows.data * (factor if factor.size == 1 else factor[rows.indices])
+    return csr_array((data, rows.indices, rows.indptr), shape=rows.shape)
+
+
+class Walk:
+    """Records of consecutive steps."""
+
+    def __init__(self, sites: Sites) -> None:
+        self.sites = sites
+        self.records: list[Record] = []
+
+    def effects(self, effects: Iterable[Effect], mean: Floats, branch: Branch = "") -> Floats:
+        """Record effects, and return the mean after them."""
+        is_known = self.sites.known_device is not None
+        for effect in effects:
+            found = effect.validate_linear(mean, self.sites)
+            kind: Kind = "fixed" if not effect.is_temporal else "reset" if effect.is_drawn_at_reset else "temporal"
+            half_step = effect.half_step(self.sites.of(effect)) if is_known and effect.is_temporal else None
+            self.records.append(Record(effect.name, *found, kind, branch, half_step))
+            mean = found.mean
+        return mean
+
+    def step(self, name: str, mean: Floats, slope: Floats | None = None, **values: Any) -> Floats:
+        """Record a step, and return its mean."""
+        self.records.append(Record(name, mean, slope, **values))
+        return mean
+
+
+def effects_at(chain: Iterable[Effect], stage: Stage) -> list[Effect]:
+    """Return the effects of a stage, in their order."""
+    return [effect for effect in chain if effect.stage == stage]
+
+
+def light_records(
+    sensor: Sensor, chain: Sequence[Effect], sites: Sites, photo: Floats, exposure_s: float
+) -> list[Record]:
+    """Return the records from photoelectron rates to expected charges, with the effects of a chain."""
+    walk, sensitivity = Walk(sites), np.atleast_1d(np.asarray(sensor.sensitivity, np.float64))
+    slope = None if sensitivity.size == 1 and sensitivity[0] == 1.0 else sensitivity
+    rates = walk.step("sensitivity", photo if slope is None else photo * slope, slope, branch="photo")
+    rates = walk.effects(effects_at(chain, "photo"), rates, "photo")
+    rates = rates + walk.effects(effects_at(chain, "dark"), sensor.nominal_dark_e_per_s, "dark")
+    walk.effects(effects_at(chain, "expected"), walk.step("exposure", rates * exposure_s, np.array([exposure_s])))
+    return walk.records
+
+
+def split_charge(chain: Iterable[Effect]) -> tuple[list[Effect], list[Effect]]:
+    """Return the effects on the collected charge up to the last one that mixes sites, and the others of this stage."""
+    charge = effects_at(chain, "charge")
+    n = max((k + 1 for k, effect in enumerate(charge) if effect.mixes_means), default=0)
+    return charge[:n], charge[n:]
+
+
+def node_records(sensor: Sensor, chain: Sequence[Effect], sites: Sites, node_e: Floats) -> list[Record]:
+    """Return the records from the charge at the sense node to the voltage at the ADC, with the effects of a chain."""
+    walk = Walk(sites)
+    charge_e = walk.effects(split_charge(chain)[1], node_e)
+    sense_v = walk.effects(
+        effects_at(chain, "sense_node"), walk.step("conversion", charge_e * sensor.v_per_e, sensor.v_per_e)
+    )
+    walk.effects(effects_at(chain, "output"), walk.step("nonlinearity", *apply_nonlinearity(sensor, sense_v)))
+    return walk.records
+
+
+def apply_nonlinearity(sensor: Sensor, sense_v: Floats) -> tuple[Floats, Floats | None]:
+    """Return voltages after nonlinearity and pedestal, and the slope of the nonlinearity, None for 1."""
+    loss = sensor.nonlinearity_fraction
+    if not loss:
+        return (sense_v + sensor.pedestal_v if sensor.pedestal_v else sense_v), None
+    fraction = sense_v / sensor.v_sat_v
+    # Outside the range the relative loss is constant: 0, or that at full range.
+    is_within = (fraction > 0.0) & (fraction < 1.0)
+    fraction = np.clip(fraction, 0.0, 1.0)
+    slope = np.maximum(1.0 - np.where(is_within, 2.0, 1.0) * loss * fraction, MIN_SLOPE)
+    return sense_v * (1.0 - loss * fraction) + sensor.pedestal_v, slope
+
+
+def transfer_of(sensor: Sensor, records: Iterable[Record], node_e: Floats) -> Transfer:
+    """Return the transfer function of :func:`node_records`: first-order in effects, exact in the nonlinearity."""
+    scale, offset, before = np.ones(1), np.zeros(1), node_e
+    v_per_e, sense_v = scale, offset
+    for record in records:
+        if record.name == "nonlinearity":
+            v_per_e, sense_v, scale, offset = scale, offset, np.ones(1), np.full(1, sensor.pedestal_v)
+        elif record.slope is not None:
+            added = 0.0 if record.name == "conversion" else record.mean - record.map(before)
+            scale, offset = record.map(scale), record.map(offset) + added
+        elif record.mean is not before:
+            offset = offset + (record.mean - before)
+        before = record.mean
+    return Transfer(v_per_e, sense_v, scale, offset, sensor.nonlinearity_fraction, sensor.v_sat_v)
+
+
+def top_e(sensor: Sensor, transfer: Transfer) -> Floats:
+    """Return the lowest charge at the sense node with the highest code, at least 0; infinite if none has it."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        top_fraction = sensor.adc.transition_levels[-2] - transfer.output_v / sensor.v_sat_v
+        fraction = np.maximum(top_fraction / transfer.scale, 0.0)
+        loss = sensor.nonlinearity_fraction
+        if loss:
+            relative = 0.5 * (1.0 - np.sqrt(np.maximum(1.0 - 4.0 * loss * fraction, 0.0))) / loss
+            fraction = np.where(fraction < 1.0 - loss, relative, fraction / (1.0 - loss))
+        top_v = np.maximum(fraction * sensor.v_sat_v - transfer.sense_v, 0.0)
+        return np.where(transfer.v_per_e > 0.0, top_v / transfer.v_per_e, np.inf)
+
+
+def propagate(
+    records: Iterable[Record], n_sites: int, is_used: Callable[[Record], bool], start: Floats | float = 0.0
+) -> Floats:
+    """
+    Return the variance of the sum of the chosen sources after the last step, (..., n_site) or (1,).
+
+    ``start``: variance of independent sites before the first step.
+    """
+    records = list(records)
+    variance: dict[str, Any] = {"photo": start, "dark": 0.0, "": None}
+    is_diagonal = True
+    for record in records:
+        at = variance[record.branch]
+        if at is None:
+            at = variance["photo"] + variance["dark"]
+        if np.any(at):
+            if record.operator is None:
+                at = at if record.factor is None else at * np.square(record.factor)
+            elif is_diagonal:
+                at = record.operator.variance(np.broadcast_to(at, np.broadcast_shapes(np.shape(at), (n_sites,))))
+                is_diagonal = False
+            else:
+                return _propagate_rows(records, n_sites, is_used, start)
+        if record.deviation is not None and is_used(record):
+            at = at + np.square(record.deviation)
+            is_diagonal &= record.groups is None
+        variance[record.branch] = at
+    total = variance[""] if variance[""] is not None else variance["photo"]
+    return np.atleast_1d(np.asarray(total, np.float64))
+
+
+def _propagate_rows(
+    records: list[Record], n_sites: int, is_used: Callable[[Record], bool], start: Floats | float
+) -> Floats:
+    """Compute :func:`propagate` where sources are correlated before they are mixed, in blocks of rows."""
+    if np.any(start):
+        records = [Record("", NOTHING, None, np.sqrt(start), branch="photo"), *records]
+        chosen = is_used
+
+        def is_used(record: Record) -> bool:
+            return not record.name or chosen(record)
+
+    shape = np.broadcast_shapes(*(np.shape(record.deviation) for record in records if record.deviation is not None))[
+        :-1
+    ]
+    out = np.empty((*shape, n_sites))
+    for index in np.ndindex(shape):
+        single = [record.of(index) for record in records]
+        for first in range(0, n_sites, BLOCK_ROWS):
+            sites = np.arange(first, min(first + BLOCK_ROWS, n_sites))
+            factors = row_factors(single, n_sites, sites, is_used)
+            out[index][sites] = sum(np.asarray(factor.power(2).sum(axis=1)).ravel() for factor in factors)
+    return out
+
+
+def row_factors(
+    records: Iterable[Record], n_sites: int, sites: Ints, is_used: Callable[[Record], bool]
+) -> Iterator[csr_array[Any]]:
+    """
+    Yield the rows of some sites of a factor F of the covariance F Fᵀ after the last step, for each chosen source.
+
+    The rows are (n, n_site) or (n, n_group), sparse.
+    """
+    from scipy.sparse import csr_array
+
+    rows = csr_array((np.ones(sites.size), sites, np.arange(sites.size + 1)), shape=(sites.size, n_sites))
+    joined: csr_array[Any] | None = None
+    branch: Branch = ""
+    for record in reversed(list(records)):
+        if record.branch != branch:
+            joined = rows if joined is None else joined
+            rows, branch = joined, record.branch
+        if record.deviation is not None and is_used(record):
+            yield record.spread(rows)
+        rows = record.rows(rows)
+
+
+def readout_model(
+    sensor: Sensor, mean_e: ArrayLike, variance_e2: ArrayLike, sites: Sites, *, is_reset: bool
+) -> ReadoutModel:
+    """
+    Compute the first-order readout model at the mean collected charges.
+
+    ``mean_e``, ``variance_e2`` (..., n_site) or number, e- and e-²: moments of collected charges. ``sites``: all sites, with a
+    device or without. ``is_reset``: whether to include the noise of effects that are drawn at the reset.
+    """
+    mean_e, variance_e2 = (np.atleast_1d(np.asarray(part, np.float64)) for part in (mean_e, variance_e2))
+    chain = sensor.chain
+    mixed = split_charge(chain)[0]
+    used = partial(is_temporal, is_reset=is_reset)
+    if mixed:
+        walk = Walk(sites)
+        mean_e = walk.effects(mixed, np.broadcast_to(mean_e, np.broadcast_shapes(mean_e.shape, (sites.n_sites,))))
+        variance_e2 = propagate(walk.records, sites.n_sites, used, variance_e2)
+    records = node_records(sensor, chain, sites, mean_e)
+    slope, variance, half_step2 = np.ones(1), np.zeros(1), np.zeros(1)
+    for record in records:
+        if record.factor is not None:
+            squared, slope = np.square(record.factor), slope * record.factor
+            variance, half_step2 = (part * squared if np.any(part) else part for part in (variance, half_step2))
+        if record.deviation is not None and used(record):
+            own = NOTHING if record.half_step is None else np.square(record.half_step)
+            variance, half_step2 = variance + np.maximum(np.square(record.deviation) - own, 0.0), half_step2 + own
+    per_v2 = np.divide(1.0, slope**2, out=np.zeros(np.shape(slope)), where=slope != 0.0)
+    return ReadoutModel(
+        mean_e=mean_e,
+        variance_e2=variance_e2,
+        is_mixed=bool(mixed),
+        transfer=transfer_of(sensor, records, mean_e),
+        gaussian_e2=variance * per_v2,
+        half_step_e=np.sqrt(half_step2 * per_v2),
+    )
+
+
+def is_temporal(record: Record, *, is_reset: bool = True) -> bool:
+    """Whether a source is temporal; draws at the reset are constants in differences of reads."""
+    return record.kind == "temporal" or (is_reset and record.kind == "reset")
