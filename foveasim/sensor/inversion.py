@@ -9,7 +9,7 @@ import numpy as np
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats
 from foveasim.sensor.effects.contract import Sites
-from foveasim.sensor.records import node_records, readout_model
+from foveasim.sensor.records import readout_model, walk_from_node
 
 if TYPE_CHECKING:
     from foveasim.sensor.sensor import Sensor
@@ -53,11 +53,11 @@ def invert(sensor: Sensor, sites: Sites, codes: Floats) -> Inverse:
     charge_e: Floats = np.zeros(np.broadcast_shapes(target_v.shape, (sites.n_sites,)))
     slope = np.ones(1)
     for _ in range(MAX_INVERSIONS):
-        records = node_records(sensor, sensor.chain, sites, charge_e)
+        records, output_v = walk_from_node(sensor, sensor.chain, sites, charge_e)
         slope = np.ones(1)
         for record in records:
             slope = record.map(slope)
-        step_e = np.divide(target_v - records[-1].mean, slope, out=np.zeros_like(charge_e), where=slope != 0.0)
+        step_e = np.divide(target_v - output_v, slope, out=np.zeros_like(charge_e), where=slope != 0.0)
         charge_e = charge_e + step_e
         if np.all(np.abs(step_e) <= INVERSION_ROUNDING * (1.0 + np.abs(charge_e))):
             break

@@ -26,15 +26,15 @@ from foveasim.sensor.records import (
     Kind,
     Record,
     Walk,
+    highest_charge_e,
     is_temporal,
     light_records,
-    node_records,
     propagate,
     row_factors,
     scale_columns,
     split_charge,
-    top_e,
     transfer_of,
+    walk_from_node,
 )
 
 if TYPE_CHECKING:
@@ -70,8 +70,6 @@ class Linearisation:
         Mean collected charge, at most the full well.
     node_e : (..., n_site) float64, e-
         Mean charge at the sense node, at most :attr:`top_e`.
-    top_e : (..., n_site) or (1,) float64, e-
-        Lowest charge at the sense node with the highest code.
 
     Notes
     -----
@@ -87,11 +85,12 @@ class Linearisation:
     expected_e: Floats
     collected_e: Floats
     node_e: Floats
-    top_e: Floats
+    _output_v: Floats
     _records: tuple[Record, ...]
     _starts: dict[str, int]
-    _full_e: Floats | None
-    _transfer: Transfer
+    _is_full: Bools | bool
+    _chain: tuple[Effect, ...]
+    _sites: Sites
 
     def __repr__(self) -> str:
         names = ", ".join(self.sources)
@@ -113,7 +112,7 @@ class Linearisation:
     def mean_dn(self) -> Floats:
         """Mean code: that of the mean voltage, minus 1/2 for quantisation, (..., n_site) or (1,)."""
         adc = self.sensor.adc
-        fraction = np.clip(self._records[-2].mean / self.sensor.v_sat_v, 0.0, 1.0)
+        fraction = np.clip(self._output_v / self.sensor.v_sat_v, 0.0, 1.0)
         return np.interp(fraction, adc.transition_levels, np.arange(adc.n_codes + 1.0)) - 0.5
 
     @cached_property
@@ -129,6 +128,16 @@ class Linearisation:
         """System gain without response nonlinearity: linear codes per electron, (..., n_site) or (1,) DN/e-."""
         return self._transfer.v_per_e * self._transfer.scale / self.sensor.v_sat_v * 2.0**self.sensor.bits
 
+    @cached_property
+    def _transfer(self) -> Transfer:
+        records, _ = walk_from_node(self.sensor, self._chain, self._sites, self.node_e)
+        return transfer_of(self.sensor, records, self.node_e)
+
+    @cached_property
+    def top_e(self) -> Floats:
+        """Lowest charge at the sense node with the highest code, (..., n_site) or (1,) e-; infinite if none has it."""
+        return highest_charge_e(self.sensor, self._transfer)
+
     @property
     def saturation_e(self) -> Floats:
         """Charge at which a site saturates, by the full well or the highest code, (..., n_site) or (1,) e-."""
@@ -138,8 +147,7 @@ class Linearisation:
     def is_saturated(self) -> Bools:
         """Whether noise is clipped by the full well or the highest code, within two standard deviations, (..., n_site)."""
         is_saturated = self.node_e + CLIPPING_SIGMAS * np.sqrt(self.variance_e2()) >= self.top_e
-        if self._full_e is not None:
-            is_saturated = is_saturated | (self._full_e >= self.sensor.well_e)
+        is_saturated = is_saturated | self._is_full
         return np.broadcast_to(is_saturated, np.broadcast_shapes(is_saturated.shape, (self.n_sites,)))
 
     def slopes(self, start: Start, end: Start) -> list[Floats | Operator]:
@@ -458,15 +466,13 @@ def linearise(
     assert expected_e is not None
     starts["charge"] = len(records)
     collected_e, slope, deviation, groups = sensor.shot.validate_linear(expected_e, sites)
-    full_e: Floats | None = None
+    is_full: Bools | bool = False
     if sensor.full_well_e is not None:
         own = 0.0 if deviation is None or not sensor.shot.is_drawn else deviation
-        full_e = collected_e + CLIPPING_SIGMAS * own
-        part = np.divide(
-            sensor.well_e, collected_e, out=np.ones(np.shape(collected_e)), where=collected_e > sensor.well_e
-        )
-        collected_e = np.minimum(collected_e, sensor.well_e)
-        deviation = None if deviation is None else deviation * np.sqrt(part) if sensor.shot.is_drawn else deviation
+        is_full = collected_e + CLIPPING_SIGMAS * own >= sensor.well_e
+        if np.any(is_full):
+            deviation = _limited(deviation, collected_e, sensor.well_e, sensor.shot.is_drawn)
+            collected_e = np.minimum(collected_e, sensor.well_e)
     if photo_fraction is None or deviation is None or not sensor.shot.is_drawn:
         records.append(Record(sensor.shot.name, collected_e, slope, deviation, groups))
     else:
@@ -479,26 +485,29 @@ def linearise(
     node_e = walk.effects(split_charge(chain)[0], collected_e)
     records += walk.records
     starts["node"] = len(records)
-    after = node_records(sensor, chain, sites, node_e)
-    transfer = transfer_of(sensor, after, node_e)
-    highest_e = top_e(sensor, transfer)
-    if np.any(node_e > highest_e):
-        # Sites above their range have the values of the end of the range.
-        part = np.divide(highest_e, node_e, out=np.ones(np.shape(node_e)), where=node_e > highest_e)
-        if sensor.shot.is_drawn:
-            for k in range(starts["charge"], starts["node"]):
-                if records[k].name in (PHOTON_SHOT, DARK_SHOT, sensor.shot.name):
-                    records[k] = records[k]._replace(deviation=records[k].deviation * np.sqrt(part))
-        node_e = np.minimum(node_e, highest_e)
-        after = node_records(sensor, chain, sites, node_e)
+    after, output_v = walk_from_node(sensor, chain, sites, node_e, keeps_means=False)
     adc = sensor.adc
+    if np.any(output_v >= adc.transition_levels[-2] * sensor.v_sat_v):
+        # Sites above their range have the values of the end of the range.
+        full, _ = walk_from_node(sensor, chain, sites, node_e)
+        highest_e = highest_charge_e(sensor, transfer_of(sensor, full, node_e))
+        for k in range(starts["charge"], starts["collected"]):
+            limited = _limited(records[k].deviation, node_e, highest_e, sensor.shot.is_drawn)
+            records[k] = records[k]._replace(deviation=limited)
+        node_e = np.minimum(node_e, highest_e)
+        after, output_v = walk_from_node(sensor, chain, sites, node_e, keeps_means=False)
     step_v = np.full(1, sensor.v_sat_v / 2.0**sensor.bits)
-    output_v = after[-1].mean
     if not adc.is_linear:
         step_v = adc.width_at_dn(np.clip(output_v / sensor.v_sat_v, 0.0, 1.0)) * step_v
     with np.errstate(divide="ignore"):
-        per_v = 1.0 / step_v
-    conversion = Record(QUANTISATION, output_v, per_v, np.full(1, math.sqrt(adc.noise_dn2)))
-    return Linearisation(
-        sensor, expected_e, collected_e, node_e, highest_e, (*records, *after, conversion), starts, full_e, transfer
-    )
+        conversion = Record(QUANTISATION, NOTHING, 1.0 / step_v, np.full(1, math.sqrt(adc.noise_dn2)))
+    steps = (*records, *after, conversion)
+    return Linearisation(sensor, expected_e, collected_e, node_e, output_v, steps, starts, is_full, tuple(chain), sites)
+
+
+def _limited(deviation: Floats | None, charge_e: Floats, limit_e: Floats, is_drawn: bool) -> Floats | None:
+    """Return the standard deviation of the collection at a limit: its variance is proportional to the charge."""
+    if deviation is None or not is_drawn:
+        return deviation
+    part = np.divide(limit_e, charge_e, out=np.ones(np.shape(charge_e)), where=charge_e > limit_e)
+    return np.asarray(deviation * np.sqrt(part))

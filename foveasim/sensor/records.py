@@ -112,10 +112,15 @@ def scale_columns(rows: csr_array[Any], factor: Floats) -> csr_array[Any]:
 
 
 class Walk:
-    """Records of consecutive steps."""
+    """
+    Records of consecutive steps.
 
-    def __init__(self, sites: Sites) -> None:
+    Without ``keeps_means`` the records have no means, which for many sites are most of their memory.
+    """
+
+    def __init__(self, sites: Sites, *, keeps_means: bool = True) -> None:
         self.sites = sites
+        self.keeps_means = keeps_means
         self.records: list[Record] = []
 
     def effects(self, effects: Iterable[Effect], mean: Floats, branch: Branch = "") -> Floats:
@@ -125,14 +130,17 @@ class Walk:
             found = effect.validate_linear(mean, self.sites)
             kind: Kind = "fixed" if not effect.is_temporal else "reset" if effect.is_drawn_at_reset else "temporal"
             half_step = effect.half_step(self.sites.of(effect)) if is_known and effect.is_temporal else None
-            self.records.append(Record(effect.name, *found, kind, branch, half_step))
+            self._add(Record(effect.name, *found, kind, branch, half_step))
             mean = found.mean
         return mean
 
     def step(self, name: str, mean: Floats, slope: Floats | None = None, **values: Any) -> Floats:
         """Record a step, and return its mean."""
-        self.records.append(Record(name, mean, slope, **values))
+        self._add(Record(name, mean, slope, **values))
         return mean
+
+    def _add(self, record: Record) -> None:
+        self.records.append(record if self.keeps_means else record._replace(mean=NOTHING))
 
 
 def effects_at(chain: Iterable[Effect], stage: Stage) -> list[Effect]:
@@ -160,15 +168,20 @@ def split_charge(chain: Iterable[Effect]) -> tuple[list[Effect], list[Effect]]:
     return charge[:n], charge[n:]
 
 
-def node_records(sensor: Sensor, chain: Sequence[Effect], sites: Sites, node_e: Floats) -> list[Record]:
-    """Return the records from the charge at the sense node to the voltage at the ADC, with the effects of a chain."""
-    walk = Walk(sites)
-    charge_e = walk.effects(split_charge(chain)[1], node_e)
-    sense_v = walk.effects(
-        effects_at(chain, "sense_node"), walk.step("conversion", charge_e * sensor.v_per_e, sensor.v_per_e)
-    )
-    walk.effects(effects_at(chain, "output"), walk.step("nonlinearity", *apply_nonlinearity(sensor, sense_v)))
-    return walk.records
+def walk_from_node(
+    sensor: Sensor, chain: Sequence[Effect], sites: Sites, node_e: Floats, *, keeps_means: bool = True
+) -> tuple[list[Record], Floats]:
+    """
+    Return the records from the charge at the sense node to the voltage at the ADC, and the mean of this voltage.
+
+    ``chain``: effects. ``keeps_means``: whether the records contain their means.
+    """
+    walk = Walk(sites, keeps_means=keeps_means)
+    mean = walk.effects(split_charge(chain)[1], node_e)
+    mean = walk.step("conversion", mean * sensor.v_per_e, sensor.v_per_e)
+    mean = walk.effects(effects_at(chain, "sense_node"), mean)
+    mean = walk.step("nonlinearity", *apply_nonlinearity(sensor, mean))
+    return walk.records, walk.effects(effects_at(chain, "output"), mean)
 
 
 def apply_nonlinearity(sensor: Sensor, sense_v: Floats) -> tuple[Floats, Floats | None]:
@@ -185,7 +198,7 @@ def apply_nonlinearity(sensor: Sensor, sense_v: Floats) -> tuple[Floats, Floats 
 
 
 def transfer_of(sensor: Sensor, records: Iterable[Record], node_e: Floats) -> Transfer:
-    """Return the transfer function of :func:`node_records`: first-order in effects, exact in the nonlinearity."""
+    """Return the transfer function of :func:`walk_from_node`: first-order in effects, exact in the nonlinearity."""
     scale, offset, before = np.ones(1), np.zeros(1), node_e
     v_per_e, sense_v = scale, offset
     for record in records:
@@ -200,7 +213,7 @@ def transfer_of(sensor: Sensor, records: Iterable[Record], node_e: Floats) -> Tr
     return Transfer(v_per_e, sense_v, scale, offset, sensor.nonlinearity_fraction, sensor.v_sat_v)
 
 
-def top_e(sensor: Sensor, transfer: Transfer) -> Floats:
+def highest_charge_e(sensor: Sensor, transfer: Transfer) -> Floats:
     """Return the lowest charge at the sense node with the highest code, at least 0; infinite if none has it."""
     with np.errstate(divide="ignore", invalid="ignore"):
         top_fraction = sensor.adc.transition_levels[-2] - transfer.output_v / sensor.v_sat_v
@@ -213,6 +226,21 @@ def top_e(sensor: Sensor, transfer: Transfer) -> Floats:
         return np.where(transfer.v_per_e > 0.0, top_v / transfer.v_per_e, np.inf)
 
 
+def _sum(one: Floats | None, other: Floats | None) -> Floats | None:
+    """Return the sum of arrays, in place of one of them if possible; None for 0."""
+    if one is None or other is None:
+        return other if one is None else one
+    if one.shape != other.shape and one.size < other.size:
+        one, other = other, one
+    return np.add(one, other, out=one if np.broadcast_shapes(one.shape, other.shape) == one.shape else None)
+
+
+def _multiply(values: Floats, factor: Floats) -> Floats:
+    """Return a product, in place of the values if possible."""
+    is_own = np.broadcast_shapes(values.shape, factor.shape) == values.shape
+    return np.multiply(values, factor, out=values if is_own else None)
+
+
 def propagate(
     records: Iterable[Record], n_sites: int, is_used: Callable[[Record], bool], start: Floats | float = 0.0
 ) -> Floats:
@@ -222,26 +250,25 @@ def propagate(
     ``start``: variance of independent sites before the first step.
     """
     records = list(records)
-    variance: dict[str, Any] = {"photo": start, "dark": 0.0, "": None}
+    sums: dict[str, Floats | None] = {"photo": np.array(start, ndmin=1) if np.any(start) else None, "dark": None}
     is_diagonal = True
     for record in records:
-        at = variance[record.branch]
-        if at is None:
-            at = variance["photo"] + variance["dark"]
-        if np.any(at):
+        at = sums[record.branch] if record.branch in sums else _sum(sums["photo"], sums["dark"])
+        if at is not None:
             if record.operator is None:
-                at = at if record.factor is None else at * np.square(record.factor)
+                if record.factor is not None:
+                    at = _multiply(_multiply(at, record.factor), record.factor)
             elif is_diagonal:
-                at = record.operator.variance(np.broadcast_to(at, np.broadcast_shapes(np.shape(at), (n_sites,))))
+                at = record.operator.variance(np.broadcast_to(at, np.broadcast_shapes(at.shape, (n_sites,))))
                 is_diagonal = False
             else:
                 return _propagate_rows(records, n_sites, is_used, start)
         if record.deviation is not None and is_used(record):
-            at = at + np.square(record.deviation)
+            at = _sum(at, np.square(record.deviation))
             is_diagonal &= record.groups is None
-        variance[record.branch] = at
-    total = variance[""] if variance[""] is not None else variance["photo"]
-    return np.atleast_1d(np.asarray(total, np.float64))
+        sums[record.branch] = at
+    total = sums.get("", sums["photo"])
+    return np.zeros(1) if total is None else total
 
 
 def _propagate_rows(
@@ -307,7 +334,7 @@ def readout_model(
         walk = Walk(sites)
         mean_e = walk.effects(mixed, np.broadcast_to(mean_e, np.broadcast_shapes(mean_e.shape, (sites.n_sites,))))
         variance_e2 = propagate(walk.records, sites.n_sites, used, variance_e2)
-    records = node_records(sensor, chain, sites, mean_e)
+    records, _ = walk_from_node(sensor, chain, sites, mean_e)
     slope, variance, half_step2 = np.ones(1), np.zeros(1), np.zeros(1)
     for record in records:
         if record.factor is not None:

@@ -115,7 +115,8 @@ class TelegraphNoise(Effect):
 
     def linearise(self, mean: Floats, *, sites: Sites) -> StepModel:
         """Return the mean, and the standard deviation of the two states."""
-        return StepModel(mean, None, np.atleast_1d(np.sqrt(self._variance(sites))))
+        known = sites.known_device is not None
+        return StepModel(mean, None, self.half_step(sites) if known else np.atleast_1d(np.sqrt(self._variance(sites))))
 
     def _variance(self, sites: Sites) -> float | Floats:
         if sites.known_device is None:
