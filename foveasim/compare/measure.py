@@ -99,7 +99,7 @@ MEASURES = {
 
 @dataclass(frozen=True, eq=False)
 class SceneMeasures:
-    """Statistical model of a capture, and measures of its sites; NaN for an annulus without sites."""
+    """Model of a capture, and measures of its sites; NaN for an annulus without sites."""
 
     capture: Capture
     model: Linearisation

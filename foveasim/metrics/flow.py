@@ -342,7 +342,7 @@ def _is_on_map(integrator: Integrator, layout: Layout) -> Bools:
 
 
 def _weights(noise: ArrayLike | Linearisation, groups: _Regions, n_sites: int) -> Callable[[Floats], Floats]:
-    """Return a function that divides changes of charges (..., n_site) by their variance, within each region."""
+    """Return a function that divides changes of charges by their variance."""
     if not isinstance(noise, Linearisation):
         variance = _per_site("variance_e2", finite_array("variance_e2", noise, above=0.0), n_sites)
         return lambda values: values / variance
@@ -351,7 +351,7 @@ def _weights(noise: ArrayLike | Linearisation, groups: _Regions, n_sites: int) -
     if not noise.is_correlated:
         return noise.weigh
 
-    def weigh(values: Floats) -> Floats:
+    def weigh(values: Floats) -> Floats:  # within each region
         total = np.zeros_like(values)
         for own in groups.sites():
             moved = np.zeros_like(values)

@@ -72,7 +72,11 @@ def linearise(code: ArrayLike, sensor: Sensor) -> Floats:
 
 
 def nominal_e_per_dn(sensor: Sensor) -> Floats:
-    """Return the number of electrons per linear code at no charge, mean over devices, (n_site,) or (1,) e-/DN."""
+    """
+    Return the electrons per linear code at zero charge, as the mean over devices.
+
+    (n_site,) or (1,) float64, e-/DN.
+    """
     return np.asarray(1.0 / sensor.linearise(0.0, is_device_known=False).linear_gain_dn_per_e)
 
 

@@ -42,14 +42,14 @@ class Inverse(NamedTuple):
         return short_repr(self)
 
 
-def invert(sensor: Sensor, sites: Sites, codes: Floats) -> Inverse:
+def invert(sensor: Sensor, sites: Sites, code_dn: Floats) -> Inverse:
     """
-    Invert the chain from the charge at the sense node to codes: see :meth:`foveasim.Sensor.invert`.
+    Invert the chain after the sense node: see :meth:`foveasim.Sensor.invert`.
 
     Newton's method starts at no charge: for a response
     that bends towards saturation it converges from below.
     """
-    target_v = sensor.adc.fraction_of_code(codes) * sensor.v_sat_v
+    target_v = sensor.adc.fraction_of_code(code_dn) * sensor.v_sat_v
     charge_e: Floats = np.zeros(np.broadcast_shapes(target_v.shape, (sites.n_sites,)))
     slope = np.ones(1)
     for _ in range(MAX_INVERSIONS):
@@ -62,6 +62,6 @@ def invert(sensor: Sensor, sites: Sites, codes: Floats) -> Inverse:
         if np.all(np.abs(step_e) <= INVERSION_ROUNDING * (1.0 + np.abs(charge_e))):
             break
     readout = readout_model(sensor, np.maximum(charge_e, 0.0), 0.0, sites, is_reset=True)
-    step_v = sensor.adc.width_of_code_dn(codes) * sensor.v_sat_v / 2.0**sensor.bits
+    step_v = sensor.adc.width_of_code_dn(code_dn) * sensor.v_sat_v / 2.0**sensor.bits
     noise_e2 = readout.noise_e2 + np.square(step_v / slope) * sensor.adc.noise_dn2
-    return Inverse(charge_e, noise_e2, (charge_e >= sensor.well_e) | (codes >= 2.0**sensor.bits - 1.0))
+    return Inverse(charge_e, noise_e2, (charge_e >= sensor.well_e) | (code_dn >= 2.0**sensor.bits - 1.0))

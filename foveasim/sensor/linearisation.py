@@ -103,7 +103,7 @@ class Linearisation:
 
     @property
     def sources(self) -> dict[str, Kind]:
-        """Sources of noise in the order of the chain: ``"temporal"``, drawn at the ``"reset"``, or ``"fixed"``, by name."""
+        """Kinds of the sources of noise by name: ``"temporal"``, ``"reset"`` or ``"fixed"``."""
         return {record.name: record.kind for record in self._records if record.deviation is not None}
 
     # -- means and slopes ---------------------------------------------------------------------------------------------
@@ -117,7 +117,7 @@ class Linearisation:
 
     @cached_property
     def gain_dn_per_e(self) -> Floats:
-        """Derivative of the code with respect to the charge at the sense node, (..., n_site) or (1,) DN/e-."""
+        """Derivative of the code with respect to the charge at the sense node, DN/e-."""
         slope = np.ones(1)
         for record in self._records[self._starts["node"] :]:
             slope = record.map(slope)
@@ -125,7 +125,7 @@ class Linearisation:
 
     @cached_property
     def linear_gain_dn_per_e(self) -> Floats:
-        """System gain without response nonlinearity: linear codes per electron, (..., n_site) or (1,) DN/e-."""
+        """Linear codes per electron without the response nonlinearity, DN/e-."""
         return self._transfer.v_per_e * self._transfer.scale / self.sensor.v_sat_v * 2.0**self.sensor.bits
 
     @cached_property
@@ -135,17 +135,21 @@ class Linearisation:
 
     @cached_property
     def top_e(self) -> Floats:
-        """Lowest charge at the sense node with the highest code, (..., n_site) or (1,) e-; infinite if none has it."""
+        """Lowest charge at the sense node with the highest code, e-; infinite if none."""
         return highest_charge_e(self.sensor, self._transfer)
 
     @property
     def saturation_e(self) -> Floats:
-        """Charge at which a site saturates, by the full well or the highest code, (..., n_site) or (1,) e-."""
+        """Charge at which a site saturates: full well, or lowest with the highest code, e-."""
         return np.minimum(self.top_e, self.sensor.well_e)
 
     @cached_property
     def is_saturated(self) -> Bools:
-        """Whether noise is clipped by the full well or the highest code, within two standard deviations, (..., n_site)."""
+        """
+        Whether the full well or the highest code clips the noise of each site.
+
+        (..., n_site) bool: within two standard deviations.
+        """
         is_saturated = self.node_e + CLIPPING_SIGMAS * np.sqrt(self.variance_e2()) >= self.top_e
         is_saturated = is_saturated | self._is_full
         return np.broadcast_to(is_saturated, np.broadcast_shapes(is_saturated.shape, (self.n_sites,)))
@@ -226,7 +230,7 @@ class Linearisation:
         return propagate(self._records, self.n_sites, self._chosen(sources, is_reset))
 
     def variance_e2(self, sources: Collection[str] | None = None, *, is_reset: bool = True) -> Floats:
-        """Compute the temporal variance referred to the charge at the sense node, e-²; see :meth:`variance_dn2`."""
+        """Compute :meth:`variance_dn2` referred to the charge at the sense node, e-²."""
         with np.errstate(divide="ignore", invalid="ignore"):
             variance = self.variance_dn2(sources, is_reset=is_reset) / np.square(self.gain_dn_per_e)
         return np.where(np.isnan(variance), 0.0, variance) if np.isnan(np.min(variance, initial=0.0)) else variance
@@ -264,7 +268,11 @@ class Linearisation:
         return np.asarray(sum(((a @ a.T).toarray() for a in factors), np.zeros((index.size, index.size))))
 
     def apply_covariance(self, values: ArrayLike) -> Floats:
-        """Apply the temporal covariance of the codes to values (..., n_site); the result is in DN² times their unit."""
+        """
+        Apply the temporal covariance of the codes, DN².
+
+        ``values`` (..., n_site): in any unit.
+        """
         values = self._check("values", values)
         records, chosen = self._records[self._starts["charge"] :], self._chosen(None, True)
         back: list[Floats] = []
@@ -290,7 +298,7 @@ class Linearisation:
 
     def solve_covariance(self, values: ArrayLike, sites: ArrayLike | None = None) -> Floats:
         """
-        Apply the inverse of the temporal covariance of the codes of all sites, or of some of them.
+        Apply the inverse of the temporal covariance of the codes, of all or some sites.
 
         Parameters
         ----------
@@ -365,7 +373,7 @@ class Linearisation:
         return np.asarray(derivatives @ self.solve_covariance(derivatives, sites).T)
 
     def _woodbury(self, rows: Floats, known: Ints) -> Floats:
-        """Solve systems with the covariance of known sites, (n, n_known), for noise that groups share and nothing mixes."""
+        """Solve systems (n, n_known) with the covariance of sites whose noise is not mixed."""
         from scipy.sparse import csr_array, eye_array, hstack
         from scipy.sparse.linalg import splu
 
@@ -506,7 +514,7 @@ def linearise(
 
 
 def _limited(deviation: Floats | None, charge_e: Floats, limit_e: Floats, is_drawn: bool) -> Floats | None:
-    """Return the standard deviation of the collection at a limit: its variance is proportional to the charge."""
+    """Return the deviation of charges at a limit; the variance is proportional to them."""
     if deviation is None or not is_drawn:
         return deviation
     part = np.divide(limit_e, charge_e, out=np.ones(np.shape(charge_e)), where=charge_e > limit_e)

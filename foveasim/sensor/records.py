@@ -1,4 +1,4 @@
-"""Records of the steps of the sensor chain: slopes and sources of noise at the mean of each site, and their propagation."""
+"""Records of the steps of the sensor chain: slopes, sources of noise, propagation."""
 
 from __future__ import annotations
 
@@ -149,12 +149,12 @@ def effects_at(chain: Iterable[Effect], stage: Stage) -> list[Effect]:
 
 
 def light_records(
-    sensor: Sensor, chain: Sequence[Effect], sites: Sites, photo: Floats, exposure_s: float
+    sensor: Sensor, chain: Sequence[Effect], sites: Sites, photo_e_per_s: Floats, exposure_s: float
 ) -> list[Record]:
-    """Return the records from photoelectron rates to expected charges, with the effects of a chain."""
+    """Return the records from photoelectron rates to expected charges."""
     walk, sensitivity = Walk(sites), np.atleast_1d(np.asarray(sensor.sensitivity, np.float64))
     slope = None if sensitivity.size == 1 and sensitivity[0] == 1.0 else sensitivity
-    rates = walk.step("sensitivity", photo if slope is None else photo * slope, slope, branch="photo")
+    rates = walk.step("sensitivity", photo_e_per_s if slope is None else photo_e_per_s * slope, slope, branch="photo")
     rates = walk.effects(effects_at(chain, "photo"), rates, "photo")
     rates = rates + walk.effects(effects_at(chain, "dark"), sensor.nominal_dark_e_per_s, "dark")
     walk.effects(effects_at(chain, "expected"), walk.step("exposure", rates * exposure_s, np.array([exposure_s])))
@@ -162,7 +162,7 @@ def light_records(
 
 
 def split_charge(chain: Iterable[Effect]) -> tuple[list[Effect], list[Effect]]:
-    """Return the effects on the collected charge up to the last one that mixes sites, and the others of this stage."""
+    """Split the effects on the collected charge after the last one that mixes sites."""
     charge = effects_at(chain, "charge")
     n = max((k + 1 for k, effect in enumerate(charge) if effect.mixes_means), default=0)
     return charge[:n], charge[n:]
@@ -172,7 +172,7 @@ def walk_from_node(
     sensor: Sensor, chain: Sequence[Effect], sites: Sites, node_e: Floats, *, keeps_means: bool = True
 ) -> tuple[list[Record], Floats]:
     """
-    Return the records from the charge at the sense node to the voltage at the ADC, and the mean of this voltage.
+    Return the records from the sense node to the ADC, and the mean voltage at the ADC.
 
     ``chain``: effects. ``keeps_means``: whether the records contain their means.
     """
@@ -185,7 +185,7 @@ def walk_from_node(
 
 
 def apply_nonlinearity(sensor: Sensor, sense_v: Floats) -> tuple[Floats, Floats | None]:
-    """Return voltages after nonlinearity and pedestal, and the slope of the nonlinearity, None for 1."""
+    """Return voltages after nonlinearity and pedestal, and its slope, None for 1."""
     loss = sensor.nonlinearity_fraction
     if not loss:
         return (sense_v + sensor.pedestal_v if sensor.pedestal_v else sense_v), None
@@ -198,7 +198,11 @@ def apply_nonlinearity(sensor: Sensor, sense_v: Floats) -> tuple[Floats, Floats 
 
 
 def transfer_of(sensor: Sensor, records: Iterable[Record], node_e: Floats) -> Transfer:
-    """Return the transfer function of :func:`walk_from_node`: first-order in effects, exact in the nonlinearity."""
+    """
+    Return the transfer function of :func:`walk_from_node`.
+
+    It is first-order in effects, and exact in the nonlinearity.
+    """
     scale, offset, before = np.ones(1), np.zeros(1), node_e
     v_per_e, sense_v = scale, offset
     for record in records:
@@ -214,7 +218,7 @@ def transfer_of(sensor: Sensor, records: Iterable[Record], node_e: Floats) -> Tr
 
 
 def highest_charge_e(sensor: Sensor, transfer: Transfer) -> Floats:
-    """Return the lowest charge at the sense node with the highest code, at least 0; infinite if none has it."""
+    """Return the lowest charge with the highest code, at least 0; infinite if none."""
     with np.errstate(divide="ignore", invalid="ignore"):
         top_fraction = sensor.adc.transition_levels[-2] - transfer.output_v / sensor.v_sat_v
         fraction = np.maximum(top_fraction / transfer.scale, 0.0)
@@ -245,8 +249,9 @@ def propagate(
     records: Iterable[Record], n_sites: int, is_used: Callable[[Record], bool], start: Floats | float = 0.0
 ) -> Floats:
     """
-    Return the variance of the sum of the chosen sources after the last step, (..., n_site) or (1,).
+    Return the variance of the chosen sources after the last step.
 
+    The result is (..., n_site) or (1,).
     ``start``: variance of independent sites before the first step.
     """
     records = list(records)
@@ -274,7 +279,7 @@ def propagate(
 def _propagate_rows(
     records: list[Record], n_sites: int, is_used: Callable[[Record], bool], start: Floats | float
 ) -> Floats:
-    """Compute :func:`propagate` where sources are correlated before they are mixed, in blocks of rows."""
+    """Compute :func:`propagate` for correlated sources that are mixed, by blocks of rows."""
     if np.any(start):
         records = [Record("", NOTHING, None, np.sqrt(start), branch="photo"), *records]
         chosen = is_used
@@ -299,7 +304,7 @@ def row_factors(
     records: Iterable[Record], n_sites: int, sites: Ints, is_used: Callable[[Record], bool]
 ) -> Iterator[csr_array[Any]]:
     """
-    Yield the rows of some sites of a factor F of the covariance F Fᵀ after the last step, for each chosen source.
+    Yield rows of a factor F of the covariance F Fᵀ after the last step, for each source.
 
     The rows are (n, n_site) or (n, n_group), sparse.
     """

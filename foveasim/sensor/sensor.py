@@ -573,7 +573,7 @@ class Sensor:
 
     def dark_response(self, exposure_s: Annotated[float, EXPOSURE]) -> Floats:
         """
-        Compute the expected charge of each site without light, as the mean over all devices, without defects.
+        Compute the expected charge without light: mean over devices, without defects.
 
         Returns
         -------

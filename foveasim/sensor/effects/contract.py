@@ -67,7 +67,7 @@ SLOPE_STEP, SMALLEST_MEAN = 2.0**-10, MappingProxyType({"e-/s": 1.0, "e-": 1.0, 
 
 
 class Operator(Protocol):
-    """Linear map between values of all sites, implemented by :class:`foveasim.sensor.effects.CrosstalkOperator`."""
+    """Protocol of linear maps of all sites, such as :class:`CrosstalkOperator`."""
 
     def apply(self, values: ArrayLike, *, n_threads: int | None = None) -> Floats:
         """Return the map of values (..., n_site)."""
@@ -79,7 +79,11 @@ class Operator(Protocol):
         """Return the variances (..., n_site) of mapped values of independent sites."""
 
     def rows(self, sites: Any) -> Any:
-        """Return the rows of some sites, (n, n_site) sparse, or those of a sparse matrix (n, n_site) times the map."""
+        """
+        Return the rows of some sites, (n, n_site) sparse.
+
+        ``sites``: their indices; or a sparse matrix (n, n_site), for its product with the map.
+        """
 
 
 class StepModel(NamedTuple):
