@@ -19,7 +19,7 @@ from foveasim._core.calls import POSITIVE, Limits
 from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_per_site, finite_array
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
-from foveasim.sensor.linearisation import Linearisation
+from foveasim.sensor.model.linearisation import Linearisation
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree

@@ -27,7 +27,7 @@ from foveasim.metrics import (
     polygon_mtf,
     size_classes_um,
 )
-from foveasim.sensor.linearisation import Linearisation
+from foveasim.sensor.model.linearisation import Linearisation
 from foveasim.sensor.signal_to_noise import site_signals
 from foveasim.units import per_mm_from_per_um
 

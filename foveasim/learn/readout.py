@@ -12,8 +12,8 @@ from torch import Tensor
 from foveasim.learn._tensors import check_tensor, constant
 from foveasim.sensor import Sensor
 from foveasim.sensor.effects import ShotNoise
-from foveasim.sensor.linearisation import QUANTISATION
-from foveasim.sensor.records import scale_columns
+from foveasim.sensor.model.linearisation import QUANTISATION
+from foveasim.sensor.model.records import scale_columns
 
 __all__ = ["Readout"]
 

@@ -30,7 +30,7 @@ from foveasim.errors import CoverageWarning, ParameterError
 from foveasim.fields import Grid
 from foveasim.integrate import Integrator
 from foveasim.layout import Layout
-from foveasim.sensor.linearisation import Linearisation
+from foveasim.sensor.model.linearisation import Linearisation
 
 __all__ = ["FlowBound", "FlowEstimate", "estimate_flow", "flow_bound", "site_gradients_e_per_um"]
 

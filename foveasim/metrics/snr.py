@@ -25,7 +25,7 @@ from foveasim.scene import Scene
 from foveasim.sensor import Sensor, SiteSignals, signal_to_noise
 from foveasim.sensor.adc import ADC, QUANTISATION_DN2
 from foveasim.sensor.limits import EXPOSURE
-from foveasim.sensor.linearisation import CLIPPING_SIGMAS
+from foveasim.sensor.model.linearisation import CLIPPING_SIGMAS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

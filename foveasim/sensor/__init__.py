@@ -11,8 +11,8 @@ from foveasim.sensor.calibration import Calibration, calibrate, linearise
 from foveasim.sensor.effects.crosstalk import CrosstalkOperator, Diffusion, InterPixelCapacitance, KernelCrosstalk
 from foveasim.sensor.effects.shot import draw_shot_noise
 from foveasim.sensor.exposures import Ramp, Rates, fit_ramp, merge_exposures, non_destructive_reads
-from foveasim.sensor.inversion import Inverse
-from foveasim.sensor.linearisation import Linearisation
+from foveasim.sensor.model.inversion import Inverse
+from foveasim.sensor.model.linearisation import Linearisation
 from foveasim.sensor.presets import PRESETS
 from foveasim.sensor.sensor import Sensor
 from foveasim.sensor.signal_to_noise import SiteSignals, signal_to_noise

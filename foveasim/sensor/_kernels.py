@@ -16,7 +16,7 @@ from foveasim._core._kernels import BATCH, fill_normals, fill_uniforms, philox_2
 from foveasim._core.jit import njit
 from foveasim.sensor.adc import ConversionTables
 from foveasim.sensor.effects.shot import PoissonTables
-from foveasim.sensor.prediction import ChargeDistributions, Quadrature, Transfer
+from foveasim.sensor.model.prediction import ChargeDistributions, Quadrature, Transfer
 
 #: ADC transfer functions, as numbered by ``ConversionTables.companding_index``.
 ADC_LINEAR, ADC_ROOT, ADC_LOG, ADC_TABLE = range(4)

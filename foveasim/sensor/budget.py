@@ -11,7 +11,7 @@ from foveasim._core.show import Drawn, drawn
 from foveasim._core.validation import Floats, as_numbers, check_per_site
 from foveasim.sensor.effects import STANDARD
 from foveasim.sensor.limits import EXPOSURE
-from foveasim.sensor.linearisation import DARK_SHOT, PHOTON_SHOT, QUANTISATION
+from foveasim.sensor.model.linearisation import DARK_SHOT, PHOTON_SHOT, QUANTISATION
 from foveasim.sensor.sensor import Sensor
 
 if TYPE_CHECKING:

@@ -42,7 +42,6 @@ from foveasim.sensor.effects.dark import ACTIVATION, DOUBLING, DarkLaw, DarkSign
 from foveasim.sensor.effects.fixed_pattern import ColumnOffset, DeadSites, PhotoResponse, PixelGain, PixelOffset
 from foveasim.sensor.effects.readout import ReadNoise, ResetNoise, TelegraphNoise
 from foveasim.sensor.effects.shot import GAUSSIAN_ABOVE, ShotChoice, ShotNoise
-from foveasim.sensor.inversion import Inverse, invert
 from foveasim.sensor.limits import (
     CHARGE,
     EXPOSURE,
@@ -55,15 +54,16 @@ from foveasim.sensor.limits import (
     VOLTS,
     WIDE_SPREAD,
 )
-from foveasim.sensor.linearisation import Linearisation, linearise
-from foveasim.sensor.prediction import (
+from foveasim.sensor.model.inversion import Inverse, invert
+from foveasim.sensor.model.linearisation import Linearisation, linearise
+from foveasim.sensor.model.prediction import (
     ChargeDistributions,
     ReadoutModel,
     Transfer,
     clipped_gaussian_moments,
     quadrature,
 )
-from foveasim.sensor.records import Record, light_records, readout_model
+from foveasim.sensor.model.records import Record, light_records, readout_model
 from foveasim.sensor.spectral.curves import ConstantCurve, Curve, CurveError
 from foveasim.sensor.spectral.response import FilterSet, rgb_filters
 from foveasim.units import electrons_to_volts, photon_energy_j

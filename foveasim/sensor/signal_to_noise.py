@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats
-from foveasim.sensor.linearisation import Linearisation
+from foveasim.sensor.model.linearisation import Linearisation
 from foveasim.sensor.sensor import Sensor
 
 __all__ = ["SiteSignals", "signal_to_noise"]

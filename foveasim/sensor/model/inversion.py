@@ -9,7 +9,7 @@ import numpy as np
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats
 from foveasim.sensor.effects.contract import Sites
-from foveasim.sensor.records import readout_model, walk_from_node
+from foveasim.sensor.model.records import readout_model, walk_from_node
 
 if TYPE_CHECKING:
     from foveasim.sensor.sensor import Sensor

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.validation import Floats, Ints
 from foveasim.sensor.effects.contract import NOTHING, Effect, Operator, Sites, Stage
-from foveasim.sensor.prediction import MIN_SLOPE, ReadoutModel, Transfer
+from foveasim.sensor.model.prediction import MIN_SLOPE, ReadoutModel, Transfer
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array

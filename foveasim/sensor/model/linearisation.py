@@ -21,8 +21,8 @@ from foveasim._core.threads import cached_property
 from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_per_site
 from foveasim.errors import ParameterError
 from foveasim.sensor.effects.contract import NOTHING, Effect, Operator, Sites
-from foveasim.sensor.prediction import Transfer
-from foveasim.sensor.records import (
+from foveasim.sensor.model.prediction import Transfer
+from foveasim.sensor.model.records import (
     Kind,
     Record,
     Walk,
