@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections import Counter
+from dataclasses import fields
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -18,6 +19,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 import foveasim
+from foveasim import Sensor
 from foveasim._core.validation import UNIT_SUFFIXES
 
 PACKAGE = Path(foveasim.__file__).parent
@@ -272,3 +274,43 @@ def test_names_imported_by_benchmarks_exist():
     ]
 
     assert missing == []
+
+
+#: Parameters of the electronics of a sensor, and properties that follow from one of them: results ask the sensor instead.
+ELECTRONIC = {
+    *(field.name for field in fields(Sensor)),
+    "dark_rate_e_per_s", "nominal_dark_e_per_s", "v_per_e", "well_e", "dark_current_ratio",
+} - {"layout", "filters", "qe", "bits", "effects", "disabled", "device_seed", "temperature_k", "crosstalk", "coupling"}  # fmt: skip
+#: Modules that show or transfer parameters, or limit charges at the full well, with those that they read.
+READS_PARAMETERS = {
+    "view/notebook/_objects.py": None,  # table of parameters
+    "learn/readout.py": {"well_e", "v_sat_v"},  # the full well and the transition levels in volts, as tensors
+    "reconstruct/estimates.py": {"well_e"},  # charges at the full well
+    "testing/_effects.py": {"nominal_dark_e_per_s"},  # an independent mean of the dark charge
+}
+
+
+def electronic_parameters(path):
+    """Return the electronic parameters that a module reads from an object called sensor, or a sensor of an object."""
+    relative = path.relative_to(PACKAGE)
+    if relative.parts[0] == "sensor" or READS_PARAMETERS.get(str(relative), set()) is None:
+        return set()
+    nodes = (node for node in ast.walk(parsed(path)) if isinstance(node, ast.Attribute) and node.attr in ELECTRONIC)
+    found = {
+        node.attr
+        for node in nodes
+        if ast.unparse(node.value).split(".")[-1] in {"sensor", "copies", "_sensor", "electronics"}
+    }
+    return found - READS_PARAMETERS.get(str(relative), set())
+
+
+def test_results_do_not_read_electronic_parameters():
+    assert offenders(electronic_parameters) == {}
+
+
+def test_parameter_rule_finds_reads(tmp_path, monkeypatch):
+    bad = tmp_path / "bad.py"
+    bad.write_text("noise = camera.sensor.read_noise_e**2 + sensor.well_e\nbits = sensor.bits\n")
+    monkeypatch.setitem(globals(), "PACKAGE", tmp_path)
+
+    assert electronic_parameters(bad) == {"read_noise_e", "well_e"}

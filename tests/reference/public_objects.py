@@ -99,6 +99,7 @@ def public_objects(directory):
         sensor.Diffusion(spread_um=0.5).compile(SITES), sensor.LIMITS["read_noise_e"], CAMERA.noise_budget(SCENE, exposure_s=0.01),
         sensor.PassBand(from_nm=400.0), sensor.ProductCurve((CURVE, CURVE)), sensor.Ramp(MANY, np.ones((1000, 9)), np.ones((1000, 9))),
         sensor.Rates(MANY, MANY, MANY), sensor.signal_to_noise(SENSOR, np.full(SITES.n_sites, 50.0), np.zeros(SITES.n_sites)),
+        SENSOR.linearise(np.full(SITES.n_sites, 50.0)), SENSOR.invert(np.full(SITES.n_sites, 50)),
         sensor.SplineCurve(wavelength_nm=TABLE, value=CURVE.value), sensor.StepCurve(edge_nm=TABLE, value=(0.5,) * 199), CURVE,
         sensor.Calibration(**dict.fromkeys(("offset_dn", "gain", "read_noise_dn", "expected_dn"), MANY), **dict.fromkeys(("hot", "dead", "noisy", "clipped"), MANY < 0.0)),
         effects.ColumnOffset(0.1), effects.DarkSignal(0.1), effects.DeadSites(0.1), effects.HotSites(0.1, 10.0), effects.PhotoResponse(0.1),

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from scipy.constants import e as ELEMENTARY_CHARGE_C
+import scipy.constants
 
 from foveasim import Sensor
 from foveasim.errors import ParameterError
@@ -18,6 +18,7 @@ from foveasim.sensor.effects import AdditiveNoise, Effect, FixedFactor, GroupedN
 N_X, N_Y = 12, 10
 LAYOUT = grid(n_x=N_X, n_y=N_Y, pitch_um=4.0).with_columns(readout_line=np.repeat(np.arange(N_Y), N_X))
 N = LAYOUT.n_sites
+ELEMENTARY_CHARGE_C = scipy.constants.e
 PHOTO = np.linspace(2000.0, 9000.0, N)
 #: 1 V of range for 20,000 e-, with a pedestal.
 BASE = {
@@ -391,7 +392,7 @@ def test_wrong_arguments_are_rejected():
     sensor = sensor_of("plain")
     model = sensor.linearise(PHOTO)
     for call, message in (
-        (lambda: sensor.linearise(), "'expected_e' must be given, or 'photo_e_per_s', but not both"),
+        (sensor.linearise, "'expected_e' must be given, or 'photo_e_per_s', but not both"),
         (lambda: sensor.linearise(PHOTO, photo_e_per_s=PHOTO), "'expected_e' must be given, or 'photo_e_per_s'"),
         (lambda: sensor.linearise(photo_e_per_s=PHOTO), "'exposure_s' must be given with 'photo_e_per_s'"),
         (lambda: sensor.linearise(-PHOTO), "'expected_e' must be >= 0"),

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -89,8 +89,10 @@ class Linearisation:
     _records: tuple[Record, ...]
     _starts: dict[str, int]
     _is_full: Bools | bool
-    _chain: tuple[Effect, ...]
-    _sites: Sites
+    _arguments: tuple[tuple[Effect, ...], Sites, Floats | None, Floats | None, float | None]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return linearise, (self.sensor, *self._arguments)
 
     def __repr__(self) -> str:
         names = ", ".join(self.sources)
@@ -130,7 +132,8 @@ class Linearisation:
 
     @cached_property
     def _transfer(self) -> Transfer:
-        records, _ = walk_from_node(self.sensor, self._chain, self._sites, self.node_e)
+        chain, sites, *_ = self._arguments
+        records, _ = walk_from_node(self.sensor, chain, sites, self.node_e)
         return transfer_of(self.sensor, records, self.node_e)
 
     @cached_property
@@ -457,6 +460,7 @@ def linearise(
     exposure_s: float | None,
 ) -> Linearisation:
     """Walk along the chain: see :meth:`foveasim.Sensor.linearise`."""
+    arguments = (tuple(chain), sites, expected_e, photo_e_per_s, exposure_s)
     records: list[Record] = []
     starts: dict[str, int] = {}
     photo_fraction: Floats | None = None
@@ -510,7 +514,7 @@ def linearise(
     with np.errstate(divide="ignore"):
         conversion = Record(QUANTISATION, NOTHING, 1.0 / step_v, np.full(1, math.sqrt(adc.noise_dn2)))
     steps = (*records, *after, conversion)
-    return Linearisation(sensor, expected_e, collected_e, node_e, output_v, steps, starts, is_full, tuple(chain), sites)
+    return Linearisation(sensor, expected_e, collected_e, node_e, output_v, steps, starts, is_full, arguments)
 
 
 def _limited(deviation: Floats | None, charge_e: Floats, limit_e: Floats, is_drawn: bool) -> Floats | None:
