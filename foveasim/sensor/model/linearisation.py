@@ -89,7 +89,7 @@ class Linearisation:
     _records: tuple[Record, ...]
     _starts: dict[str, int]
     _is_full: Bools | bool
-    _arguments: tuple[tuple[Effect, ...], Sites, Floats | None, Floats | None, float | None]
+    _arguments: tuple[Any, ...]
 
     def __reduce__(self) -> tuple[Any, ...]:
         return linearise, (self.sensor, *self._arguments)
