@@ -45,7 +45,7 @@ class Readout:
         self._coupling: list[Tensor] = []
         names: list[str] = []
         for effect in sensor.chain:
-            compile_for: Any = getattr(effect, "compile_for", None)
+            compile_for: Any = getattr(effect, "operator", None)
             if compile_for is not None and effect.stage in ("expected", "charge"):
                 operator = compile_for(sensor.sites)
                 target = self._diffusion if effect.stage == "expected" else self._coupling

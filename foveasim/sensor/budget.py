@@ -137,7 +137,7 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: Annotated[fl
             if sensor.shot.is_drawn:
                 for name, values in (("photon_shot", photo), ("dark_shot", dark)):
                     temporal[name] = np.sqrt(effect.moments(values * exposure_s, np.zeros(1), sites=any_device)[1])
-        elif effect.is_temporal or effect.is_local:
+        elif effect.reach != "all":
             values, e_per_unit = nominal[effect.stage]
             sites = sensor.sites if effect.is_temporal else any_device
             mean, variance = effect.validate_moments(values, np.zeros(1), sites)

@@ -138,7 +138,7 @@ def readout_model(
     is_mixed = False
     local: list[Effect] = []
     for effect in at("charge"):
-        if not effect.mixes_means:
+        if effect.reach != "all":
             local.append(effect)
             continue
         before = linear(local, mean_e, variance_e2)
