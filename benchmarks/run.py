@@ -35,7 +35,6 @@ from rich.console import Console
 from video import bench_video
 
 import foveasim as fs
-from foveasim._core.random_streams import Streams
 from foveasim._core.threads import thread_count
 from foveasim.sensor.blocks import for_each_block
 from layouts import bench_layouts
@@ -273,7 +272,7 @@ def bench_sensor(report: Report, n_side: int) -> None:
     rate_e_per_s = np.full(layout.n_sites, 5000.0)
 
     def exposure() -> object:
-        return sensor.expose(rate_e_per_s, 1.0, streams=Streams(1))
+        return sensor.expose(rate_e_per_s, 1.0, seed=1)
 
     # Shot, reset and read noise.
     numbers = gaussian_numbers(layout.n_sites, 3)
@@ -296,8 +295,8 @@ def bench_shot_and_read_noise(report: Report, n_side: int) -> None:
     many, few = np.full(layout.n_sites, 5000.0), np.full(layout.n_sites, 10.0)
     times = best_s(
         {
-            "many": lambda: sensor.expose(many, 1.0, streams=Streams(1)),
-            "few": lambda: sensor.expose(few, 1.0, streams=Streams(1)),
+            "many": lambda: sensor.expose(many, 1.0, seed=1),
+            "few": lambda: sensor.expose(few, 1.0, seed=1),
             "capture": lambda: camera.capture(light, exposure_s=1.0, seed=1, photo_e_per_s=many),
             "numbers": gaussian_numbers(layout.n_sites, 2),
         },

@@ -31,7 +31,7 @@ class FlickerNoise(AdditiveNoise):
 
     name = "flicker"
     stage = "output"
-    is_local = False
+    reach = "group"
 
     sigma_v: float
 
@@ -40,12 +40,13 @@ class FlickerNoise(AdditiveNoise):
         return self.sigma_v
 
     def apply(self, values: np.ndarray, *, sites: Sites, rng: np.random.Generator) -> np.ndarray:
-        """Return voltages with a noise sequence in readout order."""
-        frequency = np.fft.rfftfreq(values.size)
+        """Return voltages with a noise sequence in readout order, the same for all blocks of sites."""
+        n_sites = sites.layout.n_sites
+        frequency = np.fft.rfftfreq(n_sites)
         amplitude = np.divide(1.0, np.sqrt(frequency), out=np.zeros(frequency.size), where=frequency > 0.0)
-        amplitude *= values.size / np.sqrt(2.0 * np.sum(amplitude**2))
+        amplitude *= n_sites / np.sqrt(2.0 * np.sum(amplitude**2))
         white = (rng.standard_normal(frequency.size) + 1j * rng.standard_normal(frequency.size)) / np.sqrt(2.0)
-        return values + self.sigma_v * np.fft.irfft(amplitude * white, values.size)
+        return values + self.sigma_v * sites.select(np.fft.irfft(amplitude * white, n_sites))
 
 
 @dataclass(frozen=True)

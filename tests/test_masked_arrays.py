@@ -10,7 +10,6 @@ import shapely
 
 import foveasim as fs
 from foveasim import distortion, metrics, modes, optics, units, video, view
-from foveasim._core.random_streams import Streams
 from foveasim._core.validation import unmasked
 from foveasim._io.images import write_picture
 from foveasim.errors import ParameterError
@@ -155,8 +154,8 @@ REJECTED = {
         np.array([0.0, 0.7, 1.0]),
     ),
     "Sensor.expected_electrons": (lambda a: SENSOR.expected_electrons(a, 1.0), SITES),
-    "Sensor.collect": (lambda a: SENSOR.collect(a, streams=Streams(0)), SITES),
-    "Sensor.read": (lambda a: SENSOR.read(a, streams=Streams(0)), CODES),
+    "Sensor.collect": (lambda a: SENSOR.collect(a, seed=0), SITES),
+    "Sensor.read": (lambda a: SENSOR.read(a, seed=0), CODES),
     "Sensor.predict": (SENSOR.predict, SITES),
     "noise_budget": (
         lambda a: np.array(list(noise_budget(SENSOR, a, 1.0).values())),

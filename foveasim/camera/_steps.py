@@ -115,7 +115,7 @@ def expose(
     about = capture_settings(camera, light, exposure_s, streams) | settings
     with clock.stage("sensor"):
         expected_e, electrons, code = sensor.expose(
-            photo_e_per_s, exposure_s, streams=streams, n_threads=camera.n_threads
+            photo_e_per_s, exposure_s, n_threads=camera.n_threads, _streams=streams
         )
     assert isinstance(sensor.layout, Layout)  # as in every camera
     return Capture(

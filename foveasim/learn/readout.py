@@ -46,7 +46,7 @@ class Readout:
         self._light = [step for slope in model.slopes("light", "charge") for step in self._steps(slope)]
         coupling: list[Any] = model.slopes("collected", "node")
         self._coupling = [self._matrix(coupling)] if coupling else []
-        mixing = [effect.name for effect in sensor.chain if effect.stage == "charge" and effect.mixes_means]
+        mixing = [effect.name for effect in sensor.chain if effect.stage == "charge" and effect.reach == "all"]
         self._local = sensor.without(*mixing) if mixing else sensor
 
     def __repr__(self) -> str:
@@ -84,7 +84,7 @@ class Readout:
 
     def _collect(self, expected_e: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and variance of the charge at the sense nodes."""
-        mean_e, collection = self._mean(expected_e), self.sensor.shot
+        mean_e, collection = self._mean(expected_e), self.sensor.collection
         model = self.sensor.linearise(mean_e)
         collected = expected_e
         for slope in model.slopes("charge", "collected"):

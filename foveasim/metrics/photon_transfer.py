@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import Limits, OwnCheck
-from foveasim._core.random_streams import Streams
 from foveasim._core.validation import (
     Floats,
     Ints,
@@ -250,6 +249,7 @@ def draw_frames(
     n_frames: Annotated[int, Limits(at_least=1)] = 2,
     seed: int,
     first_frame: Annotated[int, Limits(at_least=0)] = 0,
+    exposure_s: float | None = None,
     n_threads: int | None = None,
 ) -> NDArray[Any]:
     """
@@ -263,6 +263,8 @@ def draw_frames(
     n_frames : int
     seed, first_frame : int
         Seed of the noise and index of the first frame. Equal numbers give bit-identical frames for any number of threads.
+    exposure_s : float, optional, s
+        Exposure time, for sensors whose collection depends on it.
     n_threads : int, optional
 
     Returns
@@ -277,12 +279,9 @@ def draw_frames(
     level_e = _level("expected_e", expected_e, sensor.layout.n_sites)
     codes = []
     for k in range(n_frames):
-        streams = Streams(seed, first_frame + k)
-        codes.append(
-            sensor.read(
-                sensor.collect(level_e, streams=streams, n_threads=n_threads), streams=streams, n_threads=n_threads
-            )
-        )
+        frame = first_frame + k
+        electrons = sensor.collect(level_e, seed=seed, frame=frame, exposure_s=exposure_s, n_threads=n_threads)
+        codes.append(sensor.read(electrons, seed=seed, frame=frame, n_threads=n_threads))
     return np.stack(codes)
 
 

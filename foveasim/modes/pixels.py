@@ -328,7 +328,7 @@ class SpikingPixels(_Pixels):
                         first,  # noqa: B023
                         _part(threshold_e, sites),
                         self.refractory_s,
-                        self.sensor.shot.is_drawn,
+                        self.sensor.collection.is_drawn,
                         *key,
                         sites.start,
                         max_events,

@@ -6,7 +6,7 @@ Estimates use the nominal electronics of the sensor, without the deviations of a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -60,10 +60,9 @@ def estimate_from_charge(charge_e: ArrayLike, sensor: Sensor, exposure_s: Annota
     exposure_s : float, s
     """
     charge = check_per_site("charge_e", finite_array("charge_e", charge_e), sensor.layout.n_sites)
-    shot = sensor.shot
-    _, variance_e2 = shot.moments(np.maximum(charge, 0.0), np.full(charge.size, float(shot.is_drawn)))
+    light_e, variance_e2 = sensor.invert_collection(charge, exposure_s=exposure_s)
     return SiteEstimates(
-        light_e=charge - sensor.dark_response(exposure_s),
+        light_e=light_e - sensor.dark_response(exposure_s),
         variance_e2=variance_e2,
         is_saturated=np.asarray(charge >= sensor.well_e),
     )
@@ -87,5 +86,7 @@ def estimate_from_code(code: ArrayLike, sensor: Sensor, exposure_s: Annotated[fl
     see :meth:`foveasim.sensor.Calibration.correct`.
     """
     found = sensor.invert(check_per_site("code", finite_array("code", code), sensor.layout.n_sites))
-    light = estimate_from_charge(found.charge_e, sensor, exposure_s)
-    return replace(light, variance_e2=light.variance_e2 + found.noise_e2, is_saturated=found.is_saturated)
+    light_e, variance_e2 = sensor.invert_collection(found.charge_e, found.noise_e2, exposure_s)
+    return SiteEstimates(
+        light_e=light_e - sensor.dark_response(exposure_s), variance_e2=variance_e2, is_saturated=found.is_saturated
+    )

@@ -115,8 +115,8 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: Annotated[fl
     temporal = list(TEMPORAL)
     for model, is_temporal in ((known, True), (of_devices, False)):
         names = [name for name, kind in model.sources.items() if (kind != "fixed") is is_temporal]
-        if not sensor.shot.is_drawn and is_temporal:
-            names.remove(sensor.shot.name)  # rounding to whole electrons
+        if not sensor.collection.is_drawn and is_temporal:
+            names.remove(sensor.collection.name)  # rounding to whole electrons
         noise_e |= {name: np.sqrt(model.variance_e2([name])) for name in names}
         temporal += [name for name in names if is_temporal and name not in temporal]
     names = [*temporal, *(name for name in noise_e if name not in temporal)]

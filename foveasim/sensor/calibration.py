@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import FRACTION, POSITIVE, Limits, OwnCheck
-from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Bools, Floats, as_numbers, check_number, check_per_site, finite_array, own_arrays
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.sensor.adc import QUANTISATION_DN2, interpolate_codes
@@ -413,9 +412,8 @@ def calibrate(
         stack = _Frames(2.0**sensor.bits - 1.0, table)
         expected_e = sensor.expected_electrons(photo_e / exposure_s, exposure_s)
         for frame in range(kind * n_frames, (kind + 1) * n_frames):
-            streams = Streams(seed, frame)
-            electrons = sensor.collect(expected_e, streams=streams, n_threads=n_threads)
-            stack.add(sensor.read(electrons, streams=streams, n_threads=n_threads))
+            electrons = sensor.collect(expected_e, seed=seed, frame=frame, exposure_s=exposure_s, n_threads=n_threads)
+            stack.add(sensor.read(electrons, seed=seed, frame=frame, n_threads=n_threads))
         return stack
 
     if long_exposure_s is not None:

@@ -17,7 +17,19 @@ from foveasim._core.validation import Floats
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.sensor.adc import ConversionTables
 from foveasim.sensor.blocks import for_each_block
-from foveasim.sensor.effects import STAGES, STANDARD, Effect, FixedFactor, FixedOffset, Sites
+from foveasim.sensor.effects import (
+    STAGES,
+    STANDARD,
+    Collection,
+    Effect,
+    FixedFactor,
+    FixedOffset,
+    Mixing,
+    Reach,
+    ShotNoise,
+    Sites,
+)
+from foveasim.sensor.effects.contract import REACHES
 
 #: Stages before collection, which have no random stream.
 FIXED_STAGES = ("photo", "dark", "expected")
@@ -31,7 +43,7 @@ class _Deterministic(ABC):
     """Deterministic step of the chain between effects."""
 
     name = ""
-    is_local = True
+    reach: Reach = "site"
     is_temporal = False
     is_drawn_at_reset = False
     needs_layout = False
@@ -189,6 +201,8 @@ def check_effects(added: Any) -> tuple[Effect, ...]:
     if not isinstance(added, list | tuple):
         raise ParameterError("effects", "must be a list of Effect objects", added)
     names = {*BUILTIN_NAMES, *RESERVED_NAMES}
+    if any(isinstance(effect, Collection) for effect in added):
+        names.discard(ShotNoise.name)
     for effect in added:
         if not isinstance(effect, Effect):
             raise ParameterError("effects", "must contain only foveasim.sensor.effects.Effect objects", effect)
@@ -200,6 +214,22 @@ def check_effects(added: Any) -> tuple[Effect, ...]:
         if effect.name in names:
             raise ParameterError("effects", f"must have unique names, got '{effect.name}' twice")
         names.add(effect.name)
+        if hasattr(effect, "is_local"):
+            raise ParameterError(
+                "effects",
+                f"must define 'reach' instead of 'is_local': \"site\", \"group\" or \"all\" in '{effect.name}'",
+            )
+        if effect.reach not in REACHES:
+            raise ParameterError(
+                "effects", f'must have a reach of "site", "group" or "all"; \'{effect.name}\' has {effect.reach!r}'
+            )
+        if isinstance(effect, Collection):
+            if (effect.stage, effect.reach, effect.is_temporal) != ("collection", "site", True):
+                raise ParameterError(
+                    "effects",
+                    f"must leave stage, reach and is_temporal of a Collection unchanged; '{effect.name}' does not",
+                )
+            continue
         if effect.stage not in STAGES or effect.stage == "collection":
             stages = ", ".join(stage for stage in STAGES if stage != "collection")
             raise ParameterError("effects", f"must have a stage from {stages}; '{effect.name}' has '{effect.stage}'")
@@ -209,7 +239,28 @@ def check_effects(added: Any) -> tuple[Effect, ...]:
                 f"before collection must be fixed, but '{effect.name}' at the stage '{effect.stage}' is temporal; "
                 "use the stage 'charge'",
             )
+        if effect.reach == "all" or isinstance(effect, Mixing):
+            _check_mixing(effect)
+    if len(collections := [effect.name for effect in added if isinstance(effect, Collection)]) > 1:
+        raise ParameterError("effects", f"must have at most one Collection, got {', '.join(map(repr, collections))}")
     return tuple(added)
+
+
+def _check_mixing(effect: Effect) -> None:
+    """Raise ParameterError if an effect that mixes sites is not a linear map of charges."""
+    if effect.is_temporal:
+        raise ParameterError(
+            "effects",
+            f'of reach "all" must be deterministic, but \'{effect.name}\' is temporal; use the reach "group", as GroupedNoise',
+        )
+    if not isinstance(effect, Mixing) or effect.reach != "all":
+        raise ParameterError(
+            "effects", f"of reach \"all\" must derive from Mixing and define operator(); change '{effect.name}'"
+        )
+    if effect.stage not in (*FIXED_STAGES, "charge"):
+        raise ParameterError(
+            "effects", f"that mix sites must have a stage up to 'charge'; '{effect.name}' has '{effect.stage}'"
+        )
 
 
 def check_names(names: Any, effects: Iterable[Effect]) -> tuple[str, ...]:
@@ -244,30 +295,33 @@ def run_steps(
     """
     Run steps of the chain.
 
-    Results are written by :class:`Save` and :class:`Conversion`. Consecutive local steps process one block of sites after
-    another, which stays in the cache for all of them.
+    Results are written by :class:`Save` and :class:`Conversion`. Consecutive steps that do not mix sites process one block of
+    sites after another, which stays in the cache for all of them.
 
     ``values`` (n_site,): not modified. ``sites``: all sites. ``streams``: random streams of the frame; required for temporal
     steps. ``reset_streams``: random streams of the last reset, for effects that are drawn at the reset; by default those of
     the frame. ``n_threads``: number of threads; all cores by default. Results do not depend on it.
     """
 
-    def rng_of(step: Step, *block: int) -> Any:
+    def rng_of(step: Step, block: int) -> Any:
         own = reset_streams if step.is_drawn_at_reset and reset_streams is not None else streams
-        return own.of(step.name, *block) if step.is_temporal and own is not None else None
+        if own is None or not step.is_temporal:
+            return None
+        # Draws of groups are common to all blocks.
+        return own.of(step.name, block if step.reach == "site" else None)
 
     is_own = False
-    groups = [(is_local, list(group)) for is_local, group in groupby(steps, key=lambda step: step.is_local)]
-    for number, (is_local, group) in enumerate(groups):
-        if not is_local:
+    groups = [(mixes, list(group)) for mixes, group in groupby(steps, key=lambda step: step.reach == "all")]
+    for number, (mixes, group) in enumerate(groups):
+        if mixes:
             all_sites = sites.block(slice(None), n_threads=n_threads)
             for step in group:
                 own_values = values if is_own else np.array(values, np.float64)
-                values, is_own = _apply_step(step, own_values, all_sites, rng_of(step)), True
+                values, is_own = _apply_step(step, own_values, all_sites, None), True
             continue
         first, before, result = group[0], values, Save()
         if is_own and isinstance(first, Save) and first.values.dtype == values.dtype:
-            # Shared instead of copied: local steps modify only copies of blocks.
+            # Shared instead of copied: steps modify only copies of blocks.
             first.values = values
             del group[0]
         if number + 1 < len(groups):
@@ -276,7 +330,7 @@ def run_steps(
             if isinstance(step, Save):
                 step.allocate(sites.n_sites)
         if group:
-            _run_local_steps(group, before, sites, rng_of, n_threads)
+            _run_blocks(group, before, sites, rng_of, n_threads)
         values, is_own = result.values, True
 
 
@@ -291,10 +345,10 @@ def _apply_step(step: Step, values: Any, sites: Sites, rng: Any) -> Any:
     return found
 
 
-def _run_local_steps(
+def _run_blocks(
     steps: Sequence[Step], values: Any, sites: Sites, rng_of: Callable[[Step, int], Any], n_threads: int | None
 ) -> None:
-    """Run local steps block by block."""
+    """Run steps that do not mix sites block by block."""
 
     def block(number: int, index: slice) -> None:
         part, part_sites = values[index].astype(np.float64), sites.block(index)

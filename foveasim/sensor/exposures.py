@@ -8,6 +8,7 @@ common to all reads; weights from individual reads would favour those that are l
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -186,7 +187,7 @@ def merge_exposures(
     fraction = taper
     for _ in range(N_PASSES):
         collected_e = _estimate_collected(sensor, (np.maximum(rate, 0.0) + dark_e_per_s) * t_s)
-        model = sensor.readout_model(*sensor.shot.moments(collected_e, np.zeros(1)))
+        model = sensor.readout_model(*sensor.collection.moments(collected_e, np.zeros(1)))
         information = t_s**2 / (model.variance_e2 + model.noise_e2 + conversion_e2)
         total = np.where(is_known, (taper * information).sum(axis=0), 1.0)
         fraction = taper * information / total
@@ -205,7 +206,13 @@ def merge_exposures(
 
 
 def non_destructive_reads(
-    sensor: Sensor, photo_e_per_s: ArrayLike, times_s: ArrayLike, *, streams: Streams, n_threads: int | None = None
+    sensor: Sensor,
+    photo_e_per_s: ArrayLike,
+    times_s: ArrayLike,
+    *,
+    seed: int,
+    frame: int = 0,
+    n_threads: int | None = None,
 ) -> Ramp:
     """
     Simulate non-destructive reads during one exposure.
@@ -217,15 +224,16 @@ def non_destructive_reads(
         Photoelectron rate, as from :meth:`foveasim.Camera.photoelectrons_per_s`.
     times_s : (n_read,), s
         Times of the reads since the reset, strictly increasing.
-    streams : Streams
-        Random streams of the frame.
+    seed, frame : int
+        Seed and frame number of the draws. Equal ones give bit-identical ramps.
     n_threads : int, optional
         Number of threads; all cores by default. Draws do not depend on it.
 
     Raises
     ------
     SimulationError
-        If an effect lets the expected charge decrease with time.
+        If an effect lets the expected charge decrease with time, or charges of consecutive intervals are not independent
+        (:attr:`~foveasim.sensor.effects.Collection.has_independent_increments`).
 
     Notes
     -----
@@ -241,10 +249,15 @@ def non_destructive_reads(
     --------
     >>> import foveasim as fs
     >>> sensor = fs.Sensor(fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), shot_noise="off", full_well_e=500.0)
-    >>> non_destructive_reads(sensor, [100.0, 300.0], [1.0, 2.0, 3.0], streams=Streams(0)).electrons.tolist()
+    >>> non_destructive_reads(sensor, [100.0, 300.0], [1.0, 2.0, 3.0], seed=0).electrons.tolist()
     [[100, 300], [200, 500], [300, 500]]
     """
-    times = _check_increasing("times_s", times_s)
+    times, streams, collection = _check_increasing("times_s", times_s), Streams(seed, frame), sensor.collection
+    if collection.is_drawn and not collection.has_independent_increments:
+        raise SimulationError(
+            f"non-destructive reads require a collection with independent increments, but those of '{collection.name}' depend "
+            "on the charge"
+        )
     n_sites = sensor.layout.n_sites
     photo = RATE.check_array("photo_e_per_s", photo_e_per_s)
     photo = np.broadcast_to(check_per_site("photo_e_per_s", photo, n_sites, or_one=True), n_sites)
@@ -255,13 +268,15 @@ def non_destructive_reads(
     for k, time_s in enumerate(times):
         own = Streams(int(streams.of("read of a ramp", k).integers(2**63)), streams.frame)
         before_e, expected_e = expected_e, sensor.expected_electrons(photo, float(time_s), n_threads=n_threads)
-        if sensor.shot.is_drawn:
+        draw = partial(sensor.collect, n_threads=n_threads, _streams=own)
+        if collection.is_drawn:
             added_e = _increase(before_e, expected_e, float(time_s))
-            collected = np.minimum(collected + sensor.collect(added_e, streams=own, n_threads=n_threads), well_e)
+            interval_s = float(time_s - times[k - 1]) if k else float(time_s)
+            collected = np.minimum(collected + draw(added_e, exposure_s=interval_s), well_e)
         else:
-            collected = sensor.collect(expected_e, streams=own, n_threads=n_threads)
+            collected = draw(expected_e, exposure_s=float(time_s))
         electrons[k] = collected
-        codes.append(sensor.read(collected, streams=own, reset_streams=streams, n_threads=n_threads))
+        codes.append(sensor.read(collected, n_threads=n_threads, _streams=own, _reset_streams=streams))
     return Ramp(times_s=times, electrons=electrons, code=np.stack(codes))
 
 
@@ -323,7 +338,7 @@ def fit_ramp(
     charge_e = linear_dn * e_per_dn
     model = sensor.readout_model(charge_e, is_reset=False)
     noise_e2 = _conversion_noise_e2(sensor, codes, e_per_dn) + model.noise_e2 + model.variance_e2
-    if not sensor.shot.is_drawn:
+    if not sensor.collection.is_drawn:
         noise_e2 += ROUNDING_E2
     is_below = (codes < 2.0**sensor.bits - 1.0) & (linear_dn < _saturation_dn(sensor))
     is_used = np.logical_and.accumulate(is_below, axis=0)
@@ -338,7 +353,7 @@ def fit_ramp(
     else:
         rate = replace(RATE, at_least=None, low=-RATE.high).check_array("weight_rate_e_per_s", weight_rate_e_per_s)
         check_per_site("weight_rate_e_per_s", rate, n_sites, or_one=True)
-    if not sensor.shot.is_drawn:
+    if not sensor.collection.is_drawn:
         rate = np.zeros(1)
     dt_s = np.where(is_used[1:], np.diff(times)[:, None], 0.0)
     rise_e = np.where(is_used[1:], np.diff(charge_e, axis=0), 0.0)
@@ -395,7 +410,7 @@ def _estimate_collected(sensor: Sensor, charge_e: Floats) -> Floats:
     For inter-pixel capacitance with the fractions K, the iteration ``q <- q + (charge - K q)`` (P. H. van Cittert, Zeitschrift
     für Physik 69, 298, 1931) is ended early, since its limit amplifies noise. Without mixing, charges are returned unchanged.
     """
-    if not any(effect.mixes_means and effect.stage == "charge" for effect in sensor.chain):
+    if not any(effect.reach == "all" and effect.stage == "charge" for effect in sensor.chain):
         return charge_e
     at_zero = sensor.readout_model(np.zeros(sensor.layout.n_sites))
     collected_e = charge_e
@@ -416,10 +431,10 @@ def _saturation_dn(sensor: Sensor) -> Floats:
     if sensor.full_well_e is None:
         return top_dn
     without_noise = sensor.without(
-        *(e.name for e in sensor.chain if e.is_temporal or (e.stage == "charge" and not e.is_local))
+        *(e.name for e in sensor.chain if e.is_temporal or (e.stage == "charge" and e.reach == "all"))
     )
     well_e = np.broadcast_to(np.minimum(sensor.well_e, MAX_CHARGE_E), n_sites).astype(np.int64)
-    well_dn = linearise(without_noise.read(well_e, streams=Streams(0)), sensor)
+    well_dn = linearise(without_noise.read(well_e), sensor)
     noise_dn = np.sqrt(sensor.readout_model(sensor.well_e).noise_e2) / nominal_e_per_dn(sensor)
     return np.minimum(top_dn, well_dn - MARGIN_SIGMAS * noise_dn - 1.0)
 

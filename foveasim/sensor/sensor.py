@@ -35,7 +35,7 @@ from foveasim.sensor.chain import (
     sort_by_stage,
 )
 from foveasim.sensor.device import Device
-from foveasim.sensor.effects import EFFECTS, Effect, Photosites, Sites
+from foveasim.sensor.effects import EFFECTS, Collection, Effect, Photosites, Sites
 from foveasim.sensor.effects.contract import CompleteSites, FixedFactor, FixedOffset
 from foveasim.sensor.effects.crosstalk import Diffusion, InterPixelCapacitance, KernelCrosstalk
 from foveasim.sensor.effects.dark import ACTIVATION, DOUBLING, DarkLaw, DarkSignal, HotSites, dark_current_factor
@@ -54,7 +54,7 @@ from foveasim.sensor.limits import (
     VOLTS,
     WIDE_SPREAD,
 )
-from foveasim.sensor.model.inversion import Inverse, invert
+from foveasim.sensor.model.inversion import Inverse, invert, invert_collection
 from foveasim.sensor.model.linearisation import Linearisation, linearise
 from foveasim.sensor.model.prediction import (
     ChargeDistributions,
@@ -242,6 +242,11 @@ class Sensor:
                 "check dark_reference_k and the parameters of dark_law",
             )
         object.__setattr__(self, "effects", check_effects(self.effects))
+        if self._own_collection is not None and (self.shot_noise, self.gaussian_above_e) != ("auto", 100.0):
+            raise ParameterError(
+                "shot_noise",
+                f"and 'gaussian_above_e' must be the defaults with the collection '{self._own_collection.name}' in 'effects'",
+            )
         object.__setattr__(self, "disabled", check_names(self.disabled, self.effects))
         _ = self._filters_and_qe
         for name in ("companding_table", "inl_dn"):
@@ -285,7 +290,7 @@ class Sensor:
             If a parameter whose default is not 0 or None is missing, arrays were too long to be stored, or an effect is not
             registered.
         """
-        kinds: tuple[Any, ...] = (Diffusion, KernelCrosstalk, InterPixelCapacitance, *EFFECTS.values())
+        kinds: tuple[Any, ...] = (Diffusion, KernelCrosstalk, InterPixelCapacitance, ShotNoise, *EFFECTS.values())
         classes = {kind.__name__: kind for kind in kinds}
         values: dict[str, Any] = {}
         for parameter in fields(cls):
@@ -412,11 +417,11 @@ class Sensor:
         standard = [
             *self._keyword_effects(),
             *(effect for effect in (self.crosstalk, self.coupling) if effect is not None),
-            ShotNoise("off" if ShotNoise.name in self.disabled else self.shot_noise, self.gaussian_above_e),
+            self.collection,
         ]
         # Inter-pixel capacitance precedes the readout noise.
-        standard.sort(key=lambda effect: effect.is_local)
-        chain = sort_by_stage((*standard, *self.effects))
+        standard.sort(key=lambda effect: effect.reach != "all")
+        chain = sort_by_stage((*standard, *(effect for effect in self.effects if not isinstance(effect, Collection))))
         return tuple(effect for effect in chain if effect.name not in self.disabled or effect.stage == "collection")
 
     def _keyword_effects(self) -> Iterator[Effect]:
@@ -483,7 +488,7 @@ class Sensor:
         return SensorPart(**values | {"layout": self.layout[chosen]}, _complete=self, _selection=chosen)
 
     def _check_local(self) -> None:
-        connecting = ", ".join(repr(effect.name) for effect in self.chain if not effect.is_local)
+        connecting = ", ".join(repr(effect.name) for effect in self.chain if effect.reach == "all")
         if connecting:
             raise ParameterError(
                 "sensor",
@@ -492,10 +497,18 @@ class Sensor:
             )
 
     @property
-    def shot(self) -> ShotNoise:
-        """Shot-noise draw from expected to collected charge."""
-        (shot,) = (effect for effect in self.chain if isinstance(effect, ShotNoise))
-        return shot
+    def _own_collection(self) -> Collection | None:
+        return next((effect for effect in self.effects if isinstance(effect, Collection)), None)
+
+    @cached_property
+    def collection(self) -> Collection:
+        """
+        Draw from expected to collected charge.
+
+        With its name or "shot" in ``disabled``, the rounded mean.
+        """
+        found = self._own_collection or ShotNoise(self.shot_noise, self.gaussian_above_e)
+        return found.without_draw() if {found.name, ShotNoise.name} & set(self.disabled) else found
 
     @cached_property
     def sites(self) -> Sites:
@@ -670,34 +683,71 @@ class Sensor:
         run_steps((*steps, expected_e), photo, sites=self.sites, n_threads=n_threads)
         return expected_e.values
 
-    def collect(self, expected_e: Floats, *, streams: Streams, n_threads: int | None = None) -> Ints:
-        """Draw the collected charge, (n_site,) int64 e-: shot noise, then full well."""
+    def collect(
+        self,
+        expected_e: Floats,
+        *,
+        seed: int | None = None,
+        frame: int = 0,
+        exposure_s: float | None = None,
+        n_threads: int | None = None,
+        _streams: Streams | None = None,
+    ) -> Ints:
+        """
+        Draw the collected charge, (n_site,) int64 e-: shot noise or another collection, then full well.
+
+        Parameters
+        ----------
+        expected_e : (n_site,) float64, e-
+            Expected charge from :meth:`expected_electrons`, or from another program.
+        seed, frame : int
+            Seed and frame number of the draws. Equal ones give bit-identical charges. ``seed`` is required unless nothing is
+            drawn.
+        exposure_s : float, optional, s
+            Exposure time, for collections that depend on it (:attr:`~foveasim.sensor.effects.Collection.needs_exposure`).
+        n_threads : int, optional
+            Number of threads; all cores by default. Results do not depend on it.
+        """
         expected_e = self._check_size("expected_e", expected_e)
-        electrons = Save(np.int64)
-        steps = (*self._collection, electrons)
-        run_steps(steps, expected_e, sites=self.sites, streams=streams, n_threads=n_threads)
+        electrons, sites = Save(np.int64), self._sites_during(exposure_s)
+        streams = _streams or self._streams(seed, frame, self._collection)
+        run_steps((*self._collection, electrons), expected_e, sites=sites, streams=streams, n_threads=n_threads)
         return electrons.values
 
     def read(
         self,
         electrons: Ints,
         *,
-        streams: Streams,
-        reset_streams: Streams | None = None,
+        seed: int | None = None,
+        frame: int = 0,
         n_threads: int | None = None,
+        _streams: Streams | None = None,
+        _reset_streams: Streams | None = None,
     ) -> NDArray[Any]:
         """
         Convert collected charges to digital codes, (n_site,) uint8 or uint16.
 
         The steps are effects on the charge, conversion to volts, nonlinearity, effects on the voltage, clipping at V_sat, and
         the ADC. For a linear ADC, code ``k`` covers the voltages from ``k * V_sat / 2**bits`` to
-        ``(k + 1) * V_sat / 2**bits``. Reads with the same ``reset_streams`` share the draws at the reset
-        (:attr:`~foveasim.sensor.effects.Effect.is_drawn_at_reset`), for which ``streams`` are the default.
+        ``(k + 1) * V_sat / 2**bits``.
+
+        Parameters
+        ----------
+        electrons : (n_site,), e-
+            Collected charge from :meth:`collect`, or from another program, in e- or fractions.
+        seed, frame : int
+            Seed and frame number of the draws. Equal ones give bit-identical codes. ``seed`` is required unless nothing is
+            drawn.
+        n_threads : int, optional
+            Number of threads; all cores by default. Results do not depend on it.
         """
         electrons = self._check_size("electrons", electrons)
         conversion = self._conversion()
         steps = (ChargeCheck("electrons", -np.inf), *self._after_collection, conversion)
-        run_steps(steps, electrons, sites=self.sites, streams=streams, reset_streams=reset_streams, n_threads=n_threads)
+        streams = _streams or self._streams(seed, frame, steps)
+        run_steps(
+            steps, electrons, sites=self.sites, streams=streams, reset_streams=_reset_streams, n_threads=n_threads
+        )
         return conversion.code
 
     def expose(
@@ -705,8 +755,10 @@ class Sensor:
         photo_e_per_s: Floats,
         exposure_s: Annotated[float, EXPOSURE],
         *,
-        streams: Streams,
+        seed: int | None = None,
+        frame: int = 0,
         n_threads: int | None = None,
+        _streams: Streams | None = None,
     ) -> tuple[Floats, Ints, NDArray[Any]]:
         """
         Simulate an exposure in one pass over the sites.
@@ -716,10 +768,11 @@ class Sensor:
         Parameters
         ----------
         photo_e_per_s : (n_site,) float64, e-/s
-            Photoelectron rate, as from :meth:`foveasim.Camera.photoelectrons_per_s`.
+            Photoelectron rate, as from :meth:`foveasim.Camera.photoelectrons_per_s`, or from another program.
         exposure_s : float, s
-        streams : Streams
-            Random streams of the frame.
+        seed, frame : int
+            Seed and frame number of the draws. Equal ones give bit-identical results. ``seed`` is required unless nothing is
+            drawn.
         n_threads : int, optional
             Number of threads; all cores by default. Results do not depend on it.
 
@@ -731,16 +784,26 @@ class Sensor:
             Collected charge.
         code : (n_site,) uint8 or uint16, DN
         """
-        photo, steps = self._exposure(photo_e_per_s, exposure_s)
+        photo, before = self._exposure(photo_e_per_s, exposure_s)
         expected_e, electrons, conversion = Save(), Save(np.int64), self._conversion()
-        run_steps(
-            (*steps, expected_e, *self._collection, electrons, *self._after_collection, conversion),
-            photo,
-            sites=self.sites,
-            streams=streams,
-            n_threads=n_threads,
-        )
+        steps = (*before, expected_e, *self._collection, electrons, *self._after_collection, conversion)
+        streams = _streams or self._streams(seed, frame, steps)
+        run_steps(steps, photo, sites=self._sites_during(exposure_s), streams=streams, n_threads=n_threads)
         return expected_e.values, electrons.values, conversion.code
+
+    @staticmethod
+    def _streams(seed: int | None, frame: int, steps: Iterable[Step]) -> Streams | None:
+        """Return the random streams of a frame, None if no step draws numbers."""
+        drawn = [step.name for step in steps if step.is_temporal and getattr(step, "is_drawn", True)]
+        if seed is None and drawn:
+            raise ParameterError("seed", f"must be given for the draws of {', '.join(map(repr, drawn))}")
+        return None if seed is None else Streams(seed, frame)
+
+    def _sites_during(self, exposure_s: float | None) -> Sites:
+        """Return all sites with an exposure time, which some collections require."""
+        if exposure_s is None and self.collection.needs_exposure:
+            raise ParameterError("exposure_s", f"must be given: the collection '{self.collection.name}' depends on it")
+        return self.sites.during(exposure_s)
 
     def _exposure(self, photo_e_per_s: Floats, exposure_s: float) -> tuple[Floats, tuple[Step, ...]]:
         """Return the rates of all sites, and the steps from them to the expected charges."""
@@ -754,7 +817,7 @@ class Sensor:
     @cached_property
     def _collection(self) -> tuple[Step, ...]:
         """Steps from the expected to the collected charges."""
-        steps: list[Step] = [ChargeCheck("expected_e", 0.0), self.shot]
+        steps: list[Step] = [ChargeCheck("expected_e", 0.0), self.collection]
         if self.full_well_e is not None:
             steps.append(FullWell(self.well_e))
         return tuple(steps)
@@ -789,6 +852,31 @@ class Sensor:
 
         return calibrate(self, exposure_s=exposure_s, flat_e=flat_e, n_frames=n_frames, seed=seed, **options)
 
+    def invert_collection(
+        self, charge_e: Floats, noise_e2: Floats | float = 0.0, exposure_s: Annotated[float | None, EXPOSURE] = None
+    ) -> tuple[Floats, Floats]:
+        """
+        Estimate the expected charge of each site from its charge, with the variance of the estimate.
+
+        Parameters
+        ----------
+        charge_e : (..., n_site) float64, e-
+            Collected charges, such as those of :meth:`invert`.
+        noise_e2 : (..., n_site) or number, e-²
+            Variance of these charges due to the readout.
+        exposure_s : float, optional, s
+            Required by collections that depend on it.
+
+        Returns
+        -------
+        expected_e : (..., n_site) float64, e-
+            Charge before the collection with this mean after it; half a count below the limit of a collection that has one.
+        variance_e2 : (..., n_site) float64, e-²
+            For shot noise, the charge plus one: the posterior mean of the expected charge, plus ``noise_e2``. For another
+            collection, its variance plus one plus ``noise_e2``, over the square of its slope.
+        """
+        return invert_collection(self.collection, self._sites_during(exposure_s), charge_e, noise_e2)
+
     def readout_model(
         self,
         mean_e: ArrayLike,
@@ -803,7 +891,7 @@ class Sensor:
         Parameters
         ----------
         mean_e, variance_e2 : (..., n_site) or number, e- and e-²
-            Moments of the collected charges, such as those of :attr:`shot`.
+            Moments of the collected charges, such as those of :attr:`collection`.
         is_reset : bool
             Whether to include noise drawn at the reset, which cancels in differences of non-destructive reads.
         is_device_known : bool
@@ -840,7 +928,8 @@ class Sensor:
         ParameterError
             Unless the charge or the rate is given; if a charge or a rate is negative.
         """
-        sites = self.sites if is_device_known else self.sites.without_device()
+        sites = self._sites_during(exposure_s)
+        sites = sites if is_device_known else sites.without_device()
         if (expected_e is None) == (photo_e_per_s is None):
             raise ParameterError("expected_e", "must be given, or 'photo_e_per_s', but not both")
         if photo_e_per_s is not None and exposure_s is None:
@@ -853,7 +942,7 @@ class Sensor:
 
     def linearise_intact(self, photo_e_per_s: Floats, exposure_s: float) -> Linearisation:
         """Compute :meth:`linearise` over all devices, without defects."""
-        sites = self.sites.without_device()
+        sites = self.sites.without_device().during(exposure_s)
         return linearise(self, self._intact_chain, sites, None, photo_e_per_s, exposure_s)
 
     def invert(self, code: ArrayLike) -> Inverse:
@@ -908,7 +997,7 @@ class Sensor:
 
         expected_e = self.validate_charges("expected_e", expected_e)
         mean_dn, variance_dn2 = np.empty(expected_e.size), np.empty(expected_e.size)
-        well_e, is_drawn = self.well_e, self.shot.is_drawn
+        well_e, is_drawn = self.well_e, self.collection.is_drawn
         drawn_e, drawn_e2 = expected_e, np.zeros(1)
         if not is_drawn:
             drawn_e = np.minimum(np.rint(expected_e), well_e)

@@ -15,7 +15,8 @@ from foveasim._core.validation import Floats
 from foveasim.errors import ParameterError
 from foveasim.layout import grid
 from foveasim.sensor import Sensor, noise_budget
-from foveasim.sensor.effects import EFFECTS, Effect
+from foveasim.sensor.chain import FIXED_STAGES
+from foveasim.sensor.effects import EFFECTS, Collection, Effect, Mixing, ShotNoise
 from foveasim.testing._extension import Extension, check_of, require, shot_with
 from foveasim.units import ELEMENTARY_CHARGE_C
 
@@ -79,13 +80,18 @@ def check_sensor_effect(name: str, keywords: Mapping[str, Any]) -> None:
         raise ParameterError("name", "must be an effect of the sensor", name, hint=possible_names(name, names))
     effect = sensor.chain[names.index(name)]
     _check_reproducible(sensor, effect)
-    _check_prediction(sensor, effect)
-    if not effect.mixes_means:
-        _check_moments(sensor, effect)
-    if effect.is_local:
-        _check_part(sensor, effect)
+    _check_affine(sensor, effect)
+    if isinstance(effect, Collection):
+        _check_collection(sensor, effect)
+    if not isinstance(effect, Collection) or isinstance(effect, ShotNoise):
+        _check_prediction(sensor, effect)
+        if effect.reach != "all":
+            _check_moments(sensor, effect)
+            _check_part(sensor, effect)
+    if isinstance(effect, Mixing):
+        _check_mixing(sensor, effect)
     quiet, both = (_sensor({**each, "read_noise_e": 7.0}) for each in ({}, keywords))
-    if name not in ("read", "shot"):
+    if name != "read" and not isinstance(effect, Collection):
         require(
             np.array_equal(_codes(both.without(name)), _codes(quiet)), "changes other draws when it is switched off"
         )
@@ -94,7 +100,8 @@ def check_sensor_effect(name: str, keywords: Mapping[str, Any]) -> None:
 def _sensor(keywords: Mapping[str, Any]) -> Sensor:
     """Return a sensor of squares, each with its own readout line."""
     layout = grid(n_x=SHAPE[1], n_y=SHAPE[0], pitch_um=2.0).with_columns(readout_line=np.arange(N))
-    return Sensor(layout, **{**FINE, **keywords})
+    own = any(isinstance(effect, Collection) for effect in keywords.get("effects", ()))
+    return Sensor(layout, **{**FINE, **({"shot_noise": "auto"} if own else {}), **keywords})
 
 
 def _expected_e(sensor: Sensor) -> Floats:
@@ -103,8 +110,8 @@ def _expected_e(sensor: Sensor) -> Floats:
 
 def _codes(sensor: Sensor, frame: int = 0) -> Floats:
     """Return the codes of a frame."""
-    streams = Streams(1, frame)
-    return sensor.read(sensor.collect(_expected_e(sensor), streams=streams), streams=streams).astype(np.float64)
+    electrons = sensor.collect(_expected_e(sensor), seed=1, frame=frame, exposure_s=EXPOSURE_S)
+    return sensor.read(electrons, seed=1, frame=frame).astype(np.float64)
 
 
 def _check_reproducible(sensor: Sensor, effect: Effect) -> None:
@@ -167,6 +174,54 @@ def _check_moments(sensor: Sensor, effect: Effect) -> None:
         _compare(drawn, shift_e, variance_e2, "moments() over devices")
 
 
+def _check_affine(sensor: Sensor, effect: Effect) -> None:
+    """Compare the means of effects before collection at three levels."""
+    if effect.stage in FIXED_STAGES:
+        low, centre, high = (
+            effect.validate_moments(np.full(N, k * PHOTO_E), np.zeros(1), sensor.sites)[0] for k in range(3)
+        )
+        require(
+            np.allclose(high - centre, centre - low, rtol=1e-9, atol=1e-9 * PHOTO_E),
+            "is not affine in the light, as effects before collection must be; use a Collection, or the stage 'charge'",
+        )
+
+
+def _check_mixing(sensor: Sensor, effect: Mixing) -> None:
+    """Compare draws, operator and its transpose."""
+    values, other = (np.random.default_rng(k).random(N) for k in range(2))
+    operator = effect.operator(sensor.sites)
+    mixed = effect.apply(values.copy(), sites=sensor.sites, rng=np.random.default_rng(0))
+    require(np.allclose(mixed, operator.apply(values)), "has another apply() than its operator()")
+    one, two = other @ operator.apply(values), operator.transpose().apply(other) @ values
+    require(np.isclose(one, two), "has an operator whose transpose() is wrong")
+
+
+def _check_collection(sensor: Sensor, effect: Collection) -> None:
+    """Compare draws and cumulative probabilities with the moments, from 0 e- to a bright frame."""
+    sites = sensor.sites.during(EXPOSURE_S)
+    mean = np.geomspace(0.01, 2.0 * PHOTO_E, N)
+    mean[0] = 0.0
+    centre_e, variance_e2 = effect.validate_moments(mean, np.zeros(1), sites)
+    first, probability, offsets = effect.table(mean, sites=sites)
+    site = np.repeat(np.arange(N), np.diff(offsets))
+    off = first[site] + np.arange(probability.size) - offsets[site] - centre_e[site]
+    total, bias, spread2 = (np.bincount(site, probability * power, N) for power in (np.ones(off.size), off, off**2))
+    for found, expected, what in (
+        (total, 1.0, "sum"),
+        (centre_e + bias, centre_e, "mean"),
+        (spread2, variance_e2, "variance"),
+    ):
+        require(
+            np.allclose(found, expected, rtol=1e-6, atol=1e-9),
+            f"has a cumulative() whose {what} differs from {1 if what == 'sum' else 'that of its moments()'}",
+        )
+    streams = Streams(2)
+    drawn = np.stack([effect.apply(mean.copy(), sites=sites, rng=streams.of(effect.name, k)) for k in range(N_DRAWS)])
+    require(np.all((drawn >= 0.0) & (drawn == np.rint(drawn))), "must draw integers of at least 0")
+    some = (variance_e2 > 1.0) | (centre_e == 0.0)  # enough draws of each site
+    _compare(drawn[:, some], centre_e[some], np.broadcast_to(variance_e2, N)[some], "moments()")
+
+
 def _compare(values: Floats, mean: Floats, variance: Floats, of: str) -> None:
     """Compare draws (n_draw, n_site) with moments; sites may be correlated."""
     some = np.broadcast_to(np.atleast_2d(variance) > 0.0, values.shape).all(axis=0)
@@ -191,7 +246,7 @@ def _compare(values: Floats, mean: Floats, variance: Floats, of: str) -> None:
 
 def _check_part(sensor: Sensor, effect: Effect) -> None:
     """Compare sites alone, and a block of sites, with the complete sensor."""
-    hint = "use sites.select() and sites.pattern(), or set is_local = False"
+    hint = "use sites.select() and sites.pattern(), or derive from Mixing"
     chosen = slice(N // 3, N // 2)
     sites, mean = sensor.sites, np.linspace(0.5, 2.0, N)
     complete = effect.validate_moments(mean, 0.1 * mean, sites)

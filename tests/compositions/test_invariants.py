@@ -22,7 +22,6 @@ from reference.features import axes, axes_names, is_possible, pairwise_rows, sam
 
 import foveasim as fs
 from foveasim import tiles
-from foveasim._core.random_streams import Streams
 from foveasim.config import build_shot, read_shot, to_python
 from foveasim.distortion import BrownConrady
 from foveasim.errors import FoveasimWarning
@@ -103,7 +102,7 @@ def unused_camera(shot, n_threads=None):
 
 
 def crosses_sites(shot):
-    return any(not effect.is_local for effect in shot.camera.sensor.chain)
+    return any(effect.reach != "site" for effect in shot.camera.sensor.chain)
 
 
 # -- one result on every route -----------------------------------------------------------------------------------------
@@ -274,7 +273,7 @@ def test_cropped_sites_measure_the_same(shot):
     rate_e_per_s = shot.camera.photoelectrons_per_s(shot.scene)
 
     assert_close(camera.photoelectrons_per_s(shot.scene), rate_e_per_s[kept])
-    if not any(effect.stage == "expected" or not effect.is_local for effect in camera.sensor.chain):
+    if not any(effect.stage == "expected" or effect.reach == "all" for effect in camera.sensor.chain):
         mean_dn, variance_dn2 = shot.camera.predict(shot.scene, exposure_s=shot.exposure_s)
         cropped_dn, cropped_dn2 = camera.predict(shot.scene, exposure_s=shot.exposure_s)
         assert_close(cropped_dn, mean_dn[kept], 1e-7)
@@ -356,7 +355,7 @@ def test_prediction_equals_moments_of_captures(shot):
     rate_e_per_s = shot.camera.photoelectrons_per_s(shot.scene)
     mean_dn, variance_dn2 = shot.camera.predict(shot.scene, exposure_s=shot.exposure_s)
     frames = np.array(
-        [sensor.expose(rate_e_per_s, shot.exposure_s, streams=Streams(11, k))[2] for k in range(N_FRAMES)], float
+        [sensor.expose(rate_e_per_s, shot.exposure_s, seed=11, frame=k)[2] for k in range(N_FRAMES)], float
     )
 
     # Codes that a frame in N_FRAMES leaves are not resolved by the sample.

@@ -173,12 +173,6 @@ class Objects:
         return fs.metrics.draw_frames(self.sensor, 0.0 * self.expected_e, n_frames=8, seed=2)
 
     @cached_property
-    def streams(self):
-        from foveasim._core.random_streams import Streams
-
-        return Streams(0, 0)
-
-    @cached_property
     def sites(self):
         return self.sensor.sites
 
@@ -610,9 +604,9 @@ CALLS = {
     "sensor.calibrate": lambda o: sensor.calibrate(o.sensor, exposure_s=0.01, flat_e=900.0, n_frames=4, seed=0),
     "sensor.camera_filters": lambda o: sensor.camera_filters(),
     "sensor.ccd_qe": lambda o: sensor.ccd_qe(),
-    "sensor.draw_shot_noise": lambda o: sensor.draw_shot_noise(o.expected_e, "exact", 100.0, o.streams),
+    "sensor.draw_shot_noise": lambda o: sensor.draw_shot_noise(o.expected_e, "exact", 100.0, seed=0),
     "sensor.fit_ramp": lambda o: sensor.fit_ramp(
-        sensor.non_destructive_reads(o.sensor, o.photo_e_per_s, [0.001, 0.002, 0.003], streams=o.streams).code,
+        sensor.non_destructive_reads(o.sensor, o.photo_e_per_s, [0.001, 0.002, 0.003], seed=0).code,
         [0.001, 0.002, 0.003],
         o.sensor,
     ),
@@ -620,14 +614,14 @@ CALLS = {
     "sensor.merge_exposures": lambda o: sensor.merge_exposures(np.stack([o.capture.code] * 2), [0.01, 0.01], o.sensor),
     "sensor.noise_budget": lambda o: sensor.noise_budget(o.sensor, o.photo_e_per_s, 0.01),
     "sensor.non_destructive_reads": lambda o: sensor.non_destructive_reads(
-        o.sensor, o.photo_e_per_s, [0.001, 0.002], streams=o.streams
+        o.sensor, o.photo_e_per_s, [0.001, 0.002], seed=0
     ),
     "sensor.read_curve": lambda o: sensor.read_curve(o.text(".csv", "nm,R\n400,0.1\n700,0.2\n")),
     "sensor.read_filters": lambda o: sensor.read_filters(o.text(".csv", "nm,R,G\n400,0.1,0.2\n700,0.2,0.3\n")),
     "sensor.rgb_filters": lambda o: sensor.rgb_filters(),
     "sensor.signal_to_noise": lambda o: sensor.signal_to_noise(o.sensor, o.expected_e, 0.0 * o.expected_e),
     "sensor.effects.dark_current_factor": lambda o: effects.dark_current_factor(310.0, 300.0, doubling_k=8.0),
-    "sensor.effects.draw_shot_noise": lambda o: effects.draw_shot_noise(o.expected_e, "exact", 100.0, o.streams),
+    "sensor.effects.draw_shot_noise": lambda o: effects.draw_shot_noise(o.expected_e, "exact", 100.0, seed=0),
     "studio.run_studio": lambda o: fs.studio.run_studio(o.shot_file, open_browser=False, announce=interrupt),
     "testing.check_all": lambda o: fs.testing.check_all("curve"),
     "testing.check_extension": lambda o: fs.testing.check_extension("metric", "snr"),

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import foveasim as fs
-from foveasim._core.random_streams import Streams
 from foveasim.errors import ParameterError
 from foveasim.explore import METRICS
 from foveasim.metrics import (
@@ -306,7 +305,7 @@ def test_noise_matches_squared_error_of_codes(companding, charge_e, dnl_dn, sigm
         read_noise_e=sigma_dn * step_e,
         pixel_fpn_fraction=2.0 * step_e / full_e,
     )
-    code = sensor.read(np.full(n, charge_e), streams=Streams(5))
+    code = sensor.read(np.full(n, charge_e), seed=5)
     found_e = (linearise(code, sensor) + 0.5) * full_e / 256.0 - sensor.pattern("pixel_fpn") * full_e
 
     predicted = signal_to_noise(sensor, np.full(n, float(charge_e)), np.zeros(n))

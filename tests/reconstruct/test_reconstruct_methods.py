@@ -562,8 +562,7 @@ def test_photoelectrons_estimated_from_code_unbiased(parameters):
         layout, bits=12, capacitance_f=1e-15, v_sat_v=2.0, read_noise_e=5.0, dark_e_per_s=1e4, **parameters
     )
     light_e = np.linspace(200.0, 6000.0, layout.n_sites)
-    streams = fs._core.random_streams.Streams(1, 0)
-    code = sensor.read(sensor.collect(light_e + 100.0, streams=streams), streams=streams)
+    code = sensor.read(sensor.collect(light_e + 100.0, seed=1), seed=1)
     estimates = estimate_from_code(code, sensor, 0.01)
     z = (estimates.light_e - light_e) / np.sqrt(estimates.variance_e2)
 

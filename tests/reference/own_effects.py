@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from foveasim.sensor.effects import AdditiveNoise, Effect, FixedFactor
+from foveasim.sensor.effects import AdditiveNoise, Effect, FixedFactor, GroupedNoise
 
 
 @dataclass(frozen=True)
@@ -62,25 +62,21 @@ class ResetSag(AdditiveNoise):
 
 
 @dataclass(frozen=True)
-class LineNoise(Effect):
+class LineNoise(GroupedNoise):
     """Temporal noise common to the sites of one band of 5 µm, V."""
 
     name = "line_noise"
     stage = "output"
-    is_temporal = True
-    is_local = False
 
     sigma_v: float
 
-    def apply(self, values, *, sites, rng):
-        """Return the voltages plus one draw per band."""
-        band = np.floor(sites.layout.centroid_um[:, 1] / 5.0).astype(int)
-        draws = rng.standard_normal(64) * self.sigma_v
-        return values + draws[band % 64]
+    def deviation(self, sites):
+        """Return the standard deviation, V."""
+        return self.sigma_v
 
-    def moments(self, mean, variance, *, sites):
-        """Add the variance of the draws."""
-        return mean, variance + self.sigma_v**2
+    def groups(self, sites):
+        """Return the band of every site."""
+        return np.floor(sites.layout.centroid_um[:, 1] / 5.0).astype(int)
 
 
 @dataclass(frozen=True)

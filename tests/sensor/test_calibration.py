@@ -9,7 +9,6 @@ import pytest
 import scipy.constants
 
 import foveasim as fs
-from foveasim._core.random_streams import Streams
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import grid
 from foveasim.sensor import Calibration, Diffusion, InterPixelCapacitance, Sensor, calibrate, linearise
@@ -72,7 +71,7 @@ def test_linearised_codes_are_voltage_interval_centres(parameters):
     row = grid(n_x=1000, n_y=1, pitch_um=2.0)
     sensor = Sensor(row, bits=8, v_sat_v=1.0, capacitance_f=n_charges * scipy.constants.e, **parameters)
     charge = np.arange(n_charges)
-    code = np.concatenate([sensor.read(part, streams=Streams(0)) for part in charge.reshape(-1, 1000)])
+    code = np.concatenate([sensor.read(part, seed=0) for part in charge.reshape(-1, 1000)])
     centre_dn = np.array([charge[code == k][[0, -1]].mean() if (code == k).any() else np.nan for k in range(256)])
 
     off = linearise(np.arange(256), sensor) - (centre_dn * 256 / n_charges - 0.5)
@@ -274,7 +273,7 @@ def test_companded_codes_calibrate_like_linear_codes(companding):
 
     assert np.corrcoef(calibration.gain, response_of(sensor))[0, 1] > 0.95
     expected_e = sensor.expected_electrons(np.full(N, 4e4), 0.1)
-    code = sensor.read(sensor.collect(expected_e, streams=Streams(1)), streams=Streams(1))
+    code = sensor.read(sensor.collect(expected_e, seed=1), seed=1)
     # Noise of one frame and of the calibration, without fixed pattern; gain differences change the noise by 0.3 %.
     residual_dn2 = 5064.0 + ((3 / 7) ** 2 * 1064.0 + (4 / 7) ** 2 * 8064.0) / 30
     corrected_dn = calibration.correct(code)

@@ -16,7 +16,7 @@ from foveasim._core.random_streams import Streams
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import grid
 from foveasim.sensor import Sensor, effects, noise_budget, signal_to_noise
-from foveasim.sensor.effects import AdditiveNoise, Effect, FixedFactor, FixedOffset, ShotNoise, Sites
+from foveasim.sensor.effects import AdditiveNoise, Effect, FixedFactor, FixedOffset, GroupedNoise, ShotNoise, Sites
 from foveasim.testing import check_sensor_effect
 
 SIGMAS = 5.0
@@ -56,17 +56,17 @@ class LensShading(FixedFactor):
 
 @dataclass(frozen=True)
 class Hum(Effect):
-    """Test effect derived from Effect only: multiplicative temporal noise of the charge, non-local."""
+    """Test effect derived from Effect only: multiplicative temporal noise of the charge, a sequence over all sites."""
 
     name: ClassVar[str] = "hum"
     stage: ClassVar[str] = "charge"
     is_temporal: ClassVar[bool] = True
-    is_local: ClassVar[bool] = False
+    reach: ClassVar[str] = "group"
 
     sigma: float = 0.02
 
     def apply(self, values, *, sites, rng):
-        return values * (1.0 + self.sigma * rng.standard_normal(values.size))
+        return values * (1.0 + self.sigma * sites.select(rng.standard_normal(sites.layout.n_sites)))
 
     def moments(self, mean, variance, *, sites):
         return mean, variance * (1.0 + self.sigma**2) + (mean * self.sigma) ** 2
@@ -85,9 +85,8 @@ def make_sensor(name="", *, shot_noise="off", **more):
 
 
 def codes(sensor, frame=0, seed=1):
-    streams = Streams(seed, frame)
     expected_e = sensor.expected_electrons(np.full(N, PHOTO_E / EXPOSURE_S), EXPOSURE_S)
-    return sensor.read(sensor.collect(expected_e, streams=streams), streams=streams).astype(float)
+    return sensor.read(sensor.collect(expected_e, seed=seed, frame=frame), seed=seed, frame=frame).astype(float)
 
 
 @every_effect
@@ -188,7 +187,7 @@ def test_fixed_patterns_must_define_pattern_moments():
 @pytest.mark.parametrize("returned", [None, np.zeros(3)])
 def test_wrong_result_of_effect_is_rejected(returned):
     class Wrong(Hum):
-        is_local = True
+        reach = "site"
 
         def apply(self, values, *, sites, rng):
             return returned
@@ -198,22 +197,16 @@ def test_wrong_result_of_effect_is_rejected(returned):
 
 
 @dataclass(frozen=True)
-class RowNoise(Effect):
+class RowNoise(GroupedNoise):
     """Temporal row noise: one draw per readout line."""
 
     name = "row_noise"
     stage = "charge"
-    is_temporal = True
-    is_local = False
 
     sigma_e: float = 5.0
 
-    def apply(self, values, *, sites, rng):
-        lines, line_of_site = np.unique(sites.layout.readout_line, return_inverse=True)
-        return values + (self.sigma_e * rng.standard_normal(lines.size))[line_of_site]
-
-    def moments(self, mean, variance, *, sites):
-        return mean, variance + self.sigma_e**2
+    def deviation(self, sites):
+        return self.sigma_e
 
 
 def test_shared_draws_span_site_blocks():
@@ -223,7 +216,7 @@ def test_shared_draws_span_site_blocks():
     sensor = Sensor(layout, effects=[RowNoise()], bits=16, v_sat_v=1.0, capacitance_f=1e-15)
     charge_e = np.full(layout.n_sites, 1000)
 
-    codes = [sensor.read(charge_e, streams=Streams(seed)).reshape(3, n_x) for seed in range(2)]
+    codes = [sensor.read(charge_e, seed=seed).reshape(3, n_x) for seed in range(2)]
 
     assert all(np.all(each == each[:, :1]) for each in codes)
     assert len(np.unique(np.stack(codes)[:, :, 0])) == 6
@@ -255,7 +248,7 @@ def test_cached_names_compare_by_value():
     expected = 350 * (1 + layout.channel)
 
     for frame in range(100):
-        code = sensor.read(np.full(300, 350), streams=Streams(0, frame))
+        code = sensor.read(np.full(300, 350), seed=0, frame=frame)
         assert np.abs(code - expected).max() <= 1.0
     assert len(sensor.sites._cache) == 3
 

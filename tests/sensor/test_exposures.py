@@ -11,7 +11,6 @@ import pytest
 import scipy.constants
 import scipy.signal
 
-from foveasim._core.random_streams import Streams
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import grid
 from foveasim.sensor import (
@@ -76,7 +75,7 @@ def test_merge_without_noise_is_within_rounding(companding):
     rate = np.geomspace(100.0, 1e7, 200)
     sensor = Sensor(ROW[:200], **{**SENSOR, "companding": companding, "shot_noise": "off", "read_noise_e": 0.0})
     charge_e = np.array([np.rint(rate * t_s).astype(np.int64) for t_s in EXPOSURES_S])
-    code = np.array([sensor.read(row, streams=Streams(0)) for row in charge_e])
+    code = np.array([sensor.read(row, seed=0) for row in charge_e])
 
     merged = merge_exposures(code, EXPOSURES_S, sensor)
 
@@ -197,8 +196,7 @@ def test_calibration_removes_fixed_patterns_from_merge():
     codes = []
     for k, t_s in enumerate(exposures_s):
         expected_e = sensor.expected_electrons(np.full(N, rate), t_s)
-        streams = Streams(9, k)
-        codes.append(sensor.read(sensor.collect(expected_e, streams=streams), streams=streams))
+        codes.append(sensor.read(sensor.collect(expected_e, seed=9, frame=k), seed=9, frame=k))
     is_usable = ~calibration.clipped
 
     merged = merge_exposures(codes, exposures_s, sensor, calibration=calibration)
@@ -220,7 +218,7 @@ def test_ramp_charge_covariance_has_uncorrelated_increments(rate_e_per_s, shot_n
     sensor = Sensor(ROW, shot_noise=shot_noise, **SENSOR)
     times = np.array(TIMES_S)
 
-    electrons = non_destructive_reads(sensor, rate_e_per_s, times, streams=Streams(1)).electrons.astype(float)
+    electrons = non_destructive_reads(sensor, rate_e_per_s, times, seed=1).electrons.astype(float)
 
     covariance = np.cov(electrons)
     expected = rate_e_per_s * np.minimum(times[:, None], times)
@@ -249,7 +247,7 @@ def test_read_noise_varies_and_reset_noise_persists():
     )
     reset_e = float(noise_budget(sensor, np.zeros(N), 0.0)["reset"][0])
 
-    code = non_destructive_reads(sensor, 8000.0, TIMES_S, streams=Streams(2)).code.astype(float)
+    code = non_destructive_reads(sensor, 8000.0, TIMES_S, seed=2).code.astype(float)
 
     covariance = np.cov(code)
     expected = reset_e**2 + np.eye(len(TIMES_S)) * (36.0 + 1 / 12)
@@ -262,19 +260,19 @@ def test_read_noise_varies_and_reset_noise_persists():
 def test_ramp_includes_full_well_and_dark_signal():
     sensor = Sensor(ROW[:3], shot_noise="off", full_well_e=[100.5, 1e4, 1e4], dark_e_per_s=[0.0, 0.0, 50.0])
 
-    ramp = non_destructive_reads(sensor, [60.0, 60.0, 0.3], [1.0, 2.0, 3.0], streams=Streams(0))
+    ramp = non_destructive_reads(sensor, [60.0, 60.0, 0.3], [1.0, 2.0, 3.0], seed=0)
 
     assert ramp.electrons.tolist() == [[60, 60, 50], [100, 120, 101], [100, 180, 151]]
 
 
 def test_ramp_is_reproducible_from_seed_and_frame():
     sensor = Sensor(ROW, **SENSOR)
-    code = non_destructive_reads(sensor, 300.0, TIMES_S, streams=Streams(3, 1), n_threads=1).code
+    code = non_destructive_reads(sensor, 300.0, TIMES_S, seed=3, frame=1, n_threads=1).code
 
-    assert np.array_equal(code, non_destructive_reads(sensor, 300.0, TIMES_S, streams=Streams(3, 1)).code)
-    longer = non_destructive_reads(sensor, 300.0, [*TIMES_S, 9.0], streams=Streams(3, 1)).code
+    assert np.array_equal(code, non_destructive_reads(sensor, 300.0, TIMES_S, seed=3, frame=1).code)
+    longer = non_destructive_reads(sensor, 300.0, [*TIMES_S, 9.0], seed=3, frame=1).code
     assert np.array_equal(code, longer[:-1])
-    assert (code != non_destructive_reads(sensor, 300.0, TIMES_S, streams=Streams(3, 2)).code).mean() > 0.5
+    assert (code != non_destructive_reads(sensor, 300.0, TIMES_S, seed=3, frame=2).code).mean() > 0.5
 
 
 def simulate_ramps(rate_e_per_s, times_s, seed):
@@ -353,7 +351,7 @@ def test_simulated_ramp_slope_includes_dark_signal():
     sensor = Sensor(ROW, dark_e_per_s=100.0, ktc_noise=True, cds=False, **{**SENSOR, "v_sat_v": 4.0, "bits": 14})
     times = np.linspace(0.2, 4.0, 12)
 
-    fit = fit_ramp(non_destructive_reads(sensor, 900.0, times, streams=Streams(6)).code, times, sensor)
+    fit = fit_ramp(non_destructive_reads(sensor, 900.0, times, seed=6).code, times, sensor)
 
     variance = np.mean(fit.sigma_e_per_s**2)
     assert fit.rate_e_per_s.mean() == pytest.approx(1000.0, abs=SIGMAS * math.sqrt(variance / N) + 0.1)
@@ -432,7 +430,7 @@ def test_reset_noise_of_ramp_follows_coupling(neighbour_fraction):
     coupling = InterPixelCapacitance(neighbour_fraction=neighbour_fraction)
     sensor = Sensor(ROW, **EXACT, ktc_noise=True, coupling=coupling)
 
-    code = non_destructive_reads(sensor, 5000.0, [1.0, 2.0], streams=Streams(3)).code.astype(float)
+    code = non_destructive_reads(sensor, 5000.0, [1.0, 2.0], seed=3).code.astype(float)
 
     for read in code:
         assert read.var() == pytest.approx(RESET_E**2 + 1.0 / 12.0, rel=SIGMAS * math.sqrt(2.0 / N))
@@ -443,7 +441,7 @@ def test_reset_noise_of_ramp_follows_coupling(neighbour_fraction):
 def test_reset_noise_acts_at_its_stage():
     sensor = Sensor(ROW, **EXACT, effects=[NodeReset()])
 
-    code = non_destructive_reads(sensor, 5000.0, [1.0, 2.0], streams=Streams(3)).code.astype(float)
+    code = non_destructive_reads(sensor, 5000.0, [1.0, 2.0], seed=3).code.astype(float)
 
     assert code[0].std() == pytest.approx(0.01 * 65_536, rel=SIGMAS * math.sqrt(0.5 / N))
     assert np.abs(code[1] - code[0] - 5000.0).max() <= 1.0
@@ -452,7 +450,7 @@ def test_reset_noise_acts_at_its_stage():
 def test_factor_of_reset_is_common():
     sensor = Sensor(ROW, **EXACT | {"pedestal_v": 0.0}, effects=[ResetGain()])
 
-    code = non_destructive_reads(sensor, 10_000.0, [1.0, 2.0], streams=Streams(3)).code.astype(float)
+    code = non_destructive_reads(sensor, 10_000.0, [1.0, 2.0], seed=3).code.astype(float)
 
     assert code[0].std() == pytest.approx(1000.0, rel=SIGMAS * math.sqrt(0.5 / N))
     assert np.abs(code[1] - 2.0 * code[0]).max() <= 2.0
@@ -464,7 +462,7 @@ def test_reads_have_expected_charge_of_exposures(shot_noise):
     times = np.array([0.01, 0.1, 10.0])
     expected_e = 1e4 * times / (1.0 + 1e4 * times / 1000.0)
 
-    electrons = non_destructive_reads(sensor, 1e4, times, streams=Streams(3)).electrons
+    electrons = non_destructive_reads(sensor, 1e4, times, seed=3).electrons
 
     if shot_noise == "off":
         assert np.array_equal(electrons, np.rint(np.broadcast_to(expected_e, (N, 3)).T))
@@ -481,7 +479,7 @@ def test_decreasing_expected_charge_is_rejected():
     with pytest.raises(
         SimulationError, match=r"the expected charge of site 0 decreases from 1000 to .* at 3 s; effects at"
     ):
-        non_destructive_reads(sensor, 1000.0 / 1.9, [1.0, 3.0], streams=Streams(0))
+        non_destructive_reads(sensor, 1000.0 / 1.9, [1.0, 3.0], seed=0)
 
 
 def test_ramp_noise_excludes_reset_noise():
@@ -489,7 +487,7 @@ def test_ramp_noise_excludes_reset_noise():
     sensor = Sensor(ROW, **EXACT | {"shot_noise": "auto"}, ktc_noise=True, effects=[NodeReset()], read_noise_e=5.0)
     times = np.linspace(0.5, 4.0, 8)
 
-    fit = fit_ramp(non_destructive_reads(sensor, 500.0, times, streams=Streams(5)).code, times, sensor)
+    fit = fit_ramp(non_destructive_reads(sensor, 500.0, times, seed=5).code, times, sensor)
 
     sigma = math.sqrt(np.mean(fit.sigma_e_per_s**2))
     assert sigma == pytest.approx(fit_ramp_sigma(500.0, times, 25.0 + 1.0 / 12.0), rel=1e-3)
@@ -517,7 +515,7 @@ def test_ramp_noise_includes_coupling(fraction):
     sensor = Sensor(ROW, **EXACT | {"shot_noise": "auto"}, coupling=coupling, read_noise_e=5.0)
     times = np.linspace(0.5, 4.0, 8)
 
-    fit = fit_ramp(non_destructive_reads(sensor, 4000.0, times, streams=Streams(5)).code, times, sensor)
+    fit = fit_ramp(non_destructive_reads(sensor, 4000.0, times, seed=5).code, times, sensor)
 
     kernel = np.array([[0.0, fraction, 0.0], [fraction, 1.0 - 4.0 * fraction, fraction], [0.0, fraction, 0.0]])
     is_inside = inside()
@@ -538,10 +536,10 @@ def test_coupled_noise_agrees_next_to_bright_sites(estimate):
     sensor = Sensor(ROW, **EXACT | {"shot_noise": "auto", "pedestal_v": 0.0}, coupling=coupling, read_noise_e=3.0)
     if estimate == "ramp":
         times = np.linspace(0.25, 2.0, 8)
-        found = fit_ramp(non_destructive_reads(sensor, rate, times, streams=Streams(5)).code, times, sensor)
+        found = fit_ramp(non_destructive_reads(sensor, rate, times, seed=5).code, times, sensor)
     else:
         exposures_s = [0.5, 1.0, 2.0]
-        codes = [sensor.expose(rate, t_s, streams=Streams(6, k))[2] for k, t_s in enumerate(exposures_s)]
+        codes = [sensor.expose(rate, t_s, seed=6, frame=k)[2] for k, t_s in enumerate(exposures_s)]
         found = merge_exposures(codes, exposures_s, sensor)
 
     for chosen in (is_bright & inside(), is_next & inside()):
@@ -566,9 +564,8 @@ def sensor_exposures(sensor):
     """Simulate codes of several exposures with the sensor."""
     rows = []
     for frame, t_s in enumerate(RTS_TIMES_S):
-        streams = Streams(11, frame)
-        electrons = sensor.collect(np.full(N, RTS_RATE_E_PER_S * t_s), streams=streams)
-        rows.append(sensor.read(electrons, streams=streams))
+        electrons = sensor.collect(np.full(N, RTS_RATE_E_PER_S * t_s), seed=11, frame=frame)
+        rows.append(sensor.read(electrons, seed=11, frame=frame))
     return np.stack(rows)
 
 
@@ -587,7 +584,7 @@ def test_merged_exposures_predict_rts_noise(rts_fraction, shot_noise):
 def test_ramp_fits_predict_rts_noise(rts_fraction):
     sensor = Sensor(ROW, **SENSOR, rts_fraction=rts_fraction, rts_e=200.0)
     times = np.linspace(0.05, 0.25, 6)
-    ramp = non_destructive_reads(sensor, RTS_RATE_E_PER_S, times, streams=Streams(12))
+    ramp = non_destructive_reads(sensor, RTS_RATE_E_PER_S, times, seed=12)
 
     assert_drawn_as_predicted(fit_ramp(ramp.code, times, sensor, weight_rate_e_per_s=RTS_RATE_E_PER_S))
 
@@ -616,15 +613,15 @@ CODE = np.full((2, 3), 100)
             "'calibration' must be a Calibration",
         ),
         (
-            lambda: non_destructive_reads(FEW, 1.0, [1.0, 1.0], streams=Streams(0)),
+            lambda: non_destructive_reads(FEW, 1.0, [1.0, 1.0], seed=0),
             "'times_s' must be one or more strictly increasing times",
         ),
         (
-            lambda: non_destructive_reads(FEW, [1.0, 2.0], [1.0], streams=Streams(0)),
+            lambda: non_destructive_reads(FEW, [1.0, 2.0], [1.0], seed=0),
             "'photo_e_per_s' must be one number, or",
         ),
-        (lambda: non_destructive_reads(FEW, -1.0, [1.0], streams=Streams(0)), "'photo_e_per_s' must be >= 0"),
-        (lambda: non_destructive_reads(None, 1.0, [1.0], streams=Streams(0)), "'sensor' must be a"),
+        (lambda: non_destructive_reads(FEW, -1.0, [1.0], seed=0), "'photo_e_per_s' must be >= 0"),
+        (lambda: non_destructive_reads(None, 1.0, [1.0], seed=0), "'sensor' must be a"),
         (lambda: fit_ramp(CODE[:1], [1.0], FEW), "'times_s' must have at least two values"),
         (lambda: fit_ramp(CODE, [1.0, 2.0, 3.0], FEW), "'code' must have one row per read"),
         (

@@ -10,7 +10,6 @@ import scipy.constants
 import scipy.stats
 
 import foveasim as fs
-from foveasim._core.random_streams import Streams
 from foveasim.layout import grid
 from foveasim.sensor import Diffusion, InterPixelCapacitance, Sensor
 
@@ -27,9 +26,7 @@ def draw_codes(sensor, expected_e, n_draws=N_DRAWS):
     """Simulate codes of many frames, (n_draw, n_site)."""
     return np.stack(
         [
-            sensor.read(
-                sensor.collect(expected_e, streams=Streams(5, k), n_threads=1), streams=Streams(5, k), n_threads=1
-            )
+            sensor.read(sensor.collect(expected_e, seed=5, frame=k, n_threads=1), seed=5, frame=k, n_threads=1)
             for k in range(n_draws)
         ]
     ).astype(float)

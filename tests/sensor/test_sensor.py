@@ -10,7 +10,6 @@ import scipy.constants
 import scipy.stats
 
 import foveasim as fs
-from foveasim._core.random_streams import Streams
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import grid
 from foveasim.sensor import ConstantCurve, FilterSet, Sensor, SiliconQE, draw_shot_noise
@@ -35,19 +34,19 @@ def green_power_w(photons_per_s):
 def electrons_of(sensor, photons, *, seed):
     """Draw the charge of each site for a number of expected photons in one second."""
     photo_e_per_s = sensor.responsivity_e_per_j(GREEN_NM)[0, 0] * np.full(sensor.layout.n_sites, green_power_w(photons))
-    return sensor.collect(sensor.expected_electrons(photo_e_per_s, 1.0), streams=Streams(seed))
+    return sensor.collect(sensor.expected_electrons(photo_e_per_s, 1.0), seed=seed)
 
 
 def collected(expected_e, *, seed=0, **parameters):
     """Draw the charge of each site for a number of expected electrons."""
     sensor = Sensor(MANY, **parameters)
-    return sensor.collect(np.broadcast_to(np.asarray(expected_e, float), N).copy(), streams=Streams(seed))
+    return sensor.collect(np.broadcast_to(np.asarray(expected_e, float), N).copy(), seed=seed)
 
 
 def codes(charge_e, *, seed=0, layout=None, **parameters):
     charge_e = np.asarray(charge_e, np.int64)
     sensor = Sensor(grid(n_x=charge_e.size, n_y=1, pitch_um=2.0) if layout is None else layout, **parameters)
-    return sensor.read(charge_e, streams=Streams(seed))
+    return sensor.read(charge_e, seed=seed)
 
 
 def charge_for(voltage_v, capacitance_f):
@@ -146,7 +145,7 @@ def test_large_charges_have_gaussian_quartiles():
 
 def test_rounding_to_electrons_adds_no_variance():
     n = 4_000_000
-    electrons = draw_shot_noise(np.full(n, 12.0), "auto", 10.0, Streams(7))
+    electrons = draw_shot_noise(np.full(n, 12.0), "auto", 10.0, seed=7)
     # Uncorrected rounding would add 1 / 12 to the variance of 12, twice the threshold.
     assert abs(electrons.var(ddof=1) / 12.0 - 1.0) < SIGMAS * math.sqrt(2.0 / n)
 
@@ -181,7 +180,7 @@ def test_neighbouring_sites_are_uncorrelated():
 
 def test_dark_signal_has_shot_noise():
     sensor = Sensor(MANY, dark_e_per_s=50.0)
-    electrons = sensor.collect(sensor.expected_electrons(np.zeros(N), 2.0), streams=Streams(3))
+    electrons = sensor.collect(sensor.expected_electrons(np.zeros(N), 2.0), seed=3)
     assert abs(electrons.mean() - 100.0) < SIGMAS * math.sqrt(100.0 / N)
     assert abs(electrons.var(ddof=1) / electrons.mean() - 1.0) < SIGMAS * math.sqrt(2.0 / (N - 1))
 
@@ -229,8 +228,8 @@ def test_read_noise_has_zero_mean():
 
 def test_read_noise_acts_after_full_well():
     sensor = Sensor(MANY, full_well_e=7000.0, read_noise_e=50.0, **ONE_E_PER_CODE)
-    electrons = sensor.collect(np.full(N, 1e6), streams=Streams(2))
-    code = sensor.read(electrons, streams=Streams(2)).astype(float)
+    electrons = sensor.collect(np.full(N, 1e6), seed=2)
+    code = sensor.read(electrons, seed=2).astype(float)
     assert abs(code.var(ddof=1) / (50.0**2 + 1.0 / 12.0) - 1.0) < SIGMAS * math.sqrt(2.0 / (N - 1))
 
 
@@ -292,8 +291,8 @@ def test_codes_are_clipped_to_range(bits, read_noise_e):
 @pytest.mark.parametrize("expected_e", [1e12, 1e18, 1e19, 1e25])
 def test_extreme_charges_give_highest_code(how, expected_e):
     sensor = Sensor(FOUR, shot_noise=how)
-    electrons = sensor.collect(np.full(4, expected_e), streams=Streams(1))
-    assert sensor.read(electrons, streams=Streams(1)).tolist() == [255] * 4
+    electrons = sensor.collect(np.full(4, expected_e), seed=1)
+    assert sensor.read(electrons, seed=1).tolist() == [255] * 4
 
 
 def test_codes_are_monotonic_in_charge():
@@ -339,8 +338,8 @@ def test_shot_noise_does_not_change_read_noise():
     noise_e = []
     for how in ("auto", "off"):
         quiet, noisy = (Sensor(MANY, shot_noise=how, read_noise_e=e, **ONE_E_PER_CODE) for e in (0.0, 50.0))
-        electrons = quiet.collect(np.full(N, 30_000.0), streams=Streams(6))
-        code, code_with_noise = (sensor.read(electrons, streams=Streams(6)).astype(int) for sensor in (quiet, noisy))
+        electrons = quiet.collect(np.full(N, 30_000.0), seed=6)
+        code, code_with_noise = (sensor.read(electrons, seed=6).astype(int) for sensor in (quiet, noisy))
         noise_e.append(code_with_noise - code)
     # Both differences are the same read noise to within one code.
     assert np.abs(noise_e[0] - noise_e[1]).max() <= 1
@@ -363,26 +362,26 @@ def test_same_seed_gives_identical_codes():
     np.testing.assert_array_equal(*runs)
 
 
-@pytest.mark.parametrize("other", [Streams(2, 0), Streams(1, 1)], ids=["seed", "frame"])
+@pytest.mark.parametrize("other", [{"seed": 2}, {"seed": 1, "frame": 1}], ids=["seed", "frame"])
 @pytest.mark.parametrize("mean_e", [20.0, 1e4])
 def test_seeds_and_frames_give_independent_electrons(mean_e, other):
     sensor = Sensor(MANY)
-    a, b = (sensor.collect(np.full(N, mean_e), streams=streams) for streams in (Streams(1, 0), other))
+    a, b = (sensor.collect(np.full(N, mean_e), **draws) for draws in ({"seed": 1}, other))
     assert abs(np.corrcoef(a, b)[0, 1]) < SIGMAS / math.sqrt(N)
 
 
-@pytest.mark.parametrize("other", [Streams(2, 0), Streams(1, 1)], ids=["seed", "frame"])
+@pytest.mark.parametrize("other", [{"seed": 2}, {"seed": 1, "frame": 1}], ids=["seed", "frame"])
 def test_seeds_and_frames_give_independent_noise(other):
     sensor = Sensor(MANY, read_noise_e=50.0, **ONE_E_PER_CODE)
-    a, b = (sensor.read(np.full(N, 30_000), streams=streams) for streams in (Streams(1, 0), other))
+    a, b = (sensor.read(np.full(N, 30_000), **draws) for draws in ({"seed": 1}, other))
     assert abs(np.corrcoef(a, b)[0, 1]) < SIGMAS / math.sqrt(N)
 
 
 @pytest.mark.parametrize("mean_e", [20.0, 1e4])
 def test_shot_noise_and_read_noise_are_independent(mean_e):
     sensor = Sensor(MANY, read_noise_e=50.0, **ONE_E_PER_CODE)
-    electrons = sensor.collect(np.full(N, mean_e), streams=Streams(1))
-    noise_e = sensor.read(np.full(N, 30_000), streams=Streams(1))
+    electrons = sensor.collect(np.full(N, mean_e), seed=1)
+    noise_e = sensor.read(np.full(N, 30_000), seed=1)
     assert abs(np.corrcoef(electrons, noise_e)[0, 1]) < SIGMAS / math.sqrt(N)
 
 
@@ -521,9 +520,9 @@ def test_transition_charges_have_higher_code(v_sat_v, bits, e_per_dn):
     sensor = fs.Sensor(layout, capacitance_f=capacitance_f, v_sat_v=v_sat_v, bits=bits)
     codes = np.arange(2**bits)
 
-    assert np.array_equal(sensor.read(codes * e_per_dn, streams=Streams(0)), codes)
+    assert np.array_equal(sensor.read(codes * e_per_dn, seed=0), codes)
     if e_per_dn > 1:
-        assert np.array_equal(sensor.read(codes * e_per_dn + e_per_dn - 1, streams=Streams(0)), codes)
+        assert np.array_equal(sensor.read(codes * e_per_dn + e_per_dn - 1, seed=0), codes)
 
 
 def test_filters_require_channel_column():

@@ -14,7 +14,6 @@ import scipy.stats
 import shapely
 
 import foveasim as fs
-from foveasim._core.random_streams import Streams
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import grid
 from foveasim.sensor import Sensor, _kernels, noise_budget
@@ -39,7 +38,7 @@ def expected(photo_e=0.0, exposure_s=1.0, **parameters):
 
 def codes(charge_e=30_000, *, seed=0, frame=0, **parameters):
     charge = np.broadcast_to(np.asarray(charge_e, np.int64), N).copy()
-    return sensor(**parameters).read(charge, streams=Streams(seed, frame)).astype(float)
+    return sensor(**parameters).read(charge, seed=seed, frame=frame).astype(float)
 
 
 def assert_spread(values, sigma, extra_variance=0.0):
@@ -297,8 +296,8 @@ def test_small_charges_are_poisson_independent_of_neighbours(mean_e):
     expected_e = np.full(N, mean_e)
     expected_e[::2] = np.random.default_rng(0).uniform(0.0, 1e4, N // 2)
 
-    alone = noisy.collect(np.full(N, mean_e), streams=Streams(4))
-    among = noisy.collect(expected_e, streams=Streams(4))
+    alone = noisy.collect(np.full(N, mean_e), seed=4)
+    among = noisy.collect(expected_e, seed=4)
 
     assert np.array_equal(alone[1::2], among[1::2])
     distribution = scipy.stats.poisson(mean_e)
@@ -316,10 +315,10 @@ def test_draws_are_independent_of_thread_count():
 
     for n_threads in (2, 3, 7):
         for one in (noisy, exact):
-            first = one.collect(expected_e, streams=Streams(1), n_threads=1)
-            assert np.array_equal(first, one.collect(expected_e, streams=Streams(1), n_threads=n_threads))
-        code = noisy.read(first, streams=Streams(1), n_threads=1)
-        assert np.array_equal(code, noisy.read(first, streams=Streams(1), n_threads=n_threads))
+            first = one.collect(expected_e, seed=1, n_threads=1)
+            assert np.array_equal(first, one.collect(expected_e, seed=1, n_threads=n_threads))
+        code = noisy.read(first, seed=1, n_threads=1)
+        assert np.array_equal(code, noisy.read(first, seed=1, n_threads=n_threads))
 
 
 @pytest.mark.slow(keep=4)
@@ -330,12 +329,11 @@ def test_draws_are_independent_of_thread_count():
 def test_exposure_in_one_pass_equals_its_steps(extra, n_threads):
     noisy = sensor(**{**ALL, "crosstalk": None, "full_well_e": 450.0, "pedestal_v": 0.1, **extra})
     rate_e_per_s = np.random.default_rng(0).uniform(0.0, 900.0, N)
-    streams = Streams(1, 2)
     expected_e = noisy.expected_electrons(rate_e_per_s, 0.5, n_threads=1)
-    electrons = noisy.collect(expected_e, streams=streams, n_threads=1)
-    code = noisy.read(electrons, streams=streams, n_threads=1)
+    electrons = noisy.collect(expected_e, seed=1, frame=2, n_threads=1)
+    code = noisy.read(electrons, seed=1, frame=2, n_threads=1)
 
-    found = noisy.expose(rate_e_per_s, 0.5, streams=streams, n_threads=n_threads)
+    found = noisy.expose(rate_e_per_s, 0.5, seed=1, frame=2, n_threads=n_threads)
 
     for values, wanted in zip(found, (expected_e, electrons, code), strict=True):
         assert values.dtype == wanted.dtype
@@ -346,24 +344,24 @@ def test_negative_rates_are_rejected_in_one_pass():
     rate_e_per_s = np.ones(N)
     rate_e_per_s[-1] = -7.0
     with pytest.raises(ParameterError, match=r"'expected_e' must be >= 0 everywhere, got -7\.0 e-"):
-        sensor().expose(rate_e_per_s, 1.0, streams=Streams(0))
+        sensor().expose(rate_e_per_s, 1.0, seed=0)
 
 
 def test_draws_depend_on_site_index_only():
     """The first sites of a larger layout have the same draws, also within a block."""
     options = {**FINE, "shot_noise": "auto", "read_noise_e": 4.0, "ktc_noise": True, "pedestal_v": 0.3}
     rate_e_per_s = np.random.default_rng(1).uniform(0.0, 300.0, N)
-    large = Sensor(MANY, **options).expose(rate_e_per_s, 1.0, streams=Streams(5))
+    large = Sensor(MANY, **options).expose(rate_e_per_s, 1.0, seed=5)
 
     for n in (1, 3, 1025, 40_001):
-        small = Sensor(MANY[:n], **options).expose(rate_e_per_s[:n], 1.0, streams=Streams(5))
+        small = Sensor(MANY[:n], **options).expose(rate_e_per_s[:n], 1.0, seed=5)
         assert all(np.array_equal(few, many[:n]) for few, many in zip(small, large, strict=True))
 
 
 @pytest.mark.parametrize("mean_e", [1e-3, 0.97, 1.0, 7.3, 29.999, 64.5, 99.9, 400.25, 699.5])
 def test_exact_draws_have_poisson_probabilities(mean_e):
     n = 2_000_000
-    electrons = fs.sensor.draw_shot_noise(np.full(n, mean_e), "auto", 700.0, Streams(21))
+    electrons = fs.sensor.draw_shot_noise(np.full(n, mean_e), "auto", 700.0, seed=21)
 
     distribution = scipy.stats.poisson(mean_e)
     edges = np.arange(distribution.ppf(20.0 / n), distribution.isf(20.0 / n))
@@ -375,7 +373,7 @@ def test_exact_draws_have_poisson_probabilities(mean_e):
 def test_exact_draws_follow_mean_of_each_site():
     """Scaled residuals of means between 0 and 700 have the Poisson variance and skewness."""
     mean_e = np.random.default_rng(2).uniform(0.5, 700.0, 2_000_000)
-    z = (fs.sensor.draw_shot_noise(mean_e, "auto", 700.0, Streams(22)) - mean_e) / np.sqrt(mean_e)
+    z = (fs.sensor.draw_shot_noise(mean_e, "auto", 700.0, seed=22) - mean_e) / np.sqrt(mean_e)
 
     for values, wanted in ((z, 0.0), (z**2, 1.0), (z**3, np.mean(mean_e**-0.5))):
         assert abs(values.mean() - wanted) < SIGMAS * values.std() / math.sqrt(z.size)
@@ -395,7 +393,7 @@ def test_draws_above_limit_approximate_poisson(mean_e, distance):
     charges = edges[1:] - 0.5
     n = 4_000_000
 
-    electrons = fs.sensor.draw_shot_noise(np.full(n, np.nextafter(mean_e, np.inf)), "auto", mean_e, Streams(23))
+    electrons = fs.sensor.draw_shot_noise(np.full(n, np.nextafter(mean_e, np.inf)), "auto", mean_e, seed=23)
 
     is_frequent = probability * n > 20
     counts = np.histogram(electrons, edges)[0][is_frequent]
@@ -411,14 +409,14 @@ def test_draws_above_limit_approximate_poisson(mean_e, distance):
 @pytest.mark.parametrize("gaussian_above_e", [5.0, 1e9, math.nan])
 def test_implausible_poisson_limit_is_rejected(gaussian_above_e):
     with pytest.raises(ParameterError, match="'gaussian_above_e' must be "):
-        fs.sensor.draw_shot_noise(np.ones(3), "auto", gaussian_above_e, Streams(0))
+        fs.sensor.draw_shot_noise(np.ones(3), "auto", gaussian_above_e, seed=0)
 
 
 @pytest.mark.parametrize("how", ["auto", "exact", "off"])
 def test_invalid_expectations_are_rejected(how):
     for value in (-1.0, math.nan):
         with pytest.raises(ParameterError, match="'expected_e' must be >= 0 everywhere, got"):
-            fs.sensor.draw_shot_noise([3.0, value], how, 100.0, Streams(0))
+            fs.sensor.draw_shot_noise([3.0, value], how, 100.0, seed=0)
 
 
 def reset_noise_e(some):
@@ -466,10 +464,10 @@ def test_rts_sites_alternate_between_two_states():
 
 def test_read_noise_acts_after_full_well():
     full = sensor(full_well_e=7000.0, read_noise_e=50.0, ktc_noise=False)
-    charge = full.collect(np.full(N, 9000.0), streams=Streams(0))
+    charge = full.collect(np.full(N, 9000.0), seed=0)
 
     assert np.unique(charge).tolist() == [7000]
-    assert_spread(full.read(charge, streams=Streams(0)).astype(float), 50.0, 1 / 12)
+    assert_spread(full.read(charge, seed=0).astype(float), 50.0, 1 / 12)
 
 
 # -- conversion to volts --------------------------------------------------------------------------------------------------
@@ -650,11 +648,10 @@ PATTERN_OF_KEYWORD = {
 @pytest.mark.parametrize("effect", SWITCHES)
 def test_disabled_effect_leaves_other_draws_unchanged(effect):
     on, off = sensor(**ALL), sensor(**{**ALL, effect: SWITCHES[effect]})
-    streams = Streams(3, 2)
     photo_e = np.linspace(0.0, 50_000.0, N)
 
-    charges = [s.collect(s.expected_electrons(photo_e, 1.0), streams=streams) for s in (on, off)]
-    read = [s.read(charge, streams=streams) for s, charge in zip((on, off), charges, strict=True)]
+    charges = [s.collect(s.expected_electrons(photo_e, 1.0), seed=3, frame=2) for s in (on, off)]
+    read = [s.read(charge, seed=3, frame=2) for s, charge in zip((on, off), charges, strict=True)]
 
     assert not np.array_equal(*read)
     for pattern, of in PATTERNS.items():
@@ -662,7 +659,7 @@ def test_disabled_effect_leaves_other_draws_unchanged(effect):
             assert np.array_equal(of(on), of(off))
     if effect in BEFORE_COLLECTION or effect in {"shot_noise", "full_well_e"}:
         # Equal charges give equal codes.
-        assert np.array_equal(on.read(charges[0], streams=streams), off.read(charges[0], streams=streams))
+        assert np.array_equal(on.read(charges[0], seed=3, frame=2), off.read(charges[0], seed=3, frame=2))
     else:
         assert np.array_equal(*charges)
 
@@ -670,7 +667,7 @@ def test_disabled_effect_leaves_other_draws_unchanged(effect):
 def test_rts_changes_only_rts_sites():
     on, off = sensor(**ALL), sensor(**{**ALL, "rts_fraction": 0.0})
     charge = np.full(N, 20_000, np.int64)
-    moved = on.read(charge, streams=Streams(0)) != off.read(charge, streams=Streams(0))
+    moved = on.read(charge, seed=0) != off.read(charge, seed=0)
 
     assert set(np.flatnonzero(moved)) <= set(np.flatnonzero(on.pattern("rts")))
 
@@ -685,7 +682,7 @@ def test_cropped_sensor_gives_identical_codes(effect):
 
     complete = sensor(**quiet)
     codes = [
-        s.read(s.collect(s.expected_electrons(photo_e_per_s, 1.0), streams=Streams(0)), streams=Streams(0))
+        s.read(s.collect(s.expected_electrons(photo_e_per_s, 1.0), seed=0), seed=0)
         for s, photo_e_per_s in ((complete, photo_e), (crop, photo_e[ids]))
     ]
 
@@ -701,14 +698,12 @@ def test_codes_are_independent_of_process_and_order():
 import hashlib, sys
 import numpy as np
 import foveasim as fs
-from foveasim._core.random_streams import Streams
 layout = fs.layout.grid(n_x=400, n_y=300, pitch_um=2.0)
 sensor = fs.Sensor(layout, prnu_fraction=0.02, read_noise_e=3.0, ktc_noise=True, dnl_dn=0.5, rts_fraction=0.1, rts_e=9.0, bits=12)
 photo_e = np.linspace(0.0, 500.0, layout.n_sites)
 for frame in map(int, sys.argv[2:]):
-    streams = Streams(9, frame)
-    charge = sensor.collect(sensor.expected_electrons(photo_e, 1.0), streams=streams, n_threads=int(sys.argv[1]))
-    code = sensor.read(charge, streams=streams, n_threads=int(sys.argv[1]))
+    charge = sensor.collect(sensor.expected_electrons(photo_e, 1.0), seed=9, frame=frame, n_threads=int(sys.argv[1]))
+    code = sensor.read(charge, seed=9, frame=frame, n_threads=int(sys.argv[1]))
     print(frame, hashlib.sha256(code.tobytes()).hexdigest())
 """
     runs = [
@@ -827,8 +822,8 @@ def test_line_effects_require_readout_line_column(parameters):
 def test_invalid_charges_are_rejected(charge_e, message):
     one = sensor(read_noise_e=1.0)
 
-    for step in (lambda: one.collect(charge_e, streams=Streams(0)), lambda: one.predict(charge_e)):
+    for step in (lambda: one.collect(charge_e, seed=0), lambda: one.predict(charge_e)):
         with pytest.raises(ParameterError, match=message):
             step()
     with pytest.raises(ParameterError, match="'electrons' must have one value for each of the"):
-        one.read(np.ones(3, np.int64), streams=Streams(0))
+        one.read(np.ones(3, np.int64), seed=0)

@@ -10,7 +10,6 @@ import pytest
 import shapely
 
 import foveasim as fs
-from foveasim._core.random_streams import Streams
 from foveasim.errors import ParameterError
 from foveasim.sensor import Sensor, noise_budget, signal_to_noise
 from foveasim.sensor.effects import AdditiveNoise, Effect, FixedFactor, FixedOffset, InterPixelCapacitance
@@ -217,9 +216,9 @@ def test_effect_without_layout_is_computed_for_part():
 def test_part_draws_differ_only_by_stream():
     """Draws of a part follow its own blocks of sites; without noise, codes are those of the sensor."""
     sensor = make_sensor(shot_noise="off").without("read", "rts", "ripple", "hum")
-    complete = sensor.expose(PHOTO_E_PER_S, 0.5, streams=Streams(0))
+    complete = sensor.expose(PHOTO_E_PER_S, 0.5, seed=0)
 
-    found = sensor.part(SELECTIONS[2]).expose(PHOTO_E_PER_S[SELECTIONS[2]], 0.5, streams=Streams(0))
+    found = sensor.part(SELECTIONS[2]).expose(PHOTO_E_PER_S[SELECTIONS[2]], 0.5, seed=0)
 
     for values, of_all in zip(found, complete, strict=True):
         assert np.array_equal(values, of_all[SELECTIONS[2]])

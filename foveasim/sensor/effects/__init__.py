@@ -2,8 +2,9 @@
 Effects: noise sources, fixed patterns and crosstalk, one frozen class each.
 
 ``STANDARD`` lists the classes that the keywords of :class:`foveasim.Sensor` create, in the order of the chain. Further effects
-derive from :class:`Effect`, or from :class:`AdditiveNoise`, :class:`FixedFactor` or :class:`FixedOffset`. They are passed to a
-sensor as ``effects=[...]``, or specified in settings files by their names in :data:`EFFECTS`.
+derive from :class:`Effect`, or from :class:`AdditiveNoise`, :class:`GroupedNoise`, :class:`FixedFactor`, :class:`FixedOffset`,
+:class:`Mixing` or :class:`Collection`. They are passed to a sensor as ``effects=[...]``, or specified in settings files by
+their names in :data:`EFFECTS`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Any
 
 from foveasim._core.calls import publish
 from foveasim._core.registry import import_all
+from foveasim.sensor.effects.collection import Collection
 from foveasim.sensor.effects.contract import (
     EFFECTS,
     STAGES,
@@ -19,12 +21,20 @@ from foveasim.sensor.effects.contract import (
     Effect,
     FixedFactor,
     FixedOffset,
+    GroupedNoise,
     Photosites,
+    Reach,
     Sites,
     Stage,
     StepModel,
 )
-from foveasim.sensor.effects.crosstalk import CrosstalkOperator, Diffusion, InterPixelCapacitance, KernelCrosstalk
+from foveasim.sensor.effects.crosstalk import (
+    CrosstalkOperator,
+    Diffusion,
+    InterPixelCapacitance,
+    KernelCrosstalk,
+    Mixing,
+)
 from foveasim.sensor.effects.dark import DarkLaw, DarkSignal, HotSites, dark_current_factor
 from foveasim.sensor.effects.fixed_pattern import ColumnOffset, DeadSites, PhotoResponse, PixelGain, PixelOffset
 from foveasim.sensor.effects.readout import ReadNoise, ResetNoise, TelegraphNoise
@@ -35,6 +45,7 @@ __all__ = [
     "STAGES",
     "STANDARD",
     "AdditiveNoise",
+    "Collection",
     "ColumnOffset",
     "CrosstalkOperator",
     "DarkLaw",
@@ -44,13 +55,16 @@ __all__ = [
     "Effect",
     "FixedFactor",
     "FixedOffset",
+    "GroupedNoise",
     "HotSites",
     "InterPixelCapacitance",
     "KernelCrosstalk",
+    "Mixing",
     "PhotoResponse",
     "Photosites",
     "PixelGain",
     "PixelOffset",
+    "Reach",
     "ReadNoise",
     "ResetNoise",
     "ShotNoise",

@@ -34,7 +34,9 @@ __all__ = [
     "Effect",
     "FixedFactor",
     "FixedOffset",
+    "GroupedNoise",
     "Photosites",
+    "Reach",
     "Sites",
     "Stage",
     "StepModel",
@@ -45,6 +47,9 @@ T = TypeVar("T")
 NOTHING = read_only(np.zeros(1))
 #: Cached values of a sensor: several times those of all standard effects.
 MAX_CACHED = 64
+#: Sites on which the result of an effect at a site depends.
+Reach = Literal["site", "group", "all"]
+REACHES: tuple[Reach, ...] = ("site", "group", "all")
 #: Stage of the chain at which an effect acts.
 Stage = Literal["photo", "dark", "expected", "collection", "charge", "sense_node", "output"]
 #: Unit of the values at each stage, in the order of the chain.
@@ -167,6 +172,11 @@ def _compose(selection: slice | Ints, index: slice | Ints, n: int) -> slice | In
     return slice(chosen.start, chosen.stop)
 
 
+def select_indices(sites: Sites, chosen: Ints) -> slice | Ints:
+    """Return the indices in the layout of some of the sites."""
+    return _compose(sites.index, chosen, sites.layout.n_sites)
+
+
 @dataclass(frozen=True, eq=False)
 class Sites:
     """
@@ -281,7 +291,8 @@ class Sites:
             raise ParameterError("key", "must be the effect, or a tuple of the effect and hashable values", key)
         # A known device is part of the key: functions of all sites may use its numbers.
         owner = (self.known_device, *parts)
-        found: T = self._cache.get(_cache_key(owner), lambda: compute(replace(self, index=slice(None))), owner=owner)
+        every = replace(self, index=slice(None), exposure_s=None)
+        found: T = self._cache.get(_cache_key(owner), lambda: compute(every), owner=owner)
         return found
 
     def pattern(self, key: Any, compute: Callable[[Sites], ArrayLike]) -> Floats:
@@ -350,10 +361,11 @@ class Effect(ABC):
         Stage of the chain, which determines the unit of the values: :data:`STAGES`.
     is_temporal : bool
         Whether the effect is drawn again for each frame; otherwise it is fixed for a device, or deterministic. Effects before
-        collection must be fixed.
-    is_local : bool
-        Whether each site's result and draw are independent of other sites. Otherwise, as for crosstalk or for draws that are
-        common to a row of sites, :meth:`apply` is called with all sites at once.
+        collection must be fixed, and affine in the values: light twice as strong adds twice the charge.
+    reach : {"site", "group", "all"}
+        ``"site"``: each site's result and draw are independent of other sites. ``"group"``: draws are common to groups of
+        sites, such as rows; means are per site. ``"all"``: values of sites are mixed, as by crosstalk, and :meth:`apply` is
+        called with all sites at once; such effects derive from :class:`Mixing`.
     is_drawn_at_reset : bool
         Whether all reads between two resets share one draw.
     is_defect : bool
@@ -366,15 +378,10 @@ class Effect(ABC):
     name: ClassVar[str]
     stage: ClassVar[Stage]
     is_temporal: ClassVar[bool]
-    is_local: ClassVar[bool] = True
+    reach: ClassVar[Reach] = "site"
     is_drawn_at_reset: ClassVar[bool] = False
     is_defect: ClassVar[bool] = False
     needs_layout: ClassVar[bool] = True
-
-    @property
-    def mixes_means(self) -> bool:
-        """Whether means depend on other sites, as for crosstalk: neither local nor temporal."""
-        return not (self.is_local or self.is_temporal)
 
     @abstractmethod
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
@@ -389,6 +396,9 @@ class Effect(ABC):
             The ``n`` sites of the values.
         rng : numpy.random.Generator
             Random stream of this effect, frame and block of sites. It is None for fixed effects, which use ``sites.device``.
+            For effects of reach "group", every block and every part of a sensor has the same stream, at its start: the draw
+            of a group must depend on its label only, as ``rng.standard_normal(n_groups)[label]`` with the number of all
+            groups.
         """
 
     @abstractmethod
@@ -420,6 +430,8 @@ class Effect(ABC):
         after, added = self.validate_moments(mean, NOTHING, sites)
         step = SLOPE_STEP * np.maximum(np.abs(mean), SMALLEST_MEAN[STAGES[self.stage]])
         ahead, behind = mean + step, mean - step
+        if self.stage == "collection":
+            behind = np.maximum(behind, 0.0)  # expected charges are not negative
         means = (self.validate_moments(at, NOTHING, sites)[0] for at in (ahead, behind))
         slope = np.subtract(*means) / (ahead - behind)
         return StepModel(after, slope, np.sqrt(np.maximum(added, 0.0)) if np.any(added) else None)
@@ -429,16 +441,18 @@ class Effect(ABC):
         sites = sites.of(self)
         definer = next(each for each in type(self).__mro__ if not {"linearise", "moments"}.isdisjoint(vars(each)))
         linearise = self.linearise if "linearise" in vars(definer) else partial(Effect.linearise, self)
-        found = linearise(mean, sites=sites)
+        found: Any = linearise(mean, sites=sites)
         shape = np.broadcast_shapes(np.shape(mean), (sites.n_sites,))
         try:
             model = StepModel(*found)
         except TypeError:
             raise SimulationError(f"the effect '{self.name}' must return a StepModel; check its linearise()") from None
-        names = [name for name, part in zip(StepModel._fields, model, strict=True) if isinstance(part, np.ndarray)]
+        names = [name for name in StepModel._fields[:3] if isinstance(getattr(model, name), np.ndarray)]
         what = "a mean, a slope and a deviation"
         parts: list[Any] = [getattr(model, name) for name in names]
         checked: list[Any] = self._validate_shapes(parts, len(names), shape, what, "linearise")
+        if model.groups is not None:
+            names, checked = [*names, "groups"], [*checked, _labels(self, model.groups, sites.n_sites)]
         return model._replace(**dict(zip(names, checked, strict=True)))
 
     def validate_moments(self, mean: Floats, variance: Floats, sites: Sites) -> tuple[Floats, Floats]:
@@ -564,6 +578,76 @@ class AdditiveNoise(Effect):
     def linearise(self, mean: Floats, *, sites: Sites) -> StepModel:
         """Return the mean and the standard deviation."""
         return StepModel(mean, None, sites.pattern(self, self.deviation))
+
+
+class GroupedNoise(Effect):
+    """
+    Additive Gaussian temporal noise of mean 0 that is common to groups of sites, such as rows.
+
+    Subclasses define :meth:`deviation`, and :meth:`groups` for groups other than readout lines. The draw of a group depends on
+    the name of the effect, the seed, the frame and the label of the group only, so that it is the same in all tiles.
+    """
+
+    is_temporal: ClassVar[bool] = True
+    reach: ClassVar[Reach] = "group"
+
+    @abstractmethod
+    def deviation(self, sites: Sites) -> ArrayLike:
+        """Return the standard deviation, (n,) or one number, in the unit of the stage."""
+
+    def groups(self, sites: Sites) -> ArrayLike:
+        """Return the label of each site's group, (n,) int, by default its readout line."""
+        if "readout_line" not in sites.layout.columns:
+            raise SimulationError(
+                f"the effect '{self.name}' requires a readout line for each site, but the layout has no column "
+                "'readout_line'; add it, for example with foveasim.layout.readout_by, or define groups()"
+            )
+        return sites.select(sites.layout.readout_line)
+
+    def _groups(self, sites: Sites) -> Ints:
+        """Return the labels of the sites, computed once for all sites of the layout."""
+        of_all = sites.without_device().cached(
+            (self, "groups"), lambda every: read_only(_labels(self, self.groups(every), every.n_sites).copy())
+        )
+        return np.asarray(of_all[sites.index])
+
+    def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
+        """Return the values plus the Gaussian draw of each group."""
+        from scipy.special import ndtri
+
+        from foveasim.sensor import _kernels
+
+        labels, key = self._groups(sites), rng.bit_generator.random_raw(2).astype(np.uint64)
+        drawn, index = labels, None
+        if labels.size and (last := int(labels.max())) - (first := int(labels.min())) < labels.size:
+            drawn, index = np.arange(first, last + 1), labels - first
+        words = np.ascontiguousarray(drawn, np.int64).view(np.uint64)
+        normals = ndtri(_kernels.device_uniforms(key[0], key[1], words, np.uint64(0)))
+        values += sites.pattern(self, self.deviation) * (normals if index is None else normals[index])
+        return values
+
+    def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
+        """Return the mean and the sum of the variances."""
+        return mean, variance + sites.pattern(self, self.deviation) ** 2
+
+    def linearise(self, mean: Floats, *, sites: Sites) -> StepModel:
+        """Return the mean, the standard deviation and the groups."""
+        return StepModel(mean, None, sites.pattern(self, self.deviation), self._groups(sites))
+
+
+def _labels(effect: Effect, labels: ArrayLike, n_sites: int) -> Ints:
+    """Return labels of groups, (n,) int64, after validation."""
+    array = np.asarray(labels)
+    if (
+        array.shape != (n_sites,)
+        or array.dtype.kind not in "biu"
+        or (array.dtype == np.uint64 and int(array.max(initial=0)) > np.iinfo(np.int64).max)
+    ):
+        raise SimulationError(
+            f"the effect '{effect.name}' must have one label per site, int64 of shape ({n_sites},), got {array.dtype} of shape "
+            f"{array.shape}; check its groups()"
+        )
+    return array.astype(np.int64, copy=False)
 
 
 #: Additional effects by their names in settings files. Classes are registered with ``@EFFECTS.register("name")``, or by entry

@@ -22,18 +22,20 @@ from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, Ints, as_numbers, check_per_site, check_pitch_um, finite_array
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.sensor.blocks import for_each_block
-from foveasim.sensor.effects.contract import Effect, Photosites, Sites, Stage, StepModel
+from foveasim.sensor.effects.contract import Effect, Photosites, Reach, Sites, Stage, StepModel
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-__all__ = ["CrosstalkOperator", "Diffusion", "InterPixelCapacitance", "KernelCrosstalk"]
+__all__ = ["CrosstalkOperator", "Diffusion", "InterPixelCapacitance", "KernelCrosstalk", "Mixing"]
 
 #: Maximum fraction of charge that a site loses in one step; larger fractions would make the exchange oscillate.
 MAX_STEP_FRACTION = 0.5
 NEIGHBOUR_FRACTION = Limits(at_least=0.0, at_most=MAX_STEP_FRACTION)
 #: Maximum number of steps; more would take seconds per frame for a million sites.
 MAX_STEPS = 1000
+#: Maximum number of elements of a block of rows of a matrix power.
+MAX_ELEMENTS = 1 << 22
 #: Up to this ratio of spread to distance, charge crosses at most one boundary (to float64); above it, a Fourier series is used.
 MAX_SINGLE_CROSSING_SPREAD = 0.125
 #: Number of terms of that series: the next one is below 1e-16.
@@ -128,63 +130,118 @@ class CrosstalkOperator:
         Returns
         -------
         variance : (..., n_site) float64
-            ``sum_i matrix[j, i]**2 * variance[i]``, in the same unit.
-
-        Raises
-        ------
-        SimulationError
-            If the operator has several steps, as for diffusion, which mixes expectations rather than variances.
+            ``sum_i (matrix**n_steps)[j, i]**2 * variance[i]``, in the same unit. Several steps are multiplied for a part of the
+            sites at a time.
         """
-        if self.n_steps != 1:
-            raise SimulationError(
-                f"variances are defined for operators of one step, and this operator has {self.n_steps}; diffusion acts "
-                "before the draw"
-            )
         values = check_per_site("variance", as_numbers("variance", variance), self.matrix.shape[0], or_rows=True)
-        columns = np.moveaxis(values, -1, 0)
-        mixed = self._squared_matrix @ columns.reshape(columns.shape[0], -1)
+        columns = np.moveaxis(np.asarray(values, np.float64), -1, 0)
+        before = columns.reshape(columns.shape[0], math.prod(columns.shape[1:]))
+        if self.n_steps == 1:
+            mixed = self._squared_matrix @ before
+        else:
+            n_sites = self.matrix.shape[0]
+            mixed = np.empty(before.shape)
+            for first in range(0, n_sites, self._rows_at_a_time):
+                sites = slice(first, min(first + self._rows_at_a_time, n_sites))
+                mixed[sites] = self.rows(np.arange(n_sites)[sites]).power(2) @ before
         return np.ascontiguousarray(np.moveaxis(mixed.reshape(columns.shape), 0, -1))
 
     @cached_property
     def _squared_matrix(self) -> csr_array[Any]:
         return self.matrix.power(2)
 
+    @property
+    def _rows_at_a_time(self) -> int:
+        """Number of rows of the power whose elements are limited, for neighbours in two dimensions."""
+        n_sites = max(self.matrix.shape[0], 1)
+        per_row = min(self.matrix.nnz / n_sites * self.n_steps**2, n_sites)
+        return max(1, int(MAX_ELEMENTS / max(per_row, 1.0)))
 
-class _Crosstalk(Declared, Effect):
-    """Crosstalk in the chain, compiled for the sites at first use."""
+    def transpose(self) -> CrosstalkOperator:
+        """Return the operator with the transposed matrix."""
+        return self._transposed
+
+    @cached_property
+    def _transposed(self) -> CrosstalkOperator:
+        from scipy.sparse import csr_array
+
+        return CrosstalkOperator(csr_array(self.matrix.T), self.n_steps)
+
+    def rows(self, sites: Any) -> csr_array[Any]:
+        """
+        Return rows of the matrix of all steps, ``matrix**n_steps``.
+
+        Parameters
+        ----------
+        sites : (n,) int, or sparse matrix (n, n_site)
+            Indices of the rows; or a matrix that is multiplied by ``matrix**n_steps``.
+
+        Returns
+        -------
+        rows : csr_array (n, n_site) float64
+        """
+        from scipy.sparse import csr_array, issparse
+
+        if issparse(sites):
+            rows: Any = csr_array(sites)  # type: ignore[call-overload]
+        else:
+            index = np.atleast_1d(np.arange(self.matrix.shape[0])[sites])
+            of_row = np.arange(index.size + 1)
+            rows = csr_array((np.ones(index.size), index, of_row), shape=(index.size, self.matrix.shape[0]))
+        for _ in range(self.n_steps):
+            rows = csr_array(rows @ self.matrix)
+        return rows
+
+
+class Mixing(Effect):
+    """
+    Deterministic linear mixing of the values of sites, such as crosstalk.
+
+    Subclasses define :meth:`operator`. The stage is at most "charge".
+    """
 
     is_temporal: ClassVar[bool] = False
-    is_local: ClassVar[bool] = False
+    reach: ClassVar[Reach] = "all"
+
+    @abstractmethod
+    def operator(self, sites: Sites) -> CrosstalkOperator:
+        """Compile the operator for all sites of ``sites.layout``, called once for all devices."""
+
+    def _compiled(self, sites: Sites) -> CrosstalkOperator:
+        """Return the operator, which all devices share."""
+        return sites.without_device().cached(self, self.operator)
+
+    def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
+        """Return the values after mixing, (n_site,)."""
+        return self._compiled(sites).apply(values, n_threads=sites.n_threads)
+
+    def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
+        """Compute the moments of independent values after mixing, (..., n_site)."""
+        operator = self._compiled(sites)
+        variance = _per_site(variance, sites)
+        return operator.apply(_per_site(mean, sites)), operator.variance(variance) if np.any(variance) else np.zeros(1)
+
+    def linearise(self, mean: Floats, *, sites: Sites) -> StepModel:
+        """Return the mean after mixing, and the operator."""
+        operator = self._compiled(sites)
+        return StepModel(operator.apply(_per_site(mean, sites)), operator)
+
+
+def _per_site(values: Floats, sites: Sites) -> Floats:
+    """Broadcast values (..., n) or (1,) to all sites."""
+    return np.broadcast_to(values, np.broadcast_shapes(np.shape(values), (sites.n_sites,)))
+
+
+class _Crosstalk(Declared, Mixing):
+    """Crosstalk that is compiled for a layout."""
 
     @abstractmethod
     def compile(self, layout: OwnCheck[Photosites]) -> CrosstalkOperator:
         """Compile the crosstalk for a layout."""
 
-    def compile_for(self, sites: Sites) -> CrosstalkOperator:
-        """Return the operator for all sites of the layout."""
+    def operator(self, sites: Sites) -> CrosstalkOperator:
+        """Compile the operator for all sites of the layout."""
         return self.compile(sites.layout)
-
-    def _operator(self, sites: Sites) -> CrosstalkOperator:
-        """Return the operator, which all devices share."""
-        return sites.without_device().cached(self, self.compile_for)
-
-    def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
-        """Return the charges after crosstalk, (n_site,)."""
-        return self._operator(sites).apply(values, n_threads=sites.n_threads)
-
-    def linearise(self, mean: Floats, *, sites: Sites) -> StepModel:
-        """Return the mean and the operator."""
-        operator = self._operator(sites)
-        mean = np.broadcast_to(mean, np.broadcast_shapes(np.shape(mean), (sites.n_sites,)))
-        return StepModel(operator.apply(mean), operator)
-
-    def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
-        """Compute the moments of independent charges after crosstalk, (..., n_site)."""
-        operator = self._operator(sites)
-        mean, variance = (
-            np.broadcast_to(part, np.broadcast_shapes(np.shape(part), (sites.n_sites,))) for part in (mean, variance)
-        )
-        return operator.apply(mean), operator.variance(variance) if np.any(variance) else np.zeros(1)
 
 
 # -- before the draw --------------------------------------------------------------------------------------------------
@@ -455,8 +512,8 @@ class InterPixelCapacitance(_Crosstalk):
     edge_um: Annotated[float | None, LENGTH] = None
     max_gap_um: Annotated[float | None, NOT_NEGATIVE] = None
 
-    def compile_for(self, sites: Sites) -> CrosstalkOperator:
-        """Return the operator for all sites of the layout and their sense-node capacitances."""
+    def operator(self, sites: Sites) -> CrosstalkOperator:
+        """Compile the operator for all sites of the layout and their sense-node capacitances."""
         return self.compile(sites.layout, capacitance_f=sites.capacitance_f if sites.capacitance_f.size > 1 else None)
 
     def compile(

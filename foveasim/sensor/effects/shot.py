@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -16,9 +16,10 @@ from foveasim._core.random_streams import Streams, random_key
 from foveasim._core.validation import Floats, Ints, read_only, unmasked
 from foveasim.errors import ParameterError
 from foveasim.sensor.blocks import for_each_block
-from foveasim.sensor.effects.contract import NOTHING, Effect, Sites, Stage, StepModel
+from foveasim.sensor.effects.collection import MAX_CHARGE_E, ROUNDING_E2, Collection
+from foveasim.sensor.effects.contract import Sites, StepModel
 
-__all__ = ["MAX_CHARGE_E", "PoissonTables", "ShotChoice", "ShotNoise", "draw_shot_noise"]
+__all__ = ["MAX_CHARGE_E", "ROUNDING_E2", "PoissonTables", "ShotChoice", "ShotNoise", "draw_shot_noise"]
 
 ShotChoice = Literal["auto", "exact", "off"]
 
@@ -27,10 +28,6 @@ MAX_INVERSION_MEAN_E = 700.0
 GAUSSIAN_ABOVE = Limits(at_least=10.0, at_most=MAX_INVERSION_MEAN_E)
 #: Limit of numpy's Poisson generator. Larger expectations are rounded: their relative shot noise is below 1e-9.
 MAX_EXACT_E = 1e18
-#: Upper limit of charges: 2**62 fits int64 with headroom for sums.
-MAX_CHARGE_E = 2.0**62
-#: Variance of rounding to integers.
-ROUNDING_E2 = 1.0 / 12.0
 #: Number of intervals of the guide table; a power of 2, so that intervals are exact.
 N_GUIDE = 512
 #: Cumulative Poisson probabilities reach 1 in float64 this many standard deviations plus this many electrons above the mean.
@@ -66,7 +63,7 @@ def poisson_tables(max_mean: int) -> PoissonTables:
 
 
 @dataclass(frozen=True)
-class ShotNoise(Declared, Effect):
+class ShotNoise(Declared, Collection):
     """
     Shot-noise draw from expected to collected charge, in whole electrons.
 
@@ -96,8 +93,7 @@ class ShotNoise(Declared, Effect):
 
     example: ClassVar[Mapping[str, Any]] = {"shot_noise": "auto"}
     name: ClassVar[str] = "shot"
-    stage: ClassVar[Stage] = "collection"
-    is_temporal: ClassVar[bool] = True
+    has_independent_increments: ClassVar[bool] = True
     needs_layout: ClassVar[bool] = False
 
     how: ShotChoice = "auto"
@@ -107,6 +103,10 @@ class ShotNoise(Declared, Effect):
     def is_drawn(self) -> bool:
         """Whether charges are drawn, rather than only rounded."""
         return self.how != "off"
+
+    def without_draw(self) -> ShotNoise:
+        """Return the rounded expectation."""
+        return replace(self, how="off")
 
     def apply(self, values: Floats, *, sites: Sites | None, rng: np.random.Generator) -> Floats:
         """Return the drawn charges, (n,) e-, in whole electrons."""
@@ -126,12 +126,26 @@ class ShotNoise(Declared, Effect):
         return mean, variance + (np.maximum(mean, 0.0) if self.is_drawn else ROUNDING_E2)
 
     def linearise(self, mean: Floats, *, sites: Sites | None = None) -> StepModel:
-        """Return the mean, and the standard deviation of shot noise, or of rounding if not drawn."""
-        return StepModel(mean, None, np.sqrt(self.moments(mean, NOTHING)[1]))
+        """Return the mean and its standard deviation."""
+        return StepModel(mean, None, np.sqrt(self.moments(mean, np.zeros(1))[1]))
+
+    def cumulative(self, count: Floats, mean: Floats, *, sites: Sites | None = None) -> Floats:
+        """Return the Poisson distribution, which ``"auto"`` approximates, or that of the rounded expectation."""
+        from scipy.special import pdtr
+
+        if not self.is_drawn:
+            return (count >= np.rint(mean)).astype(np.float64)
+        return np.asarray(np.where(mean > 0.0, pdtr(count, np.maximum(mean, 1e-300)), 1.0))
 
 
 def draw_shot_noise(
-    expected_e: Floats, how: ShotChoice, gaussian_above_e: float, streams: Streams, *, n_threads: int | None = None
+    expected_e: Floats,
+    how: ShotChoice,
+    gaussian_above_e: float,
+    *,
+    seed: int,
+    frame: int = 0,
+    n_threads: int | None = None,
 ) -> Ints:
     """
     Draw collected charges from expected ones.
@@ -141,8 +155,8 @@ def draw_shot_noise(
     expected_e : (n_site,) float64, e-
     how, gaussian_above_e
         See :class:`foveasim.sensor.effects.ShotNoise`.
-    streams : Streams
-        Random streams of the frame; the stream ``shot`` is used.
+    seed, frame : int
+        Seed and frame number of the draws, as for :meth:`foveasim.Sensor.collect`.
     n_threads : int, optional
         Number of threads; all cores by default. Draws do not depend on it.
 
@@ -154,7 +168,7 @@ def draw_shot_noise(
     expected_e = np.ascontiguousarray(unmasked("expected_e", expected_e), np.float64)
     if expected_e.size and not (smallest := float(np.min(expected_e))) >= 0.0:
         raise ParameterError("expected_e", "must be >= 0 everywhere", smallest, "e-")
-    shot = ShotNoise(how, gaussian_above_e)
+    shot, streams = ShotNoise(how, gaussian_above_e), Streams(seed, frame)
     electrons = np.empty(expected_e.size, np.int64)
 
     def block(number: int, sites: slice) -> None:

@@ -8,7 +8,9 @@ import numpy as np
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats
+from foveasim.sensor.effects.collection import MAX_CHARGE_E, Collection
 from foveasim.sensor.effects.contract import Sites
+from foveasim.sensor.model.prediction import MIN_SLOPE
 from foveasim.sensor.model.records import readout_model, walk_from_node
 
 if TYPE_CHECKING:
@@ -65,3 +67,25 @@ def invert(sensor: Sensor, sites: Sites, code_dn: Floats) -> Inverse:
     step_v = sensor.adc.width_of_code_dn(code_dn) * sensor.v_sat_v / 2.0**sensor.bits
     noise_e2 = readout.noise_e2 + np.square(step_v / slope) * sensor.adc.noise_dn2
     return Inverse(charge_e, noise_e2, (charge_e >= sensor.well_e) | (code_dn >= 2.0**sensor.bits - 1.0))
+
+
+def invert_collection(
+    collection: Collection, sites: Sites, charge_e: Floats, noise_e2: Floats | float
+) -> tuple[Floats, Floats]:
+    """Invert the collection: see :meth:`foveasim.Sensor.invert_collection`."""
+    added = noise_e2 + float(collection.is_drawn)
+    if collection.validate_linear(np.zeros(1), sites).slope is None:
+        return charge_e, collection.moments(np.maximum(charge_e, 0.0), added + np.zeros_like(charge_e), sites=sites)[1]
+    expected_e = np.empty(np.shape(charge_e))
+    variance_e2 = np.empty(np.shape(charge_e))
+    for index in np.ndindex(expected_e.shape[:-1]):
+        found = collection.invert(np.maximum(charge_e[index], 0.0), sites=sites)
+        is_beyond = np.isinf(found)
+        if is_beyond.any():
+            found = np.where(is_beyond, collection.invert(np.maximum(charge_e[index] - 0.5, 0.0), sites=sites), found)
+        found = np.where(np.isinf(found), MAX_CHARGE_E, found)
+        slope = np.asarray(collection.validate_linear(found, sites).slope)
+        expected_e[index] = found
+        spread2 = collection.moments(found, np.zeros(1), sites=sites)[1] + np.broadcast_to(added, charge_e.shape)[index]
+        variance_e2[index] = spread2 / np.square(np.maximum(slope, MIN_SLOPE))
+    return expected_e, variance_e2

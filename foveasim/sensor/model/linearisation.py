@@ -477,16 +477,16 @@ def linearise(
             expected_e = mean_e if expected_e is None else expected_e
     assert expected_e is not None
     starts["charge"] = len(records)
-    collected_e, slope, deviation, groups = sensor.shot.validate_linear(expected_e, sites)
+    collected_e, slope, deviation, groups = sensor.collection.validate_linear(expected_e, sites)
     is_full: Bools | bool = False
     if sensor.full_well_e is not None:
-        own = 0.0 if deviation is None or not sensor.shot.is_drawn else deviation
+        own = 0.0 if deviation is None or not sensor.collection.is_drawn else deviation
         is_full = collected_e + CLIPPING_SIGMAS * own >= sensor.well_e
         if np.any(is_full):
-            deviation = _limited(deviation, collected_e, sensor.well_e, sensor.shot.is_drawn)
+            deviation = _limited(deviation, collected_e, sensor.well_e, sensor.collection.is_drawn)
             collected_e = np.minimum(collected_e, sensor.well_e)
-    if photo_fraction is None or deviation is None or not sensor.shot.is_drawn:
-        records.append(Record(sensor.shot.name, collected_e, slope, deviation, groups))
+    if photo_fraction is None or deviation is None or not sensor.collection.is_drawn:
+        records.append(Record(sensor.collection.name, collected_e, slope, deviation, groups))
     else:
         records += [
             Record(PHOTON_SHOT, collected_e, slope, deviation * np.sqrt(photo_fraction), groups),
@@ -504,7 +504,7 @@ def linearise(
         full, _ = walk_from_node(sensor, chain, sites, node_e)
         highest_e = highest_charge_e(sensor, transfer_of(sensor, full, node_e))
         for k in range(starts["charge"], starts["collected"]):
-            limited = _limited(records[k].deviation, node_e, highest_e, sensor.shot.is_drawn)
+            limited = _limited(records[k].deviation, node_e, highest_e, sensor.collection.is_drawn)
             records[k] = records[k]._replace(deviation=limited)
         node_e = np.minimum(node_e, highest_e)
         after, output_v = walk_from_node(sensor, chain, sites, node_e, keeps_means=False)

@@ -164,7 +164,7 @@ def light_records(
 def split_charge(chain: Iterable[Effect]) -> tuple[list[Effect], list[Effect]]:
     """Split the effects on the collected charge after the last one that mixes sites."""
     charge = effects_at(chain, "charge")
-    n = max((k + 1 for k, effect in enumerate(charge) if effect.mixes_means), default=0)
+    n = max((k + 1 for k, effect in enumerate(charge) if effect.reach == "all"), default=0)
     return charge[:n], charge[n:]
 
 

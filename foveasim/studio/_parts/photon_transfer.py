@@ -67,7 +67,7 @@ def median_site(values: Floats) -> int:
 
 def copies_of(sensor: Sensor, site: int, n: int) -> Sensor:
     """Return a sensor of n copies of a photosite, without exchange of charge."""
-    connecting = [effect.name for effect in sensor.chain if not effect.is_local]
+    connecting = [effect.name for effect in sensor.chain if effect.reach == "all"]
     return (sensor.without(*connecting) if connecting else sensor).part(np.full(n, site))
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import shapely
+from scipy.special import bdtr
 
 import foveasim as fs
 from foveasim.distortion import LENSES
@@ -15,7 +16,7 @@ from foveasim.layout import DERIVED_LAYERS, FORMATS, RULES, FileFormat, Rule, Wr
 from foveasim.maps import MAP_FORMATS, Found
 from foveasim.optics import PUPILS
 from foveasim.scene import CUBE_FORMATS, SCENES
-from foveasim.sensor.effects import EFFECTS, AdditiveNoise
+from foveasim.sensor.effects import EFFECTS, AdditiveNoise, Collection
 from foveasim.sensor.spectral import CURVES
 
 
@@ -60,6 +61,26 @@ class SupplyRipple(AdditiveNoise):
     def deviation(self, sites):
         """Return the standard deviation, V."""
         return self.sigma_v
+
+
+@EFFECTS.register("binary_gates", example={"n_gates": 900})
+@dataclass(frozen=True)
+class BinaryGates(Collection):
+    """Gates that count at most one photon each: the number of those that fired is binomial."""
+
+    name = "binary_gates"
+    needs_layout = False
+
+    n_gates: int = 100
+
+    def cumulative(self, count, mean, *, sites):
+        """Return the probability of at most ``count`` fired gates."""
+        return bdtr(np.minimum(count, self.n_gates), self.n_gates, -np.expm1(-mean / self.n_gates))
+
+    def moments(self, mean, variance, *, sites):
+        """Return mean and variance of the number of fired gates."""
+        dark = np.exp(-mean / self.n_gates)  # probability that a gate does not fire
+        return self.n_gates * (1.0 - dark), variance * dark**2 + self.n_gates * dark * (1.0 - dark)
 
 
 min_roundness = Rule(
