@@ -7,6 +7,7 @@ common to all reads; weights from individual reads would favour those that are l
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -19,8 +20,11 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, Ints, as_numbers, check_per_site, own_arrays
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.sensor.calibration import Calibration, linearise, nominal_e_per_dn
+from foveasim.sensor.effects import Sites
+from foveasim.sensor.effects.contract import NOTHING
 from foveasim.sensor.effects.shot import MAX_CHARGE_E, ROUNDING_E2
 from foveasim.sensor.limits import DURATION, EXPOSURE, RATE
+from foveasim.sensor.model.prediction import MIN_SLOPE
 from foveasim.sensor.sensor import Sensor
 
 __all__ = ["Ramp", "Rates", "fit_ramp", "merge_exposures", "non_destructive_reads"]
@@ -160,7 +164,7 @@ def merge_exposures(
     times_s = DURATION.check_array("exposures_s", exposures_s, ndim=1)
     codes, linear_dn, e_per_dn = _linearise_reads(code, times_s.size, sensor, "exposure")
     n_sites = sensor.layout.n_sites
-    dark_e_per_s = np.zeros(1)
+    dark_e = np.zeros((times_s.size, 1))
     gain = np.ones(1)
     offset_dn = np.full((times_s.size, 1), -0.5)
     if calibration is not None:
@@ -169,13 +173,17 @@ def merge_exposures(
         single = calibration.exposure_s is None
         offset_dn = np.stack([calibration.offset_at(None if single else float(t_s)) for t_s in times_s])
         gain = np.where(calibration.gain > 0.0, calibration.gain, np.nan)
-        dark_e_per_s = sensor.dark_rate_e_per_s
+        dark_e = np.stack([sensor.expected_electrons(np.zeros(n_sites), float(t_s)) for t_s in times_s])
 
+    counting = _Counting(sensor, times_s)
     charge_e = (linear_dn - offset_dn) / gain * e_per_dn
     top_dn = _saturation_dn(sensor)
     top_e = (top_dn - offset_dn) / gain * e_per_dn
     conversion_e2 = _conversion_noise_e2(sensor, codes, e_per_dn)
+    # Expected charges, of which the mean charges of collections that are not linear are functions.
+    charge_e, top_e = (counting.invert(part, dark_e) for part in (charge_e, top_e))
     is_used = (codes < 2.0**sensor.bits - 1.0) & (linear_dn < top_dn) & np.isfinite(charge_e) & (top_e > 0.0)
+    top_e = np.where(np.isfinite(top_e), top_e, np.max(charge_e, initial=1.0, where=is_used))
     t_s = times_s[:, None]
     rates = np.where(is_used, charge_e, 0.0) / t_s
     width = TAPER_FRACTION * np.where(is_used, top_e, 1.0) / t_s
@@ -186,9 +194,9 @@ def merge_exposures(
     rate = (taper * rates * t_s).sum(axis=0) / total
     fraction = taper
     for _ in range(N_PASSES):
-        collected_e = _estimate_collected(sensor, (np.maximum(rate, 0.0) + dark_e_per_s) * t_s)
-        model = sensor.readout_model(*sensor.collection.moments(collected_e, np.zeros(1)))
-        information = t_s**2 / (model.variance_e2 + model.noise_e2 + conversion_e2)
+        mean_e, variance_e2, per_e = counting.moments(np.maximum(rate, 0.0) * t_s + dark_e)
+        model = sensor.readout_model(mean_e, variance_e2)
+        information = (t_s * per_e) ** 2 / (model.variance_e2 + model.noise_e2 + conversion_e2)
         total = np.where(is_known, (taper * information).sum(axis=0), 1.0)
         fraction = taper * information / total
         rate = (fraction * rates).sum(axis=0)
@@ -357,7 +365,10 @@ def fit_ramp(
         rate = np.zeros(1)
     dt_s = np.where(is_used[1:], np.diff(times)[:, None], 0.0)
     rise_e = np.where(is_used[1:], np.diff(charge_e, axis=0), 0.0)
-    shot_e2 = np.broadcast_to(np.maximum(rate, 0.0) * np.diff(times)[:, None], dt_s.shape)
+    charges_e = np.broadcast_to(np.maximum(rate, 0.0) * np.diff(times)[:, None], dt_s.shape)
+    shot_e2 = charges_e
+    if sensor.collection.is_drawn:
+        shot_e2 = sensor.collection.moments(charges_e, NOTHING, sites=sensor.sites)[1]
     if model.is_mixed:
         with_shot = sensor.readout_model(charge_e[1:], shot_e2, is_reset=False)
         shot_e2 = with_shot.variance_e2 - np.broadcast_to(model.variance_e2, charge_e.shape)[1:]
@@ -375,6 +386,51 @@ def fit_ramp(
 
 
 # -- helpers ----------------------------------------------------------------------------------------------------------
+
+
+class _Counting:
+    """Collection of a sensor for several exposures: arrays (n_exposure, n_site)."""
+
+    def __init__(self, sensor: Sensor, times_s: Floats) -> None:
+        self.sensor, self.times_s = sensor, times_s
+        sites = sensor.sites.during(float(times_s[0]))
+        self.is_linear = sensor.collection.validate_linear(np.zeros(1), sites).slope is None
+
+    def _each(self, function: Callable[[Floats, Sites], tuple[Floats, ...]], values: Floats) -> tuple[Floats, ...]:
+        """Return the results of a function of the charges and sites of each exposure."""
+        all_sites = [self.sensor.sites.during(float(time_s)) for time_s in self.times_s]
+        results = [function(row, sites) for row, sites in zip(values, all_sites, strict=True)]
+        return tuple(
+            np.stack([np.broadcast_to(part, values.shape[1]) for part in parts]) for parts in zip(*results, strict=True)
+        )
+
+    def invert(self, charge_e: Floats, dark_e: Floats) -> Floats:
+        """Return the expected charges of light for charges without those of the dark signal."""
+        if self.is_linear:
+            return charge_e
+        collection = self.sensor.collection
+        dark_e = np.broadcast_to(dark_e, charge_e.shape)
+        (dark_mean_e,) = self._each(lambda row, sites: collection.validate_moments(row, NOTHING, sites)[:1], dark_e)
+        total_e = np.maximum(np.nan_to_num(charge_e + dark_mean_e, nan=0.0), 0.0)
+        (expected_e,) = self._each(lambda row, sites: (collection.invert(row, sites=sites),), total_e)
+        return np.where(np.isfinite(charge_e), expected_e - dark_e, np.nan)
+
+    def moments(self, charge_e: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return mean and variance of the collected charges, and the slope of the mean, for charges at the sense node."""
+        collection = self.sensor.collection
+        if self.is_linear:
+            mean_e, variance_e2 = collection.moments(
+                _estimate_collected(self.sensor, charge_e), NOTHING, sites=self.sensor.sites
+            )
+            return mean_e, variance_e2, np.ones(1)
+
+        def moments(row: Floats, sites: Sites) -> tuple[Floats, ...]:
+            slope = collection.validate_linear(row, sites).slope
+            assert isinstance(slope, np.ndarray)
+            return (*collection.validate_moments(row, NOTHING, sites), slope)
+
+        mean_e, variance_e2, slope = self._each(moments, charge_e)
+        return mean_e, variance_e2, np.maximum(slope, MIN_SLOPE)
 
 
 def _check_increasing(name: str, times_s: ArrayLike) -> Floats:
