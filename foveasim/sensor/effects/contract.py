@@ -72,7 +72,11 @@ SLOPE_STEP, SMALLEST_MEAN = 2.0**-10, MappingProxyType({"e-/s": 1.0, "e-": 1.0, 
 
 
 class Operator(Protocol):
-    """Linear map between values of all sites, implemented by :class:`foveasim.sensor.effects.CrosstalkOperator`."""
+    """
+    Linear map between values of all sites.
+
+    Implemented by :class:`foveasim.sensor.effects.CrosstalkOperator`.
+    """
 
     def apply(self, values: ArrayLike, *, n_threads: int | None = None) -> Floats:
         """Return the map of values (..., n_site)."""
@@ -81,7 +85,11 @@ class Operator(Protocol):
         """Return the transposed map."""
 
     def rows(self, sites: Any) -> Any:
-        """Return the rows of some sites, (n, n_site) sparse, or those of a sparse matrix (n, n_site) times the map."""
+        """
+        Return the rows of some sites, (n, n_site) sparse.
+
+        A sparse matrix (n, n_site) instead of sites is multiplied by the map.
+        """
 
 
 class StepModel(NamedTuple):
@@ -575,7 +583,7 @@ class AdditiveNoise(Effect):
 
 class GroupedNoise(Effect):
     """
-    Additive Gaussian temporal noise of mean 0 that is common to groups of sites, such as rows.
+    Additive Gaussian temporal noise of mean 0, common to groups of sites such as rows.
 
     Subclasses define :meth:`deviation`, and :meth:`groups` for groups other than readout lines. The draw of a group depends on
     the name of the effect, the seed, the frame and the label of the group only, so that it is the same in all tiles.
