@@ -155,7 +155,7 @@ class Sensor:
         Seed of the fixed patterns, which identifies one device among all devices of this kind.
     effects : sequence of Effect
         Additional noise sources and fixed patterns: :mod:`foveasim.sensor.effects`. They are included in captures, predictions,
-        the noise budget and all weights that depend on noise.
+        the noise budget and all weights that depend on noise. A collection replaces the shot noise.
     disabled : sequence of str
         Names of effects to switch off, including those of keywords. Draws of the other effects do not change.
 
@@ -694,7 +694,7 @@ class Sensor:
         _streams: Streams | None = None,
     ) -> Ints:
         """
-        Draw the collected charge, (n_site,) int64 e-: shot noise or another collection, then full well.
+        Draw the collected charge, (n_site,) int64 e-: collection, then full well.
 
         Parameters
         ----------

@@ -188,16 +188,16 @@ def _check_affine(sensor: Sensor, effect: Effect) -> None:
 
 def _check_mixing(sensor: Sensor, effect: Mixing) -> None:
     """Compare draws, operator and its transpose."""
-    values, other = (np.random.default_rng(k).random(N) for k in range(2))
+    values, other = (Streams(k).of(effect.name).random(N) for k in range(2))
     operator = effect.operator(sensor.sites)
-    mixed = effect.apply(values.copy(), sites=sensor.sites, rng=np.random.default_rng(0))
+    mixed = effect.apply(values.copy(), sites=sensor.sites, rng=Streams(0).of(effect.name))
     require(np.allclose(mixed, operator.apply(values)), "has another apply() than its operator()")
     one, two = other @ operator.apply(values), operator.transpose().apply(other) @ values
     require(np.isclose(one, two), "has an operator whose transpose() is wrong")
 
 
 def _check_collection(sensor: Sensor, effect: Collection) -> None:
-    """Compare draws and cumulative probabilities with the moments, from 0 e- to a bright frame."""
+    """Compare draws and cumulative probabilities with the moments, from 0 e-."""
     sites = sensor.sites.during(EXPOSURE_S)
     mean = np.geomspace(0.01, 2.0 * PHOTO_E, N)
     mean[0] = 0.0

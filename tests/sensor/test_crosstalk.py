@@ -617,11 +617,6 @@ def test_charges_of_wrong_length_are_rejected(charge_e):
             call(charge_e)
 
 
-def test_variance_rejects_multi_step_operator():
-    with pytest.raises(SimulationError, match="variances are defined for operators of one step, and this operator has"):
-        Diffusion(spread_um=9.0).compile(HEXAGONS).variance(np.ones(72))
-
-
 def test_capacitances_must_match_layout():
     with pytest.raises(ParameterError, match="'capacitance_f' must be one number, or one for each of the 72 sites"):
         InterPixelCapacitance(neighbour_fraction=0.01).compile(HEXAGONS, capacitance_f=np.ones(3))

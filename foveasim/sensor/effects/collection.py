@@ -33,7 +33,7 @@ INVERSE_ROUNDING, MAX_ITERATIONS = 1e-13, 128
 
 class Collection(Effect):
     """
-    Distribution of the collected charge for a given expected charge, exactly one in each sensor.
+    Distribution of the collected charge for an expected charge, one in each sensor.
 
     Subclasses define :meth:`cumulative` and :meth:`moments`. The default of sensors is :class:`ShotNoise`; another one is
     passed in ``effects=[...]``.
@@ -133,7 +133,7 @@ class Collection(Effect):
 
     def table(self, mean: ArrayLike, *, sites: Sites) -> tuple[Ints, Floats, Ints]:
         """
-        Compute the probabilities of all counts, except those in tails with a probability of 1e-16.
+        Compute the probabilities of all counts, except tails with a probability of 1e-16.
 
         Parameters
         ----------

@@ -582,7 +582,7 @@ class AdditiveNoise(Effect):
 
 class GroupedNoise(Effect):
     """
-    Additive Gaussian temporal noise of mean 0 that is common to groups of sites, such as rows.
+    Additive Gaussian temporal noise of mean 0, common to groups of sites such as rows.
 
     Subclasses define :meth:`deviation`, and :meth:`groups` for groups other than readout lines. The draw of a group depends on
     the name of the effect, the seed, the frame and the label of the group only, so that it is the same in all tiles.

@@ -152,7 +152,7 @@ class CrosstalkOperator:
 
     @property
     def _rows_at_a_time(self) -> int:
-        """Number of rows of the power whose elements are limited, for neighbours in two dimensions."""
+        """Number of rows of the power at a time, for neighbours in two dimensions."""
         n_sites = max(self.matrix.shape[0], 1)
         per_row = min(self.matrix.nnz / n_sites * self.n_steps**2, n_sites)
         return max(1, int(MAX_ELEMENTS / max(per_row, 1.0)))

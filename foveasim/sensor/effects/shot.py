@@ -130,7 +130,11 @@ class ShotNoise(Declared, Collection):
         return StepModel(mean, None, np.sqrt(self.moments(mean, np.zeros(1))[1]))
 
     def cumulative(self, count: Floats, mean: Floats, *, sites: Sites | None = None) -> Floats:
-        """Return the Poisson distribution, which ``"auto"`` approximates, or that of the rounded expectation."""
+        """
+        Return the Poisson distribution, or that of the rounded expectation.
+
+        Draws of ``"auto"`` approximate it above ``gaussian_above_e``.
+        """
         from scipy.special import pdtr
 
         if not self.is_drawn:
