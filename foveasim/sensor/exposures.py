@@ -416,7 +416,7 @@ class _Counting:
         return np.where(np.isfinite(charge_e), expected_e - dark_e, np.nan)
 
     def moments(self, charge_e: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return mean and variance of the collected charges, and the slope of the mean, for charges at the sense node."""
+        """Return mean, variance and slope of the collection for charges at the sense node."""
         collection = self.sensor.collection
         if self.is_linear:
             mean_e, variance_e2 = collection.moments(

@@ -856,7 +856,7 @@ class Sensor:
         self, charge_e: Floats, noise_e2: Floats | float = 0.0, exposure_s: Annotated[float | None, EXPOSURE] = None
     ) -> tuple[Floats, Floats]:
         """
-        Estimate the expected charge of each site from its charge, with the variance of the estimate.
+        Estimate the expected charge of each site from its collected charge.
 
         Parameters
         ----------

@@ -10,14 +10,15 @@ from reference.own_effects import CornerLoss
 
 import foveasim as fs
 from foveasim import Camera, Optics, Sensor
-from foveasim.compare import SceneCovariance, site_information_bits
+from foveasim.compare import SceneCovariance, gaussian_information_bits, site_information_bits
+from foveasim.compare.information import _Apertures
 from foveasim.errors import ParameterError
 from foveasim.layout import grid
-from foveasim.sensor import Diffusion
-from foveasim.sensor.effects import Effect
+from foveasim.sensor import Diffusion, InterPixelCapacitance
+from foveasim.sensor.effects import Effect, GroupedNoise
 
 HALF_DIAGONAL_UM = 48.0 * np.sqrt(2.0)
-LAYOUT = grid(n_x=24, n_y=24, pitch_um=4.0)
+LAYOUT = grid(n_x=24, n_y=24, pitch_um=4.0).with_columns(readout_line=np.repeat(np.arange(24), 24))
 ELECTRONICS = {"bits": 12, "v_sat_v": 1.0, "capacitance_f": 3.2e-15, "read_noise_e": 2.0, "pedestal_v": 0.01}
 OPTICS = Optics(focal_length_mm=8.0, f_number=2.8)
 EXPOSURE_S = 0.002
@@ -56,20 +57,37 @@ EVERYTHING = {
     "gain_fpn_fraction": 0.01,
     "dark_e_per_s": 50.0,
     "crosstalk": Diffusion(spread_um=0.5),
+    "coupling": InterPixelCapacitance(neighbour_fraction=0.02),
+    "capacitance_f": 3.2e-15 * np.linspace(0.9, 1.1, LAYOUT.n_sites),
 }
 
 
-@pytest.mark.parametrize("keywords", [{}, EVERYTHING], ids=["plain", "everything"])
-def test_effect_and_sensitivity_have_equal_measures(keywords):
+@dataclass(frozen=True)
+class RowNoise(GroupedNoise):
+    """Test effect: noise of each readout line."""
+
+    name: ClassVar[str] = "row_noise"
+    stage: ClassVar[str] = "output"
+
+    def deviation(self, sites):
+        return 1e-3
+
+
+@pytest.mark.parametrize(
+    ("keywords", "effects"),
+    [({}, []), ({}, [RowNoise()]), (EVERYTHING, [RowNoise()])],
+    ids=["plain", "rows", "everything"],
+)
+def test_effect_and_sensitivity_have_equal_measures(keywords, effects):
     comparison = compare({
-        "effect": camera(effects=[CORNER_LOSS], **keywords),
-        "sensitivity": camera(sensitivity=TRANSMISSION, **keywords),
-        "without": camera(**keywords),
+        "effect": camera(effects=[CORNER_LOSS, *effects], **keywords),
+        "sensitivity": camera(sensitivity=TRANSMISSION, effects=effects, **keywords),
+        "without": camera(effects=effects, **keywords),
     })  # fmt: skip
 
     for name in ("information_bit_per_site", "shift_sigma_um", "snr_db"):
         effect, sensitivity, without = comparison.values[name]
-        assert effect == pytest.approx(sensitivity, rel=1e-10)
+        assert effect == pytest.approx(sensitivity, rel=1e-12)
         assert np.all((effect > without) if name == "shift_sigma_um" else (effect < without))
 
 
@@ -110,6 +128,25 @@ def test_information_falls_with_dead_and_saturated_sites():
     assert np.all(shift_um[1] > 1.1 * shift_um[0])
     # All sites are within two standard deviations of the full well of 20 e-.
     assert information[2] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("keywords", [{}, {"coupling": InterPixelCapacitance(neighbour_fraction=0.05)}])
+def test_correlated_noise_has_closed_form(keywords):
+    """For few sites the chain rule is exact: half the logarithm of the ratio of the determinants."""
+    part = LAYOUT[:100]
+    sensor = Sensor(part, **ELECTRONICS, effects=[RowNoise()], **keywords)
+    model = sensor.linearise(np.linspace(200.0, 900.0, 100))
+    covariance, gain = SceneCovariance([1e-4], [6.0]), model.forward(np.full(100, 900.0))
+    signal = _Apertures(part, covariance).covariance(np.arange(100))
+
+    found = site_information_bits(part, covariance, gain, [model])
+    independent = site_information_bits(part, covariance, gain, model.variance_dn2()[np.newaxis])
+
+    expected = gaussian_information_bits(
+        signal * np.multiply.outer(gain, gain), noise_covariance=model.apply_covariance(np.eye(100))
+    )
+    assert found.sum() == pytest.approx(expected, rel=1e-9)
+    assert abs(independent.sum() / expected - 1.0) > 0.01
 
 
 def test_gains_of_other_scenes_are_errors():
