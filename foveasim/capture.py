@@ -321,8 +321,11 @@ class Capture:
         """
         self._check_sensor(sensor)
         known = self._electronics if sensor is None else sensor
-        dark_e = known.expected_electrons(np.zeros(self.layout.n_sites), float(self.settings.get("exposure_s", 0.0)))
-        return signal_to_noise(known, self.expected_e, np.broadcast_to(dark_e, self.expected_e.shape)).ratio
+        exposure_s = float(self.settings.get("exposure_s", 0.0))
+        dark_e = np.broadcast_to(
+            known.expected_electrons(np.zeros(self.layout.n_sites), exposure_s), self.expected_e.shape
+        )
+        return signal_to_noise(known, self.expected_e, dark_e, exposure_s=exposure_s).ratio
 
     def _check_sensor(self, sensor: Sensor | None) -> None:
         """Raise when a sensor has another layout than the capture."""

@@ -179,7 +179,7 @@ def scene_measures(
     sensor, layout = camera.sensor, layout_of(camera)
     exposure_s = float(capture.settings["exposure_s"])
     dark_e = sensor.expected_electrons(np.zeros(layout.n_sites), exposure_s)
-    model = sensor.linearise(capture.expected_e)
+    model = sensor.linearise(capture.expected_e, exposure_s=exposure_s)
     signals = site_signals(model, dark_e)
     annulus = annulus_of(layout.centroid_um, centre_um, edges_um)
     n = edges_um.size - 1

@@ -204,7 +204,8 @@ def snr_by_class(
     groups = SiteClasses(size_classes_um(layout) if classes is None else classes, layout.n_sites)
     expected_e = sensor.expected_electrons(camera.photoelectrons_per_s(light), exposure_s)
     dark_e = sensor.expected_electrons(np.zeros(layout.n_sites), exposure_s)
-    return _table(groups, layout.area_um2, *_linear_codes(signal_to_noise(sensor, expected_e, dark_e)))
+    signals = signal_to_noise(sensor, expected_e, dark_e, exposure_s=exposure_s)
+    return _table(groups, layout.area_um2, *_linear_codes(signals))
 
 
 def relative_exposure_at_snr_fraction(
@@ -257,7 +258,8 @@ def relative_exposure_at_snr_fraction(
             break
         fraction = np.exp(search.at)
         expected_e = dark_e + fraction[groups.class_index] * (full_e - dark_e)
-        signal_dn, noise_dn2, is_clipped = _linear_codes(signal_to_noise(sensor, expected_e, dark_e))
+        signals = signal_to_noise(sensor, expected_e, dark_e, exposure_s=exposure_s)
+        signal_dn, noise_dn2, is_clipped = _linear_codes(signals)
         signal_dn, noise_dn = groups.mean(signal_dn), np.sqrt(groups.mean(noise_dn2))
         is_reached = ~search.is_done & (signal_dn > 0.0) & (signal_dn >= snr * noise_dn * (1.0 - FRACTION_ROUNDING))
         is_saturated = np.where(is_reached, groups.mean(is_clipped.astype(np.float64)) >= 0.5, is_saturated)

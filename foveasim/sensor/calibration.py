@@ -76,7 +76,8 @@ def nominal_e_per_dn(sensor: Sensor) -> Floats:
 
     (n_site,) or (1,) float64, e-/DN.
     """
-    return np.asarray(1.0 / sensor.linearise(0.0, is_device_known=False).linear_gain_dn_per_e)
+    transfer = sensor.readout_model(0.0, is_device_known=False).transfer
+    return np.asarray(1.0 / transfer.linear_gain_dn_per_e(sensor.adc.n_codes))
 
 
 # -- calibration ------------------------------------------------------------------------------------------------------

@@ -8,12 +8,14 @@ the temporal noise of the charge, including quantisation.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Floats
+from foveasim.sensor.limits import EXPOSURE
 from foveasim.sensor.model.linearisation import Linearisation
 from foveasim.sensor.sensor import Sensor
 
@@ -50,7 +52,9 @@ class SiteSignals:
         return np.divide(self.signal_e, self.noise_e, out=np.zeros_like(self.signal_e), where=self.noise_e > 0.0)
 
 
-def signal_to_noise(sensor: Sensor, expected_e: ArrayLike, dark_e: ArrayLike) -> SiteSignals:
+def signal_to_noise(
+    sensor: Sensor, expected_e: ArrayLike, dark_e: ArrayLike, *, exposure_s: Annotated[float | None, EXPOSURE] = None
+) -> SiteSignals:
     """
     Compute signal and temporal noise of each site analytically.
 
@@ -61,6 +65,8 @@ def signal_to_noise(sensor: Sensor, expected_e: ArrayLike, dark_e: ArrayLike) ->
         Expected charge from :meth:`Sensor.expected_electrons`.
     dark_e : (n_site,) float64, e-
         Expected charge of a dark frame with the same exposure.
+    exposure_s : float, optional, s
+        Required by collections that depend on it.
 
     Notes
     -----
@@ -107,13 +113,14 @@ def signal_to_noise(sensor: Sensor, expected_e: ArrayLike, dark_e: ArrayLike) ->
     charge_e, dark = (
         sensor.validate_charges(name, values) for name, values in (("expected_e", expected_e), ("dark_e", dark_e))
     )
-    return site_signals(sensor.linearise(charge_e), dark)
+    return site_signals(sensor.linearise(charge_e, exposure_s=exposure_s), dark)
 
 
 def site_signals(model: Linearisation, dark_e: Floats) -> SiteSignals:
     """Return signal and noise of :func:`signal_to_noise` for a model at the expected charge."""
     charge_e = model.node_e
-    dark_node_e = np.minimum(model.sensor.linearise(dark_e).node_e, model.top_e)
+    dark_model = model.sensor.linearise(dark_e, exposure_s=model.exposure_s)
+    dark_node_e = np.minimum(dark_model.node_e, model.top_e)
     return SiteSignals(
         signal_e=np.maximum(model.node_e - dark_node_e, 0.0),
         noise_e=np.broadcast_to(np.sqrt(model.variance_e2()), charge_e.shape),

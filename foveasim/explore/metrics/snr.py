@@ -23,7 +23,7 @@ def snr(shot: Shot, camera: Camera, capture: Capture) -> dict[str, float]:
     """
     sensor = camera.sensor
     dark_e = sensor.expected_electrons(np.zeros(sensor.layout.n_sites), shot.exposure_s)
-    found = signal_to_noise(sensor, capture.expected_e, dark_e)
+    found = signal_to_noise(sensor, capture.expected_e, dark_e, exposure_s=shot.exposure_s)
     ratio = found.ratio[~found.is_saturated]
     if not ratio.size:
         return {"mean": float("nan"), "median": float("nan")}

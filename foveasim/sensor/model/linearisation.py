@@ -104,6 +104,12 @@ class Linearisation:
         return self.sensor.layout.n_sites
 
     @property
+    def exposure_s(self) -> float | None:
+        """Exposure time, s; None if it is unknown."""
+        exposure_s: float | None = self._arguments[-1]
+        return exposure_s
+
+    @property
     def sources(self) -> dict[str, Kind]:
         """Kinds of the sources of noise by name: ``"temporal"``, ``"reset"`` or ``"fixed"``."""
         return {record.name: record.kind for record in self._records if record.deviation is not None}
@@ -128,7 +134,7 @@ class Linearisation:
     @cached_property
     def linear_gain_dn_per_e(self) -> Floats:
         """Linear codes per electron without the response nonlinearity, DN/e-."""
-        return self._transfer.v_per_e * self._transfer.scale / self.sensor.v_sat_v * 2.0**self.sensor.bits
+        return self._transfer.linear_gain_dn_per_e(self.sensor.adc.n_codes)
 
     @cached_property
     def _transfer(self) -> Transfer:

@@ -42,6 +42,10 @@ class Transfer(NamedTuple):
     nonlinearity_fraction: float
     v_sat_v: float
 
+    def linear_gain_dn_per_e(self, n_codes: int) -> Floats:
+        """Return the linear codes per electron at the slope of the response at zero."""
+        return self.v_per_e * self.scale / self.v_sat_v * n_codes
+
 
 class Quadrature(NamedTuple):
     """Gauss-Legendre nodes and weights on the interval -1 to 1."""

@@ -30,7 +30,8 @@ def photon_transfer(result: Simulated) -> PartData:
     response = float(copies.light_response()[0]) or 1.0
     photo_e_per_s = np.geomspace(LOWEST_E, HIGHEST * range_e, N_LEVELS) / (exposure_s * response)
     dark_e = copies.expected_electrons(np.zeros(N_LEVELS), exposure_s)
-    found = signal_to_noise(copies, copies.expected_electrons(photo_e_per_s, exposure_s), dark_e)
+    levels_e = copies.expected_electrons(photo_e_per_s, exposure_s)
+    found = signal_to_noise(copies, levels_e, dark_e, exposure_s=exposure_s)
     budget = noise_budget(copies, photo_e_per_s, exposure_s)
     fixed = [name for name in budget if name not in budget.temporal]
     shown = {
@@ -45,7 +46,7 @@ def photon_transfer(result: Simulated) -> PartData:
     shown = {name: values[is_shown] for name, values in shown.items() if (values[is_shown] > 0.0).all()}
     curves = [{"label": name, "unit_x": "e⁻", "unit_y": "e⁻"} for name in shown]
     about, arrays = curves_of(curves, [found.signal_e[is_shown]] * len(curves), list(shown.values()))
-    now = signal_to_noise(copies_of(sensor, site, 1), capture.expected_e[[site]], dark_e[:1])
+    now = signal_to_noise(copies_of(sensor, site, 1), capture.expected_e[[site]], dark_e[:1], exposure_s=exposure_s)
     x, y = float(now.signal_e[0]), float(now.noise_e[0])
     about["marks"] = [{"x": x, "y": y}] if min(x, y) > 0.0 and curves else []
     about["note"] = (
@@ -73,4 +74,4 @@ def copies_of(sensor: Sensor, site: int, n: int) -> Sensor:
 
 def full_range_e(sensor: Sensor) -> float:
     """Return the charge of full well or highest code, whichever is smaller, e-."""
-    return float(sensor.linearise(0.0).saturation_e[0])
+    return float(sensor.linearise(0.0, exposure_s=1.0).saturation_e[0])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.validation import Floats
+from foveasim._core.validation import Bools, Floats
 from foveasim.sensor import Sensor
 from foveasim.sensor.signal_to_noise import signal_to_noise
 from foveasim.studio._engine import Simulated
@@ -80,25 +80,34 @@ class _SnrCurve:
         photo_e_per_s = charge_e_per_s - dark_e_per_s
         highest_s = HIGHEST * full_range_e(self._copies) / charge_e_per_s
         self.exposure_s = np.geomspace(min(LOWEST_E / photo_e_per_s, 1e-3 * highest_s), highest_s, N_LEVELS)
-        found = self._signals(self.exposure_s)
-        self.ratio_db = _decibels(found.ratio)
+        ratio, is_saturated = self._signals(self.exposure_s)
+        self.ratio_db = _decibels(ratio)
         self.saturation_s = float(self.exposure_s[-1])
-        if found.is_saturated.any():
-            first = max(int(np.argmax(found.is_saturated)), 1)
+        if is_saturated.any():
+            first = max(int(np.argmax(is_saturated)), 1)
             finer_s = np.linspace(self.exposure_s[first - 1], self.exposure_s[first], N_LEVELS)
-            self.saturation_s = float(finer_s[int(np.argmax(self._signals(finer_s).is_saturated))])
+            self.saturation_s = float(finer_s[int(np.argmax(self._signals(finer_s)[1]))])
         self.saturation_db = float(self.at(np.array([self.saturation_s]))[0])
         is_below = self.exposure_s < self.saturation_s
         threshold_s = np.exp(np.interp(0.0, self.ratio_db[is_below], np.log(self.exposure_s[is_below])))
         self.dynamic_range_db = float(_decibels(np.array([self.saturation_s / threshold_s]))[0])
 
-    def _signals(self, exposure_s: Floats) -> Any:
-        """Return signals and noise at N_LEVELS exposures."""
-        return signal_to_noise(self._copies, self._charge_e_per_s * exposure_s, self._dark_e_per_s * exposure_s)
+    def _signals(self, exposure_s: Floats) -> tuple[Floats, Bools]:
+        """Return the ratio at N_LEVELS exposures, and whether the photosite is saturated."""
+        charge_e, dark_e = self._charge_e_per_s * exposure_s, self._dark_e_per_s * exposure_s
+        if not self._copies.collection.needs_exposure:
+            found = signal_to_noise(self._copies, charge_e, dark_e)
+            return found.ratio, found.is_saturated
+        single = self._copies.part(slice(0, 1))
+        each = [
+            signal_to_noise(single, charge_e[[k]], dark_e[[k]], exposure_s=float(time_s))
+            for k, time_s in enumerate(exposure_s)
+        ]
+        return np.concatenate([one.ratio for one in each]), np.concatenate([one.is_saturated for one in each])
 
     def at(self, exposure_s: Floats) -> Floats:
         """Return the ratio at an exposure, (1,) dB."""
-        return _decibels(self._signals(np.full(N_LEVELS, exposure_s[0])).ratio[:1])
+        return _decibels(self._signals(np.full(N_LEVELS, exposure_s[0]))[0][:1])
 
 
 def _decibels(ratio: Floats) -> Floats:
