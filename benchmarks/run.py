@@ -18,8 +18,9 @@ import sys
 import time
 import tracemalloc
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import scipy.fft
@@ -37,6 +38,7 @@ from video import bench_video
 import foveasim as fs
 from foveasim._core.threads import thread_count
 from foveasim.sensor.blocks import for_each_block
+from foveasim.sensor.effects import GroupedNoise, Sites
 from layouts import bench_layouts
 
 #: The largest picture of the paper.
@@ -284,6 +286,56 @@ def bench_sensor(report: Report, n_side: int) -> None:
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     report.add("memory of the same", "", "float64 arrays (n_site,)", "", peak / (8 * layout.n_sites), 4)
+    bench_model(report, n_side)
+
+
+@dataclass(frozen=True)
+class RowNoise(GroupedNoise):
+    """Noise of each readout line."""
+
+    name: ClassVar[str] = "row_noise"
+    stage: ClassVar[str] = "charge"
+
+    def deviation(self, sites: Sites) -> float:  # noqa: ARG002 -- the same for all sites
+        """Return the standard deviation, e-."""
+        return 2.0
+
+
+def bench_model(report: Report, n_side: int) -> None:
+    """Compare the first-order model of a sensor with the prediction of its codes."""
+    layout = fs.layout.grid(n_x=n_side, n_y=n_side, pitch_um=2.0)
+    layout = layout.with_columns(readout_line=np.arange(layout.n_sites) // n_side)
+    sensor = fs.Sensor(
+        layout, prnu_fraction=0.01, dark_e_per_s=20.0, dsnu_fraction=0.1, hot_fraction=1e-4, hot_e_per_s=1e4, full_well_e=1e5,
+        ktc_noise=True, read_noise_e=3.0, rts_fraction=0.01, rts_e=10.0, gain_fpn_fraction=0.01, pixel_fpn_fraction=0.02,
+        line_fpn_fraction=0.02, bits=12, pedestal_v=0.2, capacitance_f=2e-15,
+    )  # fmt: skip
+    charge_e = sensor.expected_electrons(np.linspace(200.0, 5000.0, layout.n_sites), 1.0)
+    dark_e = np.full(layout.n_sites, 20.0)
+    rows = replace(sensor, effects=[RowNoise()])
+    patterns = np.stack((charge_e, charge_e[::-1]))
+    times = best_s(
+        {
+            "predict": lambda: sensor.predict(charge_e),
+            "model": lambda: sensor.linearise(charge_e).variance_e2(),
+            "snr": lambda: fs.sensor.signal_to_noise(sensor, charge_e, dark_e),
+            "information": lambda: rows.linearise(charge_e).information(patterns),
+        },
+        6,
+        time.process_time,
+    )
+    predict_s, sites = times["predict"], f"{layout.n_sites:,} sites"
+    add_per_site(report, f"prediction of codes, {sites}", predict_s, layout.n_sites, 160)
+    report.slower_than("first-order model with variance", times["model"], "prediction of codes", predict_s, 0.3)
+    report.slower_than("signal-to-noise ratio", times["snr"], "prediction of codes", predict_s, 1.5)
+    report.slower_than(
+        "information of a shift with row noise", times["information"], "prediction of codes", predict_s, 2.0
+    )
+    tracemalloc.start()
+    sensor.linearise(charge_e).variance_e2()
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    report.add("memory of the model with variance", "", "float64 arrays (n_site,)", "", peak / (8 * layout.n_sites), 10)
 
 
 def bench_shot_and_read_noise(report: Report, n_side: int) -> None:
