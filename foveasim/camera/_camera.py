@@ -14,7 +14,7 @@ from threading import Lock
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import NOT_NEGATIVE, Limits, OwnCheck
 from foveasim._core.provenance import copy_plain_data, to_plain_data
@@ -598,7 +598,26 @@ class Camera:
             Over the temporal noise of this device; its fixed patterns are part of the mean.
         """
         expected_e = self._sensor.expected_electrons(self._photoelectrons_per_s(light, Clock()), exposure_s)
-        return self._sensor.predict(expected_e, n_threads=self._n_threads)
+        return self._sensor.predict(expected_e, exposure_s=exposure_s, n_threads=self._n_threads)
+
+    def predict_covariance(self, light: Scene | PowerMap, sites: ArrayLike, *, exposure_s: float) -> Floats:
+        """
+        Return the temporal covariance of the codes of some sites analytically.
+
+        Parameters
+        ----------
+        light : Scene or PowerMap
+        sites : (n,) int
+            Indices of the sites.
+        exposure_s : float, s
+
+        Returns
+        -------
+        covariance : (n, n) float64, DN²
+            See :meth:`foveasim.Sensor.predict_covariance`.
+        """
+        expected_e = self._sensor.expected_electrons(self._photoelectrons_per_s(light, Clock()), exposure_s)
+        return self._sensor.predict_covariance(expected_e, sites, exposure_s=exposure_s)
 
     def reference(self, light: Scene | PowerMap, grid: Grid, *, exposure_s: Annotated[float, EXPOSURE]) -> Picture:
         """

@@ -16,7 +16,7 @@ from foveasim._core._kernels import BATCH, fill_normals, fill_uniforms, philox_2
 from foveasim._core.jit import njit
 from foveasim.sensor.adc import ConversionTables
 from foveasim.sensor.effects.shot import PoissonTables
-from foveasim.sensor.model.prediction import ChargeDistributions, Quadrature, Transfer
+from foveasim.sensor.model.prediction import ChargeDistributions, ChargeTables, Transfer
 
 #: ADC transfer functions, as numbered by ``ConversionTables.companding_index``.
 ADC_LINEAR, ADC_ROOT, ADC_LOG, ADC_TABLE = range(4)
@@ -31,17 +31,33 @@ ONE, TWO = np.float32(1.0), np.float32(2.0)
 MAX_ADDED = 20
 #: Upper limit of charges: 2**62 fits int64 with headroom for sums.
 MAX_CHARGE_E = 2.0**62
-#: Upper limit of a Poisson draw above its mean: this many standard deviations plus this many electrons.
-MAX_DRAW_SIGMAS, MAX_DRAW_MARGIN_E = 12.0, 40
-#: Probabilities further than this many standard deviations from the mean are neglected.
-RANGE_SIGMAS = 9.0
-#: Maximum number of nodes of a discrete charge distribution; smallest probability included; tolerance of integer charges.
-MAX_NODES, MIN_PROBABILITY, INTEGER_TOLERANCE = 2048, 1e-18, 1e-6
+#: Probabilities further than this many standard deviations from the mean are neglected: 6e-16 for a Gaussian distribution.
+RANGE_SIGMAS = 8.0
+#: The same as the exponent of Chernoff's bound.
+RANGE_EXPONENT = 0.5 * RANGE_SIGMAS**2
+#: Maximum number of tabulated cumulative probabilities: Poisson distributions up to a mean of 1e6 e-.
+MAX_NODES = 2**14
+#: From this readout noise, charges need not be integers: exp(-2 pi² sigma²) is 4e-11.
+CONTINUOUS_ABOVE_E = 1.1
+#: Above these means, cumulative probabilities are those of the Edgeworth series at half-integers, and of the continuous charge:
+#: its steps are then below 1e-6 of the standard deviation.
+MAX_TABULATED_E, MAX_LATTICE_E = 1e6, 1e12
+#: Terms of Edgeworth series: maximum number, and the size that is neglected.
+MAX_TERMS, MIN_TERM = 48, 1e-11
+#: Coefficients of z⁴, z⁶ and z⁸ of the logarithm of (z/2) / sinh(z/2); that of z² is -1/24.
+LATTICE_4, LATTICE_6, LATTICE_8 = 1.0 / 2880.0, -1.0 / 181440.0, 1.0 / 9676800.0
+#: From this readout noise, Gaussian probabilities of intervals of 1 e- are series about their centres, to 1e-13.
+SERIES_ABOVE_E = 2.0
+#: Harmonics of the quantisation error below exp(-HARMONIC_EXPONENT) are neglected. The sum over codes is faster than more
+#: harmonics than a number, plus a number per code.
+HARMONIC_EXPONENT, MAX_HARMONICS, MAX_HARMONICS_PER_CODE = 30.0, 8.0, 2.0
+#: Smallest probability of a companding inverse; tolerance of integer charges.
+MIN_PROBABILITY, INTEGER_TOLERANCE = 1e-18, 1e-6
 #: Sites per pass of :func:`convert`: its buffers and the table of quantiles fit the L1 cache.
 PIECE = 512
 #: Bisections that determine a float64 to its last bit.
 BISECTIONS = 60
-SQRT_HALF, SQRT_TWO_PI = math.sqrt(0.5), math.sqrt(2.0 * math.pi)
+SQRT_HALF, SQRT_TWO_PI, TWO_PI = math.sqrt(0.5), math.sqrt(2.0 * math.pi), 2.0 * math.pi
 
 _floats = types.Array(types.float64, 1, "C", readonly=True)
 _ints = types.Array(types.int64, 1, "C", readonly=True)
@@ -52,12 +68,12 @@ _number, _count = types.float64, types.int64
 _adc = types.NamedTuple(
     (_number, _count, _number, _floats, _count, _floats, _number, types.uint64, _floats), ConversionTables
 )
-_charges = types.NamedTuple((_floats, _floats, _floats, _floats, _floats, _number, types.boolean), ChargeDistributions)
+_charges = types.NamedTuple((_floats, _floats, _floats, _floats, _floats, types.boolean), ChargeDistributions)
+_charge_tables = types.NamedTuple((_ints, _ints, _floats), ChargeTables)
 _poisson_tables = types.NamedTuple(
     (types.Array(types.float64, 2, "C", readonly=True), types.Array(types.uint16, 2, "C", readonly=True)), PoissonTables
 )
 _transfer = types.NamedTuple((_floats, _floats, _floats, _floats, _number, _number), Transfer)
-_quadrature = types.NamedUniTuple(_floats, 2, Quadrature)
 
 _LOW, _ONE_IN_2_32 = np.uint64(0xFFFFFFFF), 2.0**-32
 
@@ -351,107 +367,336 @@ def convert(voltage_v, line, adc, code):
 
 
 @njit()
-def _edgeworth_cdf(x, skewness):
-    """Return the standardised Gaussian CDF with the first Edgeworth term (skewness)."""
-    gaussian = 0.5 * math.erfc(-x * SQRT_HALF)
-    if skewness == 0.0:
-        return gaussian
-    return gaussian - skewness / 6.0 * (x * x - 1.0) * math.exp(-0.5 * x * x) / SQRT_TWO_PI
+def _gaussian_cdf(x):
+    return 0.5 * math.erfc(-x * SQRT_HALF)
 
 
 @njit()
-def _probability_below(q, nodes, weights, n_nodes, mean, deviation, third, well_e, sigma, half_step):
+def _edgeworth_coefficients(mean, variance, is_lattice, coefficients):
+    """
+    Compute the Edgeworth series of a Poisson number of this mean plus Gaussian noise, of this total variance.
+
+    The characteristic function at u, about the mean, is ``exp(-s² u²/2) sum c_n (i s u)^n``. The coefficients c_n, to any
+    order, are those of the exponential of a power series with the cumulants, ``mean z^j / j!`` from j = 3. With
+    ``is_lattice``, the series is that of the cumulative probability of integers, at half-integers, and ``variance`` is the
+    mean. The inversion of a lattice distribution adds the factor ``(z/2) / sinh(z/2)`` (J. E. Kolassa and P. McCullagh,
+    Edgeworth series for lattice distributions, Ann. Statist. 18, 981, 1990).
+
+    Returns the standard deviation and the number of coefficients, or 0 where the series does not reach ``MIN_TERM``.
+    """
+    spread = math.sqrt(variance - 1.0 / 12.0 if is_lattice else variance)
+    scale = 1.0 / spread
+    # Coefficients j b_j of the cumulants, in the upper half of the array, and c_n in the lower half.
+    coefficients[0], coefficients[1], coefficients[2] = 1.0, 0.0, 0.0
+    cumulant = 0.5 * mean * scale * scale
+    # Hermite polynomials of degree n - 1, times the Gaussian density, are below sqrt((n - 1)! / (2 pi)).
+    largest, limit = 0.0, 1.0 / (TWO_PI * MIN_TERM**2)
+    for n in range(3, MAX_TERMS):
+        cumulant *= scale / (n - 1.0) if n > 3 else scale
+        term = cumulant
+        if is_lattice:
+            if n == 4:
+                term += 4.0 * LATTICE_4 * scale**4
+            elif n == 6:
+                term += 6.0 * LATTICE_6 * scale**6
+            elif n == 8:
+                term += 8.0 * LATTICE_8 * scale**8
+        coefficients[np.uint64(MAX_TERMS + n)] = term
+        # c_0 is 1, and c_1 and c_2 are 0.
+        for j in range(3, n - 2):
+            term += coefficients[np.uint64(MAX_TERMS + j)] * coefficients[np.uint64(n - j)]
+        term /= n
+        coefficients[np.uint64(n)] = term
+        limit *= n - 1.0
+        size = term * term * limit
+        # Terms vary in groups of three.
+        largest = size if n % 3 == 0 else max(largest, size)
+        if n % 3 == 2 and largest < 1.0:
+            return spread, n - 2
+    return spread, 0
+
+
+@njit()
+def _edgeworth_cdf(x, coefficients, n_terms):
+    """Return the standardised Gaussian CDF, with the terms of :func:`_edgeworth_coefficients`."""
+    if x < -RANGE_SIGMAS - 1.0 or x > RANGE_SIGMAS + 3.0:
+        return 0.0 if x < 0.0 else 1.0
+    if n_terms <= 3:
+        return _gaussian_cdf(x)
+    total, previous, hermite = 0.0, 1.0, x
+    for n in range(3, n_terms):
+        previous, hermite = hermite, x * hermite - (n - 2.0) * previous
+        total += coefficients[np.uint64(n)] * hermite
+    return _gaussian_cdf(x) - total * math.exp(-0.5 * x * x) / SQRT_TWO_PI
+
+
+@njit()
+def _range_below(variance):
+    """Return the distance from the mean below which Poisson plus Gaussian numbers are neglected."""
+    return RANGE_SIGMAS * math.sqrt(variance)
+
+
+@njit()
+def _range_above(variance):
+    """
+    Return the distance from the mean above which Poisson plus Gaussian numbers are neglected.
+
+    By Bernstein's inequality, the probability of a distance x is below ``exp(-x² / (2 (variance + x/3)))``.
+    """
+    third = RANGE_EXPONENT / 3.0
+    return third + math.sqrt(third * third + 2.0 * RANGE_EXPONENT * variance)
+
+
+@njit()
+def _accumulate(cumulative, n):
+    """Replace probabilities by cumulative ones, normalised."""
+    total = 0.0
+    for j in range(n):
+        total += cumulative[np.uint64(j)]
+        cumulative[np.uint64(j)] = total
+    scale = 1.0 / total
+    for j in range(n):
+        cumulative[np.uint64(j)] *= scale
+
+
+@njit()
+def _tabulate(tables, i, cumulative):
+    """Copy the cumulative probabilities of a site; returns the number of integers, and mean and variance above the first."""
+    begin, n = tables.offset[i], tables.offset[i + 1] - tables.offset[i]
+    weight, first, second = 0.0, 0.0, 0.0
+    for j in range(n):
+        probability = tables.probability[np.uint64(begin + j)]
+        cumulative[np.uint64(j)] = probability
+        weight += probability
+        first += probability * j
+    first /= weight
+    for j in range(n):
+        second += cumulative[np.uint64(j)] * (j - first) ** 2
+    _accumulate(cumulative, n)
+    return n, first, second / weight
+
+
+@njit()
+def _tabulate_poisson(mean, cumulative):
+    """
+    Compute cumulative Poisson probabilities of consecutive integers by recursion from the mode.
+
+    Returns the first integer and their number.
+    """
+    mode = math.floor(mean)
+    first = max(math.floor(mean - _range_below(mean)), 0.0)
+    n, centre = int(math.ceil(mean + _range_above(mean)) - first), int(mode - first)
+    cumulative[np.uint64(centre)] = 1.0
+    probability, k = 1.0, mode
+    for j in range(centre + 1, n):
+        k += 1.0
+        probability *= mean / k
+        cumulative[np.uint64(j)] = probability
+    probability, k = 1.0, mode
+    inverse = 1.0 / max(mean, 1.0)
+    for j in range(centre):
+        probability *= k * inverse
+        k -= 1.0
+        cumulative[np.uint64(centre - 1 - j)] = probability
+    _accumulate(cumulative, n)
+    return first, n
+
+
+@njit()
+def _cumulative_probability(k, charge, cumulative, coefficients):
+    """Return the probability that a charge is at most the integer ``k``."""
+    first, n, end, mean, spread, n_terms = charge
+    if k >= end:
+        return 1.0
+    if k < first:
+        return 0.0
+    if n > 0:
+        return cumulative[np.uint64(np.int64(k - first))]
+    return _edgeworth_cdf((k + 0.5 - mean) / spread, coefficients, n_terms)
+
+
+@njit()
+def _mean_of_intervals(q, k, last, charge, cumulative, coefficients, sigma):
+    """
+    Return the mean cumulative probability of integers, weighted with probabilities that ``q`` minus noise is in k to k + 1.
+
+    These are the density at the centre, by recursion, times a series in ``1/sigma²`` with the Hermite polynomials of even
+    degree. The mean is that of their sum, from which the rounding error of the recursion cancels.
+    """
+    step = 1.0 / sigma
+    step2, step4, step6 = step**2 / 24.0, step**4 / 1920.0, step**6 / 322560.0
+    step8, step10 = step**8 / 92897280.0, step**10 / 40874803200.0
+    x = (q - k - 0.5) * step
+    density = math.exp(-0.5 * x * x) * step / SQRT_TWO_PI
+    ratio, decay = math.exp((x - 0.5 * step) * step), math.exp(-step * step)
+    weight, total = 0.0, 0.0
+    while k < last:
+        u = x * x
+        series = 1.0 + step2 * (u - 1.0) + step4 * ((u - 6.0) * u + 3.0) + step6 * (((u - 15.0) * u + 45.0) * u - 15.0)
+        series += step8 * ((((u - 28.0) * u + 210.0) * u - 420.0) * u + 105.0)
+        series += step10 * (((((u - 45.0) * u + 630.0) * u - 3150.0) * u + 4725.0) * u - 945.0)
+        series *= density
+        weight += series
+        total += series * _cumulative_probability(k, charge, cumulative, coefficients)
+        density *= ratio
+        ratio *= decay
+        x -= step
+        k += 1.0
+    return total / weight if weight > 0.0 else 0.0
+
+
+@njit()
+def _probability_below(q, is_discrete, charge, cumulative, coefficients, sigma, half_step):
     """
     Return the probability that a charge plus readout noise is below ``q``.
 
-    The charge distribution consists of ``n_nodes`` discrete values. For ``n_nodes = 0`` it is a Gaussian with Edgeworth
-    correction, given by its mean, standard deviation and third central moment, and truncated at the full well. The readout
-    noise is Gaussian with standard deviation ``sigma``, plus RTS noise of ``+half_step`` or ``-half_step``.
+    ``charge`` is the first integer, the number of integers in ``cumulative``, the integer from which the cumulative probability
+    is 1 (the full well, or the end of the table), and mean, standard deviation and number of terms of the Edgeworth series. It
+    is that of the charge at half-integers if ``is_discrete`` and the number of integers is 0, or that of charge plus noise if
+    not ``is_discrete``. The readout noise is Gaussian with standard deviation ``sigma``, plus RTS noise of ``+half_step`` or
+    ``-half_step``.
+
+    For integer charges, the sum of probabilities p(k) times ``Phi((q - k) / sigma)`` is that of cumulative probabilities of k
+    times the probability that ``q`` minus the noise is between k and k + 1.
     """
     total = 0.0
     n_states = 2 if half_step > 0.0 else 1
     for state in range(n_states):
         at = q + half_step if state else q - half_step
-        if n_nodes == 0:
-            if sigma == 0.0 and at > well_e:
+        if not is_discrete:
+            mean, spread, n_terms = charge[3], charge[4], charge[5]
+            if spread > 0.0:
+                total += _edgeworth_cdf((at - mean) / spread, coefficients, n_terms)
+            elif mean < at - INTEGER_TOLERANCE:
                 total += 1.0
-            else:
-                spread = math.sqrt(deviation**2 + sigma**2)
-                total += _edgeworth_cdf((at - mean) / spread, third / spread**3)
+        elif sigma == 0.0:
+            total += _cumulative_probability(math.ceil(at - INTEGER_TOLERANCE) - 1.0, charge, cumulative, coefficients)
         else:
-            for j in range(n_nodes):
-                if sigma == 0.0:
-                    total += weights[j] if nodes[j] < at - INTEGER_TOLERANCE else 0.0
-                else:
-                    total += weights[j] * 0.5 * math.erfc((nodes[j] - at) / sigma * SQRT_HALF)
+            last = min(math.floor(at + RANGE_SIGMAS * sigma) + 1.0, charge[2])
+            k = min(max(math.ceil(at - RANGE_SIGMAS * sigma) - 1.0, charge[0]), last)
+            upper = _gaussian_cdf((at - k) / sigma)
+            if sigma >= SERIES_ABOVE_E and k < last:
+                lower = _gaussian_cdf((at - last) / sigma)
+                total += (upper - lower) * _mean_of_intervals(at, k, last, charge, cumulative, coefficients, sigma)
+                k, upper = last, lower
+            while k < last:
+                lower = _gaussian_cdf((at - k - 1.0) / sigma)
+                total += (upper - lower) * _cumulative_probability(k, charge, cumulative, coefficients)
+                upper = lower
+                k += 1.0
+            total += upper
     return total / n_states
 
 
 @njit()
-def _discretise_charge(mean, is_poisson, well_e, quadrature, nodes, weights):
+def _integer_moments(mean, well_e, half_step, dn_per_e, offset_dn, n_codes):
     """
-    Compute nodes and probabilities of a Poisson charge clipped at the full well.
+    Return mean and variance of the code of a Poisson charge without Gaussian noise, for a linear ADC.
 
-    Returns the number of nodes. They are integers for ``is_poisson``; otherwise quadrature points of the Edgeworth series.
+    The sum over all integers, by recursion from the mode to both sides.
     """
-    points, gauss = quadrature
-    n = 0
-    rest = 1.0
-    if is_poisson:
-        probability = math.exp(-mean)
-        k = 0
-        last = int(mean + MAX_DRAW_SIGMAS * math.sqrt(mean)) + MAX_DRAW_MARGIN_E
-        while k <= last and k < well_e and n < nodes.size - 1:
-            if probability > MIN_PROBABILITY:
-                nodes[n], weights[n] = k, probability
-                n += 1
-            rest -= probability
-            k += 1
-            probability *= mean / k
-        if k >= well_e:
-            nodes[n], weights[n] = well_e, max(rest, 0.0)
-            n += 1
-        return n
-    deviation = math.sqrt(mean)
-    low, high = mean - RANGE_SIGMAS * deviation, min(well_e, mean + RANGE_SIGMAS * deviation)
-    if high > low:
-        for j in range(points.size):
-            charge = low + 0.5 * (points[j] + 1.0) * (high - low)
-            z = (charge - mean) / deviation
-            nodes[n] = charge
-            edgeworth = 1.0 + (z * z - 3.0) * z / (6.0 * deviation)
-            weights[n] = 0.5 * (high - low) * gauss[j] * edgeworth * math.exp(-0.5 * z * z) / (deviation * SQRT_TWO_PI)
-            rest -= weights[n]
-            n += 1
-    nodes[n], weights[n] = well_e, max(rest, 0.0)
-    return n + 1
+    mode = math.floor(mean)
+    n = int(_range_above(mean)) + 2
+    inverse = 1.0 / max(mean, 1.0)
+    reference = _quantise(dn_per_e * min(mode, well_e) + offset_dn, n_codes)
+    weight, first, second = 0.0, 0.0, 0.0
+    n_states = 2 if half_step > 0.0 else 1
+    for state in range(n_states):
+        offset = offset_dn + (half_step if state else -half_step) * dn_per_e
+        code = _quantise(dn_per_e * min(mode, well_e) + offset, n_codes) - reference
+        weight += 1.0
+        first += code
+        second += code * code
+        above, below, up, down = 1.0, 1.0, mode, mode
+        for _ in range(n):
+            up += 1.0
+            above *= mean / up
+            # 0 below the charge 0.
+            below *= down * inverse
+            down -= 1.0
+            upper = _quantise(dn_per_e * min(up, well_e) + offset, n_codes) - reference
+            lower = _quantise(dn_per_e * min(down, well_e) + offset, n_codes) - reference
+            weight += above + below
+            first += above * upper + below * lower
+            second += above * upper * upper + below * lower * lower
+    first /= weight
+    return reference + first, second / weight - first * first
 
 
-@njit(types.void(_charges, _transfer, _lines, _adc, _quadrature, types.float64[::1], types.float64[::1]))
-def predict_codes(charges, transfer, line, adc, quadrature, mean_dn, variance_dn2):
+@njit()
+def _count_harmonics(mean, sigma, dn_per_e, n_transitions):
+    """
+    Return the largest harmonic of the quantisation error, and the distance in cycles per e- that is relevant.
+
+    The modulus of the characteristic function of a Poisson number plus Gaussian noise, at f cycles per e-, is
+    ``exp(-mean (1 - cos 2 pi f) - 2 pi² sigma² f²)``: only frequencies close to integers are relevant. The largest harmonic is
+    infinite where too many are.
+    """
+    last = math.sqrt(0.5 * HARMONIC_EXPONENT) / (math.pi * sigma * dn_per_e)
+    if last < 1.0:
+        return last, 0.0
+    near = math.acos(1.0 - HARMONIC_EXPONENT / mean) / TWO_PI if 2.0 * mean > HARMONIC_EXPONENT else 0.5
+    n = min(last, near / dn_per_e + 2.0 * near * last) + last * min(dn_per_e, 1.0)
+    return (last if n <= MAX_HARMONICS + MAX_HARMONICS_PER_CODE * n_transitions else np.inf), near
+
+
+@njit()
+def _quantisation_moments(mean, sigma, half_step, dn_per_e, offset_dn, last, near):
+    """
+    Return what quantisation adds to mean and variance of a Poisson number plus Gaussian and RTS noise, linearly converted.
+
+    The code of the value y is ``y - 1/2 + S``, with the Fourier series ``S = sum sin(2 pi m y) / (pi m)`` and
+    ``S² = 1/12 + sum cos(2 pi m y) / (pi m)²``. Their means are values of the characteristic function at the harmonics m, and
+    the covariance of y and S its derivatives (B. Widrow and I. Kollár, Quantization Noise, Cambridge, 2008, chapters 4 to 6).
+    The first harmonics to ``last`` within ``near`` cycles per e- of an integer are added.
+    """
+    first, second, covariance = 0.0, 0.0, 0.0
+    m = 1.0
+    while m <= last:
+        turns = dn_per_e * m
+        whole = math.floor(turns)
+        if near < turns - whole < 1.0 - near:
+            m = max(math.ceil((whole + 1.0 - near) / dn_per_e), m + 1.0)
+            continue
+        half = math.pi * (turns - whole)
+        sine, versine = math.sin(half), math.cos(half)
+        sine, versine = 2.0 * sine * versine, 2.0 * sine * sine
+        modulus = math.exp(-mean * versine - 0.5 * (TWO_PI * turns * sigma) ** 2)
+        phase = TWO_PI * (offset_dn * m - math.floor(offset_dn * m)) + mean * sine
+        real, imaginary = modulus * math.cos(phase), modulus * math.sin(phase)
+        # Imaginary part of the mean of (y - mean of y) exp(2 pi i m y), in units of dn_per_e.
+        moment = mean * (real * sine - imaginary * versine) + TWO_PI * turns * sigma * sigma * real
+        if half_step > 0.0:
+            rts = TWO_PI * turns * half_step
+            cosine = math.cos(rts)
+            moment = cosine * moment + half_step * math.sin(rts) * real
+            real, imaginary = cosine * real, cosine * imaginary
+        first += imaginary / (math.pi * m)
+        second += real / (math.pi * m) ** 2
+        covariance += dn_per_e * moment / (math.pi * m)
+        m += 1.0
+    return first - 0.5, 1.0 / 12.0 + second - first * first + 2.0 * covariance
+
+
+@njit(types.void(_charges, _charge_tables, _transfer, _lines, _adc, types.float64[::1], types.float64[::1]))
+def predict_codes(charges, tables, transfer, line, adc, mean_dn, variance_dn2):
     """
     Compute mean and variance of the code of each site.
 
-    With ``charges.is_drawn``, charges are Poisson-distributed and clipped at the full well. Otherwise they are Gaussian with
-    variance ``variance_e2``, or equal to their mean where the variance is 0.
+    With ``charges.is_drawn``, charges are integers, clipped at the full well: those of ``tables``, or Poisson-distributed
+    where it is empty. Otherwise they are Gaussian with variance ``variance_e2``, or equal to their mean where it is 0.
     """
-    nodes, weights = np.empty(MAX_NODES), np.empty(MAX_NODES)
+    is_tabulated = charges.is_drawn and tables.first_e.size > 0
+    n_nodes = np.int64(MAX_NODES)
+    if is_tabulated:
+        for i in range(charges.mean_e.size):
+            n_nodes = max(n_nodes, tables.offset[i + 1] - tables.offset[i])
+    cumulative, coefficients = np.empty(n_nodes), np.empty(2 * MAX_TERMS)
     n_codes, nonlinearity = adc.n_codes, transfer.nonlinearity_fraction
+    # With INL and DNL, the order of codes may differ from that of transitions.
+    is_curved = adc.inl.size > 1 or adc.dnl_dn > 0.0
+    is_linear = adc.companding_index == ADC_LINEAR and nonlinearity == 0.0 and not is_curved
     for i in range(charges.mean_e.size):
-        mean, well = charges.mean_e[i], _value_of_site(charges.well_e, i)
-        sigma, half_step = _value_of_site(charges.sigma_e, i), _value_of_site(charges.half_step_e, i)
-        third = 0.0
-        n_nodes = 0
-        deviation = math.sqrt(_value_of_site(charges.variance_e2, i))
-        if charges.is_drawn:
-            deviation, third = math.sqrt(mean), mean
-            if mean <= charges.poisson_below_e:
-                n_nodes = _discretise_charge(mean, True, well, quadrature, nodes, weights)
-            elif well < mean + RANGE_SIGMAS * deviation and sigma > 0.0:
-                n_nodes = _discretise_charge(mean, False, well, quadrature, nodes, weights)
-        elif deviation == 0.0:
-            n_nodes = 1
-            nodes[0], weights[0] = min(mean, well), 1.0
         site = (
             _value_of_site(transfer.v_per_e, i),
             _value_of_site(transfer.sense_v, i),
@@ -465,24 +710,72 @@ def predict_codes(charges, transfer, line, adc, quadrature, mean_dn, variance_dn
                 0.0,
             )
             continue
-        reach = (
-            RANGE_SIGMAS * math.sqrt(deviation**2 + sigma**2) + half_step + (MAX_DRAW_MARGIN_E if n_nodes > 1 else 1.0)
-        )
-        low, high = min(mean, well) - reach, min(mean, well) + reach
-        first, last = _unquantised_code(low, site, adc), _unquantised_code(high, site, adc)
-        # Closed form for a linear ADC where noise exceeds one code and nothing is clipped: quantisation lowers the mean by
-        # 1/2 DN and adds a variance of 1/12 DN², to 1e-8.
-        dn_per_e = site[0] * site[2] / adc.v_sat_v * n_codes
-        smooth_dn = dn_per_e * (sigma if n_nodes > 0 else math.sqrt(deviation**2 + sigma**2))
-        is_uniform = (
-            adc.companding_index == ADC_LINEAR and adc.inl.size == 1 and adc.dnl_dn == 0.0 and nonlinearity == 0.0
-        )
-        if is_uniform and smooth_dn >= 1.0 and first > 0.0 and last < n_codes and mean + reach < well:
-            offset_v = site[1] * site[2] + site[3]
-            mean_dn[i] = mean * dn_per_e + offset_v / adc.v_sat_v * n_codes - 0.5
-            variance_dn2[i] = (deviation**2 + sigma**2 + half_step**2) * dn_per_e**2 + 1.0 / 12.0
-            continue
-        k_first, k_last = max(math.floor(first) - 1, 0), min(math.floor(last) + 1, n_codes - 1)
+        mean, variance = charges.mean_e[i], _value_of_site(charges.variance_e2, i)
+        well, sigma = _value_of_site(charges.well_e, i), _value_of_site(charges.sigma_e, i)
+        half_step = _value_of_site(charges.half_step_e, i)
+        reach = RANGE_SIGMAS * sigma + half_step
+        is_discrete = charges.is_drawn
+        is_poisson = is_discrete and not is_tabulated and well > mean - _range_below(mean)
+        first, n, n_terms = 0.0, np.int64(0), np.int64(0)
+        # Integer from which the cumulative probability is 1 (minus 1 for a table), and range of charge plus noise.
+        end = well
+        if is_tabulated:
+            n, mean, variance = _tabulate(tables, i, cumulative)
+            first = np.float64(tables.first_e[i])
+            mean += first
+            end = min(well, first + n - 1.0)
+            low, high = min(first, end) - reach, first + n - 1.0 + reach
+        elif is_poisson:
+            variance = mean
+            low = max(mean - _range_below(mean + sigma * sigma) - half_step, -reach)
+            high = mean + _range_above(mean + sigma * sigma) + half_step
+        else:
+            if is_discrete or variance == 0.0:
+                mean, variance = min(mean, well), 0.0
+            is_discrete = False
+            low = mean - _range_below(variance + sigma * sigma) - half_step
+            high = mean + _range_below(variance + sigma * sigma) + half_step
+        is_below_well = not is_discrete or high < well
+        spread = math.sqrt(variance + sigma * sigma)
+        if is_linear:
+            dn_per_e = site[0] * site[2] / adc.v_sat_v * n_codes
+            offset_dn = (site[1] * site[2] + site[3]) / adc.v_sat_v * n_codes
+            noise = sigma if is_discrete else spread
+            if is_poisson and noise == 0.0 and mean <= MAX_TABULATED_E:
+                mean_dn[i], variance_dn2[i] = _integer_moments(mean, well, half_step, dn_per_e, offset_dn, n_codes)
+                continue
+            if (
+                noise > 0.0
+                and is_below_well
+                and dn_per_e > 0.0
+                and dn_per_e * low + offset_dn >= 0.0
+                and dn_per_e * high + offset_dn < n_codes
+            ):
+                poisson = mean if is_poisson else 0.0
+                last, near = _count_harmonics(poisson, noise, dn_per_e, dn_per_e * (high - low))
+                if last < 1.0 or (last < np.inf and not is_tabulated):
+                    offset = offset_dn + dn_per_e * (mean - poisson)
+                    added, added2 = _quantisation_moments(poisson, noise, half_step, dn_per_e, offset, last, near)
+                    mean_dn[i] = mean * dn_per_e + offset_dn + added
+                    variance = (spread * spread + half_step * half_step) * dn_per_e * dn_per_e + added2
+                    variance_dn2[i] = max(variance, 0.0)
+                    continue
+        if is_poisson:
+            if mean > MAX_LATTICE_E or (sigma >= CONTINUOUS_ABOVE_E and is_below_well):
+                spread, n_terms = _edgeworth_coefficients(mean, mean + sigma * sigma, False, coefficients)
+                is_discrete = n_terms == 0
+            if is_discrete and mean <= MAX_TABULATED_E:
+                first, n = _tabulate_poisson(mean, cumulative)
+                end = min(well, first + n - 1.0)
+            elif is_discrete:
+                first = math.floor(mean - _range_below(mean))
+                spread, n_terms = _edgeworth_coefficients(mean, mean, True, coefficients)
+                end = min(well, math.ceil(mean + _range_above(mean)))
+        charge = (first, n, end, mean, spread, n_terms)
+        start, stop = _unquantised_code(low, site, adc), _unquantised_code(min(high, well + reach), site, adc)
+        k_first, k_last = max(math.floor(start) - 1, 0), min(math.floor(stop) + 1, n_codes - 1)
+        # Codes are relative to that of the mean: squares of large codes would lose digits of a small variance.
+        reference = math.floor(_unquantised_code(min(mean, well), site, adc))
         total, squares = 0.0, 0.0
         at, cumulated = low, 0.0
         for k in range(k_first, k_last + 1):
@@ -495,22 +788,21 @@ def predict_codes(charges, transfer, line, adc, quadrature, mean_dn, variance_dn
                 transition = k + jump if part == 0 else k + 1.0
                 if part == 1 and jump == 1.0:
                     continue
-                end = _charge_at_code(transition, site, adc)
+                end_e = _charge_at_code(transition, site, adc)
                 if k == k_last and (part == 1 or jump == 1.0):
-                    end = np.inf
-                if end <= at:
+                    end_e = np.inf
+                if end_e <= at:
                     continue
-                below = (
-                    1.0
-                    if end == np.inf
-                    else _probability_below(
-                        end, nodes, weights, n_nodes, mean, deviation, third, well, sigma, half_step
-                    )
-                )
-                centre = 0.5 * (at + end) if end < np.inf else max(at, high) + 1.0
-                code = _quantise_with_dnl(_unquantised_code(centre, site, adc), _value_of_site(line, i), adc)
+                below = 1.0
+                if end_e < np.inf:
+                    below = _probability_below(end_e, is_discrete, charge, cumulative, coefficients, sigma, half_step)
+                code = k - reference
+                if is_curved:
+                    centre = 0.5 * (at + end_e) if end_e < np.inf else max(at, high) + 1.0
+                    code = _quantise_with_dnl(_unquantised_code(centre, site, adc), _value_of_site(line, i), adc)
+                    code -= reference
                 total += code * (below - cumulated)
                 squares += code * code * (below - cumulated)
-                at, cumulated = end, below
-        mean_dn[i] = total
+                at, cumulated = end_e, below
+        mean_dn[i] = reference + total
         variance_dn2[i] = max(squares - total * total, 0.0)

@@ -127,22 +127,19 @@ def test_signal_to_noise_is_that_of_counts(collection):
 
 @COLLECTIONS
 def test_estimates_and_merges_are_unbiased(collection):
-    """Exposures of 0.5 to 2 expected counts per gate, or losses of 5 to 20 %."""
-    sensor, rate, times_s = sensor_of(collection), np.full(N, 2e4), [0.01, 0.02, 0.04]
+    """Exposures of 0.5 to 2 expected counts per gate, or losses of 20 %."""
+    sensor, rate, times_s = sensor_of(collection, pedestal_v=0.0), np.full(N, 2e4), [0.01, 0.02, 0.04]
     codes = np.stack([sensor.expose(rate, t_s, seed=6, frame=k)[2] for k, t_s in enumerate(times_s)])
 
     merged = merge_exposures(codes, times_s, sensor)
-    estimates = [estimate_from_code(code, sensor, t_s) for code, t_s in zip(codes, times_s, strict=True)]
 
-    def z(values, expected):
-        return (values.mean() - expected) / (values.std() / np.sqrt(N))
-
-    # The pedestal is an offset of the merge without calibration: 409.6 e- in each exposure.
-    assert merged.sigma_e_per_s == pytest.approx(np.full(N, merged.rate_e_per_s.std()), rel=0.15)
-    for estimate, t_s in zip(estimates, times_s, strict=True):
-        light_e = estimate.light_e
-        assert light_e.mean() == pytest.approx(2e4 * t_s, rel=0.01)
-        assert np.mean(estimate.variance_e2) == pytest.approx(light_e.var(), rel=0.15)
+    # Weights contain the square of each charge's own noise: a bias of a fraction of an electron per exposure.
+    assert merged.rate_e_per_s.mean() == pytest.approx(2e4, rel=0.003)
+    assert merged.sigma_e_per_s.mean() == pytest.approx(merged.rate_e_per_s.std(), rel=0.05)
+    for code, t_s in zip(codes, times_s, strict=True):
+        found = estimate_from_code(code, sensor, t_s)
+        assert found.light_e.mean() == pytest.approx(2e4 * t_s, rel=0.01)
+        assert found.variance_e2.mean() == pytest.approx(found.light_e.var(), rel=0.1)
 
 
 def test_calibrated_merge_follows_gates():
@@ -164,13 +161,14 @@ def test_collection_works_in_cameras_and_comparisons():
         )
 
     cameras = {"gates": camera(LAYOUT, [Gates()]), "dead": camera(LAYOUT, [DeadTime()]), "plain": camera(LAYOUT, [])}
-    scene = fs.Scene.flat(shape=(64, 64), pitch_um=400.0, distance_m=1.0, radiance_w_m2_sr_nm=0.05, band_width_nm=10.0)
-    comparison = fs.compare.cameras(cameras, {"flat": scene}, exposure_s=0.004, max_pixels=32)
+    scene = fs.Scene.flat(shape=(64, 64), pitch_um=600.0, distance_m=1.0, radiance_w_m2_sr_nm=0.05, band_width_nm=10.0)
+    exposure_s = 300.0 / float(cameras["plain"].photoelectrons_per_s(scene).mean())
+    comparison = fs.compare.cameras(cameras, {"flat": scene}, exposure_s=exposure_s, max_pixels=32)
 
     assert np.isfinite(comparison.values["snr_db"]).all()
     for each in cameras.values():
-        mean_dn, variance_dn2 = each.predict(scene, exposure_s=0.004)
-        capture = each.capture(scene, exposure_s=0.004, seed=1)
+        mean_dn, variance_dn2 = each.predict(scene, exposure_s=exposure_s)
+        capture = each.capture(scene, exposure_s=exposure_s, seed=1)
         z = (capture.code - mean_dn) / np.sqrt(variance_dn2)
         assert z.mean() == pytest.approx(0.0, abs=5.0 / np.sqrt(N))
         assert z.var() == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / N))

@@ -7,11 +7,14 @@ import math
 import numpy as np
 import pytest
 import scipy.constants
+import scipy.special
 import scipy.stats
 
 import foveasim as fs
+from foveasim._core.validation import read_only
 from foveasim.layout import grid
 from foveasim.sensor import Diffusion, InterPixelCapacitance, Sensor
+from foveasim.sensor.model.prediction import ChargeDistributions, ChargeTables, no_tables
 
 SIGMAS = 5.0
 N_DRAWS = 2000
@@ -111,17 +114,229 @@ def test_prediction_with_single_effect_matches_draws(parameters, e_per_code):
     assert_agree(sensor, sensor.expected_electrons(PHOTO_E, 1.0))
 
 
+def sensor_at(dn_per_e, n_sites=1, *, bits=16, **parameters):
+    """Create a sensor of a given system gain."""
+    capacitance_f = 2**bits / dn_per_e * scipy.constants.e / 3.0
+    return Sensor(line_of(n_sites), bits=bits, capacitance_f=capacitance_f, **parameters)
+
+
+def charge_probabilities(mean_e):
+    """Return all integers with a probability above 1e-30, and their Poisson probabilities."""
+    charge = np.arange(max(0, int(mean_e - 13 * np.sqrt(mean_e) - 40)), int(mean_e + 13 * np.sqrt(mean_e) + 90))
+    # For large means, the logarithm of the probability has rounding errors above 1e-10.
+    if mean_e > 5e3:
+        probability = np.diff(scipy.special.pdtr(np.append(charge[0] - 1, charge), mean_e))
+    else:
+        probability = scipy.stats.poisson.pmf(charge, mean_e)
+    return charge, probability / probability.sum()
+
+
+def moments_by_sums(sensor, mean_e, sigma_e=0.0):
+    """Sum over all integers and all code transitions; the variance is relative to a value near the mean code."""
+    charge, probability = charge_probabilities(mean_e)
+    if sensor.full_well_e is not None:
+        charge = np.minimum(charge, sensor.well_e[0])
+    transitions_e = sensor.adc.transition_levels[1:-1] * sensor.v_sat_v / sensor.v_per_e[0]
+    reach = 12.0 * sigma_e + 2.0
+    first, last = np.searchsorted(transitions_e, [charge[0] - reach, charge[-1] + reach])
+    transitions_e = transitions_e[first:last, np.newaxis] - 1e-7 * (sigma_e == 0.0)
+    above = (charge >= transitions_e) if sigma_e == 0.0 else scipy.special.ndtr((charge - transitions_e) / sigma_e)
+    survival = above @ probability
+    weights = -np.diff(np.concatenate([[1.0], survival, [0.0]]))
+    codes = np.arange(weights.size)
+    mean = weights @ codes
+    return first + mean, weights @ (codes - mean) ** 2
+
+
+def assert_equals_sums(sensor, means_e, sigma_e=0.0):
+    """Compare with sums over all integers: mean to 1e-9 DN, variance to 1e-9 relative or 1e-9 DN²."""
+    for mean_e in means_e:
+        mean_dn, variance_dn2 = sensor.predict(np.array([float(mean_e)]))
+        mean, variance = moments_by_sums(sensor, mean_e, sigma_e)
+        assert mean_dn[0] == pytest.approx(mean, abs=1e-9, rel=0.0), mean_e
+        assert variance_dn2[0] == pytest.approx(variance, abs=1e-9, rel=1e-9), mean_e
+
+
+#: On both sides of 100 e-, where draws change, and up to 1e4 e-.
+CHARGES_E = [0.3, 1.0, 7.0, 40.0, 99.9, 100.0, 100.1, 130.0, 200.0, 300.0, 1000.0, 10_000.0]
+
+
 def test_prediction_at_unit_gain_is_poisson():
     mean_e = np.array([0.0, 0.2, 5.0, 80.0, 300.0, 9000.0])
-    sensor = Sensor(line_of(6), **ONE_E_PER_CODE)
 
-    mean_dn, variance_dn2 = sensor.predict(mean_e)
+    mean_dn, variance_dn2 = Sensor(line_of(6), **ONE_E_PER_CODE).predict(mean_e)
 
-    assert mean_dn[:4] == pytest.approx(mean_e[:4], abs=1e-6)
-    assert variance_dn2[:4] == pytest.approx(mean_e[:4], abs=1e-4)
-    # Gaussian approximation above 100 e-: quantisation lowers the mean by 1/2 and adds a variance of 1/12.
-    assert mean_dn[4:] == pytest.approx(mean_e[4:] - 0.5, abs=1e-3)
-    assert variance_dn2[4:] == pytest.approx(mean_e[4:] + 1 / 12, abs=1e-2)
+    assert mean_dn == pytest.approx(mean_e, abs=1e-9, rel=0.0)
+    assert variance_dn2 == pytest.approx(mean_e, abs=1e-9, rel=1e-9)
+
+
+@pytest.mark.parametrize("dn_per_e", [0.08, 0.33, 0.5, 1.0])
+def test_noise_free_prediction_matches_many_draws(dn_per_e):
+    n_sites = 200_000
+    sensor = sensor_at(dn_per_e, n_sites)
+    for k, mean_e in enumerate(CHARGES_E[1:]):
+        mean_dn, variance_dn2 = (part[0] for part in sensor.predict(np.full(n_sites, mean_e)))
+        electrons = sensor.collect(np.full(n_sites, mean_e), seed=3, frame=k)
+        codes = sensor.read(electrons, seed=3, frame=k).astype(float)
+        fourth = np.mean((codes - codes.mean()) ** 4)
+
+        assert abs(codes.mean() - mean_dn) < SIGMAS * np.sqrt(variance_dn2 / n_sites) + 1e-6
+        assert abs(codes.var() - variance_dn2) < SIGMAS * np.sqrt((fourth - codes.var() ** 2) / n_sites) + 1e-6
+
+
+@pytest.mark.parametrize("dn_per_e", [0.08, 0.33, 0.5, 1.0])
+@pytest.mark.parametrize("sigma_e", [0.0, 0.3, 0.7, 1.0999, 1.1, 1.5])
+def test_linear_prediction_equals_integer_sums(dn_per_e, sigma_e):
+    assert_equals_sums(sensor_at(dn_per_e, read_noise_e=sigma_e), CHARGES_E[:-1], sigma_e)
+
+
+@pytest.mark.parametrize("sigma_e", [0.0, 0.3, 1.0, 1.5, 3.0])
+def test_prediction_near_full_well_equals_sums(sigma_e):
+    sensor = sensor_at(0.33, read_noise_e=sigma_e, full_well_e=1000.0)
+
+    assert_equals_sums(sensor, [850.0, 950.0, 999.0, 1000.5, 1040.0, 1200.0, 5000.0], sigma_e)
+
+
+@pytest.mark.parametrize("sigma_e", [0.0, 0.3, 1.0, 1.5, 3.0])
+def test_prediction_near_range_end_equals_sums(sigma_e):
+    sensor = sensor_at(1.0, bits=10, read_noise_e=sigma_e)
+
+    assert_equals_sums(sensor, [850.0, 950.0, 1000.0, 1024.0, 1100.0, 1200.0], sigma_e)
+
+
+@pytest.mark.parametrize(("mean_e", "dn_per_e"), [(2e4, 0.33), (2e4, 1.0), (1e6, 0.004), (1.2e6, 0.004)])
+def test_large_charges_without_noise_equal_sums(mean_e, dn_per_e):
+    assert_equals_sums(sensor_at(dn_per_e), [mean_e])
+
+
+@pytest.mark.parametrize("companding", ["root", "log"])
+@pytest.mark.parametrize("sigma_e", [0.0, 0.3, 1.0, 1.1, 1.5, 2.5])
+def test_companded_prediction_equals_integer_sums(companding, sigma_e):
+    sensor = sensor_at(0.33, bits=12, companding=companding, read_noise_e=sigma_e)
+
+    assert_equals_sums(sensor, CHARGES_E[1:-1], sigma_e)
+
+
+@pytest.mark.parametrize("sigma_e", [0.0, 0.5, 2.0])
+@pytest.mark.parametrize("companding", ["linear", "root"])
+def test_prediction_is_continuous_at_100_e(companding, sigma_e):
+    """Steps of 1e-3 e- change moments by no more than a smooth function of the charge does."""
+    mean_e = 100.0 + 1e-3 * np.arange(-20, 21)
+    sensor = sensor_at(0.33, mean_e.size, companding=companding, read_noise_e=sigma_e)
+
+    for values in sensor.predict(mean_e):
+        second = np.diff(values, 2)
+        assert np.abs(second).max() < 1e-5
+        assert np.ptp(np.diff(values)) < 1e-4
+
+
+def test_exact_shot_noise_has_equal_prediction():
+    mean_e = np.array([50.0, 150.0, 900.0])
+
+    auto, exact = (sensor_at(0.33, 3, shot_noise=how).predict(mean_e) for how in ("auto", "exact"))
+
+    assert np.array_equal(auto, exact)
+
+
+@pytest.mark.parametrize("dn_per_e", [0.05, 0.7])
+@pytest.mark.parametrize("sigma_e", [0.0, 0.4, 2.0])
+def test_rts_states_average_shifted_codes(dn_per_e, sigma_e):
+    """Two equally probable states: the moments are those of two sensors with offsets of half a step."""
+    mean_e = np.array([30.0, 400.0, 2000.0])
+    arguments = kernel_arguments(sensor_at(dn_per_e, 3, pedestal_v=1.0, read_noise_e=sigma_e), mean_e)
+    charges, transfer = arguments["charges"], arguments["transfer"]
+    half_step_e = 6.3
+    states = []
+    for sign in (-1.0, 1.0):
+        sense_v = transfer.sense_v + sign * half_step_e * transfer.v_per_e
+        states.append(predict(**arguments | {"transfer": transfer._replace(sense_v=sense_v)}))
+    mean = np.mean([state[0] for state in states], axis=0)
+    second = np.mean([state[1] + (state[0] - mean) ** 2 for state in states], axis=0)
+
+    predicted = predict(**arguments | {"charges": charges._replace(half_step_e=np.array([half_step_e]))})
+
+    assert predicted[0] == pytest.approx(mean, abs=1e-9, rel=0.0)
+    assert predicted[1] == pytest.approx(second, abs=1e-9, rel=1e-9)
+
+
+def kernel_arguments(sensor, mean_e):
+    """Return arguments of the kernel for Poisson-distributed charges."""
+    model = sensor.readout_model(mean_e, mean_e)
+    charges = ChargeDistributions(
+        mean_e=mean_e,
+        variance_e2=np.zeros(1),
+        well_e=sensor.well_e,
+        sigma_e=np.sqrt(model.gaussian_e2),
+        half_step_e=model.half_step_e,
+        is_drawn=True,
+    )
+    line = sensor.layout.readout_line.astype(np.int32)
+    return {
+        "charges": charges,
+        "tables": no_tables(),
+        "transfer": model.transfer,
+        "line": line,
+        "adc": sensor.adc.tables(sensor.v_sat_v, np.uint64(7)),
+    }
+
+
+def predict(charges, tables, transfer, line, adc):
+    from foveasim.sensor import _kernels
+
+    n_sites = charges.mean_e.size
+    mean_dn, variance_dn2 = np.empty(n_sites), np.empty(n_sites)
+    charges, tables, transfer = (
+        type(group)(*(read_only(part.view()) if isinstance(part, np.ndarray) else part for part in group))
+        for group in (charges, tables, transfer)
+    )
+    _kernels.predict_codes(charges, tables, transfer, read_only(line), adc, mean_dn, variance_dn2)
+    return mean_dn, variance_dn2
+
+
+def tables_of(means_e):
+    """Return Poisson distributions as tables."""
+    charges, probabilities = zip(*map(charge_probabilities, means_e), strict=True)
+    return ChargeTables(
+        first_e=np.array([charge[0] for charge in charges]),
+        offset=np.cumsum([0, *map(len, charges)]),
+        probability=np.concatenate(probabilities),
+    )
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {},
+        {"read_noise_e": 0.4},
+        {"read_noise_e": 2.0},
+        {"read_noise_e": 0.4, "full_well_e": 1010.0},
+        {"read_noise_e": 3.0, "full_well_e": 1010.0, "rts_fraction": 1.0, "rts_e": 5.0},
+        {"companding": "root"},
+        {"companding": "log", "read_noise_e": 0.4, "dnl_dn": 0.5, "inl_dn": [0.0, 1.0, 0.0]},
+        {"dnl_dn": 0.5, "nonlinearity_fraction": 0.02},
+    ],
+    ids=str,
+)
+def test_tabulated_charges_equal_poisson_charges(parameters):
+    mean_e = np.array([0.5, 20.0, 99.0, 101.0, 400.0, 1000.0, 1500.0])
+    arguments = kernel_arguments(sensor_at(0.4, mean_e.size, bits=12, **parameters), mean_e)
+
+    poisson = predict(**arguments)
+    tabulated = predict(**arguments | {"tables": tables_of(mean_e)})
+
+    assert tabulated[0] == pytest.approx(poisson[0], abs=1e-12, rel=1e-12)
+    assert tabulated[1] == pytest.approx(poisson[1], abs=1e-12, rel=1e-12)
+
+
+def test_tabulated_charges_without_poisson_match_sums():
+    """Two charges with unequal probabilities, which need not sum to 1: a linear ADC without noise returns their codes."""
+    sensor = sensor_at(1.0, 2)
+    tables = ChargeTables(np.array([5, 70_000]), np.array([0, 3, 4]), np.array([1.0, 0.0, 3.0, 2.0]))
+
+    mean_dn, variance_dn2 = predict(**kernel_arguments(sensor, np.array([9.0, 9.0])) | {"tables": tables})
+
+    assert mean_dn == pytest.approx([6.5, 65_535.0], abs=1e-9, rel=0.0)
+    assert variance_dn2 == pytest.approx([0.75, 0.0], abs=1e-9)
 
 
 def test_clipped_read_noise_matches_censored_moments():

@@ -131,6 +131,13 @@ class Linearisation:
             slope = record.map(slope)
         return slope
 
+    @property
+    def slope_dn_per_v(self) -> Floats:
+        """Derivative of the code with respect to the voltage at the ADC, DN/V."""
+        slope = self._records[-1].factor
+        assert slope is not None
+        return slope
+
     @cached_property
     def linear_gain_dn_per_e(self) -> Floats:
         """Linear codes per electron without the response nonlinearity, DN/e-."""

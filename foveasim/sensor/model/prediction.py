@@ -7,10 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from foveasim._core.validation import Floats, read_only
+from foveasim._core.validation import Floats, Ints, read_only
 
-#: Number of quadrature nodes for charges clipped at the full well.
-QUADRATURE_NODES = 96
 #: Minimum slope of a nonlinear response, relative to the slope at zero signal.
 MIN_SLOPE = 1e-6
 
@@ -23,8 +21,21 @@ class ChargeDistributions(NamedTuple):
     well_e: Floats
     sigma_e: Floats
     half_step_e: Floats
-    poisson_below_e: float
     is_drawn: bool
+
+
+class ChargeTables(NamedTuple):
+    """
+    Discrete charge distributions for the kernels: read-only arrays, empty where charges are Poisson-distributed.
+
+    Site i has the probabilities ``probability[offset[i] : offset[i + 1]]`` of consecutive charges from ``first_e[i]``, in whole
+    electrons: ``first_e`` (n,) int64, ``offset`` (n + 1,) int64, ``probability`` (offset[n],) float64. A sum other than 1 is
+    normalised.
+    """
+
+    first_e: Ints
+    offset: Ints
+    probability: Floats
 
 
 class Transfer(NamedTuple):
@@ -45,13 +56,6 @@ class Transfer(NamedTuple):
     def linear_gain_dn_per_e(self, n_codes: int) -> Floats:
         """Return the linear codes per electron at the slope of the response at zero."""
         return self.v_per_e * self.scale / self.v_sat_v * n_codes
-
-
-class Quadrature(NamedTuple):
-    """Gauss-Legendre nodes and weights on the interval -1 to 1."""
-
-    points: Floats
-    weights: Floats
 
 
 class ReadoutModel(NamedTuple):
@@ -86,13 +90,10 @@ class ReadoutModel(NamedTuple):
 
 
 @cache
-def quadrature() -> Quadrature:
-    """
-    Compute Gauss-Legendre nodes and weights.
-
-    The result is cached because the eigenvalue problem takes longer than the prediction for a small sensor.
-    """
-    return Quadrature(*(read_only(part) for part in np.polynomial.legendre.leggauss(QUADRATURE_NODES)))
+def no_tables() -> ChargeTables:
+    """Return the empty tables of Poisson-distributed charges."""
+    integers = read_only(np.zeros(0, np.int64))
+    return ChargeTables(integers, integers, read_only(np.zeros(0)))
 
 
 def clipped_gaussian_moments(mean_e: Floats, variance_e2: Floats, limit_e: Floats) -> tuple[Floats, Floats]:
