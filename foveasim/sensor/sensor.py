@@ -76,6 +76,8 @@ __all__ = ["PerSite", "Photosites", "Sensor"]
 
 #: Offset of voltages for the slope of mean codes, in standard deviations of the noise or in codes: the error is below 1e-3.
 OFFSET_SIGMAS = 0.05
+#: Fraction of its own charge that a site keeps in a mixing, above which this charge has its own distribution in predictions.
+MIN_OWN_FRACTION = 0.5
 #: One value for all sites, or an array (n_site,).
 PerSite = float | NDArray[np.float64]
 
@@ -1007,8 +1009,8 @@ class Sensor:
         INL, DNL and clipping, moments are those before quantisation plus a Fourier series of the quantisation error.
 
         Readout effects are represented by their moments: to first order at the mean charge, with Gaussian temporal noise,
-        except RTS noise, which has its two states. Charges that are mixed after the draw, as by inter-pixel capacitance, are
-        assumed to be Gaussian.
+        except RTS noise, which has its two states. Charges of other sites that are mixed in after the draw, as by inter-pixel
+        capacitance, are assumed to be Gaussian.
         A collection of a user has the sums over its probabilities (:meth:`~foveasim.sensor.effects.Collection.table`).
         """
         expected_e = self.validate_charges("expected_e", expected_e)
@@ -1068,8 +1070,19 @@ class Sensor:
         if not is_drawn:
             drawn_e, drawn_e2 = np.minimum(np.rint(drawn_e), well_e), np.zeros(1)
         spread_e2 = drawn_e if is_poisson and is_drawn else drawn_e2
-        model = self.readout_model(*clipped_gaussian_moments(drawn_e, spread_e2, well_e))
-        if model.is_mixed:
+        collected_e, collected_e2 = clipped_gaussian_moments(drawn_e, spread_e2, well_e)
+        model = self.readout_model(collected_e, collected_e2)
+        transfer, noise_e2, half_step_e = model.transfer, model.gaussian_e2, model.half_step_e
+        own = model.own_fraction
+        if own is not None and own.size and own.min() > MIN_OWN_FRACTION:
+            # The own charge has its distribution; charges of other sites are Gaussian.
+            others_e = model.mean_e - own * collected_e
+            others_e2 = np.maximum(model.variance_e2 - own**2 * collected_e2, 0.0)
+            transfer = transfer._replace(
+                v_per_e=transfer.v_per_e * own, sense_v=transfer.sense_v + transfer.v_per_e * others_e
+            )
+            noise_e2, half_step_e = (noise_e2 + others_e2) / own**2, half_step_e / own
+        elif model.is_mixed:
             # Mixed charges, after clipping at the full well, are approximated as Gaussian.
             drawn_e, drawn_e2 = model.mean_e, model.variance_e2
             is_drawn, well_e = False, np.array([np.inf])
@@ -1077,11 +1090,11 @@ class Sensor:
             mean_e=drawn_e,
             variance_e2=drawn_e2,
             well_e=well_e,
-            sigma_e=np.sqrt(model.gaussian_e2),
-            half_step_e=model.half_step_e,
+            sigma_e=np.sqrt(noise_e2),
+            half_step_e=half_step_e,
             is_drawn=is_drawn,
         )
-        transfer = model.transfer._replace(output_v=np.asarray(model.transfer.output_v + offset_v))
+        transfer = transfer._replace(output_v=np.asarray(transfer.output_v + offset_v))
 
         def block(_: int, index: slice) -> None:
             own = sites.block(index)

@@ -80,6 +80,10 @@ class Operator(Protocol):
     def transpose(self) -> Operator:
         """Return the transposed map."""
 
+    @property
+    def own_fraction(self) -> Floats:
+        """Diagonal of the map, (n_site,)."""
+
     def variance(self, variance: ArrayLike) -> Floats:
         """Return the variances (..., n_site) of mapped values of independent sites."""
 

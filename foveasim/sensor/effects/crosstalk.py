@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.calls import LENGTH, NOT_NEGATIVE, Declared, Limits, OwnCheck
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import Floats, Ints, as_numbers, check_per_site, check_pitch_um, finite_array
+from foveasim._core.validation import Floats, Ints, as_numbers, check_per_site, check_pitch_um, finite_array, read_only
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.sensor.blocks import for_each_block
 from foveasim.sensor.effects.contract import Effect, Photosites, Reach, Sites, Stage, StepModel
@@ -145,6 +145,16 @@ class CrosstalkOperator:
                 sites = slice(first, min(first + self._rows_at_a_time, n_sites))
                 mixed[sites] = self.rows(np.arange(n_sites)[sites]).power(2) @ before
         return np.ascontiguousarray(np.moveaxis(mixed.reshape(columns.shape), 0, -1))
+
+    @cached_property
+    def own_fraction(self) -> Floats:
+        """Fraction of the charge of each site that stays, (n_site,): the diagonal of the operator."""
+        if self.n_steps == 1:
+            return read_only(np.asarray(self.matrix.diagonal(), np.float64))
+        sites = np.arange(self.matrix.shape[0])
+        parts = [sites[first : first + self._rows_at_a_time] for first in range(0, sites.size, self._rows_at_a_time)]
+        diagonals = [np.asarray(self.rows(part)[np.arange(part.size), part]).ravel() for part in parts]
+        return read_only(np.concatenate(diagonals) if diagonals else np.zeros(0))
 
     @cached_property
     def _squared_matrix(self) -> csr_array[Any]:

@@ -68,6 +68,8 @@ class ReadoutModel(NamedTuple):
         Moments of the charges after effects that mix sites, such as inter-pixel capacitance.
     is_mixed : bool
         Whether such an effect is present, so that charges are no longer Poisson-distributed.
+    own_fraction : (n_site,) or None
+        Fraction of each site's own charge after a single such effect; None for none or several.
     transfer : Transfer
         Transfer function of these charges, including effects of the signal chain.
     gaussian_e2 : (..., n_site) or (1,), e-²
@@ -79,6 +81,7 @@ class ReadoutModel(NamedTuple):
     mean_e: Floats
     variance_e2: Floats
     is_mixed: bool
+    own_fraction: Floats | None
     transfer: Transfer
     gaussian_e2: Floats
     half_step_e: Floats

@@ -335,10 +335,13 @@ def readout_model(
     chain = sensor.chain
     mixed = split_charge(chain)[0]
     used = partial(is_temporal, is_reset=is_reset)
+    own_fraction: Floats | None = None
     if mixed:
         walk = Walk(sites)
         mean_e = walk.effects(mixed, np.broadcast_to(mean_e, np.broadcast_shapes(mean_e.shape, (sites.n_sites,))))
         variance_e2 = propagate(walk.records, sites.n_sites, used, variance_e2)
+        if len(mixed) == 1 and walk.records[0].operator is not None:
+            own_fraction = walk.records[0].operator.own_fraction
     records, _ = walk_from_node(sensor, chain, sites, mean_e)
     slope, variance, half_step2 = np.ones(1), np.zeros(1), np.zeros(1)
     for record in records:
@@ -353,6 +356,7 @@ def readout_model(
         mean_e=mean_e,
         variance_e2=variance_e2,
         is_mixed=bool(mixed),
+        own_fraction=own_fraction,
         transfer=transfer_of(sensor, records, mean_e),
         gaussian_e2=variance * per_v2,
         half_step_e=np.sqrt(half_step2 * per_v2),
