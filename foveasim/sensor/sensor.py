@@ -55,7 +55,7 @@ from foveasim.sensor.limits import (
     WIDE_SPREAD,
 )
 from foveasim.sensor.model.inversion import Inverse, invert, invert_collection
-from foveasim.sensor.model.linearisation import Linearisation, linearise
+from foveasim.sensor.model.linearisation import QUANTISATION, Linearisation, linearise
 from foveasim.sensor.model.prediction import (
     ChargeDistributions,
     ChargeTables,
@@ -74,8 +74,9 @@ if TYPE_CHECKING:
 
 __all__ = ["PerSite", "Photosites", "Sensor"]
 
-#: Offset of voltages for the slope of mean codes, in standard deviations of the noise or in codes: the error is below 1e-3.
-OFFSET_SIGMAS = 0.05
+#: Offset of voltages for the slope of mean codes, in standard deviations of the noise: the error is below 1e-3; and smallest
+#: noise to which it is relative, in units of the range.
+OFFSET_SIGMAS, SMALLEST_NOISE = 0.05, 1e-9
 #: Fraction of its own charge that a site keeps in a mixing, above which this charge has its own distribution in predictions.
 MIN_OWN_FRACTION = 0.5
 #: One value for all sites, or an array (n_site,).
@@ -1047,8 +1048,9 @@ class Sensor:
         covariance = model.covariance_matrix_dn2(sites)
         index = np.asarray(sites)
         # The mean code for small offsets of the voltage at the ADC.
-        noise_v = np.broadcast_to(np.sqrt(model.variance_dn2()) / model.slope_dn_per_v, charge_e.shape)
-        offset_v = OFFSET_SIGMAS * np.maximum(noise_v, self.v_sat_v / self.adc.n_codes)
+        before = [name for name, kind in model.sources.items() if kind != "fixed" and name != QUANTISATION]
+        noise_v = np.sqrt(model.variance_dn2(before)) / model.slope_dn_per_v
+        offset_v = OFFSET_SIGMAS * np.broadcast_to(np.maximum(noise_v, SMALLEST_NOISE * self.v_sat_v), charge_e.shape)
         (ahead_dn, _), (behind_dn, _) = (self._predict(charge_e, during, each) for each in (offset_v, -offset_v))
         smooth = ((ahead_dn - behind_dn) / (2.0 * offset_v * model.slope_dn_per_v))[index]
         covariance *= np.multiply.outer(smooth, smooth)

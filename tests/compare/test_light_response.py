@@ -149,6 +149,22 @@ def test_correlated_noise_has_closed_form(keywords):
     assert abs(independent.sum() / expected - 1.0) > 0.01
 
 
+@pytest.mark.parametrize("companding", ["linear", "root", "log"])
+def test_site_information_falls_with_light(companding):
+    """For 100 sites the chain rule is exact; dead and darker sites never add information."""
+    rng, part = np.random.default_rng(4), LAYOUT[:100]
+    for _ in range(20):
+        sensor = Sensor(part, **{**ELECTRONICS, "companding": companding, "bits": int(rng.integers(6, 14)),
+                                 "read_noise_e": float(rng.uniform(0.5, 20.0))}, effects=[RowNoise()])  # fmt: skip
+        light_e = rng.uniform(100.0, 3000.0, 100)
+        covariance = SceneCovariance([float(rng.uniform(1e-6, 1e-3))], [float(rng.uniform(2.0, 30.0))])
+        bits = []
+        for share in (np.ones(100), rng.uniform(0.2, 1.0, 100) * (rng.random(100) > 0.2)):
+            model = sensor.linearise(share * light_e)
+            bits.append(site_information_bits(part, covariance, model.forward(share * light_e), [model]).sum())
+        assert bits[1] <= bits[0]
+
+
 def test_gains_of_other_scenes_are_errors():
     with pytest.raises(ParameterError, match="one per scene, 3"):
         site_information_bits(

@@ -11,6 +11,7 @@ import scipy.stats
 from scipy.special import bdtr
 
 import foveasim as fs
+from foveasim.explore.worker_cache import ShotRunner
 from foveasim.layout import grid
 from foveasim.reconstruct.estimates import estimate_from_code
 from foveasim.sensor import InterPixelCapacitance, Sensor, merge_exposures, noise_budget, signal_to_noise
@@ -174,3 +175,24 @@ def test_collection_works_in_cameras_and_comparisons():
         assert z.var() == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / N))
         assert capture.signal_to_noise(sensor=each.sensor).mean() > 1.0
         assert capture.picture(of="light_e", sensor=each.sensor).data.max() > 0.0
+
+
+def test_collection_works_in_sweeps_tiles_and_video(tmp_path):
+    shot = {
+        "scene": {"kind": "flat", "radiance_w_m2_sr_nm": 0.02, "shape": [32, 32], "pitch_um": 500.0, "distance_m": 1.0, "band_width_nm": 50.0},
+        "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+        "layout": {"generator": "grid", "parameters": {"n_x": 40, "n_y": 40, "pitch_um": 2.0}},
+        "sensor": {"capacitance_f": 2e-16, "effects": [{"kind": "gates of results", "n_gates": 200}]},
+        "exposure_s": 0.001,
+    }  # fmt: skip
+    plan = fs.explore.plan_sweep(shot, {"sensor.effects.0.n_gates": [50, 200]}, metrics=["snr"])
+    runner = ShotRunner(plan.source, plan.metrics, is_geometry_varied=plan.is_geometry_varied, n_threads=1)
+    ratio = [runner.record(k, plan.settings_of(k)).values for k in range(plan.n_points)]
+
+    assert 0.0 < ratio[0]["snr_mean"] < ratio[1]["snr_mean"]
+    made = fs.config.build_shot(shot)
+    camera, scene = made.camera, made.scene
+    capture = camera.capture(scene, exposure_s=0.001, seed=3)
+    (frame,) = camera.video([scene], exposure_s=0.001, seed=3)
+    assert np.array_equal(frame.code, capture.code)
+    assert capture.electrons.max() <= 200

@@ -314,6 +314,38 @@ def test_own_effects_change_all_noise_alike():
     )
 
 
+# -- predictions ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bits", [1, 8, 12])
+def test_predicted_covariance_matches_draws(bits):
+    """At one bit the covariance is a lower bound; the mean is at the threshold."""
+    n_frames, sites = 20_000, np.array([0, 1, 2, 12, 13, 60, 61])
+    changes = {"v_sat_v": 0.6, "pedestal_v": 0.05} if bits == 1 else {"v_sat_v": 1.0}
+    sensor = sensor_of(
+        "mixed", bits=bits, effects=[RowNoise(60.0)], **{"v_sat_v": 1.0, **changes, "read_noise_e": 40.0},
+    )  # fmt: skip
+    charge_e = np.full(N, 5000.0)
+    codes = np.stack([
+        sensor.read(sensor.collect(charge_e, seed=3, frame=k), seed=3, frame=k) for k in range(n_frames)
+    ])[:, sites].astype(float)  # fmt: skip
+
+    predicted = sensor.predict_covariance(charge_e, sites)
+
+    drawn = np.cov(codes.T)
+    variance = np.diagonal(predicted)
+    assert np.array_equal(variance, sensor.predict(charge_e)[1][sites])
+    error = np.sqrt((np.multiply.outer(variance, variance) + predicted**2) / n_frames)
+    z = (drawn - predicted) / error
+    if bits == 1:
+        assert np.all(z > -5.0)
+        off = ~np.eye(sites.size, dtype=bool)
+        assert np.all(np.abs(drawn - predicted)[off] < 0.25 * np.abs(predicted[off]) + 5.0 * error[off])
+    else:
+        assert np.abs(z).max() < 5.0
+
+
 # -- saturation -------------------------------------------------------------------------------------------------------
 
 
@@ -337,7 +369,7 @@ def test_information_falls_with_light(companding):
             "plain", companding=companding, read_noise_e=float(rng.uniform(0.5, 30.0)), bits=int(rng.integers(6, 14)),
             prnu_fraction=float(rng.uniform(0.0, 0.1)), effects=[RowNoise(float(rng.uniform(0.0, 30.0)))],
         )  # fmt: skip
-        share = rng.uniform(0.2, 1.0, N)
+        share = rng.uniform(0.2, 1.0, N) * (rng.random(N) > 0.2)  # a fifth of the sites is dead
         lit, dim = (
             sensor.linearise(photo_e_per_s=PHOTO * part, exposure_s=1.0).information(patterns * part, "light")[0, 0]
             for part in (1.0, share)
