@@ -190,7 +190,7 @@ def test_collection_works_in_sweeps_tiles_and_video(tmp_path):
     ratio = [runner.record(k, plan.settings_of(k)).values for k in range(plan.n_points)]
 
     assert 0.0 < ratio[0]["snr_mean"] < ratio[1]["snr_mean"]
-    made = fs.config.build_shot(shot)
+    made = fs.config.build_shot("shot.yaml", shot)
     camera, scene = made.camera, made.scene
     capture = camera.capture(scene, exposure_s=0.001, seed=3)
     (frame,) = camera.video([scene], exposure_s=0.001, seed=3)
