@@ -16,7 +16,7 @@ from foveasim.errors import ParameterError
 from foveasim.layout import grid
 from foveasim.sensor import Sensor, noise_budget
 from foveasim.sensor.chain import FIXED_STAGES
-from foveasim.sensor.effects import EFFECTS, Collection, Effect, Mixing, ShotNoise
+from foveasim.sensor.effects import EFFECTS, Collection, Effect, Mixing
 from foveasim.testing._extension import Extension, check_of, require, shot_with
 from foveasim.units import ELEMENTARY_CHARGE_C
 
@@ -83,11 +83,10 @@ def check_sensor_effect(name: str, keywords: Mapping[str, Any]) -> None:
     _check_affine(sensor, effect)
     if isinstance(effect, Collection):
         _check_collection(sensor, effect)
-    if not isinstance(effect, Collection) or isinstance(effect, ShotNoise):
-        _check_prediction(sensor, effect)
-        if effect.reach != "all":
-            _check_moments(sensor, effect)
-            _check_part(sensor, effect)
+    _check_prediction(sensor, effect)
+    if effect.reach != "all":
+        _check_moments(sensor, effect)
+        _check_part(sensor, effect)
     if isinstance(effect, Mixing):
         _check_mixing(sensor, effect)
     quiet, both = (_sensor({**each, "read_noise_e": 7.0}) for each in ({}, keywords))
@@ -138,7 +137,7 @@ def _check_prediction(sensor: Sensor, effect: Effect) -> None:
     """Compare codes with the analytical moments of this device, or of several."""
     n = N_DRAWS if effect.is_temporal else 2
     sensors = [sensor] * n if effect.is_temporal else [replace(sensor, device_seed=k) for k in range(n)]
-    moments = [each.predict(_expected_e(each)) for each in sensors[: n if not effect.is_temporal else 1]]
+    moments = [each.predict(_expected_e(each), exposure_s=EXPOSURE_S) for each in sensors[: n if not effect.is_temporal else 1]]
     mean_dn, variance_dn2 = (np.stack([found[k] for found in moments]) for k in range(2))
     codes = np.stack([_codes(each, frame) for frame, each in enumerate(sensors)])
     some = np.broadcast_to(variance_dn2 > 0.0, codes.shape)
@@ -157,12 +156,12 @@ def _check_moments(sensor: Sensor, effect: Effect) -> None:
     unit = 1.0 / E_PER_UNIT.get(effect.stage, 1.0)
     nominal = {"photo": PHOTO_E, "dark": dark_e}.get(effect.stage, PHOTO_E + dark_e) * unit
     nominal += PEDESTAL_V if effect.stage == "output" else 0.0
-    sites = sensor.sites if effect.is_temporal else sensor.sites.without_device()
+    sites = sensor.sites.during(EXPOSURE_S) if effect.is_temporal else sensor.sites.without_device()
     mean, variance = effect.validate_moments(np.full(N, nominal), np.zeros(N), sites)
     shift_e, variance_e2 = (np.broadcast_to(part, N) for part in ((mean - nominal) / unit, variance / unit**2))
 
     budget = noise_budget(sensor, np.full(N, PHOTO_E / EXPOSURE_S), EXPOSURE_S)
-    lines = ("photon_shot", "dark_shot") if effect.name == "shot" else (effect.name,)
+    lines = ("photon_shot", "dark_shot") if isinstance(effect, Collection) else (effect.name,)
     line_e = np.sqrt(sum(budget[line] ** 2 for line in lines))
     require(
         np.allclose(line_e, np.sqrt(variance_e2), rtol=1e-6, atol=1e-9),
@@ -248,7 +247,7 @@ def _check_part(sensor: Sensor, effect: Effect) -> None:
     """Compare sites alone, and a block of sites, with the complete sensor."""
     hint = "use sites.select() and sites.pattern(), or derive from Mixing"
     chosen = slice(N // 3, N // 2)
-    sites, mean = sensor.sites, np.linspace(0.5, 2.0, N)
+    sites, mean = sensor.sites.during(EXPOSURE_S), np.linspace(0.5, 2.0, N)
     complete = effect.validate_moments(mean, 0.1 * mean, sites)
     alone = effect.validate_moments(mean[chosen], 0.1 * mean[chosen], sites.block(chosen))
     for one, other in zip(complete, alone, strict=True):
@@ -259,7 +258,8 @@ def _check_part(sensor: Sensor, effect: Effect) -> None:
         "has another effect in a part of the sensor, such as a tile; use sites.device, or set needs_layout = True"
     )
     require(np.array_equal(_expected_e(part), _expected_e(sensor)[chosen]), expected)
-    for one, other in zip(sensor.predict(_expected_e(sensor)), part.predict(_expected_e(part)), strict=True):
+    predicted = (each.predict(_expected_e(each), exposure_s=EXPOSURE_S) for each in (sensor, part))
+    for one, other in zip(*predicted, strict=True):
         require(np.array_equal(one[chosen], other), expected)
-    if not effect.is_temporal:
+    if not effect.is_temporal or effect.reach == "group":
         require(np.array_equal(_codes(sensor)[chosen], _codes(part)), expected)
