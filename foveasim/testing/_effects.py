@@ -137,7 +137,9 @@ def _check_prediction(sensor: Sensor, effect: Effect) -> None:
     """Compare codes with the analytical moments of this device, or of several."""
     n = N_DRAWS if effect.is_temporal else 2
     sensors = [sensor] * n if effect.is_temporal else [replace(sensor, device_seed=k) for k in range(n)]
-    moments = [each.predict(_expected_e(each), exposure_s=EXPOSURE_S) for each in sensors[: n if not effect.is_temporal else 1]]
+    moments = [
+        each.predict(_expected_e(each), exposure_s=EXPOSURE_S) for each in sensors[: n if not effect.is_temporal else 1]
+    ]
     mean_dn, variance_dn2 = (np.stack([found[k] for found in moments]) for k in range(2))
     codes = np.stack([_codes(each, frame) for frame, each in enumerate(sensors)])
     some = np.broadcast_to(variance_dn2 > 0.0, codes.shape)
