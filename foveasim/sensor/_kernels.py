@@ -374,13 +374,14 @@ def _gaussian_cdf(x):
 @njit()
 def _edgeworth_coefficients(mean, variance, is_lattice, coefficients):
     """
-    Compute the Edgeworth series of a Poisson number of this mean plus Gaussian noise, of this total variance.
+    Compute the Edgeworth series of a Poisson number plus Gaussian noise.
 
-    The characteristic function at u, about the mean, is ``exp(-s² u²/2) sum c_n (i s u)^n``. The coefficients c_n, to any
-    order, are those of the exponential of a power series with the cumulants, ``mean z^j / j!`` from j = 3. With
-    ``is_lattice``, the series is that of the cumulative probability of integers, at half-integers, and ``variance`` is the
-    mean. The inversion of a lattice distribution adds the factor ``(z/2) / sinh(z/2)`` (J. E. Kolassa and P. McCullagh,
-    Edgeworth series for lattice distributions, Ann. Statist. 18, 981, 1990).
+    ``variance`` is the total variance. The characteristic function at u, about the mean, is
+    ``exp(-s² u²/2) sum c_n (i s u)^n``. The coefficients c_n, to any order, are those of the exponential of a power series
+    with the cumulants, ``mean z^j / j!`` from j = 3. With ``is_lattice``, the series is that of the cumulative probability of
+    integers, at half-integers, and ``variance`` is the mean. The inversion of a lattice distribution adds the factor
+    ``(z/2) / sinh(z/2)`` (J. E. Kolassa and P. McCullagh, Edgeworth series for lattice distributions, Ann. Statist. 18, 981,
+    1990).
 
     Returns the standard deviation and the number of coefficients, or 0 where the series does not reach ``MIN_TERM``.
     """
@@ -432,14 +433,14 @@ def _edgeworth_cdf(x, coefficients, n_terms):
 
 @njit()
 def _range_below(variance):
-    """Return the distance from the mean below which Poisson plus Gaussian numbers are neglected."""
+    """Return the largest deviation below the mean of Poisson plus Gaussian numbers."""
     return RANGE_SIGMAS * math.sqrt(variance)
 
 
 @njit()
 def _range_above(variance):
     """
-    Return the distance from the mean above which Poisson plus Gaussian numbers are neglected.
+    Return the largest deviation above the mean of Poisson plus Gaussian numbers.
 
     By Bernstein's inequality, the probability of a distance x is below ``exp(-x² / (2 (variance + x/3)))``.
     """
@@ -461,11 +462,15 @@ def _accumulate(cumulative, n):
 
 @njit()
 def _tabulate(tables, i, cumulative):
-    """Copy the cumulative probabilities of a site; returns the number of integers, and mean and variance above the first."""
+    """
+    Compute the cumulative probabilities of the table of a site.
+
+    Returns the number of integers, mean minus the first integer, and variance.
+    """
     begin, n = tables.offset[i], tables.offset[i + 1] - tables.offset[i]
     weight, first, second = 0.0, 0.0, 0.0
     for j in range(n):
-        probability = tables.probability[np.uint64(begin + j)]
+        probability = tables.probability_fraction[np.uint64(begin + j)]
         cumulative[np.uint64(j)] = probability
         weight += probability
         first += probability * j
@@ -479,8 +484,9 @@ def _tabulate(tables, i, cumulative):
 @njit()
 def _tabulate_poisson(mean, cumulative):
     """
-    Compute cumulative Poisson probabilities of consecutive integers by recursion from the mode.
+    Compute cumulative Poisson probabilities of consecutive integers.
 
+    Probabilities are computed by recursion from the mode, so that they need no logarithm of the gamma function.
     Returns the first integer and their number.
     """
     mode = math.floor(mean)
@@ -518,10 +524,11 @@ def _cumulative_probability(k, charge, cumulative, coefficients):
 @njit()
 def _mean_of_intervals(q, k, last, charge, cumulative, coefficients, sigma):
     """
-    Return the mean cumulative probability of integers, weighted with probabilities that ``q`` minus noise is in k to k + 1.
+    Return the weighted mean of cumulative probabilities of integers k.
 
-    These are the density at the centre, by recursion, times a series in ``1/sigma²`` with the Hermite polynomials of even
-    degree. The mean is that of their sum, from which the rounding error of the recursion cancels.
+    Weights are the probabilities that ``q`` minus the noise is between k and k + 1: the density at the centre, by recursion,
+    times a series in ``1/sigma²`` with the Hermite polynomials of even degree. The mean is that of their sum, from which the
+    rounding error of the recursion cancels.
     """
     step = 1.0 / sigma
     step2, step4, step6 = step**2 / 24.0, step**4 / 1920.0, step**6 / 322560.0
@@ -591,9 +598,9 @@ def _probability_below(q, is_discrete, charge, cumulative, coefficients, sigma, 
 @njit()
 def _integer_moments(mean, well_e, half_step, dn_per_e, offset_dn, n_codes):
     """
-    Return mean and variance of the code of a Poisson charge without Gaussian noise, for a linear ADC.
+    Return code mean and variance of a Poisson charge, for a linear ADC.
 
-    The sum over all integers, by recursion from the mode to both sides.
+    Without Gaussian noise: the sums over all integers, by recursion from the mode to both sides.
     """
     mode = math.floor(mean)
     n = int(_range_above(mean)) + 2
@@ -626,8 +633,9 @@ def _integer_moments(mean, well_e, half_step, dn_per_e, offset_dn, n_codes):
 @njit()
 def _count_harmonics(mean, sigma, dn_per_e, n_transitions):
     """
-    Return the largest harmonic of the quantisation error, and the distance in cycles per e- that is relevant.
+    Return the largest relevant harmonic of the quantisation error.
 
+    Also returns the distance from integers, in cycles per e-, within which harmonics are relevant.
     The modulus of the characteristic function of a Poisson number plus Gaussian noise, at f cycles per e-, is
     ``exp(-mean (1 - cos 2 pi f) - 2 pi² sigma² f²)``: only frequencies close to integers are relevant. The largest harmonic is
     infinite where too many are.
@@ -643,8 +651,9 @@ def _count_harmonics(mean, sigma, dn_per_e, n_transitions):
 @njit()
 def _quantisation_moments(mean, sigma, half_step, dn_per_e, offset_dn, last, near):
     """
-    Return what quantisation adds to mean and variance of a Poisson number plus Gaussian and RTS noise, linearly converted.
+    Return mean of the quantisation error, and the variance that it adds.
 
+    The value is a Poisson number plus Gaussian and RTS noise, converted linearly.
     The code of the value y is ``y - 1/2 + S``, with the Fourier series ``S = sum sin(2 pi m y) / (pi m)`` and
     ``S² = 1/12 + sum cos(2 pi m y) / (pi m)²``. Their means are values of the characteristic function at the harmonics m, and
     the covariance of y and S its derivatives (B. Widrow and I. Kollár, Quantization Noise, Cambridge, 2008, chapters 4 to 6).

@@ -299,7 +299,7 @@ def tables_of(means_e):
     return ChargeTables(
         first_e=np.array([charge[0] for charge in charges]),
         offset=np.cumsum([0, *map(len, charges)]),
-        probability=np.concatenate(probabilities),
+        probability_fraction=np.concatenate(probabilities),
     )
 
 

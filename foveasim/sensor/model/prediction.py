@@ -26,16 +26,16 @@ class ChargeDistributions(NamedTuple):
 
 class ChargeTables(NamedTuple):
     """
-    Discrete charge distributions for the kernels: read-only arrays, empty where charges are Poisson-distributed.
+    Discrete charge distributions for the kernels; empty for Poisson distributions.
 
-    Site i has the probabilities ``probability[offset[i] : offset[i + 1]]`` of consecutive charges from ``first_e[i]``, in whole
-    electrons: ``first_e`` (n,) int64, ``offset`` (n + 1,) int64, ``probability`` (offset[n],) float64. A sum other than 1 is
-    normalised.
+    Read-only arrays. Site i has the probabilities ``probability_fraction[offset[i] : offset[i + 1]]`` of consecutive charges
+    from ``first_e[i]``, in whole electrons: ``first_e`` (n,) int64, ``offset`` (n + 1,) int64, ``probability_fraction``
+    (offset[n],) float64. A sum other than 1 is normalised.
     """
 
     first_e: Ints
     offset: Ints
-    probability: Floats
+    probability_fraction: Floats
 
 
 class Transfer(NamedTuple):
