@@ -131,7 +131,7 @@ class Views:
         return times_ms
 
     def _attempt(self, part: Part, number: Any, call: Callable[..., Any], *values: Any, **options: Any) -> Any:
-        """Return what a call for a view returns; None after an exception, which is sent: the other views are shown."""
+        """Return the result of a call; None after an exception, which is sent."""
         try:
             return call(*values, **options)
         except Exception as error:  # noqa: BLE001 -- of any view
