@@ -13,7 +13,7 @@ from foveasim.errors import ParameterError
 from foveasim.studio._costs import Costs
 from foveasim.studio._engine import PICTURE_PIXELS, Simulated
 from foveasim.studio._messages import encode_part
-from foveasim.studio._parts import PARTS
+from foveasim.studio._parts import PARTS, Part, PartData
 from foveasim.studio._parts.registry import FIRST_TILE
 
 #: Parts that are sent first and together: sites, and their values.
@@ -100,8 +100,8 @@ class Views:
             warnings.simplefilter("ignore")  # those of the simulation are in the state
             for k, name in enumerate(names):
                 part = PARTS[name]
-                depends = part.depends(result)
-                if name in self._sent and _is_same(self._sent[name], depends):
+                depends = self._attempt(part, number, _depends_of, part, result)
+                if depends is None or (name in self._sent and _is_same(self._sent[name], depends)):
                     self._version[name] = version
                     continue
                 together = first if name in first else [name]
@@ -110,12 +110,7 @@ class Views:
                     self.left_out.append(name)
                     continue
                 start_s = time.perf_counter()
-                try:
-                    data = part.make(result)
-                except Exception as error:  # noqa: BLE001 -- one view fails, the others are shown
-                    data = None
-                    text = f"{part.label}: {self._line(error)}"
-                    self._send({"kind": "error", "id": number, "part": name, "text": text})
+                data = self._attempt(part, number, _data_of, part, result)
                 self._sent[name], self._version[name] = [_weak(each) for each in depends], version
                 time_s = time.perf_counter() - start_s
                 times_ms[name] = 1e3 * time_s
@@ -125,13 +120,34 @@ class Views:
                 has_slow = k + 1 == len(first) and self._costs.parts_s(key, names[k + 1 :]) > SOON_S
                 is_drawn = is_stopped or is_late or has_slow
                 if data is not None:
-                    is_preview = result.is_preview
-                    self._send(encode_part(name, version, *data, is_preview=is_preview, has_more=not is_drawn))
+                    options = {"is_preview": result.is_preview, "has_more": not is_drawn}
+                    message = self._attempt(part, number, encode_part, name, version, *data, **options)
+                    if message is not None:
+                        self._send(message)
                 if is_drawn:
                     drawn_s = time.perf_counter()
                 if is_stopped:
                     return None
         return times_ms
+
+    def _attempt(self, part: Part, number: Any, call: Callable[..., Any], *values: Any, **options: Any) -> Any:
+        """Return the result of a call; None after an exception, which is sent."""
+        try:
+            return call(*values, **options)
+        except Exception as error:  # noqa: BLE001 -- of any view
+            self._send({"kind": "error", "id": number, "part": part.name, "text": f"{part.label}: {self._line(error)}"})
+            return None
+
+
+def _depends_of(part: Part, result: Simulated) -> tuple[Any, ...]:
+    """Return the objects that determine the data of a view."""
+    return tuple(part.depends(result))
+
+
+def _data_of(part: Part, result: Simulated) -> PartData:
+    """Return the data of a view; a value that is not a pair raises an exception."""
+    about, arrays = part.make(result)
+    return about, arrays
 
 
 def _weak(value: Any) -> Any:

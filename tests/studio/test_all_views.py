@@ -14,19 +14,47 @@ import pytest
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
-from studio.page_tools import has_picture, settle, until
+from studio.page_tools import change, has_picture, set_value, settle, until
 
 from foveasim.studio._engine import Engine
 from foveasim.studio._messages import encode_part
 from foveasim.studio._parts import PARTS, Part
+from foveasim.studio._parts.registry import capture_of
 
 EXTENDING = Path(__file__).parents[2] / "docs" / "extending.md"
 MODULES = files("foveasim.studio") / "static" / "views"
 #: Canvases of the views that are always shown.
 CANVASES = {"columns": "#map .cells", "picture": "#picture .image", "scene": "#scene .image"}
-#: Names of the shown views whose tiles contain no text other than the heading.
-EMPTY_TILES = """() => studio.views.list.filter(({ name, is_tile }) => is_tile && !([...document.getElementById("tile-" + name).children]
-  .some((child) => child.tagName !== "H2" && child.innerText.trim()))).map(({ name }) => name)"""
+#: Content of the shown tiles by view: texts without the heading, canvases (hash; null if uniform), and the data.
+TILES = """async () => {
+  await new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)));
+  const hash = (canvas) => {
+    if (!canvas.getContext("2d")) return "WebGL";
+    const { width, height } = canvas, copy = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
+    copy.drawImage(canvas, 0, 0);
+    const words = new Uint32Array(copy.getImageData(0, 0, width, height).data.buffer);
+    return words.every((word) => word === words[0]) ? null : words.reduce((sum, word) => (31 * sum + word) | 0, 0);
+  };
+  const about = ({ name }) => {
+    const tile = document.getElementById("tile-" + name), part = studio.views.parts[name];
+    const texts = [...tile.childNodes].filter(({ tagName }) => tagName !== "H2").map((node) => node.innerText ?? node.textContent);
+    const data = part ? JSON.stringify([part.about, Object.entries(part.arrays).map(([key, each]) => [key, [...each]])]) : null;
+    return [name, { text: texts.join("\\n").trim(), canvases: [...tile.querySelectorAll("canvas")].map(hash), data }];
+  };
+  return Object.fromEntries(studio.views.list.filter(({ name }) => studio.views.shown.has(name)).map(about));
+}"""
+#: Texts of values that are not there.
+NO_VALUE = re.compile(r"\b(NaN|undefined|null)\b|\[object")
+#: Settings that change the data of most views.
+OTHER = {
+    "exposure_s": 0.05,
+    "layout.parameters.min_size_um": 11.0,
+    "layout.rules.min_size_um": 20.0,
+    "optics.f_number": 4.0,
+    "sensor.qe.depth_um": 1.0,
+    "sensor.bits": 12,
+}
+SET_ALL = "values => { for (const [key, value] of Object.entries(values)) studio.connection.set(key, value, true); }"
 OPEN_ALL = "() => { for (const { name, is_tile } of studio.views.list) if (is_tile) studio.views.show(name, true); }"
 
 
@@ -45,12 +73,32 @@ def problems_of(part, result):
     return found
 
 
+def problem_of_tile(content, later=None):
+    """Return what is wrong with the content of a tile, and with that after a change of settings."""
+    if not content["text"]:
+        return "no text"
+    if content["canvases"] and not any(content["canvases"]):
+        return "empty canvases"
+    if found := NO_VALUE.search(content["text"]):
+        return f"shows {found[0]}"
+    if later is None:
+        return None
+    shown, shown_later = ([each["text"], each["canvases"]] for each in (content, later))
+    if content["data"] != later["data"] and shown == shown_later:
+        return "other data, same content"
+    return problem_of_tile(later)
+
+
+def simulate(settings):
+    simulated = Engine(n_threads=1).simulate(json.loads(json.dumps(settings)))
+    return replace(simulated, frozen=simulated)
+
+
 @pytest.fixture(scope="module")
 def result():
     from studio.conftest import SETTINGS
 
-    simulated = Engine(n_threads=1).simulate(json.loads(json.dumps(SETTINGS)))
-    return replace(simulated, frozen=simulated)
+    return simulate(SETTINGS)
 
 
 def test_views_have_data_and_modules(result):
@@ -58,6 +106,17 @@ def test_views_have_data_and_modules(result):
 
     assert {name: found for name, found in problems.items() if found} == {}
     assert {path.name.removesuffix(".js") for path in MODULES.iterdir()} == set(PARTS)
+
+
+def test_views_have_data_without_optional_settings():
+    from studio.conftest import SETTINGS
+
+    least = {**SETTINGS, "sensor": {"qe": 0.6}, "exposure_s": 0.0}
+    least["layout"] = {"generator": "grid", "parameters": {"n_x": 1, "n_y": 1, "pitch_um": 12.0}}
+    result = simulate(least)
+    problems = {name: problems_of(part, result) for name, part in PARTS.items()}
+
+    assert {name: found for name, found in problems.items() if found not in ([], ["no data"])} == {}
 
 
 def fail(_):
@@ -83,16 +142,23 @@ def test_wrong_data_of_views_are_found(result, name, make, problem):
 
 @pytest.mark.slow(keep=1)
 @pytest.mark.needs("chromium")
-def test_all_views_show_something(visit):
+def test_all_views_show_their_data(visit):
     page = visit(width=1800, height=1000)
     page.evaluate(OPEN_ALL)
     settle(page)
     page.click("#freeze")
     until(page, "() => studio.isReady && studio.views.parts.comparison && !studio.solid.isAsked")
+    before = page.evaluate(TILES)
+    change(page, SET_ALL, OTHER)
+    until(page, "() => studio.isReady && !studio.solid.isAsked")
+    later = page.evaluate(TILES)
+    problems = {name: problem_of_tile(content, later[name]) for name, content in before.items()}
 
-    assert page.evaluate(EMPTY_TILES) == []
+    assert {name: problem for name, problem in problems.items() if problem} == {}
     assert [name for name, selector in CANVASES.items() if not has_picture(page, selector)] == []
     assert set(page.evaluate("Object.keys(studio.views.made)")) == set(PARTS)
+    assert page.evaluate("studio.state.errors") == {}
+    assert "noise" in [name for name, content in before.items() if content["data"] != later[name]["data"]]
 
 
 @pytest.mark.slow(keep=1)
@@ -105,8 +171,9 @@ def test_all_views_show_something(visit):
         ("export const create = () => ({ use() { JSON.parse('no'); } });", lambda _: ({"n": 1}, {}), "Wrong cannot be shown: Unexpected token"),
         ("export const create = () => ({ use() {} });", lambda _: ({"n": 1}, {}), ""),
         ("export const create = () => ({ use() {} });", fail, "Wrong: ValueError: wrong"),
+        ("export const create = () => ({ use() {} });", lambda _: ({"n": object()}, {}), "Wrong: TypeError: Object of type object"),
     ],
-    ids=["missing", "no create", "exception", "nothing shown", "server"],
+    ids=["missing", "no create", "exception", "nothing shown", "server", "data"],
 )  # fmt: skip
 def test_wrong_view_leaves_others(visit, monkeypatch, script, make, message):
     monkeypatch.setitem(PARTS, "wrong", Part("wrong", "Wrong", make, lambda _: ()))
@@ -116,11 +183,40 @@ def test_wrong_view_leaves_others(visit, monkeypatch, script, make, message):
     page.evaluate("() => { studio.views.show('wrong', true); }")
     until(page, "text => document.getElementById('notice').textContent.startsWith(text)", message)
     settle(page)
+    shown = page.evaluate(TILES)
 
-    assert "wrong" in page.evaluate(EMPTY_TILES)
-    assert "noise" not in page.evaluate(EMPTY_TILES)
+    assert problem_of_tile(shown["wrong"]) == "no text"
+    assert problem_of_tile(shown["noise"]) is None
     page.click("#tabs [data-tile=snr]")
     until(page, "() => studio.views.made.snr?.chart.curves.length > 0")
+
+
+@pytest.mark.slow(keep=1)
+@pytest.mark.needs("chromium")
+@pytest.mark.parametrize(
+    ("script", "problem"),
+    [
+        ("root.append('a note', document.createElement('canvas')); return {};", "empty canvases"),
+        ("return { use: ({ about }) => root.append(make('p', about.m + ' s')) };", "shows undefined"),
+        ("return { use: () => root.append(make('p', 0 / 0)) };", "shows NaN"),
+        ("const p = make('p'); root.append(p); return { use: ({ about }) => { p.textContent ||= about.n; } };", "other data, same content"),
+        ("const p = make('p'); root.append(p); return { use: ({ about }) => { p.textContent = about.n; } };", None),
+    ],
+    ids=["canvas", "undefined", "not a number", "same", "correct"],
+)  # fmt: skip
+def test_wrong_content_of_tiles_is_found(visit, monkeypatch, script, problem):
+    part = Part("wrong", "Wrong", lambda result: ({"n": result.shot.exposure_s}, {}), capture_of)
+    monkeypatch.setitem(PARTS, "wrong", part)
+    module = f"import {{ make }} from '/web/page_parts.js'; export function create(root) {{ {script} }}"
+    page = visit()
+    page.route("**/views/wrong.js", lambda route: route.fulfill(body=module, content_type="text/javascript"))
+    page.evaluate("() => studio.views.show('wrong', true)")
+    settle(page)
+    before = page.evaluate(TILES)
+    set_value(page, "exposure_s", 0.03)
+    settle(page)
+
+    assert problem_of_tile(before["wrong"], page.evaluate(TILES)["wrong"]) == problem
 
 
 @pytest.mark.needs("chromium")

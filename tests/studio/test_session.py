@@ -9,6 +9,7 @@ import threading
 import time
 import weakref
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,8 +41,10 @@ def code_part(recorder):
 
 def test_first_connection_receives_all_parts(recorder):
     assert recorder.part_names[:2] == ["sites", "columns"]
-    with_data = {name for name, part in _session.PARTS.items() if part.has_data}
-    assert set(recorder.part_names) == with_data - {"solid", "comparison"}
+    parts = _session.PARTS.values()
+    first = {part.name for part in parts if part.has_data and not (part.is_costly or part.is_of_variants)}
+    assert set(recorder.part_names) == first
+    assert not first & {"solid", "comparison"}
     assert [message["kind"] for message in recorder.messages] == ["busy", "controls", "state", "done"]
     assert {header["version"] for header, _ in recorder.parts} == {1}
 
@@ -62,6 +65,8 @@ def test_integers_keep_the_controls(recorder):
 
 
 def test_only_changed_parts_are_sent(recorder):
+    bundled = ["sites", "columns", "picture", "scene", "noise", "spectrum", "photon_transfer", "snr", "mtf", "rules"]
+    recorder.do(do="views", names=bundled)
     recorder.do(do="set", key="exposure_s", value=0.02, final=True)
     assert set(recorder.part_names) == {"columns", "noise", "photon_transfer", "picture", "snr"}
     recorder.do(do="set", key="optics.f_number", value=4.0, final=True)
@@ -395,18 +400,33 @@ def test_alternatives_from_page_are_valid(recorder):
         assert state["errors"] == {}, label
 
 
-def test_failing_view_leaves_others(recorder, monkeypatch):
-    part = _session.PARTS["noise"]
+def fail(*_):
+    raise RuntimeError("two\nlines")
 
-    def fail(_):
-        raise RuntimeError("two\nlines")
 
-    monkeypatch.setitem(_session.PARTS, "noise", type(part)(part.name, part.label, fail, part.depends))
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [
+        ({"make": fail}, "RuntimeError: two lines"),
+        ({"make": lambda _: ({"n": object()}, {})}, "TypeError: Object of type object is not JSON serializable"),
+        ({"make": lambda _: ({}, {"x": np.zeros(3, complex)})}, "'arrays' must be one of uint8"),
+        ({"make": lambda _: None}, "TypeError: cannot unpack"),
+        ({"depends": fail}, "RuntimeError: two lines"),
+        ({"depends": lambda result: result}, "TypeError: 'Simulated' object is not iterable"),
+    ],
+    ids=["exception", "object", "complex", "nothing", "dependencies", "no tuple"],
+)
+def test_failing_view_leaves_others(recorder, monkeypatch, wrong, text):
+    recorder.do(do="set", key="exposure_s", value=0.03, final=True)
+    names = set(recorder.part_names)
+    monkeypatch.setitem(_session.PARTS, "noise", replace(_session.PARTS["noise"], **wrong))
     recorder.do(do="set", key="exposure_s", value=0.02, final=True)
 
-    assert set(recorder.part_names) == {"columns", "photon_transfer", "picture", "snr"}
-    errors = [message for message in recorder.messages if message["kind"] == "error"]
-    assert [(error["part"], error["text"]) for error in errors] == [("noise", "Noise: RuntimeError: two lines")]
+    assert set(recorder.part_names) == names - {"noise"}
+    (error,) = [message for message in recorder.messages if message["kind"] == "error"]
+    assert error["part"] == "noise"
+    assert error["text"].startswith(f"Noise: {text}")
+    assert recorder.messages[-1]["kind"] == "done"
 
 
 def test_freeze_keeps_summary(recorder):
