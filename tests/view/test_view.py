@@ -466,7 +466,7 @@ def test_noise_budget_bars_per_source_and_class():
     names = [text.get_text() for text in together.get_yticklabels()]
     assert names == ["photon_shot", "read", "quantisation", "prnu"]
     widths = [bar.get_width() for bar in together.patches]
-    assert widths[0] == pytest.approx(20.0)
+    assert widths[0] == pytest.approx(20.0 * np.sqrt(sensor.response.mean()))
     assert widths[1] == pytest.approx(np.sqrt(17.0))
     assert [bar.get_width() for bar in grouped.patches][1::4] == pytest.approx([3.0, 5.0])
     with pytest.raises(ParameterError, match="'classes' must have one value for each of the 4 sites"):
