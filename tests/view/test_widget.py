@@ -116,15 +116,28 @@ def position(page, frame, x_um, y_um):
     return box["x"] + x, box["y"] + y
 
 
+def hover(page, frame, site):
+    """
+    Move the mouse to a site until the frame receives it.
+
+    The frame has its own process: the browser sends it events only when it is on the screen, and drops earlier ones.
+    """
+
+    def is_hovered():
+        page.mouse.move(*position(page, frame, *LAYOUT.centroid_um[site]))
+        return frame.evaluate("foveasim.hovered") == site
+
+    until(frame, is_hovered)
+
+
 @pytest.mark.needs("chromium")
 def test_hover_and_pin_reach_python(show):
     widget = fs.view.widget(LAYOUT)
     page, frame = show(widget)
-    at = position(page, frame, *LAYOUT.centroid_um[41])
 
-    page.mouse.move(*at)
+    hover(page, frame, 41)
     until(frame, lambda: widget.hovered == 41)
-    page.mouse.click(*at)
+    page.mouse.click(*position(page, frame, *LAYOUT.centroid_um[41]))
     until(frame, lambda: widget.pinned == 41)
 
 
@@ -134,8 +147,11 @@ def test_selection_reaches_python_and_back(show):
     widget = fs.view.widget(LAYOUT)
     page, frame = show(widget)
 
-    page.mouse.click(*position(page, frame, *LAYOUT.centroid_um[0]))  # keys are for the frame
-    page.keyboard.press("s")
+    hover(page, frame, 0)
+    page.mouse.click(*position(page, frame, *LAYOUT.centroid_um[0]))
+    until(frame, lambda: widget.pinned == 0 and page.evaluate("document.activeElement.tagName") == "IFRAME")
+    page.keyboard.press("s")  # keys are for the frame with the focus
+    until(frame, lambda: frame.evaluate("foveasim.tool") == "select")
     page.mouse.move(*position(page, frame, *(LAYOUT.centroid_um[13] - 1.0)))
     page.mouse.down()
     page.mouse.move(*position(page, frame, *(LAYOUT.centroid_um[26] + 1.0)), steps=3)
