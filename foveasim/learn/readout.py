@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from foveasim.errors import ParameterError
 from foveasim.learn._tensors import check_tensor, constant
 from foveasim.sensor import Sensor
 from foveasim.sensor.effects import ShotNoise
@@ -28,6 +29,11 @@ class Readout:
     Fixed patterns are those of the device. Quantities per site that depend on the area, such as a capacitance per µm²,
     remain those of the layout of the sensor.
 
+    Raises
+    ------
+    ParameterError
+        If the collection of the sensor depends on the exposure time.
+
     Notes
     -----
     The statistics are those of :meth:`Sensor.linearise`: Gaussian temporal noise, to first order at the mean. A shot-noise
@@ -35,6 +41,10 @@ class Readout:
     """
 
     def __init__(self, sensor: Sensor) -> None:
+        if sensor.collection.needs_exposure:
+            raise ParameterError(
+                "sensor", f"must have a collection that does not depend on the exposure, got '{sensor.collection.name}'"
+            )
         self.sensor = sensor
         self._n_sites = sensor.layout.n_sites
         # Expected charges are affine in light and exposure.

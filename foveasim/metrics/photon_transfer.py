@@ -292,6 +292,7 @@ def photon_transfer(
     classes: ArrayLike | None = None,
     n_frames: int = 2,
     seed: int | None = None,
+    exposure_s: float | None = None,
     n_threads: int | None = None,
 ) -> PhotonTransfer:
     """
@@ -308,6 +309,8 @@ def photon_transfer(
         Class label of each site, such as its size or filter; a single class by default.
     n_frames, seed, n_threads
         With a sensor: frames per level, seed of the noise, and number of threads, which does not affect the result.
+    exposure_s : float, optional, s
+        With a sensor whose collection depends on it: exposure time of all levels.
 
     Returns
     -------
@@ -331,8 +334,9 @@ def photon_transfer(
         if expected_e is None or seed is None:
             raise ParameterError("expected_e" if expected_e is None else "seed", "must be given for a sensor")
         sensor, n_frames = source, check_count("n_frames", n_frames, at_least=2)
+        options: dict[str, Any] = {"seed": seed, "exposure_s": exposure_s, "n_threads": n_threads}
         frames = (
-            draw_frames(sensor, level_e, n_frames=n_frames, seed=seed, first_frame=k * n_frames, n_threads=n_threads)
+            draw_frames(sensor, level_e, n_frames=n_frames, first_frame=k * n_frames, **options)
             for k, level_e in enumerate(_levels(expected_e, sensor.layout.n_sites))
         )
         return measure_subsets(frames, classes=classes)[0]
@@ -376,6 +380,7 @@ def predicted_photon_transfer(
     expected_e: Sequence[ArrayLike] | Floats,
     *,
     classes: ArrayLike | None = None,
+    exposure_s: float | None = None,
     n_threads: int | None = None,
 ) -> PhotonTransfer:
     """
@@ -390,6 +395,8 @@ def predicted_photon_transfer(
         Expected charge at each level.
     classes : (n_site,), optional
         Class label of each site.
+    exposure_s : float, optional, s
+        Exposure time, for sensors whose collection depends on it.
     n_threads : int, optional
 
     Returns
@@ -405,7 +412,7 @@ def predicted_photon_transfer(
     groups = SiteClasses(classes, sensor.layout.n_sites)
     levels_dn = []
     for level_e in _levels(expected_e, sensor.layout.n_sites):
-        mean_dn, variance_dn2 = sensor.predict(level_e, n_threads=n_threads)
+        mean_dn, variance_dn2 = sensor.predict(level_e, exposure_s=exposure_s, n_threads=n_threads)
         levels_dn.append((groups.mean(mean_dn), groups.mean(variance_dn2), groups.variance(mean_dn)))
     return _transfer(groups, [0] * len(levels_dn), levels_dn)
 

@@ -26,6 +26,7 @@ from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.layout import Layout
 from foveasim.modes.events import Events
 from foveasim.sensor import Sensor
+from foveasim.sensor.effects import ShotNoise
 from foveasim.sensor.limits import CHARGE, DURATION, EXPOSURE, RATE, SPREAD, TEMPERATURE, WIDE_SPREAD
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
 
@@ -301,6 +302,11 @@ class SpikingPixels(_Pixels):
 
     def __post_init__(self) -> None:
         _check_sensor(self.sensor)
+        collection = self.sensor.collection
+        if collection.is_drawn and not isinstance(collection, ShotNoise):
+            raise ParameterError(
+                "sensor", f"must have shot noise for spikes, got the collection '{collection.name}'", hint="disable it"
+            )
         check_declared(self, n_sites=self.sensor.layout.n_sites)
 
     def _stream(

@@ -15,7 +15,7 @@ from foveasim._core.provenance import is_digest
 from foveasim._core.random_streams import Streams
 from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import Bools, Floats, Ints, check_per_site, finite_array, read_only, unmasked
+from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_per_site, finite_array, read_only, unmasked
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.sensor.adc import ADC, BITS, DNL, INL, LOG_STRENGTH, Companding, ConversionTables
 from foveasim.sensor.blocks import for_each_block
@@ -35,7 +35,7 @@ from foveasim.sensor.chain import (
     sort_by_stage,
 )
 from foveasim.sensor.device import Device
-from foveasim.sensor.effects import EFFECTS, Collection, Effect, Photosites, Sites
+from foveasim.sensor.effects import EFFECTS, Collection, Effect, Photosites, Sites, Stage
 from foveasim.sensor.effects.contract import NOTHING, CompleteSites, FixedFactor, FixedOffset
 from foveasim.sensor.effects.crosstalk import Diffusion, InterPixelCapacitance, KernelCrosstalk
 from foveasim.sensor.effects.dark import ACTIVATION, DOUBLING, DarkLaw, DarkSignal, HotSites, dark_current_factor
@@ -64,7 +64,7 @@ from foveasim.sensor.model.prediction import (
     clipped_gaussian_moments,
     no_tables,
 )
-from foveasim.sensor.model.records import Record, light_records, readout_model
+from foveasim.sensor.model.records import Record, effects_at, light_records, readout_model
 from foveasim.sensor.spectral.curves import ConstantCurve, Curve, CurveError
 from foveasim.sensor.spectral.response import FilterSet, rgb_filters
 from foveasim.units import electrons_to_volts, photon_energy_j
@@ -527,8 +527,8 @@ class Sensor:
         """Sites of the sensor that this one is a part of."""
         return None
 
-    def _effects_at(self, *stages: str) -> list[Effect]:
-        return [effect for effect in self.chain if effect.stage in stages]
+    def _effects_at(self, stage: Stage) -> list[Effect]:
+        return effects_at(self.chain, stage)
 
     def pattern(self, name: str) -> Floats:
         """
@@ -626,7 +626,7 @@ class Sensor:
         """Nominal dark current at the sensor's temperature, (n_site,) or (1,) e-/s."""
         return np.atleast_1d(np.asarray(self.dark_e_per_s, np.float64)) * self.dark_current_ratio
 
-    def _fixed(self, values: PerSite | Floats, stage: str) -> Floats:
+    def _fixed(self, values: PerSite | Floats, stage: Stage) -> Floats:
         """Return the values of all sites after the effects of a stage."""
         effects, values = self._effects_at(stage), np.atleast_1d(np.asarray(values, np.float64))
         if not effects:
@@ -1066,13 +1066,10 @@ class Sensor:
         mean_dn, variance_dn2 = np.empty(expected_e.size), np.empty(expected_e.size)
         well_e, collection = self.well_e, self.collection
         is_drawn, is_poisson = collection.is_drawn, isinstance(collection, ShotNoise)
-        drawn_e, drawn_e2 = expected_e, np.zeros(1)
-        if not is_poisson or not is_drawn:
-            drawn_e, drawn_e2 = collection.validate_moments(expected_e, NOTHING, sites)
+        drawn_e, drawn_e2 = collection.validate_moments(expected_e, NOTHING, sites)
         if not is_drawn:
             drawn_e, drawn_e2 = np.minimum(np.rint(drawn_e), well_e), np.zeros(1)
-        spread_e2 = drawn_e if is_poisson and is_drawn else drawn_e2
-        collected_e, collected_e2 = clipped_gaussian_moments(drawn_e, spread_e2, well_e)
+        collected_e, collected_e2 = clipped_gaussian_moments(drawn_e, drawn_e2, well_e)
         model = self.readout_model(collected_e, collected_e2)
         transfer, noise_e2, half_step_e = model.transfer, model.gaussian_e2, model.half_step_e
         own = model.own_fraction
@@ -1099,14 +1096,14 @@ class Sensor:
         transfer = transfer._replace(output_v=np.asarray(transfer.output_v + offset_v))
 
         def block(_: int, index: slice) -> None:
-            own = sites.block(index)
+            chosen = sites.block(index)
 
             def part(values: Any) -> Any:
-                return read_only(own.select(values).view()) if isinstance(values, np.ndarray) else values
+                return read_only(chosen.select(values).view()) if isinstance(values, np.ndarray) else values
 
             tables = no_tables()
             if is_drawn and not is_poisson:
-                first, probability, offsets = collection.table(expected_e[index], sites=own.of(collection))
+                first, probability, offsets = collection.table(expected_e[index], sites=chosen.of(collection))
                 tables = ChargeTables(*map(read_only, (first, offsets, probability)))
             _kernels.predict_codes(
                 ChargeDistributions(*map(part, charges)),
@@ -1160,7 +1157,7 @@ class SensorPart(Sensor):
 
 def _means(name: str, values: ArrayLike, n_sites: int) -> Floats:
     """Return charges or rates (..., n_site) or (1,) after validation."""
-    array = np.atleast_1d(np.asarray(unmasked(name, values), np.float64))
+    array = np.atleast_1d(as_numbers(name, values))
     if array.shape != (1,):
         check_per_site(name, array, n_sites, or_rows=True)
     if array.size and not (smallest := float(array.min())) >= 0.0:

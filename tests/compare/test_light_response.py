@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from reference.own_effects import CornerLoss
+from reference.own_effects import CornerLoss, RowNoise
 
 import foveasim as fs
 from foveasim import Camera, Optics, Sensor
@@ -15,11 +15,12 @@ from foveasim.compare.information import _Apertures
 from foveasim.errors import ParameterError
 from foveasim.layout import grid
 from foveasim.sensor import Diffusion, InterPixelCapacitance
-from foveasim.sensor.effects import Effect, GroupedNoise
+from foveasim.sensor.effects import Effect
 
 HALF_DIAGONAL_UM = 48.0 * np.sqrt(2.0)
 LAYOUT = grid(n_x=24, n_y=24, pitch_um=4.0).with_columns(readout_line=np.repeat(np.arange(24), 24))
 ELECTRONICS = {"bits": 12, "v_sat_v": 1.0, "capacitance_f": 3.2e-15, "read_noise_e": 2.0, "pedestal_v": 0.01}
+ROW_NOISE = RowNoise(1e-3, stage="output")
 OPTICS = Optics(focal_length_mm=8.0, f_number=2.8)
 EXPOSURE_S = 0.002
 
@@ -62,20 +63,9 @@ EVERYTHING = {
 }
 
 
-@dataclass(frozen=True)
-class RowNoise(GroupedNoise):
-    """Test effect: noise of each readout line."""
-
-    name: ClassVar[str] = "row_noise"
-    stage: ClassVar[str] = "output"
-
-    def deviation(self, sites):
-        return 1e-3
-
-
 @pytest.mark.parametrize(
     ("keywords", "effects"),
-    [({}, []), ({}, [RowNoise()]), (EVERYTHING, [RowNoise()])],
+    [({}, []), ({}, [ROW_NOISE]), (EVERYTHING, [ROW_NOISE])],
     ids=["plain", "rows", "everything"],
 )
 def test_effect_and_sensitivity_have_equal_measures(keywords, effects):
@@ -134,7 +124,7 @@ def test_information_falls_with_dead_and_saturated_sites():
 def test_correlated_noise_has_closed_form(keywords):
     """For few sites the chain rule is exact: half the logarithm of the ratio of the determinants."""
     part = LAYOUT[:100]
-    sensor = Sensor(part, **ELECTRONICS, effects=[RowNoise()], **keywords)
+    sensor = Sensor(part, **ELECTRONICS, effects=[ROW_NOISE], **keywords)
     model = sensor.linearise(np.linspace(200.0, 900.0, 100))
     covariance, gain = SceneCovariance([1e-4], [6.0]), model.forward(np.full(100, 900.0))
     signal = _Apertures(part, covariance).covariance(np.arange(100))
@@ -155,7 +145,7 @@ def test_site_information_falls_with_light(companding):
     rng, part = np.random.default_rng(4), LAYOUT[:100]
     for _ in range(20):
         sensor = Sensor(part, **{**ELECTRONICS, "companding": companding, "bits": int(rng.integers(6, 14)),
-                                 "read_noise_e": float(rng.uniform(0.5, 20.0))}, effects=[RowNoise()])  # fmt: skip
+                                 "read_noise_e": float(rng.uniform(0.5, 20.0))}, effects=[ROW_NOISE])  # fmt: skip
         light_e = rng.uniform(100.0, 3000.0, 100)
         covariance = SceneCovariance([float(rng.uniform(1e-6, 1e-3))], [float(rng.uniform(2.0, 30.0))])
         bits = []

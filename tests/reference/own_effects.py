@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import bdtr
 
-from foveasim.sensor.effects import AdditiveNoise, Effect, FixedFactor, GroupedNoise
+from foveasim.sensor.effects import AdditiveNoise, Collection, Effect, FixedFactor, GroupedNoise
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,38 @@ class AfterGlow(Effect):
     def moments(self, mean, variance, *, sites):
         """Scale the moments."""
         return mean * (1.0 + self.fraction), variance * (1.0 + self.fraction) ** 2
+
+
+@dataclass(frozen=True)
+class RowNoise(GroupedNoise):
+    """Temporal noise of each readout line, in the unit of its stage."""
+
+    sigma: float = 30.0
+    stage: str = "charge"
+    name: str = "row_noise"
+
+    def deviation(self, sites):
+        """Return the standard deviation."""
+        return self.sigma
+
+
+@dataclass(frozen=True)
+class Gates(Collection):
+    """Binary gates: at most one count in each."""
+
+    name = "gates"
+    needs_layout = False
+
+    n_gates: int = 100
+
+    def cumulative(self, count, mean, *, sites):
+        """Return the binomial distribution."""
+        return bdtr(np.minimum(count, self.n_gates), self.n_gates, -np.expm1(-mean / self.n_gates))
+
+    def moments(self, mean, variance, *, sites):
+        """Return mean and variance of the counts."""
+        dark = np.exp(-mean / self.n_gates)
+        return self.n_gates * (1.0 - dark), variance * dark**2 + self.n_gates * dark * (1.0 - dark)
 
 
 OWN_EFFECTS = {each.name: each for each in (CornerLoss, StitchedGain, ResetSag, LineNoise, AfterGlow)}

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import scipy.stats
-from scipy.special import bdtr
+from reference.own_effects import Gates
 
 import foveasim as fs
 from foveasim._core.random_streams import Streams
@@ -23,20 +23,7 @@ LAYOUT = grid(n_x=500, n_y=400, pitch_um=2.0)
 SITES = Sensor(LAYOUT).sites
 
 
-@EFFECTS.register("gates of test_collection", example={"n_gates": 900})
-@dataclass(frozen=True)
-class Gates(Collection):
-    name = "gates"
-    needs_layout = False
-
-    n_gates: int = 100
-
-    def cumulative(self, count, mean, *, sites):
-        return bdtr(np.minimum(count, self.n_gates), self.n_gates, -np.expm1(-mean / self.n_gates))
-
-    def moments(self, mean, variance, *, sites):
-        dark = np.exp(-mean / self.n_gates)
-        return self.n_gates * (1.0 - dark), variance * dark**2 + self.n_gates * dark * (1.0 - dark)
+EFFECTS.register("gates of test_collection", example={"n_gates": 900})(Gates)
 
 
 @dataclass(frozen=True)

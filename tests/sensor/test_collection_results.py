@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import scipy.constants
 import scipy.stats
-from scipy.special import bdtr
+from reference.own_effects import Gates
 
 import foveasim as fs
+from foveasim.errors import ParameterError
 from foveasim.explore.worker_cache import ShotRunner
 from foveasim.layout import grid
 from foveasim.reconstruct.estimates import estimate_from_code
@@ -25,22 +26,7 @@ ELECTRONICS = {
 }  # fmt: skip
 
 
-@EFFECTS.register("gates of results", example={"n_gates": 900})
-@dataclass(frozen=True)
-class Gates(Collection):
-    """Binary gates: at most one count in each."""
-
-    name = "gates"
-    needs_layout = False
-
-    n_gates: int = N_GATES
-
-    def cumulative(self, count, mean, *, sites):
-        return bdtr(np.minimum(count, self.n_gates), self.n_gates, -np.expm1(-mean / self.n_gates))
-
-    def moments(self, mean, variance, *, sites):
-        dark = np.exp(-mean / self.n_gates)
-        return self.n_gates * (1.0 - dark), variance * dark**2 + self.n_gates * dark * (1.0 - dark)
+EFFECTS.register("gates of results", example={"n_gates": 900})(Gates)
 
 
 @dataclass(frozen=True)
@@ -63,7 +49,7 @@ class DeadTime(Collection):
         return after, variance * (after / np.maximum(mean, 1e-300)) ** 4 + after
 
 
-COLLECTIONS = pytest.mark.parametrize("collection", [Gates(), DeadTime()], ids=["gates", "dead_time"])
+COLLECTIONS = pytest.mark.parametrize("collection", [Gates(N_GATES), DeadTime()], ids=["gates", "dead_time"])
 
 
 def sensor_of(collection, **changes):
@@ -144,7 +130,7 @@ def test_estimates_and_merges_are_unbiased(collection):
 
 
 def test_calibrated_merge_follows_gates():
-    sensor, rate, times_s = sensor_of(Gates()), np.full(N, 2e4), [0.005, 0.01, 0.02]
+    sensor, rate, times_s = sensor_of(Gates(N_GATES)), np.full(N, 2e4), [0.005, 0.01, 0.02]
     calibration = sensor.calibrate(exposure_s=0.01, flat_e=300.0, n_frames=40, seed=2)
     codes = np.stack([sensor.expose(rate, t_s, seed=6, frame=k)[2] for k, t_s in enumerate(times_s)])
 
@@ -161,7 +147,11 @@ def test_collection_works_in_cameras_and_comparisons():
             optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=Sensor(layout, **ELECTRONICS, effects=effects)
         )
 
-    cameras = {"gates": camera(LAYOUT, [Gates()]), "dead": camera(LAYOUT, [DeadTime()]), "plain": camera(LAYOUT, [])}
+    cameras = {
+        "gates": camera(LAYOUT, [Gates(N_GATES)]),
+        "dead": camera(LAYOUT, [DeadTime()]),
+        "plain": camera(LAYOUT, []),
+    }
     scene = fs.Scene.flat(shape=(64, 64), pitch_um=600.0, distance_m=1.0, radiance_w_m2_sr_nm=0.05, band_width_nm=10.0)
     exposure_s = 300.0 / float(cameras["plain"].photoelectrons_per_s(scene).mean())
     comparison = fs.compare.cameras(cameras, {"flat": scene}, exposure_s=exposure_s, max_pixels=32)
@@ -177,7 +167,7 @@ def test_collection_works_in_cameras_and_comparisons():
         assert capture.picture(of="light_e", sensor=each.sensor).data.max() > 0.0
 
 
-def test_collection_works_in_sweeps_tiles_and_video(tmp_path):
+def test_collection_works_in_sweeps_and_video(tmp_path):
     shot = {
         "scene": {"kind": "flat", "radiance_w_m2_sr_nm": 0.02, "shape": [32, 32], "pitch_um": 500.0, "distance_m": 1.0, "band_width_nm": 50.0},
         "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
@@ -196,3 +186,19 @@ def test_collection_works_in_sweeps_tiles_and_video(tmp_path):
     (frame,) = camera.video([scene], exposure_s=0.001, seed=3)
     assert np.array_equal(frame.code, capture.code)
     assert capture.electrons.max() <= 200
+
+
+def test_photon_transfer_follows_collection():
+    levels_e = [50.0, 200.0, 600.0]
+    for collection in (Gates(N_GATES), DeadTime()):
+        sensor = sensor_of(collection)
+        measured = fs.metrics.photon_transfer(sensor, levels_e, n_frames=16, seed=4, exposure_s=0.01)
+        predicted = fs.metrics.predicted_photon_transfer(sensor, levels_e, exposure_s=0.01)
+
+        assert measured.mean_dn == pytest.approx(predicted.mean_dn, rel=0.01)
+        assert measured.temporal_variance_dn2 == pytest.approx(predicted.temporal_variance_dn2, rel=0.05)
+
+
+def test_spikes_reject_other_collections():
+    with pytest.raises(ParameterError, match="'sensor' must have shot noise for spikes, got the collection 'gates'"):
+        fs.modes.SpikingPixels(sensor_of(Gates(N_GATES)), threshold_e=100.0)

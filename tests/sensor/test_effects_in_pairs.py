@@ -9,12 +9,12 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import scipy.constants
-from scipy.special import bdtr
+from reference.own_effects import Gates, RowNoise
 
 from foveasim import Sensor
 from foveasim.layout import grid
 from foveasim.sensor import Diffusion, InterPixelCapacitance, effects
-from foveasim.sensor.effects import Collection, FixedFactor, GroupedNoise
+from foveasim.sensor.effects import FixedFactor
 
 #: Levels of five rows of blocks, e-; a range of 4,000 e- with a pedestal of an eighth.
 LEVELS_E, FULL_E, PEDESTAL = (3.0, 60.0, 400.0, 1500.0, 3000.0), 4000.0, 0.125
@@ -30,17 +30,6 @@ FINE = {
 
 
 @dataclass(frozen=True)
-class Columns(GroupedNoise):
-    """Test effect: noise common to columns."""
-
-    name: ClassVar[str] = "columns"
-    stage: ClassVar[str] = "charge"
-
-    def deviation(self, sites):
-        return 6.0
-
-
-@dataclass(frozen=True)
 class Shading(FixedFactor):
     """Test effect: transmission that is the same for all devices."""
 
@@ -51,22 +40,6 @@ class Shading(FixedFactor):
         return np.linspace(0.6, 1.0, N_X)[np.arange(sites.layout.n_sites) % N_X]
 
 
-@dataclass(frozen=True)
-class Gates(Collection):
-    """Test effect: binary gates."""
-
-    name: ClassVar[str] = "gates"
-
-    n_gates: int = 4000
-
-    def cumulative(self, count, mean, *, sites):
-        return bdtr(np.minimum(count, self.n_gates), self.n_gates, -np.expm1(-mean / self.n_gates))
-
-    def moments(self, mean, variance, *, sites):
-        dark = np.exp(-mean / self.n_gates)
-        return self.n_gates * (1.0 - dark), variance * dark**2 + self.n_gates * dark * (1.0 - dark)
-
-
 #: Keywords that enable an effect, scaled to the range, by name.
 CASES = {effect.name: dict(effect.example) for effect in effects.STANDARD} | {
     "hot": {"hot_fraction": 0.05, "hot_e_per_s": 500.0},
@@ -74,9 +47,9 @@ CASES = {effect.name: dict(effect.example) for effect in effects.STANDARD} | {
     "crosstalk": {"crosstalk": Diffusion(spread_um=0.3)},
     "ipc": {"coupling": InterPixelCapacitance(neighbour_fraction=0.02)},
     "exact": {"shot_noise": "exact"},
-    "columns": {"effects": [Columns()]},
+    "columns": {"effects": [RowNoise(6.0)]},
     "shading": {"effects": [Shading()]},
-    "gates": {"effects": [Gates()]},
+    "gates": {"effects": [Gates(4000)]},
 }  # fmt: skip
 PAIRS = [(name,) for name in CASES] + list(combinations(CASES, 2))
 

@@ -8,12 +8,13 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import scipy.constants
+from reference.own_effects import RowNoise
 
 from foveasim import Sensor
 from foveasim.errors import ParameterError
 from foveasim.layout import grid
 from foveasim.sensor import Diffusion, InterPixelCapacitance, noise_budget, signal_to_noise
-from foveasim.sensor.effects import AdditiveNoise, Effect, FixedFactor, GroupedNoise
+from foveasim.sensor.effects import AdditiveNoise, Effect, FixedFactor
 
 N_X, N_Y = 12, 10
 LAYOUT = grid(n_x=N_X, n_y=N_Y, pitch_um=4.0).with_columns(readout_line=np.repeat(np.arange(N_Y), N_X))
@@ -31,46 +32,14 @@ BASE = {
 IPC = InterPixelCapacitance(neighbour_fraction=0.03)
 
 
-@dataclass(frozen=True)
-class RowNoise(GroupedNoise):
-    """Test effect: temporal noise of each readout line."""
-
-    name: ClassVar[str] = "row_noise"
-    stage: ClassVar[str] = "charge"
-
-    sigma_e: float = 30.0
-
-    def deviation(self, sites):
-        return self.sigma_e
-
-
-@dataclass(frozen=True)
-class RowVolts(GroupedNoise):
-    """Test effect: noise of each readout line in volts."""
-
-    name: ClassVar[str] = "row_volts"
-    stage: ClassVar[str] = "output"
-
-    sigma_v: float = 2e-3
-
-    def deviation(self, sites):
-        return self.sigma_v
-
-
-@dataclass(frozen=True)
-class Columns(GroupedNoise):
+class Columns(RowNoise):
     """Test effect: noise common to columns of the layout."""
-
-    name: ClassVar[str] = "columns"
-    stage: ClassVar[str] = "sense_node"
-
-    sigma_v: float = 1e-3
-
-    def deviation(self, sites):
-        return self.sigma_v
 
     def groups(self, sites):
         return np.arange(sites.layout.n_sites) % N_X
+
+
+ROW_VOLTS = RowNoise(2e-3, stage="output", name="row_volts")
 
 
 class Shading(FixedFactor):
@@ -86,7 +55,7 @@ SHADING = 1.0 - 0.6 * np.hypot(*(LAYOUT.centroid_um - LAYOUT.centroid_um[0]).T) 
 #: Chains of all kinds of steps.
 CHAINS = {
     "plain": {"read_noise_e": 5.0},
-    "rows": {"read_noise_e": 5.0, "effects": [RowNoise(), Columns()]},
+    "rows": {"read_noise_e": 5.0, "effects": [RowNoise(), Columns(1e-3, stage="sense_node", name="columns")]},
     "mixed": {"read_noise_e": 5.0, "coupling": IPC, "crosstalk": Diffusion(spread_um=1.5)},
     "all": {
         "read_noise_e": np.linspace(3.0, 9.0, N),
@@ -97,7 +66,7 @@ CHAINS = {
         "prnu_fraction": 0.05,
         "nonlinearity_fraction": 0.1,
         "capacitance_f": BASE["capacitance_f"] * np.linspace(0.9, 1.1, N),
-        "effects": [RowNoise(), RowVolts(), Shading()],
+        "effects": [RowNoise(), ROW_VOLTS, Shading()],
     },
 }
 every_chain = pytest.mark.parametrize("chain", CHAINS)
@@ -346,6 +315,31 @@ def test_predicted_covariance_matches_draws(bits):
         assert np.abs(z).max() < 5.0
 
 
+@pytest.mark.parametrize("name", ["conversion", "nonlinearity", "sensitivity", "exposure", "collected"])
+def test_names_of_effects_have_no_meaning(name):
+    """Steps of the chain that are not effects are not identified by names."""
+
+    @dataclass(frozen=True)
+    class Affine(Effect):
+        name: ClassVar[str] = "other"
+        is_temporal: ClassVar[bool] = False
+
+        stage: str
+
+        def apply(self, values, *, sites, rng):
+            return 0.5 * values + 0.01
+
+        def moments(self, mean, variance, *, sites):
+            return 0.5 * mean + 0.01, 0.25 * variance
+
+    renamed = type("Renamed", (Affine,), {"name": name})
+    for stage in ("charge", "sense_node", "output"):
+        sensors = [sensor_of("plain", effects=[kind(stage)]) for kind in (Affine, renamed)]
+        one, other = (sensor.predict(PHOTO) for sensor in sensors)
+        assert np.array_equal(one, other)
+        assert np.array_equal(*(sensor.linearise(PHOTO).variance_dn2() for sensor in sensors))
+
+
 # -- saturation -------------------------------------------------------------------------------------------------------
 
 
@@ -415,6 +409,24 @@ def test_inverse_reproduces_mean_codes(changes):
     assert not found.is_saturated.any()
 
 
+def test_codes_out_of_reach_have_no_weight():
+    """A response that ends at half the range: higher codes have a finite charge, and an infinite variance."""
+
+    class Ending(Effect):
+        name, stage, is_temporal = "ending", "output", False
+
+        def apply(self, values, *, sites, rng):
+            return 0.5 * np.tanh(values / 0.5)
+
+        def moments(self, mean, variance, *, sites):
+            return 0.5 * np.tanh(mean / 0.5), variance * (1.0 - np.tanh(mean / 0.5) ** 2) ** 2
+
+    found = sensor_of("plain", effects=[Ending()]).invert(np.where(np.arange(N) % 2, 1000, 3000))
+
+    assert np.isfinite(found.charge_e).all()
+    assert np.array_equal(np.isinf(found.noise_e2), np.arange(N) % 2 == 0)
+
+
 def test_wrong_arguments_are_rejected():
     sensor = sensor_of("plain")
     model = sensor.linearise(PHOTO)
@@ -424,6 +436,8 @@ def test_wrong_arguments_are_rejected():
         (lambda: sensor.linearise(photo_e_per_s=PHOTO), "'exposure_s' must be given with 'photo_e_per_s'"),
         (lambda: sensor.linearise(-PHOTO), "'expected_e' must be >= 0"),
         (lambda: sensor.linearise(PHOTO[:3]), "'expected_e' must have"),
+        (lambda: sensor.linearise("many"), "'expected_e' must be an array of numbers, got 'many'"),
+        (lambda: sensor.predict_covariance(PHOTO, [0.5]), "'sites' must be indices of the 120 sites"),
         (
             lambda: model.forward(np.ones(N), "light"),
             "'start' must be 'charge', 'collected' or 'node', or 'light' with",

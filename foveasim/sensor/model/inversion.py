@@ -11,7 +11,7 @@ from foveasim._core.validation import Bools, Floats
 from foveasim.sensor.effects.collection import MAX_CHARGE_E, Collection
 from foveasim.sensor.effects.contract import Sites
 from foveasim.sensor.model.prediction import MIN_SLOPE
-from foveasim.sensor.model.records import readout_model, walk_from_node
+from foveasim.sensor.model.records import readout_model, slope_of, walk_from_node
 
 if TYPE_CHECKING:
     from foveasim.sensor.sensor import Sensor
@@ -20,6 +20,8 @@ __all__ = ["Inverse"]
 
 #: Relative step at which Newton's method ends, and maximum number of steps: a double root halves the error in each.
 INVERSION_ROUNDING, MAX_INVERSIONS = 1e-14, 60
+#: Largest charge in units of the range of a linear response.
+MAX_RANGES = 10.0
 
 
 class Inverse(NamedTuple):
@@ -48,24 +50,26 @@ def invert(sensor: Sensor, sites: Sites, code_dn: Floats) -> Inverse:
     """
     Invert the chain after the sense node: see :meth:`foveasim.Sensor.invert`.
 
-    Newton's method starts at no charge: for a response
-    that bends towards saturation it converges from below.
+    Newton's method starts at no charge: for a response that bends towards saturation it converges from below. Charges are
+    limited, for codes that a response does not reach.
     """
     target_v = sensor.adc.fraction_of_code(code_dn) * sensor.v_sat_v
     charge_e: Floats = np.zeros(np.broadcast_shapes(target_v.shape, (sites.n_sites,)))
-    slope = np.ones(1)
+    slope, limit_e = np.ones(1), np.zeros(1)
     for _ in range(MAX_INVERSIONS):
         records, output_v = walk_from_node(sensor, sensor.chain, sites, charge_e)
-        slope = np.ones(1)
-        for record in records:
-            slope = record.map(slope)
+        slope = slope_of(records)
+        if not limit_e.any():  # that of a linear response with the slope at no charge
+            limit_e = MAX_RANGES * sensor.v_sat_v / np.maximum(slope, MIN_SLOPE * sensor.v_per_e)
         step_e = np.divide(target_v - output_v, slope, out=np.zeros_like(charge_e), where=slope != 0.0)
+        step_e = np.clip(step_e, -limit_e - charge_e, limit_e - charge_e)
         charge_e = charge_e + step_e
         if np.all(np.abs(step_e) <= INVERSION_ROUNDING * (1.0 + np.abs(charge_e))):
             break
     readout = readout_model(sensor, np.maximum(charge_e, 0.0), 0.0, sites, is_reset=True)
     step_v = sensor.adc.width_of_code_dn(code_dn) * sensor.v_sat_v / 2.0**sensor.bits
-    noise_e2 = readout.noise_e2 + np.square(step_v / slope) * sensor.adc.noise_dn2
+    with np.errstate(divide="ignore"):  # codes that the response does not reach
+        noise_e2 = readout.noise_e2 + np.square(step_v / slope) * sensor.adc.noise_dn2
     return Inverse(charge_e, noise_e2, (charge_e >= sensor.well_e) | (code_dn >= 2.0**sensor.bits - 1.0))
 
 

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from foveasim._core.names import possible_names
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_per_site
-from foveasim.errors import ParameterError
+from foveasim.errors import ParameterError, SimulationError
 from foveasim.sensor.effects.contract import NOTHING, Effect, Operator, Sites
 from foveasim.sensor.model.prediction import Transfer
 from foveasim.sensor.model.records import (
@@ -32,6 +32,7 @@ from foveasim.sensor.model.records import (
     propagate,
     row_factors,
     scale_columns,
+    slope_of,
     split_charge,
     transfer_of,
     walk_from_node,
@@ -126,10 +127,7 @@ class Linearisation:
     @cached_property
     def gain_dn_per_e(self) -> Floats:
         """Derivative of the code with respect to the charge at the sense node, DN/e-."""
-        slope = np.ones(1)
-        for record in self._records[self._starts["node"] :]:
-            slope = record.map(slope)
-        return slope
+        return slope_of(self._records[self._starts["node"] :])
 
     @property
     def slope_dn_per_v(self) -> Floats:
@@ -417,7 +415,12 @@ class Linearisation:
         shape = (known.size, known.size)
         matrix = LinearOperator(shape, matvec=apply, dtype=np.float64)
         inverse = LinearOperator(shape, matvec=lambda values: np.ravel(values) / variance[known], dtype=np.float64)
-        solution, _ = cg(matrix, row, rtol=RESIDUAL, maxiter=MAX_ITERATIONS, M=inverse)
+        solution, n_left = cg(matrix, row, rtol=RESIDUAL, maxiter=MAX_ITERATIONS, M=inverse)
+        if n_left:
+            raise SimulationError(
+                f"the covariance of the codes is not inverted in {MAX_ITERATIONS} iterations; reduce the noise that sites "
+                "share, or their mixing"
+            )
         return np.asarray(solution)
 
     # -- parts --------------------------------------------------------------------------------------------------------

@@ -31,6 +31,8 @@ class Record(NamedTuple):
 
     The fields from ``mean`` to ``groups`` are those of :class:`foveasim.sensor.effects.StepModel`. ``branch`` is that of the
     light or of the dark current before both are added, else empty. ``half_step`` is half the difference between two states.
+    ``role`` marks the conversion of charge to voltage, and the response nonlinearity with the pedestal: an effect of a user may
+    have any name.
     """
 
     name: str
@@ -41,11 +43,15 @@ class Record(NamedTuple):
     kind: Kind = "temporal"
     branch: Branch = ""
     half_step: Floats | None = None
+    role: Literal["conversion", "response", ""] = ""
 
     @property
     def labels(self) -> Ints:
-        """Indices of the groups of the sites, (n_site,)."""
-        return np.unique(np.asarray(self.groups), return_inverse=True)[1].ravel()
+        """Indices of the groups of the sites, (n_site,); not every index has sites."""
+        groups = np.asarray(self.groups)
+        if groups.size and groups.min() >= 0 and groups.max() < groups.size:
+            return groups
+        return np.unique(groups, return_inverse=True)[1].ravel()
 
     @property
     def operator(self) -> Operator | None:
@@ -85,8 +91,9 @@ class Record(NamedTuple):
         if self.groups is None:
             return scale_columns(rows, self.deviation)
         n_sites, label = rows.shape[1], self.labels
+        shape = n_sites, int(label.max(initial=0)) + 1
         deviation = np.broadcast_to(self.deviation, n_sites)
-        return csr_array(rows @ csr_array((deviation, label, np.arange(n_sites + 1)), shape=(n_sites, label.max() + 1)))
+        return csr_array(rows @ csr_array((deviation, label, np.arange(n_sites + 1)), shape=shape))
 
     def rows(self, rows: csr_array[Any]) -> csr_array[Any]:
         """Return rows (n, n_site) times the derivative of the mean."""
@@ -134,9 +141,9 @@ class Walk:
             mean = found.mean
         return mean
 
-    def step(self, name: str, mean: Floats, slope: Floats | None = None, **values: Any) -> Floats:
-        """Record a step, and return its mean."""
-        self._add(Record(name, mean, slope, **values))
+    def step(self, mean: Floats, slope: Floats | None = None, **values: Any) -> Floats:
+        """Record a step that is not an effect, and return its mean."""
+        self._add(Record("", mean, slope, **values))
         return mean
 
     def _add(self, record: Record) -> None:
@@ -148,16 +155,24 @@ def effects_at(chain: Iterable[Effect], stage: Stage) -> list[Effect]:
     return [effect for effect in chain if effect.stage == stage]
 
 
+def slope_of(records: Iterable[Record]) -> Floats:
+    """Return the product of the slopes of steps that do not mix sites."""
+    slope = np.ones(1)
+    for record in records:
+        slope = record.map(slope)
+    return slope
+
+
 def light_records(
     sensor: Sensor, chain: Sequence[Effect], sites: Sites, photo_e_per_s: Floats, exposure_s: float
 ) -> list[Record]:
     """Return the records from photoelectron rates to expected charges."""
     walk, sensitivity = Walk(sites), np.atleast_1d(np.asarray(sensor.sensitivity, np.float64))
     slope = None if sensitivity.size == 1 and sensitivity[0] == 1.0 else sensitivity
-    rates = walk.step("sensitivity", photo_e_per_s if slope is None else photo_e_per_s * slope, slope, branch="photo")
+    rates = walk.step(photo_e_per_s if slope is None else photo_e_per_s * slope, slope, branch="photo")
     rates = walk.effects(effects_at(chain, "photo"), rates, "photo")
     rates = rates + walk.effects(effects_at(chain, "dark"), sensor.nominal_dark_e_per_s, "dark")
-    walk.effects(effects_at(chain, "expected"), walk.step("exposure", rates * exposure_s, np.array([exposure_s])))
+    walk.effects(effects_at(chain, "expected"), walk.step(rates * exposure_s, np.array([exposure_s])))
     return walk.records
 
 
@@ -178,9 +193,9 @@ def walk_from_node(
     """
     walk = Walk(sites, keeps_means=keeps_means)
     mean = walk.effects(split_charge(chain)[1], node_e)
-    mean = walk.step("conversion", mean * sensor.v_per_e, sensor.v_per_e)
+    mean = walk.step(mean * sensor.v_per_e, sensor.v_per_e, role="conversion")
     mean = walk.effects(effects_at(chain, "sense_node"), mean)
-    mean = walk.step("nonlinearity", *apply_nonlinearity(sensor, mean))
+    mean = walk.step(*apply_nonlinearity(sensor, mean), role="response")
     return walk.records, walk.effects(effects_at(chain, "output"), mean)
 
 
@@ -206,10 +221,10 @@ def transfer_of(sensor: Sensor, records: Iterable[Record], node_e: Floats) -> Tr
     scale, offset, before = np.ones(1), np.zeros(1), node_e
     v_per_e, sense_v = scale, offset
     for record in records:
-        if record.name == "nonlinearity":
+        if record.role == "response":
             v_per_e, sense_v, scale, offset = scale, offset, np.ones(1), np.full(1, sensor.pedestal_v)
         elif record.slope is not None:
-            added = 0.0 if record.name == "conversion" else record.mean - record.map(before)
+            added = 0.0 if record.role == "conversion" else record.mean - record.map(before)
             scale, offset = record.map(scale), record.map(offset) + added
         elif record.mean is not before:
             offset = offset + (record.mean - before)
@@ -343,14 +358,10 @@ def readout_model(
         if len(mixed) == 1 and walk.records[0].operator is not None:
             own_fraction = walk.records[0].operator.own_fraction
     records, _ = walk_from_node(sensor, chain, sites, mean_e)
-    slope, variance, half_step2 = np.ones(1), np.zeros(1), np.zeros(1)
-    for record in records:
-        if record.factor is not None:
-            squared, slope = np.square(record.factor), slope * record.factor
-            variance, half_step2 = (part * squared if np.any(part) else part for part in (variance, half_step2))
-        if record.deviation is not None and used(record):
-            own = NOTHING if record.half_step is None else np.square(record.half_step)
-            variance, half_step2 = variance + np.maximum(np.square(record.deviation) - own, 0.0), half_step2 + own
+    slope = slope_of(records)
+    states = [record._replace(deviation=record.half_step) for record in records]
+    total, half_step2 = (propagate(part, sites.n_sites, used) for part in (records, states))
+    variance = np.maximum(total - half_step2, 0.0)
     per_v2 = np.divide(1.0, slope**2, out=np.zeros(np.shape(slope)), where=slope != 0.0)
     return ReadoutModel(
         mean_e=mean_e,
