@@ -11,7 +11,7 @@ import scipy.constants
 import foveasim as fs
 from foveasim.errors import ParameterError
 from foveasim.layout import grid
-from foveasim.sensor import FIXED, PRESETS, TEMPORAL, Sensor, noise_budget
+from foveasim.sensor import FIXED, PRESETS, TEMPORAL, Diffusion, Sensor, noise_budget
 
 N = 400
 LINE = grid(n_x=N, n_y=1, pitch_um=2.0).with_columns(readout_line=np.arange(N))
@@ -84,6 +84,13 @@ def test_temporal_entries_sum_to_code_variance(companding, bend):
     assert np.mean(variance_dn2[interior] / slope_dn_per_e[interior] ** 2 / total_e2[interior]) == pytest.approx(
         1.0, abs=0.01
     )
+
+
+def test_light_has_no_dark_shot_noise():
+    """Rounding of crosstalk is not a dark signal."""
+    sensor = Sensor(LINE, crosstalk=Diffusion(spread_um=0.7), prnu_fraction=0.05, sensitivity=np.linspace(0.1, 1.0, N))
+
+    assert noise_budget(sensor, np.linspace(1.0, 1e5, N), 0.01)["dark_shot"].max() == 0.0
 
 
 def test_invalid_rates_and_exposures_are_rejected():

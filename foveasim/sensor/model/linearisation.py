@@ -48,6 +48,8 @@ __all__ = ["Linearisation"]
 CLIPPING_SIGMAS = 2.0
 #: Relative residual of iterative solutions with the covariance, and maximum number of iterations.
 RESIDUAL, MAX_ITERATIONS = 1e-11, 1000
+#: Fraction of dark signal in the charge that counts as rounding.
+ROUNDING = 1e-12
 #: Names of the noise of the collection, of photoelectrons and of dark signal, and of the conversion to codes.
 PHOTON_SHOT, DARK_SHOT, QUANTISATION = "photon_shot", "dark_shot", "quantisation"
 #: Values to which derivatives refer: photoelectron rates, e-/s; expected and collected charge, and that at the sense node, e-.
@@ -489,7 +491,8 @@ def linearise(
             for record in records:
                 photo_e = photo_e if record.branch == "dark" else record.map(photo_e)
             photo_fraction = np.divide(photo_e, mean_e, out=np.zeros(np.shape(mean_e)), where=np.asarray(mean_e) > 0.0)
-            photo_fraction = np.clip(photo_fraction, 0.0, 1.0)
+            # Rounding is not a dark signal.
+            photo_fraction = np.where(photo_fraction > 1.0 - ROUNDING, 1.0, np.maximum(photo_fraction, 0.0))
             expected_e = mean_e if expected_e is None else expected_e
     assert expected_e is not None
     starts["charge"] = len(records)
