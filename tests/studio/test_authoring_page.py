@@ -526,6 +526,7 @@ def test_keyboard_alone_draws_and_moves(edit):
         field.fill(text)
         field.press("Enter")
     field.press("Enter")
+    until(page, "() => (studio.state.settings.layout.edits || []).length === 3")
     wait(page)
 
     assert edits(page)[2]["outlines_um"] == [[[-100, -100], [-90, -100], [-90, -89.5]]]
