@@ -359,13 +359,17 @@ def test_prediction_equals_moments_of_captures(shot):
     if not is_noisy.any():
         return
     error = (frames.mean(axis=0) - mean_dn)[is_noisy] / np.sqrt(variance_dn2[is_noisy] / N_FRAMES)
-    n_independent = 64 if crosses_sites(shot) else error.size
-    n_independent = min(error.size, n_independent)
+    # Sites that share noise average less of it: the mean of n correlated sites varies like that of n_independent.
+    covariance_dn2 = shot.camera.predict_covariance(shot.scene, np.flatnonzero(is_noisy), exposure_s=shot.exposure_s)
+    deviation_dn = np.sqrt(variance_dn2[is_noisy])
+    correlation = covariance_dn2 / np.multiply.outer(deviation_dn, deviation_dn)
+    n_independent = error.size**2 / correlation.sum()
+    n_independent_squares = error.size**2 / (correlation**2).sum()
     bias = 0.02 * np.sqrt(N_FRAMES)  # of the analytical mean, in standard deviations of a code: 2 %
     assert np.abs(error).max() < N_SIGMA + 1.0 + bias
     assert abs(error.mean()) < N_SIGMA / np.sqrt(n_independent) + bias
     ratio = (frames.var(axis=0, ddof=1)[is_noisy] / variance_dn2[is_noisy]).mean()
-    assert ratio == pytest.approx(1.0, abs=N_SIGMA * np.sqrt(2.5 / (N_FRAMES * n_independent)) + 0.03)
+    assert ratio == pytest.approx(1.0, abs=N_SIGMA * np.sqrt(2.5 / (N_FRAMES * n_independent_squares)) + 0.03)
 
 
 # -- the table ---------------------------------------------------------------------------------------------------------
