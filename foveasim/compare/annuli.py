@@ -14,7 +14,7 @@ from foveasim.fields import Grid
 from foveasim.metrics.quality import ssim_map
 from foveasim.reconstruct import Picture
 
-__all__ = ["PictureQuality", "annulus_of", "fit_gain", "quality_by_eccentricity"]
+__all__ = ["Annuli", "PictureQuality", "quality_by_eccentricity"]
 
 
 class PictureQuality(NamedTuple):
@@ -30,17 +30,24 @@ class PictureQuality(NamedTuple):
         return short_repr(self)
 
 
-def annulus_of(xy_um: Floats, centre_um: tuple[float, float], edges_um: Floats) -> Ints:
-    """Return the index of the annulus of points (..., 2) µm; -1 outside all of them."""
-    r_um = np.hypot(xy_um[..., 0] - centre_um[0], xy_um[..., 1] - centre_um[1])
-    index = np.searchsorted(edges_um, r_um, side="right") - 1
-    return np.where((index >= 0) & (index < edges_um.size - 1), index, -1)
+class Annuli(NamedTuple):
+    """Annuli around a fixation point, between increasing radii."""
 
+    centre_um: tuple[float, float]
+    edges_um: Floats
 
-def fit_gain(values: NDArray[np.float64], reference: NDArray[np.float64]) -> float:
-    """Return the factor of values with the smallest squared difference from a reference."""
-    power = float(np.square(values).sum())
-    return float((values * reference).sum()) / power if power > 0.0 else 1.0
+    def index_of(self, xy_um: Floats) -> Ints:
+        """Return the index of the annulus of points (..., 2) µm; -1 outside all of them."""
+        r_um = np.hypot(xy_um[..., 0] - self.centre_um[0], xy_um[..., 1] - self.centre_um[1])
+        index = np.searchsorted(self.edges_um, r_um, side="right") - 1
+        return np.where((index >= 0) & (index < self.edges_um.size - 1), index, -1)
+
+    def means(self, values: Floats, index: Ints, weights: Floats | None = None) -> Floats:
+        """Return the sum of values per sum of weights, by default 1, in each annulus; NaN without any."""
+        inside, n = index >= 0, self.edges_um.size - 1
+        sums = np.bincount(index[inside], values[inside], minlength=n)
+        totals = np.bincount(index[inside], None if weights is None else weights[inside], minlength=n)
+        return np.divide(sums, totals, out=np.full(n, np.nan), where=totals > 0)
 
 
 def quality_by_eccentricity(
@@ -98,20 +105,21 @@ def quality_by_eccentricity(
     if data_range is None:
         data_range = float(np.ptp(other[:, compared]))
     data_range = check_number("data_range", data_range, above=0.0)
-    gain = fit_gain(one[:, compared], other[:, compared])
+    power = float(np.square(one[:, compared]).sum())
+    gain = float((one[:, compared] * other[:, compared]).sum()) / power if power > 0.0 else 1.0
     error = np.where(compared, np.square(gain * one - other).mean(axis=0), 0.0)
     similarity, fits = ssim_map(
         np.where(compared, gain * one, 0.0), np.where(compared, other, 0.0), compared, data_range
     )
     grid = picture.grid
     centres_um = np.stack(np.meshgrid(grid.x_um, grid.y_um), axis=-1)
-    annulus = annulus_of(centres_um, centre_um, np.asarray(edges_um, np.float64))
-    n = len(edges_um) - 1
+    annuli = Annuli(centre_um, np.asarray(edges_um, np.float64))
+    annulus = annuli.index_of(centres_um)
     return PictureQuality(
         psnr_db=float(_psnr_db(np.asarray(error[compared].mean()), data_range)),
         ssim=float(similarity[fits].mean()) if fits.any() else float("nan"),
-        psnr_db_by_eccentricity=_psnr_db(_means(error, annulus, compared, n), data_range),
-        ssim_by_eccentricity=_means(similarity, annulus, fits, n),
+        psnr_db_by_eccentricity=_psnr_db(annuli.means(error, np.where(compared, annulus, -1)), data_range),
+        ssim_by_eccentricity=annuli.means(similarity, np.where(fits, annulus, -1)),
         gain=gain,
     )
 
@@ -119,14 +127,6 @@ def quality_by_eccentricity(
 def _psnr_db(mean_square: NDArray[np.float64], data_range: float) -> Floats:
     with np.errstate(divide="ignore"):
         return np.asarray(10.0 * np.log10(data_range**2 / mean_square))
-
-
-def _means(values: Floats, annulus: Ints, is_used: Bools, n: int) -> Floats:
-    """Return the mean over the used pixels of each annulus; NaN without any."""
-    used = is_used & (annulus >= 0)
-    sums = np.bincount(annulus[used], values[used], minlength=n)
-    counts = np.bincount(annulus[used], minlength=n)
-    return np.divide(sums, counts, out=np.full(n, np.nan), where=counts > 0)
 
 
 def _describe(grid: Grid) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Annotated
 
@@ -11,9 +11,10 @@ import numpy as np
 from foveasim._core.calls import POSITIVE
 from foveasim._core.validation import check_choice
 from foveasim.camera import Camera
+from foveasim.compare.intervals import format_number, with_unit
 from foveasim.errors import ParameterError, format_value
 
-__all__ = ["BUDGETS", "Budget", "budget_of", "check_equal_budgets"]
+__all__ = ["BUDGETS", "Budget", "budget_of", "budget_rows", "check_equal_budgets"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +72,14 @@ def budget_of(camera: Camera, frames_per_s: Annotated[float, POSITIVE]) -> Budge
         area_um2=float(sensor.layout.area_um2.sum()),
         read_noise_e2=float(np.broadcast_to(sensor.readout_model(0.0).noise_e2, n_sites).sum()),
     )
+
+
+def budget_rows(budgets: Sequence[Budget]) -> list[list[str]]:
+    """Return title and one value per camera of each budget."""
+    return [
+        [with_unit(title, unit), *(format_number(getattr(budget, attribute)) for budget in budgets)]
+        for attribute, title, unit in BUDGETS.values()
+    ]
 
 
 def check_equal_budgets(budgets: Mapping[str, Budget], budget: str | None, tolerance: float) -> None:

@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
@@ -14,19 +15,19 @@ from numpy.typing import NDArray
 
 from foveasim._core.calls import NOT_NEGATIVE, POSITIVE, Limits
 from foveasim._core.extras import import_optional
-from foveasim._core.provenance import copy_plain_data, to_plain_data, versions
-from foveasim._core.validation import Floats, Images, check_number, finite_array, read_only
+from foveasim._core.provenance import to_plain_data, versions
+from foveasim._core.validation import Floats, check_choice, check_number, finite_array, read_only
 from foveasim.camera import Camera
-from foveasim.compare.annuli import PictureQuality, quality_by_eccentricity
-from foveasim.compare.budgets import BUDGETS, Budget, budget_of, check_equal_budgets
-from foveasim.compare.information import SceneCovariance, scene_covariance
-from foveasim.compare.intervals import MedianInterval, format_interval, format_number, median_interval
+from foveasim.compare.annuli import Annuli, quality_by_eccentricity
+from foveasim.compare.budgets import BUDGETS, Budget, budget_of, budget_rows, check_equal_budgets
+from foveasim.compare.information import scene_covariance
+from foveasim.compare.intervals import MedianInterval, median_interval
 from foveasim.compare.measure import (
     MEASURES,
-    SceneMeasures,
     information_by_annulus,
     layout_measures,
     layout_of,
+    measure_rows,
     scene_measures,
     size_records,
 )
@@ -38,6 +39,7 @@ from foveasim.optics import Optics
 from foveasim.reconstruct import Picture
 from foveasim.scene import Scene
 from foveasim.sensor import Sensor
+from foveasim.sensor.model.linearisation import Linearisation
 from foveasim.units import per_mm_from_per_um
 
 if TYPE_CHECKING:
@@ -120,7 +122,7 @@ class Comparison:
             With a 95 % interval for the median of the population of scenes, for any distribution (:func:`median_interval`).
             Its bounds are NaN for fewer than five scenes, and the value itself for measures of layouts.
         """
-        return self._interval(name, by_eccentricity, lambda values: values)
+        return self._interval(name, by_eccentricity, is_difference=False)
 
     def differences(self, name: str, *, by_eccentricity: bool = False) -> MedianInterval:
         """
@@ -136,17 +138,15 @@ class Comparison:
         median, low, high : (n_camera,) or (n_camera, n_annulus) float64
             Differences are paired by scene, so that the interval does not contain the variation between scenes.
         """
+        return self._interval(name, by_eccentricity, is_difference=True)
 
-        def difference(values: Floats) -> Floats:
+    def _interval(self, name: str, by_eccentricity: bool, *, is_difference: bool) -> MedianInterval:
+        """Return the interval of a measure, or of its differences; a single value for measures of layouts."""
+        has_scenes = MEASURES[check_choice("name", name, MEASURES)].has_scenes
+        values = self.values[name + (BY_ECCENTRICITY if by_eccentricity else "")]
+        if is_difference:
             with np.errstate(invalid="ignore"):  # infinite PSNR of identical pictures
-                return np.where(values == values[:1], 0.0, values - values[:1])
-
-        return self._interval(name, by_eccentricity, difference)
-
-    def _interval(self, name: str, by_eccentricity: bool, function: Callable[[Floats], Floats]) -> MedianInterval:
-        """Return the interval of a function of a measure; a single value for measures of layouts."""
-        has_scenes = _measure(name).has_scenes
-        values = function(self.values[name + (BY_ECCENTRICITY if by_eccentricity else "")])
+                values = np.where(values == values[:1], 0.0, values - values[:1])
         return median_interval(np.moveaxis(values, 1, -1)) if has_scenes else MedianInterval(values, values, values)
 
     def records(self) -> list[dict[str, Any]]:
@@ -232,14 +232,10 @@ class Comparison:
         write_page(path, lambda: report_page(self))
 
     def __str__(self) -> str:
-        columns = [("", *self.names), *(tuple(row) for row in self._rows())]
-        widths = [max(len(row[k]) for row in columns) for k in range(len(self.names) + 1)]
+        rows = [["", *self.names], *self._rows()]
+        first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
         return "\n".join(
-            "  ".join(
-                cell.ljust(width) if k == 0 else cell.rjust(width)
-                for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-            ).rstrip()
-            for row in columns
+            "  ".join([head.ljust(first), *map(str.rjust, cells, widths)]).rstrip() for head, *cells in rows
         )
 
     def _repr_html_(self) -> str:
@@ -262,15 +258,8 @@ class Comparison:
 
     def _rows(self) -> list[list[str]]:
         """Return title and one value per camera of each row of the table."""
-        rows = []
-        for attribute, title, unit in BUDGETS.values():
-            numbers = [getattr(budget, attribute) for budget in self.budgets]
-            rows.append([f"{title} / {unit}" if unit else title, *(format_number(x) for x in numbers)])
-        rows.append(["coverage of the field / %", *(f"{100.0 * part:.1f}" for part in self.coverage_fraction)])
-        for name, measure in MEASURES.items():
-            title = f"{measure.title} / {measure.unit}" if measure.unit else measure.title
-            rows.append([title, *(format_interval(*one) for one in zip(*self.summary(name), strict=True))])
-        return rows
+        coverage = ["coverage of the field / %", *(f"{100.0 * part:.1f}" for part in self.coverage_fraction)]
+        return [*budget_rows(self.budgets), coverage, *measure_rows(self.summary)]
 
 
 def cameras(
@@ -340,48 +329,56 @@ def cameras(
         scenes = photograph_scenes(field_um(all_layouts), first.optics)
     if not scenes:
         raise ParameterError("scenes", "must be a mapping of names to at least one scene", scenes)
-    n_steps = len(named) * (len(scenes) + 1)
-    n_done = 0
+    steps = count(1)
 
     def advance() -> None:
-        nonlocal n_done
-        n_done += 1
         if progress is not None:
-            progress(n_done, n_steps)
+            progress(next(steps), len(named) * (len(scenes) + 1))
 
-    field = _field(all_layouts, fixation, n_annuli, max_pixels)
-    shots, irradiance = _simulate(named, scenes, field, exposure_s, seed, method, advance)
-    covered = {name: one.pictures[0].coverage >= MIN_COVERAGE for name, one in shots.items()}
-    is_common, is_field = (combine([*covered.values()], axis=0) for combine in (np.all, np.any))
+    annuli, grid, covariance_grid = _field(all_layouts, fixation, n_annuli, max_pixels)
+    shots: dict[str, list[_Shot]] = {name: [] for name in named}
+    irradiance = []
+    for light in scenes.values():
+        power_map = first.power_map(light) if isinstance(light, Scene) else light
+        # Means over the colour filters of the first camera.
+        irradiance.append(first.reference(power_map, covariance_grid, exposure_s=exposure_s).data.mean(axis=0))
+        for name, camera in named.items():
+            capture = camera.capture(light, exposure_s=exposure_s, seed=seed)
+            picture = capture.picture(method, of="light_e", per="um2", grid=grid, sensor=camera.sensor)
+            ideal = camera.reference(power_map, grid, exposure_s=exposure_s)
+            shots[name].append(_Shot(picture, ideal, *scene_measures(camera, capture, power_map, annuli)))
+            advance()
+    covered = [one[0].picture.coverage >= MIN_COVERAGE for one in shots.values()]
+    is_common, is_field = (combine(covered, axis=0) for combine in (np.all, np.any))
     if not is_common.any():
         raise ParameterError("cameras", "must have a common part of the field; the layouts do not overlap")
-    ideal = shots[first_name].ideal
-    covariance = scene_covariance(np.array(irradiance), field.covariance_grid.pitch_x_um)
+    covariance = scene_covariance(np.array(irradiance), covariance_grid.pitch_x_um)
+    mean_e_per_um2 = _mean_e_per_um2(shots[first_name])
     density_per_um2 = budgets[first_name].n_sites / budgets[first_name].area_um2
     wave_per_mm = WAVE_NYQUISTS * float(per_mm_from_per_um(0.5 * np.sqrt(density_per_um2)))
     values: dict[str, list[Any]] = {key: [] for name in MEASURES for key in (name, name + BY_ECCENTRICITY)}
     pictures: dict[str, list[Picture]] = {}
     for name, camera in named.items():
+        own = shots[name]
         qualities = [
-            quality_by_eccentricity(one, other, edges_um=field.edges_um, centre_um=fixation, is_compared=is_common)
-            for one, other in zip(shots[name].pictures, shots[name].ideal, strict=True)
+            quality_by_eccentricity(one.picture, one.ideal, **annuli._asdict(), is_compared=is_common) for one in own
         ]
-        found = _camera_values(
-            camera,
-            shots[name],
-            qualities,
-            covariance,
-            _mean_e_per_um2(ideal),
-            field,
-            wave_per_mm,
-            next(iter(scenes.values())),
+        light = next(iter(scenes.values()))
+        distance_m = float(light.distance_m) if isinstance(light, Scene) else None
+        channel_e_per_um2 = np.nanmean([one.ideal.data for one in own], axis=(0, 2, 3))
+        response = channel_e_per_um2[camera.sensor.filter_of_site] / mean_e_per_um2 * camera.sensor.light_response()
+        measures = [quality._asdict() | one.measures for quality, one in zip(qualities, own, strict=True)]
+        found = (
+            {key: [one[key] for one in measures] for key in measures[0]}
+            | information_by_annulus(camera, covariance, response, [one.model for one in own], annuli)
+            | layout_measures(camera, float(np.mean(light.wavelength_nm)), distance_m, annuli, wave_per_mm)
         )
-        for key, row in found.items():
-            values[key].append(row)
-        scale = float(_mean_e_per_um2(ideal) / _mean_e_per_um2(shots[name].ideal))
+        for key, rows in values.items():
+            rows.append(found[key])
+        scale = mean_e_per_um2 / _mean_e_per_um2(own)
         pictures[name] = [
-            Picture((scale * quality.gain * one.data).astype(np.float32), one.coverage, field.grid)
-            for quality, one in zip(qualities, shots[name].pictures, strict=True)
+            Picture((scale * quality.gain * one.picture.data).astype(np.float32), one.picture.coverage, grid)
+            for quality, one in zip(qualities, own, strict=True)
         ]
         advance()
     n_field = np.count_nonzero(is_field)
@@ -389,13 +386,13 @@ def cameras(
         names=tuple(named),
         scenes=tuple(map(str, scenes)),
         budgets=tuple(budgets.values()),
-        edges_um=read_only(field.edges_um),
+        edges_um=read_only(annuli.edges_um),
         centre_um=fixation,
         values={key: read_only(np.asarray(rows, np.float64)) for key, rows in values.items()},
-        coverage_fraction=read_only(np.array([np.count_nonzero(part) for part in covered.values()]) / n_field),
+        coverage_fraction=read_only(np.array([np.count_nonzero(part) for part in covered]) / n_field),
         compared_fraction=float(np.count_nonzero(is_common) / n_field),
         pictures=pictures,
-        ideal=ideal,
+        ideal=[one.ideal for one in shots[first_name]],
         sizes={name: size_records(camera) for name, camera in named.items()},
         settings={
             "budget": budget,
@@ -405,116 +402,47 @@ def cameras(
             "method": method,
             "wave_per_mm": wave_per_mm,
             "optics": to_plain_data(first.optics),
-            "distortion": None if first.distortion is None else to_plain_data(first.distortion),
+            "distortion": to_plain_data(first.distortion),
             "cameras": {
                 name: {
-                    "sensor": {k: v for k, v in to_plain_data(camera.sensor).items() if k != "layout"},
+                    "sensor": to_plain_data(camera.sensor, without={"layout"}),
                     "layout": to_plain_data(dict(layout_of(camera).provenance)),
                 }
                 for name, camera in named.items()
             },
-            "versions": copy_plain_data(versions()),
+            "versions": versions(),
         },
     )
 
 
-class _Field(NamedTuple):
-    """Fixation point, annuli, and the grids of pictures and of images for their covariance."""
+class _Shot(NamedTuple):
+    """Picture, ideal picture, model and measures of the capture of a scene by a camera."""
 
-    centre_um: tuple[float, float]
-    edges_um: Floats
-    grid: Grid
-    covariance_grid: Grid
-
-
-class _Shots(NamedTuple):
-    """Pictures, ideal pictures and measures of the captures of a camera, one per scene."""
-
-    pictures: list[Picture]
-    ideal: list[Picture]
-    measures: list[SceneMeasures]
+    picture: Picture
+    ideal: Picture
+    model: Linearisation
+    measures: dict[str, Any]
 
 
-def _field(all_layouts: Sequence[Layout], centre_um: tuple[float, float], n_annuli: int, max_pixels: int) -> _Field:
-    """Return the common field of layouts."""
+def _field(
+    all_layouts: Sequence[Layout], centre_um: tuple[float, float], n_annuli: int, max_pixels: int
+) -> tuple[Annuli, Grid, Grid]:
+    """Return the annuli of the common field of layouts, and its grids for pictures and for the covariance of images."""
     bounds_um = np.array([layout.bounds_um for layout in all_layouts])
     low, high = bounds_um[:, :2].min(axis=0), bounds_um[:, 2:].max(axis=0)
     site_um = min(math.sqrt(float(layout.area_um2.min())) for layout in all_layouts)
     n_pixels = math.ceil(SITE_PIXELS * float((high - low).max()) / site_um)
     reach_um = max(float(np.hypot(*(layout.centroid_um - centre_um).T).max()) for layout in all_layouts)
-    return _Field(
-        centre_um,
-        np.linspace(0.0, reach_um * (1.0 + EDGE_ROUNDING), n_annuli + 1),
+    return (
+        Annuli(centre_um, np.linspace(0.0, reach_um * (1.0 + EDGE_ROUNDING), n_annuli + 1)),
         _grid(low, high, max_pixels),
         _grid(low, high, min(max(n_pixels, MIN_FIELD_PIXELS), MAX_FIELD_PIXELS)),
     )
 
 
-def _simulate(
-    named: Mapping[str, Camera],
-    scenes: Mapping[str, Scene | PowerMap],
-    field: _Field,
-    exposure_s: float,
-    seed: int,
-    method: Method,
-    advance: Callable[[], None],
-) -> tuple[dict[str, _Shots], list[Images]]:
-    """
-    Capture all scenes with all cameras, and reconstruct the pictures on the common grid.
-
-    Also return the mean irradiance of each scene over the colour filters of the first camera, on the grid for covariances.
-    """
-    shots = {name: _Shots([], [], []) for name in named}
-    irradiance: list[Images] = []
-    first = next(iter(named.values()))
-    for light in scenes.values():
-        power_map = first.power_map(light) if isinstance(light, Scene) else light
-        irradiance.append(first.reference(power_map, field.covariance_grid, exposure_s=exposure_s).data.mean(axis=0))
-        for name, camera in named.items():
-            capture = camera.capture(light, exposure_s=exposure_s, seed=seed)
-            shots[name].pictures.append(
-                capture.picture(method, of="light_e", per="um2", grid=field.grid, sensor=camera.sensor)
-            )
-            shots[name].ideal.append(camera.reference(power_map, field.grid, exposure_s=exposure_s))
-            shots[name].measures.append(scene_measures(camera, capture, power_map, field.centre_um, field.edges_um))
-            advance()
-    return shots, irradiance
-
-
-def _camera_values(
-    camera: Camera,
-    shots: _Shots,
-    qualities: Sequence[PictureQuality],
-    covariance: SceneCovariance,
-    mean_e_per_um2: float,
-    field: _Field,
-    wave_per_mm: float,
-    light: Scene | PowerMap,
-) -> dict[str, Any]:
-    """Return all measures of a camera, over scenes and annuli."""
-    totals: dict[str, Any] = {key: [getattr(q, key) for q in qualities] for key in ("psnr_db", "ssim")}
-    annuli: dict[str, Any] = {key: [getattr(q, key + BY_ECCENTRICITY) for q in qualities] for key in totals}
-    for key in ("snr_db", "shift_sigma_um"):
-        totals[key] = [one.totals[key] for one in shots.measures]
-        annuli[key] = [one.annuli[key] for one in shots.measures]
-    channel_e_per_um2 = np.nanmean([picture.data for picture in shots.ideal], axis=(0, 2, 3))
-    filter_of_site = shots.measures[0].capture.filter_of_site
-    response = channel_e_per_um2[filter_of_site] / mean_e_per_um2 * camera.sensor.light_response()
-    distance_m = float(light.distance_m) if isinstance(light, Scene) else None
-    wavelength_nm = float(np.mean(light.wavelength_nm))
-    for total, by_annulus in (
-        information_by_annulus(
-            camera, covariance, response, [one.model for one in shots.measures], field.centre_um, field.edges_um
-        ),
-        layout_measures(camera, wavelength_nm, distance_m, field.centre_um, field.edges_um, wave_per_mm),
-    ):
-        totals.update(total)
-        annuli.update(by_annulus)
-    return {name: totals[name] for name in MEASURES} | {name + BY_ECCENTRICITY: annuli[name] for name in MEASURES}
-
-
-def _mean_e_per_um2(pictures: Sequence[Picture]) -> float:
-    return float(np.mean([np.nanmean(picture.data) for picture in pictures]))
+def _mean_e_per_um2(shots: Sequence[_Shot]) -> float:
+    """Return the mean of the ideal pictures."""
+    return float(np.mean([np.nanmean(one.ideal.data) for one in shots]))
 
 
 def layouts(
@@ -595,9 +523,3 @@ def _grid(low: NDArray[np.float64], high: NDArray[np.float64], max_pixels: int) 
     return Grid(
         (n_y, n_x), pitch_um, (float(centre[0] - 0.5 * n_x * pitch_um), float(centre[1] - 0.5 * n_y * pitch_um))
     )
-
-
-def _measure(name: str) -> Any:
-    if name not in MEASURES:
-        raise ParameterError("name", f"must be one of {', '.join(MEASURES)}", name)
-    return MEASURES[name]

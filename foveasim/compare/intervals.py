@@ -12,7 +12,15 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, as_numbers
 from foveasim.errors import ParameterError
 
-__all__ = ["CONFIDENCE", "MIN_SCENES", "MedianInterval", "format_interval", "format_number", "median_interval"]
+__all__ = [
+    "CONFIDENCE",
+    "MIN_SCENES",
+    "MedianInterval",
+    "format_interval",
+    "format_number",
+    "median_interval",
+    "with_unit",
+]
 
 #: Confidence of the intervals, and the smallest sample with one: the range of 5 values covers the median in 93.75 %.
 CONFIDENCE, MIN_SCENES = 0.95, 5
@@ -104,6 +112,11 @@ def format_number(value: float) -> str:
     if isinstance(value, int) or abs(value) >= 1e4:
         return f"{value:,.0f}"
     return f"{value:.5g}"
+
+
+def with_unit(title: str, unit: str) -> str:
+    """Return the title of a quantity with its unit, if it has one."""
+    return f"{title} / {unit}" if unit else title
 
 
 def format_interval(median: float, low: float, high: float) -> str:

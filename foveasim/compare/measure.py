@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Any
@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.validation import Bools, Floats, Ints
+from foveasim._core.validation import Floats, Ints
 from foveasim.camera import Camera
 from foveasim.capture import Capture
-from foveasim.compare.annuli import annulus_of
+from foveasim.compare.annuli import Annuli
 from foveasim.compare.information import SceneCovariance, site_information_bits
+from foveasim.compare.intervals import MedianInterval, format_interval, with_unit
 from foveasim.errors import FoveasimWarning, ParameterError
 from foveasim.fields import Grid, PowerMap
 from foveasim.layout import Layout
@@ -34,10 +35,10 @@ from foveasim.units import per_mm_from_per_um
 __all__ = [
     "MEASURES",
     "Measure",
-    "SceneMeasures",
     "information_by_annulus",
     "layout_measures",
     "layout_of",
+    "measure_rows",
     "scene_measures",
     "size_records",
 ]
@@ -97,16 +98,6 @@ MEASURES = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class SceneMeasures:
-    """Model of a capture, and measures of its sites; NaN for an annulus without sites."""
-
-    capture: Capture
-    model: Linearisation
-    totals: Mapping[str, Any]
-    annuli: Mapping[str, Any]
-
-
 def layout_of(camera: Camera) -> Layout:
     """Return the layout of a camera."""
     assert isinstance(camera.sensor.layout, Layout)  # guaranteed by Camera
@@ -117,14 +108,13 @@ def layout_measures(
     camera: Camera,
     wavelength_nm: float,
     distance_m: float | None,
-    centre_um: tuple[float, float],
-    edges_um: Floats,
+    annuli: Annuli,
     wave_per_mm: float,
-) -> tuple[dict[str, float], dict[str, Floats]]:
+) -> dict[str, Any]:
     """Return the measures that do not depend on a scene, in total and by annulus."""
     layout = layout_of(camera)
-    annulus = annulus_of(layout.centroid_um, centre_um, edges_um)
-    n = edges_um.size - 1
+    annulus = annuli.index_of(layout.centroid_um)
+    (x_um, y_um), edges_um = annuli
     nyquist = nyquist_per_mm(layout)
     frequency = np.linspace(
         0.0, MAX_FREQUENCY * float(per_mm_from_per_um(1.0 / np.sqrt(layout.area_um2.min()))), MTF_FREQUENCIES
@@ -148,59 +138,48 @@ def layout_measures(
         return found.alias_fraction * float(camera.optics.mtf(wave_per_mm, wavelength_nm, distance_m=distance_m))
 
     order = np.argsort(layout.area_um2, kind="stable")
-    by_annulus = [order[annulus[order] == k] for k in range(n)]
-    width_um = np.diff(edges_um)
+    by_annulus = [order[annulus[order] == k] for k in range(edges_um.size - 1)]
     ring_um = 0.5 * (edges_um[1:] + edges_um[:-1])
     # The innermost region is centred; others are to the right of the fixation point.
-    centres = [(centre_um[0] + (r if k else 0.0), centre_um[1]) for k, r in enumerate(ring_um.tolist())]
-    radii = [width if k == 0 else max(0.5 * width, 0.25 * ring_um[k]) for k, width in enumerate(width_um.tolist())]
-    annuli = {
-        "nyquist_per_mm": np.array([_median(nyquist[sites]) for sites in by_annulus]),
-        "mtf50_per_mm": np.array([mtf50(sites) for sites in by_annulus]),
-        "alias_fraction": np.array([alias(c, r) for c, r in zip(centres, radii, strict=True)]),
-    }
+    centres = [(x_um + (r if k else 0.0), y_um) for k, r in enumerate(ring_um.tolist())]
+    radii = [
+        width if k == 0 else max(0.5 * width, 0.25 * ring_um[k]) for k, width in enumerate(np.diff(edges_um).tolist())
+    ]
+    alias_fraction = np.array([alias(c, r) for c, r in zip(centres, radii, strict=True)])
     # A larger region would contain waves of many local frequencies: the total is the mean over the area.
     area_um2 = np.array([layout.area_um2[sites].sum() for sites in by_annulus])
-    weights = np.where(np.isfinite(annuli["alias_fraction"]), area_um2, 0.0)
-    totals = {
+    weights = np.where(np.isfinite(alias_fraction), area_um2, 0.0)
+    return {
         "nyquist_per_mm": _median(nyquist),
+        "nyquist_per_mm_by_eccentricity": [_median(nyquist[sites]) for sites in by_annulus],
         "mtf50_per_mm": mtf50(order),
-        "alias_fraction": float(np.nansum(weights * annuli["alias_fraction"]) / weights.sum())
-        if weights.any()
-        else math.nan,
+        "mtf50_per_mm_by_eccentricity": [mtf50(sites) for sites in by_annulus],
+        "alias_fraction": np.nansum(weights * alias_fraction) / weights.sum() if weights.any() else math.nan,
+        "alias_fraction_by_eccentricity": alias_fraction,
     }
-    return totals, annuli
 
 
 def scene_measures(
-    camera: Camera, capture: Capture, image: PowerMap, centre_um: tuple[float, float], edges_um: Floats
-) -> SceneMeasures:
-    """Return SNR and precision of a shift for a capture of an image."""
+    camera: Camera, capture: Capture, image: PowerMap, annuli: Annuli
+) -> tuple[Linearisation, dict[str, Any]]:
+    """Return the model of a capture of an image, and its SNR and precision of a shift; NaN for an annulus without sites."""
     sensor, layout = camera.sensor, layout_of(camera)
     exposure_s = float(capture.settings["exposure_s"])
     dark_e = sensor.expected_electrons(np.zeros(layout.n_sites), exposure_s)
     model = sensor.linearise(capture.expected_e, exposure_s=exposure_s)
-    signals = site_signals(model, dark_e)
-    annulus = annulus_of(layout.centroid_um, centre_um, edges_um)
-    n = edges_um.size - 1
-    sums = np.bincount(annulus[annulus >= 0], signals.ratio[annulus >= 0], minlength=n)
-    counts = np.bincount(annulus[annulus >= 0], minlength=n)
-    ratio = np.divide(sums, counts, out=np.full(n, np.nan), where=counts > 0)
+    ratio = site_signals(model, dark_e).ratio
+    annulus = annuli.index_of(layout.centroid_um)
     gradient = _shift_gradients_e_per_um(camera, image, exposure_s)
-    everything = flow_bound(gradient, model)
     parts = flow_bound(gradient, model, regions=annulus)
-    sigma_um = np.full(n, np.nan)
+    sigma_um = np.full(annuli.edges_um.size - 1, np.nan)
     sigma_um[parts.regions] = _rms(parts.sigma_um)
     with np.errstate(divide="ignore"):
-        return SceneMeasures(
-            capture,
-            model,
-            {
-                "snr_db": float(20.0 * np.log10(signals.ratio.mean())),
-                "shift_sigma_um": float(_rms(everything.sigma_um)[0]),
-            },
-            {"snr_db": 20.0 * np.log10(ratio), "shift_sigma_um": sigma_um},
-        )
+        return model, {
+            "snr_db": 20.0 * np.log10(ratio.mean()),
+            "snr_db_by_eccentricity": 20.0 * np.log10(annuli.means(ratio, annulus)),
+            "shift_sigma_um": _rms(flow_bound(gradient, model).sigma_um)[0],
+            "shift_sigma_um_by_eccentricity": sigma_um,
+        }
 
 
 def _shift_gradients_e_per_um(camera: Camera, image: PowerMap, exposure_s: float) -> Floats:
@@ -236,9 +215,8 @@ def information_by_annulus(
     covariance: SceneCovariance,
     response: NDArray[np.float64],
     models: Sequence[Linearisation],
-    centre_um: tuple[float, float],
-    edges_um: Floats,
-) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    annuli: Annuli,
+) -> dict[str, Any]:
     """
     Return the information per site and per mm², (n_scene,) and (n_scene, n_annulus).
 
@@ -247,17 +225,24 @@ def information_by_annulus(
     layout = layout_of(camera)
     gain = [layout.area_um2 * model.forward(response) for model in models]
     bits = site_information_bits(layout, covariance, gain, models)
-    annulus = annulus_of(layout.centroid_um, centre_um, edges_um)
-    n, inside = edges_um.size - 1, annulus >= 0
-    sums = np.stack([np.bincount(annulus[inside], row[inside], minlength=n) for row in bits])
-    counts = np.bincount(annulus[inside], minlength=n).astype(np.float64)
-    area_mm2 = np.bincount(annulus[inside], layout.area_um2[inside], minlength=n) / UM2_PER_MM2
-    counts[counts == 0.0], area_mm2[area_mm2 == 0.0] = np.nan, np.nan
-    totals = {
+    annulus, area_mm2 = annuli.index_of(layout.centroid_um), layout.area_um2 / UM2_PER_MM2
+    return {
         "information_bit_per_site": bits.mean(axis=1),
-        "information_bit_per_mm2": bits.sum(axis=1) / (layout.area_um2.sum() / UM2_PER_MM2),
+        "information_bit_per_site_by_eccentricity": [annuli.means(row, annulus) for row in bits],
+        "information_bit_per_mm2": bits.sum(axis=1) / area_mm2.sum(),
+        "information_bit_per_mm2_by_eccentricity": [annuli.means(row, annulus, area_mm2) for row in bits],
     }
-    return totals, {"information_bit_per_site": sums / counts, "information_bit_per_mm2": sums / area_mm2}
+
+
+def measure_rows(interval_of: Callable[[str], MedianInterval]) -> list[list[str]]:
+    """Return title and one value per camera of each measure, from a function of its name."""
+    return [
+        [
+            with_unit(measure.title, measure.unit),
+            *(format_interval(*one) for one in zip(*interval_of(name), strict=True)),
+        ]
+        for name, measure in MEASURES.items()
+    ]
 
 
 def size_records(camera: Camera) -> list[dict[str, Any]]:
@@ -282,11 +267,8 @@ def _median(values: NDArray[np.float64]) -> float:
 
 def _first_crossing(frequency_per_mm: Floats, mtf: Floats) -> float:
     """Return the first frequency at which an MTF falls to one half; NaN if it does not."""
-    below: Bools = mtf < HALF
-    if not below.any():
-        return float("nan")
-    k = int(below.argmax())
-    if k == 0:
-        return 0.0
-    part = (mtf[k - 1] - HALF) / (mtf[k - 1] - mtf[k])
-    return float(frequency_per_mm[k - 1] + part * (frequency_per_mm[k] - frequency_per_mm[k - 1]))
+    below = np.flatnonzero(mtf < HALF)
+    if not below.size:
+        return math.nan
+    around = slice(max(below[0] - 1, 0), below[0] + 1)
+    return float(np.interp(-HALF, -mtf[around], frequency_per_mm[around]))

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.compare.budgets import BUDGETS
+from foveasim.compare.budgets import BUDGETS, budget_rows
 from foveasim.compare.figures import measure_figure, sizes_figure
-from foveasim.compare.intervals import MIN_SCENES, format_interval, format_number
-from foveasim.compare.measure import MEASURES
+from foveasim.compare.intervals import MIN_SCENES
+from foveasim.compare.measure import MEASURES, measure_rows
 from foveasim.reconstruct import Picture
 from foveasim.view.web._report_page import (
     FAINT,
@@ -80,23 +80,18 @@ def _summary(comparison: Comparison) -> ReportSection:
             f"Of the field that any camera covers, {'; '.join(missing)}. Pictures are compared in the "
             f"{100.0 * comparison.compared_fraction:.1f} % that all cover."
         )
-    budgets = [
-        [f"{title} / {unit}" if unit else title, *(format_number(getattr(b, attribute)) for b in comparison.budgets)]
-        for attribute, title, unit in BUDGETS.values()
-    ]
-    medians, differences = [], []
-    for name, measure in MEASURES.items():
-        head = f"{measure.title} / {measure.unit}" if measure.unit else measure.title
-        medians.append([head, *(format_interval(*one) for one in zip(*comparison.summary(name), strict=True))])
-        others = [*zip(*comparison.differences(name), strict=True)][1:]
-        differences.append([head, *(format_interval(*one) for one in others)])
+    differences = [[head, *others] for head, _, *others in measure_rows(comparison.differences)]
     interval = "median [95 % confidence interval] over the scenes"
     return ReportSection(
         "Summary",
         notes,
         (
-            ReportTable(("Budget", *comparison.names), budgets, "Budgets of the cameras."),
-            ReportTable(("Measure", *comparison.names), medians, f"Over the complete field: {interval}."),
+            ReportTable(("Budget", *comparison.names), budget_rows(comparison.budgets), "Budgets of the cameras."),
+            ReportTable(
+                ("Measure", *comparison.names),
+                measure_rows(comparison.summary),
+                f"Over the complete field: {interval}.",
+            ),
             ReportTable(
                 ("Difference", *comparison.names[1:]),
                 differences,
