@@ -26,7 +26,6 @@ from foveasim.compare.measure import (
     MEASURES,
     information_by_annulus,
     layout_measures,
-    layout_of,
     measure_rows,
     scene_measures,
     size_records,
@@ -323,7 +322,7 @@ def cameras(
     fixation: tuple[float, float] = tuple(finite_array("centre_um", centre_um).tolist())
     budgets = {name: budget_of(camera, _rate(frames_per_s, name, exposure_s)) for name, camera in named.items()}
     check_equal_budgets(budgets, budget, tolerance)
-    all_layouts = [layout_of(camera) for camera in named.values()]
+    all_layouts = [camera.layout for camera in named.values()]
     first_name, first = next(iter(named.items()))
     if scenes is None:
         scenes = photograph_scenes(field_um(all_layouts), first.optics)
@@ -406,7 +405,7 @@ def cameras(
             "cameras": {
                 name: {
                     "sensor": to_plain_data(camera.sensor, without={"layout"}),
-                    "layout": to_plain_data(dict(layout_of(camera).provenance)),
+                    "layout": to_plain_data(dict(camera.layout.provenance)),
                 }
                 for name, camera in named.items()
             },

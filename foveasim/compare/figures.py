@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim.compare.intervals import with_unit
 from foveasim.compare.measure import MEASURES
 from foveasim.errors import printable
 
@@ -17,7 +21,7 @@ if TYPE_CHECKING:
 
     from foveasim.compare.comparison import Comparison
 
-__all__ = ["COLOURS", "draw_measure", "draw_sizes", "measure_figure", "overview", "sizes_figure"]
+__all__ = ["COLOURS", "draw_measure", "draw_sizes", "figure_of", "overview"]
 
 #: Colours of the cameras, distinguishable with colour-vision deficiencies and on light and dark pages, and their markers.
 COLOURS = ("#2f7fd6", "#e0862a", "#1f9e77", "#c95fb0", "#8a8f2e", "#c8474b", "#7a68d8", "#4aa3b5")
@@ -31,32 +35,21 @@ MAX_NAME = 28
 def draw_measure(comparison: Comparison, name: str, axes: Axes) -> None:
     """Draw one measure of all cameras against eccentricity, with confidence intervals."""
     measure = MEASURES[name]
-    medians, lows, highs = comparison.summary(name, by_eccentricity=True)
+    intervals = comparison.summary(name, by_eccentricity=True)
     r_um = 0.5 * (comparison.edges_um[1:] + comparison.edges_um[:-1])
-    for k, (y, low, high) in enumerate(zip(medians, lows, highs, strict=True)):
-        style: dict[str, Any] = {
-            "color": COLOURS[k % len(COLOURS)],
-            "marker": MARKERS[k % len(MARKERS)],
-            "markersize": 4,
-        }
-        is_finite = np.isfinite(y)
-        axes.plot(r_um[is_finite], y[is_finite], linewidth=1.6, label=_short(comparison.names[k]), **style)
-        if measure.has_scenes and np.isfinite((high - low)[is_finite]).any():
-            axes.fill_between(
-                r_um[is_finite],
-                low[is_finite],
-                high[is_finite],
-                color=style["color"],
-                alpha=0.16,
-                linewidth=0.0,
-            )
-    finite = medians[np.isfinite(medians)]
+    for k, interval in enumerate(zip(*intervals, strict=True)):
+        is_finite = np.isfinite(interval[0])
+        x, y, low, high = (part[is_finite] for part in (r_um, *interval))
+        axes.plot(x, y, linewidth=1.6, markersize=4, **_line_of(comparison, k))
+        if measure.has_scenes and np.isfinite(high - low).any():
+            axes.fill_between(x, low, high, color=COLOURS[k % len(COLOURS)], alpha=0.16, linewidth=0.0)
+    finite = intervals.median[np.isfinite(intervals.median)]
     if name in LOGARITHMIC and finite.size and (finite > 0.0).all():
         axes.set_yscale("log")
         axes.set_ylim(0.6 * finite.min(), 1.6 * finite.max())
         _label_plainly(axes.yaxis)
     axes.set_xlabel("eccentricity / µm")
-    axes.set_ylabel(f"{measure.title} / {measure.unit}" if measure.unit else measure.title)
+    axes.set_ylabel(with_unit(measure.title, measure.unit))
     axes.set_xlim(0.0, comparison.edges_um[-1])
 
 
@@ -66,24 +59,13 @@ def draw_sizes(comparison: Comparison, axes: Axes) -> None:
         rows = comparison.sizes[name]
         size_um = [row["size_um"] for row in rows]
         fraction = [100.0 * row["area_fraction"] for row in rows]
-        colour, marker = COLOURS[k % len(COLOURS)], MARKERS[k % len(MARKERS)]
-        axes.vlines(size_um, 0.0, fraction, color=colour, linewidth=2.2, alpha=0.7)
-        axes.plot(size_um, fraction, color=colour, marker=marker, markersize=5, linewidth=0.8, label=_short(name))
+        axes.vlines(size_um, 0.0, fraction, color=COLOURS[k % len(COLOURS)], linewidth=2.2, alpha=0.7)
+        axes.plot(size_um, fraction, markersize=5, linewidth=0.8, **_line_of(comparison, k))
     axes.set_xscale("log")
     _label_plainly(axes.xaxis)
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("pixel size / µm")
     axes.set_ylabel("area / %")
-
-
-def measure_figure(comparison: Comparison, name: str, ink: str = "black", faint: str = "0.9") -> Figure:
-    """Return a figure of one measure against eccentricity."""
-    return _figure(lambda axes: draw_measure(comparison, name, axes), ink, faint)
-
-
-def sizes_figure(comparison: Comparison, ink: str = "black", faint: str = "0.9") -> Figure:
-    """Return a figure of the area by size class."""
-    return _figure(lambda axes: draw_sizes(comparison, axes), ink, faint)
 
 
 def overview(comparison: Comparison) -> NDArray[Any]:
@@ -93,23 +75,23 @@ def overview(comparison: Comparison) -> NDArray[Any]:
     from foveasim.view.plots.figures import new_figure
 
     with rc_context({"text.parse_math": False}):
+        draws = [*(partial(draw_measure, comparison, name) for name in MEASURES), partial(draw_sizes, comparison)]
         n_columns = 3
-        n_rows = -(-(len(MEASURES) + 1) // n_columns)
+        n_rows = math.ceil(len(draws) / n_columns)
         figure = new_figure((4.3 * n_columns, 2.9 * n_rows))
         axes: NDArray[Any] = figure.subplots(n_rows, n_columns).ravel()
-        for name, one in zip(MEASURES, axes[: len(MEASURES)], strict=True):
-            draw_measure(comparison, name, one)
+        for draw, one in zip(draws, axes[: len(draws)], strict=True):
+            draw(one)
             _style(one, "black", "0.9")
-        draw_sizes(comparison, axes[len(MEASURES)])
-        _style(axes[len(MEASURES)], "black", "0.9")
-        for one in axes[len(MEASURES) + 1 :]:
+        for one in axes[len(draws) :]:
             one.set_visible(False)
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
-    return axes[: len(MEASURES) + 1]
+    return axes[: len(draws)]
 
 
-def _figure(draw: Any, ink: str, faint: str) -> Figure:
+def figure_of(draw: Callable[[Axes], None], ink: str, faint: str) -> Figure:
+    """Return a figure of one of the functions above, in colours of its text and its grid."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -118,9 +100,7 @@ def _figure(draw: Any, ink: str, faint: str) -> Figure:
         axes = figure.add_subplot()
         draw(axes)
         _style(axes, ink, faint)
-        legend = axes.legend(frameon=False, fontsize=9, labelcolor=ink)
-        for text in legend.get_texts():
-            text.set_parse_math(False)
+        axes.legend(frameon=False, fontsize=9, labelcolor=ink)
     return figure
 
 
@@ -143,6 +123,8 @@ def _style(axes: Axes, ink: str, faint: str) -> None:
         label.set_color(ink)
 
 
-def _short(name: str) -> str:
-    name = printable(name)
-    return name if len(name) <= MAX_NAME else name[: MAX_NAME - 1] + "…"
+def _line_of(comparison: Comparison, k: int) -> dict[str, Any]:
+    """Return colour, marker and label of a camera."""
+    name = printable(comparison.names[k])
+    label = name if len(name) <= MAX_NAME else name[: MAX_NAME - 1] + "…"
+    return {"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)], "label": label}

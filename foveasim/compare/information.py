@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import POSITIVE, Limits
+from foveasim._core.rings import next_vertex
 from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_per_site, finite_array
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
@@ -205,10 +206,7 @@ class _RadialSpectrum:
         shape = images.shape[1:]
         radius = np.hypot(fftfreq(shape[0])[:, np.newaxis], rfftfreq(shape[1]))
         # Frequencies that a real transform omits count twice.
-        self._count = np.full(radius.shape[1], 2.0)
-        self._count[0] = 1.0
-        if shape[1] % 2 == 0:
-            self._count[-1] = 1.0
+        self._count = np.where(2 * np.arange(radius.shape[1]) % shape[1] == 0, 1.0, 2.0)
         lowest = min(MIN_PERIODS / min(shape), 0.5 * MAX_FREQUENCY)
         is_used = (radius >= lowest) & (radius <= MAX_FREQUENCY)
         self._ring = np.full(radius.shape, -1, np.int64)
@@ -417,38 +415,28 @@ class _Apertures:
         long_um, short_um = np.sqrt(mean + half), np.sqrt(np.maximum(mean - half, 0.0))
         unit = np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1)
         across = np.stack((-unit[:, 1], unit[:, 0]), axis=1)
-        self._axes_um = np.stack((long_um[:, np.newaxis] * unit, short_um[:, np.newaxis] * across), axis=1)
-        self._centre_um = np.ascontiguousarray(layout.centroid_um)
+        axes_um = np.stack((long_um[:, np.newaxis] * unit, short_um[:, np.newaxis] * across), axis=1)
         # In units of a rectangle of the same moments, per axis: 1 for rectangles, larger for other shapes.
         norm: Floats = np.asarray(np.sqrt(12.0 * long_um * short_um / layout.area_um2), np.float64)
         n_orders = len(MIN_WIDTH_RATIOS) + 1
-        self._nodes = np.zeros((n_orders, n_orders))
-        self._spread = np.ones((layout.n_sites, n_orders))
+        nodes, spread = np.zeros((n_orders, n_orders)), np.ones((layout.n_sites, n_orders))
         for order in range(2, n_orders + 1):
             node = np.arange(order) - 0.5 * (order - 1)
             node /= math.sqrt(float(np.mean(np.square(node))))
-            self._nodes[order - 1, :order] = node
-            self._spread[:, order - 1] = _spread_of_norm(np.asarray(node, np.float64), norm)
-        self._amplitude, self._sigma_um = covariance.amplitude, covariance.sigma_um
-        width = self._sigma_um / (math.sqrt(12.0) * long_um[:, np.newaxis])
-        self._order = 1 + np.sum([width < ratio for ratio in MIN_WIDTH_RATIOS], axis=0, dtype=np.int64)
+            nodes[order - 1, :order] = node
+            spread[:, order - 1] = _spread_of_norm(np.asarray(node, np.float64), norm)
+        amplitude, sigma_um = covariance.amplitude, covariance.sigma_um
+        width = sigma_um / (math.sqrt(12.0) * long_um[:, np.newaxis])
+        orders = 1 + np.sum([width < ratio for ratio in MIN_WIDTH_RATIOS], axis=0, dtype=np.int64)
+        centre_um = np.ascontiguousarray(layout.centroid_um)
+        #: Arguments of the kernel.
+        self._arrays = centre_um, axes_um, spread, orders, nodes, amplitude, sigma_um
 
     def covariance(self, members: Ints) -> Floats:
         """Return the covariances of the means over sites, (n_member, n_member)."""
         from foveasim.compare import _kernels
 
-        return np.asarray(
-            _kernels.signal_covariance(
-                members,
-                self._centre_um,
-                self._axes_um,
-                self._spread,
-                self._order,
-                self._nodes,
-                self._amplitude,
-                self._sigma_um,
-            )
-        )
+        return np.asarray(_kernels.signal_covariance(members, *self._arrays))
 
 
 def _spread_of_norm(node: Floats, norm: Floats) -> Floats:
@@ -468,14 +456,10 @@ def _spread_of_norm(node: Floats, norm: Floats) -> Floats:
 
 def _second_moments_um2(layout: Layout) -> Floats:
     """Return the second moments xx, yy, xy of the sites over their area, (n_site, 3) µm²."""
-    n_vertices = np.diff(layout.ring_offsets)
-    n_rings = np.diff(layout.site_offsets)
-    site = np.repeat(np.repeat(np.arange(layout.n_sites), n_rings), n_vertices)
-    ring_start = np.repeat(layout.ring_offsets[:-1], n_vertices)
-    position = np.arange(site.size) - ring_start
-    following = ring_start + (position + 1) % np.repeat(n_vertices, n_vertices)
+    site = np.repeat(np.arange(layout.n_sites), np.diff(layout.ring_offsets[layout.site_offsets]))
     x, y = (layout.xy_um - layout.centroid_um[site]).T
-    x1, y1 = (layout.xy_um[following] - layout.centroid_um[site]).T
+    after = next_vertex(layout.ring_offsets)
+    x1, y1 = x[after], y[after]
     cross = x * y1 - x1 * y
     integrals = (
         (x * x + x * x1 + x1 * x1) * cross / 12.0,

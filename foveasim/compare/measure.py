@@ -20,7 +20,6 @@ from foveasim.compare.information import SceneCovariance, site_information_bits
 from foveasim.compare.intervals import MedianInterval, format_interval, with_unit
 from foveasim.errors import FoveasimWarning, ParameterError
 from foveasim.fields import Grid, PowerMap
-from foveasim.layout import Layout
 from foveasim.metrics import (
     aliasing_spectrum,
     flow_bound,
@@ -37,7 +36,6 @@ __all__ = [
     "Measure",
     "information_by_annulus",
     "layout_measures",
-    "layout_of",
     "measure_rows",
     "scene_measures",
     "size_records",
@@ -98,12 +96,6 @@ MEASURES = {
 }  # fmt: skip
 
 
-def layout_of(camera: Camera) -> Layout:
-    """Return the layout of a camera."""
-    assert isinstance(camera.sensor.layout, Layout)  # guaranteed by Camera
-    return camera.sensor.layout
-
-
 def layout_measures(
     camera: Camera,
     wavelength_nm: float,
@@ -112,7 +104,7 @@ def layout_measures(
     wave_per_mm: float,
 ) -> dict[str, Any]:
     """Return the measures that do not depend on a scene, in total and by annulus."""
-    layout = layout_of(camera)
+    layout = camera.layout
     annulus = annuli.index_of(layout.centroid_um)
     (x_um, y_um), edges_um = annuli
     nyquist = nyquist_per_mm(layout)
@@ -163,7 +155,7 @@ def scene_measures(
     camera: Camera, capture: Capture, image: PowerMap, annuli: Annuli
 ) -> tuple[Linearisation, dict[str, Any]]:
     """Return the model of a capture of an image, and its SNR and precision of a shift; NaN for an annulus without sites."""
-    sensor, layout = camera.sensor, layout_of(camera)
+    sensor, layout = camera.sensor, camera.layout
     exposure_s = float(capture.settings["exposure_s"])
     dark_e = sensor.expected_electrons(np.zeros(layout.n_sites), exposure_s)
     model = sensor.linearise(capture.expected_e, exposure_s=exposure_s)
@@ -188,7 +180,7 @@ def _shift_gradients_e_per_um(camera: Camera, image: PowerMap, exposure_s: float
 
     It is 0 for sites that lie partly or entirely off the image.
     """
-    grid, layout = image.grid, layout_of(camera)
+    grid, layout = image.grid, camera.layout
     uncovered_um2 = camera.integrator(grid, order=camera.order(image)).uncovered_um2
     moving = copy(camera)  # displaced images do not fill the camera's cache
 
@@ -222,7 +214,7 @@ def information_by_annulus(
 
     ``response`` is the ratio of each site's expected charge per area to the irradiance of the covariance.
     """
-    layout = layout_of(camera)
+    layout = camera.layout
     gain = [layout.area_um2 * model.forward(response) for model in models]
     bits = site_information_bits(layout, covariance, gain, models)
     annulus, area_mm2 = annuli.index_of(layout.centroid_um), layout.area_um2 / UM2_PER_MM2
@@ -247,7 +239,7 @@ def measure_rows(interval_of: Callable[[str], MedianInterval]) -> list[list[str]
 
 def size_records(camera: Camera) -> list[dict[str, Any]]:
     """Return size, number of sites and area fraction of each size class."""
-    layout = layout_of(camera)
+    layout = camera.layout
     size_um, position = np.unique(size_classes_um(layout), return_inverse=True)
     counts = np.bincount(position.ravel())
     area_um2 = np.bincount(position.ravel(), layout.area_um2)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foveasim.compare.budgets import BUDGETS, budget_rows
-from foveasim.compare.figures import measure_figure, sizes_figure
+from foveasim.compare.figures import draw_measure, draw_sizes, figure_of
 from foveasim.compare.intervals import MIN_SCENES
 from foveasim.compare.measure import MEASURES, measure_rows
 from foveasim.reconstruct import Picture
@@ -128,7 +129,7 @@ def _eccentricity(comparison: Comparison) -> ReportSection:
     intervals = ", with 95 % confidence intervals over the scenes" if len(comparison.scenes) >= MIN_SCENES else ""
     figures = [
         drawn_figure(
-            measure_figure(comparison, name, INK, FAINT),
+            figure_of(partial(draw_measure, comparison, name), INK, FAINT),
             measure.title,
             f"{measure.definition[0].upper()}{measure.definition[1:]}{intervals if measure.has_scenes else ''}.",
         )
@@ -145,7 +146,9 @@ def _sizes(comparison: Comparison) -> ReportSection:
         for row in comparison.sizes[name]
     ]
     figure = drawn_figure(
-        sizes_figure(comparison, INK, FAINT), "Area by pixel size", "Fraction of the area of the sites in each class."
+        figure_of(partial(draw_sizes, comparison), INK, FAINT),
+        "Area by pixel size",
+        "Fraction of the area of the sites in each class.",
     )
     return ReportSection(
         "Area by pixel size",
@@ -170,9 +173,8 @@ def _definitions(comparison: Comparison) -> ReportSection:
             "any distribution."
         ),
     ]
-    versions = comparison.settings["versions"]
-    found = ", ".join(f"{name} {version}" for name, version in versions.items())
-    notes.append(f"Seed {comparison.settings['seed']}; {found}.")
+    versions = ", ".join(f"{name} {version}" for name, version in comparison.settings["versions"].items())
+    notes.append(f"Seed {comparison.settings['seed']}; {versions}.")
     return ReportSection(
         "Definitions and settings",
         notes,

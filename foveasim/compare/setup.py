@@ -100,8 +100,6 @@ def photograph_scenes(
     if isinstance(pictures, Mapping):
         arrays = {str(name): np.asarray(picture) for name, picture in pictures.items()}
     else:
-        if isinstance(pictures, str | Path):
-            pictures = [pictures]
         arrays = {}
         for path in pictures:
             name = Path(path).stem
