@@ -60,12 +60,7 @@ def estimate_from_charge(charge_e: ArrayLike, sensor: Sensor, exposure_s: Annota
     exposure_s : float, s
     """
     charge = check_per_site("charge_e", finite_array("charge_e", charge_e), sensor.layout.n_sites)
-    light_e, variance_e2 = sensor.invert_collection(charge, exposure_s=exposure_s)
-    return SiteEstimates(
-        light_e=light_e - sensor.dark_response(exposure_s),
-        variance_e2=variance_e2,
-        is_saturated=np.asarray(charge >= sensor.well_e),
-    )
+    return _estimate(sensor, charge, 0.0, exposure_s, np.asarray(charge >= sensor.well_e))
 
 
 def estimate_from_code(code: ArrayLike, sensor: Sensor, exposure_s: Annotated[float, EXPOSURE]) -> SiteEstimates:
@@ -86,7 +81,13 @@ def estimate_from_code(code: ArrayLike, sensor: Sensor, exposure_s: Annotated[fl
     see :meth:`foveasim.sensor.Calibration.correct`.
     """
     found = sensor.invert(check_per_site("code", finite_array("code", code), sensor.layout.n_sites))
-    light_e, variance_e2 = sensor.invert_collection(found.charge_e, found.noise_e2, exposure_s)
-    return SiteEstimates(
-        light_e=light_e - sensor.dark_response(exposure_s), variance_e2=variance_e2, is_saturated=found.is_saturated
-    )
+    return _estimate(sensor, found.charge_e, found.noise_e2, exposure_s, found.is_saturated)
+
+
+def _estimate(
+    sensor: Sensor, charge_e: Floats, noise_e2: Floats | float, exposure_s: float, is_saturated: Bools
+) -> SiteEstimates:
+    """Return the photoelectrons for charges with noise of the readout."""
+    light_e, variance_e2 = sensor.invert_collection(charge_e, noise_e2, exposure_s)
+    dark_e = sensor.dark_response(exposure_s)
+    return SiteEstimates(light_e=light_e - dark_e, variance_e2=variance_e2, is_saturated=is_saturated)

@@ -8,7 +8,7 @@ temporal dark noise, defect pixels. All quantities refer to linear codes: compan
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,9 +20,6 @@ from foveasim.sensor.adc import QUANTISATION_DN2, interpolate_codes
 from foveasim.sensor.effects import Photosites
 from foveasim.sensor.limits import CHARGE, DURATION, EXPOSURE, RATIO
 from foveasim.sensor.sensor import Sensor
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
 
 __all__ = ["Calibration", "calibrate", "linearise", "nominal_e_per_dn"]
 
@@ -210,8 +207,15 @@ class Calibration:
         table = None if linear_dn is None else finite_array("linear_dn", linear_dn, ndim=1)
 
         def stack(name: str, frames: ArrayLike, at_least: int) -> _Frames:
-            found = _Frames(highest_dn, table)
-            for frame in _validate_frames(name, frames, at_least):
+            codes = finite_array(name, frames, ndim=2)
+            if codes.shape[0] < at_least or codes.shape[1] == 0:
+                raise ParameterError(
+                    name,
+                    f"must be at least {at_least} frame{'s' * (at_least > 1)} (n_frame, n_site), "
+                    f"got the shape {codes.shape}",
+                )
+            found = _Frames(codes.shape[1], highest_dn, table)
+            for frame in codes:
                 try:
                     found.add(frame)
                 except ParameterError as error:
@@ -222,15 +226,12 @@ class Calibration:
             stack("dark", dark, 2),
             stack("flat", flat, 1),
             None if dark_long is None else stack("dark_long", dark_long, 1),
+            _Thresholds(hot_sigmas, dead_fraction, noisy_ratio, max_clipped_fraction),
             exposure_s=exposure_s,
             long_exposure_s=long_exposure_s,
             expected_dn=expected_dn,
             expected_dark_dn_per_s=expected_dark_dn_per_s,
             expected_noise_dn=expected_noise_dn,
-            hot_sigmas=hot_sigmas,
-            dead_fraction=dead_fraction,
-            noisy_ratio=noisy_ratio,
-            max_clipped_fraction=max_clipped_fraction,
         )
 
     def offset_at(self, exposure_s: Annotated[float | None, EXPOSURE] = None) -> Floats:
@@ -244,9 +245,7 @@ class Calibration:
         SimulationError
             If the exposure time differs from that of the calibration, and the dark rate is unknown.
         """
-        if exposure_s is None:
-            return self.offset_dn
-        if exposure_s == self.exposure_s:
+        if exposure_s is None or exposure_s == self.exposure_s:
             return self.offset_dn
         if self.dark_rate_dn_per_s is None or self.exposure_s is None:
             raise SimulationError(
@@ -308,13 +307,15 @@ class Calibration:
         self, values: Floats, layout: Photosites, kind: ArrayLike | None, max_gap_um: float | None
     ) -> Floats:
         """Replace defective sites in frames (n_frame, n_site) by their nearest good neighbours."""
+        from scipy.sparse import csr_array
+
         if not hasattr(layout, "adjacency") or layout.n_sites != self.n_sites:
             raise ParameterError("fill", f"must be the layout of these {self.n_sites} sites", layout)
         kinds = None if kind is None else check_per_site("kind", finite_array("kind", kind), self.n_sites)
         bad = np.flatnonzero(self.defective)
         if bad.size == 0:
             return values
-        neighbours = _sparsity_pattern(layout.adjacency(max_gap_um=max_gap_um))
+        neighbours = csr_array(layout.adjacency(max_gap_um=max_gap_um)).astype(np.bool_)
         if neighbours.nnz == 0:
             raise SimulationError(
                 "no two sites of the layout share an edge, so defective sites have no neighbours; for sites separated by "
@@ -323,18 +324,18 @@ class Calibration:
         is_good = np.isfinite(values) & ~self.defective
         relative = np.where(is_good, values / self.expected_dn, 0.0).T
         replacements = np.full((bad.size, values.shape[0]), np.nan)
-        reachable = _sparsity_pattern(neighbours[bad])
+        reachable = neighbours[bad]
         for _ in range(MAX_FILL_STEPS):
             usable = reachable.copy()
             if kinds is not None:
                 kinds_of_bad = np.repeat(kinds[bad], np.diff(usable.indptr))
-                usable.data = (kinds_of_bad == kinds[usable.indices]).astype(np.float64)
+                usable.data = kinds_of_bad == kinds[usable.indices]
             count = usable @ is_good.T.astype(np.float64)
             mean = (usable @ relative) / np.where(count > 0.0, count, 1.0)
             replacements = np.where(np.isnan(replacements) & (count > 0.0), mean, replacements)
             if not np.isnan(replacements).any():
                 break
-            reachable = _sparsity_pattern(reachable @ neighbours + reachable)
+            reachable = reachable @ neighbours + reachable
         values[:, bad] = replacements.T * self.expected_dn[bad]
         return values
 
@@ -410,7 +411,7 @@ def calibrate(
     table = None if sensor.adc.is_linear else sensor.adc.linear_dn
 
     def frames(photo_e: Floats, exposure_s: float, kind: int) -> _Frames:
-        stack = _Frames(2.0**sensor.bits - 1.0, table)
+        stack = _Frames(n_sites, 2.0**sensor.bits - 1.0, table)
         expected_e = sensor.expected_electrons(photo_e / exposure_s, exposure_s)
         for frame in range(kind * n_frames, (kind + 1) * n_frames):
             electrons = sensor.collect(expected_e, seed=seed, frame=frame, exposure_s=exposure_s, n_threads=n_threads)
@@ -423,35 +424,38 @@ def calibrate(
         frames(zero_e, exposure_s, 0),
         frames(flat, exposure_s, 1),
         None if long_exposure_s is None else frames(zero_e, long_exposure_s, 2),
+        _Thresholds(hot_sigmas, dead_fraction, noisy_ratio, max_clipped_fraction),
         exposure_s=exposure_s,
         long_exposure_s=long_exposure_s,
         expected_dn=(lit.node_e - dark.node_e) * dn_per_e,
         expected_dark_dn_per_s=dark.node_e * dn_per_e / exposure_s,
         expected_noise_dn=np.sqrt(dark.variance_e2()) * dn_per_e,
-        hot_sigmas=hot_sigmas,
-        dead_fraction=dead_fraction,
-        noisy_ratio=noisy_ratio,
-        max_clipped_fraction=max_clipped_fraction,
     )
 
 
 # -- helpers ----------------------------------------------------------------------------------------------------------
 
 
+class _Thresholds(NamedTuple):
+    """Thresholds for defective and clipped sites: see :meth:`Calibration.from_frames`."""
+
+    hot_sigmas: float
+    dead_fraction: float
+    noisy_ratio: float
+    max_clipped_fraction: float
+
+
 class _Frames:
     """Running mean, variance (Welford's algorithm) and clipping counts of linear codes."""
 
-    def __init__(self, highest_dn: float | None, linear_dn: Floats | None) -> None:
+    def __init__(self, n_sites: int, highest_dn: float | None, linear_dn: Floats | None) -> None:
         self.highest_dn = highest_dn
         self.linear_dn = linear_dn
         self.n_frames = 0
-        self.mean_dn = self.squares_dn2 = np.zeros(0)
-        self.n_lowest = self.n_highest = np.zeros(0, np.int64)
+        self.mean_dn, self.squares_dn2 = np.zeros(n_sites), np.zeros(n_sites)
+        self.n_lowest, self.n_highest = np.zeros(n_sites, np.int64), np.zeros(n_sites, np.int64)
 
     def add(self, code: NDArray[Any]) -> None:
-        if self.n_frames == 0:
-            self.mean_dn, self.squares_dn2 = np.zeros(code.size), np.zeros(code.size)
-            self.n_lowest, self.n_highest = np.zeros(code.size, np.int64), np.zeros(code.size, np.int64)
         self.n_frames += 1
         table = self.linear_dn
         linear_dn = code.astype(np.float64) if table is None else interpolate_codes(code, table)
@@ -467,16 +471,13 @@ def _calibration(
     dark: _Frames,
     flat: _Frames,
     dark_long: _Frames | None,
+    thresholds: _Thresholds,
     *,
     exposure_s: float | None,
     long_exposure_s: float | None,
     expected_dn: ArrayLike,
     expected_dark_dn_per_s: ArrayLike,
     expected_noise_dn: ArrayLike,
-    hot_sigmas: float,
-    dead_fraction: float,
-    noisy_ratio: float,
-    max_clipped_fraction: float,
 ) -> Calibration:
     n_sites = dark.mean_dn.size
     for name, stack in (("flat", flat), ("dark_long", dark_long)):
@@ -490,13 +491,13 @@ def _calibration(
     if (dark_long is None) != (long_exposure_s is None):
         raise ParameterError("long_exposure_s", "must be given if and only if 'dark_long' is", long_exposure_s)
 
-    is_saturated = flat.n_highest > max_clipped_fraction * flat.n_frames
+    is_saturated = flat.n_highest > thresholds.max_clipped_fraction * flat.n_frames
     if is_saturated.mean() > 0.5:
         raise SimulationError(
             f"the flat frames saturate {100 * is_saturated.mean():.0f} % of the sites, so their response is unknown; reduce "
             "the flat signal"
         )
-    is_clipped = is_saturated | (dark.n_lowest > max_clipped_fraction * dark.n_frames)
+    is_clipped = is_saturated | (dark.n_lowest > thresholds.max_clipped_fraction * dark.n_frames)
     response = (flat.mean_dn - dark.mean_dn) / expected
     typical = float(np.median(response[~is_saturated]))
     if not typical > 0.0:
@@ -504,15 +505,16 @@ def _calibration(
             "the flat signal is not above the dark signal, so the response is unknown; increase the flat signal"
         )
 
-    is_hot = _find_outliers(dark.mean_dn - expected_rate * (exposure_s or 0.0), hot_sigmas, np.sqrt(QUANTISATION_DN2))
+    rounding_dn = np.sqrt(QUANTISATION_DN2)
+    is_hot = _find_outliers(dark.mean_dn - expected_rate * (exposure_s or 0.0), thresholds.hot_sigmas, rounding_dn)
     rate: Floats | None = None
     if dark_long is not None and exposure_s is not None:
         longer_s = check_number("long_exposure_s", long_exposure_s, above=exposure_s) - exposure_s
         rate = (dark_long.mean_dn - dark.mean_dn) / longer_s
-        is_hot |= _find_outliers(rate - expected_rate, hot_sigmas, np.sqrt(QUANTISATION_DN2) / longer_s)
-    is_dead = (response < dead_fraction * typical) & ~is_saturated
+        is_hot |= _find_outliers(rate - expected_rate, thresholds.hot_sigmas, rounding_dn / longer_s)
+    is_dead = (response < thresholds.dead_fraction * typical) & ~is_saturated
     noise_dn = np.sqrt(dark.squares_dn2 / (dark.n_frames - 1))
-    is_noisy = _find_noisy(noise_dn, expected_noise, _rounding_dn(dark), dark.n_frames, noisy_ratio)
+    is_noisy = _find_noisy(noise_dn, expected_noise, _rounding_dn(dark), dark.n_frames, thresholds.noisy_ratio)
     is_good = ~(is_hot | is_dead | is_noisy | is_clipped)
     if not is_good.any():
         # Without a pedestal all sites clip in dark frames; the mean is then over all sites that are not defective.
@@ -566,27 +568,8 @@ def _rounding_dn(frames: _Frames) -> Floats:
     return np.interp(frames.mean_dn, table, np.gradient(table)) * np.sqrt(QUANTISATION_DN2)
 
 
-def _validate_frames(name: str, frames: ArrayLike, at_least: int) -> Floats:
-    stack = finite_array(name, frames, ndim=2)
-    if stack.shape[0] < at_least or stack.shape[1] == 0:
-        raise ParameterError(
-            name,
-            f"must be at least {at_least} frame{'s' * (at_least > 1)} (n_frame, n_site), got the shape {stack.shape}",
-        )
-    return stack
-
-
 def _one_or_per_site(name: str, values: ArrayLike, n_sites: int, *, above: float | None) -> Floats:
     array = finite_array(name, values, above=above)
     if array.shape != (1,):
         check_per_site(name, array, n_sites, or_one=True)
     return np.broadcast_to(array, n_sites)
-
-
-def _sparsity_pattern(matrix: Any) -> csr_array[Any]:
-    """Return the sparsity pattern of a matrix, with ones as values."""
-    from scipy.sparse import csr_array
-
-    out = csr_array(matrix)
-    out.data = np.ones_like(out.data, dtype=np.float64)
-    return out

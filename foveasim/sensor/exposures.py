@@ -270,22 +270,20 @@ def non_destructive_reads(
     photo = RATE.check_array("photo_e_per_s", photo_e_per_s)
     photo = np.broadcast_to(check_per_site("photo_e_per_s", photo, n_sites, or_one=True), n_sites)
     well_e = np.minimum(sensor.well_e, MAX_CHARGE_E).astype(np.int64)
-    electrons = np.empty((times.size, n_sites), np.int64)
-    codes = []
+    electrons, codes = [], []
     expected_e, collected = np.zeros(n_sites), np.zeros(n_sites, np.int64)
-    for k, time_s in enumerate(times):
+    for k, (time_s, interval_s) in enumerate(zip(times.tolist(), np.diff(times, prepend=0.0).tolist(), strict=True)):
         own = Streams(int(streams.of("read of a ramp", k).integers(2**63)), streams.frame)
-        before_e, expected_e = expected_e, sensor.expected_electrons(photo, float(time_s), n_threads=n_threads)
+        before_e, expected_e = expected_e, sensor.expected_electrons(photo, time_s, n_threads=n_threads)
         draw = partial(sensor.collect, n_threads=n_threads, _streams=own)
         if collection.is_drawn:
-            added_e = _increase(before_e, expected_e, float(time_s))
-            interval_s = float(time_s - times[k - 1]) if k else float(time_s)
+            added_e = _increase(before_e, expected_e, time_s)
             collected = np.minimum(collected + draw(added_e, exposure_s=interval_s), well_e)
         else:
-            collected = draw(expected_e, exposure_s=float(time_s))
-        electrons[k] = collected
+            collected = draw(expected_e, exposure_s=time_s)
+        electrons.append(collected)
         codes.append(sensor.read(collected, n_threads=n_threads, _streams=own, _reset_streams=streams))
-    return Ramp(times_s=times, electrons=electrons, code=np.stack(codes))
+    return Ramp(times_s=times, electrons=np.stack(electrons), code=np.stack(codes))
 
 
 def _increase(before_e: Floats, expected_e: Floats, time_s: float) -> Floats:
@@ -392,14 +390,12 @@ class _Counting:
     """Collection of a sensor for several exposures: arrays (n_exposure, n_site)."""
 
     def __init__(self, sensor: Sensor, times_s: Floats) -> None:
-        self.sensor, self.times_s = sensor, times_s
-        sites = sensor.sites.during(float(times_s[0]))
-        self.is_linear = sensor.collection.validate_linear(np.zeros(1), sites).slope is None
+        self.sensor, self.sites = sensor, [sensor.sites.during(time_s) for time_s in times_s.tolist()]
+        self.is_linear = sensor.collection.validate_linear(np.zeros(1), self.sites[0]).slope is None
 
     def _each(self, function: Callable[[Floats, Sites], tuple[Floats, ...]], values: Floats) -> tuple[Floats, ...]:
         """Return the results of a function of the charges and sites of each exposure."""
-        all_sites = [self.sensor.sites.during(float(time_s)) for time_s in self.times_s]
-        results = [function(row, sites) for row, sites in zip(values, all_sites, strict=True)]
+        results = [function(row, sites) for row, sites in zip(values, self.sites, strict=True)]
         return tuple(
             np.stack([np.broadcast_to(part, values.shape[1]) for part in parts]) for parts in zip(*results, strict=True)
         )
