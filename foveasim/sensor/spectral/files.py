@@ -11,9 +11,8 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -49,8 +48,7 @@ OTHER_UNITS = {"angstrom", "angstroms", "ångström", "å", "mm", "m", "cm", "ev
 PERCENT = re.compile(r"[\s_]*[\[(]?\s*(%|\bpercent\b|\bpct\b|(?<=_)percent|(?<=_)pct)\s*[\])]?", re.IGNORECASE)
 
 
-@dataclass(frozen=True)
-class _Table:
+class _Table(NamedTuple):
     """Columns of a file: wavelengths in nm, values from 0 to 1."""
 
     names: tuple[str, ...]
@@ -228,17 +226,16 @@ def _numbers(path: Path, line: int, cells: list[str], n_columns: int) -> list[fl
 
 def _parse_header(path: Path, header: list[str] | None, n_values: int) -> tuple[float, np.ndarray, tuple[str, ...]]:
     """Parse the header: nm per wavelength unit, mask of percent columns, and column names."""
-    is_percent = np.zeros(n_values, np.bool_)
     if header is None:
-        return 1.0, is_percent, tuple(str(k + 1) for k in range(n_values))
+        return 1.0, np.zeros(n_values, np.bool_), tuple(str(k + 1) for k in range(n_values))
     words = [word for word in re.split(r"[\W_\d]+", header[0].lower()) if word]
     scales = [UNITS_NM[word] for word in words if word in UNITS_NM]
     other = [word for word in words[1:] if word in OTHER_UNITS]
     if other and not scales:
         raise FileError(path, f"wavelengths must be in nm or µm, got the column name {header[0][:40]!r}")
     names = tuple(PERCENT.sub("", cell).strip() for cell in header[1:])
-    for k, (cell, name) in enumerate(zip(header[1:], names, strict=True)):
-        is_percent[k] = PERCENT.search(cell) is not None
+    is_percent = np.array([PERCENT.search(cell) is not None for cell in header[1:]])
+    for k, name in enumerate(names):
         if not name or name in names[:k]:
             problem = "has no name" if not name else f"repeats the name {name!r}"
             raise FileError(path, f"column {k + 2} {problem} in the header")

@@ -25,9 +25,32 @@ Beyond = Literal["raise", "zero", "hold"]
 BEYOND_HINT = "set beyond='zero' or beyond='hold' to extrapolate"
 
 
-@CURVES.register("polynomial", example={**TABLE, "degree": 2}, expected={500.0: 0.6, 700.0: 0.4})
 @dataclass(frozen=True, kw_only=True)
-class PolynomialCurve(CurveBase):
+class _Sampled(CurveBase):
+    """Curve from values at wavelengths, in ascending order."""
+
+    wavelength_nm: Sequence[float]
+    value: Sequence[float]
+
+    __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        values = _check_fractions(self.value)
+        if values.size != len(self.wavelength_nm) or values.size < 2:
+            raise ParameterError(
+                "value", f"must have the same length as 'wavelength_nm', at least 2, got {values.size}"
+            )
+        waves_nm = wavelengths_nm("wavelength_nm", self.wavelength_nm)
+        order = np.argsort(waves_nm)
+        if np.any(np.diff(waves_nm[order]) == 0.0):
+            raise ParameterError("wavelength_nm", "must not repeat a wavelength", self.wavelength_nm, "nm")
+        object.__setattr__(self, "wavelength_nm", tuple(waves_nm[order].tolist()))
+        object.__setattr__(self, "value", tuple(values[order].tolist()))
+
+
+@CURVES.register("polynomial", example={**TABLE, "degree": 2}, expected={500.0: 0.6, 700.0: 0.4})
+@dataclass(frozen=True, kw_only=True, repr=False)
+class PolynomialCurve(_Sampled):
     """
     Least-squares polynomial fit of a table, as for the paper's quantum efficiency (Fig. 5).
 
@@ -48,14 +71,10 @@ class PolynomialCurve(CurveBase):
     Values of the polynomial are clipped to 0 .. 1.
     """
 
-    wavelength_nm: Sequence[float]
-    value: Sequence[float]
     degree: int = 5
 
-    __repr__ = short_repr
-
     def __post_init__(self) -> None:
-        _set_table(self)
+        super().__post_init__()
         object.__setattr__(self, "degree", check_count("degree", self.degree, at_least=0, at_most=len(self.value) - 1))
 
     @cached_property
@@ -67,19 +86,12 @@ class PolynomialCurve(CurveBase):
         return np.clip(self._fit(waves_nm), 0.0, 1.0)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Table(CurveBase):
+@dataclass(frozen=True, kw_only=True, repr=False)
+class _Table(_Sampled):
     """Table with an interpolation."""
 
-    wavelength_nm: Sequence[float]
-    value: Sequence[float]
     beyond: Beyond = "raise"
     source: str = field(default="", compare=False)
-
-    __repr__ = short_repr
-
-    def __post_init__(self) -> None:
-        _set_table(self)
 
     @abstractmethod
     def _interpolate(self, waves_nm: Floats) -> Floats:
@@ -190,20 +202,6 @@ def _check_fractions(value: ArrayLike) -> Floats:
     if values.size and values.max() > 1.0:
         raise ParameterError("value", "must be <= 1 everywhere", float(values.max()), hint="divide percentages by 100")
     return values
-
-
-def _set_table(curve: PolynomialCurve | _Table) -> None:
-    """Validate the table of a curve, and store it in ascending order as tuples."""
-    waves_nm = finite_array("wavelength_nm", curve.wavelength_nm, ndim=1, above=0.0)
-    values = _check_fractions(curve.value)
-    if values.size != waves_nm.size or values.size < 2:
-        raise ParameterError("value", f"must have the same length as 'wavelength_nm', at least 2, got {values.size}")
-    waves_nm = wavelengths_nm("wavelength_nm", waves_nm)
-    order = np.argsort(waves_nm)
-    if np.any(np.diff(waves_nm[order]) == 0.0):
-        raise ParameterError("wavelength_nm", "must not repeat a wavelength", curve.wavelength_nm, "nm")
-    object.__setattr__(curve, "wavelength_nm", tuple(waves_nm[order].tolist()))
-    object.__setattr__(curve, "value", tuple(values[order].tolist()))
 
 
 def _clip_to_table(waves_nm: Floats, table_nm: Sequence[float], beyond: Beyond) -> tuple[Floats, Any]:
