@@ -35,12 +35,13 @@ class _Sampled(CurveBase):
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
+        waves_nm = finite_array("wavelength_nm", self.wavelength_nm, ndim=1, above=0.0)
         values = _check_fractions(self.value)
-        if values.size != len(self.wavelength_nm) or values.size < 2:
+        if values.size != waves_nm.size or values.size < 2:
             raise ParameterError(
                 "value", f"must have the same length as 'wavelength_nm', at least 2, got {values.size}"
             )
-        waves_nm = wavelengths_nm("wavelength_nm", self.wavelength_nm)
+        waves_nm = wavelengths_nm("wavelength_nm", waves_nm)
         order = np.argsort(waves_nm)
         if np.any(np.diff(waves_nm[order]) == 0.0):
             raise ParameterError("wavelength_nm", "must not repeat a wavelength", self.wavelength_nm, "nm")
