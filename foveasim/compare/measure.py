@@ -97,11 +97,7 @@ MEASURES = {
 
 
 def layout_measures(
-    camera: Camera,
-    wavelength_nm: float,
-    distance_m: float | None,
-    annuli: Annuli,
-    wave_per_mm: float,
+    camera: Camera, wavelength_nm: float, distance_m: float | None, annuli: Annuli, wave_per_mm: float
 ) -> dict[str, Any]:
     """Return the measures that do not depend on a scene, in total and by annulus."""
     layout = camera.layout
@@ -240,11 +236,9 @@ def measure_rows(interval_of: Callable[[str], MedianInterval]) -> list[list[str]
 def size_records(camera: Camera) -> list[dict[str, Any]]:
     """Return size, number of sites and area fraction of each size class."""
     layout = camera.layout
-    size_um, position = np.unique(size_classes_um(layout), return_inverse=True)
-    counts = np.bincount(position.ravel())
+    size_um, position, counts = np.unique(size_classes_um(layout), return_inverse=True, return_counts=True)
     area_um2 = np.bincount(position.ravel(), layout.area_um2)
-    fraction = area_um2 / area_um2.sum()
-    rows = zip(size_um.tolist(), counts.tolist(), fraction.tolist(), strict=True)
+    rows = zip(size_um.tolist(), counts.tolist(), (area_um2 / area_um2.sum()).tolist(), strict=True)
     return [{"size_um": size, "n_sites": n, "area_fraction": part} for size, n, part in rows]
 
 

@@ -162,7 +162,7 @@ def merge_exposures(
     50000.0
     """
     times_s = DURATION.check_array("exposures_s", exposures_s, ndim=1)
-    codes, linear_dn, e_per_dn = _linearise_reads(code, times_s.size, sensor, "exposure")
+    codes, linear_dn, e_per_dn, conversion_e2 = _linearise_reads(code, times_s.size, sensor, "exposure")
     n_sites = sensor.layout.n_sites
     dark_e = np.zeros((times_s.size, 1))
     gain = np.ones(1)
@@ -179,7 +179,6 @@ def merge_exposures(
     charge_e = (linear_dn - offset_dn) / gain * e_per_dn
     top_dn = _saturation_dn(sensor)
     top_e = (top_dn - offset_dn) / gain * e_per_dn
-    conversion_e2 = _conversion_noise_e2(sensor, codes, e_per_dn)
     # Expected charges, of which the mean charges of collections that are not linear are functions.
     charge_e, top_e = (counting.invert(part, dark_e) for part in (charge_e, top_e))
     is_used = (codes < 2.0**sensor.bits - 1.0) & (linear_dn < top_dn) & np.isfinite(charge_e) & (top_e > 0.0)
@@ -339,11 +338,11 @@ def fit_ramp(
     times = _check_increasing("times_s", times_s)
     if times.size < 2:
         raise ParameterError("times_s", "must have at least two values", times_s, "s")
-    codes, linear_dn, e_per_dn = _linearise_reads(code, times.size, sensor, "read")
+    codes, linear_dn, e_per_dn, conversion_e2 = _linearise_reads(code, times.size, sensor, "read")
     n_sites = sensor.layout.n_sites
     charge_e = linear_dn * e_per_dn
     model = sensor.readout_model(charge_e, is_reset=False)
-    noise_e2 = _conversion_noise_e2(sensor, codes, e_per_dn) + model.noise_e2 + model.variance_e2
+    noise_e2 = conversion_e2 + model.noise_e2 + model.variance_e2
     if not sensor.collection.is_drawn:
         noise_e2 += ROUNDING_E2
     is_below = (codes < 2.0**sensor.bits - 1.0) & (linear_dn < _saturation_dn(sensor))
@@ -415,10 +414,8 @@ class _Counting:
         """Return mean, variance and slope of the collection for charges at the sense node."""
         collection = self.sensor.collection
         if self.is_linear:
-            mean_e, variance_e2 = collection.moments(
-                _estimate_collected(self.sensor, charge_e), NOTHING, sites=self.sensor.sites
-            )
-            return mean_e, variance_e2, np.ones(1)
+            collected_e = _estimate_collected(self.sensor, charge_e)
+            return *collection.moments(collected_e, NOTHING, sites=self.sensor.sites), np.ones(1)
 
         def moments(row: Floats, sites: Sites) -> tuple[Floats, ...]:
             slope = collection.validate_linear(row, sites).slope
@@ -436,8 +433,14 @@ def _check_increasing(name: str, times_s: ArrayLike) -> Floats:
     return times
 
 
-def _linearise_reads(code: ArrayLike, n_reads: int, sensor: Sensor, kind: str) -> tuple[Floats, Floats, Floats]:
-    """Return codes (n_reading, n_site), linear codes, and electrons per linear code."""
+def _linearise_reads(
+    code: ArrayLike, n_reads: int, sensor: Sensor, kind: str
+) -> tuple[NDArray[Any], Floats, Floats, Floats]:
+    """
+    Return codes (n_reading, n_site), linear codes, electrons per linear code, and the variance of conversion in e-².
+
+    The variance is that of the width of each code.
+    """
     linear_dn = linearise(code, sensor)
     codes = as_numbers("code", code)
     if codes.shape != (n_reads, sensor.layout.n_sites):
@@ -446,13 +449,9 @@ def _linearise_reads(code: ArrayLike, n_reads: int, sensor: Sensor, kind: str) -
             f"must have one row per {kind} and one column per site, {(n_reads, sensor.layout.n_sites)}, "
             f"got the shape {codes.shape}",
         )
-    return codes, linear_dn, nominal_e_per_dn(sensor)
-
-
-def _conversion_noise_e2(sensor: Sensor, codes: NDArray[Any], e_per_dn: Floats) -> Floats:
-    """Return the variance of conversion from the width of each code, (n_reading, n_site) e-²."""
+    e_per_dn = nominal_e_per_dn(sensor)
     step_e = sensor.adc.width_of_code_dn(codes) * e_per_dn
-    return np.asarray(step_e**2 * sensor.adc.noise_dn2)
+    return codes, linear_dn, e_per_dn, step_e**2 * sensor.adc.noise_dn2
 
 
 def _estimate_collected(sensor: Sensor, charge_e: Floats) -> Floats:
