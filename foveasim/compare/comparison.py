@@ -357,20 +357,21 @@ def cameras(
     wave_per_mm = WAVE_NYQUISTS * float(per_mm_from_per_um(0.5 * np.sqrt(density_per_um2)))
     values: dict[str, list[Any]] = {key: [] for name in MEASURES for key in (name, name + BY_ECCENTRICITY)}
     pictures: dict[str, list[Picture]] = {}
+    first_light = next(iter(scenes.values()))
+    distance_m = float(first_light.distance_m) if isinstance(first_light, Scene) else None
+    wavelength_nm = float(np.mean(first_light.wavelength_nm))
     for name, camera in named.items():
         own = shots[name]
         qualities = [
             quality_by_eccentricity(one.picture, one.ideal, **annuli._asdict(), is_compared=is_common) for one in own
         ]
-        light = next(iter(scenes.values()))
-        distance_m = float(light.distance_m) if isinstance(light, Scene) else None
         channel_e_per_um2 = np.nanmean([one.ideal.data for one in own], axis=(0, 2, 3))
         response = channel_e_per_um2[camera.sensor.filter_of_site] / mean_e_per_um2 * camera.sensor.light_response()
         measures = [quality._asdict() | one.measures for quality, one in zip(qualities, own, strict=True)]
         found = (
             {key: [one[key] for one in measures] for key in measures[0]}
             | information_by_annulus(camera, covariance, response, [one.model for one in own], annuli)
-            | layout_measures(camera, float(np.mean(light.wavelength_nm)), distance_m, annuli, wave_per_mm)
+            | layout_measures(camera, wavelength_nm, distance_m, annuli, wave_per_mm)
         )
         for key, rows in values.items():
             rows.append(found[key])
