@@ -64,7 +64,7 @@ from foveasim.sensor.model.prediction import (
     clipped_gaussian_moments,
     no_tables,
 )
-from foveasim.sensor.model.records import Record, effects_at, light_records, readout_model
+from foveasim.sensor.model.records import Record, light_records, map_light, readout_model
 from foveasim.sensor.spectral.curves import ConstantCurve, Curve, CurveError
 from foveasim.sensor.spectral.response import FilterSet, rgb_filters
 from foveasim.units import electrons_to_volts, photon_energy_j
@@ -527,8 +527,9 @@ class Sensor:
         """Sites of the sensor that this one is a part of."""
         return None
 
-    def _effects_at(self, stage: Stage) -> list[Effect]:
-        return effects_at(self.chain, stage)
+    def effects_at(self, stage: Stage) -> list[Effect]:
+        """Return the effects of a stage, in their order."""
+        return [effect for effect in self.chain if effect.stage == stage]
 
     def pattern(self, name: str) -> Floats:
         """
@@ -585,10 +586,7 @@ class Sensor:
         -------
         response : (n_site,) float64
         """
-        response = np.ones(self.layout.n_sites)
-        for record in self._light_records(is_device_known):
-            response = response if record.branch == "dark" else record.map(response)
-        return response
+        return map_light(self._light_records(is_device_known), np.ones(self.layout.n_sites))
 
     def dark_response(self, exposure_s: Annotated[float, EXPOSURE]) -> Floats:
         """
@@ -602,15 +600,16 @@ class Sensor:
 
     def _light_records(self, is_device_known: bool, exposure_s: float = 1.0) -> list[Record]:
         """Return the records from light to expected charge, without light."""
-        zero = np.zeros(self.layout.n_sites)
-        if is_device_known:
-            return light_records(self, self.chain, self.sites, zero, exposure_s)
-        return light_records(self, self._intact_chain, self.sites.without_device(), zero, exposure_s)
+        sensor = self if is_device_known else self._intact
+        sites = self.sites if is_device_known else self.sites.without_device()
+        return light_records(sensor, sites, np.zeros(self.layout.n_sites), exposure_s)
 
-    @property
-    def _intact_chain(self) -> tuple[Effect, ...]:
-        """Effects of sites without defects."""
-        return tuple(effect for effect in self.chain if not effect.is_defect)
+    @cached_property
+    def _intact(self) -> Sensor:
+        """Sensor without defects, which shares its compiled effects."""
+        found = self.without(*(effect.name for effect in self.chain if effect.is_defect))
+        vars(found)["sites"] = self.sites
+        return found
 
     @cached_property
     def dark_rate_e_per_s(self) -> Floats:
@@ -628,7 +627,7 @@ class Sensor:
 
     def _fixed(self, values: PerSite | Floats, stage: Stage) -> Floats:
         """Return the values of all sites after the effects of a stage."""
-        effects, values = self._effects_at(stage), np.atleast_1d(np.asarray(values, np.float64))
+        effects, values = self.effects_at(stage), np.atleast_1d(np.asarray(values, np.float64))
         if not effects:
             return read_only(values.copy())
         result = Save()
@@ -664,17 +663,17 @@ class Sensor:
     @cached_property
     def _before_exposure(self) -> tuple[Step, ...]:
         return merge_steps(
-            (Factor(self.sensitivity), *self._effects_at("photo"), Offset(self.dark_rate_e_per_s)), self.sites
+            (Factor(self.sensitivity), *self.effects_at("photo"), Offset(self.dark_rate_e_per_s)), self.sites
         )
 
     @cached_property
     def _after_collection(self) -> tuple[Step, ...]:
-        steps: list[Step] = [*self._effects_at("charge"), Factor(self.v_per_e), *self._effects_at("sense_node")]
+        steps: list[Step] = [*self.effects_at("charge"), Factor(self.v_per_e), *self.effects_at("sense_node")]
         if self.nonlinearity_fraction:
             steps.append(Nonlinearity(self.nonlinearity_fraction, self.v_sat_v))
         if self.pedestal_v:
             steps.append(Offset(self.pedestal_v))
-        return merge_steps((*steps, *self._effects_at("output")), self.sites)
+        return merge_steps((*steps, *self.effects_at("output")), self.sites)
 
     def expected_electrons(
         self, photo_e_per_s: Floats, exposure_s: Annotated[float, EXPOSURE], *, n_threads: int | None = None
@@ -818,7 +817,7 @@ class Sensor:
         if photo.shape != (1,):
             check_per_site("photo_e_per_s", photo, n_sites, or_one=True)
         photo = np.broadcast_to(photo, n_sites)
-        return photo, (*self._before_exposure, Factor(exposure_s), *self._effects_at("expected"))
+        return photo, (*self._before_exposure, Factor(exposure_s), *self.effects_at("expected"))
 
     @cached_property
     def _collection(self) -> tuple[Step, ...]:
@@ -944,12 +943,11 @@ class Sensor:
             None if values is None else _means(name, values, self.layout.n_sites)
             for name, values in (("expected_e", expected_e), ("photo_e_per_s", photo_e_per_s))
         )
-        return linearise(self, self.chain, sites, expected, photo, exposure_s)
+        return linearise(self, sites, expected, photo, exposure_s)
 
     def linearise_intact(self, photo_e_per_s: Floats, exposure_s: float) -> Linearisation:
         """Compute :meth:`linearise` over all devices, without defects."""
-        sites = self.sites.without_device().during(exposure_s)
-        return linearise(self, self._intact_chain, sites, None, photo_e_per_s, exposure_s)
+        return self._intact.linearise(photo_e_per_s=photo_e_per_s, exposure_s=exposure_s, is_device_known=False)
 
     def invert(self, code: ArrayLike) -> Inverse:
         """

@@ -57,7 +57,7 @@ def invert(sensor: Sensor, sites: Sites, code_dn: Floats) -> Inverse:
     charge_e: Floats = np.zeros(np.broadcast_shapes(target_v.shape, (sites.n_sites,)))
     slope, limit_e = np.ones(1), np.zeros(1)
     for _ in range(MAX_INVERSIONS):
-        records, output_v = walk_from_node(sensor, sensor.chain, sites, charge_e)
+        records, output_v = walk_from_node(sensor, sites, charge_e)
         slope = slope_of(records)
         if not limit_e.any():  # that of a linear response with the slope at no charge
             limit_e = MAX_RANGES * sensor.v_sat_v / np.maximum(slope, MIN_SLOPE * sensor.v_per_e)

@@ -8,7 +8,7 @@ predictions, the noise budget, signal-to-noise ratios, weights of estimates, cov
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -20,21 +20,22 @@ from foveasim._core.names import possible_names
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_per_site
 from foveasim.errors import ParameterError, SimulationError
-from foveasim.sensor.effects.contract import NOTHING, Effect, Operator, Sites
+from foveasim.sensor.effects.contract import NOTHING, Operator, Sites
 from foveasim.sensor.model.prediction import Transfer
 from foveasim.sensor.model.records import (
     Kind,
     Record,
-    Walk,
     highest_charge_e,
     is_temporal,
     light_records,
+    map_light,
     propagate,
     row_factors,
     scale_columns,
     slope_of,
     split_charge,
     transfer_of,
+    walk,
     walk_from_node,
 )
 
@@ -145,8 +146,7 @@ class Linearisation:
 
     @cached_property
     def _transfer(self) -> Transfer:
-        chain, sites, *_ = self._arguments
-        records, _ = walk_from_node(self.sensor, chain, sites, self.node_e)
+        records, _ = walk_from_node(self.sensor, self._arguments[0], self.node_e)
         return transfer_of(self.sensor, records, self.node_e)
 
     @cached_property
@@ -199,9 +199,7 @@ class Linearisation:
         ParameterError
             For ``"light"`` without the exposure.
         """
-        changes = self._check("values", values)
-        for record in self._main(start):
-            changes = record.map(changes)
+        changes = map_light(self._main(start), self._check("values", values))
         return np.where(self.is_saturated, 0.0, changes)
 
     def backward(self, values: ArrayLike, start: Start = "charge") -> Floats:
@@ -471,25 +469,22 @@ class Linearisation:
 
 def linearise(
     sensor: Sensor,
-    chain: Sequence[Effect],
     sites: Sites,
     expected_e: Floats | None,
     photo_e_per_s: Floats | None,
     exposure_s: float | None,
 ) -> Linearisation:
     """Walk along the chain: see :meth:`foveasim.Sensor.linearise`."""
-    arguments = (tuple(chain), sites, expected_e, photo_e_per_s, exposure_s)
+    arguments = (sites, expected_e, photo_e_per_s, exposure_s)
     records: list[Record] = []
     starts: dict[str, int] = {}
     photo_fraction: Floats | None = None
     if exposure_s is not None:
         rates = NOTHING if photo_e_per_s is None else photo_e_per_s
-        records = light_records(sensor, chain, sites, rates, exposure_s)
+        records = light_records(sensor, sites, rates, exposure_s)
         starts["light"] = 0
         if photo_e_per_s is not None:
-            mean_e, photo_e = records[-1].mean, photo_e_per_s
-            for record in records:
-                photo_e = photo_e if record.branch == "dark" else record.map(photo_e)
+            mean_e, photo_e = records[-1].mean, map_light(records, photo_e_per_s)
             photo_fraction = np.divide(photo_e, mean_e, out=np.zeros(np.shape(mean_e)), where=np.asarray(mean_e) > 0.0)
             # Rounding is not a dark signal.
             photo_fraction = np.where(photo_fraction > 1.0 - ROUNDING, 1.0, np.maximum(photo_fraction, 0.0))
@@ -512,28 +507,30 @@ def linearise(
             Record(DARK_SHOT, collected_e, None, deviation * np.sqrt(1.0 - photo_fraction), groups),
         ]
     starts["collected"] = len(records)
-    walk = Walk(sites)
-    node_e = walk.effects(split_charge(chain)[0], collected_e)
-    records += walk.records
-    starts["node"] = len(records)
-    after, output_v = walk_from_node(sensor, chain, sites, node_e, keeps_means=False)
+    node_e = walk(split_charge(sensor)[0], records, collected_e, sites)
+    starts["node"], records = len(records), _without_means(records)
+    after, output_v = walk_from_node(sensor, sites, node_e)
     adc = sensor.adc
     if np.any(output_v >= adc.transition_levels[-2] * sensor.v_sat_v):
         # Sites above their range have the values of the end of the range.
-        full, _ = walk_from_node(sensor, chain, sites, node_e)
-        highest_e = highest_charge_e(sensor, transfer_of(sensor, full, node_e))
+        highest_e = highest_charge_e(sensor, transfer_of(sensor, after, node_e))
         for k in range(starts["charge"], starts["collected"]):
             limited = _limited(records[k].deviation, node_e, highest_e, sensor.collection.is_drawn)
             records[k] = records[k]._replace(deviation=limited)
         node_e = np.minimum(node_e, highest_e)
-        after, output_v = walk_from_node(sensor, chain, sites, node_e, keeps_means=False)
+        after, output_v = walk_from_node(sensor, sites, node_e)
     step_v = np.full(1, sensor.v_sat_v / 2.0**sensor.bits)
     if not adc.is_linear:
         step_v = adc.width_at_dn(np.clip(output_v / sensor.v_sat_v, 0.0, 1.0)) * step_v
     with np.errstate(divide="ignore"):
         conversion = Record(QUANTISATION, NOTHING, 1.0 / step_v, np.full(1, math.sqrt(adc.noise_dn2)))
-    steps = (*records, *after, conversion)
+    steps = (*records, *_without_means(after), conversion)
     return Linearisation(sensor, expected_e, collected_e, node_e, output_v, steps, starts, is_full, arguments)
+
+
+def _without_means(records: list[Record]) -> list[Record]:
+    """Return records without their means, which for many sites are most of the memory."""
+    return [record._replace(mean=NOTHING) for record in records]
 
 
 def _limited(deviation: Floats | None, charge_e: Floats, limit_e: Floats, is_drawn: bool) -> Floats | None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.validation import Floats, Ints
-from foveasim.sensor.effects.contract import NOTHING, Effect, Operator, Sites, Stage
+from foveasim.sensor.effects.contract import Effect, Operator, Sites
 from foveasim.sensor.model.prediction import MIN_SLOPE, ReadoutModel, Transfer
 
 if TYPE_CHECKING:
@@ -98,8 +98,7 @@ class Record(NamedTuple):
     def rows(self, rows: csr_array[Any]) -> csr_array[Any]:
         """Return rows (n, n_site) times the derivative of the mean."""
         if self.operator is not None:
-            found: csr_array[Any] = self.operator.rows(rows)
-            return found
+            return self.operator.rows(rows)
         return rows if self.factor is None else scale_columns(rows, self.factor)
 
     def of(self, index: tuple[int, ...]) -> Record:
@@ -118,85 +117,58 @@ def scale_columns(rows: csr_array[Any], factor: Floats) -> csr_array[Any]:
     return csr_array((data, rows.indices, rows.indptr), shape=rows.shape)
 
 
-class Walk:
-    """
-    Records of consecutive steps.
-
-    Without ``keeps_means`` the records have no means, which for many sites are most of their memory.
-    """
-
-    def __init__(self, sites: Sites, *, keeps_means: bool = True) -> None:
-        self.sites = sites
-        self.keeps_means = keeps_means
-        self.records: list[Record] = []
-
-    def effects(self, effects: Iterable[Effect], mean: Floats, branch: Branch = "") -> Floats:
-        """Record effects, and return the mean after them."""
-        is_known = self.sites.known_device is not None
-        for effect in effects:
-            found = effect.validate_linear(mean, self.sites)
-            kind: Kind = "fixed" if not effect.is_temporal else "reset" if effect.is_drawn_at_reset else "temporal"
-            half_step = effect.half_step(self.sites.of(effect)) if is_known and effect.is_temporal else None
-            self._add(Record(effect.name, *found, kind, branch, half_step))
-            mean = found.mean
-        return mean
-
-    def step(self, mean: Floats, slope: Floats | None = None, **values: Any) -> Floats:
-        """Record a step that is not an effect, and return its mean."""
-        self._add(Record("", mean, slope, **values))
-        return mean
-
-    def _add(self, record: Record) -> None:
-        self.records.append(record if self.keeps_means else record._replace(mean=NOTHING))
+def walk(effects: Iterable[Effect], records: list[Record], mean: Floats, sites: Sites, branch: Branch = "") -> Floats:
+    """Append the records of effects, and return the mean after them."""
+    is_known = sites.known_device is not None
+    for effect in effects:
+        found = effect.validate_linear(mean, sites)
+        kind: Kind = "fixed" if not effect.is_temporal else "reset" if effect.is_drawn_at_reset else "temporal"
+        half_step = effect.half_step(sites.of(effect)) if is_known and effect.is_temporal else None
+        records.append(Record(effect.name, *found, kind, branch, half_step))
+        mean = found.mean
+    return mean
 
 
-def effects_at(chain: Iterable[Effect], stage: Stage) -> list[Effect]:
-    """Return the effects of a stage, in their order."""
-    return [effect for effect in chain if effect.stage == stage]
+def map_light(records: Iterable[Record], values: Floats) -> Floats:
+    """Return the derivative of the mean after steps times values (..., n_site), without the branch of the dark current."""
+    for record in records:
+        values = values if record.branch == "dark" else record.map(values)
+    return values
 
 
 def slope_of(records: Iterable[Record]) -> Floats:
     """Return the product of the slopes of steps that do not mix sites."""
-    slope = np.ones(1)
-    for record in records:
-        slope = record.map(slope)
-    return slope
+    return map_light(records, np.ones(1))
 
 
-def light_records(
-    sensor: Sensor, chain: Sequence[Effect], sites: Sites, photo_e_per_s: Floats, exposure_s: float
-) -> list[Record]:
+def light_records(sensor: Sensor, sites: Sites, photo_e_per_s: Floats, exposure_s: float) -> list[Record]:
     """Return the records from photoelectron rates to expected charges."""
-    walk, sensitivity = Walk(sites), np.atleast_1d(np.asarray(sensor.sensitivity, np.float64))
-    slope = None if sensitivity.size == 1 and sensitivity[0] == 1.0 else sensitivity
-    rates = walk.step(photo_e_per_s if slope is None else photo_e_per_s * slope, slope, branch="photo")
-    rates = walk.effects(effects_at(chain, "photo"), rates, "photo")
-    rates = rates + walk.effects(effects_at(chain, "dark"), sensor.nominal_dark_e_per_s, "dark")
-    walk.effects(effects_at(chain, "expected"), walk.step(rates * exposure_s, np.array([exposure_s])))
-    return walk.records
+    slope = None if np.all(sensor.sensitivity == 1.0) else np.atleast_1d(sensor.sensitivity)
+    rates = photo_e_per_s if slope is None else photo_e_per_s * slope
+    records = [Record("", rates, slope, branch="photo")]
+    rates = walk(sensor.effects_at("photo"), records, rates, sites, "photo")
+    rates = rates + walk(sensor.effects_at("dark"), records, sensor.nominal_dark_e_per_s, sites, "dark")
+    records.append(Record("", rates * exposure_s, np.array([exposure_s])))
+    walk(sensor.effects_at("expected"), records, records[-1].mean, sites)
+    return records
 
 
-def split_charge(chain: Iterable[Effect]) -> tuple[list[Effect], list[Effect]]:
+def split_charge(sensor: Sensor) -> tuple[list[Effect], list[Effect]]:
     """Split the effects on the collected charge after the last one that mixes sites."""
-    charge = effects_at(chain, "charge")
+    charge = sensor.effects_at("charge")
     n = max((k + 1 for k, effect in enumerate(charge) if effect.reach == "all"), default=0)
     return charge[:n], charge[n:]
 
 
-def walk_from_node(
-    sensor: Sensor, chain: Sequence[Effect], sites: Sites, node_e: Floats, *, keeps_means: bool = True
-) -> tuple[list[Record], Floats]:
-    """
-    Return the records from the sense node to the ADC, and the mean voltage at the ADC.
-
-    ``chain``: effects. ``keeps_means``: whether the records contain their means.
-    """
-    walk = Walk(sites, keeps_means=keeps_means)
-    mean = walk.effects(split_charge(chain)[1], node_e)
-    mean = walk.step(mean * sensor.v_per_e, sensor.v_per_e, role="conversion")
-    mean = walk.effects(effects_at(chain, "sense_node"), mean)
-    mean = walk.step(*apply_nonlinearity(sensor, mean), role="response")
-    return walk.records, walk.effects(effects_at(chain, "output"), mean)
+def walk_from_node(sensor: Sensor, sites: Sites, node_e: Floats) -> tuple[list[Record], Floats]:
+    """Return the records from the sense node to the ADC, and the mean voltage at the ADC."""
+    records: list[Record] = []
+    mean = walk(split_charge(sensor)[1], records, node_e, sites) * sensor.v_per_e
+    records.append(Record("", mean, sensor.v_per_e, role="conversion"))
+    mean = walk(sensor.effects_at("sense_node"), records, mean, sites)
+    mean, slope = apply_nonlinearity(sensor, mean)
+    records.append(Record("", mean, slope, role="response"))
+    return records, walk(sensor.effects_at("output"), records, mean, sites)
 
 
 def apply_nonlinearity(sensor: Sensor, sense_v: Floats) -> tuple[Floats, Floats | None]:
@@ -260,17 +232,9 @@ def _multiply(values: Floats, factor: Floats) -> Floats:
     return np.multiply(values, factor, out=values if is_own else None)
 
 
-def propagate(
-    records: Iterable[Record], n_sites: int, is_used: Callable[[Record], bool], start: Floats | float = 0.0
-) -> Floats:
-    """
-    Return the variance of the chosen sources after the last step.
-
-    The result is (..., n_site) or (1,).
-    ``start``: variance of independent sites before the first step.
-    """
-    records = list(records)
-    sums: dict[str, Floats | None] = {"photo": np.array(start, ndmin=1) if np.any(start) else None, "dark": None}
+def propagate(records: Sequence[Record], n_sites: int, is_used: Callable[[Record], bool]) -> Floats:
+    """Return the variance of the chosen sources after the last step, (..., n_site) or (1,)."""
+    sums: dict[str, Floats | None] = {"photo": None, "dark": None}
     is_diagonal = True
     for record in records:
         at = sums[record.branch] if record.branch in sums else _sum(sums["photo"], sums["dark"])
@@ -282,7 +246,7 @@ def propagate(
                 at = record.operator.variance(np.broadcast_to(at, np.broadcast_shapes(at.shape, (n_sites,))))
                 is_diagonal = False
             else:
-                return _propagate_rows(records, n_sites, is_used, start)
+                return _propagate_rows(records, n_sites, is_used)
         if record.deviation is not None and is_used(record):
             at = _sum(at, np.square(record.deviation))
             is_diagonal &= record.groups is None
@@ -291,22 +255,11 @@ def propagate(
     return np.zeros(1) if total is None else total
 
 
-def _propagate_rows(
-    records: list[Record], n_sites: int, is_used: Callable[[Record], bool], start: Floats | float
-) -> Floats:
+def _propagate_rows(records: Sequence[Record], n_sites: int, is_used: Callable[[Record], bool]) -> Floats:
     """Compute :func:`propagate` for correlated sources that are mixed, by blocks of rows."""
-    if np.any(start):
-        records = [Record("", NOTHING, None, np.sqrt(start), branch="photo"), *records]
-        chosen = is_used
-
-        def is_used(record: Record) -> bool:
-            return not record.name or chosen(record)
-
-    shape = np.broadcast_shapes(*(np.shape(record.deviation) for record in records if record.deviation is not None))[
-        :-1
-    ]
-    out = np.empty((*shape, n_sites))
-    for index in np.ndindex(shape):
+    shape = np.broadcast_shapes(*(np.shape(record.deviation) for record in records if record.deviation is not None))
+    out = np.empty((*shape[:-1], n_sites))
+    for index in np.ndindex(shape[:-1]):
         single = [record.of(index) for record in records]
         for first in range(0, n_sites, BLOCK_ROWS):
             sites = np.arange(first, min(first + BLOCK_ROWS, n_sites))
@@ -316,7 +269,7 @@ def _propagate_rows(
 
 
 def row_factors(
-    records: Iterable[Record], n_sites: int, sites: Ints, is_used: Callable[[Record], bool]
+    records: Sequence[Record], n_sites: int, sites: Ints, is_used: Callable[[Record], bool]
 ) -> Iterator[csr_array[Any]]:
     """
     Yield rows of a factor F of the covariance F Fᵀ after the last step, for each source.
@@ -328,7 +281,7 @@ def row_factors(
     rows = csr_array((np.ones(sites.size), sites, np.arange(sites.size + 1)), shape=(sites.size, n_sites))
     joined: csr_array[Any] | None = None
     branch: Branch = ""
-    for record in reversed(list(records)):
+    for record in reversed(records):
         if record.branch != branch:
             joined = rows if joined is None else joined
             rows, branch = joined, record.branch
@@ -347,17 +300,17 @@ def readout_model(
     device or without. ``is_reset``: whether to include the noise of effects that are drawn at the reset.
     """
     mean_e, variance_e2 = (np.atleast_1d(np.asarray(part, np.float64)) for part in (mean_e, variance_e2))
-    chain = sensor.chain
-    mixed = split_charge(chain)[0]
+    mixed = split_charge(sensor)[0]
     used = partial(is_temporal, is_reset=is_reset)
     own_fraction: Floats | None = None
     if mixed:
-        walk = Walk(sites)
-        mean_e = walk.effects(mixed, np.broadcast_to(mean_e, np.broadcast_shapes(mean_e.shape, (sites.n_sites,))))
-        variance_e2 = propagate(walk.records, sites.n_sites, used, variance_e2)
-        if len(mixed) == 1 and walk.records[0].operator is not None:
-            own_fraction = walk.records[0].operator.own_fraction
-    records, _ = walk_from_node(sensor, chain, sites, mean_e)
+        records = [Record("", mean_e, deviation=np.sqrt(variance_e2))]
+        mean_e = np.broadcast_to(mean_e, np.broadcast_shapes(mean_e.shape, (sites.n_sites,)))
+        mean_e = walk(mixed, records, mean_e, sites)
+        variance_e2 = propagate(records, sites.n_sites, used)
+        if len(mixed) == 1 and records[1].operator is not None:
+            own_fraction = records[1].operator.own_fraction
+    records, _ = walk_from_node(sensor, sites, mean_e)
     slope = slope_of(records)
     states = [record._replace(deviation=record.half_step) for record in records]
     total, half_step2 = (propagate(part, sites.n_sites, used) for part in (records, states))
