@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -163,7 +162,7 @@ class Collection(Effect):
             n_most = np.searchsorted(np.cumsum(n_counts[order[start:]]), PIECE, side="right")
             chosen = order[start : start + max(1, int(n_most))]
             n_rows = int(n_counts[chosen[-1]])
-            part = sites.block(select_indices(sites, chosen))
+            part = sites.block(select_indices(sites.index, chosen, sites.layout.n_sites))
             count = first[chosen] + np.arange(-1.0, n_rows)[:, np.newaxis]
             cumulated = self._probability(count, mean[chosen], part)
             is_there = np.arange(n_rows)[:, np.newaxis] < n_counts[chosen]
@@ -216,31 +215,14 @@ def _slope(model: StepModel) -> Floats:
     return np.asarray(1.0 if model.slope is None else model.slope, np.float64)
 
 
-@dataclass(frozen=True)
 class _RoundedMean(Collection):
     """Rounded mean of another collection, without its draw."""
 
-    of: Collection
+    is_drawn = False
 
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        """Name of the collection."""
-        return self.of.name
-
-    @property
-    def needs_exposure(self) -> bool:  # type: ignore[override]
-        """Whether the mean depends on the exposure time."""
-        return self.of.needs_exposure
-
-    @property
-    def needs_layout(self) -> bool:  # type: ignore[override]
-        """Whether the mean depends on the layout."""
-        return self.of.needs_layout
-
-    @property
-    def is_drawn(self) -> bool:
-        """Whether charges are drawn."""
-        return False
+    def __init__(self, of: Collection) -> None:
+        self.of = of
+        vars(self).update(name=of.name, needs_exposure=of.needs_exposure, needs_layout=of.needs_layout)
 
     def without_draw(self) -> Collection:
         """Return this collection."""

@@ -13,7 +13,7 @@ from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +26,9 @@ from foveasim.errors import ParameterError, SimulationError
 from foveasim.fields import PackedRings
 from foveasim.sensor.bounded_cache import BoundedCache
 from foveasim.sensor.device import Device
+
+if TYPE_CHECKING:
+    from foveasim.sensor.effects.crosstalk import CrosstalkOperator
 
 __all__ = [
     "EFFECTS",
@@ -71,30 +74,6 @@ STAGES: Mapping[Stage, str] = MappingProxyType(
 SLOPE_STEP, SMALLEST_MEAN = 2.0**-10, MappingProxyType({"e-/s": 1.0, "e-": 1.0, "V": 1e-6})
 
 
-class Operator(Protocol):
-    """Protocol of linear maps of all sites, such as :class:`CrosstalkOperator`."""
-
-    def apply(self, values: ArrayLike, *, n_threads: int | None = None) -> Floats:
-        """Return the map of values (..., n_site)."""
-
-    def transpose(self) -> Operator:
-        """Return the transposed map."""
-
-    @property
-    def own_fraction(self) -> Floats:
-        """Diagonal of the map, (n_site,)."""
-
-    def variance(self, variance: ArrayLike) -> Floats:
-        """Return the variances (..., n_site) of mapped values of independent sites."""
-
-    def rows(self, sites: Any) -> Any:
-        """
-        Return the rows of some sites, (n, n_site) sparse.
-
-        ``sites``: their indices; or a sparse matrix (n, n_site), for its product with the map.
-        """
-
-
 class StepModel(NamedTuple):
     """
     First-order model of an effect at the mean of each site.
@@ -103,7 +82,7 @@ class StepModel(NamedTuple):
     ----------
     mean : (..., n) or (1,), unit of the stage
         Mean after the effect.
-    slope : None, (..., n), (1,), or Operator
+    slope : None, (..., n), (1,), or CrosstalkOperator
         Derivative of this mean with respect to the mean before the effect; None for 1, an operator for effects that mix sites.
     deviation : None, (..., n) or (1,), unit of the stage
         Standard deviation that the effect adds; None for 0.
@@ -112,7 +91,7 @@ class StepModel(NamedTuple):
     """
 
     mean: Floats
-    slope: Floats | Operator | None = None
+    slope: Floats | CrosstalkOperator | None = None
     deviation: Floats | None = None
     groups: Ints | None = None
 
@@ -165,7 +144,7 @@ class CompleteSites(NamedTuple):
     selection: slice | Ints
 
 
-def _compose(selection: slice | Ints, index: slice | Ints, n: int) -> slice | Ints:
+def select_indices(selection: slice | Ints, index: slice | Ints, n: int) -> slice | Ints:
     """Return the indices of some of the selected elements among all ``n``; slices have step 1."""
     if not isinstance(selection, slice):
         return selection[index]
@@ -174,11 +153,6 @@ def _compose(selection: slice | Ints, index: slice | Ints, n: int) -> slice | In
         return np.asarray(chosen.start + index)
     chosen = chosen[index]
     return slice(chosen.start, chosen.stop)
-
-
-def select_indices(sites: Sites, chosen: Ints) -> slice | Ints:
-    """Return the indices in the layout of some of the sites."""
-    return _compose(sites.index, chosen, sites.layout.n_sites)
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +207,7 @@ class Sites:
         if self._complete is None or not effect.needs_layout:
             return self
         sites, selection = self._complete
-        index = _compose(selection, self.index, sites.layout.n_sites)
+        index = select_indices(selection, self.index, sites.layout.n_sites)
         found = sites.block(index, n_threads=self.n_threads).during(self.exposure_s).of(effect)
         return found if self.known_device is not None else found.without_device()
 
@@ -453,11 +427,9 @@ class Effect(ABC):
             raise SimulationError(f"the effect '{self.name}' must return a StepModel; check its linearise()") from None
         names = [name for name in StepModel._fields[:3] if isinstance(getattr(model, name), np.ndarray)]
         what = "a mean, a slope and a deviation"
-        parts: list[Any] = [getattr(model, name) for name in names]
-        checked: list[Any] = self._validate_shapes(parts, len(names), shape, what, "linearise")
-        if model.groups is not None:
-            names, checked = [*names, "groups"], [*checked, _labels(self, model.groups, sites.n_sites)]
-        return model._replace(**dict(zip(names, checked, strict=True)))
+        parts = self._validate_shapes([getattr(model, name) for name in names], len(names), shape, what, "linearise")
+        groups = None if model.groups is None else _labels(self, model.groups, sites.n_sites)
+        return model._replace(**dict(zip(names, parts, strict=True)), groups=groups)
 
     def validate_moments(self, mean: Floats, variance: Floats, sites: Sites) -> tuple[Floats, Floats]:
         """Return the result of :meth:`moments` after checking its shapes."""
@@ -505,10 +477,12 @@ class _FixedPattern(Effect):
         """
         return self.pattern(sites), 0.0
 
-    def _of_devices(self, sites: Sites) -> tuple[Floats, Floats]:
-        """Return the moments of the pattern at the sites."""
+    def _model(self, sites: Sites) -> tuple[Floats, Floats | None]:
+        """Return the pattern of the device and None, or its mean and standard deviation over devices."""
+        if sites.known_device is not None:
+            return sites.pattern(self, self.pattern), None
         centre, spread2 = (sites.select(part) for part in self.pattern_moments(replace(sites, index=slice(None))))
-        return np.atleast_1d(centre), np.atleast_1d(spread2)
+        return np.atleast_1d(centre), np.sqrt(np.atleast_1d(spread2))
 
 
 class FixedFactor(_FixedPattern):
@@ -521,19 +495,14 @@ class FixedFactor(_FixedPattern):
 
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
         """Compute the moments of a product of independent factors."""
-        if sites.known_device is not None:
-            factor = sites.pattern(self, self.pattern)
-            return mean * factor, variance * factor**2
-        centre, spread2 = self._of_devices(sites)
-        return mean * centre, variance * (centre**2 + spread2) + mean**2 * spread2
+        factor, deviation = self._model(sites)
+        spread2 = 0.0 if deviation is None else deviation**2
+        return mean * factor, variance * (factor**2 + spread2) + mean**2 * spread2
 
     def linearise(self, mean: Floats, *, sites: Sites) -> StepModel:
         """Return the mean, the factor, and the mean times its standard deviation."""
-        if sites.known_device is not None:
-            factor = sites.pattern(self, self.pattern)
-            return StepModel(mean * factor, factor)
-        centre, spread2 = self._of_devices(sites)
-        return StepModel(mean * centre, centre, np.abs(mean) * np.sqrt(spread2))
+        factor, deviation = self._model(sites)
+        return StepModel(mean * factor, factor, None if deviation is None else np.abs(mean) * deviation)
 
 
 class FixedOffset(_FixedPattern):
@@ -546,17 +515,13 @@ class FixedOffset(_FixedPattern):
 
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
         """Compute the moments of a sum of independent terms."""
-        if sites.known_device is not None:
-            return mean + sites.pattern(self, self.pattern), variance
-        centre, spread2 = self._of_devices(sites)
-        return mean + centre, variance + spread2
+        offset, deviation = self._model(sites)
+        return mean + offset, variance if deviation is None else variance + deviation**2
 
     def linearise(self, mean: Floats, *, sites: Sites) -> StepModel:
         """Return the mean, and the standard deviation of the offset."""
-        if sites.known_device is not None:
-            return StepModel(mean + sites.pattern(self, self.pattern))
-        centre, spread2 = self._of_devices(sites)
-        return StepModel(mean + centre, None, np.sqrt(spread2))
+        offset, deviation = self._model(sites)
+        return StepModel(mean + offset, None, deviation)
 
 
 class AdditiveNoise(Effect):
@@ -584,7 +549,7 @@ class AdditiveNoise(Effect):
         return StepModel(mean, None, sites.pattern(self, self.deviation))
 
 
-class GroupedNoise(Effect):
+class GroupedNoise(AdditiveNoise):
     """
     Additive Gaussian temporal noise of mean 0, common to groups of sites such as rows.
 
@@ -592,12 +557,7 @@ class GroupedNoise(Effect):
     the name of the effect, the seed, the frame and the label of the group only, so that it is the same in all tiles.
     """
 
-    is_temporal: ClassVar[bool] = True
     reach: ClassVar[Reach] = "group"
-
-    @abstractmethod
-    def deviation(self, sites: Sites) -> ArrayLike:
-        """Return the standard deviation, (n,) or one number, in the unit of the stage."""
 
     def groups(self, sites: Sites) -> ArrayLike:
         """Return the label of each site's group, (n,) int, by default its readout line."""
@@ -629,10 +589,6 @@ class GroupedNoise(Effect):
         normals = ndtri(_kernels.device_uniforms(key[0], key[1], words, np.uint64(0)))
         values += sites.pattern(self, self.deviation) * (normals if index is None else normals[index])
         return values
-
-    def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
-        """Return the mean and the sum of the variances."""
-        return mean, variance + sites.pattern(self, self.deviation) ** 2
 
     def linearise(self, mean: Floats, *, sites: Sites) -> StepModel:
         """Return the mean, the standard deviation and the groups."""

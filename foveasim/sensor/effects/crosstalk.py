@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from foveasim._core.calls import LENGTH, NOT_NEGATIVE, Declared, Limits, OwnCheck
 from foveasim._core.short_repr import short_repr
@@ -103,20 +103,15 @@ class CrosstalkOperator:
         """Apply one step to charges (n, n_site), in blocks of sites."""
         from foveasim.sensor import _kernels
 
-        out = np.empty_like(rows)
+        out, matrix = np.empty_like(rows), self.matrix
+        fractions = np.ascontiguousarray(matrix.data, np.float64)
 
         def block(_: int, sites: slice) -> None:
             for before, after in zip(rows, out, strict=True):
-                _kernels.mix(*self._arrays, before, sites.start, after[sites])
+                _kernels.mix(fractions, matrix.indices, matrix.indptr, before, sites.start, after[sites])
 
         for_each_block(rows.shape[1], block, n_threads)
         return out
-
-    @cached_property
-    def _arrays(self) -> tuple[Floats, NDArray[Any], NDArray[Any]]:
-        """Values, column indices and row offsets of the matrix, for the kernel."""
-        matrix = self.matrix
-        return np.ascontiguousarray(matrix.data, np.float64), matrix.indices, matrix.indptr
 
     def variance(self, variance: ArrayLike) -> Floats:
         """
@@ -139,11 +134,9 @@ class CrosstalkOperator:
         if self.n_steps == 1:
             mixed = self._squared_matrix @ before
         else:
-            n_sites = self.matrix.shape[0]
             mixed = np.empty(before.shape)
-            for first in range(0, n_sites, self._rows_at_a_time):
-                sites = slice(first, min(first + self._rows_at_a_time, n_sites))
-                mixed[sites] = self.rows(np.arange(n_sites)[sites]).power(2) @ before
+            for sites, rows in self._row_blocks():
+                mixed[sites] = rows.power(2) @ before
         return np.ascontiguousarray(np.moveaxis(mixed.reshape(columns.shape), 0, -1))
 
     @cached_property
@@ -151,21 +144,23 @@ class CrosstalkOperator:
         """Fraction of the charge of each site that stays, (n_site,): the diagonal of the operator."""
         if self.n_steps == 1:
             return read_only(np.asarray(self.matrix.diagonal(), np.float64))
-        sites = np.arange(self.matrix.shape[0])
-        parts = [sites[first : first + self._rows_at_a_time] for first in range(0, sites.size, self._rows_at_a_time)]
-        diagonals = [np.asarray(self.rows(part)[np.arange(part.size), part]).ravel() for part in parts]
-        return read_only(np.concatenate(diagonals) if diagonals else np.zeros(0))
+        found = np.empty(self.matrix.shape[0])
+        for sites, rows in self._row_blocks():
+            found[sites] = rows.diagonal(sites.start)
+        return read_only(found)
 
     @cached_property
     def _squared_matrix(self) -> csr_array[Any]:
         return self.matrix.power(2)
 
-    @property
-    def _rows_at_a_time(self) -> int:
-        """Number of rows of the power at a time, for neighbours in two dimensions."""
-        n_sites = max(self.matrix.shape[0], 1)
-        per_row = min(self.matrix.nnz / n_sites * self.n_steps**2, n_sites)
-        return max(1, int(MAX_ELEMENTS / max(per_row, 1.0)))
+    def _row_blocks(self) -> Iterator[tuple[slice, csr_array[Any]]]:
+        """Yield sites and their rows of the power, in blocks for neighbours in two dimensions."""
+        n_sites = self.matrix.shape[0]
+        per_row = min(self.matrix.nnz / max(n_sites, 1) * self.n_steps**2, n_sites)
+        step = max(1, int(MAX_ELEMENTS / max(per_row, 1.0)))
+        for first in range(0, n_sites, step):
+            sites = slice(first, min(first + step, n_sites))
+            yield sites, self.rows(sites)
 
     def transpose(self) -> CrosstalkOperator:
         """Return the operator with the transposed matrix."""
@@ -183,7 +178,7 @@ class CrosstalkOperator:
 
         Parameters
         ----------
-        sites : (n,) int, or sparse matrix (n, n_site)
+        sites : (n,) int or slice, or sparse matrix (n, n_site)
             Indices of the rows; or a matrix that is multiplied by ``matrix**n_steps``.
 
         Returns

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, cast
@@ -10,7 +11,7 @@ import numpy as np
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats
-from foveasim.sensor.effects.contract import AdditiveNoise, Effect, Sites, Stage, StepModel
+from foveasim.sensor.effects.contract import AdditiveNoise, Sites, Stage
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
 
 __all__ = ["ReadNoise", "ResetNoise", "TelegraphNoise"]
@@ -65,7 +66,7 @@ class ReadNoise(AdditiveNoise):
 
 
 @dataclass(frozen=True)
-class TelegraphNoise(Effect):
+class TelegraphNoise(AdditiveNoise):
     """
     Random telegraph signal (RTS) noise: two equally probable states on some sites.
 
@@ -87,18 +88,20 @@ class TelegraphNoise(Effect):
     name: ClassVar[str] = "rts"
     stage: ClassVar[Stage] = "charge"
     is_defect: ClassVar[bool] = True
-    is_temporal: ClassVar[bool] = True
     needs_layout: ClassVar[bool] = False
 
     rts_fraction: float
     rts_e: float
 
+    def deviation(self, sites: Sites) -> float | Floats:
+        """Return half the difference between the states, 0 on other sites, (n,) e-, or its RMS over all devices."""
+        if sites.known_device is None:
+            return 0.5 * self.rts_e * math.sqrt(self.rts_fraction)
+        return np.where(sites.device.uniforms(self.name) < self.rts_fraction, 0.5 * self.rts_e, 0.0)
+
     def half_step(self, sites: Sites) -> Floats:
-        """Return half the difference between the states, 0 on other sites, (n,) e-."""
-        return sites.pattern(
-            self,
-            lambda all_sites: np.where(all_sites.device.uniforms(self.name) < self.rts_fraction, 0.5 * self.rts_e, 0.0),
-        )
+        """Return half the difference between the states of the device, 0 on other sites, (n,) e-."""
+        return sites.pattern(self, self.deviation)
 
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
         """Return the values plus or minus half the difference of the states on RTS sites."""
@@ -108,17 +111,3 @@ class TelegraphNoise(Effect):
         where = rts_sites[slice(*np.searchsorted(rts_sites, (first, end)))] - first
         values[where] += np.copysign(0.5 * self.rts_e, rng.random(where.size) - 0.5)
         return values
-
-    def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
-        """Return the mean and the sum of the variances."""
-        return mean, variance + self._variance(sites)
-
-    def linearise(self, mean: Floats, *, sites: Sites) -> StepModel:
-        """Return the mean, and the standard deviation of the two states."""
-        known = sites.known_device is not None
-        return StepModel(mean, None, self.half_step(sites) if known else np.atleast_1d(np.sqrt(self._variance(sites))))
-
-    def _variance(self, sites: Sites) -> float | Floats:
-        if sites.known_device is None:
-            return self.rts_fraction * self.rts_e**2 / 4.0
-        return np.square(self.half_step(sites))

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.validation import Floats, Ints
-from foveasim.sensor.effects.contract import Effect, Operator, Sites
+from foveasim.sensor.effects.contract import Effect, Sites
+from foveasim.sensor.effects.crosstalk import CrosstalkOperator
 from foveasim.sensor.model.prediction import MIN_SLOPE, ReadoutModel, Transfer
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ class Record(NamedTuple):
 
     name: str
     mean: Floats
-    slope: Floats | Operator | None = None
+    slope: Floats | CrosstalkOperator | None = None
     deviation: Floats | None = None
     groups: Ints | None = None
     kind: Kind = "temporal"
@@ -54,7 +55,7 @@ class Record(NamedTuple):
         return np.unique(groups, return_inverse=True)[1].ravel()
 
     @property
-    def operator(self) -> Operator | None:
+    def operator(self) -> CrosstalkOperator | None:
         """Slope of a step that mixes sites."""
         return None if self.slope is None or isinstance(self.slope, np.ndarray) else self.slope
 
