@@ -8,7 +8,7 @@ predictions, the noise budget, signal-to-noise ratios, weights of estimates, cov
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -20,7 +20,8 @@ from foveasim._core.names import possible_names
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_per_site
 from foveasim.errors import ParameterError, SimulationError
-from foveasim.sensor.effects.contract import NOTHING, Operator, Sites
+from foveasim.sensor.effects.contract import NOTHING, Sites
+from foveasim.sensor.effects.crosstalk import CrosstalkOperator
 from foveasim.sensor.model.prediction import Transfer
 from foveasim.sensor.model.records import (
     Kind,
@@ -40,6 +41,8 @@ from foveasim.sensor.model.records import (
 )
 
 if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
     from foveasim.sensor.sensor import Sensor
 
 __all__ = ["Linearisation"]
@@ -170,7 +173,7 @@ class Linearisation:
         is_saturated = is_saturated | self._is_full
         return np.broadcast_to(is_saturated, np.broadcast_shapes(is_saturated.shape, (self.n_sites,)))
 
-    def slopes(self, start: Start, end: Start) -> list[Floats | Operator]:
+    def slopes(self, start: Start, end: Start) -> list[Floats | CrosstalkOperator]:
         """
         Return the slopes of the steps between two points of the chain, in their order.
 
@@ -265,10 +268,8 @@ class Linearisation:
         index, other = (self._check_sites(name, pair) for name, pair in (("sites", sites), ("others", others)))
         if index.size != other.size:
             raise ParameterError("others", f"must have as many elements as 'sites', {index.size}, got {other.size}")
-        self._check_single()
-        pairs = (row_factors(self._records, self.n_sites, each, self._chosen(None, True)) for each in (index, other))
-        products = (np.asarray(a.multiply(b).sum(axis=1)).ravel() for a, b in zip(*pairs, strict=True))
-        return np.asarray(sum(products, np.zeros(index.size)))
+        pairs = zip(self._factors(index), self._factors(other), strict=True)
+        return np.asarray(sum((np.asarray(a.multiply(b).sum(axis=1)).ravel() for a, b in pairs), np.zeros(index.size)))
 
     def covariance_matrix_dn2(self, sites: ArrayLike) -> Floats:
         """
@@ -276,9 +277,8 @@ class Linearisation:
 
         ``sites`` (n,) int: indices of the sites.
         """
-        self._check_single()
         index = self._check_sites("sites", sites)
-        factors = row_factors(self._records, self.n_sites, index, self._chosen(None, True))
+        factors = self._factors(index)
         return np.asarray(sum(((a @ a.T).toarray() for a in factors), np.zeros((index.size, index.size))))
 
     def apply_covariance(self, values: ArrayLike) -> Floats:
@@ -288,7 +288,7 @@ class Linearisation:
         ``values`` (..., n_site): in any unit.
         """
         values = self._check("values", values)
-        records, chosen = self._records[self._starts["charge"] :], self._chosen(None, True)
+        records = self._main("charge")
         back: list[Floats] = []
         for record in reversed(records):
             back.append(values)
@@ -296,19 +296,19 @@ class Linearisation:
         total: Floats = np.zeros(1)
         for record, at in zip(records, reversed(back), strict=True):
             total = record.map(np.broadcast_to(total, at.shape))
-            if record.deviation is not None and chosen(record):
+            if record.deviation is not None and is_temporal(record):
                 total = total + record.correlate(at)
         return total
 
     @cached_property
     def is_correlated(self) -> bool:
         """Whether the temporal noise of different sites is correlated."""
-        chosen = self._chosen(None, True)
-        sources = [k for k, record in enumerate(self._records) if record.deviation is not None and chosen(record)]
-        return any(
-            self._records[k].groups is not None or any(later.operator is not None for later in self._records[k + 1 :])
-            for k in sources
-        )
+        is_mixed = False
+        for record in reversed(self._main("charge")):
+            if record.deviation is not None and is_temporal(record) and (is_mixed or record.groups is not None):
+                return True
+            is_mixed |= record.operator is not None
+        return False
 
     def solve_covariance(self, values: ArrayLike, sites: ArrayLike | None = None) -> Floats:
         """
@@ -337,7 +337,7 @@ class Linearisation:
         rows = np.atleast_2d(values)[:, known]
         if not self.is_correlated:
             found = rows / variance[known]
-        elif any(record.operator is not None for record in self._records[self._starts["charge"] :]):
+        elif any(record.operator is not None for record in self._main("charge")):
             found = np.stack([self._conjugate_gradients(row, variance, known) for row in rows])
         else:
             found = self._woodbury(rows, known)
@@ -391,12 +391,11 @@ class Linearisation:
         from scipy.sparse import csr_array, eye_array, hstack
         from scipy.sparse.linalg import splu
 
-        chosen = self._chosen(None, True)
-        records = self._records[self._starts["charge"] :]
-        variance = propagate(records, self.n_sites, lambda record: chosen(record) and record.groups is None)
+        records = self._main("charge")
+        variance = propagate(records, self.n_sites, lambda record: is_temporal(record) and record.groups is None)
         independent = np.broadcast_to(variance, self.n_sites)[known]
-        factors = row_factors(records, self.n_sites, known, lambda record: chosen(record) and record.groups is not None)
-        factor = csr_array(hstack(list(factors)))
+        shared = self._factors(known, lambda record: is_temporal(record) and record.groups is not None)
+        factor = csr_array(hstack(list(shared)))
         inner = splu(
             (eye_array(factor.shape[1]) + scale_columns(csr_array(factor.T), 1.0 / independent) @ factor).tocsc()
         )
@@ -448,6 +447,11 @@ class Linearisation:
                 hint="pass exposure_s to Sensor.linearise",
             )
         return [record for record in self._records[self._starts[start] : end] if record.branch != "dark"]
+
+    def _factors(self, index: Ints, is_used: Callable[[Record], bool] = is_temporal) -> Iterator[csr_array[Any]]:
+        """Yield rows of factors F of the covariance F Fᵀ of some sites."""
+        self._check_single()
+        return row_factors(self._main("charge"), self.n_sites, index, is_used)
 
     def _check_single(self) -> None:
         """Raise unless the model is that of a single charge per site."""
