@@ -44,8 +44,8 @@ CONTINUOUS_ABOVE_E = 1.1
 MAX_TABULATED_E, MAX_LATTICE_E = 1e6, 1e12
 #: Terms of Edgeworth series: maximum number, and the size that is neglected.
 MAX_TERMS, MIN_TERM = 48, 1e-11
-#: Coefficients of z⁴, z⁶ and z⁸ of the logarithm of (z/2) / sinh(z/2); that of z² is -1/24.
-LATTICE_4, LATTICE_6, LATTICE_8 = 1.0 / 2880.0, -1.0 / 181440.0, 1.0 / 9676800.0
+#: Coefficients of the powers of z from z³ of the logarithm of (z/2) / sinh(z/2); that of z² is -1/24.
+LATTICE = (0.0, 1.0 / 2880.0, 0.0, -1.0 / 181440.0, 0.0, 1.0 / 9676800.0)
 #: From this readout noise, Gaussian probabilities of intervals of 1 e- are series about their centres, to 1e-13.
 SERIES_ABOVE_E = 2.0
 #: Harmonics of the quantisation error below exp(-HARMONIC_EXPONENT) are neglected. The sum over codes is faster than more
@@ -395,13 +395,8 @@ def _edgeworth_coefficients(mean, variance, is_lattice, coefficients):
     for n in range(3, MAX_TERMS):
         cumulant *= scale / (n - 1.0) if n > 3 else scale
         term = cumulant
-        if is_lattice:
-            if n == 4:
-                term += 4.0 * LATTICE_4 * scale**4
-            elif n == 6:
-                term += 6.0 * LATTICE_6 * scale**6
-            elif n == 8:
-                term += 8.0 * LATTICE_8 * scale**8
+        if is_lattice and n < 3 + len(LATTICE):
+            term += n * LATTICE[n - 3] * scale**n
         coefficients[np.uint64(MAX_TERMS + n)] = term
         # c_0 is 1, and c_1 and c_2 are 0.
         for j in range(3, n - 2):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any, ClassVar, TypeAlias
@@ -214,53 +214,42 @@ def check_effects(added: Any) -> tuple[Effect, ...]:
         if effect.name in names:
             raise ParameterError("effects", f"must have unique names, got '{effect.name}' twice")
         names.add(effect.name)
-        if hasattr(effect, "is_local"):
-            raise ParameterError(
-                "effects",
-                f"must define 'reach' instead of 'is_local': \"site\", \"group\" or \"all\" in '{effect.name}'",
-            )
-        if effect.reach not in REACHES:
-            raise ParameterError(
-                "effects", f'must have a reach of "site", "group" or "all"; \'{effect.name}\' has {effect.reach!r}'
-            )
-        if isinstance(effect, Collection):
-            if (effect.stage, effect.reach, effect.is_temporal) != ("collection", "site", True):
-                raise ParameterError(
-                    "effects",
-                    f"must leave stage, reach and is_temporal of a Collection unchanged; '{effect.name}' does not",
-                )
-            continue
-        if effect.stage not in STAGES or effect.stage == "collection":
-            stages = ", ".join(stage for stage in STAGES if stage != "collection")
-            raise ParameterError("effects", f"must have a stage from {stages}; '{effect.name}' has '{effect.stage}'")
-        if effect.is_temporal and effect.stage in FIXED_STAGES:
-            raise ParameterError(
-                "effects",
-                f"before collection must be fixed, but '{effect.name}' at the stage '{effect.stage}' is temporal; "
-                "use the stage 'charge'",
-            )
-        if effect.reach == "all" or isinstance(effect, Mixing):
-            _check_mixing(effect)
+        if rule := next(_violated_rules(effect), None):
+            raise ParameterError("effects", rule)
     if len(collections := [effect.name for effect in added if isinstance(effect, Collection)]) > 1:
         raise ParameterError("effects", f"must have at most one Collection, got {', '.join(map(repr, collections))}")
     return tuple(added)
 
 
-def _check_mixing(effect: Effect) -> None:
-    """Raise ParameterError if an effect that mixes sites is not a linear map of charges."""
+def _violated_rules(effect: Effect) -> Iterator[str]:
+    """Yield the rules of stages and reaches that an effect violates."""
+    name, stage = effect.name, effect.stage
+    if hasattr(effect, "is_local"):
+        yield f"must define 'reach' instead of 'is_local': \"site\", \"group\" or \"all\" in '{name}'"
+    if effect.reach not in REACHES:
+        yield f'must have a reach of "site", "group" or "all"; \'{name}\' has {effect.reach!r}'
+    if isinstance(effect, Collection):
+        if (stage, effect.reach, effect.is_temporal) != ("collection", "site", True):
+            yield f"must leave stage, reach and is_temporal of a Collection unchanged; '{name}' does not"
+        return
+    if stage not in STAGES or stage == "collection":
+        stages = ", ".join(each for each in STAGES if each != "collection")
+        yield f"must have a stage from {stages}; '{name}' has '{stage}'"
+    if effect.is_temporal and stage in FIXED_STAGES:
+        yield (
+            f"before collection must be fixed, but '{name}' at the stage '{stage}' is temporal; use the stage 'charge'"
+        )
+    if effect.reach != "all" and not isinstance(effect, Mixing):
+        return
+    # Effects that mix sites are linear maps of charges.
     if effect.is_temporal:
-        raise ParameterError(
-            "effects",
-            f'of reach "all" must be deterministic, but \'{effect.name}\' is temporal; use the reach "group", as GroupedNoise',
+        yield (
+            f'of reach "all" must be deterministic, but \'{name}\' is temporal; use the reach "group", as GroupedNoise'
         )
     if not isinstance(effect, Mixing) or effect.reach != "all":
-        raise ParameterError(
-            "effects", f"of reach \"all\" must derive from Mixing and define operator(); change '{effect.name}'"
-        )
-    if effect.stage not in (*FIXED_STAGES, "charge"):
-        raise ParameterError(
-            "effects", f"that mix sites must have a stage up to 'charge'; '{effect.name}' has '{effect.stage}'"
-        )
+        yield f"of reach \"all\" must derive from Mixing and define operator(); change '{name}'"
+    if stage not in (*FIXED_STAGES, "charge"):
+        yield f"that mix sites must have a stage up to 'charge'; '{name}' has '{stage}'"
 
 
 def check_names(names: Any, effects: Iterable[Effect]) -> tuple[str, ...]:

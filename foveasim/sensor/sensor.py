@@ -57,12 +57,12 @@ from foveasim.sensor.limits import (
 from foveasim.sensor.model.inversion import Inverse, invert, invert_collection
 from foveasim.sensor.model.linearisation import QUANTISATION, Linearisation, linearise
 from foveasim.sensor.model.prediction import (
+    NO_TABLES,
     ChargeDistributions,
     ChargeTables,
     ReadoutModel,
     Transfer,
     clipped_gaussian_moments,
-    no_tables,
 )
 from foveasim.sensor.model.records import Record, light_records, map_light, readout_model
 from foveasim.sensor.spectral.curves import ConstantCurve, Curve, CurveError
@@ -1099,7 +1099,7 @@ class Sensor:
             def part(values: Any) -> Any:
                 return read_only(chosen.select(values).view()) if isinstance(values, np.ndarray) else values
 
-            tables = no_tables()
+            tables = NO_TABLES
             if is_drawn and not is_poisson:
                 first, probability, offsets = collection.table(expected_e[index], sites=chosen.of(collection))
                 tables = ChargeTables(*map(read_only, (first, offsets, probability)))

@@ -14,7 +14,7 @@ import foveasim as fs
 from foveasim._core.validation import read_only
 from foveasim.layout import grid
 from foveasim.sensor import Diffusion, InterPixelCapacitance, Sensor
-from foveasim.sensor.model.prediction import ChargeDistributions, ChargeTables, no_tables
+from foveasim.sensor.model.prediction import NO_TABLES, ChargeDistributions, ChargeTables
 
 SIGMAS = 5.0
 N_DRAWS = 2000
@@ -273,7 +273,7 @@ def kernel_arguments(sensor, mean_e):
     line = sensor.layout.readout_line.astype(np.int32)
     return {
         "charges": charges,
-        "tables": no_tables(),
+        "tables": NO_TABLES,
         "transfer": model.transfer,
         "line": line,
         "adc": sensor.adc.tables(sensor.v_sat_v, np.uint64(7)),

@@ -113,8 +113,7 @@ class Linearisation:
     @property
     def exposure_s(self) -> float | None:
         """Exposure time, s; None if it is unknown."""
-        exposure_s: float | None = self._arguments[-1]
-        return exposure_s
+        return self._arguments[-1]
 
     @property
     def sources(self) -> dict[str, Kind]:
@@ -138,9 +137,7 @@ class Linearisation:
     @property
     def slope_dn_per_v(self) -> Floats:
         """Derivative of the code with respect to the voltage at the ADC, DN/V."""
-        slope = self._records[-1].factor
-        assert slope is not None
-        return slope
+        return slope_of(self._records[-1:])
 
     @cached_property
     def linear_gain_dn_per_e(self) -> Floats:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -36,6 +35,10 @@ class ChargeTables(NamedTuple):
     first_e: Ints
     offset: Ints
     probability_fraction: Floats
+
+
+#: Tables of Poisson-distributed charges.
+NO_TABLES = ChargeTables(read_only(np.zeros(0, np.int64)), read_only(np.zeros(0, np.int64)), read_only(np.zeros(0)))
 
 
 class Transfer(NamedTuple):
@@ -90,13 +93,6 @@ class ReadoutModel(NamedTuple):
     def noise_e2(self) -> Floats:
         """Variance of the total temporal noise of the readout, referred to the charge, e-²."""
         return np.asarray(self.gaussian_e2 + self.half_step_e**2)
-
-
-@cache
-def no_tables() -> ChargeTables:
-    """Return the empty tables of Poisson-distributed charges."""
-    integers = read_only(np.zeros(0, np.int64))
-    return ChargeTables(integers, integers, read_only(np.zeros(0)))
 
 
 def clipped_gaussian_moments(mean_e: Floats, variance_e2: Floats, limit_e: Floats) -> tuple[Floats, Floats]:
