@@ -224,10 +224,6 @@ class _RoundedMean(Collection):
         self.of = of
         vars(self).update(name=of.name, needs_exposure=of.needs_exposure, needs_layout=of.needs_layout)
 
-    def without_draw(self) -> Collection:
-        """Return this collection."""
-        return self
-
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
         """Return the rounded means, (n,) e-."""
         return np.rint(np.clip(self.of.validate_moments(values, NOTHING, sites)[0], 0.0, MAX_CHARGE_E))
