@@ -36,7 +36,7 @@ from foveasim.sensor.chain import (
 )
 from foveasim.sensor.device import Device
 from foveasim.sensor.effects import EFFECTS, Collection, Effect, Photosites, Sites, Stage
-from foveasim.sensor.effects.contract import NOTHING, CompleteSites, FixedFactor, FixedOffset
+from foveasim.sensor.effects.contract import NOTHING, FixedFactor, FixedOffset
 from foveasim.sensor.effects.crosstalk import Diffusion, InterPixelCapacitance, KernelCrosstalk
 from foveasim.sensor.effects.dark import ACTIVATION, DOUBLING, DarkLaw, DarkSignal, HotSites, dark_current_factor
 from foveasim.sensor.effects.fixed_pattern import ColumnOffset, DeadSites, PhotoResponse, PixelGain, PixelOffset
@@ -523,8 +523,8 @@ class Sensor:
         return Sites(self.layout, self.device, capacitance_f, _complete=self._complete_sites)
 
     @property
-    def _complete_sites(self) -> CompleteSites | None:
-        """Sites of the sensor that this one is a part of."""
+    def _complete_sites(self) -> tuple[Sites, slice | Ints] | None:
+        """Sites of the sensor that this one is a part of, and the indices of its sites."""
         return None
 
     def effects_at(self, stage: Stage) -> list[Effect]:
@@ -1149,8 +1149,8 @@ class SensorPart(Sensor):
         return self._complete.device.part(self._selection, self.layout)
 
     @property
-    def _complete_sites(self) -> CompleteSites:
-        return CompleteSites(self._complete.sites, self._selection)
+    def _complete_sites(self) -> tuple[Sites, slice | Ints]:
+        return self._complete.sites, self._selection
 
 
 def _means(name: str, values: ArrayLike, n_sites: int) -> Floats:

@@ -133,17 +133,6 @@ class Photosites(PackedRings, Protocol):
         """Return the lengths of shared edges, (n_site, n_site) sparse, µm."""
 
 
-class CompleteSites(NamedTuple):
-    """
-    All sites of the sensor that a part belongs to.
-
-    ``selection`` contains the indices of the part's sites among them, a slice of step 1 or (n,).
-    """
-
-    sites: Sites
-    selection: slice | Ints
-
-
 def select_indices(selection: slice | Ints, index: slice | Ints, n: int) -> slice | Ints:
     """Return the indices of some of the selected elements among all ``n``; slices have step 1."""
     if not isinstance(selection, slice):
@@ -182,7 +171,8 @@ class Sites:
     index: slice | Ints = field(default_factory=lambda: slice(None))
     n_threads: int | None = None
     exposure_s: float | None = None
-    _complete: CompleteSites | None = field(default=None, repr=False)
+    #: All sites of the sensor that a part belongs to, and the indices of its sites among them, a slice of step 1 or (n,).
+    _complete: tuple[Sites, slice | Ints] | None = field(default=None, repr=False)
     _cache: BoundedCache = field(default_factory=lambda: BoundedCache(MAX_CACHED), repr=False)
 
     __repr__ = short_repr
