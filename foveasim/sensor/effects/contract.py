@@ -468,7 +468,7 @@ class _FixedPattern(Effect):
         return self.pattern(sites), 0.0
 
     def _model(self, sites: Sites) -> tuple[Floats, Floats | None]:
-        """Return the pattern of the device and None, or its mean and standard deviation over devices."""
+        """Return the device's pattern and None, or mean and standard deviation over devices."""
         if sites.known_device is not None:
             return sites.pattern(self, self.pattern), None
         centre, spread2 = (sites.select(part) for part in self.pattern_moments(replace(sites, index=slice(None))))

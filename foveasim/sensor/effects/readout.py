@@ -94,7 +94,11 @@ class TelegraphNoise(AdditiveNoise):
     rts_e: float
 
     def deviation(self, sites: Sites) -> float | Floats:
-        """Return half the difference between the states, 0 on other sites, (n,) e-, or its RMS over all devices."""
+        """
+        Return half the difference between the states, 0 on other sites, (n,) e-.
+
+        Without a device: its RMS value over all devices.
+        """
         if sites.known_device is None:
             return 0.5 * self.rts_e * math.sqrt(self.rts_fraction)
         return np.where(sites.device.uniforms(self.name) < self.rts_fraction, 0.5 * self.rts_e, 0.0)

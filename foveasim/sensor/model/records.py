@@ -131,7 +131,7 @@ def walk(effects: Iterable[Effect], records: list[Record], mean: Floats, sites: 
 
 
 def map_light(records: Iterable[Record], values: Floats) -> Floats:
-    """Return the derivative of the mean after steps times values (..., n_site), without the branch of the dark current."""
+    """Return the derivative of the mean times values (..., n_site), without the dark branch."""
     for record in records:
         values = values if record.branch == "dark" else record.map(values)
     return values
