@@ -43,7 +43,7 @@ class Annuli(NamedTuple):
         return np.where((index >= 0) & (index < self.edges_um.size - 1), index, -1)
 
     def means(self, values: Floats, index: Ints, weights: Floats | None = None) -> Floats:
-        """Return the sum of values per sum of weights, by default 1, in each annulus; NaN without any."""
+        """Return sums of values over sums of weights, or over sites, of each annulus; or NaN."""
         inside, n = index >= 0, self.edges_um.size - 1
         sums = np.bincount(index[inside], values[inside], minlength=n)
         totals = np.bincount(index[inside], None if weights is None else weights[inside], minlength=n)

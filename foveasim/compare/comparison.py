@@ -140,7 +140,7 @@ class Comparison:
         return self._interval(name, by_eccentricity, is_difference=True)
 
     def _interval(self, name: str, by_eccentricity: bool, *, is_difference: bool) -> MedianInterval:
-        """Return the interval of a measure, or of its differences; a single value for measures of layouts."""
+        """Return the interval of a measure or its differences; one value for layouts."""
         has_scenes = MEASURES[check_choice("name", name, MEASURES)].has_scenes
         values = self.values[name + (BY_ECCENTRICITY if by_eccentricity else "")]
         if is_difference:
@@ -427,7 +427,7 @@ class _Shot(NamedTuple):
 def _field(
     all_layouts: Sequence[Layout], centre_um: tuple[float, float], n_annuli: int, max_pixels: int
 ) -> tuple[Annuli, Grid, Grid]:
-    """Return the annuli of the common field of layouts, and its grids for pictures and for the covariance of images."""
+    """Return the annuli of the common field, and its grids for pictures and covariances."""
     bounds_um = np.array([layout.bounds_um for layout in all_layouts])
     low, high = bounds_um[:, :2].min(axis=0), bounds_um[:, 2:].max(axis=0)
     site_um = min(math.sqrt(float(layout.area_um2.min())) for layout in all_layouts)

@@ -150,7 +150,11 @@ def layout_measures(
 def scene_measures(
     camera: Camera, capture: Capture, image: PowerMap, annuli: Annuli
 ) -> tuple[Linearisation, dict[str, Any]]:
-    """Return the model of a capture of an image, and its SNR and precision of a shift; NaN for an annulus without sites."""
+    """
+    Return the model of a capture of an image, its SNR and its precision of a shift.
+
+    Values of an annulus without sites are NaN.
+    """
     sensor, layout = camera.sensor, camera.layout
     exposure_s = float(capture.settings["exposure_s"])
     dark_e = sensor.expected_electrons(np.zeros(layout.n_sites), exposure_s)

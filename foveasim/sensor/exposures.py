@@ -437,9 +437,9 @@ def _linearise_reads(
     code: ArrayLike, n_reads: int, sensor: Sensor, kind: str
 ) -> tuple[NDArray[Any], Floats, Floats, Floats]:
     """
-    Return codes (n_reading, n_site), linear codes, electrons per linear code, and the variance of conversion in e-².
+    Return codes, linear codes, electrons per linear code, and the variance of conversion.
 
-    The variance is that of the width of each code.
+    ``code`` (n_reading, n_site), DN. The variance, in e-², is that of the width of each code.
     """
     linear_dn = linearise(code, sensor)
     codes = as_numbers("code", code)
