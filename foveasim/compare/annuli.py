@@ -43,7 +43,11 @@ class Annuli(NamedTuple):
         return np.where((index >= 0) & (index < self.edges_um.size - 1), index, -1)
 
     def means(self, values: Floats, index: Ints, weights: Floats | None = None) -> Floats:
-        """Return sums of values over sums of weights, or over sites, of each annulus; or NaN."""
+        """
+        Return the sum of values per sum of weights in each annulus, by default per point.
+
+        It is NaN for an annulus without points.
+        """
         inside, n = index >= 0, self.edges_um.size - 1
         sums = np.bincount(index[inside], values[inside], minlength=n)
         totals = np.bincount(index[inside], None if weights is None else weights[inside], minlength=n)

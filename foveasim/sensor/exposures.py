@@ -269,7 +269,7 @@ def non_destructive_reads(
     photo = RATE.check_array("photo_e_per_s", photo_e_per_s)
     photo = np.broadcast_to(check_per_site("photo_e_per_s", photo, n_sites, or_one=True), n_sites)
     well_e = np.minimum(sensor.well_e, MAX_CHARGE_E).astype(np.int64)
-    electrons, codes = [], []
+    electrons, codes = np.empty((times.size, n_sites), np.int64), []
     expected_e, collected = np.zeros(n_sites), np.zeros(n_sites, np.int64)
     for k, (time_s, interval_s) in enumerate(zip(times.tolist(), np.diff(times, prepend=0.0).tolist(), strict=True)):
         own = Streams(int(streams.of("read of a ramp", k).integers(2**63)), streams.frame)
@@ -280,9 +280,9 @@ def non_destructive_reads(
             collected = np.minimum(collected + draw(added_e, exposure_s=interval_s), well_e)
         else:
             collected = draw(expected_e, exposure_s=time_s)
-        electrons.append(collected)
+        electrons[k] = collected
         codes.append(sensor.read(collected, n_threads=n_threads, _streams=own, _reset_streams=streams))
-    return Ramp(times_s=times, electrons=np.stack(electrons), code=np.stack(codes))
+    return Ramp(times_s=times, electrons=electrons, code=np.stack(codes))
 
 
 def _increase(before_e: Floats, expected_e: Floats, time_s: float) -> Floats:

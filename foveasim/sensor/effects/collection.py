@@ -222,6 +222,7 @@ class _RoundedMean(Collection):
 
     def __init__(self, of: Collection) -> None:
         self.of = of
+        # Class attributes of other effects.
         vars(self).update(name=of.name, needs_exposure=of.needs_exposure, needs_layout=of.needs_layout)
 
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:

@@ -486,8 +486,9 @@ class FixedFactor(_FixedPattern):
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
         """Compute the moments of a product of independent factors."""
         factor, deviation = self._model(sites)
-        spread2 = 0.0 if deviation is None else deviation**2
-        return mean * factor, variance * (factor**2 + spread2) + mean**2 * spread2
+        if deviation is None:
+            return mean * factor, variance * factor**2
+        return mean * factor, variance * (factor**2 + deviation**2) + (mean * deviation) ** 2
 
     def linearise(self, mean: Floats, *, sites: Sites) -> StepModel:
         """Return the mean, the factor, and the mean times its standard deviation."""
