@@ -104,9 +104,12 @@ def _local_edges(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Floats, Flo
 
     Coordinates are relative to the first vertex of the ring. Computed column by column, as in :func:`to_frame`.
     """
-    after, lengths = next_vertex(ring_offsets), np.diff(ring_offsets)
+    lengths = np.diff(ring_offsets)
     x, y = (xy_um[:, axis] - np.repeat(xy_um[ring_offsets[:-1], axis], lengths) for axis in (0, 1))
-    return x, y, x[after], y[after]
+    x_after, y_after = (np.append(column[1:], 0.0) for column in (x, y))
+    for column in (x_after, y_after):
+        column[ring_offsets[1:] - 1] = 0.0
+    return x, y, x_after, y_after
 
 
 def ring_moments(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Floats]:
@@ -121,7 +124,6 @@ def ring_moments(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Floats]:
     if ring_offsets.size == 1:
         return np.zeros(0), np.zeros((0, 2))
     starts = ring_offsets[:-1]
-    anchor = xy_um[starts]
     x, y, x_after, y_after = _local_edges(xy_um, ring_offsets)
     cross = x * y_after - y * x_after
     area_um2 = 0.5 * np.add.reduceat(cross, starts)
@@ -129,7 +131,12 @@ def ring_moments(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Floats]:
     np.multiply(x + x_after, cross, out=moments[:, 0])
     np.multiply(y + y_after, cross, out=moments[:, 1])
     local_moment = np.add.reduceat(moments, starts, axis=0) / 6.0
-    return area_um2, local_moment + anchor * area_um2[:, np.newaxis]
+    return area_um2, local_moment + xy_um[starts] * area_um2[:, np.newaxis]
+
+
+def ring_area_um2(xy_um: Floats, ring_offsets: Ints) -> Floats:
+    """Return the signed area of every ring, (n_ring,) µm², as :func:`ring_moments` does."""
+    return 0.5 * _sum_of_cross_products(xy_um, ring_offsets, ring_offsets[:-1])
 
 
 def ring_unsigned_area_um2(xy_um: Floats, ring_offsets: Ints) -> Floats:
@@ -138,10 +145,15 @@ def ring_unsigned_area_um2(xy_um: Floats, ring_offsets: Ints) -> Floats:
 
     The sum, (n_ring,), is 0 for collinear vertices.
     """
-    if ring_offsets.size == 1:
+    return 0.5 * _sum_of_cross_products(xy_um, ring_offsets, ring_offsets[:-1], np.abs)
+
+
+def _sum_of_cross_products(xy_um: Floats, ring_offsets: Ints, starts: Ints, of: Any = np.positive) -> Floats:
+    """Return sums of (a function of) twice the signed areas of the triangles with each ring's first vertex."""
+    if starts.size == 0:
         return np.zeros(0)
     x, y, x_after, y_after = _local_edges(xy_um, ring_offsets)
-    return 0.5 * np.add.reduceat(np.abs(x * y_after - y * x_after), ring_offsets[:-1])
+    return np.asarray(np.add.reduceat(of(x * y_after - y * x_after), starts))
 
 
 def are_convex(xy_um: Floats, ring_offsets: Ints) -> Bools:
@@ -184,10 +196,7 @@ def site_moments(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> tuple
 
 def site_area_um2(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> Floats:
     """Return the area of every site without holes, (n_site,) µm², negative if clockwise."""
-    if site_offsets.size == 1:
-        return np.zeros(0)
-    x, y, x_after, y_after = _local_edges(xy_um, ring_offsets)
-    return 0.5 * np.add.reduceat(x * y_after - y * x_after, ring_offsets[site_offsets[:-1]])
+    return 0.5 * _sum_of_cross_products(xy_um, ring_offsets, ring_offsets[site_offsets[:-1]])
 
 
 def site_bounds_um(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> Floats:

@@ -19,7 +19,7 @@ from foveasim._core.rings import (
     are_convex,
     next_vertex,
     positions_in_runs,
-    ring_moments,
+    ring_area_um2,
     ring_unsigned_area_um2,
     site_bounds_um,
     site_moments,
@@ -622,7 +622,7 @@ def derived(
 
 def winding_um2(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> Floats:
     """Return the area of each ring, negative if its winding order is wrong."""
-    area_um2, _ = ring_moments(xy_um, ring_offsets)
+    area_um2 = ring_area_um2(xy_um, ring_offsets)
     area_um2 *= -1.0  # of holes
     area_um2[site_offsets[:-1]] *= -1.0
     return area_um2

@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from foveasim._core.rings import collapse_short_edges, next_vertex, ring_moments
+from foveasim._core.rings import collapse_short_edges, next_vertex, ring_area_um2
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout.diagrams.power import N_AUXILIARY, PowerDiagram, auxiliary_points_um
@@ -481,7 +481,7 @@ def _merge_rings(
     is_from_inside = np.repeat(is_inside, new_counts)
     merged_um[is_from_inside] = xy_um[np.repeat(is_inside, counts)]
     merged_um[~is_from_inside] = boundary_um
-    area_um2, _ = ring_moments(merged_um, merged_offsets)
+    area_um2 = ring_area_um2(merged_um, merged_offsets)
     bad = np.flatnonzero(area_um2 <= 0.0)
     if bad.size or abs(area_um2.sum() - region_um2) > AREA_ROUNDING * region_um2:
         raise GeometryError(

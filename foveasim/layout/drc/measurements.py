@@ -12,7 +12,7 @@ import shapely
 from numpy.typing import NDArray
 
 from foveasim._core.registry import Registry
-from foveasim._core.rings import next_vertex, positions_in_runs, ring_moments
+from foveasim._core.rings import next_vertex, positions_in_runs, ring_area_um2
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property, parallel_map, thread_count
 from foveasim._core.validation import Bools, Floats, Ints
@@ -256,7 +256,7 @@ def _widths(case: Case) -> Floats:
 def _holes(case: Case) -> Measurement:
     if case.layout.ring_offsets.size == case.layout.site_offsets.size:
         return Measurement(np.zeros(0))
-    area_um2, _moments = ring_moments(case.layout.xy_um, case.layout.ring_offsets)
+    area_um2 = ring_area_um2(case.layout.xy_um, case.layout.ring_offsets)
     holes = np.flatnonzero(area_um2 < 0.0)
     site = np.searchsorted(case.layout.site_offsets, holes, side="right") - 1
 

@@ -67,8 +67,8 @@ def rounding_report(
     layout: Layout, rounded_um: Floats, path: Path, dropped_columns: tuple[str, ...] = ()
 ) -> WrittenLayout:
     """Return the report of a format with rounded vertices and dropped columns."""
-    if layout.n_sites == 0:
-        return WrittenLayout(path=path, n_sites=0, dropped_columns=dropped_columns)
+    if layout.n_sites == 0 or rounded_um is layout.xy_um:
+        return WrittenLayout(path=path, n_sites=layout.n_sites, dropped_columns=dropped_columns)
     displacement_um = np.hypot(*(rounded_um - layout.xy_um).T)
     area_um2 = layout.area_um2
     error = site_area_um2(rounded_um, layout.ring_offsets, layout.site_offsets) / area_um2 - 1.0

@@ -27,8 +27,6 @@ MAX_STEP = 2**53
 MAX_CONSTANTS = 4
 #: Periods of mosaics, in sites of the same filter in a row.
 STRIDES = (1, 2, 3, 4, 6, 8)
-#: Odd multipliers of the hash of vertices (splitmix64 and the golden ratio).
-_MIX = tuple(np.uint64(c) for c in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB, 0xD6E8FEB86659FD93))
 
 
 ARRAY_FIELDS = ("first", "n_x", "n_y", "pitch", "number_steps")
@@ -78,35 +76,16 @@ def congruence_classes(xy_dbu: Ints, ring_offsets: Ints, site_offsets: Ints) -> 
     (n_site,) int64: classes 0, 1, ... in no particular order. ``origin_dbu`` (n_site, 2) int64: lower left corner of the
     bounding box; vertices of congruent sites are equal relative to it.
     """
-    start = ring_offsets[site_offsets[:-1]]
-    n_vertices = np.diff(ring_offsets[site_offsets])
-    if start.size == 0:
+    from foveasim.layout.files import _kernels
+
+    if site_offsets.size == 1:
         return np.zeros(0, np.int64), np.zeros((0, 2), np.int64)
-    origin = np.stack([np.minimum.reduceat(xy_dbu[:, axis], start) for axis in (0, 1)], axis=1)
-    site = np.repeat(np.arange(start.size), n_vertices)
-    position = positions_in_runs(n_vertices)
-    ring = np.repeat(positions_in_runs(np.diff(site_offsets)), np.diff(ring_offsets))
-    vertex = np.column_stack((xy_dbu - origin[site], ring))
-    found, first, class_of = np.unique(
-        np.add.reduceat(_vertex_hash(vertex, position), start), return_index=True, return_inverse=True
-    )
+    hashes, origin = _kernels.outline_hashes(xy_dbu, ring_offsets, site_offsets)
+    found, first, class_of = np.unique(hashes, return_index=True, return_inverse=True)
     # Sites with equal hashes are compared with the first one of their class; different ones would be a class of their own.
-    model = first[class_of]
-    has_size = n_vertices == n_vertices[model]
-    twin = np.where(has_size[site], start[model][site] + position, 0)
-    is_equal = np.logical_and.reduceat((vertex == vertex[twin]).all(axis=1), start) & has_size
-    collided = np.flatnonzero(~is_equal)
+    collided = np.flatnonzero(~_kernels.are_congruent(xy_dbu, ring_offsets, site_offsets, origin, first[class_of]))
     class_of[collided] = found.size + np.arange(collided.size)
     return class_of, origin
-
-
-def _vertex_hash(vertex: Ints, position: Ints) -> NDArray[np.uint64]:
-    """Return hashes of vertices and their positions; that of a site is their sum modulo 2^64."""
-    mixed = (position + 1).astype(np.uint64) * _MIX[0]
-    for axis in range(vertex.shape[1]):
-        mixed = (mixed ^ vertex[:, axis].astype(np.uint64)) * _MIX[axis + 1]
-        mixed ^= mixed >> np.uint64(29)
-    return mixed
 
 
 def find_arrays(class_of: Ints, origin_dbu: Ints, columns: Mapping[str, NDArray[Any]], max_dbu: int) -> Arrays:

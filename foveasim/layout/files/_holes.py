@@ -15,7 +15,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from foveasim._core.rings import positions_in_runs, ring_moments
+from foveasim._core.rings import positions_in_runs, ring_area_um2
 from foveasim._core.validation import Floats, Ints
 from foveasim.layout.files._common import check_sizes
 from foveasim.layout.model import Layout, layout_of, valid_sites
@@ -227,7 +227,7 @@ def _polygon_from_rings(rings: list[list[Point]]) -> Any:
     if not rings:
         return None
     offsets = np.cumsum([0, *map(len, rings)])
-    area_um2 = ring_moments(np.array([vertex for ring in rings for vertex in ring]), offsets)[0]
+    area_um2 = ring_area_um2(np.array([vertex for ring in rings for vertex in ring]), offsets)
     outline = int(np.argmax(np.abs(area_um2)))
     is_hole = area_um2 * area_um2[outline] < 0.0
     if np.count_nonzero(is_hole) != len(rings) - 1:

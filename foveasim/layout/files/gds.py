@@ -249,7 +249,7 @@ def _stored_columns(
 
 def _site_identity(layout: Layout, snapped: Layout) -> dict[str, NDArray[Any]]:
     """Return the column that identifies the sites, if their rounded outlines do not."""
-    if SITE_ID in layout.columns:
+    if SITE_ID in layout.columns or snapped is layout:
         return {}
     ids = site_ids(layout)
     return {} if np.array_equal(ids, site_ids(snapped)) else {SITE_ID: ids}
@@ -556,14 +556,16 @@ def _warn_of_rounding(layout: Layout, snapped: Layout, dbu_um: float) -> None:
 
 
 def _snap_to_grid(layout: Layout, dbu_um: float) -> tuple[Ints, Layout]:
-    """Round the vertices to the database grid, and check the sites; return integers and µm."""
+    """Round the vertices to the database grid, and check the sites; return integers, and the layout if nothing moves."""
     xy_dbu = np.rint(layout.xy_um / dbu_um)
     if xy_dbu.size and np.abs(xy_dbu).max() > MAX_DBU:
         raise ParameterError(
             "dbu_um", f"must be >= {np.abs(layout.xy_um).max() / MAX_DBU:.3g} for this layout", dbu_um, "µm"
         )
+    xy_um = _to_um(xy_dbu, dbu_um)
     # The holes are checked below.
-    snapped = layout_of(_to_um(xy_dbu, dbu_um), layout.ring_offsets, layout.site_offsets)
+    is_on_grid = np.array_equal(xy_um, layout.xy_um)
+    snapped = layout if is_on_grid else layout_of(xy_um, layout.ring_offsets, layout.site_offsets)
     if layout.n_sites:
         is_flat = winding_um2(*snapped.rings_um) <= 0.0
         is_bad = np.logical_or.reduceat(is_flat, layout.site_offsets[:-1]) | ~valid_sites(snapped)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 
 from foveasim._core.calls import LENGTH, Limits
-from foveasim._core.rings import ring_moments
+from foveasim._core.rings import ring_area_um2
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import MAX_SITES, Floats, Ints, check_count, check_length_um, check_sites
 from foveasim.errors import LayoutWarning, ParameterError
@@ -260,7 +260,7 @@ def _with_fovea(
 
 def _are_valid_sites(sites: Annuli, min_size_um: float) -> bool:
     """Return whether all outlines are simple and none is below the minimum size."""
-    area_um2, _ = ring_moments(sites.xy_um, sites.ring_offsets)
+    area_um2 = ring_area_um2(sites.xy_um, sites.ring_offsets)
     if area_um2.min() <= 0.0 or math.sqrt(area_um2.min()) < min_size_um:
         return False
     return bool(valid_sites(layout_of(sites.xy_um, sites.ring_offsets)).all())
