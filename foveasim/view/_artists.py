@@ -15,15 +15,16 @@ from matplotlib.text import Text
 from matplotlib.transforms import Affine2D, IdentityTransform
 from numpy.typing import NDArray
 
+from foveasim._core.validation import Floats
 from foveasim.layout import Layout
 from foveasim.view.id_map import SitePixels, site_at
 from foveasim.view.site_colours import BOUNDARY, SiteColours
 from foveasim.view.site_pictures import SiteMeans, cover
 
-#: Samples along a pixel side, fewer in pictures that would have more than 2^26 samples (256 MB).
+#: Samples of boundaries along a pixel side, fewer in pictures that would have more than 2^26 samples (256 MB).
 N_SAMPLES, MAX_SAMPLES = 3, 2**26
-#: Boundaries are drawn if they take at most this fraction of the samples in every 16th row: sites of 7 pixels.
-MAX_BOUNDARY_FRACTION, SAMPLED_ROWS = 0.05, 16
+#: Boundaries are drawn if at most this fraction of the pixels in every 16th row follows another site: sites of 7 pixels.
+MAX_BOUNDARY_FRACTION, SAMPLED_ROWS = 0.15, 16
 #: Largest length of a scale bar as a fraction of the axes.
 MAX_BAR_FRACTION = 0.25
 
@@ -44,6 +45,7 @@ class SiteImage(AxesImage):
         self._layout, self._colours = layout, colours
         self.pixels: SitePixels | None = None
         self._means: SiteMeans | None = None
+        self._lines: Floats | None = None
 
     def recolour(self, colours: SiteColours) -> None:
         """Change the colours of the sites without sampling the layout again."""
@@ -65,21 +67,28 @@ class SiteImage(AxesImage):
         (x0, y0), (x1, y1) = self.axes.transData.inverted().transform((low, high))
         bounds_um = (min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1))
         if self.pixels is None or (self.pixels.bounds_um, self.pixels.shape) != (bounds_um, (n_y, n_x)):
-            n_samples = max(1, min(N_SAMPLES, math.isqrt(MAX_SAMPLES // (n_x * n_y))))
-            self.pixels = SitePixels.from_layout(self._layout, (n_y, n_x), bounds_um, n_samples=n_samples)
-            self._means = SiteMeans(self._layout, (n_y, n_x), bounds_um)
+            self.pixels = SitePixels.from_layout(self._layout, (n_y, n_x), bounds_um, n_samples=1)
+            self._means, self._lines = SiteMeans(self._layout, (n_y, n_x), bounds_um), None
         assert self._means is not None  # created together with the pixels
         picture = self._means.picture(self._colours)
-        changes = self.pixels.ids[::SAMPLED_ROWS, 1:] != self.pixels.ids[::SAMPLED_ROWS, :-1]
-        if self._colours.has_boundaries and changes.size > 0 and float(changes.mean()) < MAX_BOUNDARY_FRACTION:
-            lines = self.pixels.boundary_fraction()
-            picture[..., :3] = cover(picture[..., :3], np.full((n_y, n_x, 3), BOUNDARY, np.uint8), lines)
-            picture[..., 3] = np.maximum(picture[..., 3], np.rint(255.0 * lines))
+        if self._colours.has_boundaries and self._has_room_for_boundaries():
+            if self._lines is None:
+                n_samples = max(1, min(N_SAMPLES, math.isqrt(MAX_SAMPLES // (n_x * n_y))))
+                samples = SitePixels.from_layout(self._layout, (n_y, n_x), bounds_um, n_samples=n_samples)
+                self._lines = samples.boundary_fraction()
+            picture[..., :3] = cover(picture[..., :3], np.full((n_y, n_x, 3), BOUNDARY, np.uint8), self._lines)
+            picture[..., 3] = np.maximum(picture[..., 3], np.rint(255.0 * self._lines))
         alpha = self.get_alpha()
         if alpha is not None:
             picture[..., 3] = np.rint(picture[..., 3] * np.float64(alpha))
         picture = picture[:: 1 if y0 < y1 else -1, :: 1 if x0 < x1 else -1]
         return np.ascontiguousarray(picture), float(low[0]), float(low[1]), Affine2D()
+
+    def _has_room_for_boundaries(self) -> bool:
+        assert self.pixels is not None  # sampled by the caller
+        rows = self.pixels.ids[::SAMPLED_ROWS]
+        changes = rows[:, 1:] != rows[:, :-1]
+        return bool(changes.size > 0 and changes.mean() < MAX_BOUNDARY_FRACTION)
 
 
 class ScaleBar(Artist):
