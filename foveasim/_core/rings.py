@@ -149,7 +149,7 @@ def ring_unsigned_area_um2(xy_um: Floats, ring_offsets: Ints) -> Floats:
 
 
 def _sum_of_cross_products(xy_um: Floats, ring_offsets: Ints, starts: Ints, of: Any = np.positive) -> Floats:
-    """Return sums of (a function of) twice the signed areas of the triangles with each ring's first vertex."""
+    """Return sums of a function of twice the signed areas of the triangles of each fan."""
     if starts.size == 0:
         return np.zeros(0)
     x, y, x_after, y_after = _local_edges(xy_um, ring_offsets)

@@ -1,4 +1,4 @@
-"""Numba kernels of GDSII and OASIS files: records of a file, congruent sites, and regular arrays."""
+"""Numba kernels of GDSII and OASIS files: records, congruent sites, regular arrays."""
 
 from __future__ import annotations
 
@@ -76,10 +76,10 @@ _29 = np.uint64(29)
 @njit(types.Tuple((types.Array(types.uint64, 1, "C"), types.Array(types.int64, 2, "C")))(_table, _keys, _keys))
 def outline_hashes(xy, ring_offsets, site_offsets):
     """
-    Return a hash of the outline of each site, independent of its position, and the lower left corner of its bounding box.
+    Return a hash of each outline that does not depend on its position, and its origin.
 
     ``xy``: (n_vertex, 2) int64. Returns ``hashes`` (n_site,) uint64: sums modulo 2^64 over the vertices. ``origin`` (n_site, 2)
-    int64.
+    int64: the lower left corner of the bounding box.
     """
     n_sites = site_offsets.size - 1
     hashes = np.zeros(n_sites, np.uint64)
@@ -109,9 +109,9 @@ def outline_hashes(xy, ring_offsets, site_offsets):
 @njit(types.Array(types.boolean, 1, "C")(_table, _keys, _keys, _table, _keys))
 def are_congruent(xy, ring_offsets, site_offsets, origin, model):
     """
-    Return whether each site, (n_site,) bool, has the rings of its model after a translation, vertex by vertex.
+    Return whether each site is a translated copy of its model, vertex by vertex.
 
-    ``xy``: (n_vertex, 2) int64. ``origin``: (n_site, 2) int64. ``model``: (n_site,) int64, sites.
+    Returns (n_site,) bool. ``xy``: (n_vertex, 2) int64. ``origin``: (n_site, 2) int64. ``model``: (n_site,) int64, sites.
     """
     found = np.zeros(model.size, np.bool_)
     for site in range(model.size):

@@ -556,7 +556,7 @@ def _warn_of_rounding(layout: Layout, snapped: Layout, dbu_um: float) -> None:
 
 
 def _snap_to_grid(layout: Layout, dbu_um: float) -> tuple[Ints, Layout]:
-    """Round the vertices to the database grid, and check the sites; return integers, and the layout if nothing moves."""
+    """Round the vertices to the database grid; the layout itself where nothing moves."""
     xy_dbu = np.rint(layout.xy_um / dbu_um)
     if xy_dbu.size and np.abs(xy_dbu).max() > MAX_DBU:
         raise ParameterError(
