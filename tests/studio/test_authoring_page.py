@@ -537,6 +537,19 @@ def test_keyboard_alone_draws_and_moves(edit):
     assert page.is_hidden(".tool-strip")
 
 
+def test_typed_positions_replace_each_other(edit):
+    page = edit("polygon")
+    page.get_by_label("Position in µm").focus()
+    for text in ("-240, 220", "@10, 0", "@0, 10.5"):
+        page.keyboard.type(text)
+        page.keyboard.press("Enter")
+        until(page, "() => studio.page.asked === null")  # the page has written the position that was placed
+    page.keyboard.press("Enter")
+    wait(page)
+
+    assert edits(page)[0]["outlines_um"] == [[[-100, -100], [-90, -100], [-90, -89.5]]]
+
+
 @pytest.mark.parametrize("width", [390, 1280, 2560])
 def test_editor_fits_width(edit, width):
     for scheme in ("light", "dark"):

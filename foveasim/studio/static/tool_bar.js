@@ -192,6 +192,14 @@ export class ToolBar {
 
   fill(name, choices) { fill(this.fields[name], choices); }
 
+  // What is typed next replaces the position.
+  _showPosition(position) {
+    const { at } = this.fields;
+    if (this.isTyping || at.value === position) return;
+    at.value = position;
+    if (document.activeElement === at) at.select();
+  }
+
   // note: instead of the usual hint; error: the last answer of the server; isReady: whether the button applies something.
   describe({ note, error, isReady, isSelected, rules, position, step }) {
     const write = (element, text) => { if (element.textContent !== text) element.textContent = text; };
@@ -207,7 +215,7 @@ export class ToolBar {
     this.rulesButton.title = rules.title;
     this.rulesButton.classList.toggle("wrong", rules.isWrong);
     this.actions.repair.disabled = !rules.exist;
-    if (!this.isTyping && this.fields.at.value !== position) this.fields.at.value = position;
+    this._showPosition(position);
     this.fields.grid.placeholder = String(step);
   }
 }
