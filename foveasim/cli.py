@@ -466,6 +466,10 @@ def video(
     frames_per_s: FramesPerS = None,
     line_s: Annotated[float, typer.Option("--line-s", help="Line time of a rolling shutter in seconds.")] = 0.0,
     stop: Annotated[int | None, typer.Option("--stop", help="Maximum number of frames.")] = None,
+    gaze: Annotated[
+        Path | None,
+        typer.Option("--gaze", help="CSV file of a gaze path with the columns t_s, x_um and y_um, instead of gaze_um."),
+    ] = None,
     threads: Threads = None,
 ) -> None:
     """Simulate a video: the camera of a shot, with pictures or a video file as scenes."""
@@ -480,7 +484,9 @@ def video(
     is_store = out.suffix.lower() == ".zarr"
     was_finished = is_store and out.exists()
     try:
-        n = run_video(shot, frames, out, frame_s=frame_s, line_s=line_s, stop=stop, n_threads=threads, progress=True)
+        n = run_video(
+            shot, frames, out, frame_s=frame_s, line_s=line_s, stop=stop, gaze=gaze, n_threads=threads, progress=True
+        )
     except KeyboardInterrupt:
         n = count_recorded_frames(out) if is_store and partial_path(out).is_dir() else 0
         stored = f"; {n:,} frames are stored next to {out}, {RESUME}" if n else ""

@@ -22,8 +22,8 @@ from foveasim._core.validation import (
     Ints,
     as_any_array,
     as_numbers,
-    check_number,
     check_pitch_um,
+    check_point,
     check_shape,
     own,
     read_only,
@@ -142,6 +142,10 @@ class SceneLike(Protocol):
         """Pixel pitch in the scene plane; None if the framing on a layout determines it."""
 
     @property
+    def centre_um(self) -> tuple[float, float]:
+        """Position (x, y) of the picture's centre in the scene plane, from the optical axis."""
+
+    @property
     def distance_m(self) -> float:
         """Distance between the scene and the pupil."""
 
@@ -175,20 +179,18 @@ class Grid:
     origin_um: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if as_numbers("origin_um", self.origin_um).shape != (2,):
-            raise ParameterError("origin_um", "must be two numbers (x0, y0)", self.origin_um, "µm")
-        x0, y0 = (check_number(f"origin_um[{i}]", x) for i, x in enumerate(self.origin_um))
+        object.__setattr__(self, "origin_um", check_point("origin_um", self.origin_um))
         object.__setattr__(self, "shape", check_shape("shape", self.shape))
-        object.__setattr__(self, "origin_um", (x0, y0))
         pitch_x_um, pitch_y_um = check_pitch_um("pitch_um", self.pitch_um)
         object.__setattr__(self, "pitch_um", pitch_x_um if pitch_x_um == pitch_y_um else (pitch_x_um, pitch_y_um))
 
     @classmethod
-    def centred(cls, shape: tuple[int, int], pitch_um: Pitch) -> Grid:
-        """Return a grid centred on the optical axis; parameters as for the class."""
+    def centred(cls, shape: tuple[int, int], pitch_um: Pitch, centre_um: tuple[float, float] = (0.0, 0.0)) -> Grid:
+        """Return a grid centred on a point (x, y), by default the optical axis; parameters as for the class."""
         n_y, n_x = check_shape("shape", shape)
         pitch_x_um, pitch_y_um = check_pitch_um("pitch_um", pitch_um)
-        return cls(shape, pitch_um, (-0.5 * n_x * pitch_x_um, -0.5 * n_y * pitch_y_um))
+        x_um, y_um = centre_um
+        return cls(shape, pitch_um, (x_um - 0.5 * n_x * pitch_x_um, y_um - 0.5 * n_y * pitch_y_um))
 
     @property
     def pitch_x_um(self) -> float:
@@ -220,6 +222,12 @@ class Grid:
         """Bounds (x_min, y_min, x_max, y_max) in µm."""
         x0, y0 = self.origin_um
         return x0, y0, x0 + self.shape[1] * self.pitch_x_um, y0 + self.shape[0] * self.pitch_y_um
+
+    @property
+    def centre_um(self) -> tuple[float, float]:
+        """Centre (x, y) in µm; exactly that of :meth:`centred`."""
+        x0, y0 = self.origin_um
+        return x0 + 0.5 * self.shape[1] * self.pitch_x_um, y0 + 0.5 * self.shape[0] * self.pitch_y_um
 
     @property
     def x_um(self) -> Floats:

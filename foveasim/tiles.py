@@ -39,7 +39,7 @@ from foveasim._io.resumable import LOCK, disk_errors, finish, partial_path, resu
 from foveasim._io.zarr_stores import ZARR, open_group, store_format
 from foveasim.camera import Camera
 from foveasim.camera._clock import Clock
-from foveasim.camera._steps import WeightedMap, capture_settings, expose, integrate_maps, to_sensor_frame, white_dn
+from foveasim.camera._steps import WeightedMap, capture_settings, expose, integrate_maps, white_dn
 from foveasim.camera._warnings import Covered, warn_of_coarse_cells, warn_of_coverage, warn_of_focal_length
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
@@ -140,7 +140,7 @@ def _whole_blocks(tile_sites: int) -> int:
 def _tiles(
     camera: Camera, source: Scene | PowerMap, exposure_s: float, streams: Streams, tile_sites: int, tiles: range
 ) -> Iterator[Capture]:
-    layout, light = camera.layout, source if isinstance(source, PowerMap) else camera.frame(source)
+    layout, light = camera.layout, camera.seen(source)
     if isinstance(light, Scene):
         warn_of_focal_length(camera.optics, camera.distortion, light)
     images = _images(camera, light)
@@ -150,11 +150,12 @@ def _tiles(
         clock = Clock()
         with clock.stage("compile layout"):
             sensor = camera.sensor.part(slice(first, last))
-            bounds_um = outline_bounds_um(sensor.layout, camera.distortion)
+            part = sensor.layout.translate(*camera.position_um)
+            bounds_um = outline_bounds_um(part, camera.distortion)
             strips = [_rows_under(image.grid, bounds_um) for image in images]
             integrators = [
                 Integrator(
-                    sensor.layout,
+                    part,
                     _strip(image.grid, *rows),
                     distortion=camera.distortion,
                     order=camera.order(light),
@@ -172,7 +173,8 @@ def _tiles(
         yield expose(camera, sensor, light, rate_e_per_s, exposure_s, part_streams, clock, tile=about)
     if coverages:
         smallest_image = min((image.grid for image in images), key=lambda grid: grid.cell_area_um2)
-        warn_of_coverage(source, Covered.union(smallest_image.bounds_um, coverages), layout.n_sites)
+        gaze_um = camera.gaze_um if any(camera.gaze_um) else None
+        warn_of_coverage(source, Covered.union(smallest_image.bounds_um, coverages), layout.n_sites, gaze_um)
 
 
 def _images(camera: Camera, light: Scene | PowerMap) -> list[_Image]:
@@ -181,11 +183,11 @@ def _images(camera: Camera, light: Scene | PowerMap) -> list[_Image]:
         return [_Image(light.grid, {band: partial(rows_of, cells) for band, cells in enumerate(light.data)})]
     used = camera.sensor.filters_used
     e_per_j = camera.sensor.responsivity_e_per_j(light.wavelength_nm)[used]
-    optics = camera.optics.resolve_oversample(light)
+    optics, frame = camera.optics.resolve_oversample(light), camera.sensor_frame(light)
     warn_of_coarse_cells(camera.optics, light, camera.layout)
     return [
         _Image(
-            to_sensor_frame(camera.distortion, grid),
+            frame.image(grid),
             dict(
                 zip(
                     used.tolist(),

@@ -284,6 +284,14 @@ def as_numbers(name: str, value: ArrayLike, *, keep_type: bool = False, missing_
         raise ParameterError(name, "must be an array of numbers", value) from None
 
 
+def check_point(name: str, value: ArrayLike, *, at_least: float | None = None) -> tuple[float, float]:
+    """Return two finite numbers (x, y) after validation."""
+    point = finite_array(name, value, at_least=at_least)
+    if point.shape != (2,):
+        raise ParameterError(name, "must be two numbers (x, y)", value, unit_of(name))
+    return float(point[0]), float(point[1])
+
+
 def finite_array(
     name: str,
     value: ArrayLike,

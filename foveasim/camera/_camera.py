@@ -22,10 +22,10 @@ from foveasim._core.random_streams import Streams
 from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property, in_order, thread_count
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import Bools, Floats, check_per_site, finite_array, read_only
+from foveasim._core.validation import Bools, Floats, check_per_site, check_point, finite_array, read_only
 from foveasim.camera._clock import Clock
 from foveasim.camera._frames import Frame, ImageCache, Position, Task, check_frames, position_settings, tasks
-from foveasim.camera._steps import WeightedMap, expose, integrate_maps, to_sensor_frame, white_dn
+from foveasim.camera._steps import SensorFrame, WeightedMap, expose, integrate_maps, white_dn
 from foveasim.camera._warnings import (
     Covered,
     format_point,
@@ -49,6 +49,10 @@ from foveasim.sensor import NoiseBudget, Sensor, noise_budget
 from foveasim.sensor.limits import EXPOSURE
 from foveasim.units import um_from_nm, w_from_w_m2_um2
 
+#: Quantity that the optical axis is fixed to when the gaze moves: see :class:`Camera`.
+GazeAxis = Literal["image", "sensor"]
+#: Distance of the centre of a layout from its origin, relative to its size, that counts as rounding.
+CENTRE_ROUNDING = 1e-9
 #: Margin of a picture that covers undistorted outlines: their edges are curves of limited accuracy.
 COVER_MARGIN = 1e-5
 #: Exposures that exceed the time between them by this fraction do so by rounding.
@@ -76,6 +80,13 @@ class Camera:
     order : {1, 2}, optional
         Order of integration: cells of constant irradiance, or with a gradient (see :class:`foveasim.Integrator`). By default
         2 for scenes whose image has cells of at most λN/2 at all wavelengths, else 1; always 1 for power maps.
+    gaze_um : (x, y), µm
+        Gaze: the point of the image at which the centre of the sensor is. Framing refers to the gaze (0, 0), so that the scale
+        of an image does not depend on the gaze.
+    axis : {"image", "sensor"}
+        What the optical axis is fixed to when the gaze moves. ``"image"``: the sensor moves behind a fixed lens; relative
+        illumination, aberrations and distortion stay with the image, which is computed once for all gazes of a video.
+        ``"sensor"``: the camera turns towards the gaze; they stay with the sensor, and the image is computed for each gaze.
     n_threads : int, optional
         Number of threads, by default one per core. Results are bit-identical for any number.
 
@@ -109,6 +120,8 @@ class Camera:
         sensor: Sensor,
         distortion: Lens | None = None,
         order: Literal[1, 2] | None = None,
+        gaze_um: tuple[float, float] = (0.0, 0.0),
+        axis: GazeAxis = "image",
         n_threads: int | None = None,
     ) -> None:
         if not isinstance(sensor.layout, Layout):
@@ -118,6 +131,8 @@ class Camera:
         self._distortion = distortion
         self._order: Literal[1, 2] | None = None if order is None else 2 if order == 2 else 1
         self._layout = sensor.layout
+        self._gaze_um = check_point("gaze_um", gaze_um)
+        self._axis: GazeAxis = axis
         self._n_threads = thread_count(n_threads)
         self._integrators: dict[tuple[Grid, int, Position, bool], Integrator] = {}
         self._bounds_um: list[tuple[float, float, float, float]] = []
@@ -151,6 +166,16 @@ class Camera:
     def layout(self) -> Layout:
         """The layout of the sensor."""
         return self._layout
+
+    @property
+    def gaze_um(self) -> tuple[float, float]:
+        """Point (x, y) of the image at which the centre of the sensor is, µm; :meth:`at` returns a camera with another."""
+        return self._gaze_um
+
+    @property
+    def axis(self) -> GazeAxis:
+        """What the optical axis is fixed to: ``"image"`` or ``"sensor"``."""
+        return self._axis
 
     @property
     def n_threads(self) -> int:
@@ -198,15 +223,16 @@ class Camera:
         ----------
         scene : Scene
             With ``fit="cover"`` the image of the picture covers all photosites, with ``"contain"`` it lies within the bounding
-            box of the layout, with ``"width"`` it has the width of this box. The centre of the picture is on the optical axis,
-            so that a layout that is not centred on the axis requires a larger picture to be covered, and contains a smaller
-            one. Outlines are undistorted first; sites outside the image circle do not count. With lateral chromatic
-            aberration, the condition holds for all wavelengths.
+            box of the layout, with ``"width"`` it has the width of this box. The optical axis and the centre of the picture are
+            at the centre of this box. With a lens model they are at its ``centre_um``, so that a layout that is not centred
+            there requires a larger picture to be covered, and contains a smaller one; outlines are undistorted first, and
+            sites outside the image circle do not count. With lateral chromatic aberration, the condition holds for all
+            wavelengths. The gaze is not considered, but ``gaze_range_um`` of the scene enlarges the box.
 
         Returns
         -------
         Scene
-            With ``pitch_um`` and without ``fit``; the scene itself if it has a pitch.
+            With ``pitch_um``; the scene itself if it has a pitch.
 
         Raises
         ------
@@ -218,24 +244,39 @@ class Camera:
             return scene
         framed = self._framed
         if framed is None or framed[0] is not scene:
-            self._framed = framed = scene, self._fit(scene, scene.fit)
+            self._framed = framed = scene, self._fit(scene)
         return framed[1]
 
-    def _fit(self, scene: Scene, fit: str | None) -> Scene:
-        """Return a scene with the pitch of a framing."""
+    def _layout_bounds_um(self) -> Floats:
+        """Return the bounds of the undistorted outlines, (4,) µm; NaN without any."""
         if not self._bounds_um:
             self._bounds_um.append(outline_bounds_um(self._layout, self._distortion))
-        bounds_um = np.array(self._bounds_um[0])
+        return np.array(self._bounds_um[0])
+
+    def sensor_frame(self, scene: Scene) -> SensorFrame:
+        """Return the frame of the sensor for the image of a scene: its optical axis, and its scales."""
+        if self._distortion is not None or scene.fit is None:
+            return SensorFrame.of(self._distortion)
+        bounds_um = self._layout_bounds_um()
+        centre_um = 0.5 * (bounds_um[:2] + bounds_um[2:])
+        is_centred = np.abs(centre_um) <= CENTRE_ROUNDING * (bounds_um[2:] - bounds_um[:2])
+        x_um, y_um = np.where(is_centred, 0.0, centre_um).tolist()
+        return SensorFrame.of(None, (x_um, y_um))
+
+    def _fit(self, scene: Scene) -> Scene:
+        """Return a scene with the pitch of its framing."""
+        fit, bounds_um = scene.fit, self._layout_bounds_um()
         if np.isnan(bounds_um).any():
             required = "photosites in the image circle" if self._layout.n_sites else "photosites"
             raise ParameterError("fit", f"must be used with a layout that has {required}", fit)
-        axis_um = np.zeros(2) if self._distortion is None else np.array(self._distortion.centre_um)
-        below_um, above_um = axis_um - bounds_um[:2], bounds_um[2:] - axis_um
+        frame = self.sensor_frame(scene)
+        axis_um, range_um = np.array(frame.axis_um), np.array(scene.gaze_range_um)
+        below_um, above_um = axis_um - bounds_um[:2] + range_um, bounds_um[2:] - axis_um + range_um
         # The image scales with the pitch. At this one its pixels are of about 1 µm.
         unit_um = 1.0 / self._optics.magnification(scene.distance_m)
-        one = scene.with_pitch(unit_um)
+        one = scene.framed(unit_um)
         images = [self._optics.grid(one)] if fit == "width" else [grid for grid, _ in self._optics.image_grids(one)]
-        half_um = 0.5 * np.array([size_um(to_sensor_frame(self._distortion, grid).bounds_um) for grid in images])
+        half_um = 0.5 * np.array([size_um(frame.image(grid).bounds_um) for grid in images])
         if fit == "width":
             scale = 0.5 * (below_um + above_um)[0] / half_um[0, 0]
         elif fit == "cover":
@@ -250,26 +291,71 @@ class Camera:
                     f"extends from {format_point(bounds_um[:2])} to {format_point(bounds_um[2:])} µm; use 'cover' or "
                     "'width', or move the layout",
                 )
-        return scene.with_pitch(float(scale) * unit_um)
+        return scene.framed(float(scale) * unit_um)
 
     def _with_pitch(self, light: Scene | PowerMap) -> Scene | PowerMap:
         """Return a scene with its pitch, or a power map."""
         return self.frame(light) if isinstance(light, Scene) else light
 
+    def seen(self, light: Scene | PowerMap, gaze_um: Position | None = None) -> Scene | PowerMap:
+        """
+        Return a scene with its pitch, where a camera that turns towards a gaze sees it.
+
+        Parameters
+        ----------
+        light : Scene or PowerMap
+        gaze_um : (x, y), optional, µm
+            By default that of the camera.
+
+        Returns
+        -------
+        Scene or PowerMap
+            For ``axis="sensor"`` a scene whose centre is displaced against the gaze; otherwise only the pitch is set.
+
+        Raises
+        ------
+        ParameterError
+            For a power map and ``axis="sensor"``: its relative illumination cannot follow the gaze.
+        """
+        gaze = np.array(self._gaze_um if gaze_um is None else gaze_um)
+        if self._axis == "image" or not gaze.any():
+            return self._with_pitch(light)
+        if isinstance(light, PowerMap):
+            raise ParameterError(
+                "axis",
+                "must be 'image' for a power map: its relative illumination and aberrations are fixed",
+                self._axis,
+            )
+        scene = self.frame(light)
+        per_um = self.sensor_frame(scene).scale * self._optics.magnification(scene.distance_m)
+        x_um, y_um = (np.array(scene.centre_um) - gaze / per_um).tolist()
+        return scene.with_centre((x_um, y_um))
+
+    @property
+    def position_um(self) -> Position:
+        """Position (x, y) of the layout's origin in the image, µm: the gaze of a sensor that moves behind the lens."""
+        return self._gaze_um if self._axis == "image" else (0.0, 0.0)
+
     def image_grid(self, scene: Scene) -> Grid:
         """
-        Return the image of a scene's pixel grid without distortion, in the sensor frame.
+        Return the image of a scene's pixel grid without distortion, in the sensor frame at the gaze (0, 0).
 
         Returns
         -------
         Grid
-            :meth:`Optics.grid`, centred on the principal point of the distortion model.
+            :meth:`Optics.grid`, centred on the optical axis: the principal point of the distortion model.
         """
-        return to_sensor_frame(self._distortion, self._optics.grid(self.frame(scene)))
+        return self.sensor_frame(scene).image(self._optics.grid(self._seen_scene(scene)))
+
+    def _seen_scene(self, scene: Scene) -> Scene:
+        """Return :meth:`seen` of a scene."""
+        seen = self.seen(scene)
+        assert isinstance(seen, Scene)
+        return seen
 
     def power_map(self, scene: Scene) -> PowerMap:
         """
-        Compute the image irradiance of a scene without distortion, in the sensor frame.
+        Compute the image irradiance of a scene without distortion, in the sensor frame at the gaze (0, 0).
 
         Returns
         -------
@@ -284,9 +370,9 @@ class Camera:
         ParameterError, SimulationError
             When the distance of the scene is at most the focal length, or the result is not finite.
         """
-        scene = self.frame(scene)
+        scene = self._seen_scene(scene)
         power_map = self._optics.resolve_oversample(scene).power_map(scene, n_threads=self._n_threads)
-        return PowerMap(power_map.data, to_sensor_frame(self._distortion, power_map.grid), power_map.wavelength_nm)
+        return PowerMap(power_map.data, self.sensor_frame(scene).image(power_map.grid), power_map.wavelength_nm)
 
     def integrator(
         self,
@@ -294,7 +380,7 @@ class Camera:
         *,
         order: Literal[1, 2] = 1,
         n_grids: int = 1,
-        position_um: Position = (0.0, 0.0),
+        position_um: Position | None = None,
         compiled: bool = True,
     ) -> Integrator:
         """
@@ -307,8 +393,8 @@ class Camera:
             Order of integration.
         n_grids : int
             Number of grids that are used together: the cache has room for them.
-        position_um : (x, y), µm
-            Position of the layout's origin in the image.
+        position_um : (x, y), optional, µm
+            Position of the layout's origin in the image, by default :attr:`position_um`.
         compiled : bool
             As for :class:`Integrator`. Both sum in different orders, and are cached separately.
 
@@ -317,6 +403,7 @@ class Camera:
         Integrator
             From the cache, when the same one was used recently.
         """
+        position_um = self.position_um if position_um is None else position_um
         key = grid, order, position_um, compiled
         integrator = self._integrators.get(key)
         if integrator is None:
@@ -337,9 +424,17 @@ class Camera:
             self._integrators.pop(next(iter(self._integrators)), None)
         return integrator
 
-    def replace(self, *, optics: Optics | None = None, sensor: Sensor | None = None) -> Camera:
+    def replace(
+        self,
+        *,
+        optics: Optics | None = None,
+        sensor: Sensor | None = None,
+        gaze_um: tuple[float, float] | None = None,
+        axis: GazeAxis | None = None,
+        n_threads: int | None = None,
+    ) -> Camera:
         """
-        Return a camera with other optics, another sensor, or both.
+        Return a camera with other optics, another sensor, or another gaze.
 
         Compiled layouts are shared when the new sensor has the same layout object.
         """
@@ -348,13 +443,50 @@ class Camera:
             sensor=self._sensor if sensor is None else sensor,
             distortion=self._distortion,
             order=self._order,
-            n_threads=self._n_threads,
+            gaze_um=self._gaze_um if gaze_um is None else gaze_um,
+            axis=self._axis if axis is None else axis,
+            n_threads=self._n_threads if n_threads is None else n_threads,
         )
         if other._layout is self._layout:
-            other._integrators, other._bounds_um = self._integrators, self._bounds_um
+            other._bounds_um = self._bounds_um
+            if other._n_threads == self._n_threads:
+                other._integrators = self._integrators
         return other
 
-    def photoelectrons_per_s(self, light: Scene | PowerMap, *, images: ImageCache | None = None) -> Floats:
+    def at(self, gaze_um: tuple[float, float] | None, axis: GazeAxis | None = None) -> Camera:
+        """
+        Return the camera with another gaze.
+
+        Parameters
+        ----------
+        gaze_um : (x, y) or None, µm
+            See the class; None for that of this camera.
+        axis : {"image", "sensor"}, optional
+            As for the class; by default that of this camera.
+
+        Returns
+        -------
+        Camera
+            Shares compiled layouts.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> layout = fs.layout.grid(n_x=8, n_y=8, pitch_um=2.0)
+        >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=fs.Sensor(layout))
+        >>> camera.at((20.0, -5.0)).gaze_um
+        (20.0, -5.0)
+        """
+        return self if gaze_um is None and axis is None else self.replace(gaze_um=gaze_um, axis=axis)
+
+    def photoelectrons_per_s(
+        self,
+        light: Scene | PowerMap,
+        *,
+        gaze_um: tuple[float, float] | None = None,
+        axis: GazeAxis | None = None,
+        images: ImageCache | None = None,
+    ) -> Floats:
         """
         Return the expected photoelectrons of every site per second.
 
@@ -362,6 +494,8 @@ class Camera:
         ----------
         light : Scene or PowerMap
             A scene, or a power map from any optics program.
+        gaze_um, axis : optional
+            As for :meth:`at`.
         images : dict, optional
             Cache of the scene's images, read and extended: for further layouts with the same optics, scene and colour
             filters.
@@ -377,6 +511,8 @@ class Camera:
         SimulationError
             When the power map is not finite within a site.
         """
+        if gaze_um is not None or axis is not None:
+            return self.at(gaze_um, axis).photoelectrons_per_s(light, images=images)
         return self._photoelectrons_per_s(light, Clock(), cached=images)
 
     def capture(
@@ -386,6 +522,8 @@ class Camera:
         exposure_s: Annotated[float, EXPOSURE],
         seed: int,
         frame: int = 0,
+        gaze_um: tuple[float, float] | None = None,
+        axis: GazeAxis | None = None,
         photo_e_per_s: Floats | None = None,
     ) -> Capture:
         """
@@ -398,9 +536,17 @@ class Camera:
         exposure_s : float, s
         seed, frame : int
             Seed and frame number of the noise. Equal ones give bit-identical captures.
+        gaze_um : (x, y), optional, µm
+            Point of the image at which the centre of the sensor is, instead of the gaze of the camera.
+        axis : {"image", "sensor"}, optional
+            What the optical axis is fixed to: see the class.
         photo_e_per_s : (n_site,) float64, optional, e-/s
-            Result of :meth:`photoelectrons_per_s` for the same ``light``, which is then not computed again.
+            Result of :meth:`photoelectrons_per_s` for the same ``light`` and gaze, which is then not computed again.
         """
+        if gaze_um is not None or axis is not None:
+            return self.at(gaze_um, axis).capture(
+                light, exposure_s=exposure_s, seed=seed, frame=frame, photo_e_per_s=photo_e_per_s
+            )
         streams = Streams(seed, frame)
         clock = Clock()
         if photo_e_per_s is None:
@@ -447,7 +593,7 @@ class Camera:
         Parameters
         ----------
         frames : iterable of Scene or PowerMap, or of pairs with a position (x_um, y_um)
-            A position places the sensor's centre in the image: a moving gaze. See :mod:`foveasim.video` for frames from
+            A position is the gaze of a frame, instead of that of the camera. See :mod:`foveasim.video` for frames from
             image and video files, and for gaze paths.
         exposure_s : float or sequence of float, s
             A sequence is an exposure bracket: the captures use its times cyclically, by their numbers.
@@ -566,11 +712,9 @@ class Camera:
         """Yield each frame with its photoelectron rates."""
         single_threaded = self
         if ahead:
-            single_threaded = Camera(
-                optics=self._optics, sensor=self._sensor, distortion=self._distortion, order=self._order, n_threads=1
-            )
-            single_threaded._bounds_um = self._bounds_um
+            single_threaded = self.replace(n_threads=1)
         image_lock = Lock()
+        warned: set[str] = set()
 
         def compute(task: Task) -> tuple[Task, Floats | None, Clock]:
             own = Clock()
@@ -578,8 +722,9 @@ class Camera:
                 return task, None, own
             # The first frame of a scene computes the images that its next frames share.
             with image_lock if task.images == {} else nullcontext():
-                position_um = task.position_um if task.is_moving else None
-                return task, single_threaded._photoelectrons_per_s(task.light, own, position_um, task.images), own
+                gaze_um = task.position_um if task.is_moving else None
+                found = single_threaded._photoelectrons_per_s(task.light, own, gaze_um, task.images, warned)
+                return task, found, own
 
         rate_e_per_s = np.zeros(self._layout.n_sites)
         for task, found, own in in_order(compute, tasks(frames), self._n_threads, ahead):
@@ -588,19 +733,40 @@ class Camera:
             clock.add(own)
             yield task, rate_e_per_s
 
-    def predict(self, light: Scene | PowerMap, *, exposure_s: float) -> tuple[Floats, Floats]:
+    def predict(
+        self,
+        light: Scene | PowerMap,
+        *,
+        exposure_s: float,
+        gaze_um: tuple[float, float] | None = None,
+        axis: GazeAxis | None = None,
+    ) -> tuple[Floats, Floats]:
         """
         Return mean and variance of every site's code analytically.
+
+        Parameters
+        ----------
+        light, exposure_s, gaze_um, axis
+            As for :meth:`capture`.
 
         Returns
         -------
         mean_dn, variance_dn2 : (n_site,) float64, DN and DN²
             Over the temporal noise of this device; its fixed patterns are part of the mean.
         """
-        expected_e = self._sensor.expected_electrons(self._photoelectrons_per_s(light, Clock()), exposure_s)
+        rate_e_per_s = self.photoelectrons_per_s(light, gaze_um=gaze_um, axis=axis)
+        expected_e = self._sensor.expected_electrons(rate_e_per_s, exposure_s)
         return self._sensor.predict(expected_e, exposure_s=exposure_s, n_threads=self._n_threads)
 
-    def predict_covariance(self, light: Scene | PowerMap, sites: ArrayLike, *, exposure_s: float) -> Floats:
+    def predict_covariance(
+        self,
+        light: Scene | PowerMap,
+        sites: ArrayLike,
+        *,
+        exposure_s: float,
+        gaze_um: tuple[float, float] | None = None,
+        axis: GazeAxis | None = None,
+    ) -> Floats:
         """
         Return the temporal covariance of the codes of some sites analytically.
 
@@ -609,14 +775,16 @@ class Camera:
         light : Scene or PowerMap
         sites : (n,) int
             Indices of the sites.
-        exposure_s : float, s
+        exposure_s, gaze_um, axis
+            As for :meth:`capture`.
 
         Returns
         -------
         covariance : (n, n) float64, DN²
             See :meth:`foveasim.Sensor.predict_covariance`.
         """
-        expected_e = self._sensor.expected_electrons(self._photoelectrons_per_s(light, Clock()), exposure_s)
+        rate_e_per_s = self.photoelectrons_per_s(light, gaze_um=gaze_um, axis=axis)
+        expected_e = self._sensor.expected_electrons(rate_e_per_s, exposure_s)
         return self._sensor.predict_covariance(expected_e, sites, exposure_s=exposure_s)
 
     def reference(self, light: Scene | PowerMap, grid: Grid, *, exposure_s: Annotated[float, EXPOSURE]) -> Picture:
@@ -627,7 +795,7 @@ class Camera:
         ----------
         light : Scene or PowerMap
         grid : Grid
-            The pixels, in the image plane without distortion.
+            The pixels, in the image plane without distortion, from the position of the sensor at the gaze of the camera.
         exposure_s : float, s
 
         Returns
@@ -639,46 +807,62 @@ class Camera:
         """
         joules_per_w_m2 = float(w_from_w_m2_um2(exposure_s))
         weights = self._sensor.responsivity_e_per_j(light.wavelength_nm) * joules_per_w_m2
-        if isinstance(light, PowerMap):
-            return replace(reference(light, grid, weights=weights), white=white_dn(self._sensor, light))
-        scene = self.frame(light)
-        optics = self._optics.resolve_oversample(scene)
+        white, scene = white_dn(self._sensor, light), self.seen(light)
+        in_image = _moved(grid, self.position_um)
+        if isinstance(scene, PowerMap):
+            return replace(reference(scene, in_image, weights=weights), grid=grid, white=white)
+        optics, frame = self._optics.resolve_oversample(scene), self.sensor_frame(scene)
         images = [
             (
-                to_sensor_frame(self._distortion, source),
+                frame.image(source),
                 optics.weighted_maps(scene, weights * is_in_image, grid=source, n_threads=self._n_threads),
             )
             for source, is_in_image in optics.image_grids(scene)
         ]
-        return replace(sum_of_images(images, grid, len(weights)), white=white_dn(self._sensor, light))
+        return replace(sum_of_images(images, in_image, len(weights)), grid=grid, white=white)
 
-    def noise_budget(self, light: Scene | PowerMap, *, exposure_s: float) -> NoiseBudget:
+    def noise_budget(
+        self,
+        light: Scene | PowerMap,
+        *,
+        exposure_s: float,
+        gaze_um: tuple[float, float] | None = None,
+        axis: GazeAxis | None = None,
+    ) -> NoiseBudget:
         """
         Return the noise of every site by source: :func:`foveasim.sensor.noise_budget`.
+
+        Parameters
+        ----------
+        light, exposure_s, gaze_um, axis
+            As for :meth:`capture`.
 
         Returns
         -------
         NoiseBudget
             Standard deviation by source, a dict of str to (n_site,) float64, e-.
         """
-        return noise_budget(self._sensor, self._photoelectrons_per_s(light, Clock()), exposure_s)
+        return noise_budget(self._sensor, self.photoelectrons_per_s(light, gaze_um=gaze_um, axis=axis), exposure_s)
 
     def _photoelectrons_per_s(
         self,
         light: Scene | PowerMap,
         clock: Clock,
-        position_um: Position | None = None,
+        moving_um: Position | None = None,
         cached: ImageCache | None = None,
+        warned: set[str] | None = None,
     ) -> Floats:
         """
         Return the expected photoelectrons of every site per second.
 
-        ``position_um`` is the position of a moving sensor, or None; ``cached`` is a cache of a scene's images by grid and
-        filter, or None.
+        ``moving_um`` is the gaze of a frame with its own, or None; ``cached`` is a cache of a scene's images by grid and
+        filter, or None; ``warned`` are the warnings of earlier frames, which are not repeated.
         """
         if not isinstance(light, Scene | PowerMap):
             raise ParameterError("light", f"must be a Scene or a PowerMap, got {type_name(light)}")
-        source, light = light, self._with_pitch(light)
+        gaze_um = self._gaze_um if moving_um is None else moving_um
+        position_um = (gaze_um[0], gaze_um[1]) if self._axis == "image" else (0.0, 0.0)
+        source, light = light, self.seen(light, gaze_um)
         e_per_j = self._sensor.responsivity_e_per_j(light.wavelength_nm)
         with clock.stage("load kernels"):
             _load_kernels(light)
@@ -689,10 +873,12 @@ class Camera:
             # Lateral chromatic aberration gives images of several sizes, each with its own grid.
             optics = self._optics.resolve_oversample(light)
             warn_of_coarse_cells(self._optics, light, self._layout)
-            images = optics.image_grids(light)
+            images, frame = optics.image_grids(light), self.sensor_frame(light)
+            # Images of a camera that turns differ for each gaze.
+            cached = None if self._axis == "sensor" and moving_um is not None else cached
             maps, grids = (
                 self._images(light, optics, images, e_per_j, clock, cached),
-                [to_sensor_frame(self._distortion, grid) for grid, _ in images],
+                [frame.image(grid) for grid, _ in images],
             )
         with clock.stage("compile layout"):
             order = self.order(light)
@@ -701,14 +887,15 @@ class Camera:
                     grid,
                     order=order,
                     n_grids=len(grids),
-                    position_um=position_um or (0.0, 0.0),
-                    # Most positions of a moving gaze occur once.
-                    compiled=position_um is None or not any(position_um),
+                    position_um=position_um,
+                    # Most gazes of a video occur once, and so do the images of a camera that turns.
+                    compiled=moving_um is None or gaze_um == self._gaze_um,
                 )
                 for grid in grids
             ]
         smallest = min(integrators, key=lambda integrator: integrator.grid.cell_area_um2)
-        warn_of_coverage(source, Covered.by(smallest), self._layout.n_sites, is_moving=position_um is not None)
+        gaze_um = None if moving_um is None and not any(gaze_um) else gaze_um
+        warn_of_coverage(source, Covered.by(smallest), self._layout.n_sites, gaze_um, warned)
         return integrate_maps(self._sensor, light, maps, integrators, clock)
 
     def _bands(self, power_map: PowerMap, e_per_j: Floats) -> Iterator[WeightedMap]:
@@ -746,6 +933,12 @@ class Camera:
             maps = optics.weighted_maps(scene, e_per_j[new] * is_in_image, grid=grid, n_threads=self._n_threads)
             for c in used:
                 yield WeightedMap(k, image(grid, int(c), maps), self._sensor.sites_of_filter[int(c)], None)
+
+
+def _moved(grid: Grid, by_um: Position) -> Grid:
+    """Return a grid at another position."""
+    (x_um, y_um), (dx_um, dy_um) = grid.origin_um, by_um
+    return Grid(grid.shape, grid.pitch_um, (x_um + dx_um, y_um + dy_um))
 
 
 def _load_kernels(light: Scene | PowerMap) -> None:

@@ -110,24 +110,24 @@ def check_frames(frames: object) -> None:
 
 def position_settings(task: Task, every: int = 1) -> dict[str, Any]:
     """
-    Return the sensor position and the gaze of a frame as settings of a capture.
+    Return the gaze of a frame as settings of a capture.
 
     ``every`` is the number of frames per capture: the digest of the rest of the path begins at the next capture. Frames without
-    positions have none of these settings.
+    positions have none of these settings. ``place_um`` is the position of the sensor where it is not the gaze, in a part of a
+    larger scene.
     """
     if not task.is_moving:
         return {}
     position_um = task.position_um
-    settings: dict[str, Any] = {"place_um": list(position_um)} if any(position_um) else {}
-    gaze: dict[str, Any] = {"xy_um": list(position_um)}
-    if isinstance(position_um, PathPosition):
-        ahead = min(position_um.number + every, len(position_um.digests) - 1)
-        gaze = {
-            "xy_um": list(position_um.gaze_um),
-            "path": position_um.digests[position_um.number].hex(),
-            "next_path": position_um.digests[ahead].hex(),
-        }
-    return settings | {"gaze": gaze}
+    if not isinstance(position_um, PathPosition):
+        return {"gaze_um": list(position_um)}
+    ahead = min(position_um.number + every, len(position_um.digests) - 1)
+    settings: dict[str, Any] = {
+        "gaze_um": list(position_um.gaze_um),
+        "gaze_path": position_um.digests[position_um.number].hex(),
+        "next_gaze_path": position_um.digests[ahead].hex(),
+    }
+    return settings if position_um == position_um.gaze_um else settings | {"place_um": list(position_um)}
 
 
 def _with_path(frames: Iterable[Frame]) -> Iterable[Frame]:

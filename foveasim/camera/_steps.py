@@ -47,16 +47,29 @@ class WeightedMap(NamedTuple):
     weight: Floats | None
 
 
-def to_sensor_frame(lens: Lens | None, grid: Grid) -> Grid:
-    """Transform a grid from the frame of the optics to that of the sensor behind a lens."""
-    if lens is None:
-        return grid
-    centre_um = np.array(lens.centre_um)
-    focal_um = np.broadcast_to(np.asarray(lens.focal_um), (2,))
-    scale = focal_um / math.sqrt(focal_um[0] * focal_um[1])
-    pitch_x_um, pitch_y_um = grid.pitch_xy_um * scale
-    x0_um, y0_um = centre_um + grid.origin_um * scale
-    return Grid(grid.shape, (float(pitch_x_um), float(pitch_y_um)), (float(x0_um), float(y0_um)))
+class SensorFrame(NamedTuple):
+    """
+    Frame of the sensor, in which the image of a lens is scaled along x and y.
+
+    ``axis_um`` (x, y): where the optical axis meets the image plane. ``scale`` (2,): factors of the image's width and height.
+    """
+
+    axis_um: tuple[float, float]
+    scale: Floats
+
+    @classmethod
+    def of(cls, lens: Lens | None, axis_um: tuple[float, float] = (0.0, 0.0)) -> SensorFrame:
+        """Return the frame of a lens model, or that with an axis and equal scales without one."""
+        if lens is None:
+            return cls(axis_um, np.ones(2))
+        focal_um = np.broadcast_to(np.asarray(lens.focal_um), (2,))
+        return cls(lens.centre_um, focal_um / math.sqrt(focal_um[0] * focal_um[1]))
+
+    def image(self, grid: Grid) -> Grid:
+        """Return a grid of the optics, which is centred on the axis, in this frame."""
+        pitch_x_um, pitch_y_um = grid.pitch_xy_um * self.scale
+        x0_um, y0_um = np.array(self.axis_um) + grid.origin_um * self.scale
+        return Grid(grid.shape, (float(pitch_x_um), float(pitch_y_um)), (float(x0_um), float(y0_um)))
 
 
 def integrate_maps(
@@ -147,6 +160,8 @@ def capture_settings(camera: Camera, light: Scene | PowerMap, exposure_s: float,
     return {
         "light": _light_settings(camera, light),
         **camera.settings,
+        "gaze_um": list(camera.gaze_um),
+        "axis": camera.axis,
         "oversample": camera.oversample(light),
         "integration_order": camera.order(light),
         "exposure_s": exposure_s,

@@ -55,13 +55,22 @@ class Covered(NamedTuple):
         return cls(image_um, (float(x0), float(y0), float(x1), float(y1)), n_uncovered, n_outside)
 
 
-def warn_of_coverage(source: Scene | PowerMap, covered: Covered, n_sites: int, *, is_moving: bool = False) -> None:
+def warn_of_coverage(
+    source: Scene | PowerMap,
+    covered: Covered,
+    n_sites: int,
+    gaze_um: Sequence[float] | None = None,
+    warned: set[str] | None = None,
+) -> None:
     """
     Warn of sites outside the image, and of a layout that measures a small part of it.
 
-    Sites outside are dark whatever the scene is.
+    Sites outside are dark whatever the scene is. ``gaze_um``: None at the centre. ``warned``: causes of earlier warnings, which
+    are not repeated.
     """
-    if covered.n_outside:
+    warned = set() if warned is None else warned
+    if covered.n_outside and "image circle" not in warned:
+        warned.add("image circle")
         warn(
             f"{covered.n_outside:,} of {n_sites:,} photosites lie outside the image circle of the lens and "
             "are dark; shrink or move the layout, or use a lens model with a larger field",
@@ -69,23 +78,29 @@ def warn_of_coverage(source: Scene | PowerMap, covered: Covered, n_sites: int, *
         )
     is_photograph = isinstance(source, Scene) and source.is_picture
     fit = source.fit if isinstance(source, Scene) else None
-    if fit in ("contain", "width"):
+    if fit in ("contain", "width") or "image" in warned:
         return
     image_um, layout_um = covered.image_um, covered.layout_um
     n_uncovered = covered.n_uncovered - covered.n_outside
     if n_uncovered:
-        remedy = (
-            "use fit='cover', or a larger pitch_um or field_of_view_deg"
-            if is_photograph
-            else "enlarge the scene (pitch_um)"
-        )
+        warned.add("image")
+        remedy, where = "enlarge the scene (pitch_um), or shrink or move the layout", ""
+        if is_photograph:
+            remedy = "use fit='cover', or a larger pitch_um or field_of_view_deg, or shrink or move the layout"
+        if gaze_um is not None:
+            where = f" at the gaze {format_point(gaze_um)} µm"
+        if fit == "cover":
+            x_um, y_um = np.abs(gaze_um if gaze_um is not None else (0.0, 0.0))
+            remedy = (
+                f"use Scene.from_picture(..., gaze_range_um=({x_um:.4g}, {y_um:.4g})), or gazes nearer to the centre"
+            )
         warn(
-            f"{n_uncovered:,} of {n_sites:,} photosites lie partly or completely outside the image, where "
+            f"{n_uncovered:,} of {n_sites:,} photosites lie partly or completely outside the image{where}, where "
             f"irradiance is 0: the image measures {_format_extent(image_um)}, the layout {_format_extent(layout_um)}; "
-            f"{remedy}, or shrink or move the layout",
+            f"{remedy}",
             CoverageWarning,
         )
-    elif is_photograph and fit is None and not is_moving:
+    elif is_photograph and fit is None and gaze_um is None:
         fraction = size_um(layout_um)[0] / size_um(image_um)[0]
         if fraction < MIN_PICTURE_FRACTION:
             warn(

@@ -340,12 +340,14 @@ def cameras(
     for light in scenes.values():
         power_map = first.power_map(light) if isinstance(light, Scene) else light
         # Means over the colour filters of the first camera.
-        irradiance.append(first.reference(power_map, covariance_grid, exposure_s=exposure_s).data.mean(axis=0))
+        seen = _behind_image(first)
+        irradiance.append(seen.reference(power_map, covariance_grid, exposure_s=exposure_s).data.mean(axis=0))
         for name, camera in named.items():
             capture = camera.capture(light, exposure_s=exposure_s, seed=seed)
             picture = capture.picture(method, of="light_e", per="um2", grid=grid, sensor=camera.sensor)
-            ideal = camera.reference(power_map, grid, exposure_s=exposure_s)
-            shots[name].append(_Shot(picture, ideal, *scene_measures(camera, capture, power_map, annuli)))
+            seen = _behind_image(camera)
+            ideal = seen.reference(power_map, grid, exposure_s=exposure_s)
+            shots[name].append(_Shot(picture, ideal, *scene_measures(seen, capture, power_map, annuli)))
             advance()
     covered = [one[0].picture.coverage >= MIN_COVERAGE for one in shots.values()]
     is_common, is_field = (combine(covered, axis=0) for combine in (np.all, np.any))
@@ -407,12 +409,19 @@ def cameras(
                 name: {
                     "sensor": to_plain_data(camera.sensor, without={"layout"}),
                     "layout": to_plain_data(dict(camera.layout.provenance)),
+                    "gaze_um": list(camera.gaze_um),
+                    "axis": camera.axis,
                 }
                 for name, camera in named.items()
             },
             "versions": versions(),
         },
     )
+
+
+def _behind_image(camera: Camera) -> Camera:
+    """Return a camera for the power map of its scene, which is that of the gaze if the camera turns."""
+    return camera if camera.axis == "image" else camera.at((0.0, 0.0))
 
 
 class _Shot(NamedTuple):

@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, create_mo
 from foveasim._core.calls import NOT_NEGATIVE, Declaration, Usual
 from foveasim._core.registry import Registry
 from foveasim._core.validation import unit_of
+from foveasim.camera import GazeAxis
 from foveasim.distortion import LENSES
 from foveasim.layout import EDITS, LAYOUTS, PRESETS, RULES, DesignRules, Readout, Routing, read_layout
 from foveasim.maps import read_power_map
@@ -224,6 +225,17 @@ def _models(_versions: tuple[int, ...]) -> Models:
         "sensor": (sensor, Field(default_factory=sensor, description="parameters of the photosites and their readout")),
         "exposure_s": (float, _field("exposure_s", ..., "exposure time", Declaration({}, EXPOSURE, Usual(1e-5, 1.0)))),
         "seed": (int, _field("seed", 0, "seed of the noise", Declaration({}, NOT_NEGATIVE, Usual(0, 100)))),
+        "gaze_um": (
+            tuple[float, float],
+            Field((0.0, 0.0), description="point of the image, in µm, at which the centre of the sensor is"),
+        ),
+        "axis": (
+            GazeAxis,
+            Field(
+                "image",
+                description="what the optical axis is fixed to: the image, or the sensor that turns towards the gaze",
+            ),
+        ),
         "integration_order": (
             Literal[1, 2] | None,
             Field(None, description="cells of constant irradiance, or with a gradient; chosen by default"),

@@ -230,9 +230,12 @@ def build_shot(
         lambda: Camera(optics=optics, sensor=sensor, distortion=distortion, order=order, n_threads=n_threads),
     )
     # Other optics and electronics share the compiled layout.
-    camera = camera.replace(optics=optics, sensor=sensor)
+    camera = _call(
+        source, "", camera.replace,
+        {"optics": optics, "sensor": sensor, "gaze_um": settings.gaze_um, "axis": settings.axis},
+    )  # fmt: skip
     if isinstance(scene, Scene):
-        framed = _call(source, "scene", camera.frame, {"scene": scene})
+        framed = _call(source, "scene", camera.seen, {"light": scene})
         _call(source, "scene", optics.grid, {"scene": framed})
         _call(source, "optics", optics.check, {"scene": framed})
     return Shot(

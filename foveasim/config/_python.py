@@ -102,6 +102,9 @@ def _shot_lines(writer: _Writer, shot: Any) -> list[str]:
         camera["order"] = shot.integration_order
     sensor = {"layout": _Name("layout"), **writer.arguments(shot.sensor)}
     capture = {"scene": _Name("scene"), "exposure_s": shot.exposure_s, "seed": shot.seed}
+    for name in ("gaze_um", "axis"):
+        if getattr(shot, name) != type(shot).model_fields[name].default:
+            camera[name] = getattr(shot, name)
     return [
         *lines,
         f"sensor = {writer.call('fs.Sensor', sensor)}",

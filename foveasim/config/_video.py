@@ -14,7 +14,7 @@ from foveasim.config import Shot
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
 from foveasim.scene import Scene
-from foveasim.video import FrameSource, count_recorded_frames, write_video
+from foveasim.video import FrameSource, GazePath, count_recorded_frames, follow_gaze, write_video
 from foveasim.video.frame_source import list_pictures
 
 #: Frame period in video files when none is specified.
@@ -31,6 +31,7 @@ def run_video(
     frame_s: float | None = None,
     line_s: float = 0.0,
     stop: int | None = None,
+    gaze: str | Path | None = None,
     n_threads: int | None = None,
     progress: bool = False,
 ) -> int:
@@ -51,6 +52,9 @@ def run_video(
         Line time of a rolling shutter.
     stop : int, optional
         Maximum number of frames.
+    gaze : path, optional
+        CSV file of a gaze path (:meth:`foveasim.video.GazePath.read`), with times from the first frame; by default the gaze of
+        the shot.
     n_threads : int, optional
         Number of frames that are computed at a time; one per core by default.
     progress : bool
@@ -77,10 +81,13 @@ def run_video(
         raise ParameterError(
             "frame_s", "must be given for a rolling shutter: pictures in a directory have no frame rate"
         )
+    path = None if gaze is None else GazePath.read(gaze)
+    frame_period_s = source.frame_s or DEFAULT_FRAME_S
     is_store = Path(out).suffix.lower() == ".zarr"
     n_before = count_recorded_frames(out) if is_store else 0
+    scenes = source.from_frame(n_before)
     captures = shot.camera.video(
-        source.from_frame(n_before),
+        scenes if path is None else follow_gaze(scenes, path, frame_s=frame_period_s, first_frame=n_before),
         exposure_s=shot.exposure_s,
         seed=shot.seed,
         first_frame=n_before,
@@ -91,16 +98,22 @@ def run_video(
     return write_video(
         captures,
         out,
-        frame_s=source.frame_s or DEFAULT_FRAME_S,
+        frame_s=frame_period_s,
         n_frames=source.n_frames,
         progress=progress,
         resume=is_store,
-        plan=_plan(shot, shot.scene, Path(frames), source.frame_s, line_s, stop) if is_store else None,
+        plan=_plan(shot, shot.scene, Path(frames), source.frame_s, line_s, stop, path) if is_store else None,
     )
 
 
 def _plan(
-    shot: Shot, scene: Scene, frames: Path, frame_s: float | None, line_s: float, stop: int | None
+    shot: Shot,
+    scene: Scene,
+    frames: Path,
+    frame_s: float | None,
+    line_s: float,
+    stop: int | None,
+    path: GazePath | None,
 ) -> dict[str, Any]:
     """Return everything that codes depend on; for frames, names and sizes of their files."""
     camera, layout = shot.camera, shot.camera.sensor.layout
@@ -119,5 +132,6 @@ def _plan(
         "frames": hashlib.sha256(json.dumps(files).encode()).hexdigest(),
         "shutter": {"frame_s": frame_s, "line_s": line_s} if line_s else None,
         "stop": stop,
+        "gaze": {"gaze_um": camera.gaze_um, "axis": camera.axis, "path": None if path is None else to_plain_data(path)},
         "versions": versions(),
     }

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.calls import check_declared
 from foveasim._core.rings import from_frame, to_frame
-from foveasim._core.validation import Floats, check_length_um, finite_array
+from foveasim._core.validation import Floats, check_length_um, check_point, finite_array
 from foveasim.errors import GeometryError, ParameterError
 
 #: Treatment of points outside the valid radius of a lens: raise an error, or return NaN.
@@ -54,10 +54,7 @@ class LensBase:
         for length_um in focal:
             check_length_um("focal_um", length_um)
         object.__setattr__(self, "focal_um", float(focal[0]) if focal.size == 1 else tuple(focal.tolist()))
-        centre = finite_array("centre_um", self.centre_um, ndim=1)
-        if centre.shape != (2,):
-            raise ParameterError("centre_um", "must be two numbers (x, y)", self.centre_um, "µm")
-        object.__setattr__(self, "centre_um", (float(centre[0]), float(centre[1])))
+        object.__setattr__(self, "centre_um", check_point("centre_um", self.centre_um))
 
     def distort(self, xy_um: ArrayLike, *, outside: Outside = "error") -> Floats:
         """

@@ -36,7 +36,8 @@ GROWING_KINDS = ("camera", "images")
 MAX_DEPTH = 6
 #: Sections of the settings of a shot that do not change the photoelectron rates, and others that do not change the optical
 #: images; the responsivity of the sensor changes both.
-AFTER_LIGHT, AFTER_IMAGE = ("sensor", "exposure_s", "seed"), ("layout", "distortion", "integration_order")
+AFTER_LIGHT = ("sensor", "exposure_s", "seed")
+AFTER_IMAGE = ("layout", "distortion", "integration_order", "gaze_um", "axis")
 #: Longest stored message, characters.
 MAX_MESSAGE_LENGTH = 500
 
@@ -294,9 +295,10 @@ def _image_settings(shot: Shot, settings: Mapping[str, Any]) -> list[Any]:
     scene = shot.scene
     # With 'fit' the pitch depends on layout and distortion.
     pitch_um = shot.camera.frame(scene).pitch_um if isinstance(scene, Scene) else None
+    gaze_um = shot.camera.gaze_um if shot.camera.axis == "sensor" else None
     # Images that are computed together share sums, whose rounding depends on their number.
     used = shot.camera.sensor.filters_used.tolist()
-    return [_without(settings, (*AFTER_LIGHT, *AFTER_IMAGE)), pitch_um, _responsivity_digest(shot), used]
+    return [_without(settings, (*AFTER_LIGHT, *AFTER_IMAGE)), pitch_um, gaze_um, _responsivity_digest(shot), used]
 
 
 def _without(settings: Mapping[str, Any], sections: Sequence[str]) -> dict[str, Any]:

@@ -96,12 +96,13 @@ class Model(nn.Module):
     ) -> None:
         super().__init__()
         self.wrt: tuple[str, ...] = _check_variables("wrt", wrt, VARIABLES)
-        self._camera, self._scene = camera, camera.frame(scene)
+        self._camera, self._scene = camera, camera.seen(scene)
         sensor = camera.sensor
         self.imaging: Imaging = Imaging(
             camera.optics, self._scene, [name for name in self.wrt if name in LENS_VARIABLES]
         )
-        self.grid: Grid = self._sensor_grid()
+        self.grid: Grid = camera.sensor_frame(self._scene).image(self.imaging.grid)
+        self.register_buffer("_position_um", constant(camera.position_um))
         self.order = camera.order(self._scene)
         layout: Any = sensor.layout
         self.mesh = Mesh(layout, boundary).requires_grad_("vertices" in self.wrt)
@@ -138,16 +139,10 @@ class Model(nn.Module):
     def __repr__(self) -> str:
         return f"Model({self._camera!r}, variables: {', '.join(self.wrt)})"
 
-    def _sensor_grid(self) -> Grid:
-        """Return the grid of the maps in the frame of the sensor."""
-        pixels, fine = self._camera.image_grid(self._scene), self.imaging.grid
-        k = fine.shape[0] // pixels.shape[0]
-        return Grid(fine.shape, (pixels.pitch_x_um / k, pixels.pitch_y_um / k), pixels.origin_um)
-
     def _count_pieces(self) -> Any:
         """Return the number of chords of each edge that the distortion requires."""
         edges = self._outlines.edges
-        layout = self.mesh.layout()
+        layout = self.mesh.layout().translate(*self._camera.position_um)
         lens = self._camera.distortion
         assert lens is not None
         pieces = UndistortedOutlines(layout, lens, min(self.grid.pitch_x_um, self.grid.pitch_y_um)).count_pieces()
@@ -158,6 +153,8 @@ class Model(nn.Module):
     def points(self) -> Tensor:
         """Return the points of the outlines in the plane of the maps, (n_point, 2) tensor, µm."""
         points = self.mesh()
+        if any(self._camera.position_um):
+            points = points + self._position_um
         lens = self._camera.distortion
         if lens is None:
             return points
@@ -234,7 +231,12 @@ class Model(nn.Module):
         if lens is not None:
             lens = with_coefficients(lens, self.distortion_names, self.distortion.detach().numpy())
         return Camera(
-            optics=self.imaging.optics(), sensor=replace(sensor, **changes), distortion=lens, order=self.order
+            optics=self.imaging.optics(),
+            sensor=replace(sensor, **changes),
+            distortion=lens,
+            order=self.order,
+            gaze_um=self._camera.gaze_um,
+            axis=self._camera.axis,
         )
 
 

@@ -84,15 +84,17 @@ def _edges_of(pupil: EdgedPupil) -> PupilEdges:
     return found
 
 
-def overlaps(n_to: int, to_step: float, n_from: int, from_step: float) -> Any:
+def overlaps(n_to: int, to_step: float, n_from: int, from_step: float, offset: float = 0.0) -> Any:
     """
-    Compute the overlaps of two centred rows of cells, as fractions of the target cells.
+    Compute the overlaps of two rows of cells, as fractions of the target cells.
+
+    ``offset`` is the distance from the centre of the source row to that of the target row.
 
     Returns ``fractions`` (n_to, n_from) sparse array.
     """
     from scipy.sparse import coo_array, diags_array
 
-    to_edges = (np.arange(n_to + 1) - 0.5 * n_to) * to_step
+    to_edges = (np.arange(n_to + 1) - 0.5 * n_to) * to_step + offset
     from_edges = (np.arange(n_from + 1) - 0.5 * n_from) * from_step
     cuts = np.unique(np.concatenate((to_edges, from_edges)))
     centres, lengths = 0.5 * (cuts[1:] + cuts[:-1]), np.diff(cuts)

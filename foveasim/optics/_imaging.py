@@ -221,8 +221,9 @@ class Imaging:
         row_sources, column_sources = self.sources()
         all_rows = _patch_extents(self, row_sources, self.grid.shape[0], node_y_um)
         all_columns = _patch_extents(self, column_sources, self.grid.shape[1], node_x_um)
+        centre_x_um, centre_y_um = self.grid.centre_um
         return [
-            ((float(x_um), float(y_um)), rows, columns)
+            ((float(x_um) + centre_x_um, float(y_um) + centre_y_um), rows, columns)
             for y_um, rows in zip(node_y_um, all_rows, strict=True)
             for x_um, columns in zip(node_x_um, all_columns, strict=True)
         ]
@@ -308,11 +309,13 @@ def isoplanatic_error(
 
     The fraction is evaluated midway between patch centres, or at the corners of the picture for a single patch.
     """
+    centre_x_um, centre_y_um = grid.centre_um
     node_y_um, node_x_um = _nodes_um(grid, n_patches)
+    node_y_um, node_x_um = node_y_um + centre_y_um, node_x_um + centre_x_um
     if n_patches == (1, 1):
-        half_y_um, half_x_um = (0.5 * n * grid.pitch_x_um for n in grid.shape)
-        midpoints_um = [(sx * half_x_um, sy * half_y_um) for sx in (-1, 1) for sy in (-1, 1)]
-        known_um = [[(0.0, 0.0)]] * 4
+        x0_um, y0_um, x1_um, y1_um = grid.bounds_um
+        midpoints_um = [(x_um, y_um) for x_um in (x0_um, x1_um) for y_um in (y0_um, y1_um)]
+        known_um = [[grid.centre_um]] * 4
     else:
         steps = [(y, x) for y in itertools.pairwise(node_y_um) for x in itertools.pairwise(node_x_um)]
         known_um = [[(float(x), float(y)) for y in ys for x in xs] for ys, xs in steps]
@@ -331,7 +334,7 @@ def isoplanatic_error(
 
 
 def _nodes_um(grid: Grid, n_patches: tuple[int, int]) -> tuple[Floats, Floats]:
-    """Return patch centres along y and x: edge to edge, or on the axis for a single patch."""
+    """Return patch centres along y and x from the centre of the grid: edge to edge, or the centre for a single patch."""
     y, x = (
         np.linspace(-0.5, 0.5, n) * size * grid.pitch_x_um if n > 1 else np.zeros(1)
         for n, size in zip(n_patches, grid.shape, strict=True)

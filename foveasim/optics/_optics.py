@@ -17,7 +17,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.show import drawn
 from foveasim._core.threads import thread_count
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import Bools, Floats, check_number, finite_array, read_only, wavelengths_nm
+from foveasim._core.validation import Bools, Floats, check_number, check_point, finite_array, read_only, wavelengths_nm
 from foveasim.errors import ParameterError, SamplingWarning
 from foveasim.fields import Grid, PowerMap, SceneLike
 from foveasim.optics._aperture import Aperture, Wavefront, overlaps
@@ -256,9 +256,11 @@ class Optics(PointImages):
         return float(um_from_m(0.5 * radius_m**2 * (1.0 / distance_m - 1.0 / self.focus_distance_m)))
 
     def grid(self, scene: SceneLike) -> Grid:
-        """Return the sensor-plane grid of the scene pixels, upright and centred on the axis."""
-        shape = scene.basis.shape
-        return Grid.centred((shape[1], shape[2]), _pitch_um(scene) * self.magnification(scene.distance_m))
+        """Return the sensor-plane grid of the scene pixels, upright; it is centred on the axis like the scene."""
+        _, n_y, n_x = scene.basis.shape
+        magnification = self.magnification(scene.distance_m)
+        x_um, y_um = scene.centre_um
+        return Grid.centred((n_y, n_x), _pitch_um(scene) * magnification, (x_um * magnification, y_um * magnification))
 
     def image_grids(self, scene: SceneLike) -> list[tuple[Grid, Bools]]:
         """
@@ -271,9 +273,13 @@ class Optics(PointImages):
         if self.lateral_colour is None:
             return [(self._refine(grid), np.ones(scene.wavelength_nm.size, bool))]
         sizes = self.lateral_colour.at(scene.wavelength_nm)
+        x_um, y_um = grid.centre_um
         return [
-            (self._refine(Grid.centred(grid.shape, grid.pitch_x_um * float(size))), sizes == size)
-            for size in np.unique(sizes)
+            (
+                self._refine(Grid.centred(grid.shape, grid.pitch_x_um * size, (x_um * size, y_um * size))),
+                sizes == size,
+            )
+            for size in np.unique(sizes).tolist()
         ]
 
     @property
@@ -481,7 +487,13 @@ class Optics(PointImages):
 
         to = self._refine(self.grid(scene))
         groups = self.image_grids(scene)
-        onto = [[overlaps(n, to.pitch_x_um, n, grid.pitch_x_um) for n in to.shape] for grid, _ in groups]
+        onto = [
+            [
+                overlaps(n, to.pitch_x_um, n, grid.pitch_x_um, to_um - from_um)
+                for n, to_um, from_um in zip(to.shape, to.centre_um[::-1], grid.centre_um[::-1], strict=True)
+            ]
+            for grid, _ in groups
+        ]
         for output in weights:
             total = np.zeros(to.shape)
             for (grid, is_of_it), (along_y, along_x) in zip(groups, onto, strict=True):
@@ -527,7 +539,9 @@ class Optics(PointImages):
         lambda_n_um = self._lambda_n_um(scene)
         aperture = self._aperture(scene.distance_m)
         is_clear_circle = self._is_clear_circle(aperture)
-        pixels = Grid.centred((scene.basis.shape[1], scene.basis.shape[2]), grid.pitch_x_um * self._n_fine)
+        pixels = Grid.centred(
+            (scene.basis.shape[1], scene.basis.shape[2]), grid.pitch_x_um * self._n_fine, grid.centre_um
+        )
         if is_clear_circle:
             lambda_n_um = np.maximum(lambda_n_um, grid.pitch_x_um / MAX_ALIASES)
         transmittance = np.array([aperture.transmittance(float(w)) for w in scene.wavelength_nm])
@@ -620,9 +634,6 @@ class Optics(PointImages):
         if distance_m is None:
             distance_m = float("inf") if self.focus_distance_m is None else self.focus_distance_m
         distance_m = self._check_distance("distance_m", distance_m)
-        position = finite_array("field_um", field_um, ndim=1)
-        if position.size != 2:
-            raise ParameterError("field_um", "must be two numbers (x, y)", field_um, "µm")
         n = self.f_number * self._image_distance_mm(distance_m) / self.focal_length_mm
         aperture = self._aperture(distance_m)
         return Point(
@@ -630,7 +641,7 @@ class Optics(PointImages):
             is_clear_circle=self._is_clear_circle(aperture),
             wavelength_nm=wave_nm,
             lambda_n_um=float(um_from_nm(wave_nm)) * n,
-            field_um=(float(position[0]), float(position[1])),
+            field_um=check_point("field_um", field_um),
         )
 
     # -- parts ----------------------------------------------------------------------------------------------------
@@ -663,7 +674,8 @@ class Optics(PointImages):
     def _field_points_um(self, grid: Grid) -> list[tuple[float, float]]:
         """Return the field points with the strongest aberrations."""
         half_x_um, half_y_um = (0.5 * n * grid.pitch_x_um for n in grid.shape[::-1])
-        corners = [(sx * half_x_um, sy * half_y_um) for sx in (-1, 1) for sy in (-1, 1)]
+        x_um, y_um = grid.centre_um
+        corners = [(x_um + sx * half_x_um, y_um + sy * half_y_um) for sx in (-1, 1) for sy in (-1, 1)]
         return [(0.0, 0.0), *(corners if self._is_varying() else ())]
 
     def _blur_um(self, scene: SceneLike, grid: Grid, aperture: Aperture, lambda_n_um: Floats) -> float:
@@ -713,5 +725,7 @@ class Optics(PointImages):
     def _squared_tangents(self, scene: SceneLike) -> tuple[Floats, Floats]:
         """Return (x0/H)² of the scene columns and (y0/H)² of the scene rows."""
         _, n_y, n_x = scene.basis.shape
-        step = float(m_from_um(_pitch_um(scene))) / scene.distance_m
-        return ((np.arange(n_x) - 0.5 * (n_x - 1)) * step) ** 2, ((np.arange(n_y) - 0.5 * (n_y - 1)) * step) ** 2
+        step, x, y = (float(m_from_um(each)) / scene.distance_m for each in (_pitch_um(scene), *scene.centre_um))
+        return ((np.arange(n_x) - 0.5 * (n_x - 1)) * step + x) ** 2, (
+            (np.arange(n_y) - 0.5 * (n_y - 1)) * step + y
+        ) ** 2

@@ -21,7 +21,17 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.calls import FINITE, NOT_NEGATIVE, POSITIVE, Limits
 from foveasim._core.short_repr import short_repr
 from foveasim._core.show import Drawn, drawn
-from foveasim._core.validation import Floats, Images, Ints, as_numbers, check_count, finite_array, own, read_only
+from foveasim._core.validation import (
+    Floats,
+    Images,
+    Ints,
+    as_numbers,
+    check_count,
+    check_point,
+    finite_array,
+    own,
+    read_only,
+)
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid
 from foveasim.layout import Layout
@@ -219,7 +229,7 @@ def to_cortical(
     """
     from scipy.ndimage import map_coordinates
 
-    centre = _centre(centre_um)
+    centre = check_point("centre_um", centre_um)
     if r_min_um is None:
         r_min_um = max(0.0, (r_max_um + offset_um) * math.exp(-2.0 * math.pi * n_rings / n_sectors) - offset_um)
     if not 0.0 < r_min_um + offset_um < r_max_um + offset_um:
@@ -311,10 +321,3 @@ def _sites_of_rings(layout: Layout) -> Ints:
     if (sector[sites] != np.arange(counts[-1])).any():
         raise ParameterError("layout", "must have the sectors 0, 1, 2, ... in every ring", hint=RESAMPLE)
     return sites
-
-
-def _centre(centre_um: tuple[float, float]) -> tuple[float, float]:
-    centre = finite_array("centre_um", centre_um, ndim=1)
-    if centre.size != 2:
-        raise ParameterError("centre_um", "must be two numbers (x, y)", centre_um, "µm")
-    return float(centre[0]), float(centre[1])

@@ -23,6 +23,7 @@ from foveasim._core.validation import (
     as_numbers,
     band_widths_nm,
     check_number,
+    check_point,
     check_shape,
     finite_array,
     freeze,
@@ -101,7 +102,8 @@ class Scene:
     band_width_nm : (n_wavelength,) float64, nm
         Widths of the bands.
     pitch_um : float or None, µm
-        Pixel pitch in the scene; None for a scene with ``fit``, and derived from ``field_of_view_deg`` if that is given.
+        Pixel pitch in the scene; None for a scene with ``fit`` that no camera has framed, and derived from
+        ``field_of_view_deg`` if that is given.
     distance_m : float, m
         Distance of the scene from the pupil of the lens.
     source : str
@@ -112,12 +114,17 @@ class Scene:
         Horizontal angle of the scene as seen from the lens.
     is_picture : bool
         Whether the scene is a photograph: cameras warn if their layout measures only a small part of it.
+    gaze_range_um : (x, y), µm
+        With ``fit="cover"``, largest distances of the gaze from the centre along either axis, in the sensor plane: the image
+        covers all photosites for each gaze within them (:attr:`foveasim.Camera.gaze_um`).
+    centre_um : (x, y), µm
+        Position of the picture's centre in the scene, from the optical axis. (0, 0) with ``fit``.
 
     Raises
     ------
     ParameterError
-        If the arrays have inconsistent shapes, or contain values that are not finite or negative, or if not exactly one of
-        pitch, fit and field of view is given.
+        If the arrays have inconsistent shapes, or contain values that are not finite or negative, or if the framing is missing
+        or contradicts itself.
 
     Notes
     -----
@@ -137,6 +144,8 @@ class Scene:
     fit: Fit | None = field(default=None, kw_only=True)
     field_of_view_deg: float | None = field(default=None, kw_only=True)
     is_picture: bool = field(default=False, kw_only=True)
+    gaze_range_um: tuple[float, float] = field(default=(0.0, 0.0), kw_only=True)
+    centre_um: tuple[float, float] = field(default=(0.0, 0.0), kw_only=True)
 
     def __post_init__(self) -> None:
         check_declared(self)
@@ -174,15 +183,20 @@ class Scene:
         object.__setattr__(self, "wavelength_nm", wavelength_nm)
         object.__setattr__(self, "band_width_nm", read_only(width_nm.copy()))
         object.__setattr__(self, "pitch_um", self._checked_pitch_um())
+        object.__setattr__(self, "centre_um", check_point("centre_um", self.centre_um))
+        object.__setattr__(self, "gaze_range_um", check_point("gaze_range_um", self.gaze_range_um, at_least=0.0))
+        if any(self.centre_um) and self.fit is not None:
+            raise _framing_conflict("fit", self.fit, "centre_um")
+        if any(self.gaze_range_um) and self.fit != "cover":
+            raise ParameterError("gaze_range_um", "requires fit='cover'", self.gaze_range_um, "µm")
 
     def _checked_pitch_um(self) -> float | None:
-        """Return the given pitch or that of the field of view; None with ``fit``."""
-        if self.fit is not None:
-            for name in ("pitch_um", "field_of_view_deg"):
-                if getattr(self, name) is not None:
-                    raise _framing_conflict("fit", self.fit, name)
-            return None
+        """Return the given pitch or that of the field of view; None with ``fit``, unless the scene is framed."""
         given_um = self.pitch_um
+        if self.fit is not None:
+            if self.field_of_view_deg is not None:
+                raise _framing_conflict("fit", self.fit, "field_of_view_deg")
+            return given_um
         if self.field_of_view_deg is None:
             if given_um is None:
                 raise ParameterError("pitch_um", "must be given, or 'fit' or 'field_of_view_deg' instead")
@@ -211,13 +225,34 @@ class Scene:
         Scene
             Shares the arrays of this scene.
         """
-        # Not dataclasses.replace, which would check all pixels again.
+        return self._with(
+            pitch_um=PITCH.check("pitch_um", pitch_um), fit=None, gaze_range_um=(0.0, 0.0), field_of_view_deg=None
+        )
+
+    def framed(self, pitch_um: float) -> Scene:
+        """Return a scene with ``fit`` with the pitch that it requires; ``fit`` remains."""
+        return self._with(pitch_um=PITCH.check("pitch_um", pitch_um))
+
+    def with_centre(self, centre_um: tuple[float, float]) -> Scene:
+        """
+        Return the scene at another position.
+
+        Parameters
+        ----------
+        centre_um : (x, y), µm
+            Position of the picture's centre, from the optical axis.
+
+        Returns
+        -------
+        Scene
+            Shares the arrays of this scene.
+        """
+        return self._with(centre_um=check_point("centre_um", centre_um))
+
+    def _with(self, **values: Any) -> Scene:
+        """Return a copy with other values; unlike ``dataclasses.replace`` it does not check all pixels again."""
         scene = copy.copy(self)
-        for name, value in {
-            "pitch_um": PITCH.check("pitch_um", pitch_um),
-            "fit": None,
-            "field_of_view_deg": None,
-        }.items():
+        for name, value in values.items():
             object.__setattr__(scene, name, value)
         return scene
 
@@ -239,6 +274,7 @@ class Scene:
         *,
         pitch_um: float | None = None,
         fit: Fit | None = None,
+        gaze_range_um: tuple[float, float] = (0.0, 0.0),
         field_of_view_deg: float | None = None,
         distance_m: float,
         peak_radiance_w_m2_sr_nm: float,
@@ -260,7 +296,10 @@ class Scene:
             Pixel pitch in the scene, instead of ``fit``.
         fit : {"cover", "contain", "width"}, optional
             Framing, from which each camera derives the pitch: the image of the picture covers the layout completely, lies
-            within its bounding box, or has its width. The optical axis is at the centre of the picture. Default: ``"cover"``.
+            within its bounding box, or has its width. The centre of the picture is at the centre of this box, or on the
+            optical axis of a lens model. Default: ``"cover"``.
+        gaze_range_um : (x, y), µm
+            With ``fit="cover"``, range of gazes for which the image covers the layout: see the class.
         field_of_view_deg : float, optional, degrees
             Horizontal angle of the picture as seen from the lens, instead of ``pitch_um`` and ``fit``.
         distance_m : float, m
@@ -286,8 +325,7 @@ class Scene:
             If channels, wavelengths and spectra are inconsistent, a value is out of range, or more than one of ``pitch_um``,
             ``fit`` and ``field_of_view_deg`` is given.
         """
-        if pitch_um is not None and field_of_view_deg is not None:
-            raise _framing_conflict("field_of_view_deg", field_of_view_deg, "pitch_um")
+        _check_framing(pitch_um, fit, field_of_view_deg)
         if pitch_um is None and field_of_view_deg is None and fit is None:
             fit = "cover"
         peak = RADIANCE.check("peak_radiance_w_m2_sr_nm", peak_radiance_w_m2_sr_nm)
@@ -344,6 +382,7 @@ class Scene:
             distance_m,
             source=str(picture) if is_file else "a picture array",
             fit=fit,
+            gaze_range_um=gaze_range_um,
             field_of_view_deg=field_of_view_deg,
             is_picture=True,
         )
@@ -356,6 +395,7 @@ class Scene:
         distance_m: float | None = None,
         pitch_um: float | None = None,
         fit: Fit | None = None,
+        gaze_range_um: tuple[float, float] = (0.0, 0.0),
         field_of_view_deg: float | None = None,
         quantity: Quantity | None = None,
         unit: str | None = None,
@@ -382,7 +422,7 @@ class Scene:
             (:mod:`foveasim.scene.cubes`), detected from its content.
         distance_m : float, optional, m
             Distance of the scene from the lens, if the file does not contain it.
-        pitch_um, fit, field_of_view_deg : optional
+        pitch_um, fit, gaze_range_um, field_of_view_deg : optional
             Pixel pitch in the scene, framing on the layout, or horizontal angle of the selected columns, as for
             :meth:`from_picture`. By default those of the file, or ``fit="cover"``.
         quantity : {"radiance", "reflectance"}, optional
@@ -434,8 +474,7 @@ class Scene:
         modification of the file has changed; replacing it by another file of the same name does not affect the scene. Scale
         factors, units, illuminant and interpolation change only the spectra of the basis images.
         """
-        if pitch_um is not None and field_of_view_deg is not None:
-            raise _framing_conflict("field_of_view_deg", field_of_view_deg, "pitch_um")
+        _check_framing(pitch_um, fit, field_of_view_deg)
         if not isinstance(path, str | Path):
             raise ParameterError(
                 "path", f"must be a file, got {type_name(path)}", hint="pass arrays to Scene, bands first"
@@ -480,6 +519,7 @@ class Scene:
             distance_m,
             source=str(path),
             fit=fit,
+            gaze_range_um=gaze_range_um,
             field_of_view_deg=field_of_view_deg,
             is_picture=True,
         )
@@ -577,6 +617,14 @@ class Scene:
             distance_m,
             source="point sources",
         )
+
+
+def _check_framing(pitch_um: float | None, fit: Fit | None, field_of_view_deg: float | None) -> None:
+    """Raise ParameterError if a framing is given in two ways."""
+    given = {"pitch_um": pitch_um, "field_of_view_deg": field_of_view_deg, "fit": fit}
+    other, name = (*(name for name in given if given[name] is not None), None, None)[:2]
+    if other is not None and name is not None:
+        raise _framing_conflict(name, given[name], other)
 
 
 def _framing_conflict(name: str, value: object, other: str) -> ParameterError:

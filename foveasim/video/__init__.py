@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from foveasim._core.calls import publish
 from foveasim.video.frame_source import FrameSource
-from foveasim.video.gaze import GazePath, pan_camera, saccades, shift_sensor
+from foveasim.video.gaze import GazePath, follow_gaze, pan_camera, saccades, shift_sensor
 from foveasim.video.recording import Recording, count_recorded_frames, partial_path, read_recording
 from foveasim.video.writing import write_video
 
@@ -20,6 +20,7 @@ __all__ = [
     "GazePath",
     "Recording",
     "count_recorded_frames",
+    "follow_gaze",
     "pan_camera",
     "partial_path",
     "read_recording",

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -14,14 +15,16 @@ from foveasim._core.calls import NOT_NEGATIVE, POSITIVE
 from foveasim._core.random_streams import Streams
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, check_number, check_shape, finite_array, read_only
+from foveasim._io.atomic import atomic_write
+from foveasim._io.text_files import read_columns
 from foveasim.camera import Camera
 from foveasim.camera._frames import PathPosition, path_digests, path_positions
-from foveasim.errors import ParameterError
+from foveasim.errors import FileError, ParameterError
 from foveasim.fields import PowerMap
 from foveasim.optics import Optics
 from foveasim.scene import Scene
 
-__all__ = ["GazePath", "pan_camera", "saccades", "shift_sensor"]
+__all__ = ["GazePath", "follow_gaze", "pan_camera", "saccades", "shift_sensor"]
 
 #: Shape of the gamma distribution of fixation durations: the standard deviation is half the mean.
 FIXATION_SHAPE = 4.0
@@ -29,6 +32,8 @@ FIXATION_SHAPE = 4.0
 MIN_FIXATION = 0.2
 #: Upper limit of points; longer paths indicate wrong units.
 MAX_POINTS = 10**8
+#: Columns of a file, and its size limit.
+COLUMNS, MAX_FILE_BYTES = ("t_s", "x_um", "y_um"), 1 << 28
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +69,47 @@ class GazePath:
             )
         object.__setattr__(self, "t_s", read_only(t_s.copy()))
         object.__setattr__(self, "xy_um", read_only(xy_um.copy()))
+
+    @classmethod
+    def read(cls, path: str | Path) -> GazePath:
+        """
+        Read a path from a CSV file.
+
+        Parameters
+        ----------
+        path : path
+            UTF-8 text with the columns ``t_s``, ``x_um`` and ``y_um``, which its first line names; others are ignored.
+
+        Raises
+        ------
+        FileError
+            When the file cannot be read, or is not such a table.
+        """
+        path = Path(path)
+        rows = read_columns(path, "a table of gazes", COLUMNS, MAX_FILE_BYTES)
+        values = np.empty((len(rows), len(COLUMNS)))
+        for k, (number, cells) in enumerate(rows):
+            try:
+                values[k] = [float(cell) for cell in cells]
+            except ValueError:
+                raise FileError(path, f"must have numbers in line {number}, got {', '.join(cells)[:60]}") from None
+        try:
+            return cls(values[:, 0], values[:, 1:])
+        except ParameterError as error:
+            raise FileError(path, str(error)) from None
+
+    def write(self, path: str | Path) -> None:
+        """
+        Write the path to a CSV file, atomically: see :meth:`read`.
+
+        Raises
+        ------
+        FileError
+            When the file cannot be written.
+        """
+        with atomic_write(path) as temporary:
+            values = np.column_stack((self.t_s, self.xy_um))
+            np.savetxt(temporary, values, fmt="%.17g", delimiter=",", header=",".join(COLUMNS), comments="")
 
     def at(self, t_s: ArrayLike) -> Floats:
         """
@@ -162,6 +208,37 @@ def shift_sensor(source: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Sce
     return ((source, position_um) for position_um in path_positions(path.xy_um))
 
 
+def follow_gaze(
+    frames: Iterable[Scene | PowerMap],
+    path: GazePath,
+    *,
+    frame_s: Annotated[float, POSITIVE],
+    first_frame: Annotated[int, NOT_NEGATIVE] = 0,
+) -> Iterator[tuple[Scene | PowerMap, tuple[float, float]]]:
+    """
+    Yield frames of a changing scene along a gaze path.
+
+    The frames are for :meth:`foveasim.Camera.video`, as those of :func:`shift_sensor` for a static scene.
+
+    Parameters
+    ----------
+    frames : iterable of Scene or PowerMap
+        Frames of a video, such as a :class:`FrameSource`.
+    path : GazePath
+    frame_s : float, s
+        Frame period.
+    first_frame : int
+        Number of the first frame, whose gaze is that at ``first_frame * frame_s``.
+
+    Yields
+    ------
+    light, (x_um, y_um)
+    """
+    for k, light in enumerate(frames, first_frame):
+        x_um, y_um = path.at(k * frame_s).tolist()
+        yield light, (x_um, y_um)
+
+
 def pan_camera(
     scene: Scene, path: GazePath, optics: Optics | Camera, *, shape: tuple[int, int]
 ) -> Iterator[tuple[Scene, tuple[float, float]]]:
@@ -202,7 +279,7 @@ def pan_camera(
             # The remaining shift moves the photosites by up to half a pixel on each side.
             margin = 1 if scene.fit == "cover" else 0
             framed = camera.frame(_crop(scene, 0, 0, max(1, n_y - margin), max(1, n_x - margin)))
-            scene = scene.with_pitch(framed.pitch_um or 0.0)
+            scene = scene.framed(framed.pitch_um or 0.0)
     elif scene.pitch_um is None:
         raise ParameterError(
             "scene", "must have a pixel pitch", hint="pass the camera instead of its optics, or camera.frame(scene)"

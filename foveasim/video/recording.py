@@ -54,7 +54,7 @@ NO_FRAME = -1
 NO_PATH = bytes(DIGEST_BYTES).hex()
 #: Settings that may always differ between captures of one recording.
 FRAME_SETTINGS = frozenset(
-    {"exposure_s", "frame", "light.source", "place_um", "gaze.xy_um", "gaze.path", "gaze.next_path"}
+    {"exposure_s", "frame", "light.source", "place_um", "gaze_um", "gaze_path", "next_gaze_path"}
 )
 
 
@@ -318,8 +318,8 @@ def _check_continuation(captures: Iterable[Capture], directory: Path, n_before: 
         if n_before and k == n_before:
             _reject(directory, _property_differences(directory, capture))
             _reject(directory, different)
-            if settings.get("gaze", {}).get("path", NO_PATH) != next_path:
-                _reject(directory, ["gaze"])
+            if settings.get("gaze_path", NO_PATH) != next_path:
+                _reject(directory, ["gaze_path"])
         elif different:
             may_differ |= set(different)
             with _open_checked(directory, "r+") as group:
@@ -382,13 +382,12 @@ class _Frames:
             self._create_arrays(capture)
         n_before, frames = self._chunk
         settings = capture.settings
-        gaze = settings.get("gaze", {})
         frames.append(
             (
                 capture.code,
                 settings.get("exposure_s", np.nan),
-                gaze.get("xy_um", (0.0, 0.0)),
-                np.frombuffer(bytes.fromhex(gaze.get("next_path", NO_PATH)), np.uint8),
+                settings.get("gaze_um", (0.0, 0.0)),
+                np.frombuffer(bytes.fromhex(settings.get("next_gaze_path", NO_PATH)), np.uint8),
                 settings.get("frame", n_before + len(frames)),
             )
         )

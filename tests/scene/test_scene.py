@@ -435,7 +435,6 @@ def test_flat_scene_rejects_invalid_shape(shape):
         ({"band_width_nm": [10.0, 10.0]}, "band_width_nm"),
         ({"pitch_um": math.nan}, "pitch_um"),
         ({"pitch_um": None}, "pitch_um"),
-        ({"fit": "cover"}, "fit"),
         ({"field_of_view_deg": 30.0}, "field_of_view_deg"),
         ({"distance_m": 0.0}, "distance_m"),
     ],

@@ -1135,7 +1135,7 @@ def test_recordings_store_and_check_gaze(tmp_path, kind, every):
         write_video(interrupted(captures(0, path), 2), file, resume=True)
     # Only the last point of the path differs.
     for other in (gaze_path(8, last_um=2.0), GazePath(path.t_s[:-1], path.xy_um[:-1])):
-        with pytest.raises(FileError, match="is another recording: 'gaze' differs"):
+        with pytest.raises(FileError, match="is another recording: 'gaze_path' differs"):
             write_video(captures(2, other), file, resume=True)
     still = camera_of(rows_layout()).video([scene], exposure_s=0.003, seed=1, first_frame=2, **shutter)
     with pytest.raises(FileError, match="is another recording"):

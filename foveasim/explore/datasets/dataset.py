@@ -496,7 +496,8 @@ class Dataset:
         if self._boxes is not None:
             boxes_px, classes = self._boxes[picture]
             on_sites = boxes_on_sites(boxes_px, integrator, lens)
-            found["box_um"] = _pad(on_sites.box_um, self._boxes.most, 0.0)
+            # From the image to the layout.
+            found["box_um"] = _pad(on_sites.box_um - np.tile(camera.position_um, 2), self._boxes.most, 0.0)
             found["box_label"] = _pad(classes, self._boxes.most, NO_CLASS)
             found["box_covers"] = _pad(on_sites.covers, self._boxes.most, False)
         if self._masks is not None:

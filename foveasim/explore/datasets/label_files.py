@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -15,6 +13,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from foveasim._core.names import missing_path
 from foveasim._core.validation import Floats
+from foveasim._io.text_files import read_columns, read_text
 from foveasim.errors import FileError
 from foveasim.explore._files import load_array
 from foveasim.explore.datasets.packed import PackedFiles
@@ -41,29 +40,15 @@ def read_labels(path: Path, pictures: Sequence[str]) -> list[int] | list[str]:
     names of the pictures in the file, which may list others too. Returns ``labels``: integers if all labels of the file are
     integers. Raises FileError when the file cannot be read, or does not contain exactly one class for each picture.
     """
-    content = _content(path)
     if path.suffix.lower() == ".npy":
         return list(_array(path).tolist())
     if path.suffix.lower() != ".csv":
         raise FileError(path, "must be a .csv file with the columns 'picture' and 'label', or an array (.npy)")
-    try:
-        lines = list(csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise FileError(path, f"is not a valid UTF-8 CSV file ({error})") from None
-    header = [name.strip() for name in lines[0]] if lines else []
-    if PICTURE not in header or LABEL not in header:
-        raise FileError(path, f"must have the columns '{PICTURE}' and '{LABEL}' in its first line, got {header}")
-    picture_column, label_column = header.index(PICTURE), header.index(LABEL)
     found: dict[str, str] = {}
-    for number, line in enumerate(lines[1:], 2):
-        if not line:
-            continue
-        if len(line) != len(header):
-            raise FileError(path, f"has {len(line)} values in line {number}, expected {len(header)}")
-        name = line[picture_column].strip()
+    for number, (name, label) in read_columns(path, "a table of labels", (PICTURE, LABEL), MAX_LABEL_BYTES):
         if name in found:
             raise FileError(path, f"lists the picture '{name}' twice, again in line {number}")
-        found[name] = line[label_column].strip()
+        found[name] = label
     _check_complete(path, pictures, found)
     labels = [found[name] for name in pictures]
     return [int(label) for label in labels] if all(INTEGER.fullmatch(label) for label in found.values()) else labels
@@ -99,7 +84,7 @@ def read_boxes(path: Path, pictures: Sequence[str]) -> list[Floats]:
     picture, or a box has no area.
     """
     try:
-        coco = TypeAdapter(_Coco).validate_json(_content(path))
+        coco = TypeAdapter(_Coco).validate_json(read_text(path, "a COCO file", MAX_LABEL_BYTES))
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         location = ".".join(map(str, first["loc"]))
@@ -157,17 +142,6 @@ def _check_complete(path: Path, pictures: Sequence[str], found: Iterable[str], o
         raise FileError(
             path, f"has no entry for {len(missing):,} of {len(pictures):,} pictures, first '{missing[0]}'; {has}{of}"
         )
-
-
-def _content(path: Path) -> bytes:
-    if not path.is_file():
-        raise FileError(path, missing_path(path))
-    if path.stat().st_size > MAX_LABEL_BYTES:
-        raise FileError(path, f"is larger than {MAX_LABEL_BYTES} bytes, the limit of label files")
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise FileError(path, f"cannot be read: {error.strerror or error}") from None
 
 
 def _array(path: Path) -> NDArray[np.generic]:

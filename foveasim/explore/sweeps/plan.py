@@ -60,7 +60,7 @@ POINT, REPEAT = "point", "repeat"
 #: Keys of files with the values of settings: by path, and by point.
 VARY, POINTS = "vary", "points"
 #: Settings of the photosites and their integration areas, and settings of the optical image.
-GEOMETRY_SETTINGS = ("layout", "distortion", "integration_order")
+GEOMETRY_SETTINGS = ("layout", "distortion", "integration_order", "gaze_um")
 IMAGE_SETTINGS = ("scene", "optics", "sensor.qe", "sensor.filters")
 
 

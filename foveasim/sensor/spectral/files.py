@@ -16,8 +16,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from foveasim._core.names import missing_path, possible_names
+from foveasim._core.names import possible_names
 from foveasim._core.validation import MAX_WAVELENGTH_NM, MIN_WAVELENGTH_NM, Floats
+from foveasim._io.text_files import read_text
 from foveasim.errors import FileError
 from foveasim.sensor.spectral.curves import CURVES
 from foveasim.sensor.spectral.response import FilterSet
@@ -157,7 +158,7 @@ def _position(path: Path, table: _Table, column: str | int) -> int:
 
 
 def _read(path: Path, wavelength_unit: WavelengthUnit | None, value_unit: ValueUnit | None) -> _Table:
-    rows = list(_rows(path, _read_string(path)))
+    rows = list(_rows(path, read_text(path, "a table of curves", MAX_FILE_BYTES)))
     if not rows:
         raise FileError(path, "contains no table, only comments and empty lines")
     first = rows[0][1][0]
@@ -178,21 +179,6 @@ def _read(path: Path, wavelength_unit: WavelengthUnit | None, value_unit: ValueU
     lines = [line for line, _ in rows]
     waves_nm = _validate_wavelengths_nm(path, lines, numbers[:, 0] * scale_nm, scale_nm)
     return _Table(names, waves_nm, _validate_values(path, lines, names, numbers[:, 1:], is_percent))
-
-
-def _read_string(path: Path) -> str:
-    try:
-        if not path.is_file():
-            raise FileError(path, missing_path(path))
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise FileError(path, f"must be a table of curves with at most {MAX_FILE_BYTES} bytes")
-        return path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise FileError(path, "is not valid UTF-8 text") from None
-    except (OSError, ValueError) as error:
-        if isinstance(error, FileError):
-            raise
-        raise FileError(path, f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 
 def _rows(path: Path, string: str) -> Iterator[tuple[int, list[str]]]:
