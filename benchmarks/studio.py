@@ -31,7 +31,7 @@ CHANGES: dict[str, tuple[str, Callable[[int], Any], float]] = {
     "exposure": ("exposure_s", lambda k: 0.03 + 1e-4 * k, SENSOR_MS),
     "read noise": ("sensor.read_noise_e", lambda k: 1.0 + 0.01 * k, SENSOR_MS),
     "f-number": ("optics.f_number", lambda k: 2.8 + 0.01 * k, F_NUMBER_MS),
-    "gaze": ("layout.move_um", lambda k: [-140.0 + k, 320.0], LAYOUT_MS),
+    "gaze": ("gaze_um", lambda k: [-140.0 + k, 320.0], LAYOUT_MS),
     "sectors": ("layout.parameters.n_sectors", lambda k: 192 - 2 * (k % 40), LAYOUT_MS),
 }
 #: A layout of 200,000 photosites.

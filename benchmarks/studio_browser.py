@@ -206,7 +206,7 @@ def random_messages(rng: random.Random, studio: Studio) -> list[dict[str, Any]]:
     def gaze() -> dict[str, Any]:
         return {
             "do": "set",
-            "key": "layout.move_um",
+            "key": "gaze_um",
             "value": [rng.uniform(-200, 200), rng.uniform(-200, 200)],
             "final": True,
         }

@@ -19,13 +19,10 @@ from foveasim.capture import Capture
 from foveasim.config import Shot
 from foveasim.errors import GeometryError
 from foveasim.explore.worker_cache import ShotRunner
-from foveasim.layout import Layout
 from foveasim.scene import Scene
 
 #: Longer side of pictures where the page gives none.
 PICTURE_PIXELS = 512
-#: Largest difference of vertices of equal outlines: rounding of positions of a few millimetres.
-ROUNDING_UM = 1e-9
 
 #: Largest number of photosites that are shown.
 MAX_SITES = 2_000_000
@@ -56,10 +53,6 @@ class Simulated:
         Variant to compare with.
     is_preview : bool
         Whether the scene was reduced.
-    unmoved : Layout, optional
-        Earlier layout that differs from that of the capture by a translation only: what depends on it is known.
-    move_um : (dx, dy), µm
-        The translation.
     picture_pixels : int
         Longer side of pictures.
     """
@@ -73,8 +66,6 @@ class Simulated:
     seconds_s: float = 0.0
     frozen: Simulated | None = None
     is_preview: bool = False
-    unmoved: Layout | None = None
-    move_um: tuple[float, float] = (0.0, 0.0)
     picture_pixels: int = PICTURE_PIXELS
 
     __repr__ = short_repr
@@ -92,7 +83,6 @@ class Engine:
 
     def __init__(self, *, n_threads: int | None = None, check: Callable[[], None] | None = None) -> None:
         self._runner = ShotRunner(None, {}, n_threads=n_threads, max_bytes=MAX_BYTES, check=check)
-        self._unmoved: Layout | None = None
 
     @property
     def n_built(self) -> dict[str, int]:
@@ -125,9 +115,6 @@ class Engine:
                 images = self._runner.images(shot, used)
             finally:
                 found = cache.finish_point()
-        move_um = None if self._unmoved is None else _translation_um(self._unmoved, capture.layout)
-        if move_um is None:
-            self._unmoved, move_um = capture.layout, (0.0, 0.0)
         messages = dict.fromkeys([*found, *(" ".join(str(warning.message).split()) for warning in caught)])
         return Simulated(
             dict(settings),
@@ -138,8 +125,6 @@ class Engine:
             list(messages),
             time.perf_counter() - start_s,
             is_preview=is_reduced,
-            unmoved=self._unmoved,
-            move_um=move_um,
         )
 
     def _shot(self, settings: Mapping[str, Any], is_preview: bool) -> tuple[Shot, Mapping[str, Any], bool]:
@@ -158,21 +143,6 @@ class Engine:
         used = {**settings, "scene": {"preview": key}, "optics": {**settings["optics"], "oversample": 1}}
         optics = self._runner.part("optics", used["optics"], lambda: replace(camera.optics, oversample=1))
         return replace(shot, scene=reduced, camera=camera.replace(optics=optics)), used, True
-
-
-def _translation_um(before: Layout, after: Layout) -> tuple[float, float] | None:
-    """Return the translation between two layouts; None if they differ otherwise."""
-    if before is after:
-        return 0.0, 0.0
-    if before.xy_um.shape != after.xy_um.shape or not (
-        np.array_equal(before.ring_offsets, after.ring_offsets)
-        and np.array_equal(before.site_offsets, after.site_offsets)
-    ):
-        return None
-    shift_um = after.xy_um - before.xy_um
-    if np.abs(shift_um - shift_um[0]).max() > ROUNDING_UM:
-        return None
-    return float(shift_um[0, 0]), float(shift_um[0, 1])
 
 
 def block_means(cells: NDArray[Any], block: int) -> NDArray[Any]:

@@ -30,7 +30,6 @@ layout:
   generator: log_polar
   parameters: {n_sectors: 48, min_size_um: 8.0, r_max_um: 690.0, stagger: true, chords_per_arc: 2}
   mosaic: [RG, GB]
-  move_um: [-140.0, 320.0]
   rules: {min_size_um: 8.0, min_width_um: 7.0}
 sensor:
   qe: {kind: silicon, depth_um: 3.0}
@@ -39,6 +38,7 @@ sensor:
   read_noise_e: 1.0
   v_sat_v: 3.0
   bits: 10
+gaze_um: [-140.0, 320.0]
 exposure_s: 0.02
 seed: 1
 """)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -165,27 +164,16 @@ def test_summary_contains_numbers_of_capture(engine, settings):
     assert summary["mean_dn"] == result.capture.code.mean()
 
 
-def test_moved_layout_has_moved_picture(engine, settings):
+@pytest.mark.parametrize("axis", ["image", "sensor"])
+def test_gaze_keeps_layout_and_scale(engine, settings, axis):
+    settings |= {"axis": axis}
     first = engine.simulate(settings)
-    moved = engine.simulate(with_value(settings, "layout.move_um", [3.25, -7.5]))
-    about, arrays = PARTS["picture"].make(moved)
-    picture = moved.capture.picture(max_pixels=moved.picture_pixels)
+    moved = engine.simulate(settings | {"gaze_um": [3.25, -7.5]})
+    about, other = (PARTS["scene"].make(each)[0] for each in (first, moved))
 
-    assert moved.unmoved is first.capture.layout
-    assert moved.move_um == pytest.approx((3.25, -7.5), abs=1e-12)
-    assert about["bounds_um"] == pytest.approx(picture.grid.bounds_um, abs=1e-9)
-    # As without the earlier layout, up to the rounding of levels.
-    own_about, own = PARTS["picture"].make(replace(moved, unmoved=None, move_um=(0.0, 0.0)))
-    assert (about["width"], about["height"]) == (own_about["width"], own_about["height"])
-    assert np.abs(arrays["rgba"].astype(int) - own["rgba"]).max() <= 1
-
-
-@pytest.mark.parametrize(
-    ("key", "value"), [("layout.parameters.pitch_um", 12.5), ("layout.parameters.n_x", 15), ("layout.inset_um", 0.5)]
-)
-def test_changed_outlines_are_not_translations(engine, settings, key, value):
-    engine.simulate(settings)
-    changed = engine.simulate(with_value(settings, key, value))
-
-    assert changed.unmoved is changed.capture.layout
-    assert changed.move_um == (0.0, 0.0)
+    assert moved.capture.layout is first.capture.layout
+    assert moved.capture.settings["light"]["pitch_um"] == first.capture.settings["light"]["pitch_um"]
+    place_um = [np.array(each["position_um"]) - each["bounds_um"][:2] for each in (about, other)]
+    assert place_um[1] - place_um[0] == pytest.approx((3.25, -7.5), abs=1e-9)
+    assert engine.n_built["images"] == (1 if axis == "image" else 2)
+    assert not np.array_equal(moved.capture.code, first.capture.code)

@@ -140,13 +140,13 @@ def test_video_plays_while_gaze_moves(visit, tmp_path):
     film(page)
     page.click("[aria-label='Play']")
     until(page, "() => studio.state.film.n >= 3")
-    page.evaluate("() => { studio.connection.set('layout.move_um', [-100, 250], true); }")
+    page.evaluate("() => { studio.connection.set('gaze_um', [-100, 250], true); }")
     until(page, "() => studio.state.film.n === 11 && !studio.sources.film.isPlaying")
     ready(page)
 
-    assert setting(page, "layout.move_um") == [-100, 250]
+    assert setting(page, "gaze_um") == [-100, 250]
     change(page, "() => { studio.connection.send({ do: 'undo' }); }")
-    assert setting(page, "layout.move_um") == [-140.0, 320.0]
+    assert setting(page, "gaze_um") == [-140.0, 320.0]
     assert page.evaluate("studio.state.film.n") == 11
     change(page, "() => { studio.connection.send({ do: 'undo' }); }")
     assert setting(page, "scene.picture") == "skimage:astronaut"

@@ -234,9 +234,9 @@ def test_every_kind_of_control_changes_state(visit):
     answer("optics.lens", "aplanatic")
     control(page, "layout.parameters.stagger", "input").uncheck()
     answer("layout.parameters.stagger", False)
-    control(page, "layout.move_um").fill("-100, 250.5")
-    control(page, "layout.move_um").press("Enter")
-    answer("layout.move_um", [-100, 250.5])
+    control(page, "gaze_um").fill("-100, 250.5")
+    control(page, "gaze_um").press("Enter")
+    answer("gaze_um", [-100, 250.5])
     control(page, "scene.picture").fill("skimage:coins")
     control(page, "scene.picture").press("Enter")
     answer("scene.picture", "skimage:coins")
@@ -449,8 +449,9 @@ def test_gaze_follows_drag_on_scene(visit):
         "() => studio.isReady && studio.state.can_undo && studio.connection.requests.doneId >= studio.connection.requests.lastId",
     )
 
-    assert setting(page, "layout.move_um") == pytest.approx([-40.0, 260.0], abs=3.0)
-    assert page.evaluate("studio.panes.scene.frame") == pytest.approx([x0 + 100, y0 - 60, x1 + 100, y1 - 60], abs=3.0)
+    assert setting(page, "gaze_um") == pytest.approx([-40.0, 260.0], abs=3.0)
+    assert page.evaluate("studio.panes.scene.place") == setting(page, "gaze_um")
+    assert page.evaluate("studio.panes.scene.frame") == [x0, y0, x1, y1]  # the layout stays
 
 
 def test_preset_replaces_the_layout(visit):
@@ -602,7 +603,7 @@ def test_keyboard_alone_changes_and_undoes(visit):
     assert page.evaluate("studio.panes.b.isWhole") is False
     page.focus("#scene .marks")
     page.keyboard.press("ArrowRight")
-    until(page, "() => studio.state.settings.layout.move_um[0] > -140")
+    until(page, "() => studio.state.settings.gaze_um[0] > -140")
 
 
 @pytest.mark.parametrize("width", [390, 1280, 2560])

@@ -44,12 +44,12 @@ def table(page):
 
 
 def test_photograph_is_captured(page, tasks):
-    gaze_um = np.array(setting(page, "layout.move_um"))
+    gaze_um = np.array(setting(page, "gaze_um"))
     tasks.photograph(page, Path(str(files("skimage.data") / "coffee.png")))
 
     assert setting(page, "scene.picture").endswith("coffee.png")
     assert setting(page, "optics.f_number") == 4
-    assert np.any(np.array(setting(page, "layout.move_um")) != gaze_um)
+    assert np.any(np.array(setting(page, "gaze_um")) != gaze_um)
     assert np.ptp(codes(page)) > 50
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -21,12 +20,9 @@ N_LEVELS = 1 << 14
 def picture(result: Simulated) -> PartData:
     """Return the picture that is reconstructed from the codes."""
     capture = result.capture
-    # The picture of a layout that only moved is that of the earlier one, whose compiled outlines are cached.
-    unmoved = capture if result.unmoved is None else replace(capture, layout=result.unmoved)
-    found = unmoved.picture(max_pixels=result.picture_pixels)
+    found = capture.picture(max_pixels=result.picture_pixels)
     levels = found.data / capture.white_dn.reshape(-1, 1, 1).astype(np.float32)
-    bounds_um = tuple(side + move for side, move in zip(found.grid.bounds_um, 2 * result.move_um, strict=True))
-    return pixels_of(levels, found.coverage, bounds_um)
+    return pixels_of(levels, found.coverage, found.grid.bounds_um)
 
 
 def pixels_of(light: NDArray[Any], coverage: NDArray[Any], bounds_um: tuple[float, ...]) -> PartData:

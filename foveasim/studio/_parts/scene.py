@@ -21,8 +21,8 @@ def _light_of(result: Simulated) -> tuple[Any, ...]:
     """Return the images, their position and the white level that scales them."""
     source, camera = result.shot.scene, result.shot.camera
     if isinstance(source, PowerMap):
-        return source, (result.picture_pixels,)
-    numbers = result.picture_pixels, *result.capture.white_dn.tolist(), *camera.image_grid(source).bounds_um
+        return source, (result.picture_pixels, *camera.position_um)
+    numbers = result.picture_pixels, *result.capture.white_dn.tolist(), *camera.image_grid(source).bounds_um, *camera.position_um
     return (*result.images.values(), tuple(result.images), numbers)
 
 
@@ -46,7 +46,7 @@ def scene(result: Simulated) -> PartData:
     data /= np.asarray(white, np.float32).reshape(-1, 1, 1)
     scale = float(np.quantile(data, WHITE_QUANTILE)) or 1.0
     about, arrays = pixels_of(data / scale, np.ones(data.shape[1:], np.float32), grid.bounds_um)
-    return about, arrays
+    return about | {"position_um": list(camera.position_um)}, arrays
 
 
 def _reduced(bands: Sequence[NDArray[Any]], grid: Grid, n_pixels: int) -> tuple[NDArray[np.float32], Grid]:

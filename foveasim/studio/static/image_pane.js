@@ -11,8 +11,8 @@ import { fitted } from "./site_pane.js";
 const GAZE_STEP = 0.02;
 
 export class ImagePane {
-  // Callbacks: hover(x, y, pane), leave(), click(x, y), gaze(dx, dy, isFinal). canMove() is whether the gaze can be dragged;
-  // mapOf() is the map whose view the picture can follow.
+  // Callbacks: hover(x, y, pane), leave(), click(x, y), on the layout; gaze(dx, dy, isFinal). canMove() is whether the gaze can be
+  // dragged; mapOf() is the map whose view the picture can follow.
   constructor(root, on, { label, mapOf, canMove = () => false }) {
     this.root = root;
     this.on = on;
@@ -29,47 +29,53 @@ export class ImagePane {
     /** @type {number[] | null} */
     this.bounds = null;
     this.follows = false;
+    // Position of the layout in the image.
     /** @type {Point} */
-    this.offset = [0, 0];
+    this.position = [0, 0];
+    // Drag of the outline: its position on the picture at the start, from the lower left corner, and its displacement.
+    /** @type {{ from: Point, offset: Point } | null} */
+    this.drag = null;
     this._listen();
   }
 
   _listen() {
     const { marks, on } = this;
+    // Point of the layout.
     /** @type {(event: MouseEvent) => Point} */
     const at = (event) => {
-      const box = marks.getBoundingClientRect(), view = this.view();
-      return [view.fromX(event.clientX - box.left), view.fromY(event.clientY - box.top)];
+      const box = marks.getBoundingClientRect(), view = this.view(), [px, py] = this.place;
+      return [view.fromX(event.clientX - box.left) - px, view.fromY(event.clientY - box.top) - py];
     };
-    /** @type {Point | null} */
+    /** @type {{ clientX: number, clientY: number, isOnLayout: boolean } | null} */
     let start = null;
-    let isMoving = false;
     marks.addEventListener("pointerdown", (event) => {
       if (!this.bounds || event.button !== 0) return;
-      start = at(event);
-      isMoving = false;
+      start = { clientX: event.clientX, clientY: event.clientY, isOnLayout: this._isInFrame(at(event)) };
       marks.setPointerCapture(event.pointerId);
     });
     marks.addEventListener("pointermove", (event) => {
       if (!this.bounds) return;
-      const [x, y] = at(event);
-      if (start && this.canMove() && this.frame && this._isInFrame(start)) {
-        if (!isMoving && Math.hypot(x - start[0], y - start[1]) * this.view().perUm < 4) return;
-        isMoving = true;
-        marks.classList.add("held");
-        this.offset = [x - start[0], y - start[1]];
-        on.gaze(...this.offset, false);
-      } else on.hover(x, y, this);
+      if (!start || !start.isOnLayout || !this.canMove()) {
+        on.hover(...at(event), this);
+        return;
+      }
+      // In pixels: the image of a camera that turns moves during the drag.
+      const dx = event.clientX - start.clientX, dy = start.clientY - event.clientY, { perUm } = this.view();
+      if (!this.drag && Math.hypot(dx, dy) < 4) return;
+      const [x0, y0] = this.bounds, [px, py] = this.place;
+      /** @type {Point} */
+      const offset = [dx / perUm, dy / perUm];
+      this.drag = { from: this.drag ? this.drag.from : [px - x0, py - y0], offset };
+      marks.classList.add("held");
+      on.gaze(...offset, false);
     });
     const end = (event) => {
-      if (isMoving) {
-        const moved = this.offset;
-        this.offset = [0, 0];
-        if (event.type === "pointerup") on.gaze(...moved, true);
+      const { drag } = this;
+      if (drag) {
+        if (event.type === "pointerup") on.gaze(...drag.offset, true);
         else on.gaze(0, 0, true);
       } else if (start && event.type === "pointerup") on.click(...at(event));
-      start = null;
-      isMoving = false;
+      this.drag = start = null;
       marks.classList.remove("held");
     };
     marks.addEventListener("pointerup", end);
@@ -85,12 +91,22 @@ export class ImagePane {
   }
 
   _isInFrame([x, y]) {
+    if (!this.frame) return false;
     const [a, b, c, d] = this.frame;
     return x >= a && x <= c && y >= b && y <= d;
   }
 
-  use({ width, height, bounds_um: bounds, frame_um: frame }, rgba) {
+  // Where the outline of the layout is: its position in the image, or that of a drag.
+  /** @returns {Point} */
+  get place() {
+    if (!this.drag || !this.bounds) return this.position;
+    const [x0, y0] = this.bounds, { from, offset } = this.drag;
+    return [x0 + from[0] + offset[0], y0 + from[1] + offset[1]];
+  }
+
+  use({ width, height, bounds_um: bounds, frame_um: frame, position_um: position }, rgba) {
     this.bounds = bounds;
+    this.position = position || [0, 0];
     this.frame = frame || null;
     this.pixels.width = width;
     this.pixels.height = height;
@@ -104,7 +120,7 @@ export class ImagePane {
     let x = 0.5 * (x0 + x1), y = 0.5 * (y0 + y1), perUm = Math.min(width / (x1 - x0), height / (y1 - y0));
     const map = this.follows ? this.mapOf() : null;
     if (map) {
-      ({ x, y } = map);
+      [x, y] = [map.x + this.position[0], map.y + this.position[1]];
       perUm = map.scale * Math.min(width / map.width, height / map.height);
     }
     return {
@@ -137,20 +153,19 @@ export class ImagePane {
   // Marks: cursor, the map whose view is a rectangle, the boundary of the layout.
   drawMarks({ cursor, map, boundary }) {
     if (!this.isShown) return;
-    const view = this.view(), isAt = cursor && cursor.from !== this;
-    const state = JSON.stringify([view.width, view.height, view.toX(0), view.toY(0), view.perUm, this.frame, this.offset,
+    const view = this.view(), isAt = cursor && cursor.from !== this, [px, py] = this.place;
+    const state = JSON.stringify([view.width, view.height, view.toX(0), view.toY(0), view.perUm, this.frame, px, py,
       isAt && [cursor.x, cursor.y], map && !this.follows && [map.x, map.y, map.scale, map.width, map.height]]);
     // Drawn again only when the marks change: each layer costs time to compose the page.
     if (state === this.shown && boundary === this.shownBoundary) return;
     this.shown = state;
     this.shownBoundary = boundary;
     const { context, width, height } = fitted(this.marks);
+    const onLayout = { ...view, toX: (/** @type {number} */ u) => view.toX(u + px), toY: (/** @type {number} */ v) => view.toY(v + py) };
     if (boundary && this.frame) {
-      const [dx, dy] = this.offset;
-      outline(context, () => boundary(context, (x) => view.toX(x + dx), (y) => view.toY(y + dy)), [3.5, 1.5],
-        ["rgb(0 0 0 / 60%)", "#ffd34d"]);
+      outline(context, () => boundary(context, onLayout.toX, onLayout.toY), [3.5, 1.5], ["rgb(0 0 0 / 60%)", "#ffd34d"]);
     }
-    if (map && !this.follows) drawView(context, view, map, width, height);
-    if (isAt) drawCross(context, view.toX(cursor.x), view.toY(cursor.y), true);
+    if (map && !this.follows) drawView(context, onLayout, map, width, height);
+    if (isAt) drawCross(context, onLayout.toX(cursor.x), onLayout.toY(cursor.y), true);
   }
 }

@@ -217,9 +217,8 @@ function showState(message) {
   $("problem").textContent = rest.join(" ");
   $("undo").disabled = !state.can_undo;
   $("redo").disabled = !state.can_redo;
-  const canMove = Boolean(gazeKey());
-  $("scene").classList.toggle("can-move", canMove);
-  $("gaze-note").hidden = !canMove;
+  $("scene").classList.add("can-move");
+  $("gaze-note").hidden = false;
   if (state.frozen && frozen) frozen.summary = state.frozen.summary;
   editor.update(state);
   views.tell("onState");
@@ -371,17 +370,10 @@ function showSelection() { views.tell("onSelection"); }
 
 // -- gaze -------------------------------------------------------------------------------------------------------------------
 
-function gazeKey() {
-  if (!page.state) return null;
-  for (const row of controls.rows.values()) if (/(^|\.)move_um$/.test(row.control.key)) return row.control.key;
-  return null;
-}
-
-// Moves the layout by a distance from its position at the start of the drag.
+// Moves the gaze by a distance from that at the start of the drag.
 /** @param {number} dx @param {number} dy @param {boolean} isFinal */
 function gaze(dx, dy, isFinal) {
-  const key = gazeKey(), { map } = panes.b;
-  if (!key) return;
+  const key = "gaze_um", { map } = panes.b;
   /** @type {Point} */
   const from = page.gazeAt || valueAt(page.state?.settings, key) || [0, 0];
   page.gazeAt = from;
@@ -599,7 +591,7 @@ function createPanes() {
     picture: new ImagePane($("picture"), onImage, { mapOf, label: "Reconstructed picture" }),
     pictureA: new ImagePane($("picture-a"), onImage, { mapOf, label: "Reconstructed picture of variant A" }),
     scene: new ImagePane($("scene"), onImage, {
-      mapOf, label: "Optical image with the outline of the layout. Arrow keys move the gaze.", canMove: () => Boolean(gazeKey()),
+      mapOf, label: "Optical image with the outline of the layout. Arrow keys move the gaze.", canMove: () => Boolean(page.state),
     }),
   };
   panes.picture.follows = panes.pictureA.follows = true;
@@ -621,7 +613,8 @@ const studio = {
   get isReady() { return Boolean(page.state && panes.b.scale && connection.isSettled && views.nLoading === 0 && page.asked === null); },
   toWindow: (x, y, pane = "b") => {
     const canvas = panes[pane].marks, box = canvas.getBoundingClientRect(), view = panes[pane].view ? panes[pane].view() : panes[pane].map;
-    return [box.left + view.toX(x), box.top + view.toY(y)];
+    const [px, py] = panes[pane].place || [0, 0];
+    return [box.left + view.toX(x + px), box.top + view.toY(y + py)];
   },
   ink: inkOf, offsetsOf,
 };
