@@ -21,6 +21,8 @@ from foveasim.view import plot_capture, save_figure
 PITCH_UM = 500.0
 DISTANCE_M = 1.0
 EXPOSURE_S = 1 / 30
+#: Position of the face in the image.
+GAZE_UM = (-140.0, 320.0)
 
 
 def camera_of(layout: fs.Layout) -> fs.Camera:
@@ -47,24 +49,23 @@ def main(out_dir: Path) -> None:
         wavelength_nm=(620, 550, 450),
     )
 
-    # %% Sensor: rings of 192 sites of at least 2 µm, centred on the face.
+    # %% Sensor: rings of 192 sites of at least 2 µm.
     layout = fs.layout.log_polar(n_sectors=192, min_size_um=2.0, r_max_um=690.0, stagger=True, chords_per_arc=2)
-    layout = fs.layout.mosaic(layout, ("RG", "GB")).translate(-140.0, 320.0)
+    layout = fs.layout.mosaic(layout, ("RG", "GB"))
     camera = camera_of(layout)
 
-    # %% Capture.
-    capture = camera.capture(scene, exposure_s=EXPOSURE_S, seed=1)
+    # %% Capture, with the gaze on the face.
+    capture = camera.capture(scene, exposure_s=EXPOSURE_S, seed=1, gaze_um=GAZE_UM)
     capture.picture(max_pixels=800).save(out_dir / "01_foveal_picture.png", capture.white_dn, encode_srgb=True)
     axes = plot_capture(capture)
     save_figure(axes.figure, out_dir / "01_foveal_layout.png", dpi=140)
 
     # %% The same field on a square grid with as many photosites.
-    x_min, y_min, x_max, y_max = layout.bounds_um
+    x_min, _, x_max, _ = layout.bounds_um
     n = math.isqrt(layout.n_sites)
     pitch_um = (x_max - x_min) / n
     square = fs.layout.mosaic(fs.layout.grid(n_x=n, n_y=n, pitch_um=pitch_um), ("RG", "GB"))
-    square = square.translate(0.5 * (x_min + x_max), 0.5 * (y_min + y_max))
-    square_capture = camera_of(square).capture(scene, exposure_s=EXPOSURE_S, seed=1)
+    square_capture = camera_of(square).capture(scene, exposure_s=EXPOSURE_S, seed=1, gaze_um=GAZE_UM)
     square_capture.picture(max_pixels=800).save(
         out_dir / "01_square_picture.png", square_capture.white_dn, encode_srgb=True
     )
