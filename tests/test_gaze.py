@@ -392,3 +392,33 @@ def test_invalid_path_file_is_one_sentence(tmp_path, text, message):
     with pytest.raises(FileError, match=message) as caught:
         GazePath.read(tmp_path / "path.csv")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["chip.gds", "chip.npz", "chip.geojson", "chip.yaml"])
+def test_layouts_are_centred_when_read(tmp_path, name):
+    layout = fs.layout.grid(n_x=4, n_y=3, pitch_um=2.0).translate(500.0, -70.0)
+    if name.endswith(".yaml"):
+        generated = {
+            "generator": "grid",
+            "parameters": {"n_x": 4, "n_y": 3, "pitch_um": 2.0},
+            "move_um": [500.0, -70.0],
+        }
+        (tmp_path / name).write_text(yaml.safe_dump(generated))
+    else:
+        layout.write(tmp_path / name)
+
+    assert fs.read_layout(tmp_path / name).bounds_um == pytest.approx((496.0, -73.0, 504.0, -67.0))
+    found = fs.read_layout(tmp_path / name, centre=True)
+    assert found.bounds_um == pytest.approx((-4.0, -3.0, 4.0, 3.0), abs=1e-9)
+    if not name.endswith(".yaml"):
+        settings = {**SETTINGS, "layout": {"file": str(tmp_path / name), "centre": True}}
+        assert read_shot_of(tmp_path, settings).camera.layout.bounds_um == found.bounds_um
+    assert layout[:0].centre().n_sites == 0
+
+
+def read_shot_of(directory, data):
+    from PIL import Image
+
+    Image.fromarray((255 * PICTURE).astype(np.uint8)).save(directory / "scene.png")
+    (directory / "shot.yaml").write_text(yaml.safe_dump(data))
+    return read_shot(directory / "shot.yaml")

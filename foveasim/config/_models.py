@@ -161,6 +161,7 @@ FILE_OPTIONS: dict[str, Any] = {
     "channels": dict[str, int | str] | None,
     "filter_names": list[str] | None,
     "invalid": Literal["error", "skip", "repair"] | None,
+    "centre": bool | None,
 }
 #: Parameters that files do not contain: a density picture covers the rectangle ``size_um``.
 _EXCLUDED = ("density_grid",)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -296,7 +296,9 @@ def read_layout(path: str | Path, **options: Any) -> Layout:
     return read_any_layout(path, **options).layout
 
 
-def read_any_layout(path: str | Path, *, directory: str | Path = ".", **options: Any) -> LayoutFile:
+def read_any_layout(
+    path: str | Path, *, directory: str | Path = ".", centre: bool | None = None, **options: Any
+) -> LayoutFile:
     """
     Read a layout with its design rules from a file, or a bundled one by its name.
 
@@ -306,6 +308,8 @@ def read_any_layout(path: str | Path, *, directory: str | Path = ".", **options:
         A file takes precedence over a bundled layout of the same name.
     directory : path
         Directory of relative paths; the working directory by default.
+    centre : bool, optional
+        Whether to move the centre of the layout's bounding box to the origin.
     **options
         Options of the format, as for :func:`foveasim.layout.read_layout`.
 
@@ -319,7 +323,9 @@ def read_any_layout(path: str | Path, *, directory: str | Path = ".", **options:
     path = layout_path(path, directory)
     if path.suffix.lower() in YAML_EXTENSIONS:
         check_no_options(**options)
-        return read_layout_file(path)
+        found = read_layout_file(path)
+        return replace(found, layout=found.layout.centre()) if centre else found
+    options |= {"centre": centre}
     return LayoutFile(layout=read_sites(path, **options), rules=None, source=str(path))
 
 

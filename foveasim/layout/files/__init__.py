@@ -62,6 +62,7 @@ def read_layout(
     channels: Mapping[Any, int | str] | None = None,
     filter_names: Sequence[str] | None = None,
     invalid: Literal["error", "skip", "repair"] | None = None,
+    centre: bool | None = None,
     **options: Any,
 ) -> Layout:
     """
@@ -89,6 +90,8 @@ def read_layout(
         GDSII and OASIS: outlines that are not simple polygons, because they cross themselves or have no area, are an error by
         default, which lists all of them with their positions. ``"skip"`` reads the others. ``"repair"`` also divides an outline
         where it crosses itself, and reads the largest part.
+    centre : bool, optional
+        Whether to move the centre of the layout's bounding box to the origin, where :class:`foveasim.Camera` has the optical axis.
     **options
         Options of other formats in :data:`foveasim.layout.files.FORMATS`.
 
@@ -121,7 +124,7 @@ def read_layout(
     chosen = validate_options(given | options, found.read_options, FORMATS, "read_options")
     with as_file_error(path, f"{found.title} layout", passes=(FoveasimError,)):
         layout: Layout = found.read(path, **chosen)
-        return layout
+        return layout.centre() if centre else layout
 
 
 def check_no_options(**options: object) -> None:

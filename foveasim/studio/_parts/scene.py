@@ -22,7 +22,12 @@ def _light_of(result: Simulated) -> tuple[Any, ...]:
     source, camera = result.shot.scene, result.shot.camera
     if isinstance(source, PowerMap):
         return source, (result.picture_pixels, *camera.position_um)
-    numbers = result.picture_pixels, *result.capture.white_dn.tolist(), *camera.image_grid(source).bounds_um, *camera.position_um
+    numbers = (
+        result.picture_pixels,
+        *result.capture.white_dn.tolist(),
+        *camera.image_grid(source).bounds_um,
+        *camera.position_um,
+    )
     return (*result.images.values(), tuple(result.images), numbers)
 
 
