@@ -710,9 +710,9 @@ class Camera:
 
     def _frame_rates(self, frames: Iterable[Frame], clock: Clock, ahead: int) -> Iterator[tuple[Task, Floats]]:
         """Yield each frame with its photoelectron rates."""
-        single_threaded = self
+        rates_of = self._photoelectrons_per_s
         if ahead:
-            single_threaded = self.replace(n_threads=1)
+            rates_of = self.replace(n_threads=1)._photoelectrons_per_s  # noqa: SLF001 -- of the same class
         image_lock = Lock()
         warned: set[str] = set()
 
@@ -723,7 +723,7 @@ class Camera:
             # The first frame of a scene computes the images that its next frames share.
             with image_lock if task.images == {} else nullcontext():
                 gaze_um = task.position_um if task.is_moving else None
-                found = single_threaded._photoelectrons_per_s(task.light, own, gaze_um, task.images, warned)
+                found = rates_of(task.light, own, gaze_um, task.images, warned)
                 return task, found, own
 
         rate_e_per_s = np.zeros(self._layout.n_sites)

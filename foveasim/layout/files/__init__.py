@@ -91,7 +91,7 @@ def read_layout(
         default, which lists all of them with their positions. ``"skip"`` reads the others. ``"repair"`` also divides an outline
         where it crosses itself, and reads the largest part.
     centre : bool, optional
-        Whether to move the centre of the layout's bounding box to the origin, where :class:`foveasim.Camera` has the optical axis.
+        Whether to move the centre of the layout's bounding box to the origin.
     **options
         Options of other formats in :data:`foveasim.layout.files.FORMATS`.
 
