@@ -721,7 +721,7 @@ class Camera:
             if task.is_repeated:
                 return task, None, own
             # The first frame of a scene computes the images that its next frames share.
-            with image_lock if task.images == {} else nullcontext():
+            with image_lock if task.images == {} and self._axis == "image" else nullcontext():
                 gaze_um = task.position_um if task.is_moving else None
                 found = rates_of(task.light, own, gaze_um, task.images, warned)
                 return task, found, own
