@@ -319,6 +319,89 @@ def test_sweeps_have_the_gaze(files, axis, expected):
     assert runner.cache.n_built["images"] == (1 if axis == "image" else 3)
 
 
+def test_datasets_have_the_gaze(files, axis, expected):
+    from foveasim import explore
+
+    shot = {name: value for name, value in with_gaze(axis).items() if name not in ("seed", "scene")}
+    scene = {name: value for name, value in SETTINGS["scene"].items() if name not in ("encoding", "picture")}
+    pictures = [(255 * PICTURE).astype(np.uint8)]
+    varied = explore.Dataset(
+        pictures, {**shot, "scene": {**scene, "encoding": "linear"}},
+        {"gaze_um.0": {"uniform": [-20.0, 20.0]}, "gaze_um.1": {"uniform": [-10.0, 10.0]}},
+        cameras=3, seed=1, fields=("expected_e",), boxes=[[[40, 30, 90, 70, 1]]],
+    )  # fmt: skip
+    fixed = explore.Dataset(
+        pictures, {**shot, "scene": {**scene, "encoding": "linear"}}, cameras=1, seed=1, fields=("expected_e",)
+    )
+    base = read_shot(files / "shot.yaml")
+
+    np.testing.assert_array_equal(fixed[0]["expected_e"], expected.expected_e)
+    for sample in varied:
+        gaze_um = (sample["settings"]["gaze_um.0"], sample["settings"]["gaze_um.1"])
+        found = base.camera.photoelectrons_per_s(base.scene, gaze_um=gaze_um, axis=axis) * EXPOSURE_S
+        np.testing.assert_allclose(sample["expected_e"], found, rtol=1e-12)
+        # Boxes are positions on the layout.
+        x0, _, x1, y1 = base.camera.image_grid(base.scene).bounds_um
+        pixel_um = (x1 - x0) / PICTURE.shape[1]
+        left_um, top_um = x0 + 40 * pixel_um - gaze_um[0], y1 - 30 * pixel_um - gaze_um[1]
+        assert sample["box_um"][0, [0, 3]] == pytest.approx([left_um, top_um], abs=1e-9)
+
+
+def test_command_of_videos_follows_a_path(files, axis, expected):
+    from PIL import Image
+    from typer.testing import CliRunner
+
+    from foveasim.cli import app
+    from foveasim.video import read_recording
+
+    (files / "frames").mkdir()
+    for k in range(2):
+        Image.fromarray((255 * PICTURE).astype(np.uint8)).save(files / "frames" / f"{k}.png")
+    GazePath([0.0, 0.04], [GAZE_UM, (0.0, 0.0)]).write(files / "path.csv")
+    command = ["video", str(files / "shot.yaml"), "--frames", str(files / "frames"), "--gaze", str(files / "path.csv")]
+    options = ["--out", str(files / "codes.zarr"), "--set", f"axis={axis}", "--fps", "25"]
+    found = CliRunner().invoke(app, [*command, *options])
+
+    assert found.exit_code == 0, found.output
+    recording = read_recording(files / "codes.zarr")
+    assert recording.gaze_um.tolist() == [list(GAZE_UM), [0.0, 0.0]]
+    assert np.array_equal(recording.code[0], expected.code)
+    failed = CliRunner().invoke(app, [*command[:-1], str(files / "none.csv"), "--out", str(files / "other.zarr")])
+    assert failed.exit_code == 2
+
+
+def test_comparisons_have_the_gaze(files):
+    from foveasim import compare
+
+    square = fs.layout.grid(n_x=12, n_y=10, pitch_um=5.0)
+    named = {"hexagonal": camera_of().at(GAZE_UM), "square": camera_of(square).at(GAZE_UM)}
+    scenes = {
+        "noise": scene_of(
+            pitch_um=100.0,
+        )
+    }
+    found = compare.cameras(named, scenes, exposure_s=EXPOSURE_S, max_pixels=32, n_annuli=2)
+    still = compare.cameras(
+        {name: camera.at((0.0, 0.0)) for name, camera in named.items()},
+        scenes,
+        exposure_s=EXPOSURE_S,
+        max_pixels=32,
+        n_annuli=2,
+    )
+    # The scene displaced against the gaze, and no gaze.
+    magnification = OPTICS.magnification(DISTANCE_M)
+    centre_um = (-GAZE_UM[0] / magnification, -GAZE_UM[1] / magnification)
+    displaced = compare.cameras(
+        {name: camera.at((0.0, 0.0)) for name, camera in named.items()},
+        {"noise": scenes["noise"].with_centre(centre_um)}, exposure_s=EXPOSURE_S, max_pixels=32, n_annuli=2,
+    )  # fmt: skip
+
+    assert found.settings["cameras"]["square"]["gaze_um"] == list(GAZE_UM)
+    psnr, other, same = (each.values["psnr_db"] for each in (found, still, displaced))
+    assert not np.allclose(psnr, other, rtol=1e-3)
+    np.testing.assert_allclose(psnr, same, rtol=1e-3)  # relative illumination differs
+
+
 def test_ideal_pictures_have_the_gaze(axis):
     camera, scene = camera_of(), scene_of()
     grid = fs.Grid.centred((6, 8), 4.0)

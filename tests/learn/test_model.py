@@ -352,12 +352,15 @@ CAMERAS = {
     "aberrated": ({"zernike": ZERNIKE, "oversample": 2}, None),
     "distorted": ({}, BrownConrady(focal_um=100.0, k1=-0.1, p1=0.01, centre_um=(1.0, 2.0))),
     "fisheye": ({"zernike": ZERNIKE}, PolynomialFisheye(focal_um=80.0, k=(0.01, 0.0, 0.0, 0.0))),
+    "gaze": ({}, BrownConrady(focal_um=100.0, k1=-0.1)),
+    "turned": ({}, BrownConrady(focal_um=100.0, k1=-0.1)),
 }
+GAZES = {"gaze": {"gaze_um": (1.3, -0.7)}, "turned": {"gaze_um": (1.3, -0.7), "axis": "sensor"}}
 
 
 def camera(name):
     optics, distortion = CAMERAS[name]
-    return fs.Camera(optics=lens(**optics), sensor=sensor(), distortion=distortion)
+    return fs.Camera(optics=lens(**optics), sensor=sensor(), distortion=distortion, **GAZES.get(name, {}))
 
 
 def variables(name):
