@@ -523,8 +523,10 @@ class Layout:
 
     def centre(self) -> Layout:
         """Translate the layout so that the centre of its bounding box is at the origin."""
+        if not self.n_sites:
+            return self
         x0_um, y0_um, x1_um, y1_um = self.bounds_um
-        return self.translate(-0.5 * (x0_um + x1_um), -0.5 * (y0_um + y1_um)) if self.n_sites else self
+        return self.translate(-0.5 * (x0_um + x1_um), -0.5 * (y0_um + y1_um))
 
     def rotate(self, angle_deg: Annotated[float, FINITE], origin_um: tuple[float, float] = (0.0, 0.0)) -> Layout:
         """Rotate counter-clockwise about a point; multiples of 90° about the origin are exact."""

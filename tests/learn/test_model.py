@@ -467,7 +467,7 @@ def test_learned_camera_reproduces_expected_charges():
 
 def replace_precision(camera):
     optics = replace(camera.optics, precision="double")
-    return fs.Camera(optics=optics, sensor=camera.sensor, distortion=camera.distortion)
+    return camera.replace(optics=optics)
 
 
 @pytest.mark.parametrize("order", [1, 2])
