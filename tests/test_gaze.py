@@ -347,7 +347,7 @@ def test_datasets_have_the_gaze(files, axis, expected):
         assert sample["box_um"][0, [0, 3]] == pytest.approx([left_um, top_um], abs=1e-9)
 
 
-def test_command_of_videos_follows_a_path(files, axis, expected):
+def test_command_of_videos_follows_a_path(files, axis):
     from PIL import Image
     from typer.testing import CliRunner
 
@@ -364,6 +364,9 @@ def test_command_of_videos_follows_a_path(files, axis, expected):
 
     assert found.exit_code == 0, found.output
     recording = read_recording(files / "codes.zarr")
+    # Pictures of videos have the encoding of photographs.
+    shot = read_shot(files / "shot.yaml", ["scene.encoding=srgb"])
+    expected = shot.camera.capture(shot.scene, exposure_s=EXPOSURE_S, seed=1, gaze_um=GAZE_UM, axis=axis)
     assert recording.gaze_um.tolist() == [list(GAZE_UM), [0.0, 0.0]]
     assert np.array_equal(recording.code[0], expected.code)
     failed = CliRunner().invoke(app, [*command[:-1], str(files / "none.csv"), "--out", str(files / "other.zarr")])
@@ -375,11 +378,8 @@ def test_comparisons_have_the_gaze(files):
 
     square = fs.layout.grid(n_x=12, n_y=10, pitch_um=5.0)
     named = {"hexagonal": camera_of().at(GAZE_UM), "square": camera_of(square).at(GAZE_UM)}
-    scenes = {
-        "noise": scene_of(
-            pitch_um=100.0,
-        )
-    }
+    light = camera_of().frame(scene_of())
+    scenes = {"noise": light.with_pitch(light.pitch_um)}
     found = compare.cameras(named, scenes, exposure_s=EXPOSURE_S, max_pixels=32, n_annuli=2)
     still = compare.cameras(
         {name: camera.at((0.0, 0.0)) for name, camera in named.items()},
