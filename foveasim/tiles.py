@@ -150,7 +150,7 @@ def _tiles(
         clock = Clock()
         with clock.stage("compile layout"):
             sensor = camera.sensor.part(slice(first, last))
-            part = sensor.layout.translate(*camera.position_um)
+            part = layout[first:last].translate(*camera.position_um)
             bounds_um = outline_bounds_um(part, camera.distortion)
             strips = [_rows_under(image.grid, bounds_um) for image in images]
             integrators = [

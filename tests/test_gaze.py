@@ -370,7 +370,8 @@ def test_command_of_videos_follows_a_path(files, axis):
     assert recording.gaze_um.tolist() == [list(GAZE_UM), [0.0, 0.0]]
     assert np.array_equal(recording.code[0], expected.code)
     failed = CliRunner().invoke(app, [*command[:-1], str(files / "none.csv"), "--out", str(files / "other.zarr")])
-    assert failed.exit_code == 2
+    assert isinstance(failed.exception, FileError)
+    assert "none.csv: no such file" in str(failed.exception)
 
 
 def test_comparisons_have_the_gaze(files):

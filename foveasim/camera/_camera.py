@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from threading import Lock
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -296,6 +296,12 @@ class Camera:
     def _with_pitch(self, light: Scene | PowerMap) -> Scene | PowerMap:
         """Return a scene with its pitch, or a power map."""
         return self.frame(light) if isinstance(light, Scene) else light
+
+    @overload
+    def seen(self, light: Scene, gaze_um: Position | None = None) -> Scene: ...
+
+    @overload
+    def seen(self, light: PowerMap, gaze_um: Position | None = None) -> PowerMap: ...
 
     def seen(self, light: Scene | PowerMap, gaze_um: Position | None = None) -> Scene | PowerMap:
         """
@@ -894,8 +900,8 @@ class Camera:
                 for grid in grids
             ]
         smallest = min(integrators, key=lambda integrator: integrator.grid.cell_area_um2)
-        gaze_um = None if moving_um is None and not any(gaze_um) else gaze_um
-        warn_of_coverage(source, Covered.by(smallest), self._layout.n_sites, gaze_um, warned)
+        named_um = None if moving_um is None and not any(gaze_um) else gaze_um
+        warn_of_coverage(source, Covered.by(smallest), self._layout.n_sites, named_um, warned)
         return integrate_maps(self._sensor, light, maps, integrators, clock)
 
     def _bands(self, power_map: PowerMap, e_per_j: Floats) -> Iterator[WeightedMap]:
