@@ -186,7 +186,7 @@ class Grid:
 
     @classmethod
     def centred(cls, shape: tuple[int, int], pitch_um: Pitch, centre_um: tuple[float, float] = (0.0, 0.0)) -> Grid:
-        """Return a grid centred on a point (x, y), by default the optical axis; parameters as for the class."""
+        """Return a grid centred on a point (x, y); parameters as for the class."""
         n_y, n_x = check_shape("shape", shape)
         pitch_x_um, pitch_y_um = check_pitch_um("pitch_um", pitch_um)
         x_um, y_um = centre_um

@@ -51,7 +51,7 @@ def test_scale_does_not_depend_on_gaze(fit):
 
 
 @pytest.mark.parametrize("axis", ["image", "sensor"])
-def test_points_land_at_their_position_minus_the_gaze(axis):
+def test_points_land_at_position_minus_gaze(axis):
     """Centroids by OpenCV, of a blob between the cells."""
     cv2 = pytest.importorskip("cv2")
     rows, columns = np.mgrid[:120, :160]
@@ -151,8 +151,8 @@ def test_relative_illumination_stays_with_its_axis():
     ],
     ids=["ideal", "lateral colour"],
 )
-def test_camera_that_turns_by_whole_pixels_sees_the_displaced_picture(optics):
-    """The picture with zero padding, displaced by whole pixels, in the place of the gaze."""
+def test_turned_camera_sees_displaced_picture(optics):
+    """The picture with zero padding, displaced by whole pixels, at the gaze."""
     camera = camera_of(optics=replace(optics, padding="zero"), axis="sensor", order=1)
     scene = fs.Scene.from_picture(
         np.pad(PICTURE, 20), pitch_um=20.0, distance_m=DISTANCE_M, peak_radiance_w_m2_sr_nm=0.05,
@@ -427,13 +427,13 @@ def test_cameras_share_their_compiled_layouts():
 
 
 @pytest.mark.parametrize("gaze_um", [(1.0,), (np.nan, 0.0), "left", ((0.0, 0.0), (1.0, 1.0))])
-def test_wrong_gaze_is_one_sentence(gaze_um):
+def test_wrong_gaze_is_one_line(gaze_um):
     with pytest.raises(ParameterError, match=r"^'gaze_um'") as caught:
         camera_of().capture(scene_of(), exposure_s=EXPOSURE_S, seed=0, gaze_um=gaze_um)
     assert "\n" not in str(caught.value)
 
 
-def test_video_warns_once_of_sites_that_leave_the_image():
+def test_video_warns_once_of_sites_outside_image():
     camera, scene = camera_of(), scene_of(fit="cover")
     path = saccades(duration_s=1.0, frame_s=0.05, size_um=(200.0, 200.0), seed=1)
     with pytest.warns(CoverageWarning) as caught:
@@ -470,7 +470,7 @@ def test_paths_are_read_as_written(tmp_path_factory, n, seed):
         ("t_s,x_um,y_um\n", "one or more times"),
     ],
 )
-def test_invalid_path_file_is_one_sentence(tmp_path, text, message):
+def test_invalid_path_file_is_one_line(tmp_path, text, message):
     (tmp_path / "path.csv").write_text(text)
 
     with pytest.raises(FileError, match=message) as caught:

@@ -169,12 +169,12 @@ class Camera:
 
     @property
     def gaze_um(self) -> tuple[float, float]:
-        """Point (x, y) of the image at which the centre of the sensor is, µm; :meth:`at` returns a camera with another."""
+        """Point (x, y) of the image at which the centre of the sensor is, µm."""
         return self._gaze_um
 
     @property
     def axis(self) -> GazeAxis:
-        """What the optical axis is fixed to: ``"image"`` or ``"sensor"``."""
+        """Quantity that the optical axis is fixed to: ``"image"`` or ``"sensor"``."""
         return self._axis
 
     @property
@@ -254,7 +254,7 @@ class Camera:
         return np.array(self._bounds_um[0])
 
     def sensor_frame(self, scene: Scene) -> SensorFrame:
-        """Return the frame of the sensor for the image of a scene: its optical axis, and its scales."""
+        """Return the optical axis and the scales of the image of a scene."""
         if self._distortion is not None or scene.fit is None:
             return SensorFrame.of(self._distortion)
         bounds_um = self._layout_bounds_um()
@@ -339,12 +339,12 @@ class Camera:
 
     @property
     def position_um(self) -> Position:
-        """Position (x, y) of the layout's origin in the image, µm: the gaze of a sensor that moves behind the lens."""
+        """Position (x, y) of the layout's origin in the image, µm."""
         return self._gaze_um if self._axis == "image" else (0.0, 0.0)
 
     def image_grid(self, scene: Scene) -> Grid:
         """
-        Return the image of a scene's pixel grid without distortion, in the sensor frame at the gaze (0, 0).
+        Return the undistorted grid of a scene's pixels, in the sensor frame at gaze (0, 0).
 
         Returns
         -------
@@ -361,7 +361,7 @@ class Camera:
 
     def power_map(self, scene: Scene) -> PowerMap:
         """
-        Compute the image irradiance of a scene without distortion, in the sensor frame at the gaze (0, 0).
+        Compute the undistorted image of a scene, in the sensor frame at gaze (0, 0).
 
         Returns
         -------

@@ -420,7 +420,7 @@ def cameras(
 
 
 def _behind_image(camera: Camera) -> Camera:
-    """Return a camera for the power map of its scene, which is that of the gaze if the camera turns."""
+    """Return a camera for its own power maps, which already have its gaze if it turns."""
     return camera if camera.axis == "image" else camera.at((0.0, 0.0))
 
 

@@ -334,7 +334,7 @@ def isoplanatic_error(
 
 
 def _nodes_um(grid: Grid, n_patches: tuple[int, int]) -> tuple[Floats, Floats]:
-    """Return patch centres along y and x from the centre of the grid: edge to edge, or the centre for a single patch."""
+    """Return patch centres along y and x from the centre of the grid, from edge to edge."""
     y, x = (
         np.linspace(-0.5, 0.5, n) * size * grid.pitch_x_um if n > 1 else np.zeros(1)
         for n, size in zip(n_patches, grid.shape, strict=True)

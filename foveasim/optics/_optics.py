@@ -256,7 +256,7 @@ class Optics(PointImages):
         return float(um_from_m(0.5 * radius_m**2 * (1.0 / distance_m - 1.0 / self.focus_distance_m)))
 
     def grid(self, scene: SceneLike) -> Grid:
-        """Return the sensor-plane grid of the scene pixels, upright; it is centred on the axis like the scene."""
+        """Return the upright sensor-plane grid of the scene pixels, centred as the scene."""
         _, n_y, n_x = scene.basis.shape
         magnification = self.magnification(scene.distance_m)
         x_um, y_um = scene.centre_um

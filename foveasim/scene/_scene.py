@@ -191,7 +191,7 @@ class Scene:
             raise ParameterError("gaze_range_um", "requires fit='cover'", self.gaze_range_um, "µm")
 
     def _checked_pitch_um(self) -> float | None:
-        """Return the given pitch or that of the field of view; None with ``fit``, unless the scene is framed."""
+        """Return the pitch: as given, or that of the field of view; None before framing."""
         given_um = self.pitch_um
         if self.fit is not None:
             if self.field_of_view_deg is not None:
@@ -250,7 +250,7 @@ class Scene:
         return self._with(centre_um=check_point("centre_um", centre_um))
 
     def _with(self, **values: Any) -> Scene:
-        """Return a copy with other values; unlike ``dataclasses.replace`` it does not check all pixels again."""
+        """Return a copy with other values, without a check of all pixels."""
         scene = copy.copy(self)
         for name, value in values.items():
             object.__setattr__(scene, name, value)

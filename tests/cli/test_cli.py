@@ -76,9 +76,9 @@ def test_demo_picture_is_upright_with_blind_spot(demo):
     photograph = read_picture(str(files("skimage.data") / "astronaut.png")).astype(float)
     # Position of each pixel in the photograph: 500 µm per pixel, 8 mm lens at 1 m, axis at the centre.
     cell_um = 500.0 * 8 / (1000 - 8)
-    grid = capture.picture(max_pixels=1024).grid
-    column = np.clip(np.round(grid.x_um / cell_um + 255.5).astype(int), 0, 511)
-    row = np.clip(np.round(255.5 - grid.y_um[::-1] / cell_um).astype(int), 0, 511)
+    grid, (gaze_x_um, gaze_y_um) = capture.picture(max_pixels=1024).grid, capture.settings["gaze_um"]
+    column = np.clip(np.round((grid.x_um + gaze_x_um) / cell_um + 255.5).astype(int), 0, 511)
+    row = np.clip(np.round(255.5 - (grid.y_um[::-1] + gaze_y_um) / cell_um).astype(int), 0, 511)
     is_seen = seen[..., 3] == 255
 
     def likeness(picture):

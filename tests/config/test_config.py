@@ -360,7 +360,7 @@ def test_last_framing_replaces_others(shot_file):
             r"shot\.yaml: --set scene\.fit: must not be given together with 'pitch_um', got 'cover'; choose one of .* to null$",
         ),
         (
-            "layout.move_um=[900, 0]; scene.fit=contain",
+            "distortion={kind: brown_conrady, focal_um: 8000}; layout.move_um=[900, 0]; scene.fit=contain",
             r"scene\.fit: must not be 'contain' with the optical axis, at \(0, 0\)",
         ),
         ("scene.field_of_view_deg=200; scene.fit=null", r"scene\.field_of_view_deg: must be < 180, got 200\.0 degrees"),

@@ -137,6 +137,7 @@ OTHERS = {
     "layout.parameters.ring_ratio": 1.4,
     "layout.mosaic": ["RB"],
     "layout.move_um": [2.0, 3.0],
+    "gaze_um": [4.0, -3.0],
     "layout.edits": [{"kind": "rotate", "angle_deg": 10.0}, {"kind": "scale", "factor": 1.2}],
     "layout.rules": {"min_size_um": 0.2},
     "layout.source": "a paper",
@@ -176,6 +177,10 @@ SECTIONS = {
             "radiance_w_m2_sr_nm": 0.004,
             "band_width_nm": 80.0,
         },
+        *[
+            {name: value for name, value in SHOT["scene"].items() if name != "pitch_um"} | {"gaze_range_um": range_um}
+            for range_um in ([0.0, 0.0], [3.0, 5.0])
+        ],
         {"kind": "power_map", "path": "map.npy", "pitch_um": 4.0, "wavelength_nm": 550.0, "unit": "w_m2"},
     ],
     "distortion": [
@@ -215,7 +220,8 @@ def leaves(model, section, prefix=""):
     """Yield path, type and value of every setting that a shot can have, including those that it has not."""
     for name, field in model.model_fields.items():
         path, value = prefix + name, section.get(name, field.default if not field.is_required() else None)
-        if name in ("kind", "generator") or path in ("layout.edits", "sensor.companding_table"):
+        in_sections = "layout.edits", "sensor.companding_table", "scene.gaze_range_um"
+        if name in ("kind", "generator") or path in in_sections:
             continue
         if isinstance(value, dict) and own_models(field.annotation) and path not in OTHERS:
             yield from leaves(matching_model(field.annotation, value), value, path + ".")
