@@ -133,13 +133,15 @@ def test_choices_are_valid_settings(demo, controls):
 def test_numbers_do_not_change_structure(demo):
     changed = json.loads(json.dumps(demo))
     changed["optics"]["f_number"] = 4.5
-    changed["layout"]["move_um"] = [1.0, 2.0]
+    changed["gaze_um"] = [1.0, 2.0]
     assert structure_of(changed) == structure_of(demo)
     changed["optics"]["lens"] = "aplanatic"
     assert structure_of(changed) != structure_of(demo)
 
 
-def test_choices_of_older_lists_have_current_values(demo, controls):
+def test_choices_of_older_lists_have_current_values(demo):
+    demo = {**demo, "layout": {**demo["layout"], "move_um": [-140.0, 320.0]}}
+    controls = controls_of(demo)
     grid = next(choice["value"] for choice in by_id(controls, "layout")["choices"] if choice["label"] == "grid")
     moved = json.loads(json.dumps(demo))
     moved["layout"]["move_um"] = [7.0, 8.0]

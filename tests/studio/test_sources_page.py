@@ -28,7 +28,10 @@ from studio.page_tools import (
 
 from foveasim.config import read_shot
 
-pytestmark = pytest.mark.needs("chromium")
+pytestmark = [
+    pytest.mark.needs("chromium"),
+    pytest.mark.filterwarnings("ignore:.*outside the image at the gaze"),  # frames are framed for the gaze (0, 0)
+]
 
 #: A camera that shows a moving picture.
 FAKE_CAMERA = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
