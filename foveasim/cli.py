@@ -50,6 +50,21 @@ Out = Annotated[Path, typer.Option("--out", "-o", help="Directory for the result
 Changes = Annotated[
     list[str] | None, typer.Option("--set", help="Replace a setting, for example sensor.bits=10; repeatable.")
 ]
+Layers = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--layer",
+        help="Layer of the photosites of a GDSII or OASIS file, 77/3, or of filters, filter_R=10/0; repeatable.",
+    ),
+]
+Channels = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--channels", help="Layers of the filters of a GDSII or OASIS file, 10/0=R,11/0=G,12/0=B; repeatable."
+    ),
+]
+Cell = Annotated[str | None, typer.Option("--cell", help="Cell of a GDSII or OASIS file.")]
+Centre = Annotated[bool, typer.Option("--centre", help="Move the centre of the layout to the origin.")]
 FramesPerS = Annotated[float | None, typer.Option("--fps", help="Frame rate in frames per second.")]
 Threads = Annotated[int | None, typer.Option("--threads", help="Number of threads; one per core by default.")]
 Workers = Annotated[int | None, typer.Option("--workers", help="Number of worker processes; one per core by default.")]
@@ -90,11 +105,15 @@ def demo(out: Out = Path("out"), threads: Threads = None) -> None:
 def run(
     settings: Annotated[Path, typer.Argument(help="YAML file of the shot.")],
     changes: Changes = None,
+    layer: Layers = None,
+    channels: Channels = None,
+    cell: Cell = None,
+    centre: Centre = False,
     out: Out = Path("out"),
     threads: Threads = None,
 ) -> None:
     """Simulate the shot of a settings file."""
-    _run([settings], changes or [], out, threads)
+    _run([settings], [*(changes or []), *_layout_changes(layer, channels, cell, centre)], out, threads)
 
 
 @app.command()
@@ -107,6 +126,10 @@ def check(
             help="YAML file of design rules, or the name of a preset such as sky130_met1; by default the rules in LAYOUT.",
         ),
     ] = None,
+    layer: Layers = None,
+    channels: Channels = None,
+    cell: Cell = None,
+    centre: Centre = False,
     report_file: Annotated[
         Path | None, typer.Option("--report", help="Write the violations to a KLayout report database (.lyrdb).")
     ] = None,
@@ -114,7 +137,7 @@ def check(
     """Check a layout against design rules; exit with 1 on violations."""
     from foveasim.config import read_any_layout, read_rules
 
-    file = read_any_layout(layout)
+    file = read_any_layout(layout, **_reading_options(layer, channels, cell, centre))
     limits = file.rules if rules is None else read_rules(rules)
     if limits is None:
         _exit(f"error: {layout}: contains no design rules; specify them with --rules", BAD_INPUT)
@@ -168,6 +191,10 @@ def layouts() -> None:
 @app.command()
 def describe(
     layout: Annotated[Path, typer.Argument(help=LAYOUT_HELP)],
+    layer: Layers = None,
+    channels: Channels = None,
+    cell: Cell = None,
+    centre: Centre = False,
     frames_per_s: FramesPerS = None,
     bits: Annotated[int, typer.Option("--bits", help="Bit depth of the codes.")] = 10,
     blanking: Annotated[float, typer.Option("--blanking", help="Blanking time over readout time.")] = 0.0,
@@ -180,7 +207,8 @@ def describe(
     readout = None
     if frames_per_s is not None:
         readout = Readout(frames_per_s=frames_per_s, bits=bits, blanking=blanking, n_lanes=lanes)
-    console.print(read_any_layout(layout).layout.describe(readout))
+    found = read_any_layout(layout, **_reading_options(layer, channels, cell, centre))
+    console.print(found.layout.describe(readout))
 
 
 @app.command()
@@ -205,6 +233,8 @@ def convert(
     source_cell: Annotated[
         str | None, typer.Option("--source-cell", help="Cell of SOURCE, a GDSII or OASIS file.")
     ] = None,
+    channels: Channels = None,
+    centre: Centre = False,
     dbu_um: Annotated[
         float | None, typer.Option("--dbu-um", help="Database unit of a GDSII or OASIS file in µm.")
     ] = None,
@@ -218,7 +248,8 @@ def convert(
     from foveasim.layout import write_layout
     from foveasim.layout.files import layer_options
 
-    layout = read_any_layout(source, cell=source_cell, invalid=invalid, **layer_options(source_layer or [])).layout
+    options = _reading_options(source_layer, channels, source_cell, centre)
+    layout = read_any_layout(source, invalid=invalid, **options).layout
     written = write_layout(layout, target, dbu_um=dbu_um, **layer_options(layer or [], layers))
     dropped = f"; dropped columns: {', '.join(written.dropped_columns)}" if written.dropped_columns else ""
     _report(
@@ -239,6 +270,10 @@ def view(
     serve: Annotated[bool, typer.Option("--serve", help="Serve the page on localhost until Ctrl-C.")] = False,
     port: Annotated[int, typer.Option("--port", help="Port for --serve; 0 for any free one.")] = 0,
     layout: Annotated[Path | None, typer.Option("--layout", help="Layout of the report.")] = None,
+    layer: Layers = None,
+    channels: Channels = None,
+    cell: Cell = None,
+    centre: Centre = False,
     rules: Annotated[
         Path | None, typer.Option("--rules", help="Design rules to check: a YAML file or the name of a preset.")
     ] = None,
@@ -261,7 +296,8 @@ def view(
     if solid and (rules is not None or layout is not None):
         _exit("error: --solid shows no violations; omit --rules and --layout", BAD_INPUT)
     with _status("reading"):
-        viewable = read_viewable(file, layout=layout, rules=rules)
+        options = _reading_options(layer, channels, cell, centre)
+        viewable = read_viewable(file, layout=layout, rules=rules, **options)
     with _status("writing the page"):
         flat = None if solid else web_page(viewable.data, report=viewable.report, name=viewable.name)
         text = solid_page(viewable.data, name=viewable.name) if flat is None else flat
@@ -280,6 +316,11 @@ def view(
 @app.command()
 def studio(
     shot: Annotated[Path | None, typer.Argument(help="YAML file of the shot; by default that of the demo.")] = None,
+    changes: Changes = None,
+    layer: Layers = None,
+    channels: Channels = None,
+    cell: Cell = None,
+    centre: Centre = False,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Directory for saved files; without it none are written.")
     ] = None,
@@ -298,7 +339,8 @@ def studio(
         if browser and not is_opened:
             _print("no browser found; open the address in one")
 
-    run_studio(shot, out=out, host=host, port=port, open_browser=browser, announce=announce)
+    changes = [*(changes or []), *_layout_changes(layer, channels, cell, centre)]
+    run_studio(shot, changes=changes, out=out, host=host, port=port, open_browser=browser, announce=announce)
 
 
 @app.command()
@@ -319,6 +361,10 @@ def compare(
     pictures: Annotated[
         list[Path] | None, typer.Option("--picture", help="Photograph to use as a scene; repeatable.")
     ] = None,
+    layer: Layers = None,
+    channels: Channels = None,
+    cell: Cell = None,
+    centre: Centre = False,
     exposure_s: Annotated[float | None, typer.Option("--exposure-s", help="Exposure time in seconds.")] = None,
     frames_per_s: FramesPerS = None,
     max_pixels: Annotated[int, typer.Option("--pixels", help="Longer side of the pictures.")] = 256,
@@ -337,6 +383,7 @@ def compare(
             budget=None if budget == "none" else budget,
             tolerance=tolerance,
             exposure_s=exposure_s,
+            layout_options=_reading_options(layer, channels, cell, centre),
             frames_per_s=frames_per_s,
             max_pixels=max_pixels,
             n_annuli=annuli,
@@ -518,6 +565,22 @@ def new(
 
     path = write_starting_file(kind, out, force=force)
     _report(f"wrote {path}; next: {starting_command(kind, path)}")
+
+
+def _reading_options(
+    layer: Sequence[str] | None, channels: Sequence[str] | None, cell: str | None, centre: bool
+) -> dict[str, Any]:
+    from foveasim.layout.files import reading_options
+
+    return reading_options(layer=layer or (), channels=channels or (), cell=cell, centre=centre)
+
+
+def _layout_changes(
+    layer: Sequence[str] | None, channels: Sequence[str] | None, cell: str | None, centre: bool
+) -> list[str]:
+    """Return the options as changes of the layout's settings."""
+    options = _reading_options(layer, channels, cell, centre)
+    return [f"layout.{name}={json.dumps(value)}" for name, value in options.items()]
 
 
 def _run(settings: Sequence[Path], changes: Sequence[str], out: Path, threads: int | None) -> list[Result]:

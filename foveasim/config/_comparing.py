@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,8 @@ from foveasim.compare.setup import DEFAULT_EXPOSURE_S, cameras_of, field_um
 from foveasim.config._objects import YAML_EXTENSIONS, Shot, read_any_layout, read_shot, resolve_files
 from foveasim.errors import FileError, ParameterError, printable
 from foveasim.fields import PowerMap
-from foveasim.layout.files import layout_path
+from foveasim.layout import Layout
+from foveasim.layout.files import check_no_options, layout_path, read_options_of
 from foveasim.scene import Scene
 
 
@@ -21,6 +22,7 @@ def compare_files(
     *,
     pictures: Sequence[str | Path] = (),
     exposure_s: float | None = None,
+    layout_options: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], None] | None = None,
     **options: Any,
 ) -> compare.Comparison:
@@ -35,6 +37,8 @@ def compare_files(
         Photographs as scenes. By default five of scikit-image for layouts, and the scenes of the shots for shots.
     exposure_s : float, optional, s
         By default that of the shots; 1/60 s for layouts.
+    layout_options : mapping, optional
+        Options of :func:`foveasim.read_layout` for the layouts whose format has them, such as ``layer`` of chip files.
     progress : function of (n_done, n), optional
     **options
         As for :func:`foveasim.compare.cameras`.
@@ -44,7 +48,8 @@ def compare_files(
     FileError
         When a file cannot be read.
     ParameterError
-        When layouts and shots are mixed, exposures differ, or as for :func:`foveasim.compare.cameras`.
+        When layouts and shots are mixed, exposures differ, no layout has one of the options,
+        or as for :func:`foveasim.compare.cameras`.
     """
     if len(paths) < 2:
         raise ParameterError("files", "must be at least two layouts or shots", len(paths))
@@ -57,7 +62,7 @@ def compare_files(
         )
     names = _unique_names([path.stem for path in found])
     if not are_shots[0]:
-        read = [read_any_layout(path).layout for path in paths]
+        read = _read_layouts(paths, layout_options or {})
         cameras = cameras_of(dict(zip(names, read, strict=True)), None, None)
         first = next(iter(cameras.values()))
         scenes: dict[str, Scene | PowerMap] = dict(
@@ -65,6 +70,7 @@ def compare_files(
         )
         exposure_s = DEFAULT_EXPOSURE_S if exposure_s is None else exposure_s
     else:
+        check_no_options(**(layout_options or {}))
         shots = dict(zip(names, [read_shot(path) for path in found], strict=True))
         cameras = {name: shot.camera for name, shot in shots.items()}
         exposures_s = {shot.exposure_s for shot in shots.values()}
@@ -79,6 +85,20 @@ def compare_files(
             exposure_s = exposures_s.pop()
         scenes = dict(_photographs(shots, pictures)) if pictures else _scenes(shots, found)
     return compare.cameras(cameras, scenes, exposure_s=exposure_s, progress=progress, **options)
+
+
+def _read_layouts(paths: Sequence[str | Path], options: Mapping[str, Any]) -> list[Layout]:
+    """Read layouts; an option is for those whose format has it, or invalid for the first."""
+    accepted = [{"centre"} | _options_of(layout_path(Path(path), ".")) for path in paths]
+    unknown = set(options) - set().union(*accepted)
+    return [
+        read_any_layout(path, **{name: value for name, value in options.items() if name in names | unknown}).layout
+        for path, names in zip(paths, accepted, strict=True)
+    ]
+
+
+def _options_of(path: Path) -> set[str]:
+    return set() if path.suffix.lower() in YAML_EXTENSIONS else read_options_of(path)
 
 
 def _is_shot(path: Path) -> bool:

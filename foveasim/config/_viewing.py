@@ -5,6 +5,7 @@ from __future__ import annotations
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from foveasim._core.short_repr import short_repr
 from foveasim._io.zarr_stores import store_format
@@ -13,6 +14,7 @@ from foveasim.config import read_any_layout, read_rules
 from foveasim.errors import FileError, ParameterError, printable
 from foveasim.layout import Layout, Report
 from foveasim.layout.drc.report import is_lyrdb, read_lyrdb
+from foveasim.layout.files import check_no_options
 
 #: Arrays of a capture's npz file that a layout's does not contain.
 CAPTURE_ARRAYS = {"code.npy", "electrons.npy"}
@@ -29,7 +31,9 @@ class Viewable:
     __repr__ = short_repr
 
 
-def read_viewable(path: str | Path, *, layout: str | Path | None = None, rules: str | Path | None = None) -> Viewable:
+def read_viewable(
+    path: str | Path, *, layout: str | Path | None = None, rules: str | Path | None = None, **options: Any
+) -> Viewable:
     """
     Read a layout, a capture, or a report of a design-rule check.
 
@@ -41,13 +45,15 @@ def read_viewable(path: str | Path, *, layout: str | Path | None = None, rules: 
         Layout of a report.
     rules : path or name of a preset, optional
         Design rules to check.
+    **options
+        Options of the layout's format, as for :func:`foveasim.read_layout`.
 
     Raises
     ------
     FileError
         When a file is missing, corrupt, or of another kind.
     ParameterError
-        When a report is given without its layout or with rules, or another file with a layout.
+        When a report is given without its layout or with rules, another file with a layout, or a capture with options.
     """
     path = Path(path)
     if is_lyrdb(path):
@@ -57,15 +63,16 @@ def read_viewable(path: str | Path, *, layout: str | Path | None = None, rules: 
             raise ParameterError(
                 "rules", "must be omitted for a report, which contains the results of a check", str(rules)
             )
-        layout_of_report = read_any_layout(layout).layout
+        layout_of_report = read_any_layout(layout, **options).layout
         return Viewable(layout_of_report, read_lyrdb(path, layout_of_report.n_sites), printable(path.stem))
     if layout is not None:
         raise ParameterError("layout", f"must be omitted: {path} is not a report (.lyrdb)", str(layout))
     limits = None if rules is None else read_rules(rules)
     if _is_capture(path):
+        check_no_options(**options)
         capture = Capture.load(path)
         return Viewable(capture, None if limits is None else capture.layout.check(limits), printable(path.stem))
-    found = read_any_layout(path).layout
+    found = read_any_layout(path, **options).layout
     return Viewable(found, None if limits is None else found.check(limits), printable(path.stem))
 
 

@@ -15,7 +15,7 @@ import sys
 import tempfile
 import threading
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -38,6 +38,7 @@ TOKEN_VARIABLE, MIN_TOKEN_LENGTH = "FOVEASIM_STUDIO_TOKEN", 24
 def run_studio(
     shot: str | Path | None = None,
     *,
+    changes: Sequence[str] = (),
     out: str | Path | None = None,
     host: str = "127.0.0.1",
     port: Annotated[int, PORT] = 0,
@@ -51,6 +52,8 @@ def run_studio(
     ----------
     shot : path, optional
         Settings file to start from; by default that of the demo.
+    changes : sequence of "key=value"
+        Settings to replace, as for :func:`foveasim.config.read_shot`.
     out : path, optional
         Directory for saved files. Without it, the studio writes no files.
     host : str
@@ -93,7 +96,7 @@ def run_studio(
         raise ParameterError("host", "must be an address of this computer", host)
     token = _own_token()
     directory = None if out is None else _writable(out)
-    settings, name = start_settings(shot)
+    settings, name = start_settings(shot, changes)
     check_settings(None if shot is None else Path(shot), settings)
     start = Start(settings, name, None if shot is None else Path(shot).absolute().parent, directory)
     if not _is_loopback(host):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import filecmp
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +27,14 @@ MAX_NAME_LENGTH, MAX_EXTENSION_LENGTH = 80, 8
 UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 
 
-def start_settings(shot: str | Path | None) -> tuple[dict[str, Any], str]:
+def start_settings(shot: str | Path | None, changes: Sequence[str] = ()) -> tuple[dict[str, Any], str]:
     """
     Return the settings of a file or the demo with absolute paths, and the name.
 
-    Raises ConfigError when the file cannot be read, or is not YAML.
+    ``changes``: "key=value". Raises ConfigError when the file cannot be read, or is not YAML.
     """
     path = demo_settings()[0] if shot is None else Path(shot)
-    settings = read_settings(path)
+    settings = read_settings(path, changes)
     if isinstance(settings.get("layout"), str):
         settings["layout"] = _inlined(settings["layout"], path.parent)
     return resolve_files(path.parent.absolute(), settings), path.stem

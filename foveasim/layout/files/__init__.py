@@ -29,7 +29,7 @@ from foveasim.errors import FileError, FoveasimError
 from foveasim.layout.files._bundled import bundled_layouts, layout_path
 from foveasim.layout.files._common import FORMATS, WrittenLayout
 from foveasim.layout.files._derived import DERIVED_LAYERS, LayoutLayer
-from foveasim.layout.files._layers import layer_options, read_layer_map
+from foveasim.layout.files._layers import layer_options, read_layer_map, reading_options
 from foveasim.layout.model import Layout
 
 __all__ = [
@@ -44,6 +44,8 @@ __all__ = [
     "layout_path",
     "read_layer_map",
     "read_layout",
+    "read_options_of",
+    "reading_options",
     "write_layout",
 ]
 
@@ -125,6 +127,11 @@ def read_layout(
     with as_file_error(path, f"{found.title} layout", passes=(FoveasimError,)):
         layout: Layout = found.read(path, **chosen)
         return layout.centre() if centre else layout
+
+
+def read_options_of(path: str | Path) -> set[str]:
+    """Return the names of the options of a layout file's format, besides ``centre``."""
+    return set(detect_format(Path(path), FORMATS, "layout file")[1].read_options)
 
 
 def check_no_options(**options: object) -> None:

@@ -107,6 +107,46 @@ def layer_options(words: Sequence[str], map_file: Path | None = None) -> dict[st
     return {"layers": {**(read_layer_map(map_file) if map_file is not None else {}), **entries}}
 
 
+def reading_options(
+    *,
+    layer: Sequence[str] = (),
+    channels: Sequence[str] = (),
+    cell: str | None = None,
+    centre: bool = False,
+) -> dict[str, Any]:
+    """
+    Return options of :func:`foveasim.read_layout` from the words of a command line.
+
+    Parameters
+    ----------
+    layer : sequence of str
+        As ``words`` of :func:`layer_options`.
+    channels : sequence of str
+        Filter layers with the name or number of their channel, ``10/0=R``; several are separated by commas.
+    cell : str, optional
+    centre : bool
+
+    Returns
+    -------
+    options : dict
+        Only those that were given.
+
+    Raises
+    ------
+    ParameterError
+        When a filter layer has no channel.
+    """
+    options = layer_options(layer)
+    found: dict[str, int | str] = {}
+    for word in ",".join(channels).split(",") if channels else ():
+        number, _, name = (part.strip() for part in word.partition("="))
+        if not number or not name:
+            raise ParameterError("channels", "must be layers with their channel, such as 10/0=R", word)
+        found[number] = int(name) if name.isdecimal() else name
+    given = {"channels": found or None, "cell": cell, "centre": centre or None}
+    return options | {name: value for name, value in given.items() if value is not None}
+
+
 def read_layer_map(path: str | Path) -> dict[str, Any]:
     """
     Read a layer map from a YAML file.
