@@ -44,7 +44,7 @@ def start_server(*options: str) -> tuple[subprocess.Popen[str], str]:
     command = [sys.executable, "-m", "foveasim", "studio", "--no-browser", *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
-    return process, process.stdout.readline().partition("studio at ")[2].partition(";")[0]
+    return process, process.stdout.readline().partition("studio at ")[2].split()[0]
 
 
 async def changes_ms(connection: Any, key: str, value: Callable[[int], Any], n: int) -> tuple[float, float]:

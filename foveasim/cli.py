@@ -307,7 +307,7 @@ def view(
         _report(f"wrote {out}")
         return
     if serve:
-        serve_page(text, port=port, announce=lambda url: _print(f"serving {file} at {url}; press Ctrl-C to stop"))
+        serve_page(text, port=port, announce=lambda url: _print(f"serving {file} at {url} (press Ctrl-C to stop)"))
         return
     path, is_opened = open_page(text)
     _print(f"opened {path}" if is_opened else f"no browser found; open {path} in one")
@@ -335,7 +335,7 @@ def studio(
     from foveasim.studio import run_studio
 
     def announce(address: str, is_opened: bool) -> None:
-        _print(f"studio at {address}; press Ctrl-C to stop")
+        _print(f"studio at {address} (press Ctrl-C to stop)")
         if browser and not is_opened:
             _print("no browser found; open the address in one")
 

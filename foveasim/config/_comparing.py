@@ -13,7 +13,7 @@ from foveasim.config._objects import YAML_EXTENSIONS, Shot, read_any_layout, rea
 from foveasim.errors import FileError, ParameterError, printable
 from foveasim.fields import PowerMap
 from foveasim.layout import Layout
-from foveasim.layout.files import check_no_options, layout_path, read_options_of
+from foveasim.layout.files import layout_path, read_options_of
 from foveasim.scene import Scene
 
 
@@ -70,7 +70,8 @@ def compare_files(
         )
         exposure_s = DEFAULT_EXPOSURE_S if exposure_s is None else exposure_s
     else:
-        check_no_options(**(layout_options or {}))
+        for name in layout_options or ():
+            raise ParameterError(name, "must be omitted for shots, whose settings contain the options of their layouts")
         shots = dict(zip(names, [read_shot(path) for path in found], strict=True))
         cameras = {name: shot.camera for name, shot in shots.items()}
         exposures_s = {shot.exposure_s for shot in shots.values()}

@@ -573,9 +573,10 @@ def put_setting(source: Source | str | Path | None, data: dict[str, Any], key: s
                 )
             step = int(name)
         elif not isinstance(section, dict):
+            example = f", such as {{file: {section}}}" if names[:i] == ["layout"] and isinstance(section, str) else ""
             raise ConfigError(
                 Source.of(source).file,
-                f"'{key}={value}' cannot be set: {'.'.join(names[:i])} must be a section, got {section!r}",
+                f"'{key}={value}' cannot be set: {'.'.join(names[:i])} must be a section{example}, got {section!r}",
             )
         elif i < len(names) - 1:
             section.setdefault(name, {})

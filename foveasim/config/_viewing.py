@@ -14,7 +14,6 @@ from foveasim.config import read_any_layout, read_rules
 from foveasim.errors import FileError, ParameterError, printable
 from foveasim.layout import Layout, Report
 from foveasim.layout.drc.report import is_lyrdb, read_lyrdb
-from foveasim.layout.files import check_no_options
 
 #: Arrays of a capture's npz file that a layout's does not contain.
 CAPTURE_ARRAYS = {"code.npy", "electrons.npy"}
@@ -69,7 +68,10 @@ def read_viewable(
         raise ParameterError("layout", f"must be omitted: {path} is not a report (.lyrdb)", str(layout))
     limits = None if rules is None else read_rules(rules)
     if _is_capture(path):
-        check_no_options(**options)
+        for name in options:
+            raise ParameterError(
+                name, f"must be omitted: {printable(str(path))} is a capture, which contains its layout"
+            )
         capture = Capture.load(path)
         return Viewable(capture, None if limits is None else capture.layout.check(limits), printable(path.stem))
     found = read_any_layout(path, **options).layout

@@ -119,6 +119,19 @@ def test_chip_is_compared_with_other_formats(foveasim, folder):
     assert "'layer' is an option of GDSII and OASIS files only" in rejected.stderr
 
 
+def test_options_are_not_for_other_files(foveasim, folder):
+    succeeded(foveasim("run", "shot.yaml", *OPTIONS, "-o", "out", cwd=folder))
+    (folder / "short.yaml").write_text(SHOT.replace("{file: chip.gds}", "chip.gds"))
+    for command, words in {
+        ("view", "out/shot_capture.npz", "--centre"): "'centre' must be omitted: out/shot_capture.npz is a capture",
+        ("compare", "shot.yaml", "shot.yaml", "--layer", "1/0"): "'layer' must be omitted for shots",
+        ("run", "short.yaml", "--layer", "1/0"): "must be a section, such as {file: chip.gds}, got 'chip.gds'",
+    }.items():
+        result = foveasim(*command, cwd=folder)
+        assert (result.returncode, result.stderr.count("\n")) == (2, 1), result.stderr
+        assert words in result.stderr
+
+
 def test_shot_reads_chip(foveasim, folder, read):
     succeeded(foveasim("run", "shot.yaml", *OPTIONS, "--centre", "-o", "out", cwd=folder))
 

@@ -139,7 +139,7 @@ def test_page_is_served_on_localhost(view, folder):
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
         try:
             line = server.stdout.readline()
-            assert re.fullmatch(r"serving layout.npz at http://127.0.0.1:\d+/; press Ctrl-C to stop\n", line)
+            assert re.fullmatch(r"serving layout.npz at http://127.0.0.1:\d+/ \(press Ctrl-C to stop\)\n", line)
             address = line.split(" ")[3].rstrip(";")
             port = int(address.rsplit(":", 1)[1].strip("/"))
             with urllib.request.urlopen(address) as answer:

@@ -55,7 +55,7 @@ def test_address_is_printed_without_browser(started, monkeypatch):
     assert result.exit_code == 0
     first, second = result.output.splitlines()
     assert first.startswith("studio at http://127.0.0.1:")
-    assert first.endswith(f"/#{started[0].token}; press Ctrl-C to stop")
+    assert first.endswith(f"/#{started[0].token} (press Ctrl-C to stop)")
     assert second == "no browser found; open the address in one"
 
 

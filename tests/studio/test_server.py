@@ -437,7 +437,7 @@ class Program:
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=Path(fs.__file__).parents[1],
         )  # fmt: skip
         line = self.process.stdout.readline()
-        address = line.split("studio at ")[1].split(";")[0]
+        address = line.split("studio at ")[1].split()[0]
         self.host, _, token = address.removeprefix("http://").partition("/#")
         self.studio = type("Address", (), {"token": token})
 
