@@ -54,6 +54,8 @@ FRAMINGS = ("pitch_um", "fit", "field_of_view_deg")
 #: Default wavelengths of the channels of colour pictures (red, green, blue) and of grey pictures.
 RGB_NM = (620.0, 550.0, 450.0)
 GREY_NM = (550.0,)
+#: Width of the band of a grey photograph, by default.
+GREY_BAND_WIDTH_NM = 100.0
 #: Larger encoded floating-point values indicate a picture in the range 0 to 255 instead of 0 to 1.
 MAX_ENCODED = 16.0
 #: Larger values are errors of units: 1e9 m is the distance and width of an astronomical scene.
@@ -290,8 +292,8 @@ class Scene:
         ----------
         picture : path, or (n_y, n_x) or (n_y, n_x, n_channel) array
             File, or array in the convention of image libraries, top row first: grey or colour, with or without alpha. 8-bit
-            and 16-bit values range from 0 to the maximum of the dtype; floating-point values have the peak 1 and may exceed
-            it. The radiance is multiplied by alpha.
+            and 16-bit values range from 0 to the maximum of the dtype, booleans are 0 and 1; floating-point values have the
+            peak 1 and may exceed it. The radiance is multiplied by alpha.
         pitch_um : float, optional, µm
             Pixel pitch in the scene, instead of ``fit``.
         fit : {"cover", "contain", "width"}, optional
@@ -311,7 +313,8 @@ class Scene:
             radiance at all wavelengths. For one wavelength a colour picture is converted to grey. With ``spectrum`` any
             number of wavelengths is allowed.
         band_width_nm : number or sequence, optional, nm
-            Widths of the bands; by default bands extend halfway to the adjacent wavelengths. Required for one wavelength.
+            Widths of the bands; by default bands extend halfway to the adjacent wavelengths. Required for one wavelength,
+            except that of a grey picture without ``wavelength_nm``, whose band is 100 nm wide.
         spectrum : (n_channel, n_wavelength), optional
             Relative spectrum of each channel at the value 1.
         encoding : {"srgb", "sqrt", "linear"}
@@ -351,6 +354,8 @@ class Scene:
         n_channels = channels.shape[0]
         if wavelength_nm is None:
             wavelength_nm = RGB_NM if n_channels == 3 else GREY_NM
+            if n_channels == 1 and band_width_nm is None:
+                band_width_nm = GREY_BAND_WIDTH_NM
         waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
         if spectrum is not None:
             relative = finite_array("spectrum", spectrum, ndim=2, at_least=0.0)

@@ -219,6 +219,27 @@ def test_default_wavelengths_are_those_of_paper(shape, wavelength_nm):
     assert scene_of(np.ones(shape)).wavelength_nm.tolist() == wavelength_nm
 
 
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "I;16"])
+def test_grey_pictures_have_one_wide_band(mode, tmp_path):
+    """One band of 100 nm at 550 nm, as for colour; 1-bit, 8-bit and 16-bit pictures agree where they are black or white."""
+    white = np.array([[0, 255, 255], [0, 0, 255]], np.uint8)
+    path = tmp_path / "grey.png"
+    if mode == "I;16":
+        Image.fromarray(white.astype(np.uint16) * 257).save(path)
+    else:
+        Image.fromarray(white).convert(mode).save(path)
+    light = {"distance_m": 1.0, "peak_radiance_w_m2_sr_nm": 0.02}
+    scene = fs.Scene.from_picture(path, **light)
+    array = fs.Scene.from_picture(white > 0, **light)
+
+    assert (scene.wavelength_nm.tolist(), scene.band_width_nm.tolist()) == ([550.0], [100.0])
+    for found in (scene, array):
+        np.testing.assert_array_equal(radiance(found)[0], 0.02 * (white[::-1] > 0))
+    layout = fs.layout.grid(n_x=3, n_y=2, pitch_um=100.0)
+    camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=fs.Sensor(layout))
+    assert camera.capture(scene, exposure_s=0.01, seed=0).settings["light"]["band_width_nm"] == [100.0]
+
+
 def test_channels_are_weighted_by_spectra():
     spectrum = [[1.0, 0.0, 0.5, 0.0], [0.0, 2.0, 0.5, 0.0], [0.0, 0.0, 0.5, 3.0]]
     scene = scene_of(
@@ -339,7 +360,11 @@ def test_from_picture_rejects_invalid_arrays(picture, message):
         (WHITE, {"wavelength_nm": [500.0, -600.0]}, "'wavelength_nm' must be > 0"),
         (WHITE, {"wavelength_nm": [500.0, math.nan]}, "'wavelength_nm' must be finite"),
         (WHITE, {"wavelength_nm": [500.0, 500.0], "band_width_nm": None}, "'wavelength_nm' must be unique"),
-        (WHITE, {"band_width_nm": None}, "'band_width_nm' must be given for a single wavelength"),
+        (
+            WHITE,
+            {"wavelength_nm": [550.0], "band_width_nm": None},
+            "'band_width_nm' must be given for a single wavelength",
+        ),
         (COLOUR, {"band_width_nm": [10.0, 10.0]}, "'band_width_nm' must be one number, or one for each of the 3"),
         (COLOUR, {"band_width_nm": [10.0, 0.0, 10.0]}, "'band_width_nm' must be > 0"),
         (WHITE, {"encoding": "gamma"}, "'encoding' must be one of 'srgb', 'sqrt', 'linear', got 'gamma'"),
