@@ -50,7 +50,7 @@ def test_centred_grid_is_centred_on_axis():
         ({"pitch_um": 0.0}, r"'pitch_um' must be > 0, got 0.0 µm"),
         ({"pitch_um": -1}, r"'pitch_um' must be > 0, got -1 µm"),
         ({"pitch_um": float("inf")}, r"'pitch_um' must be finite"),
-        ({"origin_um": (0.0, float("nan"))}, r"'origin_um\[1\]' must be finite"),
+        ({"origin_um": (0.0, float("nan"))}, r"'origin_um' must be finite everywhere, got nan µm at \[1\]"),
         ({"origin_um": (1, 2, 3)}, r"'origin_um' must be two numbers"),
     ],
 )

@@ -645,6 +645,7 @@ CALLS = {
     "video.FrameSource": lambda o: list(
         video.FrameSource(o.photos / "cats", frame_s=0.1, pitch_um=50.0, distance_m=0.5, peak_radiance_w_m2_sr_nm=0.05)
     ),
+    "video.follow_gaze": lambda o: list(video.follow_gaze([o.scene] * 2, o.gaze, frame_s=0.1)),
     "video.pan_camera": lambda o: list(video.pan_camera(o.scene, o.gaze, o.optics, shape=(40, 40))),
     "video.partial_path": lambda o: video.partial_path("video.zarr"),
     "video.read_recording": lambda o: video.read_recording(o.recording).code[0],
