@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from string import ascii_uppercase
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import NOT_NEGATIVE, Limits
+from foveasim._core.names import did_you_mean, list_names
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Ints, finite_array, freeze
 from foveasim.errors import ParameterError
@@ -24,14 +27,21 @@ INDEX_COLUMNS = (("row", "column"), ("ring", "sector"))
 LATTICE_TOLERANCE = 0.05
 #: Smallest fraction of occupied positions: that of a disc is 0.79, that of staggered rows 0.5.
 MIN_LATTICE_FRACTION = 2 / 3
-#: Named blocks, row 0 lowest. ``rgbw`` is a Bayer block with one green filter replaced by a clear one.
+#: Smallest side of a block that a string of letters describes.
+MIN_SIDE = 2
+#: Named blocks, row 0 lowest. ``rgbw`` is a Bayer block with one green filter replaced by a clear one; the spectral ones have a
+#: different filter at each site, in alphabetical order from the top left.
 MOSAICS: dict[str, tuple[str, ...]] = {
     "bayer": ("RG", "GB"),
     "quad_bayer": ("RRGG", "RRGG", "GGBB", "GGBB"),
     "nona": ("RRRGGG", "RRRGGG", "RRRGGG", "GGGBBB", "GGGBBB", "GGGBBB"),
     "x_trans": ("RBGBRG", "GGRGGB", "GGBGGR", "BRGRBG", "GGBGGR", "GGRGGB"),
     "rgbw": ("RG", "WB"),
+    "spectral_16": ("MNOP", "IJKL", "EFGH", "ABCD"),
+    "spectral_25": ("UVWXY", "PQRST", "KLMNO", "FGHIJ", "ABCDE"),
 }
+#: Order of the filters of letters by default; other letters follow alphabetically.
+LETTER_ORDER = "RGBW"
 
 
 @layout_edit(example={"block": ["RG", "GB"]})
@@ -45,24 +55,33 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
         With the columns ``row`` and ``column``, or ``ring`` and ``sector``; or sites on a rectangular lattice, such as those
         of a GDSII file. Row 0 of a lattice is the lowest, column 0 the leftmost.
     block : str or sequence of str
-        Name in :data:`MOSAICS`, or rows of letters, one letter per site: ``("RG", "GB")`` is a Bayer block with red at row
-        0, column 0. Row 0 is the lowest.
+        Name in :data:`MOSAICS`; or rows of letters, one letter per site: ``("RG", "GB")`` is a Bayer block with red at row
+        0, column 0, and row 0 is the lowest; or the letters of a square block in reading order, from the top left, such as
+        ``"RGGB"``, ``"RCCB"``, or 16 letters.
     names : str, optional
         Letters in the order of the sensor's filters: the ``channel`` of a site is the index of its letter. "RGB" by
-        default, "RGBW" for a block with a W.
+        default, "RGBW" for a block of these letters with a W; otherwise the letters of the block, R, G, B and W first, then
+        alphabetically, or all alphabetically if they are the first ones of the alphabet.
 
     Raises
     ------
     ParameterError
-        When the block is not a rectangle of known letters, or the layout has no such columns and is not a lattice.
+        When the block is neither a name nor a rectangle of known letters, or the layout has no such columns and is not a
+        lattice.
+
+    Examples
+    --------
+    >>> from foveasim.layout import grid
+    >>> mosaic(grid(n_x=4, n_y=2, pitch_um=2.0), "BGGR").channel.reshape(2, 4)[::-1].tolist()
+    [[2, 1, 2, 1], [1, 0, 1, 0]]
     """
     if isinstance(block, str):
-        block = MOSAICS.get(block, (block,))
+        block = _named_block(block)
     rows = list(block) if isinstance(block, Sequence) else []
     if not rows or not all(isinstance(row, str) and row and len(row) == len(rows[0]) for row in rows):
         raise ParameterError("block", "must be rows of letters of equal length, such as ('RG', 'GB')", block)
     if names is None:
-        names = "RGBW" if any("W" in row for row in rows) else "RGB"
+        names = _default_names(set("".join(rows)))
     if len(set(names)) != len(names):
         raise ParameterError("names", "must not contain a letter twice", names)
     unknown = sorted(set("".join(rows)) - set(names))
@@ -76,6 +95,31 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
     position += column % n_columns
     columns = {**layout.columns, "channel": freeze(channels.ravel()[position])}
     return derived(layout, f"mosaic {' '.join(rows)} of {names}", columns=columns)
+
+
+def _named_block(name: str) -> Sequence[str]:
+    """Return the rows of a named block, the lowest first, or of letters in reading order."""
+    if name in MOSAICS:
+        return MOSAICS[name]
+    side = math.isqrt(len(name))
+    if side < MIN_SIDE or side**2 != len(name) or not (name.isalpha() and name.isupper()):
+        raise ParameterError(
+            "block",
+            f"must be one of {list_names(MOSAICS, name)}, the upper-case letters of a square block, such as 'RGGB', or rows "
+            "such as ('RG', 'GB')",
+            name,
+            hint=did_you_mean(name, MOSAICS),
+        )
+    return [name[k : k + side] for k in range(0, len(name), side)][::-1]
+
+
+def _default_names(letters: set[str]) -> str:
+    """Return the letters of a block in the order of filters."""
+    if letters <= set(LETTER_ORDER):
+        return LETTER_ORDER if "W" in letters else LETTER_ORDER[:3]
+    if letters == set(ascii_uppercase[: len(letters)]):
+        return ascii_uppercase[: len(letters)]
+    return "".join(sorted(letters, key=lambda letter: (LETTER_ORDER + letter).index(letter) * 1000 + ord(letter)))
 
 
 def _indices(layout: Layout) -> tuple[NDArray[np.integer], NDArray[np.integer]]:

@@ -29,6 +29,32 @@ def test_named_mosaics_have_published_counts(name, counts):
     assert np.bincount(mosaic(GRID, name).channel).tolist() == counts
 
 
+@pytest.mark.parametrize(
+    ("letters", "names", "top"),
+    [
+        ("RGGB", "RGB", "RG"),
+        ("BGGR", "RGB", "BG"),
+        ("GRBG", "RGB", "GR"),
+        ("RCCB", "RBC", "RC"),
+        ("RGBW", "RGBW", "RG"),
+    ],
+)
+def test_letters_are_read_from_top_left(letters, names, top):
+    channel = mosaic(GRID, letters).channel.reshape(12, 12)
+
+    assert "".join(names[k] for k in channel[-1, :2]) == top
+    assert "".join(names[k] for k in [*channel[1, :2], *channel[0, :2]]) == letters
+    assert np.array_equal(channel, np.tile(channel[:2, :2], (6, 6)))
+
+
+@pytest.mark.parametrize(("name", "side"), [("spectral_16", 4), ("spectral_25", 5)])
+def test_spectral_block_has_different_filters(name, side):
+    channel = mosaic(fs.layout.grid(n_x=2 * side, n_y=side, pitch_um=1.0), name).channel.reshape(side, 2 * side)
+
+    assert channel[::-1, :side].ravel().tolist() == list(range(side**2))
+    assert np.array_equal(channel[:, side:], channel[:, :side])
+
+
 def test_x_trans_lines_contain_all_colours():
     channel = mosaic(GRID, "x_trans").channel.reshape(12, 12)
 

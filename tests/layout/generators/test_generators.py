@@ -652,7 +652,7 @@ X_TRANS = ("RBGBRG", "GGRGGB", "GGBGGR", "BRGRBG", "GGBGGR", "GGRGGB")
         pytest.param(X_TRANS, "RGB", [32, 80, 32], id="X-Trans"),
         pytest.param(("RG", "BW"), "RGBW", [36, 36, 36, 36], id="RGBW"),
         pytest.param(("G",), "RGB", [0, 144, 0], id="one filter"),
-        pytest.param("RGB", "RGB", [48, 48, 48], id="stripes"),
+        pytest.param(("RGB",), "RGB", [48, 48, 48], id="stripes"),
     ],
 )
 def test_mosaic_filter_counts(block, names, counts):
@@ -705,6 +705,9 @@ def test_mosaic_of_selected_sites():
         pytest.param(("RX", "GB"), "RGB", "'block' must use the letters 'RGB', .*'X'", id="unknown letter"),
         pytest.param(("rg", "gb"), "RGB", "'block' must use the letters 'RGB', .*'b', 'g', 'r'", id="lower case"),
         pytest.param(None, "RGB", "'block' must be", id="nothing"),
+        pytest.param("RGB", None, "'block' must be one of 'bayer', .*, or rows such as", id="no square"),
+        pytest.param("rggb", None, "'block' must be one of 'bayer', .*, or rows such as", id="small letters"),
+        pytest.param("bayr", None, "did you mean 'bayer'", id="misspelt"),
     ],
 )
 def test_mosaic_rejects_invalid_block(block, names, message):
@@ -714,7 +717,7 @@ def test_mosaic_rejects_invalid_block(block, names, message):
 
 def test_unknown_letter_message_contains_one_value():
     with pytest.raises(ParameterError, match="'X'") as caught:
-        mosaic(grid(n_x=4, n_y=4, pitch_um=1.0), ("RX", "GB"))
+        mosaic(grid(n_x=4, n_y=4, pitch_um=1.0), ("RX", "GB"), "RGB")
 
     assert str(caught.value).count("got ") == 1
 
