@@ -1,20 +1,25 @@
 """
-Physical constants, and conversions between the units that suffixes of names specify.
+Physical constants, conversions of units, and the encoding of pictures.
 
 Constants are the exact values of the 2019 SI (CODATA 2018).
 """
 
 from __future__ import annotations
 
+import numpy as np
+
 from foveasim._core.calls import publish
 from foveasim._core.validation import Floats, as_numbers, check_broadcast
+from foveasim.errors import ParameterError
 
 __all__ = [
     "BOLTZMANN_J_PER_K",
     "ELEMENTARY_CHARGE_C",
     "LIGHT_SPEED_M_PER_S",
     "PLANCK_J_S",
+    "decode_srgb",
     "electrons_to_volts",
+    "encode_srgb",
     "m_from_mm",
     "m_from_nm",
     "m_from_um",
@@ -99,6 +104,53 @@ def volts_to_electrons(voltage_v: Floats | float, capacitance_f: Floats | float)
     voltage_v, capacitance_f = as_numbers("voltage_v", voltage_v), as_numbers("capacitance_f", capacitance_f)
     check_broadcast(voltage_v=voltage_v, capacitance_f=capacitance_f)
     return voltage_v * capacitance_f / ELEMENTARY_CHARGE_C
+
+
+def encode_srgb(value: Floats | float) -> Floats:
+    """
+    Encode relative radiance as sRGB values, IEC 61966-2-1.
+
+    The values 0 and 1 are black and white; larger ones are extrapolated. Floating-point types are kept.
+
+    Examples
+    --------
+    >>> round(float(encode_srgb(0.18)), 3)
+    0.461
+
+    Raises
+    ------
+    ParameterError
+        When there is a value below 0.
+    """
+    value = _relative(value)
+    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1.0 / 2.4) - 0.055)
+
+
+def decode_srgb(value: Floats | float) -> Floats:
+    """
+    Decode sRGB values to relative radiance, the inverse of :func:`encode_srgb`.
+
+    Examples
+    --------
+    The value 128 of 255 is 22 % of white:
+
+    >>> round(float(decode_srgb(128 / 255)), 2)
+    0.22
+
+    Raises
+    ------
+    ParameterError
+        When there is a value below 0.
+    """
+    value = _relative(value)
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def _relative(value: Floats | float) -> Floats:
+    value = as_numbers("value", value, keep_type=True)
+    if value.min(initial=0.0) < 0.0:
+        raise ParameterError("value", "must be >= 0", float(value.min()))
+    return value
 
 
 publish(__name__)

@@ -56,7 +56,7 @@ def main(out_dir: Path) -> None:
 
     # %% Capture, with the gaze on the face.
     capture = camera.capture(scene, exposure_s=EXPOSURE_S, seed=1, gaze_um=GAZE_UM)
-    capture.picture(max_pixels=800).save(out_dir / "01_foveal_picture.png", capture.white_dn, encode_srgb=True)
+    capture.picture(max_pixels=800).save(out_dir / "01_foveal_picture.png", capture.white_dn)
     axes = plot_capture(capture)
     save_figure(axes.figure, out_dir / "01_foveal_layout.png", dpi=140)
 
@@ -66,9 +66,7 @@ def main(out_dir: Path) -> None:
     pitch_um = (x_max - x_min) / n
     square = fs.layout.mosaic(fs.layout.grid(n_x=n, n_y=n, pitch_um=pitch_um), ("RG", "GB"))
     square_capture = camera_of(square).capture(scene, exposure_s=EXPOSURE_S, seed=1, gaze_um=GAZE_UM)
-    square_capture.picture(max_pixels=800).save(
-        out_dir / "01_square_picture.png", square_capture.white_dn, encode_srgb=True
-    )
+    square_capture.picture(max_pixels=800).save(out_dir / "01_square_picture.png", square_capture.white_dn)
 
     # %% Checks.
     print(f"{square.n_sites} square photosites of {pitch_um:.1f} µm")

@@ -21,7 +21,6 @@ import skimage.data
 from matplotlib.figure import Figure
 
 import foveasim as fs
-from foveasim._io.encodings import encode_srgb_values
 from foveasim.config import read_shot
 from foveasim.scene import charts
 from foveasim.view import save_figure
@@ -98,7 +97,7 @@ def main(out_dir: Path) -> None:
         shown = fs.Camera(optics=optics, sensor=half, distortion=distortion).capture(
             photograph, exposure_s=shot.exposure_s, seed=1
         )
-        codes = encode_srgb_values(shown.code.reshape(shape[0] // 2, -1) / 255.0)
+        codes = fs.units.encode_srgb(shown.code.reshape(shape[0] // 2, -1) / 255.0)
         axes.imshow(codes, origin="lower", extent=(left, right, bottom, top), cmap="gray", vmin=0.0, vmax=1.0)
         axes.set_title(f"photograph, {title}", fontsize=10)
         axes.set(xlabel="x / µm", ylabel="y / µm")

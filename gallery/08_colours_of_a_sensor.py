@@ -119,7 +119,7 @@ def main(out_dir: Path) -> None:
         axes.set_ylim(200, 400)
         axes.set_title(f"{name}: {sensor.layout.n_sites:,} sites", fontsize=10)
         axes = figure.add_subplot(2, 3, 3 + position)
-        axes.imshow(capture.picture(max_pixels=600).to_image(encode_srgb=True))
+        axes.imshow(capture.picture(max_pixels=600).to_image())
         axes.set_axis_off()
         axes.set_title("colours of the nearest sites", fontsize=10)
     save_figure(figure, out_dir / "08_mosaics.png", dpi=140)

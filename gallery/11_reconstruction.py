@@ -19,7 +19,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
 import foveasim as fs
-from foveasim._io.encodings import encode_srgb_values
 from foveasim.metrics import psnr_db, ssim
 from foveasim.view import save_figure
 
@@ -78,7 +77,7 @@ def main(out_dir: Path) -> None:
     panels = {"reference": reference, **pictures}
     left, bottom, right, top = grid.bounds_um
     for (name, picture), complete, centre in zip(panels.items(), axes[:2].flat, axes[2:].flat, strict=False):
-        shown = encode_srgb_values(np.clip(picture.data[0] / white, 0.0, 1.0))
+        shown = fs.units.encode_srgb(np.clip(picture.data[0] / white, 0.0, 1.0))
         for panel in (complete, centre):
             panel.add_patch(Rectangle((left, bottom), right - left, top - bottom, **NO_DATA))
             panel.imshow(
@@ -95,7 +94,7 @@ def main(out_dir: Path) -> None:
     save_figure(figure, out_dir / "11_reconstruction.png", dpi=140)
 
     # %% Files for other programs: a PNG file of 16 bits for display, and a TIFF file of the values.
-    pictures["least_squares"].save(out_dir / "11_least_squares.png", white, encode_srgb=True, bits=16)
+    pictures["least_squares"].save(out_dir / "11_least_squares.png", white, bits=16)
     pictures["least_squares"].save(out_dir / "11_least_squares.tif")
 
     # %% Checks.

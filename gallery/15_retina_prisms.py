@@ -17,7 +17,6 @@ import skimage.data
 
 import foveasim as fs
 from foveasim import view
-from foveasim._io.encodings import decode, encode_srgb_values
 
 WAVELENGTH_NM = 550.0
 EXPOSURE_S = 0.01
@@ -43,7 +42,7 @@ def photograph(radius_um: float) -> np.ndarray:
     half = int(radius_um / PITCH_UM) + 1
     row, column = GAZE_PX
     padded = np.pad(skimage.data.chelsea(), ((half, half), (half, half), (0, 0)), mode="edge")
-    return decode(padded[row : row + 2 * half, column : column + 2 * half] / 255.0, "srgb")
+    return fs.units.decode_srgb(padded[row : row + 2 * half, column : column + 2 * half] / 255.0)
 
 
 def main(out_dir: Path) -> None:
@@ -63,7 +62,7 @@ def main(out_dir: Path) -> None:
 
     # %% Each column has the mean colour of the photograph over its site.
     site_rgb = fs.Integrator(layout, power_map.grid)(np.moveaxis(rgb[::-1], -1, 0)) / layout.area_um2
-    colours = encode_srgb_values(COLOUR_GAIN * site_rgb).T
+    colours = fs.units.encode_srgb(COLOUR_GAIN * site_rgb).T
     columns = view.prisms(capture, by=colours, max_height_um=MAX_HEIGHT_UM)
 
     # %% Complete retina, and its fovea; the software renderer, used without OpenGL, has no ambient occlusion.

@@ -64,7 +64,7 @@ def main(out_dir: Path) -> None:
         strict=True,
     ):
         picture = shot.picture(grid=grid)
-        image = picture.to_image(shot.white_dn, encode_srgb=True)
+        image = picture.to_image(shot.white_dn)
         x_min, y_min, x_max, y_max = picture.grid.bounds_um
         ax.imshow(image[..., 0], cmap="gray", vmin=0, vmax=255, extent=(x_min, x_max, y_min, y_max))
         ax.set_title(title, fontsize=10)

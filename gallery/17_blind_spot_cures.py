@@ -56,7 +56,7 @@ def main(out_dir: Path) -> None:
 
         # %% Its picture of the centre, and its layout there.
         picture = capture.picture(grid=CENTRE)
-        image = picture.to_image(capture.white_dn, encode_srgb=True)
+        image = picture.to_image(capture.white_dn)
         x_min, y_min, x_max, y_max = CENTRE.bounds_um
         axes[0, k].set_facecolor("#b9c4d6")
         axes[0, k].imshow(

@@ -63,7 +63,7 @@ PICTURE_PIXELS, GREY = 300, 60.0
 def picture_on_grey(capture: Capture, white_dn: float | None = None) -> NDArray[np.uint8]:
     """Return the picture of a capture over grey, optionally with a white level."""
     scale = 1.0 if white_dn is None else white_dn / capture.white_dn.max()
-    image = capture.picture(max_pixels=PICTURE_PIXELS).to_image(scale * capture.white_dn, encode_srgb=True)
+    image = capture.picture(max_pixels=PICTURE_PIXELS).to_image(scale * capture.white_dn)
     cover = image[..., -1:] / 255.0
     return np.rint(image[..., :-1] * cover + GREY * (1.0 - cover)).astype(np.uint8)
 

@@ -26,7 +26,6 @@ from matplotlib.patches import Circle
 from scipy.ndimage import distance_transform_edt
 
 import foveasim as fs
-from foveasim._io.encodings import encode_srgb_values
 from foveasim.metrics import estimate_flow, flow_bound, site_gradients_e_per_um
 from foveasim.reconstruct import SiteEstimates, cells, estimate_from_code, least_squares
 from foveasim.view import save_figure
@@ -287,7 +286,7 @@ def show_sensors(axes: Sequence[Axes], view: View, layouts: dict[str, fs.Layout]
         shown[f"{name}: {layout.n_sites} photosites"] = cells(layout, light_e.light_e / layout.area_um2, grid).data[0]
     x_min, y_min, x_max, y_max = light.grid.bounds_um
     for axis, (title, picture) in zip(axes, shown.items(), strict=True):
-        grey = encode_srgb_values(np.clip(picture / np.percentile(true, 99.5), 0.0, 1.0))
+        grey = fs.units.encode_srgb(np.clip(picture / np.percentile(true, 99.5), 0.0, 1.0))
         axis.imshow(grey, cmap="gray", origin="lower", extent=(x_min, x_max, y_min, y_max), interpolation="nearest")
         axis.set_title(title.replace(": ", ":\n"), fontsize=10)
         axis.set(xticks=[], yticks=[], xlim=(-260, 260), ylim=(-260, 260))

@@ -18,7 +18,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import foveasim as fs
-from foveasim._io.encodings import encode_srgb_values
 from foveasim.compare.figures import draw_measure
 from foveasim.view import save_figure
 
@@ -48,7 +47,7 @@ def draw(found: fs.compare.Comparison) -> Figure:
         for name, budget in zip(found.names, found.budgets, strict=True)
     }
     for one, (title, picture) in zip(axes[0], pictures.items(), strict=True):
-        grey = encode_srgb_values(np.clip(picture.data[0] / white, 0.0, 1.0))
+        grey = fs.units.encode_srgb(np.clip(picture.data[0] / white, 0.0, 1.0))
         one.imshow(grey, cmap="gray", origin="lower", vmin=0.0, vmax=1.0)
         one.set(title=title, xticks=[], yticks=[])
     for one, name in zip(axes[1], MEASURES, strict=True):

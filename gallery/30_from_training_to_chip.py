@@ -27,7 +27,6 @@ from shapely import get_coordinates
 from torch import Tensor
 
 import foveasim as fs
-from foveasim._io.encodings import encode_srgb_values
 from foveasim.layout import read_layout
 from foveasim.learn import Mesh, barrier, site_power
 from foveasim.view import plot_layout, save_figure
@@ -235,7 +234,7 @@ def draw_stages(task: Task, stages: Mapping[str, tuple[fs.Layout, Measurement]])
         ax.set_title(f"{name}\n{count_violations(layout)} violations", fontsize="medium")
         pictures[f"{measurement.error_percent:.2f} %"] = measurement.picture
     for ax, (title, picture) in zip(below, pictures.items(), strict=True):
-        shown = encode_srgb_values(np.clip(picture / white, 0.0, 1.0))
+        shown = fs.units.encode_srgb(np.clip(picture / white, 0.0, 1.0))
         ax.imshow(shown, cmap="gray", origin="lower", vmin=0.0, vmax=1.0, extent=extent)
         ax.set_title(title)
     for ax in (*above, *below):

@@ -9,6 +9,7 @@ import pytest
 import scipy.constants
 
 from foveasim import units
+from foveasim.errors import ParameterError
 
 
 @pytest.mark.parametrize(
@@ -86,3 +87,21 @@ def test_charge_voltage_conversion_is_invertible():
 def test_voltage_is_inversely_proportional_to_capacitance():
     voltage_v = units.electrons_to_volts(1000.0, np.array([1e-14, 2e-14]))
     assert voltage_v[0] == 2.0 * voltage_v[1]
+
+
+def test_srgb_encoding_equals_that_of_scikit_image():
+    from skimage.color import rgb2xyz
+
+    encoded = np.linspace(0.0, 1.0, 256)
+    grey = np.repeat(encoded[:, np.newaxis], 3, axis=1)
+    luminance = rgb2xyz(grey)[:, 1]
+
+    assert units.decode_srgb(encoded) == pytest.approx(luminance, abs=1e-6)
+    assert units.encode_srgb(units.decode_srgb(encoded)) == pytest.approx(encoded, abs=1e-6)
+    assert units.encode_srgb(np.float32([0.5])).dtype == np.float32
+
+
+@pytest.mark.parametrize("convert", [units.encode_srgb, units.decode_srgb])
+def test_negative_radiance_is_rejected(convert):
+    with pytest.raises(ParameterError, match=r"'value' must be >= 0, got -0\.1"):
+        convert([0.5, -0.1])

@@ -1,12 +1,11 @@
-"""Transfer functions of pictures: relative radiance from encoded values, and the inverse."""
+"""Transfer functions of pictures: relative radiance from encoded values."""
 
 from __future__ import annotations
 
 from typing import Literal
 
-import numpy as np
-
 from foveasim._core.validation import Floats
+from foveasim.units import decode_srgb
 
 #: sRGB (photographs), the square root of the radiance (the paper), linear radiance.
 Encoding = Literal["srgb", "sqrt", "linear"]
@@ -20,11 +19,4 @@ def decode(values: Floats, encoding: Encoding) -> Floats:
     """
     if encoding == "sqrt":
         return values * values
-    if encoding == "srgb":
-        return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
-    return values
-
-
-def encode_srgb_values(values: Floats) -> Floats:
-    """Encode relative radiance >= 0 in sRGB, IEC 61966-2-1."""
-    return np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1.0 / 2.4) - 0.055)
+    return decode_srgb(values) if encoding == "srgb" else values

@@ -121,7 +121,7 @@ def _pixels(picture: Picture, white: NDArray[np.float64]) -> NDArray[np.uint8]:
     if picture.data.shape[0] not in (1, 3):  # filters that are not red, green and blue are shown as their mean
         picture = Picture(picture.data.mean(axis=0, keepdims=True), picture.coverage, picture.grid)
         white = np.array([white.mean()])
-    return np.asarray(picture.to_image(np.maximum(white, 1e-12), encode_srgb=True), np.uint8)
+    return np.asarray(picture.to_image(np.maximum(white, 1e-12)), np.uint8)
 
 
 def _eccentricity(comparison: Comparison) -> ReportSection:

@@ -9,16 +9,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from foveasim._core.calls import Limits
 from foveasim._core.show import Drawn, drawn
 from foveasim._core.validation import Floats, Images, check_count, finite_array, own, unmasked
-from foveasim._io.encodings import decode, encode_srgb_values
 from foveasim._io.images import picture_format, write_picture
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid, Lattice, PackedRings, to_file_rows
 from foveasim.integrate import Integrator
+from foveasim.units import decode_srgb
+from foveasim.units import encode_srgb as encoded_in_srgb
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,7 +39,9 @@ class Picture:
     """
     Raster picture of photosite values.
 
-    Arrays are read-only; later changes of the source arrays have no effect.
+    Arrays are read-only; later changes of the source arrays have no effect. Other libraries see the picture as
+    ``np.asarray(picture)``: its pixels in sRGB with alpha, (n_y, n_x, 4) uint8, top row first, so that
+    ``plt.imshow(picture)`` and ``PIL.Image.fromarray(np.asarray(picture))`` show it.
 
     Attributes
     ----------
@@ -87,6 +90,14 @@ class Picture:
         pixels = f"{n_x} x {n_y} pixels of {self.grid.pitch_x_um:.4g} x {self.grid.pitch_y_um:.4g} µm"
         return f"Picture({pixels}, {n_channels} channel{'s' * (n_channels != 1)}, {extent})"
 
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
+        if copy is False:
+            raise ValueError("the pixels of a Picture are always a copy; 'data' contains its values without one")
+        image = self.to_image()
+        if image.shape[2] == 2:
+            image = image[..., [0, 0, 0, 1]]
+        return image if dtype is None else image.astype(dtype)
+
     plot: ClassVar[Drawn[Axes]] = drawn("plot_picture")
     _repr_html_ = drawn("to_html")
     _repr_png_ = drawn("to_png")
@@ -95,7 +106,7 @@ class Picture:
         self,
         white: float | Floats | None = None,
         *,
-        encode_srgb: bool = False,
+        encode_srgb: bool = True,
         bits: Literal[8, 16] = 8,
         background: Colour | None = None,
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
@@ -108,7 +119,7 @@ class Picture:
             Values that map to the largest integer; by default the largest value of the picture, or, for a picture with
             ``white``, the smallest multiple of it that no value exceeds.
         encode_srgb : bool
-            Whether to encode linear values with the sRGB transfer function.
+            Whether to encode linear values with the sRGB transfer function, as screens and image files expect.
         bits : {8, 16}
         background : str or (r, g, b), optional
             Colour of pixels without photosites, such as ``"white"``, ``"#204060"`` or ``(32, 64, 96)``; pixels that photosites
@@ -133,7 +144,7 @@ class Picture:
             white = balance * (float(np.nanmax(self.data / self._levels(balance), initial=0.0)) or 1.0)
         fraction = np.clip(np.nan_to_num(self.data) / self._levels(white), 0.0, 1.0)
         if encode_srgb:
-            fraction = encode_srgb_values(fraction)
+            fraction = encoded_in_srgb(fraction)
         coverage = np.clip(self.coverage, 0.0, 1.0)[np.newaxis]
         if background is None:
             layers = np.concatenate((fraction, coverage))
@@ -147,7 +158,7 @@ class Picture:
         path: str | Path,
         white: float | Floats | None = None,
         *,
-        encode_srgb: bool = False,
+        encode_srgb: bool | None = None,
         bits: Literal[8, 16, 32] | None = None,
         background: Colour | None = None,
     ) -> None:
@@ -161,8 +172,8 @@ class Picture:
             ``.tif`` with integers or floating-point numbers, or, with the extra ``pictures``, ``.exr``. 16 bits per channel
             are available in ``.png`` (in colour with the extra ``pictures``) and ``.tif``.
         white, encode_srgb
-            For integers, as for :meth:`to_image`. Floating-point files contain linear values, divided by ``white`` if it is
-            given, and cannot be encoded.
+            For integers, as for :meth:`to_image`: encoded in sRGB by default. Floating-point files contain linear values,
+            divided by ``white`` if it is given, and cannot be encoded.
         bits : {8, 16, 32}, optional
             32 writes floating-point numbers, with NaN where no photosite lies and without alpha. By default 32 for TIFF and
             EXR, and 8 for other formats.
@@ -184,6 +195,7 @@ class Picture:
         if bits != 32:
             if background is None and not chosen.has_alpha:
                 background = NO_DATA_COLOUR
+            encode_srgb = encode_srgb is None or encode_srgb
             write_picture(path, self.to_image(white, encode_srgb=encode_srgb, bits=bits or 8, background=background))
             return
         if encode_srgb:
@@ -194,7 +206,7 @@ class Picture:
         if background is not None:
             if white is None:
                 raise ParameterError("white", "must be given with 'background' in floating-point files, as its unit")
-            colour = decode(_channels(background, self.data.shape[0]), "srgb")
+            colour = decode_srgb(_channels(background, self.data.shape[0]))
             coverage = np.clip(self.coverage, 0.0, 1.0)
             values = coverage * np.nan_to_num(values) + (1.0 - coverage) * colour
         write_picture(path, np.ascontiguousarray(to_file_rows(np.asarray(values, np.float32))))

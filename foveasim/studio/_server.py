@@ -382,7 +382,7 @@ def _exported(session: Session, what: str) -> tuple[bytes, str]:
     with tempfile.TemporaryDirectory(prefix="foveasim-studio-") as directory:
         path = Path(directory) / f"{stem}.{what}"
         if what == "png":
-            capture.picture(max_pixels=1024).save(path, capture.white_dn, encode_srgb=True)
+            capture.picture(max_pixels=1024).save(path, capture.white_dn)
         else:
             write_layout(capture.layout, path)
         return path.read_bytes(), path.name

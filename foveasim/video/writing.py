@@ -155,7 +155,7 @@ class _Raster:
         if n_filters not in (1, 3):
             data, white = data.mean(axis=0, keepdims=True), float(np.mean(white))
         picture = Picture(data, self._coverage.astype(np.float32), self._integrator.grid)
-        return np.asarray(picture.to_image(white, encode_srgb=True), np.uint8)
+        return np.asarray(picture.to_image(white), np.uint8)
 
     def composite(self, capture: Capture) -> NDArray[np.uint8]:
         """Return sRGB values over a dark grey background, (n_y, n_x, 3)."""

@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.names import possible_names
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import UNIT_SUFFIXES, Floats, Ints, as_numbers, finite_array, own, unmasked
-from foveasim._io.encodings import decode, encode_srgb_values
 from foveasim.capture import Capture
 from foveasim.errors import ParameterError, type_name
 from foveasim.layout import Layout
+from foveasim.units import decode_srgb, encode_srgb
 
 __all__ = [
     "BACKGROUND",
@@ -153,12 +153,12 @@ def as_fractions(rgb: Rgb, factor: float = 1.0) -> tuple[float, float, float]:
 
 def decode_light(rgb: NDArray[Any]) -> Floats:
     """Return sRGB bytes as linear light from 0 to 1."""
-    return np.asarray(decode(np.arange(256) / 255.0, "srgb")[rgb])
+    return np.asarray(decode_srgb(np.arange(256) / 255.0)[rgb])
 
 
 def encode_light(fraction: Floats) -> RgbArray:
     """Return linear light from 0 to 1 as sRGB bytes."""
-    return np.rint(255.0 * encode_srgb_values(np.clip(fraction, 0.0, 1.0))).astype(np.uint8)
+    return np.rint(255.0 * encode_srgb(np.clip(fraction, 0.0, 1.0))).astype(np.uint8)
 
 
 def site_colours(data: Layout | Capture, by: str | ArrayLike | None = None) -> RgbArray:

@@ -185,8 +185,8 @@ def test_colours_without_white_are_balanced_and_scaled():
     data = np.array([[[4.0, 2.0]], [[8.0, 8.0]], [[2.0, 1.0]]], np.float32)
     picture = fs.Picture(data, np.ones((1, 2), np.float32), fs.Grid((1, 2), 1.0), np.array([8.0, 16.0, 4.0]))
 
-    assert picture.to_image()[0].tolist() == [[255, 255, 255, 255], [128, 255, 128, 255]]
-    assert picture.to_image(8.0)[0].tolist() == [[128, 255, 64, 255], [64, 255, 32, 255]]
+    assert picture.to_image(encode_srgb=False)[0].tolist() == [[255, 255, 255, 255], [128, 255, 128, 255]]
+    assert picture.to_image(8.0, encode_srgb=False)[0].tolist() == [[128, 255, 64, 255], [64, 255, 32, 255]]
     for white in ([1.0, 2.0], [1.0, 0.0, 1.0]):
         with pytest.raises(ParameterError, match="'white' must be"):
             fs.Picture(data, np.ones((1, 2), np.float32), picture.grid, np.array(white))

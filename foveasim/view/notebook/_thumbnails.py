@@ -79,7 +79,7 @@ def site_thumbnail(data: Layout | Capture, alt: str) -> Html:
     if not layout.n_sites:
         return Html()
     if isinstance(data, Capture) and len(data.filter_names) == 3:
-        pixels = data.picture(max_pixels=THUMBNAIL_PIXELS).to_image(encode_srgb=True, background=BACKGROUND)
+        pixels = data.picture(max_pixels=THUMBNAIL_PIXELS).to_image(background=BACKGROUND)
         return thumbnail(np.asarray(pixels, np.uint8), alt, "white-balanced picture")
     by = "code" if isinstance(data, Capture) else _quantity_of(layout)
     colours = colours_of(data, by)

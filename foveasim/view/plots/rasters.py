@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.validation import Floats, check_count
-from foveasim._io.encodings import encode_srgb_values
 from foveasim._io.mapped_files import in_memory
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PowerMap, to_file_rows
 from foveasim.reconstruct import CorticalImage, Picture
 from foveasim.scene import Scene
 from foveasim.sensor import rgb_filters
+from foveasim.units import encode_srgb
 from foveasim.view.plots.figures import new_axes
 from foveasim.view.site_colours import BACKGROUND, as_fractions
 
@@ -114,7 +114,7 @@ def plot_picture(
     picture: Picture,
     white: float | Floats | None = None,
     *,
-    encode_srgb: bool = False,
+    encode_srgb: bool = True,
     channel: int | None = None,
     ax: Axes | None = None,
     figure_inches: float = 8.0,
@@ -300,7 +300,7 @@ def picture_pixels(picture: Picture, max_pixels: int) -> NDArray[np.uint8]:
     white = picture.white
     if data.shape[0] not in (1, 3):
         data, white = data.mean(axis=0, keepdims=True), None
-    return np.asarray(Picture(data, coverage, picture.grid, white).to_image(encode_srgb=True), np.uint8)
+    return np.asarray(Picture(data, coverage, picture.grid, white).to_image(), np.uint8)
 
 
 def cortical_pixels(image: CorticalImage, max_pixels: int) -> NDArray[np.uint8]:
@@ -315,7 +315,7 @@ def cortical_pixels(image: CorticalImage, max_pixels: int) -> NDArray[np.uint8]:
         data, white = data.mean(axis=0, keepdims=True), None
     coverage = np.isfinite(data).all(axis=0).astype(np.float32)
     picture = Picture(data.astype(np.float32), coverage, Grid(coverage.shape, 1.0, (0.0, 0.0)), white)
-    return np.asarray(picture.to_image(encode_srgb=True), np.uint8)
+    return np.asarray(picture.to_image(), np.uint8)
 
 
 def _unrolled(image: CorticalImage) -> NDArray[Any]:
@@ -360,4 +360,4 @@ def _colour_weights(wavelength_nm: Floats) -> Floats:
 def _encode(rgb: NDArray[Any]) -> NDArray[np.uint8]:
     """Return linear channels (3, n_y, n_x) as sRGB pixels, top row first."""
     fraction = np.clip(rgb / (float(rgb.max(initial=0.0)) or 1.0), 0.0, 1.0)
-    return np.ascontiguousarray(np.rint(255.0 * to_file_rows(encode_srgb_values(fraction))).astype(np.uint8))
+    return np.ascontiguousarray(np.rint(255.0 * to_file_rows(encode_srgb(fraction))).astype(np.uint8))

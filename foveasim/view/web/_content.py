@@ -309,7 +309,7 @@ def _picture(layout: Layout, capture: Capture | None) -> tuple[NDArray[np.uint8]
             grey = np.mean(picture.data / white.reshape(-1, 1, 1), axis=0, keepdims=True)
             picture = replace(picture, data=grey, white=None)
             white = np.ones(1)
-        pixels = picture.to_image(white, encode_srgb=True)
+        pixels = picture.to_image(white)
         bounds_um = picture.grid.bounds_um
     else:
         x_min, y_min, x_max, y_max = layout.bounds_um
