@@ -63,8 +63,8 @@ UNITS = {"code": "DN", "electrons": "e-"}
 #: Names of variables that are derived from the layout, and of the dimensions' coordinates.
 DERIVED = ("x_um", "y_um", "area_um2", "filter_name")
 SITE, FILTER = "site", "filter"
-#: Group of a store with the outlines.
-LAYOUT_GROUP = "layout"
+#: Groups of a store with the outlines, and with the arrays of the sensor.
+LAYOUT_GROUP, SENSOR_GROUP = "layout", "sensor"
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +93,11 @@ class Capture:
         Plain data: optics, sensor, layout, scene, exposure, seed, frame, versions.
     stage_s : mapping of str to float
         Elapsed seconds of each stage, with those of kernels that are compiled in it; not saved.
+    electronics : Sensor, optional
+        The sensor, whose noise and response the methods use. None for captures that were read from a file: the methods then
+        create it from ``settings`` and ``sensor_arrays``.
+    sensor_arrays : mapping of str to array
+        Parameters of the sensor with more than 64 values, such as those per site, by their SHA-256 in ``settings``.
     """
 
     layout: Layout
@@ -105,6 +110,8 @@ class Capture:
     white_dn: Floats
     settings: Mapping[str, Any]
     stage_s: Mapping[str, float] = field(default_factory=dict)
+    electronics: Sensor | None = None
+    sensor_arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         n_filters = len(self.filter_names)
@@ -131,6 +138,8 @@ class Capture:
         # Captures of one camera share settings; a copy lets users edit those of one.
         object.__setattr__(self, "settings", copy_plain_data(self.settings))
         object.__setattr__(self, "stage_s", dict(self.stage_s))
+        if self.electronics is not None and not same_rings(self.electronics.layout, self.layout):
+            object.__setattr__(self, "electronics", None)  # a copy with other sites
 
     def __repr__(self) -> str:
         return (
@@ -175,8 +184,8 @@ class Capture:
             in µm² and its light response (and, for codes, relative conversion gain), so that a uniform scene gives a uniform
             picture. The response is that of :meth:`Sensor.light_response` over devices.
         sensor : Sensor, optional
-            The sensor of the capture, with the same sites in the same order. Required when its parameters differ between the
-            sites of a layout with more than 64 sites: ``settings`` does not contain such arrays.
+            By default that of the capture. Required for captures that were read from a file, if the sensor has effects that
+            are not registered.
         **options
             Options of the method's function: ``mu``, ``blur``, ``tolerance``, ``max_steps`` and ``variance`` for
             ``"least_squares"``, ``n_threads`` for all.
@@ -312,8 +321,7 @@ class Capture:
         Parameters
         ----------
         sensor : Sensor, optional
-            The sensor of the capture. Required when its parameters differ between the sites of a layout with more than 64
-            sites, since ``settings`` does not contain such arrays, and when it has effects that are not registered.
+            As for :meth:`picture`.
 
         Returns
         -------
@@ -364,8 +372,10 @@ class Capture:
 
     @cached_property
     def _electronics(self) -> Sensor:
-        """Sensor of the settings, without filters and quantum efficiency."""
-        known = Sensor.from_settings(self.layout, self.settings.get("sensor", {}))
+        """Sensor of the capture; without filters and quantum efficiency after reading."""
+        if self.electronics is not None:
+            return self.electronics
+        known = Sensor.from_settings(self.layout, self.settings.get("sensor", {}), self.sensor_arrays)
         if "tile" in self.settings:
             unknown = [effect.name for effect in known.effects if effect.needs_layout]
             if unknown:
@@ -502,10 +512,19 @@ class Capture:
             "bits": self.bits,
             "white_dn": self.white_dn.tolist(),
             "settings": self.settings,
+            "sensor_arrays": list(self._stored_arrays),
             "provenance": to_plain_data(dict(self.layout.provenance)),
         }
         arrays = {name: getattr(self, name) for name in ARRAYS}
-        write_archive(path, about, arrays | layout_to_arrays(self.layout))
+        of_sensor = {f"{SENSOR_GROUP}_{k}": values for k, values in enumerate(self._stored_arrays.values())}
+        write_archive(path, about, arrays | of_sensor | layout_to_arrays(self.layout))
+
+    @property
+    def _stored_arrays(self) -> Mapping[str, NDArray[Any]]:
+        """Arrays to which the settings refer: not those of a part of a sensor."""
+        known = self.sensor_arrays if self.electronics is None else self.electronics.arrays
+        needed = json.dumps(self.settings.get("sensor", {})) if known else ""
+        return {digest: values for digest, values in known.items() if digest in needed}
 
     def _save_store(self, target: Path) -> None:
         zarr = import_optional(target, "zarr")
@@ -514,6 +533,10 @@ class Capture:
             "xy_um": _variable("xy_um", ("vertex", "axis"), self.layout.xy_um),
             "ring_offsets": _variable("ring_offsets", ("ring_end",), self.layout.ring_offsets),
             "site_offsets": _variable("site_offsets", ("site_end",), self.layout.site_offsets),
+        }
+        of_sensor = {
+            digest: Variable(tuple(f"{digest[:8]}_{axis}" for axis in range(values.ndim)), values, {})
+            for digest, values in self._stored_arrays.items()
         }
         attributes = {
             "format": FILE_FORMAT,
@@ -528,6 +551,7 @@ class Capture:
             group = zarr.create_group(str(directory), zarr_format=3, attributes=attributes)
             write_variables(group, variables | coordinates)
             write_variables(group.create_group(LAYOUT_GROUP), outlines)
+            write_variables(group.create_group(SENSOR_GROUP), of_sensor)
 
     @classmethod
     def load(cls, path: str | Path) -> Capture:
@@ -556,6 +580,10 @@ class Capture:
                 bits=int(about["bits"]),
                 white_dn=np.asarray(about["white_dn"], dtype=np.float64),
                 settings=about["settings"],
+                sensor_arrays={
+                    str(digest): arrays[f"{SENSOR_GROUP}_{k}"]
+                    for k, digest in enumerate(about.get("sensor_arrays", ()))
+                },
             )
 
     @classmethod
@@ -571,6 +599,11 @@ class Capture:
                 filter_names=tuple(map(str, about["filter_names"])),
                 bits=about["bits"],
                 settings=json.loads(about["settings"]),
+                sensor_arrays={
+                    path.removeprefix(f"{SENSOR_GROUP}/"): array[...]
+                    for path, array in arrays.items()
+                    if path.startswith(f"{SENSOR_GROUP}/")
+                },
             )
 
 

@@ -14,6 +14,7 @@ Errors and warnings of foveasim.
     FoveasimWarning (UserWarning)
     ├── SamplingWarning                  the sampling is too coarse for the physics
     ├── CoverageWarning                  image and layout differ in size: photosites outside, or a small part
+    ├── ExposureWarning                  many photosites are saturated, or most receive no signal
     └── LayoutWarning                    a layout that differs from its parameters, or its file from the layout
 
 Each message gives the name of the parameter or the path of the file, the rule, the value and a hint.
@@ -32,6 +33,7 @@ __all__ = [
     "ArgumentError",
     "ConfigError",
     "CoverageWarning",
+    "ExposureWarning",
     "FileError",
     "FoveasimError",
     "FoveasimWarning",
@@ -121,6 +123,10 @@ class SamplingWarning(FoveasimWarning):
 
 class CoverageWarning(FoveasimWarning):
     """Photosites outside the image, or a layout that measures a small part of a photograph."""
+
+
+class ExposureWarning(FoveasimWarning):
+    """An exposure at which many photosites are saturated, or most receive no signal."""
 
 
 class LayoutWarning(FoveasimWarning):

@@ -64,7 +64,7 @@ MARGIN_ROWS = 2
 #: Arrays of a tile and their types; the last array of a store marks complete tiles.
 ARRAYS: dict[str, str | None] = {"expected_e": "f8", "electrons": "i8", "code": None}
 COMPLETE = "tile_is_complete"
-LAYOUT = "layout"
+LAYOUT, SENSOR = "layout", "sensor"
 CODECS = ("bytes", "zstd")
 #: Elements per chunk of the layout's arrays.
 CHUNK = 1 << 22
@@ -291,6 +291,16 @@ class TiledCapture:
             arrays = {name: array[:] for name, array in group[LAYOUT].arrays()}
             return layout_from_arrays(arrays, group.attrs["provenance"])
 
+    @cached_property
+    def _sensor(self) -> Sensor | None:
+        """Sensor of the settings, without filters and quantum efficiency; None if unknown."""
+        with _open(self.path) as group:
+            arrays = {name: array[:] for name, array in group[SENSOR].arrays()} if SENSOR in group else {}
+        try:
+            return Sensor.from_settings(self.layout, self.settings["sensor"], arrays)
+        except ParameterError:  # the capture of a tile explains it
+            return None
+
     def tile(self, number: int) -> Capture:
         """
         Read a tile.
@@ -303,9 +313,11 @@ class TiledCapture:
         number = check_count("number", number, at_least=0, at_most=self.n_tiles - 1)
         first, last = number * self.tile_sites, min((number + 1) * self.tile_sites, self.n_sites)
         with as_file_error(self.path, "tiled capture"):
-            layout = self.layout[first:last]
+            sensor = None if self._sensor is None else self._sensor.part(slice(first, last))
+            layout = self.layout[first:last] if sensor is None else sensor.layout
             return Capture(
                 layout=layout,
+                electronics=sensor,
                 **{name: getattr(self, name)[first:last] for name in ARRAYS},
                 filter_of_site=layout.channel.astype(np.min_scalar_type(-len(self.filter_names)))
                 if len(self.filter_names) > 1
@@ -492,12 +504,13 @@ def _create(directory: Path, camera: Camera, light: Scene | PowerMap, plan: Mapp
         )
     n_tiles = -(-n_sites // tile_sites)
     group.create_array(COMPLETE, shape=(n_tiles,), chunks=(1,), dtype="u1", dimension_names=("tile",), fill_value=0)
-    outlines = group.create_group(LAYOUT)
-    for name, values in layout_to_arrays(layout, is_compact=True).items():
-        chunks = (max(1, min(CHUNK, values.shape[0])), *values.shape[1:])
-        array = outlines.create_array(name, shape=values.shape, chunks=chunks, dtype=values.dtype)
-        for first in range(0, values.shape[0], chunks[0]):
-            array[first : first + chunks[0]] = values[first : first + chunks[0]]
+    for name, stored in ((LAYOUT, layout_to_arrays(layout, is_compact=True)), (SENSOR, sensor.arrays)):
+        parts = group.create_group(name)
+        for key, values in stored.items():
+            chunks = (max(1, min(CHUNK, values.shape[0])), *values.shape[1:])
+            array = parts.create_array(key, shape=values.shape, chunks=chunks, dtype=values.dtype)
+            for first in range(0, values.shape[0], chunks[0]):
+                array[first : first + chunks[0]] = values[first : first + chunks[0]]
 
 
 def _add(arrays: Mapping[str, Any], tile: int, capture: Capture) -> None:
@@ -513,7 +526,8 @@ def _open(source: Path, mode: str = "r", *, is_finished: bool = True) -> Iterato
     """Open the group of an untrusted store; exceptions of the block become FileErrors."""
     with open_group(source, "tiled capture", CODECS, FORMAT, VERSION, mode) as group:
         arrays = {name: group[name] for name in ARRAYS} if is_finished else {}
-        arrays |= {f"{LAYOUT}/{name}": array for name, array in group[LAYOUT].arrays()}
+        parts = [part for part in (LAYOUT, SENSOR) if part in group]
+        arrays |= {f"{part}/{name}": array for part in parts for name, array in group[part].arrays()}
         for name, array in arrays.items():
             # A missing chunk would be read as 0, and a few bytes of metadata can claim any size.
             n_chunks = sum(1 for file in (source / name / "c").rglob("*") if file.is_file())

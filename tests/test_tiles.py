@@ -184,18 +184,31 @@ def test_tiles_have_settings_of_camera(camera, scene, complete):
     assert part.settings == complete.settings | {"tile": tile}
 
 
-def test_effects_of_tile_need_sensor(camera, scene):
+def test_tiles_have_their_part_of_the_sensor(camera, scene, tmp_path):
     sensor = replace(camera.sensor, effects=[RegisteredShading()], dark_e_per_s=1.0)
     shaded = camera.replace(sensor=sensor)
     whole = shaded.capture(scene, exposure_s=0.01, seed=0)
     tile = next(tiles.capture_tiles(shaded, scene, exposure_s=0.01, seed=0, tile_sites=BLOCK))
 
+    expected = whole.signal_to_noise(sensor=sensor)
+    np.testing.assert_allclose(tile.signal_to_noise(), expected[:BLOCK], rtol=1e-5)
+    tile.save(tmp_path / "tile.npz")
+    loaded = fs.Capture.load(tmp_path / "tile.npz")
     with pytest.raises(
         ParameterError, match="'sensor' must be given: the effects 'registered_shading' of a tile need the"
     ):
-        tile.signal_to_noise()
-    ratio = tile.signal_to_noise(sensor=sensor.part(slice(0, BLOCK)))
-    np.testing.assert_allclose(ratio, whole.signal_to_noise(sensor=sensor)[:BLOCK], rtol=1e-5)
+        loaded.signal_to_noise()
+    assert np.array_equal(loaded.signal_to_noise(sensor=sensor.part(slice(0, BLOCK))), tile.signal_to_noise())
+
+
+def test_stored_tiles_have_parameters_per_site(camera, scene, tmp_path):
+    noise_e = np.linspace(1.0, 5.0, camera.layout.n_sites)
+    noisy = camera.replace(sensor=replace(camera.sensor, effects=[RegisteredShading()], read_noise_e=noise_e))
+    expected = noisy.capture(scene, exposure_s=0.01, seed=0).signal_to_noise()
+    written = tiles.write_tiles(tmp_path / "t.zarr", noisy, scene, exposure_s=0.01, seed=0, tile_sites=BLOCK)
+    ratio = np.concatenate([tile.signal_to_noise() for tile in written])
+
+    np.testing.assert_allclose(ratio, expected, rtol=1e-5)
 
 
 def test_tiles_of_lateral_colour_equal_capture(camera, scene):

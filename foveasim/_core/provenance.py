@@ -17,6 +17,7 @@ from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodT
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from foveasim._core.validation import own
 from foveasim._version import __version__
@@ -66,6 +67,28 @@ def to_plain_data(value: Any, *, without: Collection[str] = ()) -> Any:
 def is_digest(value: Any) -> bool:
     """Return whether plain data are the shape, dtype and SHA-256 of an array."""
     return isinstance(value, Mapping) and value.keys() == {"shape", "dtype", "sha256"}
+
+
+def large_arrays(value: Any) -> dict[str, NDArray[Any]]:
+    """Return the arrays that :func:`to_plain_data` replaces by a checksum, by this checksum."""
+    if isinstance(value, np.ndarray):
+        digest = to_plain_data(value)
+        return {digest["sha256"]: value} if is_digest(digest) else {}
+    if is_dataclass(value):
+        parts: Any = [getattr(value, f.name) for f in fields(value) if not f.name.startswith("_")]
+    elif isinstance(value, Mapping):
+        parts = value.values()
+    else:
+        parts = value if isinstance(value, list | tuple) else ()
+    return {key: array for part in parts for key, array in large_arrays(part).items()}
+
+
+def resolve(digest: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> NDArray[Any] | None:
+    """Return the array of a digest among those of :func:`large_arrays`; None if it is missing."""
+    array = arrays.get(str(digest["sha256"]))
+    if array is None:
+        return None
+    return np.ascontiguousarray(array).reshape(-1).view(str(digest["dtype"])).reshape(digest["shape"])
 
 
 def copy_plain_data(value: Any) -> Any:

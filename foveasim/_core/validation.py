@@ -54,6 +54,8 @@ UNIT_SUFFIXES = {
     "_e2": "e-²",
     "_ph": "photons",
     "_w_m2_sr_nm": "W/(m² sr nm)",
+    "_cd_m2": "cd/m²",
+    "_lux": "lx",
     "_w_m2_sr": "W/(m² sr)",
     "_e_per_s": "e-/s",
     "_e_per_j": "e-/J",

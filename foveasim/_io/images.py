@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import io
 import math
+import os
 import posixpath
 import re
 import struct
+import sys
 import warnings
 import zlib
 from collections.abc import Iterable, Iterator
@@ -25,11 +27,11 @@ from numpy.typing import NDArray
 
 from foveasim._core.extras import import_optional, needs
 from foveasim._core.names import missing_path
-from foveasim._core.validation import unmasked
+from foveasim._core.validation import as_any_array, unmasked
 from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import FileFormat, select_writer
 from foveasim._io.sandbox import read_in_sandbox
-from foveasim.errors import FileError, disk_problem
+from foveasim.errors import FileError, ParameterError, disk_problem
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -156,6 +158,28 @@ def _read_with_pillow(path: Path) -> NDArray[Any]:
         raise FileError(path, "is not a picture in a supported format") from None
     except Image.DecompressionBombError:
         raise FileError(path, f"has more than {MAX_PIXELS} pixels") from None
+
+
+def as_pixels(picture: Any) -> NDArray[Any]:
+    """
+    Return a picture as an array, as :func:`read_picture` does.
+
+    ``picture``: path, image of Pillow, or array. Raises FileError for files, and ParameterError for None and for data that are
+    not a picture.
+    """
+    if isinstance(picture, str | os.PathLike):
+        return read_picture(Path(picture))
+    if picture is None:
+        hint = "cv2.imread returns None for files that it cannot read"
+        raise ParameterError("picture", "must be a file, an image or an array", picture, hint=hint)
+    pillow = sys.modules.get("PIL.Image")
+    if pillow is None or not isinstance(picture, pillow.Image):
+        return as_any_array("picture", picture)
+    try:
+        return pixels_of_image(picture)
+    except Exception as error:  # noqa: BLE001 -- readers raise arbitrary exceptions on corrupt files
+        problem = " ".join(str(error).split()) or type(error).__name__
+        raise ParameterError("picture", f"must be an image that Pillow can decode: {problem}") from None
 
 
 def pixels_of_image(image: Image.Image) -> NDArray[Any]:

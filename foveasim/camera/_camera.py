@@ -24,6 +24,7 @@ from foveasim._core.threads import cached_property, in_order, thread_count
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, check_per_site, check_point, finite_array, read_only
 from foveasim.camera._clock import Clock
+from foveasim.camera._exposure import AUTO_SETTINGS, ExposureTime, exposure_time
 from foveasim.camera._frames import Frame, ImageCache, Position, Task, check_frames, position_settings, tasks
 from foveasim.camera._steps import SensorFrame, WeightedMap, expose, integrate_maps, white_dn
 from foveasim.camera._warnings import (
@@ -31,7 +32,9 @@ from foveasim.camera._warnings import (
     format_point,
     size_um,
     warn_of_coarse_cells,
+    warn_of_coarse_pixels,
     warn_of_coverage,
+    warn_of_exposure,
     warn_of_focal_length,
 )
 from foveasim.capture import Capture
@@ -47,6 +50,7 @@ from foveasim.reconstruct.rasters import sum_of_images
 from foveasim.scene import Scene
 from foveasim.sensor import NoiseBudget, Sensor, noise_budget
 from foveasim.sensor.limits import EXPOSURE
+from foveasim.sensor.model.auto_exposure import AUTO_PERCENTILE, AUTO_TARGET
 from foveasim.units import um_from_nm, w_from_w_m2_um2
 
 #: Quantity that the optical axis is fixed to when the gaze moves: see :class:`Camera`.
@@ -96,7 +100,11 @@ class Camera:
         On a capture, when photosites extend beyond the image or the image circle, or when the layout measures less than a
         quarter of the width of a photograph. Scenes with ``fit`` are framed on the layout, without these warnings.
     SamplingWarning
-        On a capture, when second-order integration of a sharp image on coarse cells gives negative photoelectrons.
+        On a capture, when second-order integration of a sharp image on coarse cells gives negative photoelectrons; once per
+        camera, when more than 10 % of the photosites are smaller than the pixels of a photograph.
+    ExposureWarning
+        On a capture of a photograph, once per camera and cause, when more than 20 % of the photosites are saturated, or more
+        than half receive less than one electron or one code above black.
     FoveasimWarning
         On a capture of a scene, when the ``focal_um`` of the lens model differs by more than 2 % from the image distance of the
         optics, which is their focal length for a distant scene: it would be distorted for wrong field angles.
@@ -138,6 +146,8 @@ class Camera:
         self._bounds_um: list[tuple[float, float, float, float]] = []
         #: The most recent scene with ``fit``, and the framed scene.
         self._framed: tuple[Scene, Scene] | None = None
+        #: Causes of warnings that are not repeated.
+        self._warned: set[str] = set()
 
     def __getstate__(self) -> dict[str, Any]:
         return vars(self) | {"_integrators": {}, "_bounds_um": [], "_framed": None}  # without caches
@@ -483,7 +493,11 @@ class Camera:
         >>> camera.at((20.0, -5.0)).gaze_um
         (20.0, -5.0)
         """
-        return self if gaze_um is None and axis is None else self.replace(gaze_um=gaze_um, axis=axis)
+        if gaze_um is None and axis is None:
+            return self
+        other = self.replace(gaze_um=gaze_um, axis=axis)
+        other._warned = self._warned  # noqa: SLF001 -- of the same class
+        return other
 
     def photoelectrons_per_s(
         self,
@@ -525,7 +539,7 @@ class Camera:
         self,
         light: Scene | PowerMap,
         *,
-        exposure_s: Annotated[float, EXPOSURE],
+        exposure_s: ExposureTime,
         seed: int,
         frame: int = 0,
         gaze_um: tuple[float, float] | None = None,
@@ -539,7 +553,9 @@ class Camera:
         ----------
         light : Scene or PowerMap
             A scene, or a power map from any optics program.
-        exposure_s : float, s
+        exposure_s : float or str, s
+            Exposure time: a number, a fraction such as ``"1/50"``, ``"auto"`` for that of :meth:`auto_exposure` with its
+            default target, or an exposure value such as ``"EV 12"``, for the f-number of the optics.
         seed, frame : int
             Seed and frame number of the noise. Equal ones give bit-identical captures.
         gaze_um : (x, y), optional, µm
@@ -547,20 +563,96 @@ class Camera:
         axis : {"image", "sensor"}, optional
             What the optical axis is fixed to: see the class.
         photo_e_per_s : (n_site,) float64, optional, e-/s
-            Result of :meth:`photoelectrons_per_s` for the same ``light`` and gaze, which is then not computed again.
+            Result of :meth:`photoelectrons_per_s` for the same ``light`` and gaze, which is then not computed again; without
+            warnings of the exposure.
         """
         if gaze_um is not None or axis is not None:
             return self.at(gaze_um, axis).capture(
                 light, exposure_s=exposure_s, seed=seed, frame=frame, photo_e_per_s=photo_e_per_s
             )
         streams = Streams(seed, frame)
-        clock = Clock()
+        clock, is_given = Clock(), photo_e_per_s is not None
         if photo_e_per_s is None:
             photo_e_per_s = self._photoelectrons_per_s(light, clock)
         else:
             photo_e_per_s = finite_array("photo_e_per_s", photo_e_per_s, at_least=0.0)
             check_per_site("photo_e_per_s", photo_e_per_s, self._layout.n_sites)
-        return expose(self, self._sensor, light, photo_e_per_s, exposure_s, streams, clock)
+        capture = self._expose(light, photo_e_per_s, exposure_s, streams, clock)
+        if not is_given:
+            self._check_exposure(light, photo_e_per_s, capture)
+        return capture
+
+    def _expose(
+        self,
+        light: Scene | PowerMap,
+        photo_e_per_s: Floats,
+        exposure_s: ExposureTime,
+        streams: Streams,
+        clock: Clock,
+        **settings: Any,
+    ) -> Capture:
+        """Expose the sensor for a time, or automatically."""
+        settings |= AUTO_SETTINGS if exposure_s == "auto" else {}
+        with clock.stage("sensor"):
+            time_s = self._exposure_s(exposure_s, photo_e_per_s)
+        return expose(self, self._sensor, light, photo_e_per_s, time_s, streams, clock, **settings)
+
+    def _check_exposure(self, light: Scene | PowerMap, photo_e_per_s: Floats, capture: Capture) -> None:
+        """Warn of an exposure that is wrong for a photograph."""
+        exposure_s = float(capture.settings["exposure_s"])
+        if isinstance(light, Scene) and light.is_picture and exposure_s > 0.0:
+            warn_of_exposure(self._sensor, photo_e_per_s, exposure_s, capture, self._warned)
+
+    def _exposure_s(self, exposure_s: ExposureTime, photo_e_per_s: Floats) -> float:
+        """Return an exposure time in seconds."""
+        time_s = exposure_time(exposure_s, self._optics.f_number)
+        return self._sensor.exposure_for(photo_e_per_s, n_threads=self._n_threads) if time_s == "auto" else time_s
+
+    def auto_exposure(
+        self,
+        light: Scene | PowerMap,
+        *,
+        target: float = AUTO_TARGET,
+        percentile: float = AUTO_PERCENTILE,
+        gaze_um: tuple[float, float] | None = None,
+        axis: GazeAxis | None = None,
+    ) -> float:
+        """
+        Return the exposure time that makes a bright photosite reach a fraction of its range.
+
+        Parameters
+        ----------
+        light : Scene or PowerMap
+        target, percentile : float
+            Fraction of the range from black to saturation, and percentile of the sites that reaches it:
+            :meth:`foveasim.Sensor.exposure_for`.
+        gaze_um, axis : optional
+            As for :meth:`capture`.
+
+        Returns
+        -------
+        exposure_s : float, s
+
+        Raises
+        ------
+        ParameterError
+            If no light reaches these sites, or no exposure time reaches the target.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> sensor = fs.Sensor(fs.layout.grid(n_x=8, n_y=8, pitch_um=2.0), full_well_e=1e4, capacitance_f=6e-16)
+        >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=sensor)
+        >>> scene = fs.Scene.flat(
+        ...     shape=(200, 200), pitch_um=10.0, distance_m=0.5, illuminance_lux=500.0, band_width_nm=100.0
+        ... )
+        >>> exposure_s = camera.auto_exposure(scene, target=0.5)
+        >>> capture = camera.capture(scene, exposure_s=exposure_s, seed=0)
+        >>> round(float(capture.electrons.mean()) / 1e4, 1)
+        0.5
+        """
+        rates = self.photoelectrons_per_s(light, gaze_um=gaze_um, axis=axis)
+        return self._sensor.exposure_for(rates, target=target, percentile=percentile, n_threads=self._n_threads)
 
     def rates(self, frames: OwnCheck[Iterable[Frame]], *, ahead: Annotated[int, NOT_NEGATIVE] = 0) -> Iterator[Floats]:
         """
@@ -584,7 +676,7 @@ class Camera:
         self,
         frames: OwnCheck[Iterable[Frame]],
         *,
-        exposure_s: float | Sequence[float],
+        exposure_s: ExposureTime | Sequence[float],
         seed: int,
         first_frame: int = 0,
         frame_s: float | None = None,
@@ -601,8 +693,10 @@ class Camera:
         frames : iterable of Scene or PowerMap, or of pairs with a position (x_um, y_um)
             A position is the gaze of a frame, instead of that of the camera. See :mod:`foveasim.video` for frames from
             image and video files, and for gaze paths.
-        exposure_s : float or sequence of float, s
-            A sequence is an exposure bracket: the captures use its times cyclically, by their numbers.
+        exposure_s : float, str, or sequence of float, s
+            As for :meth:`capture`. ``"auto"`` is the time of :meth:`auto_exposure` for each capture, from its first frame; for
+            equal times pass that of one frame. A sequence is an exposure bracket: the captures use its times cyclically, by
+            their numbers.
         seed : int
             Seed of the temporal noise; fixed patterns belong to the device.
         first_frame : int
@@ -654,42 +748,61 @@ class Camera:
         >>> [c.settings["frame"] for c in camera.video([scene, scene], exposure_s=0.01, seed=0)]
         [0, 1]
         """
-        exposures_s = EXPOSURE.check_array("exposure_s", exposure_s)
-        if exposures_s.ndim > 1 or exposures_s.size == 0:
-            raise ParameterError("exposure_s", "must be one time, or a sequence of times", exposure_s, "s")
-        exposures_s = np.atleast_1d(exposures_s)
+        if isinstance(exposure_s, str):
+            times_s: Sequence[ExposureTime] = [exposure_time(exposure_s, self._optics.f_number)]
+        else:
+            exposures_s = EXPOSURE.check_array("exposure_s", exposure_s)
+            if exposures_s.ndim > 1 or exposures_s.size == 0:
+                raise ParameterError("exposure_s", "must be one time, or a sequence of times", exposure_s, "s")
+            times_s = exposures_s.reshape(-1).tolist()
         check_frames(frames)
         if frame_s is None and (line_s or between != "hold" or every != 1):
             name = "line_s" if line_s else "between" if between != "hold" else "every"
             raise ParameterError(name, "requires 'frame_s', the frame period")
         streams = Streams(seed, first_frame)
         if frame_s is None:
-            return self._separate(frames, exposures_s, streams, ahead)
+            return self._separate(frames, times_s, streams, ahead)
         shutter = Shutter(self._layout, frame_s, line_s, between)
-        if exposures_s.max() > (1.0 + TIME_ROUNDING) * every * shutter.frame_s:
+        longest_s = max((time_s for time_s in times_s if isinstance(time_s, float)), default=0.0)
+        if longest_s > (1.0 + TIME_ROUNDING) * every * shutter.frame_s:
             warn(
-                f"the exposure of {exposures_s.max():g} s is longer than the {every * shutter.frame_s:g} s between the starts "
+                f"the exposure of {longest_s:g} s is longer than the {every * shutter.frame_s:g} s between the starts "
                 "of exposures, and no photosite can be exposed twice at a time; reduce 'exposure_s' or increase 'every'",
                 FoveasimWarning,
             )
-        return self._rolling(frames, exposures_s, streams, shutter, every, ahead)
+        return self._rolling(frames, times_s, streams, shutter, every, ahead)
 
     def _separate(
-        self, frames: Iterable[Frame], exposures_s: Floats, streams: Streams, ahead: int
+        self, frames: Iterable[Frame], times_s: Sequence[ExposureTime], streams: Streams, ahead: int
     ) -> Iterator[Capture]:
         """Yield one capture per frame, each exposed to this frame alone."""
         clock = Clock()
         for k, (task, rate_e_per_s) in enumerate(self._frame_rates(frames, clock, ahead)):
             number = Streams(streams.seed, streams.frame + k)
-            exposure_s = float(exposures_s[number.frame % exposures_s.size])
+            exposure_s = times_s[number.frame % len(times_s)]
             settings = position_settings(task)
-            yield expose(self, self._sensor, task.light, rate_e_per_s, exposure_s, number, clock.take(), **settings)
+            capture = self._expose(task.light, rate_e_per_s, exposure_s, number, clock.take(), **settings)
+            self._check_exposure(task.light, rate_e_per_s, capture)
+            yield capture
 
     def _rolling(
-        self, frames: Iterable[Frame], exposures_s: Floats, streams: Streams, shutter: Shutter, every: int, ahead: int
+        self,
+        frames: Iterable[Frame],
+        times_s: Sequence[ExposureTime],
+        streams: Streams,
+        shutter: Shutter,
+        every: int,
+        ahead: int,
     ) -> Iterator[Capture]:
         """Yield one capture per ``every`` frames, each a sum over its exposure."""
-        times = {"frame_s": shutter.frame_s, "line_s": shutter.line_s, "every": every, "between": shutter.between}
+        auto = AUTO_SETTINGS if "auto" in times_s else {}
+        times = {
+            "frame_s": shutter.frame_s,
+            "line_s": shutter.line_s,
+            "every": every,
+            "between": shutter.between,
+            **auto,
+        }
         in_progress: deque[tuple[int, Task, Exposure]] = deque()
         clock = Clock()
 
@@ -704,7 +817,7 @@ class Camera:
         for n, (task, rate_e_per_s) in enumerate(self._frame_rates(frames, clock, ahead)):
             if n % every == 0:
                 k = n // every
-                exposure_s = float(exposures_s[(streams.frame + k) % exposures_s.size])
+                exposure_s = self._exposure_s(times_s[(streams.frame + k) % len(times_s)], rate_e_per_s)
                 in_progress.append((k, task, Exposure(shutter, exposure_s)))
             with clock.stage("shutter"):
                 for *_, exposure in in_progress:
@@ -743,7 +856,7 @@ class Camera:
         self,
         light: Scene | PowerMap,
         *,
-        exposure_s: float,
+        exposure_s: ExposureTime,
         gaze_um: tuple[float, float] | None = None,
         axis: GazeAxis | None = None,
     ) -> tuple[Floats, Floats]:
@@ -761,6 +874,7 @@ class Camera:
             Over the temporal noise of this device; its fixed patterns are part of the mean.
         """
         rate_e_per_s = self.photoelectrons_per_s(light, gaze_um=gaze_um, axis=axis)
+        exposure_s = self._exposure_s(exposure_s, rate_e_per_s)
         expected_e = self._sensor.expected_electrons(rate_e_per_s, exposure_s)
         return self._sensor.predict(expected_e, exposure_s=exposure_s, n_threads=self._n_threads)
 
@@ -769,7 +883,7 @@ class Camera:
         light: Scene | PowerMap,
         sites: ArrayLike,
         *,
-        exposure_s: float,
+        exposure_s: ExposureTime,
         gaze_um: tuple[float, float] | None = None,
         axis: GazeAxis | None = None,
     ) -> Floats:
@@ -790,6 +904,7 @@ class Camera:
             See :meth:`foveasim.Sensor.predict_covariance`.
         """
         rate_e_per_s = self.photoelectrons_per_s(light, gaze_um=gaze_um, axis=axis)
+        exposure_s = self._exposure_s(exposure_s, rate_e_per_s)
         expected_e = self._sensor.expected_electrons(rate_e_per_s, exposure_s)
         return self._sensor.predict_covariance(expected_e, sites, exposure_s=exposure_s)
 
@@ -831,7 +946,7 @@ class Camera:
         self,
         light: Scene | PowerMap,
         *,
-        exposure_s: float,
+        exposure_s: ExposureTime,
         gaze_um: tuple[float, float] | None = None,
         axis: GazeAxis | None = None,
     ) -> NoiseBudget:
@@ -848,7 +963,8 @@ class Camera:
         NoiseBudget
             Standard deviation by source, a dict of str to (n_site,) float64, e-.
         """
-        return noise_budget(self._sensor, self.photoelectrons_per_s(light, gaze_um=gaze_um, axis=axis), exposure_s)
+        rate_e_per_s = self.photoelectrons_per_s(light, gaze_um=gaze_um, axis=axis)
+        return noise_budget(self._sensor, rate_e_per_s, self._exposure_s(exposure_s, rate_e_per_s))
 
     def _photoelectrons_per_s(
         self,
@@ -879,6 +995,7 @@ class Camera:
             # Lateral chromatic aberration gives images of several sizes, each with its own grid.
             optics = self._optics.resolve_oversample(light)
             warn_of_coarse_cells(self._optics, light, self._layout)
+            warn_of_coarse_pixels(light, self._optics.grid(light).pitch_x_um, self._layout, self._warned)
             images, frame = optics.image_grids(light), self.sensor_frame(light)
             # Images of a camera that turns differ for each gaze.
             cached = None if self._axis == "sensor" and moving_um is not None else cached

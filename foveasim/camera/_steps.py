@@ -142,6 +142,7 @@ def expose(
         white_dn=white_dn(sensor, light),
         settings=about,
         stage_s=clock.stage_s,
+        electronics=sensor,
     )
 
 

@@ -1,4 +1,4 @@
-"""Warnings of captures: photosites outside the image, focal lengths, coarse cells."""
+"""Warnings of captures: coverage, exposure, focal lengths, coarse cells and pixels."""
 
 from __future__ import annotations
 
@@ -10,19 +10,23 @@ import numpy as np
 
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats
+from foveasim.capture import Capture
 from foveasim.distortion import Lens
-from foveasim.errors import CoverageWarning, FoveasimWarning, SamplingWarning
+from foveasim.errors import CoverageWarning, ExposureWarning, FoveasimWarning, ParameterError, SamplingWarning
 from foveasim.fields import PowerMap
 from foveasim.integrate import Integrator
 from foveasim.layout import Layout
 from foveasim.optics import Optics
 from foveasim.scene import Scene
+from foveasim.sensor import Sensor
 from foveasim.units import um_from_m, um_from_nm
 
 #: Cameras warn when the layout measures less than this fraction of the width of a photograph.
 MIN_PICTURE_FRACTION = 0.25
 #: Cameras warn when the focal length of the lens model differs from the image distance by more than this fraction.
 MAX_FOCAL_DIFFERENCE = 0.02
+#: Cameras warn when a larger fraction of the sites is saturated, or smaller than the pixels of a photograph.
+MAX_SATURATED, MAX_BELOW_PIXELS = 0.2, 0.1
 #: Error of photosites above which a limited automatic oversampling causes a warning.
 MAX_AUTO_ERROR = 1e-3
 
@@ -109,6 +113,47 @@ def warn_of_coverage(
                 "pitch_um or field_of_view_deg",
                 CoverageWarning,
             )
+
+
+def warn_of_exposure(
+    sensor: Sensor, photo_e_per_s: Floats, exposure_s: float, capture: Capture, warned: set[str]
+) -> None:
+    """
+    Warn when many sites of a photograph are saturated, or most of them receive no signal.
+
+    The message contains the time of automatic exposure. ``warned``: causes of earlier warnings, which are not repeated.
+    """
+    n_sites = capture.code.size
+    n_saturated = int(np.count_nonzero(sensor.are_saturated(capture.electrons, capture.code)))
+    if n_saturated > MAX_SATURATED * n_sites:
+        problem = f"{100.0 * n_saturated / n_sites:.0f} % of the photosites are saturated"
+    elif 2 * np.count_nonzero(photo_e_per_s * exposure_s < np.maximum(sensor.first_code_e, 1.0)) > n_sites:
+        problem = "more than half of the photosites receive less than one electron or one code"
+    else:
+        return
+    cause = problem.split("photosites")[1]
+    if cause in warned:
+        return
+    warned.add(cause)
+    try:
+        remedy = f"use exposure_s={sensor.exposure_for(photo_e_per_s):.3g}, or 'auto'"
+    except ParameterError:
+        remedy = "use more light"
+    warn(f"{problem} at an exposure of {exposure_s:.3g} s; {remedy}", ExposureWarning)
+
+
+def warn_of_coarse_pixels(scene: Scene, pixel_um: float, layout: Layout, warned: set[str]) -> None:
+    """Warn when many sites are smaller than the pixels of a photograph on the sensor."""
+    if not scene.is_picture or "pixels" in warned:
+        return
+    fraction = np.count_nonzero(layout.area_um2 < pixel_um**2) / max(layout.n_sites, 1)
+    if fraction > MAX_BELOW_PIXELS:
+        warned.add("pixels")
+        warn(
+            f"{100.0 * fraction:.0f} % of the photosites are smaller than the pixels of the picture, of {pixel_um:.3g} µm on "
+            "the sensor, and cannot show finer details; use a picture with more pixels, or a smaller part of it",
+            SamplingWarning,
+        )
 
 
 def size_um(bounds_um: Sequence[float]) -> tuple[float, float]:

@@ -74,16 +74,16 @@ def compare_files(
             raise ParameterError(name, "must be omitted for shots, whose settings contain the options of their layouts")
         shots = dict(zip(names, [read_shot(path) for path in found], strict=True))
         cameras = {name: shot.camera for name, shot in shots.items()}
-        exposures_s = {shot.exposure_s for shot in shots.values()}
         if exposure_s is None:
-            if len(exposures_s) > 1:
+            times_s = {name: shot.exposure_s for name, shot in shots.items()}
+            exposure_s = next(iter(times_s.values()))
+            if len(set(times_s.values())) > 1:
                 raise ParameterError(
                     "exposure_s",
                     "must be equal",
-                    ", ".join(f"{shot.exposure_s:g} s ({name})" for name, shot in shots.items()),
+                    ", ".join(f"{time_s:g} s ({name})" for name, time_s in times_s.items()),
                     hint="specify a common one",
                 )
-            exposure_s = exposures_s.pop()
         scenes = dict(_photographs(shots, pictures)) if pictures else _scenes(shots, found)
     return compare.cameras(cameras, scenes, exposure_s=exposure_s, progress=progress, **options)
 

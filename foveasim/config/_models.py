@@ -13,13 +13,15 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, create_model
+from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, create_model
 
 from foveasim._core.calls import NOT_NEGATIVE, Declaration, Usual
 from foveasim._core.registry import Registry
 from foveasim._core.validation import unit_of
 from foveasim.camera import GazeAxis
+from foveasim.camera._exposure import exposure_time
 from foveasim.distortion import LENSES
+from foveasim.errors import ParameterError
 from foveasim.layout import EDITS, LAYOUTS, PRESETS, RULES, DesignRules, Readout, Routing, read_layout
 from foveasim.maps import read_power_map
 from foveasim.optics import PUPILS, LateralColour, Optics, Seidel, Zernike
@@ -169,6 +171,20 @@ _CROSSTALK: dict[str, Callable[..., Any]] = {"diffusion": Diffusion, "kernel": K
 _PerSite = float | PerArea | list[float]
 
 
+def _check_exposure(value: float | str) -> float | str:
+    """Check the text of an exposure time; the camera checks its range."""
+    if isinstance(value, str):
+        try:
+            exposure_time(value, f_number=1.0)
+        except ParameterError as error:
+            raise ValueError(error.detail.partition(", got ")[0]) from None
+    return value
+
+
+#: Seconds, or a text that cameras accept.
+_ExposureTime: Any = Annotated[float | str, AfterValidator(_check_exposure)]
+
+
 class Models(NamedTuple):
     """Models of settings files: shot, layout and design rules."""
 
@@ -224,7 +240,10 @@ def _models(_versions: tuple[int, ...]) -> Models:
         "distortion": (lens | None, Field(None, description="distortion model of the lens")),
         "layout": (str | layout, Field(description="a layout file, the name of a bundled layout, or a generator")),
         "sensor": (sensor, Field(default_factory=sensor, description="parameters of the photosites and their readout")),
-        "exposure_s": (float, _field("exposure_s", ..., "exposure time", Declaration({}, EXPOSURE, Usual(1e-5, 1.0)))),
+        "exposure_s": (
+            _ExposureTime,
+            _field("exposure_s", ..., "exposure time", Declaration({}, EXPOSURE, Usual(1e-5, 1.0))),
+        ),
         "seed": (int, _field("seed", 0, "seed of the noise", Declaration({}, NOT_NEGATIVE, Usual(0, 100)))),
         "gaze_um": (
             tuple[float, float],

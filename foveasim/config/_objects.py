@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel
@@ -15,9 +15,12 @@ from pydantic import BaseModel
 from foveasim._core.names import possible_names
 from foveasim._core.random_streams import Streams
 from foveasim._core.short_repr import short_repr
+from foveasim._core.threads import cached_property
 from foveasim._io.images import read_picture
 from foveasim._io.yaml_files import parse_yaml, read_yaml
 from foveasim.camera import Camera
+from foveasim.camera._exposure import exposure_time
+from foveasim.capture import Capture
 from foveasim.config._models import FILE_OPTIONS, LayerSection, PerArea, call_of, models
 from foveasim.config._problems import adapter_of, plain_settings, validate
 from foveasim.config._sources import Source
@@ -30,7 +33,6 @@ from foveasim.optics import Optics
 from foveasim.scene import Scene
 from foveasim.scene._scene import FRAMINGS
 from foveasim.sensor import Sensor
-from foveasim.sensor.limits import EXPOSURE
 
 #: Prefix of the names of pictures that scikit-image contains.
 BUNDLED_PICTURE = "skimage:"
@@ -81,7 +83,8 @@ class Shot:
     camera : Camera
     rules : DesignRules or None
         Rules that the layout is designed for.
-    exposure_s : float, s
+    requested_s : float or "auto", s
+        Exposure time, as :meth:`foveasim.Camera.capture` accepts it.
     seed : int
     """
 
@@ -89,10 +92,19 @@ class Shot:
     scene: Scene | PowerMap
     camera: Camera
     rules: DesignRules | None
-    exposure_s: float
+    requested_s: float | Literal["auto"]
     seed: int
 
     __repr__ = short_repr
+
+    @cached_property
+    def exposure_s(self) -> float:
+        """Exposure time in seconds, also of an automatic exposure."""
+        return self.camera.auto_exposure(self.scene) if self.requested_s == "auto" else self.requested_s
+
+    def captured(self, capture: Capture) -> Shot:
+        """Return the shot with the exposure time of its capture."""
+        return replace(self, requested_s=capture.settings["exposure_s"]) if self.requested_s == "auto" else self
 
 
 def read_shot(path: str | Path, changes: Sequence[str] = (), *, n_threads: int | None = None) -> Shot:
@@ -222,7 +234,9 @@ def build_shot(
     # Errors of a capture are raised here, before it starts, with the path of the key.
     _call(source, "scene", sensor.responsivity_e_per_j, {"wavelength_nm": scene.wavelength_nm})
     streams = _call(source, "", Streams, {"seed": settings.seed})
-    exposure_s = _call(source, "", EXPOSURE.check, {"name": "exposure_s", "value": settings.exposure_s})
+    exposure_s = _call(
+        source, "", exposure_time, {"exposure_s": settings.exposure_s, "f_number": optics.f_number}
+    )  # fmt: skip
     order = settings.integration_order
     camera = cache(
         "camera",
@@ -243,7 +257,7 @@ def build_shot(
         scene=scene,
         camera=camera,
         rules=file.rules,
-        exposure_s=exposure_s,
+        requested_s=exposure_s,
         seed=streams.seed,
     )
 

@@ -178,7 +178,9 @@ def _describe(kind: Any, error: Any, *, is_first: bool) -> str:
             return _not_one_of(_quoted(error["ctx"]["expected"]), value, json.dumps(value))
         case _:
             got = "" if isinstance(error["input"], dict | list) else f", got {json.dumps(error['input'])}"
-            rule = re.sub(r"^\w+ should", "must", error["msg"]).replace(" after validation", "")
+            rule = re.sub(r"^\w+ should", "must", error["msg"].removeprefix("Value error, ")).replace(
+                " after validation", ""
+            )
             return f"{rule}{got}"
 
 

@@ -82,7 +82,7 @@ def to_python(settings: Mapping[str, Any], *, source: Source | str | Path | None
             "",
             "shot = fs.config.build_shot(None, settings)",
             "camera, scene = shot.camera, shot.scene",
-            "capture = camera.capture(scene, exposure_s=shot.exposure_s, seed=shot.seed)",
+            "capture = camera.capture(scene, exposure_s=shot.requested_s, seed=shot.seed)",
         ]
     imports = ["import foveasim as fs", *sorted(writer.imports)]
     return "\n".join([HEADER, *imports, "", *lines, ""])

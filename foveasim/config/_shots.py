@@ -82,7 +82,7 @@ def write_results(shot: Shot, capture: Capture, directory: str | Path) -> tuple[
     picture, layout, saved = (
         directory / f"{shot.name}_{part}" for part in ("picture.png", "layout.png", "capture.npz")
     )
-    capture.picture(max_pixels=PICTURE_PIXELS).save(picture, capture.white_dn, encode_srgb=True)
+    capture.picture(max_pixels=PICTURE_PIXELS).save(picture, capture.white_dn)
     with hidden_figures():
         axes = plot_capture(capture)
     axes.set_title(f"{printable(shot.name)}: {capture.layout.n_sites} photosites", parse_math=False)
@@ -118,7 +118,8 @@ def run_shot(shot: Shot, directory: str | Path) -> tuple[Result, list[Path]]:
     FoveasimError
         When the parts are incompatible, or files cannot be written.
     """
-    capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed)
+    capture = shot.camera.capture(shot.scene, exposure_s=shot.requested_s, seed=shot.seed)
+    shot = shot.captured(capture)
     report = None if shot.rules is None else capture.layout.check(shot.rules)
     paths, writing_s = write_results(shot, capture, directory)
     return Result(shot, capture, report, writing_s), paths

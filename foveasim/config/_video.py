@@ -88,7 +88,7 @@ def run_video(
     scenes = source.from_frame(n_before)
     captures = shot.camera.video(
         scenes if path is None else follow_gaze(scenes, path, frame_s=frame_period_s, first_frame=n_before),
-        exposure_s=shot.exposure_s,
+        exposure_s=shot.requested_s,
         seed=shot.seed,
         first_frame=n_before,
         frame_s=source.frame_s if line_s else None,
@@ -127,7 +127,7 @@ def _plan(
         "distortion": to_plain_data(camera.distortion),
         "layout": to_plain_data({**layout.provenance, "xy_um": layout.xy_um, "columns": layout.columns}),
         "sensor": {name: value for name, value in to_plain_data(camera.sensor).items() if name != "layout"},
-        "exposure_s": shot.exposure_s,
+        "exposure_s": shot.requested_s,
         "seed": shot.seed,
         "frames": hashlib.sha256(json.dumps(files).encode()).hexdigest(),
         "shutter": {"frame_s": frame_s, "line_s": line_s} if line_s else None,

@@ -170,7 +170,8 @@ class ShotRunner:
     def simulate_capture(self, settings: Mapping[str, Any]) -> tuple[Shot, Capture]:
         """Build the shot of the given settings and simulate its capture."""
         shot = self.build_shot(settings)
-        return shot, self.capture(shot, settings)
+        capture = self.capture(shot, settings)
+        return shot.captured(capture), capture
 
     def build_shot(self, settings: Mapping[str, Any]) -> Shot:
         """Build the shot of the given settings."""
@@ -180,7 +181,7 @@ class ShotRunner:
         """Simulate the capture of a shot with the given settings."""
         photo_e_per_s = self.photoelectrons_per_s(shot, settings)
         self._before_stage()
-        return shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed, photo_e_per_s=photo_e_per_s)
+        return shot.camera.capture(shot.scene, exposure_s=shot.requested_s, seed=shot.seed, photo_e_per_s=photo_e_per_s)
 
     def part(self, kind: str, settings: Any, make: Callable[[], Any]) -> Any:
         """Return a component as :meth:`WorkerCache.part`, with a check before it is built."""

@@ -19,7 +19,6 @@ from foveasim._core.validation import (
     MAX_WAVELENGTH_NM,
     Floats,
     Images,
-    as_any_array,
     as_numbers,
     band_widths_nm,
     check_number,
@@ -34,12 +33,23 @@ from foveasim._core.validation import (
 )
 from foveasim._io.encodings import Encoding, decode
 from foveasim._io.formats import as_file_error
-from foveasim._io.images import read_picture, write_picture
+from foveasim._io.images import as_pixels, write_picture
 from foveasim._io.mapped_files import check_unchanged, value_range
-from foveasim.errors import FileError, ParameterError, printable, type_name
+from foveasim.errors import FileError, ParameterError, printable
 from foveasim.fields import from_file_rows
 from foveasim.scene._illuminants import Illuminant
-from foveasim.scene.cubes import IlluminantTable, Invalid, Quantity, Selection, read_cube, spectral_radiance
+from foveasim.scene._photometry import level_of_white, luminance_of
+from foveasim.scene.cubes import (
+    IlluminantTable,
+    Invalid,
+    Quantity,
+    Selection,
+    array_errors,
+    cube_of,
+    read_cube,
+    select,
+    spectral_radiance,
+)
 from foveasim.scene.registry import SCENES
 from foveasim.units import m_from_um, um_from_m
 
@@ -213,6 +223,16 @@ class Scene:
             raise _framing_conflict("field_of_view_deg", angle_deg, "pitch_um")
         return pitch_um
 
+    @property
+    def luminance_cd_m2(self) -> Images:
+        """
+        Luminance of each pixel, (n_y, n_x) float64, cd/m², bottom row first.
+
+        683 lm/W times the sum over the bands of radiance, photopic luminous efficiency and width.
+        """
+        weights = luminance_of(self.spectrum_w_m2_sr_nm, self.wavelength_nm, self.band_width_nm)
+        return np.asarray(np.tensordot(weights, self.basis, axes=1))
+
     def with_pitch(self, pitch_um: float) -> Scene:
         """
         Return the scene with another pixel pitch instead of its pitch, fit or field of view.
@@ -272,28 +292,32 @@ class Scene:
     @classmethod
     def from_picture(
         cls,
-        picture: str | Path | ArrayLike,
+        picture: OwnCheck[str | Path | ArrayLike],
         *,
         pitch_um: float | None = None,
         fit: Fit | None = None,
         gaze_range_um: tuple[float, float] = (0.0, 0.0),
         field_of_view_deg: float | None = None,
         distance_m: float,
-        peak_radiance_w_m2_sr_nm: float,
+        peak_radiance_w_m2_sr_nm: float | None = None,
+        luminance_cd_m2: float | None = None,
+        illuminance_lux: float | None = None,
+        reflectance: float = 1.0,
         wavelength_nm: Sequence[float] | None = None,
         band_width_nm: float | Sequence[float] | None = None,
         spectrum: Sequence[Sequence[float]] | Floats | None = None,
         encoding: Encoding = "srgb",
+        channels: Literal["rgb", "bgr"] = "rgb",
     ) -> Scene:
         """
         Create a scene from a photograph.
 
         Parameters
         ----------
-        picture : path, or (n_y, n_x) or (n_y, n_x, n_channel) array
-            File, or array in the convention of image libraries, top row first: grey or colour, with or without alpha. 8-bit
-            and 16-bit values range from 0 to the maximum of the dtype, booleans are 0 and 1; floating-point values have the
-            peak 1 and may exceed it. The radiance is multiplied by alpha.
+        picture : path, image of Pillow, or (n_y, n_x) or (n_y, n_x, n_channel) array
+            File, image, or array in the convention of image libraries, top row first: grey or colour, with or without alpha.
+            8-bit and 16-bit values range from 0 to the maximum of the dtype, booleans are 0 and 1; floating-point values have
+            the peak 1 and may exceed it. The radiance is multiplied by alpha.
         pitch_um : float, optional, µm
             Pixel pitch in the scene, instead of ``fit``.
         fit : {"cover", "contain", "width"}, optional
@@ -308,6 +332,11 @@ class Scene:
             Distance of the scene from the lens.
         peak_radiance_w_m2_sr_nm : float, W/(m² sr nm)
             Spectral radiance of the value 1; if ``spectrum`` is given, of a pixel value of 1 where ``spectrum`` is 1.
+        luminance_cd_m2 : float, cd/m²
+            Luminance of white (value 1 in all channels), instead of the radiance.
+        illuminance_lux, reflectance : float, lx
+            Illuminance of the scene, instead of the radiance, and reflectance of its white, a diffuse (Lambertian) surface:
+            the luminance of white is ``illuminance_lux * reflectance / π``.
         wavelength_nm : sequence, optional, nm
             One wavelength per channel; (620, 550, 450) for colour and 550 for grey by default. A grey picture has the same
             radiance at all wavelengths. For one wavelength a colour picture is converted to grey. With ``spectrum`` any
@@ -319,23 +348,31 @@ class Scene:
             Relative spectrum of each channel at the value 1.
         encoding : {"srgb", "sqrt", "linear"}
             Encoding of the values: sRGB (photographs), square root of the radiance (the paper), or radiance.
+        channels : {"rgb", "bgr"}
+            Order of the channels of a colour array: ``"bgr"`` for those of OpenCV.
 
         Raises
         ------
         FileError
             If the file cannot be read.
         ParameterError
-            If channels, wavelengths and spectra are inconsistent, a value is out of range, or more than one of ``pitch_um``,
-            ``fit`` and ``field_of_view_deg`` is given.
+            If channels, wavelengths and spectra are inconsistent, a value is out of range, more than one of ``pitch_um``,
+            ``fit`` and ``field_of_view_deg`` is given, or not exactly one of radiance, luminance and illuminance.
+
+        Notes
+        -----
+        Photometric quantities are the sum of the spectral radiance over the bands, weighted by their widths and by the
+        photopic luminous efficiency V(λ) (:func:`foveasim.scene.charts.photopic`), times 683 lm/W. Full daylight is about
+        20,000 to 100,000 lx, an overcast sky 1,000 to 10,000, an office 500, and the full moon 0.3.
         """
         _check_framing(pitch_um, fit, field_of_view_deg)
         if pitch_um is None and field_of_view_deg is None and fit is None:
             fit = "cover"
-        peak = RADIANCE.check("peak_radiance_w_m2_sr_nm", peak_radiance_w_m2_sr_nm)
-        if isinstance(picture, os.PathLike):
-            picture = Path(picture)
-        is_file = isinstance(picture, str | Path)
-        pixels = read_picture(picture) if is_file else as_any_array("picture", picture)  # type: ignore[arg-type]
+        peak = peak_radiance_w_m2_sr_nm
+        if peak is not None:
+            peak = RADIANCE.check("peak_radiance_w_m2_sr_nm", peak)
+        is_file = isinstance(picture, str | os.PathLike)
+        pixels = as_pixels(picture)
         if (
             pixels.ndim not in (2, 3)
             or 0 in pixels.shape
@@ -347,11 +384,13 @@ class Scene:
         has_alpha = (
             pixels.ndim == 3 and pixels.shape[2] in (2, 4) and (spectrum is None or len(spectrum) != pixels.shape[2])
         )
+        if channels == "bgr" and pixels.ndim == 3 and pixels.shape[2] in (3, 4):
+            pixels = pixels[..., [2, 1, 0, 3][: pixels.shape[2]]]
         try:
-            channels = _relative_radiance(pixels, encoding, has_alpha=has_alpha)
+            colours = _relative_radiance(pixels, encoding, has_alpha=has_alpha)
         except ParameterError as error:
             raise (FileError(str(picture), str(error)) if is_file else error) from None
-        n_channels = channels.shape[0]
+        n_channels = colours.shape[0]
         if wavelength_nm is None:
             wavelength_nm = RGB_NM if n_channels == 3 else GREY_NM
             if n_channels == 1 and band_width_nm is None:
@@ -369,7 +408,7 @@ class Scene:
         elif n_channels == 1:
             relative = np.ones((1, waves_nm.size))
         elif n_channels == 3 and waves_nm.size == 1:
-            channels, relative = np.tensordot(LUMINANCE_WEIGHTS, channels, axes=1)[np.newaxis], np.ones((1, 1))
+            colours, relative = np.tensordot(LUMINANCE_WEIGHTS, colours, axes=1)[np.newaxis], np.ones((1, 1))
         else:
             raise ParameterError(
                 "wavelength_nm",
@@ -378,11 +417,22 @@ class Scene:
                 "nm",
                 "for other wavelengths pass 'spectrum', the spectrum of each channel",
             )
+        widths_nm = band_widths_nm(waves_nm, band_width_nm)
+        peak = level_of_white(
+            "peak_radiance_w_m2_sr_nm",
+            peak,
+            relative.sum(axis=0),
+            waves_nm,
+            widths_nm,
+            luminance_cd_m2=luminance_cd_m2,
+            illuminance_lux=illuminance_lux,
+            reflectance=reflectance,
+        )
         return cls(
-            freeze(channels),
+            freeze(colours),
             peak * relative,
             waves_nm,
-            band_widths_nm(waves_nm, band_width_nm),
+            widths_nm,
             pitch_um,
             distance_m,
             source=str(picture) if is_file else "a picture array",
@@ -395,8 +445,9 @@ class Scene:
     @classmethod
     def from_cube(
         cls,
-        path: OwnCheck[str | Path],
+        path: OwnCheck[str | Path | ArrayLike],
         *,
+        axis: int = -1,
         distance_m: float | None = None,
         pitch_um: float | None = None,
         fit: Fit | None = None,
@@ -407,6 +458,8 @@ class Scene:
         scale: float | None = None,
         illuminant: Illuminant | IlluminantTable | None = None,
         radiance_w_m2_sr_nm: float | None = None,
+        luminance_cd_m2: float | None = None,
+        illuminance_lux: float | None = None,
         wavelength_nm: Sequence[float] | None = None,
         band_width_nm: float | Sequence[float] | None = None,
         bands: Sequence[int] | None = None,
@@ -422,9 +475,13 @@ class Scene:
 
         Parameters
         ----------
-        path : path
-            ENVI header or data file, MAT file, scene of ISETCam, spectral EXR, netCDF file or zarr directory
-            (:mod:`foveasim.scene.cubes`), detected from its content.
+        path : path, (n_y, n_x, n_band) array, or xarray.DataArray
+            ENVI header or data file, MAT file, scene of ISETCam, spectral EXR, netCDF or HDF5 file, zarr directory, numpy file,
+            or TIFF of several bands (:mod:`foveasim.scene.cubes`), detected from its content; or an array, top row first as in
+            pictures, which is copied. The dimensions of an xarray.DataArray have names, and coordinates may specify
+            wavelengths.
+        axis : int
+            Axis of the bands of an array.
         distance_m : float, optional, m
             Distance of the scene from the lens, if the file does not contain it.
         pitch_um, fit, gaze_range_um, field_of_view_deg : optional
@@ -442,6 +499,8 @@ class Scene:
             interpolated linearly. Default: ``"D65"``, which is tabulated from 380 to 780 nm.
         radiance_w_m2_sr_nm : float, W/(m² sr nm)
             For a reflectance: spectral radiance at 560 nm of a white with reflectance 1, or factor of the table.
+        luminance_cd_m2, illuminance_lux : float, cd/m² and lx
+            For a reflectance, instead: luminance of this white, or illuminance of the scene.
         wavelength_nm : sequence, optional, nm
             Wavelengths of all bands of the file, instead of those in the file.
         band_width_nm : number or sequence, optional, nm
@@ -480,11 +539,9 @@ class Scene:
         factors, units, illuminant and interpolation change only the spectra of the basis images.
         """
         _check_framing(pitch_um, fit, field_of_view_deg)
-        if not isinstance(path, str | Path):
-            raise ParameterError(
-                "path", f"must be a file, got {type_name(path)}", hint="pass arrays to Scene, bands first"
-            )
-        path = Path(path)
+        is_file = isinstance(path, str | os.PathLike)
+        if is_file and axis != -1:
+            raise ParameterError("axis", "must be -1 for files, whose formats specify the axes", axis)
         selection = Selection(
             wavelength_nm=wavelength_nm,
             bands=bands,
@@ -494,8 +551,10 @@ class Scene:
             columns=columns,
             invalid=invalid,
         )
-        with as_file_error(path, "hyperspectral cube", passes=(ParameterError,)):
-            cube = read_cube(path, name, selection)
+        file = Path(path) if is_file else None  # type: ignore[arg-type]
+        errors = array_errors() if file is None else as_file_error(file, "hyperspectral cube", passes=(ParameterError,))
+        with errors:
+            cube = select(cube_of(path, axis), selection) if file is None else read_cube(file, name, selection)
             radiance = spectral_radiance(
                 cube,
                 quantity=quantity,
@@ -503,26 +562,31 @@ class Scene:
                 scale=scale,
                 illuminant=illuminant,
                 radiance_w_m2_sr_nm=radiance_w_m2_sr_nm,
+                luminance_cd_m2=luminance_cd_m2,
+                illuminance_lux=illuminance_lux,
                 resample_nm=resample_nm,
+                band_width_nm=band_width_nm,
             )
             distance_m = cube.distance_m if distance_m is None else distance_m
             if distance_m is None:
-                raise ParameterError("distance_m", "must be given: the file does not contain the distance of the scene")
+                raise ParameterError(
+                    "distance_m",
+                    f"must be given: the {'file' if is_file else 'array'} does not contain the distance of the scene",
+                )
             if pitch_um is None and field_of_view_deg is None and fit is None:
                 pitch_um, field_of_view_deg = cube.square_pitch_um(), cube.field_of_view_deg
                 if pitch_um is not None:
                     field_of_view_deg = None
                 fit = "cover" if pitch_um is None and field_of_view_deg is None else None
         radiance.warn_above_one()
-        widths_nm = band_width_nm if band_width_nm is not None or resample_nm is not None else cube.band_width_nm
         return cls(
             freeze(cube.data),
             radiance.spectrum_w_m2_sr_nm,
             radiance.wavelength_nm,
-            band_widths_nm(radiance.wavelength_nm, widths_nm),
+            radiance.band_width_nm,
             pitch_um,
             distance_m,
-            source=str(path),
+            source=str(path) if is_file else "a cube array",
             fit=fit,
             gaze_range_um=gaze_range_um,
             field_of_view_deg=field_of_view_deg,
@@ -536,7 +600,10 @@ class Scene:
         shape: tuple[int, int],
         pitch_um: float,
         distance_m: float,
-        radiance_w_m2_sr_nm: float,
+        radiance_w_m2_sr_nm: float | None = None,
+        luminance_cd_m2: float | None = None,
+        illuminance_lux: float | None = None,
+        reflectance: float = 1.0,
         wavelength_nm: Sequence[float] = GREY_NM,
         band_width_nm: float | Sequence[float] | None = None,
     ) -> Scene:
@@ -549,14 +616,27 @@ class Scene:
         pitch_um, distance_m, wavelength_nm, band_width_nm
             As for :meth:`from_picture`.
         radiance_w_m2_sr_nm : float, W/(m² sr nm)
+            Or ``luminance_cd_m2``, or ``illuminance_lux`` with ``reflectance``, as for :meth:`from_picture`.
         """
-        radiance = RADIANCE.check("radiance_w_m2_sr_nm", radiance_w_m2_sr_nm)
+        if radiance_w_m2_sr_nm is not None:
+            radiance_w_m2_sr_nm = RADIANCE.check("radiance_w_m2_sr_nm", radiance_w_m2_sr_nm)
         waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
+        widths_nm = band_widths_nm(waves_nm, band_width_nm)
+        radiance = level_of_white(
+            "radiance_w_m2_sr_nm",
+            radiance_w_m2_sr_nm,
+            np.ones(waves_nm.size),
+            waves_nm,
+            widths_nm,
+            luminance_cd_m2=luminance_cd_m2,
+            illuminance_lux=illuminance_lux,
+            reflectance=reflectance,
+        )
         return cls(
             freeze(np.ones((1, *check_shape("shape", shape)), np.float32)),
             np.full((1, waves_nm.size), radiance),
             waves_nm,
-            band_widths_nm(waves_nm, band_width_nm),
+            widths_nm,
             pitch_um,
             distance_m,
             source="a uniform field",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, fields, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import FRACTION, NOT_NEGATIVE, Limits, OwnCheck, Usual, check_declared, declarations_of
 from foveasim._core.names import possible_names
-from foveasim._core.provenance import is_digest
+from foveasim._core.provenance import is_digest, large_arrays, resolve
 from foveasim._core.random_streams import Streams
 from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property
@@ -54,6 +55,7 @@ from foveasim.sensor.limits import (
     VOLTS,
     WIDE_SPREAD,
 )
+from foveasim.sensor.model.auto_exposure import AUTO_PERCENTILE, AUTO_TARGET, PERCENTILE, TARGET, exposure_for
 from foveasim.sensor.model.inversion import Inverse, invert, invert_collection
 from foveasim.sensor.model.linearisation import QUANTISATION, Linearisation, linearise
 from foveasim.sensor.model.prediction import (
@@ -79,6 +81,8 @@ __all__ = ["PerSite", "Photosites", "Sensor"]
 OFFSET_SIGMAS, SMALLEST_NOISE = 0.05, 1e-9
 #: Fraction of its own charge that a site keeps in a mixing, above which this charge has its own distribution in predictions.
 MIN_OWN_FRACTION = 0.5
+#: Parameters that depend on the wavelength, which the settings of captures do not restore.
+SPECTRAL = ("qe", "filters")
 #: One value for all sites, or an array (n_site,).
 PerSite = float | NDArray[np.float64]
 
@@ -278,7 +282,9 @@ class Sensor:
             )
 
     @classmethod
-    def from_settings(cls, layout: Photosites, settings: Mapping[str, Any]) -> Sensor:
+    def from_settings(
+        cls, layout: Photosites, settings: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]] | None = None
+    ) -> Sensor:
         """
         Create a sensor from the settings of a capture, without filters and quantum efficiency.
 
@@ -289,11 +295,13 @@ class Sensor:
         settings : mapping
             ``capture.settings["sensor"]``. Effects are identified by class among those of the package and
             :data:`foveasim.sensor.effects.EFFECTS`.
+        arrays : mapping, optional
+            ``capture.sensor_arrays``: arrays with more than 64 values, by their SHA-256 in the settings.
 
         Raises
         ------
         ParameterError
-            If a parameter whose default is not 0 or None is missing, arrays were too long to be stored, or an effect is not
+            If a parameter whose default is not 0 or None is missing, an array is missing in ``arrays``, or an effect is not
             registered.
         """
         kinds: tuple[Any, ...] = (Diffusion, KernelCrosstalk, InterPixelCapacitance, ShotNoise, *EFFECTS.values())
@@ -301,13 +309,19 @@ class Sensor:
         values: dict[str, Any] = {}
         for parameter in fields(cls):
             name = parameter.name
-            if name in ("layout", "qe", "filters"):
+            if name in SPECTRAL or name == "layout":
                 continue
             if name not in settings and parameter.default:
                 raise ParameterError("sensor", f"must be given: the settings of the capture do not contain {name!r}")
             if name in settings:
-                values[name] = _object(classes, name, settings[name])
+                values[name] = _object(classes, name, settings[name], arrays or {})
         return cls(layout, **values)
+
+    @cached_property
+    def arrays(self) -> Mapping[str, NDArray[Any]]:
+        """Arrays of which settings contain the checksum, by SHA-256."""
+        parts = [getattr(self, each.name) for each in fields(Sensor) if each.name not in (*SPECTRAL, "layout")]
+        return MappingProxyType(large_arrays(parts))
 
     def __repr__(self) -> str:
         return f"Sensor({self.layout!r}, filters {', '.join(self.filter_names)}, {self.bits} bits)"
@@ -658,6 +672,16 @@ class Sensor:
             return read_only(np.full(1, np.inf))
         return read_only(np.floor(np.atleast_1d(np.asarray(self.full_well_e, np.float64))))
 
+    @cached_property
+    def first_code_e(self) -> Floats:
+        """Charge that raises the code of a dark site by one, without noise, (n_site,) or (1,) e-."""
+        step_v = self.adc.width_at_dn(self.pedestal_v / self.v_sat_v) * self.v_sat_v / self.adc.n_codes
+        return read_only(step_v / self.v_per_e)
+
+    def are_saturated(self, electrons: Ints, code: NDArray[Any]) -> Bools:
+        """Return which sites have a full well or the highest code, (n_site,)."""
+        return np.asarray((code == 2**self.bits - 1) | (electrons >= self.well_e))
+
     # -- charges and codes ----------------------------------------------------------------------------------------
 
     @cached_property
@@ -687,6 +711,51 @@ class Sensor:
         expected_e = Save()
         run_steps((*steps, expected_e), photo, sites=self.sites, n_threads=n_threads)
         return expected_e.values
+
+    def exposure_for(
+        self,
+        photo_e_per_s: Floats,
+        *,
+        target: Annotated[float, TARGET] = AUTO_TARGET,
+        percentile: Annotated[float, PERCENTILE] = AUTO_PERCENTILE,
+        n_threads: int | None = None,
+    ) -> float:
+        """
+        Return the exposure time that makes a bright site reach a fraction of its range.
+
+        Parameters
+        ----------
+        photo_e_per_s : (n_site,) float64, e-/s
+            Photoelectron rates: :meth:`foveasim.Camera.photoelectrons_per_s`.
+        target : float
+            Mean code, as a fraction of the range of a site from black to saturation, by the full well or by the ADC.
+        percentile : float
+            Percentile of the sites that has this fraction: at 99, 1 % of the sites are brighter.
+        n_threads : int, optional
+            Number of threads; all cores by default.
+
+        Returns
+        -------
+        exposure_s : float, s
+            To a relative accuracy of 1e-4, from the mean codes of :meth:`predict`.
+
+        Raises
+        ------
+        ParameterError
+            If no light reaches these sites, or no exposure time reaches the target.
+
+        Examples
+        --------
+        A full well of 10,000 e- is filled to 70 % in 7 ms at 10⁶ e-/s:
+
+        >>> import numpy as np
+        >>> from foveasim.layout import grid
+        >>> sensor = Sensor(grid(n_x=4, n_y=4, pitch_um=2.0), full_well_e=1e4, capacitance_f=6e-16)
+        >>> round(sensor.exposure_for(np.full(16, 1e6)), 5)
+        0.007
+        """
+        photo_e_per_s = finite_array("photo_e_per_s", self._check_size("photo_e_per_s", photo_e_per_s), at_least=0.0)
+        return exposure_for(self, photo_e_per_s, target, percentile, n_threads)
 
     def collect(
         self,
@@ -1169,17 +1238,20 @@ def _is_range(selection: slice) -> bool:
     return selection.step in (None, 1) and all(bound is None or isinstance(bound, int) for bound in bounds)
 
 
-def _object(classes: Mapping[str, Any], name: str, data: Any) -> Any:
+def _object(classes: Mapping[str, Any], name: str, data: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
     """Create the effect objects that plain data describe; return other data unchanged."""
     if is_digest(data):
-        raise ParameterError(
-            "sensor", f"must be given: the settings of the capture do not contain all values of {name!r}"
-        )
+        values_of = resolve(data, arrays)
+        if values_of is None:
+            raise ParameterError(
+                "sensor", f"must be given: the settings of the capture do not contain all values of {name!r}"
+            )
+        return values_of
     if isinstance(data, list):
-        return [_object(classes, f"{name}[{k}]", item) for k, item in enumerate(data)]
+        return [_object(classes, f"{name}[{k}]", item, arrays) for k, item in enumerate(data)]
     if not isinstance(data, Mapping):
         return data
-    values = {key: _object(classes, f"{name}.{key}", item) for key, item in data.items() if key != "kind"}
+    values = {key: _object(classes, f"{name}.{key}", item, arrays) for key, item in data.items() if key != "kind"}
     if "kind" not in data:
         return values  # a parameter of an effect
     kind = str(data["kind"])

@@ -40,6 +40,8 @@ ENUMERATED = ("integration_order",)
 TAGS = ("kind", "generator")
 #: Required parameters that are files without a bundled one.
 FROM_FILES = {"path", "file"}
+#: Optional parameters that new sections contain: framing and light of scenes.
+GIVEN = {"fit", "peak_radiance_w_m2_sr_nm", "radiance_w_m2_sr_nm"}
 #: Depth of nested sections.
 MAX_DEPTH = 8
 #: Largest number of sections of a list that have controls.
@@ -383,7 +385,7 @@ def _initial(root: dict[str, Any], option: dict[str, Any], value: Any) -> dict[s
             found[name] = copy.deepcopy(template[name])
         elif name in old and any(_is_of(each, old[name]) for each in options):
             found[name] = copy.deepcopy(old[name])
-        elif name in option.get("required", ()) or name == "fit":
+        elif name in option.get("required", ()) or name in GIVEN:
             found[name] = _initial_value(name, options[0], None)
     # Framings of a scene exclude each other.
     if "fit" in found and any(found.get(name) is not None for name in ("pitch_um", "field_of_view_deg")):

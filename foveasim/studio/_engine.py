@@ -111,6 +111,7 @@ class Engine:
                     raise GeometryError(
                         f"the studio shows layouts of 1 to {MAX_SITES:,} photosites, got {capture.layout.n_sites:,}"
                     )
+                shot = shot.captured(capture)
                 photo_e_per_s = self._runner.photoelectrons_per_s(shot, used)
                 images = self._runner.images(shot, used)
             finally:

@@ -590,6 +590,7 @@ CALLS = {
     "scene.charts.grey_scale": lambda o: charts.grey_scale(n_steps=4, patch_mm=1.0, **SHEET),
     "scene.charts.illuminant": lambda o: charts.illuminant("D65", [550.0]),
     "scene.charts.letter_f": lambda o: charts.letter_f(height_mm=3.0, **SHEET),
+    "scene.charts.photopic": lambda o: charts.photopic([550.0]),
     "scene.charts.patch_reflectance": lambda o: charts.patch_reflectance([550.0]),
     "scene.charts.point_grid": lambda o: charts.point_grid(
         spacing_mm=1.0,
@@ -630,7 +631,9 @@ CALLS = {
     "tiles.capture_tiles": lambda o: list(tiles.capture_tiles(o.simple, o.scene, exposure_s=0.01, seed=0)),
     "tiles.read_tiles": lambda o: tiles.read_tiles(o.tiled.path).picture(),
     "tiles.write_tiles": lambda o: tiles.write_tiles(o.path(".zarr"), o.simple, o.scene, exposure_s=0.01, seed=0),
+    "units.decode_srgb": lambda o: units.decode_srgb(0.5),
     "units.electrons_to_volts": lambda o: units.electrons_to_volts(LENGTH, 1e-15),
+    "units.encode_srgb": lambda o: units.encode_srgb(0.5),
     "units.m_from_mm": lambda o: units.m_from_mm(LENGTH),
     "units.m_from_nm": lambda o: units.m_from_nm(LENGTH),
     "units.m_from_um": lambda o: units.m_from_um(LENGTH),

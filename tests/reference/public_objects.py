@@ -72,7 +72,7 @@ def public_objects(directory):
     capture = CAMERA.capture(SCENE, exposure_s=0.01, seed=0)
     dataset = explore.Dataset(list(np.zeros((2, 80, 80), np.uint8)), SHOT)
     explore.write_dataset(dataset, directory / "samples", per_shard=2)
-    shot = config.Shot(name="shot", scene=SCENE, camera=CAMERA, rules=None, exposure_s=0.01, seed=0)
+    shot = config.Shot(name="shot", scene=SCENE, camera=CAMERA, rules=None, requested_s=0.01, seed=0)
     plan = explore.Plan(
         source=config.Source(file=Path("sweep.yaml")), written=config.Source(file=Path("sweep.yaml")), settings={"a": list(range(100))}, values={"sensor.bits": list(range(100))}, mode="zip",
         repeats=1, seed=0, metrics={}, files={},

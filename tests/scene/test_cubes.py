@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import scipy.constants
 import scipy.io
+import tifffile
 
 import foveasim as fs
 from foveasim._io.rasters.mat import write_mat73
@@ -333,7 +334,10 @@ def test_missing_files_give_one_line(tmp_path):
     )
     assert_rejected(tmp_path / "cub.hdr", "did you mean 'cube.hdr'")
     (tmp_path / "text.hdr").write_text("#?RADIANCE\n")
-    assert_rejected(tmp_path / "text.hdr", "not a valid hyperspectral cube: expected ENVI, EXR, MAT, netCDF or zarr")
+    assert_rejected(
+        tmp_path / "text.hdr",
+        "not a valid hyperspectral cube: expected ENVI, EXR, MAT, netCDF, numpy array, TIFF or zarr",
+    )
     for name in ("cube.dat", "cube.raw"):
         (tmp_path / name).write_bytes(bytes(240))
     assert_rejected(path, r"several data files, cube\.dat, cube\.raw; pass the data file instead")
@@ -401,11 +405,62 @@ def test_wrong_arguments_give_one_line(tmp_path, options, match):
     assert_rejected(write_envi(tmp_path / "cube.hdr"), match, ParameterError, **options)
 
 
-def test_array_instead_of_file_is_rejected():
-    with pytest.raises(
-        ParameterError, match="'path' must be a file, got an ndarray; pass arrays to Scene, bands first"
-    ):
-        Scene.from_cube(VALUES, **RADIANCE)
+def test_arrays_are_those_of_files(tmp_path):
+    """Rows of numpy arrays are top row first, as those of pictures."""
+    options = {"wavelength_nm": WAVES, "unit": "W m-2 sr-1 nm-1", "distance_m": 1.0, "pitch_um": 100.0}
+    values = np.random.default_rng(0).random((4, 5, len(WAVES))).astype(np.float32)
+    np.save(tmp_path / "cube.npy", values)
+    tifffile.imwrite(tmp_path / "bands.tif", np.moveaxis(values, -1, 0), photometric="minisblack")
+    tifffile.imwrite(tmp_path / "pixels.tif", values, photometric="minisblack", planarconfig="contig")
+    scene = Scene.from_cube(values, **options)
+    others = [
+        Scene.from_cube(np.moveaxis(values, -1, 0), axis=0, **options),
+        *(Scene.from_cube(tmp_path / name, **options) for name in ("cube.npy", "bands.tif", "pixels.tif")),
+    ]
+    before = values.copy()
+    values[:] = 0.0
+
+    assert np.array_equal(scene.basis, np.moveaxis(before, -1, 0)[:, ::-1])
+    for other in others:
+        assert np.array_equal(other.basis, scene.basis)
+        assert np.array_equal(other.spectrum_w_m2_sr_nm, scene.spectrum_w_m2_sr_nm)
+
+
+def test_labelled_array_has_its_wavelengths():
+    xarray = pytest.importorskip("xarray")
+    values = np.random.default_rng(0).random((2, 4, 5))
+    coords = {"wavelength": ("wavelength", [500.0, 600.0], {"units": "nm"})}
+    array = xarray.DataArray(values, coords, ("wavelength", "y", "x"), attrs={"units": "W m-2 sr-1 nm-1"})
+    scene = Scene.from_cube(array.transpose("y", "x", "wavelength"), distance_m=1.0, pitch_um=100.0)
+
+    assert scene.wavelength_nm.tolist() == [500.0, 600.0]
+    assert scene.basis * scene.spectrum_w_m2_sr_nm[0, 0] == pytest.approx(values[:, ::-1])
+
+
+def test_dataset_of_hdf5_is_selected_by_name(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    values = np.random.default_rng(0).random((4, 5, 2))
+    with h5py.File(tmp_path / "cube.h5", "w") as file:
+        file["first"], file["second"] = values, 2.0 * values
+    options = {"wavelength_nm": [500.0, 600.0], "unit": "W m-2 sr-1 nm-1", "distance_m": 1.0, "pitch_um": 100.0}
+    scene = Scene.from_cube(tmp_path / "cube.h5", name="second", **options)
+
+    assert scene.basis * scene.spectrum_w_m2_sr_nm[0, 0] == pytest.approx(2.0 * np.moveaxis(values, -1, 0)[:, ::-1])
+
+
+@pytest.mark.parametrize(
+    ("array", "options", "message"),
+    [
+        (np.ones((2, 3, 2)), {}, "'path' is an array that does not specify the wavelengths of its bands; pass wave"),
+        (np.ones((2, 3, 2)), {"wavelength_nm": [500, 600]}, "'path' is an array that does not specify the unit of its"),
+        (np.ones(4), {}, r"'path' must be a file, or an array of rows, columns and bands, got \(4,\)"),
+        (np.ones((2, 3, 2)), {"axis": 5}, "'axis' must be an axis of the array, from -3 to 2, got 5"),
+        ("cube.npy", {"axis": 0}, "'axis' must be -1 for files, whose formats specify the axes, got 0"),
+    ],
+)
+def test_incomplete_arrays_give_one_line(array, options, message):
+    with pytest.raises(ParameterError, match=message):
+        Scene.from_cube(array, distance_m=1.0, **options)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1.0])
@@ -497,7 +552,12 @@ def test_wrong_illumination_gives_one_line(tmp_path):
     path = write_envi(tmp_path / "cube.hdr", VALUES / 100.0, wavelength="{450, 550, 850}")
     lit = {"unit": "1", "radiance_w_m2_sr_nm": 0.3}
 
-    assert_rejected(path, "'radiance_w_m2_sr_nm' must be given for a cube of reflectance", ParameterError, unit="1")
+    assert_rejected(
+        path,
+        "'radiance_w_m2_sr_nm' must be given, or 'luminance_cd_m2' or 'illuminance_lux' instead",
+        ParameterError,
+        unit="1",
+    )
     assert_rejected(path, "'illuminant' 'D65' must be from 380 to 780.*850.*; select range_nm=", ParameterError, **lit)
     assert_rejected(path, "did you mean 'D65'", ParameterError, **lit, illuminant="d65")
     for table, match in (

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from dataclasses import dataclass
+import pickle
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -425,10 +426,12 @@ class Shading(FixedFactor):
 
 
 @pytest.mark.parametrize("extension", ["npz", "zarr"])
-@pytest.mark.parametrize(("n", "is_stored"), [(64, True), (65, False)])
-def test_loaded_capture_needs_long_arrays(tmp_path, extension, n, is_stored):
+@pytest.mark.parametrize("n", [64, 65])
+def test_loaded_capture_has_parameters_per_site(tmp_path, extension, n):
     row = grid(n_x=n, n_y=1, pitch_um=2.0)
-    sensor = Sensor(row, **FINE, read_noise_e=2.0, effects=[Shading(np.linspace(0.5, 1.0, n))])
+    noise_e = np.linspace(1.0, 9.0, n)
+    curve = fs.sensor.TableCurve(wavelength_nm=np.arange(400.0, 700.0), value=np.linspace(0.5, 0.9, 300))
+    sensor = Sensor(row, **FINE, qe=curve, read_noise_e=noise_e, effects=[Shading(np.linspace(0.5, 1.0, n))])
     light = fs.PowerMap(np.full((1, 10, 200), 1e-3), fs.Grid.centred((10, 200), 1.0), [550.0])
     camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=4.0), sensor=sensor)
     capture = camera.capture(light, exposure_s=0.01, seed=1)
@@ -436,13 +439,30 @@ def test_loaded_capture_needs_long_arrays(tmp_path, extension, n, is_stored):
     loaded = fs.Capture.load(tmp_path / f"capture.{extension}")
 
     expected = capture.signal_to_noise(sensor=sensor)
-    assert np.array_equal(loaded.signal_to_noise(sensor=sensor), expected)
-    if is_stored:
-        assert np.array_equal(loaded.signal_to_noise(), expected)
-    else:
-        message = r"^'sensor' must be given: .* do not contain all values of 'effects\[0\]\.factor'$"
+    loaded.save(tmp_path / f"again.{extension}")
+    again = fs.Capture.load(tmp_path / f"again.{extension}")
+    for each in (capture, loaded, again, pickle.loads(pickle.dumps(loaded))):
+        assert np.array_equal(each.signal_to_noise(), expected)
+    found = [c.picture("least_squares", max_pixels=80).data for c in (capture, loaded)]
+    assert np.array_equal(*found)
+    assert len(loaded.sensor_arrays) == (2 if n > 64 else 0)
+    missing = replace(loaded, sensor_arrays={})
+    if n > 64:
+        message = r"^'sensor' must be given: .* do not contain all values of 'read_noise_e'$"
         with pytest.raises(ParameterError, match=message):
-            loaded.signal_to_noise()
+            missing.signal_to_noise()
+
+
+def test_capture_of_unregistered_effect_has_sensor(tmp_path):
+    sensor = Sensor(ROW, **FINE, effects=[LampFlicker()])
+    light = fs.PowerMap(np.full((1, 10, 2 * N), 1e-3), fs.Grid.centred((10, 2 * N), 1.0), [550.0])
+    camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=4.0), sensor=sensor)
+    capture = camera.capture(light, exposure_s=0.01, seed=1)
+    capture.save(tmp_path / "capture.npz")
+
+    assert np.array_equal(capture.signal_to_noise(), capture.signal_to_noise(sensor=sensor))
+    with pytest.raises(ParameterError, match="'sensor' must be given: its effect 'LampFlicker' is not registered"):
+        fs.Capture.load(tmp_path / "capture.npz").signal_to_noise()
 
 
 def test_settings_of_changed_effects_are_rejected():

@@ -780,7 +780,7 @@ def test_written_pictures_match_captures(tmp_path):
     assert write_video(captures, tmp_path / "pictures", max_pixels=60) == 2
 
     for k, capture in enumerate(captures):
-        expected = capture.picture(max_pixels=60).to_image(capture.white_dn, encode_srgb=True)
+        expected = capture.picture(max_pixels=60).to_image(capture.white_dn)
         assert np.array_equal(read_picture(tmp_path / "pictures" / f"frame_{k:06d}.png"), expected)
 
 

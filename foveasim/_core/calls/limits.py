@@ -205,12 +205,9 @@ class Declaration(NamedTuple):
         words = [word for word in self.kinds.get(Literal, ()) if isinstance(word, str)]
         if self.is_per_site:
             return partial(_per_site, limits)
-        if kinds == {float} and self.limits is not None:
-            return lambda name, value, _: limits.check(name, value)
-        if kinds in ({int}, {int, Literal}) and self.limits is not None:
-            return lambda name, value, _: (
-                value if isinstance(value, str) and value in words else limits.check_count(name, value)
-            )
+        if kinds - {Literal} in ({float}, {int}) and self.limits is not None:
+            check = limits.check if float in kinds else limits.check_count
+            return lambda name, value, _: value if isinstance(value, str) and value in words else check(name, value)
         if kinds == {Literal} and len(words) == len(self.kinds[Literal]):
             return lambda name, value, _: check_choice(name, value, words)
         if kinds == {bool}:

@@ -448,9 +448,9 @@ class Dataset:
         power_settings = [self._picture_of(index), rate_settings(shot, settings)]
         photo_e_per_s = self._cached("power", power_settings, lambda: camera.photoelectrons_per_s(scene))
         capture = camera.capture(
-            scene, exposure_s=shot.exposure_s, seed=self.seed, frame=index, photo_e_per_s=photo_e_per_s
+            scene, exposure_s=shot.requested_s, seed=self.seed, frame=index, photo_e_per_s=photo_e_per_s
         )
-        return shot, capture
+        return shot.captured(capture), capture
 
     def _sample(self, index: int) -> dict[str, Any]:
         self._messages = []

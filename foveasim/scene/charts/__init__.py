@@ -5,10 +5,11 @@ Each function returns a :class:`foveasim.Scene`. The origin of a chart is the ce
 The value of a pixel is the *mean* of the ideal chart over its square, so that edges are anti-aliased and the total power is
 correct. The documentation of each function states whether this mean is exact.
 
-All functions have the parameters ``shape``, ``pitch_um``, ``distance_m``, ``radiance_w_m2_sr_nm`` (of white),
-``wavelength_nm`` and ``band_width_nm``. ``contrast`` is the Michelson contrast, (white - black) / (white + black): the
-radiance of white is fixed, and the radiance of black is the fraction ``(1 - contrast) / (1 + contrast)`` of it. A pattern
-with fewer than 2 pixels per period averages to grey and issues a :class:`foveasim.errors.SamplingWarning`.
+All functions have the parameters ``shape``, ``pitch_um``, ``distance_m``, ``wavelength_nm``, ``band_width_nm``, and
+``radiance_w_m2_sr_nm`` of white, or ``luminance_cd_m2`` or ``illuminance_lux`` instead. ``contrast`` is the Michelson
+contrast, (white - black) / (white + black): the radiance of white is fixed, and the radiance of black is the fraction
+``(1 - contrast) / (1 + contrast)`` of it. A pattern with fewer than 2 pixels per period averages to grey and issues a
+:class:`foveasim.errors.SamplingWarning`.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING
 from foveasim._core.calls import publish
 from foveasim._core.registry import import_all
 from foveasim.scene._illuminants import illuminant
+from foveasim.scene._photometry import photopic
 from foveasim.scene.charts._colours import PATCH_NAMES, patch_reflectance
 from foveasim.scene.charts._edges import BarElement, bar_elements, bars, checkerboard, letter_f, slanted_edge
 from foveasim.scene.charts._patches import colour_chart, grey_scale
@@ -36,6 +38,7 @@ __all__ = [
     "illuminant",
     "letter_f",
     "patch_reflectance",
+    "photopic",
     "point_grid",
     "siemens_star",
     "sine",

@@ -14,6 +14,7 @@ from foveasim._core.calls import FRACTION, Limits, check_arguments, check_declar
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, band_widths_nm, check_shape, freeze, wavelengths_nm
 from foveasim.errors import ParameterError, SamplingWarning
+from foveasim.scene._photometry import level_of_white
 from foveasim.scene._scene import DISTANCE, GREY_NM, PITCH, RADIANCE, Scene
 from foveasim.scene.registry import SCENES
 from foveasim.units import m_from_um
@@ -48,6 +49,9 @@ PARAMETERS = {
     "distance_m": "distance_m : float, m\n        Distance of the scene from the lens.",
     "radiance_w_m2_sr_nm": "radiance_w_m2_sr_nm : number, or one per wavelength, W/(m² sr nm)\n"
     "        Spectral radiance of white.",
+    "luminance_cd_m2": "luminance_cd_m2 : float, cd/m²\n        Luminance of white, instead of its radiance.",
+    "illuminance_lux": "illuminance_lux, reflectance : float, lx\n"
+    "        Illuminance of the chart, instead of the radiance, and reflectance of its white, a diffuse surface.",
     "wavelength_nm": "wavelength_nm : sequence, nm\n        Wavelengths.",
     "band_width_nm": "band_width_nm : number or sequence, optional, nm\n"
     "        Widths of the bands; by default bands extend halfway to the adjacent wavelengths. Required for one wavelength.",
@@ -67,7 +71,10 @@ class Raster(TypedDict):
 class Picture(Raster):
     """Parameters of charts with a radiance of white."""
 
-    radiance_w_m2_sr_nm: OneOrMore
+    radiance_w_m2_sr_nm: NotRequired[OneOrMore | None]
+    luminance_cd_m2: NotRequired[float | None]
+    illuminance_lux: NotRequired[float | None]
+    reflectance: NotRequired[float]
     wavelength_nm: NotRequired[Sequence[float]]
 
 
@@ -85,23 +92,39 @@ class Canvas:
     shape: tuple[int, int]
     pitch_um: Annotated[float, PITCH]
     distance_m: Annotated[float, DISTANCE]
-    radiance_w_m2_sr_nm: OneOrMore
+    radiance_w_m2_sr_nm: OneOrMore | None = None
+    luminance_cd_m2: float | None = None
+    illuminance_lux: float | None = None
+    reflectance: float = 1.0
     wavelength_nm: Sequence[float] = GREY_NM
     band_width_nm: OneOrMore | None = None
 
     def __post_init__(self) -> None:
         check_declared(self)
         waves_nm = wavelengths_nm("wavelength_nm", self.wavelength_nm)
-        radiance = RADIANCE.check_array("radiance_w_m2_sr_nm", self.radiance_w_m2_sr_nm)
+        widths_nm = band_widths_nm(waves_nm, self.band_width_nm)
+        given = self.radiance_w_m2_sr_nm
+        radiance = np.ones(1) if given is None else RADIANCE.check_array("radiance_w_m2_sr_nm", given)
         if radiance.ndim > 1 or radiance.size not in (1, waves_nm.size):
             raise ParameterError(
                 "radiance_w_m2_sr_nm", f"must be one number, or one for each of the {waves_nm.size} wavelengths"
             )
+        radiance = np.broadcast_to(radiance, waves_nm.shape)
+        level = level_of_white(
+            "radiance_w_m2_sr_nm",
+            None if given is None else 1.0,
+            radiance,
+            waves_nm,
+            widths_nm,
+            luminance_cd_m2=self.luminance_cd_m2,
+            illuminance_lux=self.illuminance_lux,
+            reflectance=self.reflectance,
+        )
         for name, value in {
             "shape": check_shape("shape", self.shape),
-            "radiance_w_m2_sr_nm": np.broadcast_to(radiance, waves_nm.shape),
+            "radiance_w_m2_sr_nm": level * radiance,
             "wavelength_nm": waves_nm,
-            "band_width_nm": band_widths_nm(waves_nm, self.band_width_nm),
+            "band_width_nm": widths_nm,
         }.items():
             object.__setattr__(self, name, value)
 
@@ -228,7 +251,10 @@ def chart(name: str, *, example: Mapping[str, Any], expected: Sequence[str]) -> 
         types = get_type_hints(Canvas, include_extras=True)
         function.__signature__ = signature  # type: ignore[attr-defined]
         function.__annotations__ = {**{each.name: types[each.name] for each in common}, **hints}
-        described, text = "\n    ".join(PARAMETERS[each.name] for each in common), function.__doc__ or ""
+        described, text = (
+            "\n    ".join(PARAMETERS[each.name] for each in common if each.name in PARAMETERS),
+            function.__doc__ or "",
+        )
         function.__doc__ = text.replace("{picture}", described if "Returns\n" in text else described + RETURNS)
         complete = {key: value for key, value in EXAMPLE_PICTURE.items() if key in signature.parameters} | {**example}
         return SCENES.register(name, check_arguments(function), example=complete, expected=expected)  # type: ignore[return-value]

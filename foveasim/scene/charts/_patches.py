@@ -11,6 +11,7 @@ from foveasim._core.calls import NOT_NEGATIVE, POSITIVE, Limits
 from foveasim._core.validation import Floats
 from foveasim.scene._illuminants import Illuminant
 from foveasim.scene._illuminants import illuminant as cie_illuminant
+from foveasim.scene._photometry import level_of_white
 from foveasim.scene._scene import RADIANCE, Scene
 from foveasim.scene.charts._canvas import Canvas, Fractions, Picture, Raster, add_rectangle, chart
 from foveasim.scene.charts._colours import PATCH_NAMES, nonnegative_factors, patch_reflectance
@@ -87,7 +88,9 @@ def colour_chart(
     gap_mm: Annotated[float, NOT_NEGATIVE] = 0.0,
     illuminant: Illuminant = "D65",
     n_basis: Annotated[int, Limits(at_least=1, at_most=len(PATCH_NAMES))] = 12,
-    radiance_w_m2_sr_nm: Annotated[float, RADIANCE],
+    radiance_w_m2_sr_nm: Annotated[float | None, RADIANCE] = None,
+    luminance_cd_m2: float | None = None,
+    illuminance_lux: float | None = None,
     wavelength_nm: Sequence[float] = COLOUR_NM,
     **raster: Unpack[Raster],
 ) -> Scene:
@@ -108,6 +111,8 @@ def colour_chart(
         Number of basis images, at most 24. The computing time of the optics is proportional to it; see the notes.
     radiance_w_m2_sr_nm : float, W/(m² sr nm)
         Spectral radiance at 560 nm of a white with reflectance 1.
+    luminance_cd_m2, illuminance_lux : float, cd/m² and lx
+        Luminance of this white, or illuminance of the chart, instead of the radiance.
     wavelength_nm : sequence, nm
         Wavelengths from 380 to 780; by default 400 to 700 in steps of 10.
     {picture}
@@ -141,7 +146,17 @@ def colour_chart(
     canvas.check_fits("patch_mm", N_COLUMNS * step_mm - gap_mm, N_ROWS * step_mm - gap_mm)
     canvas.warn_if_fine("patch_mm", 2.0 * patch_mm)
     weights, spectra = _patch_spectra(np.asarray(canvas.wavelength_nm), n_basis)
-    illumination = radiance_w_m2_sr_nm * cie_illuminant(illuminant, np.asarray(canvas.wavelength_nm))
+    waves_nm = np.asarray(canvas.wavelength_nm)
+    illumination = cie_illuminant(illuminant, waves_nm)
+    illumination *= level_of_white(
+        "radiance_w_m2_sr_nm",
+        radiance_w_m2_sr_nm,
+        illumination,
+        waves_nm,
+        np.asarray(canvas.band_width_nm),
+        luminance_cd_m2=luminance_cd_m2,
+        illuminance_lux=illuminance_lux,
+    )
     return canvas.scene_of(_patches(canvas, weights, patch_mm, step_mm), spectra * illumination, "a colour chart")
 
 

@@ -9,6 +9,8 @@ extension       format                            metadata in the file
 .exr            spectral EXR                      wavelengths, unit, radiance or reflectance
 .nc             netCDF, HDF5                      wavelengths, unit, pixel pitch
 .zarr           zarr directory                    wavelengths, unit, pixel pitch
+.npy            numpy array (row, column, band)   none
+.tif            TIFF of several bands             none
 ==============  ================================  =================================================================
 
 The format is detected from the content of a file. Each format is one entry of :data:`CUBE_FORMATS`; ``read(path, name)``
@@ -19,10 +21,11 @@ from __future__ import annotations
 
 from foveasim._core.calls import publish
 from foveasim._core.registry import import_all
+from foveasim.scene.cubes._arrays import array_errors, cube_of
 from foveasim.scene.cubes._cube import Cube, Quantity
 from foveasim.scene.cubes._formats import CUBE_FORMATS, read_cube
 from foveasim.scene.cubes._radiance import IlluminantTable, Radiance, spectral_radiance
-from foveasim.scene.cubes._selection import Invalid, Selection
+from foveasim.scene.cubes._selection import Invalid, Selection, select
 
 __all__ = [
     "CUBE_FORMATS",
@@ -32,7 +35,10 @@ __all__ = [
     "Quantity",
     "Radiance",
     "Selection",
+    "array_errors",
+    "cube_of",
     "read_cube",
+    "select",
     "spectral_radiance",
 ]
 

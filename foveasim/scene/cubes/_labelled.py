@@ -1,9 +1,9 @@
 """
 Cubes in netCDF files and zarr directories.
 
-The dimensions are wavelength, y and x, in any order. The attribute ``units`` of the array is the unit of its values, and that
-of the coordinates is the unit of wavelengths and positions. Rows and columns with positions in a unit of length specify the
-pixel pitch.
+The dimensions are wavelength, y and x, in any order; without names they are y, x and wavelength. The attribute ``units`` of
+the array is the unit of its values, and that of the coordinates is the unit of wavelengths and positions. Rows and columns with
+positions in a unit of length specify the pixel pitch.
 """
 
 from __future__ import annotations
@@ -21,7 +21,15 @@ from foveasim._core.extras import import_optional
 from foveasim._core.validation import Floats
 from foveasim._io.rasters import pitch_of_axes
 from foveasim._io.rasters.datasets import NETCDF, ZARR, open_netcdf, open_zarr, select_array
-from foveasim._io.rasters.labels import BAND, coordinate, in_order, length_of_coordinate, squeeze, unit_of_array
+from foveasim._io.rasters.labels import (
+    BAND,
+    coordinate,
+    in_order,
+    is_unnamed,
+    length_of_coordinate,
+    squeeze,
+    unit_of_array,
+)
 from foveasim.scene.cubes._cube import EXAMPLE_NM, EXAMPLE_UNIT, Cube, example_radiance
 from foveasim.scene.cubes._formats import CUBE_FORMATS
 
@@ -46,6 +54,8 @@ def cube_of_array(array: xr.DataArray, close: Callable[[], None] | None = None) 
 
     Raises FormatError if the dimensions are not those of a cube, or the positions are not uniform.
     """
+    if array.ndim == 3 and is_unnamed(array):  # datasets of HDF5 files without dimension scales, as numpy arrays
+        array = array.rename(dict(zip(array.dims, ("y", "x", "band"), strict=True)))
     array, band, (y, x) = in_order(squeeze(array))
     along_x, along_y = (coordinate(array, d) for d in (x, y))
     metadata: dict[str, Any] = {}

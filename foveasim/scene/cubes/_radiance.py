@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import Floats, check_number, finite_array, wavelengths_nm
+from foveasim._core.validation import Floats, band_widths_nm, check_number, finite_array, wavelengths_nm
 from foveasim._io.formats import FormatError
 from foveasim._io.mapped_files import value_range
 from foveasim._io.rasters.units import Powers, parse_unit, round_factor
 from foveasim.errors import FoveasimWarning, ParameterError
 from foveasim.scene._illuminants import Illuminant
 from foveasim.scene._illuminants import illuminant as cie_illuminant
+from foveasim.scene._photometry import level_of_white, the_only
 from foveasim.scene.cubes._cube import Cube, Quantity
 from foveasim.scene.cubes._selection import interpolation_weights
 from foveasim.units import photon_energy_j
@@ -44,6 +45,7 @@ class Radiance:
 
     spectrum_w_m2_sr_nm: Floats
     wavelength_nm: Floats
+    band_width_nm: Floats
     max_fraction: float
 
     def warn_above_one(self) -> None:
@@ -64,7 +66,10 @@ def spectral_radiance(
     scale: float | None,
     illuminant: Illuminant | IlluminantTable | None,
     radiance_w_m2_sr_nm: float | None,
+    luminance_cd_m2: float | None,
+    illuminance_lux: float | None,
     resample_nm: Sequence[float] | None,
+    band_width_nm: float | Sequence[float] | None,
 ) -> Radiance:
     """
     Return the spectra of a cube; parameters as for :meth:`foveasim.Scene.from_cube`.
@@ -82,15 +87,38 @@ def spectral_radiance(
         waves_nm = wavelengths_nm("resample_nm", resample_nm)
         weights = interpolation_weights(bands_nm, waves_nm)
     spectrum, max_fraction = factor[:, np.newaxis] * weights, 0.0
+    own_nm = cube.band_width_nm if band_width_nm is None and resample_nm is None else band_width_nm
+    widths_nm = band_widths_nm(waves_nm, own_nm)
+    level = {"luminance_cd_m2": luminance_cd_m2, "illuminance_lux": illuminance_lux}
     if kind == "reflectance":
         bands = (cube.data[k : k + 1] for k in range(factor.size))
         max_fraction = max(f * value_range(band)[1] for f, band in zip(factor.tolist(), bands, strict=True))
-        spectrum = spectrum * _illumination(waves_nm, illuminant, radiance_w_m2_sr_nm)
+        white, name = radiance_w_m2_sr_nm, "radiance_w_m2_sr_nm"
+        the_only({name: white, **level})
+        if white is not None:
+            white = check_number(name, white, at_least=0.0)
+        relative = _illumination(waves_nm, illuminant)
+        spectrum = (
+            spectrum
+            * relative
+            * level_of_white(
+                name,
+                white,
+                relative,
+                waves_nm,
+                widths_nm,
+                luminance_cd_m2=luminance_cd_m2,
+                illuminance_lux=illuminance_lux,
+            )
+        )
     else:
-        for name, value in (("illuminant", illuminant), ("radiance_w_m2_sr_nm", radiance_w_m2_sr_nm)):
+        given = {"illuminant": illuminant, "radiance_w_m2_sr_nm": radiance_w_m2_sr_nm, **level}
+        for name, value in given.items():
             if value is not None:
                 raise ParameterError(name, "must be omitted for a cube of radiance", value)
-    return Radiance(spectrum_w_m2_sr_nm=spectrum, wavelength_nm=waves_nm, max_fraction=max_fraction)
+    return Radiance(
+        spectrum_w_m2_sr_nm=spectrum, wavelength_nm=waves_nm, band_width_nm=widths_nm, max_fraction=max_fraction
+    )
 
 
 def _quantity(cube: Cube, bands_nm: Floats, quantity: Quantity | None, unit: str | None) -> tuple[Quantity, Floats]:
@@ -133,20 +161,12 @@ def _parse(text: str, bands_nm: Floats) -> tuple[Quantity | None, Floats, str]:
     return None, ones, "is neither a spectral radiance nor a reflectance"
 
 
-def _illumination(
-    waves_nm: Floats, illuminant: Illuminant | IlluminantTable | None, radiance_w_m2_sr_nm: float | None
-) -> Floats:
-    """Return the spectral radiance of a white of reflectance 1, (n_wavelength,)."""
-    if radiance_w_m2_sr_nm is None:
-        raise ParameterError(
-            "radiance_w_m2_sr_nm",
-            "must be given for a cube of reflectance: the spectral radiance of a white of reflectance 1 at 560 nm",
-        )
-    white = check_number("radiance_w_m2_sr_nm", radiance_w_m2_sr_nm, at_least=0.0)
+def _illumination(waves_nm: Floats, illuminant: Illuminant | IlluminantTable | None) -> Floats:
+    """Return the relative spectrum of a white of reflectance 1, (n_wavelength,)."""
     if isinstance(illuminant, Mapping):
-        return white * _table(illuminant, waves_nm)
+        return _table(illuminant, waves_nm)
     try:
-        return white * cie_illuminant(illuminant or "D65", waves_nm)
+        return cie_illuminant(illuminant or "D65", waves_nm)
     except ParameterError as error:
         raise ParameterError(
             "illuminant",
