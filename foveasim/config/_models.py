@@ -165,6 +165,8 @@ FILE_OPTIONS: dict[str, Any] = {
     "invalid": Literal["error", "skip", "repair"] | None,
     "centre": bool | None,
 }
+#: Parameters of scenes from arrays.
+_OF_ARRAYS = ("axis", "channels")
 #: Parameters that files do not contain: a density picture covers the rectangle ``size_um``.
 _EXCLUDED = ("density_grid",)
 _CROSSTALK: dict[str, Callable[..., Any]] = {"diffusion": Diffusion, "kernel": KernelCrosstalk}
@@ -230,7 +232,10 @@ def _models(_versions: tuple[int, ...]) -> Models:
     rules = _rules()
     layout = _layout(rules)
     power_map = _model("power_map", read_power_map, **(_FILE_TYPES | _WAVELENGTHS))
-    scene = _union_of("kind", {**_registered_sections(SCENES, **(_FILE_TYPES | _WAVELENGTHS)), "power_map": power_map})
+    scene = _union_of(
+        "kind",
+        {**_registered_sections(SCENES, skip=_OF_ARRAYS, **(_FILE_TYPES | _WAVELENGTHS)), "power_map": power_map},
+    )
     fields: dict[str, Any] = {
         "scene": (
             scene,

@@ -384,6 +384,8 @@ class Scene:
         has_alpha = (
             pixels.ndim == 3 and pixels.shape[2] in (2, 4) and (spectrum is None or len(spectrum) != pixels.shape[2])
         )
+        if channels == "bgr" and not isinstance(picture, np.ndarray):
+            raise ParameterError("channels", "must be 'rgb' for files and images of Pillow", channels)
         if channels == "bgr" and pixels.ndim == 3 and pixels.shape[2] in (3, 4):
             pixels = pixels[..., [2, 1, 0, 3][: pixels.shape[2]]]
         try:

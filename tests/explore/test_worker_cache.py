@@ -112,6 +112,8 @@ ABERRATED = SHOT | {
     },
 }
 ABERRATIONS = ("optics.zernike", "optics.seidel", "optics.field_patches")
+#: Alternatives of the radiance of a scene.
+LEVELS = ("scene.luminance_cd_m2", "scene.illuminance_lux", "scene.reflectance")
 #: Other values of settings whose type does not suggest one.
 OTHERS = {
     "scene.picture": "other.png",
@@ -220,7 +222,7 @@ def leaves(model, section, prefix=""):
     """Yield path, type and value of every setting that a shot can have, including those that it has not."""
     for name, field in model.model_fields.items():
         path, value = prefix + name, section.get(name, field.default if not field.is_required() else None)
-        in_sections = "layout.edits", "sensor.companding_table", "scene.gaze_range_um"
+        in_sections = "layout.edits", "sensor.companding_table", "scene.gaze_range_um", *LEVELS
         if name in ("kind", "generator") or path in in_sections:
             continue
         if isinstance(value, dict) and own_models(field.annotation) and path not in OTHERS:

@@ -76,3 +76,10 @@ def test_missing_array_gives_one_line():
         ParameterError, match=r"'picture' must be a file, an image or an array, got None; cv2\.imread ret"
     ):
         scene_of(None)
+
+
+def test_files_have_their_own_order(tmp_path):
+    PHOTOGRAPH.save(tmp_path / "photo.png")
+    for picture in (tmp_path / "photo.png", PHOTOGRAPH):
+        with pytest.raises(ParameterError, match="'channels' must be 'rgb' for files and images of Pillow, got 'bgr'"):
+            scene_of(picture, channels="bgr")
