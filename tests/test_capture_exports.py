@@ -298,6 +298,7 @@ def test_view_shows_store_like_archive(capture, tmp_path):
 # -- names of the package ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_explore_is_imported_when_used():
     code = (
         "import sys, foveasim as fs; before = 'foveasim.explore' in sys.modules; fs.explore.run_sweep; "

@@ -89,34 +89,32 @@ def distributions():
     return packages_distributions()
 
 
-def only_for_types(tree):
-    """Nodes below ``if TYPE_CHECKING``."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
-            yield from (inner for statement in node.body for inner in ast.walk(statement))
+@cache
+def imports(path):
+    """Imports and calls of a file, without those below ``if TYPE_CHECKING``."""
+    found = [ast.parse(path.read_text())]
+    for node in found:  # which grows
+        is_for_types = isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
+        found.extend(node.orelse if is_for_types else ast.iter_child_nodes(node))
+    return [node for node in found if isinstance(node, ast.Import | ast.ImportFrom | ast.Call)]
+
+
+def modules_of(node):
+    """Full names of the modules of an import statement."""
+    if isinstance(node, ast.Import):
+        return [alias.name for alias in node.names]
+    return [node.module] if isinstance(node, ast.ImportFrom) and node.level == 0 else []
 
 
 @cache
 def imported_modules(path):
     """Full names of the modules that a file imports, also those given to a function by name."""
-    return tuple(_imports(ast.parse(path.read_text())))
-
-
-def _imports(tree):
-    skipped = set(only_for_types(tree))
-    for node in ast.walk(tree):
-        if node in skipped:
-            continue
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.level == 0:
-            yield node.module
-        elif (
-            isinstance(node, ast.Call)
-            and (name := getattr(node.func, "attr", getattr(node.func, "id", ""))) in IMPORTING
-        ):
-            args = node.args[1:2] if name == "import_optional" else node.args  # after its subject, before the extra
-            yield from (a.value for a in args if isinstance(a, ast.Constant) and isinstance(a.value, str))
+    found = [name for node in imports(path) for name in modules_of(node)]
+    for call in (node for node in imports(path) if isinstance(node, ast.Call)):
+        if (name := getattr(call.func, "attr", getattr(call.func, "id", ""))) in IMPORTING:
+            args = call.args[1:2] if name == "import_optional" else call.args  # after its subject, before the extra
+            found.extend(a.value for a in args if isinstance(a, ast.Constant) and isinstance(a.value, str))
+    return found
 
 
 def imported_distributions(path):
@@ -218,19 +216,11 @@ GUARDED = {
 
 
 def test_optional_modules_are_imported_with_install_hint():
-    found = set()
-    for path in PACKAGE.rglob("*.py"):
-        tree = ast.parse(path.read_text())
-        skipped = set(only_for_types(tree))
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Import):
-                modules = [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom) and node.level == 0:
-                modules = [node.module]
-            else:
-                continue
-            if node not in skipped and {name.partition(".")[0] for name in modules} & set(EXTRA_OF):
-                found.add(str(path.relative_to(PACKAGE)))
+    found = {
+        str(path.relative_to(PACKAGE))
+        for path in PACKAGE.rglob("*.py")
+        if {name.partition(".")[0] for node in imports(path) for name in modules_of(node)} & set(EXTRA_OF)
+    }
 
     assert {path for path in found if not path.startswith("learn/")} == set(GUARDED)
 

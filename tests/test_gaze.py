@@ -169,12 +169,12 @@ def test_turned_camera_sees_displaced_picture(optics):
 def test_coma_stays_with_its_axis():
     """A point in the corner of the picture: without coma for a camera that turns towards it."""
     sharp = replace(OPTICS, padding="zero")
-    optics = replace(sharp, seidel=fs.optics.Seidel(coma_um=1.0, field_radius_um=100.0), field_patches=31)
-    point = np.zeros((121, 161))
-    point[20, 140] = 1.0  # from the top
+    optics = replace(sharp, seidel=fs.optics.Seidel(coma_um=1.0, field_radius_um=100.0), field_patches=9)
+    point = np.zeros((81, 111))
+    point[20, 85] = 1.0  # from the top
     scene = scene_of(point, pitch_um=50.0)
     cell_um = optics.grid(scene).pitch_x_um
-    gaze_um = (60.0 * cell_um, 40.0 * cell_um)
+    gaze_um = (30.0 * cell_um, 20.0 * cell_um)
     camera, ideal = camera_of(optics=optics, order=1), camera_of(optics=sharp, order=1)
 
     expected = ideal.photoelectrons_per_s(scene, gaze_um=gaze_um)
@@ -182,8 +182,8 @@ def test_coma_stays_with_its_axis():
         camera.photoelectrons_per_s(scene, gaze_um=gaze_um, axis=axis) for axis in ("sensor", "image")
     )
     difference = [np.abs(each - expected).sum() / expected.sum() for each in (by_sensor, by_image)]
-    assert difference[0] < 0.05
-    assert difference[1] > 0.5
+    assert difference[0] < 0.1
+    assert difference[1] > 1.0
 
 
 def test_power_map_cannot_turn():

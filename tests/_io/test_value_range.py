@@ -20,6 +20,7 @@ def mapped(tmp_path):
     return map_file(tmp_path / "images.raw", IMAGES.dtype, IMAGES.shape, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "view",
     [

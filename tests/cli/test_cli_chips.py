@@ -106,6 +106,7 @@ def test_chip_is_viewed(foveasim, folder, is_report):
     assert f"{N_X * N_Y} photosites" in (folder / "page.html").read_text("utf-8")
 
 
+@pytest.mark.slow
 def test_chip_is_compared_with_other_formats(foveasim, folder):
     """The options of chip files are for the chip; both layouts are centred."""
     grid = fs.layout.grid(n_x=N_X, n_y=N_Y, pitch_um=PITCH_UM).translate(80.0, 0.0)

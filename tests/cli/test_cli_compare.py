@@ -59,6 +59,7 @@ def test_layouts_are_compared_in_a_report(foveasim, folder):
     assert "<h1>Comparison of foveal and square</h1>" in (folder / "r.html").read_text()
 
 
+@pytest.mark.slow
 def test_shots_are_compared_on_their_scenes(foveasim, folder):
     result = foveasim(
         "compare", "shot.yaml", "fine.yaml", "shot.yaml", "--budget", "area", "-o", "s.html", *FAST, cwd=folder

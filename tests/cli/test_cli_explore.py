@@ -317,6 +317,7 @@ def test_study_without_valid_trial_exits_with_1(foveasim, folder):
     assert (code, wrong) == (1, "no valid trial in b.db: all others violate the limits\n")
 
 
+@pytest.mark.slow
 def test_failed_trials_are_reported(foveasim, folder):
     (folder / "some.yaml").write_text(json.dumps(STUDY | {"objectives": {"harsh": "maximize"}, "trials": 8}))
 
@@ -397,6 +398,7 @@ def test_foreign_trials_are_not_changed(foveasim, folder):
     assert len(stored(folder / "own.db").trials) == 1
 
 
+@pytest.mark.slow
 def test_storage_failure_keeps_finished_trials(folder):
     plan = explore.read_study(folder / "study.yaml")
 
@@ -636,6 +638,7 @@ def test_interrupted_dataset_resumes_identically(folder):
         assert_same(found[k], data[k])
 
 
+@pytest.mark.slow
 def test_warnings_of_samples_appear_once(folder):
     layout = SHOT["layout"] | {"parameters": {"n_x": 12, "n_y": 12, "pitch_um": 30.0}}  # beyond the pictures
     (folder / "far.yaml").write_text(json.dumps(DATA_SET | {"set": {"layout": layout}}))

@@ -75,6 +75,7 @@ def test_describe_prints_provenance_as_it_is(foveasim, marked):
     assert re.search(rf"origin\s+{re.escape(name)}\s", result.stdout)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("environment", [{}, {"FORCE_COLOR": "1", "TERM": "xterm"}], ids=["pipe", "terminal"])
 def test_run_prints_names_as_they_are(foveasim, marked, environment):
     folder, name = marked
@@ -162,7 +163,7 @@ def test_names_outside_utf8_are_escaped(tmp_path):
     assert failed.stderr == rb"error: $caf\udce9$^.yamlx: no such file; did you mean '$caf\udce9$^.yaml'?" + b"\n"
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("arguments", "code", "printed"),
     [

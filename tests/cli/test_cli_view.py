@@ -245,6 +245,7 @@ def test_served_page_survives_clients_that_reset(serve):
     assert len(body) == BIG_BYTES
 
 
+@pytest.mark.slow
 @on_linux
 def test_half_sent_requests_are_dropped(serve):
     port, _ = serve(patience_s=0.3)

@@ -154,7 +154,7 @@ def test_information_of_squares_matches_closed_form(sigma_um, side_um, snr):
     assert bits.sum() == pytest.approx(gaussian_information_bits(signal, noise), rel=1e-2)
 
 
-@pytest.mark.slow(keep=6)
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("sigma_um", [1.0, 2.0, 5.0])
 @pytest.mark.parametrize(
     ("vertices_um", "tolerance"),
@@ -181,7 +181,7 @@ def gaussian_field(rng, sigma_um, n, pitch_um):
     return np.fft.ifft2(np.fft.fft2(rng.standard_normal((n, n))) * root).real
 
 
-@pytest.mark.slow(keep=3)
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("side_um", "n_pixels"), [(1.0, (2, 4)), (2.0, (1, 2, 4, 8)), (4.0, (2, 4, 8)), (16.0, (8, 16))]
 )

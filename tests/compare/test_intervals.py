@@ -45,7 +45,7 @@ def coverage(population, n):
     return np.mean((low <= np.median(population)) & (np.median(population) <= high))
 
 
-@pytest.mark.slow(keep=("12",))
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [5, 12])
 @pytest.mark.parametrize("name", MEASURES_OF_SCENES)
 def test_intervals_cover_95_percent(compared, name, n):

@@ -63,6 +63,7 @@ EVERYTHING = {
 }
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("keywords", "effects"),
     [({}, []), ({}, [ROW_NOISE]), (EVERYTHING, [ROW_NOISE])],
@@ -81,6 +82,7 @@ def test_effect_and_sensitivity_have_equal_measures(keywords, effects):
         assert np.all((effect > without) if name == "shift_sigma_um" else (effect < without))
 
 
+@pytest.mark.slow
 def test_picture_per_area_corrects_effects_on_light():
     """A uniform scene has a uniform picture per area, whether the corner is dark by an effect or by a sensitivity."""
     cameras = (camera(effects=[CORNER_LOSS]), camera(sensitivity=TRANSMISSION))

@@ -184,7 +184,7 @@ def test_random_settings_are_drawn_independently():
 N_DRAWS = 4000
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("distribution", "cdf"),
     [
@@ -666,6 +666,7 @@ def test_stored_samples_equal_simulated_samples(name, workers, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
+@pytest.mark.slow
 def test_tar_shards_do_not_depend_on_workers(tmp_path):
     for workers in (1, 2):
         explore.write_dataset(labelled(), tmp_path / f"data{workers}", per_shard=6, workers=workers)
@@ -962,6 +963,7 @@ class Unpicklable(Lazy):
         raise ValueError("cannot be unpickled")
 
 
+@pytest.mark.slow
 def test_unpicklable_pictures_are_rejected(tmp_path):
     local = Lazy(pictures(4))
     local.key = threading.Lock()

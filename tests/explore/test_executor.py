@@ -174,6 +174,7 @@ def test_ranges_are_cut_at_shared_parts(n_workers):
     assert set(first.values()) <= set(cuts)
 
 
+@pytest.mark.slow
 def test_item_that_kills_workers_is_reported():
     def deadly(item):
         if item == 7:
@@ -188,6 +189,7 @@ def test_item_that_kills_workers_is_reported():
     assert again == {0: 0, 1: 1, 2: 2}
 
 
+@pytest.mark.slow
 def test_local_workers_have_present_environment(monkeypatch):
     with executor(os.getenv, what="the function", workers=1) as run:  # starts the process that forks workers
         list(run(["HOME"], ()))
@@ -202,6 +204,7 @@ def test_local_workers_have_present_environment(monkeypatch):
     assert dict(os.environ) == before
 
 
+@pytest.mark.slow
 def test_local_workers_have_different_random_states():
     def draw(_):
         time.sleep(0.05)
@@ -238,6 +241,7 @@ def test_datasets_are_equal_on_a_scheduler(scheduler, name, tmp_path):
         np.testing.assert_array_equal(here[k]["electrons"], there[k]["electrons"])
 
 
+@pytest.mark.slow
 def test_studies_are_equal_on_a_scheduler(scheduler):
     shot = SHOT | {"scene": SHOT["scene"] | {"picture": "skimage:camera"}}
     given = {"n_trials": 8, "batch": 4, "seed": 2}
@@ -249,6 +253,7 @@ def test_studies_are_equal_on_a_scheduler(scheduler):
     assert [(t.params, t.values) for t in here.trials] == [(t.params, t.values) for t in there.trials]
 
 
+@pytest.mark.slow
 def test_in_process_executor_needs_no_dask():
     with executor(lambda item: -item, what="the function") as run:
         assert list(run([3, 1], ())) == [(3, -3), (1, -1)]

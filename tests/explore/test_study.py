@@ -139,7 +139,7 @@ def test_interrupted_study_resumes_identically(tmp_path):
     assert outcomes(explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=20, seed=6)) != outcomes(complete)
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("n_workers", [1, 2])
 def test_batches_do_not_depend_on_workers(n_workers):
     def run(**options):
@@ -158,7 +158,7 @@ def test_batch_size_changes_the_search():
     assert outcomes(one) != outcomes(many)
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("stopped_at", [13, 17, 18])
 def test_interrupted_batch_resumes_bit_identically(stopped_at, tmp_path, monkeypatch):
     def run(**options):

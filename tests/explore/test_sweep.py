@@ -187,6 +187,7 @@ def free_port():
         return one.getsockname()[1]
 
 
+@pytest.mark.slow
 def test_occupied_dask_port_causes_no_warning():
     # Warnings are errors in tests; dask would warn about its occupied default port.
     with socket.socket() as default:
@@ -316,6 +317,7 @@ def test_points_of_killed_worker_are_retried(where, tmp_path):
     assert max(seeds.count(seed) for seed in seeds) <= 2
 
 
+@pytest.mark.slow
 def test_worker_cache_uses_quarter_of_memory(scheduler):
     def cache_bytes(*_):
         from distributed import get_worker
@@ -1127,6 +1129,7 @@ def test_file_and_call_give_equal_plans(directory):
     assert read.dims == ("sensor.bits", "exposure_s", "repeat")
 
 
+@pytest.mark.slow
 def test_sweep_file_imports_no_code(directory):
     (directory / "untrusted.py").write_text(f"open({str(directory / 'imported')!r}, 'w')")
     sweep = {"shot": "shot.yaml", "vary": {"sensor.bits": [8]}, "metrics": ["untrusted:metric"]}

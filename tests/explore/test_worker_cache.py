@@ -346,6 +346,7 @@ def test_cached_components_equal_fresh_ones(runner):
     assert len(unchanged) < 0.1 * len(values), unchanged
 
 
+@pytest.mark.slow
 def test_cached_aberrations_equal_fresh_ones(runner):
     values = list(varied(ABERRATED, aberrations=True))
 

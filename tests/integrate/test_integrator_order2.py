@@ -132,6 +132,7 @@ def test_random_map_equals_clipping_over_zoo(name):
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=150)
 @given(polygon=polygons(SHAPE))
 def test_random_map_equals_clipping_over_polygons(polygon):

@@ -142,6 +142,7 @@ def test_lattice_adjoint_and_matrix_agree(order):
     np.testing.assert_allclose(integrator.weights() @ cells.ravel(), integrator(cells), rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["lattice", "rectangles"])
 def test_threads_do_not_change_rectangles(kind):
     shape = RectangleLattice(

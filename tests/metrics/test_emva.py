@@ -394,6 +394,7 @@ def coverage(sensors, name, true, kind=0):
 COVERAGE_ERROR = SIGMAS * math.sqrt(0.95 * 0.05 / N_SENSORS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "true"), [*EXACT.items(), ("dsnu_e", KIND_DSNU_E[0])])
 def test_intervals_contain_parameter_with_stated_probability(sensors, name, true):
     assert coverage(sensors, name, true) >= 0.95 - COVERAGE_ERROR

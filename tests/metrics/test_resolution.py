@@ -283,6 +283,7 @@ def plain_standard(picture, pitch_um, frequency_per_mm):
     return found / np.sinc(cycles / 4.0)
 
 
+@pytest.mark.slow
 def test_edge_mtf_noise_is_below_standard():
     values, mtf = squares_at_an_edge()
     f = np.linspace(0.0, 500.0 / 3.0, 51)

@@ -92,6 +92,7 @@ def test_zernike_polynomials_match_closed_forms(n, m, form):
     assert zernike(n, m, r * np.cos(t), r * np.sin(t)) == pytest.approx(form(r, t), abs=1e-13)
 
 
+@pytest.mark.slow
 def test_psf_is_independent_of_index_and_unit():
     psfs = [
         aberrated(**c).psf(WAVELENGTH_NM).psf_per_um2
@@ -336,6 +337,7 @@ def test_patches_with_equal_psfs_match_convolution(padding, padding_cells):
     assert patched.sum() == pytest.approx(plain.sum(), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_uniform_scene_stays_uniform_with_patches():
     image = np.ones((400, 420))
     patched = map_of(lens(seidel=Seidel(coma_um=1e-9), padding="reflect"), image, pitch_um=46.4).data
@@ -344,6 +346,7 @@ def test_uniform_scene_stays_uniform_with_patches():
     assert patched == pytest.approx(plain, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_isoplanatic_error_decreases_with_patch_count():
     image = np.zeros((161, 161))
     rng = np.random.default_rng(2)

@@ -381,6 +381,7 @@ def test_weighted_maps_equal_weighted_sum_of_maps(precision):
     assert collapsed == pytest.approx(expected, abs=expected.max() * (3e-6 if precision == "single" else 3e-8))
 
 
+@pytest.mark.slow
 def test_psf_width_scales_with_wavelength():
     blue, _ = airy_map(6, 401, wavelength_nm=450.0)
     scene = fs.Scene.point_sources(

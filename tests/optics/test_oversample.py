@@ -219,6 +219,7 @@ def test_auto_oversample_respects_memory_limit():
         assert OPTICS.auto_oversample(scene) == expected
 
 
+@pytest.mark.slow
 def test_oversample_supports_patches_and_lateral_colour():
     """Each band has its own image size and grid, with field-dependent aberrations."""
     optics = replace(

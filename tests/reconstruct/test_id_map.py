@@ -49,6 +49,7 @@ def lattice_sites(draw):
     )
 
 
+@pytest.mark.slow
 @given(layout=lattice_sites(), steps=st.sampled_from([1, 2, 4]), n_threads=st.sampled_from([1, 3]))
 @settings(max_examples=100)
 def test_samples_match_exact_rational_arithmetic(layout, steps, n_threads):

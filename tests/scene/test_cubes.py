@@ -213,7 +213,7 @@ def test_replaced_file_leaves_mapped_scene_valid(tmp_path, all_mapped):
     np.testing.assert_array_equal(radiance(scene), VALUES)
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("order", "<>")
 @pytest.mark.parametrize("interleave", ["bsq", "bil", "bip"])
 def test_mapped_and_copied_captures_are_equal(tmp_path, interleave, order, monkeypatch):

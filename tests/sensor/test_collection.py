@@ -60,6 +60,7 @@ def assert_binomial(drawn, n_gates, mean_e):
     assert drawn.var() == pytest.approx(expected.var(), rel=5.0 * np.sqrt(2.0 / drawn.size))
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(("n_gates", "mean_e"), [(100, 0.3), (100, 60.0), (100, 400.0), (5000, 900.0)])
 def test_draws_are_binomial(n_gates, mean_e):
     sensor = Sensor(LAYOUT, effects=[Gates(n_gates)])
@@ -90,6 +91,7 @@ def test_draws_do_not_depend_on_other_sites():
     assert np.array_equal(few, sensor.collect(mean_e, seed=3)[:1000])
 
 
+@pytest.mark.slow
 def test_captures_tiles_and_video_are_binomial():
     sensor = Sensor(LAYOUT, effects=[Gates()], bits=12)
     camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=4.0), sensor=sensor)

@@ -141,6 +141,7 @@ def test_calibrated_merge_follows_gates():
     assert np.isfinite(merged.rate_e_per_s).all()
 
 
+@pytest.mark.slow
 def test_collection_works_in_cameras_and_comparisons():
     def camera(layout, effects):
         return fs.Camera(
@@ -188,6 +189,7 @@ def test_collection_works_in_sweeps_and_video(tmp_path):
     assert capture.electrons.max() <= 200
 
 
+@pytest.mark.slow
 def test_photon_transfer_follows_collection():
     levels_e = [50.0, 200.0, 600.0]
     for collection in (Gates(N_GATES), DeadTime()):

@@ -169,6 +169,7 @@ def test_long_spread_variance_matches_diffusion_formula():
     assert math.isclose(measured_um2, variance_um2 + 1.0 / 6.0, rel_tol=1e-9)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("name", ["hexagons", "voronoi"])
 def test_short_spread_matches_monte_carlo_loss(name):
     """

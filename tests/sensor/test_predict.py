@@ -170,6 +170,7 @@ def test_prediction_at_unit_gain_is_poisson():
     assert variance_dn2 == pytest.approx(mean_e, abs=1e-9, rel=1e-9)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("dn_per_e", [0.08, 0.33, 0.5, 1.0])
 def test_noise_free_prediction_matches_many_draws(dn_per_e):
     n_sites = 200_000
@@ -381,7 +382,7 @@ def test_prediction_includes_diffusion_and_coupling():
     assert_agree(sensor, expected_e)
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow
 @pytest.mark.parametrize("photo_e", [0.0, 60.0, 1500.0, 4990.0, 5100.0, 12_000.0])
 def test_prediction_with_crosstalk_and_all_effects(photo_e):
     layout = grid(n_x=8, n_y=8, pitch_um=3.0)

@@ -321,7 +321,7 @@ def test_draws_are_independent_of_thread_count():
         assert np.array_equal(code, noisy.read(first, seed=1, n_threads=n_threads))
 
 
-@pytest.mark.slow(keep=4)
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("n_threads", [1, 2, 7])
 @pytest.mark.parametrize(
     "extra", [{}, {"crosstalk": fs.sensor.Diffusion(spread_um=0.3)}, {"shot_noise": "exact"}], ids=str
@@ -693,6 +693,7 @@ def test_cropped_sensor_gives_identical_codes(effect):
     assert np.array_equal(crop, complete[ids])
 
 
+@pytest.mark.slow
 def test_codes_are_independent_of_process_and_order():
     program = """
 import hashlib, sys

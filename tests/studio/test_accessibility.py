@@ -78,7 +78,7 @@ def test_pages_have_no_serious_violations(browser, tmp_path, make, scheme):
     assert found == []
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_studio_has_no_serious_violations(visit, scheme):
     page = visit(width=1800, height=1000, color_scheme=scheme)
@@ -98,7 +98,7 @@ def test_studio_has_no_serious_violations(visit, scheme):
     check(page)
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 def test_violations_are_found(browser):
     page = browser.new_page()
     page.set_content("<p style='color: #ccc; background: #fff'>pale</p><input><img src='data:,'>")

@@ -32,7 +32,7 @@ pytestmark = pytest.mark.needs("chromium")
 # -- views ------------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 def test_every_view_shows_data(visit):
     page = visit(width=2560, height=1440)
     until(page, "() => ['noise', 'spectrum', 'mtf', 'rules', 'scene'].every((name) => studio.views.parts[name])")

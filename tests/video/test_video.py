@@ -112,7 +112,7 @@ def test_image_of_same_object_is_computed_once():
     assert np.array_equal(second.expected_e, third.expected_e)
 
 
-@pytest.mark.slow(keep=5)
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize(
     "changes", [{}, {"pupil": fs.optics.Blades(6), "zernike": fs.optics.Zernike(coefficients={7: 0.05})}]

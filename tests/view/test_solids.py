@@ -115,6 +115,7 @@ def test_lens_is_at_most_a_hemisphere():
     assert top_um == pytest.approx([0.6 + 1.0 / np.sqrt(np.pi), 0.6 + 3.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["squares", "rings with arcs", "gaps"])
 def test_round_lenses_closed_without_overlap(name):
     model = solids(LAYOUTS[name](), SensorStack(n_lens_corners=20, n_lens_steps=5))

@@ -595,6 +595,7 @@ def test_ambient_occlusion_darkens_without_edge_artefact():
     assert np.all(shaded[:, [0, -1]] == render3d.BACKGROUND)
 
 
+@pytest.mark.slow
 @pytest.mark.needs("renderer")
 def test_ambient_occlusion_leaves_plane_unchanged():
     flat = prisms(fs.layout.grid(n_x=40, n_y=40, pitch_um=2.0), np.ones(1600), by=np.full((1600, 3), 200, np.uint8))
@@ -657,7 +658,7 @@ print(fs.view.find_renderer(), len(np.unique(picture)) > 2, *[w.message for w in
 """
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("machine", MACHINES)
 def test_missing_drivers_do_not_crash_interpreter(machine):
     bare = {k: v for k, v in os.environ.items() if k not in {"DISPLAY", renderer.VTK_VARIABLE}}

@@ -922,6 +922,7 @@ def in_one_order(triangles_um, sites, *more):
 BIG = fs.layout.mosaic(fs.layout.grid(n_x=90, n_y=70, pitch_um=2.0), ("RG", "GB"))
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("layout", "meshes", "n_tiles"),
     [
@@ -1057,7 +1058,7 @@ VIEWS = {
 }
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.needs("chromium")
 @pytest.mark.parametrize(
     "build",
@@ -1110,7 +1111,7 @@ def test_picks_match_ray_casting(visit, build):
         assert (which[0][is_clear] >= 0).sum() > 25
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.needs("chromium")
 def test_gestures_change_only_the_view(visit):
     page = visit(solid_page(CAPTURE))

@@ -181,7 +181,7 @@ def test_colours_are_set_in_both_directions(show):
     until(frame, lambda: page.query_selector("iframe").bounding_box()["height"] == 400)
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.needs("chromium")
 @pytest.mark.parametrize(("style", "theme"), [("color: #eee", "dark"), ("color: #111", "light")])
 def test_theme_follows_the_notebook(show, style, theme):

@@ -761,7 +761,7 @@ HARMLESS = {
 }
 
 
-@pytest.mark.slow(keep=("geojson-", "yaml-"))
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("extension", "name"), [(extension, name) for extension, bombs in BOMBS.items() for name in bombs]
 )
@@ -847,7 +847,7 @@ def test_flipped_bits_raise_or_give_layout(valid_files, tmp_path, extension):
         assert_harmless(answer, ERRORS | {"Layout"})
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("extension", ["npz", "parquet"])
 def test_flipped_directory_bits_raise_or_give_layout(valid_files, tmp_path, extension):
     data = valid_files[extension]

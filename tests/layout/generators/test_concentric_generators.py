@@ -188,7 +188,7 @@ def test_giotto_neighbours_share_edges_exactly(parameters):
     assert set(counts) == {1, 2}
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("chords_per_arc", [1, 2, 3, 4, 7])
 @pytest.mark.parametrize("stagger", [False, True])
 @pytest.mark.parametrize("fovea", ["rings", "none"])
@@ -577,7 +577,7 @@ def test_octagonal_rejects_invalid_parameters(changed, message):
 # -- all families ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "parameters", "n_sites", "area_um2"),
     [

@@ -206,6 +206,7 @@ def areas_um2(edges, n):
     return np.bincount(edges.cell, 0.5 * (x0 * y1 - x1 * y0), minlength=n)
 
 
+@pytest.mark.slow
 @given(st.sampled_from([BOX, NOTCH, STAR, FRAME]), st.integers(5, 120), st.sampled_from([0.05, 0.3, 1.0]), seeds)
 @relaxed
 def test_updated_cells_equal_new_cells(region, n, step_fraction, seed):
@@ -295,6 +296,7 @@ def test_shared_edges_are_paired():
 # -- isotropic foveal rings ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @given(st.floats(10.0, 5000.0), st.floats(1e-3, 1e3), st.integers(1, 25))
 @relaxed
 def test_foveal_rings_tile_disc_without_blind_spot(fov_um, a_fraction, n_rings):
@@ -457,6 +459,7 @@ def test_density_driven_sites_tile_region(n_sites, region, density, n_iterations
     assert layout.columns["share"].mean() == pytest.approx(1.0, rel=1e-12)
 
 
+@pytest.mark.slow
 @given(seeds)
 @settings(relaxed, max_examples=5)
 def test_layout_depends_only_on_seed(seed):
@@ -928,6 +931,7 @@ def test_invalid_quadtree_raises(changes, message):
 shapes = st.sampled_from(["disc", "square"])
 
 
+@pytest.mark.slow
 @given(st.floats(0.1, 50.0), st.floats(3.0, 40.0), shapes)
 @relaxed
 def test_penrose_rhombs_tile_without_gaps(side_um, size, shape):

@@ -39,7 +39,7 @@ CASES = [
 IDS = [f"{name}-{'-'.join(sorted(set(parameters) - {'importance'}))}" for name, parameters in CASES]
 
 
-@pytest.mark.slow(keep=15)
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")
 @pytest.mark.parametrize("n_sites", [900, 2117])
 @pytest.mark.parametrize(("name", "parameters"), CASES, ids=IDS)

@@ -46,6 +46,7 @@ def size_um(layout):
 # -- lattices in a region --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @relaxed
 @given(
     name=st.sampled_from(sorted(REGIONS)),
