@@ -2,8 +2,9 @@
 Selection of tests, their requirements, kernels, and distribution to processes.
 
 The default run leaves out tests marked ``slow`` and tests in a browser, except for those that ``slow(keep=...)`` selects: a
-number of parameter sets of each function, spread evenly, or parts of their names. Runs of named files and directories, and
-those with FOVEASIM_TESTS_ALL=1, contain all tests. ``needs("renderer")``, ``"chromium"``, ``"torch"`` mark requirements.
+number of parameter sets of each function, spread evenly, or parts of their names; its random tests have a third of the
+examples. Runs of named files and directories, and those with FOVEASIM_TESTS_ALL=1, contain all tests. ``needs("renderer")``,
+``"chromium"``, ``"torch"`` mark requirements.
 """
 
 from __future__ import annotations
@@ -18,12 +19,9 @@ from pathlib import Path
 
 import hypothesis
 import pytest
+from effort import examples
 
 from foveasim import compile_kernels
-
-# New examples in each run on a developer's machine, the same ones in continuous integration.
-hypothesis.settings.register_profile("foveasim", deadline=None, derandomize="CI" in os.environ)
-hypothesis.settings.load_profile("foveasim")
 
 # Bytecode is stored next to the sources, as is the machine code of kernels, even where the environment disables it: the tests start
 # hundreds of processes, and each would compile the package.
@@ -64,11 +62,15 @@ INDEPENDENT = {
 
 def pytest_configure(config):
     """Select all tests of named files; compile all kernels once, before several processes would each compile them."""
-    if hasattr(config, "workerinput"):
-        return
-    if config.args_source is config.ArgsSource.ARGS:
+    is_worker = hasattr(config, "workerinput")
+    if not is_worker and config.args_source is config.ArgsSource.ARGS:
         os.environ.setdefault("FOVEASIM_TESTS_ALL", "1")
-    if getattr(config.option, "numprocesses", None):
+    # New examples in each run on a developer's machine, the same ones in continuous integration.
+    hypothesis.settings.register_profile(
+        "foveasim", deadline=None, max_examples=examples(100), derandomize="CI" in os.environ
+    )
+    hypothesis.settings.load_profile("foveasim")
+    if not is_worker and getattr(config.option, "numprocesses", None):
         compile_kernels()
 
 

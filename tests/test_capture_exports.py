@@ -252,7 +252,7 @@ CORRUPTIONS = {
 }  # fmt: skip
 
 
-@pytest.mark.slow(keep=12)
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("how", CORRUPTIONS)
 def test_corrupt_store_gives_file_error(capture, tmp_path, how):
     store = tmp_path / "x.zarr"

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
@@ -72,7 +73,7 @@ def test_edges_of_picture_meet_layout(fit):
 
 
 @given(n_x=st.integers(2, 60), n_y=st.integers(2, 60), n_columns=st.integers(1, 9), n_rows=st.integers(1, 9))
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 def test_cover_and_contain_are_dual(n_x, n_y, n_columns, n_rows):
     """A picture lies within a layout when the layout, as a picture, covers the picture, as a layout."""
     within = camera_of(fs.layout.grid(n_x=n_columns, n_y=n_rows, pitch_um=1.0)).frame(
@@ -106,7 +107,7 @@ def test_moved_layout_is_framed_from_lens_axis(move_um, fit, image_um):
 @pytest.mark.filterwarnings("ignore:.*lie partly or completely outside the image")
 @pytest.mark.parametrize("fit", ["cover", "contain", "width"])
 @given(dx_um=st.floats(-1e3, 1e3), dy_um=st.floats(-1e3, 1e3))
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 def test_picture_is_framed_on_moved_layout(fit, dx_um, dy_um):
     """A chip that is drawn with its origin in a corner, or anywhere, has the captures of a centred one."""
     centred, scene = camera_of(order=1), scene_of(fit=fit)

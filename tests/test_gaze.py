@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -447,7 +448,7 @@ def test_video_warns_once_of_sites_outside_image():
 
 
 @given(st.integers(1, 20), st.integers(0, 2**32 - 1))
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 def test_paths_are_read_as_written(tmp_path_factory, n, seed):
     rng = np.random.default_rng(seed)
     path = GazePath(np.sort(rng.random(n)), rng.normal(scale=100.0, size=(n, 2)))

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -21,7 +22,7 @@ from foveasim._core.rings import (
     site_moments,
 )
 
-relaxed = settings(max_examples=60)
+relaxed = settings(max_examples=examples(60))
 
 #: Multiples of 2^-16 µm, which shifts by integer µm preserve exactly.
 dyadic = st.integers(-(2**20), 2**20).map(lambda k: k / 2**16)
@@ -193,7 +194,7 @@ small = st.tuples(st.integers(-4, 4), st.integers(-4, 4))
 
 
 @given(st.lists(st.lists(small, min_size=3, max_size=7), min_size=1, max_size=6))
-@settings(max_examples=400)
+@settings(max_examples=examples(400))
 def test_convex_rings_equal_their_hulls(all_rings):
     all_rings = [ring for ring in all_rings if all(a != b for a, b in pairwise([*ring, ring[0]]))]
     if not all_rings:

@@ -140,6 +140,7 @@ def covariance_of_squares(layout, side_um, covariance):
     return total
 
 
+@pytest.mark.slow(keep=6)
 @pytest.mark.parametrize("snr", [10.0, 1000.0])
 @pytest.mark.parametrize("side_um", [1.0, 2.0, 4.0, 8.0, 16.0, 32.0])
 @pytest.mark.parametrize("sigma_um", [(3.0,), (1.5, 6.0, 24.0)])

@@ -6,13 +6,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+from effort import examples
 
 import foveasim as fs
 from foveasim.compare import median_interval
 from foveasim.compare.intervals import format_interval
 from foveasim.errors import ParameterError
 
-N_SCENES, N_SAMPLES = 120, 20_000
+N_SCENES, N_SAMPLES = examples(120), 20_000
 MEASURES_OF_SCENES = ("ssim", "shift_sigma_um", "psnr_db", "snr_db", "information_bit_per_site")
 
 

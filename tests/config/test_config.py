@@ -465,6 +465,7 @@ def test_all_bundled_layouts_are_listed():
     assert list(bundled_layouts()) == sorted(SHIPPED)
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize("name", SHIPPED)
 def test_bundled_layout_satisfies_its_rules(name, tmp_path):
     file = read_any_layout(name)

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -24,7 +25,7 @@ from foveasim.errors import ConfigError, FileError, GeometryError, ParameterErro
 
 cv2 = pytest.importorskip("cv2")
 
-relaxed = settings(max_examples=40)
+relaxed = settings(max_examples=examples(40))
 SIZE = (1920, 1080)
 PIXEL_UM = 2.2
 

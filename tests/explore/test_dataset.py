@@ -104,6 +104,7 @@ def test_samples_do_not_depend_on_order():
         assert_same(labelled()[k], forwards[k])
 
 
+@pytest.mark.slow
 def test_samples_do_not_depend_on_process():
     data = labelled()
     order = np.random.default_rng(1).permutation(len(data)).tolist()
@@ -1136,6 +1137,7 @@ CONTAINERS = {
 }
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize("container", CONTAINERS)
 def test_changed_inputs_are_rejected(container, tmp_path):
     """Complete shards of changed inputs are not overwritten; missing shards use the current inputs."""

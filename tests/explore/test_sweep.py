@@ -377,6 +377,7 @@ def test_pause_of_all_workers_is_reported(monkeypatch):
         with_timeout(lambda: explore.run_sweep(pausing_plan(lambda _: True), workers=2))
 
 
+@pytest.mark.slow
 def test_killed_scheduler_is_reported_with_journal(scheduler, tmp_path):
     """Runs last with this scheduler, which it kills."""
     address, program = scheduler
@@ -754,6 +755,7 @@ UNUSUAL = {
 }
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize("kind", UNUSUAL)
 def test_unusual_results_are_stored_and_read(kind, tmp_path):
     plan = explore.plan_sweep(SHOT, {"exposure_s": [0.01, 0.02]}, repeats=2)

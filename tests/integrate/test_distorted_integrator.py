@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -107,7 +108,7 @@ def test_operator_adjoint_and_matrix_agree(conserve):
     assert (integrator.spread(values) * cells).sum() == pytest.approx((integrator(cells) * values).sum(), rel=1e-12)
 
 
-@settings(max_examples=12)
+@settings(max_examples=examples(12))
 @given(x_um=st.floats(-40, 40), y_um=st.floats(-40, 40))
 def test_point_source_appears_at_distorted_position(x_um, y_um):
     """An asymmetric lens, points in all four quadrants: neither axis is mirrored."""

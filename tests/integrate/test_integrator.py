@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.clipping import exact_weights, shapely_weights
@@ -61,7 +62,7 @@ def test_zoo_sums_equal_rational_clipping(name, compiled):
     assert fs.Integrator(layout, GRID, compiled=compiled)(MAP)[0] == pytest.approx(expected, rel=EXACT, abs=0.0)
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(polygon=polygons(SHAPE))
 def test_random_polygons_equal_rational_clipping(polygon):
     expected = float((exact_weights(polygon, SHAPE) * MAP).sum())
@@ -71,7 +72,7 @@ def test_random_polygons_equal_rational_clipping(polygon):
         assert fs.Integrator(layout, GRID, compiled=compiled)(MAP)[0] == pytest.approx(expected, rel=EXACT, abs=0.0)
 
 
-@settings(max_examples=2500)
+@settings(max_examples=examples(2500))
 @given(polygon=polygons(SHAPE))
 def test_random_polygons_agree_with_shapely_clipping(polygon):
     expected = float((shapely_weights(polygon, SHAPE) * MAP).sum())
@@ -173,7 +174,7 @@ def test_split_site_parts_add_up(name):
     assert parts.sum() == pytest.approx(unsplit, rel=EXACT)
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(
     pitch_um=st.floats(2.0, 1e3),
     x0=st.floats(-1e4, 1e4),

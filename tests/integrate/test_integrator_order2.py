@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from reference.polygons import POLYGONS, polygons
 
@@ -119,7 +120,7 @@ def test_linear_fields_are_exact_over_the_zoo(name):
     )
 
 
-@settings(max_examples=1000)
+@settings(max_examples=examples(1000))
 @given(polygon=polygons(SHAPE))
 def test_linear_fields_are_exact_over_random_polygons(polygon):
     assert second(polygon)(linear_means())[0] == pytest.approx(linear_integral(polygon), rel=EXACT, abs=0.0)
@@ -133,7 +134,7 @@ def test_random_map_equals_clipping_over_zoo(name):
 
 
 @pytest.mark.slow
-@settings(max_examples=150)
+@settings(max_examples=examples(150))
 @given(polygon=polygons(SHAPE))
 def test_random_map_equals_clipping_over_polygons(polygon):
     expected = second_order_by_clipping(polygon, MAP)
@@ -141,7 +142,7 @@ def test_random_map_equals_clipping_over_polygons(polygon):
         assert second(polygon, compiled=compiled)(MAP)[0] == pytest.approx(expected, rel=EXACT, abs=1e-15)
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(polygon=polygons((2, 2)))
 def test_two_by_two_map_is_exact(polygon):
     got = second(polygon, fs.Grid((2, 2), 1.0))(linear_means((2, 2)))[0]

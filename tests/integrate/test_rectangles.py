@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -188,7 +189,7 @@ def test_clockwise_rectangles_are_rejected():
         fs.Integrator(layout, fs.Grid((4, 4), 1.0))
 
 
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(
     ends=st.lists(st.tuples(st.floats(-3, 12), st.floats(0.01, 9)), min_size=1, max_size=4),
     pitch=st.floats(0.05, 3),

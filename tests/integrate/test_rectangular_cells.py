@@ -9,6 +9,7 @@ import pytest
 import shapely
 import xarray as xr
 from astropy.io import fits
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.polygons import POLYGONS
@@ -147,7 +148,7 @@ def test_weights_agree_with_shapely_clipping(layout):
 
 
 @ORDER
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(
     pitch=st.tuples(st.floats(0.05, 20.0), st.floats(0.05, 20.0)),
     origin=st.tuples(st.floats(-9.0, 1.0), st.floats(-9.0, 1.0)),
@@ -286,6 +287,7 @@ def rectangular_map():
     return fs.PowerMap(rng.random((2, 5, 7), dtype=np.float32), grid, np.array([450.0, 620.5]))
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("extension", ["npz", "fits", "tif", "exr", "nc", "zarr"])
 def test_files_round_trip_rectangular_cells(tmp_path, extension):
     light = rectangular_map()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -84,7 +85,7 @@ def test_gradient_agrees_with_difference_quotients(order):
 
 @pytest.mark.parametrize("order", [1, 2])
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 def test_drawn_outlines_agree_with_differences(order, seed):
     check_against_differences(random_layout(seed), random_map(seed % 1000), order, np.random.default_rng(seed), 3)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -72,7 +73,7 @@ def test_max_gap_includes_sites_across_trench():
     )
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(seed=st.integers(0, 10_000), angle_deg=st.floats(0, 360))
 def test_random_tilings_agree_with_shapely(seed, angle_deg):
     """Random guillotine cuts; the reference is the common line of each pair before the rotation."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -127,7 +128,7 @@ def test_noding_t_junctions_gives_valid_coverage(angle_deg):
     assert rotated.area_um2 == pytest.approx(ZONES.area_um2, rel=1e-12)
 
 
-@settings(max_examples=25)
+@settings(max_examples=examples(25))
 @given(angle_deg=st.floats(0, 90), grid_um=st.sampled_from([0.001, 0.005, 0.02]), name=st.sampled_from(sorted(TILINGS)))
 def test_snapping_creates_no_gaps_or_overlaps(angle_deg, grid_um, name):
     layout = node(TILINGS[name]).rotate(angle_deg).translate(0.3, 0.7)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -85,7 +86,7 @@ def test_line_within_site_raises():
         fs.layout.cut_along(GRID, [[1.0, 1.0], [9.0, 9.0]])
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(dx=st.floats(-3.0, 3.0), dy=st.floats(-3.0, 3.0))
 def test_moved_inner_vertex_preserves_tiling(dx, dy):
     edited = fs.layout.move_vertices(GRID, [[0.0, 0.0]], [[dx, dy]])

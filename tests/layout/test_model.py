@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely import affinity
@@ -18,7 +19,7 @@ from shapely import affinity
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout import Layout
 
-relaxed = settings(max_examples=60)
+relaxed = settings(max_examples=examples(60))
 
 #: Coordinates are multiples of this, so that shifts by whole µm are exact.
 STEP_UM = 2.0**-16
@@ -586,7 +587,7 @@ def test_invalid_selection_raises(mixed, selection, error, message):
     ],
 )
 @given(polygons=polygon_lists())
-@settings(relaxed, max_examples=10)
+@settings(relaxed, max_examples=examples(10))
 def test_quarter_turns_are_exact(angle_deg, rotated, polygons):
     layout = Layout.from_polygons(polygons)
     x, y = layout.xy_um.T

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
@@ -147,7 +148,7 @@ def test_all_lines_cross_first_ring():
 
 
 @pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")  # large ratios end below r_max_um
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(
     n_sectors=st.integers(10, 40),
     fovea=st.sampled_from(["none", "rings", "linear", "hexagons"]),

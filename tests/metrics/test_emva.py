@@ -405,6 +405,7 @@ def test_intervals_contain_parameter_with_stated_probability(sensors, name, true
     assert all(each.intervals.is_resolved(name)[0] for each in sensors)
 
 
+@pytest.mark.slow
 def test_simultaneous_intervals_contain_parameters(sensors):
     for name in ("linearity_error_min_fraction", "linearity_error_max_fraction", "underflow_fraction"):
         assert coverage(sensors, name, 0.0) >= 0.95 - COVERAGE_ERROR, name

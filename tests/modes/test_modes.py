@@ -619,7 +619,7 @@ def write_corrupt_hdf5(path, defect):
             file.create_dataset("events/p", (10**11,), "u1", chunks=(10**6,), compression="gzip")
 
 
-@pytest.mark.slow(keep=4)
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("defect", "message"),
     [

@@ -322,7 +322,7 @@ def test_psf_is_exact_at_patch_centre(n_patches):
     assert power_map.data[0] == pytest.approx(reference.data[0], abs=0.02 * reference.data.max())
 
 
-@pytest.mark.slow(keep=3)
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("padding_cells", [None, 0, 30])
 @pytest.mark.parametrize("padding", ["reflect", "edge", "zero"])
 def test_patches_with_equal_psfs_match_convolution(padding, padding_cells):
@@ -461,7 +461,7 @@ def test_unit_lateral_colour_is_bit_identical():
     assert np.array_equal(plain, same)
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("moved_cells", [3.0, 11.3, 27.0])
 def test_tilt_displaces_psf_over_wide_cells(moved_cells):
     """Reference: the same tilt on cells a fifth as wide as 2.6 λN, binned."""

@@ -48,7 +48,7 @@ def airy_energy(centre, sides):
     return np.array(found)
 
 
-@pytest.mark.slow(keep=21)
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize("k", [2, 3, 4, 5])
 @pytest.mark.parametrize("cells_per_lambda_n", [0.3, 0.7, 1.2, 3.0])
 @pytest.mark.parametrize("source_pixel", ["point", "square"])

@@ -88,7 +88,7 @@ def test_strehl_matches_quadrature_for_36_terms(pupil):
         assert got == pytest.approx(np.abs(weight @ wave) ** 2 / weight.sum() ** 2, rel=1e-6), term
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["circle", "obstructed", "picture"])
 def test_psf_is_independent_of_window(name):
     optics = lens(PUPILS[name][0], z8=0.5, z36=-0.2)
@@ -167,6 +167,7 @@ def test_otf_of_picture_is_pixel_correlation():
     assert got == pytest.approx(np.array(expected), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_otf_is_transform_of_psf():
     """The phase of the OTF has the sign of its definition, also for an asymmetric PSF."""
     optics = lens([Blades(5, angle_deg=11.0)], z7=0.3, z10=0.1, z2=0.2)

@@ -148,6 +148,7 @@ def test_sampled_circle_otf_matches_closed_form(n_across):
     assert otf[n + 3, n + 3] == 1.0
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("angle_deg", [0.0, 30.0, 77.0])
 def test_interpolated_otf_matches_closed_form(angle_deg):
     s = np.linspace(0.0, 1.2, 601)
@@ -261,6 +262,7 @@ def test_near_point_psf_scales_with_bellows_factor():
 # -- power maps--------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("cells_per_lambda_n", [4.1, 1.3, 0.4, 0.11])
 def test_sampled_circle_map_matches_closed_form(cells_per_lambda_n):
     closed, sampled = lens(), lens(pupil=clear)

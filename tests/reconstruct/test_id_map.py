@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.id_map import id_map as slow_id_map
@@ -51,7 +52,7 @@ def lattice_sites(draw):
 
 @pytest.mark.slow
 @given(layout=lattice_sites(), steps=st.sampled_from([1, 2, 4]), n_threads=st.sampled_from([1, 3]))
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 def test_samples_match_exact_rational_arithmetic(layout, steps, n_threads):
     # Pixel centres at multiples of 1, 1/2 and 1/4.
     n = 10 * steps

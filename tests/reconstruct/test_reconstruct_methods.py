@@ -80,6 +80,7 @@ def test_flat_field_stays_flat(layout, method):
     assert np.nanmax(np.abs(picture.data - 7.5)) <= 7.5e-6
 
 
+@pytest.mark.slow(keep=2)
 @METHOD
 def test_uncovered_pixels_are_nan(method):
     grid = raster_grid(FOVEAL, 151)

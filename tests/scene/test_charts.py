@@ -102,7 +102,7 @@ def test_slanted_edge_matches_polygon_areas(angle_deg, shape):
     np.testing.assert_allclose(got, shapely.area(shapely.intersection(pixels, white)), atol=2 * EPS32)
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("n_spokes", [2, 3, 8, 31])
 def test_star_matches_sector_areas(n_spokes):
     shape, radius_mm = (41, 46), 19.3

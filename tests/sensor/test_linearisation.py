@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import scipy.constants
+from effort import examples
 from reference.own_effects import RowNoise
 
 from foveasim import Sensor
@@ -190,7 +191,7 @@ def test_several_charges_take_one_call():
 @pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("bits", [8, 12])
 def test_covariance_matches_draws(bits):
-    n_frames, full_e = 20_000, 2e4 * (16 if bits == 8 else 1) / 16
+    n_frames, full_e = examples(20_000), 2e4 * (16 if bits == 8 else 1) / 16
     # At least one code of noise at both resolutions.
     sensor = sensor_of(
         "mixed", bits=bits, capacitance_f=full_e * ELEMENTARY_CHARGE_C, effects=[RowNoise(60.0 if bits == 8 else 30.0)]

@@ -645,6 +645,7 @@ PATTERN_OF_KEYWORD = {
 }
 
 
+@pytest.mark.slow(keep=5)
 @pytest.mark.parametrize("effect", SWITCHES)
 def test_disabled_effect_leaves_other_draws_unchanged(effect):
     on, off = sensor(**ALL), sensor(**{**ALL, effect: SWITCHES[effect]})

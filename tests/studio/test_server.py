@@ -168,6 +168,7 @@ def test_other_files_are_not_served(served, path):
     assert served.get(path)[0] in (404, 405)
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize(
     ("name", "value", "status"),
     [
@@ -197,6 +198,7 @@ def test_other_hosts_and_origins_are_rejected(served, name, value, status):
                 run(connect())
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize(
     "first", ['{"token": "wrong"}', "{}", "[]", "x", '{"token": 5}', '{"token": "é"}', r'{"token": "\ud800"}']
 )

@@ -146,6 +146,7 @@ def test_errors_disappear_with_valid_change(recorder):
     assert recorder.do(do="set", key="optics.f_number", value=4.0, final=True)["errors"] == {}
 
 
+@pytest.mark.slow(keep=6)
 @pytest.mark.parametrize(
     "message",
     [
@@ -173,6 +174,7 @@ def test_malformed_messages_give_one_line(recorder, message):
     assert recorder.do(do="set", key="seed", value=9, final=True)["errors"] == {}
 
 
+@pytest.mark.slow(keep=5)
 @pytest.mark.parametrize(
     "message",
     [

@@ -236,7 +236,7 @@ def test_corrupt_picture_of_folder_is_named(visit):
     assert "a.png" in setting(page, "scene.picture")
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 def test_source_menu_selects_test_chart(visit):
     page = visit()
     page.focus("#source")

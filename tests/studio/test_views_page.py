@@ -79,7 +79,7 @@ def test_signal_mark_follows_exposure(visit):
     assert page.evaluate("studio.views.made.photon_transfer.chart.marks[0].x") == pytest.approx(before / 2, rel=1e-3)
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 def test_logarithmic_chart_reads_values_at_mouse(visit):
     page = visit()
     show(page, "snr")

@@ -885,7 +885,7 @@ def small_chunks(monkeypatch):
     monkeypatch.setattr(sys.modules[read_recording.__module__], "CHUNK_CODES", 500)
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow(keep=1)
 @pytest.mark.usefixtures("small_chunks")
 @pytest.mark.parametrize("n_added", [(0, 3), (4, 1, 4), (5, 6), (11,), (1, 0, 1)])
 def test_interrupted_recording_resumes_bit_identically(tmp_path, n_added):
@@ -1120,7 +1120,7 @@ GAZE_FRAMES = {
 }
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("kind", GAZE_FRAMES)
 @pytest.mark.parametrize("every", [1, 2])
 def test_recordings_store_and_check_gaze(tmp_path, kind, every):

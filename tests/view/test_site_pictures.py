@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib import colormaps
@@ -64,7 +65,7 @@ def test_pixels_are_exact_means_of_clipped_polygons():
 
 
 @pytest.mark.slow
-@settings(max_examples=25)
+@settings(max_examples=examples(25))
 @given(st.integers(0, 2**32 - 1), st.integers(1, 9), st.integers(1, 9), st.sampled_from(["viridis", "gray"]))
 def test_values_have_colours_of_their_map_only(seed, n_y, n_x, colour_map):
     rng = np.random.default_rng(seed)

@@ -286,7 +286,7 @@ def row(page, label):
     )
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.needs("chromium")
 def test_mouse_shows_site_and_values(visit):
     page = visit(web_page(MIXED_LAYOUT))
@@ -627,7 +627,7 @@ MALICIOUS = (
 )
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.needs("chromium")
 def test_untrusted_names_are_escaped(visit, tmp_path):
     layout = MIXED_LAYOUT.with_columns(**{

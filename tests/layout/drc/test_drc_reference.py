@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.rules import REFERENCES, layouts
@@ -16,7 +17,7 @@ from shapely.affinity import rotate
 import foveasim as fs
 from foveasim.layout.drc.rules import RULES
 
-relaxed = settings(max_examples=60)
+relaxed = settings(max_examples=examples(60))
 
 #: Steps, and the tolerances of deviations from them (degrees, µm).
 STEPS = {

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -46,7 +47,7 @@ def test_low_density_found_only_around_hole():
     assert [0.25 - v.value for v in report.violations] == pytest.approx(removed_fraction)
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(seed=st.integers(0, 10_000), window_um=st.floats(3.0, 30.0), has_die=st.booleans())
 def test_densities_match_clipped_site_areas(seed, window_um, has_die):
     rng = np.random.default_rng(seed)
@@ -89,7 +90,7 @@ def test_data_rate_limit_is_checked():
 @pytest.mark.filterwarnings(
     "ignore::foveasim.errors.LayoutWarning"
 )  # with coarse ratios, the last ring lies inside r_max_um
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(n_sectors=st.integers(20, 400), pitch_um=st.floats(0.2, 2.0), n_layers=st.integers(1, 4))
 def test_log_polar_lines_cross_first_ring(n_sectors, pitch_um, n_layers):
     layout = log_polar(n_sectors=n_sectors, min_size_um=2.0, r_max_um=2.0 * n_sectors)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -58,7 +59,7 @@ def test_site_overlapping_several_is_dropped_alone():
     assert changed(changes) == {0}
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(seed=st.integers(0, 10_000), repair=st.sampled_from(["drop", "merge", "refill"]))
 def test_repair_satisfies_rules_and_preserves_rest(seed, repair):
     rng = np.random.default_rng(seed)

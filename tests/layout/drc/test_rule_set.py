@@ -8,6 +8,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.affinity import rotate
@@ -77,7 +78,7 @@ def test_space_rule_ignores_abutting_sites():
     assert report.violations[0].marker.length == pytest.approx(0.3)
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(seed=st.integers(0, 10_000), limit_um=st.floats(0.1, 2.0))
 def test_spaces_match_pairwise_distances(seed, limit_um):
     rng = np.random.default_rng(seed)

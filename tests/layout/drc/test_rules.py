@@ -11,6 +11,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from rich.console import Console
@@ -20,7 +21,7 @@ from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout import DesignRules, Layout, grid, hexagonal, log_polar, zones
 from foveasim.layout.drc.rules import min_width_um
 
-relaxed = settings(max_examples=40)
+relaxed = settings(max_examples=examples(40))
 
 #: All rules of this file; a layout of 25 unit squares around the origin satisfies them.
 ALL_RULES = DesignRules(
@@ -222,7 +223,7 @@ def test_width_ignores_coincident_vertices():
 
 @pytest.mark.parametrize("shape", [shape for shape, _ in WIDTHS.values()], ids=WIDTHS)
 @given(angle_deg=st.floats(0, 360), factor=st.floats(0.1, 10), shift_um=st.integers(-1000, 1000))
-@settings(relaxed, max_examples=15)
+@settings(relaxed, max_examples=examples(15))
 def test_width_follows_rotation_and_scale(shape, angle_deg, factor, shift_um):
     layout = Layout.from_polygons([shape])
     moved = layout.rotate(angle_deg).scale(factor).translate(shift_um, -shift_um)

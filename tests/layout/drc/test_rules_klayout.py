@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.rules import layouts
@@ -17,7 +18,7 @@ import foveasim as fs
 kdb = pytest.importorskip("klayout.db")
 rdb = pytest.importorskip("klayout.rdb")
 
-relaxed = settings(max_examples=40)
+relaxed = settings(max_examples=examples(40))
 seeds = st.integers(0, 2**32 - 1)
 
 #: Database unit of polygons compared in memory.

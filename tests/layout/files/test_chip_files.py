@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -565,7 +566,7 @@ def test_flat_file_has_same_content(bayer, tmp_path, extension):
     assert_lossless(fs.read_layout(tmp_path / f"False.{extension}"), bayer)
 
 
-@pytest.mark.slow(keep=4)
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize(("extension", "then"), [("gds", "gds"), ("gds", "oas"), ("oas", "oas")])
 @pytest.mark.parametrize("name", ["grid", "one row", "hexagons", "x_trans", "flags"])
 def test_arrays_survive_klayout(tmp_path, extension, then, name):
@@ -670,7 +671,7 @@ def lattices(draw):
     return rng.permutation(table) if draw(st.booleans()) else table
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(lattices())
 def test_arrays_reproduce_every_site_once(table):
     columns = {"a": table[:, 3]}
@@ -690,7 +691,7 @@ def test_arrays_reproduce_every_site_once(table):
     assert sorted(seen) == list(range(len(table)))
 
 
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(-9, 9), st.integers(-9, 9)), min_size=1, max_size=30))
 def test_congruent_sites_are_equal_up_to_translation(sites):
     shapes = [
@@ -710,7 +711,7 @@ def test_congruent_sites_are_equal_up_to_translation(sites):
     assert origin.tolist() == [r.min(0).tolist() for r in rings]
 
 
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 @given(st.lists(st.tuples(st.integers(3, 12), st.integers(3, 12), st.integers(0, 2**32)), min_size=1, max_size=5))
 def test_parts_of_holed_sites_cover_them(sites):
     polygons = []

@@ -201,6 +201,7 @@ HARD_FLOATS = [
 HARD_INTS = [0, -1, 2**53 + 1, 2**63 - 1, -(2**63), -(2**63) + 1, 2**32, -(2**31)]
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("extension", GDSII_OASIS)
 @pytest.mark.parametrize(
     "column",
@@ -346,6 +347,7 @@ def test_shape_without_columns_drops_all_columns(tmp_path, text):
     assert list(edited(tmp_path, edit)) == []
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize(
     ("text", "left"),
     [
@@ -664,6 +666,7 @@ def test_large_coordinates_require_larger_unit(tmp_path):
         write_layout(layout, tmp_path / "a.gds", dbu_um=1e-4)
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("extension", GDSII_OASIS)
 @pytest.mark.parametrize("n", [8190, 8191, 12_000])
 def test_site_with_many_vertices_round_trips(tmp_path, extension, n):

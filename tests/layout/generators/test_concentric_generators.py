@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -19,7 +20,7 @@ from foveasim.layout.generators.giotto import giotto, giotto_ratio
 from foveasim.layout.generators.grid import grid
 from foveasim.layout.generators.octagonal import octagonal
 
-relaxed = settings(max_examples=40)
+relaxed = settings(max_examples=examples(40))
 
 units_um = st.floats(0.05, 50.0)
 
@@ -165,7 +166,7 @@ def test_giotto_ring_radii_follow_rule(parameters):
 
 
 @given(giotto_parameters())
-@settings(relaxed, max_examples=80)
+@settings(relaxed, max_examples=examples(80))
 def test_giotto_tiles_disc_or_annulus(parameters):
     layout = giotto(**parameters)
     n_corners = outer_corners(parameters)
@@ -336,7 +337,7 @@ def half_sides_um(n_rings, ring_ratio, pitch_um, n_fovea=1):
 
 
 @given(foveal_parameters())
-@settings(relaxed, max_examples=80)
+@settings(relaxed, max_examples=examples(80))
 def test_foveal_cartesian_tiles_its_square(parameters):
     layout = foveal_cartesian(**parameters)
     half_um = half_sides_um(**parameters)[-1]
@@ -474,7 +475,7 @@ def octagonal_parameters(draw):
 
 
 @given(octagonal_parameters())
-@settings(relaxed, max_examples=60)
+@settings(relaxed, max_examples=examples(60))
 def test_octagons_and_diamonds_tile_without_holes(parameters):
     layout = octagonal(**parameters)
 

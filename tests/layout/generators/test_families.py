@@ -16,6 +16,7 @@ from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_ty
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 
@@ -26,7 +27,7 @@ from foveasim.layout import LAYOUTS
 
 #: Most random combinations of parameters are invalid, and generators reject them with an error of the package.
 random_settings = settings(
-    max_examples=60,
+    max_examples=examples(60),
     suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
 )
 without_warnings = pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")
@@ -164,6 +165,7 @@ def test_provenance_reproduces_layout(family):
         assert np.array_equal(LAYOUTS[family.generator](**parameters).xy_um, layout.xy_um)
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_settings_schema_contains_generator(name):
     sections = schema()["$defs"]

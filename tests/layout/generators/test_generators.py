@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
@@ -18,7 +19,7 @@ from scipy.spatial import cKDTree
 from foveasim.errors import LayoutWarning, ParameterError
 from foveasim.layout import Layout, grid, hexagonal, log_polar, mosaic, square_ring_ratio, tiling, zones
 
-relaxed = settings(max_examples=30)
+relaxed = settings(max_examples=examples(30))
 
 pitches_um = st.floats(0.05, 50.0)
 
@@ -222,7 +223,7 @@ def chords_of(layout):
 
 
 @given(log_polar_parameters())
-@settings(relaxed, max_examples=60)
+@settings(relaxed, max_examples=examples(60))
 def test_log_polar_tiles_its_annulus(parameters):
     layout = log_polar(**parameters)
     n_corners = parameters["n_sectors"] * chords_of(layout)
@@ -492,7 +493,7 @@ def zone_parameters(draw):
 
 
 @given(zone_parameters())
-@settings(relaxed, max_examples=60)
+@settings(relaxed, max_examples=examples(60))
 def test_zones_tile_their_square(parameters):
     layout = zones(**parameters)
 

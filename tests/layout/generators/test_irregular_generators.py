@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
@@ -29,7 +30,7 @@ from foveasim.layout.generators.voronoi import (
     voronoi,
 )
 
-relaxed = settings(max_examples=30)
+relaxed = settings(max_examples=examples(30))
 GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
 
 BOX = shapely.box(-10, -5, 20, 8)
@@ -142,7 +143,7 @@ def test_separated_part_is_assigned_to_neighbour():
 
 @given(st.sampled_from([NOTCH, STAR]), st.integers(8, 80), seeds)
 # About one in six of these layouts has exactly one separated part.
-@settings(relaxed, max_examples=60, suppress_health_check=[HealthCheck.filter_too_much])
+@settings(relaxed, max_examples=examples(60), suppress_health_check=[HealthCheck.filter_too_much])
 def test_separated_part_joins_longest_shared_boundary(region, n, seed):
     """The reference cells are those of shapely, for layouts with one separated part."""
     centres = points_in(region, n, seed)
@@ -461,7 +462,7 @@ def test_density_driven_sites_tile_region(n_sites, region, density, n_iterations
 
 @pytest.mark.slow
 @given(seeds)
-@settings(relaxed, max_examples=5)
+@settings(relaxed, max_examples=examples(5))
 def test_layout_depends_only_on_seed(seed):
     first, repeated, other = (
         voronoi(n_sites=50, size_um=(9.0, 6.0), density=fovea, seed=s) for s in (seed, seed, seed + 1)
@@ -583,7 +584,7 @@ def integrate_function(ring, centre, function):
 
 
 @given(regions, st.integers(1, 25), st.sampled_from(["uniform", "function", "picture"]), st.integers(1, 3), seeds)
-@settings(relaxed, max_examples=15)
+@settings(relaxed, max_examples=examples(15))
 def test_lloyd_iterations_agree_with_reference(region, n_sites, kind, n_iterations, seed):
     """The reference computes all cells in each iteration, and integrates them one by one."""
     density, grid = {"uniform": (None, None), "function": (fovea, None), "picture": random_picture(region)}[kind]
@@ -663,6 +664,7 @@ def test_equal_capacity_sites_tile_region(n_sites, region, kind, n_iterations, s
     np.testing.assert_allclose(layout.columns["share"], 1.0, atol=1e-6)
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("region", [BOX, NOTCH, STAR, FRAME], ids=["box", "notch", "star", "frame"])
 @pytest.mark.parametrize("n_sites", [30, 300])
 def test_equal_capacity_without_density_is_equal_area(n_sites, region):
@@ -944,7 +946,7 @@ def test_penrose_rhombs_tile_without_gaps(side_um, size, shape):
 
 
 @given(st.floats(0.1, 50.0), shapes)
-@settings(relaxed, max_examples=8)
+@settings(relaxed, max_examples=examples(8))
 def test_penrose_areas_have_golden_ratio(side_um, shape):
     layout = penrose(side_um=side_um, size_um=25 * side_um, shape=shape)
     corners = layout.xy_um.reshape(-1, 4, 2)

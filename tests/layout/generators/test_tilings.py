@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import shapely
+from effort import examples
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -14,7 +15,7 @@ import foveasim as fs
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout import fill, giotto, grid, hexagonal, log_polar, merge_small, tiling, zones
 
-relaxed = settings(max_examples=40)
+relaxed = settings(max_examples=examples(40))
 
 NOTCHED = shapely.Polygon([(-20, -15), (25, -18), (22, 4), (3, 2), (6, 20), (-18, 17)])
 HOLED = NOTCHED.difference(shapely.Point(-8, -2).buffer(5.0))
