@@ -41,6 +41,7 @@ from foveasim.reconstruct import (
     raster_grid,
     to_cortical,
 )
+from foveasim.reconstruct.picture import Gaps
 from foveasim.sensor import Sensor, signal_to_noise
 
 if TYPE_CHECKING:
@@ -159,6 +160,7 @@ class Capture:
         grid: Grid | None = None,
         of: Quantity = "code",
         per: Literal["site", "um2"] = "site",
+        gaps: Gaps = "fill",
         sensor: Sensor | None = None,
         **options: Any,
     ) -> Picture:
@@ -183,6 +185,9 @@ class Capture:
             ``"site"``: the values themselves, so that larger sites are brighter. ``"um2"``: values divided by the site's area
             in µm² and its light response (and, for codes, relative conversion gain), so that a uniform scene gives a uniform
             picture. The response is that of :meth:`Sensor.light_response` over devices.
+        gaps : {"fill", "empty"}
+            Whether sites extend to the centre of the gap to a neighbour, such as a trench; gaps wider than half the size (root
+            of the area) of the smaller site, and blind spots, are empty.
         sensor : Sensor, optional
             By default that of the capture. Required for captures that were read from a file, if the sensor has effects that
             are not registered.
@@ -217,7 +222,7 @@ class Capture:
             raise ParameterError(name, f"must be an option of the method {method!r}", hint=hint)
         self._check_sensor(sensor)
         grid = raster_grid(self.layout, max_pixels) if grid is None else grid
-        picture = self._reconstruct(method, grid, of, per, sensor, options)
+        picture = self._reconstruct(method, grid, of, per, sensor, {"gaps": gaps, **options})
         return replace(picture, white=self.white_dn) if (self.white_dn > 0.0).all() else picture
 
     def _reconstruct(

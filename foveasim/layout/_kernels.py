@@ -507,6 +507,42 @@ def shared_lengths(xy, after, first_vertex, first, second, max_gap):
     return lengths
 
 
+@njit(types.void(_points, _ints, _ints, _ints, _ints, _floats, types.float64, types.float64[::1]))
+def edge_gaps(xy, after, first_vertex, first, second, limit, touching, gap):
+    """
+    Update the smallest distances of edges to facing edges of another site.
+
+    Edges of each pair of sites (first[i], second[i]) face each other where they have opposite directions and each is in front
+    of the other, at most ``limit`` of both sites away, within ``touching``. Vertices are as in ``shared_lengths``; the edge of
+    a vertex leads to the next one.
+    """
+    for pair in range(first.size):
+        i, j = first[pair], second[pair]
+        largest = min(limit[i], limit[j])
+        for a in range(first_vertex[i], first_vertex[i + 1]):
+            ax, ay = xy[a, 0], xy[a, 1]
+            ex, ey = xy[after[a], 0] - ax, xy[after[a], 1] - ay
+            length = np.hypot(ex, ey)
+            if length <= MIN_EDGE_UM:
+                continue
+            ex, ey = ex / length, ey / length
+            for c in range(first_vertex[j], first_vertex[j + 1]):
+                cx, cy = xy[c, 0] - ax, xy[c, 1] - ay
+                dx, dy = xy[after[c], 0] - ax, xy[after[c], 1] - ay
+                high = cx * ex + cy * ey
+                low = dx * ex + dy * ey
+                begin, end = max(low, 0.0), min(high, length)
+                if end - begin <= MIN_EDGE_UM:
+                    continue
+                # Interiors are to the left.
+                slope = ((dy - cy) * ex - (dx - cx) * ey) / (high - low)
+                away = dx * ey - dy * ex - slope * low
+                at_begin, at_end = away + slope * begin, away + slope * end
+                if min(at_begin, at_end) >= -touching and max(at_begin, at_end) <= largest:
+                    distance = max(0.5 * (at_begin + at_end), 0.0)
+                    gap[a], gap[c] = min(gap[a], distance), min(gap[c], distance)
+
+
 @njit(types.int64[::1](_ints, _ints, _floats, types.int64))
 def colour_greedily(first, neighbour, shared, n_colours):
     """

@@ -9,23 +9,22 @@ import numpy as np
 
 from foveasim._core.calls import Limits
 from foveasim._core.rings import TIE_FRACTION, site_moments
-from foveasim._core.validation import Floats, Ints, as_numbers, check_memory, check_per_site, finite_array, read_only
+from foveasim._core.validation import Floats, Ints, as_numbers, check_memory, check_per_site, finite_array
 from foveasim.fields import Grid, PackedRings
-from foveasim.integrate import Integrator
 from foveasim.layout import Layout
-from foveasim.reconstruct.picture import Picture, coverage_fraction
+from foveasim.reconstruct.picture import MAX_CACHED, MAX_CACHED_SITES, Gaps, Picture, raster_of
 
 __all__ = ["cells", "fill_channels"]
 
-#: Number of cached layouts, and the largest number of their sites, about 200 bytes each.
-MAX_CACHED, MAX_CACHED_SITES = 2, 1 << 18
 #: Nearest sites of a channel that are averaged in demosaicing, with all further ones at the distance of the last.
 NEIGHBOURS = 4
 #: Smallest distance that determines a weight: coincident sites have a finite one.
 MIN_DISTANCE_UM = 1e-12
 
 
-def cells(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | None = None) -> Picture:
+def cells(
+    layout: PackedRings, values: Floats, grid: Grid, *, gaps: Gaps = "fill", n_threads: int | None = None
+) -> Picture:
     """
     Compute a raster picture of area-weighted means of photosite values.
 
@@ -35,6 +34,9 @@ def cells(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | N
     values : (n_site,) or (n_channel, n_site)
     grid : Grid
         Pixels of the picture.
+    gaps : {"fill", "empty"}
+        Whether sites extend to the centre of the gap to a neighbour, such as a trench; gaps wider than half the size (root
+        of the area) of the smaller site, and blind spots, are empty.
     n_threads : int, optional
         All cores by default.
 
@@ -44,12 +46,8 @@ def cells(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | N
         ``Wᵀ values / Wᵀ 1`` with the exact overlap areas W of sites and pixels: boundaries are anti-aliased, and a uniform
         field stays uniform.
     """
-    arguments = grid, n_threads
-    integrator, coverage = _compiled_once(layout, *arguments) if _is_cached(layout) else _compiled(layout, *arguments)
     channels = np.atleast_2d(finite_array("values", values))
-    covered_um2 = np.where(coverage > 0.0, coverage, np.nan) * grid.cell_area_um2
-    data = integrator.spread(channels) / covered_um2
-    return Picture(read_only(data.astype(np.float32)), read_only(coverage.astype(np.float32)), grid)
+    return raster_of(layout, grid, gaps, n_threads).means(channels)
 
 
 def fill_channels(
@@ -89,12 +87,6 @@ def fill_channels(
 def _is_cached(layout: PackedRings) -> TypeGuard[Layout]:
     """Return whether parts of a layout are cached: only of layouts, which are immutable."""
     return isinstance(layout, Layout) and layout.n_sites <= MAX_CACHED_SITES
-
-
-def _compiled(layout: PackedRings, grid: Grid, n_threads: int | None) -> tuple[Integrator, Floats]:
-    """Return the integrator of a layout on the pixels of a picture, and their coverage."""
-    integrator = Integrator(layout, grid, n_threads=n_threads)
-    return integrator, coverage_fraction(integrator)
 
 
 def _neighbours(layout: PackedRings, channels: bytes, n_channels: int) -> dict[int, tuple[Ints, Ints, Any]]:
@@ -140,6 +132,5 @@ def _mean_of_nearest(points_um: Floats, at_um: Floats) -> Any:
     return csr_array((np.concatenate(weights), entries), shape=(len(at_um), len(points_um)))
 
 
-# Pictures of one layout share its compiled sites and neighbours, such as the samples of a dataset or the frames of a video.
-_compiled_once = lru_cache(maxsize=MAX_CACHED)(_compiled)
+# Captures of one layout share its neighbours.
 _neighbours_once = lru_cache(maxsize=MAX_CACHED)(_neighbours)

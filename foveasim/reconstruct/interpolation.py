@@ -1,8 +1,8 @@
 """
 Interpolation of photosite values between site centroids.
 
-Both methods are exact at the centroids. The coverage is that of the site outlines, not of the triangles between centroids, so
-that a blind spot remains without data.
+Both methods are exact at the centroids. The coverage is that of the site outlines, without the gaps between neighbours, and not
+of the triangles between centroids, so that a blind spot remains without data.
 """
 
 from __future__ import annotations
@@ -13,11 +13,10 @@ import numpy as np
 
 from foveasim._core.rings import site_moments
 from foveasim._core.threads import parallel_map, thread_count
-from foveasim._core.validation import Floats, Ints, as_numbers, read_only
+from foveasim._core.validation import Floats, Ints, as_numbers
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PackedRings
-from foveasim.integrate import Integrator
-from foveasim.reconstruct.picture import Picture, coverage_fraction
+from foveasim.reconstruct.picture import Gaps, Picture, raster_of
 
 __all__ = ["linear", "natural", "site_values"]
 
@@ -29,7 +28,9 @@ PIXELS_PER_PIECE = 1 << 14
 MAX_DISTANCES = 1 << 22
 
 
-def linear(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | None = None) -> Picture:
+def linear(
+    layout: PackedRings, values: Floats, grid: Grid, *, gaps: Gaps = "fill", n_threads: int | None = None
+) -> Picture:
     """
     Interpolate values linearly on the Delaunay triangulation of the site centroids.
 
@@ -40,6 +41,8 @@ def linear(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | 
         NaN where a site does not measure a channel, which is then interpolated from the other sites.
     grid : Grid
         Pixels of the picture; values are those at the pixel centres.
+    gaps : {"fill", "empty"}
+        As for :func:`cells`.
     n_threads : int, optional
         All cores by default.
 
@@ -54,10 +57,12 @@ def linear(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | 
     ParameterError
         When there is not one value per site, a value is infinite, or a channel has no values.
     """
-    return _interpolate(layout, values, grid, n_threads, is_smooth=False)
+    return _interpolate(layout, values, grid, gaps, n_threads, is_smooth=False)
 
 
-def natural(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | None = None) -> Picture:
+def natural(
+    layout: PackedRings, values: Floats, grid: Grid, *, gaps: Gaps = "fill", n_threads: int | None = None
+) -> Picture:
     """
     Interpolate values by Sibson's natural neighbours of the site centroids.
 
@@ -66,7 +71,7 @@ def natural(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int |
 
     Parameters
     ----------
-    layout, values, grid, n_threads
+    layout, values, grid, gaps, n_threads
         As for :func:`linear`.
 
     Returns
@@ -74,7 +79,7 @@ def natural(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int |
     Picture
         As for :func:`linear`, but with a continuous gradient except at the centroids.
     """
-    return _interpolate(layout, values, grid, n_threads, is_smooth=True)
+    return _interpolate(layout, values, grid, gaps, n_threads, is_smooth=True)
 
 
 def site_values(values: Floats, n_sites: int) -> Floats:
@@ -94,12 +99,13 @@ def site_values(values: Floats, n_sites: int) -> Floats:
     return channels
 
 
-def _interpolate(layout: PackedRings, values: Floats, grid: Grid, n_threads: int | None, *, is_smooth: bool) -> Picture:
-    integrator = Integrator(layout, grid, n_threads=n_threads)
-    channels = site_values(values, integrator.n_sites)
+def _interpolate(
+    layout: PackedRings, values: Floats, grid: Grid, gaps: Gaps, n_threads: int | None, *, is_smooth: bool
+) -> Picture:
+    raster = raster_of(layout, grid, gaps, n_threads)
+    channels = site_values(values, raster.sites.n_sites)
     _, centroid_um = site_moments(layout.xy_um, layout.ring_offsets, layout.site_offsets)
-    fraction = coverage_fraction(integrator)
-    row, column = np.nonzero(fraction)
+    row, column = np.nonzero(raster.covered_fraction)
     points_um = np.stack((grid.x_um[column], grid.y_um[row]), axis=1)
     data = np.full((channels.shape[0], *grid.shape), np.nan)
     patterns, pattern = np.unique(~np.isnan(channels), axis=0, return_inverse=True)
@@ -108,7 +114,7 @@ def _interpolate(layout: PackedRings, values: Floats, grid: Grid, n_threads: int
         mesh = _Mesh.from_centroids(centroid_um[is_known], channels[np.ix_(in_pattern, np.flatnonzero(is_known))])
         found = mesh.evaluate(points_um, thread_count(n_threads), is_smooth=is_smooth)
         data[in_pattern[:, np.newaxis], row, column] = found
-    return Picture(read_only(data.astype(np.float32)), read_only(fraction.astype(np.float32)), grid)
+    return raster.picture(data)
 
 
 @dataclass(frozen=True, eq=False)

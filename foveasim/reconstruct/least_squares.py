@@ -17,13 +17,13 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.calls import POSITIVE, Limits
 from foveasim._core.threads import cached_property, parallel_map, thread_count
-from foveasim._core.validation import Floats, finite_array, read_only
+from foveasim._core.validation import Floats, finite_array
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PackedRings
 from foveasim.integrate import Integrator
 from foveasim.reconstruct._bounded import minimise_nonnegative
 from foveasim.reconstruct.interpolation import site_values
-from foveasim.reconstruct.picture import Picture, coverage_fraction
+from foveasim.reconstruct.picture import Gaps, Picture, raster_of
 
 __all__ = ["least_squares"]
 
@@ -53,6 +53,7 @@ def least_squares(
     blur: ArrayLike | None = None,
     tolerance: Annotated[float, Limits(above=0.0, at_most=0.1)] = 1e-4,
     max_steps: Annotated[int, Limits(at_least=1)] = 5000,
+    gaps: Gaps = "fill",
     n_threads: int | None = None,
 ) -> Picture:
     """
@@ -85,6 +86,8 @@ def least_squares(
         and a preconditioner M. The objective then exceeds its minimum by about the square of this limit.
     max_steps : int
         Largest number of applications of the operator per solution.
+    gaps : {"fill", "empty"}
+        As for :func:`cells`.
     n_threads : int, optional
         All cores by default. Channels are solved in parallel.
 
@@ -112,14 +115,14 @@ def least_squares(
     """
     from scipy import fft
 
-    integrator = Integrator(layout, grid, n_threads=n_threads)
+    raster = raster_of(layout, grid, gaps, n_threads)
+    integrator = raster.sites
     channels = site_values(values, integrator.n_sites)
     n_channels, n_sites = channels.shape
     if not isinstance(mu, str):
         mu = POSITIVE.check("mu", mu)
     elif variance is None:
         raise ParameterError("mu", "must be a number without 'variance', as both rules depend on the noise")
-    coverage = coverage_fraction(integrator)
     kernel_of = _kernels_of(blur, n_channels)
     pad = tuple(n // 2 for n in kernel_of[0].shape) if kernel_of else (0, 0)
     shape = tuple(fft.next_fast_len(n + 2 * p, real=True) if p else n for n, p in zip(grid.shape, pad, strict=True))
@@ -155,8 +158,8 @@ def least_squares(
         return x.reshape(shape)[pad[0] : pad[0] + grid.shape[0], pad[1] : pad[1] + grid.shape[1]]
 
     data = np.array(parallel_map(solve, range(n_channels), thread_count(n_threads)))
-    data[:, coverage == 0.0] = np.nan
-    return Picture(read_only(data.astype(np.float32)), read_only(coverage.astype(np.float32)), grid)
+    data[:, raster.covered_fraction == 0.0] = np.nan
+    return raster.picture(data)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,29 +5,36 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from foveasim._core.calls import Limits
 from foveasim._core.show import Drawn, drawn
-from foveasim._core.validation import Floats, Images, check_count, finite_array, own, unmasked
+from foveasim._core.validation import Bools, Floats, Images, Ints, check_count, finite_array, own, read_only, unmasked
 from foveasim._io.images import picture_format, write_picture
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid, Lattice, PackedRings, to_file_rows
 from foveasim.integrate import Integrator
+from foveasim.layout import Layout
+from foveasim.layout.gaps import close_gaps
 from foveasim.units import decode_srgb
 from foveasim.units import encode_srgb as encoded_in_srgb
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Picture", "coverage_fraction", "raster_grid"]
+__all__ = ["Picture", "raster_grid"]
 
-#: Coverage below this fraction is rounding error.
-NO_COVERAGE = 1e-9
+#: Coverage below this fraction, and lack of coverage below that one, are rounding errors.
+NO_COVERAGE, COMPLETE = 1e-9, 1e-6
+#: Number of cached rasters, and the largest number of their sites, about 200 bytes each.
+MAX_CACHED, MAX_CACHED_SITES = 2, 1 << 18
+#: Whether gaps between neighbours, such as trenches, are drawn.
+Gaps: TypeAlias = Literal["fill", "empty"]
 #: Colour of pixels without photosites in formats without alpha.
 NO_DATA_COLOUR = "white"
 #: A name or code of HTML, such as "white" or "#204060", or red, green and blue from 0 to 255.
@@ -256,11 +263,56 @@ def raster_grid(layout: PackedRings, max_pixels: Annotated[int, Limits(at_least=
     return Grid((n_y, n_x), pitch_um, origin_um)
 
 
-def coverage_fraction(integrator: Integrator) -> Floats:
+class Raster(NamedTuple):
     """
-    Compute the exact fraction of each pixel that photosites cover, (n_y, n_x).
+    Photosites on the pixels of a picture.
 
-    Fractions within rounding error of 0 are 0.
+    ``sites``: integrator of the photosites. ``drawn``: that of the outlines in the picture, without gaps between neighbours
+    if these are filled. ``covered_um2`` (n_y, n_x): area of the drawn outlines in each pixel. ``covered_fraction``
+    (n_y, n_x): fraction of each pixel.
     """
-    fraction = integrator.spread(np.ones(integrator.n_sites)) / integrator.grid.cell_area_um2
-    return np.where(fraction > NO_COVERAGE, fraction, 0.0)
+
+    sites: Integrator
+    drawn: Integrator
+    covered_um2: Floats
+    covered_fraction: Floats
+
+    def means(self, values: Floats) -> Picture:
+        """Return the means of values (n_channel, n_site) over the covered part of each pixel."""
+        covered_um2 = np.where(self.covered_fraction > 0.0, self.covered_um2, np.nan)
+        return self.picture(self.drawn.spread(values) / covered_um2)
+
+    def picture(self, values: Floats) -> Picture:
+        """Return the picture with these values, (n_channel, n_y, n_x)."""
+        coverage = read_only(self.covered_fraction.astype(np.float32))
+        return Picture(read_only(values.astype(np.float32)), coverage, self.sites.grid)
+
+
+def raster_of(layout: PackedRings, grid: Grid, gaps: Gaps, n_threads: int | None) -> Raster:
+    """Return the photosites on the pixels of a picture; those of the last layouts are cached."""
+    if isinstance(layout, Layout) and layout.n_sites <= MAX_CACHED_SITES:
+        return _raster_once(layout, grid, gaps, n_threads)
+    return _raster(layout, grid, gaps, n_threads)
+
+
+def _raster(layout: PackedRings, grid: Grid, gaps: Gaps, n_threads: int | None) -> Raster:
+    sites = Integrator(layout, grid, n_threads=n_threads)
+    covered_um2 = sites.spread(np.ones(sites.n_sites))
+    closed = close_gaps(layout, _sites_at_gaps(sites, covered_um2)) if gaps == "fill" else None
+    drawn = sites if closed is None else Integrator(closed, grid, n_threads=n_threads)
+    covered_um2 = covered_um2 if closed is None else drawn.spread(np.ones(sites.n_sites))
+    fraction = covered_um2 / grid.cell_area_um2
+    return Raster(sites, drawn, covered_um2, np.where(fraction > NO_COVERAGE, np.minimum(fraction, 1.0), 0.0))
+
+
+def _sites_at_gaps(sites: Integrator, covered_um2: Floats) -> Ints:
+    """Return the sites at pixels that are not covered completely: others have no gap."""
+    from scipy.ndimage import binary_dilation
+
+    is_incomplete: Bools = covered_um2 < (1.0 - COMPLETE) * sites.grid.cell_area_um2
+    near = binary_dilation(is_incomplete, np.ones((3, 3), np.bool_), border_value=1)
+    return np.flatnonzero(sites(near.astype(np.float64)) > 0.0)
+
+
+# Pictures of one layout share its raster, such as the samples of a dataset or the frames of a video.
+_raster_once = lru_cache(maxsize=MAX_CACHED)(_raster)

@@ -18,10 +18,9 @@ from foveasim._io.zarr_stores import ZARR
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Grid
-from foveasim.integrate import Integrator
 from foveasim.layout import Layout
-from foveasim.reconstruct import Picture, fill_channels, raster_grid
-from foveasim.reconstruct.picture import coverage_fraction
+from foveasim.reconstruct import fill_channels, raster_grid
+from foveasim.reconstruct.picture import raster_of
 from foveasim.video.recording import check_consistent, count_recorded_frames, record, resume_recording
 
 __all__ = ["write_video"]
@@ -139,9 +138,7 @@ class _Raster:
         grid = raster_grid(layout, max_pixels)
         if has_even_size:  # chroma subsampling of video formats needs even sizes
             grid = Grid(tuple(n + n % 2 for n in grid.shape), grid.pitch_um, grid.origin_um)  # type: ignore[arg-type]
-        self._layout, self._integrator = layout, Integrator(layout, grid)
-        self._coverage = coverage_fraction(self._integrator)
-        self._covered_um2 = np.where(self._coverage > 0.0, self._coverage, np.nan) * grid.cell_area_um2
+        self._layout, self._raster = layout, raster_of(layout, grid, "fill", None)
 
     def image(self, capture: Capture) -> NDArray[np.uint8]:
         """Return sRGB values and coverage, (n_y, n_x, 2 or 4), top row first."""
@@ -150,11 +147,10 @@ class _Raster:
         if n_filters > 1:
             values = fill_channels(self._layout, values[0], capture.filter_of_site, n_filters)
             values = np.where(np.isnan(values), 0.0, values)
-        data = (self._integrator.spread(values) / self._covered_um2).astype(np.float32)
         white: Any = capture.white_dn
         if n_filters not in (1, 3):
-            data, white = data.mean(axis=0, keepdims=True), float(np.mean(white))
-        picture = Picture(data, self._coverage.astype(np.float32), self._integrator.grid)
+            values, white = values.mean(axis=0, keepdims=True), float(np.mean(white))
+        picture = self._raster.means(values)
         return np.asarray(picture.to_image(white), np.uint8)
 
     def composite(self, capture: Capture) -> NDArray[np.uint8]:

@@ -19,7 +19,7 @@ from foveasim._core.validation import Bools, Floats, check_shape, unmasked
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PackedRings
 from foveasim.integrate import Integrator
-from foveasim.reconstruct.picture import coverage_fraction
+from foveasim.reconstruct.picture import raster_of
 from foveasim.view.id_map import validate_bounds
 from foveasim.view.site_colours import BACKGROUND, NO_DATA, Rgb, SiteColours, decode_light, encode_light
 
@@ -100,10 +100,10 @@ class _Band:
     def __init__(self, layout: PackedRings, is_near: Bools, grid: Grid, first_row: int, n_threads: int | None) -> None:
         part, self.sites = _select(layout, is_near)
         self.rows = slice(first_row, first_row + grid.shape[0])
-        self.integrator = Integrator(part, grid, n_threads=n_threads)
-        coverage = coverage_fraction(self.integrator)
-        self.alpha = np.rint(255.0 * np.minimum(coverage, 1.0)).astype(np.uint8)
-        self.covered_um2 = np.where(coverage > 0.0, coverage, np.inf) * grid.cell_area_um2
+        raster = raster_of(part, grid, "empty", n_threads)
+        self.integrator = raster.sites
+        self.alpha = np.rint(255.0 * raster.covered_fraction).astype(np.uint8)
+        self.covered_um2 = np.where(raster.covered_fraction > 0.0, raster.covered_um2, np.inf)
 
     def means(self, values: Floats) -> Floats:
         """Return means (..., n_y, n_x) over the covered part of each pixel; 0 without sites."""

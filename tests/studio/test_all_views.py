@@ -219,6 +219,7 @@ def test_wrong_content_of_tiles_is_found(visit, monkeypatch, script, problem):
     page = visit()
     page.route("**/views/wrong.js", lambda route: route.fulfill(body=module, content_type="text/javascript"))
     page.evaluate("() => studio.views.show('wrong', true)")
+    until(page, "() => studio.isReady && studio.views.parts.wrong && studio.views.made.wrong")
     settle(page)
     before = page.evaluate(TILES)
     set_value(page, "exposure_s", 0.03)
