@@ -28,7 +28,7 @@ EXTRA_OF = {
         "maps": ("astropy", "h5netcdf", "pandas"),
         "notebook": ("anywidget", "traitlets"),
         "parquet": ("pyarrow",),
-        "pictures": ("OpenEXR", "imagecodecs"),
+        "pictures": ("OpenEXR", "imagecodecs", "pillow_heif", "rawpy"),
         "studio": ("starlette", "uvicorn", "websockets"),
         "video": ("av", "h5py", "zarr"),
         "view": ("lxml", "networkx", "pyvista", "vtkmodules"),

@@ -41,7 +41,7 @@ MAX_PIXELS = 2**28
 #: Limits of decompressed EXR data: for small files, and per byte of larger ones, the maximum ratio of deflate.
 MIN_DECOMPRESSED_BYTES, MAX_DECOMPRESSION_RATIO = 2**28, 1032
 #: Formats that are read with Pillow; its other formats are not photographs.
-PILLOW_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "PPM", "JPEG2000", "TGA")
+PILLOW_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "PPM", "JPEG2000", "TGA", "AVIF")
 #: Modes of Pillow that are read unchanged, and conversions of other modes.
 UNCHANGED_MODES = ("L", "LA", "RGB", "RGBA", "F")
 CONVERTED_MODES = {
@@ -61,12 +61,23 @@ START_OF_SCAN, MARKER_BYTES = 0xDA, 2
 #: Orientation tag of TIFF and EXIF.
 ORIENTATION_TAG = 274
 TIFF_EXTENSIONS = (".tif", ".tiff")
+#: Extensions of camera raw files, most of which are TIFF files by their first bytes.
+RAW_EXTENSIONS = (
+    *(".3fr", ".arw", ".cr2", ".cr3", ".dng", ".erf", ".iiq", ".kdc", ".mef", ".mos", ".mrw", ".nef", ".nrw", ".orf"),
+    *(".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
+)
 #: Extensions of picture files in directories.
 PICTURE_EXTENSIONS = (
-    *(".bmp", ".exr", ".hdr", ".jp2", ".jpeg", ".jpg", ".png", ".ppm", ".tga"),
+    *(".avif", ".bmp", ".exr", ".hdr", ".heic", ".heif", ".jp2", ".jpeg", ".jpg", ".png", ".ppm", ".tga"),
     *TIFF_EXTENSIONS,
     ".webp",
+    *RAW_EXTENSIONS,
 )
+#: Brands of the pictures in files of the ISO base media format: AVIF, and HEIC in all profiles.
+AVIF_BRANDS = (b"avif", b"avis")
+HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"hevm", b"hevs", b"mif1", b"msf1")
+#: Parameters of libraw that give the sRGB encoding of linear values: exponent and slope of the linear part.
+SRGB_GAMMA = (2.4, 12.92)
 
 
 def picture_names(names: Iterable[str]) -> list[str]:
@@ -94,13 +105,14 @@ def read_picture(path: str | Path) -> NDArray[Any]:
     """
     Read a picture file.
 
-    ``path``: PNG, JPEG, TIFF, WebP, BMP, GIF, PPM, JPEG 2000, Radiance HDR; with the extra ``pictures`` also EXR. Returns
-    ``picture`` (n_y, n_x) or (n_y, n_x, n_channel), uint8, uint16 or float32: top row first; 1 to 4 channels: grey, grey and
-    alpha, colour, colour and alpha. Palettes are converted to colours, and the orientation tag is applied. Raises FileError
-    when the file is missing, not a picture, truncated, too large, or contains several pictures.
+    ``path``: PNG, JPEG, TIFF, WebP, BMP, GIF, PPM, JPEG 2000, AVIF; with the extra ``pictures`` also Radiance HDR, EXR, HEIC,
+    and camera raw files, which are demosaiced with the white balance of the camera and encoded in sRGB. Returns ``picture``
+    (n_y, n_x) or (n_y, n_x, n_channel), uint8, uint16 or float32: top row first; 1 to 4 channels: grey, grey and alpha, colour,
+    colour and alpha. Palettes are converted to colours, and the orientation tag is applied. Raises FileError when the file is
+    missing, not a picture, truncated, too large, or contains several pictures.
 
-    Bit errors are detected in formats with checksums: PNG, and EXR and TIFF with deflate compression. EXR is read in the
-    sandbox process, because corrupt files can crash its library.
+    Bit errors are detected in formats with checksums: PNG, and EXR and TIFF with deflate compression. EXR, HEIC and raw files
+    are read in the sandbox process, because corrupt files can crash their libraries.
     """
     path = Path(path)
     try:
@@ -111,7 +123,7 @@ def read_picture(path: str | Path) -> NDArray[Any]:
     except OSError as error:
         raise FileError(path, f"cannot be opened: {error.strerror or error}") from None
     try:
-        picture = _select_reader(head)(path)
+        picture = _select_reader(path, head)(path)
     except FileError:
         raise
     except Exception as error:  # noqa: BLE001 -- readers raise arbitrary exceptions on corrupt files
@@ -123,8 +135,12 @@ def read_picture(path: str | Path) -> NDArray[Any]:
     return picture
 
 
-def _select_reader(head: bytes) -> Any:
+def _select_reader(path: Path, head: bytes) -> Any:
     """Return the reader for a file that begins with these bytes."""
+    if path.suffix.lower() in RAW_EXTENSIONS:
+        return _read_raw
+    if head[4:8] == b"ftyp" and head[8:12] in HEIF_BRANDS and not any(brand in head for brand in AVIF_BRANDS):
+        return _read_heif
     if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         return _read_tiff
     if head[:8] == PNG_MAGIC and head[24:25] == b"\x10":
@@ -145,7 +161,8 @@ def _read_with_pillow(path: Path) -> NDArray[Any]:
     try:
         with _pillow_limit(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # invalid metadata
-            with Image.open(path, formats=PILLOW_FORMATS) as image:
+            Image.init()
+            with Image.open(path, formats=[each for each in PILLOW_FORMATS if each in Image.OPEN]) as image:
                 check_picture_size(path, image.width, image.height)
                 n_pictures = getattr(image, "n_frames", 1)
                 if (
@@ -155,6 +172,9 @@ def _read_with_pillow(path: Path) -> NDArray[Any]:
                 _check_complete(path, str(image.format))
                 return pixels_of_image(image)
     except UnidentifiedImageError:
+        if "AVIF" not in Image.OPEN and path.read_bytes()[8:12] in AVIF_BRANDS:
+            detail = "needs Pillow 11.3 or later with AVIF; install it with: pip install --upgrade pillow"
+            raise FileError(path, detail) from None
         raise FileError(path, "is not a picture in a supported format") from None
     except Image.DecompressionBombError:
         raise FileError(path, f"has more than {MAX_PIXELS} pixels") from None
@@ -367,6 +387,46 @@ def _read_with_openexr(name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
     picture = np.asarray(next(iter(layers.values())), dtype=np.float32)
     if picture.shape[:2] != (n_y, n_x):
         raise FileError(path, f"must have channels of {n_x} x {n_y} pixels, got an array of the shape {picture.shape}")
+    return {}, [picture]
+
+
+def _read_heif(path: Path) -> NDArray[Any]:
+    import_optional(path, "pillow_heif")
+    return read_in_sandbox(_read_with_libheif, path, kind="HEIC", max_decompressed_bytes=_max_decompressed_bytes)[1][0]
+
+
+def _read_with_libheif(name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+    """Read the primary picture of a HEIC file, upright, in the sandbox process."""
+    path = Path(name)
+    pillow_heif = import_optional(path, "pillow_heif")
+    file = pillow_heif.open_heif(name, convert_hdr_to_8bit=False, hdr_to_16bit=False)
+    check_picture_size(path, *file.size)
+    picture = np.asarray(file)
+    largest = 2 ** file.info.get("bit_depth", 8) - 1
+    if picture.dtype != np.uint8:  # 10 or 12 bits
+        picture = np.rint(picture * (np.iinfo(np.uint16).max / largest)).astype(np.uint16)
+    return {}, [picture]
+
+
+def _read_raw(path: Path) -> NDArray[Any]:
+    import_optional(path, "rawpy")
+    return read_in_sandbox(_read_with_libraw, path, kind="raw", max_decompressed_bytes=_max_decompressed_bytes)[1][0]
+
+
+def _read_with_libraw(name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+    """Demosaic a raw file in sRGB, as white-balanced by the camera, in the sandbox process."""
+    path = Path(name)
+    rawpy = import_optional(path, "rawpy")
+    with rawpy.imread(name) as raw:
+        check_picture_size(path, raw.sizes.raw_width, raw.sizes.raw_height)
+        picture = raw.postprocess(
+            gamma=SRGB_GAMMA,
+            no_auto_bright=True,
+            adjust_maximum_thr=0.0,  # white is saturation, not the brightest pixel
+            use_camera_wb=True,
+            output_bps=16,
+            output_color=rawpy.ColorSpace.sRGB,
+        )
     return {}, [picture]
 
 
