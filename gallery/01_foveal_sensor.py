@@ -40,6 +40,7 @@ def camera_of(layout: fs.Layout) -> fs.Camera:
 
 def main(out_dir: Path) -> None:
     """Write the pictures and the layout to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     # %% Scene: a photograph with pixels of 0.5 mm at a distance of 1 m.
     scene = fs.Scene.from_picture(
         astronaut(),

@@ -27,6 +27,7 @@ SHAPE = (1025, 1025)
 
 def main(out_dir: Path) -> None:
     """Write the curve of ensquared energy to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     # %% One point on the axis; nine cells of the power map per wavelength x f-number.
     optics = fs.Optics(focal_length_mm=22.0, f_number=4.0, padding="periodic", precision="double")
     lambda_n_um = 1e-3 * WAVELENGTH_NM * optics.working_f_number(DISTANCE_M)

@@ -90,6 +90,7 @@ def energy_fraction(cells: float, side: float) -> float:
 
 def main(out_dir: Path) -> None:
     """Write the error curves to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     # %% Odd numbers of cells per wavelength x f-number: the edges of the square pass through cell centres.
     errors = np.array([energy_fraction(cells, SIDE) - ENERGY_FRACTION for cells in CELLS])
     for cells, error in zip(CELLS, errors, strict=True):

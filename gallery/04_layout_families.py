@@ -34,6 +34,7 @@ def families() -> dict[str, fs.Layout]:
 
 def main(out_dir: Path) -> None:
     """Write the overview of generators and the foveas to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     # %% One layout per generator, with different colours for neighbours.
     layouts = families()
     n_rows = -(-len(layouts) // 3)

@@ -76,6 +76,7 @@ def closed_form(layout: fs.Layout, angle: float) -> np.ndarray:
 
 def main(out_dir: Path) -> None:
     """Write the charts, the edge and the star to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     # %% All charts.
     figure = Figure(figsize=(8.0, 6.4), layout="constrained")
     for position, (name, scene) in enumerate(grey_charts().items(), start=1):

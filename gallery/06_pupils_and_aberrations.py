@@ -55,6 +55,7 @@ def lenses() -> dict[str, fs.Optics]:
 
 def main(out_dir: Path) -> None:
     """Write PSFs, letters and a field of points to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     # %% PSF, image of a letter and MTF of each lens.
     all_lenses = lenses()
     letter = charts.letter_f(

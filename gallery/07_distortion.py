@@ -47,6 +47,7 @@ def centroids_um(layout: fs.Layout, values: np.ndarray, guess_um: np.ndarray, sh
 
 def main(out_dir: Path) -> None:
     """Write the run of the paper, points, a letter and the warping error to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     # %% Settings of the paper: a million sites, whose outlines are undistorted once. The paper combines the distortion of a
     # lens of 3.5 mm with the image of one of 22 mm, of which captures warn.
     warnings.filterwarnings("ignore", message="the focal length of the lens model")

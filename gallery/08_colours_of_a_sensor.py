@@ -75,6 +75,7 @@ def electrons(sensor: fs.Sensor, scene: fs.Scene) -> np.ndarray:
 
 def main(out_dir: Path) -> None:
     """Write the curves and the mosaics to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     # %% Fig. 5: a table of quantum efficiencies, and polynomial fits.
     table, polynomials = ccd_qe(), fits()
     waves_nm = np.arange(FROM_NM, TO_NM + 1.0)

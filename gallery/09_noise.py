@@ -107,6 +107,7 @@ def draw_chain(axes: Axes, sensor: fs.Sensor, photo_e_per_s: float) -> None:
 
 def main(out_dir: Path) -> None:
     """Write the chain and pictures with each noise source to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     # %% The chain of a sensor with all sources, at half of the full well capacity.
     complete = camera(
         prnu_fraction=0.01,

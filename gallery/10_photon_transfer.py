@@ -57,6 +57,7 @@ def charges(sensor: fs.Sensor, photons_per_um2: np.ndarray) -> list[np.ndarray]:
 
 def main(out_dir: Path) -> None:
     """Write the curves to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     # %% Frames of uniform irradiance, from 1 % of saturation to beyond it, and dark frames.
     sensor = two_sizes(fs.layout.zones(side_um=(200, 400), pitch_um=PITCH_UM))
     layout = sensor.layout

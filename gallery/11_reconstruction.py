@@ -35,6 +35,7 @@ METHODS = ("cells", "linear", "natural", "least_squares")
 
 def main(out_dir: Path) -> None:
     """Write the pictures side by side to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     # %% A photograph on a log-polar sensor with capacitances proportional to the areas of the sites.
     layout = fs.layout.log_polar(n_sectors=200, min_size_um=2.0, r_max_um=510.0, stagger=True)
     optics = fs.Optics(focal_length_mm=8.0, f_number=4.0)

@@ -53,6 +53,7 @@ def layout_with_violations() -> fs.Layout:
 
 def main(out_dir: Path) -> None:
     """Write the layout, its readout lines and its violations to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     layout = layout_with_violations()
     report = layout.check(RULES)
 

@@ -24,6 +24,7 @@ N_PIXELS, N_PARTS = 2000, 10
 
 def main(out_dir: Path) -> None:
     """Write the plots to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     # %% Four plots of one layout.
     layout = fs.layout.log_polar(n_sectors=36, min_size_um=4.0, r_max_um=102.0, fovea="hexagons", stagger=True)
     mosaic = fs.layout.graph_colouring(layout, 3)

@@ -38,6 +38,7 @@ def foveal_layout() -> fs.Layout:
 
 def main(out_dir: Path) -> None:
     """Write the picture and the solids to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     layout = foveal_layout()
     # The software renderer, for machines without OpenGL, has no ambient occlusion.
     renderer = "pyvista" if view.find_renderer() else "software"

@@ -47,6 +47,7 @@ def photograph(radius_um: float) -> np.ndarray:
 
 def main(out_dir: Path) -> None:
     """Write the pictures to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     layout = retina()
     rgb = photograph(layout.bounds_um[2])
     joules_um2 = MAX_PHOTONS_PER_UM2 * fs.units.photon_energy_j(WAVELENGTH_NM) * rgb @ np.array([0.3, 0.6, 0.1])

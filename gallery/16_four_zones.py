@@ -27,6 +27,7 @@ EXPOSURE_S = 1 / 30
 
 def main(out_dir: Path) -> None:
     """Write the pictures of both sensors to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     # %% Scene, and two sensors of the same size: four zones, and a uniform grid of the smallest pixels.
     # Additional sky at the top shifts the photographer to the finest zone.
     photograph = np.pad(photographer(), ((126, 0), (25, 0)), mode="edge")[:512, :512]

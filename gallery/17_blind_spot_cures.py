@@ -31,6 +31,7 @@ FOVEAS = {"none": "blind spot", "hexagons": "hexagons", "rings": "rings", "linea
 
 def main(out_dir: Path) -> None:
     """Write the four pictures to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     # %% Face of the astronaut on the optical axis.
     scene = fs.Scene.from_picture(
         astronaut()[20:200, 134:314],

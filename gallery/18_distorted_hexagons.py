@@ -25,6 +25,7 @@ LENS = fs.distortion.BrownConrady(focal_um=4000.0, k1=-1.4, k2=1.6)
 
 def main(out_dir: Path) -> None:
     """Write the captures of both lenses and the outlines to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     # %% Checkerboard of 20 mm squares at a distance of 0.5 m, and a sensor of hexagons.
     scene = charts.checkerboard(
         square_mm=20.0,

@@ -89,6 +89,7 @@ def spectra(layout: fs.Layout, *, is_foveal: bool) -> tuple[SamplingSpectrum, Al
 
 def main(out_dir: Path) -> None:
     """Write the curves and the spectra to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     # %% MTF of lens and pixels, by a slanted edge and in closed form.
     sensors = {
         "squares": fs.layout.grid(n_x=56, n_y=56, pitch_um=PITCH_UM),

@@ -82,6 +82,7 @@ def plot_sites(axes: Axes, layout: fs.Layout, values: np.ndarray, colours: str, 
 
 def main(out_dir: Path) -> None:
     """Write the pictures to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     optics = fs.Optics(focal_length_mm=FOCAL_LENGTH_MM, f_number=2.8)
 
     # %% A sensor read line by line, bottom line first, and one exposure with each shutter.

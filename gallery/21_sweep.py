@@ -26,6 +26,7 @@ MAGNIFICATION = 8.0 / (1000.0 - 8.0)
 
 def main(out_dir: Path) -> None:
     """Write the results and their figure to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     # %% Twenty-five cameras; the same call resumes an interrupted sweep.
     plan = read_sweep(SWEEP)
     results = run_sweep(plan, out=out_dir / "21_foveal_sweep.zarr", workers=2)

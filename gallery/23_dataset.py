@@ -70,6 +70,7 @@ def picture_on_grey(capture: Capture, white_dn: float | None = None) -> NDArray[
 
 def main(out_dir: Path) -> None:
     """Write samples of both datasets to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     photograph = skimage.data.astronaut()
 
     # %% Classification: the same class for all layouts, lenses, exposures and electronics.

@@ -341,6 +341,7 @@ def show_task(axes: Axes, results: dict[str, list[MotionErrors]], task: Task) ->
 
 def main(out_dir: Path, *, is_large: bool = False) -> None:
     """Write a figure of motion errors and of two sensors to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     # %% Motion errors of all sensors.
     views = [view_of(name) for name in GAZES]
     results = [family_errors(views, task, is_large=is_large) for task in TASKS]

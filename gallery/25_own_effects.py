@@ -66,6 +66,7 @@ class LensShading(FixedFactor):
 
 def main(out_dir: Path) -> None:
     """Write pictures and the noise budget to a directory."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     # %% A sensor with both effects.
     layout = fs.layout.grid(n_x=N_SIDE, n_y=N_SIDE, pitch_um=3.0)
     user_effects = [FlickerNoise(sigma_v=6e-3), LensShading(corner_loss=0.3)]

@@ -59,6 +59,7 @@ def draw(found: fs.compare.Comparison) -> Figure:
 
 def main(out_dir: Path) -> None:
     """Write the figure to a directory, and check the differences."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     found = compare()
     figure = draw(found)
     save_figure(figure, out_dir / "26_foveal_against_square.png", dpi=140)

@@ -278,6 +278,7 @@ def deviation(values: NDArray[np.float64]) -> float:
 
 def main(out_dir: Path, *, n_steps: int = 2000, seeds: Sequence[int] = (1,), mnist: Path | None = None) -> None:
     """Write the figures to a directory, and print the accuracies."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     random = torch.Generator().manual_seed(0)
     sources = [Digits.from_fonts()] * 2 if mnist is None else [Digits.from_mnist(mnist, p) for p in ("train", "t10k")]

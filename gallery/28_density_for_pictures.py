@@ -221,6 +221,7 @@ def deviation(values: NDArray[np.float64]) -> float:
 
 def main(out_dir: Path, *, n_cells: int = 48, n_steps: int = 200, seeds: Sequence[int] = (1,)) -> None:
     """Write the figures to a directory, and print the errors."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     pictures = Pictures.of_size(n_cells)
 

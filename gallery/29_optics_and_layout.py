@@ -288,6 +288,7 @@ def deviation(values: NDArray[np.float64]) -> float:
 
 def main(out_dir: Path, *, n_steps: int = 200, n_test: int = 500, stride: int = 1, seeds: Sequence[int] = (1,)) -> None:
     """Write the figures to a directory, and print the errors."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     # An exposure in which the point gives the specified charge.
     start, centre = Design.start(), SCENE_CELLS // 2

@@ -263,6 +263,7 @@ def main(
     out_dir: Path, *, n_x: int = 12, n_steps: int = 150, n_pictures: int = 40, seeds: Sequence[int] = (1,)
 ) -> None:
     """Write a chip per seed and the figures to a directory, and print the table."""
+    out_dir.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     task = Task.of_size(n_x * PITCH_UM)
     pictures = photographs(int((n_x * PITCH_UM + MARGIN_UM) / PIXEL_UM), n_pictures, seed=0)

@@ -30,7 +30,6 @@ SHOWN_INCHES, MIN_TEXT_PT = 736 / 96, 9.0
 @pytest.mark.parametrize("path", PARAMETERS)
 def test_script_runs_and_writes_its_pictures(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "out").mkdir()
     small = []
     save = foveasim.view.save_figure
 

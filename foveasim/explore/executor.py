@@ -41,8 +41,8 @@ MAX_DEATHS = 3
 NO_WORKER_TIMEOUT_S = 60.0
 #: Interval between updates of the worker list, seconds.
 POLL_S = 1.0
-#: Limits of the number of local processes.
-WORKERS = Limits(at_least=1, at_most=1024)
+#: Limits of the number of local processes; 0 is this process.
+WORKERS = Limits(at_least=0, at_most=1024)
 
 #: Computes items and yields each with its result, or with KILLED, in order of completion. The second argument contains the
 #: positions, in ascending order, at which costly shared components of the items change.
@@ -56,7 +56,7 @@ def executor(
     what: str,
     users: Iterable[Callable[..., Any]] = (),
     scheduler: str | None = None,
-    workers: int | None = None,
+    workers: int = 0,
 ) -> Iterator[Run]:
     """
     Start workers that evaluate one function.
@@ -64,7 +64,7 @@ def executor(
     ``function``: function of an item that returns its result. Each worker process has one copy, which may cache shared
     components. ``what``: name of the user objects in the function, for the message when it cannot be pickled. ``users``: user
     functions inside ``function``. Their modules are pickled by value, so workers need not import them. ``scheduler``: address
-    of a dask scheduler; by default local worker processes. ``workers``: number of local processes; None evaluates in this
+    of a dask scheduler; by default local worker processes. ``workers``: number of local processes; 0 evaluates in this
     process, without dask. Yields ``run``: see :data:`Run`. A ``FoveasimError`` of the function ends the run. Raises
     ParameterError when dask is not installed, or no scheduler answers. Raises SimulationError when workers do not start, or
     the function cannot be pickled; from ``run`` when the scheduler or all workers are lost, or workers cannot evaluate the
@@ -76,12 +76,12 @@ def executor(
     worker without a range gets half of the longest range, at a cost of O(log n_worker) per task. After the loss of a worker,
     the items of its task are retried one by one, so that an item that crashes affects no other item.
     """
-    if scheduler is None and workers is None:
+    if scheduler is None and workers == 0:
         yield lambda items, _cuts: ((item, function(item)) for item in items)
         return
     check_installed()
     payload = _pickle(function, what, users)
-    with open_client(scheduler, workers or 1) as client:
+    with open_client(scheduler, workers) as client:
         shared = client.submit(_Shared, payload, versions(), pure=False)
         yield lambda items, cuts: _Dispatch(client, shared, items, cuts).run()
 

@@ -270,7 +270,7 @@ class _CheckedImages(dict[Any, Any]):
 
 def _worker() -> Any:
     """Return the dask worker that runs this code, or None."""
-    if "distributed" not in sys.modules:
+    if sys.modules.get("distributed") is None:
         return None
     from distributed import get_worker
 

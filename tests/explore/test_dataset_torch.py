@@ -37,6 +37,13 @@ def test_torch_loader_gives_equal_samples_with_workers(tmp_path):
     np.testing.assert_array_equal(found[0][3]["code"][5].numpy(), data[125]["code"])
 
 
+def test_adapter_shows_its_dataset():
+    data = explore.Dataset(pictures(3), SHOT, VARY)
+
+    assert repr(explore.torch_dataset(data)) == f"TorchDataset({data!r})"
+    assert repr(explore.torch_dataset(data, len)) == f"TorchDataset({data!r}, len)"
+
+
 def test_deep_codes_become_signed_tensors():
     import torch
 

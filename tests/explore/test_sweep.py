@@ -169,7 +169,7 @@ def test_integer_keys_equal_string_keys():
 
 
 @pytest.mark.slow(keep=1)
-@pytest.mark.parametrize("workers", [1, 2, 4])
+@pytest.mark.parametrize("workers", [0, 1, 2, 4])
 def test_results_do_not_depend_on_workers(workers, reference_results, tmp_path):
     found = explore.run_sweep(plan_200(), out=tmp_path / "r.zarr", workers=workers)
 
@@ -185,6 +185,14 @@ def free_port():
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
         return one.getsockname()[1]
+
+
+def test_sweep_in_process_needs_no_dask(monkeypatch):
+    """A metric is called in this process, where a debugger stops in it."""
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    found = explore.sweep(SHOT, {"sensor.bits": [8, 10]}, metrics={"pid": lambda *_: float(os.getpid())}, workers=0)
+    assert found["error"].values.tolist() == ["", ""]
+    assert found["pid"].values.tolist() == [os.getpid()] * 2
 
 
 @pytest.mark.slow

@@ -67,6 +67,10 @@ def _dataset_class() -> Any:
         def __init__(self, dataset: Samples, transform: Callable[[dict[str, Any]], Any] | None) -> None:
             self.dataset, self.transform = dataset, transform
 
+        def __repr__(self) -> str:
+            applied = "" if self.transform is None else f", {getattr(self.transform, '__name__', self.transform)}"
+            return f"TorchDataset({self.dataset!r}{applied})"
+
         def __reduce__(self) -> tuple[Any, ...]:
             # Pickle cannot import a class that is defined in a function.
             return torch_dataset, (self.dataset, self.transform)

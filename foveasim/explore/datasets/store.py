@@ -81,9 +81,9 @@ def write_dataset(
     per_shard : int, optional
         Number of samples per shard; by default 1/32 of the dataset, from 8 to 512 samples, and at most about 64 MiB.
     workers : int, optional
-        Number of processes. They import the main file of the calling program: call this function under
-        ``if __name__ == "__main__":``. None: one process per core, as soon as the estimated remaining time in this process
-        exceeds 10 s.
+        Number of processes; 1 and 0 are this process. Others import the main file of the calling program: call this function
+        under ``if __name__ == "__main__":``. None: one process per core, as soon as the estimated remaining time in this
+        process exceeds 10 s.
     scheduler : str, optional
         Address of a dask scheduler instead, such as ``"tcp://10.0.0.1:8786"``. Its workers need this package, and access to
         the pictures and ``path`` under the same names.
@@ -195,7 +195,7 @@ def _write_each(
     write = partial(_write_shard, dataset, shards)
     start_s = time.monotonic()
     n_done = 0
-    if scheduler is None and workers in (None, 1):
+    if scheduler is None and workers in (None, 0, 1):
         for n_done, k in enumerate(missing):
             n_left = len(missing) - n_done
             left_s = n_left * (time.monotonic() - start_s) / n_done if n_done else 0.0

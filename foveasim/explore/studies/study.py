@@ -86,7 +86,7 @@ def study(
     scheduler : str, optional
         Address of a dask scheduler. Its workers need this package and the files that the settings reference.
     workers : int, optional
-        Number of local processes instead. By default trials are computed in this process.
+        Number of local processes instead. By default, and with 0, trials are computed in this process.
     progress : callable, optional
         Called with the number of finished trials and the total number.
 
@@ -156,8 +156,7 @@ def run_study(
     SimulationError
         When the scheduler or all workers are lost. Finished trials are stored.
     """
-    if workers is not None:
-        workers = min(workers, plan.batch)
+    n_workers = min(workers or 0, plan.batch)
     optuna = import_optional("study", "optuna")
     url = _url(storage)
     with _file_lock(storage, url), _without_empty_file(url):
@@ -167,7 +166,7 @@ def run_study(
             trials = _prepare(optuna, storage, optuna_study, plan, token)
         runner = ShotRunner(plan.source, plan.base.metrics)
         users = list(plan.base.metrics.values())
-        with executor(runner, what="the metrics", users=users, scheduler=scheduler, workers=workers) as run:
+        with executor(runner, what="the metrics", users=users, scheduler=scheduler, workers=n_workers) as run:
             n_done = len(completed_trials(optuna_study))
             while n_done < plan.n_trials:
                 if progress is not None:

@@ -108,7 +108,8 @@ def run_sweep(
         Address of a dask scheduler, such as ``"tcp://10.0.0.1:8786"``. Its workers need this package, and access to the files
         that the settings reference under the same names. By default local processes.
     workers : int, optional
-        Number of local processes; by default one per core.
+        Number of local processes; by default one per core. 0 computes all points in this process, as debuggers and profilers
+        need it.
     retry : bool
         Whether failed points are computed again; if the store has no journal and contains errors, all points are.
     progress : callable, optional
@@ -177,7 +178,7 @@ def _run(
         return
     n_workers = min(thread_count() if workers is None else workers, n_pending)
     # The workers of a scheduler determine their own number of threads.
-    n_threads = max(1, thread_count() // n_workers) if scheduler is None else None
+    n_threads = max(1, thread_count() // max(1, n_workers)) if scheduler is None else None
     runner = ShotRunner(
         plan.source_with(), plan.metrics, is_geometry_varied=plan.is_geometry_varied, n_threads=n_threads
     )
