@@ -420,6 +420,34 @@ def sweep(
 
 
 @app.command()
+def plot(
+    results: Annotated[Path, typer.Argument(help="Zarr store of a sweep.")] = Path("results.zarr"),
+    metric: Annotated[str | None, typer.Option("--metric", help="Metric to draw; by default the first one.")] = None,
+    x: Annotated[
+        str | None, typer.Option("--x", help="Setting along x; by default the numeric one with the most values.")
+    ] = None,
+    at: Annotated[
+        list[str] | None,
+        typer.Option("--at", help="Value of another setting, for example sensor.bits=10; repeatable."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="File of the figure, .png, .svg or .pdf; next to the store by default."),
+    ] = None,
+) -> None:
+    """Draw a metric of a sweep against a setting."""
+    from foveasim.explore import open_results
+    from foveasim.view import hidden_figures, plot_results, save_figure
+
+    selected = dict(part.partition("=")[::2] for part in at or ())
+    with hidden_figures():
+        axes = plot_results(open_results(results), metric, x=x, at=selected)
+        target = results.with_suffix(".png") if out is None else out
+        save_figure(axes.figure, target)  # type: ignore[arg-type]
+    _report(f"wrote {target}")
+
+
+@app.command()
 def study(
     settings: Annotated[
         Path, typer.Argument(help="YAML file of the study: a shot, ranges of its settings, and objectives.")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import collections.abc
 import inspect
+import itertools
 import runpy
 import types
 import typing
@@ -169,12 +170,12 @@ def wrong_values():
 
 def random_calls(n_calls, seed):
     """Yield calls with one or two wrong arguments: name, function, object of a method, and named arguments."""
-    rng = np.random.default_rng(seed)
     objects = make_objects()
     calls = public_calls()
     n = 0
-    while n < n_calls:
+    for again in itertools.count():
         for name, call, owner in calls:
+            rng = np.random.default_rng([seed, again, *name.encode()])  # that of a call does not depend on the others
             bound = next((each for each in objects if owner is not None and isinstance(each, owner)), None)
             parameters = list(inspect.signature(call).parameters.values())[0 if owner is None else 1 :]
             parameters = [p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
@@ -183,11 +184,14 @@ def random_calls(n_calls, seed):
             kinds = annotations_of(call)
             values = {p.name: example(kinds.get(p.name), objects) for p in parameters if p.default is p.empty}
             n_wrong = 1 if rng.random() < 0.7 else min(2, len(parameters))
-            pool = wrong_values()
             for k in rng.choice(len(parameters), n_wrong, replace=False):
+                is_count = "int" in str(kinds.get(parameters[k].name))
+                pool = [value for value in wrong_values() if not (is_count and isinstance(value, int) and value > 1)]
                 values[parameters[k].name] = pool[rng.integers(len(pool))]
             n += 1
             yield name, call, () if owner is None else (bound,), values
+        if n == n_calls:
+            return
 
 
 def test_wrong_types_give_errors_of_package(tmp_path, monkeypatch):

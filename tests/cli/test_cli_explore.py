@@ -917,3 +917,22 @@ def test_failing_workers_print_one_line(foveasim, folder, monkeypatch):
     assert wrong.startswith("error: the workers did not start (Nanny failed to start.); retry, or use fewer workers")
     assert wrong.count("\n") == 1
     assert not (folder / "results.zarr").exists()
+
+
+def test_plot_draws_a_stored_sweep(tmp_path, foveasim):
+    shot = {
+        "scene": {"kind": "flat", "shape": [16, 16], "pitch_um": 500.0, "distance_m": 1.0, "radiance_w_m2_sr_nm": 0.02, "band_width_nm": 50.0},
+        "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+        "layout": {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 3.0}},
+        "exposure_s": 0.001,
+    }  # fmt: skip
+    explore.sweep(shot, {"sensor.bits": [8, 10, 12]}, metrics=["snr"], out=tmp_path / "results.zarr", workers=0)
+
+    code, said, _ = foveasim("plot", tmp_path / "results.zarr", "--metric", "snr_mean")
+    assert code == 0
+    assert said.split() == ["wrote", str(tmp_path / "results.png")]
+    assert (tmp_path / "results.png").read_bytes().startswith(b"\x89PNG")
+
+    code, _, said = foveasim("plot", tmp_path / "results.zarr", "--metric", "snr", "--out", tmp_path / "other.png")
+    assert (code, (tmp_path / "other.png").exists()) == (2, False)
+    assert "'metric' must be one of" in said

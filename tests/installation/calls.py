@@ -681,6 +681,9 @@ CALLS = {
     "view.plot_picture": lambda o: view.plot_picture(o.picture),
     "view.plot_power_map": lambda o: view.plot_power_map(o.power_map),
     "view.plot_report": lambda o: view.plot_report(o.report),
+    "view.plot_results": lambda o: view.plot_results(
+        explore.open_results(o.written(".zarr", lambda p: explore.run_sweep(o.plan, out=p, workers=1)))
+    ),
     "view.plot_scene": lambda o: view.plot_scene(o.scene),
     "view.plotter": lambda o: view.plotter(o.layout, off_screen=True),
     "view.polydata": lambda o: view.polydata(o.layout),
@@ -754,6 +757,7 @@ COMMANDS = {
         o.path(".html"),
     ],
     "sweep": lambda o: [o.sweep_file, "--workers", "1", "--out", o.path(".zarr")],
+    "plot": lambda o: [o.written(".zarr", lambda p: explore.run_sweep(o.plan, out=p, workers=1))],
     "study": lambda o: [o.study_file, "--out", o.path(".db")],
     "study --workers": lambda o: [o.study_file, "--workers", "1", "--out", o.path(".db")],
     "dataset": lambda o: [o.dataset_file, "--out", o.path("")],

@@ -5,6 +5,7 @@ from __future__ import annotations
 from foveasim._core.calls import publish
 from foveasim.view.plots.figures import hidden_figures
 from foveasim.view.plots.rasters import plot_cortical, plot_image, plot_picture, plot_power_map, plot_scene
+from foveasim.view.plots.results import plot_results
 from foveasim.view.plots.rules import plot_report
 from foveasim.view.plots.sites import (
     plot_capture,
@@ -26,6 +27,7 @@ __all__ = [
     "plot_picture",
     "plot_power_map",
     "plot_report",
+    "plot_results",
     "plot_scene",
     "save_drawing",
     "save_figure",
