@@ -24,7 +24,7 @@ __all__ = ["plot_results"]
 MAX_CURVES = 12
 #: Relative deviation of ratios between neighbouring values that are spaced geometrically.
 GEOMETRIC = 0.1
-#: Dimension of repeated points, and variables that are no results.
+#: Dimension of repeated points, and variables besides the metrics.
 REPEAT, NO_METRICS = "repeat", ("seed",)
 
 
@@ -37,7 +37,9 @@ def plot_results(
     ax: Axes | None = None,
 ) -> Axes:
     """
-    Draw a metric of a sweep against a setting: one curve for each combination of the other settings.
+    Draw a metric of a sweep against a setting.
+
+    There is one curve for each combination of the other settings.
 
     Parameters
     ----------
@@ -142,7 +144,7 @@ def _coordinate(values: xr.DataArray, name: str) -> NDArray[Any]:
 
 
 def _is_geometric(positions: NDArray[Any]) -> bool:
-    """Return whether at least three positive numbers have equal ratios, which are not equal steps."""
+    """Return whether at least three positive numbers are spaced geometrically."""
     if positions.dtype.kind not in "fiu" or positions.size < 3 or positions.min() <= 0.0:
         return False
     steps = np.diff(np.log(np.sort(positions.astype(np.float64))))
