@@ -434,6 +434,7 @@ class Layout:
         # shapely requires the first vertex again at the end of a ring.
         ring_of = np.repeat(np.arange(n_vertices.size), n_vertices + 1)
         closed = self.xy_um[self.ring_offsets[:-1][ring_of] + positions_in_runs(n_vertices + 1) % n_vertices[ring_of]]
+        closed[np.abs(closed) < np.finfo(np.float64).tiny] = 0.0  # GEOS misplaces intersections of denormal coordinates
         rings = shapely.linearrings(closed, indices=ring_of)
         return np.asarray(
             shapely.polygons(rings, indices=np.repeat(np.arange(self.n_sites), np.diff(self.site_offsets)))

@@ -56,6 +56,7 @@ def size_um(layout):
     pitch_um=st.floats(1.2, 9.0),
     origin_um=st.tuples(st.floats(-5, 5), st.floats(-5, 5)),
 )
+@example(name="holed", cells="hexagons", border="cut", pitch_um=2.0, origin_um=(5e-324, 0.0))
 def test_tiling_fills_region(name, cells, border, pitch_um, origin_um):
     layout = tiling(pitch_um=pitch_um, cells=cells, region=REGIONS[name], border=border, origin_um=origin_um)
 
