@@ -512,9 +512,9 @@ def edge_gaps(xy, after, first_vertex, first, second, limit, touching, gap):
     """
     Update the smallest distances of edges to facing edges of another site.
 
-    Edges of each pair of sites (first[i], second[i]) face each other where they have opposite directions and each is in front
-    of the other, at most ``limit`` of both sites away, within ``touching``. Vertices are as in ``shared_lengths``; the edge of
-    a vertex leads to the next one.
+    An edge of the site first[i] faces one of second[i] where it has the opposite direction and is in front of it, at most
+    ``limit`` of both sites away, within ``touching``. Vertices are as in ``shared_lengths``; the edge of a vertex leads to the
+    next one.
     """
     for pair in range(first.size):
         i, j = first[pair], second[pair]
@@ -539,8 +539,7 @@ def edge_gaps(xy, after, first_vertex, first, second, limit, touching, gap):
                 away = dx * ey - dy * ex - slope * low
                 at_begin, at_end = away + slope * begin, away + slope * end
                 if min(at_begin, at_end) >= -touching and max(at_begin, at_end) <= largest:
-                    distance = max(0.5 * (at_begin + at_end), 0.0)
-                    gap[a], gap[c] = min(gap[a], distance), min(gap[c], distance)
+                    gap[a] = min(gap[a], max(0.5 * (at_begin + at_end), 0.0))
 
 
 @njit(types.int64[::1](_ints, _ints, _floats, types.int64))

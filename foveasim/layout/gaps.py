@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from foveasim._core.rings import next_vertex, site_area_um2, site_bounds_um
-from foveasim._core.validation import Floats, Ints, freeze
+from foveasim._core.rings import next_vertex, positions_in_runs, site_area_um2, site_bounds_um
+from foveasim._core.validation import Bools, Floats, Ints, freeze
 from foveasim.fields import PackedRings
 from foveasim.layout.adjacency import TOUCHING_UM
 from foveasim.layout.lattice import RectangleLattice
@@ -50,14 +50,14 @@ def edge_gaps_um(layout: PackedRings, sites: Ints | None = None) -> Floats:
     reach_um = 0.5 * limit_um[sites, np.newaxis] * np.array([-1.0, -1.0, 1.0, 1.0])
     boxes = shapely.box(*(site_bounds_um(xy_um, ring_offsets, site_offsets)[sites] + reach_um).T)
     first, second = shapely.STRtree(boxes).query(boxes)
-    is_first = first < second
+    is_other = first != second
     gap_um = np.full(xy_um.shape[0], np.inf)
     _kernels.edge_gaps(
         xy_um,
         next_vertex(ring_offsets),
         ring_offsets[site_offsets],
-        sites[first[is_first]],
-        sites[second[is_first]],
+        sites[first[is_other]],
+        sites[second[is_other]],
         limit_um,
         TOUCHING_UM,
         gap_um,
@@ -71,7 +71,7 @@ def close_gaps(layout: PackedRings, sites: Ints | None = None) -> PackedRings | 
 
     None if there are no gaps. Edges without a neighbour stay where they are, so that blind spots remain. ``sites`` as for
     :func:`edge_gaps_um`. The inverse of :func:`foveasim.layout.inset` where sites tile: equal up to rounding at all vertices
-    between two edges with neighbours. Sites that would lose area, by the displacement of a reflex vertex, keep their outline.
+    between two edges with neighbours. Sites that would lose area, or whose outline would cross itself, keep theirs.
     """
     lattice: RectangleLattice | None = getattr(layout, "lattice", None)
     if lattice is not None:
@@ -82,10 +82,19 @@ def close_gaps(layout: PackedRings, sites: Ints | None = None) -> PackedRings | 
         return None
     moved_um = layout.xy_um + _mitred(layout.xy_um, layout.ring_offsets, offset_um)
     before_um2 = site_area_um2(layout.xy_um, layout.ring_offsets, layout.site_offsets)
-    is_smaller = site_area_um2(moved_um, layout.ring_offsets, layout.site_offsets) < before_um2
-    n_vertices = np.diff(layout.ring_offsets[layout.site_offsets])
-    is_kept = np.repeat(is_smaller, n_vertices)[:, np.newaxis]
+    is_kept = site_area_um2(moved_um, layout.ring_offsets, layout.site_offsets) < before_um2
+    is_kept |= ~_are_simple(moved_um, layout.ring_offsets, layout.site_offsets)
+    is_kept = np.repeat(is_kept, np.diff(layout.ring_offsets[layout.site_offsets]))[:, np.newaxis]
     return Outlines(freeze(np.where(is_kept, layout.xy_um, moved_um)), layout.ring_offsets, layout.site_offsets)
+
+
+def _are_simple(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> Bools:
+    """Return whether no ring of a site crosses itself, (n_site,)."""
+    n_vertices = np.diff(ring_offsets) + 1  # with the first one again
+    ring_of = np.repeat(np.arange(n_vertices.size), n_vertices)
+    vertices = ring_offsets[ring_of] + positions_in_runs(n_vertices) % (n_vertices - 1)[ring_of]
+    is_simple = shapely.is_valid(shapely.polygons(shapely.linearrings(xy_um[vertices], indices=ring_of)))
+    return np.logical_and.reduceat(is_simple, site_offsets[:-1])
 
 
 def _mitred(xy_um: Floats, ring_offsets: Ints, offset_um: Floats) -> Floats:

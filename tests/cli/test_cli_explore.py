@@ -702,7 +702,7 @@ def test_invalid_dataset_writes_nothing(foveasim, folder, change, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--workers", "0"], "'workers' must be >= 1, got 0"),
+        (["--workers", "-1"], "'workers' must be >= 0, got -1"),
         (["--out", "no/where"], "cannot be written: the directory"),
         (["--out", "photos"], "photos: is not a dataset of foveasim"),
         (["--out", "x.txt"], "must have the extension .zarr, or none"),
