@@ -41,7 +41,7 @@ MAX_PIXELS = 2**28
 #: Limits of decompressed EXR data: for small files, and per byte of larger ones, the maximum ratio of deflate.
 MIN_DECOMPRESSED_BYTES, MAX_DECOMPRESSION_RATIO = 2**28, 1032
 #: Formats that are read with Pillow; its other formats are not photographs.
-PILLOW_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "PPM", "JPEG2000", "TGA", "AVIF")
+PILLOW_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "PPM", "JPEG2000", "TGA")
 #: Modes of Pillow that are read unchanged, and conversions of other modes.
 UNCHANGED_MODES = ("L", "LA", "RGB", "RGBA", "F")
 CONVERTED_MODES = {
@@ -138,15 +138,18 @@ def read_picture(path: str | Path) -> NDArray[Any]:
 def _select_reader(path: Path, head: bytes) -> Any:
     """Return the reader for a file that begins with these bytes."""
     if path.suffix.lower() in RAW_EXTENSIONS:
-        return _read_raw
-    if head[4:8] == b"ftyp" and head[8:12] in HEIF_BRANDS and not any(brand in head for brand in AVIF_BRANDS):
-        return _read_heif
+        return partial(_read_in_sandbox, reader=_read_with_libraw, kind="raw")
+    if head[4:8] == b"ftyp" and any(brand in head for brand in AVIF_BRANDS):
+        return _read_avif
+    if head[4:8] == b"ftyp" and head[8:12] in HEIF_BRANDS:
+        return partial(_read_in_sandbox, reader=_read_with_libheif, kind="HEIC")
     if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         return _read_tiff
     if head[:8] == PNG_MAGIC and head[24:25] == b"\x10":
         return _read_deep_png
     if head[:4] == b"\x76\x2f\x31\x01":
-        return _read_exr
+        # OpenEXR prints read errors and may continue without the data.
+        return partial(_read_in_sandbox, reader=_read_with_openexr, kind="EXR", is_silent=True)
     if head[:2] == b"#?":
         return _read_radiance
     return _read_with_pillow
@@ -155,14 +158,22 @@ def _select_reader(path: Path, head: bytes) -> Any:
 # -- readers: return the upright picture, or raise any exception ----------------------------------------------------
 
 
-def _read_with_pillow(path: Path) -> NDArray[Any]:
+def _read_avif(path: Path) -> NDArray[Any]:
+    from PIL import Image
+
+    Image.init()
+    if "AVIF" not in Image.OPEN:
+        raise FileError(path, "needs Pillow 11.3 or later with AVIF; install it with: pip install --upgrade pillow")
+    return _read_with_pillow(path, ("AVIF",))
+
+
+def _read_with_pillow(path: Path, formats: tuple[str, ...] = PILLOW_FORMATS) -> NDArray[Any]:
     from PIL import Image, UnidentifiedImageError
 
     try:
         with _pillow_limit(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # invalid metadata
-            Image.init()
-            with Image.open(path, formats=[each for each in PILLOW_FORMATS if each in Image.OPEN]) as image:
+            with Image.open(path, formats=formats) as image:
                 check_picture_size(path, image.width, image.height)
                 n_pictures = getattr(image, "n_frames", 1)
                 if (
@@ -172,9 +183,6 @@ def _read_with_pillow(path: Path) -> NDArray[Any]:
                 _check_complete(path, str(image.format))
                 return pixels_of_image(image)
     except UnidentifiedImageError:
-        if "AVIF" not in Image.OPEN and path.read_bytes()[8:12] in AVIF_BRANDS:
-            detail = "needs Pillow 11.3 or later with AVIF; install it with: pip install --upgrade pillow"
-            raise FileError(path, detail) from None
         raise FileError(path, "is not a picture in a supported format") from None
     except Image.DecompressionBombError:
         raise FileError(path, f"has more than {MAX_PIXELS} pixels") from None
@@ -359,10 +367,10 @@ def _read_radiance(path: Path) -> NDArray[Any]:
     return np.asarray(imagecodecs.rgbe_decode(content))
 
 
-def _read_exr(path: Path) -> NDArray[Any]:
-    # OpenEXR prints read errors and may continue without the data.
+def _read_in_sandbox(path: Path, *, reader: Any, kind: str, is_silent: bool = False) -> NDArray[Any]:
+    """Return the picture of a reader that runs in the sandbox process."""
     return read_in_sandbox(
-        _read_with_openexr, path, kind="EXR", max_decompressed_bytes=_max_decompressed_bytes, is_silent=True
+        reader, path, kind=kind, max_decompressed_bytes=_max_decompressed_bytes, is_silent=is_silent
     )[1][0]
 
 
@@ -390,11 +398,6 @@ def _read_with_openexr(name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
     return {}, [picture]
 
 
-def _read_heif(path: Path) -> NDArray[Any]:
-    import_optional(path, "pillow_heif")
-    return read_in_sandbox(_read_with_libheif, path, kind="HEIC", max_decompressed_bytes=_max_decompressed_bytes)[1][0]
-
-
 def _read_with_libheif(name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
     """Read the primary picture of a HEIC file, upright, in the sandbox process."""
     path = Path(name)
@@ -406,11 +409,6 @@ def _read_with_libheif(name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
     if picture.dtype != np.uint8:  # 10 or 12 bits
         picture = np.rint(picture * (np.iinfo(np.uint16).max / largest)).astype(np.uint16)
     return {}, [picture]
-
-
-def _read_raw(path: Path) -> NDArray[Any]:
-    import_optional(path, "rawpy")
-    return read_in_sandbox(_read_with_libraw, path, kind="raw", max_decompressed_bytes=_max_decompressed_bytes)[1][0]
 
 
 def _read_with_libraw(name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:

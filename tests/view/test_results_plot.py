@@ -59,18 +59,28 @@ def test_categories_are_along_x():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"metric": "mtg"}, "'metric' must be one of mtf, psnr_db, got 'mtg'"),
-        ({"metric": "seed"}, "'metric' must be one of mtf, psnr_db"),
-        ({"x": "bits"}, "'x' must be one of optics.f_number, sensor.bits, layout.kind"),
-        ({"at": {"bits": 8}}, "'at' must be one of optics.f_number"),
+        ({"metric": "mtg"}, "'metric' must be one of 'mtf', 'psnr_db', got 'mtg'"),
+        ({"metric": "seed"}, "'metric' must be one of 'mtf', 'psnr_db'"),
+        ({"x": "bits"}, "'x' must be one of 'optics.f_number', 'sensor.bits', 'layout.kind'"),
+        ({"at": {"bits": 8}}, "'at' must be one of 'optics.f_number'"),
         ({"at": {"sensor.bits": "many"}}, "'at' must be a number for 'sensor.bits'"),
-        ({"at": {"layout.kind": "round"}}, "'at' must be one of grid, hexagonal"),
+        ({"at": {"sensor.bits": "nan"}}, "'at' must be a number for 'sensor.bits'"),
+        ({"at": {"layout.kind": "round"}}, "'at' must be one of 'grid', 'hexagonal'"),
         ({"metric": "psnr_db", "at": {"sensor.bits": 8}}, "'results' must have a setting with at least two values"),
     ],
 )
 def test_wrong_choices_give_one_line(options, message):
     with pytest.raises(ParameterError, match=message):
         plot_results(RESULTS, **options)
+
+
+def test_settings_of_points_are_along_x():
+    settings = {"a": ("point", [3.0, 1.0]), "b": ("point", [5.0, 6.0]), "point": [0, 1]}
+    points = xr.Dataset({"m": ("point", [10.0, 20.0])}, settings)
+
+    ax = plot_results(points, x="a")
+    assert ax.get_xlabel() == "a"
+    assert [line.get_xdata().tolist() for line in ax.lines] == [[3.0, 1.0]]
 
 
 def test_too_many_curves_are_rejected():

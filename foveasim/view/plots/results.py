@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.names import possible_names
+from foveasim._core.validation import check_choice
 from foveasim.errors import ParameterError
 from foveasim.view.plots.sites import plot_curves
 
@@ -73,14 +73,19 @@ def plot_results(
     """
     values = _metric(results, metric)
     for name, value in (at or {}).items():
-        values = _selected(values, _known("at", name, values.dims), value)
+        values = _selected(values, check_choice("at", name, [*map(str, values.dims)]), value)
     if REPEAT in values.dims:
         values = values.mean(REPEAT)
     values = values.squeeze()
     if not values.dims:
         raise ParameterError("results", "must have a setting with at least two values to draw")
-    along = _default_x(values) if x is None else _known("x", x, values.dims)
-    others = [str(dim) for dim in values.dims if dim != along]
+    # The settings of a list of points are coordinates along one dimension.
+    along = (
+        _default_x(values)
+        if x is None
+        else check_choice("x", x, [*map(str, values.dims), *_settings_along_points(values)])
+    )
+    others = [str(dim) for dim in values.dims if dim not in values[along].dims]
     n_curves = math.prod(values.sizes[dim] for dim in others)
     if n_curves > MAX_CURVES:
         hint = f"specify the value of {' or '.join(map(repr, others))} with 'at'"
@@ -106,15 +111,12 @@ def _metric(results: xr.Dataset, metric: str | None) -> xr.DataArray:
     ]
     if not names:
         raise ParameterError("results", "must contain a metric of numbers, with the settings as dimensions")
-    return results[names[0] if metric is None else _known("metric", metric, names)]
+    return results[names[0] if metric is None else check_choice("metric", metric, names)]
 
 
-def _known(parameter: str, name: str, names: Any) -> str:
-    """Return a name, or raise a ParameterError that lists the known ones."""
-    known = [str(each) for each in names]
-    if name not in known:
-        raise ParameterError(parameter, f"must be one of {', '.join(known)}", name, hint=possible_names(name, known))
-    return name
+def _settings_along_points(values: xr.DataArray) -> list[str]:
+    """Return the coordinates of one dimension with another name."""
+    return [str(name) for name, each in values.coords.items() if each.ndim == 1 and name not in values.dims]
 
 
 def _selected(values: xr.DataArray, name: str, value: Any) -> xr.DataArray:
@@ -122,12 +124,15 @@ def _selected(values: xr.DataArray, name: str, value: Any) -> xr.DataArray:
     positions = _coordinate(values, name)
     if positions.dtype.kind in "fiu":
         try:
-            index = int(np.abs(positions - float(value)).argmin())
+            number = float(value)
         except (TypeError, ValueError):
-            raise ParameterError("at", f"must be a number for {name!r}", value) from None
+            number = math.nan
+        if not math.isfinite(number):
+            raise ParameterError("at", f"must be a number for {name!r}", value)
+        index = int(np.abs(positions - number).argmin())
     else:
         texts = [str(position) for position in positions.tolist()]
-        index = texts.index(_known("at", str(value), texts))
+        index = texts.index(check_choice("at", str(value), texts))
     return values.isel({name: index})
 
 
