@@ -220,6 +220,7 @@ def bench_first_capture(report: Report) -> None:
     """Measure the first capture of the demo in a new process, with and without compiled kernels."""
     with tempfile.TemporaryDirectory() as cache:
         environment = os.environ | {"NUMBA_CACHE_DIR": cache}
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)  # the modules are compiled, too
 
         def first() -> list[float]:
             done = subprocess.run(
