@@ -93,6 +93,22 @@ def test_merging_all_sites_gives_outline():
     assert np.diff(ring.site_offsets)[0] == 2  # the outline and the blind spot
 
 
+def test_merging_almost_touching_sites_keeps_all():
+    """Three sites whose corners are 1e-5 µm apart: GEOS 3.14 omits one of them from their union."""
+    corners_um = [
+        [(-6.758490333564913, 19.748722176826735), (-29.748722176826735, 19.748722176826735),
+         (-29.748722176826735, -19.748722176826735), (-6.722685417952121, -19.748722176826735),
+         (0.1012090988071385, -0.0139799906228933)],
+        [(0.101201867852465, -0.0140009025853924), (-6.7447407214700625, -19.812506241439117),
+         (29.812506241439117, -19.812506241439117), (29.812506241439117, 0.0333580044926785)],
+        [(29.81255548136612, 0.0333580829796105), (29.81255548136612, 19.81255548136612),
+         (-6.780647085167256, 19.81255548136612), (0.1012163494064031, -0.0140008795022399)],
+    ]  # fmt: skip
+    layout = fs.Layout.from_polygons(corners_um)
+
+    assert fs.layout.merge(layout, [0, 0, 0]).area_um2 == pytest.approx(layout.area_um2.sum(), abs=1e-3)
+
+
 def test_merging_disconnected_sites_raises():
     with pytest.raises(GeometryError, match="site 0 must be connected to the other sites") as caught:
         merge(GRID, np.where(np.isin(np.arange(80), (0, 79)), 1, 2 + np.arange(80)))

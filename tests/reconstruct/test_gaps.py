@@ -154,6 +154,7 @@ def test_rows_and_columns_close_like_polygons():
 
 @settings(max_examples=examples(60))
 @example(seed=816, n_sites=46, fraction=0.15625)  # an outline would cross itself
+@example(seed=9481, n_sites=3, fraction=0.030324362386746025)  # vertices that almost touch
 @given(seed=st.integers(0, 10_000), n_sites=st.integers(3, 60), fraction=st.floats(0.01, 0.2))
 def test_closed_sites_do_not_overlap(seed, n_sites, fraction):
     """Random cells with margins of their own: sites grow, and stay within the cells that they had."""
@@ -166,5 +167,6 @@ def test_closed_sites_do_not_overlap(seed, n_sites, fraction):
 
     sites, found = layout.polygons(), polygons(closed)
     assert (shapely.area(found) >= layout.area_um2 - 1e-9).all()
-    assert shapely.area(found).sum() <= shapely.area(shapely.union_all(found)) * (1.0 + 0.02)
+    # Without the grid, GEOS 3.14 can omit a polygon whose vertices almost touch others.
+    assert shapely.area(found).sum() <= shapely.area(shapely.union_all(found, grid_size=1e-9)) * (1.0 + 0.02)
     assert shapely.covers(found.take(range(n_sites)), shapely.buffer(sites, -1e-6)).all()

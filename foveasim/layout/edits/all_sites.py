@@ -29,6 +29,8 @@ from foveasim.layout.model import INTEGER_RANGES, Layout, derived, layout_of
 __all__ = ["clip", "cut_out", "inset", "joining_groups", "merge", "merge_small", "node", "snap", "split", "union"]
 
 PARTS = Limits(at_least=1, at_most=64)
+#: Relative area below which a union lacks a polygon.
+AREA_ROUNDING = 1e-9
 
 
 def union(layouts: Iterable[Layout]) -> Layout:
@@ -162,8 +164,10 @@ def merge(layout: Layout, groups: ArrayLike) -> Layout:
     rows = np.full((count.size, int(count.max(initial=1))), None, dtype=object)
     rows[group[order], positions_in_runs(count)] = layout.polygons()[order]
     joined = shapely.union_all(rows, axis=1) if count.size else np.zeros(0, dtype=object)
-    # Shared edges that coincide only within rounding leave gaps, which are closed on a fine grid.
-    has_gaps = (shapely.get_type_id(joined) != shapely.GeometryType.POLYGON) | _has_slivers(joined)
+    # Shared edges that coincide only within rounding leave gaps, which are closed on a fine grid. With vertices that are 1e-5 µm
+    # apart, GEOS 3.14 can omit polygons.
+    is_incomplete = shapely.area(joined) < (1.0 - AREA_ROUNDING) * np.bincount(group, layout.area_um2, count.size)
+    has_gaps = (shapely.get_type_id(joined) != shapely.GeometryType.POLYGON) | _has_slivers(joined) | is_incomplete
     joined[has_gaps] = shapely.union_all(rows[has_gaps], axis=1, grid_size=TOUCHING_UM)
     is_disconnected = shapely.get_type_id(joined) != shapely.GeometryType.POLYGON
     if is_disconnected.any():
