@@ -104,7 +104,7 @@ def test_merging_almost_touching_sites_keeps_all():
         [(29.81255548136612, 0.0333580829796105), (29.81255548136612, 19.81255548136612),
          (-6.780647085167256, 19.81255548136612), (0.1012163494064031, -0.0140008795022399)],
     ]  # fmt: skip
-    layout = fs.Layout.from_polygons(corners_um)
+    layout = fs.Layout.from_polygons([shapely.Polygon(corners) for corners in corners_um])
 
     assert fs.layout.merge(layout, [0, 0, 0]).area_um2 == pytest.approx(layout.area_um2.sum(), abs=1e-3)
 

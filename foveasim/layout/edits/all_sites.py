@@ -164,8 +164,8 @@ def merge(layout: Layout, groups: ArrayLike) -> Layout:
     rows = np.full((count.size, int(count.max(initial=1))), None, dtype=object)
     rows[group[order], positions_in_runs(count)] = layout.polygons()[order]
     joined = shapely.union_all(rows, axis=1) if count.size else np.zeros(0, dtype=object)
-    # Shared edges that coincide only within rounding leave gaps, which are closed on a fine grid. With vertices that are 1e-5 µm
-    # apart, GEOS 3.14 can omit polygons.
+    # Shared edges that coincide only within rounding leave gaps, which are closed on a fine grid. GEOS 3.14 can omit polygons
+    # whose vertices are 1e-5 µm apart.
     is_incomplete = shapely.area(joined) < (1.0 - AREA_ROUNDING) * np.bincount(group, layout.area_um2, count.size)
     has_gaps = (shapely.get_type_id(joined) != shapely.GeometryType.POLYGON) | _has_slivers(joined) | is_incomplete
     joined[has_gaps] = shapely.union_all(rows[has_gaps], axis=1, grid_size=TOUCHING_UM)
