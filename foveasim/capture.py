@@ -27,6 +27,7 @@ from foveasim.fields import Grid
 from foveasim.layout import Layout
 from foveasim.layout.packed import layout_from_arrays, layout_to_arrays
 from foveasim.reconstruct import (
+    ColourCorrection,
     CorticalImage,
     Picture,
     cells,
@@ -161,6 +162,7 @@ class Capture:
         of: Quantity = "code",
         per: Literal["site", "um2"] = "site",
         gaps: Gaps = "fill",
+        colour: Literal["corrected", "raw"] | None = None,
         sensor: Sensor | None = None,
         **options: Any,
     ) -> Picture:
@@ -188,6 +190,10 @@ class Capture:
         gaps : {"fill", "empty"}
             Whether sites extend to the centre of the gap to a neighbour, such as a trench; gaps wider than half the size (root
             of the area) of the smaller site, and blind spots, are empty.
+        colour : {"corrected", "raw"}, optional
+            Whether images of the picture, such as files and plots, have the colours of the scene (:attr:`colour_correction`) or
+            those of the filters. ``data`` are the values of the filters in both cases. Default: ``"corrected"`` where there is
+            a correction.
         sensor : Sensor, optional
             By default that of the capture. Required for captures that were read from a file, if the sensor has effects that
             are not registered.
@@ -198,13 +204,14 @@ class Capture:
         Returns
         -------
         Picture
-            One channel per colour filter, with the white balance of ``white_dn``; NaN outside the photosites.
+            One channel per colour filter, with the white balance of ``white_dn`` and the colour correction; NaN outside the
+            photosites.
 
         Raises
         ------
         ParameterError
-            When a choice or option is invalid, the sensor's parameters are required and not known, or the sensor has
-            another layout.
+            When a choice or option is invalid, the sensor's parameters are required and not known, the sensor has another
+            layout, or a required colour correction does not exist.
 
         Notes
         -----
@@ -223,7 +230,31 @@ class Capture:
         self._check_sensor(sensor)
         grid = raster_grid(self.layout, max_pixels) if grid is None else grid
         picture = self._reconstruct(method, grid, of, per, sensor, {"gaps": gaps, **options})
-        return replace(picture, white=self.white_dn) if (self.white_dn > 0.0).all() else picture
+        matrix = self._colour_matrix(colour)
+        return replace(picture, white=self.white_dn, colour_matrix=matrix) if (self.white_dn > 0.0).all() else picture
+
+    @property
+    def colour_correction(self) -> ColourCorrection | None:
+        """
+        Colour correction of the filters for the scene, with its colour errors.
+
+        For photographs in red, green and blue, the inverse of what the filters do to their three bands; otherwise the
+        least-squares solution for the patches under the illuminant of the scene. None when the filters cannot distinguish
+        colours: fewer than three with photosites, or equal ones.
+        """
+        found = self.settings.get("colour")
+        return None if found is None else ColourCorrection.from_settings(found)
+
+    def _colour_matrix(self, colour: str | None) -> Floats | None:
+        found = None if colour == "raw" else self.colour_correction
+        if found is None and colour == "corrected":
+            raise ParameterError(
+                "colour",
+                "must be 'raw': the capture has no colour correction",
+                colour,
+                hint="this needs three different filters, and three bands of light",
+            )
+        return None if found is None else found.matrix
 
     def _reconstruct(
         self, method: str, grid: Grid, of: str, per: str, sensor: Sensor | None, options: dict[str, Any]

@@ -355,7 +355,9 @@ class TiledCapture:
         n_sites = count.reshape(n_filters, n_y, n_x)
         data = total.reshape(n_sites.shape) / np.where(n_sites > 0.0, n_sites, np.nan)
         coverage = np.asarray(n_sites.any(axis=0), np.float32)
-        return Picture(np.asarray(data, np.float32), coverage, grid, white=self.white_dn)
+        colour = self.settings.get("colour")
+        matrix = None if colour is None else np.asarray(colour["matrix"])
+        return Picture(np.asarray(data, np.float32), coverage, grid, white=self.white_dn, colour_matrix=matrix)
 
 
 def write_tiles(

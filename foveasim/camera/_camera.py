@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from threading import Lock
 from typing import Annotated, Any, Literal, overload
 
@@ -24,6 +25,7 @@ from foveasim._core.threads import cached_property, in_order, thread_count
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, check_per_site, check_point, finite_array, read_only
 from foveasim.camera._clock import Clock
+from foveasim.camera._colour import colour_correction
 from foveasim.camera._exposure import AUTO_SETTINGS, ExposureTime, exposure_time
 from foveasim.camera._frames import Frame, ImageCache, Position, Task, check_frames, position_settings, tasks
 from foveasim.camera._steps import SensorFrame, WeightedMap, expose, integrate_maps, white_dn
@@ -923,15 +925,17 @@ class Camera:
         -------
         Picture
             Exact means over the pixels, e-/µm², one channel per filter, without noise and dark signal; NaN outside the image.
-            With the white balance of captures. With lateral chromatic aberration, the sum of the images of all sizes, each on
-            its own cells, as in captures.
+            With the white balance and colour correction of captures. With lateral chromatic aberration, the sum of the images
+            of all sizes, each on its own cells, as in captures.
         """
         joules_per_w_m2 = float(w_from_w_m2_um2(exposure_s))
         weights = self._sensor.responsivity_e_per_j(light.wavelength_nm) * joules_per_w_m2
-        white, scene = white_dn(self._sensor, light), self.seen(light)
+        colour, scene = colour_correction(self._sensor, light), self.seen(light)
+        matrix = None if colour is None else colour.matrix
+        shown = partial(replace, grid=grid, white=white_dn(self._sensor, light), colour_matrix=matrix)
         in_image = _moved(grid, self.position_um)
         if isinstance(scene, PowerMap):
-            return replace(reference(scene, in_image, weights=weights), grid=grid, white=white)
+            return shown(reference(scene, in_image, weights=weights))
         optics, frame = self._optics.resolve_oversample(scene), self.sensor_frame(scene)
         images = [
             (
@@ -940,7 +944,7 @@ class Camera:
             )
             for source, is_in_image in optics.image_grids(scene)
         ]
-        return replace(sum_of_images(images, in_image, len(weights)), grid=grid, white=white)
+        return shown(sum_of_images(images, in_image, len(weights)))
 
     def noise_budget(
         self,

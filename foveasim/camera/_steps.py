@@ -13,6 +13,7 @@ from foveasim._core.provenance import to_plain_data, versions
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Bools, Floats, read_only
 from foveasim.camera._clock import Clock
+from foveasim.camera._colour import colour_correction, white_response
 from foveasim.camera._warnings import warn_of_negative
 from foveasim.capture import Capture
 from foveasim.distortion import Lens
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
 
 #: Fourier transforms in float32 leave negative rates of up to this fraction of the largest one.
 NEGATIVE_ROUNDING = 1e-4
-#: Lower limit of a filter's response, relative to the strongest filter, for white balance.
-MIN_WHITE_FRACTION = 0.01
 
 
 class WeightedMap(NamedTuple):
@@ -147,19 +146,16 @@ def expose(
 
 
 def white_dn(sensor: Sensor, light: Scene | PowerMap) -> Floats:
-    """Return each filter's relative response to an equal-energy spectrum, as a code."""
-    width_nm = light.band_width_nm if isinstance(light, Scene) else np.ones(light.wavelength_nm.size)
-    response = sensor.responsivity_e_per_j(light.wavelength_nm) @ width_nm
-    max_response = float(response.max(initial=0.0))
-    if max_response == 0.0:
-        return np.ones(response.size)
-    return np.maximum(response / max_response, MIN_WHITE_FRACTION) * (2**sensor.bits - 1)
+    """Return the code of white of each filter, up to a common factor."""
+    return white_response(sensor, light) * (2**sensor.bits - 1)
 
 
 def capture_settings(camera: Camera, light: Scene | PowerMap, exposure_s: float, streams: Streams) -> dict[str, Any]:
     """Return the settings of a capture, as plain data."""
+    colour = colour_correction(camera.sensor, light)
     return {
         "light": _light_settings(camera, light),
+        "colour": None if colour is None else colour.to_settings(),
         **camera.settings,
         "gaze_um": list(camera.gaze_um),
         "axis": camera.axis,
@@ -190,4 +186,5 @@ def _light_settings(camera: Camera, light: Scene | PowerMap) -> dict[str, object
         "wavelength_nm": light.wavelength_nm.tolist(),
         "band_width_nm": light.band_width_nm.tolist(),
         "spectrum_w_m2_sr_nm": to_plain_data(light.spectrum_w_m2_sr_nm),
+        "illuminant": to_plain_data(light.illuminant),
     }

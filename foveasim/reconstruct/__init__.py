@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from foveasim._core.calls import publish
 from foveasim.reconstruct.cells import cells, fill_channels
+from foveasim.reconstruct.colour import ColourCorrection
 from foveasim.reconstruct.cortical import CorticalImage, cortical, from_cortical, to_cortical
 from foveasim.reconstruct.estimates import SiteEstimates, electrons_per_code, estimate_from_charge, estimate_from_code
 from foveasim.reconstruct.interpolation import linear, natural
@@ -12,6 +13,7 @@ from foveasim.reconstruct.picture import Picture, raster_grid
 from foveasim.reconstruct.rasters import blur_kernel, reference
 
 __all__ = [
+    "ColourCorrection",
     "CorticalImage",
     "Picture",
     "SiteEstimates",

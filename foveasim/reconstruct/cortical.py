@@ -71,7 +71,8 @@ class CorticalImage:
     sites : (n_ring, n_sector) int64, optional
         Site of each pixel; None for resampled images.
     white : (n_channel,) float64, optional
-        Values of white, as of :class:`foveasim.Picture`.
+    colour_matrix : (3, n_channel) float64, optional
+        Values of white, and colour correction, as of :class:`foveasim.Picture`.
     """
 
     data: Images
@@ -81,6 +82,7 @@ class CorticalImage:
     offset_um: float = 0.0
     sites: Ints | None = None
     white: Floats | None = None
+    colour_matrix: Floats | None = None
 
     __repr__ = short_repr
 
@@ -255,7 +257,7 @@ def to_cortical(
         weights = map_coordinates(is_known.astype(np.float64), (y, x), order=1, mode="constant", cval=0.0)
         sums = map_coordinates(np.where(is_known, plane, 0.0), (y, x), order=1, mode="constant", cval=0.0)
         channel[:] = np.divide(sums, weights, out=np.full(sums.shape, np.nan), where=weights >= MIN_KNOWN)
-    return replace(image, data=data, white=picture.white)
+    return replace(image, data=data, white=picture.white, colour_matrix=picture.colour_matrix)
 
 
 def from_cortical(image: CorticalImage, grid: Grid, *, method: Literal["linear", "nearest"] = "linear") -> Picture:
@@ -301,7 +303,8 @@ def from_cortical(image: CorticalImage, grid: Grid, *, method: Literal["linear",
                 weights += known * (part * weight)
         data[:, row, column] = np.divide(total, weights, out=np.full(total.shape, np.nan), where=weights >= MIN_KNOWN)
     coverage = np.isfinite(data).any(axis=0)
-    return Picture(read_only(data.astype(np.float32)), read_only(coverage.astype(np.float32)), grid, image.white)
+    parts = read_only(data.astype(np.float32)), read_only(coverage.astype(np.float32)), grid
+    return Picture(*parts, image.white, image.colour_matrix)
 
 
 def _sites_of_rings(layout: Layout) -> Ints:

@@ -21,6 +21,7 @@ from foveasim.fields import Grid, Lattice, PackedRings, to_file_rows
 from foveasim.integrate import Integrator
 from foveasim.layout import Layout
 from foveasim.layout.gaps import close_gaps
+from foveasim.reconstruct.colour import check_matrix
 from foveasim.units import decode_srgb
 from foveasim.units import encode_srgb as encoded_in_srgb
 
@@ -60,17 +61,21 @@ class Picture:
         Pixels in the sensor plane.
     white : (n_channel,) float64, optional
         Values of white in each channel, up to a common factor, for the white balance of colours.
+    colour_matrix : (3, n_channel) float64, optional
+        Linear red, green and blue (sRGB) of white-balanced values, for :meth:`to_rgb` and all images. ``data`` are not
+        corrected.
 
     Raises
     ------
     ParameterError
-        When there is not one positive white per channel.
+        When there is not one positive white per channel, or the matrix has another shape.
     """
 
     data: Images
     coverage: Images
     grid: Grid
     white: Floats | None = None
+    colour_matrix: Floats | None = None
 
     def __post_init__(self) -> None:
         for name, missing_is_nan in (("data", True), ("coverage", False)):
@@ -89,6 +94,9 @@ class Picture:
                     "white", f"must be one number for each of the {self.data.shape[0]} channels", white
                 )
             object.__setattr__(self, "white", own(white))
+        if self.colour_matrix is not None:
+            matrix = check_matrix("colour_matrix", self.colour_matrix, self.data.shape[0])
+            object.__setattr__(self, "colour_matrix", matrix)
 
     def __repr__(self) -> str:
         n_channels, n_y, n_x = self.data.shape
@@ -109,6 +117,35 @@ class Picture:
     _repr_html_ = drawn("to_html")
     _repr_png_ = drawn("to_png")
 
+    def to_rgb(self, white: float | Floats | None = None, *, clip: bool = False) -> Picture:
+        """
+        Return the picture as light, in linear sRGB or grey.
+
+        Parameters
+        ----------
+        white : number or (n_channel,), optional
+            Values that become 1; by default those of the picture, or 1. A single number applies neither white balance nor
+            colour correction.
+        clip : bool
+            Whether values above white are limited to it, before the colour correction, so that saturated photosites are white.
+
+        Returns
+        -------
+        Picture
+            Values relative to white: three channels, corrected with ``colour_matrix`` if there is one, and then negative for
+            colours outside sRGB; one channel for grey pictures, and the mean of other numbers of channels.
+        """
+        given = (1.0 if self.white is None else self.white) if white is None else white
+        levels = self._levels(given)
+        data = np.asarray(self.data / levels)
+        if clip:
+            data = np.minimum(data, 1.0)
+        if self.colour_matrix is not None and levels.size == self.data.shape[0]:
+            data = np.einsum("ck,kyx->cyx", self.colour_matrix, data)
+        elif data.shape[0] not in (1, 3):
+            data = data.mean(axis=0, keepdims=True)
+        return Picture(read_only(data.astype(np.float32)), self.coverage, self.grid)
+
     def to_image(
         self,
         white: float | Floats | None = None,
@@ -123,8 +160,8 @@ class Picture:
         Parameters
         ----------
         white : number or (n_channel,), optional
-            Values that map to the largest integer; by default the largest value of the picture, or, for a picture with
-            ``white``, the smallest multiple of it that no value exceeds.
+            Values that map to the largest integer, as for :meth:`to_rgb`; by default the largest value of the picture, or, for
+            a picture with ``white``, the smallest multiple of it that no value exceeds.
         encode_srgb : bool
             Whether to encode linear values with the sRGB transfer function, as screens and image files expect.
         bits : {8, 16}
@@ -134,22 +171,18 @@ class Picture:
 
         Returns
         -------
-        image : (n_y, n_x, n_channel + 1) or, with a background, (n_y, n_x, 1 or 3), uint8 or uint16
-            Grey or RGB, with the coverage as alpha. With a background there is no alpha; a grey picture on a background of
-            another colour becomes RGB.
+        image : (n_y, n_x, 2 or 4) or, with a background, (n_y, n_x, 1 or 3), uint8 or uint16
+            Grey or RGB as of :meth:`to_rgb`, with the coverage as alpha. With a background there is no alpha; a grey picture on
+            a background of another colour becomes RGB.
 
         Raises
         ------
         ParameterError
-            When the picture has neither 1 nor 3 channels, ``white`` is not positive, ``bits`` is neither 8 nor 16, or
-            ``background`` is not a colour.
+            When ``white`` is not positive, ``bits`` is neither 8 nor 16, or ``background`` is not a colour.
         """
-        if self.data.shape[0] not in (1, 3):
-            raise ParameterError("data", f"must have 1 or 3 channels to be shown, got {self.data.shape[0]}")
-        if white is None:
-            balance = np.ones(1) if self.white is None else self.white
-            white = balance * (float(np.nanmax(self.data / self._levels(balance), initial=0.0)) or 1.0)
-        fraction = np.clip(np.nan_to_num(self.data) / self._levels(white), 0.0, 1.0)
+        light = np.asarray(self.to_rgb(white, clip=white is not None).data, np.float64)
+        level = 1.0 if white is not None else float(np.nanmax(light, initial=0.0)) or 1.0
+        fraction = np.clip(np.nan_to_num(light) / level, 0.0, 1.0)
         if encode_srgb:
             fraction = encoded_in_srgb(fraction)
         coverage = np.clip(self.coverage, 0.0, 1.0)[np.newaxis]
@@ -179,8 +212,8 @@ class Picture:
             ``.tif`` with integers or floating-point numbers, or, with the extra ``pictures``, ``.exr``. 16 bits per channel
             are available in ``.png`` (in colour with the extra ``pictures``) and ``.tif``.
         white, encode_srgb
-            For integers, as for :meth:`to_image`: encoded in sRGB by default. Floating-point files contain linear values,
-            divided by ``white`` if it is given, and cannot be encoded.
+            For integers, as for :meth:`to_image`: encoded in sRGB by default. Floating-point files contain linear values and
+            cannot be encoded: ``data``, or, with ``white``, light as of :meth:`to_rgb`.
         bits : {8, 16, 32}, optional
             32 writes floating-point numbers, with NaN where no photosite lies and without alpha. By default 32 for TIFF and
             EXR, and 8 for other formats.
@@ -207,13 +240,15 @@ class Picture:
             return
         if encode_srgb:
             raise ParameterError("encode_srgb", "must be False for floating-point files, which store linear values")
-        if self.data.shape[0] not in (1, 3):
-            raise ParameterError("data", f"must have 1 or 3 channels to be saved, got {self.data.shape[0]}")
-        values = np.asarray(self.data if white is None else self.data / self._levels(white))
+        values = np.asarray(self.data if white is None else self.to_rgb(white).data)
+        if values.shape[0] not in (1, 3):
+            raise ParameterError(
+                "data", f"must have 1 or 3 channels to be saved without 'white', got {self.data.shape[0]}"
+            )
         if background is not None:
             if white is None:
                 raise ParameterError("white", "must be given with 'background' in floating-point files, as its unit")
-            colour = decode_srgb(_channels(background, self.data.shape[0]))
+            colour = decode_srgb(_channels(background, values.shape[0]))
             coverage = np.clip(self.coverage, 0.0, 1.0)
             values = coverage * np.nan_to_num(values) + (1.0 - coverage) * colour
         write_picture(path, np.ascontiguousarray(to_file_rows(np.asarray(values, np.float32))))

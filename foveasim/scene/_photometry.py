@@ -42,7 +42,7 @@ def photopic(wavelength_nm: ArrayLike) -> Floats:
     >>> photopic([450.0, 555.0, 620.0]).tolist()
     [0.038, 1.0, 0.381]
     """
-    at_nm, efficiency = read_table("cie_photopic")
+    at_nm, _, efficiency, _ = read_table("cie_observer")
     return np.interp(wavelengths_nm("wavelength_nm", wavelength_nm), at_nm, efficiency, left=0.0, right=0.0)
 
 

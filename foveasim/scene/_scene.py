@@ -131,6 +131,11 @@ class Scene:
         covers all photosites for each gaze within them (:attr:`foveasim.Camera.gaze_um`).
     centre_um : (x, y), µm
         Position of the picture's centre in the scene, from the optical axis. (0, 0) with ``fit``.
+    illuminant : (n_wavelength,) float64, optional
+        Relative spectrum of white, for the white balance and the colour correction of captures; by default of equal energy.
+    is_rgb : bool
+        Whether the three basis images are the channels of a photograph in linear sRGB, which the colour correction of captures
+        reproduces.
 
     Raises
     ------
@@ -158,6 +163,8 @@ class Scene:
     is_picture: bool = field(default=False, kw_only=True)
     gaze_range_um: tuple[float, float] = field(default=(0.0, 0.0), kw_only=True)
     centre_um: tuple[float, float] = field(default=(0.0, 0.0), kw_only=True)
+    illuminant: Floats | None = field(default=None, kw_only=True)
+    is_rgb: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
         check_declared(self)
@@ -194,6 +201,15 @@ class Scene:
         object.__setattr__(self, "spectrum_w_m2_sr_nm", read_only(spectrum.copy()))
         object.__setattr__(self, "wavelength_nm", wavelength_nm)
         object.__setattr__(self, "band_width_nm", read_only(width_nm.copy()))
+        if self.illuminant is not None:
+            illuminant = finite_array("illuminant", self.illuminant, ndim=1, at_least=0.0)
+            if illuminant.shape != wavelength_nm.shape or not illuminant.any():
+                raise ParameterError(
+                    "illuminant", f"must be {wavelength_nm.size} values, one per wavelength, and not all 0", illuminant
+                )
+            object.__setattr__(self, "illuminant", own(illuminant))
+        if self.is_rgb and basis.shape[0] != len(RGB_NM):
+            raise ParameterError("is_rgb", f"requires three basis images, got {basis.shape[0]}")
         object.__setattr__(self, "pitch_um", self._checked_pitch_um())
         object.__setattr__(self, "centre_um", check_point("centre_um", self.centre_um))
         object.__setattr__(self, "gaze_range_um", check_point("gaze_range_um", self.gaze_range_um, at_least=0.0))
@@ -442,6 +458,7 @@ class Scene:
             gaze_range_um=gaze_range_um,
             field_of_view_deg=field_of_view_deg,
             is_picture=True,
+            is_rgb=colours.shape[0] == len(RGB_NM),
         )
 
     @classmethod
@@ -593,6 +610,7 @@ class Scene:
             gaze_range_um=gaze_range_um,
             field_of_view_deg=field_of_view_deg,
             is_picture=True,
+            illuminant=radiance.illuminant,
         )
 
     @classmethod

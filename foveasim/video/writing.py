@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Annotated, Any
@@ -147,11 +148,9 @@ class _Raster:
         if n_filters > 1:
             values = fill_channels(self._layout, values[0], capture.filter_of_site, n_filters)
             values = np.where(np.isnan(values), 0.0, values)
-        white: Any = capture.white_dn
-        if n_filters not in (1, 3):
-            values, white = values.mean(axis=0, keepdims=True), float(np.mean(white))
-        picture = self._raster.means(values)
-        return np.asarray(picture.to_image(white), np.uint8)
+        colour = capture.colour_correction
+        picture = replace(self._raster.means(values), colour_matrix=None if colour is None else colour.matrix)
+        return np.asarray(picture.to_image(capture.white_dn), np.uint8)
 
     def composite(self, capture: Capture) -> NDArray[np.uint8]:
         """Return sRGB values over a dark grey background, (n_y, n_x, 3)."""

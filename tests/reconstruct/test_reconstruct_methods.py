@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -702,6 +703,17 @@ def test_float_file_is_relative_to_white(tmp_path):
     assert read_picture(tmp_path / "p.tif") == pytest.approx(expected, nan_ok=True)
 
 
+@pytest.mark.parametrize("n_channels", [2, 5])
+def test_other_numbers_of_channels_are_averaged(n_channels):
+    picture = asymmetric(n_channels)
+    white = np.arange(1.0, n_channels + 1.0)
+    grey = np.mean(picture.data / white.reshape(-1, 1, 1), axis=0, keepdims=True)
+
+    assert picture.to_rgb(white).data == pytest.approx(grey, nan_ok=True)
+    expected = Picture(np.asarray(grey), picture.coverage, picture.grid)
+    np.testing.assert_array_equal(replace(picture, white=white).to_image(), expected.to_image())
+
+
 @pytest.mark.parametrize(
     ("n_channels", "name", "options", "error", "message"),
     [
@@ -710,8 +722,7 @@ def test_float_file_is_relative_to_white(tmp_path):
         (1, "p.exr", {"bits": 16}, fs.errors.FileError, "only 1 to 4 channels of float32"),
         (1, "p.jpg", {"bits": 16}, fs.errors.FileError, "only 1 to 4 channels of uint8"),
         (1, "p.tif", {"encode_srgb": True}, ParameterError, "'encode_srgb' must be False for floating-point files"),
-        (2, "p.tif", {}, ParameterError, "'data' must have 1 or 3 channels to be saved, got 2"),
-        (2, "p.png", {}, ParameterError, "'data' must have 1 or 3 channels to be shown, got 2"),
+        (2, "p.tif", {}, ParameterError, "'data' must have 1 or 3 channels to be saved without 'white', got 2"),
         (1, "p.tif", {"background": "white"}, ParameterError, "'white' must be given with 'background'"),
         (1, "nowhere/p.exr", {}, fs.errors.FileError, "the directory .*nowhere does not exist"),
     ],

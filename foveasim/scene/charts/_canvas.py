@@ -208,11 +208,13 @@ class Canvas:
         fractions += np.float32(black)
         return self.scene_of(fractions[np.newaxis], np.asarray(self.radiance_w_m2_sr_nm)[np.newaxis], source)
 
-    def scene_of(self, basis: Fractions, spectrum_w_m2_sr_nm: Floats, source: str) -> Scene:
+    def scene_of(
+        self, basis: Fractions, spectrum_w_m2_sr_nm: Floats, source: str, illuminant: Floats | None = None
+    ) -> Scene:
         """
         Return the scene of basis images and their spectra.
 
-        The images (n_basis, n_y, n_x) are not copied; the spectra are (n_basis, n_wavelength).
+        The images (n_basis, n_y, n_x) are not copied; the spectra are (n_basis, n_wavelength), the illuminant (n_wavelength,).
         """
         return Scene(
             freeze(basis),
@@ -222,6 +224,7 @@ class Canvas:
             self.pitch_um,
             self.distance_m,
             source=source,
+            illuminant=illuminant,
         )
 
 

@@ -148,7 +148,7 @@ def colour_chart(
     weights, spectra = _patch_spectra(np.asarray(canvas.wavelength_nm), n_basis)
     waves_nm = np.asarray(canvas.wavelength_nm)
     illumination = cie_illuminant(illuminant, waves_nm)
-    illumination *= level_of_white(
+    level = level_of_white(
         "radiance_w_m2_sr_nm",
         radiance_w_m2_sr_nm,
         illumination,
@@ -157,7 +157,8 @@ def colour_chart(
         luminance_cd_m2=luminance_cd_m2,
         illuminance_lux=illuminance_lux,
     )
-    return canvas.scene_of(_patches(canvas, weights, patch_mm, step_mm), spectra * illumination, "a colour chart")
+    basis = _patches(canvas, weights, patch_mm, step_mm)
+    return canvas.scene_of(basis, spectra * illumination * level, "a colour chart", illumination)
 
 
 def _patch_spectra(wavelength_nm: Floats, n_basis: int) -> tuple[Floats, Floats]:

@@ -41,12 +41,17 @@ MAX_REFLECTANCE = 1.01
 
 @dataclass(frozen=True, kw_only=True)
 class Radiance:
-    """Spectra of the bands of a cube, as those of a scene, and the largest reflectance or 0."""
+    """
+    Spectra of the bands of a cube, as those of a scene, and the largest reflectance or 0.
+
+    ``illuminant``: relative spectrum of white, for a reflectance.
+    """
 
     spectrum_w_m2_sr_nm: Floats
     wavelength_nm: Floats
     band_width_nm: Floats
     max_fraction: float
+    illuminant: Floats | None
 
     def warn_above_one(self) -> None:
         """Warn of a reflectance above 1."""
@@ -86,7 +91,7 @@ def spectral_radiance(
     else:
         waves_nm = wavelengths_nm("resample_nm", resample_nm)
         weights = interpolation_weights(bands_nm, waves_nm)
-    spectrum, max_fraction = factor[:, np.newaxis] * weights, 0.0
+    spectrum, max_fraction, relative = factor[:, np.newaxis] * weights, 0.0, None
     own_nm = cube.band_width_nm if band_width_nm is None and resample_nm is None else band_width_nm
     widths_nm = band_widths_nm(waves_nm, own_nm)
     level = {"luminance_cd_m2": luminance_cd_m2, "illuminance_lux": illuminance_lux}
@@ -117,7 +122,11 @@ def spectral_radiance(
             if value is not None:
                 raise ParameterError(name, "must be omitted for a cube of radiance", value)
     return Radiance(
-        spectrum_w_m2_sr_nm=spectrum, wavelength_nm=waves_nm, band_width_nm=widths_nm, max_fraction=max_fraction
+        spectrum_w_m2_sr_nm=spectrum,
+        wavelength_nm=waves_nm,
+        band_width_nm=widths_nm,
+        max_fraction=max_fraction,
+        illuminant=relative,
     )
 
 

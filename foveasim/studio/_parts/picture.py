@@ -21,14 +21,11 @@ def picture(result: Simulated) -> PartData:
     """Return the picture that is reconstructed from the codes."""
     capture = result.capture
     found = capture.picture(max_pixels=result.picture_pixels)
-    levels = found.data / capture.white_dn.reshape(-1, 1, 1).astype(np.float32)
-    return pixels_of(levels, found.coverage, found.grid.bounds_um)
+    return pixels_of(found.to_rgb(capture.white_dn, clip=True).data, found.coverage, found.grid.bounds_um)
 
 
 def pixels_of(light: NDArray[Any], coverage: NDArray[Any], bounds_um: tuple[float, ...]) -> PartData:
-    """Return bytes of a picture, top row first, from linear (n_channel, n_y, n_x)."""
-    if light.shape[0] not in (1, 3):
-        light = light.mean(axis=0, keepdims=True)
+    """Return bytes of a picture, top row first, from linear (1 or 3, n_y, n_x)."""
     level = np.clip(np.nan_to_num(light) * np.float32(N_LEVELS - 1), 0, N_LEVELS - 1).astype(np.uint16)
     pixels = np.empty((*coverage.shape, 4), np.uint8)
     pixels[..., :3] = np.moveaxis(_srgb_table()[level], 0, -1)[::-1]

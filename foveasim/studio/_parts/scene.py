@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim.fields import Grid, PowerMap
+from foveasim.reconstruct import Picture
 from foveasim.studio._engine import Simulated, block_means
 from foveasim.studio._parts.picture import pixels_of
 from foveasim.studio._parts.registry import PartData, part
@@ -22,9 +23,11 @@ def _light_of(result: Simulated) -> tuple[Any, ...]:
     source, camera = result.shot.scene, result.shot.camera
     if isinstance(source, PowerMap):
         return source, (result.picture_pixels, *camera.position_um)
+    colour = result.capture.colour_correction
     numbers = (
         result.picture_pixels,
         *result.capture.white_dn.tolist(),
+        *(() if colour is None else colour.matrix.ravel().tolist()),
         *camera.image_grid(source).bounds_um,
         *camera.position_um,
     )
@@ -36,7 +39,7 @@ def scene(result: Simulated) -> PartData:
     """Return the optical image through each colour filter."""
     camera, source = result.shot.camera, result.shot.scene
     if isinstance(source, PowerMap):
-        bands, grid = list(source.data[np.argsort(-source.wavelength_nm)]), source.grid
+        bands, grid, matrix = list(source.data[np.argsort(-source.wavelength_nm)]), source.grid, None
         white = np.ones(len(bands))
     else:
         # With lateral chromatic aberration, each wavelength has its own grid: the largest is shown.
@@ -46,11 +49,12 @@ def scene(result: Simulated) -> PartData:
         pitch_um = (bounds_um[2:] - bounds_um[:2]) / widest.shape[::-1]
         grid = Grid(widest.shape, (float(pitch_um[0]), float(pitch_um[1])), tuple(bounds_um[:2].tolist()))
         bands = [found[c] for c in sorted(found)]
-        white = result.capture.white_dn[sorted(found)]
+        white, colour = result.capture.white_dn[sorted(found)], result.capture.colour_correction
+        matrix = None if colour is None else colour.matrix[:, sorted(found)]  # 0 for filters without photosites
     data, grid = _reduced(bands, grid, result.picture_pixels)
-    data /= np.asarray(white, np.float32).reshape(-1, 1, 1)
-    scale = float(np.quantile(data, WHITE_QUANTILE)) or 1.0
-    about, arrays = pixels_of(data / scale, np.ones(data.shape[1:], np.float32), grid.bounds_um)
+    shown = Picture(data, np.ones(data.shape[1:], np.float32), grid, white, matrix).to_rgb()
+    scale = float(np.quantile(shown.data, WHITE_QUANTILE)) or 1.0
+    about, arrays = pixels_of(shown.data / scale, shown.coverage, grid.bounds_um)
     return about | {"position_um": list(camera.position_um)}, arrays
 
 

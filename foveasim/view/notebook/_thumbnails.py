@@ -72,15 +72,15 @@ def site_thumbnail(data: Layout | Capture, alt: str) -> Html:
     """
     Return a picture of a layout, transparent between photosites, or of a capture.
 
-    Captures of three filters are shown as a white-balanced picture, others by the codes of their photosites. They have the
+    Captures in colour are shown as a picture, others by the codes of their photosites. They have the
     background of plots, on which black and white photosites are visible.
     """
     layout = data.layout if isinstance(data, Capture) else data
     if not layout.n_sites:
         return Html()
-    if isinstance(data, Capture) and len(data.filter_names) == 3:
+    if isinstance(data, Capture) and (len(data.filter_names) == 3 or data.colour_correction):
         pixels = data.picture(max_pixels=THUMBNAIL_PIXELS).to_image(background=BACKGROUND)
-        return thumbnail(np.asarray(pixels, np.uint8), alt, "white-balanced picture")
+        return thumbnail(np.asarray(pixels, np.uint8), alt, "picture")
     by = "code" if isinstance(data, Capture) else _quantity_of(layout)
     colours = colours_of(data, by)
     scale = colours.scale

@@ -293,28 +293,23 @@ def picture_pixels(picture: Picture, max_pixels: int) -> NDArray[np.uint8]:
     """
     Return a picture as sRGB-encoded pixels, averaged to a smaller size.
 
-    Pictures of neither 1 nor 3 channels are shown as the mean of their channels. The result is (n_y, n_x, 2 or 4) uint8, with
-    alpha.
+    The result is (n_y, n_x, 2 or 4) uint8, with alpha.
     """
     data, coverage = block_means(picture.data, max_pixels), block_means(picture.coverage[np.newaxis], max_pixels)[0]
-    white = picture.white
-    if data.shape[0] not in (1, 3):
-        data, white = data.mean(axis=0, keepdims=True), None
-    return np.asarray(Picture(data, coverage, picture.grid, white).to_image(), np.uint8)
+    smaller = Picture(data, coverage, picture.grid, picture.white, picture.colour_matrix)
+    return np.asarray(smaller.to_image(), np.uint8)
 
 
 def cortical_pixels(image: CorticalImage, max_pixels: int) -> NDArray[np.uint8]:
     """
     Return a log-polar image as sRGB-encoded pixels with alpha, the outermost ring first.
 
-    Larger ones are averaged. Images of neither 1 nor 3 channels are shown as the mean of their channels. There are two pixels
-    per sector, so that staggered rings are shifted.
+    Larger ones are averaged. There are two pixels per sector, so that staggered rings are shifted.
     """
-    data, white = block_means(_unrolled(image), max_pixels), image.white
-    if data.shape[0] not in (1, 3):
-        data, white = data.mean(axis=0, keepdims=True), None
+    data = block_means(_unrolled(image), max_pixels)
     coverage = np.isfinite(data).all(axis=0).astype(np.float32)
-    picture = Picture(data.astype(np.float32), coverage, Grid(coverage.shape, 1.0, (0.0, 0.0)), white)
+    grid = Grid(coverage.shape, 1.0, (0.0, 0.0))
+    picture = Picture(data.astype(np.float32), coverage, grid, image.white, image.colour_matrix)
     return np.asarray(picture.to_image(), np.uint8)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from io import BytesIO
 from typing import Any
 
@@ -304,12 +304,7 @@ def _picture(layout: Layout, capture: Capture | None) -> tuple[NDArray[np.uint8]
     """
     if capture is not None:
         picture = capture.picture(max_pixels=PICTURE_PIXELS)
-        white = capture.white_dn
-        if picture.data.shape[0] not in (1, 3):
-            grey = np.mean(picture.data / white.reshape(-1, 1, 1), axis=0, keepdims=True)
-            picture = replace(picture, data=grey, white=None)
-            white = np.ones(1)
-        pixels = picture.to_image(white)
+        pixels = picture.to_image(capture.white_dn)
         bounds_um = picture.grid.bounds_um
     else:
         x_min, y_min, x_max, y_max = layout.bounds_um

@@ -1,0 +1,94 @@
+"""Colorimetry: tristimulus values, linear sRGB, CIELAB, and the colours of the chart."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from foveasim._core.validation import Floats, read_only
+from foveasim.scene._illuminants import illuminant, read_table
+
+#: Chromaticities (x, y) of red, green, blue and white of sRGB (IEC 61966-2-1).
+SRGB_XY = np.array([[0.64, 0.33], [0.30, 0.60], [0.15, 0.06], [0.3127, 0.3290]])
+#: Sharpened cone responses of XYZ (Lam 1985, Bradford).
+BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+#: End of the linear part of CIELAB, and its slope: CIE 15:2004, section 8.2.1.
+LAB_LINEAR_END, LAB_SLOPE = (24.0 / 116.0) ** 3, 841.0 / 108.0
+
+
+def _xyz_of_xy(xy: Floats) -> Floats:
+    """Return tristimulus values (n, 3) of chromaticities (n, 2), with Y = 1."""
+    return np.column_stack((xy[:, 0], xy[:, 1], 1.0 - xy.sum(axis=1))) / xy[:, 1:]
+
+
+def _srgb_primaries() -> Floats:
+    """Return the tristimulus values (3, 3) of linear red, green and blue, whose sum is white."""
+    xyz = _xyz_of_xy(SRGB_XY)
+    return np.asarray(np.linalg.solve(xyz[:3].T, xyz[3])[:, np.newaxis] * xyz[:3])
+
+
+#: Tristimulus values of linear red, green and blue, one per row; those of white.
+XYZ_OF_SRGB = _srgb_primaries()
+WHITE_XYZ = XYZ_OF_SRGB.sum(axis=0)
+#: Luminance of linear red, green and blue (0.2126, 0.7152, 0.0722).
+LUMINANCE_WEIGHTS = XYZ_OF_SRGB[:, 1]
+
+
+def tristimulus(spectra: Floats, wavelength_nm: Floats, band_width_nm: Floats) -> Floats:
+    """
+    Return the tristimulus values X, Y and Z (n, 3) of spectra (n, n_wavelength).
+
+    CIE 1931 observer. Sums over the bands, without the factor of photometric units. Colour-matching functions are interpolated linearly between
+    steps of 5 nm, and 0 outside 380 to 780 nm.
+    """
+    at_nm, *observer = read_table("cie_observer")
+    matching = [np.interp(wavelength_nm, at_nm, column, left=0.0, right=0.0) for column in observer]
+    return np.asarray((spectra * band_width_nm) @ np.transpose(matching))
+
+
+def srgb_of(xyz: Floats, white_xyz: Floats) -> Floats:
+    """
+    Return linear sRGB (n, 3) of tristimulus values (n, 3).
+
+    Chromatic adaptation to D65 by the linear Bradford transform: white (3,) becomes (1, 1, 1).
+    """
+    cones = xyz @ BRADFORD.T / (BRADFORD @ white_xyz) * (BRADFORD @ WHITE_XYZ)
+    return np.asarray(np.linalg.solve(XYZ_OF_SRGB.T, np.linalg.solve(BRADFORD, cones.T)).T)
+
+
+def lab_of(srgb: Floats) -> Floats:
+    """Return CIELAB (n, 3) of linear sRGB (n, 3), which may be negative."""
+    relative = srgb @ XYZ_OF_SRGB / WHITE_XYZ
+    x, y, z = np.where(
+        relative > LAB_LINEAR_END, np.cbrt(np.maximum(relative, 0.0)), LAB_SLOPE * relative + 16.0 / 116.0
+    ).T
+    return np.column_stack((116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)))
+
+
+def reflectances(wavelength_nm: Floats) -> Floats:
+    """Return the reflectances (24, n_wavelength) of the chart; constant beyond its table."""
+    at_nm, *patches = read_table("colour_chart_24")
+    return np.array([np.interp(wavelength_nm, at_nm, patch) for patch in patches])
+
+
+def patch_colours(illumination: Floats, wavelength_nm: Floats, band_width_nm: Floats) -> Floats | None:
+    """
+    Return linear sRGB (24, 3) of the patches under an illumination (n_wavelength,).
+
+    None when it lacks one of the three tristimulus values.
+    """
+    patches, white = (
+        tristimulus(illumination * part, wavelength_nm, band_width_nm)
+        for part in (reflectances(wavelength_nm), np.ones((1, wavelength_nm.size)))
+    )
+    return srgb_of(patches, white[0]) if white.min() > 0.0 else None
+
+
+@cache
+def photograph_of_patches() -> Floats:
+    """Return linear sRGB (24, 3) of the chart in daylight, as a picture file stores it."""
+    waves_nm = np.arange(380.0, 781.0, 5.0)
+    found = patch_colours(illuminant("D65", waves_nm), waves_nm, np.full(waves_nm.size, 5.0))
+    assert found is not None
+    return read_only(np.clip(found, 0.0, None))
