@@ -159,7 +159,11 @@ def write_gallery(_app: Sphinx, _config: Config) -> None:
             done.touch()
         title = script.stem[3:].replace("_", " ").capitalize()
         description = (ast.get_docstring(ast.parse(script.read_text())) or "").replace("``", "`")
-        pictures = [f"{script.stem}/{picture.name}" for picture in sorted(folder.glob("*.png"))]
+        pictures = [
+            f"{script.stem}/{picture.name}"
+            for picture in sorted(folder.iterdir())
+            if picture.suffix in (".png", ".webp")
+        ]
         shown = "\n\n".join(f"![{picture}]({picture})" for picture in pictures) or WITHOUT_TORCH
         source = (
             f"```{{literalinclude}} ../../gallery/{script.name}\n:language: python\n:start-at: from __future__\n```"

@@ -1,80 +1,166 @@
 """
-How does a foveal colour sensor capture a photograph, compared with a square grid of as many photosites?
+What does a foveal sensor gain and lose against a square grid with as many photosites?
 
-New here: ``layout.log_polar``, ``layout.mosaic``, ``Scene.from_picture``, ``Optics``, ``Sensor``, ``Camera``, ``Capture``.
+New here: ``layout.log_polar``, ``translate``, ``layout.clip``, ``layout.union``, ``Scene.from_picture``, ``Optics``,
+``Sensor.from_preset``, ``Camera``, ``Capture.picture``, ``Camera.reference``.
 
-Expect: a blind spot with a radius of 60.12 µm (within 0.01 µm), the inner radius of the first ring with pixels of at least
-2 µm; photosites of 11.4 µm on the square grid, which covers the same field.
+Expect: 6,432 foveal photosites from 3 to 72 µm against 6,400 of 19 µm; on the face 3,195 against 272, and a PSNR of 31.8
+against 23.1 dB; on the shuttle 111 against 256, and 21.8 against 25.1 dB.
 """
 
 from __future__ import annotations
 
-import math
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
+import matplotlib.pyplot as plt
+import numpy as np
+import shapely
 from skimage.data import astronaut
 
 import foveasim as fs
+from foveasim.metrics import psnr_db
 from foveasim.view import plot_capture, save_figure
 
-PITCH_UM = 500.0
+N_SQUARE, PITCH_UM = 80, 19.0
+HALF_UM = 0.5 * N_SQUARE * PITCH_UM
+MIN_SIZE_UM = 3.0
 DISTANCE_M = 1.0
-EXPOSURE_S = 1 / 30
-#: Position of the face in the image.
-GAZE_UM = (-140.0, 320.0)
+OPTICS = fs.Optics(focal_length_mm=8.0, f_number=2.8, source_pixel="square")
+#: Centres of two parts of the photograph, as fractions of its width and height from the upper left, and half their side.
+FACE, SHUTTLE, HALF_FRACTION = (0.434, 0.228), (0.814, 0.248), 0.1028
+#: Bands of a prism that splits light to three chips.
+BANDS_NM = ((580.0, 700.0), (490.0, 580.0), (400.0, 490.0))
+PAGE, FOVEAL, SQUARE = "#14181d", "#f5a623", "#63b8f0"
 
 
-def camera_of(layout: fs.Layout) -> fs.Camera:
-    """Return a camera with these photosites and a fixed capacitance per area."""
-    sensor = fs.Sensor(
-        layout,
-        qe=fs.SiliconQE(depth_um=3.0),
-        filters="rgb",
-        capacitance_f=1e-15 * layout.area_um2,
-        read_noise_e=1.0,
-        bits=10,
+class Part(NamedTuple):
+    """A square part of the picture; lengths in µm."""
+
+    x_um: float
+    y_um: float
+    half_um: float
+
+    @classmethod
+    def at(cls, fractions: tuple[float, float]) -> Part:
+        """Return the part around a point of the photograph."""
+        x, y = fractions
+        return cls(2.0 * HALF_UM * (x - 0.5), 2.0 * HALF_UM * (0.5 - y), 2.0 * HALF_UM * HALF_FRACTION)
+
+    def grid(self, n_pixels: int) -> fs.Grid:
+        """Return the pixels of a picture of the part."""
+        return fs.Grid.centred((n_pixels, n_pixels), 2.0 * self.half_um / n_pixels, (self.x_um, self.y_um))
+
+    def count(self, layout: fs.Layout) -> int:
+        """Return the number of photosites with their centroid in the part."""
+        distance_um = np.abs(layout.centroid_um - (self.x_um, self.y_um)).max(axis=1)
+        return int(np.count_nonzero(distance_um < self.half_um))
+
+
+def foveal_layout(gaze_um: tuple[float, float]) -> fs.Layout:
+    """Return log-polar rings around the gaze, clipped to the square field."""
+    rings = fs.layout.log_polar(118, min_size_um=MIN_SIZE_UM, r_max_um=2200.0, fovea="rings", stagger=True)
+    field = shapely.box(-HALF_UM, -HALF_UM, HALF_UM, HALF_UM)
+    # Small pieces at the edge of the field become part of their neighbours.
+    return fs.layout.merge_small(fs.layout.clip(rings.translate(*gaze_um), field), min_size_um=MIN_SIZE_UM)
+
+
+def three_chips(layout: fs.Layout) -> fs.Camera:
+    """Return a camera with a prism: every photosite exists on three chips, for red, green and blue."""
+    chips = [layout.with_columns(channel=np.full(layout.n_sites, k)) for k in range(len(BANDS_NM))]
+    bands = fs.sensor.FilterSet(
+        [fs.sensor.PassBand(from_nm=low, to_nm=high) for low, high in BANDS_NM], ("red", "green", "blue")
     )
-    return fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    sensor = fs.Sensor.from_preset(
+        fs.layout.union(chips), "machine_vision", filters=bands, qe=fs.SiliconQE(depth_um=3.0), prnu_fraction=0.01
+    )
+    return fs.Camera(optics=OPTICS, sensor=sensor)
+
+
+def photograph() -> fs.Scene:
+    """Return the photograph under 500 lx, as large as the field."""
+    pitch_um = 2.0 * HALF_UM / OPTICS.magnification(DISTANCE_M) / astronaut().shape[0]
+    return fs.Scene.from_picture(astronaut(), pitch_um=pitch_um, distance_m=DISTANCE_M, illuminance_lux=500.0)
 
 
 def main(out_dir: Path) -> None:
     """Write the pictures and the layout to a directory."""
     out_dir.mkdir(parents=True, exist_ok=True)
-    # %% Scene: a photograph with pixels of 0.5 mm at a distance of 1 m.
-    scene = fs.Scene.from_picture(
-        astronaut(),
-        pitch_um=PITCH_UM,
-        distance_m=DISTANCE_M,
-        peak_radiance_w_m2_sr_nm=0.02,
-        wavelength_nm=(620, 550, 450),
+    # %% The same scene, lens, electronics and number of photosites.
+    scene, face, shuttle = photograph(), Part.at(FACE), Part.at(SHUTTLE)
+    layouts = {
+        "foveal": foveal_layout((face.x_um, face.y_um)),
+        "square": fs.layout.grid(n_x=N_SQUARE, n_y=N_SQUARE, pitch_um=PITCH_UM),
+    }
+    cameras = {name: three_chips(layout) for name, layout in layouts.items()}
+    exposure_s = cameras["square"].auto_exposure(scene)
+    captures = {name: camera.capture(scene, exposure_s=exposure_s, seed=1) for name, camera in cameras.items()}
+
+    # %% Number of photosites and PSNR of both parts, in light.
+    counts, quality_db = {}, {}
+    for name, camera in cameras.items():
+        for title, part in (("face", face), ("shuttle", shuttle)):
+            grid = part.grid(128)
+            found = captures[name].picture(grid=grid, of="light_e", per="um2")
+            counts[name, title] = part.count(layouts[name])
+            quality_db[name, title] = psnr_db(found, camera.reference(scene, grid, exposure_s=exposure_s))
+
+    # %% One figure of all.
+    figure = draw(layouts, captures, {"face": face, "shuttle": shuttle}, counts, quality_db)
+    save_figure(figure, out_dir / "01_first_picture.png", dpi=150)
+    foveal = layouts["foveal"]
+    captures["foveal"].picture(max_pixels=800).save(out_dir / "01_foveal_picture.png", captures["foveal"].white_dn)
+    chip = fs.Camera(optics=OPTICS, sensor=fs.Sensor.from_preset(foveal, "machine_vision"))
+    save_figure(
+        plot_capture(chip.capture(scene, exposure_s="auto", seed=1)).figure, out_dir / "01_foveal_layout.png", dpi=140
     )
 
-    # %% Sensor: rings of 192 sites of at least 2 µm.
-    layout = fs.layout.log_polar(n_sectors=192, min_size_um=2.0, r_max_um=690.0, stagger=True, chords_per_arc=2)
-    layout = fs.layout.mosaic(layout, ("RG", "GB"))
-    camera = camera_of(layout)
-
-    # %% Capture, with the gaze on the face.
-    capture = camera.capture(scene, exposure_s=EXPOSURE_S, seed=1, gaze_um=GAZE_UM)
-    capture.picture(max_pixels=800).save(out_dir / "01_foveal_picture.png", capture.white_dn)
-    axes = plot_capture(capture)
-    save_figure(axes.figure, out_dir / "01_foveal_layout.png", dpi=140)
-
-    # %% The same field on a square grid with as many photosites.
-    x_min, _, x_max, _ = layout.bounds_um
-    n = math.isqrt(layout.n_sites)
-    pitch_um = (x_max - x_min) / n
-    square = fs.layout.mosaic(fs.layout.grid(n_x=n, n_y=n, pitch_um=pitch_um), ("RG", "GB"))
-    square_capture = camera_of(square).capture(scene, exposure_s=EXPOSURE_S, seed=1, gaze_um=GAZE_UM)
-    square_capture.picture(max_pixels=800).save(out_dir / "01_square_picture.png", square_capture.white_dn)
-
     # %% Checks.
-    print(f"{square.n_sites} square photosites of {pitch_um:.1f} µm")
-    assert abs(pitch_um - 11.4) < 0.05
-    blind_radius_um = layout.provenance["blind_radius_um"]
-    print(f"{layout.n_sites} foveal photosites, blind spot with a radius of {blind_radius_um:.2f} µm")
-    assert abs(blind_radius_um - 60.12) < 0.01
+    sizes_um = np.sqrt(foveal.area_um2)
+    print(f"{foveal.n_sites:,} foveal photosites of {sizes_um.min():.1f} to {sizes_um.max():.0f} µm")
+    for key, value_db in quality_db.items():
+        print(f"{key[0]}, {key[1]}: {counts[key]:,} photosites, PSNR {value_db:.1f} dB")
+    assert abs(foveal.n_sites - layouts["square"].n_sites) < 0.01 * foveal.n_sites
+    assert sizes_um.min() > MIN_SIZE_UM * (1.0 - 1e-9)
+    assert counts["foveal", "face"] > 10 * counts["square", "face"]
+    assert quality_db["foveal", "face"] > quality_db["square", "face"] + 5.0
+    assert quality_db["foveal", "shuttle"] < quality_db["square", "shuttle"] - 2.0
+
+
+def draw(
+    layouts: dict[str, fs.Layout],
+    captures: dict[str, fs.Capture],
+    parts: dict[str, Part],
+    counts: dict[tuple[str, str], int],
+    quality_db: dict[tuple[str, str], float],
+) -> plt.Figure:
+    """Return a figure of both pictures and their parts."""
+    figure = plt.figure(figsize=(8.0, 6.9), facecolor=PAGE)
+    figure.suptitle("Same photograph, same lens, same number of photosites", color="white", weight="bold", size=15)
+    columns = figure.add_gridspec(2, 4, height_ratios=(2.02, 1.0), left=0.01, right=0.99, top=0.89, bottom=0.085)
+    columns.update(hspace=0.02, wspace=0.02)
+    for k, (name, colour) in enumerate((("foveal", FOVEAL), ("square", SQUARE))):
+        layout, capture = layouts[name], captures[name]
+        sizes_um = np.sqrt(layout.area_um2)
+        range_um = f"{PITCH_UM:.0f}" if name == "square" else f"{sizes_um.min():.0f} to {sizes_um.max():.0f}"
+        axes = figure.add_subplot(columns[0, 2 * k : 2 * k + 2])
+        image = capture.picture(max_pixels=900).to_image(capture.white_dn, background=PAGE)
+        axes.imshow(image, extent=(-HALF_UM, HALF_UM, -HALF_UM, HALF_UM))
+        axes.set_title(f"{name}: {layout.n_sites:,} of {range_um} µm", color=colour, weight="bold", size=12)
+        axes.axis("off")
+        for m, (title, part) in enumerate(parts.items()):
+            corner = (part.x_um - part.half_um, part.y_um - part.half_um)
+            axes.add_patch(plt.Rectangle(corner, 2 * part.half_um, 2 * part.half_um, fill=False, ec=colour, lw=1.5))
+            zoomed = figure.add_subplot(columns[1, 2 * k + m])
+            picture = capture.picture(grid=part.grid(400))
+            zoomed.imshow(picture.to_image(capture.white_dn, background=PAGE))
+            zoomed.set(xticks=[], yticks=[])
+            for spine in zoomed.spines.values():
+                spine.set(edgecolor=colour, linewidth=1.5)
+            caption = f"{title}: {counts[name, title]:,} photosites\nPSNR {quality_db[name, title]:.1f} dB"
+            zoomed.set_xlabel(caption, color=colour, size=10.5)
+    return figure
 
 
 if __name__ == "__main__":

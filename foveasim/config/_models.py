@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_type_hints
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, create_model
+from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, create_model, model_validator
 
 from foveasim._core.calls import NOT_NEGATIVE, Declaration, Usual
 from foveasim._core.registry import Registry
@@ -26,6 +26,7 @@ from foveasim.layout import EDITS, LAYOUTS, PRESETS, RULES, DesignRules, Readout
 from foveasim.maps import read_power_map
 from foveasim.optics import PUPILS, LateralColour, Optics, Seidel, Zernike
 from foveasim.scene import SCENES
+from foveasim.sensor import PRESETS as SENSOR_PRESETS
 from foveasim.sensor import (
     Diffusion,
     FilterSet,
@@ -302,7 +303,7 @@ def _sensor() -> type[Section]:
         ),
     ]
     effects = _registered_sections(EFFECTS)
-    return _model(
+    sensor = _model(
         "sensor",
         Sensor,
         skip=("layout",) if effects else ("layout", "effects"),
@@ -318,6 +319,20 @@ def _sensor() -> type[Section]:
         effects=list[_union_of("kind", effects)] if effects else list[Any],  # type: ignore[misc]
         disabled=list[str],
     )
+    preset: Any = (
+        Literal[tuple(SENSOR_PRESETS)] | None,
+        Field(None, description="published electronics, whose values other keys replace: foveasim.sensor.PRESETS"),
+    )
+    validators: Any = {"expand_preset": model_validator(mode="before")(expand_preset)}
+    return create_model("sensor", __base__=sensor, __doc__=sensor.__doc__, __validators__=validators, preset=preset)
+
+
+def expand_preset(sensor: Any) -> Any:
+    """Return the settings of a sensor with the values of its preset."""
+    name = sensor.get("preset") if isinstance(sensor, Mapping) else None
+    if not isinstance(name, str) or name not in SENSOR_PRESETS:
+        return sensor
+    return SENSOR_PRESETS[name].settings() | {key: value for key, value in sensor.items() if key != "preset"}
 
 
 def _layout_kind(section: Any) -> str | None:

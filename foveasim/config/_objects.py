@@ -486,7 +486,7 @@ def _values(source: Source, prefix: str, section: BaseModel) -> dict[str, Any]:
     return {
         name: _build(source, prefix + name, getattr(section, name))
         for name in type(section).model_fields
-        if name not in {"kind", "generator"}
+        if name not in {"kind", "generator", "preset"}
     }
 
 

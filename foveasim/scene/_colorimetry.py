@@ -39,8 +39,8 @@ def tristimulus(spectra: Floats, wavelength_nm: Floats, band_width_nm: Floats) -
     """
     Return the tristimulus values X, Y and Z (n, 3) of spectra (n, n_wavelength).
 
-    CIE 1931 observer. Sums over the bands, without the factor of photometric units. Colour-matching functions are interpolated linearly between
-    steps of 5 nm, and 0 outside 380 to 780 nm.
+    CIE 1931 observer. Sums over the bands, without the factor of photometric units. Colour-matching functions are interpolated
+    linearly between steps of 5 nm, and 0 outside 380 to 780 nm.
     """
     at_nm, *observer = read_table("cie_observer")
     matching = [np.interp(wavelength_nm, at_nm, column, left=0.0, right=0.0) for column in observer]

@@ -13,7 +13,7 @@ from foveasim.sensor.effects.shot import draw_shot_noise
 from foveasim.sensor.exposures import Ramp, Rates, fit_ramp, merge_exposures, non_destructive_reads
 from foveasim.sensor.model.inversion import Inverse
 from foveasim.sensor.model.linearisation import Linearisation
-from foveasim.sensor.presets import PRESETS
+from foveasim.sensor.presets import PRESETS, Preset
 from foveasim.sensor.sensor import Sensor
 from foveasim.sensor.signal_to_noise import SiteSignals, signal_to_noise
 from foveasim.sensor.spectral.curves import (
@@ -51,6 +51,7 @@ __all__ = [
     "NoiseBudget",
     "PassBand",
     "PolynomialCurve",
+    "Preset",
     "ProductCurve",
     "Ramp",
     "Rates",

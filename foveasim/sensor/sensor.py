@@ -67,6 +67,7 @@ from foveasim.sensor.model.prediction import (
     clipped_gaussian_moments,
 )
 from foveasim.sensor.model.records import Record, light_records, map_light, readout_model
+from foveasim.sensor.presets import find_preset
 from foveasim.sensor.spectral.curves import ConstantCurve, Curve, CurveError
 from foveasim.sensor.spectral.response import FilterSet, rgb_filters
 from foveasim.units import electrons_to_volts, photon_energy_j
@@ -280,6 +281,34 @@ class Sensor:
                 f"the layout has sites of channel {highest}, but the sensor has only filters 0 to {self.n_filters - 1} "
                 f"({', '.join(self.filter_names)})"
             )
+
+    @classmethod
+    def from_preset(cls, layout: OwnCheck[Photosites], preset: str, **parameters: Any) -> Sensor:
+        """
+        Create a sensor with the electronics of a published one.
+
+        Parameters
+        ----------
+        layout : Layout
+        preset : {"mobile", "machine_vision", "scientific", "paper_foveal", ...}
+            Name in :data:`foveasim.sensor.PRESETS`, which contains the sources. Full wells of measured pixels are proportional
+            to the area of a site.
+        **parameters
+            Other parameters of the class, such as ``filters``, or values instead of those of the preset.
+
+        Raises
+        ------
+        ParameterError
+            If there is no such preset, or a parameter is invalid.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=4, n_y=3, pitch_um=3.45), "machine_vision")
+        >>> sensor.bits, round(float(sensor.capacitance_f[0] / 1.602176634e-19))  # full well capacity at 1 V
+        (12, 10700)
+        """
+        return cls(layout, **(find_preset(preset).values(layout.area_um2) | parameters))
 
     @classmethod
     def from_settings(

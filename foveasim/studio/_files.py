@@ -18,6 +18,7 @@ from foveasim.config import (
     read_settings,
     resolve_files,
 )
+from foveasim.config._models import expand_preset
 from foveasim.config._objects import BUNDLED_PICTURE, FILE_SETTINGS
 from foveasim.errors import FileError, ParameterError, printable
 
@@ -35,6 +36,7 @@ def start_settings(shot: str | Path | None, changes: Sequence[str] = ()) -> tupl
     """
     path = demo_settings()[0] if shot is None else Path(shot)
     settings = read_settings(path, changes)
+    settings["sensor"] = expand_preset(settings.get("sensor", {}))  # controls show its values
     if isinstance(settings.get("layout"), str):
         settings["layout"] = _inlined(settings["layout"], path.parent)
     return resolve_files(path.parent.absolute(), settings), path.stem

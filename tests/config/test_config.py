@@ -12,7 +12,17 @@ import yaml
 import foveasim as fs
 from foveasim._io.images import read_picture, write_picture
 from foveasim._io.yaml_files import read_yaml
-from foveasim.config import bundled_layouts, demo_settings, read_any_layout, read_layout_file, read_shot, schema
+from foveasim.config import (
+    build_shot,
+    bundled_layouts,
+    demo_settings,
+    read_any_layout,
+    read_layout_file,
+    read_settings,
+    read_shot,
+    schema,
+    to_python,
+)
 from foveasim.errors import ConfigError, FileError
 from foveasim.view import plot_layout, save_figure
 
@@ -675,3 +685,31 @@ def test_plain_settings_equal_those_of_files():
 
     assert json.loads(json.dumps(found)) == found
     assert found == {"4": [1, 2.5], "7": [0, 1, 2], "path": "a/b", "x": {"y": 0.5, "z": None}}
+
+
+# -- presets of electronics ----------------------------------------------------------------------------------------------
+
+
+def preset_settings(**sensor):
+    return read_settings(demo_settings()[1]) | {"sensor": sensor}
+
+
+def test_presets_of_files_equal_those_of_python():
+    shot = build_shot(None, preset_settings(preset="scientific", bits=12))
+    expected = fs.Sensor.from_preset(shot.camera.layout, "scientific", bits=12)
+
+    for name in ("bits", "cds", "read_noise_e", "v_sat_v", "full_well_e", "dark_e_per_s"):
+        assert getattr(shot.camera.sensor, name) == getattr(expected, name)
+    assert np.array_equal(shot.camera.sensor.capacitance_f, expected.capacitance_f)
+
+
+def test_unknown_preset_lists_those_that_exist():
+    with pytest.raises(ConfigError, match=r"sensor\.preset: must be one of 'mobile', 'machine_vision', 'scientific'"):
+        build_shot(None, preset_settings(preset="webcam"))
+
+
+def test_preset_in_python_has_its_values():
+    source = to_python(preset_settings(preset="mobile"))
+
+    assert "capacitance_f=3.5" in source
+    assert "preset" not in source

@@ -12,6 +12,7 @@ import foveasim as fs
 from foveasim.errors import ParameterError
 from foveasim.layout import grid
 from foveasim.sensor import FIXED, PRESETS, TEMPORAL, Diffusion, Sensor, noise_budget
+from foveasim.units import ELEMENTARY_CHARGE_C
 
 N = 400
 LINE = grid(n_x=N, n_y=1, pitch_um=2.0).with_columns(readout_line=np.arange(N))
@@ -102,7 +103,7 @@ def test_invalid_rates_and_exposures_are_rejected():
 
 def test_camera_and_sensor_methods_match_functions():
     layout = grid(n_x=20, n_y=20, pitch_um=4.0)
-    sensor = Sensor(layout, prnu_fraction=0.02, **PRESETS["paper_foveal"])
+    sensor = Sensor.from_preset(layout, "paper_foveal", prnu_fraction=0.02)
     camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
     scene = fs.Scene.flat(shape=(200, 200), pitch_um=60.0, distance_m=1.0, radiance_w_m2_sr_nm=0.5, band_width_nm=10.0)
 
@@ -125,10 +126,40 @@ def test_camera_and_sensor_methods_match_functions():
     ],
 )
 def test_presets_match_published_parameters(name, published):
-    sensor = Sensor(LINE, **PRESETS[name])
+    sensor = Sensor.from_preset(LINE, name)
 
     assert {key: getattr(sensor, key) for key in published} == published
-    assert set(PRESETS[name]) == set(published)
+    assert PRESETS[name].settings() == published
+
+
+@pytest.mark.parametrize(
+    ("name", "pixel_um", "full_well_e", "dynamic_range_db", "bits"),
+    [
+        ("mobile", 1.4, 4300, 68.0, 10),
+        ("machine_vision", 3.45, 10_700, 75.46, 12),
+        ("scientific", 6.5, 30_000, 86.7, 16),
+    ],
+)
+def test_presets_have_published_dynamic_range(name, pixel_um, full_well_e, dynamic_range_db, bits):
+    pixels = grid(n_x=3, n_y=2, pitch_um=pixel_um)
+    sensor = Sensor.from_preset(pixels, name)
+
+    assert sensor.bits == bits
+    assert sensor.capacitance_f * sensor.v_sat_v / ELEMENTARY_CHARGE_C == pytest.approx(np.full(6, full_well_e))
+    assert 20.0 * np.log10(full_well_e / sensor.read_noise_e) == pytest.approx(dynamic_range_db, abs=0.1)
+
+
+def test_presets_scale_with_area_and_can_be_changed():
+    layout = fs.layout.log_polar(n_sectors=32, min_size_um=3.0, r_max_um=100.0)
+    sensor = Sensor.from_preset(layout, "machine_vision", bits=8, dark_e_per_s=5.0)
+    density = np.asarray(sensor.capacitance_f) * sensor.v_sat_v / ELEMENTARY_CHARGE_C / layout.area_um2
+
+    assert density == pytest.approx(np.full(layout.n_sites, 10_700 / 3.45**2))
+    assert (sensor.bits, sensor.dark_e_per_s, sensor.read_noise_e) == (8, 5.0, 1.8)
+    with pytest.raises(
+        ParameterError, match="'preset' must be the name of a preset, got 'machine_visoin'; did you mean"
+    ):
+        Sensor.from_preset(layout, "machine_visoin")
 
 
 def test_budget_lists_sums_and_draws_bars():
