@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
@@ -24,6 +24,7 @@ from foveasim.compare.information import scene_covariance
 from foveasim.compare.intervals import MedianInterval, median_interval
 from foveasim.compare.measure import (
     MEASURES,
+    best_cameras,
     information_by_annulus,
     layout_measures,
     measure_rows,
@@ -31,6 +32,7 @@ from foveasim.compare.measure import (
     size_records,
 )
 from foveasim.compare.setup import DEFAULT_EXPOSURE_S, cameras_of, field_um, photograph_scenes
+from foveasim.compare.verdict import verdict_lines
 from foveasim.errors import ParameterError, format_value
 from foveasim.fields import Grid, PowerMap
 from foveasim.layout import Layout
@@ -56,6 +58,8 @@ SITE_PIXELS, MIN_FIELD_PIXELS, MAX_FIELD_PIXELS = 4, 256, 2048
 #: Frequency of the waves for aliases, in Nyquist frequencies of a square grid; relative margin of the outermost annulus.
 WAVE_NYQUISTS, EDGE_ROUNDING = 1.5, 1e-9
 BY_ECCENTRICITY = "_by_eccentricity"
+#: Explanation of a mark in tables.
+BEST_NOTE = "* best value of the row"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -148,6 +152,18 @@ class Comparison:
                 values = np.where(values == values[:1], 0.0, values - values[:1])
         return median_interval(np.moveaxis(values, 1, -1)) if has_scenes else MedianInterval(values, values, values)
 
+    def verdict(self) -> list[str]:
+        """
+        Return the result in words.
+
+        Returns
+        -------
+        lines : list of str
+            For each camera after the first: where it or the first camera has the higher PSNR, by how much, and at which
+            eccentricity they cross; and the difference over the field. Differences up to 0.1 dB count as equal.
+        """
+        return verdict_lines(self)
+
     def records(self) -> list[dict[str, Any]]:
         """Return one dict per camera, with its budget, its coverage and all measures."""
         rows = []
@@ -233,16 +249,16 @@ class Comparison:
     def __str__(self) -> str:
         rows = [["", *self.names], *self._rows()]
         first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
-        return "\n".join(
-            "  ".join([head.ljust(first), *map(str.rjust, cells, widths)]).rstrip() for head, *cells in rows
-        )
+        table = ["  ".join([head.ljust(first), *map(str.rjust, cells, widths)]).rstrip() for head, *cells in rows]
+        return "\n".join([*self.verdict(), *table, BEST_NOTE])
 
     def _repr_html_(self) -> str:
         from foveasim.view.notebook import html_table
 
-        return html_table(repr(self), ("", *self.names), self._rows())
+        return html_table(" ".join([f"{self!r}.", *self.verdict(), BEST_NOTE]), ("", *self.names), self._rows())
 
     def __rich__(self) -> RenderableType:
+        from rich.console import Group
         from rich.table import Table
 
         from foveasim._io.terminal import as_plain_text
@@ -253,12 +269,16 @@ class Comparison:
             table.add_column(as_plain_text(name), justify="right")
         for row in self._rows():
             table.add_row(*map(as_plain_text, row))
-        return table
+        return Group(*map(as_plain_text, self.verdict()), table, BEST_NOTE)
 
     def _rows(self) -> list[list[str]]:
         """Return title and one value per camera of each row of the table."""
         coverage = ["coverage of the field / %", *(f"{100.0 * part:.1f}" for part in self.coverage_fraction)]
-        return [*budget_rows(self.budgets), coverage, *measure_rows(self.summary)]
+        rows = measure_rows(self.summary)
+        for row, best in zip(rows, best_cameras(self.summary), strict=True):
+            if best is not None:
+                row[best + 1] += " *"
+        return [*budget_rows(self.budgets), coverage, *rows]
 
 
 def cameras(
@@ -379,7 +399,7 @@ def cameras(
             rows.append(found[key])
         scale = mean_e_per_um2 / _mean_e_per_um2(own)
         pictures[name] = [
-            Picture((scale * quality.gain * one.picture.data).astype(np.float32), one.picture.coverage, grid)
+            replace(one.picture, data=(scale * quality.gain * one.picture.data).astype(np.float32))
             for quality, one in zip(qualities, own, strict=True)
         ]
         advance()

@@ -58,12 +58,17 @@ HALF = 0.5
 
 @dataclass(frozen=True)
 class Measure:
-    """Title, unit and definition of a measure, and whether it depends on the scene."""
+    """
+    Title, unit and definition of a measure.
+
+    ``has_scenes``: whether it depends on the scene. ``is_better_low``: whether lower values are better.
+    """
 
     title: str
     unit: str
     definition: str
     has_scenes: bool
+    is_better_low: bool = False
 
 
 #: Measures by the names of their variables; each also has a variable ``NAME_by_eccentricity``.
@@ -80,7 +85,8 @@ MEASURES = {
         "information per area", "bit/mm²", "the same, per area of the sites", True
     ),
     "shift_sigma_um": Measure(
-        "precision of a shift", "µm", "smallest standard deviation of an estimated image shift, rms of x and y", True
+        "precision of a shift", "µm", "smallest standard deviation of an estimated image shift, rms of x and y", True,
+        is_better_low=True,
     ),
     "nyquist_per_mm": Measure("Nyquist frequency", "1/mm", "median over the sites, from the spacing of their rows", False),
     "mtf50_per_mm": Measure(
@@ -92,6 +98,7 @@ MEASURES = {
         "largest contrast of an alias of a sine wave along x, at 1.5 times the Nyquist frequency of a square grid with as many "
         "sites per area as the first camera",
         False,
+        is_better_low=True,
     ),
 }  # fmt: skip
 
@@ -235,6 +242,16 @@ def measure_rows(interval_of: Callable[[str], MedianInterval]) -> list[list[str]
         ]
         for name, measure in MEASURES.items()
     ]
+
+
+def best_cameras(interval_of: Callable[[str], MedianInterval]) -> list[int | None]:
+    """Return the camera with the best value of each measure; None when several have it, or values are unknown."""
+    found: list[int | None] = []
+    for name, measure in MEASURES.items():
+        values = (-1.0 if measure.is_better_low else 1.0) * np.asarray(interval_of(name).median, np.float64)
+        best = np.flatnonzero(values == values.max(initial=-np.inf))
+        found.append(int(best[0]) if best.size == 1 else None)
+    return found
 
 
 def size_records(camera: Camera) -> list[dict[str, Any]]:

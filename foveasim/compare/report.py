@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from foveasim.compare.budgets import BUDGETS, budget_rows
 from foveasim.compare.figures import draw_measure, draw_sizes, figure_of
 from foveasim.compare.intervals import MIN_SCENES
-from foveasim.compare.measure import MEASURES, measure_rows
+from foveasim.compare.measure import MEASURES, best_cameras, measure_rows
 from foveasim.reconstruct import Picture
 from foveasim.view.web._report_page import (
     FAINT,
@@ -66,10 +66,11 @@ def _summary(comparison: Comparison) -> ReportSection:
     if n < MIN_SCENES:
         scenes += f", without confidence intervals, which require {MIN_SCENES} scenes"
     notes = [
+        *comparison.verdict(),
         (
             f"{equal} Same lens, exposure of {1e3 * comparison.settings['exposure_s']:.4g} ms, and picture grid; {scenes}: "
             f"{', '.join(comparison.scenes)}."
-        )
+        ),
     ]
     missing = [
         f"{name} does not cover {100.0 * (1.0 - part):.1f} %"
@@ -91,7 +92,8 @@ def _summary(comparison: Comparison) -> ReportSection:
             ReportTable(
                 ("Measure", *comparison.names),
                 measure_rows(comparison.summary),
-                f"Over the complete field: {interval}.",
+                f"Over the complete field: {interval}. Bold: the best value of a row.",
+                best_cameras(comparison.summary),
             ),
             ReportTable(
                 ("Difference", *comparison.names[1:]),
@@ -106,7 +108,8 @@ def _pictures(comparison: Comparison) -> list[list[ReportFigure]]:
     rows = []
     for k, scene in enumerate(comparison.scenes[:MAX_SHOWN_SCENES]):
         ideal = comparison.ideal[k]
-        white = np.array([np.nanquantile(channel, WHITE_QUANTILE) for channel in ideal.data])
+        balance = np.ones(len(ideal.data)) if ideal.white is None else ideal.white
+        white = balance * np.nanquantile(ideal.data / balance.reshape(-1, 1, 1), WHITE_QUANTILE)
         row = [picture_figure(_pixels(ideal, white), "ideal", f"{scene}: irradiance on the picture grid.")]
         for i, name in enumerate(comparison.names):
             psnr = comparison.values["psnr_db"][i, k]
@@ -118,9 +121,6 @@ def _pictures(comparison: Comparison) -> list[list[ReportFigure]]:
 
 
 def _pixels(picture: Picture, white: NDArray[np.float64]) -> NDArray[np.uint8]:
-    if picture.data.shape[0] not in (1, 3):  # filters that are not red, green and blue are shown as their mean
-        picture = Picture(picture.data.mean(axis=0, keepdims=True), picture.coverage, picture.grid)
-        white = np.array([white.mean()])
     return np.asarray(picture.to_image(np.maximum(white, 1e-12)), np.uint8)
 
 

@@ -12,6 +12,7 @@ import yaml
 from foveasim._core.provenance import to_plain_data
 from foveasim.config import read_layout
 from foveasim.layout import DERIVED_LAYERS, EDITS, LAYOUTS, RULES, DesignRules, Layout, LayoutLayer, mosaic
+from foveasim.layout._noding import intersections
 from foveasim.layout.files._derived import shapes_of_layout, shapes_of_sites
 from foveasim.testing._extension import Extension, check_of, require, shot_with, square_grid
 
@@ -37,9 +38,10 @@ def _check_sites(layout: object, *, may_overlap: bool = False) -> Layout:
     if not may_overlap:
         first, second = shapely.STRtree(polygons).query(polygons, predicate="intersects")
         pairs = first < second
-        common_um2 = shapely.area(shapely.intersection(polygons[first[pairs]], polygons[second[pairs]]))
-        worst = common_um2.max(initial=0.0)
-        require(worst <= AREA_TOLERANCE * layout.area_um2.min(), f"has sites that overlap, by up to {worst:.4g} µm²")
+        min_um2 = AREA_TOLERANCE * layout.area_um2.min()
+        common = intersections(polygons[first[pairs]], polygons[second[pairs]], min_um2)
+        worst = shapely.area(common).max(initial=0.0)
+        require(worst <= min_um2, f"has sites that overlap, by up to {worst:.4g} µm²")
     return layout
 
 

@@ -61,7 +61,7 @@ def test_starting_shot_runs(foveasim, new_file):
     result = foveasim("run", path.name, "--set", *SMALL, "--out", "out", cwd=path.parent)
 
     assert (result.returncode, result.stderr) == (0, "")
-    assert fs.Capture.load(path.parent / "out" / "shot_capture.npz").bits == 10
+    assert fs.Capture.load(path.parent / "out" / "shot_capture.npz").bits == 12
 
 
 def test_starting_layout_satisfies_its_rules(foveasim, new_file):

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import foveasim as fs
 from foveasim.compare import MEASURES, quality_by_eccentricity
+from foveasim.compare.measure import best_cameras
 from foveasim.errors import FileError, ParameterError
 from foveasim.reconstruct import Picture
 
@@ -284,8 +287,11 @@ def test_overview_draws_every_measure(compared):
 
 def test_table_lists_cameras_and_measures(compared):
     lines = str(compared).splitlines()
+    verdict = compared.verdict()
 
-    assert all(name in lines[0] for name in compared.names)
+    assert lines[: len(verdict)] == verdict
+    assert all(name in lines[len(verdict)] for name in compared.names)
+    assert lines[-1] == "* best value of the row"
     assert [line for line in lines if line.startswith("PSNR / dB")]
     assert "[" not in str(compared)  # three scenes have no interval
 
@@ -297,3 +303,98 @@ def test_progress_counts_to_its_total(scenes, foveal):
     )
 
     assert counts == [(k, 8) for k in range(1, 9)]
+
+
+# -- verdict -------------------------------------------------------------------------------------------------------------
+
+
+def with_differences(compared, by_annulus_db, over_field_db, n_scenes=3):
+    """Return a comparison of two cameras whose PSNR differs by these values from annulus to annulus."""
+    first = np.full((n_scenes, len(by_annulus_db)), 20.0)
+    values = {
+        "psnr_db_by_eccentricity": np.array([first, first + by_annulus_db]),
+        "psnr_db": 20.0 + np.array([np.zeros(n_scenes), np.broadcast_to(over_field_db, n_scenes)]),
+    }
+    return replace(
+        compared,
+        names=("foveal", "square"),
+        scenes=tuple(f"scene {k}" for k in range(n_scenes)),
+        edges_um=np.linspace(0.0, 100.0, len(by_annulus_db) + 1),
+        values={**compared.values, **values},
+    )
+
+
+@pytest.mark.parametrize(
+    ("by_annulus_db", "sentence"),
+    [
+        # Between the centres at 37.5 and 62.5 µm, from -2 to 3 dB: zero at two fifths of the way.
+        (
+            [-6.0, -2.0, 3.0, 1.0],
+            (
+                "Within 48 µm of the fixation point, foveal has a higher PSNR than square, by up to 6.0 dB; beyond, square has the "
+                "higher one, by up to 3.0 dB."
+            ),
+        ),
+        ([1.0, 2.0, 0.05, 0.5], "square has a higher PSNR than foveal at all eccentricities, by up to 2.0 dB."),
+        ([0.08, -0.08, 0.0, np.nan], "foveal and square have the same PSNR at all eccentricities, within 0.1 dB."),
+        (
+            [-1.0, 1.0, -1.0, -1.0],
+            (
+                "The higher PSNR is that of foveal (by up to 1.0 dB) and of square (by up to 1.0 dB) in turn: from the fixation point "
+                "outwards, it changes at 25 and 50 µm, beginning with foveal."
+            ),
+        ),
+    ],
+)
+def test_verdict_says_where_which_is_better(compared, by_annulus_db, sentence):
+    assert with_differences(compared, by_annulus_db, 1.0).verdict()[0] == sentence
+
+
+@pytest.mark.parametrize(
+    ("over_field_db", "n_scenes", "sentence"),
+    [
+        (2.5, 3, "Over the field, square has a PSNR that is 2.5 dB higher than that of foveal."),
+        (0.05, 3, "Over the field, the PSNR of foveal and square is equal within 0.1 dB."),
+        (np.nan, 3, "Over the field, the PSNR of foveal and square cannot be compared."),
+        (
+            [-1.0, -2.0, -3.0, -4.0, -5.0],
+            5,
+            (
+                "Over the field, foveal has a PSNR that is 3.0 dB higher than that of square (95 % confidence interval over 5 scenes "
+                "1.0 to 5.0 dB)."
+            ),
+        ),
+        (
+            [1.0, -2.0, -3.0, -4.0, -5.0],
+            5,
+            (
+                "Over the field, foveal has a PSNR that is 3.0 dB higher than that of square (95 % confidence interval over 5 scenes "
+                "-1.0 to 5.0 dB: not significant)."
+            ),
+        ),
+    ],
+)
+def test_verdict_over_the_field_has_interval(compared, over_field_db, n_scenes, sentence):
+    assert with_differences(compared, [1.0, 1.0], over_field_db, n_scenes).verdict()[1] == sentence
+
+
+def test_best_values_are_marked(compared):
+    values = {name: np.array(array, copy=True) for name, array in compared.values.items()}
+    values["psnr_db"][:] = [[10.0], [12.0], [10.0]]
+    values["shift_sigma_um"][:] = [[0.1], [0.2], [0.3]]
+    changed = replace(compared, values=values)
+    rows = {line.split("  ")[0]: line for line in str(changed).splitlines()}
+
+    assert best_cameras(changed.summary)[list(MEASURES).index("psnr_db")] == 1
+    assert best_cameras(changed.summary)[list(MEASURES).index("shift_sigma_um")] == 0
+    assert re.search(r" 10 +12 \* +10$", rows["PSNR / dB"])
+    values["shift_sigma_um"][2] = 0.1
+    assert best_cameras(changed.summary)[list(MEASURES).index("shift_sigma_um")] is None
+
+
+def test_report_begins_with_the_verdict(compared, tmp_path):
+    compared.write(tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text("utf-8")
+
+    assert html.escape(compared.verdict()[0]) in page.split("<table")[0]
+    assert page.count('<strong title="best value">') == sum(best is not None for best in best_cameras(compared.summary))

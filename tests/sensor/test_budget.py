@@ -149,7 +149,7 @@ def test_presets_have_published_dynamic_range(name, pixel_um, full_well_e, dynam
     assert 20.0 * np.log10(full_well_e / sensor.read_noise_e) == pytest.approx(dynamic_range_db, abs=0.1)
 
 
-def test_presets_scale_with_area_and_can_be_changed():
+def test_presets_scale_with_area():
     layout = fs.layout.log_polar(n_sectors=32, min_size_um=3.0, r_max_um=100.0)
     sensor = Sensor.from_preset(layout, "machine_vision", bits=8, dark_e_per_s=5.0)
     density = np.asarray(sensor.capacitance_f) * sensor.v_sat_v / ELEMENTARY_CHARGE_C / layout.area_um2

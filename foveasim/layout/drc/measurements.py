@@ -16,7 +16,7 @@ from foveasim._core.rings import next_vertex, positions_in_runs, ring_area_um2
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property, parallel_map, thread_count
 from foveasim._core.validation import Bools, Floats, Ints
-from foveasim.layout._noding import node_edges
+from foveasim.layout._noding import intersections, node_edges
 from foveasim.layout.adjacency import TOUCHING_UM
 from foveasim.layout.drc.routing import Readout, Routing, track_demand
 from foveasim.layout.model import Layout
@@ -323,9 +323,10 @@ def _per_site(reduction: np.ufunc, per_vertex: Floats, layout: Layout) -> Floats
 def _overlaps(case: Case) -> Measurement:
     found, area_um2 = case.contacts, case.layout.area_um2
     pairs = found.sites_of(~found.is_non_overlapping)
-    common = shapely.intersection(case.shapes(pairs[:, 0]), case.shapes(pairs[:, 1]))
+    min_um2 = AREA_ROUNDING * area_um2[pairs].min(axis=1, initial=np.inf)
+    common = intersections(case.shapes(pairs[:, 0]), case.shapes(pairs[:, 1]), min_um2)
     common_um2 = shapely.area(common)
-    is_real = common_um2 > AREA_ROUNDING * area_um2[pairs].min(axis=1, initial=np.inf)
+    is_real = common_um2 > min_um2
     return Measurement(common_um2[is_real], pairs[is_real].__getitem__, common[is_real].take)
 
 

@@ -9,6 +9,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -37,11 +38,16 @@ class ReportFigure:
 
 @dataclass(frozen=True)
 class ReportTable:
-    """Table of strings: heads of the columns, and rows that begin with their heads."""
+    """
+    Table of strings: heads of the columns, and rows that begin with their heads.
+
+    ``best``: for each row, the index of the cell after its head that is emphasised, or None.
+    """
 
     heads: Sequence[str]
     rows: Sequence[Sequence[str]]
     caption: str
+    best: Sequence[int | None] = ()
 
 
 @dataclass(frozen=True)
@@ -133,14 +139,20 @@ def _section(section: ReportSection, *, is_first: bool) -> str:
 def _table(table: ReportTable) -> str:
     heads = "".join(f'<th scope="col">{_text(head)}</th>' for head in table.heads)
     rows = "\n".join(
-        f'<tr><th scope="row">{_text(row[0])}</th>' + "".join(f"<td>{_text(cell)}</td>" for cell in row[1:]) + "</tr>"
-        for row in table.rows
+        f'<tr><th scope="row">{_text(head)}</th>'
+        + "".join(f"<td>{_emphasised(cell) if k == best else _text(cell)}</td>" for k, cell in enumerate(cells))
+        + "</tr>"
+        for (head, *cells), best in zip_longest(table.rows, table.best)
     )
     return (
         f'<p class="caption">{_text(table.caption)}</p>\n'
         f'<div class="table" tabindex="0"><table aria-label="{_text(table.caption)}">'
         f"<thead><tr>{heads}</tr></thead>\n<tbody>{rows}</tbody></table></div>"
     )
+
+
+def _emphasised(cell: str) -> str:
+    return f'<strong title="best value">{_text(cell)}</strong>'
 
 
 def _figure(figure: ReportFigure) -> str:

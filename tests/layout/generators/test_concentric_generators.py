@@ -13,6 +13,7 @@ import shapely
 from effort import examples
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from reference.overlaps import overlaps_um2
 
 from foveasim.errors import ParameterError
 from foveasim.layout.generators.foveal_cartesian import foveal_cartesian
@@ -28,8 +29,7 @@ units_um = st.floats(0.05, 50.0)
 def assert_tiles(layout):
     """Assert that sites share complete edges, do not overlap, and sum to the covered area."""
     polygons = layout.polygons()
-    a, b = shapely.STRtree(polygons).query(polygons, predicate="intersects")
-    common_um2 = shapely.area(shapely.intersection(polygons[a[a < b]], polygons[b[a < b]]))
+    common_um2 = overlaps_um2(polygons)
 
     assert bool(np.all(shapely.is_valid(polygons)))
     assert bool(shapely.coverage_is_valid(polygons))

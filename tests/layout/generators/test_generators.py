@@ -14,6 +14,7 @@ import shapely
 from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.overlaps import overlaps_um2
 from scipy.spatial import cKDTree
 
 from foveasim.errors import LayoutWarning, ParameterError
@@ -27,8 +28,7 @@ pitches_um = st.floats(0.05, 50.0)
 def assert_tiles(layout):
     """Assert that sites do not overlap, and that their areas sum to the covered area."""
     polygons = layout.polygons()
-    a, b = shapely.STRtree(polygons).query(polygons, predicate="intersects")
-    common_um2 = shapely.area(shapely.intersection(polygons[a[a < b]], polygons[b[a < b]]))
+    common_um2 = overlaps_um2(polygons)
 
     assert bool(np.all(shapely.is_valid(polygons)))
     assert common_um2.max(initial=0.0) <= 1e-9 * layout.area_um2.min()
