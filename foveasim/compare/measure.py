@@ -245,7 +245,7 @@ def measure_rows(interval_of: Callable[[str], MedianInterval]) -> list[list[str]
 
 
 def best_cameras(interval_of: Callable[[str], MedianInterval]) -> list[int | None]:
-    """Return the camera with the best value of each measure; None when several have it, or values are unknown."""
+    """Return the camera with the best value of each measure; None if there are several."""
     found: list[int | None] = []
     for name, measure in MEASURES.items():
         values = (-1.0 if measure.is_better_low else 1.0) * np.asarray(interval_of(name).median, np.float64)

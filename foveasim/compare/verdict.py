@@ -17,7 +17,7 @@ EQUAL_DB = 0.1
 
 
 def verdict_lines(comparison: Comparison) -> list[str]:
-    """Return one sentence by eccentricity, and one over the field, for each camera after the first."""
+    """Return two sentences, by eccentricity and over the field, for each other camera."""
     by_annulus = comparison.differences("psnr_db", by_eccentricity=True).median
     over_field = comparison.differences("psnr_db")
     first, *others = comparison.names
@@ -30,7 +30,7 @@ def verdict_lines(comparison: Comparison) -> list[str]:
 
 
 def _by_eccentricity(first: str, other: str, difference_db: Floats, edges_um: Floats) -> str:
-    """Return where which camera has the higher PSNR; differences (n_annulus,) are those of the other camera."""
+    """Return where which camera has the higher PSNR, from differences (n_annulus,)."""
     known = np.isfinite(difference_db)
     difference_db, centre_um = difference_db[known], 0.5 * (edges_um[1:] + edges_um[:-1])[known]
     sign = np.where(np.abs(difference_db) > EQUAL_DB, np.sign(difference_db), 0.0)

@@ -219,6 +219,7 @@ def build_shot(
         values = {
             name: value.per_um2 * layout.area_um2 if isinstance(value, PerArea) else value
             for name, value in _values(source, "sensor.", settings.sensor).items()
+            if name != "preset"  # expanded
         }
         sensor: Sensor = _call(source, "sensor", Sensor, {"layout": layout, **values})
         return sensor
@@ -486,7 +487,7 @@ def _values(source: Source, prefix: str, section: BaseModel) -> dict[str, Any]:
     return {
         name: _build(source, prefix + name, getattr(section, name))
         for name in type(section).model_fields
-        if name not in {"kind", "generator", "preset"}
+        if name not in {"kind", "generator"}
     }
 
 

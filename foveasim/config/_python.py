@@ -175,7 +175,7 @@ class _Writer:
         return {
             name: self._file(name, getattr(section, name))
             for name in type(section).model_fields
-            if name in section.model_fields_set and name not in {"kind", "generator", "preset"}
+            if name in section.model_fields_set and name not in {"kind", "generator"}
         }
 
     def _file(self, name: str, value: Any) -> Any:

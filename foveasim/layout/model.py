@@ -581,7 +581,7 @@ class Layout:
         return check(self, rules)
 
     def enforce(
-        self, rules: DesignRules, *, repair: Literal["drop", "merge", "refill"] = "drop"
+        self, rules: DesignRules, *, repair: Literal["drop", "shrink", "merge", "refill"] = "drop"
     ) -> tuple[Layout, tuple[Change, ...]]:
         """Repair violations of design rules; see :func:`foveasim.layout.enforce`."""
         from foveasim.layout.drc.repair import enforce

@@ -217,8 +217,9 @@ class Rule:
         Whether values are deviations, compared with 0; the limit is then a step or a field.
     rounding : float
         Values beyond the limit by no more than this satisfy the rule.
-    repair : {"drop", "merge", None}
-        Repair of a violation: ``"drop"`` drops its site, or the smaller site of a pair; ``"merge"`` merges the site with a
+    repair : {"drop", "shrink", "merge", None}
+        Repair of a violation: ``"drop"`` drops its site, or the smaller site of a pair; ``"shrink"`` cuts the outlines
+        of a pair, or drops the smaller one; ``"merge"`` merges the site with a
         neighbour, or drops it; None where neither helps.
     """
 
@@ -228,7 +229,7 @@ class Rule:
     is_upper: bool = False
     is_deviation: bool = False
     rounding: float = LENGTH_ROUNDING_UM
-    repair: Literal["drop", "merge"] | None = "drop"
+    repair: Literal["drop", "shrink", "merge"] | None = "drop"
 
     __repr__ = short_repr
 
@@ -600,7 +601,7 @@ _register(
 )  # fmt: skip
 _register(
     "min_space_um", "the space between sites that do not touch is at least the limit", "µm", _spaces, 2.0, 2.1,
-    {"layout": _SPACED},
+    {"layout": _SPACED}, repair="shrink",
 )  # fmt: skip
 _register(
     "max_aspect_ratio", "the aspect ratio of a site is at most the limit", "", _aspect_ratios, 2.0, 1.9,
@@ -616,7 +617,7 @@ _register(
 _register("grid_um", "vertices lie on the manufacturing grid", "µm", _grid_deviations, 10.0, 3.0, is_deviation=True)
 _register(
     "max_overlap_um2", "the overlap of two sites is at most the limit", "µm²", _overlaps, 4.0, 3.9,
-    {"layout": _rectangles((0.0, 0.0, 10.0, 10.0), (8.0, 8.0, 20.0, 20.0))}, rounding=0.0,
+    {"layout": _rectangles((0.0, 0.0, 10.0, 10.0), (8.0, 8.0, 20.0, 20.0))}, rounding=0.0, repair="shrink",
 )  # fmt: skip
 _register(
     "max_gap_um2", "the area of a gap is at most the limit", "µm²", _gaps, 101.0, 99.0, {"layout": _HOLLOW},

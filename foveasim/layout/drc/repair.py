@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import shapely
@@ -12,18 +12,25 @@ import shapely
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Ints
 from foveasim.errors import GeometryError, ParameterError
-from foveasim.layout.drc.rules import RULES, DesignRules, Report, RuleResult
+from foveasim.layout.drc.rules import RULES, DesignRules, Report, RuleResult, Violation
 from foveasim.layout.edit_registry import layout_edit
+from foveasim.layout.edits._parts import replace_sites
 from foveasim.layout.edits.all_sites import joining_groups, merge, union
 from foveasim.layout.generators.tiling import fill
 from foveasim.layout.model import Layout, derived
 
 __all__ = ["Change", "enforce", "repair"]
 
-Repair: TypeAlias = Literal["drop", "merge", "refill"]
+Repair: TypeAlias = Literal["drop", "shrink", "merge", "refill"]
 
 #: Maximum number of merging rounds; a merged site may still be too small.
 MAX_ROUNDS = 100
+#: Rounds in which both sites of a pair retreat, and further ones in which the larger site retreats alone.
+BOTH_ROUNDS, LARGER_ROUNDS = 4, 12
+#: Additional distance of a retreat, for rounding: far below any manufacturing grid.
+RETREAT_ROUNDING_UM = 1e-7
+#: Rounding of a distance in steps of the manufacturing grid.
+GRID_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,14 +42,17 @@ class Change:
     ----------
     rule : str
         Name of the violated rule.
-    action : {"dropped", "merged", "replaced"}
+    action : {"dropped", "merged", "replaced", "shrunk"}
     site_ids : tuple of int
         Indices of the sites in the input layout; for merged sites, all sites of the group.
+    lost_um2 : tuple of float, µm²
+        Area that each site lost, if sites were shrunk.
     """
 
     rule: str
-    action: Literal["dropped", "merged", "replaced"]
+    action: Literal["dropped", "merged", "replaced", "shrunk"]
     site_ids: tuple[int, ...]
+    lost_um2: tuple[float, ...] = ()
 
     __repr__ = short_repr
 
@@ -56,9 +66,11 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> t
     layout : Layout
     rules : DesignRules
         Violations of waived rules are not repaired.
-    repair : {"drop", "merge", "refill"}
+    repair : {"drop", "shrink", "merge", "refill"}
         ``"drop"`` removes the sites that violate a rule (of two sites that overlap or are too close, the smaller one); a
-        minimum size then leaves the blind spot of a foveal layout. ``"merge"`` first merges sites that are too small with
+        minimum size then leaves the blind spot of a foveal layout. ``"shrink"`` first cuts the outlines of sites that are too
+        close, at equal distances from both (in multiples of ``grid_um``), and the larger one of two that overlap, and drops
+        the remaining ones. ``"merge"`` first merges sites that are too small with
         the neighbour that shares the longest boundary, repeatedly, and drops the remaining ones. ``"refill"`` drops sites,
         and fills the area of sites that were too small, including the area that they enclose, with hexagons of the minimum
         size. A new site has the column values of the nearest dropped site.
@@ -87,7 +99,9 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> t
     current_index = np.arange(layout.n_sites)  # current index of each input site, -1 for dropped sites
     changes: list[Change] = []
     original = layout
-    if repair == "merge":
+    if repair == "shrink":
+        layout = _shrink(layout, active, changes)
+    elif repair == "merge":
         layout, current_index = _merge_small(layout, active, current_index, changes)
     layout, current_index = _drop_violating_sites(layout, active, current_index, changes)
     if repair == "refill":
@@ -108,7 +122,7 @@ def repair(layout: Layout, *, rules: DesignRules | None = None, method: Repair =
     layout : Layout
     rules : DesignRules
         Required in Python. In settings files, those of the layout by default.
-    method : {"drop", "merge", "refill"}
+    method : {"drop", "shrink", "merge", "refill"}
         As ``repair`` of :func:`enforce`.
 
     Raises
@@ -142,6 +156,58 @@ def _drop_violating_sites(
         layout = layout[~is_dropped]
         report = layout.check(rules)
     return layout, current_index
+
+
+def _shrink(layout: Layout, rules: DesignRules, changes: list[Change]) -> Layout:
+    """Cut outlines of sites that are too close or overlap, in rounds."""
+    spacing = rules.only(lambda name: RULES[name].repair == "shrink")
+    area_um2 = layout.area_um2
+    shrunk: dict[str, set[int]] = {}
+    for attempt in range(BOTH_ROUNDS + LARGER_ROUNDS):
+        report = layout.check(spacing)
+        if report.ok:
+            break
+        polygons, size_um2 = layout.polygons(), layout.area_um2
+        cuts: dict[int, list[Any]] = {}
+        for violation in (found for result in report.results for found in result.violations):
+            smaller, larger = sorted(violation.site_ids, key=lambda site: float(size_um2[site]))
+            is_overlap = violation.unit == "µm²"
+            retreating = (larger,) if is_overlap or attempt >= BOTH_ROUNDS else (smaller, larger)
+            reach_um = 0.0 if is_overlap else _reach_um(violation, rules.grid_um, len(retreating))
+            for site in retreating:
+                other = polygons[smaller if site == larger else larger]
+                cuts.setdefault(site, []).append(shapely.buffer(other, reach_um, join_style="mitre"))
+            shrunk.setdefault(violation.rule, set()).update(retreating)
+        sites = np.array(sorted(cuts), dtype=np.int64)
+        outlines = [_largest(shapely.difference(polygons[site], shapely.union_all(cuts[int(site)]))) for site in sites]
+        has_area = np.array([outline is not None for outline in outlines])
+        sites = sites[has_area]  # others are dropped afterwards
+        if not sites.size:
+            break
+        remaining = [outline for outline in outlines if outline is not None]
+        layout = replace_sites(layout, sites, remaining, sites, "shrunk by rules")
+    lost_um2 = area_um2 - layout.area_um2
+    for rule, found in shrunk.items():
+        ids = tuple(sorted(site for site in found if lost_um2[site] > 0.0))
+        if ids:
+            changes.append(Change(rule, "shrunk", ids, tuple(lost_um2[list(ids)].tolist())))
+    return layout
+
+
+def _reach_um(violation: Violation, grid_um: float | None, n_retreating: int) -> float:
+    """Return the distance from the other site to which a site that is too close retreats."""
+    retreat_um = (violation.limit - violation.value) / n_retreating
+    if grid_um:
+        retreat_um = math.ceil(retreat_um / grid_um - GRID_ROUNDING) * grid_um
+        return violation.value + retreat_um
+    return violation.value + retreat_um + RETREAT_ROUNDING_UM
+
+
+def _largest(shape: Any) -> Any:
+    """Return the largest polygon of a shape, or None."""
+    parts = shapely.get_parts(shape)
+    parts = parts[shapely.area(parts) > 0.0]
+    return parts[int(shapely.area(parts).argmax())] if parts.size else None
 
 
 def _refill(layout: Layout, original: Layout, rules: DesignRules, changes: list[Change]) -> Layout:

@@ -60,7 +60,7 @@ def test_site_overlapping_several_is_dropped_alone():
 
 
 @settings(max_examples=examples(30))
-@given(seed=st.integers(0, 10_000), repair=st.sampled_from(["drop", "merge", "refill"]))
+@given(seed=st.integers(0, 10_000), repair=st.sampled_from(["drop", "shrink", "merge", "refill"]))
 def test_repair_satisfies_rules_and_preserves_rest(seed, repair):
     rng = np.random.default_rng(seed)
     layout = fs.Layout.from_rectangles(rng.uniform(0, 15, (30, 2)), rng.uniform(0.3, 2.5, (30, 2)))
@@ -117,8 +117,8 @@ def test_irreparable_violations_raise_error():
 
 
 def test_unknown_repair_is_rejected():
-    with pytest.raises(ParameterError, match="'repair' must be one of 'drop', 'merge', 'refill', got 'shrink'"):
-        RINGS.enforce(fs.DesignRules(), repair="shrink")
+    with pytest.raises(ParameterError, match="'repair' must be one of 'drop', 'shrink', 'merge', 'refill', got 'grow'"):
+        RINGS.enforce(fs.DesignRules(), repair="grow")
 
 
 def test_site_in_hole_merges_with_frame():
@@ -141,3 +141,58 @@ def test_repair_may_drop_all_sites():
 
     assert legal.n_sites == 0
     assert changed(changes) == set(range(RINGS.n_sites))
+
+
+# -- shrinking -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("space_um", "limit_um", "grid_um", "retreat_um"),
+    [(0.4, 1.0, None, 0.3), (0.4, 1.0, 0.1, 0.3), (0.5, 0.9, 0.25, 0.25)],
+)
+def test_sites_retreat_equally_on_the_grid(space_um, limit_um, grid_um, retreat_um):
+    layout = fs.Layout.from_rectangles([[0.0, 0.0], [2.0 + space_um, 0.0], [20.0, 0.0]], 2.0)
+    rules = fs.DesignRules(min_space_um=limit_um, grid_um=grid_um)
+    legal, changes = layout.enforce(rules, repair="shrink")
+
+    assert legal.check(rules).ok
+    assert [(change.rule, change.action, change.site_ids) for change in changes] == [("min_space_um", "shrunk", (0, 1))]
+    assert changes[0].lost_um2 == pytest.approx([2.0 * retreat_um] * 2, rel=1e-5)
+    assert legal.bounds_um == layout.bounds_um
+    assert legal.area_um2 == pytest.approx([4.0 - 2.0 * retreat_um, 4.0 - 2.0 * retreat_um, 4.0], rel=1e-5)
+
+
+def test_larger_of_two_overlapping_sites_is_cut():
+    layout = fs.Layout.from_rectangles([[0.0, 0.0], [1.5, 0.0]], [2.0, 1.8])
+    legal, changes = layout.enforce(fs.DesignRules(max_overlap_um2=0.0), repair="shrink")
+
+    assert [(change.action, change.site_ids) for change in changes] == [("shrunk", (0,))]
+    assert changes[0].lost_um2 == pytest.approx([0.4 * 1.8])
+    assert legal.area_um2 == pytest.approx([4.0 - 0.72, 1.8**2])
+
+
+@pytest.mark.parametrize("margin_um", [0.02, 0.1])
+def test_trenches_are_widened_without_losing_sites(margin_um):
+    layout = fs.layout.inset(fs.layout.log_polar(n_sectors=24, min_size_um=1.5, r_max_um=20.0, stagger=True), margin_um)
+    rules = fs.DesignRules(min_space_um=0.3, min_size_um=0.5)
+    legal, changes = layout.enforce(rules, repair="shrink")
+
+    assert legal.check(rules).ok
+    assert legal.n_sites == layout.n_sites
+    assert {change.action for change in changes} == {"shrunk"}
+    assert legal.columns.keys() == layout.columns.keys()
+    # At least the area of half the missing width along the facing edges, at most three times as much.
+    missing_um2 = (0.15 - margin_um) * shapely.length(layout.polygons())
+    lost_um2 = layout.area_um2 - legal.area_um2
+    assert (lost_um2 <= 3.0 * missing_um2).all()
+    assert np.median(lost_um2 / missing_um2) > 0.8
+
+
+def test_sites_that_vanish_are_dropped():
+    layout = fs.Layout.from_rectangles([[0.0, 0.0], [1.2, 0.0]], [2.0, 0.2])
+    rules = fs.DesignRules(min_space_um=1.0, min_size_um=0.15)
+    legal, changes = layout.enforce(rules, repair="shrink")
+
+    assert legal.check(rules).ok
+    assert {change.action for change in changes} == {"shrunk", "dropped"}
+    assert legal.n_sites == 1
