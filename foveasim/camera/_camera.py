@@ -79,8 +79,8 @@ class Camera:
     optics : Optics
     sensor : Sensor
     distortion : lens model of foveasim.distortion, optional
-        Displaces the image points of the ideal lens. The outlines of the photosites are undistorted once; no image is
-        resampled. The optical axis meets the sensor at its ``centre_um``: the ideal image, relative illumination and field
+        Displaces the image points of the ideal lens. The outlines of the photosites are mapped back through it once; no image
+        is resampled. The optical axis meets the sensor at its ``centre_um``: the ideal image, relative illumination and field
         positions of a scene are centred there, as in OpenCV's ``projectPoints``. Where its ``focal_um`` differs between x
         and y, the ideal image is scaled accordingly, with unchanged area.
     order : {1, 2}, optional
