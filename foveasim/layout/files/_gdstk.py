@@ -127,7 +127,7 @@ def read(
     top = _top_cell(cells, cell)
     order = _post_order(cells, top)
     found = _layers_with_shapes(cells, order)
-    layers = _layers_of_sites(found, layers)
+    layers = _layers_of_sites(found, layers, filters)
     is_site = {key for key in found if _last_match(key, layers) >= 0}
     filter_of = {key: k for key in found if (k := _last_match(key, filters)) >= 0}
     own = {name: _Selected(cells[name], is_site, filter_of) for name in order}
@@ -178,12 +178,15 @@ def _layers_with_shapes(cells: dict[str, Any], order: list[str]) -> dict[tuple[i
 
 
 def _layers_of_sites(
-    found: dict[tuple[int, int], bool], wanted: list[tuple[int, int | None]] | None
+    found: dict[tuple[int, int], bool],
+    wanted: list[tuple[int, int | None]] | None,
+    filters: list[tuple[int, int | None]],
 ) -> list[tuple[int, int | None]]:
     """
     Return the layers of the photosites.
 
-    By default these are the layers of the shapes with numbers of photosites, or the only layer with shapes.
+    By default these are the layers of the shapes with numbers of photosites, or the only layer with shapes except those of
+    filters; if all shapes are those of filters, they are the photosites.
     """
     if wanted is not None:
         for number, kind in wanted:
@@ -192,6 +195,11 @@ def _layers_of_sites(
                 raise FormatError(f"has no shape on layer {text}; its layers with shapes are {_format_layers(found)}")
         return wanted
     numbered = [key for key, is_numbered in found.items() if is_numbered]
+    if filters and not numbered:
+        others = [key for key in found if _last_match(key, filters) < 0]
+        if not others:
+            return [filters[k] for k in sorted({_last_match(key, filters) for key in found})]
+        found = dict.fromkeys(others, False)
     layers = {number for number, _ in numbered} or {number for number, _ in found}
     if len(layers) > 1:
         raise FormatError(f"has shapes on several layers, {_format_layers(found)}; select one with layer=")

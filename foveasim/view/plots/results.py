@@ -145,7 +145,10 @@ def _default_x(values: xr.DataArray) -> str:
 def _coordinate(values: xr.DataArray, name: str) -> NDArray[Any]:
     """Return the values of a setting, or numbers from 0."""
     found = np.asarray(values[name].values)
-    return found if found.dtype.kind in "fiu" else found.astype(str)
+    if found.dtype.kind in "fiu":
+        return found
+    # Strings of variable width have no conversion to those of fixed width.
+    return np.array([str(value) for value in found.tolist()])
 
 
 def _is_geometric(positions: NDArray[Any]) -> bool:
