@@ -24,6 +24,7 @@ from foveasim.capture import Capture
 from foveasim.errors import FoveasimWarning, GeometryError, ParameterError, SimulationError
 from foveasim.layout import Layout
 from foveasim.view._annotations import Label, add_strip, strip_width_px
+from foveasim.view._ipython import is_notebook
 from foveasim.view.meshes import Mesh, import_pyvista, prisms
 from foveasim.view.renderer import ON_SCREEN, begin_rendering, find_renderer, missing_software
 
@@ -299,6 +300,8 @@ def show(scene: Renderable, *, viewpoint: Viewpoint | None = None, size_px: tupl
     """
     Show a scene in an interactive window until the window is closed.
 
+    In a notebook on a machine without a screen, a picture of :func:`render` is shown instead.
+
     Parameters
     ----------
     scene, viewpoint, size_px
@@ -307,10 +310,17 @@ def show(scene: Renderable, *, viewpoint: Viewpoint | None = None, size_px: tupl
     Raises
     ------
     SimulationError
-        When this machine has no screen, no OpenGL or no PyVista; the message names a remedy.
+        Outside notebooks, when this machine has no screen, no OpenGL or no PyVista; the message names a remedy.
     """
     meshes = _meshes(scene)
     missing = missing_software()
+    if (missing or find_renderer() not in ON_SCREEN) and is_notebook():
+        from IPython.display import display
+        from PIL import Image
+
+        picture = Image.fromarray(render(scene, viewpoint=viewpoint, size_px=size_px, legend=True))
+        display(picture)  # type: ignore[no-untyped-call]
+        return
     if missing:
         raise SimulationError(missing)
     if find_renderer() not in ON_SCREEN:

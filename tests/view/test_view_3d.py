@@ -622,6 +622,21 @@ def test_show_raises_without_screen(monkeypatch):
         show(prisms(ODD_LAYOUT))
 
 
+@pytest.mark.parametrize("missing", ["", "this machine has no OpenGL; install it"])
+def test_notebooks_without_screen_show_a_picture(monkeypatch, missing):
+    display = pytest.importorskip("IPython.display")
+    shown = []
+    monkeypatch.setattr(render3d, "missing_software", lambda: missing)
+    monkeypatch.setattr(render3d, "find_renderer", lambda: None)
+    monkeypatch.setattr(render3d, "is_notebook", lambda: True)
+    monkeypatch.setattr(display, "display", shown.append)
+    monkeypatch.setattr(render3d, "render", lambda scene, **options: render(scene, **options, renderer="software"))
+    ODD_LAYOUT.plot3d(size_px=(300, 200))
+
+    assert [picture.size for picture in shown] == [(300, 200)]
+    assert np.array_equal(shown[0], render(ODD_LAYOUT, size_px=(300, 200), renderer="software"))
+
+
 # -- missing software ----------------------------------------------------------------------------------------------------
 
 

@@ -14,6 +14,8 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TYPE_CHECKING
 
+from foveasim.view._ipython import ipython_shell
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -77,11 +79,5 @@ def _is_shown() -> bool:
     if backend.lower() in with_window:
         # Importing pyplot would load a GUI toolkit, and toolkits work in the main thread only.
         return has_pyplot and threading.current_thread() is threading.main_thread()
-    return has_pyplot or _is_ipython()
-
-
-def _is_ipython() -> bool:
-    """Return whether the code runs in IPython."""
     # Programs started from a notebook inherit its backend, but show no figures.
-    ipython = sys.modules.get("IPython")
-    return ipython is not None and ipython.get_ipython() is not None
+    return has_pyplot or ipython_shell() is not None
