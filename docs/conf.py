@@ -116,6 +116,17 @@ def public_names() -> dict[str, list[str]]:
     return public
 
 
+def main_names(public: dict[str, list[str]]) -> list[str]:
+    """List the names of ``foveasim`` that have their page in another module, in the order of the data flow."""
+    top = importlib.import_module("foveasim")
+    modules = {name: module for module, names in public.items() if module != "foveasim" for name in names}
+    found = [f"{modules[name]}.{name}" for name in top.__all__ if name in modules]
+    order = ["scene", "optics", "layout", "sensor", "reconstruct"]
+    return sorted(
+        found, key=lambda name: (*(k for k, part in enumerate(order) if f".{part}." in name), len(order), name)
+    )
+
+
 def gallery_scripts(repository: Path) -> list[Path]:
     """List the scripts of the gallery, which have a page each."""
     return sorted((repository / "gallery").glob("[0-9]*.py"))
@@ -138,6 +149,9 @@ def write_reference(_app: Sphinx, _config: Config) -> None:
     for name, about in MODULES.items():
         names = "\n".join(f"   {n}" for n in public[name])
         table = f".. currentmodule:: {name}\n\n.. autosummary::\n   :toctree: made\n   :nosignatures:\n\n{names}\n"
+        if name == "foveasim":
+            main = "\n".join(f"   ~{full_name}" for full_name in main_names(public))
+            table = f".. autosummary::\n   :nosignatures:\n\n{main}\n\n{table}"
         (REFERENCE / f"{name}.md").write_text(f"# {name}\n\n{about}\n\n```{{eval-rst}}\n{table}```\n")
     contents = "\n".join(MODULES)
     rows = "\n".join(f"| [{name}]({name}.md) | {about} | {len(public[name])} |" for name, about in MODULES.items())
@@ -161,7 +175,7 @@ def write_gallery(_app: Sphinx, _config: Config) -> None:
         description = (ast.get_docstring(ast.parse(script.read_text())) or "").replace("``", "`")
         pictures = [
             f"{script.stem}/{picture.name}"
-            for picture in sorted(folder.iterdir())
+            for picture in sorted(folder.glob("*.*"))
             if picture.suffix in (".png", ".webp")
         ]
         shown = "\n\n".join(f"![{picture}]({picture})" for picture in pictures) or WITHOUT_TORCH

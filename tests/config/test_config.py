@@ -467,6 +467,7 @@ SHIPPED = {
     "prima_100": 378,
     "prima_75": 142,
     "quad_bayer": 128 * 128,
+    "spectral_16": 128 * 96,
     "x_trans": 144 * 96,
 }
 

@@ -809,6 +809,21 @@ def test_solid_picture_contains_scale_bar_and_legend(visit, tmp_path):
             assert (np.abs(foot - FILTER_COLOURS[name]).max(axis=2) <= 8).sum() >= 4
 
 
+def test_many_white_sites_are_coloured_by_size():
+    def colouring(layout):
+        text = solid_page(layout)
+        return json.loads(re.search(r'<script type="application/json" id="about">(.*?)</script>', text)[1]).get(
+            "colouring"
+        )
+
+    zones = fs.layout.zones(side_um=(32.0, 64.0), pitch_um=(1.0, 2.0))
+    assert zones.n_sites > 1000
+    assert colouring(zones) == "size_um"
+    assert colouring(fs.layout.zones(side_um=(8.0, 16.0), pitch_um=(1.0, 2.0))) is None
+    assert colouring(fs.layout.grid(n_x=40, n_y=40, pitch_um=1.0)) is None
+    assert colouring(zones.with_columns(channel=np.arange(zones.n_sites) % 3)) is None
+
+
 @pytest.mark.needs("chromium")
 def test_capture_in_3d_has_every_colouring(visit):
     page = visit(solid_page(CAPTURE))

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from foveasim.capture import Capture
 from foveasim.layout import Layout
 from foveasim.view.meshes import Mesh, prisms
@@ -14,6 +16,9 @@ from foveasim.view.web._bodies import bodies_of
 from foveasim.view.web._content import describe_sites
 from foveasim.view.web._pack import pack
 from foveasim.view.web._page import assemble_page, write_page
+
+#: Photosites above which lenses of one colour look like a blank sheet.
+MAX_WHITE_SITES = 1000
 
 
 def solid_page(data: Layout | Capture, *, solids: Solids | None = None, name: str = "") -> str:
@@ -25,7 +30,7 @@ def solid_page(data: Layout | Capture, *, solids: Solids | None = None, name: st
     data : Layout or Capture
     solids : Solids, optional
         Solids of the photosites of this data. By default the parts of a layout, from :func:`foveasim.view.solids`, or the
-        photosites of a capture as prisms whose heights are their codes.
+        photosites of a capture as prisms whose heights are their codes. Many photosites without filters are coloured by size.
     name : str
         Heading; by default the generator of the layout.
 
@@ -49,6 +54,13 @@ def solid_page(data: Layout | Capture, *, solids: Solids | None = None, name: st
     else:
         meshes = (solids_of(data) if solids is None else solids).meshes
         shown = "z points toward the lens."
+        if (
+            solids is None
+            and layout.n_sites > MAX_WHITE_SITES
+            and not np.ptp(layout.channel)
+            and np.ptp(layout.area_um2)
+        ):
+            about["colouring"] = "size_um"
     bodies, surfaces = bodies_of(meshes, layout)
     arrays |= {**surfaces, "area_um2": layout.area_um2}
     packed = {key: pack(values) for key, values in arrays.items()}
