@@ -6,6 +6,7 @@ import ast
 import importlib
 import inspect
 import pkgutil
+import re
 import runpy
 import shutil
 import sys
@@ -133,10 +134,15 @@ def gallery_scripts(repository: Path) -> list[Path]:
 
 
 def generated_pages(repository: Path) -> set[Path]:
-    """List the pages that the build writes, relative to the directory of the documentation."""
+    """List the pages and pictures that the build writes, relative to the directory of the documentation."""
     modules = {f"{name}.md" for name in MODULES}
     made = {f"made/{module}.{name}.rst" for module, names in public_names().items() for name in names}
     scripts = {f"{script.stem}.md" for script in gallery_scripts(repository)}
+    scripts |= {
+        f"{script.stem}/{picture}"
+        for script in gallery_scripts(repository)
+        for picture in re.findall(r'"(\w+\.(?:png|webp))"', script.read_text())
+    }
     reference = {Path("reference", page) for page in {"index.md"} | modules | made}
     return reference | {Path("gallery", page) for page in {"index.md"} | scripts}
 

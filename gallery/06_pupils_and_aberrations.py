@@ -25,6 +25,8 @@ from foveasim.view import save_figure
 
 WAVELENGTH_NM = 550.0
 DISTANCE_M = 0.5
+#: Spacing of the points of the field.
+SPACING_MM = 3.6
 LENS = {"focal_length_mm": 10.0, "f_number": 4.0}
 LIGHT = {"distance_m": DISTANCE_M, "wavelength_nm": [WAVELENGTH_NM], "band_width_nm": 10.0}
 #: Wavefront error for a Strehl ratio of about 0.8 (Marechal criterion), waves rms.
@@ -51,6 +53,20 @@ def lenses() -> dict[str, fs.Optics]:
         "astigmatism": fs.Optics(zernike=parts.Zernike(coefficients={6: 0.25}, **waves), **LENS),
         "spherical": fs.Optics(zernike=parts.Zernike(coefficients={11: 0.25}, **waves), **LENS),
     }
+
+
+def enlarged(power_map: fs.PowerMap, spacing_um: float) -> np.ndarray:
+    """Return the images of a grid of points, of which only the surroundings are shown, top row first."""
+    half = int(0.5 * spacing_um / 3.0 / power_map.grid.pitch_x_um)
+    cells = power_map.data[0] ** 0.4
+
+    def windows(centres_um: np.ndarray, axis_um: np.ndarray) -> list[slice]:
+        middle = [int(np.abs(axis_um - at).argmin()) for at in centres_um]
+        return [slice(k - half, k + half + 1) for k in middle]
+
+    columns = windows(spacing_um * np.arange(-3, 4), power_map.grid.x_um)
+    rows = windows(spacing_um * np.arange(2, -3, -1), power_map.grid.y_um)
+    return np.block([[cells[row, column][::-1] for column in columns] for row in rows])
 
 
 def main(out_dir: Path) -> None:
@@ -92,7 +108,7 @@ def main(out_dir: Path) -> None:
     save_figure(figure, out_dir / "06_pupils.png", dpi=140)
 
     # %% Field of points through a lens with coma and astigmatism that increase with field height.
-    points = charts.point_grid(shape=(360, 480), pitch_um=60.0, spacing_mm=3.6, intensity_w_sr_nm=1e-6, **LIGHT)
+    points = charts.point_grid(shape=(360, 480), pitch_um=60.0, spacing_mm=SPACING_MM, intensity_w_sr_nm=1e-6, **LIGHT)
     field = fs.Optics(
         **LENS, seidel=parts.Seidel(coma_um=1.2, astigmatism_um=0.6, field_radius_um=300.0), field_patches=7
     )
@@ -101,18 +117,10 @@ def main(out_dir: Path) -> None:
         {"no aberrations": fs.Optics(**LENS), "coma, astigmatism": field}.items(), start=1
     ):
         axes = figure.add_subplot(1, 2, position)
-        power_map = lens.power_map(points)
-        left, bottom, right, top = power_map.grid.bounds_um
         axes.imshow(
-            power_map.data[0] ** 0.4,
-            origin="lower",
-            extent=(left, right, bottom, top),
-            cmap="magma",
-            interpolation="none",
+            enlarged(lens.power_map(points), 1000.0 * SPACING_MM * lens.magnification(DISTANCE_M)), cmap="magma"
         )
-        axes.set_title(name)
-        axes.set_xlabel("x / µm")
-        axes.set_ylabel("y / µm")
+        axes.set(title=name, xticks=[], yticks=[], xlabel="points of the field, each enlarged 3 ×")
     save_figure(figure, out_dir / "06_field.png", dpi=140)
 
     # %% Checks.

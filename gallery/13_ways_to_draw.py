@@ -14,6 +14,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import skimage.data
 from matplotlib.figure import Figure
 
 import foveasim as fs
@@ -44,15 +45,18 @@ def main(out_dir: Path) -> None:
         ax.set(xlim=(-80.0, 80.0), ylim=(-80.0, 80.0))
     save_figure(figure, out_dir / "13_ways_to_draw.png", dpi=140)
 
-    # %% A million hexagons with the values of a zone plate at their centroids, and an enlarged part.
+    # %% A million hexagons with the values of a photograph at their centroids, and an enlarged part.
     hexagons = fs.layout.hexagonal(n_columns=1000, n_rows=1000, pitch_um=1.0)
-    radius_um = np.hypot(*hexagons.centroid_um.T)
-    rings = np.cos(np.pi * radius_um**2 / 900.0)
+    photograph = skimage.data.camera()[::-1] / 255.0
+    row, column = (
+        np.clip((c / 1000.0 + 0.5) * photograph.shape[0], 0, photograph.shape[0] - 1).astype(int)
+        for c in hexagons.centroid_um.T[::-1]
+    )
     figure = Figure(figsize=(8.0, 4.0), layout="constrained")
-    for ax, half_um in zip(figure.subplots(1, 2), (None, 22.0), strict=True):
-        hexagons.plot(rings, label="cos(π r² / 900 µm²)", ax=ax, legend=half_um is not None)
+    for ax, half_um in zip(figure.subplots(1, 2), (None, 60.0), strict=True):
+        hexagons.plot(photograph[row, column], label="value", ax=ax, legend=half_um is not None)
         if half_um is not None:
-            ax.set(xlim=(410.0 - half_um, 410.0 + half_um), ylim=(-half_um, half_um))
+            ax.set(xlim=(-120.0 - half_um, -120.0 + half_um), ylim=(310.0 - half_um, 310.0 + half_um))
     save_figure(figure, out_dir / "13_a_million.png", dpi=92)
 
     # %% Photosite at each pixel, and areas counted in pixels.

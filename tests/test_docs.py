@@ -100,7 +100,7 @@ def write_repository(root, links):
     """Write two pages and one gallery script, in a directory with the name of a generated one."""
     for folder in ("docs/guides", "docs/gallery", "gallery"):
         (root / folder).mkdir(parents=True)
-    (root / "gallery" / "01_edges.py").write_text("")
+    (root / "gallery" / "01_edges.py").write_text('save(out_dir / "01_edges.png")')
     (root / "docs" / "gallery" / "02_removed.md").write_text("[](../nowhere.md)")
     (root / "README.md").write_text("[](docs/index.md)")
     (root / "docs" / "index.md").write_text("[](guides/a.md) [](https://example.org/a.md) [](#section)")
@@ -114,6 +114,7 @@ def write_repository(root, links):
         "a.md#section",
         "../gallery/index.md",
         "../gallery/01_edges.md",
+        "../gallery/01_edges/01_edges.png",
         "../reference/index.md",
         "../reference/foveasim.layout.md",
         "../reference/made/foveasim.layout.hexagonal.rst",
@@ -131,6 +132,7 @@ def test_good_link_is_accepted(tmp_path, link):
         "b.md",
         "../pictures/a.png",
         "../gallery/01_corners.md",
+        "../gallery/01_edges/01_corners.png",
         "../gallery/02_removed.md",
         "../gallery/made/01_edges.md",
         "../reference/foveasim.nothing.md",
