@@ -36,10 +36,15 @@ def start_settings(shot: str | Path | None, changes: Sequence[str] = ()) -> tupl
     """
     path = demo_settings()[0] if shot is None else Path(shot)
     settings = read_settings(path, changes)
-    settings["sensor"] = expand_preset(settings.get("sensor", {}))  # controls show its values
+    settings = with_preset(settings)
     if isinstance(settings.get("layout"), str):
         settings["layout"] = _inlined(settings["layout"], path.parent)
     return resolve_files(path.parent.absolute(), settings), path.stem
+
+
+def with_preset(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return settings with the values of the sensor's preset, which the controls show."""
+    return {**settings, "sensor": expand_preset(settings["sensor"])} if "sensor" in settings else settings
 
 
 def presets() -> list[dict[str, str]]:
@@ -166,7 +171,7 @@ class Files:
         Raises FileError when the file is not available, or not valid YAML.
         """
         self.available(path)
-        return resolve_files(Path(path).parent, read_settings(path))
+        return resolve_files(Path(path).parent, with_preset(read_settings(path)))
 
     def layout_of(self, path: str) -> Any:
         """

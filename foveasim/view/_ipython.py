@@ -15,3 +15,8 @@ def ipython_shell() -> Any:
 def is_notebook() -> bool:
     """Return whether this code runs in the kernel of a notebook, which shows pictures."""
     return hasattr(ipython_shell(), "kernel")
+
+
+def display(data: object) -> None:
+    """Show an object below the cell of a notebook that runs this code."""
+    sys.modules["IPython"].display.display(data)

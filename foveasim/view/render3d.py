@@ -24,7 +24,7 @@ from foveasim.capture import Capture
 from foveasim.errors import FoveasimWarning, GeometryError, ParameterError, SimulationError
 from foveasim.layout import Layout
 from foveasim.view._annotations import Label, add_strip, strip_width_px
-from foveasim.view._ipython import is_notebook
+from foveasim.view._ipython import display, is_notebook
 from foveasim.view.meshes import Mesh, import_pyvista, prisms
 from foveasim.view.renderer import ON_SCREEN, begin_rendering, find_renderer, missing_software
 
@@ -315,11 +315,9 @@ def show(scene: Renderable, *, viewpoint: Viewpoint | None = None, size_px: tupl
     meshes = _meshes(scene)
     missing = missing_software()
     if (missing or find_renderer() not in ON_SCREEN) and is_notebook():
-        from IPython.display import display
         from PIL import Image
 
-        picture = Image.fromarray(render(scene, viewpoint=viewpoint, size_px=size_px, legend=True))
-        display(picture)  # type: ignore[no-untyped-call]
+        display(Image.fromarray(render(scene, viewpoint=viewpoint, size_px=size_px, legend=True)))
         return
     if missing:
         raise SimulationError(missing)

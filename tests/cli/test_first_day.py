@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shlex
-import subprocess
-import sys
 import webbrowser
 from pathlib import Path
 
@@ -200,34 +197,28 @@ def test_sweep_with_plot(folder, in_folder):
         assert figure.size[0] > 400
 
 
-def test_notebook_shows_results(folder):
-    """Cells of a notebook, in a session of IPython."""
-    pytest.importorskip("IPython")
+def test_notebook_shows_results(folder, monkeypatch):
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    monkeypatch.setenv("PYTHONPATH", str(README.parent), prepend=os.pathsep)
+    monkeypatch.setenv("IPYTHONDIR", str(folder / "ipython"))
     cells = [
-        "import foveasim as fs",
-        "shot = fs.config.read_shot('shot.yaml')",
-        "capture = shot.camera.capture(shot.scene, exposure_s=shot.requested_s, seed=shot.seed)",
-        "capture",
+        "import foveasim as fs\nshot = fs.config.read_shot('shot.yaml')",
+        "capture = shot.camera.capture(shot.scene, exposure_s=shot.requested_s, seed=shot.seed)\ncapture",
         "capture.picture(max_pixels=64)",
         "shot.camera.layout",
         "shot.scene",
         "capture.colour_correction",
+        "capture.layout.plot3d(size_px=(300, 200))",
     ]
-    script = (
-        "import json\nfrom IPython.core.interactiveshell import InteractiveShell\nshell = InteractiveShell.instance()\n"
-        f"shown = []\nfor cell in {cells!r}:\n    result = shell.run_cell(cell)\n    result.raise_error()\n"
-        "    shown.append(sorted(shell.display_formatter.format(result.result)[0]) if result.result is not None else [])\n"
-        "print('SHOWN' + json.dumps(shown))\n"
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in cells])
+    client = nbclient.NotebookClient(
+        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=folder, capture_output=True, text=True, timeout=300, check=False,
-        env={**os.environ, "IPYTHONDIR": str(folder / "ipython"), "MPLBACKEND": "agg"},
-    )  # fmt: skip
+    client.execute()
+    shown = [{kind for output in cell.outputs for kind in output.get("data", {})} for cell in notebook.cells]
 
-    assert done.returncode == 0, done.stderr
-    shown = json.loads(done.stdout.split("SHOWN")[1])
-    assert all("text/html" in kinds or "image/png" in kinds for kinds in shown[3:7])
-    assert shown[7] == ["text/plain"]
+    assert all(kinds & {"text/html", "image/png"} for kinds in (*shown[1:5], shown[6]))
+    assert "ΔE*ab" in notebook.cells[5].outputs[-1]["data"]["text/plain"]
 
 
 @pytest.mark.slow

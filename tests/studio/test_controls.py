@@ -6,16 +6,17 @@ import json
 
 import pytest
 
-from foveasim.config import build_shot, check_settings, demo_settings, read_settings, schema
+from foveasim.config import build_shot, check_settings, schema
 from foveasim.studio import _controls
 from foveasim.studio._controls import chosen_value, controls_of, structure_of, value_at
+from foveasim.studio._files import start_settings
 
 KINDS = {"number", "integer", "choice", "boolean", "text", "list", "group", "sections"}
 
 
 @pytest.fixture(scope="module")
 def demo():
-    return read_settings(demo_settings()[0])
+    return start_settings(None)[0]
 
 
 @pytest.fixture(scope="module")

@@ -624,12 +624,11 @@ def test_show_raises_without_screen(monkeypatch):
 
 @pytest.mark.parametrize("missing", ["", "this machine has no OpenGL; install it"])
 def test_notebooks_without_screen_show_a_picture(monkeypatch, missing):
-    display = pytest.importorskip("IPython.display")
     shown = []
     monkeypatch.setattr(render3d, "missing_software", lambda: missing)
     monkeypatch.setattr(render3d, "find_renderer", lambda: None)
     monkeypatch.setattr(render3d, "is_notebook", lambda: True)
-    monkeypatch.setattr(display, "display", shown.append)
+    monkeypatch.setattr(render3d, "display", shown.append)
     monkeypatch.setattr(render3d, "render", lambda scene, **options: render(scene, **options, renderer="software"))
     ODD_LAYOUT.plot3d(size_px=(300, 200))
 
