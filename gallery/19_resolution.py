@@ -141,9 +141,11 @@ def main(out_dir: Path) -> None:
         "sunflower": fs.layout.sunflower(n_sites=2500, spacing_um=PITCH_UM),
         "Voronoi, uniform density": fs.layout.voronoi(n_sites=2500, size_um=(200.0, 200.0), seed=1),
     }
-    figure = Figure(figsize=(8.0, 13.6), layout="constrained")
-    alias_ratio = {}
-    for axes, (name, layout) in zip(figure.subplots(5, 3).ravel(), shown.items(), strict=True):
+    n_rows = -(-len(shown) // 3)
+    figure = Figure(figsize=(8.0, 2.7 * n_rows), layout="constrained")
+    alias_ratio, parts = {}, iter(figure.subplots(n_rows, 3).ravel())
+    for name, layout in shown.items():
+        axes = next(parts)
         points, alias = spectra(layout, is_foveal=is_foveal.get(name, False))
         alias_ratio[name] = alias.alias_fraction / alias.baseband_fraction
         reach = points.frequency_per_mm[-1] / points.nyquist_per_mm
@@ -161,6 +163,8 @@ def main(out_dir: Path) -> None:
         axes.plot(*(alias.alias_per_mm / points.nyquist_per_mm), "x", color="lime")
         axes.set_title(f"{name}\nalias {100.0 * alias_ratio[name]:.0f} % of the sine", fontsize=10)
         axes.set(xticks=(-2, 0, 2), yticks=(-2, 0, 2))
+    for axes in parts:
+        axes.set_visible(False)
     figure.suptitle(
         "power spectra of sampling points, frequencies in units of Nyquist (circle):\na sine (+) and its strongest alias (×)"
     )
