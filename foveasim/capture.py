@@ -242,8 +242,7 @@ class Capture:
         least-squares solution for the patches under the illuminant of the scene. None when the filters cannot distinguish
         colours: fewer than three with photosites, or equal ones.
         """
-        found = self.settings.get("colour")
-        return None if found is None else ColourCorrection.from_settings(found)
+        return ColourCorrection.from_settings(self.settings)
 
     def _colour_matrix(self, colour: str | None) -> Floats | None:
         found = None if colour == "raw" else self.colour_correction

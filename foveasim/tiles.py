@@ -48,7 +48,7 @@ from foveasim.integrate import Integrator, outline_bounds_um
 from foveasim.layout import Layout
 from foveasim.layout.packed import layout_from_arrays, layout_to_arrays
 from foveasim.optics._imaging import MapRows, rows_of
-from foveasim.reconstruct import Picture, raster_grid
+from foveasim.reconstruct import ColourCorrection, Picture, raster_grid
 from foveasim.scene import Scene
 from foveasim.sensor import Sensor
 from foveasim.sensor.blocks import BLOCK_SITES
@@ -355,8 +355,8 @@ class TiledCapture:
         n_sites = count.reshape(n_filters, n_y, n_x)
         data = total.reshape(n_sites.shape) / np.where(n_sites > 0.0, n_sites, np.nan)
         coverage = np.asarray(n_sites.any(axis=0), np.float32)
-        colour = self.settings.get("colour")
-        matrix = None if colour is None else np.asarray(colour["matrix"])
+        colour = ColourCorrection.from_settings(self.settings)
+        matrix = None if colour is None else colour.matrix
         return Picture(np.asarray(data, np.float32), coverage, grid, white=self.white_dn, colour_matrix=matrix)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -311,10 +313,20 @@ def test_log_polar_images_are_corrected(captured):
     assert picture.to_image().shape == (16, 16, 4)
 
 
+@pytest.mark.parametrize(
+    "colour", [{}, [], {"matrix": "x", "delta_e": []}, {"matrix": np.eye(3).tolist(), "delta_e": ["a"]}]
+)
+def test_damaged_settings_of_colours_are_reported(captured, colour):
+    _, capture = captured
+    damaged = replace(capture, settings={**capture.settings, "colour": colour})
+    with pytest.raises(ParameterError, match=r"'(settings|matrix|delta_e)' must"):
+        damaged.picture(max_pixels=8)
+
+
 def test_settings_of_colours_are_plain(captured):
     _, capture = captured
     correction = capture.colour_correction
-    again = fs.reconstruct.ColourCorrection.from_settings(capture.settings["colour"])
+    again = fs.reconstruct.ColourCorrection.from_settings(capture.settings)
     assert np.array_equal(again.matrix, correction.matrix)
     assert np.isnan(correction.delta_e_raw).all()  # four filters are not red, green and blue
     with pytest.raises(ParameterError, match="'matrix' must have the shape"):

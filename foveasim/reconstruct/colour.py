@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from foveasim._core.validation import Floats, finite_array, own
+from foveasim._core.validation import Floats, as_numbers, finite_array, own
 from foveasim.errors import ParameterError
 
 #: Patches of the colour chart.
@@ -48,15 +48,16 @@ class ColourCorrection:
     def __post_init__(self) -> None:
         object.__setattr__(self, "matrix", check_matrix("matrix", self.matrix))
         for name, missing_is_nan in (("delta_e", False), ("delta_e_raw", True)):
-            values = np.asarray(getattr(self, name), np.float64)
+            values = as_numbers(name, getattr(self, name), missing_is_nan=missing_is_nan)
             if values.shape != (N_PATCHES,) or not (np.isfinite(values) | missing_is_nan).all():
                 raise ParameterError(name, f"must be {N_PATCHES} finite values, one for each patch", values)
             object.__setattr__(self, name, own(values))
 
     def __repr__(self) -> str:
+        raw = "" if np.isnan(self.delta_e_raw).any() else f"; raw: mean {self.delta_e_raw.mean():.3g}"
         return (
             f"ColourCorrection({self.matrix.shape[1]} filters, ΔE*ab of the patches: mean {self.delta_e.mean():.3g}, "
-            f"maximum {self.delta_e.max():.3g}; raw: mean {self.delta_e_raw.mean():.3g})"
+            f"maximum {self.delta_e.max():.3g}{raw})"
         )
 
     def to_settings(self) -> dict[str, Any]:
@@ -65,7 +66,18 @@ class ColourCorrection:
         return {"matrix": self.matrix.tolist(), "delta_e": self.delta_e.tolist(), **raw}
 
     @classmethod
-    def from_settings(cls, settings: Mapping[str, Any]) -> ColourCorrection:
-        """Return the correction of plain data."""
-        unknown = np.full(N_PATCHES, np.nan)
-        return cls(settings["matrix"], settings["delta_e"], settings.get("delta_e_raw", unknown))
+    def from_settings(cls, settings: Mapping[str, Any]) -> ColourCorrection | None:
+        """
+        Return the correction in the settings of a capture, None if there is none.
+
+        Raises
+        ------
+        ParameterError
+            When the settings are invalid, as in a damaged file.
+        """
+        found = settings.get("colour")
+        if found is None:
+            return None
+        if not isinstance(found, Mapping) or not {"matrix", "delta_e"} <= set(found):
+            raise ParameterError("settings", "must contain 'matrix' and 'delta_e' under 'colour'", found)
+        return cls(found["matrix"], found["delta_e"], found.get("delta_e_raw", np.full(N_PATCHES, np.nan)))

@@ -31,8 +31,8 @@ def _srgb_primaries() -> Floats:
 #: Tristimulus values of linear red, green and blue, one per row; those of white.
 XYZ_OF_SRGB = _srgb_primaries()
 WHITE_XYZ = XYZ_OF_SRGB.sum(axis=0)
-#: Luminance of linear red, green and blue (0.2126, 0.7152, 0.0722).
-LUMINANCE_WEIGHTS = XYZ_OF_SRGB[:, 1]
+#: Luminance of linear red, green and blue, rounded as in Rec. ITU-R BT.709.
+LUMINANCE_WEIGHTS = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 def tristimulus(spectra: Floats, wavelength_nm: Floats, band_width_nm: Floats) -> Floats:

@@ -37,6 +37,7 @@ from foveasim._io.images import as_pixels, write_picture
 from foveasim._io.mapped_files import check_unchanged, value_range
 from foveasim.errors import FileError, ParameterError, printable
 from foveasim.fields import from_file_rows
+from foveasim.scene._colorimetry import LUMINANCE_WEIGHTS
 from foveasim.scene._illuminants import Illuminant
 from foveasim.scene._photometry import level_of_white, luminance_of
 from foveasim.scene.cubes import (
@@ -77,8 +78,6 @@ MAX_RADIANCE = 1e24
 RADIANCE = Limits(at_least=0.0, at_most=MAX_RADIANCE)
 #: Characters of the source in the representation.
 MAX_SOURCE = 100
-#: Weights of red, green and blue in the luminance of a colour (Rec. ITU-R BT.709).
-LUMINANCE_WEIGHTS = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 class _BasisImages:

@@ -308,7 +308,8 @@ class Sensor:
         >>> sensor.bits, round(float(sensor.capacitance_f[0] / 1.602176634e-19))  # full well capacity at 1 V
         (12, 10700)
         """
-        return cls(layout, **(find_preset(preset).values(layout.area_um2) | parameters))
+        ideal = cls(layout)  # checks the layout
+        return cls(layout, **(find_preset(preset).values(ideal.layout.area_um2) | parameters))
 
     @classmethod
     def from_settings(

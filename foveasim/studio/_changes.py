@@ -7,7 +7,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from foveasim.config import put_setting
+from foveasim.config._models import expand_preset
 from foveasim.errors import ParameterError, printable
+from foveasim.sensor import PRESETS
 from foveasim.studio._controls import controls_of, value_at
 from foveasim.studio._files import Files, with_layout
 from foveasim.studio._templates import WITHOUT_MOSAIC
@@ -100,6 +102,14 @@ def match_filters(settings: dict[str, Any]) -> None:
         layout.setdefault("edits", [{"kind": "graph_colouring", "n_channels": N_FILTERS}])
     elif "generator" in layout and layout.get("mosaic") is None:
         layout["mosaic"] = ["RG", "GB"]
+
+
+def choose_preset(settings: dict[str, Any]) -> None:
+    """Replace the electronics of the sensor by those of its preset, without earlier values."""
+    sensor = settings.get("sensor")
+    if isinstance(sensor, dict) and sensor.get("preset") is not None:
+        names = {name for preset in PRESETS.values() for name in preset.settings()}
+        settings["sensor"] = expand_preset({key: value for key, value in sensor.items() if key not in names})
 
 
 def with_file(

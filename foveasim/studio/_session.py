@@ -25,6 +25,7 @@ from foveasim.studio._changes import (
     ONCE,
     changed_keys,
     check_depth,
+    choose_preset,
     is_change,
     is_draft,
     is_frame,
@@ -345,6 +346,8 @@ class Session:
                     put_setting(None, settings, key, value)
                 if key == "layout":
                     match_filters(settings)
+                elif key == "sensor.preset":
+                    choose_preset(settings)
             case "reset":
                 settings = reset(settings, self.start.settings, key_of(message))
             case "delete":

@@ -160,6 +160,8 @@ def test_presets_scale_with_area():
         ParameterError, match="'preset' must be the name of a preset, got 'machine_visoin'; did you mean"
     ):
         Sensor.from_preset(layout, "machine_visoin")
+    with pytest.raises(ParameterError, match="'layout' must be a Layout, got a str"):
+        Sensor.from_preset("layout", "mobile")
 
 
 def test_budget_lists_sums_and_draws_bars():

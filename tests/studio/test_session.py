@@ -21,6 +21,7 @@ import foveasim as fs
 from foveasim._io.images import write_picture
 from foveasim.cli import app
 from foveasim.config import build_shot, read_settings
+from foveasim.sensor import PRESETS
 from foveasim.studio import _session, _views
 from foveasim.studio._files import start_settings
 from foveasim.studio._session import Session, Start
@@ -377,6 +378,16 @@ def test_presets_give_valid_states(recorder, name):
 
     assert state["errors"] == {}
     assert state["summary"]["n_sites"] > 100
+
+
+def test_electronics_are_replaced_by_a_preset(recorder):
+    recorder.do(do="set", key="sensor.read_noise_e", value=50.0, final=True)
+    for name, bits in (("mobile", 10), ("scientific", 16), ("paper_foveal", 8)):
+        sensor = recorder.do(do="set", key="sensor.preset", value=name, final=True)["settings"]["sensor"]
+        assert sensor["bits"] == bits
+        assert {key: sensor[key] for key in PRESETS[name].settings()} == PRESETS[name].settings()
+        assert sensor["filters"] == "rgb"
+    assert "cds" not in sensor  # of the preset before
 
 
 def test_restored_settings_give_same_codes(recorder, make_session):
