@@ -100,6 +100,16 @@ class Capture:
         create it from ``settings`` and ``sensor_arrays``.
     sensor_arrays : mapping of str to array
         Parameters of the sensor with more than 64 values, such as those per site, by their SHA-256 in ``settings``.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=16, n_y=16, pitch_um=3.45), "machine_vision")
+    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    >>> capture = camera.capture(scene, exposure_s="auto", seed=0)
+    >>> capture.code.shape, capture.electrons.dtype, bool(0.6 < capture.code.mean() / 4095 < 0.8)
+    ((256,), dtype('int64'), True)
     """
 
     layout: Layout

@@ -169,7 +169,7 @@ def layouts() -> None:
     from foveasim.layout import LAYOUTS
 
     table = Table(box=None)
-    for heading in ("name", "photosites", "field / µm", "pixel size / µm", "generator"):
+    for heading in ("name", "photosites", "field / µm", "site size / µm", "generator"):
         table.add_column(heading, justify="left" if heading in {"name", "generator"} else "right")
     with _status("reading layouts"):
         for name, path in bundled_layouts().items():
@@ -200,7 +200,7 @@ def describe(
     blanking: Annotated[float, typer.Option("--blanking", help="Blanking time over readout time.")] = 0.0,
     lanes: Annotated[int, typer.Option("--lanes", help="Number of output lanes.")] = 1,
 ) -> None:
-    """Print counts, areas, pixel sizes, channels and, with --fps, the data rate of a layout."""
+    """Print counts, areas, site sizes, channels and, with --fps, the data rate of a layout."""
     from foveasim.config import read_any_layout
     from foveasim.layout import Readout
 

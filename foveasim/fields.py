@@ -259,6 +259,14 @@ class PowerMap:
     ------
     ParameterError
         When shapes do not match, cells are masked, or a wavelength is not positive.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> light = fs.PowerMap.from_array(np.ones((4, 6)), pitch_um=2.0, wavelength_nm=550.0)
+    >>> light.data.shape, light.grid.bounds_um
+    ((1, 4, 6), (-6.0, -4.0, 6.0, 4.0))
     """
 
     data: Images

@@ -39,7 +39,15 @@ BOLTZMANN_J_PER_K = 1.380649e-23
 
 
 def m_from_um(length_um: Floats | float) -> Floats:
-    """Convert micrometres to metres."""
+    """
+    Convert micrometres to metres.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> float(fs.units.m_from_um(250.0))
+    0.00025
+    """
     return as_numbers("length_um", length_um) * 1e-6
 
 
@@ -54,7 +62,15 @@ def m_from_nm(length_nm: Floats | float) -> Floats:
 
 
 def um_from_m(length_m: Floats | float) -> Floats:
-    """Convert metres to micrometres."""
+    """
+    Convert metres to micrometres.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> float(fs.units.um_from_m(0.5))
+    500000.0
+    """
     return as_numbers("length_m", length_m) * 1e6
 
 
@@ -64,17 +80,41 @@ def um_from_nm(length_nm: Floats | float) -> Floats:
 
 
 def per_um_from_per_mm(frequency_per_mm: Floats | float) -> Floats:
-    """Convert line pairs per millimetre to line pairs per micrometre."""
+    """
+    Convert line pairs per millimetre to line pairs per micrometre.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> float(fs.units.per_um_from_per_mm(100.0))
+    0.1
+    """
     return as_numbers("frequency_per_mm", frequency_per_mm) * 1e-3
 
 
 def per_mm_from_per_um(frequency_per_um: Floats | float) -> Floats:
-    """Convert line pairs per micrometre to line pairs per millimetre."""
+    """
+    Convert line pairs per micrometre to line pairs per millimetre.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> float(fs.units.per_mm_from_per_um(0.1))
+    100.0
+    """
     return as_numbers("frequency_per_um", frequency_per_um) * 1e3
 
 
 def w_from_w_m2_um2(power_w_m2_um2: Floats | float) -> Floats:
-    """Convert (W/m²)·µm², irradiance in W/m² integrated over an area in µm², to watts."""
+    """
+    Convert (W/m²)·µm², irradiance in W/m² integrated over an area in µm², to watts.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> float(fs.units.w_from_w_m2_um2(2.0))
+    2e-12
+    """
     return as_numbers("power_w_m2_um2", power_w_m2_um2) * 1e-12
 
 
@@ -93,14 +133,30 @@ def photon_energy_j(wavelength_nm: Floats | float) -> Floats:
 
 
 def electrons_to_volts(charge_e: Floats | float, capacitance_f: Floats | float) -> Floats:
-    """Convert a charge in electrons on a capacitance to a voltage, ``q n / C``."""
+    """
+    Convert a charge in electrons on a capacitance to a voltage, ``q n / C``.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> round(float(fs.units.electrons_to_volts(10_000.0, 1.6e-15)), 4)
+    1.0014
+    """
     charge_e, capacitance_f = as_numbers("charge_e", charge_e), as_numbers("capacitance_f", capacitance_f)
     check_broadcast(charge_e=charge_e, capacitance_f=capacitance_f)
     return ELEMENTARY_CHARGE_C * charge_e / capacitance_f
 
 
 def volts_to_electrons(voltage_v: Floats | float, capacitance_f: Floats | float) -> Floats:
-    """Convert a voltage on a capacitance to a charge in electrons, ``C U / q``."""
+    """
+    Convert a voltage on a capacitance to a charge in electrons, ``C U / q``.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> round(float(fs.units.volts_to_electrons(1.0, 1.6e-15)))  # full well at 1 V
+    9986
+    """
     voltage_v, capacitance_f = as_numbers("voltage_v", voltage_v), as_numbers("capacitance_f", capacitance_f)
     check_broadcast(voltage_v=voltage_v, capacitance_f=capacitance_f)
     return voltage_v * capacitance_f / ELEMENTARY_CHARGE_C

@@ -167,6 +167,7 @@ def test_turned_camera_sees_displaced_picture(optics):
     np.testing.assert_allclose(found, camera.photoelectrons_per_s(displaced), rtol=2e-5)
 
 
+@pytest.mark.slow
 def test_coma_stays_with_its_axis():
     """A point in the corner of the picture: without coma for a camera that turns towards it."""
     sharp = replace(OPTICS, padding="zero")

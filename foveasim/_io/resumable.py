@@ -20,6 +20,12 @@ def partial_path(path: str | Path) -> Path:
     Return the directory in which an unfinished recording or capture is stored.
 
     It is in the same directory as the target, and exists until the last part is written.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.video.partial_path("codes.zarr").name
+    'codes.zarr.partial'
     """
     target = Path(path)
     return target.with_name(target.name + ".partial")

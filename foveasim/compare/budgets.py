@@ -9,9 +9,9 @@ from typing import Annotated
 import numpy as np
 
 from foveasim._core.calls import POSITIVE
+from foveasim._core.quantities import format_quantity
 from foveasim._core.validation import check_choice
 from foveasim.camera import Camera
-from foveasim.compare.intervals import format_number, with_unit
 from foveasim.errors import ParameterError, format_value
 
 __all__ = ["BUDGETS", "Budget", "budget_of", "budget_rows", "check_equal_budgets"]
@@ -62,6 +62,15 @@ def budget_of(camera: Camera, frames_per_s: Annotated[float, POSITIVE]) -> Budge
     ----------
     camera : Camera
     frames_per_s : float, 1/s
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> sensor = fs.Sensor(fs.layout.grid(n_x=20, n_y=10, pitch_um=3.0), bits=12)
+    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    >>> budget = fs.compare.budget_of(camera, 30.0)
+    >>> budget.n_sites, budget.data_rate_bit_per_s, round(budget.area_um2)
+    (200, 72000.0, 1800)
     """
     sensor = camera.sensor
     n_sites = sensor.layout.n_sites
@@ -77,7 +86,7 @@ def budget_of(camera: Camera, frames_per_s: Annotated[float, POSITIVE]) -> Budge
 def budget_rows(budgets: Sequence[Budget]) -> list[list[str]]:
     """Return title and one value per camera of each budget."""
     return [
-        [with_unit(title, unit), *(format_number(getattr(budget, attribute)) for budget in budgets)]
+        [title, *(format_quantity(getattr(budget, attribute), unit, digits=6) for budget in budgets)]
         for attribute, title, unit in BUDGETS.values()
     ]
 

@@ -64,7 +64,7 @@ def draw_sizes(comparison: Comparison, axes: Axes) -> None:
     axes.set_xscale("log")
     _label_plainly(axes.xaxis)
     axes.set_ylim(bottom=0.0)
-    axes.set_xlabel("pixel size / µm")
+    axes.set_xlabel("site size / µm")
     axes.set_ylabel("area / %")
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.quantities import format_quantity
 from foveasim.compare.budgets import BUDGETS, budget_rows
 from foveasim.compare.figures import draw_measure, draw_sizes, figure_of
 from foveasim.compare.intervals import MIN_SCENES
@@ -62,15 +63,13 @@ def _summary(comparison: Comparison) -> ReportSection:
         if budget is not None
         else "The budgets are not equal."
     )
+    exposure = format_quantity(comparison.settings["exposure_s"], "s")
     scenes = f"{n} scenes" if n > 1 else "one scene"
     if n < MIN_SCENES:
         scenes += f", without confidence intervals, which require {MIN_SCENES} scenes"
     notes = [
         *comparison.verdict(),
-        (
-            f"{equal} Same lens, exposure of {1e3 * comparison.settings['exposure_s']:.4g} ms, and picture grid; {scenes}: "
-            f"{', '.join(comparison.scenes)}."
-        ),
+        (f"{equal} Same lens, exposure of {exposure}, and picture grid; {scenes}: {', '.join(comparison.scenes)}."),
     ]
     missing = [
         f"{name} does not cover {100.0 * (1.0 - part):.1f} %"
@@ -147,11 +146,11 @@ def _sizes(comparison: Comparison) -> ReportSection:
     ]
     figure = drawn_figure(
         figure_of(partial(draw_sizes, comparison), INK, FAINT),
-        "Area by pixel size",
+        "Area by site size",
         "Fraction of the area of the sites in each class.",
     )
     return ReportSection(
-        "Area by pixel size",
+        "Area by site size",
         tables=[ReportTable(("Camera", "size / µm", "sites", "area / %"), rows, "Size classes of equal ratios.")],
         figures=[[figure]],
     )

@@ -42,6 +42,13 @@ def default_sensor(layout: Layout) -> Sensor:
     Parameters
     ----------
     layout : Layout
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> sensor = fs.compare.default_sensor(fs.layout.grid(n_x=4, n_y=4, pitch_um=4.0))
+    >>> sensor.bits, sensor.filter_names
+    (10, ('all',))
     """
     return Sensor(
         layout, qe=QE, capacitance_f=CAPACITANCE_F_PER_UM2 * layout.area_um2, read_noise_e=READ_NOISE_E, bits=BITS

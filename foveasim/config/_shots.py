@@ -156,8 +156,8 @@ def results_table(results: Sequence[Result]) -> Table:
     rows = {
         "photosites": [f"{c.layout.n_sites:,}" for c in captures],
         "design rules": [_verdict(result.report) for result in results],
-        "smallest pixel / µm": [f"{np.sqrt(c.layout.area_um2.min()):.2f}" for c in captures],
-        "largest pixel / µm": [f"{np.sqrt(c.layout.area_um2.max()):.2f}" for c in captures],
+        "smallest site / µm": [f"{c.layout.size_um.min():.2f}" for c in captures],
+        "largest site / µm": [f"{c.layout.size_um.max():.2f}" for c in captures],
         "blind-spot radius / µm": [_blind_spot(c.layout) for c in captures],
         "median electrons": [f"{np.median(c.electrons):,.0f}" for c in captures],
         "maximum electrons": [f"{c.electrons.max():,}" for c in captures],

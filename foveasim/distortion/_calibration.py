@@ -67,6 +67,14 @@ def from_opencv(
     ------
     ParameterError
         If a shape or a value differs from the above, or the matrix has a skew.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> matrix = [[1000.0, 0.0, 320.0], [0.0, 1000.0, 240.0], [0.0, 0.0, 1.0]]
+    >>> lens = fs.distortion.from_opencv(matrix, [-0.2, 0.05, 0.0, 0.0], image_size=(640, 480), pixel_um=3.0)
+    >>> float(lens.distort([[600.0, 0.0]])[0, 0].round(1))
+    595.3
     """
     matrix = finite_array("camera_matrix", camera_matrix, ndim=2)
     if matrix.shape != (3, 3) or matrix[0, 1] or matrix[1, 0] or not (matrix[2] == (0.0, 0.0, 1.0)).all():
@@ -101,6 +109,14 @@ def to_opencv(
     ------
     ParameterError
         If OpenCV has no equivalent of the lens model.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> lens = fs.distortion.BrownConrady(k1=-0.2, k2=0.05, focal_um=3000.0)
+    >>> matrix, coefficients = fs.distortion.to_opencv(lens, image_size=(640, 480), pixel_um=3.0)
+    >>> matrix.tolist(), coefficients[:2].tolist()
+    ([[1000.0, 0.0, 319.5], [0.0, 1000.0, 239.5], [0.0, 0.0, 1.0]], [-0.2, 0.05])
     """
     width, height = _size(image_size)
     fx, fy = np.broadcast_to(np.asarray(lens.focal_um), (2,)) / pixel_um

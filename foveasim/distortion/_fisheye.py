@@ -151,6 +151,13 @@ class PolynomialFisheye(_AngularLens):
     Notes
     -----
     The model is valid up to the angle at which the height stops increasing, at most 90°.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> lens = fs.distortion.PolynomialFisheye(k=(0.0, 0.0, 0.0, 0.0), focal_um=2000.0)  # equidistant: r = f θ
+    >>> lens.distort([[2000.0, 0.0]]).round(1).tolist()  # 45 degrees
+    [[1570.8, 0.0]]
     """
 
     k: Sequence[float]
@@ -219,6 +226,13 @@ class Scaramuzza(_AngularLens):
     -----
     Equations 7 and 8 of the paper, with r̃ = sqrt(x̃² + ỹ²). The model is valid up to the radius r at which the angle stops
     increasing, and for angles of less than 90°.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> lens = fs.distortion.Scaramuzza(a=(700.0, -4e-4, 0.0, 0.0), pixel_um=3.0, focal_um=2100.0)
+    >>> lens.distort([[900.0, 0.0]]).round(1).tolist()
+    [[857.9, 0.0]]
     """
 
     a: Sequence[float]

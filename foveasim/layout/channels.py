@@ -175,6 +175,14 @@ def random_channels(layout: Layout, fractions: ArrayLike, *, seed: int) -> Layou
     ------
     ParameterError
         When a fraction is negative, or all are 0.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> layout = fs.layout.random_channels(fs.layout.grid(n_x=10, n_y=10, pitch_um=2.0), [0.5, 0.25, 0.25], seed=0)
+    >>> np.bincount(layout.channel).tolist()
+    [50, 25, 25]
     """
     parts = finite_array("fractions", fractions, ndim=1, at_least=0.0)
     if not parts.sum() > 0.0:
@@ -213,6 +221,14 @@ def graph_colouring(
     ------
     ParameterError
         When ``n_channels`` is not from 1 to 64.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.graph_colouring(fs.layout.hexagonal(n_columns=6, n_rows=6, pitch_um=3.0), 3)
+    >>> sites = layout.adjacency().tocoo()
+    >>> bool((layout.channel[sites.row] != layout.channel[sites.col]).all())  # no neighbours with the same filter
+    True
     """
     from foveasim.layout import _kernels
 

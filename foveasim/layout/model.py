@@ -113,6 +113,16 @@ class Layout:
     -----
     All arrays are read-only, and methods return new layouts. Indexing with a mask, a slice or site indices selects sites:
     ``layout[layout.area_um2 > 4.0]``.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import shapely
+    >>> layout = fs.Layout.from_polygons([shapely.box(0, 0, 2, 2), shapely.Point(5, 1).buffer(1.0)])
+    >>> layout.n_sites, layout.area_um2.round(2).tolist()
+    (2, [4.0, 3.14])
+    >>> layout[layout.area_um2 > 3.5].n_sites  # selections as of arrays
+    1
     """
 
     xy_um: Floats
@@ -405,6 +415,11 @@ class Layout:
     def area_um2(self) -> Floats:
         """Area of each site, holes excluded, (n_site,) µm²."""
         return self._moments[0]
+
+    @property
+    def size_um(self) -> Floats:
+        """Size of each site: the square root of its area, (n_site,) µm."""
+        return read_only(np.sqrt(self.area_um2))
 
     @property
     def centroid_um(self) -> Floats:

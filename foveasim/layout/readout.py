@@ -34,6 +34,12 @@ def readout_by(layout: Layout, column: str) -> Layout:
     ------
     ParameterError
         When the layout has no such column.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.layout.readout_by(fs.layout.grid(n_x=3, n_y=2, pitch_um=2.0), "row").readout_line.tolist()
+    [0, 0, 0, 1, 1, 1]
     """
     return readout_order(layout.with_columns(readout_line=layout.index_column(column)))
 
@@ -57,6 +63,15 @@ def nearest_bus(layout: Layout, buses: Sequence[Any]) -> Layout:
     ------
     ParameterError
         When there is no bus, or one is not a geometry.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.grid(n_x=4, n_y=1, pitch_um=2.0)
+    >>> import shapely
+    >>> buses = [shapely.LineString([(x_um, -5.0), (x_um, 5.0)]) for x_um in (-3.0, 3.0)]
+    >>> fs.layout.nearest_bus(layout, buses).readout_line.tolist()
+    [0, 0, 1, 1]
     """
     lines = list(buses) if isinstance(buses, Sequence | np.ndarray) else []
     if not lines or not all(isinstance(line, shapely.Geometry) and not line.is_empty for line in lines):
@@ -79,6 +94,13 @@ def readout_order(layout: Layout) -> Layout:
     -------
     Layout
         With the column ``readout_order``, counted from 0 in each ``readout_line``: lines are read in parallel.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.readout_by(fs.layout.grid(n_x=3, n_y=2, pitch_um=2.0), "column")
+    >>> fs.layout.readout_order(layout).columns["readout_order"].tolist()
+    [0, 0, 0, 1, 1, 1]
     """
     line = layout.readout_line
     order = np.lexsort((layout.centroid_um[:, 0], layout.centroid_um[:, 1], line))

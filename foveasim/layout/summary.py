@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
+from foveasim._core.quantities import format_quantity
 from foveasim._core.show import drawn
 from foveasim._core.validation import Floats, Ints
 from foveasim.layout.drc.routing import Readout
@@ -41,7 +42,7 @@ class Summary:
     fill_factor : float
         Total area as a fraction of the area of the convex hull.
     size_um : (5,) float64, µm
-        Minimum, lower quartile, median, upper quartile and maximum pixel size, the square root of the area of a site.
+        Minimum, lower quartile, median, upper quartile and maximum site size, the square root of the area of a site.
     size_edges_um, size_counts : (n_class + 1,) float64 µm and (n_class,) int64
         Histogram of the sizes, with class limits of equal ratios.
     channels : mapping of int to int
@@ -82,9 +83,9 @@ class Summary:
             ("photosites", f"{self.n_sites:,}"),
             ("vertices", f"{self.n_vertices:,}"),
             ("field", f"{x1 - x0:.6g} x {y1 - y0:.6g} µm, from ({x0:.6g}, {y0:.6g}) to ({x1:.6g}, {y1:.6g})"),
-            ("area", f"{self.area_um2:,.6g} µm²"),
+            ("area", format_quantity(self.area_um2, "µm²", digits=6)),
             ("fill factor", f"{100.0 * self.fill_factor:.4g} % of the convex hull"),
-            ("pixel size", f"{low:.4g} to {high:.4g} µm, median {median:.4g}, quartiles {lower:.4g} and {upper:.4g}"),
+            ("site size", f"{low:.4g} to {high:.4g} µm, median {median:.4g}, quartiles {lower:.4g} and {upper:.4g}"),
             ("channels", ", ".join(f"{channel}: {n:,}" for channel, n in self.channels.items())),
             ("readout lines", f"{self.n_lines:,}"),
         ]
@@ -92,8 +93,7 @@ class Summary:
             r = self.readout
             lanes = f" on each of {r.n_lanes} lanes" if r.n_lanes > 1 else ""
             terms = f"{r.frames_per_s:g} frames/s, {r.bits} bits, {100.0 * r.blanking:g} % blanking"
-            rate = r.gbit_per_s(self.n_sites)
-            shown = f"{rate:.4g} Gbit/s" if rate >= 1.0 else f"{1e3 * rate:.4g} Mbit/s"
+            shown = format_quantity(1e9 * r.gbit_per_s(self.n_sites), "bit/s")
             rows.append(("data rate", f"{shown}{lanes} ({terms})"))
         return rows
 
@@ -119,7 +119,7 @@ class Summary:
         facts = Table(show_header=False, box=None)
         for name, value in self.rows():
             facts.add_row(name, as_plain_text(value))
-        sizes = Table(title="Pixel sizes", title_justify="left", box=None)
+        sizes = Table(title="Site sizes", title_justify="left", box=None)
         for heading in ("from µm", "to µm", "sites"):
             sizes.add_column(heading, justify="right")
         sizes.add_column("")
@@ -149,10 +149,16 @@ def describe(layout: Layout, readout: Readout | None = None) -> Summary:
     ------
     GeometryError
         When the layout has no sites.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.layout.describe(fs.layout.hexagonal(n_columns=20, n_rows=20, pitch_um=3.0))
+    Summary(400 photosites of 2.792 to 2.792 µm on 61.5 x 52.8275 µm, from hexagonal)
     """
     bounds_um = layout.bounds_um
     hull_um2 = float(shapely.MultiPoint(layout.xy_um).convex_hull.area)
-    size_um = np.sqrt(layout.area_um2)
+    size_um = layout.size_um
     edges_um = _size_edges_um(float(size_um.min()), float(size_um.max()))
     channel, counts = np.unique(layout.channel, return_counts=True)
     return Summary(

@@ -53,6 +53,15 @@ def to_xarray(power_map: PowerMap) -> xr.DataArray:
     ------
     ParameterError
         If ``power_map`` is not a PowerMap, or xarray is missing.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> light = fs.PowerMap.from_array(np.ones((4, 6)), pitch_um=2.0, wavelength_nm=550.0)
+    >>> array = fs.maps.to_xarray(light)
+    >>> array.dims, array.attrs["units"]
+    (('wavelength', 'y', 'x'), 'W m-2')
     """
     xr = import_optional("xarray", "xarray", "maps")
     grid = power_map.grid
@@ -101,6 +110,14 @@ def from_xarray(
     ------
     ParameterError
         If the array has other dimensions or invalid values, or metadata are missing.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> light = fs.PowerMap.from_array(np.ones((4, 6)), pitch_um=2.0, wavelength_nm=550.0)
+    >>> fs.maps.from_xarray(fs.maps.to_xarray(light)).grid == light.grid
+    True
     """
     given = Given(
         pitch_um=pitch_um, wavelength_nm=wavelength_nm, band_width_nm=band_width_nm, unit=unit, origin_um=origin_um

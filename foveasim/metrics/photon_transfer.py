@@ -275,6 +275,15 @@ def draw_frames(
     ------
     ParameterError
         When a number is out of range, or ``expected_e`` does not have one value per site.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> sensor = fs.Sensor(fs.layout.grid(50, 50, 3.0), capacitance_f=1.6e-15, v_sat_v=1.0, bits=12)
+    >>> frames = fs.metrics.draw_frames(sensor, np.full(2500, 1000.0), n_frames=4, seed=0)
+    >>> frames.shape
+    (4, 2500)
     """
     level_e = _level("expected_e", expected_e, sensor.layout.n_sites)
     codes = []
@@ -408,6 +417,16 @@ def predicted_photon_transfer(
     ------
     ParameterError
         As for :func:`photon_transfer`.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> sensor = fs.Sensor(fs.layout.grid(4, 4, 3.0), capacitance_f=1.6e-15, v_sat_v=1.0, bits=12)
+    >>> curve = fs.metrics.predicted_photon_transfer(sensor, [np.full(16, e) for e in (1000.0, 4000.0)])
+    >>> slope = np.diff(curve.temporal_variance_dn2[:, 0]) / np.diff(curve.mean_dn[:, 0])
+    >>> slope.round(4).tolist()  # DN per electron
+    [0.4104]
     """
     groups = SiteClasses(classes, sensor.layout.n_sites)
     levels_dn = []

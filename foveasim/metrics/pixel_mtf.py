@@ -36,6 +36,12 @@ def wave_vectors_per_mm(frequency_per_mm: ArrayLike, angle_deg: ArrayLike = 0.0)
     ------
     ParameterError
         When a number is not finite, or the lengths of both differ.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.metrics.wave_vectors_per_mm([100.0], 90.0).round(6).tolist()
+    [[0.0, 100.0]]
     """
     frequency = np.atleast_1d(finite_array("frequency_per_mm", frequency_per_mm))
     angle = np.deg2rad(np.atleast_1d(finite_array("angle_deg", angle_deg)))

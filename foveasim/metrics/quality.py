@@ -88,6 +88,14 @@ def ssim(
     ------
     ParameterError
         As for :func:`psnr_db`; when the window is even, or no window fits.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> picture = np.random.default_rng(0).random((32, 32))
+    >>> round(fs.metrics.ssim(picture, picture), 6), round(fs.metrics.ssim(0.5 * picture + 0.25, picture), 3)
+    (1.0, 0.801)
     """
     one, other, is_compared = _prepare_comparison(picture, reference, min_coverage)
     if window % 2 == 0:

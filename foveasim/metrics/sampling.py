@@ -75,7 +75,7 @@ def nyquist_per_mm(
             raise ParameterError(
                 "per_channel", "must be False with by='area'; use by='neighbours' for one filter of a mosaic"
             )
-        return per_mm_from_per_um(0.5 / np.sqrt(layout.area_um2))
+        return per_mm_from_per_um(0.5 / layout.size_um)
     return per_mm_from_per_um(0.5 / neighbour_spacing_um(layout, per_channel=per_channel)[1])
 
 
@@ -98,6 +98,13 @@ def neighbour_spacing_um(layout: Layout, *, per_channel: bool = False) -> tuple[
     nearest_um, row_um : (n_site,) float64, µm
         Distances between centroids; their product is the cell area of a lattice. NaN without such a neighbour; coincident
         sites have a distance of 0 and NaN for the row.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> nearest_um, row_um = fs.metrics.neighbour_spacing_um(fs.layout.hexagonal(n_columns=9, n_rows=9, pitch_um=4.0))
+    >>> round(float(nearest_um[40]), 4), round(float(row_um[40]), 4)  # 4 and 4 · √3 / 2
+    (4.0, 3.4641)
     """
     nearest_um, row_um = np.full(layout.n_sites, np.nan), np.full(layout.n_sites, np.nan)
     channel = layout.channel if per_channel else np.zeros(layout.n_sites, np.int64)
@@ -272,12 +279,20 @@ def nyquist_vs_eccentricity(
     ------
     ParameterError
         When an argument is out of range, or the layout has no sites.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.log_polar(n_sectors=64, min_size_um=3.0, r_max_um=300.0)
+    >>> table = fs.metrics.nyquist_vs_eccentricity(layout, n_bins=4)
+    >>> list(table.records()[0])
+    ['from_um', 'to_um', 'n_sites', 'size_um', 'nyquist_min_per_mm', 'nyquist_per_mm', 'nyquist_max_per_mm']
     """
     centre = finite_array("centre_um", centre_um)
     if layout.n_sites == 0:
         raise ParameterError("layout", "must have at least one site")
     nyquist = nyquist_per_mm(layout, by=by, per_channel=per_channel)
-    r_um, size_um = np.hypot(*(layout.centroid_um - centre).T), np.sqrt(layout.area_um2)
+    r_um, size_um = np.hypot(*(layout.centroid_um - centre).T), layout.size_um
     edges_um = np.linspace(r_um.min(), max(r_um.max(), r_um.min() + 1e-9), n_bins + 1)
     position = np.asarray(np.searchsorted(edges_um[1:-1], r_um, side="right"))
     counts = np.bincount(position, minlength=n_bins)

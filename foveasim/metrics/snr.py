@@ -106,12 +106,10 @@ class SnrTable:
         return [dict(zip(columns, row, strict=True)) for row in rows]
 
     def plot(self, *, ax: Axes | None = None) -> Axes:
-        """Draw the SNR of each class against its mean pixel size on matplotlib axes."""
+        """Draw the SNR of each class against its mean site size on matplotlib axes."""
         from foveasim.view import plot_curves
 
-        return plot_curves(
-            {"": (self.size_um, self.snr)}, "pixel size / µm", "SNR", logarithmic="xy", marker="o", ax=ax
-        )
+        return plot_curves({"": (self.size_um, self.snr)}, "site size / µm", "SNR", logarithmic="xy", marker="o", ax=ax)
 
     def _repr_html_(self) -> str:
         from foveasim.view import to_html
@@ -159,10 +157,18 @@ def size_classes_um(layout: Layout, n_classes: Annotated[int, Limits(at_least=1)
     ------
     ParameterError
         When ``n_classes`` is below 1, or the layout has no sites.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> layout = fs.layout.log_polar(n_sectors=64, min_size_um=3.0, r_max_um=300.0)
+    >>> np.unique(fs.metrics.size_classes_um(layout, 3)).round(1).tolist()
+    [4.3, 8.8, 18.2]
     """
     if layout.n_sites == 0:
         raise ParameterError("layout", "must have at least one site")
-    size_um = np.sqrt(layout.area_um2)
+    size_um = layout.size_um
     low_um, high_um = float(size_um.min()), float(size_um.max())
     if high_um <= low_um * (1.0 + SIZE_ROUNDING):
         return np.full(layout.n_sites, low_um)
@@ -198,6 +204,17 @@ def snr_by_class(
     -----
     Signal and noise are those of :func:`foveasim.sensor.signal_to_noise`, in linear codes: the noise includes quantisation
     once; companding and response nonlinearity are referred to the charge.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> layout = fs.layout.grid(n_x=16, n_y=16, pitch_um=4.0)
+    >>> sensor = fs.Sensor.from_preset(layout, "machine_vision")
+    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    >>> table = fs.metrics.snr_by_class(camera, scene, exposure_s=0.005)
+    >>> table.size_um.tolist(), bool(40.0 < table.snr[0] < 120.0)
+    ([4.0], True)
     """
     exposure_s = EXPOSURE.check("exposure_s", exposure_s)
     sensor, layout = _sensor_and_layout(camera)

@@ -62,6 +62,15 @@ class Events:
     ------
     ParameterError
         When times are not in ascending order, a site is not in the layout, or a polarity is neither 1 nor -1.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> layout, polarity = fs.layout.grid(2, 1, 3.0), np.array([1, -1], np.int8)
+    >>> events = fs.modes.Events(t_s=np.array([0.1, 0.2]), site=np.array([0, 1]), polarity=polarity, layout=layout)
+    >>> events.histogram([0.0, 0.15, 0.3]).tolist()
+    [[1, 0], [0, 1]]
     """
 
     t_s: Floats

@@ -96,6 +96,12 @@ def zernike(n: int, m: int, x: ArrayLike, y: ArrayLike) -> Floats:
     -----
     ``R`` is computed from Jacobi polynomials, which are numerically stable at high orders: Born and Wolf, Principles of
     Optics, section 9.2.1.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> round(float(fs.optics.zernike(2, 0, 0.0, 0.0)), 4), round(float(fs.optics.zernike(2, 0, 1.0, 0.0)), 4)
+    (-1.7321, 1.7321)
     """
     from scipy.special import eval_jacobi
 
@@ -231,6 +237,13 @@ class Seidel(Declared):
     -----
     W. T. Welford, Aberrations of Optical Systems, chapter 7: the wave aberration coefficients W040, W131, W222, W220. The
     fifth, distortion, is a lens model of ``foveasim.distortion``.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> lens = fs.Optics(focal_length_mm=8.0, f_number=2.8, seidel=fs.optics.Seidel(coma_um=0.1))
+    >>> [round(lens.strehl(550.0, field_um=(x_um, 0.0)), 3) for x_um in (0.0, 500.0, 1000.0)]
+    [1.0, 0.96, 0.85]
     """
 
     spherical_um: Annotated[float, PATH] = 0.0

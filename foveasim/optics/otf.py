@@ -51,6 +51,12 @@ def circular_otf(s: ArrayLike) -> Floats:
     Notes
     -----
     Goodman, Introduction to Fourier Optics, section on the OTF of a diffraction-limited system.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.optics.circular_otf([0.0, 0.25, 0.5, 1.0]).round(5).tolist()
+    [1.0, 0.68504, 0.391, 0.0]
     """
     ratio: Floats = np.minimum(np.abs(as_numbers("s", s)), 1.0)
     return np.asarray((2.0 / np.pi) * (np.arccos(ratio) - ratio * np.sqrt(1.0 - ratio * ratio)))

@@ -228,6 +228,15 @@ def to_cortical(
     -------
     CorticalImage
         NaN where the picture has no data.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.grid(n_x=40, n_y=40, pitch_um=2.0)
+    >>> picture = fs.reconstruct.cells(layout, layout.centroid_um[:, 0] ** 2, fs.Grid.centred((40, 40), 2.0))
+    >>> image = fs.reconstruct.to_cortical(picture, n_rings=8, n_sectors=32, r_min_um=4.0, r_max_um=36.0)
+    >>> image.data.shape
+    (1, 8, 32)
     """
     from scipy.ndimage import map_coordinates
 

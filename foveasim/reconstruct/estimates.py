@@ -44,7 +44,16 @@ class SiteEstimates:
 
 
 def electrons_per_code(sensor: Sensor) -> Floats:
-    """Return the electrons per linear code of the nominal sensor, (n_site,) e-/DN."""
+    """
+    Return the electrons per linear code of the nominal sensor, (n_site,) e-/DN.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> sensor = fs.Sensor(fs.layout.grid(2, 1, 3.0), capacitance_f=1.6e-15, v_sat_v=1.0, bits=12)
+    >>> fs.reconstruct.electrons_per_code(sensor).round(3).tolist()
+    [2.438, 2.438]
+    """
     return np.broadcast_to(nominal_e_per_dn(sensor), sensor.layout.n_sites)
 
 

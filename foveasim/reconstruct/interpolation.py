@@ -56,6 +56,15 @@ def linear(
     ------
     ParameterError
         When there is not one value per site, a value is infinite, or a channel has no values.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0)
+    >>> grid = fs.Grid.centred((4, 4), 1.0)
+    >>> picture = fs.reconstruct.linear(layout, layout.centroid_um[:, 0], grid)  # a ramp remains one
+    >>> picture.data[0, 1].round(3).tolist()
+    [-1.5, -0.5, 0.5, 1.5]
     """
     return _interpolate(layout, values, grid, gaps, n_threads, is_smooth=False)
 
@@ -78,6 +87,15 @@ def natural(
     -------
     Picture
         As for :func:`linear`, but with a continuous gradient except at the centroids.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0)
+    >>> grid = fs.Grid.centred((4, 4), 1.0)
+    >>> picture = fs.reconstruct.natural(layout, layout.centroid_um[:, 0], grid)
+    >>> picture.data[0, 1].round(3).tolist()
+    [-1.5, -0.5, 0.5, 1.5]
     """
     return _interpolate(layout, values, grid, gaps, n_threads, is_smooth=True)
 

@@ -282,7 +282,16 @@ def _channels(colour: Colour, n_channels: int) -> Floats:
 
 
 def raster_grid(layout: PackedRings, max_pixels: Annotated[int, Limits(at_least=1, at_most=2**15)]) -> Grid:
-    """Return a grid of square pixels over the layout, ``max_pixels`` along its longer side."""
+    """
+    Return a grid of square pixels over the layout, ``max_pixels`` along its longer side.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> grid = fs.reconstruct.raster_grid(fs.layout.grid(n_x=40, n_y=20, pitch_um=3.0), 400)
+    >>> grid.shape, round(grid.pitch_um, 4)
+    ((200, 400), 0.3)
+    """
     lattice: Lattice | None = getattr(layout, "lattice", None)
     if lattice is None and layout.xy_um.size == 0:
         raise GeometryError("the layout has no sites; a picture needs at least one")

@@ -52,6 +52,12 @@ def illuminant(name: Illuminant, wavelength_nm: ArrayLike) -> Floats:
     Daylight according to CIE 15:2004: S0 + M1 S1 + M2 S2 with M1 and M2 rounded to three decimals; the components are
     interpolated linearly between steps of 10 nm. The published tables of D50, D55, D65 and D75 in steps of 5 nm agree to
     1e-5 of the value at 560 nm.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.scene.charts.illuminant("D65", [450.0, 560.0]).round(3).tolist()
+    [1.17, 1.0]
     """
     waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
     if name == "E":

@@ -145,6 +145,15 @@ class Scene:
     Notes
     -----
     Spectral radiance of pixel [iy, ix] at wavelength k: ``sum_b basis[b, iy, ix] * spectrum[b, k]``.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> picture = np.tile(np.linspace(0.0, 1.0, 64), (48, 1))
+    >>> scene = fs.Scene.from_picture(picture, pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> scene.basis.shape, round(float(scene.luminance_cd_m2.max()), 1)  # 500 / π
+    ((1, 48, 64), 159.2)
     """
 
     if TYPE_CHECKING:
@@ -409,10 +418,8 @@ class Scene:
             raise (FileError(str(picture), str(error)) if is_file else error) from None
         n_channels = colours.shape[0]
         if wavelength_nm is None:
-            wavelength_nm = RGB_NM if n_channels == 3 else GREY_NM
-            if n_channels == 1 and band_width_nm is None:
-                band_width_nm = GREY_BAND_WIDTH_NM
-        waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
+            wavelength_nm = RGB_NM if n_channels == 3 else None
+        waves_nm, widths_nm = scene_bands(wavelength_nm, band_width_nm)
         if spectrum is not None:
             relative = finite_array("spectrum", spectrum, ndim=2, at_least=0.0)
             if relative.shape != (n_channels, waves_nm.size):
@@ -434,7 +441,6 @@ class Scene:
                 "nm",
                 "for other wavelengths pass 'spectrum', the spectrum of each channel",
             )
-        widths_nm = band_widths_nm(waves_nm, band_width_nm)
         peak = level_of_white(
             "peak_radiance_w_m2_sr_nm",
             peak,
@@ -623,7 +629,7 @@ class Scene:
         luminance_cd_m2: float | None = None,
         illuminance_lux: float | None = None,
         reflectance: float = 1.0,
-        wavelength_nm: Sequence[float] = GREY_NM,
+        wavelength_nm: Sequence[float] | None = None,
         band_width_nm: float | Sequence[float] | None = None,
     ) -> Scene:
         """
@@ -639,8 +645,7 @@ class Scene:
         """
         if radiance_w_m2_sr_nm is not None:
             radiance_w_m2_sr_nm = RADIANCE.check("radiance_w_m2_sr_nm", radiance_w_m2_sr_nm)
-        waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
-        widths_nm = band_widths_nm(waves_nm, band_width_nm)
+        waves_nm, widths_nm = scene_bands(wavelength_nm, band_width_nm)
         radiance = level_of_white(
             "radiance_w_m2_sr_nm",
             radiance_w_m2_sr_nm,
@@ -670,7 +675,7 @@ class Scene:
         intensity_w_sr_nm: float | Sequence[float],
         pitch_um: float,
         distance_m: float,
-        wavelength_nm: Sequence[float] = GREY_NM,
+        wavelength_nm: Sequence[float] | None = None,
         band_width_nm: float | Sequence[float] | None = None,
     ) -> Scene:
         """
@@ -709,18 +714,28 @@ class Scene:
             )
         image = np.zeros((1, n_y, n_x))
         np.add.at(image[0], (points[:, 0], points[:, 1]), intensity)
-        waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
+        waves_nm, widths_nm = scene_bands(wavelength_nm, band_width_nm)
         # A pixel of pitch p0 and radiance I / p0² has the intensity I.
         per_area = np.full((1, waves_nm.size), 1.0 / float(m_from_um(pitch_um)) ** 2)
         return cls(
             read_only(image),
             per_area,
             waves_nm,
-            band_widths_nm(waves_nm, band_width_nm),
+            widths_nm,
             pitch_um,
             distance_m,
             source="point sources",
         )
+
+
+def scene_bands(
+    wavelength_nm: Sequence[float] | None, band_width_nm: float | Sequence[float] | None
+) -> tuple[Floats, Floats]:
+    """Return the wavelengths and widths of bands; by default one band at 550 nm of 100 nm."""
+    if wavelength_nm is None:
+        wavelength_nm, band_width_nm = GREY_NM, GREY_BAND_WIDTH_NM if band_width_nm is None else band_width_nm
+    waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
+    return waves_nm, band_widths_nm(waves_nm, band_width_nm)
 
 
 def _check_framing(pitch_um: float | None, fit: Fit | None, field_of_view_deg: float | None) -> None:

@@ -105,6 +105,15 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: Annotated[fl
 
     Fixed entries are standard deviations over all devices of the kind, at their mean: the sum of squares is the variance of a
     site's mean over devices, to first order. Crosstalk and inter-pixel capacitance reduce them, as they mix sites.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> sensor = fs.Sensor(fs.layout.grid(8, 8, 3.0), read_noise_e=5.0, capacitance_f=1.6e-15, v_sat_v=1.0, bits=12)
+    >>> budget = fs.sensor.noise_budget(sensor, np.full(64, 1e5), 0.01)
+    >>> round(float(budget["photon_shot"].mean()), 2), round(float(budget["read"].mean()), 2)
+    (31.62, 5.0)
     """
     rates = check_per_site("photo_e_per_s", as_numbers("photo_e_per_s", photo_e_per_s), sensor.layout.n_sites)
     known, of_devices = (

@@ -177,6 +177,14 @@ class Sensor:
         of sites.
     SimulationError
         If the layout has channels without a filter, or lacks the column ``channel`` or ``readout_line`` where it is required.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.mosaic(fs.layout.grid(n_x=64, n_y=64, pitch_um=3.0), "RGGB")
+    >>> sensor = fs.Sensor(layout, filters="rgb", qe=0.6, read_noise_e=2.0, full_well_e=1e4, bits=12)
+    >>> [effect.name for effect in sensor.chain]
+    ['shot', 'read']
     """
 
     layout: OwnCheck[Photosites]

@@ -52,6 +52,14 @@ class GazePath:
     ------
     ParameterError
         When times are not strictly ascending, or there is not one position per time.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> path = fs.video.GazePath(np.array([0.0, 1.0]), np.array([[0.0, 0.0], [100.0, 50.0]]))
+    >>> path.at([0.25]).tolist()
+    [[25.0, 12.5]]
     """
 
     t_s: Floats
@@ -204,6 +212,15 @@ def shift_sensor(source: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Sce
     Yields
     ------
     source, (x_um, y_um)
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> scene = fs.Scene.flat(shape=(8, 8), pitch_um=100.0, distance_m=1.0, illuminance_lux=100.0)
+    >>> path = fs.video.GazePath(np.array([0.0, 0.1]), np.array([[0.0, 0.0], [5.0, 0.0]]))
+    >>> [gaze_um for _, gaze_um in fs.video.shift_sensor(scene, path)]
+    [(0.0, 0.0), (5.0, 0.0)]
     """
     return ((source, position_um) for position_um in path_positions(path.xy_um))
 
@@ -233,6 +250,15 @@ def follow_gaze(
     Yields
     ------
     light, (x_um, y_um)
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> frames = [fs.Scene.flat(shape=(8, 8), pitch_um=100.0, distance_m=1.0, illuminance_lux=100.0)] * 3
+    >>> path = fs.video.GazePath(np.array([0.0, 0.1]), np.array([[0.0, 0.0], [10.0, 0.0]]))
+    >>> [gaze_um for _, gaze_um in fs.video.follow_gaze(frames, path, frame_s=0.05)]
+    [(0.0, 0.0), (5.0, 0.0), (10.0, 0.0)]
     """
     for k, light in enumerate(frames, first_frame):
         x_um, y_um = path.at(k * frame_s).tolist()

@@ -92,6 +92,13 @@ def site_at(layout: PackedRings, x_um: float, y_um: float) -> int:
     Return the index of the site at a point, -1 where there is none.
 
     Boundaries and overlaps are resolved as in :func:`id_map`.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0)
+    >>> fs.view.site_at(layout, 0.1, 0.1), fs.view.site_at(layout, 9.0, 0.0)
+    (4, -1)
     """
     point = finite_array("x_um, y_um", (x_um, y_um))
     return int(_sites_at(layout, point[:1], point[1:], 1)[0, 0])

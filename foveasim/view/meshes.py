@@ -32,6 +32,7 @@ from foveasim.capture import Capture
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout import Layout
 from foveasim.view.site_colours import SiteColours, colours_of
+from foveasim.view.site_pictures import colours_in_picture
 
 if TYPE_CHECKING:
     from pyvista import PolyData
@@ -220,7 +221,8 @@ def prisms(
         Quantity shown by the height: ``"code"``, ``"electrons"``, ``"expected_e"``, ``"area_um2"``, ``"size_um"``, any
         numerical column, or one value per site, at least 0. By default the code of a capture, or the site sizes of a layout.
     by : str or array, optional
-        Quantity shown by the colour, as in :func:`foveasim.view.colours_of`; by default that of the height.
+        Quantity shown by the colour, as in :func:`foveasim.view.colours_of`; by default that of the height, or the colours
+        of the picture for the codes of a colour capture.
     max_height_um : float, µm
         Height of the tallest prism; 0.15 of the layout's longer side by default.
     has_floor : bool
@@ -247,6 +249,8 @@ def prisms(
     """
     is_capture = isinstance(data, Capture)
     layout = data.layout if isinstance(data, Capture) else data
+    if isinstance(data, Capture) and height is None and by is None:
+        by = colours_in_picture(data)
     height = ("code" if is_capture else "size_um") if height is None else unmasked("height", height)
     try:
         shown = colours_of(data, height)

@@ -225,12 +225,9 @@ def colours_of(data: Layout | Capture, by: str | ArrayLike | None = None, *, lab
 def _column(layout: Layout, by: str, is_capture: bool) -> NDArray[Any]:
     if by in layout.columns:
         return layout.columns[by]
-    if by == "area_um2":
-        return layout.area_um2
-    if by == "size_um":
-        return np.asarray(np.sqrt(layout.area_um2))
-    if by == "readout_line":
-        return layout.readout_line
+    if by in {"area_um2", "size_um", "readout_line"}:
+        values: NDArray[Any] = getattr(layout, by)
+        return values
     known = [*(MEASURED if is_capture else ()), "channel", "area_um2", "size_um", "readout_line", *layout.columns]
     raise ParameterError("by", "must be a column or an array", by, hint=possible_names(by, sorted(set(known))))
 

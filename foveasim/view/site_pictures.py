@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.rings import site_area_um2, site_bounds_um
 from foveasim._core.validation import Bools, Floats, check_shape, unmasked
+from foveasim.capture import Capture
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PackedRings
 from foveasim.integrate import Integrator
@@ -29,6 +30,8 @@ __all__ = ["SiteMeans", "cover", "picture_colours", "site_picture"]
 PIXELS_PER_BAND = 2**22
 #: Fractions of a pixel up to this are rounding errors.
 ROUNDING = 1e-9
+#: Filters of a colour capture at least, and colours of its picture.
+N_COLOURS = 3
 
 
 class SiteMeans:
@@ -171,6 +174,17 @@ def site_picture(
     """
     clear = SiteMeans(layout, shape, bounds_um).picture(colours)
     return cover(np.full((*clear.shape[:2], 3), background, np.uint8), clear[..., :3], clear[..., 3] / 255.0)
+
+
+def colours_in_picture(capture: Capture) -> NDArray[np.uint8] | None:
+    """Return the colours of photosites in their picture, (n_site, 3), or None if it is grey."""
+    if len(capture.filter_names) < N_COLOURS:
+        return None
+    picture = capture.picture()
+    image = picture.to_image()
+    if image.shape[2] < N_COLOURS:
+        return None
+    return picture_colours(capture.layout, np.asarray(image[..., :N_COLOURS], np.uint8), picture.grid.bounds_um)
 
 
 def picture_colours(

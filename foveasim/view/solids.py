@@ -83,6 +83,13 @@ class SensorStack(Declared):
     n_lens_corners : int
         Minimum number of vertices of a lens outline, which becomes rounder toward the apex. 0 uses the vertices of the site,
         and its shape from rim to apex.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> solids = fs.view.solids(fs.layout.grid(n_x=2, n_y=2, pitch_um=3.0), fs.view.SensorStack(well_depth_um=2.0))
+    >>> [mesh.name for mesh in solids.meshes]
+    ['wells', 'trenches', 'filters', 'lenses']
     """
 
     well_depth_um: Annotated[float, replace(LENGTH, at_most=MAX_THICKNESS_UM)] = 3.0

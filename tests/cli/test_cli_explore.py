@@ -159,6 +159,7 @@ def called_study(**options):
 # -- studies ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_study_command_equals_call(foveasim, folder):
     called = called_study()
 

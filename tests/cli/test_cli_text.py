@@ -168,10 +168,10 @@ def test_names_outside_utf8_are_escaped(tmp_path):
     ("arguments", "code", "printed"),
     [
         (("layouts",), 0, b"field / um"),
-        (("describe", "four_zones"), 0, b"um2"),
+        (("describe", "four_zones"), 0, b"mm2"),
         (("check", "rings.yaml"), 1, b"fail"),
         (("convert", "rings.yaml", "rings.svg"), 0, b"moved by at most 6.4e-05 um"),
-        (("run", "shot.yaml", "-o", "out"), 0, b"smallest pixel / um"),
+        (("run", "shot.yaml", "-o", "out"), 0, b"smallest site / um"),
         (("video", "picture.yaml", "--frames", "frames", "-o", "seen.gif"), 0, b"2 frames"),
         (("view", "shot.yaml", "--out", "page.html"), 2, b"error: shot.yaml"),
         (("describe", "\u00e9\u00b5.yaml"), 2, b"error: "),

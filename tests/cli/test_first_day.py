@@ -72,6 +72,7 @@ def test_own_photograph_with_gaze_and_colours(folder):
     assert balance[0] == pytest.approx(balance[1], abs=0.02)
 
 
+@pytest.mark.slow
 def test_comparison_at_equal_number_of_sites(folder):
     foveal = fs.layout.log_polar(n_sectors=57, min_size_um=3.0, r_max_um=150.4, fovea="rings", stagger=True)
     square = fs.layout.grid(n_sites=1024, size_um=(266.0, 266.0))
@@ -197,6 +198,7 @@ def test_sweep_with_plot(folder, in_folder):
         assert figure.size[0] > 400
 
 
+@pytest.mark.slow
 def test_notebook_shows_results(folder, monkeypatch):
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
     monkeypatch.setenv("PYTHONPATH", str(README.parent), prepend=os.pathsep)

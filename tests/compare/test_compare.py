@@ -131,6 +131,7 @@ def test_uniform_grid_has_known_frequencies(compared):
     assert 0.3 * 603.0 / side_um < compared.values["mtf50_per_mm"][1] < 650.0 / side_um
 
 
+@pytest.mark.slow
 def test_finer_grid_has_higher_psnr(scenes):
     grids = {f"{n}": fs.layout.grid(n_x=n, size_um=(160.0, 160.0)) for n in (16, 32, 64)}
     found = fs.compare.layouts(grids, scenes, budget=None, **OPTIONS)

@@ -450,7 +450,7 @@ def test_schema_contains_parameters_of_calls():
     ):
         assert f'"{name}"' in text
     assert schema()["title"] == "foveasim settings"
-    assert "Minimum pixel size that can be manufactured" in text
+    assert "Minimum site size that can be manufactured" in text
     assert schema()["required"] == ["scene", "optics", "layout", "exposure_s"]
 
 
@@ -468,6 +468,7 @@ SHIPPED = {
     "prima_75": 142,
     "quad_bayer": 128 * 128,
     "spectral_16": 128 * 96,
+    "square_grid": 119 * 119,
     "x_trans": 144 * 96,
 }
 

@@ -124,6 +124,7 @@ def outcomes(study):
     ]
 
 
+@pytest.mark.slow
 def test_interrupted_study_resumes_identically(tmp_path):
     def run(n_trials, **options):
         return explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=n_trials, seed=5, **options)

@@ -113,6 +113,7 @@ def test_measures_agree_with_shapely(polygons):
     layout = Layout.from_polygons(polygons)
 
     np.testing.assert_allclose(layout.area_um2, shapely.area(polygons), rtol=1e-12)
+    np.testing.assert_allclose(layout.size_um**2, shapely.area(polygons), rtol=1e-12)
     np.testing.assert_allclose(layout.centroid_um, shapely.get_coordinates(shapely.centroid(polygons)), atol=1e-10)
     assert layout.site_bounds_um.tolist() == shapely.bounds(polygons).tolist()
     assert layout.bounds_um == tuple(shapely.total_bounds(polygons).tolist())

@@ -58,7 +58,7 @@ def test_table_contains_all_fields():
 
     assert "200" in text
     assert "0: 50, 1: 100, 2: 50" in text
-    assert "0.09 Mbit/s" in text
+    assert "90 kbit/s" in text
     assert "on each of 2 lanes (60 frames/s, 12 bits, 25 % blanking)" in text
     assert "█" in text
     assert str(layout.describe()).splitlines()[1] == "photosites: 200"

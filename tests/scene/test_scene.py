@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from PIL import Image
 import foveasim as fs
 from foveasim._io.encodings import decode
 from foveasim.errors import FileError, ParameterError
-from foveasim.scene import Scene
+from foveasim.scene import Scene, charts
 
 EPS32 = float(np.finfo(np.float32).eps)
 
@@ -410,6 +411,21 @@ def test_negative_file_value_error_names_file(tmp_path):
         scene_of(tmp_path / "f.tif")
 
 
+@pytest.mark.parametrize(
+    "create",
+    [
+        partial(Scene.flat, radiance_w_m2_sr_nm=1.0),
+        partial(Scene.point_sources, pixels=[(0, 0)], intensity_w_sr_nm=1.0),
+        partial(charts.slanted_edge, radiance_w_m2_sr_nm=1.0),
+        partial(charts.point_grid, spacing_mm=2.0, intensity_w_sr_nm=1.0),
+    ],
+)
+def test_scenes_without_wavelengths_have_green_band(create):
+    scene = create(shape=(40, 60), pitch_um=1000.0, distance_m=1.0)
+
+    assert (scene.wavelength_nm.tolist(), scene.band_width_nm.tolist()) == ([550.0], [100.0])
+
+
 def test_from_picture_rejects_missing_file(tmp_path):
     with pytest.raises(FileError, match=r"nowhere\.png: no such file$"):
         scene_of(tmp_path / "nowhere.png")
@@ -428,7 +444,7 @@ def test_from_picture_rejects_missing_file(tmp_path):
         ({"intensity_w_sr_nm": -1.0}, "intensity_w_sr_nm"),
         ({"intensity_w_sr_nm": math.nan}, "intensity_w_sr_nm"),
         ({"intensity_w_sr_nm": [1.0, 2.0]}, "intensity_w_sr_nm"),
-        ({"band_width_nm": None}, "band_width_nm"),
+        ({"wavelength_nm": [550.0], "band_width_nm": None}, "band_width_nm"),
         ({"pitch_um": 0.0}, "pitch_um"),
         ({"shape": (4,)}, "shape"),
         ({"shape": (4, 6, 3)}, "shape"),

@@ -130,7 +130,7 @@ def test_html_contains_key_figures(items, capture):
 
     assert f"{SITES.n_sites:,} photosites" in text["layout"]
     assert f"to {capture.code.max():,} of 255 DN" in text["capture"]
-    assert "0.01 s" in text["capture"]
+    assert "10 ms" in text["capture"]
     assert "read_noise_e = 1.5 e-" in text["sensor"]
     assert "1 to 2 e-/s" in text["sensor"]
     for effect in SENSOR.chain:

@@ -243,7 +243,7 @@ class Rule:
 
 
 def _sizes(case: Case) -> Floats:
-    return np.asarray(np.sqrt(case.layout.area_um2))
+    return case.layout.size_um
 
 
 def _areas(case: Case) -> Floats:
@@ -457,7 +457,7 @@ def _growths(case: Case) -> Measurement:
     The marker is the first site of the outer ring.
     """
     rings, first, ring = np.unique(case.layout.index_column("ring"), return_index=True, return_inverse=True)
-    size_um = np.bincount(ring, np.sqrt(case.layout.area_um2)) / np.bincount(ring) if rings.size else np.zeros(0)
+    size_um = np.bincount(ring, case.layout.size_um) / np.bincount(ring) if rings.size else np.zeros(0)
     order = np.argsort(ring, kind="stable")
     members = np.split(order, np.cumsum(np.bincount(ring))[:-1])[1:] if rings.size else []
     return Measurement(
@@ -476,7 +476,7 @@ def _neighbour_ratios(case: Case) -> Measurement:
         return _kernels.shared_lengths(layout.xy_um, case.after, case.first_vertex, a[piece], b[piece], TOUCHING_UM)
 
     pairs = touching[np.concatenate(parallel_map(shared_um, _task_slices(a.size), thread_count())) > 0.0]
-    size_um = np.sqrt(layout.area_um2)
+    size_um = layout.size_um
     ratio = size_um[found.first[pairs]] / size_um[found.second[pairs]]
     return Measurement(
         np.maximum(ratio, 1.0 / ratio),
@@ -675,6 +675,12 @@ def min_width_um(layout: Layout) -> Floats:
     The minimum of: the distance between two non-adjacent edges that face each other across the site (antiparallel
     within 26 degrees); the distance from a reflex vertex straight across the site to an edge; the width of the
     narrowest strip parallel to one of its edges that contains the site.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.layout.min_width_um(fs.Layout.from_rectangles([[0.0, 0.0]], [[3.0, 1.5]])).tolist()
+    [1.5]
     """
     from foveasim.layout import _kernels
 

@@ -131,6 +131,13 @@ def repair(layout: Layout, *, rules: DesignRules | None = None, method: Repair =
         As for :func:`enforce`.
     ParameterError
         When there are no rules.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.Layout.from_rectangles([[0.0, 0.0], [5.0, 0.0]], [[3.0, 3.0], [3.0, 0.5]])
+    >>> fs.layout.repair(layout, rules=fs.DesignRules(min_width_um=1.0)).n_sites
+    1
     """
     if rules is None:
         raise ParameterError("rules", "must be given", hint="in settings files, the layout may have them")

@@ -34,6 +34,12 @@ class Readout(Declared):
         Time without data as a fraction of the time with data, such as 0.2.
     n_lanes : int
         Number of output lanes, with equal data rates.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.layout.Readout(frames_per_s=30.0, bits=10, n_lanes=4).gbit_per_s(1_000_000)
+    0.075
     """
 
     frames_per_s: Annotated[float, POSITIVE]

@@ -50,6 +50,13 @@ def union(layouts: Iterable[Layout]) -> Layout:
     ------
     ParameterError
         When the sequence is empty or contains another object, or no integer type fits all values of a column.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> left, right = (fs.layout.grid(n_x=2, n_y=2, pitch_um=2.0).translate(x_um, 0.0) for x_um in (-5.0, 5.0))
+    >>> fs.layout.union([left, right]).n_sites
+    8
     """
     layouts = list(layouts)
     if not layouts or not all(isinstance(layout, Layout) for layout in layouts):
@@ -80,6 +87,14 @@ def clip(layout: Layout, region: Any, *, cut: Literal["pieces", "drop"] = "piece
     ------
     ParameterError
         When the region is not a valid polygon.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import shapely
+    >>> layout = fs.layout.grid(n_x=10, n_y=10, pitch_um=2.0)
+    >>> fs.layout.clip(layout, shapely.Point(0, 0).buffer(6.0), cut="drop").n_sites
+    16
     """
     return _clip_sites(
         layout, as_region("region", region), shapely.intersection, shapely.covers, cut, "clipped to a region"
@@ -98,6 +113,14 @@ def cut_out(layout: Layout, region: Any, *, cut: Literal["pieces", "drop"] = "pi
         Area to remove: for a circuit, a fiducial mark, or a fovea that is filled later.
     cut : {"pieces", "drop"}
         As for :func:`clip`.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import shapely
+    >>> layout = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0)
+    >>> fs.layout.cut_out(layout, shapely.box(-2.0, -2.0, 2.0, 2.0)).n_sites
+    12
     """
     return _clip_sites(layout, as_region("region", region), shapely.difference, shapely.disjoint, cut, "region cut out")
 
@@ -119,6 +142,13 @@ def inset(layout: Layout, margin_um: ArrayLike) -> Layout:
         When a site would vanish or split into parts; ``.site_ids`` are their indices.
     ParameterError
         When a margin is negative.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.inset(fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), 0.1)  # a trench of 0.2 µm
+    >>> layout.area_um2.round(4).tolist()
+    [3.24, 3.24]
     """
     margins_um = finite_array("margin_um", margin_um, at_least=0.0)
     check_per_site("margin_um", margins_um, layout.n_sites, or_one=True)
@@ -154,6 +184,13 @@ def merge(layout: Layout, groups: ArrayLike) -> Layout:
         When the sites of a group are not connected; ``.site_ids`` are their indices.
     ParameterError
         When ``groups`` does not contain one non-negative integer per site.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.grid(n_x=4, n_y=1, pitch_um=2.0)
+    >>> fs.layout.merge(layout, [0, 0, 1, 1]).area_um2.tolist()  # binning of pairs
+    [8.0, 8.0]
     """
     labels = np.asarray(unmasked("groups", groups))
     if labels.shape != (layout.n_sites,) or labels.dtype.kind not in "iu" or labels.min(initial=0) < 0:
@@ -211,6 +248,13 @@ def merge_small(layout: Layout, *, min_size_um: Annotated[float, LENGTH]) -> Lay
     ------
     ParameterError
         When the size is not positive.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.split_at(fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), [(1.0, 0.0)], n_x=4)
+    >>> fs.layout.merge_small(layout, min_size_um=1.2).area_um2.tolist()
+    [5.0, 3.0]
     """
     while True:
         small = np.flatnonzero(is_below_size(layout.area_um2, min_size_um))
@@ -266,6 +310,13 @@ def split(layout: Layout, *, n_x: Annotated[int, PARTS] = 2, n_y: Annotated[int,
     ------
     ParameterError
         When a number is below 1.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> dual = fs.layout.split(fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), n_x=2)
+    >>> dual.n_sites, dual.area_um2.tolist()
+    (4, [2.0, 2.0, 2.0, 2.0])
     """
     check_sites(max(1, layout.n_sites * n_x * n_y))
     box = layout.site_bounds_um[:, np.newaxis, :]
@@ -296,6 +347,13 @@ def node(layout: Layout) -> Layout:
     Layout
         The same sites. T-junctions have a vertex on both sides afterwards, so rotation, snapping and the database unit of
         a GDSII file do not open gaps there.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.Layout.from_rectangles([[0.0, 0.0], [3.0, 0.0]], [[4.0, 4.0], [2.0, 2.0]])
+    >>> fs.layout.node(layout).xy_um.shape[0]  # the corners of the small square are vertices of the large one, too
+    10
     """
     xy_um, ring_offsets, _ = insert_points(layout.xy_um, layout.ring_offsets, np.unique(layout.xy_um, axis=0))
     return derived(layout, "noded", (xy_um, ring_offsets, layout.site_offsets))
@@ -324,6 +382,13 @@ def snap(layout: Layout, grid_um: Annotated[float, LENGTH]) -> Layout:
         When a snapped site has no area, or crosses itself.
     ParameterError
         When the grid is not positive.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.snap(fs.layout.hexagonal(n_columns=1, n_rows=1, pitch_um=3.0), 0.005)
+    >>> layout.xy_um[:2].tolist()
+    [[1.5, -0.865], [1.5, 0.865]]
     """
     noded = node(layout)
     xy_um = np.round(noded.xy_um / grid_um) * grid_um

@@ -55,6 +55,12 @@ def sites_at(layout: Layout, points_um: ArrayLike) -> Ints:
     ------
     ParameterError
         When a point lies outside all sites.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.layout.sites_at(fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0), [(0.0, 0.0), (2.0, 2.0)]).tolist()
+    [4, 8]
     """
     points_um = _points("points_um", points_um)
     candidates = _near(layout, points_um, 0.0)
@@ -83,6 +89,12 @@ def remove_at(layout: Layout, points_um: ArrayLike) -> Layout:
     ------
     ParameterError
         When a point lies outside all sites.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.layout.remove_at(fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0), [(0.0, 0.0)]).n_sites
+    8
     """
     sites = np.unique(sites_at(layout, points_um))
     none = np.zeros(0, np.int64)
@@ -111,6 +123,13 @@ def merge_at(layout: Layout, points_um: ArrayLike) -> Layout:
         When the sites are not connected; ``.site_ids`` are their indices.
     ParameterError
         When a point lies outside all sites.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.grid(n_x=3, n_y=1, pitch_um=2.0)
+    >>> fs.layout.merge_at(layout, [(0.0, 0.0), (2.0, 0.0)]).n_sites
+    2
     """
     sites = np.unique(sites_at(layout, points_um))
     try:
@@ -147,6 +166,12 @@ def split_at(
     ------
     ParameterError
         When a point lies outside all sites, or a number is below 1.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.layout.split_at(fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), [(1.0, 0.0)], n_x=2, n_y=2).n_sites
+    5
     """
     sites = np.unique(sites_at(layout, points_um))
     parts = split(layout[sites], n_x=n_x, n_y=n_y)
@@ -176,6 +201,13 @@ def cut_along(layout: Layout, line_um: ArrayLike, *, points_um: ArrayLike | None
     ------
     ParameterError
         When the line does not cut a site, or a point lies outside all sites.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.grid(n_x=2, n_y=2, pitch_um=2.0)
+    >>> fs.layout.cut_along(layout, [(-2.0, 1.0), (2.0, 1.0)]).area_um2.tolist()
+    [4.0, 4.0, 2.0, 2.0, 2.0, 2.0]
     """
     vertices = _points("line_um", line_um, at_least=2)
     line = shapely.LineString(vertices)
@@ -221,6 +253,13 @@ def move_sites(layout: Layout, points_um: ArrayLike, by_um: tuple[float, float])
     ------
     ParameterError
         When a point lies outside all sites.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0)
+    >>> fs.layout.move_sites(layout, [(1.0, 0.0)], (0.5, 0.0)).centroid_um.tolist()
+    [[-1.0, 0.0], [1.5, 0.0]]
     """
     sites = np.unique(sites_at(layout, points_um))
     moved = layout[sites].translate(*finite_array("by_um", by_um).tolist())
@@ -250,6 +289,13 @@ def move_vertices(
         When an outline would cross itself or vanish; ``.site_ids`` contains the index of its site.
     ParameterError
         When a point is neither a vertex nor on an edge, or the numbers of points differ.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0)
+    >>> fs.layout.move_vertices(layout, [(0.0, 1.0)], [(0.5, 1.0)]).area_um2.tolist()
+    [4.5, 3.5]
     """
     from_um, to_um = _points("from_um", from_um), _points("to_um", to_um)
     if from_um.shape != to_um.shape:
@@ -282,6 +328,13 @@ def remove_vertices(
         When an outline would cross itself or vanish; ``.site_ids`` contains the index of its site.
     ParameterError
         When there is no vertex at a point.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.grid(n_x=1, n_y=1, pitch_um=2.0)
+    >>> fs.layout.remove_vertices(layout, [(1.0, 1.0)]).area_um2.tolist()  # a triangle
+    [2.0]
     """
     points_um = _points("points_um", points_um)
     sites = _near(layout, points_um, tolerance_um)
@@ -316,6 +369,13 @@ def set_channel(layout: Layout, points_um: ArrayLike, channel: Annotated[int, NO
     ------
     ParameterError
         When a point lies outside all sites, or the index is negative.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.mosaic(fs.layout.grid(n_x=2, n_y=2, pitch_um=2.0), "RGGB")
+    >>> fs.layout.set_channel(layout, [(-1.0, -1.0)], 2).channel.tolist()
+    [2, 2, 0, 1]
     """
     channels = layout.channel.copy()
     channels[sites_at(layout, points_um)] = channel

@@ -52,6 +52,15 @@ def draw(
     ------
     ParameterError
         When an outline is not a valid polygon, or no area of the outlines remains.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import shapely
+    >>> layout = fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0)
+    >>> drawn = fs.layout.draw(layout, [shapely.box(-1.5, -1.5, 1.5, 1.5)])  # the others lose what it covers
+    >>> drawn.n_sites, float(drawn.area_um2.sum())
+    (9, 36.0)
     """
     if isinstance(outlines_um, str) or not isinstance(outlines_um, Sequence | np.ndarray) or len(outlines_um) == 0:
         raise ParameterError("outlines_um", "must be a list of one or more outlines")
@@ -109,6 +118,15 @@ def overlay(
     ------
     ParameterError
         When the layer has no sites, also in the region, or no site remains.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> coarse = fs.layout.grid(n_x=4, n_y=4, pitch_um=4.0)
+    >>> fine = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0)
+    >>> both = fs.layout.overlay(coarse, fine)  # a fine centre
+    >>> both.n_sites, float(both.area_um2.sum())
+    (28, 256.0)
     """
     if layer.n_sites == 0:
         raise ParameterError("layer", "must be a layout with sites", layer)

@@ -115,6 +115,12 @@ def read_layout(
     -----
     LayoutWarning
         When invalid outlines are skipped or repaired; the message lists them with their positions.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.read_layout("prima_75")  # a bundled layout; files by their paths
+    Layout(142 sites from tiling, columns ['column', 'readout_line', 'row'])
     """
     path = Path(path)
     if str(path) in bundled_layouts() and not path.exists():

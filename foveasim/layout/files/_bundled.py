@@ -9,7 +9,15 @@ from foveasim.errors import FileError
 
 
 def bundled_layouts() -> dict[str, Path]:
-    """Return the files of the bundled layouts by name: real sensors and those of the paper."""
+    """
+    Return the files of the bundled layouts by name: real sensors and those of the paper.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> sorted(fs.layout.bundled_layouts())[:3]
+    ['bayer_grid', 'four_zones', 'foveal_blind_spot']
+    """
     package = Path(__file__).parents[2]
     # They are inside an installed package, and next to the package in a repository checkout.
     directory = next(root / "layouts" for root in (package, package.parent) if (root / "layouts").is_dir())

@@ -93,6 +93,13 @@ def hexagonal(
     ------
     ParameterError
         When a number is out of range, the width exceeds the pitch, or the width is specified twice.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.hexagonal(n_columns=30, n_rows=20, pitch_um=3.0)
+    >>> layout.n_sites, round(float(layout.area_um2[0]), 4)
+    (600, 7.7942)
     """
     n_columns, n_rows, pitch_um = _cells_in_field(n_columns, n_rows, pitch_um, size_um, orientation)
     fraction = linear_fill_factor(pitch_um, width_um, trench_um, fill_factor)

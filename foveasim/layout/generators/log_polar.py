@@ -40,6 +40,12 @@ def square_ring_ratio(n_sectors: Annotated[int, SECTORS]) -> float:
     -----
     Height ``r_c * 2 (q - 1) / (q + 1)`` equal to the chord ``2 r_c sin(π / n)`` on the centre line gives
     ``q = (1 + sin(π / n)) / (1 - sin(π / n))``.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> round(fs.layout.square_ring_ratio(96), 5)
+    1.06765
     """
     s = math.sin(math.pi / n_sectors)
     return (1.0 + s) / (1.0 - s)
@@ -116,7 +122,7 @@ def log_polar(
         Upper limit of the outer radius. Rings grow by their ratio as long as they fit: the outermost ring ends exactly at
         this radius with ``n_rings``, otherwise inside it.
     min_size_um : float, optional, µm
-        Minimum pixel size that can be manufactured. It limits the size of all sites as the design rule ``min_size_um``
+        Minimum site size that can be manufactured. It limits the size of all sites as the design rule ``min_size_um``
         measures it, the square root of the area between chords, and also the height of rings and the arc length on their
         centre line. Rings with smaller sites are omitted, which results in the **blind spot**. With approximately square
         sites, its radius on the centre line of the first ring is ``min_size / (2 sin(π / n_sectors))`` for two or more

@@ -176,6 +176,15 @@ def fill(layout: Layout, region: Any, *, size_um: Annotated[float, LENGTH], colu
     ------
     ParameterError
         When the region is not a valid polygon, or the size is out of range.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import shapely
+    >>> rings = fs.layout.log_polar(n_sectors=24, min_size_um=2.0, r_max_um=32.4)
+    >>> filled = fs.layout.fill(rings, shapely.Point(0, 0).buffer(10.0), size_um=2.0)
+    >>> filled.n_sites - rings.n_sites  # hexagons in the blind spot
+    25
     """
     open_region = _uncovered_part(layout, as_region("region", region))
     if open_region.is_empty:

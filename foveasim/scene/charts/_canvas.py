@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from foveasim._core.calls import FRACTION, Limits, check_arguments, check_declared, without_declarations
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import Bools, Floats, band_widths_nm, check_shape, freeze, wavelengths_nm
+from foveasim._core.validation import Bools, Floats, check_shape, freeze
 from foveasim.errors import ParameterError, SamplingWarning
 from foveasim.scene._photometry import level_of_white
-from foveasim.scene._scene import DISTANCE, GREY_NM, PITCH, RADIANCE, Scene
+from foveasim.scene._scene import DISTANCE, PITCH, RADIANCE, Scene, scene_bands
 from foveasim.scene.registry import SCENES
 from foveasim.units import m_from_um
 
@@ -52,7 +52,8 @@ PARAMETERS = {
     "luminance_cd_m2": "luminance_cd_m2 : float, cd/m²\n        Luminance of white, instead of its radiance.",
     "illuminance_lux": "illuminance_lux, reflectance : float, lx\n"
     "        Illuminance of the chart, instead of the radiance, and reflectance of its white, a diffuse surface.",
-    "wavelength_nm": "wavelength_nm : sequence, nm\n        Wavelengths.",
+    "wavelength_nm": "wavelength_nm : sequence, optional, nm\n"
+    "        Wavelengths; by default one band at 550 nm with a width of 100 nm.",
     "band_width_nm": "band_width_nm : number or sequence, optional, nm\n"
     "        Widths of the bands; by default bands extend halfway to the adjacent wavelengths. Required for one wavelength.",
 }
@@ -75,7 +76,7 @@ class Picture(Raster):
     luminance_cd_m2: NotRequired[float | None]
     illuminance_lux: NotRequired[float | None]
     reflectance: NotRequired[float]
-    wavelength_nm: NotRequired[Sequence[float]]
+    wavelength_nm: NotRequired[Sequence[float] | None]
 
 
 class Pattern(Picture):
@@ -96,13 +97,12 @@ class Canvas:
     luminance_cd_m2: float | None = None
     illuminance_lux: float | None = None
     reflectance: float = 1.0
-    wavelength_nm: Sequence[float] = GREY_NM
+    wavelength_nm: Sequence[float] | None = None
     band_width_nm: OneOrMore | None = None
 
     def __post_init__(self) -> None:
         check_declared(self)
-        waves_nm = wavelengths_nm("wavelength_nm", self.wavelength_nm)
-        widths_nm = band_widths_nm(waves_nm, self.band_width_nm)
+        waves_nm, widths_nm = scene_bands(self.wavelength_nm, self.band_width_nm)
         given = self.radiance_w_m2_sr_nm
         radiance = np.ones(1) if given is None else RADIANCE.check_array("radiance_w_m2_sr_nm", given)
         if radiance.ndim > 1 or radiance.size not in (1, waves_nm.size):

@@ -98,6 +98,15 @@ def checkerboard(
     -----
     SamplingWarning
         If a square is smaller than a pixel.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> scene = fs.scene.charts.checkerboard(
+    ...     square_mm=4.0, n_squares=(4, 6), shape=(90, 120), pitch_um=400.0, distance_m=0.5, illuminance_lux=500.0
+    ... )
+    >>> scene.basis.shape
+    (1, 90, 120)
     """
     canvas = Canvas(**pattern)
     edges_mm = canvas.y_edges_mm, canvas.x_edges_mm
@@ -144,6 +153,15 @@ def slanted_edge(
     contrast : float
         (white - black) / (white + black); 0.6 by default, a ratio of 4 between white and black, as in ISO 12233.
     {picture}
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> scene = fs.scene.charts.slanted_edge(
+    ...     angle_deg=5.0, shape=(90, 120), pitch_um=400.0, distance_m=0.5, illuminance_lux=500.0
+    ... )
+    >>> round(float(scene.basis.min() / scene.basis.max()), 4)  # a ratio of 4
+    0.25
     """
     canvas = Canvas(contrast=contrast, **picture)
     angle = np.deg2rad(angle_deg)
@@ -191,6 +209,15 @@ def bars(
     The gaps between bars are equal to their width, their length is five widths (MIL-STD-150A). The arrangement differs from
     the spiral of the standard: each group is a column with its first element on top, the coarsest group is on the left, and
     vertical bars are left of horizontal bars. :func:`bar_elements` returns the positions.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> scene = fs.scene.charts.bars(
+    ...     groups=[-1], shape=(90, 120), pitch_um=400.0, distance_m=0.5, illuminance_lux=500.0
+    ... )
+    >>> scene.basis.shape
+    (1, 90, 120)
     """
     canvas = Canvas(**pattern)
     elements = bar_elements(groups)
@@ -304,6 +331,15 @@ def letter_f(
     -----
     SamplingWarning
         If a stroke is narrower than a pixel.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> scene = fs.scene.charts.letter_f(
+    ...     height_mm=20.0, shape=(90, 120), pitch_um=400.0, distance_m=0.5, illuminance_lux=500.0
+    ... )
+    >>> sorted(set(scene.basis.ravel().tolist()))
+    [0.0, 1.0]
     """
     canvas = Canvas(**pattern)
     unit_mm = height_mm / F_HEIGHT

@@ -65,6 +65,15 @@ def grey_scale(
     -----
     SamplingWarning
         If a patch is smaller than a pixel.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> scene = fs.scene.charts.grey_scale(
+    ...     patch_mm=3.0, shape=(90, 120), pitch_um=400.0, distance_m=0.5, illuminance_lux=500.0
+    ... )
+    >>> scene.basis.shape
+    (1, 90, 120)
     """
     canvas = Canvas(**picture)
     canvas.check_fits("patch_mm", n_steps * patch_mm, patch_mm)
@@ -140,6 +149,15 @@ def colour_chart(
     Spectra are exact with 24 basis images, or with one basis image per wavelength. With fewer basis images the spectra are
     sums of ``n_basis`` spectra, with a mean and maximum colour difference of 0.1 and 0.5 CIELAB units for 12 basis images,
     0.3 and 1.3 for 10, 0.8 and 2.5 for 8.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> scene = fs.scene.charts.colour_chart(
+    ...     patch_mm=5.0, gap_mm=1.0, shape=(90, 120), pitch_um=400.0, distance_m=0.5, illuminance_lux=500.0
+    ... )
+    >>> scene.basis.shape, scene.wavelength_nm.size
+    ((12, 90, 120), 31)
     """
     canvas = Canvas(radiance_w_m2_sr_nm=1.0, wavelength_nm=wavelength_nm, **raster)
     step_mm = patch_mm + gap_mm

@@ -10,7 +10,7 @@ import numpy as np
 from foveasim._core.calls import NOT_NEGATIVE, POSITIVE
 from foveasim._core.validation import check_shape
 from foveasim.errors import ParameterError
-from foveasim.scene._scene import GREY_NM, Scene
+from foveasim.scene._scene import Scene
 from foveasim.scene.charts._canvas import Canvas, Raster, chart
 
 #: Tolerance of a spacing from an integer number of pixels.
@@ -27,7 +27,7 @@ def point_grid(
     spacing_mm: Annotated[float, POSITIVE],
     n_points: tuple[int, int] | None = None,
     intensity_w_sr_nm: Annotated[float, NOT_NEGATIVE],
-    wavelength_nm: Sequence[float] = GREY_NM,
+    wavelength_nm: Sequence[float] | None = None,
     **raster: Unpack[Raster],
 ) -> Scene:
     """
@@ -41,8 +41,8 @@ def point_grid(
         Number of rows and columns of points; by default the largest odd numbers that fit into the picture.
     intensity_w_sr_nm : float, W/(sr nm)
         Spectral radiant intensity of each point.
-    wavelength_nm : sequence, nm
-        Wavelengths; the intensity is the same at all of them.
+    wavelength_nm : sequence, optional, nm
+        Wavelengths; the intensity is the same at all of them. By default one band at 550 nm with a width of 100 nm.
     {picture}
 
     Raises
@@ -60,6 +60,15 @@ def point_grid(
     The power of a point is assigned to the pixel that contains it. A point on the boundary of two pixels is assigned to the
     right or upper pixel: if the centre of the picture is such a boundary, the grid is shifted by half a pixel to the right
     or up.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> scene = fs.scene.charts.point_grid(
+    ...     spacing_mm=4.0, intensity_w_sr_nm=1e-6, shape=(90, 120), pitch_um=400.0, distance_m=0.5
+    ... )
+    >>> int((scene.basis > 0.0).sum())
+    99
     """
     canvas = Canvas(radiance_w_m2_sr_nm=1.0, wavelength_nm=wavelength_nm, **raster)
     step = round(spacing_mm / canvas.pitch_mm)

@@ -55,6 +55,15 @@ def sine(
     -----
     SamplingWarning
         If a period is shorter than two pixels.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> scene = fs.scene.charts.sine(
+    ...     line_pairs_per_mm=0.2, shape=(90, 120), pitch_um=400.0, distance_m=0.5, illuminance_lux=500.0
+    ... )
+    >>> scene.basis.shape
+    (1, 90, 120)
     """
     canvas = Canvas(contrast=contrast, **picture)
     angle, phase = np.deg2rad(angle_deg), np.deg2rad(phase_deg)
@@ -107,6 +116,15 @@ def zone_plate(
     The fraction of white is ``(1 + cos(π f r² / R)) / 2`` with the frequency f at the rim R, so that the frequency at r is
     ``f r / R``. The background outside the rim is the mean of black and white. The means are exact (Fresnel integrals),
     except in pixels on the rim, which are sampled at 32 x 32 points.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> scene = fs.scene.charts.zone_plate(
+    ...     line_pairs_per_mm=1.0, shape=(90, 120), pitch_um=400.0, distance_m=0.5, illuminance_lux=500.0
+    ... )
+    >>> scene.basis.shape
+    (1, 90, 120)
     """
     canvas = Canvas(**pattern)
     radius_mm = canvas.radius_mm(radius_mm)
@@ -171,6 +189,15 @@ def siemens_star(
     The background outside the rim is the mean of black and white. Where sectors are wider than 1.5 pixels, means of the
     square profile are exact and means of the sinusoidal profile are accurate to 1e-4. Pixels nearer to the centre and pixels
     on the rim are sampled at 32 x 32 points.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> scene = fs.scene.charts.siemens_star(
+    ...     n_spokes=36, shape=(90, 120), pitch_um=400.0, distance_m=0.5, illuminance_lux=500.0
+    ... )
+    >>> scene.basis.shape
+    (1, 90, 120)
     """
     canvas = Canvas(**pattern)
     radius_mm = canvas.radius_mm(radius_mm)

@@ -49,6 +49,14 @@ class ReadNoise(AdditiveNoise):
     ----------
     read_noise_e : float or (n_site,), e-
         Standard deviation, referred to the charge.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> sensor = fs.Sensor(fs.layout.grid(n_x=8, n_y=8, pitch_um=3.0), read_noise_e=3.0)
+    >>> next(effect for effect in sensor.chain if isinstance(effect, fs.sensor.effects.ReadNoise))
+    ReadNoise(read_noise_e=3.0)
     """
 
     example: ClassVar[Mapping[str, Any]] = {"read_noise_e": 12.0}

@@ -77,6 +77,12 @@ class ConstantCurve(CurveBase):
     ----------
     value : float
         Value at all wavelengths, from 0 to 1.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.sensor.ConstantCurve(0.6)([450.0, 550.0]).tolist()
+    [0.6, 0.6]
     """
 
     value: Annotated[float, FRACTION] = 1.0
@@ -99,6 +105,12 @@ class GaussianCurve(CurveBase):
         Centre wavelength and full width at half maximum.
     peak : float
         Value at the centre.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.sensor.GaussianCurve(centre_nm=550.0, fwhm_nm=80.0, peak=0.9)([550.0, 590.0]).round(3).tolist()
+    [0.9, 0.45]
     """
 
     centre_nm: Annotated[float, POSITIVE]
@@ -199,6 +211,12 @@ class SiliconQE(CurveBase):
     Notes
     -----
     ``transmission * (1 - exp(-depth / l))`` with the absorption length ``l(wavelength)`` (Beer-Lambert law).
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.SiliconQE(depth_um=3.0)([450.0, 550.0, 850.0]).round(3).tolist()
+    [1.0, 0.854, 0.142]
     """
 
     depth_um: Annotated[float, Limits(above=0.0, at_most=1e5), Usual(0.5, 10.0)]
@@ -226,6 +244,13 @@ class ProductCurve(CurveBase):
     ------
     ParameterError
         If there is no curve, or a number is out of range; when called, if one of the curves rejects a wavelength.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> stack = fs.sensor.ProductCurve([fs.sensor.ConstantCurve(0.9), fs.sensor.SiliconQE(depth_um=3.0)])
+    >>> stack([550.0]).round(3).tolist()
+    [0.768]
     """
 
     curves: Sequence[Factor]
@@ -270,6 +295,13 @@ class BandMean(CurveBase):
     of its halves. A filter narrower than the wavelength interval of the scene must not be evaluated at these wavelengths
     alone: for a filter of 10 nm and an interval of 20 nm, this gives 0.2 to 1.9 times the true number of electrons, whereas
     the band mean is exact.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> green = fs.sensor.GaussianCurve(centre_nm=540.0, fwhm_nm=80.0)
+    >>> round(float(fs.sensor.BandMean(curve=green, band_width_nm=100.0)(550.0)), 3)
+    0.71
     """
 
     curve: Curve

@@ -55,6 +55,12 @@ def camera_filters() -> FilterSet:
     Source: M. M. Darrodi et al., Reference data set for camera spectral sensitivity estimation, J. Opt. Soc. Am. A 32, 381,
     2015. The data are interpreted as response per radiance, and divided by the wavelength to give electrons per photon. J.
     Jiang et al. (WACV 2013) measured the same camera type: the difference is at most 0.11, except at the steep edge at 420 nm.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.sensor.camera_filters().names
+    ('R', 'G', 'B')
     """
     measured = read_filters(_data("nikon_d5100_rgb"))
     curves = []

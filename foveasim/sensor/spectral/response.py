@@ -37,6 +37,14 @@ class FilterSet:
         Transmissions, with or without quantum efficiency.
     names : sequence of str, optional
         One name per curve; "0", "1", ... by default.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> bands = [fs.sensor.GaussianCurve(centre_nm=centre_nm, fwhm_nm=60.0) for centre_nm in (450.0, 550.0)]
+    >>> filters = fs.sensor.FilterSet(bands, ["B", "G"])
+    >>> filters.names
+    ('B', 'G')
     """
 
     curves: Sequence[Curve]
@@ -97,5 +105,12 @@ def rgb_filters() -> FilterSet:
 
     The bands have a typical shape, but are not measured: centres 610, 540 and 460 nm, FWHM 90 nm. For measured filters see
     :func:`foveasim.sensor.camera_filters`.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> filters = fs.sensor.rgb_filters()
+    >>> filters.names, round(float(filters.curves[1](540.0)), 2)
+    (('R', 'G', 'B'), 1.0)
     """
     return FilterSet(tuple(GaussianCurve(centre_nm=c, fwhm_nm=90.0) for c in (610.0, 540.0, 460.0)), ("R", "G", "B"))

@@ -70,6 +70,13 @@ class PolynomialCurve(_Sampled):
     Notes
     -----
     Values of the polynomial are clipped to 0 .. 1.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> curve = fs.sensor.PolynomialCurve(wavelength_nm=[400, 500, 600, 700], value=[0.3, 0.6, 0.6, 0.4], degree=2)
+    >>> curve([550.0]).round(3).tolist()
+    [0.631]
     """
 
     degree: int = 5
@@ -116,6 +123,12 @@ class TableCurve(_Table):
         Behaviour outside the table: raise an error, return 0, or return the value at the end.
     source : str
         Source of the data; stored with the results.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.sensor.TableCurve(wavelength_nm=[400, 500, 700], value=[0.2, 0.6, 0.4])([450.0, 600.0]).round(3).tolist()
+    [0.4, 0.5]
     """
 
     def _interpolate(self, waves_nm: Floats) -> Floats:
@@ -140,6 +153,13 @@ class SplineCurve(_Table):
     -----
     Cubic pieces with the slopes of Fritsch and Butland (SIAM J. Sci. Stat. Comput. 5, 1984): the curve is monotonic between
     adjacent values, and therefore stays within 0 to 1. As with linear interpolation, a peak between two values is lost.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> curve = fs.sensor.SplineCurve(wavelength_nm=[400, 500, 600, 700], value=[0.3, 0.6, 0.6, 0.4])
+    >>> curve([450.0, 550.0]).round(3).tolist()
+    [0.506, 0.6]
     """
 
     @cached_property
@@ -170,6 +190,12 @@ class StepCurve(CurveBase):
         Behaviour outside the edges: raise an error, return 0, or return the value at the end.
     source : str
         Source of the data; stored with the results.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.sensor.StepCurve(edge_nm=[400, 500, 700], value=[0.4, 0.6])([450.0, 550.0]).tolist()
+    [0.4, 0.6]
     """
 
     edge_nm: Sequence[float]

@@ -19,4 +19,4 @@ def noise(result: Simulated) -> PartData:
         for name, values in budget.items()
         if (found := float(np.median(values))) > 0.0
     ]
-    return {"sources": sources, "unit": "e⁻", "median_electrons": float(np.median(capture.electrons))}, {}
+    return {"sources": sources, "unit": "e-", "median_electrons": float(np.median(capture.electrons))}, {}

@@ -44,13 +44,13 @@ def photon_transfer(result: Simulated) -> PartData:
     # Above saturation, signal and noise are those at saturation.
     is_shown = ~found.is_saturated & (found.signal_e > 0.0)
     shown = {name: values[is_shown] for name, values in shown.items() if (values[is_shown] > 0.0).all()}
-    curves = [{"label": name, "unit_x": "e⁻", "unit_y": "e⁻"} for name in shown]
+    curves = [{"label": name, "unit_x": "e-", "unit_y": "e-"} for name in shown]
     about, arrays = curves_of(curves, [found.signal_e[is_shown]] * len(curves), list(shown.values()))
     now = signal_to_noise(copies_of(sensor, site, 1), capture.expected_e[[site]], dark_e[:1], exposure_s=exposure_s)
     x, y = float(now.signal_e[0]), float(now.noise_e[0])
     about["marks"] = [{"x": x, "y": y}] if min(x, y) > 0.0 and curves else []
     about["note"] = (
-        f"Photosite {site:,}, {float(now.gain_dn_per_e.flat[0]):.3g} DN/e⁻, full range {range_e:,.0f} e⁻"
+        f"Photosite {site:,}, {float(now.gain_dn_per_e.flat[0]):.3g} DN/e-, full range {range_e:,.0f} e-"
         f"{'; now saturated' if now.is_saturated[0] else ''}"
     )
     return about, arrays

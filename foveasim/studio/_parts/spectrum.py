@@ -24,7 +24,7 @@ def spectrum(result: Simulated) -> PartData:
     wavelength_nm, e_per_j = _responsivity(result)
     e_per_photon = e_per_j * photon_energy_j(wavelength_nm)
     curves = [
-        {"label": name, "unit_x": "nm", "unit_y": "e⁻ per photon", "name": name} for name in result.capture.filter_names
+        {"label": name, "unit_x": "nm", "unit_y": "e- per photon", "name": name} for name in result.capture.filter_names
     ]
     return curves_of(curves, [wavelength_nm] * len(curves), list(e_per_photon))
 

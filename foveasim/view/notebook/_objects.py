@@ -9,6 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from foveasim._core.quantities import format_quantity
 from foveasim._core.short_repr import format_field
 from foveasim._core.validation import unit_of
 from foveasim.camera import Camera
@@ -55,6 +56,12 @@ def to_html(item: Any) -> str:
     ------
     ParameterError
         When the object is of another type.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.view.to_html(fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0)).count("<table")
+    1
     """
     return _to_html(item)
 
@@ -92,7 +99,7 @@ def _layout_facts(layout: Layout) -> dict[str, object]:
     if not layout.n_sites:
         return {"columns": ", ".join(layout.columns)}
     x0, y0, x1, y1 = layout.bounds_um
-    size_um = np.sqrt(layout.area_um2)
+    size_um = layout.size_um
     low, median, high = (float(x) for x in (size_um.min(), np.median(size_um), size_um.max()))
     same = high <= low * (1.0 + 1e-6)
     origin = layout.provenance.get("generator", layout.provenance.get("made_by", ""))
@@ -100,8 +107,8 @@ def _layout_facts(layout: Layout) -> dict[str, object]:
     given = [f"{name}={format_field(value)}" for name, value in dict(parameters).items() if value is not None]
     rows: dict[str, object] = {
         "field": f"{x1 - x0:.6g} x {y1 - y0:.6g} µm",
-        "pixel size": f"{median:.4g} µm" if same else f"{low:.4g} to {high:.4g} µm, median {median:.4g} µm",
-        "area": f"{layout.area_um2.sum():,.6g} µm²",
+        "site size": f"{median:.4g} µm" if same else f"{low:.4g} to {high:.4g} µm, median {median:.4g} µm",
+        "area": format_quantity(float(layout.area_um2.sum()), "µm²"),
         "origin": f"{origin}({', '.join(given)})" if given else str(origin),
     }
     for name, heading in (("channel", "channels"), ("readout_line", "readout lines")):
@@ -125,7 +132,7 @@ def _capture(capture: Capture) -> str:
     exposure_s, seed = capture.settings.get("exposure_s"), capture.settings.get("seed")
     rows |= {
         "filters": ", ".join(capture.filter_names),
-        "exposure": f"{exposure_s:.6g} s" if isinstance(exposure_s, int | float) else "",
+        "exposure": format_quantity(exposure_s, "s") if isinstance(exposure_s, int | float) else "",
         "seed": "" if seed is None else seed,
     }
     return panel(title, site_thumbnail(capture, title), facts(rows))
@@ -147,8 +154,8 @@ def _sensor_facts(sensor: Sensor) -> dict[str, object]:
         "sensitivity": "" if np.all(np.asarray(sensor.sensitivity) == 1.0) else _describe("", sensor.sensitivity),
         "capacitance": _describe("capacitance_f", sensor.capacitance_f),
         "full well": top,
-        "saturation voltage": f"{sensor.v_sat_v:g} V",
-        "pedestal": f"{sensor.pedestal_v:g} V" if sensor.pedestal_v else "",
+        "saturation voltage": format_quantity(sensor.v_sat_v, "V"),
+        "pedestal": format_quantity(sensor.pedestal_v, "V") if sensor.pedestal_v else "",
         "ADC": f"{adc.bits} bits, {adc.companding}",
         "dark current": f"{_describe('dark_e_per_s', sensor.dark_e_per_s)} at {sensor.dark_reference_k:g} K"
         if np.any(sensor.dark_e_per_s)
@@ -183,11 +190,10 @@ def _describe(name: str, value: Any) -> str:
     """Return a value, or the range of the values per site, with the unit of its name."""
     unit = unit_of(name)
     if isinstance(value, np.ndarray) and value.size > 1 and value.dtype.kind in "iuf":
-        text = f"{value.min():.4g} to {value.max():.4g}"
-    elif isinstance(value, float | np.floating | np.ndarray) and np.size(value) == 1:
-        text = f"{float(value):.6g}"
-    else:
-        text = format_field(value)
+        return format_quantity([float(value.min()), float(value.max())], unit)
+    if isinstance(value, float | np.floating | np.ndarray) and np.size(value) == 1:
+        return format_quantity(float(value), unit, digits=6)
+    text = format_field(value)
     return f"{text} {unit}" if unit else text
 
 
@@ -214,7 +220,7 @@ def _camera(camera: Camera) -> str:
     rows = {
         **dict(_given_parameters(optics)),
         "distortion": "none" if camera.distortion is None else format_field(camera.distortion),
-        **{name: value for name, value in _layout_facts(layout).items() if name in ("field", "pixel size")},
+        **{name: value for name, value in _layout_facts(layout).items() if name in ("field", "site size")},
         **_sensor_facts(sensor),
     }
     return panel(title, site_thumbnail(layout, title), facts(rows), _effects_table(sensor))

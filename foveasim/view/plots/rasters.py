@@ -144,6 +144,15 @@ def plot_picture(
     ------
     ParameterError
         When there is no such channel, or as for :meth:`foveasim.Picture.to_image`.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> layout = fs.layout.grid(n_x=8, n_y=8, pitch_um=2.0)
+    >>> picture = fs.reconstruct.cells(layout, layout.area_um2, fs.Grid.centred((16, 16), 1.0))
+    >>> fs.view.plot_picture(picture).get_ylabel()
+    'y / µm'
     """
     n_channels = picture.data.shape[0]
     if n_channels == 3 and channel is None:

@@ -86,6 +86,13 @@ def plot_layout(
     Up to 4,000 sites are drawn as outlines, which remain vector graphics in files. Larger layouts are drawn as an image, which
     is sampled again after each zoom and at the resolution of a saved file. Its boundaries are anti-aliased with 3 x 3 samples
     per pixel.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> axes = fs.view.plot_layout(fs.layout.hexagonal(n_columns=9, n_rows=9, pitch_um=3.0), "area_um2")
+    >>> axes.get_xlabel()
+    'x / µm'
     """
     return _plot(layout, colours_of(layout, by, label=label), overlay, scale_bar, legend, ax, figure_inches)
 
@@ -122,6 +129,16 @@ def plot_capture(
     ------
     ParameterError
         As for :func:`plot_layout`, or as for :meth:`Capture.signal_to_noise`.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=16, n_y=16, pitch_um=3.45), "machine_vision")
+    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    >>> axes = fs.view.plot_capture(camera.capture(scene, exposure_s="auto", seed=0), "electrons")
+    >>> axes.get_xlabel()
+    'x / µm'
     """
     if isinstance(by, str) and by == "snr" and by not in capture.layout.columns:
         by, label = capture.signal_to_noise(), label or "signal-to-noise ratio"
@@ -343,7 +360,7 @@ def _format_site(layout: Layout, colours: SiteColours, x_um: float, y_um: float,
     position = f"x = {x_um:.6g} µm, y = {y_um:.6g} µm"
     if site < 0:
         return position
-    size_um = float(np.sqrt(layout[[site]].area_um2[0]))
+    size_um = float(layout.size_um[site])
     text = f"{position}: site {site}, size {size_um:.4g} µm"
     if colours.values is None or colours.title == "size / µm":
         return text

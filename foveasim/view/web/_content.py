@@ -11,6 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from foveasim._core.quantities import format_quantity
 from foveasim._core.rings import same_rings
 from foveasim._core.validation import UNIT_SUFFIXES, Floats
 from foveasim.capture import Capture
@@ -190,8 +191,8 @@ def _columns(
         if len(colours) > 1:
             lit = {**columns[0], "key": "picture", "label": "colour mosaic", "kind": "lit", "colours": colours}
             columns.insert(0, {**lit, "array": code, "is_repeat": True})
-        add("electrons", "electrons", "e⁻", capture.electrons)
-        add("expected_e", "expected electrons", "e⁻", capture.expected_e)
+        add("electrons", "electrons", "e-", capture.electrons)
+        add("expected_e", "expected electrons", "e-", capture.expected_e)
         ratio = _signal_to_noise(capture, sensor)
         if ratio is not None:
             add(
@@ -209,7 +210,7 @@ def _columns(
         letters = list(CHANNEL_NAMES[:n_channels]) if n_channels in (3, 4) else [str(k) for k in range(n_channels)]
         colours = [_filter_colour(k, name) for k, name in enumerate(letters)]
         add("channel", "channel", "", layout.channel, "kinds", names=letters, colours=colours)
-    columns.append({"key": "size_um", "label": "pixel size", "unit": "µm", "kind": "linear", "of": "size"})
+    columns.append({"key": "size_um", "label": "site size", "unit": "µm", "kind": "linear", "of": "size"})
     columns.append({"key": "area_um2", "label": "area", "unit": "µm²", "kind": "linear", "of": "area"})
     taken = {column["key"] for column in columns}
     for key in sorted(layout.columns, key=lambda name: name != "readout_line"):
@@ -396,6 +397,6 @@ def _notes(layout: Layout, capture: Capture | None, origin: str) -> list[str]:
         notes.append(f"{capture.bits} bits")
         exposure_s = capture.settings.get("exposure_s")
         if isinstance(exposure_s, int | float):
-            notes.append(f"{1e3 * exposure_s:.4g} ms")
+            notes.append(format_quantity(exposure_s, "s"))
         notes.append(f"{100 * capture.saturated_fraction:.3g} % saturated")
     return notes

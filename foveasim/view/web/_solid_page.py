@@ -30,7 +30,8 @@ def solid_page(data: Layout | Capture, *, solids: Solids | None = None, name: st
     data : Layout or Capture
     solids : Solids, optional
         Solids of the photosites of this data. By default the parts of a layout, from :func:`foveasim.view.solids`, or the
-        photosites of a capture as prisms whose heights are their codes. Many photosites without filters are coloured by size.
+        photosites of a capture as prisms whose heights are their codes, in the colours of a colour picture. Many photosites
+        without filters are coloured by size.
     name : str
         Heading; by default the generator of the layout.
 
@@ -50,7 +51,10 @@ def solid_page(data: Layout | Capture, *, solids: Solids | None = None, name: st
     if solids is None and isinstance(data, Capture):
         meshes: Sequence[Mesh] = (prisms(data, has_floor=True),)
         shown = "Column heights show the codes."
-        about["colouring"] = about["columns"][0]["key"]
+        if meshes[0].shown is not None and meshes[0].shown.values is None:
+            about["ownColours"] = "of the picture"
+        else:
+            about["colouring"] = about["columns"][0]["key"]
     else:
         meshes = (solids_of(data) if solids is None else solids).meshes
         shown = "z points toward the lens."

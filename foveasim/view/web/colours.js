@@ -175,6 +175,20 @@ export function shown(value) {
   return size >= 1e-3 && size < 1e7 ? SIX_DIGITS.format(value) : value.toExponential(4);
 }
 
+// Units with metric prefixes, from the largest.
+const PREFIXED = new Set(["s", "F", "V", "bit/s"]);
+/** @type {[number, string][]} */
+const PREFIXES = [[1e9, "G"], [1e6, "M"], [1e3, "k"], [1, ""], [1e-3, "m"], [1e-6, "µ"], [1e-9, "n"], [1e-12, "p"], [1e-15, "f"]];
+
+// Formats a value with its unit, with a metric prefix where the unit has one, and otherwise with thousands.
+/** @param {number} value @param {string} unit */
+export function quantity(value, unit) {
+  if (!PREFIXED.has(unit) || !Number.isFinite(value) || !value) return shown(value) + (unit ? " " + unit : "");
+  const rounded = Number(value.toPrecision(4));
+  const [size, prefix] = PREFIXES.find(([from]) => Math.abs(rounded) >= from * (1 - 1e-9)) ?? PREFIXES[PREFIXES.length - 1];
+  return shown(Number((rounded / size).toPrecision(4))) + " " + prefix + unit;
+}
+
 // Formats a site's value of a column with its unit, using the site areas in µm²; "…" while the column is not loaded.
 /** @param {Column} column @param {number} site @param {Numbers} areas */
 export function textOf(column, site, areas) {

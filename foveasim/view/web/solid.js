@@ -188,7 +188,8 @@ function moveCut(steps) {
 }
 
 function listenToTools() {
-  $("colouring").append(...[["", "of the parts"], ...about.columns.map((column) => [column.key, titleOf(column)])].map(([key, text]) => {
+  const own = ["", about.ownColours ?? "of the parts"];
+  $("colouring").append(...[own, ...about.columns.map((column) => [column.key, titleOf(column)])].map(([key, text]) => {
     const option = make("option", text);
     option.value = key;
     return option;

@@ -1,13 +1,13 @@
 // Summary of the result, beside that of variant A, and warnings.
 
-import { shown } from "/web/colours.js";
+import { quantity, shown } from "/web/colours.js";
 import { make } from "/web/page_parts.js";
 
 // Words of the summary that have another form than the key.
 const SUMMARY = {
   n_sites: ["photosites", ""], width_um: ["width", "µm"], height_um: ["height", "µm"], min_size_um: ["smallest site", "µm"],
   max_size_um: ["largest site", "µm"],
-  exposure_s: ["exposure", "s"], bits: ["bits", ""], mean_dn: ["mean code", "DN"], median_e: ["median signal", "e⁻"],
+  exposure_s: ["exposure", "s"], bits: ["bits", ""], mean_dn: ["mean code", "DN"], median_e: ["median signal", "e-"],
   saturated_fraction: ["saturated", "%"],
   dark_fraction: ["code 0", "%"], f_number: ["f-number", ""], magnification: ["magnification", ""],
 };
@@ -16,7 +16,7 @@ function textOf(key, value) {
   if (value === undefined) return "–";
   if (key.endsWith("_fraction")) return shown(Number((100 * value).toPrecision(3))) + " %";
   const unit = SUMMARY[key]?.[1];
-  return shown(Number.isInteger(value) ? value : Number(value.toPrecision(5))) + (unit ? " " + unit : "");
+  return quantity(Number.isInteger(value) ? value : Number(value.toPrecision(5)), unit ?? "");
 }
 
 // Returns the rows of the numbers of a summary, beside those of variant A if there is one.
