@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import shapely
 from matplotlib.figure import Figure
+from scipy.ndimage import maximum_filter
 
 import foveasim as fs
 from foveasim.metrics import slanted_edge_mtf
@@ -78,16 +79,19 @@ def main(out_dir: Path) -> None:
     """Write the charts, the edge and the star to a directory."""
     out_dir.mkdir(parents=True, exist_ok=True)
     # %% All charts.
-    figure = Figure(figsize=(8.0, 6.4), layout="constrained")
+    figure = Figure(figsize=(8.0, 5.6), layout="constrained")
     for position, (name, scene) in enumerate(grey_charts().items(), start=1):
         axes = figure.add_subplot(3, 4, position)
-        axes.imshow(scene.basis[0], origin="lower", cmap="gray", vmin=0.0)
+        # A point is one pixel, and is drawn larger.
+        picture = maximum_filter(scene.basis[0], 5) if name == "point_grid" else scene.basis[0]
+        axes.imshow(picture, origin="lower", cmap="gray", vmin=0.0)
         axes.set_title(name, fontsize=10)
     axes = figure.add_subplot(3, 4, 11)
     axes.imshow(colour_chart_rgb(), origin="lower")
     axes.set_title("colour_chart", fontsize=10)
     for axes in figure.axes:
-        axes.set_axis_off()
+        axes.set(xticks=[], yticks=[])
+        axes.spines[:].set_color("0.6")
     save_figure(figure, out_dir / "05_charts.png", dpi=140)
 
     # %% Slanted edge on hexagons: each site samples the edge profile at its own distance.

@@ -18,7 +18,7 @@ import numpy as np
 import skimage.data
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyBboxPatch
+from matplotlib.patches import FancyBboxPatch, Rectangle
 from skimage.transform import resize
 
 import foveasim as fs
@@ -32,6 +32,8 @@ N_SIDE = 256
 PITCH_UM = 2.0
 V_SAT_V = 3.0
 N_FRAMES = 24
+#: Coat and hand of the photographer: rows from the bottom, and columns.
+DARK = (slice(110, 174), slice(60, 124))
 #: Stages of the chain, with the quantity that passes each.
 STAGES = {
     "photo": "photocurrent",
@@ -131,11 +133,17 @@ def main(out_dir: Path) -> None:
     # %% The three read noises of the paper.
     noises_e = (0.0, 50.0, 200.0)
     cameras = [camera(read_noise_e=noise_e) for noise_e in noises_e]
-    figure = Figure(figsize=(8.0, 3.1), layout="constrained")
-    for axes, tested, noise_e in zip(figure.subplots(1, 3), cameras, noises_e, strict=True):
-        axes.imshow(codes(tested, scene), origin="lower", cmap="gray", vmin=0, vmax=1023 * MAX_PHOTONS / FULL_WELL_E)
-        axes.set_title(f"read noise {noise_e:g} e-")
-        axes.set_axis_off()
+    white = 1023 * MAX_PHOTONS / FULL_WELL_E
+    figure = Figure(figsize=(8.0, 5.7), layout="constrained")
+    for (whole, part), tested, noise_e in zip(figure.subplots(2, 3).T, cameras, noises_e, strict=True):
+        code = codes(tested, scene)
+        whole.imshow(code, origin="lower", cmap="gray", vmin=0, vmax=white)
+        whole.add_patch(Rectangle((DARK[1].start, DARK[0].start), 64, 64, fill=False, color="tab:red"))
+        whole.set_title(f"read noise {noise_e:g} e-")
+        part.imshow(code[DARK], origin="lower", cmap="gray", vmin=0, vmax=0.15 * white)
+        part.set_title("dark part, brighter", fontsize=10)
+        for axes in (whole, part):
+            axes.set_axis_off()
     save_figure(figure, out_dir / "09_read_noise.png", dpi=140)
 
     # %% Fixed-pattern noise of columns and of pixels.

@@ -30,6 +30,8 @@ FIELD_UM, N_PIXELS = 1024.0, 512
 CAPACITANCE_F_PER_UM2 = 6e-17
 #: Pixels without photosites: none of the grey levels of a picture.
 NO_DATA = {"facecolor": "0.93", "edgecolor": "0.6", "hatch": "////", "linewidth": 0.0, "label": "no photosites"}
+#: Face of the astronaut, x and y, where photosites measure 6 to 13 µm.
+FACE_UM = (-190.0, 50.0, 150.0, 390.0)
 METHODS = ("cells", "linear", "natural", "least_squares")
 
 
@@ -71,27 +73,27 @@ def main(out_dir: Path) -> None:
     for method in METHODS:
         print(f"{method:13s}: PSNR {quality_db[method]:.2f} dB, SSIM {similarity[method]:.3f}")
 
-    # %% Figure: complete pictures, and their centres.
+    # %% Figure: a complete picture, and the face in each of them.
     white = float(np.nanmax(reference.data))
-    figure = Figure(figsize=(8.0, 11.0), layout="constrained")
-    axes = figure.subplots(4, 3)
-    panels = {"reference": reference, **pictures}
+    figure = Figure(figsize=(8.0, 5.9), layout="constrained")
+    (complete, *closer) = figure.subplots(2, 3).flat
     left, bottom, right, top = grid.bounds_um
-    for (name, picture), complete, centre in zip(panels.items(), axes[:2].flat, axes[2:].flat, strict=False):
-        shown = fs.units.encode_srgb(np.clip(picture.data[0] / white, 0.0, 1.0))
-        for panel in (complete, centre):
-            panel.add_patch(Rectangle((left, bottom), right - left, top - bottom, **NO_DATA))
-            panel.imshow(
-                shown, origin="lower", cmap="gray", vmin=0.0, vmax=1.0, extent=(left, right, bottom, top), zorder=2
-            )
-            panel.set_xticks([])
-            panel.set_yticks([])
-        centre.set(xlim=(-150.0, 150.0), ylim=(-150.0, 150.0))
-        complete.set_title(name if name not in quality_db else f"{name}: {quality_db[name]:.1f} dB", fontsize=10)
-        centre.set_title(f"{name}, central 300 µm", fontsize=10)
-    for panel in axes[1::2, 2]:
-        panel.set_axis_off()
-        panel.legend(handles=[Patch(**NO_DATA)], loc="center", frameon=False)
+    panels = {"reference": reference, **pictures}
+    for panel, name in zip((complete, *closer), ("cells", *panels), strict=True):
+        panel.add_patch(Rectangle((left, bottom), right - left, top - bottom, **NO_DATA))
+        shown = fs.units.encode_srgb(np.clip(panels[name].data[0] / white, 0.0, 1.0))
+        extent = (left, right, bottom, top)
+        panel.imshow(shown, origin="lower", cmap="gray", vmin=0.0, vmax=1.0, extent=extent, zorder=2)
+        panel.set_xticks([])
+        panel.set_yticks([])
+        panel.set_title(name if name not in quality_db else f"{name}: {quality_db[name]:.1f} dB", fontsize=11)
+    complete.set_title("the field, with the part shown", fontsize=11)
+    complete.add_patch(
+        Rectangle((FACE_UM[0], FACE_UM[2]), *np.diff(FACE_UM)[::2], fill=False, color="tab:red", zorder=3)
+    )
+    complete.legend(handles=[Patch(**NO_DATA)], loc="lower left", fontsize=10)
+    for panel in closer:
+        panel.set(xlim=FACE_UM[:2], ylim=FACE_UM[2:])
     save_figure(figure, out_dir / "11_reconstruction.png", dpi=140)
 
     # %% Files for other programs: a PNG file of 16 bits for display, and a TIFF file of the values.

@@ -30,6 +30,8 @@ RULES = fs.DesignRules(
 )
 #: Inserted violations: width of a sliver, side of a small pixel, width of an overlap, width of a space.
 SLIVER_UM, SMALL_SIDE_UM, OVERLAP_UM, SPACE_UM = 0.6, 1.5, 0.4, 0.2
+#: Sites with violations, and their names in the figure.
+INSERTED = {12: "sliver", 47: "sliver", 25: "too small", 36: "too small", 8: "overlap", 42: "narrow space"}
 EXPECTED = {"min_width_um": 2, "min_size_um": 2, "min_space_um": 1, "max_overlap_um2": 1, "min_angle_deg": 0}
 
 
@@ -57,13 +59,16 @@ def main(out_dir: Path) -> None:
     layout = layout_with_violations()
     report = layout.check(RULES)
 
-    # %% Sizes of the sites with readout lines, and the readout line of each site.
-    figure = Figure(figsize=(8.0, 8.8), layout="constrained")
-    left, right = figure.subplots(2, 1)
-    layout.plot("size_um", overlay="readout_lines", ax=left)
-    left.set_title("sizes, and readout lines", fontsize=10)
-    layout.plot("readout_line", ax=right)
-    right.set_title("readout line of each site", fontsize=10)
+    # %% Sizes of the sites with readout lines, and names of what is inserted.
+    figure = Figure(figsize=(8.0, 5.4), layout="constrained")
+    axes = figure.add_subplot()
+    layout.plot("size_um", overlay="readout_lines", scale_bar=False, ax=axes)
+    for site, text in INSERTED.items():
+        arrow = {"arrowstyle": "->", "color": "black"}
+        box = {"boxstyle": "round", "facecolor": "white", "edgecolor": "0.6"}
+        x_um, y_um = layout.centroid_um[site]
+        at_um = (x_um + (3.2 if x_um < 0.0 else -3.2), y_um + 2.9)
+        axes.annotate(text, (x_um, y_um), at_um, arrowprops=arrow, bbox=box, ha="center", fontsize=10)
     save_figure(figure, out_dir / "12_layout.png", dpi=140)
 
     # %% Violations.

@@ -65,7 +65,7 @@ def main(out_dir: Path) -> None:
         )
         axes[0, k].set_title(f"{name}:\n{layout.n_sites:,} photosites", fontsize=10)
         inner = fs.layout.clip(layout, shapely.box(*INNER_BOUNDS_UM), cut="drop")
-        inner.plot(ax=axes[1, k])
+        inner.plot(ax=axes[1, k], scale_bar=False)
         axes[1, k].set(xlim=INNER_BOUNDS_UM[::2], ylim=INNER_BOUNDS_UM[1::2], ylabel="")
         if k == 0:
             axes[0, k].set_ylabel("y / µm")

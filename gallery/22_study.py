@@ -52,7 +52,7 @@ def covered_fraction(_shot: Shot, _camera: fs.Camera, capture: fs.Capture) -> fl
 def main(out_dir: Path) -> None:
     """Write the study and its figure to a directory."""
     out_dir.mkdir(parents=True, exist_ok=True)
-    # %% Search over sectors and minimum pixel size; the blind spot grows with both.
+    # %% Search over sectors and minimum site size; the blind spot grows with both.
     result = study(
         SHOT,
         {

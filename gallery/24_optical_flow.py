@@ -47,10 +47,10 @@ MOTIONS_UM = MOTION_UM * np.array([[np.cos(angle), np.sin(angle)] for angle in n
 TOLERANCE = 3e-4
 #: Maximum random offset of the gaze in each shot, in pixels of the photograph.
 GAZE_OFFSET_CELLS = 3
-#: Common parameters of all sensors: minimum pixel size, and electronics.
+#: Common parameters of all sensors: minimum site size, and electronics.
 MIN_SIZE_UM = 5.0
 QE, READ_NOISE_E, BITS, CAPACITANCE_F_PER_UM2 = 0.6, 3.0, 12, 2.5e-17
-#: The fovea covers the target and a margin for its motion; its hexagons may be larger than the minimum pixel size.
+#: The fovea covers the target and a margin for its motion; its hexagons may be larger than the minimum site size.
 FOVEA_RADIUS_UM = 56.0
 #: Option --large: all layouts for both tasks, and more draws.
 LARGE_GRID_SITES = tuple(int(n) for n in np.geomspace(150, 7800, 12))
@@ -75,7 +75,7 @@ class Task(NamedTuple):
     reach_um: float
     n_draws: int
     allowed_um: float
-    #: Layouts near the Pareto front: numbers of sites of grids; sectors and fovea pixel sizes of foveal layouts.
+    #: Layouts near the Pareto front: numbers of sites of grids; sectors and fovea site sizes of foveal layouts.
     grids: tuple[int, ...]
     foveals: tuple[tuple[int, float], ...]
 
