@@ -86,7 +86,7 @@ docs: $(VENV)/.installed-docs
 	@echo "open docs/_build/html/index.html"
 
 clean:
-	rm -rf $(VENV) $(LOWEST) $(TORCH_VENV) out docs/_build docs/gallery docs/reference node_modules .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(LOWEST) $(TORCH_VENV) out docs/_build docs/gallery docs/layouts docs/reference node_modules .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find foveasim tests -name __pycache__ -type d -exec rm -rf {} +
 
 $(VENV)/.made $(LOWEST)/uv/.made $(TORCH_VENV)/.made:

@@ -13,6 +13,8 @@ from types import ModuleType
 
 import matplotlib as mpl
 import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from PIL import Image
 from skimage.data import astronaut
 
@@ -24,7 +26,7 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 #: Targets of links and pictures, without URLs and sections of the same page.
 TARGET = re.compile(r"\]\((?![a-z]+:)([^)#\s]+)")
 #: Directories that the build writes.
-GENERATED = {"_build", "gallery", "reference"}
+GENERATED = {"_build", "gallery", "layouts", "reference"}
 
 
 def pages_of(root):
@@ -36,7 +38,7 @@ def pages_of(root):
 def broken_links(root):
     """Yield page and target of links to neither files of the repository nor generated pages."""
     docs = root.resolve() / "docs"
-    generated = runpy.run_path(str(ROOT / "docs" / "conf.py"))["generated_pages"](root)
+    generated = runpy.run_path(str(ROOT / "docs" / "generated_pages.py"))["generated_pages"](root)
     top = [root / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md") if (root / name).exists()]
     for page in [*top, *pages_of(root)]:
         for target in TARGET.findall(page.read_text()):
@@ -144,6 +146,65 @@ def test_broken_link_is_reported(tmp_path, link):
     write_repository(tmp_path / "gallery", [link])
 
     assert list(broken_links(tmp_path / "gallery")) == [("docs/guides/a.md", link)]
+
+
+GENERATORS = runpy.run_path(str(ROOT / "docs" / "generated_pages.py"))
+DARK = runpy.run_path(str(ROOT / "docs" / "dark_figures.py"))
+
+
+def test_chapters_of_gallery_contain_each_script_once():
+    numbers = sorted(number for numbers in GENERATORS["CHAPTERS"].values() for number in numbers)
+
+    assert numbers == [int(script.name[:2]) for script in GENERATORS["gallery_scripts"](ROOT)]
+
+
+def test_registries_are_described_by_their_entries():
+    tables = GENERATORS["tables_of"]("foveasim.layout", ["LAYOUTS", "RULES", "grid"])
+    lines = {name: GENERATORS["entry_of"](next(iter(table.values()))) for name, table in tables.items()}
+
+    assert set(tables) == {"LAYOUTS", "RULES"}
+    assert all(len(line) > 20 and "\n" not in line for line in lines.values())
+    assert GENERATORS["comment_on"]("LAYOUTS", "foveasim.layout").startswith("Layout generators by their name")
+
+
+def test_functions_of_layout_are_in_groups():
+    names = GENERATORS["public_names"]()["foveasim.layout"]
+    groups = dict(GENERATORS["sections_of"]("foveasim.layout", names))
+
+    assert sorted(name for group in groups.values() for name in group) == sorted(names)
+    assert {"grid", "log_polar"} <= set(groups["Generators"])
+    assert {"clip", "mosaic"} <= set(groups["Edits"])
+
+
+def test_dark_variant_inverts_greys_and_is_reverted():
+    figure = Figure()
+    axes = figure.add_subplot()
+    (black, red) = (axes.plot([0, 1], color=colour)[0] for colour in ("black", "red"))
+    text = axes.annotate("a", (0, 0), (0.5, 0.5), bbox={"facecolor": "white"}, arrowprops={"arrowstyle": "->"})
+    image = axes.imshow([[0.0, 1.0]], cmap="gray")
+    restore = DARK["invert_greys"](figure)
+
+    assert [to_rgb(colour) for colour in (black.get_color(), text.get_color(), axes.xaxis.label.get_color())] == [
+        (DARK["BLACK"],) * 3
+    ] * 3
+    for patch in (figure.patch, axes.patch, text.get_bbox_patch()):
+        assert to_rgb(patch.get_facecolor()) == pytest.approx((DARK["WHITE"],) * 3)
+    assert red.get_color() == "red"
+    assert image.get_cmap().name == "gray"
+
+    for set_value, value in reversed(restore):
+        set_value(value)
+    assert black.get_color() == "black"
+    assert to_rgb(figure.patch.get_facecolor()) == (1.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("size", [(300, 100), (100, 300), (640, 480)])
+def test_thumbnails_have_one_shape(tmp_path, size):
+    Image.new("RGBA", size, (200, 0, 0, 128)).save(tmp_path / "picture.png")
+    GENERATORS["write_thumbnail"](tmp_path / "picture.png", tmp_path / "thumbnail.jpg")
+
+    with Image.open(tmp_path / "thumbnail.jpg") as thumbnail:
+        assert thumbnail.size == (480, 360)
 
 
 ROW = re.compile(r"^\| `(\w+)` \|[^|]*\| `([^`]*)` \|", re.MULTILINE)

@@ -16,7 +16,7 @@ import foveasim as fs
 from foveasim import video
 from foveasim._core.short_repr import format_field, short_repr
 
-MODULES = runpy.run_path(str(Path(__file__).parents[1] / "docs" / "conf.py"))["MODULES"]
+MODULES = runpy.run_path(str(Path(__file__).parents[1] / "docs" / "generated_pages.py"))["MODULES"]
 MAX_CHARACTERS = 260
 
 

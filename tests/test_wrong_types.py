@@ -19,7 +19,7 @@ import pytest
 import foveasim as fs
 from foveasim.errors import FoveasimError, ParameterError
 
-MODULES = runpy.run_path(str(Path(__file__).parents[1] / "docs" / "conf.py"))["MODULES"]
+MODULES = runpy.run_path(str(Path(__file__).parents[1] / "docs" / "generated_pages.py"))["MODULES"]
 N_CALLS = 1550
 MAX_RAW_FRACTION = 0.01
 #: Modules and calls that open windows, serve pages or need PyTorch.

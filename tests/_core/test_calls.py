@@ -21,7 +21,7 @@ from foveasim.errors import ArgumentError, ParameterError
 from foveasim.layout import LAYOUTS, layout_family
 from foveasim.layout.generators.grid import grid as grid_of_module
 
-MODULES = runpy.run_path(str(Path(__file__).parents[2] / "docs" / "conf.py"))["MODULES"]
+MODULES = runpy.run_path(str(Path(__file__).parents[2] / "docs" / "generated_pages.py"))["MODULES"]
 #: Packages inside the documented ones, from which their names can be imported, too.
 PACKAGES = [
     item.name
@@ -118,7 +118,7 @@ def test_signatures_and_examples_remain_visible():
     assert "@layout_family" in inspect.getsource(fs.layout.grid)
     finder = DocTestFinder(exclude_empty=True)
     found = {test.name for test in finder.find(import_module("foveasim.view.id_map")) if test.examples}
-    assert found == {"foveasim.view.id_map.id_map"}
+    assert found == {"foveasim.view.id_map.id_map", "foveasim.view.id_map.site_at"}
 
 
 def test_checked_functions_are_pickled_by_name():

@@ -27,7 +27,9 @@ from foveasim.errors import ParameterError
 from foveasim.sensor.adc import ADC
 
 ROOT = Path(__file__).parents[2]
-MODULES = [name for name in runpy.run_path(str(ROOT / "docs" / "conf.py"))["MODULES"] if not name.endswith(".learn")]
+MODULES = [
+    name for name in runpy.run_path(str(ROOT / "docs" / "generated_pages.py"))["MODULES"] if not name.endswith(".learn")
+]
 LAYOUT = fs.layout.grid(4, 4, 3.0)
 #: Required parameters without limits.
 EXAMPLES = {

@@ -1,0 +1,335 @@
+"""Pages that the build of the site writes: gallery, bundled layouts, reference."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import pkgutil
+import re
+import runpy
+import shutil
+from collections.abc import Iterator, Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image, ImageOps
+
+import foveasim.view
+from foveasim._core.registry import Registry
+from foveasim.config import bundled_layouts, read_layout_file
+from foveasim.layout import LAYOUTS
+from foveasim.scene import SCENES
+
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+    from sphinx.config import Config
+
+    from foveasim import Layout
+
+REPOSITORY = Path(__file__).parent.parent
+#: Pages of the gallery; pictures are generated again when a script is newer.
+GALLERY = Path(__file__).parent / "gallery"
+#: Text instead of pictures where a script could not run.
+WITHOUT_TORCH = "This site was built without PyTorch, which the script requires; its pictures are therefore missing."
+
+#: Description of the module that only a build with PyTorch documents.
+LEARN = "Gradients with respect to photosites, optics and electronics, for PyTorch."
+#: Modules of the reference, with descriptions; their ``__all__`` lists the public names.
+MODULES = {
+    "foveasim": "The main classes, from scenes to captures: `import foveasim as fs`. The other modules are its attributes.",
+    "foveasim.layout": "Layouts of photosites as packed polygons: generators, edits, design rules, files.",
+    "foveasim.scene": "Scenes: radiance from photographs, hyperspectral cubes, flat fields and point sources.",
+    "foveasim.scene.charts": "Test charts with physical sizes.",
+    "foveasim.optics": "Pupils, aberrations, PSF, OTF, and the power map of a scene.",
+    "foveasim.distortion": "Lens distortion models and calibration files.",
+    "foveasim.maps": "Files of power maps from other programs.",
+    "foveasim.sensor": "Quantum efficiency, colour filters, the electronic chain, noise budget, calibration, HDR merge.",
+    "foveasim.sensor.effects": "Noise sources, fixed patterns and crosstalk, and the interface of user effects.",
+    "foveasim.reconstruct": "Raster pictures from captures.",
+    "foveasim.tiles": "Captures of sensors that are larger than memory.",
+    "foveasim.video": "Frames from files, gaze paths, recordings.",
+    "foveasim.modes": "Rolling shutters, event pixels, integrate-and-fire pixels.",
+    "foveasim.metrics": "Resolution, aliasing, photon transfer, signal-to-noise ratio, picture quality, optical flow.",
+    "foveasim.compare": "Cameras and layouts at equal budget: pictures, quality by eccentricity, information, reports.",
+    "foveasim.view": "Plots, 3D rendering, solids, and interactive pages.",
+    "foveasim.explore": "Sweeps, optimisation studies and datasets.",
+    "foveasim.config": "Settings files in YAML.",
+    "foveasim.studio": "Interactive design in the browser.",
+    **({"foveasim.learn": LEARN} if find_spec("torch") else {}),
+    "foveasim.testing": "Checks of extensions.",
+    "foveasim.errors": "Exceptions and warnings.",
+    "foveasim.units": "Unit conversions.",
+}
+#: Headings of the names of large modules, by the module in which a name is defined; the rest is without heading.
+GROUPS = {
+    "foveasim.layout": {
+        "Generators": ("foveasim.layout.generators", "foveasim.layout.diagrams"),
+        "Edits": ("foveasim.layout.edits", "foveasim.layout.channels", "foveasim.layout.gaps"),
+        "Design rules": ("foveasim.layout.drc",),
+        "Neighbours and readout": ("foveasim.layout.adjacency", "foveasim.layout.readout"),
+        "Files": ("foveasim.layout.files",),
+    },
+}
+#: Functions that modules list by their registry.
+REGISTERED = {
+    "foveasim.layout": LAYOUTS.within("foveasim.layout.generators"),
+    "foveasim.scene.charts": SCENES.within("foveasim.scene.charts"),
+}
+REFERENCE = Path(__file__).parent / "reference"
+#: Pages of the bundled layouts.
+BUNDLED = Path(__file__).parent / "layouts"
+#: Photosites around the centre in the right part of their figures; differences of size below this are rounding.
+N_NEAR, SAME_SIZE_UM = 150, 1e-6
+#: Size of thumbnails of the gallery, and height over width of the part that they show.
+THUMBNAIL_PX, TALLEST = (480, 360), 0.9
+#: Chapters of the gallery, those of the guides, with the numbers of their scripts; others follow at the end.
+CHAPTERS = {
+    "First pictures": (1, 31, 26),
+    "Design": (4, 12, 13, 14, 15, 16, 17),
+    "Light": (32, 2, 3, 5, 6, 7, 18),
+    "Electronics": (9, 10, 8, 11, 20, 25),
+    "Measure": (19, 24),
+    "Scale": (21, 22, 23),
+    "Learn": (27, 28, 29, 30),
+}
+
+
+def public_names() -> dict[str, list[str]]:
+    """List the public names of every module, which have a page each."""
+    modules = {name: importlib.import_module(name) for name in MODULES}
+    parts = {
+        name: {m.name for m in pkgutil.iter_modules(getattr(module, "__path__", []))}
+        for name, module in modules.items()
+    }
+    public = {}
+    for name, module in modules.items():
+        # Names that a package imports from its subpackages are listed there.
+        hidden = {"__version__"}.union(*(other.__all__ for at, other in modules.items() if at.startswith(f"{name}.")))
+        # Modules are not imported for this: foveasim.learn needs PyTorch.
+        listed = dict.fromkeys([*module.__all__, *REGISTERED.get(name, {})])
+        names = [n for n in listed if n not in hidden | parts[name]]
+        public[name] = [n for n in names if not inspect.ismodule(getattr(module, n))]
+    return public
+
+
+def main_names(public: dict[str, list[str]]) -> list[str]:
+    """List the names of ``foveasim`` that have their page in another module, in the order of the data flow."""
+    top = importlib.import_module("foveasim")
+    modules = {name: module for module, names in public.items() if module != "foveasim" for name in names}
+    found = [f"{modules[name]}.{name}" for name in top.__all__ if name in modules]
+    order = ["scene", "optics", "layout", "sensor", "reconstruct"]
+    return sorted(
+        found, key=lambda name: (*(k for k, part in enumerate(order) if f".{part}." in name), len(order), name)
+    )
+
+
+def gallery_scripts(repository: Path) -> list[Path]:
+    """List the scripts of the gallery, which have a page each."""
+    return sorted((repository / "gallery").glob("[0-9]*.py"))
+
+
+def generated_pages(repository: Path) -> set[Path]:
+    """List the pages and pictures that the build writes, relative to the directory of the documentation."""
+    modules = {f"{name}.md" for name in MODULES}
+    made = {
+        f"made/{module}.{name}.rst"
+        for module, names in public_names().items()
+        for name in names
+        if name not in tables_of(module, names)
+    }
+    scripts = {f"{script.stem}.md" for script in gallery_scripts(repository)}
+    scripts |= {
+        f"{script.stem}/{picture}"
+        for script in gallery_scripts(repository)
+        for picture in re.findall(r'"(\w+\.(?:png|webp))"', script.read_text())
+    }
+    layouts = {Path("layouts", page) for page in ("index.md", *(f"{name}.png" for name in bundled_layouts()))}
+    reference = {Path("reference", page) for page in {"index.md"} | modules | made}
+    return layouts | reference | {Path("gallery", page) for page in {"index.md"} | scripts}
+
+
+def tables_of(name: str, names: list[str]) -> dict[str, Mapping[Any, Any]]:
+    """Return the registries and other mappings among the public names of a module."""
+    module = importlib.import_module(name)
+    return {n: getattr(module, n) for n in names if isinstance(getattr(module, n), Mapping)}
+
+
+def entry_of(value: object) -> str:
+    """Return one line about an object in a mapping."""
+    parts = [getattr(value, attribute, "") for attribute in ("title", "description", "definition")]
+    texts = [part for part in parts if isinstance(part, str) and part]
+    if not texts and (inspect.isroutine(value) or inspect.isclass(value)):
+        texts = [(inspect.getdoc(value) or "").partition("\n\n")[0]]
+    if not texts:
+        texts = [", ".join(map(str, value)) if isinstance(value, tuple) else str(value)]
+    return plain_roles(": ".join(texts)).replace("|", "\\|")
+
+
+def plain_roles(text: str) -> str:
+    """Return reStructuredText of one paragraph as Markdown."""
+    return re.sub(r":\w+:`~?([^`]*)`", r"`\1`", text).replace("``", "`").replace("\n", " ").strip()
+
+
+def comment_on(name: str, module: str) -> str:
+    """Return the comment before the definition of a constant of a module, from the module that defines it."""
+    for path in sorted((REPOSITORY / module.replace(".", "/")).rglob("*.py")):
+        found = re.search(rf"((?:^#: .*\n)+){name}(?:: .*)? = ", path.read_text(), re.MULTILINE)
+        if found:
+            return plain_roles(re.sub(r"^#: ", "", found[1], flags=re.MULTILINE))
+    return ""
+
+
+def sections_of(name: str, names: list[str]) -> Iterator[tuple[str, list[str]]]:
+    """Yield headings, the first one empty, and names of a module."""
+    groups = GROUPS.get(name, {})
+    module = importlib.import_module(name)
+    heading_of = {}
+    for n in names:
+        home = getattr(getattr(module, n), "__module__", "") or ""
+        heading_of[n] = next((heading for heading, homes in groups.items() if home.startswith(homes)), "")
+    for heading in ("", *groups):
+        yield heading, [n for n in names if heading_of[n] == heading]
+
+
+def write_reference(_app: Sphinx, _config: Config) -> None:
+    """Write an index with descriptions, and a page with the public names of every module."""
+    shutil.rmtree(REFERENCE, ignore_errors=True)  # pages of removed names
+    REFERENCE.mkdir()
+    public = public_names()
+    for name, about in MODULES.items():
+        tables = tables_of(name, public[name])
+        page = [f"# {name}", about]
+        if name == "foveasim":
+            main = "\n".join(f"   ~{full_name}" for full_name in main_names(public))
+            page.append(f"```{{eval-rst}}\n.. autosummary::\n   :nosignatures:\n\n{main}\n```")
+        for heading, names in sections_of(name, [n for n in public[name] if n not in tables]):
+            rows = "\n".join(f"   {n}" for n in names)
+            page.append(f"## {heading}" * bool(heading))
+            page.append(
+                f"```{{eval-rst}}\n.. currentmodule:: {name}\n\n.. autosummary::\n   :toctree: made\n   :nosignatures:\n\n"
+                f"{rows}\n```"
+            )
+        for n, table in tables.items():
+            kind = f"Registry: {table.kind}. " if isinstance(table, Registry) else ""
+            rows = "\n".join(f"| `{key}` | {entry_of(value)} |" for key, value in table.items())
+            page.append(f"## {n}\n\n{kind}{comment_on(n, name)}\n\n| key | |\n|---|---|\n{rows}")
+        (REFERENCE / f"{name}.md").write_text("\n\n".join(filter(None, page)) + "\n")
+    contents = "\n".join(MODULES)
+    rows = "\n".join(f"| [{name}]({name}.md) | {about} | {len(public[name])} |" for name, about in MODULES.items())
+    table = f"| module | contents | public names |\n|---|---|---|\n{rows}"
+    page_text = f"# Reference\n\n{table}\n\n```{{toctree}}\n:hidden:\n:maxdepth: 1\n\n{contents}\n```\n"
+    (REFERENCE / "index.md").write_text(page_text)
+
+
+def write_layouts(_app: Sphinx, _config: Config) -> None:
+    """Write a page with picture, figures and source of every bundled layout."""
+    from dark_figures import with_dark_variants  # in this directory
+
+    BUNDLED.mkdir(exist_ok=True)
+    sections = []
+    for name, path in bundled_layouts().items():
+        picture = BUNDLED / f"{name}.png"
+        layout = read_layout_file(path).layout
+        if not picture.exists() or picture.stat().st_mtime < path.stat().st_mtime:
+            with with_dark_variants():
+                foveasim.view.save_figure(figure_of(layout), picture, dpi=140)
+        comment, _, rest = path.read_text().partition("\n")
+        source = " ".join(rest.partition("source: >")[2].split())
+        found = layout.describe()
+        x0, y0, x1, y1 = found.bounds_um
+        low, high = (f"{size:.3g}" for size in (found.size_um[0], found.size_um[-1]))
+        figures = (
+            f"{found.n_sites:,} photosites of {low if low == high else f'{low} to {high}'} µm in a field of "
+            f"{x1 - x0:,.5g} × {y1 - y0:,.5g} µm."
+        )
+        title = comment.removeprefix("# ")
+        sections.append(f"## {name}\n\n{title} {figures}\n\n![{title}]({name}.png)\n\nSource: {source}")
+    about = (
+        "Each name stands for a layout in every command, and in `fs.read_layout`: `foveasim view giotto_2`. The files are in "
+        "`layouts/`, with design rules that they satisfy."
+    )
+    (BUNDLED / "index.md").write_text("\n\n".join(["# Bundled layouts", about, *sections]) + "\n")
+
+
+def figure_of(layout: Layout) -> Figure:
+    """Draw a layout, and its photosites around the centre."""
+    figure = Figure(figsize=(7.4, 3.7), layout="constrained")
+    whole, part = figure.subplots(1, 2)
+    x0, y0, x1, y1 = layout.bounds_um
+    centre_um = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
+    has_channels = layout.channel.max() > 0
+    by = "channel" if has_channels else "size_um" if np.ptp(layout.size_um) > SAME_SIZE_UM else None
+    layout.plot(by, ax=whole, legend=not has_channels)
+    offset_um = layout.centroid_um - centre_um
+    radius_um = np.hypot(*offset_um.T)
+    innermost = np.flatnonzero(radius_um < 1.01 * radius_um.min() + SAME_SIZE_UM)
+    first = innermost[np.argmax(offset_um[innermost, 0])]
+    if radius_um[first] > layout.size_um[first]:  # the edge of a blind spot
+        centre_um = layout.centroid_um[first]
+    distance_um = np.hypot(*(layout.centroid_um - centre_um).T)
+    near = min(N_NEAR, layout.n_sites - 1)
+    reach_um = np.partition(distance_um, near)[near]
+    layout[distance_um < 2.0 * reach_um].plot("channel" if has_channels else None, ax=part, legend=False)
+    part.set_xlim(centre_um[0] - reach_um, centre_um[0] + reach_um)
+    part.set_ylim(centre_um[1] - reach_um, centre_um[1] + reach_um)
+    return figure
+
+
+def write_thumbnail(picture: Path, thumbnail: Path) -> None:
+    """Write a picture of 4:3: all of it on white, or its upper part if it is tall."""
+    with Image.open(picture) as opened:
+        image = opened.convert("RGBA")
+    n_y = min(image.height, round(TALLEST * image.width))
+    white = Image.new("RGBA", (image.width, n_y), "white")
+    white.alpha_composite(image.crop((0, 0, image.width, n_y)))
+    ImageOps.pad(white.convert("RGB"), THUMBNAIL_PX, color="white").save(thumbnail, quality=88)
+
+
+def write_gallery(_app: Sphinx, _config: Config) -> None:
+    """Run every script of the gallery; write a page with its question, pictures and source, and an index of cards."""
+    from dark_figures import SUFFIX, with_dark_variants
+
+    cards: dict[int, str] = {}
+    for script in gallery_scripts(REPOSITORY):
+        folder = GALLERY / script.stem
+        done = folder / "done"
+        is_skipped = "import torch" in script.read_text() and not find_spec("torch")
+        if not is_skipped and (not done.exists() or done.stat().st_mtime < script.stat().st_mtime):
+            folder.mkdir(parents=True, exist_ok=True)
+            with with_dark_variants():
+                runpy.run_path(str(script))["main"](folder)
+            done.touch()
+        title = script.stem[3:].replace("_", " ").capitalize()
+        description = (ast.get_docstring(ast.parse(script.read_text())) or "").replace("``", "`")
+        pictures = [
+            f"{script.stem}/{picture.name}"
+            for picture in sorted(folder.glob("*.*"))
+            if picture.suffix in (".png", ".webp") and not picture.stem.endswith(SUFFIX)
+        ]
+        shown = "\n\n".join(f"![{picture}]({picture})" for picture in pictures) or WITHOUT_TORCH
+        source = (
+            f"```{{literalinclude}} ../../gallery/{script.name}\n:language: python\n:start-at: from __future__\n```"
+        )
+        text = f"# {title}\n\n{description}\n\n{shown}\n\n## gallery/{script.name}\n\n{source}\n"
+        (GALLERY / f"{script.stem}.md").write_text(text)
+        question = description.partition("\n")[0]
+        if pictures:
+            write_thumbnail(GALLERY / pictures[0], folder / "thumbnail.jpg")
+        thumbnail = f":img-top: {script.stem}/thumbnail.jpg\n:img-alt: {title}\n" if pictures else ""
+        cards[int(script.stem[:2])] = (
+            f":::{{grid-item-card}} {title}\n:link: {script.stem}\n:link-type: doc\n{thumbnail}\n{question}\n:::"
+        )
+    about = "Each script generates its pictures when the site is built, and checks its figures."
+    listed = {number for numbers in CHAPTERS.values() for number in numbers}
+    chapters = {**CHAPTERS, "More": tuple(number for number in cards if number not in listed)}
+    stems = {int(script.stem[:2]): script.stem for script in gallery_scripts(REPOSITORY)}
+    contents = "\n".join(stems[number] for numbers in chapters.values() for number in numbers)
+    page = [f"# Gallery\n\n{about}\n\n```{{toctree}}\n:hidden:\n\n{contents}\n```"]
+    for chapter, numbers in chapters.items():
+        if numbers:
+            page += [f"## {chapter}", "::::{grid} 1 2 3 3\n:gutter: 3", *(cards[number] for number in numbers), "::::"]
+    (GALLERY / "index.md").write_text("\n\n".join(page) + "\n")
