@@ -67,6 +67,7 @@ def test_coverage_is_independent_of_distribution(draw, n):
     assert 0.93 < np.mean((low <= median) & (median <= high)) < 0.965
 
 
+@pytest.mark.slow
 def test_summary_resamples_with_scenes(compared):
     values = {name: array[:, :5] for name, array in compared.values.items() if array.ndim > 1}
     few = dataclasses.replace(compared, values={**compared.values, **values}, scenes=compared.scenes[:5])

@@ -103,7 +103,6 @@ def undo(page):
 # -- drawing ----------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow(keep=1)
 def test_drawn_polygon_is_in_geojson(edit):
     page = edit("polygon")
     corners = [(-15.0, -15.0), (30.0, -15.0), (30.0, 15.0), (0.0, 30.0)]

@@ -313,7 +313,6 @@ def test_mouse_shows_site_and_values(visit):
     assert np.array_equal(np.array(values, dtype=float), MIXED_LAYOUT.columns["gain"], equal_nan=True)
 
 
-@pytest.mark.slow(keep=1)
 @pytest.mark.needs("chromium")
 def test_page_picks_match_python(visit):
     pick = "points => points.map(([x, y]) => foveasim.pickAll(x, y))"
