@@ -96,7 +96,7 @@ def draw_chain(axes: Axes, sensor: fs.Sensor, photo_e_per_s: float) -> None:
         box = FancyBboxPatch(
             (-0.78, low), 0.46, high - low, boxstyle="round,pad=0.0,rounding_size=0.02", transform=place
         )
-        box.set(facecolor="#e8eef8", edgecolor="#3b6ab0", clip_on=False, mutation_aspect=12.0)
+        box.set(facecolor="0.93", edgecolor="#3b6ab0", clip_on=False, mutation_aspect=12.0)
         axes.add_patch(box)
         axes.text(-0.55, 0.5 * (low + high), text, transform=place, ha="center", va="center")
         if rows[-1] + 1 < len(names):

@@ -4,9 +4,9 @@ How many photosites does motion estimation require on a uniform grid, and with a
 New here: ``foveasim.metrics.estimate_flow``, ``flow_bound`` and ``site_gradients_e_per_um``; reconstructions by
 ``foveasim.reconstruct.least_squares`` as the reference of the next capture.
 
-Expect: for a target of 100 µm at the gaze and an error of 0.15 µm, about 450 foveal photosites, or about 5,600 on a uniform
-grid of the same field, more than 8 times as many. For 25 patches over the complete field and an error of 0.8 µm, no gain: 1,050
-photosites on a uniform grid, 1,100 on foveal layouts; the 425 that nearly suffice at the gaze give almost no information. With
+Expect: for a target of 100 µm at the gaze and an error of 0.15 µm, about 500 foveal photosites, or about 4,700 on a uniform
+grid of the same field, more than 8 times as many. For 25 patches over the complete field and an error of 0.8 µm, no gain: 1,010
+photosites on a uniform grid, 1,060 on foveal layouts; the 425 that nearly suffice at the gaze give almost no information. With
 a known picture, the median of the errors is within 10 % of the Cramér-Rao bound. With two captures, a grid of 1,000 exceeds the
 bound more than 5 times: not photon noise, but unknown detail between the sites limits it.
 """
