@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageOps
 
 import foveasim.view
+from foveasim._core.quantities import format_quantity
 from foveasim._core.registry import Registry
 from foveasim.config import bundled_layouts, read_layout_file
 from foveasim.layout import LAYOUTS
@@ -241,11 +242,8 @@ def write_layouts(_app: Sphinx, _config: Config) -> None:
         source = " ".join(rest.partition("source: >")[2].split())
         found = layout.describe()
         x0, y0, x1, y1 = found.bounds_um
-        low, high = (f"{size:.3g}" for size in (found.size_um[0], found.size_um[-1]))
-        figures = (
-            f"{found.n_sites:,} photosites of {low if low == high else f'{low} to {high}'} µm in a field of "
-            f"{x1 - x0:,.5g} × {y1 - y0:,.5g} µm."
-        )
+        sizes = format_quantity([float(found.size_um[0]), float(found.size_um[-1])], "µm", digits=3)
+        figures = f"{found.n_sites:,} photosites of {sizes} in a field of {x1 - x0:,.5g} × {y1 - y0:,.5g} µm."
         title = comment.removeprefix("# ")
         sections.append(f"## {name}\n\n{title} {figures}\n\n![{title}]({name}.png)\n\nSource: {source}")
     about = (

@@ -165,6 +165,7 @@ def layouts() -> None:
     """List the bundled layouts, by name, and the layout generators."""
     from rich.table import Table
 
+    from foveasim._core.quantities import format_quantity
     from foveasim.config import bundled_layouts, read_layout_file
     from foveasim.layout import LAYOUTS
 
@@ -175,7 +176,7 @@ def layouts() -> None:
         for name, path in bundled_layouts().items():
             found = read_layout_file(path).layout.describe()
             x0, y0, x1, y1 = found.bounds_um
-            sizes = f"{found.size_um[0]:.3g} to {found.size_um[-1]:.3g}"
+            sizes = format_quantity([float(found.size_um[0]), float(found.size_um[-1])], "", digits=3)
             table.add_row(name, f"{found.n_sites:,}", f"{x1 - x0:.5g} x {y1 - y0:.5g}", sizes, found.origin)
     console.print(table)
     families = Table(box=None)

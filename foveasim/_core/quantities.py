@@ -14,7 +14,7 @@ LARGE = {"µm²": (1e5, 1e6, "mm²"), "µm": (1e4, 1e3, "mm")}
 
 def format_quantity(values: float | Sequence[float], unit: str, *, digits: int = 4) -> str:
     """
-    Return a value, or the range of two, with its unit.
+    Return a value, or the range of two unless they appear equal, with its unit.
 
     Examples
     --------
@@ -32,7 +32,7 @@ def format_quantity(values: float | Sequence[float], unit: str, *, digits: int =
         power = 3 * math.floor(0.5 * (math.log10(sizes[0]) + math.log10(sizes[-1])) / 3.0 + 1e-9)
         power = min(max(power, min(PREFIXES)), max(PREFIXES))
         size, unit = 10.0**power, PREFIXES[power] + unit
-    text = " to ".join(_format(number / size, digits) for number in numbers)
+    text = " to ".join(dict.fromkeys(_format(number / size, digits) for number in numbers))
     return f"{text} {unit}" if unit else text
 
 

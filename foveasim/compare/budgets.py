@@ -105,7 +105,7 @@ def check_equal_budgets(budgets: Mapping[str, Budget], budget: str | None, toler
     (first, reference), *others = ((name, getattr(found, attribute)) for name, found in budgets.items())
     for name, value in others:
         if abs(value - reference) > tolerance * abs(reference):
-            shown = [f"{number:,.6g} {unit}".rstrip() for number in (reference, value)]
+            shown = [format_quantity(number, unit, digits=6) for number in (reference, value)]
             raise ParameterError(
                 "budget",
                 f"must be equal within {100.0 * tolerance:g} %: the {title} of {format_value(first)} is {shown[0]}, "

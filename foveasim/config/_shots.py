@@ -142,7 +142,7 @@ def write_3d_picture(result: Result, directory: str | Path) -> Path | None:
     if missing_software():
         return None
     path = check_directory(directory) / f"{result.shot.name}_3d.png"
-    render(prisms(result.capture, "code"), path, renderer="pyvista")
+    render(prisms(result.capture), path, renderer="pyvista")
     return path
 
 

@@ -70,14 +70,18 @@ class Summary:
     def __repr__(self) -> str:
         x0, y0, x1, y1 = self.bounds_um
         return (
-            f"Summary({self.n_sites:,} photosites of {self.size_um[0]:.4g} to {self.size_um[-1]:.4g} µm on "
+            f"Summary({self.n_sites:,} photosites of {self._sizes()} on "
             f"{x1 - x0:.6g} x {y1 - y0:.6g} µm, from {self.origin})"
         )
+
+    def _sizes(self) -> str:
+        """Return the smallest and the largest size."""
+        return format_quantity([float(self.size_um[0]), float(self.size_um[-1])], "µm")
 
     def rows(self) -> list[tuple[str, str]]:
         """Return names and values as strings, in the order of the table."""
         x0, y0, x1, y1 = self.bounds_um
-        low, lower, median, upper, high = self.size_um
+        _, lower, median, upper, _ = self.size_um
         rows = [
             ("origin", self.origin),
             ("photosites", f"{self.n_sites:,}"),
@@ -85,7 +89,7 @@ class Summary:
             ("field", f"{x1 - x0:.6g} x {y1 - y0:.6g} µm, from ({x0:.6g}, {y0:.6g}) to ({x1:.6g}, {y1:.6g})"),
             ("area", format_quantity(self.area_um2, "µm²", digits=6)),
             ("fill factor", f"{100.0 * self.fill_factor:.4g} % of the convex hull"),
-            ("site size", f"{low:.4g} to {high:.4g} µm, median {median:.4g}, quartiles {lower:.4g} and {upper:.4g}"),
+            ("site size", f"{self._sizes()}, median {median:.4g}, quartiles {lower:.4g} and {upper:.4g}"),
             ("channels", ", ".join(f"{channel}: {n:,}" for channel, n in self.channels.items())),
             ("readout lines", f"{self.n_lines:,}"),
         ]
@@ -154,7 +158,7 @@ def describe(layout: Layout, readout: Readout | None = None) -> Summary:
     --------
     >>> import foveasim as fs
     >>> fs.layout.describe(fs.layout.hexagonal(n_columns=20, n_rows=20, pitch_um=3.0))
-    Summary(400 photosites of 2.792 to 2.792 µm on 61.5 x 52.8275 µm, from hexagonal)
+    Summary(400 photosites of 2.792 µm on 61.5 x 52.8275 µm, from hexagonal)
     """
     bounds_um = layout.bounds_um
     hull_um2 = float(shapely.MultiPoint(layout.xy_um).convex_hull.area)

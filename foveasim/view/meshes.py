@@ -221,8 +221,8 @@ def prisms(
         Quantity shown by the height: ``"code"``, ``"electrons"``, ``"expected_e"``, ``"area_um2"``, ``"size_um"``, any
         numerical column, or one value per site, at least 0. By default the code of a capture, or the site sizes of a layout.
     by : str or array, optional
-        Quantity shown by the colour, as in :func:`foveasim.view.colours_of`; by default that of the height, or the colours
-        of the picture for the codes of a colour capture.
+        Quantity shown by the colour, as in :func:`foveasim.view.colours_of`; by default that of the height. A colour capture
+        without ``height`` and ``by`` has the colours of its picture.
     max_height_um : float, µm
         Height of the tallest prism; 0.15 of the layout's longer side by default.
     has_floor : bool

@@ -100,14 +100,13 @@ def _layout_facts(layout: Layout) -> dict[str, object]:
         return {"columns": ", ".join(layout.columns)}
     x0, y0, x1, y1 = layout.bounds_um
     size_um = layout.size_um
-    low, median, high = (float(x) for x in (size_um.min(), np.median(size_um), size_um.max()))
-    same = high <= low * (1.0 + 1e-6)
+    sizes = format_quantity([float(size_um.min()), float(size_um.max())], "µm")
     origin = layout.provenance.get("generator", layout.provenance.get("made_by", ""))
     parameters = layout.provenance.get("parameters", {})
     given = [f"{name}={format_field(value)}" for name, value in dict(parameters).items() if value is not None]
     rows: dict[str, object] = {
         "field": f"{x1 - x0:.6g} x {y1 - y0:.6g} µm",
-        "site size": f"{median:.4g} µm" if same else f"{low:.4g} to {high:.4g} µm, median {median:.4g} µm",
+        "site size": f"{sizes}, median {np.median(size_um):.4g} µm" if " to " in sizes else sizes,
         "area": format_quantity(float(layout.area_um2.sum()), "µm²"),
         "origin": f"{origin}({', '.join(given)})" if given else str(origin),
     }

@@ -360,7 +360,7 @@ def _format_site(layout: Layout, colours: SiteColours, x_um: float, y_um: float,
     position = f"x = {x_um:.6g} µm, y = {y_um:.6g} µm"
     if site < 0:
         return position
-    size_um = float(layout.size_um[site])
+    size_um = float(layout[[site]].size_um[0])
     text = f"{position}: site {site}, size {size_um:.4g} µm"
     if colours.values is None or colours.title == "size / µm":
         return text
