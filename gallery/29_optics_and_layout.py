@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
 from numpy.typing import NDArray
 from shapely import get_coordinates
 from torch import Tensor
@@ -30,7 +31,7 @@ import foveasim as fs
 from foveasim.learn import Imaging, Mesh, barrier, site_power
 from foveasim.optics import Zernike
 from foveasim.reconstruct import estimate_from_code
-from foveasim.view import plot_layout, save_figure
+from foveasim.view import save_figure
 
 #: Map cells of 0.75 µm; 6 x 6 photosites of 8 µm; and a scene with a margin, so that its centre moves over all positions.
 CELL_UM, FIELD_CELLS, SCENE_CELLS, N_X = 0.75, 64, 112, 6
@@ -242,27 +243,37 @@ def learn(name: str, n_steps: int, stride: int, seed: int) -> Design:
 
 def draw_designs(designs: Mapping[str, Design], estimates: Mapping[str, Sequence[NDArray[np.float64]]]) -> Figure:
     """Draw the layout, the image of a point and the errors of every design."""
-    figure = Figure(figsize=(7.6, 4.6), layout="constrained")
-    axes = figure.subplots(3, len(designs))
-    reach_um = 0.5 * SCENE_CELLS * CELL_UM
+    figure = Figure(figsize=(7.6, 5.6), layout="constrained")
+    rows = figure.subfigures(3, 1, height_ratios=(1.12, 1.0, 1.16))
+    titles = ("Photosites, with the part below", "Image of a point, on the photosites", "Errors of the position / µm")
+    for row, title in zip(rows, titles, strict=True):
+        row.suptitle(title, x=0.01, ha="left", fontsize="medium", fontweight="bold")
+    axes = np.array([row.subplots(1, len(designs)) for row in rows])
+    reach_um, shown_um = 0.5 * SCENE_CELLS * CELL_UM, 14.0
     for (above, centre, below), (name, design) in zip(axes.T, designs.items(), strict=True):
-        layout = design.mesh.layout()
-        plot_layout(layout, ax=above, scale_bar=False)
-        above.set_title(name)
+        outlines = [get_coordinates(polygon) for polygon in design.mesh.layout().polygons()]
+        above.add_collection(PolyCollection(outlines, facecolor="0.93", edgecolor="0.35", linewidth=0.6))
+        above.add_patch(Rectangle((-shown_um, -shown_um), 2 * shown_um, 2 * shown_um, fill=False, edgecolor="tab:blue"))
+        half_um = 0.5 * FIELD_CELLS * CELL_UM + 0.5
+        above.set(xlim=(-half_um, half_um), ylim=(-half_um, half_um), aspect="equal", title=name)
+        above.axis("off")
         with torch.no_grad():
             psf = design.imaging()[0].numpy()
         extent = (-reach_um, reach_um, -reach_um, reach_um)
         centre.imshow(np.sqrt(np.maximum(psf, 0.0)), origin="lower", extent=extent, cmap="gray_r")
-        outlines = [get_coordinates(polygon) for polygon in layout.polygons()]
-        centre.add_collection(PolyCollection(outlines, facecolor="none", edgecolor="tab:blue", linewidth=0.6))
+        centre.add_collection(PolyCollection(outlines, facecolor="none", edgecolor="tab:blue", linewidth=0.8))
+        centre.set(xticks=[], yticks=[], xlim=(-shown_um, shown_um), ylim=(-shown_um, shown_um))
         true_um, found_um = estimates[name]
-        below.plot(*(found_um - true_um)[:400].T, ".", markersize=2, color="black", alpha=0.3)
-        above.set(xticks=[], yticks=[], xlabel="", ylabel="")
-        centre.set(xticks=[], yticks=[], xlim=(-14.0, 14.0), ylim=(-14.0, 14.0))
-        below.set(xlim=(-5.0, 5.0), ylim=(-5.0, 5.0), aspect="equal", xticks=(-4, 0, 4), yticks=[])
-    axes[2, 0].set_yticks((-4, 0, 4))
-    for ax, label in zip(axes[:, 0], ("layout, 48 µm", "image, 28 µm", "errors / µm"), strict=True):
-        ax.set_ylabel(label)
+        below.plot(*(found_um - true_um)[:400].T, ".", markersize=2, color="0.4")
+        rms = rms_um(true_um, found_um)
+        below.add_patch(Circle((0.0, 0.0), rms, fill=False, edgecolor="tab:red", linewidth=1.4, zorder=3))
+        below.text(0.04, 0.95, f"RMS {rms:.2f} µm", transform=below.transAxes, va="top", color="tab:red")
+        below.set(xlim=(-5.5, 5.5), ylim=(-5.5, 5.5), aspect="equal", xticks=(-4, 0, 4), yticks=(-4, 0, 4))
+        if below is not axes[2, 0]:
+            below.set_yticklabels([])
+    bar_um = 10.0
+    axes[1, 0].plot((-12.0, -12.0 + bar_um), (-12.0, -12.0), color="black", linewidth=2.5, solid_capstyle="butt")
+    axes[1, 0].text(-12.0 + 0.5 * bar_um, -11.2, f"{bar_um:g} µm", ha="center", va="bottom", fontsize="small")
     return figure
 
 

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import skimage.data
 import torch
+from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -29,7 +30,7 @@ from torch import Tensor
 import foveasim as fs
 from foveasim.layout import read_layout
 from foveasim.learn import Mesh, barrier, site_power
-from foveasim.view import plot_layout, save_figure
+from foveasim.view import save_figure
 
 #: Pitch of the uniform grid; map cells are 1 µm wide.
 PITCH_UM = 3
@@ -217,28 +218,41 @@ def measure(task: Task, layout: fs.Layout, pictures: Sequence[NDArray[np.uint8]]
 
 
 def draw_stages(task: Task, stages: Mapping[str, tuple[fs.Layout, Measurement]]) -> Figure:
-    """Draw layouts with their violations, and reconstructions of the same photograph."""
-    figure = Figure(figsize=(7.6, 4.5), layout="constrained")
-    above, below = figure.subplots(2, 1 + len(stages))
+    """Draw layouts with their violations, reconstructions of the same photograph, and their errors."""
+    figure = Figure(figsize=(7.6, 6.4), layout="constrained")
+    axes = figure.subplots(3, 1 + len(stages))
+    (importance, image, unused), stage_axes = axes[:, 0], axes[:, 1:].T
     _, first = next(iter(stages.values()))
     left, bottom, right, top = task.grid.bounds_um
     extent, white = (left, right, bottom, top), float(first.reference.max())
-    above[0].imshow(task.importance, cmap="gray", origin="lower", extent=extent)
-    above[0].set_title("importance")
-    pictures = {"optical image": first.reference}
-    for ax, (name, (layout, measurement)) in zip(above[1:], stages.items(), strict=True):
-        plot_layout(layout, ax=ax, scale_bar=False)
-        results = layout.check(RULES).results
-        sites = sorted({site for result in results for violation in result.violations for site in violation.site_ids})
-        ax.add_collection(PolyCollection([get_coordinates(p) for p in layout.polygons()[sites]], facecolor="tab:red"))
-        ax.set_title(f"{name}\n{count_violations(layout)} violations", fontsize="medium")
-        pictures[f"{measurement.error_percent:.2f} %"] = measurement.picture
-    for ax, (title, picture) in zip(below, pictures.items(), strict=True):
+
+    def draw(ax: Axes, picture: NDArray[np.float64], title: str) -> None:
+        """Draw charges per area as a picture."""
         shown = fs.units.encode_srgb(np.clip(picture / white, 0.0, 1.0))
         ax.imshow(shown, cmap="gray", origin="lower", vmin=0.0, vmax=1.0, extent=extent)
-        ax.set_title(title)
-    for ax in (*above, *below):
-        ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
+        ax.set_title(title, fontsize="medium")
+
+    importance.imshow(task.importance, cmap="gray", origin="lower", extent=extent)
+    importance.set_title("importance of errors", fontsize="medium")
+    draw(image, first.reference, "optical image")
+    unused.axis("off")
+    errors = None
+    for (above, centre, below), (name, (layout, measurement)) in zip(stage_axes, stages.items(), strict=True):
+        results = layout.check(RULES).results
+        sites = {site for result in results for violation in result.violations for site in violation.site_ids}
+        colours = ["#f4b6ae" if site in sites else "0.93" for site in range(layout.n_sites)]
+        outlines = [get_coordinates(polygon) for polygon in layout.polygons()]
+        above.add_collection(PolyCollection(outlines, facecolor=colours, edgecolor="0.35", linewidth=0.6))
+        above.set(xlim=extent[:2], ylim=extent[2:], aspect="equal")
+        above.set_title(f"{name}\n{count_violations(layout)} violations", fontsize="medium")
+        draw(centre, measurement.picture, f"error {measurement.error_percent:.1f} %")
+        difference = (measurement.picture - measurement.reference) / white
+        errors = below.imshow(difference, cmap="RdBu_r", origin="lower", vmin=-0.3, vmax=0.3, extent=extent)
+    for ax in axes.flat:
+        ax.set(xticks=[], yticks=[], xlabel="")
+    scale = unused.inset_axes((0.85, 0.04, 0.07, 0.92))
+    figure.colorbar(errors, cax=scale, label="difference / white").ax.yaxis.set_ticks_position("left")
+    scale.yaxis.set_label_position("left")
     return figure
 
 

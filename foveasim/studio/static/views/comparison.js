@@ -1,6 +1,6 @@
 // Table of the variants A and B: budgets and picture quality.
 
-import { shown } from "/web/colours.js";
+import { quantity, shown } from "/web/colours.js";
 import { make } from "/web/page_parts.js";
 
 // Largest relative difference of equal numbers of photosites: generators solve for a number within this tolerance.
@@ -9,14 +9,10 @@ const MATCHED = 0.01;
 const NOTES = { frames_per_s: "At the data rate of A", total_e: "Signal of all photosites in a frame",
   read_noise_e: "Root sum of squares over all photosites",
   readout_steps: "Photosites on the longest readout line; lines are read in parallel", area_mm2: "Total area of the photosites" };
-/** @type {[number, string][]} */
-const [NO_PREFIX, ...PREFIXES] = [[1, ""], [1e9, " G"], [1e6, " M"], [1e5, " k"]];
-
-// Four digits; large numbers with a prefix.
-function figure(value) {
+// Four digits; "∞" for an infinite value, "–" without value.
+function figure(value, unit) {
   if (typeof value !== "number") return value ? "∞" : "–";
-  const [limit, prefix] = PREFIXES.find(([from]) => Math.abs(value) >= from) || NO_PREFIX, scale = prefix === " k" ? 1e3 : limit;
-  return shown(Number((value / scale).toPrecision(4))) + prefix;
+  return quantity(Number(value.toPrecision(4)), unit);
 }
 
 // Shows rows of { name, label, unit, values: [a, b] }; null without variants.
@@ -27,13 +23,13 @@ function show({ table, note, button }, about) {
   const head = make("tr"), sizes = [about.fovea_um, about.field_um].map((side) => shown(Math.round(side)));
   head.append(make("td"), ...["A", "B"].map((name) => { const cell = make("th", name); cell.scope = "col"; return cell; }));
   const rows = about.rows.map(({ name, label, unit, values }) => {
-    const row = make("tr"), title = make("th", label + (unit ? ", " + unit : ""));
+    const row = make("tr"), title = make("th", label);
     title.scope = "row";
     row.dataset.name = name;
     title.title = NOTES[name] || "";
     if (/^(fovea|field)_/.test(name)) title.title = "Against the optical image, after a fit of one gain, on a square of "
       + sizes[name.startsWith("fovea") ? 0 : 1] + " µm";
-    row.append(title, ...values.map((value) => make("td", name === "n_sites" ? shown(value) : figure(value))));
+    row.append(title, ...values.map((value) => make("td", name === "n_sites" ? shown(value) : figure(value, unit))));
     row.classList.toggle("differs", values[0] !== values[1]);
     return row;
   });
