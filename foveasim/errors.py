@@ -50,7 +50,20 @@ _NO_VALUE = object()
 
 
 class FoveasimError(Exception):
-    """Base class of all errors of the package; pickling preserves instances."""
+    """
+    Base class of all errors of the package; pickling preserves instances.
+
+    Examples
+    --------
+    All errors of the package have this class, such as that of a file that does not exist:
+
+    >>> import foveasim as fs
+    >>> try:
+    ...     fs.read_layout("missing.gds")
+    ... except fs.FoveasimError as error:
+    ...     print(type(error).__name__)
+    FileError
+    """
 
     def __init__(self, message: str = "", *, prefix: str = "") -> None:
         super().__init__(prefix + _shorten(message))
@@ -63,7 +76,20 @@ class FoveasimError(Exception):
 
 
 class ParameterError(FoveasimError, ValueError):
-    """Invalid value of a parameter, raised where the value enters the package."""
+    """
+    Invalid value of a parameter, raised where the value enters the package.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> try:
+    ...     fs.layout.grid(n_x=4, n_y=4, pitch_um=-2.0)
+    ... except fs.errors.ParameterError as error:
+    ...     print(error.name, error.value, error.unit)
+    ...     print(error)
+    pitch_um -2.0 µm
+    'pitch_um' must be > 0, got -2.0 µm; lengths on a sensor are in µm
+    """
 
     def __init__(self, name: str, rule: str, value: object = _NO_VALUE, unit: str = "", hint: str = "") -> None:
         self.name = name
@@ -76,11 +102,35 @@ class ParameterError(FoveasimError, ValueError):
 
 
 class ArgumentError(ParameterError, TypeError):
-    """A call with a misspelt, missing or surplus argument; the message contains the signature."""
+    """
+    A call with a misspelt, missing or surplus argument; the message contains the signature.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> try:
+    ...     fs.Optics(focal_length_mm=8.0, f_nummer=2.8)
+    ... except fs.errors.ArgumentError as error:
+    ...     print(error.name, "-", str(error).partition("; ")[2])
+    f_nummer - did you mean 'f_number'?
+    """
 
 
 class GeometryError(FoveasimError, ValueError):
-    """Outlines that are not valid photosites; ``site_ids`` are their indices."""
+    """
+    Outlines that are not valid photosites; ``site_ids`` are their indices.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import shapely
+    >>> bow_tie = shapely.Polygon([(0.0, 0.0), (2.0, 2.0), (2.0, 0.0), (0.0, 2.0)])
+    >>> try:
+    ...     fs.Layout.from_polygons([shapely.box(3.0, 0.0, 5.0, 2.0), bow_tie])
+    ... except fs.errors.GeometryError as error:
+    ...     print(error.site_ids)
+    (1,)
+    """
 
     def __init__(self, message: str, site_ids: tuple[int, ...] = ()) -> None:
         self.site_ids = site_ids
@@ -88,7 +138,18 @@ class GeometryError(FoveasimError, ValueError):
 
 
 class FileError(FoveasimError, ValueError):
-    """A file that is missing, corrupt, of another format, or too large."""
+    """
+    A file that is missing, corrupt, of another format, or too large.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> try:
+    ...     fs.read_power_map("missing.npz")
+    ... except fs.errors.FileError as error:
+    ...     print(error.path, "-", error.detail)
+    missing.npz - no such file
+    """
 
     def __init__(self, path: str | Path | None, message: str, *, position: tuple[int, int] | None = None) -> None:
         self.path: Path | None = None if path is None else Path(path)
@@ -106,31 +167,128 @@ class ConfigError(FileError):
     Settings with an unknown key, a wrong type, or an invalid value.
 
     ``path`` is None for settings from Python, ``position`` the line and column in a file, from 1, if it is known.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> try:
+    ...     fs.config.read_shot(fs.config.demo_settings()[0], ["sensor.bits=40"])
+    ... except fs.errors.ConfigError as error:
+    ...     print(error.path.name, "-", error.detail)
+    foveal.yaml - --set sensor.bits: must be <= 16, got 40
     """
 
 
 class SimulationError(FoveasimError, RuntimeError):
-    """Parts that are valid separately and incompatible with each other."""
+    """
+    Parts that are valid separately and incompatible with each other.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.grid(n_x=2, n_y=2, pitch_um=3.0)
+    >>> try:
+    ...     fs.modes.Shutter(layout, frame_s=0.04, line_s=1e-5)
+    ... except fs.errors.SimulationError as error:
+    ...     print(str(error).partition("; ")[0])
+    a rolling shutter needs the line of each site
+    """
 
 
 class FoveasimWarning(UserWarning):
-    """Base class of all warnings of the package."""
+    """
+    Base class of all warnings of the package.
+
+    Examples
+    --------
+    Raise warnings of the package as errors, so that a script stops at the first one:
+
+    >>> import warnings
+    >>> import foveasim as fs
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("error", fs.errors.FoveasimWarning)
+    ...     layout = fs.layout.grid(n_x=4, n_y=4, pitch_um=3.0)
+    >>> layout.n_sites
+    16
+    """
 
 
 class SamplingWarning(FoveasimWarning):
-    """A picture or grid that is too coarse or too small for the optics."""
+    """
+    A picture or grid that is too coarse or too small for the optics.
+
+    Examples
+    --------
+    Ignore the warnings of one kind, here of a chart with fewer than two pixels per period:
+
+    >>> import warnings
+    >>> import foveasim as fs
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("ignore", fs.errors.SamplingWarning)
+    ...     chart = fs.scene.charts.siemens_star(shape=(64, 64), pitch_um=100.0, distance_m=1.0, luminance_cd_m2=100.0)
+    >>> chart.basis.shape
+    (1, 64, 64)
+    """
 
 
 class CoverageWarning(FoveasimWarning):
-    """Photosites outside the image, or a layout that measures a small part of a photograph."""
+    """
+    Photosites outside the image, or a layout that measures a small part of a photograph.
+
+    Examples
+    --------
+    Record the warning of a scene whose image is smaller than the layout:
+
+    >>> import warnings
+    >>> import foveasim as fs
+    >>> sensor = fs.Sensor(fs.layout.grid(n_x=32, n_y=32, pitch_um=3.0))
+    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    >>> scene = fs.Scene.flat(shape=(40, 40), pitch_um=250.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> with warnings.catch_warnings(record=True) as found:
+    ...     warnings.simplefilter("always", fs.errors.CoverageWarning)
+    ...     capture = camera.capture(scene, exposure_s=0.001, seed=0)
+    >>> str(found[0].message).partition(" the image")[0]
+    '348 of 1,024 photosites lie partly or completely outside'
+    """
 
 
 class ExposureWarning(FoveasimWarning):
-    """An exposure at which many photosites are saturated, or most receive no signal."""
+    """
+    An exposure at which many photosites are saturated, or most receive no signal.
+
+    Examples
+    --------
+    Ignore the warning of a capture that is saturated on purpose:
+
+    >>> import warnings
+    >>> import foveasim as fs
+    >>> sensor = fs.Sensor(fs.layout.grid(n_x=4, n_y=4, pitch_um=3.0), full_well_e=1e4)
+    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("ignore", fs.errors.ExposureWarning)
+    ...     capture = camera.capture(scene, exposure_s=10.0, seed=0)
+    >>> int(capture.electrons.min())
+    10000
+    """
 
 
 class LayoutWarning(FoveasimWarning):
-    """A layout that covers less of its field than specified, or a file with rounded outlines."""
+    """
+    A layout that covers less of its field than specified, or a file with rounded outlines.
+
+    Examples
+    --------
+    Record the warning of rings that end far within the outer radius:
+
+    >>> import warnings
+    >>> import foveasim as fs
+    >>> with warnings.catch_warnings(record=True) as found:
+    ...     warnings.simplefilter("always", fs.errors.LayoutWarning)
+    ...     layout = fs.layout.log_polar(n_sectors=8, min_size_um=4.0, r_max_um=30.0)
+    >>> str(found[0].message).partition(":")[0]
+    "'r_max_um' is 30 µm, but the outermost ring ends at 16.8392 µm"
+    """
 
 
 def _restore(kind: type[FoveasimError], args: tuple[Any, ...], state: dict[str, Any]) -> FoveasimError:

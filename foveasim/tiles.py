@@ -68,6 +68,8 @@ LAYOUT, SENSOR = "layout", "sensor"
 CODECS = ("bytes", "zstd")
 #: Elements per chunk of the layout's arrays.
 CHUNK = 1 << 22
+#: Chunks of zeros are written too: missing ones indicate a corrupt store.
+ALL_CHUNKS = {"write_empty_chunks": True}
 
 
 # -- computation ------------------------------------------------------------------------------------------------------
@@ -124,6 +126,16 @@ def capture_tiles(
         After the last tile, as for a capture.
     FoveasimWarning
         Before the first tile, when the lens model contradicts the focal length of the optics, as for a capture.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=300, n_y=300, pitch_um=2.0), "machine_vision")
+    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=1500.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> tiles = fs.tiles.capture_tiles(camera, scene, exposure_s=0.001, seed=0, tile_sites=65_536)
+    >>> [tile.code.size for tile in tiles]
+    [65536, 24464]
     """
     streams = Streams(seed, frame)
     tile_sites = _whole_blocks(tile_sites)
@@ -393,6 +405,18 @@ def write_tiles(
         disk.
     ParameterError, SimulationError
         As for :func:`capture_tiles`.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=20, n_y=20, pitch_um=3.0), "machine_vision")
+    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=400.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     fs.tiles.write_tiles(Path(directory, "wall.zarr"), camera, scene, exposure_s=0.001, seed=0)
+    TiledCapture(400 sites in 1 tiles, 12 bits, 'wall.zarr')
     """
     target = Path(path)
     if target.suffix.lower() != ZARR:
@@ -443,6 +467,19 @@ def read_tiles(path: str | Path) -> TiledCapture:
     ------
     FileError
         When zarr is missing, or the store is missing, corrupt or incomplete, or not a tiled capture.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=20, n_y=20, pitch_um=3.0), "machine_vision")
+    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=400.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     _ = fs.tiles.write_tiles(Path(directory, "wall.zarr"), camera, scene, exposure_s=0.001, seed=0)
+    ...     print(fs.tiles.read_tiles(Path(directory, "wall.zarr")).code[100:104].dtype)
+    uint16
     """
     source = Path(path)
     if not source.is_dir():
@@ -503,6 +540,7 @@ def _create(directory: Path, camera: Camera, light: Scene | PowerMap, plan: Mapp
             chunks=(tile_sites,),
             dtype=dtype or ("u1" if sensor.bits <= 8 else "u2"),
             dimension_names=("site",),
+            config=ALL_CHUNKS,
         )
     n_tiles = -(-n_sites // tile_sites)
     group.create_array(COMPLETE, shape=(n_tiles,), chunks=(1,), dtype="u1", dimension_names=("tile",), fill_value=0)
@@ -510,7 +548,7 @@ def _create(directory: Path, camera: Camera, light: Scene | PowerMap, plan: Mapp
         parts = group.create_group(name)
         for key, values in stored.items():
             chunks = (max(1, min(CHUNK, values.shape[0])), *values.shape[1:])
-            array = parts.create_array(key, shape=values.shape, chunks=chunks, dtype=values.dtype)
+            array = parts.create_array(key, shape=values.shape, chunks=chunks, dtype=values.dtype, config=ALL_CHUNKS)
             for first in range(0, values.shape[0], chunks[0]):
                 array[first : first + chunks[0]] = values[first : first + chunks[0]]
 

@@ -52,12 +52,28 @@ def m_from_um(length_um: Floats | float) -> Floats:
 
 
 def m_from_mm(length_mm: Floats | float) -> Floats:
-    """Convert millimetres to metres."""
+    """
+    Convert millimetres to metres.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> float(fs.units.m_from_mm(8.0))  # focal length of a lens
+    0.008
+    """
     return as_numbers("length_mm", length_mm) * 1e-3
 
 
 def m_from_nm(length_nm: Floats | float) -> Floats:
-    """Convert nanometres to metres."""
+    """
+    Convert nanometres to metres.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> float(fs.units.m_from_nm(550.0))
+    5.5e-07
+    """
     return as_numbers("length_nm", length_nm) * 1e-9
 
 
@@ -75,7 +91,16 @@ def um_from_m(length_m: Floats | float) -> Floats:
 
 
 def um_from_nm(length_nm: Floats | float) -> Floats:
-    """Convert nanometres to micrometres."""
+    """
+    Convert nanometres to micrometres.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> fs.units.um_from_nm(np.array([450.0, 550.0])).tolist()
+    [0.45, 0.55]
+    """
     return as_numbers("length_nm", length_nm) * 1e-3
 
 

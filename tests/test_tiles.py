@@ -211,6 +211,16 @@ def test_stored_tiles_have_parameters_per_site(camera, scene, tmp_path):
     np.testing.assert_allclose(ratio, expected, rtol=1e-5)
 
 
+def test_stored_tiles_of_zeros_are_complete(camera, tmp_path):
+    """Codes, electrons and a parameter per site are 0 everywhere."""
+    silent = camera.replace(sensor=replace(camera.sensor, effects=(), read_noise_e=np.zeros(camera.layout.n_sites)))
+    dark = fs.PowerMap.from_array(np.zeros((520, 720)), pitch_um=PITCH_UM, wavelength_nm=500.0)
+    tiles.write_tiles(tmp_path / "dark.zarr", silent, dark, exposure_s=0.01, seed=0, tile_sites=BLOCK)
+    found = tiles.read_tiles(tmp_path / "dark.zarr")
+
+    np.testing.assert_array_equal(found.code[:], silent.capture(dark, exposure_s=0.01, seed=0).code)
+
+
 def test_tiles_of_lateral_colour_equal_capture(camera, scene):
     lens = fs.optics.LateralColour(wavelength_nm=(450.0, 535.0, 620.0), magnification=(1.01, 1.0, 1.005))
     coloured = camera.replace(optics=fs.Optics(focal_length_mm=8.0, f_number=4.0, lateral_colour=lens))

@@ -337,6 +337,18 @@ def cameras(
     -----
     The reference of a picture is the ideal image on its grid: exact means of the irradiance, with the spectral response of the
     camera. One gain per picture is fitted. Pictures are compared where all cameras cover at least half of a pixel.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> optics = fs.Optics(focal_length_mm=8.0, f_number=2.8)
+    >>> layouts = {"grid": fs.layout.grid(n_x=20, n_y=20, pitch_um=4.0)}
+    >>> layouts["hexagonal"] = fs.layout.hexagonal(n_columns=20, n_rows=20, pitch_um=4.3)
+    >>> cameras = {name: fs.Camera(optics=optics, sensor=fs.compare.default_sensor(layouts[name])) for name in layouts}
+    >>> scene = fs.Scene.flat(shape=(40, 40), pitch_um=400.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> found = fs.compare.cameras(cameras, {"wall": scene}, exposure_s=0.01, n_annuli=2, max_pixels=32)
+    >>> {name: round(budget.area_um2) for name, budget in zip(found.names, found.budgets)}
+    {'grid': 6400, 'hexagonal': 6405}
     """
     named = _check_cameras(cameras)
     fixation: tuple[float, float] = tuple(finite_array("centre_um", centre_um).tolist())
@@ -510,6 +522,14 @@ def layouts(
 
     Examples
     --------
+    >>> import foveasim as fs
+    >>> scene = fs.scene.charts.slanted_edge(shape=(64, 64), pitch_um=250.0, distance_m=1.0, luminance_cd_m2=100.0)
+    >>> layouts = {"grid": fs.layout.grid(n_x=20, n_y=20, pitch_um=4.0)}
+    >>> layouts["hexagonal"] = fs.layout.hexagonal(n_columns=20, n_rows=20, pitch_um=4.3)
+    >>> found = fs.compare.layouts(layouts, {"edge": scene}, n_annuli=2, max_pixels=40)
+    >>> found.values["psnr_db"].round().tolist()
+    [[26.0], [28.0]]
+
     ::
 
         foveal = fs.layout.log_polar(n_sites=14_000, min_size_um=2.0, r_max_um=690.0)

@@ -50,6 +50,12 @@ def compare_files(
     ParameterError
         When layouts and shots are mixed, exposures differ, no layout has one of the options,
         or as for :func:`foveasim.compare.cameras`.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> found = fs.config.compare_files(["foveal.yaml", "square.yaml"], budget="data_rate")  # doctest: +SKIP
+    >>> found.write("report.html")  # doctest: +SKIP
     """
     if len(paths) < 2:
         raise ParameterError("files", "must be at least two layouts or shots", len(paths))

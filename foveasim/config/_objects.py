@@ -127,6 +127,14 @@ def read_shot(path: str | Path, changes: Sequence[str] = (), *, n_threads: int |
         When a setting is invalid; with the file, the path of the key, and the expected and actual value.
     FileError
         When a picture of the file cannot be read.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> path = fs.config.demo_settings()[0]
+    >>> shot = fs.config.read_shot(path, ["optics.f_number=4", "exposure_s=0.002"])
+    >>> shot.camera.optics.f_number, shot.camera.sensor.layout.n_sites, shot.requested_s
+    (4.0, 14208, 0.002)
     """
     source = Source(file=Path(path), replaced={change.partition("=")[0].strip(): CHANGE for change in changes})
     return build_shot(source, read_settings(path, changes), n_threads=n_threads)
@@ -145,6 +153,13 @@ def read_settings(path: str | Path, changes: Sequence[str] = ()) -> dict[str, An
     ------
     ConfigError
         When the file is not valid YAML, or a change is not "key=value".
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> settings = fs.config.read_settings(fs.config.demo_settings()[0], ["sensor.bits=10"])
+    >>> settings["optics"], settings["sensor"]["bits"]
+    ({'focal_length_mm': 8.0, 'f_number': 2.8}, 10)
     """
     path = Path(path)
     data = read_yaml(path)
@@ -168,6 +183,17 @@ def check_settings(source: Source | str | Path | None, settings: Mapping[str, An
     ------
     ConfigError
         When a setting is invalid.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> settings = fs.config.read_settings(fs.config.demo_settings()[0])
+    >>> fs.config.put_setting(None, settings, "exposure_s", "short")
+    >>> try:
+    ...     fs.config.check_settings(None, settings)
+    ... except fs.errors.ConfigError as error:
+    ...     print(error)
+    exposure_s: must be a time in seconds, a fraction such as '1/50', 'auto', or a value such as 'EV 12', got "short"
     """
     validate(source, models().shot, settings)
 
@@ -202,6 +228,19 @@ def build_shot(
     ------
     ConfigError, FileError
         As for :func:`read_shot`.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> settings = {
+    ...     "scene": {"kind": "flat", "shape": [60, 60], "pitch_um": 300.0, "distance_m": 1.0, "illuminance_lux": 500.0},
+    ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    ...     "layout": {"generator": "grid", "parameters": {"n_x": 16, "n_y": 16, "pitch_um": 3.0}},
+    ...     "exposure_s": "auto",
+    ... }
+    >>> shot = fs.config.build_shot(None, settings)
+    >>> shot.camera.capture(shot.scene, exposure_s=shot.requested_s, seed=shot.seed).code.shape
+    (256,)
     """
     source = Source.of(source)
     settings = validate(source, models().shot, data)
@@ -271,6 +310,14 @@ def read_layout_file(path: str | Path) -> LayoutFile:
     ------
     ConfigError
         When the file is invalid; with the file, the path of the key, and the expected and actual value.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> path = fs.config.bundled_layouts()["prima_100"]
+    >>> found = fs.config.read_layout_file(path)
+    >>> found.layout.n_sites, found.layout.provenance["generator"]
+    (378, 'hexagonal')
     """
     source = Source.of(path)
     return _build_layout(source, "", validate(source, models().layout, read_yaml(Path(path))))
@@ -334,6 +381,13 @@ def read_any_layout(
         When neither a file nor a bundled layout has this name, or it cannot be read.
     ParameterError
         When the format of the file does not have an option.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> found = fs.config.read_any_layout("prima_100")
+    >>> found.layout.n_sites, found.rules.min_width_um
+    (378, 84.9)
     """
     path = layout_path(path, directory)
     if path.suffix.lower() in YAML_EXTENSIONS:
@@ -352,6 +406,21 @@ def read_rules(path: str | Path) -> DesignRules:
     ------
     ConfigError
         When the file is invalid; with the file, the path of the key, and the expected and actual value.
+
+    Examples
+    --------
+    A bundled preset, and a file:
+
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> fs.config.read_rules("sky130_diff").limits()
+    {'min_width_um': 0.15, 'min_space_um': 0.27, 'edge_angle_step_deg': 90.0, 'grid_um': 0.005}
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     path = Path(directory, "rules.yaml")
+    ...     _ = path.write_text("min_size_um: 4.0")
+    ...     print(fs.config.read_rules(path))
+    DesignRules(min_size_um=4.0)
     """
     path = Path(path)
     if not path.exists() and not path.suffix and path.name == str(path):
@@ -365,7 +434,15 @@ def read_rules(path: str | Path) -> DesignRules:
 
 
 def schema(section: Any = "shot", title: str = "foveasim settings") -> dict[str, Any]:
-    """Return the JSON schema of a ``"shot"``, a ``"layout"`` or ``"rules"``, or of a model."""
+    """
+    Return the JSON schema of a ``"shot"``, a ``"layout"`` or ``"rules"``, or of a model.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> list(fs.config.schema()["properties"])
+    ['scene', 'optics', 'distortion', 'layout', 'sensor', 'exposure_s', 'seed', 'gaze_um', 'axis', 'integration_order']
+    """
     model = getattr(models(), section) if isinstance(section, str) else section
     model_schema = adapter_of("section", model).json_schema()
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **model_schema, "title": title}
@@ -571,6 +648,14 @@ def put_setting(source: Source | str | Path | None, data: dict[str, Any], key: s
     ------
     ConfigError
         When a part of the path is empty, or not a section.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> settings = fs.config.read_settings(fs.config.demo_settings()[0])
+    >>> fs.config.put_setting(None, settings, "optics.f_number", 4.0)
+    >>> settings["optics"]
+    {'focal_length_mm': 8.0, 'f_number': 4.0}
     """
     names = key.split(".")
     if not all(names):

@@ -83,6 +83,14 @@ def validate(source: Source | str | Path | None, kind: Any, data: Mapping[str, A
     ------
     ConfigError
         With the file, its line and column, the path of the key, and the expected and actual value.
+
+    Examples
+    --------
+    Check a mapping of design rules:
+
+    >>> import foveasim as fs
+    >>> fs.config.validate(None, fs.DesignRules, {"min_size_um": 2.0, "grid_um": 0.005})
+    DesignRules(min_size_um=2.0, grid_um=0.005)
     """
     source = Source.of(source)
     adapter = adapter_of("kind", kind)

@@ -29,7 +29,15 @@ PICTURE_PIXELS = 1024
 
 
 def demo_settings() -> list[Path]:
-    """Return the bundled settings files of the demo."""
+    """
+    Return the bundled settings files of the demo.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> [path.name for path in fs.config.demo_settings()]
+    ['foveal.yaml', 'four_zones.yaml']
+    """
     return [Path(str(files("foveasim.config") / f"{name}.yaml")) for name in DEMO_SHOTS]
 
 
@@ -117,6 +125,21 @@ def run_shot(shot: Shot, directory: str | Path) -> tuple[Result, list[Path]]:
     ------
     FoveasimError
         When the parts are incompatible, or files cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import foveasim as fs
+    >>> settings = {
+    ...     "scene": {"kind": "flat", "shape": [60, 60], "pitch_um": 300.0, "distance_m": 1.0, "illuminance_lux": 500.0},
+    ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    ...     "layout": {"generator": "grid", "parameters": {"n_x": 16, "n_y": 16, "pitch_um": 3.0}},
+    ...     "exposure_s": "auto",
+    ... }
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     result, paths = fs.config.run_shot(fs.config.build_shot("wall", settings), directory)
+    ...     print([path.name for path in paths])
+    ['wall_picture.png', 'wall_layout.png', 'wall_capture.npz']
     """
     capture = shot.camera.capture(shot.scene, exposure_s=shot.requested_s, seed=shot.seed)
     shot = shot.captured(capture)

@@ -24,12 +24,20 @@ COMMAND = re.compile(r"^# +(foveasim .*)$", re.MULTILINE)
 
 
 def starting_file(kind: str) -> str:
-    """
+    r"""
     Return the commented YAML of a kind of file, with valid values.
 
     Parameters
     ----------
     kind : {"shot", "layout", "rules", "sweep", "study", "dataset"}
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> print(*fs.config.starting_file("rules").splitlines()[4:7], sep="\n")
+    min_size_um: 4.0                     # µm, square root of the area of a photosite
+    min_width_um: 3.0                    # µm, between facing edges of a photosite
+    max_aspect_ratio: 2.0                # longer over shorter side of the rectangle around a photosite
     """
     check_choice("kind", kind, STARTING_FILES)
     text = (files("foveasim.config") / "starting_files" / f"{kind}.yaml").read_text(encoding="utf-8")
@@ -44,7 +52,15 @@ def starting_file(kind: str) -> str:
 
 
 def starting_command(kind: str, path: str | Path) -> str:
-    """Return the command that uses a file of a kind."""
+    """
+    Return the command that uses a file of a kind.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.config.starting_command("sweep", "sweep.yaml")
+    'foveasim sweep sweep.yaml --out results.zarr'
+    """
     found = COMMAND.search(starting_file(kind))
     assert found is not None
     return found[1].replace("FILE", shlex.quote(str(path)))
@@ -71,6 +87,16 @@ def write_starting_file(kind: str, path: str | Path | None = None, *, force: boo
     ------
     FileError
         When the file exists, or cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     path = fs.config.write_starting_file("shot", Path(directory, "shot.yaml"))
+    ...     print(fs.config.read_shot(path).camera.optics.focal_length_mm)
+    8.0
     """
     text = starting_file(kind)
     path = Path(f"{kind}.yaml" if path is None else path)

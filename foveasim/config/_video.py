@@ -71,6 +71,12 @@ def run_video(
         When frames cannot be read, the output cannot be written, or a zarr store is another recording.
     ParameterError, SimulationError
         When the shot has a power map instead of a scene, or the parts are incompatible.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> shot = fs.config.read_shot("shot.yaml")  # doctest: +SKIP
+    >>> fs.config.run_video(shot, "frames", "video.mp4", frame_s=0.04)  # doctest: +SKIP
     """
     if not isinstance(shot.scene, Scene):
         raise SimulationError(

@@ -53,6 +53,13 @@ def read_viewable(
         When a file is missing, corrupt, or of another kind.
     ParameterError
         When a report is given without its layout or with rules, another file with a layout, or a capture with options.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> view = fs.config.read_viewable("four_zones", rules="sky130_diff")
+    >>> view.name, view.report.ok
+    ('four_zones', True)
     """
     path = Path(path)
     if is_lyrdb(path):

@@ -137,7 +137,7 @@ def read_calibration(
     focal_um: float | None = None,
     image_size: tuple[int, int] | None = None,
 ) -> Lens:
-    """
+    r"""
     Read a lens from a calibration file.
 
     Parameters
@@ -156,6 +156,19 @@ def read_calibration(
     ------
     ConfigError
         If the file has none of these formats or lacks a parameter of the lens.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> text = "camera_matrix: [[1000, 0, 320], [0, 1000, 240], [0, 0, 1]]\ndistortion_coefficients: [-0.2, 0.05, 0, 0]\n"
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     path = Path(directory, "calibration.yaml")
+    ...     _ = path.write_text(text)
+    ...     lens = fs.distortion.read_calibration(path, pixel_um=3.0, image_size=(640, 480))
+    >>> lens.focal_um, lens.k1, lens.k2
+    ((3000.0, 3000.0), -0.2, 0.05)
     """
     from foveasim._io.yaml_files import parse_yaml, read_text
 

@@ -18,7 +18,16 @@ Outside: TypeAlias = Literal["error", "mask"]
 
 @runtime_checkable
 class Lens(Protocol):
-    """Protocol of lens models for cameras."""
+    """
+    Protocol of lens models for cameras.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> lens = fs.distortion.BrownConrady(focal_um=8000.0, k1=-0.1)
+    >>> isinstance(lens, fs.distortion.Lens), lens.distort([[1000.0, 0.0]]).round(2).tolist()
+    (True, [[998.44, 0.0]])
+    """
 
     @property
     def focal_um(self) -> float | tuple[float, float]:

@@ -28,6 +28,12 @@ def schema_of(kind: str) -> dict[str, Any]:
     Parameters
     ----------
     kind : {"shot", "layout", "rules", "sweep", "study", "dataset"}
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> list(fs.explore.schema_of("sweep")["properties"])
+    ['shot', 'set', 'vary', 'points', 'mode', 'repeats', 'seed', 'metrics']
     """
     check_choice("kind", kind, FILES)
     return schema(FILES[kind], f"foveasim {kind}")

@@ -52,6 +52,13 @@ class Summary:
     readout : Readout or None
     origin : str
         Name of the generator, or of the function that made the layout.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> summary = fs.layout.describe(fs.layout.grid(n_x=10, n_y=10, pitch_um=3.0, fill_factor=0.64))
+    >>> summary.n_sites, round(summary.area_um2, 1), summary.size_um.round(2).tolist()
+    (100, 576.0, [2.4, 2.4, 2.4, 2.4, 2.4])
     """
 
     n_sites: int

@@ -382,6 +382,18 @@ def write_events(
     neither the single array (n, 4) of v2e nor the HDF5 format of Metavision. Additional arrays are ``events/site``, and
     ``sites/x_um``, ``sites/y_um``, ``sites/area_um2``, ``sites/x`` and ``sites/y``, because several sites may have the same
     address; and ``layout``, with which :meth:`Events.load` restores the events.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> pixels = fs.modes.EventPixels(fs.Sensor(fs.layout.grid(n_x=2, n_y=1, pitch_um=10.0)), floor_e_per_s=0.0)
+    >>> events = pixels.events([[100.0, 100.0], [1000.0, 100.0]], frame_s=1.0, seed=0)
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     path = Path(directory, "events.h5")
+    ...     print(fs.modes.write_events([events], path), set(fs.modes.Events.load(path).site.tolist()))
+    11 {0}
     """
     target = Path(path)
     if target.suffix.lower() not in HDF5_EXTENSIONS:

@@ -114,6 +114,19 @@ class Exposure:
         Exposure timing.
     exposure_s : float, s
         Exposure time; 0 for an instantaneous exposure.
+
+    Examples
+    --------
+    With a rolling shutter, half of the exposure of the second line is in the second frame:
+
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> layout = fs.layout.grid(n_x=1, n_y=2, pitch_um=2.0).with_columns(readout_order=np.array([0, 1]))
+    >>> exposure = fs.modes.Exposure(fs.modes.Shutter(layout, frame_s=1.0, line_s=0.5), exposure_s=1.0)
+    >>> for rate_e_per_s in (100.0, 200.0):
+    ...     exposure.add(np.full(2, rate_e_per_s))
+    >>> exposure.is_complete, exposure.mean_e_per_s(np.full(2, 200.0)).tolist()
+    (True, [100.0, 150.0])
     """
 
     def __init__(self, shutter: Shutter, exposure_s: Annotated[float, EXPOSURE]) -> None:

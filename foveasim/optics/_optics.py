@@ -725,8 +725,8 @@ class Optics(PointImages):
             height, width = (n * grid.pitch_x_um for n in grid.shape)
             warn(
                 f"the image of the scene is only {width:.4g} x {height:.4g} µm, and the Airy disc has a diameter of "
-                f"{2.44 * widest_um:.3g} µm: Eq. 5 of the paper requires an aperture radius much larger than "
-                f"H λ / (p0 min(M, N)), got {ratio:.3g} times this value; use a larger picture or a smaller "
+                f"{2.44 * widest_um:.3g} µm: an aperture radius much larger than "
+                f"H λ / (p0 min(M, N)) is required, got {ratio:.3g} times this value; use a larger picture or a smaller "
                 "f-number, and check the units of pitch_um, distance_m and focal_length_mm",
                 SamplingWarning,
             )

@@ -47,6 +47,13 @@ class PointSpread:
     grid : Grid
         Cells around the image point.
     wavelength_nm : float, nm
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> point = fs.Optics(focal_length_mm=8.0, f_number=2.8).psf(550.0)
+    >>> round(float(point.psf_per_um2.max()), 3)  # π / (2 λ N)²
+    0.331
     """
 
     psf_per_um2: Floats

@@ -285,6 +285,14 @@ class LateralColour:
     ------
     ParameterError
         When the lengths of the sequences differ, or a size differs from 1 by more than 0.1.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> colour = fs.optics.LateralColour(wavelength_nm=[450.0, 550.0, 650.0], magnification=[0.998, 1.0, 1.001])
+    >>> lens = fs.Optics(focal_length_mm=8.0, f_number=2.8, lateral_colour=colour)
+    >>> lens.lateral_colour.at([500.0, 700.0]).round(4).tolist()
+    [0.999, 1.001]
     """
 
     wavelength_nm: Sequence[float]

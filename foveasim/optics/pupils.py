@@ -214,6 +214,16 @@ class PupilImage:
         When the file cannot be read.
     ParameterError
         When an array is not square or not finite, or a transmittance is outside 0 to 1.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> stop = np.zeros((64, 64))
+    >>> stop[:, 16:48] = 1.0  # a vertical slit of half the diameter
+    >>> pupil = fs.optics.PupilImage(stop)
+    >>> pupil(np.array([0.0, 0.75]), np.array([0.0, 0.0]), 550.0).tolist()
+    [1.0, 0.0]
     """
 
     picture: str | Path | ArrayLike = field(repr=False)

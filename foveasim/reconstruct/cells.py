@@ -45,6 +45,14 @@ def cells(
     Picture
         ``Wᵀ values / Wᵀ 1`` with the exact overlap areas W of sites and pixels: boundaries are anti-aliased, and a uniform
         field stays uniform.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> pair = fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0)
+    >>> picture = fs.reconstruct.cells(pair, [10.0, 30.0], fs.Grid.centred((1, 3), 1.0))
+    >>> picture.data[0].tolist()  # equal parts of the central pixel lie on both sites
+    [[10.0, 20.0, 30.0]]
     """
     channels = np.atleast_2d(finite_array("values", values))
     return raster_of(layout, grid, gaps, n_threads).means(channels)
@@ -69,6 +77,14 @@ def fill_channels(
         The site's value in its own channel; in other channels the mean of the four nearest sites of that channel, weighted by
         inverse distance. Further sites at the distance of the fourth are included, so that the result does not depend on the
         order of the sites. NaN for a channel without sites.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> layout = fs.layout.mosaic(fs.layout.grid(n_x=2, n_y=2, pitch_um=3.0), ["RG", "GB"])
+    >>> fs.reconstruct.fill_channels(layout, np.array([1.0, 2.0, 3.0, 4.0]), layout.channel, 3).tolist()
+    [[1.0, 1.0, 1.0, 1.0], [2.5, 2.0, 3.0, 2.5], [4.0, 4.0, 4.0, 4.0]]
     """
     values = as_numbers("values", values)
     n_sites = layout.site_offsets.size - 1

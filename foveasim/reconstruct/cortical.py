@@ -73,6 +73,14 @@ class CorticalImage:
     white : (n_channel,) float64, optional
     colour_matrix : (3, n_channel) float64, optional
         Values of white, and colour correction, as of :class:`foveasim.Picture`.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.log_polar(n_sectors=32, n_rings=8, r_min_um=10.0, r_max_um=80.0)
+    >>> image = fs.reconstruct.cortical(layout, layout.size_um)
+    >>> image.radius_um.round(1).tolist()
+    [10.0, 13.0, 16.8, 21.8, 28.3, 36.7, 47.6, 61.7, 80.0]
     """
 
     data: Images
@@ -153,6 +161,14 @@ def cortical(layout: Layout, values: ArrayLike) -> CorticalImage:
     ------
     ParameterError
         When the layout does not have two or more concentric rings of equal sectors, or there is not one value per site.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.log_polar(n_sectors=32, n_rings=8, r_min_um=10.0, r_max_um=60.0)
+    >>> image = fs.reconstruct.cortical(layout, layout.columns["ring"])
+    >>> image.data.shape, image.data[0, :3, 0].tolist()
+    ((1, 8, 32), [0.0, 1.0, 2.0])
     """
     channels = np.atleast_2d(as_numbers("values", values, missing_is_nan=True))
     if channels.ndim != 2 or channels.shape[1] != layout.n_sites:
@@ -286,6 +302,15 @@ def from_cortical(image: CorticalImage, grid: Grid, *, method: Literal["linear",
     -------
     Picture
         NaN outside the rings, and where the image is unknown.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.log_polar(n_sectors=32, n_rings=8, r_min_um=10.0, r_max_um=60.0)
+    >>> image = fs.reconstruct.cortical(layout, layout.columns["ring"])
+    >>> picture = fs.reconstruct.from_cortical(image, fs.Grid.centred((64, 64), 2.0), method="nearest")
+    >>> picture.data[0, 32, 36:64:4].tolist()  # along the x axis, outwards
+    [nan, 2.0, 4.0, 5.0, 6.0, 7.0, 7.0]
     """
     x_um, y_um = np.meshgrid(grid.x_um - image.centre_um[0], grid.y_um - image.centre_um[1])
     r_um, angle_rad = np.hypot(x_um, y_um), np.arctan2(y_um, x_um)

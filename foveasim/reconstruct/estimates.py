@@ -34,6 +34,15 @@ class SiteEstimates:
         Noise variance of ``light_e``. For shot noise, the charge plus one: the posterior mean of the expected charge.
     is_saturated : (n_site,) bool
         Whether a site is saturated, so that ``light_e`` is a lower bound.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> sensor = fs.Sensor(fs.layout.grid(n_x=2, n_y=1, pitch_um=3.0), full_well_e=5000.0)
+    >>> estimates = fs.reconstruct.estimate_from_charge([399, 2499], sensor, exposure_s=0.01)
+    >>> (estimates.light_e / np.sqrt(estimates.variance_e2)).round(1).tolist()  # signal-to-noise ratio
+    [20.0, 50.0]
     """
 
     light_e: Floats
@@ -67,6 +76,14 @@ def estimate_from_charge(charge_e: ArrayLike, sensor: Sensor, exposure_s: Annota
     sensor : Sensor
         Nominal sensor: its fixed patterns are not used.
     exposure_s : float, s
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> sensor = fs.Sensor(fs.layout.grid(n_x=2, n_y=1, pitch_um=3.0), dark_e_per_s=100.0, full_well_e=5000.0)
+    >>> estimates = fs.reconstruct.estimate_from_charge([410, 5000], sensor, exposure_s=0.1)
+    >>> estimates.light_e.tolist(), estimates.is_saturated.tolist()
+    ([400.0, 4990.0], [False, True])
     """
     charge = check_per_site("charge_e", finite_array("charge_e", charge_e), sensor.layout.n_sites)
     return _estimate(sensor, charge, 0.0, exposure_s, np.asarray(charge >= sensor.well_e))
@@ -88,6 +105,14 @@ def estimate_from_code(code: ArrayLike, sensor: Sensor, exposure_s: Annotated[fl
     -----
     Crosstalk, inter-pixel capacitance, differential nonlinearity and fixed patterns are not corrected. For fixed patterns
     see :meth:`foveasim.sensor.Calibration.correct`.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> sensor = fs.Sensor(fs.layout.grid(n_x=2, n_y=1, pitch_um=3.0), capacitance_f=1.602176634e-15, v_sat_v=1.0, bits=10)
+    >>> estimates = fs.reconstruct.estimate_from_code([512, 1023], sensor, exposure_s=0.01)
+    >>> estimates.light_e.round().tolist(), estimates.is_saturated.tolist()
+    ([5005.0, 9995.0], [False, True])
     """
     found = sensor.invert(check_per_site("code", finite_array("code", code), sensor.layout.n_sites))
     return _estimate(sensor, found.charge_e, found.noise_e2, exposure_s, found.is_saturated)

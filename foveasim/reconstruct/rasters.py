@@ -42,6 +42,14 @@ def reference(power_map: PowerMap, grid: Grid, *, weights: Floats | None = None)
     -------
     Picture
         NaN outside the map; the coverage is the fraction of a pixel on the map.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> power_map = fs.PowerMap.from_array(np.array([[1.0, 3.0], [5.0, 7.0]]), pitch_um=2.0, wavelength_nm=550.0)
+    >>> fs.reconstruct.reference(power_map, fs.Grid.centred((1, 1), 4.0)).data.tolist()
+    [[[4.0]]]
     """
     channel_weights = (
         np.eye(power_map.wavelength_nm.size) if weights is None else finite_array("weights", weights, ndim=2)
@@ -105,6 +113,14 @@ def blur_kernel(
     -----
     On the optical axis: field-dependent aberrations are those of the field centre. The PSF is sampled at λN/4 or finer, and
     averaged exactly over both the emitting and the receiving pixel.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> lens = fs.Optics(focal_length_mm=8.0, f_number=2.8)
+    >>> kernel = fs.reconstruct.blur_kernel(lens, fs.Grid.centred((32, 32), 1.0), wavelength_nm=550.0)
+    >>> kernel.shape, round(float(kernel[kernel.shape[0] // 2, kernel.shape[1] // 2]), 3)
+    ((31, 31), 0.245)
     """
     shorter_um = min(grid.pitch_x_um, grid.pitch_y_um)
     if radius is None:

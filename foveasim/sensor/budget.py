@@ -32,6 +32,15 @@ class NoiseBudget(dict[str, Floats]):
     ----------
     temporal : tuple of str
         Names of the temporal effects; the others are fixed patterns.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> sensor = fs.Sensor(fs.layout.grid(n_x=8, n_y=8, pitch_um=3.0), read_noise_e=5.0, prnu_fraction=0.01)
+    >>> budget = fs.sensor.noise_budget(sensor, np.full(64, 1e5), 0.01)
+    >>> [name for name in budget if name not in budget.temporal and budget[name].any()]  # fixed patterns
+    ['prnu']
     """
 
     def __init__(self, noise_e: Mapping[str, Floats], temporal: Sequence[str]) -> None:

@@ -54,6 +54,14 @@ class Rates:
         Predicted standard deviation: the inverse square root of the sum of inverse variances.
     n_used : (n_site,) int64
         Number of reads used.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> sensor = fs.Sensor(fs.layout.grid(n_x=1, n_y=1, pitch_um=2.0), bits=10, v_sat_v=1.0, capacitance_f=1.6406288e-16)
+    >>> rates = fs.sensor.merge_exposures([[500], [1023]], [0.1, 10.0], sensor)
+    >>> rates.rate_e_per_s.round().tolist(), rates.n_used.tolist()
+    ([5005.0], [1])
     """
 
     rate_e_per_s: Floats
@@ -334,6 +342,16 @@ def fit_ramp(
     weights from the site's own rate the bias is a fraction of an electron per ramp.
 
     Reads are used up to the first saturated one (highest code, or within five standard deviations of the full well).
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0)
+    >>> sensor = fs.Sensor(layout, capacitance_f=1.6e-15, v_sat_v=1.0, bits=14, shot_noise="off")
+    >>> times_s = [1.0, 2.0, 3.0, 4.0]
+    >>> ramp = fs.sensor.non_destructive_reads(sensor, [100.0, 1000.0], times_s, seed=0)
+    >>> fs.sensor.fit_ramp(ramp.code, times_s, sensor).rate_e_per_s.round().tolist()
+    [100.0, 1000.0]
     """
     times = _check_increasing("times_s", times_s)
     if times.size < 2:

@@ -32,6 +32,13 @@ class Preset:
         Parameters of :class:`foveasim.Sensor` that are equal for all sites.
     per_um2 : mapping of str to float
         Parameters per µm² of the area of a site.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> preset = fs.sensor.PRESETS["machine_vision"]
+    >>> preset.title, preset.parameters["bits"], sorted(preset.per_um2)
+    ('machine vision, global shutter, pixels of 3.45 µm', 12, ['capacitance_f'])
     """
 
     title: str

@@ -84,6 +84,11 @@ def run_studio(
     -----
     The address contains a random token. The environment variable ``FOVEASIM_STUDIO_TOKEN`` specifies another one, so that the
     address is the same after a restart.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.studio.run_studio("shot.yaml", changes=["sensor.bits=10"], out="saved")  # doctest: +SKIP
     """
     for module in MODULES:
         import_optional("studio", module)

@@ -103,6 +103,11 @@ def check_extension(kind: str, name: str) -> None:
         When the object does not have a property of its kind.
     ParameterError
         When the kind or the name is unknown.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.testing.check_extension("layout family", "hexagonal")  # AssertionError for a violated property
     """
     check = _check_of(kind)
     item, example = check.registry.find("name", name), check.registry.example(name)
@@ -125,6 +130,11 @@ def check_all(kind: str | None = None) -> None:
     ------
     AssertionError
         When objects do not have a property of their kind; the message lists all of them.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.testing.check_all("effect")  # doctest: +SKIP
     """
     failed = []
     for found, name in extensions(kind):

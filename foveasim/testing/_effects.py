@@ -73,6 +73,11 @@ def check_sensor_effect(name: str, keywords: Mapping[str, Any]) -> None:
         differs in a part of the sensor.
     ParameterError
         When the keywords do not enable the effect.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.testing.check_sensor_effect("read", {"read_noise_e": 3.0})  # AssertionError for a difference
     """
     sensor = _sensor(keywords)
     names = [found.name for found in sensor.chain]

@@ -295,6 +295,17 @@ def pan_camera(
     ParameterError
         Immediately when an argument is of another class, the part is larger than the scene, or a scene with ``fit`` is given
         without a camera; during iteration when the part extends beyond the scene.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> optics = fs.Optics(focal_length_mm=8.0, f_number=2.8)
+    >>> scene = fs.Scene.flat(shape=(200, 200), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> path = fs.video.GazePath(np.array([0.0, 0.1]), np.array([[0.0, 0.0], [10.0, 0.0]]))
+    >>> frames = list(fs.video.pan_camera(scene, path, optics, shape=(64, 64)))
+    >>> frames[1][0].basis.shape, round(frames[1][1][0], 2)  # 10 µm are 2 pixels of 4.03 µm, and 1.94 µm
+    ((1, 64, 64), 1.94)
     """
     n_y, n_x = check_shape("shape", shape)
     if n_y > scene.basis.shape[1] or n_x > scene.basis.shape[2]:

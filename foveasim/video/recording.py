@@ -119,6 +119,20 @@ def read_recording(path: str | Path) -> Recording:
     ------
     FileError
         When the store is missing, corrupt, or not a video of captures.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=8, n_y=8, pitch_um=3.0), "machine_vision")
+    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=300.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     path = Path(directory, "wall.zarr")
+    ...     _ = fs.video.write_video(camera.video([scene] * 3, exposure_s=0.001, seed=0), path)
+    ...     print(fs.video.read_recording(path).code.shape, fs.video.read_recording(path).frame.tolist())
+    (3, 64) [0, 1, 2]
     """
     source = Path(path)
     import_optional(source, "zarr")
@@ -161,6 +175,15 @@ def count_recorded_frames(path: str | Path) -> int:
     ------
     FileError
         When the path contains other data, or the recording is corrupt.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     print(fs.video.count_recorded_frames(Path(directory, "long.zarr")))  # not begun
+    0
     """
     target = Path(path)
     if target.suffix.lower() != ZARR:

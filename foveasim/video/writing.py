@@ -94,6 +94,17 @@ def write_video(
 
     Examples
     --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=8, n_y=8, pitch_um=3.0), "machine_vision")
+    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=300.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> captures = camera.video([scene] * 3, exposure_s=0.001, seed=0)
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     print(fs.video.write_video(captures, Path(directory, "wall.gif"), frame_s=0.1))
+    3
+
     The same lines start a recording, resume it after an interruption, and do nothing when it is finished::
 
         n = count_recorded_frames("long.zarr")

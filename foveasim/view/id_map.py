@@ -116,6 +116,13 @@ class SitePixels:
     bounds_um : (x_min, y_min, x_max, y_max), µm
     n_samples : int
         Samples along each side of a pixel.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> pixels = fs.view.SitePixels.from_layout(fs.layout.grid(n_x=2, n_y=2, pitch_um=3.0), (20, 20))
+    >>> pixels.site_at([-1.0, 1.0], [-1.0, 1.0]).tolist()
+    [0, 3]
     """
 
     ids: NDArray[np.int32]

@@ -78,6 +78,13 @@ class Mesh:
         Colours of the photosites with their scale or legend.
     is_smooth : bool
         Whether the triangles that face up approximate a smooth surface, which is shaded without edges.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> columns = fs.view.prisms(fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), [1.0, 3.0], max_height_um=6.0)
+    >>> columns.points_um.max(axis=0).tolist(), sorted(set(columns.photosite.tolist()))
+    ([2.0, 1.0, 6.0], [0, 1])
     """
 
     name: str
@@ -301,6 +308,13 @@ def polydata(data: Layout | Capture) -> PolyData:
     Notes
     -----
     VTK measures cells with reflex vertices incorrectly; use ``area_um2``, or ``triangulate()`` the mesh first.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> mesh = fs.view.polydata(fs.layout.hexagonal(n_columns=4, n_rows=4, pitch_um=3.0))
+    >>> mesh.n_cells, sorted(mesh.cell_data)[:3]
+    (16, ['area_um2', 'channel', 'column'])
     """
     layout = data.layout if isinstance(data, Capture) else data
     columns: dict[str, NDArray[Any]] = {}

@@ -101,6 +101,14 @@ class Viewpoint:
         Point in the centre of the picture; the centre of the scene by default.
     view_deg : float
         Vertical angle of view: small angles flatten the perspective, large angles exaggerate it.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> from_above = fs.view.Viewpoint(azimuth_deg=-90.0, elevation_deg=90.0)
+    >>> layout = fs.layout.grid(n_x=4, n_y=4, pitch_um=3.0)
+    >>> fs.view.render(layout, viewpoint=from_above, size_px=(120, 120), renderer="software", legend=False).shape
+    (120, 120, 3)
     """
 
     azimuth_deg: Annotated[float, FINITE] = -65.0
@@ -190,6 +198,14 @@ def render(
         When the scene is empty.
     SimulationError
         When ``renderer="pyvista"`` and PyVista cannot render on this machine.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.hexagonal(n_columns=4, n_rows=4, pitch_um=3.0)
+    >>> picture = fs.view.render(layout, size_px=(160, 100), renderer="software", legend=False)
+    >>> picture.shape, picture[0, 0].tolist()  # the background
+    ((100, 160, 3), [238, 240, 244])
     """
     meshes = _meshes(scene)
     legend = isinstance(scene, Layout | Capture) if legend is None else legend
@@ -244,6 +260,15 @@ def sites_in_view(
     -------
     site : (n_y, n_x) int32
         Top row first; -1 where no photosite is visible.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> layout = fs.layout.hexagonal(n_columns=4, n_rows=4, pitch_um=3.0)
+    >>> site = fs.view.sites_in_view(layout, viewpoint=fs.view.Viewpoint(elevation_deg=90.0), size_px=(160, 100))
+    >>> np.unique(site).size - 1  # all sites from above, and the background
+    16
     """
     meshes = _meshes(scene)
     n_x, n_y = _size(size_px, 1)
@@ -282,6 +307,13 @@ def plotter(
         When the scene is empty.
     SimulationError
         When this machine has no OpenGL or no PyVista.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> plotter = fs.view.plotter(fs.layout.grid(n_x=4, n_y=4, pitch_um=3.0), off_screen=True)  # doctest: +SKIP
+    >>> plotter.add_text("16 photosites")  # doctest: +SKIP
+    >>> plotter.screenshot("columns.png")  # doctest: +SKIP
     """
     meshes = _meshes(scene)
     size = _size(size_px, 1)
@@ -311,6 +343,13 @@ def show(scene: Renderable, *, viewpoint: Viewpoint | None = None, size_px: tupl
     ------
     SimulationError
         Outside notebooks, when this machine has no screen, no OpenGL or no PyVista; the message names a remedy.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> sensor_stack = fs.view.SensorStack(well_depth_um=3.0, trench_width_um=0.3)
+    >>> model = fs.view.stack(fs.layout.grid(n_x=6, n_y=6, pitch_um=3.0), sensor_stack)
+    >>> fs.view.show(model)  # doctest: +SKIP
     """
     meshes = _meshes(scene)
     missing = missing_software()
@@ -354,6 +393,12 @@ def show_columns(
         As for :func:`foveasim.view.prisms`.
     SimulationError
         As for :func:`show`.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.log_polar(n_sectors=64, n_rings=16, r_min_um=20.0, r_max_um=100.0)
+    >>> fs.view.show_columns(layout, "size_um", max_height_um=20.0)  # doctest: +SKIP
     """
     show(prisms(data, height, by=by, max_height_um=max_height_um), viewpoint=viewpoint, size_px=size_px)
 

@@ -132,6 +132,14 @@ class SiteColours:
         Whether boundaries between sites are drawn; not for measured signals and given colours.
     is_on_scale : bool
         Whether the colours are those of the scale; on a mosaic they are filter colours scaled by the values.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.log_polar(n_sectors=32, n_rings=8, r_min_um=10.0, r_max_um=60.0)
+    >>> colours = fs.view.colours_of(layout, "size_um")
+    >>> colours.title, colours.rgb.shape
+    ('size / µm', (256, 3))
     """
 
     rgb: RgbArray
@@ -162,7 +170,16 @@ def encode_light(fraction: Floats) -> RgbArray:
 
 
 def site_colours(data: Layout | Capture, by: str | ArrayLike | None = None) -> RgbArray:
-    """Return the RGB colours of photosites, (n_site, 3) uint8; see :func:`colours_of`."""
+    """
+    Return the RGB colours of photosites, (n_site, 3) uint8; see :func:`colours_of`.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.mosaic(fs.layout.grid(n_x=2, n_y=2, pitch_um=3.0), ["RG", "GB"])
+    >>> fs.view.site_colours(layout, "channel").tolist()
+    [[255, 64, 51], [77, 230, 77], [77, 230, 77], [77, 115, 255]]
+    """
     return colours_of(data, by).rgb
 
 

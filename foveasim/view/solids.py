@@ -133,6 +133,13 @@ class SolidsReport:
     parts : tuple of PartReport
     overlap_um3 : mapping of (name, name) to float, µm³
         Overlap volume of two parts.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> report = fs.view.solids(fs.layout.grid(n_x=2, n_y=2, pitch_um=4.0)).check()
+    >>> {part.name: part.status for part in report.parts}
+    {'wells': 'NoError', 'trenches': 'NoError', 'filters': 'NoError', 'lenses': 'NoError'}
     """
 
     parts: tuple[PartReport, ...]
@@ -162,6 +169,13 @@ class Solids:
     parts : mapping of str to Mesh
         ``"wells"``, ``"trenches"``, ``"filters"``, ``"lenses"``: those in the stack. The surface of every photosite is closed
         separately; those of neighbours touch.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> model = fs.view.solids(fs.layout.grid(n_x=2, n_y=2, pitch_um=4.0), fs.view.SensorStack(trench_width_um=0.4))
+    >>> list(model.parts), round(model.fill_factor, 2)
+    (['wells', 'trenches', 'filters', 'lenses'], 0.81)
     """
 
     layout: Layout
@@ -397,6 +411,14 @@ def stack(
     ------
     GeometryError, ParameterError
         As for :func:`solids`.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.mosaic(fs.layout.grid(n_x=6, n_y=6, pitch_um=3.0), ["RG", "GB"])
+    >>> model = fs.view.stack(layout, fs.view.SensorStack(well_depth_um=3.0, trench_width_um=0.3))
+    >>> {mesh.name: len(set(mesh.photosite.tolist())) for mesh in model.meshes}  # photosites that remain in each part
+    {'wells': 30, 'trenches': 30, 'filters': 27, 'lenses': 20}
     """
     model = solids(data, sensor_stack, by=by)
     for fractions, names in TERRACES:
@@ -429,6 +451,17 @@ def write_meshes(meshes: Sequence[Mesh], path: str | Path) -> None:
         When the extension is another, the file cannot be written, or a library for ``.3mf`` is not installed.
     GeometryError
         When there are no triangles.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> columns = fs.view.prisms(fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), [1.0, 3.0])
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     fs.view.write_meshes([columns], Path(directory, "columns.stl"))
+    ...     print(Path(directory, "columns.stl").stat().st_size)  # 84 bytes, and 50 per triangle
+    1084
     """
     import trimesh
 

@@ -482,6 +482,14 @@ def directory(tmp_path):
     return tmp_path
 
 
+def test_geometric_range_has_round_numbers(tmp_path):
+    (tmp_path / "shot.yaml").write_text(json.dumps(SHOT))
+    vary = {"sensor.bits": {"from": 2, "to": 8, "n": 3, "spacing": "geometric"}}
+    (tmp_path / "sweep.yaml").write_text(json.dumps({"shot": "shot.yaml", "vary": vary}))
+
+    assert explore.read_sweep(tmp_path / "sweep.yaml").values["sensor.bits"] == [2, 4, 8]
+
+
 COMMAND = [sys.executable, "-m", "foveasim.cli", "sweep", "sweep.yaml", "--workers", "1", "--metric", "own:mean_dn"]
 
 

@@ -390,7 +390,9 @@ def test_match_gives_the_same_number_of_sites(visit):
 
     assert after["n_sites"] == ["912", "900"]
     assert page.evaluate("studio.state.summary.width_um") == pytest.approx(960.0, rel=1e-6)
-    assert all(value.endswith(" dB") and float(value[:-3]) > 5 for value in after["fovea_psnr_db"] + after["field_psnr_db"])
+    assert all(
+        value.endswith(" dB") and float(value[:-3]) > 5 for value in after["fovea_psnr_db"] + after["field_psnr_db"]
+    )
     page.click("#freeze")
     assert page.is_hidden("#comparison")
 

@@ -160,6 +160,17 @@ def read_dataset(path: str | Path, *, n_threads: int = 1) -> DatasetFile:
         When a setting is invalid; with the file, the key, the expected and the actual value.
     FileError
         When pictures or labels cannot be read, or do not match.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     path = fs.config.write_starting_file("dataset", Path(directory, "dataset.yaml"))
+    ...     found = fs.explore.read_dataset(path)
+    >>> len(found.dataset), found.dataset.class_names
+    (12, ['cat', 'cup', 'person'])
     """
     path = Path(path)
     section: DatasetSection = validate(path, DatasetSection, read_yaml(path))

@@ -51,6 +51,18 @@ def classification(
     ------
     FileError, ParameterError, ConfigError
         As for :class:`Dataset`.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> scene = {"kind": "picture", "picture": "", "fit": "cover", "distance_m": 1.0, "illuminance_lux": 500.0}
+    >>> layout = {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 8.0}}
+    >>> shot = {"scene": scene, "optics": {"focal_length_mm": 8.0, "f_number": 2.8}, "layout": layout, "exposure_s": 0.01}
+    >>> pictures = np.full((2, 32, 32), 128, np.uint8)
+    >>> dataset = fs.explore.classification(pictures, shot, cameras=3, labels=["cat", "dog"])
+    >>> len(dataset), dataset.class_names, dataset[5]["code"].shape
+    (6, ['cat', 'dog'], (64,))
     """
     f_number, exposure_s = _read_numbers(shot, options, "optics.f_number", "exposure_s")
     defaults: dict[str, Any] = {
@@ -101,6 +113,17 @@ def denoising(
     ------
     FileError, ParameterError, ConfigError
         As for :class:`Dataset`.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> scene = {"kind": "picture", "picture": "", "fit": "cover", "distance_m": 1.0, "illuminance_lux": 500.0}
+    >>> layout = {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 8.0}}
+    >>> shot = {"scene": scene, "optics": {"focal_length_mm": 8.0, "f_number": 2.8}, "layout": layout, "exposure_s": 0.01}
+    >>> dataset = fs.explore.denoising(np.full((2, 32, 32), 128, np.uint8), shot, draws=4)
+    >>> len(dataset), sorted(key for key in dataset[0] if key in ("code", "expected_dn"))
+    (8, ['code', 'expected_dn'])
     """
     (exposure_s,) = _read_numbers(shot, options, "exposure_s")
     defaults: dict[str, Any] = {

@@ -111,6 +111,21 @@ def write_dataset(
     -----
     FoveasimWarning
         Once, when samples have warnings; the item ``warning`` of a sample contains its own.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> scene = {"kind": "picture", "picture": "", "fit": "cover", "distance_m": 1.0, "illuminance_lux": 500.0}
+    >>> layout = {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 8.0}}
+    >>> shot = {"scene": scene, "optics": {"focal_length_mm": 8.0, "f_number": 2.8}, "layout": layout, "exposure_s": 0.01}
+    >>> dataset = fs.explore.denoising(np.full((2, 32, 32), 128, np.uint8), shot)
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     stored = fs.explore.write_dataset(dataset, Path(directory, "noisy"))
+    ...     print(len(stored), sorted(path.name for path in stored.path.glob("*.tar")))
+    8 ['shard-000000.tar']
     """
     target = Path(path).absolute()
     kind = _shards_class(target)
@@ -307,6 +322,21 @@ def open_dataset(path: str | Path) -> StoredSamples:
     ------
     FileError
         When the dataset does not exist, is corrupt, or is incomplete.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> scene = {"kind": "picture", "picture": "", "fit": "cover", "distance_m": 1.0, "illuminance_lux": 500.0}
+    >>> layout = {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 8.0}}
+    >>> shot = {"scene": scene, "optics": {"focal_length_mm": 8.0, "f_number": 2.8}, "layout": layout, "exposure_s": 0.01}
+    >>> dataset = fs.explore.denoising(np.full((2, 32, 32), 128, np.uint8), shot)
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     _ = fs.explore.write_dataset(dataset, Path(directory, "noisy.zarr"))
+    ...     print(fs.explore.open_dataset(Path(directory, "noisy.zarr"))[5]["code"].shape)
+    (64,)
     """
     source = Path(path).absolute()
     try:

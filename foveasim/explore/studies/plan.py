@@ -168,6 +168,17 @@ def read_study(path: str | Path, *, metrics: Sequence[str] = (), n_trials: int |
         When a setting is invalid; with the file, the key, the expected and the actual value.
     ParameterError
         When a metric does not exist.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     path = fs.config.write_starting_file("study", Path(directory, "study.yaml"))
+    ...     plan = fs.explore.read_study(path)
+    >>> dict(plan.objectives), plan.n_trials
+    ({'psnr_db': 'maximize', 'n_sites': 'minimize'}, 40)
     """
     path = Path(path)
     section: StudySection = validate(path, StudySection, read_yaml(path))
@@ -230,6 +241,15 @@ def plan_study(
     ------
     ParameterError, ConfigError
         When a path, a range or a name is invalid.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> shot = fs.config.demo_settings()[0]
+    >>> search = {"optics.f_number": (1.4, 8.0), "sensor.bits": [8, 10, 12]}
+    >>> plan = fs.explore.plan_study(shot, search, {"snr_mean": "maximize"}, n_trials=50)
+    >>> plan.n_trials, dict(plan.objectives), list(plan.base.metrics)
+    (50, {'snr_mean': 'maximize'}, ['snr'])
     """
     n_trials = check_count("n_trials", n_trials, at_most=MAX_POINTS)
     batch = check_count("batch", batch, at_most=MAX_POINTS)

@@ -109,6 +109,17 @@ def study(
     The sampler (tree-structured Parzen estimator) is seeded for every trial with the seed and the number of the trial: an
     interrupted study resumes with identical results, and results do not depend on the number of workers. Only one program at a
     time may write a study.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> scene = {"kind": "flat", "shape": [60, 60], "pitch_um": 300.0, "distance_m": 1.0, "illuminance_lux": 500.0}
+    >>> layout = {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 3.0}}
+    >>> shot = {"scene": scene, "optics": {"focal_length_mm": 8.0, "f_number": 2.8}, "layout": layout, "exposure_s": 0.002}
+    >>> shot["sensor"] = {"preset": "machine_vision"}
+    >>> found = fs.explore.study(shot, {"optics.f_number": [2.0, 8.0]}, {"snr_mean": "maximize"}, n_trials=4)
+    >>> found.best_params
+    {'optics.f_number': 2.0}
     """
     plan = plan_study(
         shot,
@@ -155,6 +166,17 @@ def run_study(
         When the storage cannot be used, or contains another study of this name.
     SimulationError
         When the scheduler or all workers are lost. Finished trials are stored.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> scene = {"kind": "flat", "shape": [60, 60], "pitch_um": 300.0, "distance_m": 1.0, "illuminance_lux": 500.0}
+    >>> layout = {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 3.0}}
+    >>> shot = {"scene": scene, "optics": {"focal_length_mm": 8.0, "f_number": 2.8}, "layout": layout, "exposure_s": 0.002}
+    >>> shot["sensor"] = {"preset": "machine_vision"}
+    >>> plan = fs.explore.plan_study(shot, {"optics.f_number": [2.0, 8.0]}, {"snr_mean": "maximize"}, n_trials=4)
+    >>> fs.explore.run_study(plan).best_params
+    {'optics.f_number': 2.0}
     """
     n_workers = min(workers or 0, plan.batch)
     optuna = import_optional("study", "optuna")
@@ -202,6 +224,18 @@ def best_table(plan: StudyPlan, optuna_study: optuna.Study) -> Table:
     Return a table of the best trials, sorted by the first objective.
 
     Columns are the objectives, the results with constraints, and the settings.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> scene = {"kind": "flat", "shape": [60, 60], "pitch_um": 300.0, "distance_m": 1.0, "illuminance_lux": 500.0}
+    >>> layout = {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 3.0}}
+    >>> shot = {"scene": scene, "optics": {"focal_length_mm": 8.0, "f_number": 2.8}, "layout": layout, "exposure_s": 0.002}
+    >>> shot["sensor"] = {"preset": "machine_vision"}
+    >>> plan = fs.explore.plan_study(shot, {"optics.f_number": [2.0, 8.0]}, {"snr_mean": "maximize"}, n_trials=1)
+    >>> table = fs.explore.best_table(plan, fs.explore.run_study(plan))
+    >>> table.row_count
+    1
     """
     from rich.table import Table
     from rich.text import Text

@@ -282,6 +282,17 @@ def read_sweep(path: str | Path, *, metrics: Sequence[str] = ()) -> Plan:
         When a setting is invalid; with the file, the key, the expected and the actual value.
     ParameterError
         When a metric does not exist.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     path = fs.config.write_starting_file("sweep", Path(directory, "sweep.yaml"))
+    ...     plan = fs.explore.read_sweep(path)
+    >>> plan.n_points, list(plan.values)
+    (9, ['layout.parameters.n_sectors', 'optics.f_number'])
     """
     path = Path(path)
     section: SweepSection = validate(path, SweepSection, read_yaml(path))
@@ -356,6 +367,14 @@ def plan_sweep(
     ------
     ParameterError, ConfigError
         When nothing varies, a path or a value is invalid, or there are too many points.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> shot = fs.config.demo_settings()[0]
+    >>> plan = fs.explore.plan_sweep(shot, {"sensor.bits": [8, 10], "optics.f_number": [2.0, 2.8, 4.0]}, repeats=5)
+    >>> plan.n_points, list(plan.metrics)
+    (30, ['mean_code_dn', 'saturated_fraction', 'snr', 'n_sites'])
     """
     own = Source.of(source)
     shot_source, data = locate_shot(own, shot)
@@ -534,6 +553,7 @@ def _expand_range(path: Path, name: str, value_range: _Range) -> list[Any]:
         numbers = np.linspace(value_range.low, value_range.high, value_range.n)
     if not np.isfinite(numbers).all():
         raise ConfigError(path, f"vary.{name}: must have finite bounds")
+    numbers = np.array([float(f"{number:.14g}") for number in numbers])  # 4 instead of 3.999999999999999
     is_integer = bool((numbers == np.rint(numbers)).all())
     return [int(number) if is_integer else float(number) for number in numbers]
 

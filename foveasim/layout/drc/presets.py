@@ -16,7 +16,16 @@ __all__ = ["PRESETS", "Preset"]
 
 
 class Preset(NamedTuple):
-    """Limits by parameter name of :class:`foveasim.layout.DesignRules`, and their source."""
+    """
+    Limits by parameter name of :class:`foveasim.layout.DesignRules`, and their source.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> preset = fs.layout.PRESETS["sky130_diff"]
+    >>> fs.DesignRules(**preset.limits, min_size_um=2.0)
+    DesignRules(min_size_um=2.0, min_width_um=0.15, min_space_um=0.27, edge_angle_step_deg=90.0, grid_um=0.005)
+    """
 
     limits: Mapping[str, Any]
     source: str

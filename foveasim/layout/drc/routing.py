@@ -136,6 +136,16 @@ def track_demand(layout: Layout, routing: Routing) -> TrackDemand:
     ------
     ParameterError
         When the layout has no such column.
+
+    Examples
+    --------
+    Ten columns on the full width of 30 µm, with one track per µm:
+
+    >>> import foveasim as fs
+    >>> layout = fs.layout.readout_by(fs.layout.grid(n_x=10, n_y=4, pitch_um=3.0), "column")
+    >>> demand = fs.layout.track_demand(layout, fs.layout.Routing(width_um=0.5, space_um=0.5, direction="upwards"))
+    >>> demand.n_nets.tolist(), demand.n_tracks.tolist()
+    ([10], [30])
     """
     line = layout.index_column("readout_line")
     if line.size == 0:

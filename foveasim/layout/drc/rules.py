@@ -207,6 +207,14 @@ class Violation:
     unit : str
     marker : shapely geometry
         Location, in µm.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> report = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0).check(fs.DesignRules(min_size_um=2.5))
+    >>> violation = report.violations[0]
+    >>> violation.rule, violation.value, violation.limit, violation.unit
+    ('min_size_um', 2.0, 2.5, 'µm')
     """
 
     rule: str
@@ -315,6 +323,14 @@ class Report:
         One result per rule with a limit.
     layout : Layout, optional
         The checked layout, for drawings; None for reports of files.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0)
+    >>> report = layout.check(fs.DesignRules(min_size_um=2.5, max_overlap_um2=0.0))
+    >>> report.ok, {result.rule: len(result.values) for result in report.results}
+    (False, {'min_size_um': 16, 'max_overlap_um2': 0})
     """
 
     n_sites: int

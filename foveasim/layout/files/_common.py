@@ -54,6 +54,17 @@ class WrittenLayout:
         Maximum relative change of a site's area by rounding.
     dropped_columns : tuple of str
         Names of the columns that the file does not contain, sorted.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> layout = fs.layout.hexagonal(n_columns=4, n_rows=4, pitch_um=3.0)
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     written = layout.write(Path(directory, "layout.gds"))
+    >>> written.n_sites, written.max_displacement_um < 0.001
+    (16, True)
     """
 
     path: Path

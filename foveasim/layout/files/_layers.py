@@ -148,7 +148,7 @@ def reading_options(
 
 
 def read_layer_map(path: str | Path) -> dict[str, Any]:
-    """
+    r"""
     Read a layer map from a YAML file.
 
     Parameters
@@ -165,6 +165,17 @@ def read_layer_map(path: str | Path) -> dict[str, Any]:
     ------
     ConfigError
         When the file is missing, or not a mapping in YAML.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     path = Path(directory, "layers.yaml")
+    ...     _ = path.write_text("photosite: 77/3\nwell: {layer: 20/0, inset_um: 0.2}\n")
+    ...     print(fs.layout.read_layer_map(path))
+    {'photosite': '77/3', 'well': {'layer': '20/0', 'inset_um': 0.2}}
     """
     from foveasim._io.yaml_files import read_yaml
 

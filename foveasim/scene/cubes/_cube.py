@@ -57,6 +57,15 @@ class Cube:
     distance_m : float, m
     close : callable
         Function that closes the file, called after the data are read.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> data = np.ones((3, 4, 6))  # bands, rows, columns
+    >>> cube = fs.scene.Cube(data=data, wavelength=[0.45, 0.55, 0.65], wavelength_unit="um", quantity="reflectance")
+    >>> cube.data.shape, cube.wavelength_unit
+    ((3, 4, 6), 'um')
     """
 
     data: Any

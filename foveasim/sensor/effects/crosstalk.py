@@ -66,6 +66,14 @@ class CrosstalkOperator:
         charge is lost.
     n_steps : int
         Number of times that the matrix is applied.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> row = fs.layout.grid(n_x=3, n_y=1, pitch_um=4.0)
+    >>> operator = fs.sensor.Diffusion.from_neighbour_fraction(0.1, pitch_um=4.0).compile(row)
+    >>> operator.apply([0.0, 1000.0, 0.0]).round(6).tolist()
+    [25.0, 950.0, 25.0]
     """
 
     matrix: csr_array[Any]

@@ -168,6 +168,14 @@ def draw_shot_noise(
     -------
     electrons : (n_site,) int64, e-
         Non-negative.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> electrons = fs.sensor.draw_shot_noise(np.full(100_000, 400.0), "exact", 500.0, seed=0)
+    >>> round(float(electrons.mean())), round(float(electrons.std()))
+    (400, 20)
     """
     expected_e = np.ascontiguousarray(unmasked("expected_e", expected_e), np.float64)
     if expected_e.size and not (smallest := float(np.min(expected_e))) >= 0.0:

@@ -74,7 +74,7 @@ def read_curve(
     between: Between = "lines",
     beyond: Beyond = "raise",
 ) -> TableCurve | SplineCurve:
-    """
+    r"""
     Read one curve from a text file.
 
     Parameters
@@ -102,6 +102,18 @@ def read_curve(
     FileError
         If the file is missing, too large or not a valid table, or a value is out of range; the message states the line, the
         rule and the value.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     path = Path(directory, "qe.csv")
+    ...     _ = path.write_text("wavelength_nm,QE [%]\n400,20\n550,60\n700,40\n")
+    ...     curve = fs.sensor.read_curve(path)
+    >>> curve([475.0, 550.0]).round(3).tolist()
+    [0.4, 0.6]
     """
     path = Path(path)
     table = _read(path, wavelength_unit, value_unit)
@@ -119,7 +131,7 @@ def read_filters(
     between: Between = "lines",
     beyond: Beyond = "raise",
 ) -> FilterSet:
-    """
+    r"""
     Read a set of colour filters from a text file, one per value column.
 
     Parameters
@@ -133,6 +145,18 @@ def read_filters(
     -------
     FilterSet
         Filters in the order of the columns, which corresponds to the channels of a layout.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     path = Path(directory, "filters.csv")
+    ...     _ = path.write_text("nm,R,G,B\n450,0.02,0.1,0.8\n550,0.05,0.9,0.1\n650,0.9,0.1,0.02\n")
+    ...     filters = fs.sensor.read_filters(path)
+    >>> filters.names, filters.curves[1]([550.0]).tolist()
+    (('R', 'G', 'B'), [0.9])
     """
     path = Path(path)
     table = _read(path, wavelength_unit, value_unit)

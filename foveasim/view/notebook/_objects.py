@@ -85,6 +85,15 @@ def to_png(picture: Picture) -> bytes:
     Return a picture as a PNG file for notebooks.
 
     It has at most 640 x 640 pixels, and is transparent where no photosite lies.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> layout = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0)
+    >>> picture = fs.reconstruct.cells(layout, np.arange(16.0), fs.Grid.centred((8, 8), 1.0))
+    >>> fs.view.to_png(picture)[1:4]
+    b'PNG'
     """
     return encode_png(picture_pixels(picture, PNG_PIXELS), MAX_PNG_BYTES)[0]
 

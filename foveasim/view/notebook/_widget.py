@@ -46,6 +46,12 @@ def widget(
 
     Examples
     --------
+    >>> import foveasim as fs
+    >>> view = fs.view.widget(fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0), name="a small grid")
+    >>> view.by = "area_um2"
+    >>> view.by, view.pinned
+    ('area_um2', -1)
+
     Select sites in the widget by a rectangle, or in Python, and read their values::
 
         view = fs.view.widget(capture)

@@ -55,7 +55,17 @@ def new_figure(figure_inches: tuple[float, float]) -> Figure:
 
 @contextmanager
 def hidden_figures() -> Iterator[None]:
-    """Make plain figures inside the block, such as those of files, also in notebooks."""
+    """
+    Make plain figures inside the block, such as those of files, also in notebooks.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> with fs.view.hidden_figures():
+    ...     axes = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0).plot()
+    >>> axes.get_xlabel()
+    'x / µm'
+    """
     token = _is_hidden.set(True)
     try:
         yield

@@ -61,6 +61,13 @@ def plot_scene(scene: Scene, *, ax: Axes | None = None, figure_inches: float = 8
         In the plane of the scene, centred on the optical axis; in pixels for a scene with ``fit``, whose size depends on the
         camera. The colours are those of a camera with generic RGB filters
         (:func:`foveasim.rgb_filters`), balanced for equal radiance in all bands, sRGB-encoded; grey outside the visible range.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> scene = fs.scene.charts.slanted_edge(shape=(64, 64), pitch_um=500.0, distance_m=1.0, luminance_cd_m2=100.0)
+    >>> fs.view.plot_scene(scene).get_xlabel()
+    'x / mm'
     """
     n_y, n_x = scene.basis.shape[1:]
     unit, per_pixel = "pixels", 1.0
@@ -100,6 +107,15 @@ def plot_power_map(
     ------
     ParameterError
         When there is no such band.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> power_map = fs.Optics(focal_length_mm=8.0, f_number=2.8).power_map(scene)
+    >>> axes = fs.view.plot_power_map(power_map)
+    >>> axes.figure.axes[1].get_ylabel()  # of the colour bar
+    'irradiance / (W/m²)'
     """
     n_bands = power_map.data.shape[0]
     if band is not None:
@@ -204,6 +220,15 @@ def plot_image(
     Returns
     -------
     matplotlib axes
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> values = np.random.default_rng(0).random((20, 30))
+    >>> axes = fs.view.plot_image(values, (0.0, 0.0, 3.0, 2.0), "time / s", "frequency / Hz", label="power", ratio=0.5)
+    >>> [text.get_ylabel() for text in axes.figure.axes]  # image and colour bar
+    ['frequency / Hz', 'power']
     """
     x0, y0, x1, y1 = np.asarray(bounds, np.float64).tolist()
     height_over_width = (y1 - y0) / (x1 - x0)
@@ -242,6 +267,14 @@ def plot_cortical(
     ------
     ParameterError
         When there is no such channel.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.log_polar(n_sectors=32, n_rings=8, r_min_um=10.0, r_max_um=60.0)
+    >>> image = fs.reconstruct.cortical(layout, layout.size_um)
+    >>> fs.view.plot_cortical(image).get_xlabel()
+    'angle / degrees'
     """
     n_channels, n_rings, n_sectors = image.data.shape
     if n_channels not in (1, 3) and channel is None:

@@ -62,6 +62,15 @@ def plot_report(
     ------
     ParameterError
         When the number of sites differs from that of the checked layout.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0)
+    >>> report = layout.check(fs.DesignRules(min_size_um=2.5))
+    >>> axes = fs.view.plot_report(report)
+    >>> [text.get_text() for text in axes.get_legend().get_texts()]
+    ['min_size_um: 16 violations, worst 2 µm, limit 2.5 µm']
     """
     from matplotlib.transforms import ScaledTranslation
 

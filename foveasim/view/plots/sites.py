@@ -168,6 +168,16 @@ def plot_noise_budget(
     ------
     ParameterError
         When there is not one class per site.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> sensor = fs.Sensor(fs.layout.grid(n_x=8, n_y=8, pitch_um=3.0), read_noise_e=5.0, prnu_fraction=0.01)
+    >>> budget = fs.sensor.noise_budget(sensor, np.full(64, 1e5), 0.01)
+    >>> axes = fs.view.plot_noise_budget(budget)
+    >>> axes.get_xlabel(), [label.get_text() for label in axes.get_yticklabels()]
+    ('noise / e- rms', ['photon_shot', 'read', 'quantisation', 'prnu'])
     """
     ax = new_axes(7.0, 0.64) if ax is None else ax
     if not noise_e:
@@ -223,6 +233,17 @@ def plot_curves(
     Returns
     -------
     matplotlib axes
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> frequency_per_mm = np.linspace(0.0, 300.0, 31)
+    >>> lenses = {f"f/{n}": fs.Optics(focal_length_mm=8.0, f_number=n) for n in (2.8, 8.0)}
+    >>> curves = {name: (frequency_per_mm, lens.mtf(frequency_per_mm, 550.0)) for name, lens in lenses.items()}
+    >>> axes = fs.view.plot_curves(curves, "spatial frequency / (1/mm)", "MTF")
+    >>> [text.get_text() for text in axes.get_legend().get_texts()]
+    ['f/2.8', 'f/8.0']
     """
     ax = new_axes(7.0, 0.64) if ax is None else ax
     for name, (x, y) in curves.items():
@@ -246,6 +267,17 @@ def save_figure(figure: Figure, path: str | Path, dpi: float = 150.0) -> None:
     ------
     FileError
         When the format is unknown, or the file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> figure = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0).plot().figure
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     fs.view.save_figure(figure, Path(directory, "layout.pdf"))
+    ...     print(Path(directory, "layout.pdf").read_bytes()[:4])
+    b'%PDF'
     """
     # A few percent larger than at the default level 6, in half the time.
     options: dict[str, Any] = {"pil_kwargs": {"compress_level": 1}} if Path(path).suffix.lower() == ".png" else {}
@@ -277,6 +309,17 @@ def save_drawing(data: Layout | Capture, path: str | Path, by: str | ArrayLike |
         When there are more than 20,000 sites.
     FileError
         When the extension is another, or the file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     path = Path(directory, "layout.svg")
+    ...     fs.view.save_drawing(fs.layout.hexagonal(n_columns=4, n_rows=4, pitch_um=3.0), path)
+    ...     print(path.read_text("utf-8").count("<path"))
+    16
     """
     layout = data.layout if isinstance(data, Capture) else data
     rgb = colours_of(data, by).rgb

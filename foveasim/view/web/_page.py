@@ -129,6 +129,19 @@ def write_web_page(
         When the extension is another, or the file cannot be written.
     ParameterError, GeometryError
         As for :func:`web_page`.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> layout = fs.layout.grid(n_x=4, n_y=3, pitch_um=2.0)
+    >>> report = layout.check(fs.DesignRules(min_size_um=2.5))
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     path = Path(directory, "grid.html")
+    ...     fs.view.write_web_page(layout, path, report=report, name="a small grid")
+    ...     print("min_size_um" in path.read_text("utf-8"))
+    True
     """
     write_page(path, lambda: web_page(data, report=report, second=second, optical_image=optical_image, name=name))
 

@@ -46,6 +46,13 @@ def solid_page(data: Layout | Capture, *, solids: Solids | None = None, name: st
         When the data is neither, or the solids are not of its photosites with one colour per site and part.
     GeometryError
         When there is nothing to show.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> page = fs.view.solid_page(fs.layout.grid(n_x=2, n_y=2, pitch_um=3.0), name="four photosites")
+    >>> "<title>four photosites</title>" in page
+    True
     """
     about, arrays, layout = describe_sites(data, name=name)
     if solids is None and isinstance(data, Capture):
@@ -98,5 +105,16 @@ def write_solid_page(data: Layout | Capture, path: str | Path, *, solids: Solids
         When the extension is another, or the file cannot be written.
     ParameterError, GeometryError
         As for :func:`solid_page`.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import foveasim as fs
+    >>> with tempfile.TemporaryDirectory() as directory:
+    ...     path = Path(directory, "grid.html")
+    ...     fs.view.write_solid_page(fs.layout.grid(n_x=2, n_y=2, pitch_um=3.0), path)
+    ...     print(path.read_text("utf-8")[:15])
+    <!doctype html>
     """
     write_page(path, lambda: solid_page(data, solids=solids, name=name))
