@@ -54,8 +54,11 @@ def dark_path(path: Path) -> Path:
 
 def invert_greys(figure: Figure) -> list[tuple[Any, Any]]:
     """Invert the greys of a figure, and return the setters of its colours with their former values."""
-    restore = []
+    restore: list[tuple[Any, Any]] = []
+    if np.mean(to_rgba(figure.get_facecolor())[:3]) < 0.5:
+        return restore  # dark already
     for artist in _artists(figure):
+        found = []  # before colours are set: those of markers follow the colour of their line
         for name in PROPERTIES:
             get, set_value = getattr(artist, f"get_{name}", None), getattr(artist, f"set_{name}", None)
             if get is None or set_value is None or (isinstance(artist, Collection) and name == "color"):
@@ -63,8 +66,10 @@ def invert_greys(figure: Figure) -> list[tuple[Any, Any]]:
             value = get()
             inverted = _inverted(value)
             if inverted is not None:
-                restore.append((set_value, value))
-                set_value(inverted)
+                found.append((set_value, value, inverted))
+        for set_value, value, inverted in found:
+            restore.append((set_value, value))
+            set_value(inverted)
     return restore
 
 

@@ -1,5 +1,5 @@
 """
-Which fraction of the energy of a point source falls on a square pixel?
+Which fraction of the energy of a point source falls on a square photosite?
 
 New here: ``Scene.point_sources``, ``Optics.power_map``, ``Integrator``, ``Layout.from_rectangles``.
 
@@ -49,7 +49,7 @@ def main(out_dir: Path) -> None:
 
     axes = Figure(figsize=(6.4, 4.0), layout="constrained").add_subplot()
     axes.plot(SIDES, 100 * ensquared, "o-", markersize=3)
-    axes.set_xlabel("pixel side / (wavelength × f-number)")
+    axes.set_xlabel("side of the photosite / (wavelength × f-number)")
     axes.set_ylabel("ensquared energy / %")
     axes.set_ylim(0, 100)
     axes.grid(visible=True, alpha=0.3)

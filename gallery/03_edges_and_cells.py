@@ -1,12 +1,12 @@
 """
-How large is the power error of a pixel whose edges cut cells of the power map?
+How large is the power error of a photosite whose edges cut cells of the power map?
 
 New here: the discretisation error of power maps with constant cells; ``Optics(oversample=k)``, cells smaller than the pixels
 of the scene, and their cost.
 
 Expect: an error that decreases as the power -2 of the number of cells (within 0.25), and no error where edges coincide with
-cell boundaries; with the oversampling that a camera selects, at most 1e-3 of a point's energy in any pixel of side wavelength
-x f-number.
+cell boundaries; with the oversampling that a camera selects, at most 1e-3 of a point's energy in any photosite of side
+wavelength x f-number.
 """
 
 from __future__ import annotations
@@ -119,14 +119,14 @@ def main(out_dir: Path) -> None:
     oversampled.axhline(1e-3, color="grey", linestyle=":")
     oversampled.set_xticks(OVERSAMPLE, [f"{k}\n× {k * k}" for k in OVERSAMPLE])
     oversampled.set_xlabel("oversample: cells along a scene pixel,\nand relative memory")
-    oversampled.set_ylabel("largest error of the energy fraction of a pixel")
+    oversampled.set_ylabel("largest error of the energy fraction of a photosite")
     oversampled.legend()
     axes.loglog(CELLS, np.abs(errors), "o-", label="edges inside cells")
     axes.loglog(CELLS, np.abs(errors[0]) * (CELLS[0] / CELLS) ** 2, ":", color="grey", label="power -2")
     axes.set_xticks([3, 6, 10, 20], ["3", "6", "10", "20"])
     axes.set_xticks([], minor=True)
     axes.set_xlabel("cells per wavelength × f-number")
-    axes.set_ylabel("error of the energy fraction of a pixel")
+    axes.set_ylabel("error of the energy fraction of a photosite")
     axes.legend()
     save_figure(figure, out_dir / "03_edges_and_cells.png", dpi=140)
 

@@ -1,10 +1,10 @@
 """
-How does a sensor of four zones, whose pixel pitch doubles outwards, record a photograph?
+How does a sensor of four zones, whose pitch doubles outwards, record a photograph?
 
 New here: a bundled layout (``layouts/four_zones.yaml``), a picture of a region, additivity of charge.
 
 Expect: Fig. 14 of the paper with another photograph: 13,312 photosites, compared with 262,144 of a uniform grid of the smallest
-pixels. The expected charge of a pixel of 8, 16 or 32 µm is the sum over the 4, 16 or 64 small pixels in the same area, within
+ones. The expected charge of a photosite of 8, 16 or 32 µm is the sum over the 4, 16 or 64 small ones in the same area, within
 1e-12 of the total charge; in the central zone both sensors are equal.
 """
 
@@ -28,7 +28,7 @@ EXPOSURE_S = 1 / 30
 def main(out_dir: Path) -> None:
     """Write the pictures of both sensors to a directory."""
     out_dir.mkdir(parents=True, exist_ok=True)
-    # %% Scene, and two sensors of the same size: four zones, and a uniform grid of the smallest pixels.
+    # %% Scene, and two sensors of the same size: four zones, and a uniform grid of the smallest photosites.
     # Additional sky at the top shifts the photographer to the finest zone.
     photograph = np.pad(photographer(), ((126, 0), (25, 0)), mode="edge")[:512, :512]
     scene = fs.Scene.from_picture(
@@ -58,9 +58,9 @@ def main(out_dir: Path) -> None:
     for ax, (title, shot, grid) in zip(
         figure.subplots(1, 3),
         (
-            (f"{fine.n_sites:,} pixels\nof 4 µm", fine_capture, None),
-            (f"{zones.n_sites:,} pixels\nof 4, 8, 16 and 32 µm", zone_capture, None),
-            ("central zone:\n4,096 pixels of 4 µm", zone_capture, centre),
+            (f"{fine.n_sites:,} photosites\nof 4 µm", fine_capture, None),
+            (f"{zones.n_sites:,} photosites\nof 4, 8, 16 and 32 µm", zone_capture, None),
+            ("central zone:\n4,096 photosites of 4 µm", zone_capture, centre),
         ),
         strict=True,
     ):
@@ -72,7 +72,7 @@ def main(out_dir: Path) -> None:
         ax.set(xlabel="x / µm", ylabel="y / µm")
     save_figure(figure, out_dir / "16_four_zones.png", dpi=140)
 
-    # %% Additivity: the charge of every pixel is the sum over the small pixels in the same area.
+    # %% Additivity: the charge of every photosite is the sum over the small ones in the same area.
     column, row = (np.floor(fine.centroid_um / SMALLEST_UM).astype(int) + n_side // 2).T
     charge_e = np.zeros((n_side, n_side))
     charge_e[row, column] = fine_capture.expected_e

@@ -91,7 +91,7 @@ def main(out_dir: Path) -> None:
         zorder=3,
         label="feasible",
     )
-    colour_bar = figure.colorbar(points, ax=ax, label="smallest pixel / µm")
+    colour_bar = figure.colorbar(points, ax=ax, label="smallest photosite / µm")
     colour_bar.ax.set_yticks([0.5, 1, 2, 4], ["0.5", "1", "2", "4"])
     colour_bar.ax.set_yticks([], minor=True)
     ax.set(xscale="log", xlabel="photosites", ylabel="PSNR relative to the optical image / dB")

@@ -198,6 +198,22 @@ def test_dark_variant_inverts_greys_and_is_reverted():
     assert to_rgb(figure.patch.get_facecolor()) == (1.0, 1.0, 1.0)
 
 
+def test_markers_have_inverted_greys():
+    figure = Figure()
+    (points,) = figure.add_subplot().plot([0, 1], "ko")
+    DARK["invert_greys"](figure)
+
+    assert to_rgb(points.get_markerfacecolor()) == to_rgb(points.get_markeredgecolor()) == (DARK["BLACK"],) * 3
+
+
+def test_greys_of_dark_figures_remain():
+    figure = Figure(facecolor="#101418")
+    title = figure.suptitle("a", color="white")
+
+    assert DARK["invert_greys"](figure) == []
+    assert title.get_color() == "white"
+
+
 @pytest.mark.parametrize("size", [(300, 100), (100, 300), (640, 480)])
 def test_thumbnails_have_one_shape(tmp_path, size):
     Image.new("RGBA", size, (200, 0, 0, 128)).save(tmp_path / "picture.png")
