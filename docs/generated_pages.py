@@ -34,8 +34,10 @@ if TYPE_CHECKING:
 REPOSITORY = Path(__file__).parent.parent
 #: Pages of the gallery; pictures are generated again when a script is newer.
 GALLERY = Path(__file__).parent / "gallery"
+#: Pictures that are stored, such as those of scripts that require PyTorch.
+PICTURES = Path(__file__).parent / "pictures"
 #: Text instead of pictures where a script could not run.
-WITHOUT_TORCH = "This site was built without PyTorch, which the script requires; its pictures are therefore missing."
+WITHOUT_TORCH = "This site was built without PyTorch, which the script requires; the picture is from an earlier run."
 
 #: Description of the module that only a build with PyTorch documents.
 LEARN = "Gradients with respect to photosites, optics and electronics, for PyTorch."
@@ -308,7 +310,12 @@ def write_gallery(_app: Sphinx, _config: Config) -> None:
             for picture in sorted(folder.glob("*.*"))
             if picture.suffix in (".png", ".webp") and not picture.stem.endswith(SUFFIX)
         ]
-        shown = "\n\n".join(f"![{picture}]({picture})" for picture in pictures) or WITHOUT_TORCH
+        if is_skipped and not pictures:
+            kept = sorted(PICTURES.glob(f"{script.stem[:2]}_*.png"))
+            pictures = [f"../pictures/{picture.name}" for picture in kept if not picture.stem.endswith(SUFFIX)]
+            folder.mkdir(parents=True, exist_ok=True)
+            description += f"\n\n{WITHOUT_TORCH}"
+        shown = "\n\n".join(f"![{picture}]({picture})" for picture in pictures)
         source = (
             f"```{{literalinclude}} ../../gallery/{script.name}\n:language: python\n:start-at: from __future__\n```"
         )

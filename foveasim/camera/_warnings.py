@@ -151,7 +151,7 @@ def warn_of_coarse_pixels(scene: Scene, pixel_um: float, layout: Layout, warned:
         warned.add("pixels")
         warn(
             f"{100.0 * fraction:.0f} % of the photosites are smaller than the pixels of the picture, of {pixel_um:.3g} µm on "
-            "the sensor, and cannot show finer details; use a picture with more pixels, or a smaller part of it",
+            "the sensor, and cannot show finer details; use a picture with more pixels",
             SamplingWarning,
         )
 
