@@ -46,6 +46,8 @@ class _Pool:
         # Reentrant: garbage collection may delete an array, and thus call put, at any allocation.
         self._lock = ForkSafeLock()
         self._unused: list[NDArray[np.uint8]] = []
+        # Not read from the module in put: variables of modules are None while the interpreter exits.
+        self.max_unused_bytes = MAX_UNUSED_BYTES
 
     def get(self, n_bytes: int) -> NDArray[np.uint8]:
         with self._lock:
@@ -57,7 +59,7 @@ class _Pool:
     def put(self, buffer: NDArray[np.uint8]) -> None:
         with self._lock:
             self._unused.append(buffer)
-            while sum(unused.size for unused in self._unused) > MAX_UNUSED_BYTES:
+            while sum(unused.size for unused in self._unused) > self.max_unused_bytes:
                 del self._unused[0]
 
     def clear(self) -> None:

@@ -51,7 +51,7 @@ def test_views_prevent_memory_reuse():
 
 def test_unused_memory_is_limited(monkeypatch):
     n_bytes = 4 * SHAPE[0] * SHAPE[1]
-    monkeypatch.setattr(work_arrays, "MAX_UNUSED_BYTES", 2 * n_bytes)
+    monkeypatch.setattr(work_arrays._POOL, "max_unused_bytes", 2 * n_bytes)
     arrays = [work_array(SHAPE, np.float32) for _ in range(4)]
     del arrays
 

@@ -140,7 +140,7 @@ def test_memory_is_one_spectrum_per_map(monkeypatch):
     for _ in optics.weighted_maps(band_of(scene, 0, 0), np.ones((1, 1))):
         pass  # imports kernels
     monkeypatch.setattr(work_arrays, "_POOL", work_arrays._Pool())
-    monkeypatch.setattr(work_arrays, "MAX_UNUSED_BYTES", 0)
+    monkeypatch.setattr(work_arrays._POOL, "max_unused_bytes", 0)
     spectrum_bytes = 8 * shape[0] * (shape[1] // 2 + 1)
     map_bytes = 4 * shape[0] * shape[1]
     # Blocks of rows and columns per thread, and small tables.
