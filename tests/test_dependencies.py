@@ -181,7 +181,7 @@ def test_install_hints_name_an_extra():
         for path in folder.rglob("*.*")
         if path.suffix in {".py", ".md"}
     ]
-    hints = {extra for text in texts for extra in re.findall(r"foveasim\[([\w,]+)\]", text)}
+    hints = {extra for text in texts for extra in re.findall(r"'(?:foveasim|\.)\[([\w,]+)\]'", text)}
 
     assert hints
     assert {part for hint in hints for part in hint.split(",")} <= set(PROJECT["optional-dependencies"])

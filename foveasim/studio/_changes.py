@@ -15,15 +15,18 @@ from foveasim.studio._files import Files, with_layout
 from foveasim.studio._templates import WITHOUT_MOSAIC
 
 #: Messages that change the settings.
-CHANGES = ("set", "reset", "delete", "undo", "redo", "preset", "restore", "file", "video", "frame", "match")
+CHANGES = ("set", "reset", "delete", "undo", "redo", "preset", "restore", "file", "video", "frame", "match", "solve")
 #: Changes that advance a source of frames: newer ones do not stop their simulations.
 ONCE = ("video", "frame")
 #: Longest path of a setting.
 MAX_KEY_LENGTH = 500
 #: Largest depth of settings from the page.
 MAX_DEPTH = 20
-#: Number of colour filters that a layout without mosaic receives.
-N_FILTERS = 3
+#: Filters that a layout receives: a mosaic, or a colouring of the sites.
+MOSAIC = ["RG", "GB"]
+COLOURING = {"kind": "graph_colouring", "n_channels": 3}
+#: Edits that assign filters to sites.
+COLOURING_KINDS = ("graph_colouring", "mosaic", "random_channels")
 
 
 def is_change(message: Any) -> bool:
@@ -93,15 +96,31 @@ def changed_keys(settings: Any, start: Any, key: str = "") -> list[str]:
     return [] if settings == start else [key]
 
 
-def match_filters(settings: dict[str, Any]) -> None:
-    """Add a mosaic to a layout, or filters that differ between neighbours."""
-    layout, sensor = settings.get("layout"), settings.get("sensor")
-    if not isinstance(layout, dict) or not isinstance(sensor, dict) or sensor.get("filters") is None:
+def match_filters(settings: dict[str, Any], before: Mapping[str, Any]) -> None:
+    """
+    Let sites have filters: with a mosaic, or a colouring of generators without rows and columns, or rings and sectors.
+
+    What this added for the layout ``before`` is removed.
+    """
+    layout, old, sensor = settings.get("layout"), before.get("layout"), settings.get("sensor")
+    if not isinstance(layout, dict) or "generator" not in layout:
         return
-    if layout.get("generator") in WITHOUT_MOSAIC:
-        layout.setdefault("edits", [{"kind": "graph_colouring", "n_channels": N_FILTERS}])
-    elif "generator" in layout and layout.get("mosaic") is None:
-        layout["mosaic"] = ["RG", "GB"]
+    old = old if isinstance(old, dict) else {}
+    edits = list(layout.get("edits") or [])
+    if old.get("generator") in WITHOUT_MOSAIC and layout["generator"] not in WITHOUT_MOSAIC and COLOURING in edits:
+        edits.remove(COLOURING)
+    if isinstance(sensor, dict) and sensor.get("filters") is not None:
+        has_filters = any(edit.get("kind") in COLOURING_KINDS for edit in edits if isinstance(edit, dict))
+        if layout["generator"] in WITHOUT_MOSAIC:
+            layout.pop("mosaic", None)
+            if not has_filters:
+                edits.append(dict(COLOURING))
+        elif layout.get("mosaic") is None and not has_filters:
+            layout["mosaic"] = copy.deepcopy(old.get("mosaic") or MOSAIC)
+    if edits != (layout.get("edits") or []):
+        layout["edits"] = edits
+        if not edits:
+            del layout["edits"]
 
 
 def choose_preset(settings: dict[str, Any]) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 from foveasim._core.validation import UNIT_SUFFIXES
 from foveasim.config import bundled_layouts, schema
+from foveasim.studio._solving import PARAMETERS, unknown_of, unknowns_of
 from foveasim.studio._templates import INITIAL, PER_AREA, WITHOUT_MOSAIC, templates
 
 __all__ = ["chosen_value", "controls_of", "structure_of", "value_at"]
@@ -42,6 +43,8 @@ TAGS = ("kind", "generator")
 FROM_FILES = {"path", "file"}
 #: Optional parameters that new sections contain: framing and light of scenes.
 GIVEN = {"fit", "peak_radiance_w_m2_sr_nm", "radiance_w_m2_sr_nm"}
+#: Description of the choice of a generator's unknown.
+SOLVE_HELP = "The parameter that follows from the others: the number of photosites, or one that gives the number."
 #: Depth of nested sections.
 MAX_DEPTH = 8
 #: Largest number of sections of a list that have controls.
@@ -69,11 +72,36 @@ def controls_of(settings: Mapping[str, Any], start: Mapping[str, Any] | None = N
     found: list[dict[str, Any]] = []
     for name, node in root["properties"].items():
         found += _controls(root, name, name, node, settings.get(name), start, is_required=name in root["required"])
-    n_of_key = Counter(control["key"] for control in found)
+    found = _with_unknown(found, settings)
+    n_of_key = Counter(control["key"] for control in found if "do" not in control)
     for control in found:
+        if "do" in control:
+            continue
         is_form = control["kind"] == "choice" and n_of_key[control["key"]] > 1
         control["id"] = f"{control['key']}:form" if is_form else control["key"]
     return found
+
+
+def _with_unknown(controls: list[dict[str, Any]], settings: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Add the choice of the generator's parameter that follows from the others, before its parameters."""
+    unknowns, unknown = unknowns_of(settings), unknown_of(settings)
+    first = next((i for i, each in enumerate(controls) if each["key"].startswith(f"{PARAMETERS}.")), None)
+    if not unknowns or first is None:
+        return controls
+    for control in controls[first:]:
+        if control["key"].removeprefix(f"{PARAMETERS}.") in unknowns:
+            control["is_optional"] = False  # always visible, also while another one is solved for
+    solve = {
+        **_described(PARAMETERS, "layout", {"description": SOLVE_HELP}),
+        "id": f"{PARAMETERS}:solve",
+        "label": "solve for",
+        "kind": "choice",
+        "is_optional": False,
+        "do": "solve",
+        "choices": [{"label": label, "value": name} for name, label in unknowns.items()],
+        "value": unknown,
+    }
+    return [*controls[:first], solve, *controls[first:]]
 
 
 def value_at(settings: Any, key: str) -> Any:

@@ -74,15 +74,11 @@ def apply_preset(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def with_layout(settings: Mapping[str, Any], layout: Any) -> dict[str, Any]:
-    """Return settings with another layout: the picture covers it, and filters have a mosaic."""
+    """Return settings with another layout, which the picture covers."""
     found = copy.deepcopy(dict(settings))
-    old = found.get("layout")
     found["layout"] = copy.deepcopy(layout)
     if found.get("scene", {}).get("kind") == "picture":
         put_setting(None, found, "scene.fit", "cover")
-    if isinstance(layout, dict) and "generator" in layout and found.get("sensor", {}).get("filters") is not None:
-        mosaic = old.get("mosaic") if isinstance(old, dict) else None
-        found["layout"].setdefault("mosaic", mosaic or ["RG", "GB"])
     return found
 
 

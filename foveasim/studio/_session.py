@@ -21,6 +21,7 @@ from foveasim._io.atomic import atomic_write
 from foveasim._io.yaml_files import format_yaml
 from foveasim.config import check_settings, put_setting
 from foveasim.errors import ParameterError, SimulationError, printable
+from foveasim.layout import Layout
 from foveasim.studio._changes import (
     ONCE,
     changed_keys,
@@ -44,7 +45,7 @@ from foveasim.studio._frames import Frames
 from foveasim.studio._history import History
 from foveasim.studio._messages import from_json, one_line, to_json
 from foveasim.studio._parts import PARTS, summary_of
-from foveasim.studio._variants import with_n_sites
+from foveasim.studio._solving import balanced, solved_of, with_n_sites, with_unknown
 from foveasim.studio._views import Views
 
 #: Size limit of all uploaded files.
@@ -265,6 +266,11 @@ class Session:
             raise SupersededError
 
     @property
+    def _layout(self) -> Layout | None:
+        """The present layout, None before the first result."""
+        return None if self.result is None else self.result.capture.layout
+
+    @property
     def is_preview(self) -> bool:
         """Whether the views show a preview, or were left out for one."""
         return bool(self._views.left_out) or (self.result is not None and self.result.is_preview)
@@ -325,7 +331,7 @@ class Session:
 
     def _apply(self, message: dict[str, Any]) -> None:
         """Apply one change to the history."""
-        settings = self.history.settings
+        settings = before = self.history.settings
         match message["do"]:
             case "undo":
                 if not self.history.undo():
@@ -344,14 +350,19 @@ class Session:
                 else:
                     value = chosen_value(key, value, self._controls, settings, self.start.settings)
                     put_setting(None, settings, key, value)
-                if key == "layout":
-                    match_filters(settings)
-                elif key == "sensor.preset":
+                settings = balanced(settings, key, self._layout)
+                if key == "sensor.preset":
                     choose_preset(settings)
             case "reset":
-                settings = reset(settings, self.start.settings, key_of(message))
+                settings = balanced(
+                    reset(settings, self.start.settings, key_of(message)), key_of(message), self._layout
+                )
             case "delete":
-                settings = reset(settings, {}, key_of(message))
+                settings = balanced(reset(settings, {}, key_of(message)), key_of(message), self._layout)
+            case "solve":
+                if self._layout is None:
+                    raise SimulationError("there is no layout whose parameters are known")
+                settings = with_unknown(settings, string_of(message, "name"), self._layout)
             case "preset":
                 settings = apply_preset(string_of(message, "name"), settings)
             case "restore":
@@ -381,6 +392,8 @@ class Session:
                     return
                 settings = with_file(settings, self.start.settings, self.files, str(self.frames.path), "scene")
         settings = self.files.resolve(settings)
+        if message["do"] not in ("restore", "frame") and _chooses_filters(before, settings):
+            match_filters(settings, before)
         check_settings(None, settings)
         if message["do"] == "set" and message.get("final", True) is False:
             self.history.preview(settings)
@@ -521,6 +534,7 @@ class Session:
             "errors": self._errors,
             "warnings": [] if result is None else result.warnings,
             "summary": {} if result is None else summary_of(result),
+            "solved": {} if result is None else solved_of(result.settings, result.capture.layout),
             "frozen": self._frozen,
             "film": self.frames.about(settings),
             "is_preview": result is not None and result.is_preview,
@@ -565,3 +579,14 @@ class Session:
         for listener in list(self._listeners):
             with suppress(Exception):
                 listener(sent)
+
+
+def _chooses_filters(before: dict[str, Any], settings: dict[str, Any]) -> bool:
+    """Return whether settings have another generator or file of the layout, or other filters."""
+
+    def chosen(each: dict[str, Any]) -> Any:
+        layout, sensor = each.get("layout"), each.get("sensor")
+        generator = (layout.get("generator"), layout.get("file")) if isinstance(layout, dict) else layout
+        return generator, sensor.get("filters") is None if isinstance(sensor, dict) else None
+
+    return chosen(before) != chosen(settings)

@@ -1,19 +1,18 @@
-"""Comparison of two variants: budgets, picture quality, and the same number of photosites."""
+"""Comparison of two variants: budgets and picture quality."""
 
 from __future__ import annotations
 
-import copy
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
 from foveasim._core.validation import Floats
 from foveasim.compare import budget_of, quality_by_eccentricity
-from foveasim.errors import FoveasimError, ParameterError
+from foveasim.errors import FoveasimError
 from foveasim.fields import Grid
-from foveasim.layout import LAYOUTS, Layout
+from foveasim.layout import Layout
 from foveasim.studio._engine import Simulated
+from foveasim.studio._solving import is_generated
 
 #: Side of the compared pictures, pixels.
 N_PIXELS = 160
@@ -21,11 +20,6 @@ N_PIXELS = 160
 FOVEA_FRACTION = 0.2
 #: Sites of the fovea have at most this multiple of the area of the smallest ones, without the smallest 1 %, often slivers.
 FOVEA_AREA_RATIO, SLIVER_QUANTILE = 2.0, 0.01
-#: Parameters of raster generators that the number of sites in a field of given size replaces.
-RASTER = ("grid", "hexagonal", "octagonal")
-RASTER_PARAMETERS = ("n_x", "n_y", "n_columns", "n_rows", "pitch_um", "pitch_y_um")
-#: Largest difference of the number of sites, in percent, where generators have no nearer possible number.
-MAX_PERCENT = 8
 MM2_PER_UM2 = 1e-6
 #: Rows of the comparison: label and unit by name.
 ROWS = {
@@ -69,7 +63,7 @@ def compare(a: Simulated, b: Simulated) -> dict[str, Any]:
         "rows": rows,
         "field_um": 2.0 * half_um,
         "fovea_um": 2.0 * FOVEA_FRACTION * half_um,
-        "can_match": _is_generated(b.settings),
+        "can_match": is_generated(b.settings),
     }
 
 
@@ -115,52 +109,3 @@ def _square(centre_um: Floats, half_um: float) -> Grid:
     return Grid(
         (N_PIXELS, N_PIXELS), (pitch_um, pitch_um), (float(centre_um[0] - half_um), float(centre_um[1] - half_um))
     )
-
-
-def _is_generated(settings: dict[str, Any]) -> bool:
-    layout = settings.get("layout")
-    return isinstance(layout, dict) and layout.get("generator") in LAYOUTS
-
-
-def with_n_sites(settings: dict[str, Any], n_sites: int, layout: Layout) -> dict[str, Any]:
-    """
-    Return settings whose generator solves for a number of photosites.
-
-    Rasters have the field of the present layout, and other pitches; of other generators, one parameter is solved for.
-
-    ``layout``: present layout of the settings. Raises ParameterError when the layout has no generator, or its generator has no
-    such parameter.
-    """
-    if not _is_generated(settings):
-        raise ParameterError("layout", "must have a generator, whose number of photosites can be chosen")
-    found = copy.deepcopy(settings)
-    name = found["layout"]["generator"]
-    parameters = found["layout"].setdefault("parameters", {})
-    solvable = LAYOUTS[name].solve_for  # type: ignore[attr-defined]
-    given = [unknown.name for unknown in solvable if parameters.get(unknown.name) is not None]
-    if name in RASTER:
-        x0_um, y0_um, x1_um, y1_um = layout.bounds_um
-        if parameters.get("size_um") is None:
-            parameters["size_um"] = [round(x1_um - x0_um, 6), round(y1_um - y0_um, 6)]
-        candidates = [{key: value for key, value in parameters.items() if key not in RASTER_PARAMETERS}]
-    elif solvable and parameters.get("n_sites") is None:
-        if not given:
-            raise ParameterError("layout", f"of {name} must contain {' or '.join(each.name for each in solvable)}")
-        candidates = [{key: value for key, value in parameters.items() if key != other} for other in given]
-    else:
-        candidates = [parameters]
-    chosen = candidates[0] | {"n_sites": n_sites}
-    if solvable and LAYOUTS[name].picture is None:  # type: ignore[attr-defined]
-        chosen = _nearest(name, candidates, n_sites) or chosen  # without any, the generator reports the reason
-    found["layout"]["parameters"] = chosen
-    return found
-
-
-def _nearest(generator: str, candidates: list[dict[str, Any]], n_sites: int) -> dict[str, Any] | None:
-    """Return the first parameters with a possible number of sites near the given one."""
-    for percent in sorted(range(-MAX_PERCENT, MAX_PERCENT + 1), key=abs):
-        for parameters in candidates:
-            with suppress(FoveasimError):
-                layout = LAYOUTS[generator](**{**parameters, "n_sites": round(n_sites * (1.0 + 0.01 * percent))})
-                return parameters | {"n_sites": layout.n_sites if percent else n_sites}
-    return None

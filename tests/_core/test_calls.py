@@ -118,7 +118,7 @@ def test_signatures_and_examples_remain_visible():
     assert "@layout_family" in inspect.getsource(fs.layout.grid)
     finder = DocTestFinder(exclude_empty=True)
     found = {test.name for test in finder.find(import_module("foveasim.view.id_map")) if test.examples}
-    assert found == {"foveasim.view.id_map.id_map", "foveasim.view.id_map.site_at"}
+    assert {"foveasim.view.id_map.id_map", "foveasim.view.id_map.site_at"} <= found
 
 
 def test_checked_functions_are_pickled_by_name():

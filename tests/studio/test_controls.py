@@ -114,7 +114,7 @@ def test_values_per_area_have_two_controls(controls):
 def test_choices_are_valid_settings(demo, controls):
     n_checked = 0
     for control in controls:
-        for choice in control.get("choices", ()):
+        for choice in () if "do" in control else control.get("choices", ()):
             settings = json.loads(json.dumps(demo))
             if choice["value"] is None or control["key"] == "integration_order":
                 continue

@@ -553,7 +553,8 @@ def _expand_range(path: Path, name: str, value_range: _Range) -> list[Any]:
         numbers = np.linspace(value_range.low, value_range.high, value_range.n)
     if not np.isfinite(numbers).all():
         raise ConfigError(path, f"vary.{name}: must have finite bounds")
-    numbers = np.array([float(f"{number:.14g}") for number in numbers])  # 4 instead of 3.999999999999999
+    rounded = np.array([float(f"{number:.12g}") for number in numbers])
+    numbers = np.where(np.isclose(numbers, rounded, rtol=1e-15, atol=0.0), rounded, numbers)  # 4 for 3.999999999999999
     is_integer = bool((numbers == np.rint(numbers)).all())
     return [int(number) if is_integer else float(number) for number in numbers]
 

@@ -302,6 +302,17 @@ class Row {
     this.sent = this.on.send(value, isFinal) ?? this.sent;
   }
 
+  // Shows the value that the generator has solved for, or the default, where none is given.
+  solve(value) {
+    const { default: initial } = this.control, text = fieldText(value ?? initial);
+    if (this.field instanceof HTMLInputElement && this.field.type === "text" && this.field.placeholder !== text) {
+      this.field.placeholder = text;
+      this.field.classList.toggle("solved", value !== undefined);
+    }
+    if (value !== this.solved) this.isCurrent = false;
+    this.solved = value;
+  }
+
   // Shows the value of a state, unless the user is changing it or it has an error.
   update(value, isChanged, error, id) {
     if (this.isCurrent && value === this.value && isChanged === this.isMarked && !error) return;
@@ -334,14 +345,14 @@ class Row {
       field.value = String(chosen);
     } else if (control.kind === "boolean") Object.assign(field, { checked: Boolean(value ?? control.default) });
     else if (field.value !== fieldText(value)) field.value = fieldText(value);
-    if (slider) this._place(slider, typeof value === "number" ? value : NaN);
+    if (slider) this._place(slider, typeof value === "number" ? value : typeof this.solved === "number" ? this.solved : NaN);
   }
 }
 
 export class Controls {
   root; search; onlyChanged; on;
 
-  // Callbacks: send(key, value, isFinal) returns the number of the message; reset(key), remove(key).
+  // Callbacks: send(key, value, isFinal) and act(do, name) return the number of the message; reset(key), remove(key).
   constructor(root, search, onlyChanged, on) {
     Object.assign(this, { root, search, onlyChanged, on });
     this.rows = new Map();
@@ -377,8 +388,9 @@ export class Controls {
       const id = control.id || control.key, known = before.get(id), shape = shapeOf(control);
       // The heading of a section is enough.
       if (control.kind === "group" && !control.key.includes(".")) continue;
+      const act = control.do;
       const row = known && known.shape === shape ? known : new Row(control, {
-        send: (value, isFinal) => this.on.send(control.key, value, isFinal),
+        send: (value, isFinal) => (act ? this.on.act(act, value) : this.on.send(control.key, value, isFinal)),
         reset: () => this.on.reset(control.key),
         remove: () => this.on.remove(control.key),
       });
@@ -467,6 +479,8 @@ export class Controls {
     // A value of its own after a choice shows the error.
     for (const row of [...this.rows.values()].reverse()) {
       const { key } = row.control;
+      if (row.control.do) { row.update(row.control.value, false, undefined, null); continue; }
+      row.solve(state.solved?.[key]);
       row.update(valueAt(state.settings, key), row.control.kind !== "group" && isChanged(row.control), errors[key], state.id ?? null);
       delete errors[key];
     }

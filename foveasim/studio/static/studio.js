@@ -626,6 +626,7 @@ function start() {
     send: (key, value, isFinal) => connection.set(key, value, isFinal),
     reset: (key) => connection.send({ do: "reset", key }),
     remove: (key) => connection.send({ do: "delete", key }),
+    act: (what, name) => connection.send({ do: what, name }),
   });
   createEditor();
   const scene = () => [...controls.rows.values()].find(({ control: { key, kind } }) => key === "scene" && kind === "choice");
