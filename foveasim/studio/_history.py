@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 #: Largest number of undo steps; earlier ones are discarded.
@@ -78,6 +78,13 @@ class History:
         self._past = [*self._past, self._present]
         self._present = later
         return True
+
+    def mapped(self, change: Callable[[dict[str, Any]], dict[str, Any]]) -> History:
+        """Return an independent history with changed states."""
+        other = History({})
+        other._past, other._future = [change(each) for each in self._past], [change(each) for each in self._future]
+        other._present, other._draft = change(self._present), None if self._draft is None else change(self._draft)
+        return other
 
     def copy(self) -> History:
         """Return an independent history with the same states, which are not copied."""

@@ -108,10 +108,18 @@ class Studio:
             session.close()
         self.sessions.clear()
 
-    def session(self, name: object) -> tuple[Session | None, bool]:
-        """Return the session of a name or a new one, if possible, and whether it is new."""
-        if isinstance(name, str) and name in self.sessions:
-            return self.sessions[name], False
+    def session(self, name: object, page: object = None) -> tuple[Session | None, bool]:
+        """
+        Return the session of a name or a new one, if possible, and whether it has the initial state.
+
+        ``page``: identifier of the page. If another page uses the session, such as the one that a tab was duplicated from, the
+        new session has a copy of its state.
+        """
+        origin = self.sessions.get(name) if isinstance(name, str) else None
+        page = page if isinstance(page, str) else None
+        if origin is not None and (origin.is_idle or origin.page == page):
+            origin.page = page
+            return origin, False
         self.free_idle()
         if len(self.sessions) >= MAX_SESSIONS:
             # A page that was closed leaves its session; the oldest one makes space.
@@ -120,9 +128,10 @@ class Studio:
                 return None, True
             oldest = min(idle, key=lambda each: each.last_used_s)
             self.sessions.pop(oldest.name).close()
-        session = Session(secrets.token_urlsafe(12), self.start)
+        session = Session(secrets.token_urlsafe(12), self.start, origin=origin)
+        session.page = page
         self.sessions[session.name] = session
-        return session, True
+        return session, origin is None
 
     def free_idle(self, idle_s: float = IDLE_S) -> None:
         """Close sessions without a page."""
@@ -165,7 +174,7 @@ class Studio:
             if not isinstance(first, dict) or not self._is_token(first.get("token")):
                 await socket.close(WRONG_TOKEN, "wrong token")
                 return
-            session, is_new = self.session(first.get("session"))
+            session, is_new = self.session(first.get("session"), first.get("page"))
             if session is None:
                 await socket.close(TOO_MANY, "too many sessions")
                 return

@@ -83,10 +83,11 @@ class Session:
     """
     Settings of a page with history, and a thread that simulates them.
 
-    ``name``: identifier. ``n_threads``: number of threads of the simulation.
+    ``name``: identifier. ``n_threads``: number of threads of the simulation. ``origin``: session whose history and uploaded
+    files are copied.
     """
 
-    def __init__(self, name: str, start: Start, *, n_threads: int | None = None) -> None:
+    def __init__(self, name: str, start: Start, *, n_threads: int | None = None, origin: Session | None = None) -> None:
         self.name, self.start = name, start
         self.uploads = Path(tempfile.mkdtemp(prefix="foveasim-studio-"))
         self.files = Files(start.settings, start.directory, self.uploads)
@@ -95,6 +96,10 @@ class Session:
         self.result: Simulated | None = None
         self.last_used_s = time.monotonic()
         self.n_free_bytes = MAX_SESSION_BYTES
+        if origin is not None:
+            self._copy_state(origin)
+        # Identifier of the page that is connected, or was last.
+        self.page: str | None = None
         self._uploading = threading.Lock()  # in threads of the server
         self.frames = Frames(self.uploads, self._new_path)
         self._costs = Costs()
@@ -133,6 +138,25 @@ class Session:
             "settings": to_json(settings),
             "name": self.start.name,
         }
+
+    def _copy_state(self, origin: Session) -> None:
+        """Take over the history and the uploaded files of another session."""
+        with origin._uploading:
+            self.n_free_bytes = origin.n_free_bytes
+            for path in origin.uploads.iterdir():
+                if path.is_file():
+                    shutil.copy2(path, self.uploads / path.name)
+
+        def moved(value: Any) -> Any:
+            """Return settings with the paths of this session's files."""
+            if isinstance(value, dict):
+                return {name: moved(item) for name, item in value.items()}
+            if isinstance(value, list):
+                return [moved(item) for item in value]
+            return value.replace(old, new) if isinstance(value, str) else value
+
+        old, new = f"{origin.uploads}/", f"{self.uploads}/"
+        self.history = origin.history.mapped(moved)
 
     def attach(self, listener: Listener) -> None:
         """Add a connection, which receives all parts."""

@@ -102,10 +102,10 @@ class Page:
         return arrays[next(column["array"] for column in header["about"]["columns"] if column["key"] == "code")]
 
 
-async def opened(served, session=None, token=None):
+async def opened(served, session=None, token=None, page=None):
     connection = await websockets.connect(f"ws://{served.host}/socket", max_size=None)
     CONNECTIONS.append(connection)
-    await connection.send(json.dumps({"token": token or served.studio.token, "session": session}))
+    await connection.send(json.dumps({"token": token or served.studio.token, "session": session, "page": page}))
     page = Page(connection)
     page.hello = await page.until("hello")
     await page.until("done")
@@ -290,6 +290,42 @@ def test_tabs_have_separate_sessions(served, settings):
     assert one.hello["session"] != two.hello["session"]
     assert np.array_equal(one.code, codes_of({**settings, "exposure_s": 0.03}))
     assert np.array_equal(two.code, codes_of({**settings, "seed": 8}))
+
+
+def test_duplicated_tab_has_a_copy(served, settings, tmp_path):
+    """Both pages have the same state at first, files included, and change separately."""
+    write_picture(tmp_path / "photo.png", np.random.default_rng(0).integers(0, 256, (40, 50, 3), dtype=np.uint8))
+
+    async def visit():
+        one = await opened(served, page="one")
+        name = one.hello["session"]
+        answer = await asyncio.to_thread(
+            served.authorised, name, "/file?name=photo.png", (tmp_path / "photo.png").read_bytes()
+        )
+        await one.do(do="set", key="exposure_s", value=0.02, final=True)
+        await one.do(do="file", path=json.loads(answer[2])["path"], **{"as": "scene"})
+        two = await opened(served, name, page="two")
+        copied = two.state["settings"]
+        await one.do(do="set", key="exposure_s", value=0.03, final=True)
+        await two.do(do="set", key="seed", value=8, final=True)
+        await one.connection.close()
+        await asyncio.sleep(0.3)
+        again = await opened(served, name, page="three")  # the page was loaded again
+        for page in (two, again):
+            await page.connection.close()
+        return one, two, again, copied
+
+    one, two, again, copied = run(visit())
+    assert one.hello["session"] != two.hello["session"]
+    assert again.hello["session"] == one.hello["session"]
+    assert not two.hello["is_new"]
+    assert two.state["can_undo"]
+    assert copied["exposure_s"] == 0.02
+    assert copied["scene"]["picture"] != one.state["settings"]["scene"]["picture"]
+    assert Path(copied["scene"]["picture"]).read_bytes() == (tmp_path / "photo.png").read_bytes()
+    assert two.state["settings"]["exposure_s"] == 0.02
+    assert np.array_equal(again.code, codes_of({**one.state["settings"], "exposure_s": 0.03}))
+    assert np.array_equal(two.code, codes_of({**copied, "seed": 8}))
 
 
 def test_sessions_are_limited_and_freed(served, monkeypatch):

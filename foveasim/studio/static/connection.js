@@ -11,6 +11,9 @@ const WRONG_TOKEN = 4403;
 // A preview that is not answered in this time no longer delays the next one.
 const PATIENCE_MS = 4000;
 
+// Identifies this page: a duplicated tab remembers the same session, and receives a copy of it.
+const PAGE = Array.from(crypto.getRandomValues(new Uint32Array(4)), (part) => part.toString(36)).join("");
+
 // What the page remembers in this tab, such as its session.
 export const memory = {
   /** @param {string} name */
@@ -104,7 +107,7 @@ export class Connection {
     const socket = new WebSocket((location.protocol === "https:" ? "wss://" : "ws://") + location.host + "/socket");
     this.socket = socket;
     socket.binaryType = "arraybuffer";
-    socket.addEventListener("open", () => socket.send(JSON.stringify({ token: this.token, session: memory.get("session") })));
+    socket.addEventListener("open", () => socket.send(JSON.stringify({ token: this.token, session: memory.get("session"), page: PAGE })));
     socket.addEventListener("message", ({ data }) => {
       if (typeof data === "string") this._receive(JSON.parse(data));
       else this.on.part(readPart(data));
