@@ -335,9 +335,12 @@ def studio(
     """Change the settings of a shot in the browser, with views that follow at once."""
     from foveasim.studio import run_studio
 
+    announced: list[str] = []
+
     def announce(address: str, is_opened: bool) -> None:
-        _print(f"studio at {address} (press Ctrl-C to stop)")
-        if browser and not is_opened:
+        _print(f"studio at {address} (press Ctrl-C to stop)" if not announced else f"also at {address} ")
+        announced.append(address)
+        if browser and not is_opened and len(announced) == 1:
             _print("no browser found; open the address in one")
 
     changes = [*(changes or []), *_layout_changes(layer, channels, cell, centre)]

@@ -63,7 +63,7 @@ def run_studio(
     open_browser : bool
         Whether to open a browser.
     announce : function of (address, whether a browser opens it), optional
-        Called when the server accepts requests; by default the address is printed.
+        Called for each address when the server accepts requests; by default the addresses are printed.
 
     Raises
     ------
@@ -82,8 +82,9 @@ def run_studio(
 
     Notes
     -----
-    The address contains a random token. The environment variable ``FOVEASIM_STUDIO_TOKEN`` specifies another one, so that the
-    address is the same after a restart.
+    The address contains a random token. Browsers are started with a file that leads to it, which only the user can read: other
+    users can see the arguments of commands. The environment variable ``FOVEASIM_STUDIO_TOKEN`` specifies another token, so
+    that the address is the same after a restart.
 
     Examples
     --------
@@ -94,7 +95,7 @@ def run_studio(
         import_optional("studio", module)
     from foveasim.config import check_settings
     from foveasim.studio._files import start_settings
-    from foveasim.studio._server import UNSPECIFIED, Studio, host_names, serve
+    from foveasim.studio._server import UNSPECIFIED, Studio, host_names, in_address, other_addresses, serve
     from foveasim.studio._session import Start
 
     if not host:  # a socket would listen at all addresses
@@ -120,22 +121,29 @@ def run_studio(
         raise ParameterError("port", f"must be a free port ({error.strerror or error})", port) from None
     with listener:
         found = int(listener.getsockname()[1])
-        studio = Studio(start, token=token, hosts=host_names(host, found))
-        shown = host if host not in UNSPECIFIED else "127.0.0.1" if has_both or ":" not in host else "::1"
-        address = f"http://{f'[{shown}]' if ':' in shown else shown}:{found}/#{studio.token}"
+        is_everywhere = host in UNSPECIFIED
+        studio = Studio(start, token=token, hosts=host_names(host, found), has_all_addresses=is_everywhere)
+        first = host if not is_everywhere else "127.0.0.1" if has_both or ":" not in host else "::1"
+        others = (
+            [each for each in other_addresses() if has_both or (":" in each) == (":" in host)] if is_everywhere else []
+        )
+        addresses = [f"http://{in_address(each)}:{found}/#{studio.token}" for each in (first, *others)]
         browser = _graphical_browser() if open_browser else None
 
         def ready() -> None:
-            if announce is not None:
-                announce(address, browser is not None)
-            else:
-                sys.stdout.write(f"{address}\n")
-                sys.stdout.flush()
+            for address in addresses:
+                if announce is not None:
+                    announce(address, browser is not None)
+                else:
+                    sys.stdout.write(f"{address}\n")
+                    sys.stdout.flush()
             if browser is not None:
                 # In a thread: some commands return only when the browser is closed.
-                threading.Thread(target=browser.open, args=(address,), daemon=True).start()
+                threading.Thread(target=browser.open, args=(page.as_uri(),), name="studio browser", daemon=True).start()
 
-        serve(studio, listener, ready)
+        with tempfile.TemporaryDirectory(prefix="foveasim-studio-") as folder:
+            page = _redirection(Path(folder), addresses[0])
+            serve(studio, listener, ready)
 
 
 def _graphical_browser() -> webbrowser.BaseBrowser | None:
@@ -145,6 +153,17 @@ def _graphical_browser() -> webbrowser.BaseBrowser | None:
     except webbrowser.Error:
         return None
     return None if browser.name in TEXT_BROWSERS else browser
+
+
+def _redirection(folder: Path, address: str) -> Path:
+    """Write a page that leads to an address, which only the user can read."""
+    path = folder / "studio.html"
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
+        file.write(
+            f'<!doctype html><meta charset="utf-8"><title>foveasim studio</title>'
+            f'<meta http-equiv="refresh" content="0; url={address}"><a href="{address}">foveasim studio</a>\n'
+        )
+    return path
 
 
 def _own_token() -> str | None:

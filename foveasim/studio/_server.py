@@ -5,14 +5,17 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hmac
+import ipaddress
 import json
 import secrets
+import signal
 import socket
 import sys
 import tempfile
+import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -43,7 +46,9 @@ IDLE_S, MAX_SESSIONS = 1800.0, 8
 #: Time limit for the first message of a connection.
 HELLO_S = 10.0
 #: Simultaneous connections; further ones receive 503.
-MAX_CONNECTIONS = 128
+MAX_CONNECTIONS = 256
+#: Simultaneous connections that have not sent the token; the oldest ones are closed.
+MAX_STRANGERS = 64
 #: Largest number of messages that wait for a slow connection.
 MAX_OUTGOING = 1000
 #: Longest time that a simulation delays the thread that sends messages.
@@ -85,12 +90,17 @@ class Studio:
         Secret of the address; random by default.
     hosts : set of str
         Values of the header ``Host`` that are accepted.
+    has_all_addresses : bool
+        Whether the server listens at all addresses of this computer: ``Host`` may be the one of the connection.
     """
 
-    def __init__(self, start: Start, *, token: str | None = None, hosts: set[str]) -> None:
+    def __init__(
+        self, start: Start, *, token: str | None = None, hosts: set[str], has_all_addresses: bool = False
+    ) -> None:
         self.start, self.hosts = start, hosts
         self.token = token or secrets.token_urlsafe(24)
         self.sessions: dict[str, Session] = {}
+        self.strangers = _Strangers()
         routes = [
             Route("/", self._index),
             Route("/static/{name}", self._static),
@@ -100,7 +110,7 @@ class Studio:
             Route("/download", self._download),
             WebSocketRoute("/socket", self._socket),
         ]
-        self.app: ASGIApp = _Guard(Starlette(routes=routes), hosts)
+        self.app: ASGIApp = _Guard(Starlette(routes=routes), hosts, has_all_addresses=has_all_addresses)
 
     def close(self) -> None:
         """Close all sessions."""
@@ -174,6 +184,7 @@ class Studio:
             if not isinstance(first, dict) or not self._is_token(first.get("token")):
                 await socket.close(WRONG_TOKEN, "wrong token")
                 return
+            self.strangers.remove(socket.client)
             session, is_new = self.session(first.get("session"), first.get("page"))
             if session is None:
                 await socket.close(TOO_MANY, "too many sessions")
@@ -194,6 +205,7 @@ class Studio:
         except (WebSocketDisconnect, TimeoutError, KeyError, RuntimeError):
             pass  # disconnected, silent, or a first message in binary
         finally:
+            self.strangers.remove(socket.client)
             if session is not None and outgoing is not None:
                 session.detach(outgoing.put)
             if sender is not None:
@@ -213,6 +225,7 @@ class Studio:
         scheme, _, token = request.headers.get("authorization", "").partition(" ")
         if scheme.lower() != "bearer" or not self._is_token(token.strip()):
             return _error("wrong token", 403)
+        self.strangers.remove(request.client)
         session = self.sessions.get(request.headers.get("x-session", ""))
         return _error("unknown session; reload the page", 404) if session is None else session
 
@@ -255,6 +268,31 @@ class Studio:
             return _error(f"the file cannot be written: {one_line(error)}", 400)
         disposition = f'attachment; filename="{name}"'
         return Response(content, media_type="application/octet-stream", headers={"Content-Disposition": disposition})
+
+
+class _Strangers:
+    """
+    Connections that have not sent the token, from the oldest.
+
+    Beyond :data:`MAX_STRANGERS` the oldest ones are closed, so that silent connections do not block others.
+    """
+
+    def __init__(self) -> None:
+        self._transports: dict[tuple[str, int], asyncio.Transport] = {}
+
+    def add(self, transport: asyncio.Transport) -> None:
+        """Add a new connection."""
+        peer = transport.get_extra_info("peername")
+        if not isinstance(peer, tuple):
+            return
+        self._transports[str(peer[0]), int(peer[1])] = transport
+        while len(self._transports) > MAX_STRANGERS:
+            self._transports.pop(next(iter(self._transports))).abort()
+
+    def remove(self, client: Any) -> None:
+        """Remove a connection that is closed, or has sent the token, by its address and port."""
+        if client is not None:
+            self._transports.pop((str(client[0]), int(client[1])), None)
 
 
 class _Outbox:
@@ -304,9 +342,8 @@ def _part_name(message: bytes) -> str:
 class _Guard:
     """Check of the headers ``Host`` and ``Origin``, and headers of all responses."""
 
-    def __init__(self, app: ASGIApp, hosts: set[str]) -> None:
-        self.app, self.hosts = app, hosts
-        self.origins = {f"http://{host}" for host in hosts}
+    def __init__(self, app: ASGIApp, hosts: set[str], *, has_all_addresses: bool) -> None:
+        self.app, self.hosts, self.has_all_addresses = app, hosts, has_all_addresses
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
@@ -314,7 +351,16 @@ class _Guard:
             return
         hosts = [value.decode("latin-1").lower() for name, value in scope["headers"] if name == b"host"]
         origins = [value.decode("latin-1").lower() for name, value in scope["headers"] if name == b"origin"]
-        if len(hosts) != 1 or hosts[0] not in self.hosts or any(origin not in self.origins for origin in origins):
+        allowed = self.hosts
+        if self.has_all_addresses and scope.get("server"):  # of the interface that the connection came through
+            address, port = scope["server"]
+            address = address.removeprefix("::ffff:")  # IPv4 of a socket for both
+            allowed = allowed | _with_port({in_address(address)}, port)
+        if (
+            len(hosts) != 1
+            or hosts[0] not in allowed
+            or any(origin not in {f"http://{host}" for host in allowed} for origin in origins)
+        ):
             if scope["type"] == "websocket":
                 await receive()
                 await send({"type": "websocket.close", "code": WRONG_TOKEN})
@@ -399,17 +445,34 @@ def _exported(session: Session, what: str) -> tuple[bytes, str]:
 
 def host_names(host: str, port: int) -> set[str]:
     """Return the accepted values of the header ``Host``."""
-    names = {"127.0.0.1", "localhost", "[::1]", _in_address(host)}
+    names = {"127.0.0.1", "localhost", "[::1]", in_address(host)}
     if host in UNSPECIFIED:
-        names.add(socket.gethostname())
-        with contextlib.suppress(OSError):
-            names |= {_in_address(str(found[4][0])) for found in socket.getaddrinfo(socket.gethostname(), None)}
-    return {f"{name}:{port}".lower() for name in names} | (names if port == HTTP_PORT else set())
+        names |= {socket.gethostname(), *(in_address(address) for address in other_addresses())}
+    return _with_port(names, port)
 
 
-def _in_address(host: str) -> str:
+def _with_port(names: set[str], port: int) -> set[str]:
+    """Return values of the header ``Host``."""
+    lower = {name.lower() for name in names}
+    return {f"{name}:{port}" for name in lower} | (lower if port == HTTP_PORT else set())
+
+
+def in_address(host: str) -> str:
     """Return a host as in a URL."""
     return f"[{host}]" if ":" in host else host
+
+
+def other_addresses() -> list[str]:
+    """Return addresses at which other computers may reach this one: of its routes and of its name."""
+    found: list[str] = []
+    for family, remote in ((socket.AF_INET, "192.0.2.1"), (socket.AF_INET6, "2001:db8::1")):
+        # For datagrams, connecting selects an interface and sends nothing; both addresses are reserved for documentation.
+        with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.connect((remote, 9))
+            found.append(str(probe.getsockname()[0]))
+    with contextlib.suppress(OSError):
+        found += [str(each[4][0]) for each in socket.getaddrinfo(socket.gethostname(), None)]
+    return [each for each in dict.fromkeys(found) if not ipaddress.ip_address(each.partition("%")[0]).is_loopback]
 
 
 def serve(
@@ -419,12 +482,22 @@ def serve(
     started: Callable[[Any], object] | None = None,
 ) -> None:
     """
-    Serve the studio until Ctrl-C.
+    Serve the studio until Ctrl-C, SIGTERM or SIGHUP; then all sessions are closed, and uploaded files deleted.
 
     ``listener``: bound to the address. ``announce``: called when the server accepts requests. ``started``: called with the
     server, whose ``should_exit`` stops it, before it runs.
     """
     import uvicorn
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+
+    class Protocol(H11Protocol):
+        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+            super().connection_made(transport)
+            studio.strangers.add(transport)
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            studio.strangers.remove(self.client)
+            super().connection_lost(exc)
 
     class Server(uvicorn.Server):
         async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -441,6 +514,7 @@ def serve(
         log_level="critical",
         access_log=False,
         lifespan="off",
+        http=Protocol,
         ws="websockets-sansio",
         ws_max_size=MAX_MESSAGE_BYTES,
         ws_per_message_deflate=False,  # costs more time than the transfer on this computer
@@ -453,11 +527,40 @@ def serve(
     interval_s = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     try:
-        with contextlib.suppress(KeyboardInterrupt):
-            server = Server(config)
-            if started is not None:
-                started(server)
+        server = Server(config)
+        if started is not None:
+            started(server)
+        with contextlib.suppress(KeyboardInterrupt), _ended_by_signals(server):
             server.run(sockets=[listener])
     finally:
         sys.setswitchinterval(interval_s)
         studio.close()
+
+
+@contextlib.contextmanager
+def _ended_by_signals(server: Any) -> Iterator[None]:
+    """Let SIGTERM and SIGHUP stop a server, and then raise SystemExit; signals that are ignored remain so."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(number: int, _frame: Any) -> None:
+        # The server handles SIGTERM itself, and raises it again when it has stopped.
+        if server.should_exit or not server.started:
+            raise SystemExit(128 + number)
+        received.append(number)
+        server.should_exit = True
+
+    received: list[int] = []
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = {number: signal.getsignal(number) for number in numbers}
+    changed = {number: handler for number, handler in before.items() if handler is not signal.SIG_IGN}
+    for number in changed:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number, handler in changed.items():
+            signal.signal(number, handler)
+    if received:
+        raise SystemExit(128 + received[0])

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import queue
 import socket
+import stat
 import sys
 import threading
 import webbrowser
+from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 import pytest
 from typer.testing import CliRunner
@@ -28,6 +32,9 @@ def started(monkeypatch):
     def record(served, _listener, announce):
         found.append(served)
         announce()
+        for thread in threading.enumerate():
+            if thread.name == "studio browser":  # its page is deleted with the server
+                thread.join(1.0)
         served.close()
 
     monkeypatch.setattr(_server, "serve", record)
@@ -41,7 +48,8 @@ class Browser:
         self.name, self.opened = name, opened
 
     def open(self, address):
-        self.opened.put(address)
+        path = Path(url2pathname(urlsplit(address).path))
+        self.opened.put((path.read_text(), stat.S_IMODE(path.stat().st_mode)))
 
 
 def no_browser():
@@ -64,7 +72,10 @@ def test_browser_opens_address(started, monkeypatch):
     monkeypatch.setattr("webbrowser.get", lambda: Browser("firefox", opened))
     result = CliRunner().invoke(app, ["studio", str(demo_settings()[1])])
 
-    assert opened.get(timeout=60.0) in result.output
+    # A file for this user: the arguments of a command are visible to all.
+    page, mode = opened.get(timeout=60.0)
+    assert mode == 0o600
+    assert f'url={result.output.split()[2]}"' in page
     assert "no browser" not in result.output
     assert started[0].start.name == "four_zones"
 
@@ -173,7 +184,14 @@ def test_printed_address_is_reachable(monkeypatch, host):
     with pytest.warns(FoveasimWarning):
         run_studio(host=host, open_browser=False, announce=announce)
 
-    assert len(connected) == 1
+    assert connected
+    assert all(
+        each.split("#")[0] in {f"http://{name}/" for name in host_names(host, port_of(each))} for each in connected
+    )
+
+
+def port_of(address):
+    return urlsplit(address).port
 
 
 def test_host_names_have_the_port():

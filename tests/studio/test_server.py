@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -25,7 +26,7 @@ from foveasim._io.images import write_picture
 from foveasim.config import build_shot
 from foveasim.studio import _server
 from foveasim.studio._messages import decode_part
-from foveasim.studio._server import HEADERS, Studio, host_names, serve
+from foveasim.studio._server import HEADERS, Studio, host_names, other_addresses, serve
 from foveasim.studio._session import Start
 
 TIMEOUT_S = 60.0
@@ -469,14 +470,16 @@ def test_slow_connections_receive_parts_of_variant():
 class Program:
     """The command in a process of its own."""
 
-    def __init__(self, *arguments):
+    def __init__(self, *arguments, temporary=None, n_lines=1):
         self.process = subprocess.Popen(
             [sys.executable, "-m", "foveasim", "studio", "--no-browser", *arguments],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=Path(fs.__file__).parents[1],
+            env=os.environ | ({"TMPDIR": str(temporary)} if temporary else {}),
         )  # fmt: skip
-        line = self.process.stdout.readline()
-        address = line.split("studio at ")[1].split()[0]
-        self.host, _, token = address.removeprefix("http://").partition("/#")
+        lines = [self.process.stdout.readline() for _ in range(n_lines)]
+        self.addresses = [line.split(" at ")[1].split()[0] for line in lines]
+        self.host, _, token = self.addresses[0].removeprefix("http://").partition("/#")
+        self.port = int(self.host.rpartition(":")[2])
         self.studio = type("Address", (), {"token": token})
 
     def stop(self, number):
@@ -484,6 +487,74 @@ class Program:
         self.process.send_signal(number)
         _, errors = self.process.communicate(timeout=TIMEOUT_S)
         return self.process.returncode, errors
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_signals_delete_uploaded_files(name, tmp_path):
+    """Also those of a session with an open page; the exit code is that of the signal."""
+    number = getattr(signal, name, None)
+    if number is None:
+        pytest.skip("not on this system")
+    program = Program(temporary=tmp_path)
+
+    async def visit():
+        page = await opened(program)
+        request = urllib.request.Request(
+            f"http://{program.host}/file?name=a.png",
+            b"content",
+            {"Authorization": f"Bearer {program.studio.token}", "X-Session": page.hello["session"]},
+        )
+        with await asyncio.to_thread(urllib.request.urlopen, request, timeout=TIMEOUT_S) as answer:
+            path = Path(json.loads(answer.read())["path"])
+        existed = await asyncio.to_thread(path.is_file) and path.is_relative_to(tmp_path)
+        return existed, *await asyncio.to_thread(program.stop, number)
+
+    existed, code, errors = run(visit())
+    assert existed
+    assert (code, errors) == (0 if name == "SIGINT" else 128 + number, "")
+    assert list(tmp_path.rglob("*")) == []
+
+
+def test_printed_addresses_answer():
+    """At all addresses of this computer, with the address as host, and with no other one."""
+    program = Program("--host", "0.0.0.0", n_lines=1 + len([each for each in other_addresses() if ":" not in each]))
+    try:
+        for address in program.addresses:
+            with urllib.request.urlopen(address.partition("#")[0], timeout=TIMEOUT_S) as answer:
+                assert answer.status == 200
+            request = urllib.request.Request(address.partition("#")[0], headers={"Host": f"192.0.2.77:{program.port}"})
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                urllib.request.urlopen(request, timeout=TIMEOUT_S)
+    finally:
+        _, errors = program.stop(signal.SIGTERM)
+    assert len(errors.splitlines()) == 1  # the warning
+
+
+def test_silent_connections_block_nobody(served):
+    """The oldest ones are closed; a page with its token stays connected."""
+    silent = []
+
+    async def visit():
+        page = await opened(served)
+        silent.extend([socket.create_connection(("127.0.0.1", served.port), TIMEOUT_S) for _ in range(140)])
+        status, _, _ = await asyncio.to_thread(served.get, "/")
+        other = await opened(served)
+        await page.do(do="set", key="seed", value=8, final=True)
+        for each in (page, other):
+            await each.connection.close()
+        return status, page.state["settings"]["seed"]
+
+    try:
+        assert run(visit()) == (200, 8)
+        silent[0].settimeout(TIMEOUT_S)
+        try:
+            closed = silent[0].recv(1) == b""
+        except ConnectionResetError:
+            closed = True
+        assert closed
+    finally:
+        for each in silent:
+            each.close()
 
 
 @pytest.mark.slow
