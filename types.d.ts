@@ -59,6 +59,7 @@ interface Choice { label: string; value: any }
 interface Control {
   key: string; id: string; label: string; unit: string; help: string; section: string;
   kind: "number" | "integer" | "boolean" | "text" | "list" | "choice" | "sections" | "group";
+  do?: string; value?: string | null;  // of a choice that is no setting: its message, and the present choice
   default?: any; is_required?: boolean; is_optional?: boolean; is_item?: boolean;
   minimum?: number | null; maximum?: number | null; suggested?: number[]; scale?: "log" | "linear";
   choices?: Choice[]; selected?: number | null; length?: number | null;
@@ -76,7 +77,7 @@ interface Busy { kind: "busy" }
 interface ControlsMessage { kind: "controls"; controls: Control[] }
 interface State {
   kind: "state"; id: number | null; version: number; settings: Settings; changed: string[]; can_undo: boolean; can_redo: boolean;
-  errors: { [key: string]: string }; warnings: string[]; summary: Summary; frozen: { summary: Summary; settings: Settings } | null;
+  errors: { [key: string]: string }; warnings: string[]; notes: string[]; solved: { [key: string]: number }; summary: Summary; frozen: { summary: Summary; settings: Settings } | null;
   film: FilmAbout | null; is_preview: boolean;
 }
 interface Done {
@@ -84,8 +85,10 @@ interface Done {
 }
 interface Failure { kind: "error"; id: number | null; text: string; part?: string }
 interface TextMessage { kind: "text"; id: number; what: string; text: string; files: string[] }
+interface Note { kind: "note"; text: string }
+interface Progress { kind: "progress"; text: string }
 interface Saved { kind: "saved"; id: number; path: string }
-type ServerMessage = Busy | ControlsMessage | State | Done | Failure | TextMessage | Saved;
+type ServerMessage = Busy | ControlsMessage | State | Done | Failure | TextMessage | Saved | Note | Progress;
 
 // Binary messages: a header and arrays; as readPart returns them.
 interface PartHeader {
@@ -105,7 +108,7 @@ type Change =
   | { do: "undo" | "redo" | "match" }
   | { do: "set"; key: string; value: unknown; final: boolean }
   | { do: "reset" | "delete"; key: string }
-  | { do: "preset" | "save"; name: string }
+  | { do: "preset" | "save" | "solve"; name: string }
   | { do: "restore"; settings: Settings | undefined }
   | { do: "file"; path: string | undefined; as: string }
   | { do: "video"; path: string | undefined }

@@ -123,8 +123,9 @@ class ShotRunner:
         Threads of a capture; by default those of the worker, or of this process.
     max_bytes : int
         Size limit of the arrays in the cache. On a worker the limit is at most a quarter of its memory.
-    check : callable, optional
-        Called before each stage; it may raise an exception to stop the simulation. Stages until then remain in the cache.
+    check : function of str, optional
+        Called with the name of each stage before it; it may raise an exception to stop the simulation. Stages until then
+        remain in the cache.
 
     Notes
     -----
@@ -139,7 +140,7 @@ class ShotRunner:
         is_geometry_varied: bool = True,
         n_threads: int | None = None,
         max_bytes: int = MAX_BYTES,
-        check: Callable[[], None] | None = None,
+        check: Callable[[str], None] | None = None,
     ) -> None:
         self.source: Source | Path | None = source
         self.metrics: Mapping[str, Metric] = metrics
@@ -180,21 +181,21 @@ class ShotRunner:
     def capture(self, shot: Shot, settings: Mapping[str, Any]) -> Capture:
         """Simulate the capture of a shot with the given settings."""
         photo_e_per_s = self.photoelectrons_per_s(shot, settings)
-        self._before_stage()
+        self._before_stage("capture")
         return shot.camera.capture(shot.scene, exposure_s=shot.requested_s, seed=shot.seed, photo_e_per_s=photo_e_per_s)
 
     def part(self, kind: str, settings: Any, make: Callable[[], Any]) -> Any:
         """Return a component as :meth:`WorkerCache.part`, with a check before it is built."""
 
         def checked() -> Any:
-            self._before_stage()
+            self._before_stage(kind)
             return make()
 
         return self.cache.part(kind, settings, checked)
 
-    def _before_stage(self) -> None:
+    def _before_stage(self, name: str) -> None:
         if self.check is not None:
-            self.check()
+            self.check(name)
 
     def photoelectrons_per_s(self, shot: Shot, settings: Mapping[str, Any]) -> Floats:
         """Return the photoelectron rates of a shot's sites, (n_site,) e-/s."""
@@ -213,7 +214,7 @@ class ShotRunner:
 
     def _make_images(self) -> dict[Any, Any]:
         """Return an empty cache of images, with a check after each."""
-        return {} if self.check is None else _CheckedImages(self._before_stage)
+        return {} if self.check is None else _CheckedImages(lambda: self._before_stage("optical image"))
 
     def _measure(self, metric: Metric, shot: Shot, capture: Capture, settings: Mapping[str, Any]) -> Any:
         """Compute a metric, with a cached reference where the metric takes one."""

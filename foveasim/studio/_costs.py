@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from foveasim.errors import FoveasimError
+
 #: Simulations and views that take longer are reduced or left out while a control is dragged.
 SLOW_S = 0.15
 #: Rest after which a preview is replaced by the complete result.
@@ -18,6 +20,10 @@ DECAY = 0.5
 
 class SupersededError(Exception):
     """A newer change waits: the simulation stops."""
+
+
+class CancelledError(FoveasimError):
+    """The user has cancelled a change."""
 
 
 class Costs:

@@ -77,11 +77,11 @@ class Engine:
 
     Layout, scene, optics, distortion, compiled outlines, optical images and power on sites are cached by their settings.
 
-    ``n_threads``: number of threads; one per core by default. ``check``: called before each stage; it may raise an exception
-    to stop the simulation.
+    ``n_threads``: number of threads; one per core by default. ``check``: called with the name of each stage before it; it may
+    raise an exception to stop the simulation.
     """
 
-    def __init__(self, *, n_threads: int | None = None, check: Callable[[], None] | None = None) -> None:
+    def __init__(self, *, n_threads: int | None = None, check: Callable[[str], None] | None = None) -> None:
         self._runner = ShotRunner(None, {}, n_threads=n_threads, max_bytes=MAX_BYTES, check=check)
 
     @property

@@ -37,7 +37,7 @@ from foveasim.studio._changes import (
     with_file,
 )
 from foveasim.studio._controls import chosen_value, controls_of, structure_of
-from foveasim.studio._costs import RELEASE_S, REST_S, Costs, SupersededError
+from foveasim.studio._costs import RELEASE_S, REST_S, CancelledError, Costs, SupersededError
 from foveasim.studio._engine import Engine, Simulated
 from foveasim.studio._exports import text_of, without_directories
 from foveasim.studio._files import Files, apply_preset, file_name, is_unused_or_copy, unused_path
@@ -45,6 +45,7 @@ from foveasim.studio._frames import Frames
 from foveasim.studio._history import History
 from foveasim.studio._messages import from_json, one_line, to_json
 from foveasim.studio._parts import PARTS, summary_of
+from foveasim.studio._pictures import reduced_picture, resolved_pixels
 from foveasim.studio._solving import balanced, solved_of, with_n_sites, with_unknown
 from foveasim.studio._views import Views
 
@@ -112,11 +113,14 @@ class Session:
         self._frozen_result: Simulated | None = None
         self._errors: dict[str, str] = {}
         self._simulated_frame: str | None = None
+        # Sentences about pictures that were reduced, by path.
+        self._notes: dict[str, str] = {}
         # Setting that changed last, and whether this was during a drag.
         self._key: str | None = None
         self._is_dragging = False
         self._wants_rest = False
         self._has_unused_memory = False
+        self._is_cancelled = False
         self._can_stop = False
         self._stopped_s = -math.inf
         self._listeners: set[Listener] = set()
@@ -177,7 +181,10 @@ class Session:
         return not self._listeners
 
     def post(self, message: Any) -> None:
-        """Add a message of the page; it is handled in the thread of the session."""
+        """Add a message of the page; it is handled in the thread of the session, but ``cancel`` at once."""
+        if isinstance(message, dict) and message.get("do") == "cancel":
+            self._is_cancelled = True
+            return
         with self._wake:
             self.last_used_s = time.monotonic()
             if is_frame(message) and self._waiting and is_frame(self._waiting[-1]) and not message.get("is_first"):
@@ -277,10 +284,14 @@ class Session:
         self._send_parts()
         self._wants_rest = self.is_preview
 
-    def _check(self) -> None:
-        """Stop a simulation when the session is closed or a newer change waits."""
+    def _check(self, stage: str) -> None:
+        """Report a stage; stop a simulation when the session is closed, the user cancels, or a newer change waits."""
         if self._is_closed:
             raise SupersededError
+        if self._is_cancelled:
+            raise CancelledError("cancelled; the settings are those before")
+        if not self._is_dragging:
+            self._send({"kind": "progress", "text": stage})
         if not self._can_stop or not any(is_change(m) and m["do"] not in ONCE for m in list(self._waiting)):
             return
         now_s = time.monotonic()
@@ -301,7 +312,7 @@ class Session:
 
     def _complete(self) -> None:
         """Replace a preview by the complete result."""
-        self._is_dragging = self._wants_rest = False
+        self._is_dragging = self._wants_rest = self._is_cancelled = False
         self._send({"kind": "busy"})
         try:
             self._simulate(self.history.settings)
@@ -326,6 +337,7 @@ class Session:
             )
         ]
         before = self.history.copy()
+        self._is_cancelled = False
         self._send({"kind": "busy"})
         try:
             for message in kept:
@@ -337,6 +349,9 @@ class Session:
         except SupersededError:
             self.history = before
             raise
+        except CancelledError as error:
+            self.history, self._errors = before, {}
+            self._send({"kind": "note", "text": self._line(error)})
         except Exception as error:  # noqa: BLE001 -- settings may cause any exception of the package or a library
             self.history = before
             if len(kept) > 1:
@@ -395,9 +410,10 @@ class Session:
                     raise ParameterError("settings", "must be a mapping")
                 settings = self.files.with_uploads(restored)
             case "file":
-                settings = with_file(
-                    settings, self.start.settings, self.files, string_of(message, "path"), message.get("as")
-                )
+                opened, use = string_of(message, "path"), message.get("as")
+                if use == "scene":
+                    opened = self._reduced(opened)
+                settings = with_file(settings, self.start.settings, self.files, opened, use)
             case "match":
                 if self._frozen_result is None or self.result is None:
                     raise SimulationError("there is no variant A to compare with")
@@ -423,6 +439,18 @@ class Session:
             self.history.preview(settings)
         else:
             self.history.commit(settings)
+
+    def _reduced(self, path: str) -> str:
+        """Return the path of a picture, or of a smaller one if it is larger than the sensor can resolve."""
+        if self.result is None:
+            return path
+        self._check(f"reading {Path(self.files.available(path)).name}")
+        encoding = self.history.settings["scene"].get("encoding", "srgb")
+        found = reduced_picture(Path(path), self._new_path, resolved_pixels(self.result.shot), encoding)
+        if found is None:
+            return path
+        self._notes[str(found[0])] = found[1]
+        return str(found[0])
 
     def _simulate(self, settings: dict[str, Any], *, can_stop: bool = True) -> None:
         settings, before = self.frames.with_current(settings), self._simulated_frame
@@ -557,6 +585,7 @@ class Session:
             "can_redo": self.history.can_redo,
             "errors": self._errors,
             "warnings": [] if result is None else result.warnings,
+            "notes": [note for path, note in self._notes.items() if settings.get("scene", {}).get("picture") == path],
             "summary": {} if result is None else summary_of(result),
             "solved": {} if result is None else solved_of(result.settings, result.capture.layout),
             "frozen": self._frozen,

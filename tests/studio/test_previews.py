@@ -272,13 +272,13 @@ def test_closing_stops_the_simulation(settings, make_threaded, monkeypatch):
 def slowly(check, is_started):
     """Return a check that waits until the session is closed."""
 
-    def wait(session):
+    def wait(session, stage):
         is_started.set()
         for _ in range(6000):
             if session._is_closed:
                 break
             time.sleep(0.01)
-        check(session)
+        check(session, stage)
 
     return wait
 
@@ -286,7 +286,7 @@ def slowly(check, is_started):
 def test_check_stops_before_the_next_stage(settings):
     built = []
 
-    def check():
+    def check(_stage):
         built.append(dict(engine.n_built))
         if engine.n_built.get("scene"):
             raise SupersededError
@@ -308,11 +308,11 @@ def test_newer_change_stops_a_simulation(settings, make_threaded, monkeypatch):
     stages = []
     make = session.engine._runner.check
 
-    def slow_check():
+    def slow_check(stage):
         stages.append(time.monotonic())
         started.set()
         time.sleep(0.2)
-        make()
+        make(stage)
 
     session.engine._runner.check = slow_check
     session.post({"do": "set", "key": "optics.f_number", "value": 4.0, "final": True, "id": 1})
@@ -338,15 +338,15 @@ def test_endless_changes_are_not_stopped_forever(recorder, monkeypatch):
     session._can_stop = True
     session._waiting.append({"do": "set", "key": "seed", "value": 1, "final": True})
     with pytest.raises(SupersededError):
-        session._check()
+        session._check("capture")
     monkeypatch.setattr(_session, "MAX_STOPPED_S", 0.0)
-    session._check()
+    session._check("capture")
     session._waiting.clear()
-    session._check()
+    session._check("capture")
 
 
 def test_frames_stop_no_simulation(recorder):
     session = recorder.session
     session._can_stop = True
     session._waiting.append({"do": "frame", "n": 3})
-    session._check()
+    session._check("capture")

@@ -178,6 +178,9 @@ export class Connection {
     return id;
   }
 
+  // Cancels the present change; this has no answer of its own.
+  cancel() { this.socket?.send(JSON.stringify({ do: "cancel" })); }
+
   // Asks for the data of views, and for pictures of this size, unless they are those of the last time.
   /** @param {string[]} names @param {number} pixels */
   askFor(names, pixels) {

@@ -17,7 +17,7 @@ import { SitePane, useSoftware } from "./site_pane.js";
 import { Sources } from "./sources.js";
 import { Views } from "./views.js";
 
-const BUSY_DELAY_MS = 150;
+const BUSY_DELAY_MS = 150, LONG_MS = 1000;
 const SIZE_DELAY_MS = 250;
 const HOLD_MS = 100;
 const PICTURE_SIZES = [256, 320, 384, 512, 768, 1024], SMALLER = 0.85;
@@ -43,7 +43,7 @@ class StudioPage {
   // Position of the layout at the start of a drag.
   /** @type {Point | null} */ gazeAt = null;
   /** @type {Boundary | null} */ boundary = null;
-  key = ""; hovered = -1; pinned = -1; isSelecting = false; sizeTimer = 0; holdTimer = 0; busyTimer = 0; drawnAt = 0;
+  key = ""; stage = ""; longTimer = 0; hovered = -1; pinned = -1; isSelecting = false; sizeTimer = 0; holdTimer = 0; busyTimer = 0; drawnAt = 0;
 }
 
 const page = new StudioPage();
@@ -170,11 +170,30 @@ function receive(message, { isFailed }) {
   else if (kind === "error") notice(message.text);
   else if (kind === "text") files.receiveText(message);
   else if (kind === "saved") notice("Saved as " + message.path);
+  else if (kind === "note") notice(message.text);
+  else if (kind === "progress") { showStage(message.text); return; }
+  // After the state only views follow, which cannot be cancelled.
+  if (kind === "busy" || kind === "state") showStage("", kind === "busy");
   showBusy(requests.isBusy);
+}
+
+// Work of more than a second shows its stage, and can be cancelled.
+/** @param {string} text */
+function showStage(text, canCancel = true) {
+  page.stage = text;
+  if (!canCancel) { clearTimeout(page.longTimer); page.longTimer = 0; $("cancel").hidden = true; }
+  else if (!$("cancel").hidden) showStatus(text + "…");
+  else page.longTimer ||= setTimeout(() => {
+    page.longTimer = 0;
+    if (!connection.requests.isBusy) return;
+    $("cancel").hidden = false;
+    showStatus((page.stage || "computing") + "…");
+  }, LONG_MS);
 }
 
 /** @param {boolean} isBusy */
 function showBusy(isBusy) {
+  if (!isBusy) showStage("", false);
   clearTimeout(page.busyTimer);
   // Short work is not announced: each change of the page costs a frame.
   const show = () => { document.body.classList.add("busy"); showStatus("computing…"); };
@@ -210,6 +229,7 @@ function showState(message) {
   // The buttons show where the history ends.
   delete errors.undo;
   delete errors.redo;
+  for (const note of state.notes) if (!page.state?.notes.includes(note)) notice(note);
   page.state = state;
   memory.set("settings", JSON.stringify(state.settings));
   const rest = controls.update(state);
@@ -435,6 +455,7 @@ function listenToButtons() {
     if ($("preset").value) connection.send({ do: "preset", name: $("preset").value });
     $("preset").value = "";
   });
+  press("cancel", () => { connection.cancel(); $("cancel").hidden = true; showStatus("stopping after: " + page.stage); });
   press("freeze", () => {
     if (!page.frozen) freeze();
     else { connection.send({ do: "unfreeze" }); unfreeze(); }

@@ -1,0 +1,89 @@
+"""Photographs that are opened on the page: large ones are reduced to what the sensor can resolve."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim._io.encodings import Encoding, decode
+from foveasim._io.images import read_picture, write_picture
+from foveasim.config import Shot
+from foveasim.units import encode_srgb
+
+#: Pixels of a reduced picture per side of the smallest photosite, and per λN.
+PER_SITE, PER_LAMBDA_N = 3.0, 4.0
+#: Limits of the longer side of reduced pictures.
+MIN_PIXELS, MAX_PIXELS = 1024, 8192
+
+
+def resolved_pixels(shot: Shot) -> int:
+    """Return the longer side of a picture, in pixels, beyond which the sensor of a shot cannot resolve more."""
+    layout = shot.camera.layout
+    x0_um, y0_um, x1_um, y1_um = layout.bounds_um
+    lambda_n_um = 0.4 * shot.camera.optics.f_number  # at 400 nm
+    pixel_um = max(float(np.sqrt(layout.area_um2.min())) / PER_SITE, lambda_n_um / PER_LAMBDA_N)
+    return int(np.clip(math.ceil(max(x1_um - x0_um, y1_um - y0_um) / pixel_um), MIN_PIXELS, MAX_PIXELS))
+
+
+def reduced_picture(
+    path: Path, new_path: Callable[[str], Path], n_pixels: int, encoding: Encoding
+) -> tuple[Path, str] | None:
+    """
+    Write a picture with means of blocks of pixels, in relative radiance, unless it is small.
+
+    ``new_path``: returns an unused path for a name. ``n_pixels``: the shorter side of the result is not smaller. Returns the
+    path of the new TIFF file, and a sentence; None for a picture of less than twice this size. Raises FileError when the file
+    is not a picture.
+    """
+    pixels = read_picture(path)
+    n_y, n_x = pixels.shape[:2]
+    block = min(n_y, n_x) // n_pixels
+    if block < 2:
+        return None
+    target = new_path(f"{path.stem}_{n_x // block}x{n_y // block}.tif")
+    try:
+        write_picture(target, _block_means(pixels, block, encoding))
+    except BaseException:
+        target.unlink(missing_ok=True)
+        raise
+    return target, (
+        f"{path.name} has {n_x:,} × {n_y:,} pixels; it was reduced to {n_x // block:,} × {n_y // block:,}, more than this "
+        "sensor can resolve"
+    )
+
+
+def _block_means(pixels: NDArray[Any], block: int, encoding: Encoding) -> NDArray[Any]:
+    """Return means of square blocks, uint16 or float32; incomplete blocks at the right and at the bottom are cropped."""
+    n_y, n_x = (n // block for n in pixels.shape[:2])
+    n_channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+    n_colours = n_channels - (n_channels in (2, 4))  # without alpha
+    has_integers = np.issubdtype(pixels.dtype, np.integer)
+    peak = np.iinfo(pixels.dtype).max if has_integers else 1.0
+    table = decode(np.arange(peak + 1) / peak, encoding).astype(np.float32) if has_integers else None
+    means = np.empty((n_y, n_x, n_channels), np.float32)
+    for row in range(n_y):
+        rows = pixels[row * block : (row + 1) * block, : n_x * block].reshape(block, n_x, block, n_channels)
+        for channel in range(n_channels):
+            values = rows[..., channel]
+            if table is not None and channel < n_colours:
+                values = table[values]
+            elif table is not None:
+                values = values / np.float32(peak)
+            elif channel < n_colours:
+                values = decode(values.astype(np.float64), encoding)
+            means[row, :, channel] = values.mean(axis=(0, 2), dtype=np.float64)
+    means[..., :n_colours] = _encode(means[..., :n_colours], encoding)
+    found = means[..., 0] if pixels.ndim == 2 else means
+    return np.rint(np.clip(found, 0.0, 1.0) * 65535.0).astype(np.uint16) if has_integers else found
+
+
+def _encode(radiance: NDArray[np.float32], encoding: Encoding) -> NDArray[np.float32]:
+    """Return the inverse of :func:`foveasim._io.encodings.decode`."""
+    if encoding == "sqrt":
+        return np.sqrt(radiance)
+    return encode_srgb(radiance.astype(np.float64)).astype(np.float32) if encoding == "srgb" else radiance
