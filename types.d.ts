@@ -54,7 +54,9 @@ type Arrays = { [name: string]: any };
 // -- messages of the server -----------------------------------------------------------------------------------------------
 
 interface Preset { name: string; label: string; kind: string }
-interface ViewAbout { name: string; label: string; is_tile: boolean; is_first: boolean; is_costly: boolean; has_data: boolean }
+interface ViewAbout {
+  name: string; label: string; is_tile: boolean; is_first: boolean; is_wide: boolean; is_costly: boolean; has_data: boolean;
+}
 interface Choice { label: string; value: any }
 interface Control {
   key: string; id: string; label: string; unit: string; help: string; section: string;
@@ -87,8 +89,9 @@ interface Failure { kind: "error"; id: number | null; text: string; part?: strin
 interface TextMessage { kind: "text"; id: number; what: string; text: string; files: string[] }
 interface Note { kind: "note"; text: string }
 interface Progress { kind: "progress"; text: string }
+interface Exists { kind: "exists"; id: number; name: string; file: string }
 interface Saved { kind: "saved"; id: number; path: string }
-type ServerMessage = Busy | ControlsMessage | State | Done | Failure | TextMessage | Saved | Note | Progress;
+type ServerMessage = Busy | ControlsMessage | State | Done | Failure | TextMessage | Saved | Note | Progress | Exists;
 
 // Binary messages: a header and arrays; as readPart returns them.
 interface PartHeader {
@@ -105,10 +108,11 @@ type Boundary = (context: CanvasRenderingContext2D, toX: (x: number) => number, 
 // -- messages to the server; Connection.send adds their numbers -------------------------------------------------------------
 
 type Change =
-  | { do: "undo" | "redo" | "match" }
+  | { do: "undo" | "redo" | "match" | "fit" }
   | { do: "set"; key: string; value: unknown; final: boolean }
   | { do: "reset" | "delete"; key: string }
-  | { do: "preset" | "save" | "solve"; name: string }
+  | { do: "preset" | "solve"; name: string }
+  | { do: "save"; name: string; may_replace?: boolean }
   | { do: "restore"; settings: Settings | undefined }
   | { do: "file"; path: string | undefined; as: string }
   | { do: "video"; path: string | undefined }

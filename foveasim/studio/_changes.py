@@ -15,7 +15,21 @@ from foveasim.studio._files import Files, with_layout
 from foveasim.studio._templates import WITHOUT_MOSAIC
 
 #: Messages that change the settings.
-CHANGES = ("set", "reset", "delete", "undo", "redo", "preset", "restore", "file", "video", "frame", "match", "solve")
+CHANGES = (
+    "set",
+    "reset",
+    "delete",
+    "undo",
+    "redo",
+    "preset",
+    "restore",
+    "file",
+    "video",
+    "frame",
+    "match",
+    "solve",
+    "fit",
+)
 #: Changes that advance a source of frames: newer ones do not stop their simulations.
 ONCE = ("video", "frame")
 #: Longest path of a setting.
@@ -94,6 +108,13 @@ def changed_keys(settings: Any, start: Any, key: str = "") -> list[str]:
             for found in changed_keys(settings.get(name), start.get(name), f"{key}.{name}" if key else name)
         ]
     return [] if settings == start else [key]
+
+
+def chooses_filters(message: dict[str, Any]) -> bool:
+    """Return whether a message chooses a layout, or the filters of the sensor."""
+    return message["do"] in ("preset", "file") or (
+        message["do"] in ("set", "reset", "delete") and message.get("key") in ("layout", "sensor", "sensor.filters")
+    )
 
 
 def match_filters(settings: dict[str, Any], before: Mapping[str, Any]) -> None:

@@ -5,13 +5,17 @@ from __future__ import annotations
 import copy
 import filecmp
 import re
+import unicodedata
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from foveasim._io.yaml_files import read_yaml
 from foveasim.config import (
     YAML_EXTENSIONS,
+    Shot,
     bundled_layouts,
     demo_settings,
     put_setting,
@@ -20,12 +24,15 @@ from foveasim.config import (
 )
 from foveasim.config._models import expand_preset
 from foveasim.config._objects import BUNDLED_PICTURE, FILE_SETTINGS
-from foveasim.errors import FileError, ParameterError, printable
+from foveasim.errors import FileError, ParameterError, SimulationError, printable
+from foveasim.scene import Scene
 
-#: Longest name and extension of an uploaded file.
-MAX_NAME_LENGTH, MAX_EXTENSION_LENGTH = 80, 8
-#: Characters that names of stored files do not contain.
-UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
+#: Size of the image of a fitted scene, relative to the photosites: second-order integration needs a further cell.
+MARGIN = 1.01
+#: Longest name, in bytes of UTF-8, and extension of a stored file.
+MAX_NAME_BYTES, MAX_EXTENSION_LENGTH = 120, 8
+#: Characters that names of stored files do not contain: all but letters and digits of any script, "_" and "-".
+UNSAFE = re.compile(r"[^\w-]+")
 
 
 def start_settings(shot: str | Path | None, changes: Sequence[str] = ()) -> tuple[dict[str, Any], str]:
@@ -78,7 +85,40 @@ def with_layout(settings: Mapping[str, Any], layout: Any) -> dict[str, Any]:
     found = copy.deepcopy(dict(settings))
     found["layout"] = copy.deepcopy(layout)
     if found.get("scene", {}).get("kind") == "picture":
-        put_setting(None, found, "scene.fit", "cover")
+        _cover(found)
+    return found
+
+
+def _cover(settings: dict[str, Any]) -> None:
+    """Let the picture cover the layout at the present gaze."""
+    put_setting(None, settings, "scene.fit", "cover")
+    gaze_um = settings.get("gaze_um") or (0.0, 0.0)
+    range_um = settings["scene"].get("gaze_range_um") or (0.0, 0.0)
+    if settings.get("axis") != "sensor" and any(abs(g) > r for g, r in zip(gaze_um, range_um, strict=True)):
+        settings["scene"]["gaze_range_um"] = [max(abs(g), r) for g, r in zip(gaze_um, range_um, strict=True)]
+
+
+def with_covering_scene(settings: Mapping[str, Any], shot: Shot) -> dict[str, Any]:
+    """
+    Return settings in which the image covers all photosites at the present gaze.
+
+    Pictures are framed; charts and other scenes have larger pixels. ``shot``: present shot of the settings. Raises
+    SimulationError for power maps, which have a size of their own.
+    """
+    found = copy.deepcopy(dict(settings))
+    if not isinstance(shot.scene, Scene):
+        raise SimulationError("a power map has the size of its file; shrink or move the layout instead")
+    if found["scene"].get("kind") == "picture":
+        _cover(found)
+        return found
+    gaze_um = np.array(found.get("gaze_um") or (0.0, 0.0)) if found.get("axis") != "sensor" else np.zeros(2)
+    bounds_um = np.array(shot.camera.layout.bounds_um).reshape(2, 2) + gaze_um
+    image_um = np.array(shot.camera.image_grid(shot.scene).bounds_um).reshape(2, 2)
+    factor = float((np.abs(bounds_um).max(axis=0) / np.abs(image_um).min(axis=0)).max())
+    pitch_um = found["scene"].get("pitch_um")
+    if pitch_um is None:
+        raise SimulationError("the scene has no pitch_um that could be changed")
+    found["scene"]["pitch_um"] = float(f"{pitch_um * max(1.0, MARGIN * factor):.6g}")
     return found
 
 
@@ -190,10 +230,11 @@ class Files:
 
 def file_name(name: str) -> str:
     """Return a safe name for an uploaded file, with its extension."""
+    name = unicodedata.normalize("NFC", name)
     stem, dot, extension = Path(name.replace("\\", "/")).name.rpartition(".")
     stem, extension = (UNSAFE.sub("_", part).strip("_") for part in ((stem, extension) if dot else (extension, "")))
     extension = extension[:MAX_EXTENSION_LENGTH].lower()
-    short = (stem or "file")[:MAX_NAME_LENGTH]
+    short = (stem or "file").encode()[:MAX_NAME_BYTES].decode(errors="ignore")
     return f"{short}.{extension}" if extension else short
 
 

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from starlette.applications import Starlette
 from starlette.requests import Request
@@ -266,7 +267,8 @@ class Studio:
             return _error(" ".join(printable(str(error)).split()), 400)
         except (OSError, MemoryError) as error:
             return _error(f"the file cannot be written: {one_line(error)}", 400)
-        disposition = f'attachment; filename="{name}"'
+        plain = name.encode("ascii", "replace").decode().replace("?", "_")
+        disposition = f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name)}"
         return Response(content, media_type="application/octet-stream", headers={"Content-Disposition": disposition})
 
 

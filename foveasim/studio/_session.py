@@ -27,6 +27,7 @@ from foveasim.studio._changes import (
     changed_keys,
     check_depth,
     choose_preset,
+    chooses_filters,
     is_change,
     is_draft,
     is_frame,
@@ -40,7 +41,14 @@ from foveasim.studio._controls import chosen_value, controls_of, structure_of
 from foveasim.studio._costs import RELEASE_S, REST_S, CancelledError, Costs, SupersededError
 from foveasim.studio._engine import Engine, Simulated
 from foveasim.studio._exports import text_of, without_directories
-from foveasim.studio._files import Files, apply_preset, file_name, is_unused_or_copy, unused_path
+from foveasim.studio._files import (
+    Files,
+    apply_preset,
+    file_name,
+    is_unused_or_copy,
+    unused_path,
+    with_covering_scene,
+)
 from foveasim.studio._frames import Frames
 from foveasim.studio._history import History
 from foveasim.studio._messages import from_json, one_line, to_json
@@ -398,6 +406,10 @@ class Session:
                 )
             case "delete":
                 settings = balanced(reset(settings, {}, key_of(message)), key_of(message), self._layout)
+            case "fit":
+                if self.result is None:
+                    raise SimulationError("there is no image to fit")
+                settings = with_covering_scene(settings, self.result.shot)
             case "solve":
                 if self._layout is None:
                     raise SimulationError("there is no layout whose parameters are known")
@@ -432,7 +444,7 @@ class Session:
                     return
                 settings = with_file(settings, self.start.settings, self.files, str(self.frames.path), "scene")
         settings = self.files.resolve(settings)
-        if message["do"] not in ("restore", "frame") and _chooses_filters(before, settings):
+        if chooses_filters(message):
             match_filters(settings, before)
         check_settings(None, settings)
         if message["do"] == "set" and message.get("final", True) is False:
@@ -512,8 +524,13 @@ class Session:
                     "files": list(exported[1]),
                 })  # fmt: skip
             case "save":
-                path = self._save(string_of(message, "name"))
-                self._send({"kind": "saved", "id": message.get("id"), "path": str(path)})
+                name, may_replace = string_of(message, "name"), message.get("may_replace") is True
+                path = self._saved_path(name)
+                if path.exists() and not may_replace:
+                    self._send({"kind": "exists", "id": message.get("id"), "name": name, "file": path.name})
+                else:
+                    self._save(path)
+                    self._send({"kind": "saved", "id": message.get("id"), "path": str(path)})
             case unknown:
                 raise ParameterError("do", "must be the name of a message", printable(str(unknown))[:40])
         self._send_state()
@@ -541,13 +558,16 @@ class Session:
         settings = self.history.settings
         return without_directories(settings, self.uploads, self.frames.export(settings), name_of)
 
-    def _save(self, name: str) -> Path:
-        """Write the settings to the directory for saved files, with copies of uploaded files."""
-        out = self.start.out
-        if out is None:
+    def _saved_path(self, name: str) -> Path:
+        """Return the path of saved settings with a name."""
+        if self.start.out is None:
             raise SimulationError("files are written only with --out; use the download instead")
         safe = file_name(name)
-        path = out / (safe if safe.endswith((".yaml", ".yml")) else f"{safe}.yaml")
+        return self.start.out / (safe if safe.endswith((".yaml", ".yml")) else f"{safe}.yaml")
+
+    def _save(self, path: Path) -> None:
+        """Write the settings to a file, with copies of uploaded files in its directory."""
+        out = path.parent
         out.mkdir(parents=True, exist_ok=True)
         originals = {path: path}
 
@@ -567,7 +587,6 @@ class Session:
                 shutil.copyfile(original, temporary)
         with atomic_write(path) as temporary:
             temporary.write_text(format_yaml(settings), encoding="utf-8")
-        return path
 
     def _send_state(self) -> None:
         settings, result = self.history.settings, self.result
@@ -632,14 +651,3 @@ class Session:
         for listener in list(self._listeners):
             with suppress(Exception):
                 listener(sent)
-
-
-def _chooses_filters(before: dict[str, Any], settings: dict[str, Any]) -> bool:
-    """Return whether settings have another generator or file of the layout, or other filters."""
-
-    def chosen(each: dict[str, Any]) -> Any:
-        layout, sensor = each.get("layout"), each.get("sensor")
-        generator = (layout.get("generator"), layout.get("file")) if isinstance(layout, dict) else layout
-        return generator, sensor.get("filters") is None if isinstance(sensor, dict) else None
-
-    return chosen(before) != chosen(settings)

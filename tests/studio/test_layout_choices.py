@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import pytest
+from studio.conftest import Recorder, WithoutThread
 from studio.test_session import code_part, codes_of
 
+from foveasim.config import bundled_layouts
 from foveasim.layout import LAYOUTS
 from foveasim.studio._controls import controls_of
+from foveasim.studio._files import start_settings
+from foveasim.studio._session import Start
 from foveasim.studio._solving import unknown_of, unknowns_of, with_unknown
 from foveasim.studio._templates import SECTIONS, WITHOUT_MOSAIC
 
@@ -78,8 +82,6 @@ def test_bundled_layouts_and_files_have_filters(recorder, tmp_path):
 
 def generated(name):
     section = {key: value for key, value in SECTIONS[f"{name} parameters"].items() if key != "n_sites"}
-    if name == "fovi":
-        section["n_rings"] = 66
     return {"layout": {"generator": name, "parameters": section}}
 
 
@@ -182,3 +184,33 @@ def test_controls_have_the_unknown(settings):
         ["n_sites", "n_sectors", "min_size_um"],
     )
     assert not any(each["id"].endswith(":solve") for each in controls_of({**settings, "layout": {"file": "chip.gds"}}))
+
+
+# -- rules --------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", list(LAYOUTS))
+def test_generators_start_without_violations(name):
+    """With the rules and the filters of the demo."""
+    settings = start_settings(None)[0]
+    recorder = Recorder(WithoutThread("test", Start(settings, "demo"), n_threads=1))
+    try:
+        state = choose(recorder, name.replace("_", " "))
+        result = recorder.session.result
+        assert state["errors"] == {}
+        assert result.capture.layout.check(result.shot.rules).ok
+    finally:
+        recorder.session.close()
+
+
+@pytest.mark.parametrize("name", [name for name in bundled_layouts() if name != "spectral_16"])
+def test_bundled_layouts_lie_in_the_image(name):
+    """At the gaze of the demo, which is off the axis."""
+    settings = start_settings(None)[0]
+    recorder = Recorder(WithoutThread("test", Start(settings, "demo"), n_threads=1))
+    try:
+        state = recorder.do(do="preset", name=f"layout:{name}")
+        assert state["errors"] == {}
+        assert not any("outside the image" in warning for warning in state["warnings"])
+    finally:
+        recorder.session.close()

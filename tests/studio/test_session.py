@@ -517,7 +517,7 @@ def test_saved_pictures_never_share_a_name(make_session, tmp_path):
     settings = recorder.session.history.settings
     layout = {"generator": "voronoi", "parameters": {"density": str(files["photo_2.png"])}}
     recorder.session.history.commit({**settings, "layout": layout})
-    recorder.session._save("both")
+    recorder.do(do="save", name="both")
     saved = read_settings(out / "both.yaml")
 
     assert (out / saved["scene"]["picture"]).read_bytes() == files["photo.png"].read_bytes()
@@ -529,7 +529,8 @@ def test_saved_settings_replace_no_upload(make_session, tmp_path):
     recorder = make_session(out=tmp_path / "out")
     path = recorder.session.add_file("shot.yaml", b"generator: grid\n")
     recorder.session.history.commit({**recorder.session.history.settings, "layout": {"file": str(path)}})
-    saved = read_settings(recorder.session._save("shot.yaml"))
+    recorder.do(do="save", name="shot.yaml")
+    saved = read_settings(tmp_path / "out" / "shot.yaml")
 
     assert (tmp_path / "out" / saved["layout"]["file"]).read_bytes() == path.read_bytes()
 

@@ -40,6 +40,8 @@ class Part:
         Position on the page; views below :data:`FIRST_TILE` are always shown, others in tiles.
     is_first : bool
         Whether the tile is shown at first.
+    is_wide : bool
+        Whether the tile is shown at first on wide pages.
     is_costly : bool
         Whether the part is computed only when a page asks for it, and not for previews.
     is_of_variants : bool
@@ -52,6 +54,7 @@ class Part:
     depends: Callable[[Simulated], tuple[Any, ...]]
     order: int = 1000
     is_first: bool = False
+    is_wide: bool = False
     is_costly: bool = False
     is_of_variants: bool = False
 
@@ -69,6 +72,7 @@ class Part:
             "label": self.label,
             "is_tile": self.order >= FIRST_TILE,
             "is_first": self.is_first,
+            "is_wide": self.is_first or self.is_wide,
             "is_costly": self.is_costly,
             "has_data": self.has_data,
         }

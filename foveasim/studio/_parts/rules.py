@@ -11,7 +11,7 @@ from foveasim.studio._parts.registry import PartData, part
 from foveasim.view.web._content import rules_of
 
 
-@part("Design rules", lambda result: (result.capture.layout, result.shot.rules), order=90)
+@part("Design rules", lambda result: (result.capture.layout, result.shot.rules), order=90, is_wide=True)
 def rules(result: Simulated) -> PartData:
     """Return the results of the design-rule check."""
     if result.shot.rules is None:

@@ -18,7 +18,7 @@ from foveasim.studio._parts.registry import PartData, capture_of, curves_of, par
 LOWEST_DB = -10.0
 
 
-@part("SNR", capture_of, order=70)
+@part("SNR", capture_of, order=70, is_wide=True)
 def snr(result: Simulated) -> PartData:
     """Return the SNR against exposure of the median photosite of each filter."""
     sensor, capture, exposure_s = result.shot.camera.sensor, result.capture, result.shot.exposure_s

@@ -7,12 +7,15 @@ import { listenToRange } from "/web/shell.js";
 import { sizeOf } from "./frames.js";
 import { fitted } from "./site_pane.js";
 
+const SVG = "http://www.w3.org/2000/svg";
 const FONT = "11px system-ui, sans-serif";
 // Names of curves with a colour of their own; other curves have the next of the list, by theme.
 const NAMED = { R: ["#c62828", "#ff7b72"], G: ["#1b7f3b", "#5fd37f"], B: ["#1f5fbf", "#7db3ff"], W: ["#566073", "#c3cad6"] };
 const INKS = [["#1f5fbf", "#7db3ff"], ["#c2571a", "#ffa657"], ["#1b7f3b", "#5fd37f"], ["#8338a8", "#d2a8ff"], ["#a02c5a", "#ff8cc0"],
   ["#566073", "#c3cad6"]];
 const STEPS = 72;
+// Dashes of curves, which thus differ by more than their colour; those of variant A are thinner and end with a letter.
+const DASHES = [[], [7, 3], [2, 2.5], [9, 3, 2, 3], [4, 3], [1, 4]];
 
 const theme = () => (document.documentElement.dataset.theme === "dark" ? 1 : 0);
 const inkOfCurve = (curve, k) => (NAMED[curve.name] || INKS[k % INKS.length])[theme()];
@@ -28,6 +31,19 @@ function limitsOf(arrays) {
   let low = Infinity, high = -Infinity;
   for (const values of arrays) for (const v of values) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); }
   return low === Infinity ? [0, 1] : [low, high > low ? high : low + 1];
+}
+
+// Round numbers up to a largest one whose square roots are far apart, from the largest.
+export function rootTicks(most, least = 0.22) {
+  const ticks = [];
+  for (let e = Math.floor(Math.log10(most)); e >= 0; e--) {
+    for (const step of [8, 6, 5, 4, 3, 2, 1.5, 1]) {
+      const tick = step * 10 ** e, root = Math.sqrt(tick / most);
+      const above = ticks.length ? Math.sqrt(ticks[ticks.length - 1] / most) : Infinity;
+      if (Number.isInteger(tick) && root <= 1 && root >= least && above - root >= least) ticks.push(tick);
+    }
+  }
+  return ticks;
 }
 
 // Powers of ten in a range; with few of them also 2 and 5 times.
@@ -61,7 +77,7 @@ function decadeLimits(arrays) {
   return low === Infinity ? [1, 10] : [low, Math.max(high, 1.01 * low)];
 }
 
-// Curves y of x with their legend; dashed curves are those of variant A. Axes in "log" (such as "xy") are logarithmic.
+// Curves y of x with their legend; those with isDashed are of variant A. Axes in "log" (such as "xy") are logarithmic.
 export class CurveChart {
   root; nameX; nameY; label; log; marks = []; lines = [];
 
@@ -100,13 +116,15 @@ export class CurveChart {
   draw() {
     if (!sizeOf(this.root).width) return;
     const { curves } = this, own = curves.filter((curve) => !curve.isDashed), left = 46, right = 10, top = 8, bottom = 32;
-    const inks = curves.map((curve) => inkOfCurve(curve, own.findIndex((one) => one.label === curve.label)));
+    const indices = curves.map((curve) => own.findIndex((one) => one.label === curve.label));
+    const inks = curves.map((curve, k) => inkOfCurve(curve, indices[k]));
+    const dashes = indices.map((k) => DASHES[Math.max(k, 0) % DASHES.length]);
     const isLogX = this.log.includes("x"), isLogY = this.log.includes("y");
     const allX = [...curves.map((curve) => curve.x), this.marks.map((mark) => mark.x)];
     const axisX = axisOf(...(isLogX ? decadeLimits(allX) : limitsOf(allX)), isLogX), wide = sizeOf(this.canvas).width - left - right;
     const here = this.at === null || !own.length ? null : axisX.value(clamp((this.at - left) / wide, 0, 1));
     // The legend first: the rest of the height is for the canvas.
-    this._listCurves(curves, inks, here, own);
+    this._listCurves(curves, inks, dashes, here, own);
     const { context, width, height } = fitted(this.canvas);
     context.font = FONT;
     if (!own.length) {
@@ -149,17 +167,23 @@ export class CurveChart {
     context.textAlign = "left";
     curves.forEach((curve, k) => {
       context.strokeStyle = inks[k];
-      context.lineWidth = curve.isDashed ? 1.25 : 1.75;
-      context.setLineDash(curve.isDashed ? [4, 3] : []);
+      context.lineWidth = curve.isDashed ? 1 : 2;
+      context.setLineDash(dashes[k]);
       context.beginPath();
       let isDown = false;
+      /** @type {Point | null} */
+      let last = null;
       for (let i = 0; i < curve.x.length; i++) {
         if (!Number.isFinite(curve.y[i])) { isDown = false; continue; }
         if (isDown) context.lineTo(toX(curve.x[i]), toY(curve.y[i]));
         else context.moveTo(toX(curve.x[i]), toY(curve.y[i]));
         isDown = true;
+        last = [toX(curve.x[i]), toY(curve.y[i])];
       }
       context.stroke();
+      if (!curve.isDashed || !last) return;
+      context.fillStyle = inks[k];
+      context.fillText("A", clamp(last[0] - 9, left, left + w - 9), clamp(last[1] - 4, top + 9, top + h - 2));
     });
     context.setLineDash([]);
     for (const mark of this.marks) this._drawMark(context, mark, toX(mark.x), toY(Math.max(mark.y, axisY.low)), own, inks);
@@ -202,10 +226,9 @@ export class CurveChart {
     context.fill();
   }
 
-  _listCurves(curves, inks, here, own) {
+  _listCurves(curves, inks, dashes, here, own) {
     const items = curves.map((curve, k) => {
-      const item = make("li"), swatch = make("i");
-      swatch.style.background = inks[k];
+      const item = make("li"), swatch = swatchOf(inks[k], dashes[k], curve.isDashed);
       const value = here === null ? "" : " " + brief(Number(valueAt(curve, here).toPrecision(3)));
       const line = curve.isDashed ? null : this.lines.find((one) => one.label === curve.label);
       const text = (curve.isDashed ? "A: " : "") + curve.label + value
@@ -216,6 +239,16 @@ export class CurveChart {
     if (here !== null) items.unshift(make("li", brief(Number(here.toPrecision(4))) + " " + own[0].unit_x));
     this.legend.replaceChildren(...items);
   }
+}
+
+// A short line as in the chart.
+function swatchOf(ink, dash, isThin) {
+  const swatch = document.createElementNS(SVG, "svg"), line = document.createElementNS(SVG, "line");
+  const set = (element, values) => { for (const [name, value] of Object.entries(values)) element.setAttribute(name, value); };
+  set(swatch, { width: "26", height: "8", viewBox: "0 0 26 8", "aria-hidden": "true" });
+  set(line, { x1: "0", x2: "26", y1: "4", y2: "4", stroke: ink, "stroke-dasharray": dash.join(" "), "stroke-width": isThin ? "1" : "2.5" });
+  swatch.append(line);
+  return swatch;
 }
 
 const curvesOf = ({ about, arrays }, isDashed) =>
@@ -283,9 +316,9 @@ export class Histogram {
     context.font = FONT;
     context.fillStyle = inkOf("--quiet");
     context.textAlign = "right";
-    for (const fraction of [0.25, 0.5, 1]) {
-      const count = fraction ** 2 * most, y = Math.round(top + h - fraction * h) + 0.5;
-      context.fillText(brief(Math.round(count)), left - 5, y + 3.5);
+    for (const count of rootTicks(most)) {
+      const y = Math.round(top + h - Math.sqrt(count / most) * h) + 0.5;
+      context.fillText(brief(count), left - 5, y + 3.5);
       context.fillStyle = inkOf("--line");
       context.fillRect(left, y - 0.5, w, 1);
       context.fillStyle = inkOf("--quiet");

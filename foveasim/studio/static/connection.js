@@ -10,6 +10,8 @@ const LONGEST_DELAY_MS = 4000;
 const WRONG_TOKEN = 4403;
 // A preview that is not answered in this time no longer delays the next one.
 const PATIENCE_MS = 4000;
+// Without any message for this time after a change, the server does not answer.
+const SILENT_MS = 1500;
 
 // Identifies this page: a duplicated tab remembers the same session, and receives a copy of it.
 const PAGE = Array.from(crypto.getRandomValues(new Uint32Array(4)), (part) => part.toString(36)).join("");
@@ -78,12 +80,15 @@ export class Connection {
   /** @type {WebSocket | null} */ socket = null;
   // Final values that were set without a connection.
   /** @type {Map<string, unknown>} */ unsent = new Map();
+  // Values whose messages are not answered, with their numbers: they are sent again after the connection was lost.
+  /** @type {Map<string, { id: number, value: unknown }>} */ unanswered = new Map();
+  isSilent = false; silence = 0;
 
   // isSame: whether the token is that of an earlier connection; isFailed: whether a message of the page failed.
   /**
    * @typedef {{
    *   hello: (message: Hello, about: { isSame: boolean }) => void, message: (message: ServerMessage, about: { isFailed: boolean }) => void,
-   *   part: (part: Part) => void, status: (status: "open" | "lost" | "denied") => void,
+   *   part: (part: Part) => void, status: (status: "open" | "lost" | "denied") => void, silent: (isSilent: boolean) => void,
    * }} Listeners
    * @param {Listeners} on
    */
@@ -109,6 +114,7 @@ export class Connection {
     socket.binaryType = "arraybuffer";
     socket.addEventListener("open", () => socket.send(JSON.stringify({ token: this.token, session: memory.get("session"), page: PAGE })));
     socket.addEventListener("message", ({ data }) => {
+      this._hear();
       if (typeof data === "string") this._receive(JSON.parse(data));
       else this.on.part(readPart(data));
     });
@@ -121,6 +127,9 @@ export class Connection {
     this.socket = null;
     this.isOpen = false;
     clearTimeout(this.patience);
+    this._hear();
+    for (const [key, { value }] of this.unanswered) this.unsent.set(key, value);
+    this.unanswered.clear();
     this.requests.settle(Infinity, true);
     this.requests = new Requests(this.requests.lastId);
     this.isDenied = code === WRONG_TOKEN;
@@ -157,6 +166,7 @@ export class Connection {
     if (!isDone && !isFailed) return;
     // The answer to no message has no number.
     const id = message.id ?? 0;
+    for (const [key, sent] of this.unanswered) if (sent.id <= id) this.unanswered.delete(key);
     requests.settle(id, isFailed);
     if (requests.draftId !== null && id >= requests.draftId) this._sendDraft();
   }
@@ -175,7 +185,17 @@ export class Connection {
     if (!this.isOpen || !this.socket) return null;
     const id = this.requests.next();
     this.socket.send(JSON.stringify({ ...message, id }));
+    this.silence ||= setTimeout(() => { this.isSilent = true; this.on.silent(true); }, SILENT_MS);
     return id;
+  }
+
+  // The server has sent something.
+  _hear() {
+    clearTimeout(this.silence);
+    this.silence = 0;
+    if (!this.isSilent) return;
+    this.isSilent = false;
+    this.on.silent(false);
   }
 
   // Cancels the present change; this has no answer of its own.
@@ -218,6 +238,7 @@ export class Connection {
     }
     if (isFinal) requests.nextDraft = null;
     const id = this.send({ do: "set", key, value, final: isFinal });
+    if (isFinal && id !== null) this.unanswered.set(key, { id, value });
     requests.draftId = id;
     clearTimeout(this.patience);
     this.patience = setTimeout(() => this._sendDraft(), PATIENCE_MS);

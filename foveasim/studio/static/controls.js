@@ -420,6 +420,9 @@ export class Controls {
     this._filter();
   }
 
+  // Messages of an earlier connection may be lost: the next state shows what the server has.
+  forgetSent() { for (const row of this.rows.values()) { row.sent = 0; row.isCurrent = false; } }
+
   _fillSection(name, rows) {
     let section = this.sections.get(name);
     if (!section) {

@@ -13,7 +13,7 @@ function useOf(name) {
 }
 
 export class Files {
-  connection; on; wantsToken = false;
+  connection; on; wantsToken = false; saved = "";
 
   // Callbacks: busy(text) while a file is sent, with null at its end; dropped(transfer) returns whether it takes the files.
   constructor(connection, on) {
@@ -31,6 +31,9 @@ export class Files {
     });
     $("save-form").addEventListener("submit", (event) => {
       if (event.submitter?.getAttribute("value") === "save") connection.send({ do: "save", name: $("save-name").value });
+    });
+    $("replace-form").addEventListener("submit", (event) => {
+      if (event.submitter?.getAttribute("value") === "replace") connection.send({ do: "save", name: this.saved, may_replace: true });
     });
     $("link-form").addEventListener("submit", async (event) => {
       const text = $("link-text").value;
@@ -88,6 +91,14 @@ export class Files {
     }
     const use = useOf(file.name);
     this.connection.send(use === "video" ? { do: "video", path: answer.path } : { do: "file", path: answer.path, as: use });
+  }
+
+  // Asks before saved settings are replaced.
+  /** @param {Exists} message */
+  askToReplace({ name, file }) {
+    this.saved = name;
+    $("replace-title").textContent = file + " exists. Replace it?";
+    $("replace-dialog").showModal();
   }
 
   async receiveText({ what, text, files }) {

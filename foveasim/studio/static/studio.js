@@ -13,6 +13,7 @@ import { Files } from "./files.js";
 import { inNextFrame } from "./frames.js";
 import { ImagePane } from "./image_pane.js";
 import { listenToDialogs } from "./menus.js";
+import { Problems } from "./problems.js";
 import { SitePane, useSoftware } from "./site_pane.js";
 import { Sources } from "./sources.js";
 import { Views } from "./views.js";
@@ -43,7 +44,8 @@ class StudioPage {
   // Position of the layout at the start of a drag.
   /** @type {Point | null} */ gazeAt = null;
   /** @type {Boundary | null} */ boundary = null;
-  key = ""; stage = ""; longTimer = 0; hovered = -1; pinned = -1; isSelecting = false; sizeTimer = 0; holdTimer = 0; busyTimer = 0; drawnAt = 0;
+  key = ""; stage = ""; longTimer = 0; hovered = -1; pinned = -1; isSelecting = false;
+  sizeTimer = 0; holdTimer = 0; busyTimer = 0; drawnAt = 0;
 }
 
 const page = new StudioPage();
@@ -61,6 +63,8 @@ let sources;
 let files;
 /** @type {Views} */
 let views;
+/** @type {Problems} */
+let problems;
 
 // -- drawing ------------------------------------------------------------------------------------------------------------
 
@@ -156,6 +160,7 @@ function showHeld() {
   page.held = { states: [], parts: [] };
   for (const state of states) showState(state);
   for (const part of parts) views.use(part);
+  if (page.state) problems.update(page.state, views.parts.rules);
 }
 
 /** @param {ServerMessage} message @param {{ isFailed: boolean }} about */
@@ -170,6 +175,7 @@ function receive(message, { isFailed }) {
   else if (kind === "error") notice(message.text);
   else if (kind === "text") files.receiveText(message);
   else if (kind === "saved") notice("Saved as " + message.path);
+  else if (kind === "exists") files.askToReplace(message);
   else if (kind === "note") notice(message.text);
   else if (kind === "progress") { showStage(message.text); return; }
   // After the state only views follow, which cannot be cancelled.
@@ -252,6 +258,7 @@ function showState(message) {
 function hello(message, { isSame }) {
   document.title = (message.name ? message.name + " – " : "") + "foveasim studio";
   controls.describe(message.controls);
+  controls.forgetSent();
   fillPresets(message.presets);
   $("save").hidden = !message.can_save;
   views.describe(message.views);
@@ -294,6 +301,14 @@ function showConnection(status) {
     $("problem").hidden = false;
     $("problem").textContent = "The address has no valid token. Open the address that foveasim studio printed.";
   }
+}
+
+// A change that the server does not answer is not shown as done.
+/** @param {boolean} isSilent */
+function showSilence(isSilent) {
+  document.body.classList.toggle("silent", isSilent);
+  if (isSilent) showStatus("waiting for the server…");
+  else if (connection.isOpen && !connection.requests.isBusy) showStatus("ready");
 }
 
 // Longer side of pictures in pixels of the screen, in a few steps, a little smaller at most; more when they are enlarged.
@@ -656,7 +671,10 @@ function start() {
     charts: () => scene()?.control.choices || [],
   });
   views = new Views(studio, () => { sendViews(); resize(); });
-  connection = new Connection({ hello, message: receive, part: receivePart, status: showConnection });
+  // Its violations are reported with the other problems.
+  views.needed.add("rules");
+  problems = new Problems({ show: (view) => views.show(view, true), fit: () => connection.send({ do: "fit" }) });
+  connection = new Connection({ hello, message: receive, part: receivePart, status: showConnection, silent: showSilence });
   files = new Files(connection, {
     busy: (text) => {
       connection.requests.isBusy = text !== null;

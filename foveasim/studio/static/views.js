@@ -2,7 +2,7 @@
 
 import { $, find, make, notice } from "/web/page_parts.js";
 
-// From this width, all tiles are shown at first that cost little.
+// From this width, more tiles are shown at first.
 const WIDE = 1800;
 
 // A module exports create(root, studio), which adds elements to its tile and returns an object with any of these methods:
@@ -39,7 +39,7 @@ export class Views {
     let chosen;
     try { chosen = JSON.parse(localStorage.getItem("foveasim-studio-tiles") || "null"); } catch { /* the first ones */ }
     /** @type {(view: ViewAbout) => boolean} */
-    const isFirst = innerWidth >= WIDE ? (view) => !view.is_costly : (view) => view.is_first;
+    const isFirst = innerWidth >= WIDE ? (view) => view.is_wide : (view) => view.is_first;
     for (const view of list.filter((each) => each.is_tile)) {
       const tile = make("section", undefined, "tile"), button = make("button", view.label);
       tile.id = "tile-" + view.name;

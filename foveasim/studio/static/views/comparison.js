@@ -12,6 +12,8 @@ const NOTES = { frames_per_s: "At the data rate of A", total_e: "Signal of all p
 // Four digits; "∞" for an infinite value, "–" without value.
 function figure(value, unit) {
   if (typeof value !== "number") return value ? "∞" : "–";
+  // A frame has millions of electrons.
+  if (unit === "e-" && value >= 1e6) return shown(Number((value / 1e6).toPrecision(4))) + " Me-";
   return quantity(Number(value.toPrecision(4)), unit);
 }
 

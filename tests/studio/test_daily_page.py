@@ -1,0 +1,275 @@
+"""The page in daily work: problems, unknowns of generators, duplicated tabs, a silent server, cancelling, saving."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("starlette")
+pytest.importorskip("uvicorn")
+
+from studio.page_tools import TOKEN, Server, change, codes, control, set_value, setting, settle, until
+
+from foveasim.studio._session import Session
+
+pytestmark = pytest.mark.needs("chromium")
+
+
+def text_of(page, selector):
+    return page.evaluate("selector => document.querySelector(selector).textContent", selector)
+
+
+def field(page, key, value):
+    box = control(page, key)
+    box.fill(value)
+    box.press("Enter")
+    until(page, "() => studio.isReady && studio.connection.requests.doneId >= studio.connection.requests.lastId")
+
+
+# -- problems -----------------------------------------------------------------------------------------------------------
+
+
+def test_worst_problem_and_badges_are_visible(visit):
+    page = visit()
+    until(page, "() => studio.views.parts.rules")
+    set_value(page, "layout.rules.min_size_um", 12.0)
+    until(page, "() => document.querySelector('#tabs [data-tile=rules] .count')")
+    violations = page.evaluate("studio.views.parts.rules.about.rules.reduce((sum, rule) => sum + rule.count, 0)")
+    assert violations > 100
+    assert text_of(page, "#tabs [data-tile=rules] .count") == f"{violations:,}"
+    assert page.inner_text("#worst-text").startswith(f"{violations:,} violations of design rules")
+    page.click("#worst-text")
+    assert page.is_visible("#tile-rules")
+
+    set_value(page, "layout.rules.min_size_um", 4.0)
+    until(page, "() => !document.querySelector('#tabs [data-tile=rules] .count')")
+    set_value(page, "exposure_s", 1.0)
+    until(page, "() => document.querySelector('#tabs [data-tile=histogram] .count')")
+    saturated = page.evaluate("studio.state.summary.saturated_fraction")
+    assert text_of(page, "#tabs [data-tile=histogram] .count") == f"{float(f'{100 * saturated:.2g}'):g} %"
+    assert "saturated" in page.get_attribute("#worst-text", "title")
+
+
+@pytest.mark.parametrize("kind", ["picture", "siemens_star"])
+def test_fit_scene_covers_all_photosites(visit, kind):
+    page = visit()
+    if kind != "picture":
+        chart = {
+            "kind": kind,
+            "n_spokes": 36,
+            "radius_mm": 30.0,
+            "shape": [256, 256],
+            "pitch_um": 300.0,
+            "distance_m": 1.0,
+        }
+        set_value(page, "scene", {**chart, "radiance_w_m2_sr_nm": 0.02, "wavelength_nm": 550.0, "band_width_nm": 100.0})
+    set_value(page, "gaze_um", [1500.0, 200.0])
+    until(page, "() => !document.getElementById('fit-scene').hidden")
+    assert "outside the image" in page.inner_text("#worst-text")
+    change(page, "() => document.getElementById('fit-scene').click()")
+
+    until(page, "() => document.getElementById('fit-scene').hidden")
+    assert not [warning for warning in page.evaluate("studio.state.warnings") if "outside the image" in warning]
+    assert setting(page, "gaze_um") == [1500.0, 200.0]
+    change(page, "() => document.getElementById('undo').click()")
+    until(page, "() => !document.getElementById('fit-scene').hidden")
+
+
+def test_first_tiles_have_content(visit):
+    page = visit(width=1920, height=1080)
+    until(page, "() => ['noise', 'mtf', 'snr', 'rules'].every((name) => studio.views.parts[name])")
+    tiles = page.locator("#tiles .tile:visible")
+    names = tiles.evaluate_all("all => all.map((tile) => tile.id.slice(5))")
+
+    assert names == ["histogram", "site", "noise", "snr", "mtf", "rules", "summary"]
+    assert page.locator("#site dd").first.inner_text() != ""
+    assert "nearest to the centre" in page.inner_text("#site-heading")
+    centres = np.array(
+        page.evaluate("Array.from({ length: studio.panes.b.sites.n }, (_, i) => studio.panes.b.sites.centre(i))")
+    )
+    nearest = np.argmin((centres**2).sum(axis=1))
+    assert f"{nearest:,}" in page.inner_text("#site-heading")
+
+
+# -- charts ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("most", [1, 7, 912, 3890, 14_208, 1_000_000])
+def test_root_axes_have_round_ticks(visit, most):
+    page = visit()
+    ticks = page.evaluate("async most => (await import('/static/charts.js')).rootTicks(most)", most)
+
+    assert ticks
+    assert ticks == sorted(ticks, reverse=True)
+    assert ticks[0] <= most < 2 * ticks[0]
+    assert all(tick == int(tick) and len(str(int(tick)).rstrip("0")) <= 2 for tick in ticks)
+    positions = np.sqrt(np.array(ticks) / most)
+    assert (np.diff(positions) <= -0.2).all()
+
+
+def test_curves_differ_by_more_than_hue(visit):
+    page = visit(width=1920, height=1080)
+    page.click("[data-tile=spectrum]")
+    until(
+        page,
+        "() => studio.views.parts.spectrum && document.querySelectorAll('#spectrum .chart-legend line').length === 3",
+    )
+    lines = "#spectrum .chart-legend line"
+    dashes = page.locator(lines).evaluate_all("all => all.map((line) => line.getAttribute('stroke-dasharray'))")
+    assert len(set(dashes)) == 3
+
+    page.click("#freeze")
+    set_value(page, "sensor.qe", 0.4)
+    until(page, "() => document.querySelectorAll('#spectrum .chart-legend line').length === 6")
+    found = page.locator(lines).evaluate_all("all => all.map((line) => line.getAttribute('stroke-width'))")
+    assert (found[:3], found[3:]) == (["2.5"] * 3, ["1"] * 3)
+
+
+# -- unknowns -----------------------------------------------------------------------------------------------------------------
+
+
+def test_number_of_photosites_is_entered(visit):
+    page = visit()
+    before = page.evaluate("studio.state.summary.n_sites")
+    field(page, "layout.parameters.n_sites", "5000")
+    assert page.evaluate("studio.state.summary.n_sites") == pytest.approx(5000, rel=0.01)
+    solve = page.locator(".control[data-id='layout.parameters:solve'] select")
+    assert solve.evaluate("select => select.selectedOptions[0].textContent") == "n sectors"
+    sectors = control(page, "layout.parameters.n_sectors")
+    assert sectors.input_value() == ""
+    assert sectors.get_attribute("placeholder") == str(
+        page.evaluate("studio.state.solved['layout.parameters.n_sectors']")
+    )
+
+    solve.select_option(label="min size")
+    until(page, "() => studio.isReady && !('min_size_um' in studio.state.settings.layout.parameters)")
+    assert page.evaluate("studio.state.summary.n_sites") == pytest.approx(5000, rel=0.02)
+    for _ in range(2):
+        change(page, "() => document.getElementById('undo').click()")
+    assert page.evaluate("studio.state.summary.n_sites") == before
+    assert solve.evaluate("select => select.selectedOptions[0].textContent") == "number of photosites"
+
+
+# -- connections ---------------------------------------------------------------------------------------------------------------
+
+
+def test_duplicated_tab_is_a_copy(visit):
+    page = visit()
+    set_value(page, "exposure_s", 0.004)
+    with page.expect_popup() as popup:
+        page.evaluate("window.open(location.href)")  # a new tab with the storage of this one
+    other = popup.value
+    settle(other)
+    assert setting(other, "exposure_s") == 0.004
+    set_value(page, "exposure_s", 0.01)
+    set_value(other, "optics.f_number", 4.0)
+
+    assert (setting(page, "exposure_s"), setting(page, "optics.f_number")) == (0.01, 2.8)
+    assert (setting(other, "exposure_s"), setting(other, "optics.f_number")) == (0.004, 4.0)
+    assert control(page, "exposure_s").input_value() == "0.01"
+    assert not np.array_equal(codes(page), codes(other))
+    assert page.evaluate("sessionStorage.getItem('foveasim-studio-session')") != other.evaluate(
+        "sessionStorage.getItem('foveasim-studio-session')"
+    )
+
+
+def test_silent_server_is_not_shown_as_ready(visit, server):
+    page = visit()
+    name = page.evaluate("sessionStorage.getItem('foveasim-studio-session')")
+    with server.studio.sessions[name]._wake:  # no message is accepted
+        control(page, "optics.f_number").fill("4")
+        control(page, "optics.f_number").press("Enter")
+        until(page, "() => document.body.classList.contains('silent')")
+        assert page.inner_text("#status") == "waiting for the server…"
+        assert setting(page, "optics.f_number") == 2.8
+    until(page, "() => studio.isReady && studio.state.settings.optics.f_number === 4")
+    assert not page.evaluate("document.body.classList.contains('silent')")
+
+
+def test_change_of_a_broken_connection_is_repeated(browser, tmp_path, visit):
+    own = Server(tmp_path)
+    try:
+        page = visit(is_checked=False, address=own.address)
+        settle(page)
+        session = next(iter(own.studio.sessions.values()))
+        session._is_closed = True  # messages are accepted, and not answered
+        with session._wake:
+            session._wake.notify_all()
+        session._thread.join(20)
+        control(page, "optics.f_number").fill("4")
+        control(page, "optics.f_number").press("Enter")
+        until(page, "() => studio.connection.unanswered.size === 1")
+        own.stop()
+        until(page, "() => document.body.classList.contains('offline')")
+        own.start()
+        until(page, "() => studio.isReady && studio.state.settings.optics.f_number === 4")
+        assert control(page, "optics.f_number").input_value() == "4"
+    finally:
+        own.stop()
+
+
+def test_long_work_is_cancelled(visit, server, monkeypatch):
+    page = visit()
+    before = codes(page)
+    check = Session._check
+
+    def slow(session, stage):
+        time.sleep(0.5)
+        check(session, stage)
+
+    monkeypatch.setattr(Session, "_check", slow)
+    for session in server.studio.sessions.values():
+        monkeypatch.setattr(session.engine._runner, "check", session._check)
+    field_of = control(page, "layout.parameters.n_sectors")
+    field_of.fill("64")
+    field_of.press("Enter")
+    page.wait_for_selector("#cancel:not([hidden])")
+    assert "…" in page.inner_text("#status")
+    page.click("#cancel")
+    until(page, "() => studio.isReady && document.getElementById('notice').textContent.includes('cancelled')")
+    monkeypatch.undo()
+
+    assert setting(page, "layout.parameters.n_sectors") == 48
+    assert field_of.input_value() == "48"
+    assert not page.is_visible("#cancel")
+    assert np.array_equal(codes(page), before)
+
+
+# -- files -----------------------------------------------------------------------------------------------------------------------
+
+
+def test_save_asks_before_it_replaces(browser, tmp_path, visit):
+    own = Server(tmp_path)
+    try:
+        page = visit(address=own.address)
+        settle(page)
+
+        def save(name):
+            page.click("#file")
+            page.click("#save")
+            page.fill("#save-name", name)
+            page.click("#save-form button[value=save]")
+
+        save("Fovéa 網膜")
+        path = tmp_path / "Fovéa_網膜.yaml"
+        until(page, "() => document.getElementById('notice').textContent.startsWith('Saved')")
+        first = path.read_text()
+        set_value(page, "exposure_s", 0.005)
+        save("Fovéa 網膜")
+        page.wait_for_selector("#replace-dialog[open]")
+        assert page.inner_text("#replace-title") == "Fovéa_網膜.yaml exists. Replace it?"
+        page.click("#replace-form button[value='']")
+        assert path.read_text() == first
+        save("Fovéa 網膜")
+        page.click("#replace-form button[value=replace]")
+        until(page, "() => document.getElementById('notice').textContent.startsWith('Saved')")
+        for _ in range(100):
+            if path.read_text() != first:
+                break
+            time.sleep(0.05)
+        assert "exposure_s: 0.005" in path.read_text()
+        assert TOKEN not in path.read_text()
+    finally:
+        own.stop()
