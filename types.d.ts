@@ -59,7 +59,7 @@ interface ViewAbout {
 }
 interface Choice { label: string; value: any }
 interface Control {
-  key: string; id: string; label: string; unit: string; help: string; section: string;
+  key: string; id: string; label: string; unit: string; help: string; section: string; synonyms?: string; context?: string;
   kind: "number" | "integer" | "boolean" | "text" | "list" | "choice" | "sections" | "group";
   do?: string; value?: string | null;  // of a choice that is no setting: its message, and the present choice
   default?: any; is_required?: boolean; is_optional?: boolean; is_item?: boolean;

@@ -12,6 +12,7 @@ from typing import Any
 
 from foveasim._core.validation import UNIT_SUFFIXES
 from foveasim.config import bundled_layouts, schema
+from foveasim.studio._labels import words_of
 from foveasim.studio._solving import PARAMETERS, unknown_of, unknowns_of
 from foveasim.studio._templates import INITIAL, PER_AREA, WITHOUT_MOSAIC, templates
 
@@ -74,12 +75,25 @@ def controls_of(settings: Mapping[str, Any], start: Mapping[str, Any] | None = N
         found += _controls(root, name, name, node, settings.get(name), start, is_required=name in root["required"])
     found = _with_unknown(found, settings)
     n_of_key = Counter(control["key"] for control in found if "do" not in control)
+    _distinguish(found)
     for control in found:
         if "do" in control:
             continue
         is_form = control["kind"] == "choice" and n_of_key[control["key"]] > 1
         control["id"] = f"{control['key']}:form" if is_form else control["key"]
     return found
+
+
+def _distinguish(controls: list[dict[str, Any]]) -> None:
+    """Add the section above to names that several controls have."""
+    keys: dict[str, set[str]] = {}
+    for control in controls:
+        keys.setdefault(control["label"], set()).add(control["key"])
+    labels = {control["key"]: control["label"] for control in controls if "do" not in control}
+    for control in controls:
+        if len(keys[control["label"]]) > 1 and "." in control["key"]:
+            above = control["key"].rpartition(".")[0]
+            control["context"] = labels.get(above, above.rpartition(".")[2].replace("_", " "))
 
 
 def _with_unknown(controls: list[dict[str, Any]], settings: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -92,9 +106,10 @@ def _with_unknown(controls: list[dict[str, Any]], settings: Mapping[str, Any]) -
         if control["key"].removeprefix(f"{PARAMETERS}.") in unknowns:
             control["is_optional"] = False  # always visible, also while another one is solved for
     solve = {
-        **_described(PARAMETERS, "layout", {"description": SOLVE_HELP}),
+        **_described(PARAMETERS, "layout", {}),
         "id": f"{PARAMETERS}:solve",
         "label": "solve for",
+        "help": SOLVE_HELP,
         "kind": "choice",
         "is_optional": False,
         "do": "solve",
@@ -267,14 +282,27 @@ def _described(key: str, section: str, node: dict[str, Any]) -> dict[str, Any]:
     name = key.rpartition(".")[2]
     suffix = next((s for s in UNIT_SUFFIXES if name.endswith(s) and len(s) < len(name)), "")
     label = name.removesuffix(suffix).replace("_", " ") if UNIT_SUFFIXES.get(suffix) else name.replace("_", " ")
+    words = words_of(key)
+    found = _sentence(_plain(node.get("description", "")))
     return {
         "key": key,
-        "label": label,
-        "unit": UNIT_SUFFIXES.get(suffix, ""),
+        "label": words.label or label,
+        "unit": words.unit or UNIT_SUFFIXES.get(suffix, "") or ("fraction" if suffix == "_fraction" else ""),
         "section": section,
-        "help": _plain(node.get("description", "")),
+        "help": words.help or found or f"{(words.label or label).capitalize()}.",
+        "synonyms": words.synonyms,
         "default": node.get("default"),
     }
+
+
+def _sentence(text: str) -> str:
+    """Return a text that begins with a capital letter and ends with a full stop."""
+    if not text:
+        return ""
+    first, _, rest = text.partition(" ")
+    first = first if any(letter.isupper() for letter in first) or not first.isalpha() else first.capitalize()
+    joined = f"{first} {rest}".strip()
+    return joined if joined.endswith((".", "!", "?", ":")) else f"{joined}."
 
 
 def _plain(text: str) -> str:

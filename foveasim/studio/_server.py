@@ -268,7 +268,7 @@ class Studio:
         except (OSError, MemoryError) as error:
             return _error(f"the file cannot be written: {one_line(error)}", 400)
         plain = name.encode("ascii", "replace").decode().replace("?", "_")
-        disposition = f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name)}"
+        disposition = f'attachment; filename="{plain}"' + ("" if plain == name else f"; filename*=UTF-8''{quote(name)}")
         return Response(content, media_type="application/octet-stream", headers={"Content-Disposition": disposition})
 
 

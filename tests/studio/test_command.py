@@ -246,7 +246,10 @@ def test_start_settings_have_absolute_paths(tmp_path):
         (".hidden", "file.hidden"),
         ("", "file"),
         ("..", "file"),
-        ("a" * 300 + ".png", "a" * 80 + ".png"),
+        ("a" * 300 + ".png", "a" * 120 + ".png"),
+        ("Fovéa 網膜.PNG", "Fovéa_網膜.png"),
+        ("網" * 300 + ".png", "網" * 40 + ".png"),
+        ("fove\u0301a.png", "fovéa.png"),
     ],
 )
 def test_names_of_uploads_are_safe(given, expected):

@@ -273,3 +273,115 @@ def test_save_asks_before_it_replaces(browser, tmp_path, visit):
         assert TOKEN not in path.read_text()
     finally:
         own.stop()
+
+
+# -- controls ----------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "expected"),
+    [
+        ("1/60", "s", 1 / 60),
+        ("20 ms", "s", 0.02),
+        ("20ms", "s", 0.02),
+        ("500 µs", "s", 5e-4),
+        ("3*2.2", "", 6.6),
+        ("0,02", "s", 0.02),
+        ("1,5e-3", "s", 1.5e-3),
+        ("14,208", "", 14208.0),
+        ("1,000.5", "", 1000.5),
+        ("9 fF", "F", 9e-15),
+        ("1e-15", "F", 1e-15),
+        ("2.2 mm", "µm", 2200.0),
+        ("550", "nm", 550.0),
+        ("0.55 µm", "nm", 550.0),
+        ("1.2 kV", "V", 1200.0),
+        ("5 %", "fraction", 0.05),
+        ("-(2 + 3) * 4 / 8", "", -2.5),
+        ("2×3", "", 6.0),
+        ("30°", "degrees", 30.0),
+        ("100 e-", "e-", 100.0),
+        ("2 s", "µm", None),
+        ("1/0", "s", None),
+        ("auto", "s", None),
+        ("", "s", None),
+        ("1 + ", "", None),
+        ("alert(1)", "", None),
+        ("1 2", "", None),
+        ("EV 12", "s", None),
+    ],
+)
+def test_numbers_are_read_as_written(numbers, text, unit, expected):
+    found = numbers.evaluate(
+        "([text, unit]) => { const v = numberOf(text, unit); return Number.isFinite(v) ? v : null; }", [text, unit]
+    )
+    assert found == (expected if expected is None else pytest.approx(expected, rel=1e-11))
+
+
+@pytest.fixture(scope="module")
+def numbers(server, browser):
+    page = browser.new_page(bypass_csp=True)
+    page.goto(server.address)
+    page.evaluate("import('/static/numbers.js').then((found) => { window.numberOf = found.numberOf; })")
+    until(page, "() => window.numberOf")
+    yield page
+    page.close()
+
+
+def test_fields_accept_written_numbers(visit):
+    page = visit()
+    for text, value in (("1/50", 0.02), ("20 ms", 0.02), ("0,03", 0.03), ("8*2 ms", 0.016)):
+        field(page, "exposure_s", text)
+        assert setting(page, "exposure_s") == pytest.approx(value)
+        assert float(control(page, "exposure_s").input_value()) == pytest.approx(value)
+    field(page, "layout.parameters.n_sectors", "8*8")
+    assert setting(page, "layout.parameters.n_sectors") == 64
+    field(page, "optics.f_number", "wide")
+    assert "f_number" in page.inner_text(".control[data-key='optics.f_number'] .error")
+
+
+@pytest.mark.parametrize(
+    ("words", "key"),
+    [
+        ("saccade", "gaze_um"),
+        ("snr", "sensor.read_noise_e"),
+        ("bayer", "layout.mosaic"),
+        ("format", "layout.parameters.r_max_um"),
+        ("aperture", "optics.f_number"),
+        ("shutter", "exposure_s"),
+        ("drc", "layout.rules"),
+        ("quantum", "sensor.qe"),
+    ],
+)
+def test_search_knows_other_words(visit, words, key):
+    page = visit()
+    page.fill("#search", words)
+    keys = page.locator(".control:visible").evaluate_all("all => all.map((row) => row.dataset.key)")
+
+    assert key in keys
+    assert len(keys) < 30
+
+
+def test_every_control_has_name_and_help(visit):
+    """Names are unique; the help is that of screen readers, and is shown for the focus of the keyboard and for a touch."""
+    page = visit(has_touch=True)
+    found = page.evaluate(
+        """() => [...document.querySelectorAll(".control")].filter((row) => row.querySelector("input, select")).map((row) => {
+          const field = row.querySelector(".line > input, .line > select");
+          const help = document.getElementById(field.getAttribute("aria-describedby").split(" ")[0]);
+          return [row.dataset.id, field.getAttribute("aria-label"), help.textContent];
+        })"""
+    )
+    assert len(found) > 100
+    names = [name for _, name, _ in found if name]
+    assert sorted({name for name in names if names.count(name) > 1}) == []
+    assert [key for key, _, text in found if len(text) < 10 or (not text[0].isupper() and text[0].isalpha())] == []
+
+    page.focus("#search")
+    for _ in range(3):
+        page.keyboard.press("Tab")
+    key = page.evaluate("document.activeElement.closest('.control').dataset.key")
+    assert page.inner_text("#hint").endswith(key)
+    control(page, "optics.f_number")
+    page.locator(".control[data-key='optics.f_number'] label").tap()
+    assert "focal length over the diameter" in page.inner_text("#hint")

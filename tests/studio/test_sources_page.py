@@ -404,7 +404,7 @@ def test_equal_variants_have_equal_rows(visit):
 
     assert all(a == b for a, b in found.values())
     assert found["bits_per_frame"] == ["9,120", "9,120"]
-    assert found["frames_per_s"] == ["50", "50"]
+    assert found["frames_per_s"] == ["50 1/s", "50 1/s"]
     assert page.is_disabled("#match")
 
 

@@ -35,6 +35,7 @@ pytestmark = pytest.mark.needs("chromium")
 @pytest.mark.slow
 def test_every_view_shows_data(visit):
     page = visit(width=2560, height=1440)
+    page.click("[data-tile=spectrum]")
     until(page, "() => ['noise', 'spectrum', 'mtf', 'rules', 'scene'].every((name) => studio.views.parts[name])")
     for selector in (
         "#map .cells",

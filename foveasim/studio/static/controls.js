@@ -2,6 +2,7 @@
 
 import { clamp, roundStep, shown } from "/web/colours.js";
 import { change, make } from "/web/page_parts.js";
+import { numberOf } from "./numbers.js";
 
 // Sections that are open at first; settings outside all sections are in the first of them.
 const OPEN = ["exposure", "layout", "optics", "sensor"];
@@ -10,6 +11,7 @@ const TAGS = ["kind", "generator"];
 // A step of a logarithmic slider is at least this factor.
 const LOG_STEP = 1.02;
 const LINEAR_STEPS = 200;
+const HINT = "Point at a setting, or select it, for its meaning.";
 
 export const valueAt = (settings, key) => key.split(".").reduce((part, name) =>
   (part === null || part === undefined ? undefined : part[name]), settings);
@@ -21,6 +23,9 @@ export function fieldText(value) {
   if (Array.isArray(value) && value.every((item) => item === null || typeof item !== "object")) return value.map(fieldText).join(", ");
   return typeof value === "object" ? JSON.stringify(value) : String(value);
 }
+
+// Exposures may also be words or exposure values.
+const hasNumbers = ({ kind, unit, key }) => kind === "number" || kind === "integer" || (kind === "text" && unit && key === "exposure_s");
 
 const asNumber = (text) => (text.trim() !== "" && Number.isFinite(Number(text)) ? Number(text) : text.trim());
 
@@ -79,14 +84,6 @@ function chosenOf({ choices, selected }, value) {
   return found >= 0 ? found : selected ?? -1;
 }
 
-// Abbreviations that names of settings have in lower case.
-const SHORT = { qe: "QE", prnu: "PRNU", dsnu: "DSNU", fpn: "FPN", rts: "RTS", ktc: "kTC", cds: "CDS", inl: "INL", dnl: "DNL", mtf: "MTF" };
-
-function labelOf({ key, label }) {
-  if (/\.per_um2$/.test(key)) return "per µm²";
-  return label.split(" ").map((word) => SHORT[word] || word).join(" ");
-}
-
 const choicesOf = (control) => (control.choices || []).map((choice) =>
   (choice !== null && typeof choice === "object" && "value" in choice ? choice : { label: fieldText(choice), value: choice }));
 
@@ -122,13 +119,16 @@ class Row {
     this.root.dataset.key = control.key;
     this.root.dataset.id = control.id || control.key;
     this.root.style.setProperty("--depth", String(Math.max(0, control.key.split(".").length - 2 + (control.is_value ? 1 : 0))));
+    // Names of controls and their help for screen readers; the page shows the help of the focused control.
+    this.help = make("span", control.help || "", "unseen");
+    this.help.id = this.id + "-help";
+    this.name = control.label + (control.is_value ? ", value" : "") + (control.context ? ", " + control.context : "");
     this.label = make("label", control.is_value ? "value" : control.label);
     this.label.htmlFor = this.id;
-    this.label.title = control.key + (control.help ? ": " + control.help : "");
     this.reset = make("button", "↺", "reset");
     this.reset.type = "button";
     this.reset.title = "Reset to the value at the start";
-    this.reset.setAttribute("aria-label", "Reset " + control.label);
+    this.reset.setAttribute("aria-label", "Reset " + this.name);
     this.reset.hidden = true;
     this.reset.addEventListener("click", () => { this.field?.focus(); on.reset(); });
     this.error = make("p", undefined, "error");
@@ -140,11 +140,13 @@ class Row {
     else this._build();
     for (const input of [this.field, this.slider]) {
       if (!input) continue;
-      input.setAttribute("aria-describedby", this.error.id);
-      if (control.help) input.title = control.help;
+      input.setAttribute("aria-describedby", this.help.id + " " + this.error.id);
     }
-    this.root.append(this.error);
-    this.words = [control.label, control.key, control.help, control.section].join(" ").toLowerCase().replaceAll("_", " ");
+    this.field?.setAttribute("aria-label", this.name + (control.unit ? ", " + control.unit : ""));
+    this.adder?.setAttribute("aria-describedby", this.help.id);
+    this.root.append(this.help, this.error);
+    this.words = [control.label, control.key, control.help, control.section, control.synonyms, control.context].join(" ").toLowerCase()
+      .replaceAll("_", " ");
   }
 
   _makeField() {
@@ -196,7 +198,7 @@ class Row {
     slider.type = "range";
     slider.min = "0";
     slider.step = "1";
-    slider.setAttribute("aria-label", this.control.label + " slider");
+    slider.setAttribute("aria-label", this.name + " slider");
     const value = () => this.range.toValue(Number(slider.value));
     const release = () => {
       if (!this.isHeld) return;
@@ -294,7 +296,10 @@ class Row {
     const { kind } = this.control, text = field.value;
     if (text === fieldText(this.value) && this.error.hidden) return;
     if (text.trim() === "" && kind !== "text") this.on.remove();
-    else this._send(kind === "list" ? listOf(text) : kind === "text" ? text : asNumber(text), true);
+    else {
+      const number = hasNumbers(this.control) ? numberOf(text, this.control.unit) : NaN;
+      this._send(kind === "list" ? listOf(text) : Number.isFinite(number) ? number : text.trim(), true);
+    }
   }
 
   _send(value, isFinal) {
@@ -350,11 +355,12 @@ class Row {
 }
 
 export class Controls {
-  root; search; onlyChanged; on;
+  root; search; onlyChanged; on; hint;
 
   // Callbacks: send(key, value, isFinal) and act(do, name) return the number of the message; reset(key), remove(key).
-  constructor(root, search, onlyChanged, on) {
-    Object.assign(this, { root, search, onlyChanged, on });
+  constructor(root, search, onlyChanged, hint, on) {
+    Object.assign(this, { root, search, onlyChanged, hint, on });
+    hint.textContent = HINT;
     this.rows = new Map();
     this.sections = new Map();
     this.state = null;
@@ -365,6 +371,10 @@ export class Controls {
       this._filter();
       event.stopPropagation();
     });
+    // The help of the control with the focus, or under the mouse.
+    for (const type of ["focusin", "pointerover"]) root.addEventListener(type, (event) => this._hint(event.target));
+    root.addEventListener("pointerleave", () => this._hint(document.activeElement));
+    root.addEventListener("focusout", () => this._hint(null));
     onlyChanged.addEventListener("click", () => {
       onlyChanged.setAttribute("aria-pressed", String(onlyChanged.getAttribute("aria-pressed") !== "true"));
       this._filter();
@@ -381,10 +391,8 @@ export class Controls {
     const forms = new Set(list.filter((one) => one.id === one.key + ":form").map((one) => one.key));
     for (const described of list) {
       // The value after the choice of its form.
-      const control = { ...described, label: labelOf(described), is_value: forms.has(described.key) && described.id === described.key };
+      const control = { ...described, is_value: forms.has(described.key) && described.id === described.key };
       if (/\.per_um2$/.test(control.key)) control.unit = "";
-      if (!control.unit && / fraction$/.test(control.label)) Object.assign(control,
-        { label: control.label.slice(0, -9), unit: "fraction" });
       const id = control.id || control.key, known = before.get(id), shape = shapeOf(control);
       // The heading of a section is enough.
       if (control.kind === "group" && !control.key.includes(".")) continue;
@@ -422,6 +430,15 @@ export class Controls {
 
   // Messages of an earlier connection may be lost: the next state shows what the server has.
   forgetSent() { for (const row of this.rows.values()) { row.sent = 0; row.isCurrent = false; } }
+
+  // Shows the help of the control that contains an element; none for others.
+  /** @param {EventTarget | null} target */
+  _hint(target) {
+    const id = target instanceof Element ? target.closest(".control")?.getAttribute("data-id") : null, row = id ? this.rows.get(id) : null;
+    if (!row) { change(this.hint, { textContent: HINT }); return; }
+    const { unit, help, key } = row.control;
+    this.hint.replaceChildren(make("b", row.name + (unit ? " / " + unit : "")), " " + (help || "") + " ", make("code", key));
+  }
 
   _fillSection(name, rows) {
     let section = this.sections.get(name);

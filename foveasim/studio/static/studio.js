@@ -658,7 +658,7 @@ Object.assign(window, { studio });
 
 function start() {
   createPanes();
-  controls = new Controls($("sections"), $("search"), $("only-changed"), {
+  controls = new Controls($("sections"), $("search"), $("only-changed"), $("hint"), {
     send: (key, value, isFinal) => connection.set(key, value, isFinal),
     reset: (key) => connection.send({ do: "reset", key }),
     remove: (key) => connection.send({ do: "delete", key }),

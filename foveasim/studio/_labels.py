@@ -1,0 +1,241 @@
+"""Names, sentences of help and further search words of settings on the page, where those of the schema are too short."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Words:
+    """
+    Words of a setting.
+
+    ``label``: name on the page, ``help``: sentence, ``unit``: unit; empty ones are those of the schema. ``synonyms``: further
+    words that the search finds.
+    """
+
+    label: str = ""
+    help: str = ""
+    unit: str = ""
+    synonyms: str = ""
+
+
+#: Words by the last name of a setting, or by its last two for a name with several meanings.
+WORDS: dict[str, Words] = {
+    "a": Words("polynomial", "Coefficients a0, a2, a3, a4 of the polynomial of the lens."),
+    "a_um": Words("radius of the fovea"),
+    "astigmatism_um": Words(help="Path difference of the astigmatism at the edge of the aperture and of the field."),
+    "axis": Words("gaze moves", synonyms="optical axis turn camera gaze"),
+    "band_width_nm": Words(synonyms="spectral bandwidth"),
+    "bits": Words(
+        "bits of the ADC",
+        "Number of bits of a code, from 1 to 16.",
+        synonyms="adc resolution bit depth quantisation dynamic range",
+    ),
+    "by_um": Words("displacement", "Displacement of the sites along x and y."),
+    "capacitance_f": Words("sense-node capacitance", synonyms="conversion gain full well"),
+    "cds": Words("correlated double sampling", synonyms="cds reset noise"),
+    "coma_um": Words(help="Path difference of the coma at the edge of the aperture and of the field."),
+    "companding": Words(
+        help="Law by which voltages are compressed before the codes: linear, square root, logarithmic or a table.",
+        synonyms="gamma log compression hdr",
+    ),
+    "companding_table": Words(help="Fractions of the code range at equal voltage steps, from 0 to 1."),
+    "coupling": Words("inter-pixel capacitance", synonyms="ipc crosstalk"),
+    "crosstalk": Words("charge crosstalk", synonyms="diffusion"),
+    "dark_activation_ev": Words(
+        "activation energy", "Activation energy of the Arrhenius law of the dark current.", synonyms="dark current"
+    ),
+    "dark_diffusion_fraction": Words(
+        "diffusion part",
+        "Fraction of the dark current at its reference that is diffusion current.",
+        synonyms="dark current",
+    ),
+    "dark_doubling_k": Words("doubling of dark current", "Temperature rise that doubles the dark current."),
+    "dark_e_per_s": Words("dark current", synonyms="dark signal leakage thermal"),
+    "dark_law": Words("temperature law", synonyms="dark current"),
+    "dark_reference_k": Words(
+        "reference temperature", "Temperature at which the dark current is given.", synonyms="dark current"
+    ),
+    "dead_fraction": Words("dead sites", synonyms="defects bad pixels"),
+    "device_seed": Words(synonyms="device fixed pattern"),
+    "disabled": Words("disabled effects", synonyms="switch off without noise"),
+    "distance_m": Words("scene distance", synonyms="object working"),
+    "dnl_dn": Words("DNL", "Differential nonlinearity of the ADC: standard deviation of the code transitions."),
+    "dsnu_fraction": Words("DSNU", synonyms="fixed pattern"),
+    "dx_um": Words("displacement along x", "Displacement of all sites along x."),
+    "dy_um": Words("displacement along y", "Displacement of all sites along y."),
+    "emission": Words(synonyms="relative illumination cos4 vignetting falloff"),
+    "exposure_s": Words(
+        help="Exposure time: seconds, a fraction such as 1/60, a value such as EV 12, or auto.",
+        synonyms="shutter integration time ev brightness",
+    ),
+    "f_number": Words("f-number", synonyms="aperture iris stop f/ diffraction depth of field"),
+    "field_curvature_um": Words(
+        help="Path difference of the field curvature at the edge of the aperture and of the field."
+    ),
+    "field_of_view_deg": Words(synonyms="fov angle of view"),
+    "filters": Words("colour filters", synonyms="cfa rgb bayer spectral"),
+    "fit": Words("framing", synonyms="fit cover crop size format"),
+    "focal_length_mm": Words("focal length", "Focal length of the lens.", synonyms="zoom fov"),
+    "focus_distance_m": Words("focus distance", synonyms="defocus blur sharpness"),
+    "fovea": Words("filling of the fovea", synonyms="blind spot centre"),
+    "fov_um": Words("field diameter"),
+    "fractions": Words("frequencies of the filters"),
+    "from_nm": Words("cut-on wavelength"),
+    "from_um": Words("moved vertices"),
+    "full_well_e": Words("full well", synonyms="saturation capacity dynamic range"),
+    "fwhm_nm": Words("full width at half maximum", "Full width of the curve at half of its maximum."),
+    "gain_fpn_fraction": Words("gain FPN", synonyms="fixed pattern"),
+    "gaussian_above_e": Words("exact shot noise up to", synonyms="poisson"),
+    "gaze_range_um": Words(synonyms="fixation saccade eye"),
+    "gaze_um": Words(
+        "gaze",
+        "Point of the image at which the centre of the sensor is.",
+        synonyms="fixation saccade eye position pan shift move",
+    ),
+    "hot_e_per_s": Words(
+        "dark current of hot sites",
+        "Additional dark current of hot sites, at the reference temperature.",
+        synonyms="defects",
+    ),
+    "hot_fraction": Words(
+        "hot sites", "Fraction of sites with additional dark current.", synonyms="defects bad pixels"
+    ),
+    "illuminance_lux": Words(
+        help="Illuminance of the scene, instead of its radiance.", synonyms="light lux brightness photometric"
+    ),
+    "inl_dn": Words("INL", "Integral nonlinearity of the ADC: deviations at equal code intervals."),
+    "inset_um": Words("inset", synonyms="fill factor trench gap"),
+    "integration_order": Words("integration order", synonyms="gradient accuracy"),
+    "k": Words("polynomial of the angle"),
+    "ktc_noise": Words("reset noise (kTC)", synonyms="ktc reset"),
+    "lateral_colour": Words("lateral chromatic aberration", synonyms="colour fringe"),
+    "layout": Words("layout", synonyms="generator bayer hexagonal log polar foveal grid sensor format"),
+    "layout.source": Words("source of the layout", "Where the figures of the layout come from."),
+    "lens": Words("lens model", synonyms="aplanatic thin sine condition"),
+    "limit": Words("importance of a square"),
+    "line_fpn_fraction": Words(
+        "column FPN",
+        "Standard deviation of the offsets of readout lines, over the saturation voltage.",
+        synonyms="fixed pattern",
+    ),
+    "log_strength": Words("strength of log companding", "Strength of the logarithmic companding."),
+    "luminance_cd_m2": Words(
+        help="Luminance of white, instead of the radiance.", synonyms="light brightness display nit photometric"
+    ),
+    "max_data_rate_gbit_per_s": Words(
+        "largest data rate", "Largest data rate of one lane; requires a readout.", "Gbit/s", "bandwidth"
+    ),
+    "max_density": Words("largest fill factor", "Largest fill factor of every window."),
+    "max_gap_um2": Words("largest gap"),
+    "max_growth": Words(
+        "largest growth", "Largest ratio of the mean site size of a ring to that of the next inner ring."
+    ),
+    "max_neighbour_ratio": Words("largest ratio of neighbours"),
+    "max_overlap_um2": Words("largest overlap"),
+    "max_sites": Words("most photosites"),
+    "max_aspect_ratio": Words("largest aspect ratio"),
+    "max_size_um": Words("largest size", "Largest size of a site, the square root of its area.", synonyms="pixel"),
+    "max_track_utilisation": Words("largest track utilisation", synonyms="routing"),
+    "min_angle_deg": Words("smallest angle"),
+    "min_area_um2": Words("smallest area"),
+    "min_density": Words("smallest fill factor", "Smallest fill factor of every window."),
+    "min_growth": Words(
+        "smallest growth", "Smallest ratio of the mean site size of a ring to that of the next inner ring."
+    ),
+    "min_hole_um2": Words("smallest hole"),
+    "min_size_um": Words("smallest size", synonyms="pixel blind spot"),
+    "min_space_um": Words("smallest space", synonyms="gap distance"),
+    "min_width_um": Words("smallest width"),
+    "mosaic": Words("mosaic", synonyms="bayer rggb quad x-trans cfa colour filter array"),
+    "move_um": Words("position of the layout", synonyms="shift translate"),
+    "n_across": Words("diameter in smallest sites"),
+    "n_basis": Words("basis images"),
+    "n_blades": Words("blades"),
+    "n_channels": Words("filters"),
+    "n_chords": Words("sides of a circle"),
+    "n_columns": Words("columns", "Number of sites per row."),
+    "n_fovea": Words("size of the fovea"),
+    "n_iterations": Words("iterations"),
+    "n_lanes": Words("lanes"),
+    "n_layers": Words("metal layers"),
+    "n_levels": Words("subdivisions"),
+    "n_points": Words("points"),
+    "n_rho": Words("rings of the layout"),
+    "n_rings": Words("rings"),
+    "n_rows": Words("rows", "Number of rows."),
+    "n_sectors": Words("sectors", synonyms="angular resolution"),
+    "n_sites": Words("photosites", synonyms="number of pixels resolution megapixels count format"),
+    "n_spokes": Words("spokes"),
+    "n_squares": Words("squares"),
+    "n_steps": Words("patches"),
+    "n_theta": Words("sites per ring"),
+    "n_vanes": Words("vanes", "Number of vanes of the spider."),
+    "n_x": Words("columns", "Number of columns.", synonyms="resolution width format"),
+    "n_y": Words("rows", "Number of rows; by default as many as columns.", synonyms="resolution height format"),
+    "nonlinearity_fraction": Words("nonlinearity"),
+    "outlines_um": Words("outlines", "Outlines of the new sites: lists of vertices."),
+    "oversample": Words("oversampling"),
+    "parameters": Words(help="Parameters of the generator."),
+    "peak_radiance_w_m2_sr_nm": Words("radiance of white", synonyms="light brightness"),
+    "pedestal_v": Words("black level", synonyms="offset pedestal"),
+    "per_um2": Words("per µm²", "Value of a photosite per µm² of its area."),
+    "phase_deg": Words("phase"),
+    "picture": Words(synonyms="photograph image file scene"),
+    "pitch_um": Words("pitch", synonyms="pixel size spacing"),
+    "pitch_y_um": Words("pitch of the rows"),
+    "pixel_fpn_fraction": Words(
+        "pixel FPN",
+        "Standard deviation of the offsets of sites, over the saturation voltage.",
+        synonyms="fixed pattern dsnu",
+    ),
+    "preset": Words(synonyms="electronics template published"),
+    "prnu_fraction": Words("PRNU", synonyms="fixed pattern non-uniformity"),
+    "pupil": Words(synonyms="aperture stop iris psf"),
+    "qe": Words("quantum efficiency", synonyms="qe sensitivity"),
+    "r_max_um": Words("outer radius", synonyms="size format field"),
+    "r_min_um": Words("inner radius", synonyms="blind spot"),
+    "radius_um": Words(synonyms="size format field"),
+    "read_noise_e": Words("read noise", synonyms="snr noise floor dynamic range"),
+    "reflectance": Words(help="Reflectance of the white of the scene, with an illuminance."),
+    "rows": Words(help="Part of the image, in pixels from the top."),
+    "columns": Words(help="Part of the image, in pixels from the left."),
+    "rts_e": Words("step of RTS noise", "Difference of the two levels of a site with a random telegraph signal."),
+    "rts_fraction": Words(
+        "sites with RTS noise", "Fraction of sites with a random telegraph signal (RTS).", synonyms="telegraph"
+    ),
+    "rules": Words("design rules", synonyms="drc violations"),
+    "rules.min_size_um": Words("smallest size", "Smallest size of a site, the square root of its area."),
+    "rules.grid_um": Words("manufacturing grid"),
+    "scene": Words("scene", synonyms="photograph chart cube light"),
+    "seed": Words("seed of the noise", "Seed of the temporal noise: equal seeds give equal noise.", synonyms="random"),
+    "random_channels.seed": Words("seed", "Seed of the random filters."),
+    "sensitivity": Words(synonyms="fill factor microlens"),
+    "sensor": Words("sensor", synonyms="electronics pixel"),
+    "shot_noise": Words(
+        help="Draw of the photon shot noise: automatic, exact Poisson numbers, or off.", synonyms="poisson photon snr"
+    ),
+    "size_um": Words("size of the field", synonyms="format sensor size width height"),
+    "snap_um": Words("grid of the vertices"),
+    "spherical_um": Words(
+        "spherical aberration", "Path difference of the spherical aberration at the edge of the aperture."
+    ),
+    "temperature_k": Words(help="Temperature of the sensor.", synonyms="cooling dark current"),
+    "to_nm": Words("cut-off wavelength"),
+    "to_um": Words("new positions"),
+    "qe.transmission": Words("transmission into the silicon"),
+    "optics.transmission": Words("transmission of the lens", synonyms="glass t-stop"),
+    "trench_um": Words("trench"),
+    "unit_um": Words("size of the smallest site"),
+    "v_sat_v": Words("saturation voltage", synonyms="full scale swing"),
+    "wavelength_nm": Words(synonyms="colour spectrum"),
+    "zernike": Words("Zernike aberrations", synonyms="wavefront defocus"),
+    "seidel": Words("Seidel aberrations", synonyms="wavefront coma astigmatism"),
+}
+
+
+def words_of(key: str) -> Words:
+    """Return the words of the setting with a path."""
+    names = [name for name in key.split(".") if not name.isdecimal()]
+    return WORDS.get(".".join(names[-2:])) or WORDS.get(names[-1]) or Words()
