@@ -111,9 +111,22 @@ def run(
     centre: Centre = False,
     out: Out = Path("out"),
     threads: Threads = None,
+    require: Annotated[
+        bool, typer.Option("--require", help="Exit with 1 if a requirement of the settings is not met.")
+    ] = False,
 ) -> None:
-    """Simulate the shot of a settings file."""
-    _run([settings], [*(changes or []), *_layout_changes(layer, channels, cell, centre)], out, threads)
+    """Simulate the shot of a settings file, and check its requirements."""
+    (result,) = _run([settings], [*(changes or []), *_layout_changes(layer, channels, cell, centre)], out, threads)
+    if require and not result.shot.requirements:
+        _exit(f"error: {settings}: contains no requirements", BAD_INPUT)
+    if result.shot.requirements:
+        from foveasim.explore import check_requirements
+
+        found = check_requirements(result.shot, result.capture)
+        for checked in found:
+            console.print(as_plain_text(str(checked)))
+        if require and not all(checked.is_met for checked in found):
+            raise typer.Exit(FAILED)
 
 
 @app.command()

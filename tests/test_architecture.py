@@ -55,7 +55,7 @@ DIMENSIONLESS = {
     "a", "above", "amplitude", "at_least", "at_most", "blanking", "coefficients", "colour_matrix", "companding_table", "contrast", "contrast_off", "contrast_on", "count", "custom", "data_range", "delta_e", "delta_e_raw", "deviation", "dpi", "esf", "f_number", "factor", "figure_inches", "fill_factor", "gain", "gamma", "half_step", "high", "hot_sigmas", "illuminant", "k", "k1", "k2", "k3", "k4", "k5", "k6", "kernel",
     "limit", "limits", "log_strength", "low", "magnification", "matrix", "median", "min_coverage", "misfit", "missing", "mtf", "mtf_sigma", "mu", "max_aspect_ratio", "obscuration", "offset",
     "max_density", "max_growth", "max_neighbour_ratio", "max_track_utilisation", "min_density", "min_growth", "neighbour_fraction", "noisy_ratio", "out", "p1", "p2", "peak", "per_vertex", "percentile", "power", "psnr_db", "psnr_db_by_eccentricity", "qe", "ratio", "reflectance", "rounding",
-    "ring_ratio", "sensitivity", "site_weights", "snr", "spectrum", "ssim", "ssim_by_eccentricity", "stretch", "target", "tolerance", "transmission", "value", "values", "variance", "wavelength", "weight", "weights", "white", "worst_area_error", "zoom",
+    "result", "result_at", "results", "ring_ratio", "sensitivity", "site_weights", "snr", "spectrum", "ssim", "ssim_by_eccentricity", "stretch", "target", "tolerance", "transmission", "value", "values", "variance", "wavelength", "weight", "weights", "white", "worst_area_error", "zoom",
 }  # fmt: skip
 #: Names in private functions, in cells, pitches, steps or aperture radii as their docstrings specify.
 INTERNAL = {

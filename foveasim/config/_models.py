@@ -20,6 +20,7 @@ from foveasim._core.registry import Registry
 from foveasim._core.validation import unit_of
 from foveasim.camera import GazeAxis
 from foveasim.camera._exposure import exposure_time
+from foveasim.config._requirements import Requirement
 from foveasim.distortion import LENSES
 from foveasim.errors import ParameterError
 from foveasim.layout import EDITS, LAYOUTS, PRESETS, RULES, DesignRules, Readout, Routing, read_layout
@@ -267,6 +268,11 @@ def _models(_versions: tuple[int, ...]) -> Models:
             Field(None, description="cells of constant irradiance, or with a gradient; chosen by default"),
         ),
     }
+    requirement = _model("requirement", Requirement)
+    fields["requirements"] = (
+        list[requirement] | None,  # type: ignore[valid-type]
+        Field(None, description="conditions on results, which foveasim run --require checks"),
+    )
     summary = "A shot: scene or power map, optics, distortion, layout, sensor, exposure."
     return Models(create_model("ShotSection", __base__=Section, __doc__=summary, **fields), layout, rules)
 

@@ -23,6 +23,7 @@ from foveasim.camera._exposure import exposure_time
 from foveasim.capture import Capture
 from foveasim.config._models import FILE_OPTIONS, LayerSection, PerArea, call_of, models
 from foveasim.config._problems import adapter_of, plain_settings, validate
+from foveasim.config._requirements import Requirement
 from foveasim.config._sources import Source
 from foveasim.errors import ConfigError, FoveasimError, ParameterError
 from foveasim.fields import Grid, PowerMap
@@ -86,6 +87,8 @@ class Shot:
     requested_s : float or "auto", s
         Exposure time, as :meth:`foveasim.Camera.capture` accepts it.
     seed : int
+    requirements : tuple of Requirement
+        Conditions on results, which :func:`foveasim.explore.check_requirements` checks.
     """
 
     name: str
@@ -94,6 +97,7 @@ class Shot:
     rules: DesignRules | None
     requested_s: float | Literal["auto"]
     seed: int
+    requirements: tuple[Requirement, ...] = ()
 
     __repr__ = short_repr
 
@@ -299,6 +303,7 @@ def build_shot(
         rules=file.rules,
         requested_s=exposure_s,
         seed=streams.seed,
+        requirements=tuple(_build(source, "requirements", settings.requirements or [])),
     )
 
 

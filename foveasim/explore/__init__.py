@@ -12,6 +12,8 @@ from foveasim.explore.datasets.plan import DatasetFile, read_dataset
 from foveasim.explore.datasets.pytorch import torch_dataset
 from foveasim.explore.datasets.recipes import classification, denoising
 from foveasim.explore.datasets.store import StoredSamples, open_dataset, write_dataset
+from foveasim.explore.requirements import CheckedRequirement, check_requirements, measure
+from foveasim.explore.solving import Solution, solve
 from foveasim.explore.studies.plan import StudyPlan, plan_study, read_study
 from foveasim.explore.studies.study import best_table, run_study, storage_name, study
 from foveasim.explore.studies.trials import finished_trials, trials_table
@@ -21,17 +23,21 @@ from foveasim.explore.sweeps.sweep import run_sweep, sweep
 
 __all__ = [
     "METRICS",
+    "CheckedRequirement",
     "Dataset",
     "DatasetFile",
     "Metric",
     "Plan",
+    "Solution",
     "StoredSamples",
     "StudyPlan",
     "best_table",
+    "check_requirements",
     "classification",
     "denoising",
     "finished_trials",
     "import_metric",
+    "measure",
     "open_dataset",
     "open_results",
     "parse_distribution",
@@ -43,6 +49,7 @@ __all__ = [
     "run_study",
     "run_sweep",
     "schema_of",
+    "solve",
     "storage_name",
     "study",
     "sweep",

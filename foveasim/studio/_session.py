@@ -22,22 +22,6 @@ from foveasim._io.yaml_files import format_yaml
 from foveasim.config import check_settings, put_setting
 from foveasim.errors import ParameterError, SimulationError, printable
 from foveasim.layout import Layout
-from foveasim.studio._changes import (
-    ONCE,
-    changed_keys,
-    check_depth,
-    choose_preset,
-    chooses_filters,
-    is_change,
-    is_draft,
-    is_frame,
-    key_of,
-    match_filters,
-    reset,
-    string_of,
-    with_file,
-)
-from foveasim.studio._controls import chosen_value, controls_of, structure_of
 from foveasim.studio._costs import RELEASE_S, REST_S, CancelledError, Costs, SupersededError
 from foveasim.studio._engine import Engine, Simulated
 from foveasim.studio._exports import text_of, without_directories
@@ -54,7 +38,23 @@ from foveasim.studio._history import History
 from foveasim.studio._messages import from_json, one_line, to_json
 from foveasim.studio._parts import PARTS, summary_of
 from foveasim.studio._pictures import reduced_picture, resolved_pixels
-from foveasim.studio._solving import balanced, solved_of, with_n_sites, with_unknown
+from foveasim.studio._settings.changes import (
+    ONCE,
+    changed_keys,
+    check_depth,
+    choose_preset,
+    chooses_filters,
+    is_change,
+    is_draft,
+    is_frame,
+    key_of,
+    match_filters,
+    reset,
+    string_of,
+    with_file,
+)
+from foveasim.studio._settings.controls import chosen_value, controls_of, structure_of
+from foveasim.studio._settings.unknowns import balanced, solved_of, with_n_sites, with_unknown
 from foveasim.studio._views import Views
 
 #: Size limit of all uploaded files.

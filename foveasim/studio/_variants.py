@@ -12,7 +12,7 @@ from foveasim.errors import FoveasimError
 from foveasim.fields import Grid
 from foveasim.layout import Layout
 from foveasim.studio._engine import Simulated
-from foveasim.studio._solving import is_generated
+from foveasim.studio._settings.unknowns import is_generated
 
 #: Side of the compared pictures, pixels.
 N_PIXELS = 160

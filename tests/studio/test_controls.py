@@ -7,9 +7,9 @@ import json
 import pytest
 
 from foveasim.config import build_shot, check_settings, schema
-from foveasim.studio import _controls
-from foveasim.studio._controls import chosen_value, controls_of, structure_of, value_at
 from foveasim.studio._files import start_settings
+from foveasim.studio._settings import controls as _controls
+from foveasim.studio._settings.controls import chosen_value, controls_of, structure_of, value_at
 
 KINDS = {"number", "integer", "choice", "boolean", "text", "list", "group", "sections"}
 

@@ -20,7 +20,7 @@ from foveasim.studio._engine import Engine
 from foveasim.studio._exports import notebook
 from foveasim.studio._frames import camera_frame
 from foveasim.studio._server import _exported, _message
-from foveasim.studio._solving import with_n_sites
+from foveasim.studio._settings.unknowns import with_n_sites
 from foveasim.studio._variants import compare, fovea_um
 
 WIDTH, HEIGHT = 40, 24

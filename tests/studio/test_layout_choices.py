@@ -8,11 +8,11 @@ from studio.test_session import code_part, codes_of
 
 from foveasim.config import bundled_layouts
 from foveasim.layout import LAYOUTS
-from foveasim.studio._controls import controls_of
 from foveasim.studio._files import start_settings
 from foveasim.studio._session import Start
-from foveasim.studio._solving import unknown_of, unknowns_of, with_unknown
-from foveasim.studio._templates import SECTIONS, WITHOUT_MOSAIC
+from foveasim.studio._settings.controls import controls_of
+from foveasim.studio._settings.templates import SECTIONS, WITHOUT_MOSAIC
+from foveasim.studio._settings.unknowns import unknown_of, unknowns_of, with_unknown
 
 
 def choose(recorder, label, **message):

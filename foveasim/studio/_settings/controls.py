@@ -12,9 +12,9 @@ from typing import Any
 
 from foveasim._core.validation import UNIT_SUFFIXES
 from foveasim.config import bundled_layouts, schema
-from foveasim.studio._labels import words_of
-from foveasim.studio._solving import PARAMETERS, unknown_of, unknowns_of
-from foveasim.studio._templates import INITIAL, PER_AREA, WITHOUT_MOSAIC, templates
+from foveasim.studio._settings.labels import words_of
+from foveasim.studio._settings.templates import INITIAL, PER_AREA, WITHOUT_MOSAIC, templates
+from foveasim.studio._settings.unknowns import PARAMETERS, unknown_of, unknowns_of
 
 __all__ = ["chosen_value", "controls_of", "structure_of", "value_at"]
 

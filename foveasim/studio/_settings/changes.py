@@ -10,9 +10,9 @@ from foveasim.config import put_setting
 from foveasim.config._models import expand_preset
 from foveasim.errors import ParameterError, printable
 from foveasim.sensor import PRESETS
-from foveasim.studio._controls import controls_of, value_at
 from foveasim.studio._files import Files, with_layout
-from foveasim.studio._templates import WITHOUT_MOSAIC
+from foveasim.studio._settings.controls import controls_of, value_at
+from foveasim.studio._settings.templates import WITHOUT_MOSAIC
 
 #: Messages that change the settings.
 CHANGES = (

@@ -1,0 +1,153 @@
+"""Requirements of a design: conditions on results of a shot."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from foveasim.errors import ParameterError
+
+#: Results that requirements can limit, by name: label and unit.
+MEASURES: dict[str, tuple[str, str]] = {
+    "snr": ("signal-to-noise ratio", ""),
+    "snr_db": ("signal-to-noise ratio", "dB"),
+    "n_sites": ("photosites", ""),
+    "saturated_fraction": ("saturated photosites", "fraction"),
+    "mean_code_dn": ("mean code", "DN"),
+    "mtf": ("MTF of lens and photosite", ""),
+    "psnr_db": ("PSNR", "dB"),
+    "data_rate_gbit_per_s": ("data rate", "Gbit/s"),
+    "violations": ("violations of design rules", ""),
+    "smallest_size_um": ("smallest photosite", "µm"),
+    "exposure_s": ("exposure", "s"),
+}
+MeasureName = Literal[
+    "snr",
+    "snr_db",
+    "n_sites",
+    "saturated_fraction",
+    "mean_code_dn",
+    "mtf",
+    "psnr_db",
+    "data_rate_gbit_per_s",
+    "violations",
+    "smallest_size_um",
+    "exposure_s",
+]
+#: Results of a complete sensor, without a region.
+WITHOUT_REGION = ("data_rate_gbit_per_s", "violations", "exposure_s")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Requirement:
+    """
+    A condition on a result of a shot: of all photosites, one, those in an annulus, or those in a rectangle.
+
+    Attributes
+    ----------
+    measure : str
+        Result that is limited: ``"snr"``, the median ratio of signal to temporal noise, and ``"snr_db"`` in dB; ``"n_sites"``;
+        ``"saturated_fraction"``; ``"mean_code_dn"``; ``"mtf"``, of the lens on the axis times the photosite of median area, at
+        ``frequency_per_mm``; ``"psnr_db"``, of the reconstructed picture; ``"data_rate_gbit_per_s"`` of one lane;
+        ``"violations"`` of the design rules; ``"smallest_size_um"``; ``"exposure_s"``.
+    at_least, at_most : float, optional
+        Limits in the unit of the result, at least one of them.
+    annulus_um : (inner, outer), µm, optional
+        Distances of the centroids from the centre of the layout's bounding box.
+    rectangle_um : (x0, y0, x1, y1), µm, optional
+        Rectangle that contains the centroids, in sensor coordinates.
+    site : int, optional
+        Index of a photosite.
+    frequency_per_mm : float, optional
+        Spatial frequency on the sensor, of ``"mtf"``. At least 0 per mm.
+
+    Raises
+    ------
+    ParameterError
+        When a limit is missing, or the measure does not have the region or the frequency.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> print(fs.config.Requirement(measure="snr", at_least=10.0, annulus_um=(400.0, 600.0)))
+    signal-to-noise ratio from 400 to 600 µm: at least 10
+    """
+
+    measure: MeasureName
+    at_least: float | None = None
+    at_most: float | None = None
+    annulus_um: tuple[float, float] | None = None
+    rectangle_um: tuple[float, float, float, float] | None = None
+    site: int | None = None
+    frequency_per_mm: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.measure not in MEASURES:
+            raise ParameterError("measure", f"must be one of {', '.join(MEASURES)}", self.measure)
+        if self.at_least is None and self.at_most is None:
+            raise ParameterError("at_least", "or 'at_most' must be given")
+        for name in ("at_least", "at_most", "frequency_per_mm"):
+            value = getattr(self, name)
+            if value is not None and not math.isfinite(value):
+                raise ParameterError(name, "must be finite", value)
+        if self.at_least is not None and self.at_most is not None and self.at_least > self.at_most:
+            raise ParameterError("at_least", f"must be <= at_most, {self.at_most:g}", self.at_least)
+        regions = [name for name in ("annulus_um", "rectangle_um", "site") if getattr(self, name) is not None]
+        if len(regions) > 1:
+            raise ParameterError(regions[1], f"excludes {regions[0]}", getattr(self, regions[1]))
+        if regions and self.measure in WITHOUT_REGION:
+            raise ParameterError(
+                regions[0],
+                f"must not be given: {self.measure} is a result of the complete sensor",
+                getattr(self, regions[0]),
+            )
+        if self.annulus_um is not None and not 0.0 <= self.annulus_um[0] < self.annulus_um[1]:
+            raise ParameterError("annulus_um", "must be two increasing radii >= 0", self.annulus_um, "µm")
+        if self.rectangle_um is not None and not (
+            self.rectangle_um[0] < self.rectangle_um[2] and self.rectangle_um[1] < self.rectangle_um[3]
+        ):
+            raise ParameterError(
+                "rectangle_um", "must be (x0, y0, x1, y1) with x0 < x1 and y0 < y1", self.rectangle_um, "µm"
+            )
+        if self.site is not None and self.site < 0:
+            raise ParameterError("site", "must be the index of a photosite, from 0", self.site)
+        if (self.frequency_per_mm is not None) != (self.measure == "mtf"):
+            raise ParameterError(
+                "frequency_per_mm", "must be given if and only if measure='mtf'", self.frequency_per_mm
+            )
+        if self.frequency_per_mm is not None and self.frequency_per_mm < 0.0:
+            raise ParameterError("frequency_per_mm", "must be >= 0", self.frequency_per_mm, "per mm")
+
+    @property
+    def unit(self) -> str:
+        """Unit of the result and of the limits."""
+        return MEASURES[self.measure][1]
+
+    @property
+    def subject(self) -> str:
+        """The result that is limited, in words."""
+        parts = [MEASURES[self.measure][0]]
+        if self.frequency_per_mm is not None:
+            parts.append(f"at {self.frequency_per_mm:g} per mm")
+        if self.annulus_um is not None:
+            parts.append("from {:g} to {:g} µm".format(*self.annulus_um))
+        if self.rectangle_um is not None:
+            parts.append("in ({:g}, {:g}) to ({:g}, {:g}) µm".format(*self.rectangle_um))
+        if self.site is not None:
+            parts.append(f"of photosite {self.site:,}")
+        return " ".join(parts)
+
+    def __str__(self) -> str:
+        unit = f" {self.unit}" if self.unit else ""
+        limits = [
+            f"{word} {value:,.6g}{unit}"
+            for word, value in (("at least", self.at_least), ("at most", self.at_most))
+            if value is not None
+        ]
+        return f"{self.subject}: {' and '.join(limits)}"
+
+    def margin(self, value: float) -> float:
+        """Return the distance of a result from the nearest limit: negative where the requirement is not met, or NaN."""
+        margins = [value - self.at_least] if self.at_least is not None else []
+        return min([*margins, self.at_most - value] if self.at_most is not None else margins)
