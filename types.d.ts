@@ -89,9 +89,14 @@ interface Failure { kind: "error"; id: number | null; text: string; part?: strin
 interface TextMessage { kind: "text"; id: number; what: string; text: string; files: string[] }
 interface Note { kind: "note"; text: string }
 interface Progress { kind: "progress"; text: string }
+interface Sought {
+  kind: "sought"; id: number; key: string; label: string; unit: string; value: number; result: number; subject: string; measure: string;
+  result_unit: string;
+  limits: (number | null)[]; curve: (number | null)[][];
+}
 interface Exists { kind: "exists"; id: number; name: string; file: string }
 interface Saved { kind: "saved"; id: number; path: string }
-type ServerMessage = Busy | ControlsMessage | State | Done | Failure | TextMessage | Saved | Note | Progress | Exists;
+type ServerMessage = Busy | ControlsMessage | State | Done | Failure | TextMessage | Saved | Note | Progress | Exists | Sought;
 
 // Binary messages: a header and arrays; as readPart returns them.
 interface PartHeader {
@@ -112,6 +117,7 @@ type Change =
   | { do: "set"; key: string; value: unknown; final: boolean }
   | { do: "reset" | "delete"; key: string }
   | { do: "preset" | "solve"; name: string }
+  | { do: "seek"; key: string; requirement: { [name: string]: unknown } | undefined }
   | { do: "save"; name: string; may_replace?: boolean }
   | { do: "restore"; settings: Settings | undefined }
   | { do: "file"; path: string | undefined; as: string }

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from foveasim.errors import FoveasimError
-
 #: Simulations and views that take longer are reduced or left out while a control is dragged.
 SLOW_S = 0.15
 #: Rest after which a preview is replaced by the complete result.
@@ -22,7 +20,7 @@ class SupersededError(Exception):
     """A newer change waits: the simulation stops."""
 
 
-class CancelledError(FoveasimError):
+class CancelledError(Exception):
     """The user has cancelled a change."""
 
 

@@ -19,8 +19,10 @@ from typing import Any
 from foveasim._core.work_arrays import release_memory
 from foveasim._io.atomic import atomic_write
 from foveasim._io.yaml_files import format_yaml
-from foveasim.config import check_settings, put_setting
+from foveasim.config import MEASURES, Requirement, check_settings, put_setting, validate
 from foveasim.errors import ParameterError, SimulationError, printable
+from foveasim.explore import measure
+from foveasim.explore.solving import search_value
 from foveasim.layout import Layout
 from foveasim.studio._costs import RELEASE_S, REST_S, CancelledError, Costs, SupersededError
 from foveasim.studio._engine import Engine, Simulated
@@ -53,7 +55,7 @@ from foveasim.studio._settings.changes import (
     string_of,
     with_file,
 )
-from foveasim.studio._settings.controls import chosen_value, controls_of, structure_of
+from foveasim.studio._settings.controls import chosen_value, controls_of, structure_of, value_at
 from foveasim.studio._settings.unknowns import balanced, solved_of, with_n_sites, with_unknown
 from foveasim.studio._views import Views
 
@@ -359,7 +361,7 @@ class Session:
             raise
         except CancelledError as error:
             self.history, self._errors = before, {}
-            self._send({"kind": "note", "text": self._line(error)})
+            self._send({"kind": "note", "text": str(error)})
         except Exception as error:  # noqa: BLE001 -- settings may cause any exception of the package or a library
             self.history = before
             if len(kept) > 1:
@@ -406,6 +408,8 @@ class Session:
                 )
             case "delete":
                 settings = balanced(reset(settings, {}, key_of(message)), key_of(message), self._layout)
+            case "seek":
+                settings = self._sought(settings, message)
             case "fit":
                 if self.result is None:
                     raise SimulationError("there is no image to fit")
@@ -451,6 +455,57 @@ class Session:
             self.history.preview(settings)
         else:
             self.history.commit(settings)
+
+    def _sought(self, settings: dict[str, Any], message: dict[str, Any]) -> dict[str, Any]:
+        """Return settings with the value of a number at which a requirement is met, and send the curve of results."""
+        key, wanted = key_of(message), from_json(check_depth(message.get("requirement")))
+        control = next(
+            (each for each in self._controls if each["key"] == key and each["kind"] in ("number", "integer")), None
+        )
+        if control is None or self.result is None:
+            raise ParameterError("key", "must be the key of a number", printable(key)[:40])
+        if not isinstance(wanted, dict):
+            raise ParameterError("requirement", "must be a mapping")
+        requirement: Requirement = validate(None, Requirement, wanted)
+        present = value_at(settings, key)
+        present = (
+            solved_of(settings, self.result.capture.layout).get(key, control["default"]) if present is None else present
+        )
+        if not isinstance(present, int | float):
+            present = control["suggested"][0]
+        low, high = message.get("bounds") or control["suggested"]
+        n_done = 0
+
+        def changed(value: float) -> dict[str, Any]:
+            found = copy.deepcopy(settings)
+            put_setting(None, found, key, value)
+            return balanced(found, key, self._layout)
+
+        def result_at(value: float) -> float:
+            nonlocal n_done
+            n_done += 1
+            self._check(f"goal seek, step {n_done}")
+            result = self.engine.simulate(changed(value))
+            return measure(requirement, result.shot, result.capture)
+
+        solution = search_value(
+            key, present, requirement, result_at, bounds=(low, high), is_integer=control["kind"] == "integer"
+        )
+        self._send({
+            "kind": "sought",
+            "id": message.get("id"),
+            "key": key,
+            "label": control["label"],
+            "unit": control["unit"],
+            "value": solution.value,
+            "result": solution.result,
+            "subject": requirement.subject,
+            "measure": MEASURES[requirement.measure][0],
+            "result_unit": requirement.unit,
+            "limits": [requirement.at_least, requirement.at_most],
+            "curve": [list(point) for point in solution.curve],
+        })  # fmt: skip
+        return changed(solution.value)
 
     def _reduced(self, path: str) -> str:
         """Return the path of a picture, or of a smaller one if it is larger than the sensor can resolve."""

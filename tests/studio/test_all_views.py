@@ -148,6 +148,7 @@ def test_wrong_data_of_views_are_found(result, name, make, problem):
 @pytest.mark.needs("chromium")
 def test_all_views_show_their_data(visit):
     page = visit(width=1800, height=1000)
+    set_value(page, "requirements", [{"measure": "snr", "at_least": 5.0}])
     page.evaluate(OPEN_ALL)
     settle(page)
     page.click("#freeze")

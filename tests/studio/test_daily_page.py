@@ -243,7 +243,7 @@ def test_long_work_is_cancelled(visit, server, monkeypatch):
 def test_save_asks_before_it_replaces(browser, tmp_path, visit):
     own = Server(tmp_path)
     try:
-        page = visit(address=own.address)
+        page = visit(is_checked=False, address=own.address)
         settle(page)
 
         def save(name):

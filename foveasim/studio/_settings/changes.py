@@ -29,9 +29,10 @@ CHANGES = (
     "match",
     "solve",
     "fit",
+    "seek",
 )
 #: Changes that advance a source of frames: newer ones do not stop their simulations.
-ONCE = ("video", "frame")
+ONCE = ("video", "frame", "seek")
 #: Longest path of a setting.
 MAX_KEY_LENGTH = 500
 #: Largest depth of settings from the page.

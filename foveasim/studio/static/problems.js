@@ -10,12 +10,15 @@ const OUTSIDE = /outside the image/;
 const percent = (fraction) => shown(Number((100 * fraction).toPrecision(2))) + " %";
 
 // Returns problems as { text, view, count, isMild, canFit }; count is the badge of the tab of their view.
-/** @param {State} state @param {Part | undefined} rules */
-export function problemsOf(state, rules) {
+/** @param {State} state @param {{ [name: string]: Part }} parts */
+export function problemsOf(state, { rules, requirements }) {
   const found = [], { warnings, summary, notes } = state, saturated = summary.saturated_fraction ?? 0;
   const violations = (rules?.about.rules || []).reduce((sum, { count }) => sum + count, 0);
   if (violations) found.push({ text: shown(violations) + " violation" + (violations === 1 ? "" : "s") + " of design rules", view: "rules",
     count: shown(violations), isMild: false, canFit: false });
+  const all = requirements?.about.rows || [], unmet = all.filter((row) => !row.is_met).length;
+  if (unmet) found.push({ text: shown(unmet) + " of " + shown(all.length) + " requirements not met", view: "requirements",
+    count: shown(unmet), isMild: false, canFit: false });
   const isOutside = (warning) => OUTSIDE.test(warning);
   for (const text of warnings.filter(isOutside)) found.push({ text, view: "summary", count: "", isMild: false, canFit: true });
   if (saturated >= SATURATED) found.push({ text: percent(saturated) + " of the photosites are saturated", view: "histogram",
@@ -36,9 +39,9 @@ export class Problems {
     $("fit-scene").addEventListener("click", on.fit);
   }
 
-  /** @param {State} state @param {Part | undefined} rules */
-  update(state, rules) {
-    this.found = problemsOf(state, rules);
+  /** @param {State} state @param {{ [name: string]: Part }} parts */
+  update(state, parts) {
+    this.found = problemsOf(state, parts);
     const text = JSON.stringify(this.found);
     if (text === this.shown) return;
     this.shown = text;
@@ -47,7 +50,7 @@ export class Problems {
       title: this.found.map((one) => one.text).join("\n") });
     $("worst-text").classList.toggle("mild", Boolean(worst?.isMild));
     change($("fit-scene"), { hidden: !this.found.some((one) => one.canFit) });
-    for (const view of ["rules", "summary", "histogram"]) this._mark(view, this.found.filter((one) => one.view === view));
+    for (const view of ["rules", "requirements", "summary", "histogram"]) this._mark(view, this.found.filter((one) => one.view === view));
   }
 
   // The badge of a tab: a number that the problem has, or the number of problems.

@@ -160,7 +160,7 @@ function showHeld() {
   page.held = { states: [], parts: [] };
   for (const state of states) showState(state);
   for (const part of parts) views.use(part);
-  if (page.state) problems.update(page.state, views.parts.rules);
+  if (page.state) problems.update(page.state, views.parts);
 }
 
 /** @param {ServerMessage} message @param {{ isFailed: boolean }} about */
@@ -175,6 +175,7 @@ function receive(message, { isFailed }) {
   else if (kind === "error") notice(message.text);
   else if (kind === "text") files.receiveText(message);
   else if (kind === "saved") notice("Saved as " + message.path);
+  else if (kind === "sought") views.show("goal", true).then(() => views.made.goal?.show(message));
   else if (kind === "exists") files.askToReplace(message);
   else if (kind === "note") notice(message.text);
   else if (kind === "progress") { showStage(message.text); return; }
@@ -672,7 +673,7 @@ function start() {
   });
   views = new Views(studio, () => { sendViews(); resize(); });
   // Its violations are reported with the other problems.
-  views.needed.add("rules");
+  views.needed.add("rules").add("requirements");
   problems = new Problems({ show: (view) => views.show(view, true), fit: () => connection.send({ do: "fit" }) });
   connection = new Connection({ hello, message: receive, part: receivePart, status: showConnection, silent: showSilence });
   files = new Files(connection, {

@@ -1,0 +1,69 @@
+// Goal seek: the value of a setting at which a result meets a condition, with the curve of results.
+
+import { quantity } from "/web/colours.js";
+import { make, notice } from "/web/page_parts.js";
+import { CurveChart } from "../charts.js";
+import { ConditionForm } from "../condition_form.js";
+
+const figure = (value, unit) => quantity(Number.isInteger(value) ? value : Number(value.toPrecision(4)), unit === "fraction" ? "" : unit);
+
+export function create(root, studio) {
+  const form = new ConditionForm(studio.page), setting = make("select"), solve = make("button", "Solve");
+  const text = make("p", "", "quiet"), frame = make("div", undefined, "chart");
+  setting.setAttribute("aria-label", "Setting to change");
+  solve.type = "button";
+  text.id = "goal-text";
+  text.setAttribute("role", "status");
+  text.textContent = "Choose a setting and the result that it must give.";
+  frame.id = "goal";
+  form.root.prepend(setting);
+  form.root.append(solve);
+  root.append(form.root, text, frame);
+  /** @type {CurveChart | null} */
+  let chart = null;
+  let names = "";
+  // The settings that are numbers.
+  const list = () => {
+    const rows = [...studio.controls.rows.values()].filter(({ control: { kind } }) => kind === "number" || kind === "integer");
+    const found = JSON.stringify(rows.map(({ control: { key } }) => key));
+    if (found === names) return;
+    names = found;
+    const chosen = setting.value || "exposure_s";
+    setting.replaceChildren(...rows.map(({ name, control: { key } }) => new Option(name, key)));
+    setting.value = rows.some(({ control: { key } }) => key === chosen) ? chosen : rows[0]?.control.key ?? "";
+  };
+  solve.addEventListener("click", () => {
+    const { requirement, problem } = form.read();
+    if (problem) { notice(problem); return; }
+    text.textContent = "seeking…";
+    studio.connection.send({ do: "seek", key: setting.value, requirement });
+  });
+  form.value.addEventListener("keydown", (event) => { if (event.key === "Enter") solve.click(); });
+  // The measures are those of the requirements.
+  studio.views.need("requirements", true);
+  return {
+    form,
+    draw: () => chart?.draw(),
+    onState() {
+      list();
+      const about = studio.views.parts.requirements?.about;
+      if (about) form.use(about.measures);
+      const problem = studio.state.errors.seek || (text.textContent === "seeking…" && Object.values(studio.state.errors)[0]);
+      if (problem) text.textContent = problem;
+    },
+    // Shows the answer of the server.
+    show(found) {
+      text.textContent = found.label + " of " + figure(found.value, found.unit) + ": " + found.subject + " "
+        + figure(found.result, found.result_unit);
+      const points = found.curve.filter((point) => point[1] !== null), xs = points.map((point) => point[0]);
+      frame.replaceChildren();
+      const isLog = xs[0] > 0 && xs[xs.length - 1] / xs[0] >= 50;
+      chart = new CurveChart(frame, { nameX: found.label, nameY: found.measure, label: "Goal seek", log: isLog ? "x" : "" });
+      const curve = { label: found.subject, name: "", unit_x: found.unit, unit_y: found.result_unit, x: xs,
+        y: points.map((point) => point[1]) };
+      /** @type {any} */
+      const marks = [{ x: found.value, y: found.result, name: "", kind: "dot" }];
+      chart.use([curve], { marks });
+    },
+  };
+}
