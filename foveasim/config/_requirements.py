@@ -42,7 +42,7 @@ WITHOUT_REGION = ("data_rate_gbit_per_s", "violations", "exposure_s")
 @dataclass(frozen=True, kw_only=True)
 class Requirement:
     """
-    A condition on a result of a shot: of all photosites, one, those in an annulus, or those in a rectangle.
+    A condition on a result of a shot, of all photosites or of some.
 
     Attributes
     ----------
@@ -148,6 +148,10 @@ class Requirement:
         return f"{self.subject}: {' and '.join(limits)}"
 
     def margin(self, value: float) -> float:
-        """Return the distance of a result from the nearest limit: negative where the requirement is not met, or NaN."""
+        """
+        Return the distance of a result from the nearest limit.
+
+        Negative where the requirement is not met, or NaN.
+        """
         margins = [value - self.at_least] if self.at_least is not None else []
         return min([*margins, self.at_most - value] if self.at_most is not None else margins)

@@ -1,4 +1,4 @@
-"""Results of shots that requirements limit, of all photosites or of a region, and the check of requirements."""
+"""Results of shots that requirements limit, and the check of requirements."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class CheckedRequirement:
 
     @property
     def margin(self) -> float:
-        """Distance of the result from the nearest limit, in its unit; negative or NaN where the requirement is not met."""
+        """Distance of the result from the nearest limit; negative or NaN where it is not met."""
         return self.requirement.margin(self.value)
 
     @property
@@ -245,7 +245,11 @@ def _exposure(shot: Shot, _capture: Capture, _requirement: Requirement, _sites: 
 
 @METRICS.register("requirements")
 def requirements(shot: Shot, camera: Camera, capture: Capture) -> dict[str, Any]:  # noqa: ARG001 -- the signature of metrics
-    """Return whether all requirements of the shot are met, 1 or 0, and the margin of each, by its number from 1."""
+    """
+    Return whether all requirements of the shot are met, 1 or 0, and the margin of each.
+
+    Margins have the number of the requirement, from 1.
+    """
     if not shot.requirements:
         raise ParameterError("requirements", "must be in the settings of the shot")
     found = check_requirements(shot, capture)

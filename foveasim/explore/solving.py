@@ -59,14 +59,17 @@ def solve(
     bounds: tuple[float, float],
 ) -> Solution:
     """
-    Return the value of a setting, nearest to the present one, at which a requirement is met.
+    Return the value of a setting at which a requirement is met.
+
+    Of several values, that is the one nearest to the present value.
 
     Parameters
     ----------
     shot : path or mapping
         Settings file of a shot, or its settings.
     setting : str
-        Path of a number, such as ``"exposure_s"`` or ``"layout.parameters.n_sectors"``. It is an integer if the present one is.
+        Path of a number, such as ``"exposure_s"`` or ``"layout.parameters.n_sectors"``. It is an integer if the present one is; without a
+        present one, the solution is the nearest to the middle of the range.
     requirement : Requirement
         Equal limits demand a result that equals them within 0.1 %, or the nearest one of an integer setting.
     bounds : (low, high)
@@ -105,7 +108,7 @@ def solve(
         put_setting(source, changed, setting, value)
         return measure(requirement, *runner.simulate_capture(changed))
 
-    present = _number_at(settings, setting)
+    present = _number_at(settings, setting, bounds)
     return search_value(setting, present, requirement, result_at, bounds=bounds)
 
 
@@ -180,7 +183,7 @@ class _Target:
         return self.low <= result <= self.high
 
     def is_between(self, one: float, other: float) -> bool:
-        """Return whether a limit lies between two results of which at most one is within the limits."""
+        """Return whether a limit lies between two results, unless both meet the target."""
         if not (math.isfinite(one) and math.isfinite(other)) or (self.is_met(one) and self.is_met(other)):
             return False
         return any(min(one, other) <= limit <= max(one, other) for limit in (self.low, self.high))
@@ -195,7 +198,11 @@ def _refined(
     *,
     is_integer: bool,
 ) -> list[float]:
-    """Return values between two of them, near the limit, that meet the target; of integers also the nearest to equality."""
+    """
+    Return values between two of them, near the limit, that meet the target.
+
+    Of integers, the nearest one to an equality is returned too.
+    """
     for _ in range(N_REFINEMENTS):
         middle = at(math.sqrt(one * other) if one > 0.0 and other / one > 2.0 else 0.5 * (one + other))
         if middle in (one, other) or not math.isfinite(results[middle]):
@@ -227,10 +234,13 @@ def _position(value: float, low: float, high: float) -> float:
     return (value - low) / (high - low)
 
 
-def _number_at(settings: Mapping[str, Any], setting: str) -> float:
+def _number_at(settings: Mapping[str, Any], setting: str, bounds: tuple[float, float]) -> float:
+    """Return the present number of a setting; for none and "auto" the middle of its range."""
     value: Any = settings
     for name in setting.split("."):
         value = value.get(name) if isinstance(value, Mapping) else None
+    if value is None or value == "auto":
+        return math.sqrt(bounds[0] * bounds[1]) if bounds[0] > 0.0 else 0.5 * (bounds[0] + bounds[1])
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ParameterError("setting", "must be the path of a number in the settings", setting)
     return value

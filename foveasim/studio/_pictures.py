@@ -1,4 +1,4 @@
-"""Photographs that are opened on the page: large ones are reduced to what the sensor can resolve."""
+"""Reduction of large photographs to what the sensor can resolve."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MIN_PIXELS, MAX_PIXELS = 1024, 8192
 
 
 def resolved_pixels(shot: Shot) -> int:
-    """Return the longer side of a picture, in pixels, beyond which the sensor of a shot cannot resolve more."""
+    """Return the longer side of a picture beyond which a sensor resolves no more, pixels."""
     layout = shot.camera.layout
     x0_um, y0_um, x1_um, y1_um = layout.bounds_um
     lambda_n_um = 0.4 * shot.camera.optics.f_number  # at 400 nm
@@ -34,10 +34,12 @@ def reduced_picture(
     path: Path, new_path: Callable[[str], Path], n_pixels: int, encoding: Encoding
 ) -> tuple[Path, str] | None:
     """
-    Write a picture with means of blocks of pixels, in relative radiance, unless it is small.
+    Write a picture with means of blocks of pixels, unless it is small.
+
+    The means are those of the relative radiance.
 
     ``new_path``: returns an unused path for a name. ``n_pixels``: the shorter side of the result is not smaller. Returns the
-    path of the new TIFF file, and a sentence; None for a picture of less than twice this size. Raises FileError when the file
+    path of the new TIFF file, and a note in one line; None for a picture of less than twice this size. Raises FileError when the file
     is not a picture.
     """
     pixels = read_picture(path)
@@ -58,7 +60,11 @@ def reduced_picture(
 
 
 def _block_means(pixels: NDArray[Any], block: int, encoding: Encoding) -> NDArray[Any]:
-    """Return means of square blocks, uint16 or float32; incomplete blocks at the right and at the bottom are cropped."""
+    """
+    Return means of square blocks, uint16 or float32.
+
+    Incomplete blocks at the right and at the bottom are cropped.
+    """
     n_y, n_x = (n // block for n in pixels.shape[:2])
     n_channels = 1 if pixels.ndim == 2 else pixels.shape[2]
     n_colours = n_channels - (n_channels in (2, 4))  # without alpha

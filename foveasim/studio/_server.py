@@ -121,7 +121,7 @@ class Studio:
 
     def session(self, name: object, page: object = None) -> tuple[Session | None, bool]:
         """
-        Return the session of a name or a new one, if possible, and whether it has the initial state.
+        Return the session of a name or a new one, and whether it has the initial state.
 
         ``page``: identifier of the page. If another page uses the session, such as the one that a tab was duplicated from, the
         new session has a copy of its state.
@@ -465,7 +465,7 @@ def in_address(host: str) -> str:
 
 
 def other_addresses() -> list[str]:
-    """Return addresses at which other computers may reach this one: of its routes and of its name."""
+    """Return addresses of this computer for others: of its routes, and of its name."""
     found: list[str] = []
     for family, remote in ((socket.AF_INET, "192.0.2.1"), (socket.AF_INET6, "2001:db8::1")):
         # For datagrams, connecting selects an interface and sends nothing; both addresses are reserved for documentation.
@@ -484,7 +484,9 @@ def serve(
     started: Callable[[Any], object] | None = None,
 ) -> None:
     """
-    Serve the studio until Ctrl-C, SIGTERM or SIGHUP; then all sessions are closed, and uploaded files deleted.
+    Serve the studio until Ctrl-C, SIGTERM or SIGHUP.
+
+    All sessions are then closed, and uploaded files deleted.
 
     ``listener``: bound to the address. ``announce``: called when the server accepts requests. ``started``: called with the
     server, whose ``should_exit`` stops it, before it runs.
@@ -541,7 +543,11 @@ def serve(
 
 @contextlib.contextmanager
 def _ended_by_signals(server: Any) -> Iterator[None]:
-    """Let SIGTERM and SIGHUP stop a server, and then raise SystemExit; signals that are ignored remain so."""
+    """
+    Let SIGTERM and SIGHUP stop a server, and then raise SystemExit.
+
+    Signals that are ignored remain so.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -191,7 +191,11 @@ class Session:
         return not self._listeners
 
     def post(self, message: Any) -> None:
-        """Add a message of the page; it is handled in the thread of the session, but ``cancel`` at once."""
+        """
+        Add a message of the page.
+
+        It is handled in the thread of the session, but ``cancel`` at once.
+        """
         if isinstance(message, dict) and message.get("do") == "cancel":
             self._is_cancelled = True
             return
@@ -295,7 +299,11 @@ class Session:
         self._wants_rest = self.is_preview
 
     def _check(self, stage: str) -> None:
-        """Report a stage; stop a simulation when the session is closed, the user cancels, or a newer change waits."""
+        """
+        Report a stage, or stop a simulation.
+
+        It is stopped when the session is closed, the user cancels, or a newer change waits.
+        """
         if self._is_closed:
             raise SupersededError
         if self._is_cancelled:
@@ -457,7 +465,11 @@ class Session:
             self.history.commit(settings)
 
     def _sought(self, settings: dict[str, Any], message: dict[str, Any]) -> dict[str, Any]:
-        """Return settings with the value of a number at which a requirement is met, and send the curve of results."""
+        """
+        Return settings in which a requirement is met.
+
+        One number is changed; the curve of its results is sent to the page.
+        """
         key, wanted = key_of(message), from_json(check_depth(message.get("requirement")))
         control = next(
             (each for each in self._controls if each["key"] == key and each["kind"] in ("number", "integer")), None
@@ -508,7 +520,7 @@ class Session:
         return changed(solution.value)
 
     def _reduced(self, path: str) -> str:
-        """Return the path of a picture, or of a smaller one if it is larger than the sensor can resolve."""
+        """Return the path of a picture, or of a reduced one if it is large."""
         if self.result is None:
             return path
         self._check(f"reading {Path(self.files.available(path)).name}")

@@ -94,7 +94,7 @@ def test_metrics_and_requirements_agree(taken):
     assert explore.measure(of("snr"), shot, capture) == explore.METRICS["snr"](shot, shot.camera, capture)["median"]
 
 
-def test_picture_quality_of_a_region_is_that_of_its_pixels():
+def test_picture_quality_is_of_the_region():
     """A fovea resolves a chart that the periphery does not."""
     scene = {
         "kind": "siemens_star",
@@ -213,7 +213,7 @@ def between(low, high, measure="snr"):
     return Requirement(measure=measure, at_least=low, at_most=high)
 
 
-def test_exposure_for_a_ratio_has_a_closed_form():
+def test_exposure_has_a_closed_form():
     """Shot noise only: the ratio is the root of the charge, which is proportional to the exposure."""
     sensor = {"bits": 16, "capacitance_f": 1e-14, "v_sat_v": 3.0}
     settings = {**SHOT, "sensor": sensor}

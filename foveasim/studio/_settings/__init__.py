@@ -1,1 +1,1 @@
-"""Settings on the page: controls with their words and initial values, changes, and the unknowns of generators."""
+"""Settings on the page: controls, their words and initial values, and changes."""

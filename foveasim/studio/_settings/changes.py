@@ -120,9 +120,9 @@ def chooses_filters(message: dict[str, Any]) -> bool:
 
 def match_filters(settings: dict[str, Any], before: Mapping[str, Any]) -> None:
     """
-    Let sites have filters: with a mosaic, or a colouring of generators without rows and columns, or rings and sectors.
+    Let sites have filters.
 
-    What this added for the layout ``before`` is removed.
+    Sites in rows and columns, or rings and sectors, have a mosaic, others a colouring. What this added for the layout ``before`` is removed.
     """
     layout, old, sensor = settings.get("layout"), before.get("layout"), settings.get("sensor")
     if not isinstance(layout, dict) or "generator" not in layout:

@@ -97,7 +97,7 @@ def _distinguish(controls: list[dict[str, Any]]) -> None:
 
 
 def _with_unknown(controls: list[dict[str, Any]], settings: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Add the choice of the generator's parameter that follows from the others, before its parameters."""
+    """Add the choice of the generator's unknown before its parameters."""
     unknowns, unknown = unknowns_of(settings), unknown_of(settings)
     first = next((i for i, each in enumerate(controls) if each["key"].startswith(f"{PARAMETERS}.")), None)
     if not unknowns or first is None:

@@ -1,4 +1,4 @@
-"""Names, sentences of help and further search words of settings on the page, where those of the schema are too short."""
+"""Names, help and further search words of settings on the page."""
 
 from __future__ import annotations
 

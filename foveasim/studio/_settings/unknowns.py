@@ -1,4 +1,4 @@
-"""Number of photosites of generators: the parameter that follows from the others, and settings in which it does."""
+"""Unknowns of generators: the parameter that follows from the others."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def is_generated(settings: Mapping[str, Any]) -> bool:
 
 
 def unknowns_of(settings: Mapping[str, Any]) -> dict[str, str]:
-    """Return the parameters of the generator that can follow from the others, with labels; none without a choice."""
+    """Return the parameters of the generator that can follow from the others, with labels."""
     if not is_generated(settings):
         return {}
     name = settings["layout"]["generator"]
@@ -56,7 +56,7 @@ def unknown_of(settings: Mapping[str, Any]) -> str | None:
 
 
 def solved_of(settings: Mapping[str, Any], layout: Layout) -> dict[str, Any]:
-    """Return values of the generator's parameters that are were solved for, and the number of photosites, by key."""
+    """Return the parameters that the generator solved for, and the number of sites, by key."""
     if not unknowns_of(settings):
         return {}
     generator, given = settings["layout"]["generator"], settings["layout"].get("parameters") or {}
@@ -68,7 +68,9 @@ def solved_of(settings: Mapping[str, Any], layout: Layout) -> dict[str, Any]:
 
 def with_unknown(settings: Mapping[str, Any], unknown: str, layout: Layout) -> dict[str, Any]:
     """
-    Return settings in which another parameter follows from the others; the number of photosites remains.
+    Return settings in which another parameter follows from the others.
+
+    The number of photosites remains.
 
     ``layout``: present layout of the settings. Raises ParameterError when the generator cannot solve for the parameter.
     """

@@ -4,7 +4,8 @@ import { quantity } from "/web/colours.js";
 import { make, notice } from "/web/page_parts.js";
 import { ConditionForm } from "../condition_form.js";
 
-const figure = (value, unit) => (value === null ? "–" : quantity(Number.isInteger(value) ? value : Number(value.toPrecision(4)), unit === "fraction" ? "" : unit));
+const figure = (value, unit) => (value === null ? "–"
+  : quantity(Number.isInteger(value) ? value : Number(value.toPrecision(4)), unit === "fraction" ? "" : unit));
 
 export function create(root, studio) {
   const list = make("ul", undefined, "requirements"), form = new ConditionForm(studio.page), add = make("button", "Add");
