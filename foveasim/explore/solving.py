@@ -68,8 +68,8 @@ def solve(
     shot : path or mapping
         Settings file of a shot, or its settings.
     setting : str
-        Path of a number, such as ``"exposure_s"`` or ``"layout.parameters.n_sectors"``. It is an integer if the present one is; without a
-        present one, the solution is the nearest to the middle of the range.
+        Path of a number, such as ``"exposure_s"`` or ``"layout.parameters.n_sectors"``. It is an integer if the present
+        one is; without a present one, the solution is the nearest to the middle of the range.
     requirement : Requirement
         Equal limits demand a result that equals them within 0.1 %, or the nearest one of an integer setting.
     bounds : (low, high)

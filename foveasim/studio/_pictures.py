@@ -39,8 +39,8 @@ def reduced_picture(
     The means are those of the relative radiance.
 
     ``new_path``: returns an unused path for a name. ``n_pixels``: the shorter side of the result is not smaller. Returns the
-    path of the new TIFF file, and a note in one line; None for a picture of less than twice this size. Raises FileError when the file
-    is not a picture.
+    path of the new TIFF file, and a note in one line; None for a picture of less than twice this size. Raises FileError when
+    the file is not a picture.
     """
     pixels = read_picture(path)
     n_y, n_x = pixels.shape[:2]

@@ -122,7 +122,8 @@ def match_filters(settings: dict[str, Any], before: Mapping[str, Any]) -> None:
     """
     Let sites have filters.
 
-    Sites in rows and columns, or rings and sectors, have a mosaic, others a colouring. What this added for the layout ``before`` is removed.
+    Sites in rows and columns, or rings and sectors, have a mosaic, others a colouring. What this added for the
+    layout ``before`` is removed.
     """
     layout, old, sensor = settings.get("layout"), before.get("layout"), settings.get("sensor")
     if not isinstance(layout, dict) or "generator" not in layout:
