@@ -117,6 +117,7 @@ type Change =
   | { do: "set"; key: string; value: unknown; final: boolean }
   | { do: "reset" | "delete"; key: string }
   | { do: "preset" | "solve"; name: string }
+  | { do: "pin"; sites: number[] }
   | { do: "seek"; key: string; requirement: { [name: string]: unknown } | undefined }
   | { do: "save"; name: string; may_replace?: boolean }
   | { do: "restore"; settings: Settings | undefined }

@@ -55,6 +55,8 @@ class Simulated:
         Whether the scene was reduced.
     picture_pixels : int
         Longer side of pictures.
+    pinned : tuple of int
+        Photosites that charts compare, instead of typical ones.
     """
 
     settings: dict[str, Any]
@@ -67,6 +69,7 @@ class Simulated:
     frozen: Simulated | None = None
     is_preview: bool = False
     picture_pixels: int = PICTURE_PIXELS
+    pinned: tuple[int, ...] = ()
 
     __repr__ = short_repr
 

@@ -61,6 +61,8 @@ from foveasim.studio._views import Views
 
 #: Size limit of all uploaded files.
 MAX_SESSION_BYTES = 512 << 20
+#: Largest number of photosites that charts compare.
+MAX_PINNED = 6
 #: Largest number of messages that wait.
 MAX_WAITING = 1000
 #: Newer changes stop simulations for at most this time in succession, so that some are shown.
@@ -123,6 +125,7 @@ class Session:
         self._frozen_result: Simulated | None = None
         self._errors: dict[str, str] = {}
         self._simulated_frame: str | None = None
+        self._pinned: tuple[int, ...] = ()
         # Sentences about pictures that were reduced, by path.
         self._notes: dict[str, str] = {}
         # Setting that changed last, and whether this was during a drag.
@@ -567,6 +570,15 @@ class Session:
                         self._errors = {"": self._line(error)}
             case "views":
                 self._views.select(message.get("names"), message.get("pixels"))
+            case "pin":
+                sites = message.get("sites")
+                if (
+                    not isinstance(sites, list)
+                    or len(sites) > MAX_PINNED
+                    or not all(type(each) is int for each in sites)
+                ):
+                    raise ParameterError("sites", f"must be a list of at most {MAX_PINNED} indices of photosites")
+                self._pinned = tuple(dict.fromkeys(each for each in sites if each >= 0))
             case "freeze":
                 if self.result is None:
                     raise SimulationError("there is no result to freeze")
@@ -688,7 +700,11 @@ class Session:
         if self.result is None:
             return
         times_ms = self._views.send_changed(
-            replace(self.result, frozen=self._frozen_result),
+            replace(
+                self.result,
+                frozen=self._frozen_result,
+                pinned=tuple(site for site in self._pinned if site < self.result.capture.layout.n_sites),
+            ),
             self._version,
             self._last_id,
             key=self._key,

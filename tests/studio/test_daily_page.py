@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import time
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
+from PIL import Image
 
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
@@ -385,3 +388,84 @@ def test_every_control_has_name_and_help(visit):
     control(page, "optics.f_number")
     page.locator(".control[data-key='optics.f_number'] label").tap()
     assert "focal length over the diameter" in page.inner_text("#hint")
+
+
+# -- photosites in charts -----------------------------------------------------------------------------------------------------------
+
+
+def labels(page, name):
+    return page.evaluate("name => studio.views.made[name].chart.curves.map((curve) => curve.label)", name)
+
+
+def test_charts_compare_pinned_photosites(visit):
+    page = visit(width=1920, height=1080)
+    page.click("[data-tile='photon_transfer']")
+    until(page, "() => ['snr', 'mtf', 'photon_transfer'].every((name) => studio.views.made[name]?.chart.curves.length)")
+    typical = {name: labels(page, name) for name in ("snr", "mtf", "photon_transfer")}
+    last = page.evaluate("studio.panes.b.sites.n") - 1
+    page.evaluate("studio.keep(0)")  # fovea ...
+    x, y = page.evaluate("site => studio.toWindow(...studio.panes.b.sites.centre(site))", last)
+    page.keyboard.down("Shift")
+    page.mouse.click(x, y)  # ... against periphery
+    page.keyboard.up("Shift")
+    until(page, "() => studio.isReady && studio.page.kept.length === 2")
+    names = ["photosite 0", f"photosite {last:,}"]
+    until(page, "() => studio.views.made.photon_transfer.chart.curves.length === 2")
+    assert labels(page, "snr") == labels(page, "photon_transfer") == names
+    assert labels(page, "mtf")[1:] == names
+    peaks = page.evaluate("studio.views.made.snr.chart.curves.map((curve) => Math.max(...curve.y))")
+    assert peaks[1] > peaks[0] + 3.0  # larger photosites have larger full wells
+
+    set_value(page, "optics.f_number", 4.0)
+    assert labels(page, "snr") == names
+    page.keyboard.press("Escape")
+    until(page, "() => studio.isReady && studio.views.made.photon_transfer.chart.curves.length > 2")
+    assert {name: labels(page, name) for name in typical} == typical
+
+
+def test_photosites_are_kept_by_keyboard(visit):
+    page = visit(width=1920, height=1080)
+    button = page.locator("#compare-site")
+    button.focus()
+    page.keyboard.press("Enter")
+    until(page, "() => studio.isReady && studio.page.kept.length === 1")
+    assert button.get_attribute("aria-pressed") == "true"
+    page.keyboard.press("Enter")
+    until(page, "() => studio.isReady && studio.page.kept.length === 0")
+
+
+@pytest.mark.parametrize(("tile", "n_columns"), [("snr", 3), ("histogram", 3), ("mtf", 3)])
+def test_charts_are_saved_as_files(visit, tmp_path, tile, n_columns):
+    page = visit(width=1920, height=1080)
+    until(page, "tile => studio.views.made[tile] && studio.views.parts.snr", tile)
+    settle(page)
+    found = {}
+    for kind in ("csv", "svg", "png"):
+        with page.expect_download() as download:
+            page.locator(f"#tile-{tile} .chart-file").select_option(value=kind)
+        path = tmp_path / download.value.suggested_filename
+        download.value.save_as(path)
+        found[kind] = path
+    assert [path.name for path in found.values()] == [f"{tile}.{kind}" for kind in found]
+
+    head, *rows = csv.reader(found["csv"].read_text().splitlines())
+    assert len(head) == n_columns
+    assert {len(row) for row in rows} == {n_columns}
+    if tile == "histogram":
+        assert sum(float(row[2]) for row in rows) == page.evaluate("studio.panes.b.sites.n")
+    else:
+        curves = page.evaluate(
+            "tile => studio.views.made[tile].chart.curves.map((c) => [c.label, [...c.x], [...c.y]])", tile
+        )
+        expected = [[label, x, y] for label, xs, ys in curves for x, y in zip(xs, ys, strict=True)]
+        assert [[label, float(x), float(y)] for label, x, y in rows] == expected
+    root = ET.parse(found["svg"]).getroot()
+    texts = [text.text for text in root.iter("{http://www.w3.org/2000/svg}text")]
+    assert (
+        len(list(root.iter("{http://www.w3.org/2000/svg}path")) or list(root.iter("{http://www.w3.org/2000/svg}rect")))
+        > 3
+    )
+    assert any(head[0 if tile == "histogram" else 1].split(" from")[0].split(" /")[0] in text for text in texts)
+    with Image.open(found["png"]) as picture:
+        assert picture.size == (1280, 800)
+        assert len(picture.convert("RGB").getcolors(10**6)) > 10

@@ -96,3 +96,28 @@ def test_cancelled_goal_seek_changes_nothing(recorder):
         do="seek", key="exposure_s", requirement={"measure": "snr", "at_least": 20, "at_most": 20}, id=1
     )
     assert (state["settings"], state["errors"], state["can_undo"]) == (before, {}, False)
+
+
+# -- pinned photosites ---------------------------------------------------------------------------------------------------------
+
+
+def curves(recorder, name):
+    return [
+        curve["label"] for header, _ in recorder.parts if header["part"] == name for curve in header["about"]["curves"]
+    ]
+
+
+def test_pinned_photosites_have_their_curves(recorder):
+    recorder.do(do="pin", sites=[3, 200, 3], id=1)
+    assert curves(recorder, "snr") == curves(recorder, "photon_transfer") == ["photosite 3", "photosite 200"]
+    assert curves(recorder, "mtf")[1:] == ["photosite 3", "photosite 200"]
+    assert "columns" not in recorder.part_names
+    recorder.do(do="set", key="layout.parameters.n_x", value=8, id=2)  # 112 photosites
+    assert curves(recorder, "snr") == ["photosite 3"]
+
+
+@pytest.mark.parametrize("sites", [None, ["3"], [1.5], list(range(7)), [True]])
+def test_wrong_pins_are_one_line(recorder, sites):
+    recorder.do(do="pin", sites=sites, id=1)
+    (problem,) = [message["text"] for message in recorder.messages if message["kind"] == "error"]
+    assert "must be a list of at most 6 indices" in problem

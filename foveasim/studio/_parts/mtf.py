@@ -8,7 +8,7 @@ from foveasim.layout import Layout
 from foveasim.metrics import nyquist_per_mm, polygon_mtf
 from foveasim.scene import Scene
 from foveasim.studio._engine import Simulated
-from foveasim.studio._parts.registry import PartData, curves_of, part
+from foveasim.studio._parts.registry import PartData, curves_of, label_of, part
 from foveasim.units import per_mm_from_per_um
 
 #: Number of frequencies of MTF curves.
@@ -19,16 +19,20 @@ N_NEIGHBOURS = 64
 
 @part(
     "MTF",
-    lambda result: (result.capture.layout, result.shot.camera.optics, result.shot.scene),
+    lambda result: (result.capture.layout, result.shot.camera.optics, result.shot.scene, result.pinned),
     order=80,
     is_first=True,
 )
 def mtf(result: Simulated) -> PartData:
-    """Return MTF curves of the lens on the axis and of three photosites."""
+    """Return MTF curves of the lens on the axis, and of pinned or three photosites."""
     layout, scene = result.capture.layout, result.shot.scene
     order = np.argsort(layout.area_um2, kind="stable")
     chosen = {"smallest site": order[0], "median site": order[order.size // 2], "largest site": order[-1]}
-    last_per_mm = float(per_mm_from_per_um(1.0 / np.sqrt(layout.area_um2[order[0]])))
+    smallest = order[0]
+    if result.pinned:
+        chosen = {label_of(site): site for site in result.pinned}
+        smallest = min(result.pinned, key=lambda site: float(layout.area_um2[site]))
+    last_per_mm = float(per_mm_from_per_um(1.0 / np.sqrt(layout.area_um2[smallest])))
     frequency_per_mm = np.linspace(0.0, last_per_mm, N_FREQUENCIES)
     values = {name: polygon_mtf(layout[np.array([site])], frequency_per_mm)[0] for name, site in chosen.items()}
     if isinstance(scene, Scene):

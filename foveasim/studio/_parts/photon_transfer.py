@@ -6,9 +6,9 @@ import numpy as np
 
 from foveasim._core.validation import Floats
 from foveasim.sensor import NoiseBudget, Sensor, noise_budget
-from foveasim.sensor.signal_to_noise import signal_to_noise
+from foveasim.sensor.signal_to_noise import SiteSignals, signal_to_noise
 from foveasim.studio._engine import Simulated
-from foveasim.studio._parts.registry import PartData, capture_of, curves_of, part
+from foveasim.studio._parts.registry import PartData, curves_of, label_of, part, pinned_of
 
 #: Number of levels of a curve.
 N_LEVELS = 129
@@ -18,20 +18,16 @@ LOWEST_E, HIGHEST = 0.1, 4.0
 SEPARATE = PHOTON_SHOT, QUANTISATION = "photon_shot", "quantisation"
 
 
-@part("Photon transfer", capture_of, order=60)
+@part("Photon transfer", pinned_of, order=60)
 def photon_transfer(result: Simulated) -> PartData:
     """Return noise against signal of the photosite of median charge."""
     sensor, capture, exposure_s = result.shot.camera.sensor, result.capture, result.shot.exposure_s
     if exposure_s == 0.0:
         return curves_of([], [], [])
+    if result.pinned:
+        return _pinned_curves(result)
     site = median_site(capture.expected_e)
-    copies = copies_of(sensor, site, N_LEVELS)
-    range_e = full_range_e(copies)
-    response = float(copies.light_response()[0]) or 1.0
-    photo_e_per_s = np.geomspace(LOWEST_E, HIGHEST * range_e, N_LEVELS) / (exposure_s * response)
-    dark_e = copies.expected_electrons(np.zeros(N_LEVELS), exposure_s)
-    levels_e = copies.expected_electrons(photo_e_per_s, exposure_s)
-    found = signal_to_noise(copies, levels_e, dark_e, exposure_s=exposure_s)
+    copies, photo_e_per_s, dark_e, found = _levels(result, site)
     budget = noise_budget(copies, photo_e_per_s, exposure_s)
     fixed = [name for name in budget if name not in budget.temporal]
     shown = {
@@ -50,10 +46,39 @@ def photon_transfer(result: Simulated) -> PartData:
     x, y = float(now.signal_e[0]), float(now.noise_e[0])
     about["marks"] = [{"x": x, "y": y}] if min(x, y) > 0.0 and curves else []
     about["note"] = (
-        f"Photosite {site:,}, {float(now.gain_dn_per_e.flat[0]):.3g} DN/e-, full range {range_e:,.0f} e-"
+        f"Photosite {site:,}, {float(now.gain_dn_per_e.flat[0]):.3g} DN/e-, full range {full_range_e(copies):,.0f} e-"
         f"{'; now saturated' if now.is_saturated[0] else ''}"
     )
     return about, arrays
+
+
+def _levels(result: Simulated, site: int) -> tuple[Sensor, Floats, Floats, SiteSignals]:
+    """Return copies of a photosite, photoelectron rates, dark signals and signals."""
+    exposure_s = result.shot.exposure_s
+    copies = copies_of(result.shot.camera.sensor, site, N_LEVELS)
+    response = float(copies.light_response()[0]) or 1.0
+    photo_e_per_s = np.geomspace(LOWEST_E, HIGHEST * full_range_e(copies), N_LEVELS) / (exposure_s * response)
+    dark_e = copies.expected_electrons(np.zeros(N_LEVELS), exposure_s)
+    levels_e = copies.expected_electrons(photo_e_per_s, exposure_s)
+    return copies, photo_e_per_s, dark_e, signal_to_noise(copies, levels_e, dark_e, exposure_s=exposure_s)
+
+
+def _pinned_curves(result: Simulated) -> PartData:
+    """Return the temporal noise against the signal of each pinned photosite."""
+    capture, exposure_s = result.capture, result.shot.exposure_s
+    x, y, marks, notes = [], [], [], []
+    for site in result.pinned:
+        copies, _, dark_e, found = _levels(result, site)
+        is_shown = ~found.is_saturated & (found.signal_e > 0.0) & (found.noise_e > 0.0)
+        x.append(found.signal_e[is_shown])
+        y.append(found.noise_e[is_shown])
+        now = signal_to_noise(copies.part(slice(0, 1)), capture.expected_e[[site]], dark_e[:1], exposure_s=exposure_s)
+        if min(float(now.signal_e[0]), float(now.noise_e[0])) > 0.0:
+            marks.append({"x": float(now.signal_e[0]), "y": float(now.noise_e[0]), "name": label_of(site)})
+        notes.append(f"{site:,}: full range {full_range_e(copies):,.0f} e-")
+    labels = [label_of(site) for site in result.pinned]
+    about, arrays = curves_of([{"label": n, "name": n, "unit_x": "e-", "unit_y": "e-"} for n in labels], x, y)
+    return about | {"marks": marks, "note": "; ".join(notes)}, arrays
 
 
 def _root_sum_of_squares(budget: NoiseBudget, names: list[str]) -> Floats:

@@ -12,7 +12,18 @@ from numpy.typing import NDArray
 from foveasim._core.short_repr import short_repr
 from foveasim.studio._engine import Simulated
 
-__all__ = ["PARTS", "Part", "PartData", "capture_of", "curves_of", "layout_of", "page_part", "part"]
+__all__ = [
+    "PARTS",
+    "Part",
+    "PartData",
+    "capture_of",
+    "curves_of",
+    "label_of",
+    "layout_of",
+    "page_part",
+    "part",
+    "pinned_of",
+]
 
 #: Order of the first view in a tile.
 FIRST_TILE = 10
@@ -113,6 +124,16 @@ def of_page(_result: Simulated) -> PartData:
 def capture_of(result: Simulated) -> tuple[Any, ...]:
     """Return the dependencies of views of a capture."""
     return (result.capture,)
+
+
+def pinned_of(result: Simulated) -> tuple[Any, ...]:
+    """Return the dependencies of views of a capture that compare pinned photosites."""
+    return (result.capture, result.pinned)
+
+
+def label_of(site: int) -> str:
+    """Return the label of the curve of a photosite."""
+    return f"photosite {site:,}"
 
 
 def layout_of(result: Simulated) -> tuple[Any, ...]:

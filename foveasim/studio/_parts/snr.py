@@ -12,25 +12,22 @@ from foveasim.sensor import Sensor
 from foveasim.sensor.signal_to_noise import signal_to_noise
 from foveasim.studio._engine import Simulated
 from foveasim.studio._parts.photon_transfer import HIGHEST, LOWEST_E, N_LEVELS, copies_of, full_range_e, median_site
-from foveasim.studio._parts.registry import PartData, capture_of, curves_of, part
+from foveasim.studio._parts.registry import PartData, curves_of, label_of, part, pinned_of
 
 #: Lowest ratio in the chart, dB.
 LOWEST_DB = -10.0
 
 
-@part("SNR", capture_of, order=70, is_wide=True)
+@part("SNR", pinned_of, order=70, is_wide=True)
 def snr(result: Simulated) -> PartData:
-    """Return the SNR against exposure of the median photosite of each filter."""
+    """Return the SNR against exposure of pinned photosites, or the median one of each filter."""
     sensor, capture, exposure_s = result.shot.camera.sensor, result.capture, result.shot.exposure_s
     curves: list[dict[str, Any]] = []
     x: list[NDArray[Any]] = []
     y: list[NDArray[Any]] = []
     marks: list[dict[str, Any]] = []
     ranges = []
-    for k in np.unique(capture.filter_of_site) if exposure_s > 0.0 else ():
-        name = capture.filter_names[k]
-        sites = np.flatnonzero(capture.filter_of_site == k)
-        site = int(sites[median_site(capture.expected_e[sites])])
+    for name, site in _chosen(result) if exposure_s > 0.0 else ():
         charge_e_per_s = float(capture.expected_e[site]) / exposure_s
         dark_e_per_s = float(copies_of(sensor, site, 1).expected_electrons(np.zeros(1), exposure_s)[0]) / exposure_s
         if charge_e_per_s <= dark_e_per_s:
@@ -51,6 +48,17 @@ def snr(result: Simulated) -> PartData:
     about["note"] = f"Dynamic range / dB: {shown}" if ranges else "No photoelectrons"
     about["dynamic_range_db"] = dict(ranges)
     return about, arrays
+
+
+def _chosen(result: Simulated) -> list[tuple[str, int]]:
+    """Return photosites with the names of their curves."""
+    if result.pinned:
+        return [(label_of(site), site) for site in result.pinned]
+    capture, found = result.capture, []
+    for k in np.unique(capture.filter_of_site):
+        sites = np.flatnonzero(capture.filter_of_site == k)
+        found.append((capture.filter_names[k], int(sites[median_site(capture.expected_e[sites])])))
+    return found
 
 
 class _SnrCurve:

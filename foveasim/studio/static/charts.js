@@ -4,6 +4,7 @@ import { brief, clamp, roundStep, shown } from "/web/colours.js";
 import { watchSize } from "/web/gl.js";
 import { inkOf, make } from "/web/page_parts.js";
 import { listenToRange } from "/web/shell.js";
+import { addFiles } from "./chart_files.js";
 import { sizeOf } from "./frames.js";
 import { fitted } from "./site_pane.js";
 
@@ -14,6 +15,8 @@ const NAMED = { R: ["#c62828", "#ff7b72"], G: ["#1b7f3b", "#5fd37f"], B: ["#1f5f
 const INKS = [["#1f5fbf", "#7db3ff"], ["#c2571a", "#ffa657"], ["#1b7f3b", "#5fd37f"], ["#8338a8", "#d2a8ff"], ["#a02c5a", "#ff8cc0"],
   ["#566073", "#c3cad6"]];
 const STEPS = 72;
+// Margins of the histogram.
+const LEFT = 46, RIGHT = 10;
 // Dashes of curves, which thus differ by more than their colour; those of variant A are thinner and end with a letter.
 const DASHES = [[], [7, 3], [2, 2.5], [9, 3, 2, 3], [4, 3], [1, 4]];
 
@@ -113,20 +116,36 @@ export class CurveChart {
     this.draw();
   }
 
+  // Rows of a file: the curves one below the other.
+  rows() {
+    const { curves } = this, [first] = curves;
+    if (!first) return [];
+    const head = ["curve", axisTitle(this.nameX, first.unit_x), axisTitle(this.nameY, first.unit_y)];
+    const name = (curve) => (curve.isDashed ? "A: " : "") + curve.label;
+    return [head, ...curves.flatMap((curve) => Array.from(curve.x, (x, i) => [name(curve), x, curve.y[i]]))];
+  }
+
   draw() {
-    if (!sizeOf(this.root).width) return;
-    const { curves } = this, own = curves.filter((curve) => !curve.isDashed), left = 46, right = 10, top = 8, bottom = 32;
+    if (sizeOf(this.root).width) this.paint(null);
+  }
+
+  // Draws the chart on its canvas, or a file, which has the legend in the drawing.
+  paint(target) {
+    const { curves } = this, own = curves.filter((curve) => !curve.isDashed), left = 46, right = 10, bottom = 32;
+    const top = target ? 8 + 15 * curves.length : 8;
     const indices = curves.map((curve) => own.findIndex((one) => one.label === curve.label));
     const inks = curves.map((curve, k) => inkOfCurve(curve, indices[k]));
     const dashes = indices.map((k) => DASHES[Math.max(k, 0) % DASHES.length]);
     const isLogX = this.log.includes("x"), isLogY = this.log.includes("y");
     const allX = [...curves.map((curve) => curve.x), this.marks.map((mark) => mark.x)];
-    const axisX = axisOf(...(isLogX ? decadeLimits(allX) : limitsOf(allX)), isLogX), wide = sizeOf(this.canvas).width - left - right;
-    const here = this.at === null || !own.length ? null : axisX.value(clamp((this.at - left) / wide, 0, 1));
+    const axisX = axisOf(...(isLogX ? decadeLimits(allX) : limitsOf(allX)), isLogX);
+    const wide = (target || sizeOf(this.canvas)).width - left - right;
+    const here = target || this.at === null || !own.length ? null : axisX.value(clamp((this.at - left) / wide, 0, 1));
     // The legend first: the rest of the height is for the canvas.
-    this._listCurves(curves, inks, dashes, here, own);
-    const { context, width, height } = fitted(this.canvas);
+    if (!target) this._listCurves(curves, inks, dashes, here, own);
+    const { context, width, height } = target || fitted(this.canvas);
     context.font = FONT;
+    if (target) this._paintLegend(context, inks, dashes);
     if (!own.length) {
       context.fillStyle = inkOf("--quiet");
       context.fillText("no data", 8, 20);
@@ -191,6 +210,23 @@ export class CurveChart {
       context.fillStyle = inkOf("--quiet");
       context.fillRect(toX(here), top, 1, h);
     }
+  }
+
+  _paintLegend(context, inks, dashes) {
+    this.curves.forEach((curve, k) => {
+      const y = 12 + 15 * k;
+      context.strokeStyle = inks[k];
+      context.lineWidth = curve.isDashed ? 1 : 2;
+      context.setLineDash(dashes[k]);
+      context.beginPath();
+      context.moveTo(50, y);
+      context.lineTo(78, y);
+      context.stroke();
+      context.fillStyle = inkOf("--text");
+      context.textAlign = "left";
+      context.fillText((curve.isDashed ? "A: " : "") + curve.label, 84, y + 4);
+    });
+    context.setLineDash([]);
   }
 
   // Vertical lines in the colours of the curves of the same label, with a triangle on the axis.
@@ -260,6 +296,7 @@ export const curveView = (options) => (root) => {
   const frame = make("div", undefined, "chart"), chart = new CurveChart(frame, options);
   frame.id = root.id.replace("tile-", "");
   root.append(frame);
+  addFiles(root, root.querySelector("h2")?.textContent ?? options.label, () => chart);
   return {
     chart,
     draw: () => chart.draw(),
@@ -303,13 +340,28 @@ export class Histogram {
   }
 
   draw(range, value) {
-    const { scale, counts, others } = this;
     this.drawn = [range, value];
-    if (!scale || !sizeOf(this.root).width) return;
-    const { context, width, height } = fitted(this.canvas), left = 46, right = 10, top = 8, bottom = 32, w = width - left - right;
+    if (!this.scale || !sizeOf(this.root).width) return;
+    const target = fitted(this.canvas);
+    this.left = LEFT;
+    this.wide = target.width - LEFT - RIGHT;
+    this.paint(target);
+  }
+
+  // Rows of a file: the values at the ends of the steps, and the number of photosites.
+  rows() {
+    const { scale, counts } = this;
+    if (!scale) return [];
+    const { label, unit } = scale.column, value = (k) => Number(scale.value(k / counts.length).toPrecision(8));
+    return [[axisTitle(label + " from", unit), axisTitle(label + " to", unit), "photosites"],
+      ...Array.from(counts, (count, k) => [value(k), value(k + 1), count])];
+  }
+
+  // Draws the histogram on its canvas, or a file.
+  paint({ context, width, height }) {
+    const { scale, counts, others, drawn: [range, value] } = this, left = LEFT, top = 8, bottom = 32, w = width - left - RIGHT;
     const h = height - top - bottom;
-    this.left = left;
-    this.wide = w;
+    if (!scale || !counts) return;
     const most = Math.max(1, ...counts, ...(others || [])), tall = (count) => (count ? Math.max(1.5, Math.sqrt(count / most) * h) : 0);
     const step = w / counts.length, inside = inkOf("--accent"), outside = inkOf("--line");
     const [from, to] = range ? range.map((v) => left + scale.fraction(v) * w) : [-1, width + 1];
@@ -351,7 +403,7 @@ export class Histogram {
         clamp(left + at, left, width - 14), top + h + 15);
     }
     context.fillText(axisTitle(column.label, column.unit), left + 0.5 * w, height - 4);
-    if (Number.isFinite(value)) {
+    if (value !== undefined && Number.isFinite(value)) {
       context.fillStyle = inkOf("--text");
       context.fillRect(clamp(left + scale.fraction(value) * w - 1, left, left + w - 2), top, 2, h);
     }

@@ -210,17 +210,18 @@ export class SitePane {
     return true;
   }
 
-  // Draws marks: { cursor, hovered, pinned, rectangle, selected, trace }.
-  drawMarks({ cursor, hovered, pinned, rectangle, selected, trace }) {
+  // Draws marks: { cursor, hovered, pinned, kept, rectangle, selected, trace }.
+  drawMarks({ cursor, hovered, pinned, kept = /** @type {number[]} */ ([]), rectangle, selected, trace }) {
     const { map } = this;
     if (!map || !this.isShown) return;
-    const isAt = cursor && cursor.from !== this, state = [hovered, pinned, rectangle, selected.length, selected[0],
+    const isAt = cursor && cursor.from !== this, state = [hovered, pinned, kept, rectangle, selected.length, selected[0],
       trace && [...trace.box], isAt && [cursor.x, cursor.y]];
-    const isEmpty = hovered < 0 && pinned < 0 && !rectangle && !selected.length && !trace && !isAt;
+    const isEmpty = hovered < 0 && pinned < 0 && !kept.length && !rectangle && !selected.length && !trace && !isAt;
     if (!this._isNew("marks", isEmpty ? [map.width, map.height] : [this._viewState(map), state])) return;
     const { context } = fitted(this.marks);
     if (trace) drawTrace(context, map, trace);
     drawSelected(context, map, rectangle, selected);
+    for (const site of kept) ringSites(context, map, site, -1);
     ringSites(context, map, pinned, hovered);
     if (isAt) drawCross(context, map.toX(cursor.x), map.toY(cursor.y));
   }

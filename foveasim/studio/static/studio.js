@@ -21,6 +21,7 @@ import { Views } from "./views.js";
 const BUSY_DELAY_MS = 150, LONG_MS = 1000;
 const SIZE_DELAY_MS = 250;
 const HOLD_MS = 100;
+const MOST_KEPT = 6;
 const PICTURE_SIZES = [256, 320, 384, 512, 768, 1024], SMALLER = 0.85;
 
 // Variant A: whether the server has answered, whether its result is kept, the number of its message, and what it showed.
@@ -35,6 +36,9 @@ class StudioPage {
   /** @type {Cursor | null} */ cursor = null;
   /** @type {Rectangle | null} */ rectangle = null;
   /** @type {number[]} */ selected = [];
+  // Photosites that charts compare.
+  /** @type {number[]} */ kept = [];
+  hasShift = false;
   /** @type {Interval | null} */ range = null;
   /** @type {boolean | undefined} */ wantsLog = undefined;
   // Names of the panes that the next frame draws.
@@ -103,8 +107,8 @@ function drawAsked() {
 }
 
 function drawMarks() {
-  const { cursor, rectangle, selected, pinned, hovered } = page, { a, b } = panes;
-  if (b.isShown) b.drawMarks({ cursor, hovered, pinned, rectangle, selected, trace: b.trace() });
+  const { cursor, rectangle, selected, pinned, hovered, kept } = page, { a, b } = panes;
+  if (b.isShown) b.drawMarks({ cursor, hovered, pinned, kept, rectangle, selected, trace: b.trace() });
   if (page.frozen && a.isShown) {
     const hoveredA = cursor ? a.pick(cursor.x, cursor.y) : -1, pinnedA = page.frozen.sites === b.sites ? pinned : -1;
     a.drawMarks({ cursor, hovered: hoveredA, pinned: pinnedA, rectangle, selected: [], trace: null });
@@ -265,6 +269,7 @@ function hello(message, { isSame }) {
   views.describe(message.views);
   const stored = message.is_new ? memory.get("settings") : null;
   sendViews();
+  if (page.kept.length) connection.send({ do: "pin", sites: page.kept });
   if (stored && isSame) connection.send({ do: "restore", settings: JSON.parse(stored) });
   else if (stored && message.settings && JSON.stringify(message.settings) !== stored) {
     page.offered = JSON.parse(stored);
@@ -355,6 +360,23 @@ function tellSite() {
 function pin(site) {
   page.pinned = site === page.pinned ? -1 : site;
   if (page.pinned >= 0) views.show("site", true);
+  tellSite();
+  ask("marks");
+}
+
+// Adds a photosite to those that charts compare, or removes it.
+/** @param {number} site */
+function keep(site) {
+  if (site < 0) return;
+  const kept = page.kept.includes(site) ? page.kept.filter((one) => one !== site) : [...page.kept, site];
+  if (kept.length > MOST_KEPT) notice("Charts compare at most " + MOST_KEPT + " photosites");
+  else keepOnly(kept);
+}
+
+/** @param {number[]} kept */
+function keepOnly(kept) {
+  page.kept = kept;
+  connection.send({ do: "pin", sites: kept });
   tellSite();
   ask("marks");
 }
@@ -511,6 +533,11 @@ function undoByKey(event) {
 }
 
 function listenToKeys() {
+  /** @param {KeyboardEvent} event */
+  const follow = (event) => { page.hasShift = event.shiftKey; };
+  addEventListener("keydown", follow, true);
+  addEventListener("keyup", follow, true);
+  addEventListener("blur", () => { page.hasShift = false; });
   document.addEventListener("keydown", (event) => {
     const isOpen = document.querySelector("dialog[open]"), { key } = event;
     const target = event.target instanceof Element ? event.target : document.body;
@@ -547,6 +574,7 @@ function clearAll() {
   useSelection(false);
   select(null);
   page.pinned = -1;
+  if (page.kept.length) keepOnly([]);
   studio.rules?.choose(null);
   if (page.range) setRange(null);
   tellSite();
@@ -614,7 +642,7 @@ function createPanes() {
     select,
     moved: (pane) => { stopFlight(); if (pane === panes.a) panes.b.follow(panes.a); ask("map"); },
     hover, leave,
-    click: (pane) => { if (pane === panes.b && !page.isSelecting && !editor.isOn) pin(page.hovered); },
+    click: (pane) => { if (pane === panes.b && !page.isSelecting && !editor.isOn) (page.hasShift ? keep : pin)(page.hovered); },
   };
   const onImage = {
     hover, leave, gaze,
@@ -636,7 +664,7 @@ function createPanes() {
 
 // What the modules of views, tests and scripts use.
 const studio = {
-  page, ask, drawAsked, recolour, showSelection, setRange, select, hover, leave, pin, fly, flyToStep, sendViews,
+  page, ask, drawAsked, recolour, showSelection, setRange, select, hover, leave, pin, keep, fly, flyToStep, sendViews,
   get panes() { return panes; },
   get controls() { return controls; },
   get connection() { return connection; },

@@ -2,6 +2,7 @@
 
 import { quantity } from "/web/colours.js";
 import { make, notice } from "/web/page_parts.js";
+import { addFiles } from "../chart_files.js";
 import { CurveChart } from "../charts.js";
 import { ConditionForm } from "../condition_form.js";
 
@@ -19,6 +20,7 @@ export function create(root, studio) {
   form.root.prepend(setting);
   form.root.append(solve);
   root.append(form.root, text, frame);
+  addFiles(root, "Goal seek", () => chart);
   /** @type {CurveChart | null} */
   let chart = null;
   let names = "";

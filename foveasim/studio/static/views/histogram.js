@@ -3,6 +3,7 @@
 import { shown } from "/web/colours.js";
 import { statistics } from "/web/measure.js";
 import { make } from "/web/page_parts.js";
+import { addFiles } from "../chart_files.js";
 import { Histogram } from "../charts.js";
 
 // Returns statistics of the values of a pane by name, as texts.
@@ -23,6 +24,7 @@ export function create(root, { page, panes, setRange }) {
   frame.id = "histogram";
   list.id = "statistics";
   root.append(frame, list);
+  addFiles(root, "Histogram", () => chart);
   const draw = () => {
     const { scale, column } = panes.b, site = page.pinned >= 0 ? page.pinned : page.hovered;
     if (scale) chart.draw(page.range, site >= 0 ? column.values[site] : NaN);

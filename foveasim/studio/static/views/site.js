@@ -21,17 +21,25 @@ function nearest(sites) {
   return found;
 }
 
-export function create(root, { page, panes }) {
+export function create(root, { page, panes, keep }) {
   const heading = root.querySelector("h2"), list = make("dl", undefined, "table");
   heading.id = "site-heading";
   list.id = "site";
-  root.append(list);
+  const compare = make("button", "Compare in charts");
+  compare.type = "button";
+  compare.id = "compare-site";
+  compare.addEventListener("click", () => keep(Number(compare.dataset.site)));
+  root.append(list, compare);
   return {
     onSite() {
       const { sites, columns } = panes.b, chosen = page.hovered >= 0 ? page.hovered : page.pinned;
       if (!sites) return;
       const site = chosen >= 0 ? chosen : nearest(sites);
       change(heading, { textContent: siteHeading(site, page.pinned, chosen >= 0 ? [] : ["nearest to the centre"]) });
+      const isKept = page.kept.includes(site);
+      compare.dataset.site = String(site);
+      change(compare, { textContent: isKept ? "Remove from charts" : "Compare in charts" });
+      compare.setAttribute("aria-pressed", String(isKept));
       list.replaceChildren(...siteRows(sites, columns, site, 4).flatMap(([label, text]) => [make("dt", label), make("dd", text)]));
     },
   };

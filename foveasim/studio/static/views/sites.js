@@ -20,6 +20,7 @@ export function create(root, { page, panes, editor, ask }) {
       page.boundary = part.boundary;
       page.hovered = -1;
       if (page.pinned >= sites.n) page.pinned = -1;
+      page.kept = page.kept.filter((site) => site < sites.n);
       page.selected = page.rectangle && !editor.isOn ? b.sitesIn(page.rectangle) : editor.useSites(sites);
       // Frames of the layout move with it.
       if (scene.bounds) scene.frame = part.about.bounds_um;
