@@ -9,6 +9,7 @@ import re
 import tempfile
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,13 @@ from foveasim.config import to_python
 from foveasim.errors import FoveasimError, ParameterError, printable
 from foveasim.layout import Layout, write_layout
 from foveasim.studio._messages import to_json
+from foveasim.studio._settings.changes import changed_keys
+from foveasim.studio._settings.controls import value_at
 
 #: Date of the files in archives, so that equal states have equal archives; the earliest that the format can represent.
 DATE = (1980, 1, 1, 0, 0, 0)
+#: Longest value in a list of changes, characters.
+MAX_VALUE_LENGTH = 60
 #: Permissions of the files in archives: read by all, written by the owner.
 PERMISSIONS = 0o644 << 16
 
@@ -48,6 +53,22 @@ def text_of(what: str, settings: Mapping[str, Any], start: Mapping[str, Any], na
             return "".join(difflib.unified_diff(old, new, f"{name}.yaml", "studio"))
         case _:
             raise ParameterError("what", "must be yaml, python, notebook, link or diff", printable(what)[:40])
+
+
+def log_of(states: Sequence[Mapping[str, Any]]) -> str:
+    """Return a numbered list of the changes from each state to the next, with both values."""
+    lines = []
+    for number, (before, after) in enumerate(pairwise(states), 1):
+        keys = changed_keys(after, before)
+        changes = [f"{key}: {_short(value_at(before, key))} → {_short(value_at(after, key))}" for key in keys]
+        lines.append(f"{number}. {'; '.join(changes)}")
+    return "\n".join(lines)
+
+
+def _short(value: Any) -> str:
+    """Return a value in at most :data:`MAX_VALUE_LENGTH` characters."""
+    text = "–" if value is None else json.dumps(to_json(value), ensure_ascii=False)
+    return text if len(text) <= MAX_VALUE_LENGTH else f"{text[: MAX_VALUE_LENGTH - 1]}…"
 
 
 def without_directories(

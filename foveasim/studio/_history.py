@@ -40,6 +40,11 @@ class History:
         """Whether there is a later state."""
         return bool(self._future)
 
+    @property
+    def states(self) -> list[dict[str, Any]]:
+        """All states from the start to the current one, without drafts."""
+        return [*self._past, self._present]
+
     def preview(self, settings: dict[str, Any]) -> None:
         """Show settings without an undo step."""
         self._draft = settings

@@ -26,7 +26,7 @@ from foveasim.explore.solving import search_value
 from foveasim.layout import Layout
 from foveasim.studio._costs import RELEASE_S, REST_S, CancelledError, Costs, SupersededError
 from foveasim.studio._engine import Engine, Simulated
-from foveasim.studio._exports import text_of, without_directories
+from foveasim.studio._exports import log_of, text_of, without_directories
 from foveasim.studio._files import (
     Files,
     apply_preset,
@@ -620,9 +620,11 @@ class Session:
         """
         Return the current settings in a text format, or their changes as a difference.
 
-        ``what``: {"yaml", "python", "notebook", "link", "diff"}. ``exported``: as :meth:`exported` returns it, for several
-        texts of the same state. Raises ParameterError when the format is unknown.
+        ``what``: {"yaml", "python", "notebook", "link", "diff", "log"}. ``exported``: as :meth:`exported` returns it,
+        for several texts of the same state. Raises ParameterError when the format is unknown.
         """
+        if what == "log":
+            return log_of(self.history.states).replace(f"{self.uploads}/", "")
         settings, files = self.exported() if exported is None else exported
         return text_of(what, settings, self.start.settings, self.start.name, list(files))
 

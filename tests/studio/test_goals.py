@@ -121,3 +121,22 @@ def test_wrong_pins_are_one_line(recorder, sites):
     recorder.do(do="pin", sites=sites, id=1)
     (problem,) = [message["text"] for message in recorder.messages if message["kind"] == "error"]
     assert "must be a list of at most 6 indices" in problem
+
+
+# -- list of changes -------------------------------------------------------------------------------------------------------------
+
+
+def test_changes_are_listed(recorder):
+    """Undone steps are not part of the list, and several keys of a step are one line."""
+    recorder.do(do="set", key="optics.f_number", value=4.0, id=1)
+    recorder.do(do="set", key="layout.parameters.n_sites", value=300, id=2)
+    recorder.do(do="set", key="seed", value=9, id=3)
+    recorder.do(do="undo", id=4)
+    recorder.do(do="set", key="exposure_s", value=0.02, final=False, id=5)
+    recorder.do(do="set", key="exposure_s", value=0.03, id=6)
+    first, second, third = recorder.session.text("log").splitlines()
+
+    assert first == "1. optics.f_number: 2.8 → 4.0"
+    assert "layout.parameters.n_sites: – → 304" in second  # the nearest possible number
+    assert "layout.parameters.n_x: 16 → –" in second
+    assert third == "3. exposure_s: 0.01 → 0.03"

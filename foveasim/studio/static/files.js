@@ -72,7 +72,7 @@ export class Files {
       connection.send({ do: "text", what: "link" });
     }
     else if (action === "save") $("save-dialog").showModal();
-    else if (action === "diff") connection.send({ do: "text", what: "diff" });
+    else if (action === "diff" || action === "log") connection.send({ do: "text", what: action });
     else if (copy) connection.send({ do: "text", what: copy });
     else if (file) {
       const { blob, error } = await connection.fetchFile(file);
@@ -107,6 +107,7 @@ export class Files {
         + (await fragmentOf(text, this.wantsToken ? this.connection.token : "")), "Link");
       if (files.length) notice("The link contains only the names of uploaded files: " + files.join(", "));
     } else if (what === "diff") showText("Differences", text || "The settings are those at the start.");
+    else if (what === "log") showText("Changes of this session", text || "Nothing was changed.");
     else copyText(text, what === "yaml" ? "YAML" : "Python");
   }
 
