@@ -27,7 +27,7 @@ from foveasim.config._objects import (
 )
 from foveasim.config._problems import plain_settings, validate
 from foveasim.config._python import to_python
-from foveasim.config._requirements import MEASURES, Requirement
+from foveasim.config._requirements import RESULTS, Requirement
 from foveasim.config._shots import (
     Result,
     check_directory,
@@ -44,7 +44,7 @@ from foveasim.config._viewing import Viewable, read_viewable
 from foveasim.layout import bundled_layouts
 
 __all__ = [
-    "MEASURES",
+    "RESULTS",
     "STARTING_FILES",
     "YAML_EXTENSIONS",
     "LayoutFile",

@@ -9,7 +9,7 @@ from typing import Literal
 from foveasim.errors import ParameterError
 
 #: Results that requirements can limit, by name: label and unit.
-MEASURES: dict[str, tuple[str, str]] = {
+RESULTS: dict[str, tuple[str, str]] = {
     "snr": ("signal-to-noise ratio", ""),
     "snr_db": ("signal-to-noise ratio", "dB"),
     "n_sites": ("photosites", ""),
@@ -83,8 +83,8 @@ class Requirement:
     frequency_per_mm: float | None = None
 
     def __post_init__(self) -> None:
-        if self.measure not in MEASURES:
-            raise ParameterError("measure", f"must be one of {', '.join(MEASURES)}", self.measure)
+        if self.measure not in RESULTS:
+            raise ParameterError("measure", f"must be one of {', '.join(RESULTS)}", self.measure)
         if self.at_least is None and self.at_most is None:
             raise ParameterError("at_least", "or 'at_most' must be given")
         for name in ("at_least", "at_most", "frequency_per_mm"):
@@ -122,12 +122,12 @@ class Requirement:
     @property
     def unit(self) -> str:
         """Unit of the result and of the limits."""
-        return MEASURES[self.measure][1]
+        return RESULTS[self.measure][1]
 
     @property
     def subject(self) -> str:
         """The result that is limited, in words."""
-        parts = [MEASURES[self.measure][0]]
+        parts = [RESULTS[self.measure][0]]
         if self.frequency_per_mm is not None:
             parts.append(f"at {self.frequency_per_mm:g} per mm")
         if self.annulus_um is not None:

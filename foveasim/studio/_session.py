@@ -19,7 +19,7 @@ from typing import Any
 from foveasim._core.work_arrays import release_memory
 from foveasim._io.atomic import atomic_write
 from foveasim._io.yaml_files import format_yaml
-from foveasim.config import MEASURES, Requirement, check_settings, put_setting, validate
+from foveasim.config import RESULTS, Requirement, check_settings, put_setting, validate
 from foveasim.errors import ParameterError, SimulationError, printable
 from foveasim.explore import measure
 from foveasim.explore.solving import search_value
@@ -515,7 +515,7 @@ class Session:
             "value": solution.value,
             "result": solution.result,
             "subject": requirement.subject,
-            "measure": MEASURES[requirement.measure][0],
+            "measure": RESULTS[requirement.measure][0],
             "result_unit": requirement.unit,
             "limits": [requirement.at_least, requirement.at_most],
             "curve": [list(point) for point in solution.curve],

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import foveasim as fs
 from foveasim import explore
 from foveasim.cli import app
-from foveasim.config import MEASURES, Requirement, build_shot
+from foveasim.config import RESULTS, Requirement, build_shot
 from foveasim.errors import ConfigError, ParameterError, SimulationError
 from foveasim.explore.solving import search_value
 
@@ -287,10 +287,10 @@ def test_unreachable_goals_state_the_range():
 
 
 def test_all_measures_have_words():
-    assert set(MEASURES) == set(Requirement.__annotations__ and MEASURES)
-    for name in MEASURES:
+    assert set(RESULTS) == set(Requirement.__annotations__ and RESULTS)
+    for name in RESULTS:
         options = {"frequency_per_mm": 10.0} if name == "mtf" else {}
         assert str(Requirement(measure=name, at_least=1.0, **options)).endswith(
-            f"at least 1{' ' + MEASURES[name][1] if MEASURES[name][1] else ''}"
+            f"at least 1{' ' + RESULTS[name][1] if RESULTS[name][1] else ''}"
         )
     assert fs.config.Requirement is Requirement

@@ -71,6 +71,7 @@ VARIED = PHOTOGRAPHED | {"scene": {k: v for k, v in PHOTOGRAPHED["scene"].items(
 VARY = {"sensor.bits": [8, 10]}
 SEARCH = {"sensor.bits": [8, 10]}
 GOALS = {"snr_mean": "maximize"}
+LIMIT = fs.config.Requirement(measure="snr", at_least=1.0)
 DRAWS = {"optics.f_number": {"uniform": [2.0, 4.0]}}
 SHEET = {
     "shape": (60, 60),
@@ -427,6 +428,9 @@ CALLS = {
         pixel_um=10.0,
     ),
     "distortion.to_opencv": lambda o: distortion.to_opencv(o.lens, image_size=(64, 64), pixel_um=10.0),
+    "explore.check_requirements": lambda o: explore.check_requirements(o.shot, o.result.capture),
+    "explore.measure": lambda o: explore.measure(LIMIT, o.shot, o.result.capture),
+    "explore.solve": lambda o: explore.solve(SHOT, "exposure_s", LIMIT, bounds=(1e-6, 1.0)),
     "explore.best_table": lambda o: explore.best_table(o.study_plan, o.study),
     "explore.classification": lambda o: explore.classification([PICTURE], VARIED, labels=["cat"])[0],
     "explore.denoising": lambda o: explore.denoising([PICTURE], VARIED)[0],

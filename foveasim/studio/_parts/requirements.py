@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from foveasim.config import MEASURES
+from foveasim.config import RESULTS
 from foveasim.config._requirements import WITHOUT_REGION
 from foveasim.errors import FoveasimError
 from foveasim.explore import CheckedRequirement, measure
@@ -27,6 +27,6 @@ def requirements(result: Simulated) -> PartData:
         rows.append(row)
     measures = [
         {"name": name, "label": f"{label} / {unit}" if unit else label, "has_region": name not in WITHOUT_REGION}
-        for name, (label, unit) in MEASURES.items()
+        for name, (label, unit) in RESULTS.items()
     ]
     return {"rows": rows, "measures": measures}, {}
