@@ -102,6 +102,9 @@ class Requirement:
                 f"must not be given: {self.measure} is a result of the complete sensor",
                 getattr(self, regions[0]),
             )
+        for name in ("annulus_um", "rectangle_um"):
+            if not all(math.isfinite(value) for value in getattr(self, name) or ()):
+                raise ParameterError(name, "must be finite", getattr(self, name), "µm")
         if self.annulus_um is not None and not 0.0 <= self.annulus_um[0] < self.annulus_um[1]:
             raise ParameterError("annulus_um", "must be two increasing radii >= 0", self.annulus_um, "µm")
         if self.rectangle_um is not None and not (

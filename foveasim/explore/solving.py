@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from foveasim._core.short_repr import short_repr
-from foveasim.config import Requirement, Source, put_setting, read_settings
-from foveasim.errors import FoveasimError, ParameterError, SimulationError
+from foveasim.config import Requirement, Source, check_settings, put_setting, read_settings
+from foveasim.errors import ConfigError, FoveasimError, ParameterError, SimulationError
 from foveasim.explore.requirements import measure
 from foveasim.explore.sweeps.plan import copy_settings
 from foveasim.explore.worker_cache import ShotRunner
@@ -68,8 +68,8 @@ def solve(
     shot : path or mapping
         Settings file of a shot, or its settings.
     setting : str
-        Path of a number, such as ``"exposure_s"`` or ``"layout.parameters.n_sectors"``. It is an integer if the present
-        one is; without a present one, the solution is the nearest to the middle of the range.
+        Path of a number, such as ``"exposure_s"`` or ``"layout.parameters.n_sectors"``. Without a present number, the
+        solution is the nearest to the middle of the range.
     requirement : Requirement
         Equal limits demand a result that equals them within 0.1 %, or the nearest one of an integer setting.
     bounds : (low, high)
@@ -109,7 +109,8 @@ def solve(
         return measure(requirement, *runner.simulate_capture(changed))
 
     present = _number_at(settings, setting, bounds)
-    return search_value(setting, present, requirement, result_at, bounds=bounds)
+    is_integer = _is_integer(source, settings, setting)
+    return search_value(setting, present, requirement, result_at, bounds=bounds, is_integer=is_integer)
 
 
 def search_value(
@@ -119,26 +120,25 @@ def search_value(
     result_at: Callable[[float], float],
     *,
     bounds: tuple[float, float],
-    is_integer: bool | None = None,
+    is_integer: bool = False,
 ) -> Solution:
     """
     Return the value nearest to the present one at which a requirement is met.
 
     Values over the range bracket the limits; intervals are then halved.
 
-    ``result_at``: returns the result of a value. ``is_integer``: whether values are integers; by default as ``start``.
+    ``result_at``: returns the result of a value. ``is_integer``: whether values are integers.
     Raises ParameterError when the bounds are not ascending, and SimulationError when the requirement is met nowhere.
     """
     low, high = bounds
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         raise ParameterError("bounds", "must be ascending and finite", bounds)
-    is_integer = isinstance(start, int) if is_integer is None else is_integer
     target = _Target(requirement)
     results: dict[float, float] = {}
     problems: list[str] = []
 
     def at(value: float) -> float:
-        value = round(value) if is_integer else float(f"{value:.6g}")
+        value = min(max(round(value), math.ceil(low)), math.floor(high)) if is_integer else float(f"{value:.6g}")
         if value not in results:
             try:
                 results[value] = float(result_at(value))
@@ -149,10 +149,14 @@ def search_value(
 
     start = min(max(start, low), high)
     values = sorted({at(value) for value in [*_spaced(low, high), start]})
+    for one, other in pairwise(values):  # results may be finite up to a limit, such as saturation
+        if math.isfinite(results[one]) != math.isfinite(results[other]):
+            _approach(one, other, results, at)
+    values = sorted(results)
     met = [value for value in values if target.is_met(results[value])]
     for one, other in pairwise(values):
         if target.is_between(results[one], results[other]):
-            met += _refined(one, other, target, results, at, is_integer=is_integer)
+            met += _refined(one, other, target, results, at)
     if not met:
         known = [result for result in results.values() if math.isfinite(result)]
         if not known:
@@ -195,13 +199,11 @@ def _refined(
     target: _Target,
     results: Mapping[float, float],
     at: Callable[[float], float],
-    *,
-    is_integer: bool,
 ) -> list[float]:
     """
     Return values between two of them, near the limit, that meet the target.
 
-    Of integers, the nearest one to an equality is returned too.
+    Where no result equals the target, the nearest one is returned.
     """
     for _ in range(N_REFINEMENTS):
         middle = at(math.sqrt(one * other) if one > 0.0 and other / one > 2.0 else 0.5 * (one + other))
@@ -216,9 +218,21 @@ def _refined(
         if abs(other - one) <= WIDTH * max(abs(one), abs(other)):
             break
     found = [value for value in (one, other) if target.is_met(results[value])]
-    if not found and target.is_equality and is_integer:
+    if not found and target.is_equality:
         found = [min((one, other), key=lambda value: abs(results[value] - target.middle))]
     return found
+
+
+def _approach(one: float, other: float, results: Mapping[float, float], at: Callable[[float], float]) -> None:
+    """Simulate values towards the limit between a finite result and none."""
+    for _ in range(N_REFINEMENTS // 2):
+        middle = at(0.5 * (one + other))
+        if middle in (one, other):
+            return
+        if math.isfinite(results[middle]) == math.isfinite(results[one]):
+            one = middle
+        else:
+            other = middle
 
 
 def _spaced(low: float, high: float) -> list[float]:
@@ -235,12 +249,26 @@ def _position(value: float, low: float, high: float) -> float:
 
 
 def _number_at(settings: Mapping[str, Any], setting: str, bounds: tuple[float, float]) -> float:
-    """Return the present number of a setting; for none and "auto" the middle of its range."""
+    """Return the present number of a setting; for none, or a text, the middle of its range."""
     value: Any = settings
     for name in setting.split("."):
-        value = value.get(name) if isinstance(value, Mapping) else None
-    if value is None or value == "auto":
+        if isinstance(value, list):
+            value = value[int(name)] if name.isdecimal() and int(name) < len(value) else None
+        else:
+            value = value.get(name) if isinstance(value, Mapping) else None
+    if value is None or (setting == "exposure_s" and isinstance(value, str)):
         return math.sqrt(bounds[0] * bounds[1]) if bounds[0] > 0.0 else 0.5 * (bounds[0] + bounds[1])
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ParameterError("setting", "must be the path of a number in the settings", setting)
     return value
+
+
+def _is_integer(source: Source, settings: Mapping[str, Any], setting: str) -> bool:
+    """Return whether a setting accepts only integers."""
+    changed = copy_settings(dict(settings))
+    put_setting(source, changed, setting, 2.5)
+    try:
+        check_settings(source, changed)
+    except ConfigError as error:
+        return "integer" in error.detail
+    return False

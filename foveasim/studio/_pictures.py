@@ -63,7 +63,7 @@ def _block_means(pixels: NDArray[Any], block: int, encoding: Encoding) -> NDArra
     """
     Return means of square blocks, uint16 or float32.
 
-    Incomplete blocks at the right and at the bottom are cropped.
+    Incomplete blocks at the right and at the bottom are cropped; the result has no alpha.
     """
     n_y, n_x = (n // block for n in pixels.shape[:2])
     n_channels = 1 if pixels.ndim == 2 else pixels.shape[2]
@@ -71,20 +71,18 @@ def _block_means(pixels: NDArray[Any], block: int, encoding: Encoding) -> NDArra
     has_integers = np.issubdtype(pixels.dtype, np.integer)
     peak = np.iinfo(pixels.dtype).max if has_integers else 1.0
     table = decode(np.arange(peak + 1) / peak, encoding).astype(np.float32) if has_integers else None
-    means = np.empty((n_y, n_x, n_channels), np.float32)
+    means = np.empty((n_y, n_x, n_colours), np.float32)
     for row in range(n_y):
         rows = pixels[row * block : (row + 1) * block, : n_x * block].reshape(block, n_x, block, n_channels)
-        for channel in range(n_channels):
+        # Transparent pixels are black, as in scenes.
+        alpha = rows[..., -1] / np.float32(peak) if n_colours < n_channels else None
+        for channel in range(n_colours):
             values = rows[..., channel]
-            if table is not None and channel < n_colours:
-                values = table[values]
-            elif table is not None:
-                values = values / np.float32(peak)
-            elif channel < n_colours:
-                values = decode(values.astype(np.float64), encoding)
+            values = decode(np.maximum(values, 0.0).astype(np.float64), encoding) if table is None else table[values]
+            values = values if alpha is None else values * alpha
             means[row, :, channel] = values.mean(axis=(0, 2), dtype=np.float64)
-    means[..., :n_colours] = _encode(means[..., :n_colours], encoding)
-    found = means[..., 0] if pixels.ndim == 2 else means
+    means = _encode(means, encoding)
+    found = means[..., 0] if n_colours == 1 else means
     return np.rint(np.clip(found, 0.0, 1.0) * 65535.0).astype(np.uint16) if has_integers else found
 
 

@@ -524,6 +524,7 @@ def serve(
         ws_per_message_deflate=False,  # costs more time than the transfer on this computer
         timeout_graceful_shutdown=0,
         limit_concurrency=MAX_CONNECTIONS,
+        proxy_headers=False,
         server_header=False,
         date_header=False,
     )

@@ -10,7 +10,7 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -56,13 +56,22 @@ from foveasim.studio._settings.changes import (
     with_file,
 )
 from foveasim.studio._settings.controls import chosen_value, controls_of, structure_of, value_at
-from foveasim.studio._settings.unknowns import balanced, solved_of, with_n_sites, with_unknown
+from foveasim.studio._settings.unknowns import (
+    PARAMETERS,
+    balanced,
+    generated_layout,
+    solved_of,
+    with_n_sites,
+    with_unknown,
+)
 from foveasim.studio._views import Views
 
 #: Size limit of all uploaded files.
 MAX_SESSION_BYTES = 512 << 20
 #: Largest number of photosites that charts compare.
 MAX_PINNED = 6
+#: Kinds of controls whose values goal seek can change, and its range of automatic exposures.
+NUMBERS, EXPOSURES_S = ("number", "integer"), (1e-5, 1.0)
 #: Largest number of messages that wait.
 MAX_WAITING = 1000
 #: Newer changes stop simulations for at most this time in succession, so that some are shown.
@@ -128,12 +137,13 @@ class Session:
         self._pinned: tuple[int, ...] = ()
         # Sentences about pictures that were reduced, by path.
         self._notes: dict[str, str] = {}
+        self._reductions: dict[tuple[str, int, str], tuple[Path, str] | None] = {}
         # Setting that changed last, and whether this was during a drag.
         self._key: str | None = None
         self._is_dragging = False
         self._wants_rest = False
         self._has_unused_memory = False
-        self._is_cancelled = False
+        self._is_cancelled = self._is_working = False
         self._can_stop = False
         self._stopped_s = -math.inf
         self._listeners: set[Listener] = set()
@@ -160,9 +170,13 @@ class Session:
         """Take over the history and the uploaded files of another session."""
         with origin._uploading:
             self.n_free_bytes = origin.n_free_bytes
-            for path in origin.uploads.iterdir():
-                if path.is_file():
-                    shutil.copy2(path, self.uploads / path.name)
+            with suppress(FileNotFoundError):  # of a session that is being closed
+                for path in origin.uploads.iterdir():
+                    if path.is_file():
+                        shutil.copy2(path, self.uploads / path.name)
+                # The file of a source of frames is written when it is required.
+                for name, frame in origin.frames.export(origin.history.settings).items():
+                    shutil.copy2(frame, self.uploads / Path(name).name)
 
         def moved(value: Any) -> Any:
             """Return settings with the paths of this session's files."""
@@ -197,10 +211,11 @@ class Session:
         """
         Add a message of the page.
 
-        It is handled in the thread of the session, but ``cancel`` at once.
+        It is handled in the thread of the session, but ``cancel`` at once: it stops the work in progress and what waits.
         """
         if isinstance(message, dict) and message.get("do") == "cancel":
-            self._is_cancelled = True
+            with self._wake:
+                self._is_cancelled = self._is_working or bool(self._waiting)
             return
         with self._wake:
             self.last_used_s = time.monotonic()
@@ -266,6 +281,7 @@ class Session:
                     return
                 messages = list(self._waiting)
                 self._waiting.clear()
+                self._is_working = True
             try:
                 if messages or self._wants_rest:
                     self._has_unused_memory = True
@@ -275,11 +291,15 @@ class Session:
                     release_memory()
             except BaseException as error:  # noqa: BLE001 -- the session continues with its last valid state
                 self._send_error(self._last_id, error)
+            finally:
+                with self._wake:
+                    self._is_cancelled = self._is_working = False
 
     def _handle(self, messages: list[Any]) -> None:
         """Handle messages in order; consecutive changes are simulated once."""
         changes: list[dict[str, Any]] = []
         done = 0
+        self._is_working = True
         try:
             for k, message in enumerate(messages):
                 if is_change(message):
@@ -298,6 +318,8 @@ class Session:
             with self._wake:
                 self._waiting.extendleft(reversed(messages[done:]))
             return
+        finally:
+            self._is_cancelled = self._is_working = False
         self._send_parts()
         self._wants_rest = self.is_preview
 
@@ -321,10 +343,16 @@ class Session:
         if now_s - self._stopped_s < MAX_STOPPED_S:
             raise SupersededError
 
-    @property
-    def _layout(self) -> Layout | None:
-        """The present layout, None before the first result."""
-        return None if self.result is None else self.result.capture.layout
+    def _generated(self, settings: Mapping[str, Any]) -> Layout | None:
+        """Return the layout of the generator of settings, without edits; None without one."""
+        if self.result is None:
+            return generated_layout(settings, None)
+        shown, section = self.result.capture.layout, settings.get("layout")
+        is_shown = self.result.settings.get("layout") == section
+        changes = ("edits", "inset_um", "move_um", "snap_um")
+        if isinstance(section, dict) and is_shown and not any(section.get(name) for name in changes):
+            return shown
+        return generated_layout(settings, shown)
 
     @property
     def is_preview(self) -> bool:
@@ -333,12 +361,14 @@ class Session:
 
     def _complete(self) -> None:
         """Replace a preview by the complete result."""
-        self._is_dragging = self._wants_rest = self._is_cancelled = False
+        self._is_dragging = self._wants_rest = False
         self._send({"kind": "busy"})
         try:
             self._simulate(self.history.settings)
         except SupersededError:
             return
+        except CancelledError:
+            self._send({"kind": "note", "text": "cancelled; the preview remains"})
         except Exception as error:  # noqa: BLE001 -- the preview stays, with the reason
             self._errors = {"": self._line(error)}
         self._send_state()
@@ -358,7 +388,6 @@ class Session:
             )
         ]
         before = self.history.copy()
-        self._is_cancelled = False
         self._send({"kind": "busy"})
         try:
             for message in kept:
@@ -410,15 +439,15 @@ class Session:
                 else:
                     value = chosen_value(key, value, self._controls, settings, self.start.settings)
                     put_setting(None, settings, key, value)
-                settings = balanced(settings, key, self._layout)
+                settings = balanced(settings, key, before, self._generated)
                 if key == "sensor.preset":
                     choose_preset(settings)
             case "reset":
-                settings = balanced(
-                    reset(settings, self.start.settings, key_of(message)), key_of(message), self._layout
-                )
+                key = key_of(message)
+                settings = balanced(reset(settings, self.start.settings, key), key, before, self._generated)
             case "delete":
-                settings = balanced(reset(settings, {}, key_of(message)), key_of(message), self._layout)
+                key = key_of(message)
+                settings = balanced(reset(settings, {}, key), key, before, self._generated)
             case "seek":
                 settings = self._sought(settings, message)
             case "fit":
@@ -426,9 +455,10 @@ class Session:
                     raise SimulationError("there is no image to fit")
                 settings = with_covering_scene(settings, self.result.shot)
             case "solve":
-                if self._layout is None:
+                generated = self._generated(settings)
+                if generated is None:
                     raise SimulationError("there is no layout whose parameters are known")
-                settings = with_unknown(settings, string_of(message, "name"), self._layout)
+                settings = with_unknown(settings, string_of(message, "name"), generated)
             case "preset":
                 settings = apply_preset(string_of(message, "name"), settings)
             case "restore":
@@ -444,8 +474,10 @@ class Session:
             case "match":
                 if self._frozen_result is None or self.result is None:
                     raise SimulationError("there is no variant A to compare with")
-                n_sites = self._frozen_result.capture.layout.n_sites
-                settings = with_n_sites(settings, n_sites, self.result.capture.layout)
+                n_sites, edited = self._frozen_result.capture.layout.n_sites, self.result.capture.layout
+                own = self._generated(settings) or edited
+                # Edits may change the number of the generator.
+                settings = with_n_sites(settings, max(1, round(n_sites * own.n_sites / edited.n_sites)), own)
             case "video":
                 path = Path(self.files.available(string_of(message, "path")))
                 shown = self.frames.path if self.frames.open_video(path) else path
@@ -474,8 +506,9 @@ class Session:
         One number is changed; the curve of its results is sent to the page.
         """
         key, wanted = key_of(message), from_json(check_depth(message.get("requirement")))
+        is_exposure = key == "exposure_s"  # also a text, such as "auto"
         control = next(
-            (each for each in self._controls if each["key"] == key and each["kind"] in ("number", "integer")), None
+            (each for each in self._controls if each["key"] == key and (each["kind"] in NUMBERS or is_exposure)), None
         )
         if control is None or self.result is None:
             raise ParameterError("key", "must be the key of a number", printable(key)[:40])
@@ -483,18 +516,30 @@ class Session:
             raise ParameterError("requirement", "must be a mapping")
         requirement: Requirement = validate(None, Requirement, wanted)
         present = value_at(settings, key)
-        present = (
-            solved_of(settings, self.result.capture.layout).get(key, control["default"]) if present is None else present
-        )
-        if not isinstance(present, int | float):
-            present = control["suggested"][0]
-        low, high = message.get("bounds") or control["suggested"]
+        if is_exposure and not isinstance(present, int | float):
+            present = self.result.shot.exposure_s
+        if present is None:
+            present = solved_of(settings, self.result.capture.layout).get(key, control["default"])
+        low, high = control.get("suggested") or EXPOSURES_S
+        if isinstance(present, int | float):
+            low, high = min(low, present), max(high, present if key != f"{PARAMETERS}.n_sites" else 4 * present)
+        else:
+            present = low
+        if message.get("bounds") is not None:
+            bounds = message["bounds"]
+            if (
+                not isinstance(bounds, list)
+                or len(bounds) != 2
+                or not all(type(each) in (int, float) for each in bounds)
+            ):
+                raise ParameterError("bounds", "must be two numbers")
+            low, high = bounds
         n_done = 0
 
         def changed(value: float) -> dict[str, Any]:
             found = copy.deepcopy(settings)
             put_setting(None, found, key, value)
-            return balanced(found, key, self._layout)
+            return balanced(found, key, settings, self._generated)
 
         def result_at(value: float) -> float:
             nonlocal n_done
@@ -528,7 +573,10 @@ class Session:
             return path
         self._check(f"reading {Path(self.files.available(path)).name}")
         encoding = self.history.settings["scene"].get("encoding", "srgb")
-        found = reduced_picture(Path(path), self._new_path, resolved_pixels(self.result.shot), encoding)
+        key = (path, resolved_pixels(self.result.shot), encoding)
+        if key not in self._reductions:
+            self._reductions[key] = reduced_picture(Path(path), self._new_path, key[1], encoding)
+        found = self._reductions[key]
         if found is None:
             return path
         self._notes[str(found[0])] = found[1]
@@ -726,7 +774,7 @@ class Session:
 
     def _line(self, error: BaseException) -> str:
         """Return an error in one line, without the directory of uploads."""
-        return one_line(error).replace(f"{self.uploads}/", "")
+        return str(error) if isinstance(error, CancelledError) else one_line(error).replace(f"{self.uploads}/", "")
 
     def _send_error(self, number: Any, error: BaseException) -> None:
         self._send({"kind": "error", "id": number, "text": self._line(error)})

@@ -294,3 +294,34 @@ def test_all_measures_have_words():
             f"at least 1{' ' + RESULTS[name][1] if RESULTS[name][1] else ''}"
         )
     assert fs.config.Requirement is Requirement
+
+
+@pytest.mark.parametrize("setting", ["optics.f_number", "exposure_s"])
+def test_whole_numbers_are_no_integers(setting):
+    """A value such as 4 in a file does not restrict the solution."""
+    settings = {**SHOT, "optics": {"focal_length_mm": 8, "f_number": 4}, "exposure_s": 1}
+    found = explore.solve(
+        settings, setting, between(20.0, 20.0), bounds=(1.5, 400.0) if setting != "exposure_s" else (1e-6, 1.0)
+    )
+    assert found.value != round(found.value)
+    assert found.result == pytest.approx(20.0, rel=0.01)
+
+
+def test_results_near_zero_are_found():
+    found = search_value(
+        "x", 5.0, between(0.0, 0.0, "snr_db"), lambda x: 20.0 * math.log10(x / 3.0), bounds=(0.1, 100.0)
+    )
+    assert found.value == pytest.approx(3.0, rel=1e-3)
+
+
+def test_results_just_below_saturation_are_found():
+    found = search_value(
+        "x", 1.0, Requirement(measure="snr", at_least=6.9), lambda x: x if x < 7.0 else math.nan, bounds=(0.5, 40.0)
+    )
+    assert 6.9 <= found.value < 7.0
+
+
+@pytest.mark.parametrize("region", [{"annulus_um": (0.0, math.inf)}, {"rectangle_um": (0.0, 0.0, math.nan, 1.0)}])
+def test_regions_are_finite(region):
+    with pytest.raises(ParameterError, match="must be finite"):
+        Requirement(measure="snr", at_least=1.0, **region)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from studio.conftest import Recorder, WithoutThread
 from studio.test_session import code_part, codes_of
 
-from foveasim.config import bundled_layouts
+from foveasim.config import bundled_layouts, demo_settings
 from foveasim.layout import LAYOUTS
 from foveasim.studio._files import start_settings
 from foveasim.studio._session import Start
@@ -214,3 +216,102 @@ def test_bundled_layouts_lie_in_the_image(name):
         assert not any("outside the image" in warning for warning in state["warnings"])
     finally:
         recorder.session.close()
+
+
+# -- unknowns and edits -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def of_layout(make_session, settings):
+    def make(generator, parameters, **more):
+        layout = {"generator": generator, "parameters": parameters, **more}
+        plain = {**settings, "layout": layout, "sensor": {"qe": 0.6}}
+        plain["scene"] = {**settings["scene"], "shape": [256, 256], "pitch_um": 1000.0}
+        return make_session(start=plain)
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("generator", "parameters", "edits"),
+    [
+        ("grid", {"n_x": 20, "n_y": 13, "pitch_um": 8.0, "trench_um": 1.0}, []),
+        ("grid", {"n_x": 20, "n_y": 13, "pitch_um": 8.0, "fill_factor": 0.5}, []),
+        ("grid", {"n_x": 20, "n_y": 20, "pitch_um": 8.0}, [{"kind": "scale", "factor": 1.2}]),
+        ("grid", {"n_x": 20, "n_y": 20, "pitch_um": 8.0}, [{"kind": "rotate", "angle_deg": 45.0}]),
+        ("hexagonal", {"n_columns": 20, "n_rows": 23, "pitch_um": 8.0}, []),
+        (
+            "log_polar",
+            {"n_sectors": 32, "min_size_um": 6.0, "r_max_um": 150.0},
+            [{"kind": "split", "n_x": 2, "n_y": 1}],
+        ),
+    ],
+)
+def test_unknowns_keep_number_and_field(of_layout, generator, parameters, edits):
+    recorder = of_layout(generator, parameters, edits=edits)
+    before = recorder.do(do="refresh")["summary"]
+    names = list(unknowns_of(recorder.session.history.settings))
+    for k, name in enumerate([*names[1:], *reversed(names), *names], 1):
+        state = recorder.do(do="solve", name=name, id=k)
+        assert state["errors"] == {}
+        assert state["summary"]["n_sites"] == before["n_sites"]
+        assert state["summary"]["width_um"] == pytest.approx(before["width_um"], rel=0.03)
+
+
+def test_numbers_are_the_nearest_possible_ones(of_layout):
+    recorder = of_layout("grid", {"n_x": 20, "n_y": 20, "pitch_um": 8.0})
+    for wanted in (410, 430, 450, 500, 900):
+        state = recorder.do(do="set", key="layout.parameters.n_sites", value=wanted)
+        assert state["errors"] == {}
+        assert state["summary"]["n_sites"] == pytest.approx(wanted, rel=0.06)
+        assert state["settings"]["layout"]["parameters"]["n_sites"] == pytest.approx(
+            state["summary"]["n_sites"], rel=0.01
+        )
+    assert recorder.do(do="set", key="layout.parameters.n_y", value=10)["errors"] == {}
+    for wrong in ("abc", 1.5, -3):
+        before = recorder.session.history.settings
+        state = recorder.do(do="set", key="layout.parameters.n_sites", value=wrong)
+        assert list(state["errors"]) == ["layout.parameters.n_sites"]
+        assert state["settings"] == before
+
+
+@pytest.mark.parametrize(("key", "other"), [("pitch_um", "size_um"), ("size_um", "pitch_um")])
+def test_removed_size_follows(of_layout, key, other):
+    recorder = of_layout("grid", {"n_x": 20, "n_y": 20, "pitch_um": 8.0})
+    recorder.do(do="solve", name={"size_um": "pitch_um", "pitch_um": "columns"}[key])
+    state = recorder.do(do="delete", key=f"layout.parameters.{key}")
+    assert state["errors"] == {}
+    assert other in state["settings"]["layout"]["parameters"]
+    assert state["summary"]["n_sites"] == 400
+
+
+def test_waiting_changes_build_on_each_other(of_layout):
+    recorder = of_layout("grid", {"n_x": 20, "n_y": 20, "pitch_um": 8.0})
+    changes = [{"do": "set", "key": "layout.parameters.n_x", "value": 40, "final": True, "id": 1}]
+    state = recorder.handle([*changes, {"do": "solve", "name": "pitch_um", "id": 2}])
+    assert state["settings"]["layout"]["parameters"] == {"size_um": [320.0, 160.0], "n_sites": 800}
+    assert state["summary"]["n_sites"] == 800
+
+
+def test_opened_settings_remain_as_written(recorder):
+    """A colouring of the file equals the one that the former layout received."""
+    recorder.do(do="set", key="sensor.filters", value="rgb")
+    choose(recorder, "sunflower")
+    content = (
+        Path(demo_settings()[0])
+        .read_text()
+        .replace("mosaic: [RG, GB]", "edits: [{kind: graph_colouring, n_channels: 3}]")
+    )
+    assert "graph_colouring" in content
+    path = recorder.session.add_file("own.yaml", content.encode())
+    state = recorder.do(do="file", path=str(path), **{"as": "settings"})
+    assert state["errors"] == {}
+    assert state["settings"]["layout"]["edits"] == [{"kind": "graph_colouring", "n_channels": 3}]
+    assert "mosaic" not in state["settings"]["layout"]
+
+
+def test_colouring_ends_with_the_filters(recorder):
+    choose(recorder, "sunflower")
+    state = recorder.do(do="set", key="sensor.filters", value=None)
+    assert state["errors"] == {}
+    assert not state["settings"]["layout"].get("edits")

@@ -26,7 +26,12 @@ def requirements(result: Simulated) -> PartData:
             row |= {"value": checked.value, "margin": checked.margin, "is_met": checked.is_met, "problem": ""}
         rows.append(row)
     measures = [
-        {"name": name, "label": f"{label} / {unit}" if unit else label, "has_region": name not in WITHOUT_REGION}
+        {
+            "name": name,
+            "label": f"{label} / {unit}" if unit else label,
+            "unit": unit,
+            "has_region": name not in WITHOUT_REGION,
+        }
         for name, (label, unit) in RESULTS.items()
     ]
     return {"rows": rows, "measures": measures}, {}

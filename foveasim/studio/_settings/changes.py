@@ -113,9 +113,15 @@ def changed_keys(settings: Any, start: Any, key: str = "") -> list[str]:
 
 def chooses_filters(message: dict[str, Any]) -> bool:
     """Return whether a message chooses a layout, or the filters of the sensor."""
-    return message["do"] in ("preset", "file") or (
-        message["do"] in ("set", "reset", "delete") and message.get("key") in ("layout", "sensor", "sensor.filters")
-    )
+    match message["do"]:
+        case "preset":
+            return str(message.get("name")).startswith("layout:")
+        case "file":
+            return message.get("as") == "layout"
+        case "set" | "reset" | "delete":
+            return message.get("key") in ("layout", "sensor", "sensor.filters")
+        case _:
+            return False
 
 
 def match_filters(settings: dict[str, Any], before: Mapping[str, Any]) -> None:
@@ -132,7 +138,11 @@ def match_filters(settings: dict[str, Any], before: Mapping[str, Any]) -> None:
     edits = list(layout.get("edits") or [])
     if old.get("generator") in WITHOUT_MOSAIC and layout["generator"] not in WITHOUT_MOSAIC and COLOURING in edits:
         edits.remove(COLOURING)
-    if isinstance(sensor, dict) and sensor.get("filters") is not None:
+    is_coloured = isinstance(sensor, dict) and sensor.get("filters") is not None
+    was_coloured = isinstance(before.get("sensor"), dict) and before["sensor"].get("filters") is not None
+    if was_coloured and not is_coloured and layout["generator"] in WITHOUT_MOSAIC and COLOURING in edits:
+        edits.remove(COLOURING)
+    if is_coloured:
         has_filters = any(edit.get("kind") in COLOURING_KINDS for edit in edits if isinstance(edit, dict))
         if layout["generator"] in WITHOUT_MOSAIC:
             layout.pop("mosaic", None)

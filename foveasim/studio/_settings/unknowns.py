@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+import math
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from typing import Any
+
+import numpy as np
 
 from foveasim.errors import FoveasimError, ParameterError, printable
 from foveasim.layout import LAYOUTS, Layout
@@ -16,10 +20,14 @@ PARAMETERS = "layout.parameters"
 RASTERS = {"grid": ("n_x", "n_y"), "hexagonal": ("n_columns", "n_rows"), "octagonal": ("n_x", "n_y")}
 #: Unknown of rasters whose numbers of columns and rows follow from the pitch.
 COLUMNS = "columns"
+#: Parameters of rasters that exclude each other.
+EXCLUDED = {"pitch_um": "size_um", "size_um": "pitch_um"}
 #: Parameters for which a generator solves only without another one.
 INSTEAD_OF = {"n_fovea": "pitch_um"}
 #: Largest difference of the number of sites, in percent, where generators have no nearer possible number.
 MAX_PERCENT = 8
+#: Margins of the field of a raster, relative to its pitch, that are tried so that the number of sites remains.
+MARGINS = (0.0, 0.1, 0.25, 0.5)
 
 
 def is_generated(settings: Mapping[str, Any]) -> bool:
@@ -44,8 +52,7 @@ def unknowns_of(settings: Mapping[str, Any]) -> dict[str, str]:
 
 def unknown_of(settings: Mapping[str, Any]) -> str | None:
     """Return the parameter of :func:`unknowns_of` that follows from the others in settings."""
-    unknowns = unknowns_of(settings)
-    if not unknowns:
+    if not unknowns_of(settings):
         return None
     name, parameters = settings["layout"]["generator"], settings["layout"].get("parameters") or {}
     if parameters.get("n_sites") is None:
@@ -61,74 +68,102 @@ def solved_of(settings: Mapping[str, Any], layout: Layout) -> dict[str, Any]:
         return {}
     generator, given = settings["layout"]["generator"], settings["layout"].get("parameters") or {}
     names = [*(each.name for each in _solvable(generator)), *RASTERS.get(generator, ())]
-    generated = _generated_parameters(settings, layout)
+    generated = _parameters_of(layout)
     found = {name: generated[name] for name in names if given.get(name) is None and generated.get(name) is not None}
     return {f"{PARAMETERS}.{name}": value for name, value in {**found, "n_sites": layout.n_sites}.items()}
+
+
+def generated_layout(settings: Mapping[str, Any], shown: Layout | None) -> Layout | None:
+    """
+    Return the layout of a generator without edits.
+
+    ``shown``: layout with edits, which replaces it for generators that read a picture. Returns None if there is none.
+    """
+    if not is_generated(settings):
+        return shown
+    layout = settings["layout"]
+    if LAYOUTS[layout["generator"]].picture is not None:  # type: ignore[attr-defined]
+        return shown
+    with suppress(FoveasimError, TypeError, ValueError):
+        return _generate(layout["generator"], layout.get("parameters") or {})
+    return shown
 
 
 def with_unknown(settings: Mapping[str, Any], unknown: str, layout: Layout) -> dict[str, Any]:
     """
     Return settings in which another parameter follows from the others.
 
-    The number of photosites remains.
+    The number of photosites remains, or is the nearest possible one.
 
-    ``layout``: present layout of the settings. Raises ParameterError when the generator cannot solve for the parameter.
+    ``layout``: that of the generator, see :func:`generated_layout`. Raises ParameterError when the generator cannot solve for
+    the parameter.
     """
     unknowns = unknowns_of(settings)
     if unknown not in unknowns:
         names = ", ".join(unknowns) or "none: the layout has no generator that solves for its number of photosites"
         raise ParameterError("name", f"must be one of {names}", printable(unknown)[:40])
-    found = copy.deepcopy(dict(settings))
-    parameters = found["layout"].setdefault("parameters", {})
-    n_sites = parameters.pop("n_sites", None)
-    generated = _generated_parameters(settings, layout)
-    for solvable in _solvable(found["layout"]["generator"]):
-        if parameters.get(solvable.name) is None and generated.get(solvable.name) is not None:
-            parameters[solvable.name] = generated[solvable.name]
+    found = _with_solved(settings, layout)
     if unknown == "n_sites":
         return found
-    return with_n_sites(found, n_sites or _count(found, layout), layout, unknown)
+    return with_n_sites(found, layout.n_sites, layout, unknown)
 
 
-def balanced(settings: dict[str, Any], key: str, layout: Layout | None) -> dict[str, Any]:
+def balanced(
+    settings: dict[str, Any],
+    key: str,
+    before: Mapping[str, Any],
+    layout_of: Callable[[Mapping[str, Any]], Layout | None],
+) -> dict[str, Any]:
     """
     Return settings whose generator has exactly one unknown after a change of a key.
 
     A number of photosites replaces a parameter that follows from it, and a parameter that is given replaces the number; a
-    parameter that is removed follows from the present number. ``layout``: present layout, None without one.
+    parameter that is removed follows from the number.
+
+    ``before``: settings before the change. ``layout_of``: returns the generator's layout of settings, None without one.
     """
     name = key.removeprefix(f"{PARAMETERS}.")
     unknowns = unknowns_of(settings)
-    if name == key or layout is None or not unknowns:
+    same = (
+        is_generated(before) and before["layout"]["generator"] == settings["layout"]["generator"] if unknowns else False
+    )
+    layout = layout_of(before) if name != key and same else None
+    if layout is None:
         return settings
     generator, parameters = settings["layout"]["generator"], settings["layout"].get("parameters") or {}
-    n_sites = parameters.get("n_sites")
-    other = {"pitch_um": "size_um", "size_um": "pitch_um"}.get(name) if generator in RASTERS else None
-    if other is not None and parameters.get(name) is not None and parameters.get(other) is not None:
-        found = copy.deepcopy(settings)
-        del found["layout"]["parameters"][other]
-        return found
-    solvable = {each.name: each for each in _solvable(generator)}
-    names = {*solvable, *RASTERS.get(generator, ())}
+    n_sites, value = parameters.get("n_sites"), parameters.get(name)
+    columns, rows = RASTERS.get(generator, ("", ""))
     if name == "n_sites":
         if n_sites is None:
-            return with_unknown(settings, "n_sites", layout)
-        if unknown_of(settings) is None or (
-            generator in RASTERS and any(parameters.get(each) is not None for each in RASTERS[generator])
-        ):
-            return with_n_sites(settings, n_sites, layout)
-    elif name in names and n_sites is not None and parameters.get(name) is not None:
-        if unknown_of(settings) is None or name in RASTERS.get(generator, ()):
-            found = copy.deepcopy(settings)
-            del found["layout"]["parameters"]["n_sites"]
-            return found
-    elif name in solvable and n_sites is None and parameters.get(name) is None and not solvable[name].is_optional:
-        return with_n_sites(settings, layout.n_sites, layout, name if generator not in RASTERS else None)
-    return settings
+            return with_unknown(before, "n_sites", layout)
+        if not _is_count(n_sites):
+            return settings  # its validation reports it
+        unknown = unknown_of(before)
+        return with_n_sites(
+            _without_n_sites(settings, layout), n_sites, layout, None if unknown == "n_sites" else unknown
+        )
+    if value is None:
+        follows = {"pitch_um": "pitch_um", "size_um": COLUMNS}.get(name, name) if generator in RASTERS else name
+        return with_unknown(before, follows, layout) if follows in unknowns else settings
+    if generator in RASTERS and parameters.get(EXCLUDED.get(name, "")) is not None:
+        settings = _without(settings, EXCLUDED[name])
+    if n_sites is None or not _is_count(n_sites):
+        return settings
+    if name == rows and unknown_of(settings) == "pitch_um":
+        return _without(_with_solved(settings, layout), "n_sites")
+    if name == columns or (name in {each.name for each in _solvable(generator)} and unknown_of(settings) is None):
+        return _without(settings, "n_sites")
+    # The number may have no nearer possible one with the new value.
+    return with_n_sites(settings, n_sites, layout, unknown_of(settings), is_resized=False)
 
 
 def with_n_sites(
-    settings: Mapping[str, Any], n_sites: int, layout: Layout, unknown: str | None = None
+    settings: Mapping[str, Any],
+    n_sites: int,
+    layout: Layout,
+    unknown: str | None = None,
+    *,
+    is_resized: bool = True,
 ) -> dict[str, Any]:
     """
     Return settings whose generator solves for a number of photosites.
@@ -136,32 +171,28 @@ def with_n_sites(
     By default, rasters have the field of the present layout, and other pitches; of other generators, one parameter is solved
     for.
 
-    ``layout``: present layout of the settings. ``unknown``: parameter of :func:`unknowns_of` that is solved for. Raises
-    ParameterError when the layout has no generator, or its generator has no such parameter.
+    ``layout``: that of the generator, see :func:`generated_layout`. ``unknown``: parameter of :func:`unknowns_of` that is
+    solved for. ``is_resized``: whether the other parameters of a raster are derived from the layout. Raises ParameterError
+    when the layout has no generator, or its generator has no such parameter.
     """
     if not is_generated(settings):
         raise ParameterError("layout", "must have a generator, whose number of photosites can be chosen")
     found = copy.deepcopy(dict(settings))
     name = found["layout"]["generator"]
     parameters = found["layout"].setdefault("parameters", {})
+    parameters.pop("n_sites", None)
     solvable = _solvable(name)
-    given = [each.name for each in solvable if parameters.get(each.name) is not None and unknown in (None, each.name)]
     if name in RASTERS:
-        x0_um, y0_um, x1_um, y1_um = layout.bounds_um
-        replaced = {*RASTERS[name], "pitch_um", "pitch_y_um"}
-        if unknown == COLUMNS:
-            replaced = {*RASTERS[name], "size_um"}
-            if parameters.get("pitch_um") is None:
-                n_columns = _generated_parameters(settings, layout).get(RASTERS[name][0]) or 1
-                parameters["pitch_um"] = round((x1_um - x0_um) / n_columns, 6)
-        elif parameters.get("size_um") is None:
-            parameters["size_um"] = [round(x1_um - x0_um, 6), round(y1_um - y0_um, 6)]
-        candidates = [{key: value for key, value in parameters.items() if key not in replaced}]
-    elif solvable and (parameters.get("n_sites") is None or unknown is not None or len(given) == len(solvable)):
+        candidates = (
+            list(_raster_candidates(name, parameters, layout, n_sites, unknown)) if is_resized else [parameters]
+        )
+    elif solvable:
+        given = [
+            each.name for each in solvable if parameters.get(each.name) is not None and unknown in (None, each.name)
+        ]
         if not given and unknown is None:
             raise ParameterError("layout", f"of {name} must contain {' or '.join(each.name for each in solvable)}")
-        others = given or [unknown]
-        candidates = [{key: value for key, value in parameters.items() if key != other} for other in others]
+        candidates = [_but(parameters, other) for other in given or [str(unknown)]]
     else:
         candidates = [parameters]
     chosen = candidates[0] | {"n_sites": n_sites}
@@ -171,14 +202,93 @@ def with_n_sites(
     return found
 
 
+def _raster_candidates(
+    generator: str, parameters: Mapping[str, Any], layout: Layout, n_sites: int, unknown: str | None
+) -> Iterator[dict[str, Any]]:
+    """Yield parameters of a raster without its number of sites, the best ones first."""
+    columns, rows = RASTERS[generator]
+    generated = _parameters_of(layout)
+    n_columns, n_rows = generated.get(columns) or 1, generated.get(rows)
+    x0_um, y0_um, x1_um, y1_um = layout.bounds_um
+    width_um, height_um = x1_um - x0_um, y1_um - y0_um
+    pitch_um = generated.get("pitch_um") or width_um / n_columns
+    if generator != "octagonal":  # whose rows alternate with diamonds
+        if generated.get("pitch_um") is None and n_columns > 1:
+            pitch_um = float(np.hypot(*(layout.centroid_um[1] - layout.centroid_um[0])))
+        n_rows = n_rows or max(1, round(layout.n_sites / n_columns))
+    if unknown == COLUMNS:
+        kept = _but(parameters, columns, rows, "size_um") | {"pitch_um": round(pitch_um, 6)}
+        if n_rows is not None:
+            yield kept | {rows: max(1, round(n_rows * math.sqrt(n_sites / layout.n_sites)))}
+        yield kept
+        return
+    kept = _but(parameters, columns, rows, "pitch_um", "pitch_y_um")
+    if parameters.get("size_um") is not None:
+        yield kept
+        return
+    if generator == "grid":  # outlines are smaller than the cells
+        width_um, height_um = n_columns * pitch_um, (n_rows or n_columns) * (generated.get("pitch_y_um") or pitch_um)
+        yield kept | {"size_um": [round(width_um, 6), round(height_um, 6)]}
+    for margin in MARGINS:
+        yield kept | {"size_um": [round(width_um + margin * pitch_um, 6), round(height_um + margin * pitch_um, 6)]}
+
+
 def _nearest(generator: str, candidates: list[dict[str, Any]], n_sites: int) -> dict[str, Any] | None:
-    """Return the first parameters with a possible number of sites near the given one."""
+    """Return parameters with a possible number of sites, of rasters the nearest."""
     for percent in sorted(range(-MAX_PERCENT, MAX_PERCENT + 1), key=abs):
+        found: list[tuple[int, dict[str, Any]]] = []
         for parameters in candidates:
-            with suppress(FoveasimError):
-                layout = LAYOUTS[generator](**{**parameters, "n_sites": round(n_sites * (1.0 + 0.01 * percent))})
-                return parameters | {"n_sites": layout.n_sites if percent else n_sites}
+            with suppress(FoveasimError, TypeError):
+                wanted = max(1, round(n_sites * (1.0 + 0.01 * percent)))
+                layout = _generate(generator, parameters | {"n_sites": wanted})
+                found.append(
+                    (abs(layout.n_sites - n_sites), parameters | {"n_sites": layout.n_sites if percent else n_sites})
+                )
+                if layout.n_sites == n_sites or generator not in RASTERS:
+                    break
+        if found:
+            return min(found, key=lambda each: each[0])[1]
     return None
+
+
+def _generate(generator: str, parameters: Mapping[str, Any]) -> Layout:
+    """Return a layout; its warnings are those of the simulation that follows."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return LAYOUTS[generator](**parameters)
+
+
+def _with_solved(settings: Mapping[str, Any], layout: Layout) -> dict[str, Any]:
+    """Return settings with the solved parameters instead of the number of sites."""
+    found = copy.deepcopy(dict(settings))
+    parameters, generated = found["layout"].setdefault("parameters", {}), _parameters_of(layout)
+    parameters.pop("n_sites", None)
+    for solvable in _solvable(found["layout"]["generator"]):
+        if parameters.get(solvable.name) is None and generated.get(solvable.name) is not None:
+            parameters[solvable.name] = generated[solvable.name]
+    return found
+
+
+def _without_n_sites(settings: Mapping[str, Any], layout: Layout) -> dict[str, Any]:
+    """Return settings without the number of sites; rasters lack a parameter."""
+    if settings["layout"]["generator"] in RASTERS:
+        return _without(settings, "n_sites")
+    return _with_solved(settings, layout)
+
+
+def _without(settings: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Return settings without a parameter of the generator."""
+    found = copy.deepcopy(dict(settings))
+    found["layout"]["parameters"].pop(name, None)
+    return found
+
+
+def _but(parameters: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    return {key: value for key, value in parameters.items() if key not in names}
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and value > 0
 
 
 def _solvable(generator: str) -> tuple[Any, ...]:
@@ -187,19 +297,9 @@ def _solvable(generator: str) -> tuple[Any, ...]:
     return found
 
 
-def _generated_parameters(settings: Mapping[str, Any], layout: Layout) -> dict[str, Any]:
-    """Return the parameters of the layout's generator with those that it solved for."""
-    provenance = layout.provenance
-    is_same = provenance.get("generator") == settings["layout"]["generator"]
-    return dict(provenance.get("parameters") or {}) if is_same else {}
-
-
-def _count(settings: Mapping[str, Any], layout: Layout) -> int:
-    """Return the number of sites that the generator gives, without edits."""
-    name, parameters = settings["layout"]["generator"], settings["layout"]["parameters"]
-    if not settings["layout"].get("edits") or LAYOUTS[name].picture is not None:  # type: ignore[attr-defined]
-        return layout.n_sites
-    return int(LAYOUTS[name](**parameters).n_sites)
+def _parameters_of(layout: Layout) -> dict[str, Any]:
+    """Return the parameters of a layout's generator with those that it solved for."""
+    return dict(layout.provenance.get("parameters") or {})
 
 
 def _label(name: str) -> str:

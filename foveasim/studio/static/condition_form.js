@@ -61,16 +61,16 @@ export class ConditionForm {
     const name = this.measure.value, about = this.measures.find((each) => each.name === name);
     /** @type {{ [key: string]: unknown }} */
     const requirement = { measure: name };
-    const number = (field, what) => {
-      const found = numberOf(field.value, "");
+    const number = (field, what, unit = "µm") => {
+      const found = numberOf(field.value, unit);
       if (!Number.isFinite(found)) throw new Error("Enter " + what + " as a number");
       return found;
     };
     try {
-      const value = number(this.value, "the value");
+      const value = number(this.value, "the value", about?.unit ?? "");
       if (this.limit.value !== "at_most") requirement.at_least = value;
       if (this.limit.value !== "at_least") requirement.at_most = value;
-      if (name === "mtf") requirement.frequency_per_mm = number(this.frequency, "the spatial frequency");
+      if (name === "mtf") requirement.frequency_per_mm = number(this.frequency, "the spatial frequency", "");
       if (about?.has_region) this._readRegion(requirement, number);
     } catch (error) {
       return { problem: error instanceof Error ? error.message : String(error) };

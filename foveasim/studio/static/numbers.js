@@ -5,7 +5,7 @@ const PREFIXES = { G: 1e9, M: 1e6, k: 1e3, "": 1, c: 1e-2, m: 1e-3, µ: 1e-6, μ
 const BASES = { s: ["", "s"], V: ["", "V"], F: ["", "F"], m: ["", "m"], mm: ["m", "m"], µm: ["µ", "m"], nm: ["n", "m"],
   "Gbit/s": ["G", "bit/s"] };
 // Other spellings of units without prefixes.
-const SPELLINGS = { degrees: ["°", "deg", "degree", "degrees"], "e-": ["e", "e-", "e−"], lx: ["lx", "lux"], "%": ["%"] };
+const SPELLINGS = { degrees: ["°", "deg", "degree", "degrees"], "e-": ["e", "e-", "e−"], lx: ["lx", "lux"], lux: ["lx", "lux"] };
 
 // Value of an arithmetic expression of numbers, + - * / × ÷ and parentheses; NaN if it is none.
 /** @type {(text: string) => number} */

@@ -1,12 +1,10 @@
 // Goal seek: the value of a setting at which a result meets a condition, with the curve of results.
 
-import { quantity } from "/web/colours.js";
 import { make, notice } from "/web/page_parts.js";
 import { addFiles } from "../chart_files.js";
 import { CurveChart } from "../charts.js";
 import { ConditionForm } from "../condition_form.js";
-
-const figure = (value, unit) => quantity(Number.isInteger(value) ? value : Number(value.toPrecision(4)), unit === "fraction" ? "" : unit);
+import { figure } from "./requirements.js";
 
 export function create(root, studio) {
   const form = new ConditionForm(studio.page), setting = make("select"), solve = make("button", "Solve");
@@ -24,6 +22,9 @@ export function create(root, studio) {
   /** @type {CurveChart | null} */
   let chart = null;
   let names = "";
+  // Number of the last message, until it is answered.
+  /** @type {number | null} */
+  let asked = null;
   // The settings that are numbers.
   const list = () => {
     const rows = [...studio.controls.rows.values()].filter(({ control: { kind } }) => kind === "number" || kind === "integer");
@@ -38,7 +39,7 @@ export function create(root, studio) {
     const { requirement, problem } = form.read();
     if (problem) { notice(problem); return; }
     text.textContent = "seeking…";
-    studio.connection.send({ do: "seek", key: setting.value, requirement });
+    asked = studio.connection.send({ do: "seek", key: setting.value, requirement });
   });
   form.value.addEventListener("keydown", (event) => { if (event.key === "Enter") solve.click(); });
   // The measures are those of the requirements.
@@ -50,14 +51,16 @@ export function create(root, studio) {
       list();
       const about = studio.views.parts.requirements?.about;
       if (about) form.use(about.measures);
-      const problem = studio.state.errors.seek || (text.textContent === "seeking…" && Object.values(studio.state.errors)[0]);
-      if (problem) text.textContent = problem;
+      if (asked === null || (studio.state.id ?? 0) < asked) return;
+      text.textContent = studio.state.id === asked ? Object.values(studio.state.errors)[0] || "Cancelled." : "";
+      asked = null;
     },
     // Shows the answer of the server.
     show(found) {
+      asked = null;
       text.textContent = found.label + " of " + figure(found.value, found.unit) + ": " + found.subject + " "
         + figure(found.result, found.result_unit);
-      const points = found.curve.filter((point) => point[1] !== null), xs = points.map((point) => point[0]);
+      const points = found.curve.filter((point) => Number.isFinite(point[1])), xs = points.map((point) => point[0]);
       frame.replaceChildren();
       const isLog = xs[0] > 0 && xs[xs.length - 1] / xs[0] >= 50;
       chart = new CurveChart(frame, { nameX: found.label, nameY: found.measure, label: "Goal seek", log: isLog ? "x" : "" });

@@ -4,8 +4,11 @@ import { quantity } from "/web/colours.js";
 import { make, notice } from "/web/page_parts.js";
 import { ConditionForm } from "../condition_form.js";
 
-const figure = (value, unit) => (value === null ? "–"
-  : quantity(Number.isInteger(value) ? value : Number(value.toPrecision(4)), unit === "fraction" ? "" : unit));
+// Results may be infinite, or have no value.
+export function figure(value, unit) {
+  if (typeof value !== "number") return value === ".inf" ? "∞" : value === "-.inf" ? "−∞" : "–";
+  return quantity(Number.isInteger(value) ? value : Number(value.toPrecision(4)), unit === "fraction" ? "" : unit);
+}
 
 export function create(root, studio) {
   const list = make("ul", undefined, "requirements"), form = new ConditionForm(studio.page), add = make("button", "Add");
