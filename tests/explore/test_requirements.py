@@ -297,7 +297,7 @@ def test_all_measures_have_words():
 
 
 @pytest.mark.parametrize("setting", ["optics.f_number", "exposure_s"])
-def test_whole_numbers_are_no_integers(setting):
+def test_numbers_of_files_are_continuous(setting):
     """A value such as 4 in a file does not restrict the solution."""
     settings = {**SHOT, "optics": {"focal_length_mm": 8, "f_number": 4}, "exposure_s": 1}
     found = explore.solve(

@@ -255,7 +255,9 @@ def test_unknowns_keep_number_and_field(of_layout, generator, parameters, edits)
         state = recorder.do(do="solve", name=name, id=k)
         assert state["errors"] == {}
         assert state["summary"]["n_sites"] == before["n_sites"]
-        assert state["summary"]["width_um"] == pytest.approx(before["width_um"], rel=0.03)
+        # The outermost ring of log-polar layouts ends at the last complete one.
+        tolerance = 0.15 if generator == "log_polar" else 0.03
+        assert state["summary"]["width_um"] == pytest.approx(before["width_um"], rel=tolerance)
 
 
 def test_numbers_are_the_nearest_possible_ones(of_layout):
