@@ -55,6 +55,7 @@ def test_worst_problem_and_badges_are_visible(visit):
     assert "saturated" in page.get_attribute("#worst-text", "title")
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("kind", ["picture", "siemens_star"])
 def test_fit_scene_covers_all_photosites(visit, kind):
     page = visit()
@@ -99,6 +100,7 @@ def test_first_tiles_have_content(visit):
 # -- charts ---------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("most", [1, 7, 912, 3890, 14_208, 1_000_000])
 def test_root_axes_have_round_ticks(visit, most):
     page = visit()
@@ -191,6 +193,7 @@ def test_silent_server_is_not_shown_as_ready(visit, server):
     assert not page.evaluate("document.body.classList.contains('silent')")
 
 
+@pytest.mark.slow
 def test_change_of_a_broken_connection_is_repeated(browser, tmp_path, visit):
     own = Server(tmp_path)
     try:
@@ -343,6 +346,7 @@ def test_fields_accept_written_numbers(visit):
     assert "f_number" in page.inner_text(".control[data-key='optics.f_number'] .error")
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("words", "key"),
     [
@@ -423,6 +427,7 @@ def test_charts_compare_pinned_photosites(visit):
     assert {name: labels(page, name) for name in typical} == typical
 
 
+@pytest.mark.slow
 def test_photosites_are_kept_by_keyboard(visit):
     page = visit(width=1920, height=1080)
     button = page.locator("#compare-site")
@@ -434,6 +439,7 @@ def test_photosites_are_kept_by_keyboard(visit):
     until(page, "() => studio.isReady && studio.page.kept.length === 0")
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(("tile", "n_columns"), [("snr", 3), ("histogram", 3), ("mtf", 3)])
 def test_charts_are_saved_as_files(visit, tmp_path, tile, n_columns):
     page = visit(width=1920, height=1080)

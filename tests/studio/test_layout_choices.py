@@ -26,6 +26,7 @@ def choose(recorder, label, **message):
 # -- filters ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("other", WITHOUT_MOSAIC)
 def test_colouring_ends_with_its_generator(recorder, settings, other):
     before = choose(recorder, "grid")["settings"]["layout"]
@@ -100,6 +101,7 @@ SOLVING = [
 ]
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize(("name", "unknown"), SOLVING)
 def test_generators_solve_for_every_unknown(name, unknown):
     settings = generated(name)
@@ -191,6 +193,7 @@ def test_controls_have_the_unknown(settings):
 # -- rules --------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("name", list(LAYOUTS))
 def test_generators_start_without_violations(name):
     """With the rules and the filters of the demo."""
@@ -205,6 +208,7 @@ def test_generators_start_without_violations(name):
         recorder.session.close()
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("name", [name for name in bundled_layouts() if name != "spectral_16"])
 def test_bundled_layouts_lie_in_the_image(name):
     """At the gaze of the demo, which is off the axis."""
@@ -232,6 +236,7 @@ def of_layout(make_session, settings):
     return make
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize(
     ("generator", "parameters", "edits"),
     [
