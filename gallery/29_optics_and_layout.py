@@ -273,7 +273,7 @@ def draw_designs(designs: Mapping[str, Design], estimates: Mapping[str, Sequence
             below.set_yticklabels([])
     bar_um = 10.0
     axes[1, 0].plot((-12.0, -12.0 + bar_um), (-12.0, -12.0), color="black", linewidth=2.5, solid_capstyle="butt")
-    axes[1, 0].text(-12.0 + 0.5 * bar_um, -11.2, f"{bar_um:g} µm", ha="center", va="bottom", fontsize="small")
+    axes[1, 0].text(-12.0 + 0.5 * bar_um, -11.2, f"{bar_um:g} µm", ha="center", va="bottom")
     return figure
 
 
