@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Literal
 
+import numpy as np
+
 from foveasim._core.validation import Floats
-from foveasim.units import decode_srgb
+from foveasim.units import decode_srgb, encode_srgb
 
 #: sRGB (photographs), the square root of the radiance (the paper), linear radiance.
 Encoding = Literal["srgb", "sqrt", "linear"]
@@ -20,3 +22,10 @@ def decode(values: Floats, encoding: Encoding) -> Floats:
     if encoding == "sqrt":
         return values * values
     return decode_srgb(values) if encoding == "srgb" else values
+
+
+def encode(value: Floats, encoding: Encoding) -> Floats:
+    """Encode relative radiance >= 0: the inverse of :func:`decode`."""
+    if encoding == "sqrt":
+        return np.sqrt(value)
+    return encode_srgb(value) if encoding == "srgb" else value

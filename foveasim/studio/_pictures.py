@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._io.encodings import Encoding, decode
+from foveasim._io.encodings import Encoding, decode, encode
 from foveasim._io.images import read_picture, write_picture
 from foveasim.config import Shot
-from foveasim.units import encode_srgb
 
 #: Pixels of a reduced picture per side of the smallest photosite, and per λN.
 PER_SITE, PER_LAMBDA_N = 3.0, 4.0
@@ -81,13 +80,6 @@ def _block_means(pixels: NDArray[Any], block: int, encoding: Encoding) -> NDArra
             values = decode(np.maximum(values, 0.0).astype(np.float64), encoding) if table is None else table[values]
             values = values if alpha is None else values * alpha
             means[row, :, channel] = values.mean(axis=(0, 2), dtype=np.float64)
-    means = _encode(means, encoding)
+    means = encode(means.astype(np.float64), encoding).astype(np.float32)
     found = means[..., 0] if n_colours == 1 else means
     return np.rint(np.clip(found, 0.0, 1.0) * 65535.0).astype(np.uint16) if has_integers else found
-
-
-def _encode(radiance: NDArray[np.float32], encoding: Encoding) -> NDArray[np.float32]:
-    """Return the inverse of :func:`foveasim._io.encodings.decode`."""
-    if encoding == "sqrt":
-        return np.sqrt(radiance)
-    return encode_srgb(radiance.astype(np.float64)).astype(np.float32) if encoding == "srgb" else radiance
