@@ -49,7 +49,7 @@ HELLO_S = 10.0
 #: Simultaneous connections; further ones receive 503.
 MAX_CONNECTIONS = 256
 #: Simultaneous connections that have not sent the token; the oldest ones are closed.
-MAX_STRANGERS = 64
+MAX_UNAUTHENTICATED = 64
 #: Largest number of messages that wait for a slow connection.
 MAX_OUTGOING = 1000
 #: Longest time that a simulation delays the thread that sends messages.
@@ -101,7 +101,7 @@ class Studio:
         self.start, self.hosts = start, hosts
         self.token = token or secrets.token_urlsafe(24)
         self.sessions: dict[str, Session] = {}
-        self.strangers = _Strangers()
+        self.unauthenticated = _Unauthenticated()
         routes = [
             Route("/", self._index),
             Route("/static/{name}", self._static),
@@ -185,7 +185,7 @@ class Studio:
             if not isinstance(first, dict) or not self._is_token(first.get("token")):
                 await socket.close(WRONG_TOKEN, "wrong token")
                 return
-            self.strangers.remove(socket.client)
+            self.unauthenticated.remove(socket.client)
             session, is_new = self.session(first.get("session"), first.get("page"))
             if session is None:
                 await socket.close(TOO_MANY, "too many sessions")
@@ -206,7 +206,7 @@ class Studio:
         except (WebSocketDisconnect, TimeoutError, KeyError, RuntimeError):
             pass  # disconnected, silent, or a first message in binary
         finally:
-            self.strangers.remove(socket.client)
+            self.unauthenticated.remove(socket.client)
             if session is not None and outgoing is not None:
                 session.detach(outgoing.put)
             if sender is not None:
@@ -226,7 +226,7 @@ class Studio:
         scheme, _, token = request.headers.get("authorization", "").partition(" ")
         if scheme.lower() != "bearer" or not self._is_token(token.strip()):
             return _error("wrong token", 403)
-        self.strangers.remove(request.client)
+        self.unauthenticated.remove(request.client)
         session = self.sessions.get(request.headers.get("x-session", ""))
         return _error("unknown session; reload the page", 404) if session is None else session
 
@@ -272,11 +272,11 @@ class Studio:
         return Response(content, media_type="application/octet-stream", headers={"Content-Disposition": disposition})
 
 
-class _Strangers:
+class _Unauthenticated:
     """
     Connections that have not sent the token, from the oldest.
 
-    Beyond :data:`MAX_STRANGERS` the oldest ones are closed, so that silent connections do not block others.
+    Beyond :data:`MAX_UNAUTHENTICATED` the oldest ones are closed, so that silent connections do not block others.
     """
 
     def __init__(self) -> None:
@@ -288,7 +288,7 @@ class _Strangers:
         if not isinstance(peer, tuple):
             return
         self._transports[str(peer[0]), int(peer[1])] = transport
-        while len(self._transports) > MAX_STRANGERS:
+        while len(self._transports) > MAX_UNAUTHENTICATED:
             self._transports.pop(next(iter(self._transports))).abort()
 
     def remove(self, client: Any) -> None:
@@ -497,10 +497,10 @@ def serve(
     class Protocol(H11Protocol):
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
             super().connection_made(transport)
-            studio.strangers.add(transport)
+            studio.unauthenticated.add(transport)
 
         def connection_lost(self, exc: Exception | None) -> None:
-            studio.strangers.remove(self.client)
+            studio.unauthenticated.remove(self.client)
             super().connection_lost(exc)
 
     class Server(uvicorn.Server):
