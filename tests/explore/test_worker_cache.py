@@ -159,6 +159,7 @@ OTHERS = {
     "sensor.inl_dn": [0.0, 3.0, 0.0],
     "sensor.disabled": ["read"],
     "integration_order": 2,
+    "requirements": [{"measure": "n_sites", "at_least": 10.0}],
 }
 #: Sections as a whole.
 SECTIONS = {
