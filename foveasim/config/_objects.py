@@ -643,6 +643,28 @@ def _replace(path: Path, data: dict[str, Any], change: str) -> None:
     put_setting(path, data, key.strip(), resolve_files(Path(), parsed, key.strip()))
 
 
+def get_setting(settings: Mapping[str, Any], key: str) -> Any:
+    """
+    Return a value by its path, such as ``"sensor.bits"``; None if it is missing.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> settings = fs.config.read_settings(fs.config.demo_settings()[0])
+    >>> fs.config.get_setting(settings, "optics.focal_length_mm")
+    8.0
+    """
+    found: Any = settings
+    for name in key.split("."):
+        if isinstance(found, list) and name.isdecimal() and int(name) < len(found):
+            found = found[int(name)]
+        elif isinstance(found, Mapping) and name in found:
+            found = found[name]
+        else:
+            return None
+    return found
+
+
 def put_setting(source: Source | str | Path | None, data: dict[str, Any], key: str, value: Any) -> None:
     """
     Set a value by its path, such as ``"sensor.bits"``, in place.

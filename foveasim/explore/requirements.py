@@ -13,7 +13,6 @@ from foveasim._core.short_repr import short_repr
 from foveasim.camera import Camera
 from foveasim.capture import Capture
 from foveasim.config import Requirement, Shot
-from foveasim.config._requirements import RESULTS
 from foveasim.errors import SimulationError
 from foveasim.explore._metrics import METRICS
 from foveasim.explore.metrics.psnr import PSNR_PIXELS, picture_psnr_db
@@ -253,6 +252,3 @@ def requirements(shot: Shot, camera: Camera, capture: Capture) -> dict[str, Any]
     found = check_requirements(shot, capture)
     margins = {f"margin_{k}": checked.margin for k, checked in enumerate(found, 1)}
     return {"are_met": float(all(checked.is_met for checked in found)), **margins}
-
-
-assert set(_FUNCTIONS) == set(RESULTS)

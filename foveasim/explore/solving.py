@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from foveasim._core.short_repr import short_repr
-from foveasim.config import Requirement, Source, check_settings, put_setting, read_settings
-from foveasim.errors import ConfigError, FoveasimError, ParameterError, SimulationError
+from foveasim.config import Requirement, Source, get_setting, put_setting, read_settings
+from foveasim.errors import FoveasimError, ParameterError, SimulationError
 from foveasim.explore.requirements import measure
-from foveasim.explore.sweeps.plan import copy_settings
+from foveasim.explore.sweeps.plan import copy_settings, takes_integers
 from foveasim.explore.worker_cache import ShotRunner
 
 __all__ = ["Solution", "search_value", "solve"]
@@ -71,7 +71,7 @@ def solve(
         Path of a number, such as ``"exposure_s"`` or ``"layout.parameters.n_sectors"``. Without a present number, the
         solution is the nearest to the middle of the range.
     requirement : Requirement
-        Equal limits demand a result that equals them within 0.1 %, or the nearest one of an integer setting.
+        Equal limits demand a result that equals them within 0.1 %; where results have steps, the nearest one is accepted.
     bounds : (low, high)
         Range of the setting.
 
@@ -109,7 +109,7 @@ def solve(
         return measure(requirement, *runner.simulate_capture(changed))
 
     present = _number_at(settings, setting, bounds)
-    is_integer = _is_integer(source, settings, setting)
+    is_integer = takes_integers(source, settings, setting)
     return search_value(setting, present, requirement, result_at, bounds=bounds, is_integer=is_integer)
 
 
@@ -250,25 +250,9 @@ def _position(value: float, low: float, high: float) -> float:
 
 def _number_at(settings: Mapping[str, Any], setting: str, bounds: tuple[float, float]) -> float:
     """Return the present number of a setting; for none, or a text, the middle of its range."""
-    value: Any = settings
-    for name in setting.split("."):
-        if isinstance(value, list):
-            value = value[int(name)] if name.isdecimal() and int(name) < len(value) else None
-        else:
-            value = value.get(name) if isinstance(value, Mapping) else None
+    value = get_setting(settings, setting)
     if value is None or (setting == "exposure_s" and isinstance(value, str)):
         return math.sqrt(bounds[0] * bounds[1]) if bounds[0] > 0.0 else 0.5 * (bounds[0] + bounds[1])
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ParameterError("setting", "must be the path of a number in the settings", setting)
     return value
-
-
-def _is_integer(source: Source, settings: Mapping[str, Any], setting: str) -> bool:
-    """Return whether a setting accepts only integers."""
-    changed = copy_settings(dict(settings))
-    put_setting(source, changed, setting, 2.5)
-    try:
-        check_settings(source, changed)
-    except ConfigError as error:
-        return "integer" in error.detail
-    return False

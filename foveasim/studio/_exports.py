@@ -15,12 +15,11 @@ from typing import Any
 
 from foveasim import __version__
 from foveasim._io.yaml_files import format_yaml
-from foveasim.config import to_python
+from foveasim.config import get_setting, to_python
 from foveasim.errors import FoveasimError, ParameterError, printable
 from foveasim.layout import Layout, write_layout
 from foveasim.studio._messages import to_json
 from foveasim.studio._settings.changes import changed_keys
-from foveasim.studio._settings.controls import value_at
 
 #: Date of the files in archives, so that equal states have equal archives; the earliest that the format can represent.
 DATE = (1980, 1, 1, 0, 0, 0)
@@ -60,7 +59,7 @@ def log_of(states: Sequence[Mapping[str, Any]]) -> str:
     lines = []
     for number, (before, after) in enumerate(pairwise(states), 1):
         keys = changed_keys(after, before)
-        changes = [f"{key}: {_short(value_at(before, key))} → {_short(value_at(after, key))}" for key in keys]
+        changes = [f"{key}: {_short(get_setting(before, key))} → {_short(get_setting(after, key))}" for key in keys]
         lines.append(f"{number}. {'; '.join(changes)}")
     return "\n".join(lines)
 

@@ -19,7 +19,7 @@ from typing import Any
 from foveasim._core.work_arrays import release_memory
 from foveasim._io.atomic import atomic_write
 from foveasim._io.yaml_files import format_yaml
-from foveasim.config import RESULTS, Requirement, check_settings, put_setting, validate
+from foveasim.config import RESULTS, Requirement, check_settings, get_setting, put_setting, validate
 from foveasim.errors import ParameterError, SimulationError, printable
 from foveasim.explore import measure
 from foveasim.explore.solving import search_value
@@ -55,7 +55,7 @@ from foveasim.studio._settings.changes import (
     string_of,
     with_file,
 )
-from foveasim.studio._settings.controls import chosen_value, controls_of, structure_of, value_at
+from foveasim.studio._settings.controls import chosen_value, controls_of, structure_of
 from foveasim.studio._settings.unknowns import (
     PARAMETERS,
     balanced,
@@ -515,7 +515,7 @@ class Session:
         if not isinstance(wanted, dict):
             raise ParameterError("requirement", "must be a mapping")
         requirement: Requirement = validate(None, Requirement, wanted)
-        present = value_at(settings, key)
+        present = get_setting(settings, key)
         if is_exposure and not isinstance(present, int | float):
             present = self.result.shot.exposure_s
         if present is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ import foveasim as fs
 from foveasim import explore
 from foveasim.cli import app
 from foveasim.config import RESULTS, Requirement, build_shot
+from foveasim.config._requirements import MeasureName
 from foveasim.errors import ConfigError, ParameterError, SimulationError
+from foveasim.explore.requirements import _FUNCTIONS
 from foveasim.explore.solving import search_value
 
 SHOT = {
@@ -287,7 +290,7 @@ def test_unreachable_goals_state_the_range():
 
 
 def test_all_measures_have_words():
-    assert set(RESULTS) == set(Requirement.__annotations__ and RESULTS)
+    assert set(get_args(MeasureName)) == set(RESULTS) == set(_FUNCTIONS)
     for name in RESULTS:
         options = {"frequency_per_mm": 10.0} if name == "mtf" else {}
         assert str(Requirement(measure=name, at_least=1.0, **options)).endswith(

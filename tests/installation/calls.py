@@ -386,6 +386,7 @@ CALLS = {
     ),
     "config.demo_settings": lambda o: config.demo_settings(),
     "config.picture_path": lambda o: config.picture_path(with_settings_files(o), "photos/cats/1.png", "scene.picture"),
+    "config.get_setting": lambda o: config.get_setting(SHOT, "sensor.bits"),
     "config.put_setting": lambda o: config.put_setting(None, json.loads(json.dumps(SHOT)), "sensor.bits", 10),
     "config.read_any_layout": lambda o: config.read_any_layout(next(iter(config.bundled_layouts()))),
     "config.read_layout_file": lambda o: config.read_layout_file(next(iter(config.bundled_layouts().values()))),

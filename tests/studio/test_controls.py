@@ -6,10 +6,10 @@ import json
 
 import pytest
 
-from foveasim.config import build_shot, check_settings, schema
+from foveasim.config import build_shot, check_settings, get_setting, schema
 from foveasim.studio._files import start_settings
 from foveasim.studio._settings import controls as _controls
-from foveasim.studio._settings.controls import chosen_value, controls_of, structure_of, value_at
+from foveasim.studio._settings.controls import chosen_value, controls_of, structure_of
 
 KINDS = {"number", "integer", "choice", "boolean", "text", "list", "group", "sections"}
 
@@ -72,7 +72,7 @@ def test_ranges_contain_values(demo, controls):
     assert len(numbers) > 40
     for control in numbers:
         low, high = control["suggested"]
-        value = value_at(demo, control["key"])
+        value = get_setting(demo, control["key"])
         assert low < high, control
         assert control["scale"] == "linear" or low > 0.0
         assert value is None or low <= value <= high, control
@@ -166,7 +166,7 @@ def test_sections_of_lists_have_controls(demo):
     assert by_id(controls, "layout.edits.0.margin_um")["kind"] == "number"
     assert by_id(controls, "layout.edits.1.overlap")["kind"] == "choice"
     assert [control["label"] for control in controls if control.get("is_item")] == ["1. inset", "2. draw"]
-    assert value_at(settings, "layout.edits.0.margin_um") == 0.2
+    assert get_setting(settings, "layout.edits.0.margin_um") == 0.2
     assert structure_of(settings) != structure_of({**settings, "layout": {**settings["layout"], "edits": edits[:1]}})
 
 

@@ -17,9 +17,9 @@ from foveasim._core.names import did_you_mean, possible_names
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import check_count
 from foveasim._io.yaml_files import read_yaml
-from foveasim.config import Source, check_settings, put_setting, resolve_files, validate
+from foveasim.config import Source, put_setting, resolve_files, validate
 from foveasim.config._models import Section
-from foveasim.errors import ConfigError, ParameterError
+from foveasim.errors import ParameterError
 from foveasim.explore._metrics import METRICS, OTHER_METRICS, Metric, add_metrics, has_result, resolve_metrics
 from foveasim.explore.sweeps.plan import (
     MAX_POINTS,
@@ -27,6 +27,7 @@ from foveasim.explore.sweeps.plan import (
     check_disjoint,
     copy_settings,
     plan_sweep,
+    takes_integers,
     with_file_context,
 )
 
@@ -375,11 +376,7 @@ def _typed_range(plan: Plan, path: str, search_range: Search) -> Search:
     low, *others = _bounds(path, search_range)
     if isinstance(search_range, list) or not all(isinstance(bound, int) for bound in (low, *others)):
         return search_range
-    settings: dict[str, Any] = copy_settings(plan.settings)
-    put_setting(plan.source, settings, path, low + 0.5)
-    try:
-        check_settings(plan.source, settings)
-    except ConfigError:
+    if takes_integers(plan.source, plan.settings, path, low + 0.5):
         return search_range
     if isinstance(search_range, Mapping):
         return {key: float(value) if key in {"from", "to"} else value for key, value in search_range.items()}

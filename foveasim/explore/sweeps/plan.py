@@ -568,3 +568,18 @@ def copy_settings(data: Any) -> Any:
     if isinstance(data, dict):
         return {key: copy_settings(value) for key, value in data.items()}
     return [copy_settings(value) for value in data] if isinstance(data, list) else data
+
+
+def takes_integers(source: Source, settings: Mapping[str, Any], path: str, probe: Any = 2.5) -> bool:
+    """
+    Return whether a setting accepts only integers.
+
+    ``probe``: a number in its range that is not an integer.
+    """
+    changed = copy_settings(dict(settings))
+    put_setting(source, changed, path, probe)
+    try:
+        check_settings(source, changed)
+    except ConfigError as error:
+        return "integer" in error.detail
+    return False

@@ -6,12 +6,12 @@ import copy
 from collections.abc import Mapping
 from typing import Any
 
-from foveasim.config import put_setting
+from foveasim.config import get_setting, put_setting
 from foveasim.config._models import expand_preset
 from foveasim.errors import ParameterError, printable
 from foveasim.sensor import PRESETS
 from foveasim.studio._files import Files, with_layout
-from foveasim.studio._settings.controls import controls_of, value_at
+from foveasim.studio._settings.controls import controls_of
 from foveasim.studio._settings.templates import WITHOUT_MOSAIC
 
 #: Messages that change the settings.
@@ -87,12 +87,12 @@ def check_depth(value: Any, depth: int = 0) -> Any:
 def reset(settings: dict[str, Any], start: Mapping[str, Any], key: str) -> dict[str, Any]:
     """Return settings with the initial value of a key, or without it."""
     found = copy.deepcopy(settings)
-    value = value_at(start, key)
+    value = get_setting(start, key)
     if value is not None:
         put_setting(None, found, key, copy.deepcopy(value))
         return found
     above, _, last = key.rpartition(".")
-    section: Any = value_at(found, above) if above else found
+    section: Any = get_setting(found, above) if above else found
     if isinstance(section, dict):
         section.pop(last, None)
     elif isinstance(section, list) and last.isdecimal() and int(last) < len(section):

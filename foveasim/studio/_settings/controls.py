@@ -11,12 +11,12 @@ from functools import lru_cache
 from typing import Any
 
 from foveasim._core.validation import UNIT_SUFFIXES
-from foveasim.config import bundled_layouts, schema
+from foveasim.config import bundled_layouts, get_setting, schema
 from foveasim.studio._settings.labels import words_of
 from foveasim.studio._settings.templates import INITIAL, PER_AREA, WITHOUT_MOSAIC, templates
 from foveasim.studio._settings.unknowns import PARAMETERS, unknown_of, unknowns_of
 
-__all__ = ["chosen_value", "controls_of", "structure_of", "value_at"]
+__all__ = ["chosen_value", "controls_of", "structure_of"]
 
 #: Ranges of sliders that annotations do not declare, by parameter: lowest and highest value; logarithmic if the lowest is
 #: positive and far below the highest.
@@ -119,18 +119,6 @@ def _with_unknown(controls: list[dict[str, Any]], settings: Mapping[str, Any]) -
     return [*controls[:first], solve, *controls[first:]]
 
 
-def value_at(settings: Any, key: str) -> Any:
-    """Return the value of a key such as ``"layout.edits.0.kind"``, None if it is missing."""
-    for name in key.split("."):
-        if isinstance(settings, list) and name.isdecimal() and int(name) < len(settings):
-            settings = settings[int(name)]
-        elif isinstance(settings, Mapping) and name in settings:
-            settings = settings[name]
-        else:
-            return None
-    return settings
-
-
 def structure_of(settings: Any, key: str = "") -> Any:
     """Return names, kinds and strings of settings, which determine the list of controls."""
     if isinstance(settings, Mapping):
@@ -214,7 +202,7 @@ def _controls(
                 yield from _parameters(root, item_key, section, found, item, start, depth)
         return
     if not sections:
-        yield {**control, **_simple(name, options, value, default, value_at(start, key))}
+        yield {**control, **_simple(name, options, value, default, get_setting(start, key))}
         return
     if len(sections) == 1 and len(options) == 1 and not control["is_optional"]:
         yield {**control, "kind": "group"}
@@ -224,7 +212,7 @@ def _controls(
         if selected is None and value is None and not isinstance(default, dict):
             value = default
         if selected is None and others and value is not None:
-            simple = _simple(name, others, value, default, value_at(start, key))
+            simple = _simple(name, others, value, default, get_setting(start, key))
             if simple["kind"] != "choice":  # names are alternatives of the control above
                 yield {**control, **simple}
     if selected is None and len(sections) == 1 and len(options) == 1 and not control["is_optional"]:
@@ -382,7 +370,7 @@ def _alternatives(
         choices.append({"label": "none", "value": None})
         selected = 0 if value is None else None
     name = key.rpartition(".")[2]
-    started = value_at(start, key)
+    started = get_setting(start, key)
     for option in options:
         is_selected = selected is None and _is_of(option, value)
         if not is_selected and (option.get("type") == "array" or set(option.get("required", ())) & FROM_FILES):

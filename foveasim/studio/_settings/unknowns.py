@@ -124,10 +124,9 @@ def balanced(
     """
     name = key.removeprefix(f"{PARAMETERS}.")
     unknowns = unknowns_of(settings)
-    same = (
-        is_generated(before) and before["layout"]["generator"] == settings["layout"]["generator"] if unknowns else False
-    )
-    layout = layout_of(before) if name != key and same else None
+    if not unknowns or name == key or not is_generated(before):
+        return settings
+    layout = layout_of(before) if before["layout"]["generator"] == settings["layout"]["generator"] else None
     if layout is None:
         return settings
     generator, parameters = settings["layout"]["generator"], settings["layout"].get("parameters") or {}
