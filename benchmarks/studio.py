@@ -1,7 +1,7 @@
 """
 Latency of the studio: from a message of the page until the last changed view has arrived, without a browser.
 
-    python benchmarks/studio.py             the demo with 14,208 photosites, and a layout of 200,000
+    python benchmarks/studio.py             the demo, and layouts of 200,000 and 1,000,000 photosites
     python benchmarks/studio.py --quick     5 changes instead of 50, without bounds
 """
 
@@ -23,19 +23,48 @@ from rich.console import Console
 
 from foveasim.studio._messages import decode_part
 
-#: Bounds of the median in ms, with the browser.
-SENSOR_MS, F_NUMBER_MS, LAYOUT_MS, LARGE_MS = 80.0, 150.0, 200.0, 600.0
 N_CHANGES, N_QUICK = 50, 5
-#: Changes by name: setting, its k-th value, and bound in ms.
-CHANGES: dict[str, tuple[str, Callable[[int], Any], float]] = {
-    "exposure": ("exposure_s", lambda k: 0.03 + 1e-4 * k, SENSOR_MS),
-    "read noise": ("sensor.read_noise_e", lambda k: 1.0 + 0.01 * k, SENSOR_MS),
-    "f-number": ("optics.f_number", lambda k: 2.8 + 0.01 * k, F_NUMBER_MS),
-    "gaze": ("gaze_um", lambda k: [-140.0 + k, 320.0], LAYOUT_MS),
-    "sectors": ("layout.parameters.n_sectors", lambda k: 192 - 2 * (k % 40), LAYOUT_MS),
+#: Sensors by number of photosites: settings that differ from the demo.
+SENSORS: dict[str, dict[str, Any]] = {
+    "14,208": {},
+    "200,000": {
+        "layout": {
+            "generator": "log_polar",
+            "parameters": {"n_sectors": 680, "min_size_um": 0.4, "r_max_um": 690.0, "stagger": True},
+            "mosaic": ["RG", "GB"],
+        },
+    },
+    "1,000,000": {
+        "layout": {
+            "generator": "grid",
+            "parameters": {"n_x": 1000, "n_y": 1000, "pitch_um": 1.0},
+            "mosaic": ["RG", "GB"],
+        },
+    },
 }
-#: A layout of 200,000 photosites.
-LARGE = {"generator": "grid", "parameters": {"n_x": 500, "n_y": 400, "pitch_um": 2.0}, "mosaic": ["RG", "GB"]}
+#: Settings by name: key, and its k-th value.
+SETTINGS: dict[str, tuple[str, Callable[[int], Any]]] = {
+    "exposure": ("exposure_s", lambda k: 0.03 + 1e-4 * k),
+    "read noise": ("sensor.read_noise_e", lambda k: 1.0 + 0.01 * k),
+    "f-number": ("optics.f_number", lambda k: 2.8 + 0.01 * k),
+    "gaze": ("gaze_um", lambda k: [-140.0 + k, 320.0]),
+    "sectors": ("layout.parameters.n_sectors", lambda k: 192 - 2 * (k % 40)),
+    "many sectors": ("layout.parameters.n_sectors", lambda k: 678 - 2 * (k % 4)),
+}
+#: Changes by number of photosites: name of the setting, bound of the median in ms for all views, and that for the map.
+CHANGES: dict[str, list[tuple[str, float, float | None]]] = {
+    "14,208": [
+        ("exposure", 45.0, None),
+        ("read noise", 45.0, None),
+        ("f-number", 90.0, None),
+        ("gaze", 90.0, None),
+        ("sectors", 150.0, None),
+    ],
+    "200,000": [("exposure", 150.0, None), ("gaze", 250.0, None), ("many sectors", 1500.0, 500.0)],
+    "1,000,000": [("exposure", 1000.0, None)],
+}
+#: Bound of the time until a layout of a number of photosites is shown, ms.
+SHOWN_MS = {"1,000,000": 8000.0}
 console = Console(width=130)
 
 
@@ -84,27 +113,21 @@ async def bench(report: Report, address: str, n: int) -> None:
                 if isinstance(message, str) and json.loads(message)["kind"] == "done":
                     return
 
-        async def measure(label: str, key: str, value: Callable[[int], Any], bound_ms: float) -> None:
-            first_ms, all_ms = await changes_ms(connection, key, value, n)
-            report.add(
-                label,
-                f"{all_ms:.0f} ms",
-                f"bound; values {first_ms:.0f} ms",
-                f"{bound_ms:g} ms",
-                all_ms / bound_ms,
-                1.0,
-            )
-
         await done()
-        for name, (key, value, bound_ms) in CHANGES.items():
-            await measure(f"14,208 photosites: {name}", key, value, bound_ms)
-        for key, value in (("scene.fit", "cover"), ("layout", LARGE)):
-            await connection.send(json.dumps({"do": "set", "key": key, "value": value, "final": True}))
-            await done()
-        key, change, _ = CHANGES["exposure"]
-        await measure("200,000 photosites: exposure", key, change, LARGE_MS)
-        key, change, _ = CHANGES["f-number"]
-        await measure("200,000 photosites: f-number", key, change, LARGE_MS)
+        for sensor, sections in SENSORS.items():
+            for key, section in sections.items():
+                await connection.send(json.dumps({"do": "set", "key": key, "value": section, "final": True}))
+                await done()
+            for name, bound_ms, _ in CHANGES[sensor]:
+                first_ms, all_ms = await changes_ms(connection, *SETTINGS[name], n)
+                report.add(
+                    f"{sensor} photosites: {name}",
+                    f"{all_ms:.0f} ms",
+                    f"bound; values {first_ms:.0f} ms",
+                    f"{bound_ms:g} ms",
+                    all_ms / bound_ms,
+                    1.0,
+                )
 
 
 def main() -> int:

@@ -1,7 +1,7 @@
 """
 The studio in Chromium: latency from a control to the drawn views, and a soak test with random changes.
 
-    python benchmarks/studio_browser.py                 medians of 50 changes; the demo, and 200,000 photosites
+    python benchmarks/studio_browser.py                 medians of 50 changes; 14,208 to 1,000,000 photosites
     python benchmarks/studio_browser.py --quick         5 changes, without bounds
     python benchmarks/studio_browser.py --soak 30       random changes for 30 minutes: memory, console, stale views, codes
 """
@@ -18,7 +18,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ import numpy as np
 from playwright.sync_api import Page, sync_playwright
 from report import Report
 from rich.console import Console
-from studio import CHANGES, LARGE, LARGE_MS, N_CHANGES, N_QUICK, start_server
+from studio import CHANGES, N_CHANGES, N_QUICK, SENSORS, SETTINGS, SHOWN_MS, start_server
 
 from foveasim.config import build_shot
 
@@ -160,21 +159,21 @@ class Studio:
 def measure_latency(studio: Studio, report: Report, n: int) -> None:
     """Add the latency of changes to the report."""
 
-    def measure(label: str, key: str, value: Callable[[int], Any], bound_ms: float) -> None:
-        times = [studio.page.evaluate(CHANGE, [key, value(k)]) for k in range(n + 2)][2:]
-        drawn_ms, all_ms = np.median(times, axis=0)
-        shown = f"bound; photosites {drawn_ms:.0f} ms"
-        report.add(label, f"{all_ms:.0f} ms", shown, f"{bound_ms:g} ms", all_ms / bound_ms, 1.0)
+    def add(label: str, time_ms: float, bound_ms: float, about: str = "bound") -> None:
+        report.add(label, f"{time_ms:.0f} ms", about, f"{bound_ms:g} ms", time_ms / bound_ms, 1.0)
 
-    for name, (key, value, bound_ms) in CHANGES.items():
-        measure(f"14,208 photosites: {name}", key, value, bound_ms)
-    large = [
-        {"do": "set", "key": key, "value": value, "final": True}
-        for key, value in (("scene.fit", "cover"), ("layout", LARGE))
-    ]
-    studio.send(large)
-    for name in ("exposure", "f-number"):
-        measure(f"200,000 photosites: {name}", *CHANGES[name][:2], LARGE_MS)
+    for sensor, sections in SENSORS.items():
+        for key, section in sections.items():
+            _, shown_ms = studio.page.evaluate(CHANGE, [key, section])
+            if sensor in SHOWN_MS:
+                add(f"{sensor} photosites: shown", shown_ms, SHOWN_MS[sensor])
+        for name, bound_ms, map_bound_ms in CHANGES[sensor]:
+            key, value = SETTINGS[name]
+            times = [studio.page.evaluate(CHANGE, [key, value(k)]) for k in range(n + 2)][2:]
+            drawn_ms, all_ms = np.median(times, axis=0)
+            add(f"{sensor} photosites: {name}", all_ms, bound_ms, f"bound; photosites {drawn_ms:.0f} ms")
+            if map_bound_ms is not None:
+                add(f"{sensor} photosites: {name}, the map", drawn_ms, map_bound_ms)
 
 
 def random_messages(rng: random.Random, studio: Studio) -> list[dict[str, Any]]:

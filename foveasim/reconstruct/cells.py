@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import Annotated, Any, TypeGuard
+from typing import Annotated, Any
 
 import numpy as np
 
 from foveasim._core.calls import Limits
 from foveasim._core.rings import TIE_FRACTION, site_moments
+from foveasim._core.threads import thread_count
 from foveasim._core.validation import Floats, Ints, as_numbers, check_memory, check_per_site, finite_array
 from foveasim.fields import Grid, PackedRings
-from foveasim.layout import Layout
-from foveasim.reconstruct.picture import MAX_CACHED, MAX_CACHED_SITES, Gaps, Picture, raster_of
+from foveasim.reconstruct.picture import Gaps, Picture, cached_by_layout, raster_of
 
 __all__ = ["cells", "fill_channels"]
 
@@ -91,8 +90,7 @@ def fill_channels(
     check_per_site("values", values, n_sites)
     check_per_site("channel", np.asarray(channel), n_sites)
     check_memory("n_channels", 8 * n_channels * n_sites, n_channels, "take fewer channels")
-    arguments = np.asarray(channel, np.int64).tobytes(), n_channels
-    neighbours = _neighbours_once(layout, *arguments) if _is_cached(layout) else _neighbours(layout, *arguments)
+    neighbours = _neighbours(layout, np.asarray(channel, np.int32).tobytes(), n_channels)
     filled = np.full((n_channels, values.size), np.nan)
     for c, (own, others, mean_of) in neighbours.items():
         filled[c, own] = values[own]
@@ -100,20 +98,17 @@ def fill_channels(
     return filled
 
 
-def _is_cached(layout: PackedRings) -> TypeGuard[Layout]:
-    """Return whether parts of a layout are cached: only of layouts, which are immutable."""
-    return isinstance(layout, Layout) and layout.n_sites <= MAX_CACHED_SITES
-
-
+# Captures of one layout share its neighbours.
+@cached_by_layout
 def _neighbours(layout: PackedRings, channels: bytes, n_channels: int) -> dict[int, tuple[Ints, Ints, Any]]:
     """
     Find the nearest sites of each channel for the sites of the others.
 
     Returns by channel: its sites, the other sites, and the weights of the former in the means of the latter, a sparse matrix
-    (n_other, n_own). ``channels`` are the bytes of the channels of the sites, int64.
+    (n_other, n_own). ``channels`` are the bytes of the channels of the sites, int32.
     """
     _, centroid_um = site_moments(layout.xy_um, layout.ring_offsets, layout.site_offsets)
-    channel = np.frombuffer(channels, np.int64)
+    channel = np.frombuffer(channels, np.int32)
     found = {}
     for c in range(n_channels):
         own, others = np.flatnonzero(channel == c), np.flatnonzero(channel != c)
@@ -128,11 +123,12 @@ def _mean_of_nearest(points_um: Floats, at_um: Floats) -> Any:
     from scipy.spatial import cKDTree
 
     tree = cKDTree(points_um)
-    rows, columns, weights = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0)]
-    remaining, k = np.arange(len(at_um)), 2 * NEIGHBOURS
+    rows, columns, weights = [np.zeros(0, np.int32)], [np.zeros(0, np.int32)], [np.zeros(0)]
+    remaining, k = np.arange(len(at_um), dtype=np.int32), 2 * NEIGHBOURS
     while remaining.size:
         k = min(k, len(points_um))
-        distance_um, nearest = map(np.asarray, tree.query(at_um[remaining], k=np.arange(1, k + 1)))
+        found = tree.query(at_um[remaining], k=np.arange(1, k + 1), workers=thread_count())
+        distance_um, nearest = np.asarray(found[0]), np.asarray(found[1], np.int32)
         distance_um = np.maximum(distance_um, MIN_DISTANCE_UM)
         limit_um = distance_um[:, min(NEIGHBOURS, k) - 1 : min(NEIGHBOURS, k)] * (1.0 + TIE_FRACTION)
         # Rows whose last point is within the limit may have further ties.
@@ -144,9 +140,5 @@ def _mean_of_nearest(points_um: Floats, at_um: Floats) -> Any:
         columns.append(nearest[is_used])
         weights.append(weight[is_used])
         remaining, k = remaining[~is_complete], 4 * k
-    entries = np.concatenate(rows), np.concatenate(columns)
+    entries = np.concatenate(rows), np.concatenate(columns)  # below 2³¹: a matrix of half the size
     return csr_array((np.concatenate(weights), entries), shape=(len(at_um), len(points_um)))
-
-
-# Captures of one layout share its neighbours.
-_neighbours_once = lru_cache(maxsize=MAX_CACHED)(_neighbours)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -32,14 +32,15 @@ __all__ = ["Picture", "raster_grid"]
 
 #: Coverage below this fraction, and lack of coverage below that one, are rounding errors.
 NO_COVERAGE, COMPLETE = 1e-9, 1e-6
-#: Number of cached rasters, and the largest number of their sites, about 200 bytes each.
-MAX_CACHED, MAX_CACHED_SITES = 2, 1 << 18
+#: Layouts with cached parts, up to 200 bytes per site: the number of them with up to a number of sites.
+MAX_CACHED: tuple[tuple[int, int], ...] = ((2, 1 << 18), (1, 1 << 20))
 #: Whether gaps between neighbours, such as trenches, are drawn.
 Gaps: TypeAlias = Literal["fill", "empty"]
 #: Colour of pixels without photosites in formats without alpha.
 NO_DATA_COLOUR = "white"
 #: A name or code of HTML, such as "white" or "#204060", or red, green and blue from 0 to 255.
 Colour: TypeAlias = str | Sequence[int]
+_Made = TypeVar("_Made")
 
 
 @dataclass(frozen=True, eq=False)
@@ -343,14 +344,28 @@ class Raster(NamedTuple):
         return Picture(read_only(values.astype(np.float32)), coverage, self.sites.grid)
 
 
+def cached_by_layout(make: Callable[..., _Made]) -> Callable[..., _Made]:
+    """
+    Return a function whose last results are cached, for layouts of up to a million sites.
+
+    ``make``: function of a layout and hashable values.
+    """
+    caches = [(max_sites, lru_cache(maxsize=count)(make)) for count, max_sites in MAX_CACHED]
+
+    def cached(layout: PackedRings, *values: Any) -> _Made:
+        if isinstance(layout, Layout):  # immutable
+            for max_sites, found in caches:
+                if layout.n_sites <= max_sites:
+                    return found(layout, *values)
+        return make(layout, *values)
+
+    return cached
+
+
+# Pictures of one layout share its raster, such as the samples of a dataset or the frames of a video.
+@cached_by_layout
 def raster_of(layout: PackedRings, grid: Grid, gaps: Gaps, n_threads: int | None) -> Raster:
-    """Return the photosites on the pixels of a picture; those of the last layouts are cached."""
-    if isinstance(layout, Layout) and layout.n_sites <= MAX_CACHED_SITES:
-        return _raster_once(layout, grid, gaps, n_threads)
-    return _raster(layout, grid, gaps, n_threads)
-
-
-def _raster(layout: PackedRings, grid: Grid, gaps: Gaps, n_threads: int | None) -> Raster:
+    """Return the photosites on the pixels of a picture."""
     sites = Integrator(layout, grid, n_threads=n_threads)
     covered_um2 = sites.spread(np.ones(sites.n_sites))
     closed = close_gaps(layout, _sites_at_gaps(sites, covered_um2)) if gaps == "fill" else None
@@ -367,7 +382,3 @@ def _sites_at_gaps(sites: Integrator, covered_um2: Floats) -> Ints:
     is_incomplete: Bools = covered_um2 < (1.0 - COMPLETE) * sites.grid.cell_area_um2
     near = binary_dilation(is_incomplete, np.ones((3, 3), np.bool_), border_value=1)
     return np.flatnonzero(sites(near.astype(np.float64)) > 0.0)
-
-
-# Pictures of one layout share its raster, such as the samples of a dataset or the frames of a video.
-_raster_once = lru_cache(maxsize=MAX_CACHED)(_raster)

@@ -13,8 +13,10 @@ _points = types.Array(types.float64, 2, "C", readonly=True)
 _ids = types.Array(types.int32, 2, "C", readonly=True)
 _colours = types.Array(types.float32, 2, "C", readonly=True)
 _encoded = types.Array(types.uint8, 1, "C", readonly=True)
-
-
+_bits = types.Array(types.uint64, 2, "C", readonly=True)
+#: Odd multipliers of hashes: 2⁶⁴ divided by the golden ratio, and a prime of xxHash64.
+_MIX, _PRIME = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F)
+_HALF_WORD = np.uint64(32)
 #: Samples over a shorter length than this are at one position.
 MIN_LENGTH = 1e-200
 
@@ -138,3 +140,99 @@ def blend(ids, colours, encoded, n_samples, has_boundaries, first_row, band):
             band[row, column, 1] = encoded[int(green * scale + 0.5)]
             band[row, column, 2] = encoded[int(blue * scale + 0.5)]
             band[row, column, 3] = (255 * n + n_samples * n_samples // 2) // (n_samples * n_samples)
+
+
+@njit(types.float64[::1](_points, _ints, _ints))
+def smallest_fan_triangles(xy, first, end):
+    """
+    Return the smallest signed area of the triangles of a fan from the first vertex of each ring, (n,).
+
+    The i-th ring has the vertices ``first[i] : end[i]``.
+    """
+    smallest = np.empty(first.size)
+    for i in range(first.size):
+        x, y = xy[first[i], 0], xy[first[i], 1]
+        ax, ay = xy[first[i] + 1, 0] - x, xy[first[i] + 1, 1] - y
+        found = np.inf
+        for v in range(first[i] + 2, end[i]):
+            bx, by = xy[v, 0] - x, xy[v, 1] - y
+            found = min(found, 0.5 * (ax * by - ay * bx))
+            ax, ay = bx, by
+        smallest[i] = found
+    return smallest
+
+
+@njit()
+def _slot(a, b, mask):
+    """Return the first place of a pair of 64-bit integers in a hash table."""
+    mixed = (a * _MIX) ^ ((b + _MIX) * _PRIME)
+    return np.int64((mixed ^ (mixed >> _HALF_WORD)) * _PRIME >> _HALF_WORD) & mask
+
+
+@njit()
+def _table_size(n):
+    """Return the size of a hash table of n values, at most half full, a power of 2."""
+    size = 16
+    while size < 2 * n:
+        size *= 2
+    return size
+
+
+@njit(types.int64(_bits, types.int64[::1], types.int64[::1]))
+def number_points(bits, position, first):
+    """
+    Number points by their first occurrence, and return the number of distinct ones.
+
+    ``bits`` (n, 2): their coordinates, equal where the points are. The number of each point is written to ``position``, and the
+    first point of each number to ``first``.
+    """
+    table = np.full(_table_size(bits.shape[0]), -1, np.int32)
+    n_found = 0
+    for i in range(bits.shape[0]):
+        at = _slot(bits[i, 0], bits[i, 1], table.size - 1)
+        while table[at] >= 0:
+            known = first[table[at]]
+            if bits[known, 0] == bits[i, 0] and bits[known, 1] == bits[i, 1]:
+                break
+            at = (at + 1) & (table.size - 1)
+        if table[at] < 0:
+            table[at] = n_found
+            first[n_found] = i
+            n_found += 1
+        position[i] = table[at]
+    return n_found
+
+
+@njit(types.int64[:, ::1](_ints, _ints))
+def outer_edges(position, ring_offsets):
+    """
+    Return the edges of rings that no other edge coincides with, pairs of positions (n, 2).
+
+    ``position``: number of each vertex of the rings, equal where the vertices are.
+    """
+    table = np.full(_table_size(position.size), -1, np.int32)
+    ends = np.empty((position.size, 2), np.int64)
+    counts = np.zeros(position.size, np.int32)
+    n_found = 0
+    for ring in range(ring_offsets.size - 1):
+        for v in range(ring_offsets[ring], ring_offsets[ring + 1]):
+            following = v + 1 if v + 1 < ring_offsets[ring + 1] else ring_offsets[ring]
+            a, b = position[v], position[following]
+            low, high = min(a, b), max(a, b)
+            at = _slot(np.uint64(low), np.uint64(high), table.size - 1)
+            while table[at] >= 0:
+                known = table[at]
+                if min(ends[known, 0], ends[known, 1]) == low and max(ends[known, 0], ends[known, 1]) == high:
+                    break
+                at = (at + 1) & (table.size - 1)
+            if table[at] < 0:
+                table[at] = n_found
+                ends[n_found, 0], ends[n_found, 1] = a, b
+                n_found += 1
+            counts[table[at]] += 1
+    n_outer = 0
+    for k in range(n_found):
+        if counts[k] == 1:
+            ends[n_outer, 0], ends[n_outer, 1] = ends[k, 0], ends[k, 1]
+            n_outer += 1
+    return ends[:n_outer].copy()

@@ -30,7 +30,7 @@ from foveasim.view.site_colours import (
 )
 from foveasim.view.site_pictures import site_picture
 from foveasim.view.web._pack import back_references, to_smallest_type
-from foveasim.view.web._shapes import shapes_of
+from foveasim.view.web._shapes import Shapes, shapes_of
 
 #: Columns of a second capture.
 SECOND = ("picture", "code", "electrons", "expected_e", "snr")
@@ -96,7 +96,7 @@ def content_of(
         )
     if second is not None:
         about["columns"] += _second_columns(layout, second, arrays)
-    arrays |= outlines_of(layout)
+    arrays |= outlines_of(shapes_of(layout))
     alt = "Picture of the capture" if isinstance(data, Capture) else "Photosites of the layout"
     if optical_image is None:
         pixels, bounds_um = _picture(layout, data if isinstance(data, Capture) else None)
@@ -150,9 +150,8 @@ def describe_sites(
 # -- outlines -----------------------------------------------------------------------------------------------------------
 
 
-def outlines_of(layout: Layout) -> dict[str, NDArray[Any]]:
+def outlines_of(shapes: Shapes) -> dict[str, NDArray[Any]]:
     """Return the arrays of the outlines and triangles of photosites."""
-    shapes = shapes_of(layout)
     arrays = {
         "xy_um": shapes.xy_um,
         "position": to_smallest_type(back_references(shapes.position)),

@@ -77,23 +77,18 @@ def shapes_of(layout: Layout) -> Shapes:
 
 def _unique_positions(xy_um: Floats) -> tuple[Floats, Ints]:
     """Return distinct positions in order of their first vertex, and each vertex's position."""
-    keys = (np.ascontiguousarray(xy_um) + 0.0).view(np.complex128)[:, 0]  # + 0.0 replaces -0 by 0
-    _, first, position = np.unique(keys, return_index=True, return_inverse=True)
-    rank = np.empty(first.size, np.int64)
-    by_first = np.argsort(first)
-    rank[by_first] = np.arange(first.size)
-    return xy_um[first[by_first]], rank[position]
+    from foveasim.view._kernels import number_points
+
+    xy_um = np.ascontiguousarray(xy_um) + 0.0  # replaces -0 by 0
+    position, first = np.empty((2, xy_um.shape[0]), np.int64)
+    n_distinct = number_points(xy_um.view(np.uint64), position, first)
+    return xy_um[first[:n_distinct]], position
 
 
 def _is_filled(layout: Layout, rings: Ints) -> Bools:
     """Return whether the fan from the first vertex of each ring has no reversed triangle."""
-    if rings.size == 0:
-        return np.zeros(0, bool)
-    n_triangles = layout.ring_offsets[rings + 1] - layout.ring_offsets[rings] - 2
-    apex = np.repeat(layout.ring_offsets[rings], n_triangles)
-    second = apex + 1 + positions_in_runs(n_triangles)
-    a, b = layout.xy_um[second] - layout.xy_um[apex], layout.xy_um[second + 1] - layout.xy_um[apex]
-    area_um2 = 0.5 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    starts = np.cumsum(n_triangles) - n_triangles
+    from foveasim.view._kernels import smallest_fan_triangles
+
+    smallest_um2 = smallest_fan_triangles(layout.xy_um, layout.ring_offsets[rings], layout.ring_offsets[rings + 1])
     tolerance_um2 = ROUNDING * np.abs(layout.area_um2[np.searchsorted(layout.site_offsets, rings)])
-    return np.asarray(np.minimum.reduceat(area_um2, starts) >= -tolerance_um2)
+    return np.asarray(smallest_um2 >= -tolerance_um2)

@@ -8,7 +8,7 @@ export function create(root, { page, panes, editor, ask }) {
   const { b, scene } = panes;
   const prepare = (part) => {
     part.sites = new Sites(part.arrays, part.about);
-    part.boundary = boundaryOf(part.sites);
+    part.boundary = boundaryOf(part.sites, part.arrays.boundary);
   };
   return {
     prepare,
