@@ -80,6 +80,7 @@ interface ControlsMessage { kind: "controls"; controls: Control[] }
 interface State {
   kind: "state"; id: number | null; version: number; settings: Settings; changed: string[]; can_undo: boolean; can_redo: boolean;
   errors: { [key: string]: string }; warnings: string[]; notes: string[]; solved: { [key: string]: number }; summary: Summary; frozen: { summary: Summary; settings: Settings } | null;
+  variants: { id: string; name: string; note: string; is_compared: boolean; problem: string | null }[];
   film: FilmAbout | null; is_preview: boolean;
 }
 interface Done {
@@ -125,7 +126,11 @@ type Change =
   | { do: "video"; path: string | undefined }
   | { do: "frame"; n: number }
   | { do: "views"; names: string[]; pixels: number }
-  | { do: "freeze" | "unfreeze" }
+  | { do: "freeze"; variant?: string }
+  | { do: "unfreeze" }
+  | { do: "variant"; action: "keep" | "update" | "describe" | "delete"; variant?: string; name?: string; note?: string }
+  | { do: "apply"; variant: string }
+  | { do: "compare"; variants: string[] }
   | { do: "text"; what: string };
 interface FrameHeader { width: number; height: number; is_first: boolean }
 

@@ -49,8 +49,8 @@ class Simulated:
     warnings : list of str
     seconds_s : float, s
         Time of the simulation.
-    frozen : Simulated, optional
-        Variant to compare with.
+    compared : tuple of (str, Simulated)
+        Variants to compare with, and their names.
     is_preview : bool
         Whether the scene was reduced.
     picture_pixels : int
@@ -66,7 +66,7 @@ class Simulated:
     images: dict[Any, Any]
     warnings: list[str] = field(default_factory=list)
     seconds_s: float = 0.0
-    frozen: Simulated | None = None
+    compared: tuple[tuple[str, Simulated], ...] = ()
     is_preview: bool = False
     picture_pixels: int = PICTURE_PIXELS
     pinned: tuple[int, ...] = ()

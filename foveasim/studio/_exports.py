@@ -71,12 +71,12 @@ def _short(value: Any) -> str:
 
 
 def without_directories(
-    settings: dict[str, Any], uploads: Path, frames: Mapping[str, Path], name_of: Callable[[Path], str]
+    settings: dict[str, Any], directories: Sequence[Path], frames: Mapping[str, Path], name_of: Callable[[Path], str]
 ) -> tuple[dict[str, Any], dict[str, Path]]:
     """
     Return settings with names for the paths of uploaded files, and the files by name.
 
-    ``uploads``: directory of uploaded files. ``frames``: files that replace others, by the path in the settings. ``name_of``:
+    ``directories``: those of uploaded files. ``frames``: files that replace others, by the path in the settings. ``name_of``:
     returns the name of a file.
     """
     files: dict[str, Path] = {}
@@ -86,7 +86,7 @@ def without_directories(
             return {name: renamed(item) for name, item in value.items()}
         if isinstance(value, list):
             return [renamed(item) for item in value]
-        if isinstance(value, str) and Path(value).parent == uploads:
+        if isinstance(value, str) and Path(value).parent in directories:
             file = frames.get(value, Path(value))
             name = name_of(file)
             files[name] = file

@@ -136,17 +136,17 @@ class Files:
     """
     Files that the settings of a session may contain.
 
-    These are pictures of scikit-image, uploaded files, files of the initial settings, and files in their directory.
+    These are pictures of scikit-image, uploaded files, files of the initial settings, and files in some directories.
 
-    ``start``: the initial settings, with absolute paths. ``directory``: directory of the settings file. ``uploads``: directory
-    of the uploaded files.
+    ``start``: the initial settings, with absolute paths. ``uploads``: directory of the uploaded files. ``directories``: those
+    of the settings file and of variants.
     """
 
-    def __init__(self, start: Mapping[str, Any], directory: Path | None, uploads: Path) -> None:
+    def __init__(self, start: Mapping[str, Any], uploads: Path, *directories: Path) -> None:
         named: list[Path] = []
         resolve_files(Path(), dict(start), found=named)
         self._named = {path.resolve() for path in named}
-        self._directories = [path.resolve() for path in (uploads, directory) if path is not None]
+        self._directories = [path.resolve() for path in (uploads, *directories)]
         self._uploads = uploads
 
     def allows(self, path: str | Path) -> bool:

@@ -20,7 +20,7 @@ from foveasim._core.work_arrays import release_memory
 from foveasim._io.atomic import atomic_write
 from foveasim._io.yaml_files import format_yaml
 from foveasim.config import RESULTS, Requirement, check_settings, get_setting, put_setting, validate
-from foveasim.errors import ParameterError, SimulationError, printable
+from foveasim.errors import FoveasimError, ParameterError, SimulationError, printable
 from foveasim.explore import measure
 from foveasim.explore.solving import search_value
 from foveasim.layout import Layout
@@ -39,6 +39,7 @@ from foveasim.studio._frames import Frames
 from foveasim.studio._history import History
 from foveasim.studio._messages import from_json, one_line, to_json
 from foveasim.studio._parts import PARTS, summary_of
+from foveasim.studio._parts.comparison import FROZEN
 from foveasim.studio._pictures import reduced_picture, resolved_pixels
 from foveasim.studio._settings.changes import (
     ONCE,
@@ -64,12 +65,13 @@ from foveasim.studio._settings.unknowns import (
     with_n_sites,
     with_unknown,
 )
+from foveasim.studio._variants import DIRECTORY, Variants
 from foveasim.studio._views import Views
 
 #: Size limit of all uploaded files.
 MAX_SESSION_BYTES = 512 << 20
-#: Largest number of photosites that charts compare.
-MAX_PINNED = 6
+#: Largest number of photosites that charts compare, and of variants that are compared with the current state.
+MAX_PINNED, MAX_COMPARED = 6, 5
 #: Kinds of controls whose values goal seek can change, and its range of automatic exposures.
 NUMBERS, EXPOSURES_S = ("number", "integer"), (1e-5, 1.0)
 #: Largest number of messages that wait.
@@ -112,7 +114,11 @@ class Session:
     def __init__(self, name: str, start: Start, *, n_threads: int | None = None, origin: Session | None = None) -> None:
         self.name, self.start = name, start
         self.uploads = Path(tempfile.mkdtemp(prefix="foveasim-studio-"))
-        self.files = Files(start.settings, start.directory, self.uploads)
+        directory = (self.uploads if start.out is None else start.out.absolute()) / DIRECTORY
+        self.variants = Variants(directory, self._save)
+        self.files = Files(
+            start.settings, self.uploads, *(() if start.directory is None else (start.directory,)), directory
+        )
         self.engine = Engine(n_threads=n_threads, check=self._check)
         self.history = History(start.settings)
         self.result: Simulated | None = None
@@ -132,6 +138,9 @@ class Session:
         self._controls: list[dict[str, Any]] = []
         self._frozen: dict[str, Any] | None = None
         self._frozen_result: Simulated | None = None
+        # Variants that are compared, with the settings that were simulated, and the errors of others.
+        self._compared: dict[str, tuple[dict[str, Any], Simulated]] = {}
+        self._variant_errors: dict[str, str] = {}
         self._errors: dict[str, str] = {}
         self._simulated_frame: str | None = None
         self._pinned: tuple[int, ...] = ()
@@ -177,6 +186,8 @@ class Session:
                 # The file of a source of frames is written when it is required.
                 for name, frame in origin.frames.export(origin.history.settings).items():
                     shutil.copy2(frame, self.uploads / Path(name).name)
+                if self.start.out is None and origin.variants.directory.is_dir():
+                    shutil.copytree(origin.variants.directory, self.variants.directory)
 
         def moved(value: Any) -> Any:
             """Return settings with the paths of this session's files."""
@@ -459,6 +470,8 @@ class Session:
                 if generated is None:
                     raise SimulationError("there is no layout whose parameters are known")
                 settings = with_unknown(settings, string_of(message, "name"), generated)
+            case "apply":
+                settings = self.variants.settings_of(message.get("variant"))
             case "preset":
                 settings = apply_preset(string_of(message, "name"), settings)
             case "restore":
@@ -628,19 +641,14 @@ class Session:
                     raise ParameterError("sites", f"must be a list of at most {MAX_PINNED} indices of photosites")
                 self._pinned = tuple(dict.fromkeys(each for each in sites if each >= 0))
             case "freeze":
-                if self.result is None:
-                    raise SimulationError("there is no result to freeze")
-                if self.result.is_preview:
-                    self._is_dragging = False
-                    self._simulate(self.history.settings, can_stop=False)
-                self._frozen_result = self.result
-                self._frozen = {"summary": summary_of(self.result), "settings": self.history.settings}
-                self._send_parts(is_freeze=True)  # before later changes: the page keeps those of the variant
+                self._freeze(message.get("variant"))
             case "unfreeze":
                 self._frozen = self._frozen_result = None
-                for part in PARTS.values():
-                    if part.is_of_variants:
-                        self._views.forget(part.name)
+                self._forget_comparison()
+            case "variant":
+                self._change_variant(message)
+            case "compare":
+                self._compare(message.get("variants"))
             case "text":
                 what, exported = string_of(message, "what"), self.exported()
                 self._send({
@@ -661,6 +669,82 @@ class Session:
             case unknown:
                 raise ParameterError("do", "must be the name of a message", printable(str(unknown))[:40])
         self._send_state()
+
+    # -- variants ---------------------------------------------------------------------------------------------------
+
+    def _freeze(self, variant: Any) -> None:
+        """
+        Keep the current result, or that of a variant, as A.
+
+        The page keeps what is sent before the next change.
+        """
+        if self.result is None:
+            raise SimulationError("there is no result to freeze")
+        if self.result.is_preview:
+            self._is_dragging = False
+            self._simulate(self.history.settings, can_stop=False)
+        settings, current = self.history.settings, self.result
+        if variant is not None:
+            self._send({"kind": "busy"})
+            settings = self.files.resolve(self.variants.settings_of(variant))
+            self.result = self.engine.simulate(settings)
+            self._version += 1
+        self._frozen_result = self.result
+        self._frozen = {"summary": summary_of(self.result), "settings": settings}
+        self._send_parts(is_freeze=True)
+        if variant is not None:
+            self.result = current
+            self._version += 1
+
+    def _change_variant(self, message: dict[str, Any]) -> None:
+        variant = message.get("variant")
+        match message.get("action"):
+            case "keep":
+                self.variants.keep(message.get("name"), message.get("note", ""))
+            case "update":
+                self.variants.update(variant)
+            case "describe":
+                self.variants.describe(variant, message.get("name"), message.get("note"))
+            case "delete":
+                self.variants.delete(variant)
+            case unknown:
+                raise ParameterError("action", "must be keep, update, describe or delete", printable(str(unknown))[:40])
+        self._compare([each.id for each in self.variants if each.id in self._compared])
+
+    def _compare(self, wanted: Any) -> None:
+        """
+        Simulate variants that are compared with the current state.
+
+        Those that fail are left out, with the reason.
+        """
+        if not isinstance(wanted, list) or len(wanted) > MAX_COMPARED:
+            raise ParameterError("variants", f"must be a list of at most {MAX_COMPARED} variants")
+        self._send({"kind": "busy"})
+        before, self._compared, self._variant_errors = self._compared, {}, {}
+        for variant in dict.fromkeys(str(each) for each in wanted):
+            try:
+                settings = self.files.resolve(self.variants.settings_of(variant))
+                known = before.get(variant)
+                if known is None or known[0] != settings:
+                    known = settings, self.engine.simulate(settings)
+                self._compared[variant] = known
+            except FoveasimError as error:
+                self._variant_errors[variant] = self._line(error)
+        self._forget_comparison()
+
+    def _forget_comparison(self) -> None:
+        """Send views of variants again when the next variant is compared."""
+        if not self._variants_shown:
+            for part in PARTS.values():
+                if part.is_of_variants:
+                    self._views.forget(part.name)
+
+    @property
+    def _variants_shown(self) -> tuple[tuple[str, Simulated], ...]:
+        """The variants that are compared with the current state, A first."""
+        names = {each.id: each.name for each in self.variants} if self._compared else {}
+        named = [(names.get(variant, variant), result) for variant, (_, result) in self._compared.items()]
+        return (*(() if self._frozen_result is None else ((FROZEN, self._frozen_result),)), *named)
 
     # -- answers ----------------------------------------------------------------------------------------------------
 
@@ -685,7 +769,8 @@ class Session:
         ``name_of``: returns the name of a file. Returns ``files``: uploaded files by name, and the current frame of a source.
         """
         settings = self.history.settings
-        return without_directories(settings, self.uploads, self.frames.export(settings), name_of)
+        directories = self.uploads, self.variants.directory
+        return without_directories(settings, directories, self.frames.export(settings), name_of)
 
     def _saved_path(self, name: str) -> Path:
         """Return the path of saved settings with a name."""
@@ -694,8 +779,12 @@ class Session:
         safe = file_name(name)
         return self.start.out / (safe if safe.endswith((".yaml", ".yml")) else f"{safe}.yaml")
 
-    def _save(self, path: Path) -> None:
-        """Write the settings to a file, with copies of uploaded files in its directory."""
+    def _save(self, path: Path, text: str = "") -> None:
+        """
+        Write the settings to a file, with copies of uploaded files in its directory.
+
+        ``text``: comments at the beginning of the file.
+        """
         out = path.parent
         out.mkdir(parents=True, exist_ok=True)
         originals = {path: path}
@@ -715,7 +804,7 @@ class Session:
             with atomic_write(out / copied) as temporary:
                 shutil.copyfile(original, temporary)
         with atomic_write(path) as temporary:
-            temporary.write_text(format_yaml(settings), encoding="utf-8")
+            temporary.write_text(text + format_yaml(settings), encoding="utf-8")
 
     def _send_state(self) -> None:
         settings, result = self.history.settings, self.result
@@ -737,6 +826,10 @@ class Session:
             "summary": {} if result is None else summary_of(result),
             "solved": {} if result is None else solved_of(result.settings, result.capture.layout),
             "frozen": self._frozen,
+            "variants": [
+                {**vars(each), "is_compared": each.id in self._compared, "problem": self._variant_errors.get(each.id)}
+                for each in self.variants
+            ],
             "film": self.frames.about(settings),
             "is_preview": result is not None and result.is_preview,
         })  # fmt: skip
@@ -752,7 +845,7 @@ class Session:
         times_ms = self._views.send_changed(
             replace(
                 self.result,
-                frozen=self._frozen_result,
+                compared=self._variants_shown,
                 pinned=tuple(site for site in self._pinned if site < self.result.capture.layout.n_sites),
             ),
             self._version,

@@ -1,111 +1,159 @@
-"""Comparison of two variants: budgets and picture quality."""
+"""Variants: named states of a session with notes, each in a settings file."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-import numpy as np
+from foveasim._io.atomic import atomic_write
+from foveasim._io.yaml_files import read_text, read_yaml
+from foveasim.config import resolve_files
+from foveasim.errors import FileError, ParameterError, printable
+from foveasim.studio._files import file_name, unused_path, with_preset
 
-from foveasim._core.validation import Floats
-from foveasim.compare import budget_of, quality_by_eccentricity
-from foveasim.errors import FoveasimError
-from foveasim.fields import Grid
-from foveasim.layout import Layout
-from foveasim.studio._engine import Simulated
-from foveasim.studio._settings.unknowns import is_generated
-
-#: Side of the compared pictures, pixels.
-N_PIXELS = 160
-#: Half side of the fovea as a fraction of that of the field.
-FOVEA_FRACTION = 0.2
-#: Sites of the fovea have at most this multiple of the area of the smallest ones, without the smallest 1 %, often slivers.
-FOVEA_AREA_RATIO, SLIVER_QUANTILE = 2.0, 0.01
-MM2_PER_UM2 = 1e-6
-#: Rows of the comparison: label and unit by name.
-ROWS = {
-    "n_sites": ("photosites", ""),
-    "bits_per_frame": ("bits per frame", ""),
-    "frames_per_s": ("frame rate", "1/s"),
-    "readout_steps": ("longest line", "sites"),
-    "area_mm2": ("area", "mm²"),
-    "total_e": ("electrons", "e-"),
-    "read_noise_e": ("read noise", "e-"),
-    "fovea_psnr_db": ("PSNR, fovea", "dB"),
-    "field_psnr_db": ("PSNR, field", "dB"),
-    "fovea_ssim": ("SSIM, fovea", ""),
-    "field_ssim": ("SSIM, field", ""),
-}
+#: Directory of the variants, in that of saved files.
+DIRECTORY = "variants"
+EXTENSION = ".yaml"
+#: Longest name and note, characters, and largest number of variants.
+MAX_NAME_LENGTH, MAX_NOTE_LENGTH, MAX_VARIANTS = 80, 1000, 200
+#: Comments at the beginning of a file: the name, then the lines of the note.
+COMMENT = "# "
+_COMMENTS = re.compile(r"\A(#.*\n)*")
 
 
-def compare(a: Simulated, b: Simulated) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Variant:
     """
-    Return budgets and picture quality of two variants.
+    A named state.
 
-    The data rate is that of A: with its readout, or one frame per exposure. Pictures are compared with the optical image in
-    squares of equal size around the fovea of each variant.
-
-    Returns
-    -------
-    about : dict
-        Rows with the name, label, unit and the values of both variants; sides of the squares, µm.
+    ``id``: stem of its file. ``name``, ``note``: texts of the user.
     """
-    half_um = min(_half_side_um(result.capture.layout) for result in (a, b))
-    readout = None if a.shot.rules is None else a.shot.rules.readout
-    exposure_s = a.shot.exposure_s
-    frames_per_s = readout.frames_per_s if readout is not None else 1.0 / exposure_s if exposure_s > 0 else None
-    rate_bit_per_s = frames_per_s and budget_of(a.shot.camera, frames_per_s).data_rate_bit_per_s
-    found = [_measures(result, rate_bit_per_s, half_um) for result in (a, b)]
-    rows = [
-        {"name": name, "label": label, "unit": unit, "values": [each[name] for each in found]}
-        for name, (label, unit) in ROWS.items()
+
+    id: str
+    name: str
+    note: str
+
+
+class Variants:
+    """
+    Variants in a directory, which is created with the first one.
+
+    Their files are those of a shot: ``foveasim run`` simulates them. Uploaded pictures that they contain are next to them.
+
+    ``write``: writes the settings of the session to a file, with a text before them and copies of uploaded files.
+    """
+
+    def __init__(self, directory: Path, write: Callable[[Path, str], None]) -> None:
+        self.directory, self._write = directory, write
+
+    def __iter__(self) -> Iterator[Variant]:
+        """Return all variants by name, with numbers in order of their value."""
+        paths = [path for path in self.directory.glob(f"*{EXTENSION}") if not path.name.startswith(".")]
+        return iter(sorted((_described(path) for path in paths), key=lambda each: (_in_order(each.name), each.id)))
+
+    def path_of(self, variant: Any) -> Path:
+        """
+        Return the file of a variant.
+
+        Raises ParameterError when there is no such variant.
+        """
+        path = self.directory / f"{variant}{EXTENSION}"
+        if (
+            not isinstance(variant, str)
+            or variant != Path(variant).name
+            or variant.startswith(".")
+            or not path.is_file()
+        ):
+            raise ParameterError("variant", "must be one of the session", printable(str(variant))[:40])
+        return path
+
+    def keep(self, name: Any, note: Any = "") -> str:
+        """
+        Keep the present state as a variant, and return its identifier.
+
+        Raises ParameterError when the name is empty or too long, the note is too long, or there are too many variants.
+        """
+        text = _comments(name, note)
+        if len(list(self)) >= MAX_VARIANTS:
+            raise ParameterError("variants", f"must be at most {MAX_VARIANTS}; delete some first")
+        self.directory.mkdir(parents=True, exist_ok=True)
+        path = unused_path(
+            self.directory / f"{file_name(str(name)).replace('.', '_')}{EXTENSION}", lambda each: not each.exists()
+        )
+        self._write(path, text)
+        return path.stem
+
+    def update(self, variant: Any) -> None:
+        """Replace the state of a variant by the present one."""
+        path = self.path_of(variant)
+        found = _described(path)
+        self._write(path, _comments(found.name, found.note))
+
+    def describe(self, variant: Any, name: Any, note: Any) -> None:
+        """Change the name and the note of a variant."""
+        path, text = self.path_of(variant), _comments(name, note)
+        settings = _COMMENTS.sub("", read_text(path), count=1)
+        with atomic_write(path) as temporary:
+            temporary.write_text(text + settings, encoding="utf-8")
+
+    def delete(self, variant: Any) -> None:
+        """Delete a variant, and the pictures that no other one contains."""
+        path = self.path_of(variant)
+        own = _files_of(path)
+        path.unlink()
+        others = {file for each in self for file in _files_of(self.path_of(each.id))}
+        for file in own - others:
+            if file.parent == self.directory:
+                file.unlink(missing_ok=True)
+
+    def settings_of(self, variant: Any) -> dict[str, Any]:
+        """
+        Return the settings of a variant, with absolute paths.
+
+        Raises FileError when the file is not valid YAML.
+        """
+        path = self.path_of(variant)
+        settings = read_yaml(path)
+        if not isinstance(settings, dict):
+            raise FileError(path, "must contain the settings of a shot")
+        return dict(resolve_files(path.parent.absolute(), with_preset(settings)))
+
+
+def _files_of(path: Path) -> set[Path]:
+    """Return the files that the settings in a file contain; none if it cannot be read."""
+    found: list[Path] = []
+    try:
+        resolve_files(path.parent.absolute(), read_yaml(path), found=found)
+    except (FileError, ValueError):
+        return set()
+    return set(found)
+
+
+def _described(path: Path) -> Variant:
+    """Return the variant in a file; its name is that of the file if there are no comments."""
+    try:
+        comments = _COMMENTS.match(read_text(path))
+    except FileError:
+        comments = None
+    name, *note = [line.removeprefix("#").strip() for line in (comments.group() if comments else "").splitlines()] or [
+        ""
     ]
-    return {
-        "rows": rows,
-        "field_um": 2.0 * half_um,
-        "fovea_um": 2.0 * FOVEA_FRACTION * half_um,
-        "can_match": is_generated(b.settings),
-    }
+    return Variant(path.stem, (name or path.stem)[:MAX_NAME_LENGTH], "\n".join(note)[:MAX_NOTE_LENGTH])
 
 
-def _measures(result: Simulated, rate_bit_per_s: float | None, half_um: float) -> dict[str, float | None]:
-    budget = budget_of(result.shot.camera, 1.0)
-    found: dict[str, float | None] = {
-        "n_sites": budget.n_sites,
-        "bits_per_frame": budget.data_rate_bit_per_s,
-        "frames_per_s": rate_bit_per_s and rate_bit_per_s / budget.data_rate_bit_per_s,
-        "readout_steps": budget.readout_steps,
-        "area_mm2": budget.area_um2 * MM2_PER_UM2,
-        "total_e": float(result.capture.electrons.sum(dtype=np.float64)),
-        "read_noise_e": float(np.sqrt(budget.read_noise_e2)),
-    }
-    camera, scene, centre_um = result.shot.camera, result.shot.scene, fovea_um(result.capture.layout)
-    for name, side_um in (("field", half_um), ("fovea", FOVEA_FRACTION * half_um)):
-        grid = _square(centre_um, side_um)
-        try:
-            picture = result.capture.picture(of="light_e", per="um2", grid=grid, sensor=camera.sensor)
-            reference = camera.reference(scene, grid, exposure_s=result.shot.exposure_s)
-            quality = quality_by_eccentricity(picture, reference, edges_um=np.array([0.0, side_um]))
-            found |= {f"{name}_psnr_db": quality.psnr_db, f"{name}_ssim": quality.ssim}
-        except FoveasimError:  # such as a uniform image, or one outside the image circle
-            found |= {f"{name}_psnr_db": None, f"{name}_ssim": None}
-    return found
+def _comments(name: Any, note: Any) -> str:
+    """Return a name and a note as comments of YAML."""
+    if not isinstance(name, str) or not 0 < len(name.strip()) <= MAX_NAME_LENGTH:
+        raise ParameterError("name", f"must have 1 to {MAX_NAME_LENGTH} characters")
+    if not isinstance(note, str) or len(note) > MAX_NOTE_LENGTH:
+        raise ParameterError("note", f"must have at most {MAX_NOTE_LENGTH} characters")
+    lines = [" ".join(name.split()), *note.strip().splitlines()]
+    return "".join(f"{COMMENT}{printable(line)}".rstrip() + "\n" for line in lines)
 
 
-def fovea_um(layout: Layout) -> Floats:
-    """Return the mean centroid of the smallest photosites, (x, y) µm."""
-    limit_um2 = FOVEA_AREA_RATIO * np.quantile(layout.area_um2, SLIVER_QUANTILE)
-    centre_um: Floats = layout.centroid_um[layout.area_um2 <= limit_um2].mean(axis=0)
-    return centre_um
-
-
-def _half_side_um(layout: Layout) -> float:
-    """Return half the shorter side of the bounding box."""
-    x0_um, y0_um, x1_um, y1_um = layout.bounds_um
-    return 0.5 * min(x1_um - x0_um, y1_um - y0_um)
-
-
-def _square(centre_um: Floats, half_um: float) -> Grid:
-    pitch_um = 2.0 * half_um / N_PIXELS
-    return Grid(
-        (N_PIXELS, N_PIXELS), (pitch_um, pitch_um), (float(centre_um[0] - half_um), float(centre_um[1] - half_um))
-    )
+def _in_order(name: str) -> list[tuple[int, str]]:
+    """Return a key in which numbers have the order of their values."""
+    return [(int(part), "") if part.isdecimal() else (0, part.casefold()) for part in re.split(r"(\d+)", name)]

@@ -89,7 +89,7 @@ class Views:
         times_ms: dict[str, float] = {}
         self.left_out = []
         drawn_s = time.perf_counter()
-        shown = [name for name in self._names if result.frozen is not None or not PARTS[name].is_of_variants]
+        shown = [name for name in self._names if result.compared or not PARTS[name].is_of_variants]
         # Sites and their values belong together; the others in the order of their age, small ones before images.
         first = [name for name in FIRST if name in shown]
         names = first + sorted(

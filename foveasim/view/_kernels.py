@@ -145,9 +145,9 @@ def blend(ids, colours, encoded, n_samples, has_boundaries, first_row, band):
 @njit(types.float64[::1](_points, _ints, _ints))
 def smallest_fan_triangles(xy, first, end):
     """
-    Return the smallest signed area of the triangles of a fan from the first vertex of each ring, (n,).
+    Return the smallest signed area of the triangles of fans, (n,).
 
-    The i-th ring has the vertices ``first[i] : end[i]``.
+    Each fan is that from the first vertex of a ring. The i-th ring has the vertices ``first[i] : end[i]``.
     """
     smallest = np.empty(first.size)
     for i in range(first.size):

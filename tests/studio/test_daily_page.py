@@ -264,12 +264,12 @@ def test_save_asks_before_it_replaces(browser, tmp_path, visit):
         first = path.read_text()
         set_value(page, "exposure_s", 0.005)
         save("Fovéa 網膜")
-        page.wait_for_selector("#replace-dialog[open]")
-        assert page.inner_text("#replace-title") == "Fovéa_網膜.yaml exists. Replace it?"
-        page.click("#replace-form button[value='']")
+        page.wait_for_selector("#confirm-dialog[open]")
+        assert page.inner_text("#confirm-title") == "Fovéa_網膜.yaml exists. Replace it?"
+        page.click("#confirm-dialog button[value='']")
         assert path.read_text() == first
         save("Fovéa 網膜")
-        page.click("#replace-form button[value=replace]")
+        page.click("#confirm-verb")
         until(page, "() => document.getElementById('notice').textContent.startsWith('Saved')")
         for _ in range(100):
             if path.read_text() != first:

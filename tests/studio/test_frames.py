@@ -16,12 +16,12 @@ from PIL import Image
 
 from foveasim.capture import Capture
 from foveasim.errors import ParameterError
+from foveasim.studio._comparison import compare, fovea_um
 from foveasim.studio._engine import Engine
 from foveasim.studio._exports import notebook
 from foveasim.studio._frames import camera_frame
 from foveasim.studio._server import _exported, _message
 from foveasim.studio._settings.unknowns import with_n_sites
-from foveasim.studio._variants import compare, fovea_um
 
 WIDTH, HEIGHT = 40, 24
 
@@ -319,7 +319,7 @@ def test_finer_sites_have_better_pictures(settings):
     coarse = engine.simulate(settings)
     settings["layout"]["parameters"] = {"n_x": 64, "n_y": 56, "pitch_um": 3.0}
     fine = engine.simulate(settings)
-    found = {row["name"]: row["values"] for row in compare(coarse, fine)["rows"]}
+    found = {row["name"]: row["values"] for row in compare([("coarse", coarse), ("fine", fine)])["rows"]}
 
     for name in ("fovea_psnr_db", "field_psnr_db", "field_ssim"):
         assert found[name][1] > found[name][0]

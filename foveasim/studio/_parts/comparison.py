@@ -1,18 +1,26 @@
-"""Comparison of the frozen variant A and the current variant B."""
+"""Comparison of the frozen variant A, named variants and the current state."""
 
 from __future__ import annotations
 
+from typing import Any
+
 from foveasim.errors import SimulationError
+from foveasim.studio._comparison import compare
 from foveasim.studio._engine import Simulated
 from foveasim.studio._parts.registry import PartData, part
-from foveasim.studio._variants import compare
+
+#: Names of the frozen variant and the current state.
+FROZEN, CURRENT = "A", "B"
 
 
-@part(
-    "A and B", lambda result: (result.capture, result.frozen and result.frozen.capture), order=130, is_of_variants=True
-)
+def _captures_of(result: Simulated) -> tuple[Any, ...]:
+    """Return the captures of all variants, and their names."""
+    return (result.capture, *(each.capture for _, each in result.compared), tuple(name for name, _ in result.compared))
+
+
+@part("Comparison", _captures_of, order=130, is_of_variants=True)
 def comparison(result: Simulated) -> PartData:
-    """Return budgets and picture quality of the frozen variant and the current one."""
-    if result.frozen is None:
-        raise SimulationError("there is no variant A to compare with")
-    return compare(result.frozen, result), {}
+    """Return budgets and picture quality of all variants, the current state last."""
+    if not result.compared:
+        raise SimulationError("there is no variant to compare with")
+    return compare([*result.compared, (CURRENT, result)]), {}

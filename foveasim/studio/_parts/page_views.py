@@ -15,6 +15,7 @@ page_part("site", "Photosite", order=30, is_wide=True)
 page_part("goal", "Goal seek", order=97)
 page_part("steps", "Steps", order=100)
 page_part("summary", "Summary", order=110, is_first=True)
+page_part("variants", "Variants", order=125)
 page_part("selection", "Selection", order=120)
 
 

@@ -56,7 +56,7 @@ class Part:
     is_costly : bool
         Whether the part is computed only when a page asks for it, and not for previews.
     is_of_variants : bool
-        Whether the part is computed only when there is a variant A.
+        Whether the part is computed only when there are variants to compare with.
     """
 
     name: str

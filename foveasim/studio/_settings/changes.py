@@ -21,6 +21,7 @@ CHANGES = (
     "delete",
     "undo",
     "redo",
+    "apply",
     "preset",
     "restore",
     "file",

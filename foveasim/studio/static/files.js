@@ -2,7 +2,7 @@
 
 import { $, download, notice } from "/web/page_parts.js";
 import { fragmentOf, settingsOf, stateOf } from "./links.js";
-import { copyText, listenToMenu, showText } from "./menus.js";
+import { confirmed, copyText, listenToMenu, showText } from "./menus.js";
 import { isVideo } from "./sources.js";
 
 // How the server uses a file: by its name.
@@ -13,7 +13,7 @@ function useOf(name) {
 }
 
 export class Files {
-  connection; on; wantsToken = false; saved = "";
+  connection; on; wantsToken = false;
 
   // Callbacks: busy(text) while a file is sent, with null at its end; dropped(transfer) returns whether it takes the files.
   constructor(connection, on) {
@@ -31,9 +31,6 @@ export class Files {
     });
     $("save-form").addEventListener("submit", (event) => {
       if (event.submitter?.getAttribute("value") === "save") connection.send({ do: "save", name: $("save-name").value });
-    });
-    $("replace-form").addEventListener("submit", (event) => {
-      if (event.submitter?.getAttribute("value") === "replace") connection.send({ do: "save", name: this.saved, may_replace: true });
     });
     $("link-form").addEventListener("submit", async (event) => {
       const text = $("link-text").value;
@@ -95,10 +92,8 @@ export class Files {
 
   // Asks before saved settings are replaced.
   /** @param {Exists} message */
-  askToReplace({ name, file }) {
-    this.saved = name;
-    $("replace-title").textContent = file + " exists. Replace it?";
-    $("replace-dialog").showModal();
+  async askToReplace({ name, file }) {
+    if (await confirmed(file + " exists. Replace it?", "Replace")) this.connection.send({ do: "save", name, may_replace: true });
   }
 
   async receiveText({ what, text, files }) {

@@ -46,7 +46,29 @@ export function showText(title, text) {
   if (!$("text-dialog").open) $("text-dialog").showModal();
 }
 
+// Answers the question of the dialog that is open.
+/** @type {((isConfirmed: boolean) => void) | null} */
+let answer = null;
+
+// Resolves to whether the user confirms a question; the verb is that of the button.
+/** @type {(question: string, verb: string) => Promise<boolean>} */
+export function confirmed(question, verb) {
+  const dialog = $("confirm-dialog");
+  $("confirm-title").textContent = question;
+  $("confirm-verb").textContent = verb;
+  answer?.(false);
+  dialog.returnValue = "";
+  dialog.showModal();
+  return new Promise((resolve) => { answer = resolve; });
+}
+
 export function listenToDialogs() {
+  $("confirm-dialog").addEventListener("close", () => {
+    // The event of an earlier question may be late.
+    if ($("confirm-dialog").open) return;
+    answer?.($("confirm-dialog").returnValue === "yes");
+    answer = null;
+  });
   $("text-copy").addEventListener("click", async () => {
     try {
       await navigator.clipboard.writeText($("text").textContent || "");

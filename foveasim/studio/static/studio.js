@@ -270,6 +270,8 @@ function hello(message, { isSame }) {
   const stored = message.is_new ? memory.get("settings") : null;
   sendViews();
   if (page.kept.length) connection.send({ do: "pin", sites: page.kept });
+  const compared = JSON.parse(memory.get("compared") || "[]");
+  if (compared.length) connection.send({ do: "compare", variants: compared });
   if (stored && isSame) connection.send({ do: "restore", settings: JSON.parse(stored) });
   else if (stored && message.settings && JSON.stringify(message.settings) !== stored) {
     page.offered = JSON.parse(stored);
@@ -443,11 +445,13 @@ function gaze(dx, dy, isFinal) {
 
 // -- A and B ----------------------------------------------------------------------------------------------------------------
 
-function freeze() {
+// Keeps the present state, or a named variant, as A.
+/** @param {string} [variant] */
+function freeze(variant) {
   if (!panes.b.sites || !page.state) return;
   page.frozen = { isAnswered: false, isKept: false };
   keepVariant(page.frozen);
-  page.frozen.id = connection.send({ do: "freeze" });
+  page.frozen.id = connection.send({ do: "freeze", variant });
   views.show("comparison", true);
   showVariants();
 }
@@ -460,6 +464,13 @@ function keepVariant(frozen) {
   if (a.sites !== sites) a.useSites(sites, b.palette);
   a.useColumns(columns, filterOf);
   if (picture) panes.pictureA.use(picture.about, picture.arrays.rgba);
+}
+
+// Compares named variants with the present state.
+/** @param {string[]} variants */
+function compare(variants) {
+  memory.set("compared", JSON.stringify(variants));
+  connection.send({ do: "compare", variants });
 }
 
 function unfreeze() {
@@ -664,7 +675,7 @@ function createPanes() {
 
 // What the modules of views, tests and scripts use.
 const studio = {
-  page, ask, drawAsked, recolour, showSelection, setRange, select, hover, leave, pin, keep, fly, flyToStep, sendViews,
+  page, ask, drawAsked, recolour, showSelection, setRange, select, hover, leave, pin, keep, fly, flyToStep, sendViews, freeze, compare,
   get panes() { return panes; },
   get controls() { return controls; },
   get connection() { return connection; },

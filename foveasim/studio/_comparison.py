@@ -1,0 +1,115 @@
+"""Comparison of variants: budgets and picture quality."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from foveasim._core.validation import Floats
+from foveasim.compare import budget_of, quality_by_eccentricity
+from foveasim.errors import FoveasimError
+from foveasim.fields import Grid
+from foveasim.layout import Layout
+from foveasim.studio._engine import Simulated
+from foveasim.studio._settings.unknowns import is_generated
+
+#: Side of the compared pictures, pixels.
+N_PIXELS = 160
+#: Half side of the fovea as a fraction of that of the field.
+FOVEA_FRACTION = 0.2
+#: Sites of the fovea have at most this multiple of the area of the smallest ones, without the smallest 1 %, often slivers.
+FOVEA_AREA_RATIO, SLIVER_QUANTILE = 2.0, 0.01
+MM2_PER_UM2 = 1e-6
+#: Rows of the comparison: label and unit by name.
+ROWS = {
+    "n_sites": ("photosites", ""),
+    "bits_per_frame": ("bits per frame", ""),
+    "frames_per_s": ("frame rate", "1/s"),
+    "readout_steps": ("longest line", "sites"),
+    "area_mm2": ("area", "mm²"),
+    "total_e": ("electrons", "e-"),
+    "read_noise_e": ("read noise", "e-"),
+    "fovea_psnr_db": ("PSNR, fovea", "dB"),
+    "field_psnr_db": ("PSNR, field", "dB"),
+    "fovea_ssim": ("SSIM, fovea", ""),
+    "field_ssim": ("SSIM, field", ""),
+}
+
+
+def compare(variants: Sequence[tuple[str, Simulated]]) -> dict[str, Any]:
+    """
+    Return budgets and picture quality of variants with their names.
+
+    The data rate is that of the first variant: with its readout, or one frame per exposure. Pictures are compared with the
+    optical image in squares of equal size around the fovea of each variant.
+
+    Returns
+    -------
+    about : dict
+        Names; rows with the name, label, unit and the values of all variants; sides of the squares, µm; whether the last
+        variant can have another number of photosites.
+    """
+    first, last = variants[0][1], variants[-1][1]
+    half_um = min(_half_side_um(result.capture.layout) for _, result in variants)
+    readout = None if first.shot.rules is None else first.shot.rules.readout
+    exposure_s = first.shot.exposure_s
+    frames_per_s = readout.frames_per_s if readout is not None else 1.0 / exposure_s if exposure_s > 0 else None
+    rate_bit_per_s = frames_per_s and budget_of(first.shot.camera, frames_per_s).data_rate_bit_per_s
+    found = [_measures(result, rate_bit_per_s, half_um) for _, result in variants]
+    rows = [
+        {"name": name, "label": label, "unit": unit, "values": [each[name] for each in found]}
+        for name, (label, unit) in ROWS.items()
+    ]
+    return {
+        "names": [name for name, _ in variants],
+        "rows": rows,
+        "field_um": 2.0 * half_um,
+        "fovea_um": 2.0 * FOVEA_FRACTION * half_um,
+        "can_match": is_generated(last.settings),
+    }
+
+
+def _measures(result: Simulated, rate_bit_per_s: float | None, half_um: float) -> dict[str, float | None]:
+    budget = budget_of(result.shot.camera, 1.0)
+    found: dict[str, float | None] = {
+        "n_sites": budget.n_sites,
+        "bits_per_frame": budget.data_rate_bit_per_s,
+        "frames_per_s": rate_bit_per_s and rate_bit_per_s / budget.data_rate_bit_per_s,
+        "readout_steps": budget.readout_steps,
+        "area_mm2": budget.area_um2 * MM2_PER_UM2,
+        "total_e": float(result.capture.electrons.sum(dtype=np.float64)),
+        "read_noise_e": float(np.sqrt(budget.read_noise_e2)),
+    }
+    camera, scene, centre_um = result.shot.camera, result.shot.scene, fovea_um(result.capture.layout)
+    for name, side_um in (("field", half_um), ("fovea", FOVEA_FRACTION * half_um)):
+        grid = _square(centre_um, side_um)
+        try:
+            picture = result.capture.picture(of="light_e", per="um2", grid=grid, sensor=camera.sensor)
+            reference = camera.reference(scene, grid, exposure_s=result.shot.exposure_s)
+            quality = quality_by_eccentricity(picture, reference, edges_um=np.array([0.0, side_um]))
+            found |= {f"{name}_psnr_db": quality.psnr_db, f"{name}_ssim": quality.ssim}
+        except FoveasimError:  # such as a uniform image, or one outside the image circle
+            found |= {f"{name}_psnr_db": None, f"{name}_ssim": None}
+    return found
+
+
+def fovea_um(layout: Layout) -> Floats:
+    """Return the mean centroid of the smallest photosites, (x, y) µm."""
+    limit_um2 = FOVEA_AREA_RATIO * np.quantile(layout.area_um2, SLIVER_QUANTILE)
+    centre_um: Floats = layout.centroid_um[layout.area_um2 <= limit_um2].mean(axis=0)
+    return centre_um
+
+
+def _half_side_um(layout: Layout) -> float:
+    """Return half the shorter side of the bounding box."""
+    x0_um, y0_um, x1_um, y1_um = layout.bounds_um
+    return 0.5 * min(x1_um - x0_um, y1_um - y0_um)
+
+
+def _square(centre_um: Floats, half_um: float) -> Grid:
+    pitch_um = 2.0 * half_um / N_PIXELS
+    return Grid(
+        (N_PIXELS, N_PIXELS), (pitch_um, pitch_um), (float(centre_um[0] - half_um), float(centre_um[1] - half_um))
+    )
