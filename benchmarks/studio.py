@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+import os
 import subprocess
 import sys
 import time
@@ -21,6 +22,7 @@ import websockets
 from report import Report
 from rich.console import Console
 
+from foveasim.studio import TOKEN_VARIABLE
 from foveasim.studio._messages import decode_part
 
 N_CHANGES, N_QUICK = 50, 5
@@ -68,10 +70,11 @@ SHOWN_MS = {"1,000,000": 8000.0}
 console = Console(width=130)
 
 
-def start_server(*options: str) -> tuple[subprocess.Popen[str], str]:
+def start_server(*options: str, token: str | None = None) -> tuple[subprocess.Popen[str], str]:
     """Start the studio with options of its command, and return its process and address."""
     command = [sys.executable, "-m", "foveasim", "studio", "--no-browser", *options]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    environment = os.environ if token is None else {**os.environ, TOKEN_VARIABLE: token}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
     assert process.stdout is not None
     return process, process.stdout.readline().partition("studio at ")[2].split()[0]
 

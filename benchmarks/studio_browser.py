@@ -3,7 +3,8 @@ The studio in Chromium: latency from a control to the drawn views, and a soak te
 
     python benchmarks/studio_browser.py                 medians of 50 changes; 14,208 to 1,000,000 photosites
     python benchmarks/studio_browser.py --quick         5 changes, without bounds
-    python benchmarks/studio_browser.py --soak 30       random changes for 30 minutes: memory, console, stale views, codes
+    python benchmarks/studio_browser.py --soak 30       random changes for 30 minutes, with duplicated tabs and restarts of the
+                                                        server: memory, console, stale views, codes
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import hashlib
 import json
 import random
 import resource
+import secrets
 import shutil
 import subprocess
 import sys
@@ -39,6 +41,9 @@ REST_S = 7.0
 #: Interval at which the memory of the server is printed.
 PRINT_S = 120.0
 LEAK_MIB = 200.0
+#: Time after which the soak test restarts the server, and the numbers of steps after which it duplicates the tab, refreshes the
+#: views, and compares the codes with those of the settings.
+RESTART_S, DUPLICATED, REFRESHED, COMPARED = 300.0, 15, 10, 20
 #: Sends a change, and resolves to the times until the photosites are drawn and until the frame with all views is painted. The
 #: page tells when it is done: timers or frames that poll would take time from it.
 CHANGE = """([key, value]) => new Promise((resolve) => {
@@ -97,6 +102,8 @@ PARTS = """() => {
   const text = ({ about, arrays }) => JSON.stringify(about) + sums(arrays);
   return Object.fromEntries(Object.entries(studio.views.parts).map(([name, part]) => [name, text(part)]));
 }"""
+READY = "window.studio && studio.isReady && studio.connection.isOpen && studio.connection.requests.nDone > 0"
+STATE = "() => JSON.stringify(studio.state.settings)"
 CODES = """() => Array.from(studio.panes.b.columns.find(({ key }) => key === "code").values)"""
 CONTROLS = (
     "() => [...studio.controls.rows.values()].map(({ control, value }) => ({ ...control, value: value ?? null }))"
@@ -110,7 +117,10 @@ class Studio:
     """The server, and its page in Chromium."""
 
     def __init__(self, out: Path, arguments: tuple[str, ...]) -> None:
-        self.server, address = start_server("--out", str(out))
+        self.token = secrets.token_urlsafe(24)
+        self.options = ("--out", str(out))
+        self.server, address = start_server(*self.options, token=self.token)
+        self.port = address.split("/")[2].rpartition(":")[2]
         self.playwright = sync_playwright().start()
         browser = self.playwright.chromium.launch(executable_path=shutil.which("chromium"), args=list(arguments))
         context = browser.new_context(viewport={"width": 1440, "height": 900}, bypass_csp=True)
@@ -119,9 +129,7 @@ class Studio:
         self.page.on("console", lambda message: self._log(message.text))
         self.page.on("pageerror", lambda error: self._log(str(error)))
         self.page.goto(address)
-        self.page.wait_for_function(
-            "window.studio && studio.isReady && studio.connection.requests.nDone > 0", timeout=TIMEOUT_MS
-        )
+        self.page.wait_for_function(READY, timeout=TIMEOUT_MS)
         self.start = self.page.evaluate("() => studio.page.state.settings")
         self.devtools = context.new_cdp_session(self.page)
 
@@ -129,12 +137,28 @@ class Studio:
         self.messages.append(text)
         console.print(f"console: {text}")
 
-    def send(self, messages: list[dict[str, Any]], *, is_complete: bool = False) -> bool:
+    def send(self, messages: list[dict[str, Any]], *, is_complete: bool = False, page: Page | None = None) -> bool:
         """Send messages, wait until they are done, or also all previews complete; return whether this took a minute."""
-        problem = self.page.evaluate(SEND, [messages, is_complete])
+        problem = (page or self.page).evaluate(SEND, [messages, is_complete])
         if problem is not None:
             console.print(f"late: {problem}")
         return problem is not None
+
+    def restart(self) -> None:
+        """Restart the server at the same address, and wait for the page."""
+        self.server.terminate()
+        self.server.wait()
+        self.server, _ = start_server(*self.options, "--port", self.port, token=self.token)
+        self.page.wait_for_function(READY, timeout=TIMEOUT_MS)
+
+    def duplicate(self) -> Page:
+        """Duplicate the tab, and wait for the page."""
+        with self.page.context.expect_page() as opened:
+            self.page.evaluate("() => { open(location.href); }")
+        found = opened.value
+        found.on("pageerror", lambda error: self._log(str(error)))
+        found.wait_for_function(READY, timeout=TIMEOUT_MS)
+        return found
 
     def close(self) -> None:
         """End browser and server."""
@@ -176,9 +200,9 @@ def measure_latency(studio: Studio, report: Report, n: int) -> None:
                 add(f"{sensor} photosites: {name}, the map", drawn_ms, map_bound_ms)
 
 
-def random_messages(rng: random.Random, studio: Studio) -> list[dict[str, Any]]:
+def random_messages(rng: random.Random, studio: Studio, page: Page) -> list[dict[str, Any]]:
     """Return one to five random messages of a user."""
-    controls = studio.page.evaluate(CONTROLS)
+    controls = page.evaluate(CONTROLS)
     numbers = [c for c in controls if c["kind"] in ("number", "integer") and c["value"] is not None]
     numbers = [c for c in numbers if not c["key"].startswith("layout")]
     choices, presets = _choices(controls), _presets(studio)
@@ -195,7 +219,7 @@ def random_messages(rng: random.Random, studio: Studio) -> list[dict[str, Any]]:
         return {"do": "set", "key": control["key"], "value": rng.choice(control["choices"])["value"], "final": True}
 
     def edit() -> dict[str, Any]:
-        state = studio.page.evaluate("() => studio.page.state")
+        state = page.evaluate("() => studio.page.state")
         x0, y0, x1, y1 = state["summary"]["bounds_um"]
         x, y = rng.uniform(x0, x1), rng.uniform(y0, y1)
         outline = [[x, y], [x + 20.0, y], [x + 10.0, y + 15.0]]
@@ -253,67 +277,132 @@ def warm_up(studio: Studio) -> None:
         studio.send([{"do": "restore", "settings": studio.start}])
 
 
+class Soak:
+    """Random changes of a page, and what went wrong."""
+
+    def __init__(self, studio: Studio, seed: int) -> None:
+        self.studio, self.seed, self.rng = studio, seed, random.Random(seed)
+        self.n_steps = self.n_late = 0
+        # Checks by name: how many failed, of how many.
+        self.checks: dict[str, list[int]] = {}
+        warm_up(studio)
+        self.first_mib = studio.memory_mib()
+        self.grown_mib = 0.0
+
+    def check(self, name: str, is_fine: bool) -> None:
+        """Count a check."""
+        found = self.checks.setdefault(name, [0, 0])
+        found[0] += not is_fine
+        found[1] += 1
+        if not is_fine:
+            console.print(f"step {self.n_steps}: {name}")
+
+    def step(self, page: Page) -> None:
+        """Make some changes."""
+        self.n_late += self.studio.send(random_messages(self.rng, self.studio, page), page=page)
+        self.n_steps += 1
+
+    def refresh(self, page: Page) -> None:
+        """Compare the views with those that the server sends again."""
+        # A preview is shown as such until the complete result replaces it.
+        self.n_late += self.studio.send([], is_complete=True, page=page)
+        before = page.evaluate(PARTS)
+        self.studio.send([{"do": "refresh"}], page=page)
+        after = page.evaluate(PARTS)
+        stale = [name for name in before if name in after and _digest(before[name]) != _digest(after[name])]
+        self.check("stale views", not stale)
+        if stale:
+            console.print(f"stale {stale}")
+
+    def compare(self, page: Page) -> None:
+        """Compare the codes with those of the settings in this process."""
+        self.n_late += self.studio.send([], is_complete=True, page=page)
+        self.check("codes other than those of the settings", _is_equal(page))
+
+    def duplicate(self) -> None:
+        """Change a duplicated tab, which is another session with the same state."""
+        self.n_late += self.studio.send([], is_complete=True)
+        before, page = self.studio.page.evaluate(STATE), self.studio.duplicate()
+        self.check("duplicated tabs with another state", page.evaluate(STATE) == before)
+        for _ in range(3):
+            self.step(page)
+        self.refresh(page)
+        self.compare(page)
+        page.close()
+        self.check("changes of duplicated tabs in others", self.studio.page.evaluate(STATE) == before)
+        self.refresh(self.studio.page)
+
+    def restart(self) -> None:
+        """Restart the server: the page restores its state."""
+        self.measure()
+        self.n_late += self.studio.send(random_messages(self.rng, self.studio, self.studio.page))
+        self.studio.send([], is_complete=True)
+        before = self.studio.page.evaluate(STATE)
+        self.studio.restart()
+        self.n_late += self.studio.send([], is_complete=True)
+        self.check("states that are lost at a restart", self.studio.page.evaluate(STATE) == before)
+        self.compare(self.studio.page)
+
+    def measure(self) -> None:
+        """Compare the memory with that after all views, presets and choices."""
+        found = self.studio.memory_mib()
+        self.grown_mib = max(self.grown_mib, sum(found) - sum(self.first_mib))
+        console.print(f"{self.n_steps} steps: server {found[0]:.0f} MiB, page {found[1]:.0f} MiB")
+
+    def report(self, report: Report) -> None:
+        """Add the results to the report."""
+        bound = f"{LEAK_MIB:g} MiB"
+        report.add("soak: memory growth", f"{self.grown_mib:.0f} MiB", "bound", bound, self.grown_mib / LEAK_MIB, 1.0)
+        self.checks["console messages"] = [len(self.studio.messages), self.n_steps]
+        self.checks["answers later than a minute"] = [self.n_late, self.n_steps]
+        for name, (n_found, n_of) in self.checks.items():
+            report.add(f"soak: {name}", f"{n_found} of {n_of}", "none", "0", float(n_found > 0) * 2.0, 1.0)
+
+
 def soak(studio: Studio, report: Report, minutes: float, seed: int, out: Path) -> None:
     """Make random changes, and add memory, console messages, stale views and differences of codes to the report."""
-    rng = random.Random(seed)
-    warm_up(studio)
-    first = studio.memory_mib()
-    console.print(f"after every view, preset and choice: server {first[0]:.0f} MiB, page {first[1]:.0f} MiB")
-    start_s = printed_s = time.monotonic()
-    n_steps = n_refreshed = n_stale = n_compared = n_different = n_late = 0
-    while time.monotonic() - start_s < 60.0 * minutes:
-        n_late += studio.send(random_messages(rng, studio))
-        n_steps += 1
-        if n_steps % 3 == 0:
-            tile = rng.choice(studio.page.evaluate(TILES))
+    run = Soak(studio, seed)
+    console.print(
+        f"after every view, preset and choice: server {run.first_mib[0]:.0f} MiB, page {run.first_mib[1]:.0f} MiB; seed {seed}"
+    )
+    start_s = printed_s = restarted_s = time.monotonic()
+    while (now_s := time.monotonic()) - start_s < 60.0 * minutes:
+        run.step(studio.page)
+        if run.n_steps % 3 == 0:
+            tile = run.rng.choice(studio.page.evaluate(TILES))
             studio.page.click(f"#tabs button[data-tile='{tile}']")
-        if time.monotonic() - printed_s > PRINT_S:
-            printed_s = time.monotonic()
-            console.print(f"{printed_s - start_s:.0f} s, {n_steps} steps: server {studio.server_mib():.0f} MiB")
-        if n_steps % 10 == 0:
-            # A preview is shown as such until the complete result replaces it.
-            n_late += studio.send([], is_complete=True)
-            before = studio.page.evaluate(PARTS)
-            studio.send([{"do": "refresh"}])
-            after = studio.page.evaluate(PARTS)
-            shown = [name for name in before if name in after]
-            stale = [name for name in shown if _digest(before[name]) != _digest(after[name])]
-            n_refreshed, n_stale = n_refreshed + 1, n_stale + len(stale)
-            if stale:
-                console.print(f"step {n_steps}: stale {stale}")
-        if n_steps % 20 == 0:
-            n_compared += 1
-            n_different += not _is_equal(studio)
+        if run.n_steps % REFRESHED == 0:
+            run.refresh(studio.page)
+        if run.n_steps % COMPARED == 0:
+            run.compare(studio.page)
+        if run.n_steps % DUPLICATED == 0:
+            run.duplicate()
+        if now_s - restarted_s > RESTART_S:
+            run.restart()
+            restarted_s = time.monotonic()
+        if now_s - printed_s > PRINT_S:
+            printed_s = now_s
+            console.print(f"{now_s - start_s:.0f} s, {run.n_steps} steps: server {studio.server_mib():.0f} MiB")
     studio.send([{"do": "save", "name": "soak.yaml"}, {"do": "refresh"}])
     codes = np.array(studio.page.evaluate(CODES))
-    run = [sys.executable, "-m", "foveasim", "run", str(out / "soak.yaml"), "--out", str(out / "results")]
-    subprocess.run(run, check=True, stdout=subprocess.DEVNULL)
-    is_same = np.array_equal(codes, _codes_of_run(out / "results"))
-    last = studio.memory_mib()
-    grown_mib = last[0] - first[0] + last[1] - first[1]
-    console.print(f"{n_steps} steps; server {last[0]:.0f} MiB, page {last[1]:.0f} MiB; seed {seed}")
-    report.add("soak: memory growth", f"{grown_mib:.0f} MiB", "bound", f"{LEAK_MIB:g} MiB", grown_mib / LEAK_MIB, 1.0)
-    for name, n_found, n_of in (
-        ("console messages", len(studio.messages), n_steps),
-        ("answers later than a minute", n_late, n_steps),
-        ("stale views", n_stale, n_refreshed),
-        ("codes other than those of the settings", n_different, n_compared),
-        ("codes other than those of foveasim run", int(not is_same), 1),
-    ):
-        report.add(f"soak: {name}", f"{n_found} of {n_of}", "none", "0", float(n_found > 0) * 2.0, 1.0)
+    command = [sys.executable, "-m", "foveasim", "run", str(out / "soak.yaml"), "--out", str(out / "results")]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    run.check("codes other than those of foveasim run", np.array_equal(codes, _codes_of_run(out / "results")))
+    run.measure()
+    run.report(report)
 
 
 def _digest(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _is_equal(studio: Studio) -> bool:
+def _is_equal(page: Page) -> bool:
     """Return whether the codes of the page are those of its settings in this process."""
-    settings = json.loads(studio.page.evaluate("() => JSON.stringify(studio.page.state.settings)"), parse_float=float)
+    settings = json.loads(page.evaluate(STATE), parse_float=float)
     settings = _with_infinities(settings)
     shot = build_shot(None, settings)
     codes = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed).code
-    return np.array_equal(np.array(studio.page.evaluate(CODES)), codes)
+    return np.array_equal(np.array(page.evaluate(CODES)), codes)
 
 
 def _with_infinities(value: Any) -> Any:

@@ -26,7 +26,8 @@ def picture(result: Simulated) -> PartData:
 
 def pixels_of(light: NDArray[Any], coverage: NDArray[Any], bounds_um: tuple[float, ...]) -> PartData:
     """Return bytes of a picture, top row first, from linear (1 or 3, n_y, n_x)."""
-    level = np.clip(np.nan_to_num(light) * np.float32(N_LEVELS - 1), 0, N_LEVELS - 1).astype(np.uint16)
+    # fmax and fmin ignore NaN, which becomes 0.
+    level = np.fmin(np.fmax(light * np.float32(N_LEVELS - 1), 0), N_LEVELS - 1).astype(np.uint16)
     pixels = np.empty((*coverage.shape, 4), np.uint8)
     pixels[..., :3] = np.moveaxis(_srgb_table()[level], 0, -1)[::-1]
     pixels[..., 3] = np.rint(255.0 * np.clip(coverage, 0.0, 1.0))[::-1]

@@ -9,7 +9,7 @@ import { Histogram } from "../charts.js";
 // Returns statistics of the values of a pane by name, as texts.
 function statisticsOf({ column, sites }) {
   if (column.names) return { n: shown(sites.n) };
-  const sorted = Float64Array.from(column.values).sort(), figure = (v) => (Number.isNaN(v) ? "–" : shown(Number(v.toPrecision(4))));
+  const sorted = column.values.slice().sort(), figure = (v) => (Number.isNaN(v) ? "–" : shown(Number(v.toPrecision(4))));
   // NaN is last.
   const found = statistics(sorted, sorted.keys()), first = sorted.findIndex((v) => v > -Infinity);
   const median = found.n ? sorted[first + (found.n >> 1)] : NaN;
