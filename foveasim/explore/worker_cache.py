@@ -88,6 +88,10 @@ class WorkerCache:
         for key in [key for key in self._parts if quoted in key[1]]:
             del self._parts[key]
 
+    def clear(self) -> None:
+        """Remove all components."""
+        self._parts.clear()
+
     def finish_point(self) -> list[str]:
         """
         Remove the least recently used components, except those of the last point.

@@ -10,6 +10,8 @@ SLOW_S = 0.15
 REST_S = 0.3
 #: Rest after which unused memory is returned to the operating system.
 RELEASE_S = 5.0
+#: Rest after which a session without a page releases its results.
+FORGET_S = 20.0
 #: Settings that no stage with a scene depends on.
 FAST_KEYS = ("exposure_s", "seed")
 #: An earlier time counts with this factor: stages may come from the cache once.

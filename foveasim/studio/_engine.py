@@ -96,6 +96,10 @@ class Engine:
         """Remove cached stages whose settings contain a string, such as the path of a frame."""
         self._runner.cache.forget(text)
 
+    def clear(self) -> None:
+        """Remove all cached stages."""
+        self._runner.cache.clear()
+
     def simulate(self, settings: Mapping[str, Any], *, is_preview: bool = False) -> Simulated:
         """
         Simulate the shot of settings.

@@ -24,7 +24,7 @@ from foveasim.errors import FoveasimError, ParameterError, SimulationError, prin
 from foveasim.explore import measure
 from foveasim.explore.solving import search_value
 from foveasim.layout import Layout
-from foveasim.studio._costs import RELEASE_S, REST_S, CancelledError, Costs, SupersededError
+from foveasim.studio._costs import FORGET_S, RELEASE_S, REST_S, CancelledError, Costs, SupersededError
 from foveasim.studio._engine import Engine, Simulated
 from foveasim.studio._exports import log_of, text_of, without_directories
 from foveasim.studio._files import (
@@ -212,6 +212,7 @@ class Session:
         with self._wake:
             self._listeners.discard(listener)
             self.last_used_s = time.monotonic()
+            self._wake.notify()
 
     @property
     def is_idle(self) -> bool:
@@ -284,10 +285,8 @@ class Session:
     def _handle_until_closed(self) -> None:
         while True:
             with self._wake:
-                is_at_rest = False
-                rest_s = REST_S if self._wants_rest else RELEASE_S if self._has_unused_memory else None
-                while not self._waiting and not self._is_closed and not is_at_rest:
-                    is_at_rest = not self._wake.wait(rest_s)
+                while not self._waiting and not self._is_closed and self._wake.wait(self._rest_s):
+                    pass
                 if self._is_closed:
                     return
                 messages = list(self._waiting)
@@ -297,14 +296,31 @@ class Session:
                 if messages or self._wants_rest:
                     self._has_unused_memory = True
                     self._handle(messages) if messages else self._complete()
-                else:
+                elif self._has_unused_memory:
                     self._has_unused_memory = False
                     release_memory()
+                else:
+                    self._forget_result()
             except BaseException as error:  # noqa: BLE001 -- the session continues with its last valid state
                 self._send_error(self._last_id, error)
             finally:
                 with self._wake:
                     self._is_cancelled = self._is_working = False
+
+    @property
+    def _rest_s(self) -> float | None:
+        """Time without messages after which the thread has something to do; None for any time."""
+        if self._wants_rest:
+            return REST_S
+        if self._has_unused_memory:
+            return RELEASE_S
+        return FORGET_S if self.is_idle and self.result is not None else None
+
+    def _forget_result(self) -> None:
+        """Release the memory of a session without a page, which simulates its settings again for the next one."""
+        self.result = None
+        self.engine.clear()
+        release_memory()
 
     def _handle(self, messages: list[Any]) -> None:
         """Handle messages in order; consecutive changes are simulated once."""

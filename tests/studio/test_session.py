@@ -663,6 +663,30 @@ def test_thread_survives_unexpected_exceptions(settings, monkeypatch):
     assert threading.active_count() < 50
 
 
+def test_session_without_page_releases_its_results(settings, monkeypatch):
+    monkeypatch.setattr(_session, "FORGET_S", 0.05)
+    monkeypatch.setattr(_session, "RELEASE_S", 0.05)
+    session, messages = Session("threaded", Start(settings), n_threads=1), []
+
+    def is_done():
+        return any(isinstance(message, str) and json.loads(message)["kind"] == "done" for message in messages)
+
+    try:
+        session.attach(messages.append)
+        wait_until(is_done)
+        code = session.result.capture.code
+        time.sleep(0.3)
+        assert session.result is not None
+        session.detach(messages.append)
+        wait_until(lambda: session.result is None)
+        messages.clear()
+        session.attach(messages.append)
+        wait_until(is_done)
+        assert np.array_equal(session.result.capture.code, code)
+    finally:
+        session.close()
+
+
 def test_failing_listener_leaves_others(recorder):
     def fail(_message):
         raise OSError
