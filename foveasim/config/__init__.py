@@ -28,7 +28,7 @@ from foveasim.config._objects import (
 )
 from foveasim.config._problems import plain_settings, validate
 from foveasim.config._python import to_python
-from foveasim.config._requirements import RESULTS, Requirement
+from foveasim.config._requirements import RESULTS, RegionResult, Requirement
 from foveasim.config._shots import (
     Result,
     check_directory,
@@ -49,6 +49,7 @@ __all__ = [
     "STARTING_FILES",
     "YAML_EXTENSIONS",
     "LayoutFile",
+    "RegionResult",
     "Requirement",
     "Result",
     "Shot",

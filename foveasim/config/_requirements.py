@@ -1,14 +1,14 @@
-"""Requirements of a design: conditions on results of a shot."""
+"""Results of a shot that files can name, and requirements, which limit them."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
 from foveasim.errors import ParameterError
 
-#: Results that requirements can limit, by name: label and unit.
+#: Results of photosites by name: label and unit.
 RESULTS: dict[str, tuple[str, str]] = {
     "snr": ("signal-to-noise ratio", ""),
     "snr_db": ("signal-to-noise ratio", "dB"),
@@ -40,19 +40,17 @@ WITHOUT_REGION = ("data_rate_gbit_per_s", "violations", "exposure_s")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Requirement:
+class RegionResult:
     """
-    A condition on a result of a shot, of all photosites or of some.
+    A result of a shot, of all photosites or of some.
 
     Attributes
     ----------
     measure : str
-        Result that is limited: ``"snr"``, the median ratio of signal to temporal noise, and ``"snr_db"`` in dB; ``"n_sites"``;
+        ``"snr"``, the median ratio of signal to temporal noise, and ``"snr_db"`` in dB; ``"n_sites"``;
         ``"saturated_fraction"``; ``"mean_code_dn"``; ``"mtf"``, of the lens on the axis times the photosite of median area, at
         ``frequency_per_mm``; ``"psnr_db"``, of the reconstructed picture; ``"data_rate_gbit_per_s"`` of one lane;
         ``"violations"`` of the design rules; ``"smallest_size_um"``; ``"exposure_s"``.
-    at_least, at_most : float, optional
-        Limits in the unit of the result, at least one of them.
     annulus_um : (inner, outer), µm, optional
         Distances of the centroids from the centre of the layout's bounding box.
     rectangle_um : (x0, y0, x1, y1), µm, optional
@@ -65,18 +63,19 @@ class Requirement:
     Raises
     ------
     ParameterError
-        When a limit is missing, or the measure does not have the region or the frequency.
+        When the measure does not have the region or the frequency.
 
     Examples
     --------
     >>> import foveasim as fs
-    >>> print(fs.config.Requirement(measure="snr", at_least=10.0, annulus_um=(400.0, 600.0)))
-    signal-to-noise ratio from 400 to 600 µm: at least 10
+    >>> fs.config.RegionResult(measure="mtf", frequency_per_mm=50.0, annulus_um=(0.0, 100.0)).subject
+    'MTF of lens and photosite at 50 per mm from 0 to 100 µm'
     """
 
+    #: Unknown keys of files are errors.
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
+
     measure: MeasureName
-    at_least: float | None = None
-    at_most: float | None = None
     annulus_um: tuple[float, float] | None = None
     rectangle_um: tuple[float, float, float, float] | None = None
     site: int | None = None
@@ -85,14 +84,18 @@ class Requirement:
     def __post_init__(self) -> None:
         if self.measure not in RESULTS:
             raise ParameterError("measure", f"must be one of {', '.join(RESULTS)}", self.measure)
-        if self.at_least is None and self.at_most is None:
-            raise ParameterError("at_least", "or 'at_most' must be given")
-        for name in ("at_least", "at_most", "frequency_per_mm"):
-            value = getattr(self, name)
-            if value is not None and not math.isfinite(value):
-                raise ParameterError(name, "must be finite", value)
-        if self.at_least is not None and self.at_most is not None and self.at_least > self.at_most:
-            raise ParameterError("at_least", f"must be <= at_most, {self.at_most:g}", self.at_least)
+        self._check_region()
+        if self.frequency_per_mm is not None and not math.isfinite(self.frequency_per_mm):
+            raise ParameterError("frequency_per_mm", "must be finite", self.frequency_per_mm)
+        if (self.frequency_per_mm is not None) != (self.measure == "mtf"):
+            raise ParameterError(
+                "frequency_per_mm", "must be given if and only if measure='mtf'", self.frequency_per_mm
+            )
+        if self.frequency_per_mm is not None and self.frequency_per_mm < 0.0:
+            raise ParameterError("frequency_per_mm", "must be >= 0", self.frequency_per_mm, "per mm")
+
+    def _check_region(self) -> None:
+        """Check that there is at most one region, and that it is valid."""
         regions = [name for name in ("annulus_um", "rectangle_um", "site") if getattr(self, name) is not None]
         if len(regions) > 1:
             raise ParameterError(regions[1], f"excludes {regions[0]}", getattr(self, regions[1]))
@@ -115,21 +118,15 @@ class Requirement:
             )
         if self.site is not None and self.site < 0:
             raise ParameterError("site", "must be the index of a photosite, from 0", self.site)
-        if (self.frequency_per_mm is not None) != (self.measure == "mtf"):
-            raise ParameterError(
-                "frequency_per_mm", "must be given if and only if measure='mtf'", self.frequency_per_mm
-            )
-        if self.frequency_per_mm is not None and self.frequency_per_mm < 0.0:
-            raise ParameterError("frequency_per_mm", "must be >= 0", self.frequency_per_mm, "per mm")
 
     @property
     def unit(self) -> str:
-        """Unit of the result and of the limits."""
+        """Unit of the result."""
         return RESULTS[self.measure][1]
 
     @property
     def subject(self) -> str:
-        """The result that is limited, in words."""
+        """The result, in words."""
         parts = [RESULTS[self.measure][0]]
         if self.frequency_per_mm is not None:
             parts.append(f"at {self.frequency_per_mm:g} per mm")
@@ -140,6 +137,45 @@ class Requirement:
         if self.site is not None:
             parts.append(f"of photosite {self.site:,}")
         return " ".join(parts)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Requirement(RegionResult):
+    """
+    A condition on a result of a shot.
+
+    Attributes
+    ----------
+    measure, annulus_um, rectangle_um, site, frequency_per_mm
+        The result that is limited, as for :class:`RegionResult`.
+    at_least, at_most : float, optional
+        Limits in the unit of the result, at least one of them.
+
+    Raises
+    ------
+    ParameterError
+        When a limit is missing, or the measure does not have the region or the frequency.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> print(fs.config.Requirement(measure="snr", at_least=10.0, annulus_um=(400.0, 600.0)))
+    signal-to-noise ratio from 400 to 600 µm: at least 10
+    """
+
+    at_least: float | None = None
+    at_most: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.at_least is None and self.at_most is None:
+            raise ParameterError("at_least", "or 'at_most' must be given")
+        for name in ("at_least", "at_most"):
+            value = getattr(self, name)
+            if value is not None and not math.isfinite(value):
+                raise ParameterError(name, "must be finite", value)
+        if self.at_least is not None and self.at_most is not None and self.at_least > self.at_most:
+            raise ParameterError("at_least", f"must be <= at_most, {self.at_most:g}", self.at_least)
 
     def __str__(self) -> str:
         unit = f" {self.unit}" if self.unit else ""

@@ -12,7 +12,7 @@ from foveasim.explore.datasets.plan import DatasetFile, read_dataset
 from foveasim.explore.datasets.pytorch import torch_dataset
 from foveasim.explore.datasets.recipes import classification, denoising
 from foveasim.explore.datasets.store import StoredSamples, open_dataset, write_dataset
-from foveasim.explore.requirements import CheckedRequirement, check_requirements, measure
+from foveasim.explore.requirements import CheckedRequirement, ResultMetric, check_requirements, measure
 from foveasim.explore.solving import Solution, solve
 from foveasim.explore.studies.plan import StudyPlan, plan_study, read_study
 from foveasim.explore.studies.study import best_table, run_study, storage_name, study
@@ -28,6 +28,7 @@ __all__ = [
     "DatasetFile",
     "Metric",
     "Plan",
+    "ResultMetric",
     "Solution",
     "StoredSamples",
     "StudyPlan",

@@ -1,4 +1,4 @@
-"""Results of shots that requirements limit, and the check of requirements."""
+"""Results of shots and their photosites, as metrics, and the check of requirements."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from foveasim._core.short_repr import short_repr
 from foveasim.camera import Camera
 from foveasim.capture import Capture
-from foveasim.config import Requirement, Shot
+from foveasim.config import RegionResult, Requirement, Shot
 from foveasim.errors import SimulationError
 from foveasim.explore._metrics import METRICS
 from foveasim.explore.metrics.psnr import PSNR_PIXELS, picture_psnr_db
@@ -23,10 +23,10 @@ from foveasim.layout import Layout
 from foveasim.metrics import polygon_mtf, psnr_db
 from foveasim.scene import Scene
 
-__all__ = ["CheckedRequirement", "check_requirements", "measure"]
+__all__ = ["CheckedRequirement", "ResultMetric", "check_requirements", "measure"]
 
-#: A function of a shot, its capture, a requirement and the sites of its region.
-_Measure = Callable[[Shot, Capture, Requirement, NDArray[np.intp]], float]
+#: A function of a shot, its capture, a result and the sites of its region.
+_Measure = Callable[[Shot, Capture, RegionResult, NDArray[np.intp]], float]
 _FUNCTIONS: dict[str, _Measure] = {}
 
 
@@ -99,9 +99,9 @@ def check_requirements(shot: Shot, capture: Capture) -> list[CheckedRequirement]
     return [CheckedRequirement(requirement, measure(requirement, shot, capture)) for requirement in shot.requirements]
 
 
-def measure(requirement: Requirement, shot: Shot, capture: Capture) -> float:
+def measure(result: RegionResult, shot: Shot, capture: Capture) -> float:
     """
-    Return the result that a requirement limits.
+    Return the value of a result, such as that of a requirement.
 
     Raises SimulationError when its region contains no photosite, or the result does not exist for the scene.
 
@@ -110,26 +110,50 @@ def measure(requirement: Requirement, shot: Shot, capture: Capture) -> float:
     >>> import foveasim as fs
     >>> shot = fs.config.read_shot(fs.config.demo_settings()[0])
     >>> capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=0)
-    >>> round(fs.explore.measure(fs.config.Requirement(measure="smallest_size_um", at_least=2.0), shot, capture), 3)
+    >>> round(fs.explore.measure(fs.config.RegionResult(measure="smallest_size_um"), shot, capture), 3)
     2.0
     """
-    sites = sites_of(requirement, capture.layout)
+    sites = sites_of(result, capture.layout)
     if not sites.size:
-        raise SimulationError(f"{requirement.subject}: the region contains no photosite")
-    return float(_FUNCTIONS[requirement.measure](shot, capture, requirement, sites))
+        raise SimulationError(f"{result.subject}: the region contains no photosite")
+    return float(_FUNCTIONS[result.measure](shot, capture, result, sites))
 
 
-def sites_of(requirement: Requirement, layout: Layout) -> NDArray[np.intp]:
-    """Return the indices of the photosites in the region of a requirement."""
-    if requirement.site is not None:
-        if requirement.site >= layout.n_sites:
-            raise SimulationError(f"{requirement.subject}: the layout has only {layout.n_sites:,} photosites")
-        return np.array([requirement.site])
-    if requirement.annulus_um is not None:
+@dataclass(frozen=True)
+class ResultMetric:
+    """
+    Metric of a result, of all photosites or of some.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fovea = fs.explore.ResultMetric(fs.config.RegionResult(measure="snr", annulus_um=(0.0, 200.0)))
+    >>> shot = fs.config.demo_settings()[0]
+    >>> found = fs.explore.sweep(shot, {"exposure_s": [0.01, 0.02]}, metrics={"fovea_snr": fovea}, workers=0)
+    >>> found["fovea_snr"].shape
+    (2,)
+    """
+
+    result: RegionResult
+
+    __repr__ = short_repr
+
+    def __call__(self, shot: Shot, camera: Camera, capture: Capture) -> float:  # noqa: ARG002 -- the signature of metrics
+        """Return the value of the result."""
+        return measure(self.result, shot, capture)
+
+
+def sites_of(result: RegionResult, layout: Layout) -> NDArray[np.intp]:
+    """Return the indices of the photosites in the region of a result."""
+    if result.site is not None:
+        if result.site >= layout.n_sites:
+            raise SimulationError(f"{result.subject}: the layout has only {layout.n_sites:,} photosites")
+        return np.array([result.site])
+    if result.annulus_um is not None:
         radius_um = np.hypot(*(layout.centroid_um - centre_um_of(layout)).T)
-        return np.flatnonzero((radius_um >= requirement.annulus_um[0]) & (radius_um < requirement.annulus_um[1]))
-    if requirement.rectangle_um is not None:
-        x0, y0, x1, y1 = requirement.rectangle_um
+        return np.flatnonzero((radius_um >= result.annulus_um[0]) & (radius_um < result.annulus_um[1]))
+    if result.rectangle_um is not None:
+        x0, y0, x1, y1 = result.rectangle_um
         x, y = layout.centroid_um.T
         return np.flatnonzero((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1))
     return np.arange(layout.n_sites)
@@ -150,39 +174,39 @@ def _function(name: str) -> Callable[[_Measure], _Measure]:
 
 
 @_function("snr")
-def _snr(shot: Shot, capture: Capture, _requirement: Requirement, sites: NDArray[np.intp]) -> float:
+def _snr(shot: Shot, capture: Capture, _result: RegionResult, sites: NDArray[np.intp]) -> float:
     ratio, is_saturated = signal_to_noise_of(shot, shot.camera, capture)
     used = ratio[sites][~is_saturated[sites]]
     return float(np.median(used)) if used.size else float("nan")
 
 
 @_function("snr_db")
-def _snr_db(shot: Shot, capture: Capture, requirement: Requirement, sites: NDArray[np.intp]) -> float:
-    ratio = _snr(shot, capture, requirement, sites)
+def _snr_db(shot: Shot, capture: Capture, result: RegionResult, sites: NDArray[np.intp]) -> float:
+    ratio = _snr(shot, capture, result, sites)
     return 20.0 * float(np.log10(ratio)) if ratio > 0.0 else float("-inf" if ratio == 0.0 else "nan")
 
 
 @_function("n_sites")
-def _n_sites(_shot: Shot, _capture: Capture, _requirement: Requirement, sites: NDArray[np.intp]) -> float:
+def _n_sites(_shot: Shot, _capture: Capture, _result: RegionResult, sites: NDArray[np.intp]) -> float:
     return sites.size
 
 
 @_function("saturated_fraction")
-def _saturated(_shot: Shot, capture: Capture, _requirement: Requirement, sites: NDArray[np.intp]) -> float:
+def _saturated(_shot: Shot, capture: Capture, _result: RegionResult, sites: NDArray[np.intp]) -> float:
     return float(np.mean(capture.code[sites] == 2**capture.bits - 1))
 
 
 @_function("mean_code_dn")
-def _mean_code(_shot: Shot, capture: Capture, _requirement: Requirement, sites: NDArray[np.intp]) -> float:
+def _mean_code(_shot: Shot, capture: Capture, _result: RegionResult, sites: NDArray[np.intp]) -> float:
     return float(np.mean(capture.code[sites]))
 
 
 @_function("mtf")
-def _mtf(shot: Shot, capture: Capture, requirement: Requirement, sites: NDArray[np.intp]) -> float:
-    assert requirement.frequency_per_mm is not None
+def _mtf(shot: Shot, capture: Capture, result: RegionResult, sites: NDArray[np.intp]) -> float:
+    assert result.frequency_per_mm is not None
     layout, scene = capture.layout, shot.scene
     median = sites[np.argsort(layout.area_um2[sites], kind="stable")[sites.size // 2]]
-    per_mm = np.array([requirement.frequency_per_mm])
+    per_mm = np.array([result.frequency_per_mm])
     found = float(polygon_mtf(layout[np.array([median])], per_mm)[0, 0])
     if isinstance(scene, Scene):
         wavelength_nm = float(np.median(scene.wavelength_nm))
@@ -191,54 +215,54 @@ def _mtf(shot: Shot, capture: Capture, requirement: Requirement, sites: NDArray[
 
 
 @_function("psnr_db")
-def _psnr(shot: Shot, capture: Capture, requirement: Requirement, _sites: NDArray[np.intp]) -> float:
-    if requirement.site is not None:
-        raise SimulationError(f"{requirement.subject}: a picture quality needs an annulus or a rectangle")
+def _psnr(shot: Shot, capture: Capture, result: RegionResult, _sites: NDArray[np.intp]) -> float:
+    if result.site is not None:
+        raise SimulationError(f"{result.subject}: a picture quality needs an annulus or a rectangle")
     camera = shot.camera
-    if requirement.annulus_um is None and requirement.rectangle_um is None:
+    if result.annulus_um is None and result.rectangle_um is None:
         return picture_psnr_db(shot, camera, capture)
-    if requirement.rectangle_um is not None:
-        x0, y0, x1, y1 = requirement.rectangle_um
+    if result.rectangle_um is not None:
+        x0, y0, x1, y1 = result.rectangle_um
     else:
-        assert requirement.annulus_um is not None
+        assert result.annulus_um is not None
         x, y = centre_um_of(capture.layout)
-        outer_um = requirement.annulus_um[1]
+        outer_um = result.annulus_um[1]
         x0, y0, x1, y1 = x - outer_um, y - outer_um, x + outer_um, y + outer_um
     pitch_um = max(x1 - x0, y1 - y0) / PSNR_PIXELS
     shape = (max(1, round((y1 - y0) / pitch_um)), max(1, round((x1 - x0) / pitch_um)))
     grid = Grid(shape, ((x1 - x0) / shape[1], (y1 - y0) / shape[0]), (x0, y0))
     reference = camera.reference(shot.scene, grid, exposure_s=shot.exposure_s)
     picture = capture.picture(of="light_e", per="um2", grid=grid, sensor=camera.sensor)
-    if requirement.annulus_um is not None:
+    if result.annulus_um is not None:
         x_um, y_um = (origin + (np.arange(n) + 0.5) * step for origin, n, step in (
             (x0, shape[1], grid.pitch_x_um), (y0, shape[0], grid.pitch_y_um)
         ))  # fmt: skip
         centre = centre_um_of(capture.layout)
         radius_um = np.hypot(x_um - centre[0], (y_um - centre[1])[:, None])
-        inner, outer = requirement.annulus_um
+        inner, outer = result.annulus_um
         picture = replace(picture, data=np.where((radius_um >= inner) & (radius_um < outer), picture.data, np.nan))
     return psnr_db(picture, reference)
 
 
 @_function("data_rate_gbit_per_s")
-def _data_rate(shot: Shot, capture: Capture, _requirement: Requirement, _sites: NDArray[np.intp]) -> float:
+def _data_rate(shot: Shot, capture: Capture, _result: RegionResult, _sites: NDArray[np.intp]) -> float:
     return data_rate_gbit_per_s(shot, shot.camera, capture)
 
 
 @_function("violations")
-def _violations(shot: Shot, capture: Capture, requirement: Requirement, _sites: NDArray[np.intp]) -> float:
+def _violations(shot: Shot, capture: Capture, result: RegionResult, _sites: NDArray[np.intp]) -> float:
     if shot.rules is None:
-        raise SimulationError(f"{requirement.subject}: the layout has no design rules")
-    return sum(len(result) for result in capture.layout.check(shot.rules).results)
+        raise SimulationError(f"{result.subject}: the layout has no design rules")
+    return sum(len(rule) for rule in capture.layout.check(shot.rules).results)
 
 
 @_function("smallest_size_um")
-def _smallest(_shot: Shot, capture: Capture, _requirement: Requirement, sites: NDArray[np.intp]) -> float:
+def _smallest(_shot: Shot, capture: Capture, _result: RegionResult, sites: NDArray[np.intp]) -> float:
     return float(capture.layout.size_um[sites].min())
 
 
 @_function("exposure_s")
-def _exposure(shot: Shot, _capture: Capture, _requirement: Requirement, _sites: NDArray[np.intp]) -> float:
+def _exposure(shot: Shot, _capture: Capture, _result: RegionResult, _sites: NDArray[np.intp]) -> float:
     return shot.exposure_s
 
 

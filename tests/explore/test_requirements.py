@@ -201,6 +201,47 @@ def test_sweeps_have_the_margins():
     json.dumps(found.attrs)
 
 
+def test_sweep_files_contain_results_of_photosites(tmp_path):
+    """Points with the seed of the shot are captures of the changed shot."""
+    inner, all_sites = {"measure": "mean_code_dn", "annulus_um": [0.0, 40.0]}, {"measure": "psnr_db"}
+    file = {"shot": SHOT, "vary": {"exposure_s": [1e-4, 1e-3]}, "seed": "shot"}
+    file["results"] = {"inner_dn": inner, "quality_db": all_sites}
+    path = tmp_path / "sweep.yaml"
+    path.write_text(yaml.safe_dump(file))
+    found = explore.run_sweep(explore.read_sweep(path), workers=0)
+
+    assert {"inner_dn", "quality_db", "seed"} <= set(found) and "n_sites" not in found
+    assert found["seed"].values.tolist() == [SHOT["seed"]] * 2
+    for exposure_s in (1e-4, 1e-3):
+        shot = build_shot(None, {**SHOT, "exposure_s": exposure_s})
+        capture = shot.camera.capture(shot.scene, exposure_s=exposure_s, seed=SHOT["seed"])
+        point = found.sel(exposure_s=exposure_s)
+        radius_um = np.hypot(
+            *(capture.layout.centroid_um - np.reshape(capture.layout.bounds_um, (2, 2)).mean(axis=0)).T
+        )
+        assert float(point["inner_dn"]) == capture.code[radius_um < 40.0].mean()
+        assert float(point["quality_db"]) == explore.METRICS["psnr_db"](shot, shot.camera, capture)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": "shot", "repeats": 2}, "'repeats' must be 1 with the seed of the shot"),
+        ({"seed": "short"}, "seed"),
+        ({"results": {"a": {"measure": "srn"}}}, r"results\.a\.measure: must be one of 'snr'"),
+        ({"results": {"a": {"measure": "snr", "at_least": 2.0}}}, r"results\.a\.at_least"),
+        ({"results": {"a b": {"measure": "snr"}}}, "must have names that are identifiers"),
+        ({"metrics": ["snr"], "results": {"snr": {"measure": "snr"}}}, "'results' must not have the name of a metric"),
+    ],
+)
+def test_wrong_results_of_files_are_one_line(tmp_path, change, message):
+    path = tmp_path / "sweep.yaml"
+    path.write_text(yaml.safe_dump({"shot": SHOT, "vary": {"exposure_s": [1e-4, 1e-3]}, **change}))
+    with pytest.raises(ConfigError, match=message) as caught:
+        explore.read_sweep(path)
+    assert "\n" not in str(caught.value)
+
+
 def test_requirements_repeat_no_simulation(taken):
     runner = explore.worker_cache.ShotRunner(None, {})
     runner.simulate_capture(SHOT)

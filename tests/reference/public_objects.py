@@ -68,6 +68,7 @@ SHOT = {
 
 
 REQUIREMENT = config.Requirement(measure="snr", at_least=1.0, annulus_um=(0.0, 50.0))
+RESULT = config.RegionResult(measure="snr", annulus_um=(0.0, 50.0))
 
 
 def public_objects(directory):
@@ -124,7 +125,7 @@ def public_objects(directory):
         view.SensorStack(), view.colours_of(SITES, "area_um2"), view.SitePixels.from_layout(SITES, (50, 50)), solids, solids.check(), view.Viewpoint(),
         plan, explore.StudyPlan(base=plan, search={}, objectives={"m": "minimize"}, constraints={}, n_trials=1, batch=1, name="study", directory=directory, files={}),
         config.LayoutFile(layout=SITES, rules=fs.DesignRules(min_size_um=1.0), source="sites.npz"), config.Result(shot, capture, REPORT, 0.1), shot,
-        REQUIREMENT, explore.CheckedRequirement(REQUIREMENT, 5.0), explore.Solution("exposure_s", 0.01, 5.0, [(float(k), 1.0) for k in range(50)]),
+        REQUIREMENT, RESULT, explore.ResultMetric(RESULT), explore.CheckedRequirement(REQUIREMENT, 5.0), explore.Solution("exposure_s", 0.01, 5.0, [(float(k), 1.0) for k in range(50)]),
         config.Viewable(capture, REPORT, "capture"), drc.Case(SITES, fs.DesignRules(min_size_um=1.0)), drc.Measurement(MANY),
         config.Source(file=Path("sweep.yaml"), keys=("shot",), index="3"), layout.SolveFor(name="n_x", is_integer=True, is_increasing=True, guess=len),
         compare.budget_of(CAMERA, 30.0), compare.MEASURES["psnr_db"], compare.median_interval(np.ones((50, 5))), compare.SceneCovariance(np.ones(50), np.ones(50)),

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from foveasim._core.threads import cached_property
 from foveasim._core.validation import Ints, check_count
 from foveasim._io.yaml_files import position_of, read_yaml
 from foveasim.config import (
+    RegionResult,
     Source,
     check_settings,
     plain_settings,
@@ -35,11 +36,13 @@ from foveasim.config._models import Section
 from foveasim.errors import ConfigError, ParameterError
 from foveasim.explore._files import digests
 from foveasim.explore._metrics import Metric, add_metrics, resolve_metrics
+from foveasim.explore.requirements import ResultMetric
 
 __all__ = [
     "MAX_POINTS",
     "Plan",
     "SweepSection",
+    "ValueRange",
     "check_disjoint",
     "coordinate",
     "copy_settings",
@@ -57,8 +60,13 @@ MAX_POINTS = 1_000_000
 CHECKED_VALUES = 1000
 #: Names of dimensions that are not settings.
 POINT, REPEAT = "point", "repeat"
+#: Setting with the seed of a shot.
+SEED = "seed"
 #: Keys of files with the values of settings: by path, and by point.
 VARY, POINTS = "vary", "points"
+#: Seed of a sweep, from which those of its points are derived; or that of the shot, which then is the seed of all points.
+Seed = int | Literal["shot"]
+OF_SHOT: Final = "shot"
 #: Settings of the photosites and their integration areas, and settings of the optical image.
 GEOMETRY_SETTINGS = ("layout", "distortion", "integration_order", "gaze_um")
 IMAGE_SETTINGS = ("scene", "optics", "sensor.qe", "sensor.filters")
@@ -88,6 +96,8 @@ class Plan:
     metrics : mapping of str to function
     files : mapping of str to str
         SHA-256 of the files that the settings reference directly or indirectly.
+    is_seed_common : bool
+        Whether the seed is that of the shot, and of all points.
     """
 
     source: Source
@@ -99,6 +109,7 @@ class Plan:
     seed: int
     metrics: Mapping[str, Metric]
     files: Mapping[str, str]
+    is_seed_common: bool = False
 
     __repr__ = short_repr
 
@@ -134,8 +145,8 @@ class Plan:
         return self._settings_with(chosen) | {"seed": self.seed_of(point)}
 
     def seed_of(self, point: int) -> int:
-        """Return the noise seed of a point, derived from the sweep seed and the point number."""
-        return derive_seed(self.seed, point)
+        """Return the noise seed of a point: derived from the sweep seed and the point number, or that of the shot."""
+        return self.seed if self.is_seed_common else derive_seed(self.seed, point)
 
     @property
     def is_geometry_varied(self) -> bool:
@@ -173,7 +184,7 @@ class Plan:
             "vary": {path: list(values) for path, values in self.values.items()},
             "mode": self.mode,
             "repeats": self.repeats,
-            "seed": self.seed,
+            "seed": OF_SHOT if self.is_seed_common else self.seed,
             "metrics": dict(self._metric_identities),
             "files": dict(self.files),
             "versions": versions(),
@@ -236,7 +247,7 @@ class Plan:
         return self.source.with_replaced(replaced)
 
 
-class _Range(Section):
+class ValueRange(Section):
     """Range of ``n`` values with linear or geometric spacing."""
 
     low: float = Field(alias="from")
@@ -244,18 +255,42 @@ class _Range(Section):
     n: int = Field(ge=1, le=MAX_POINTS)
     spacing: Literal["linear", "geometric"] = "linear"
 
+    def values(self) -> list[int | float]:
+        """
+        Return the values, integers if all are.
+
+        Raises ParameterError when a bound is not finite, or the bounds allow no geometric spacing.
+        """
+        if self.spacing == "geometric":
+            if not self.low * self.high > 0.0:
+                raise ParameterError(
+                    "range", "must have non-zero bounds of equal sign for geometric spacing", [self.low, self.high]
+                )
+            numbers = np.geomspace(self.low, self.high, self.n)
+        else:
+            numbers = np.linspace(self.low, self.high, self.n)
+        if not np.isfinite(numbers).all():
+            raise ParameterError("range", "must have finite bounds", [self.low, self.high])
+        rounded = np.array([float(f"{number:.12g}") for number in numbers])
+        numbers = np.where(
+            np.isclose(numbers, rounded, rtol=1e-15, atol=0.0), rounded, numbers
+        )  # 4 for 3.999999999999999
+        is_integer = bool((numbers == np.rint(numbers)).all())
+        return [int(number) if is_integer else float(number) for number in numbers]
+
 
 class SweepSection(Section):
     """Settings of a sweep: shot, varied settings, repeats, seed and metrics."""
 
     shot: str | dict[str, Any] = Field(description="settings file, relative to this file, or the settings")
     set: dict[str, Any] = Field({}, description="settings that are replaced in all points, by path")
-    vary: dict[str, list[Any] | _Range] | None = Field(None, description="values or ranges, by setting path")
+    vary: dict[str, list[Any] | ValueRange] | None = Field(None, description="values or ranges, by setting path")
     points: list[dict[str, Any]] | None = Field(None, description="settings of each point, instead of vary")
     mode: Literal["product", "zip"] = Field("product", description="all combinations, or values in parallel")
     repeats: int = Field(1, description="captures of each point, which differ in their seeds")
-    seed: int = 0
-    metrics: list[str] | None = Field(None, description="names of metrics; a default set if omitted")
+    seed: Seed = Field(0, description="from which the seeds of the points are derived; shot: all have that of the shot")
+    metrics: list[str] | None = Field(None, description="names of metrics; a default set if omitted, without results")
+    results: dict[str, RegionResult] = Field({}, description="further metrics by name: results of photosites")
 
 
 def read_sweep(path: str | Path, *, metrics: Sequence[str] = ()) -> Plan:
@@ -267,8 +302,9 @@ def read_sweep(path: str | Path, *, metrics: Sequence[str] = ()) -> Plan:
     path : path
         File with the keys ``shot`` (a settings file, or the settings), ``vary`` (setting paths to lists, or to
         ``{from: 2, to: 16, n: 8, spacing: geometric}``) or ``points`` (a list of settings), ``mode``, ``repeats``, ``seed``,
-        ``metrics``, and ``set`` (settings that are replaced in all points). Metrics in the file must be names in
-        :data:`METRICS`, so that reading a file never imports code.
+        ``metrics``, ``results`` (metrics of photosites by name, each as a :class:`~foveasim.config.RegionResult`), and ``set``
+        (settings that are replaced in all points). Metrics in the file must be names in :data:`METRICS`, so that reading a
+        file never imports code.
     metrics : sequence of str
         Further metrics: names, or ``module:function``, which is imported.
 
@@ -301,12 +337,12 @@ def read_sweep(path: str | Path, *, metrics: Sequence[str] = ()) -> Plan:
     vary: Any = section.points
     if section.vary is not None:
         vary = {
-            name: _expand_range(path, name, values) if isinstance(values, _Range) else values
+            name: _expand_range(path, name, values) if isinstance(values, ValueRange) else values
             for name, values in section.vary.items()
         }
     with with_file_context(path):
         # Names in the file are looked up in METRICS, and never imported.
-        file_metrics = resolve_metrics(section.metrics)
+        file_metrics = _metrics_of(section)
     all_metrics = add_metrics(file_metrics, metrics)
     with with_file_context(path):
         return plan_sweep(
@@ -327,7 +363,7 @@ def plan_sweep(
     *,
     mode: Literal["product", "zip"] = "product",
     repeats: int = 1,
-    seed: int = 0,
+    seed: Seed = 0,
     metrics: Iterable[str | Metric] | Mapping[str, Metric] | None = None,
     changes: Mapping[str, Any] | None = None,
     source: Source | str | Path | None = None,
@@ -346,8 +382,9 @@ def plan_sweep(
         All combinations of the values, or the k-th values of all settings together.
     repeats : int
         Captures of each point, which differ in their seeds.
-    seed : int
-        Seed from which the seed of every point is derived.
+    seed : int or "shot"
+        Seed from which the seed of every point is derived; ``"shot"`` for the seed of the shot in all points, whose noise is
+        then equal.
     metrics : names or functions, or mapping of names to functions, optional
         See :data:`METRICS`. A function of a shot, its camera and its capture returns a number, a string, a mapping of names to
         numbers or strings, a numpy array, or an xarray.DataArray.
@@ -393,7 +430,9 @@ def plan_sweep(
     settings = resolve_files(shot_source.directory, data, found=found)
     shot_source = with_changes(own, shot_source, changes)
     put_changes(own, shot_source, settings, changes, found)
-    settings.pop("seed", None)
+    of_shot = settings.pop(SEED, 0)
+    if seed == OF_SHOT and repeats > 1:
+        raise ParameterError("repeats", "must be 1 with the seed of the shot, which gives equal captures", repeats)
     plan = Plan(
         source=shot_source.absolute(),
         written=own.absolute().at(written_as),
@@ -401,7 +440,8 @@ def plan_sweep(
         values={path: [resolve_files(own.directory, v, path, found) for v in each] for path, each in values.items()},
         mode=mode,
         repeats=repeats,
-        seed=check_count("seed", seed, at_least=0),
+        seed=check_count("seed", of_shot if seed == OF_SHOT else seed, at_least=0),
+        is_seed_common=seed == OF_SHOT,
         metrics=resolve_metrics(metrics),
         files=digests(found),
     )
@@ -544,19 +584,21 @@ def _constant(text: str) -> float:
     return float(text)
 
 
-def _expand_range(path: Path, name: str, value_range: _Range) -> list[Any]:
-    if value_range.spacing == "geometric":
-        if not value_range.low * value_range.high > 0.0:
-            raise ConfigError(path, f"vary.{name}: must have non-zero bounds of equal sign for geometric spacing")
-        numbers = np.geomspace(value_range.low, value_range.high, value_range.n)
-    else:
-        numbers = np.linspace(value_range.low, value_range.high, value_range.n)
-    if not np.isfinite(numbers).all():
-        raise ConfigError(path, f"vary.{name}: must have finite bounds")
-    rounded = np.array([float(f"{number:.12g}") for number in numbers])
-    numbers = np.where(np.isclose(numbers, rounded, rtol=1e-15, atol=0.0), rounded, numbers)  # 4 for 3.999999999999999
-    is_integer = bool((numbers == np.rint(numbers)).all())
-    return [int(number) if is_integer else float(number) for number in numbers]
+def _expand_range(path: Path, name: str, value_range: ValueRange) -> list[Any]:
+    try:
+        return value_range.values()
+    except ParameterError as error:
+        raise ConfigError(path, f"{VARY}.{name}: {error.detail}") from None
+
+
+def _metrics_of(section: SweepSection) -> dict[str, Metric]:
+    """Return the metrics and results of a file by name."""
+    results = {name: ResultMetric(result) for name, result in section.results.items()}
+    named = {} if results and section.metrics is None else resolve_metrics(section.metrics)
+    twice = next((name for name in results if name in named), None)
+    if twice is not None:
+        raise ParameterError("results", "must not have the name of a metric", twice)
+    return named | resolve_metrics(results) if results else named
 
 
 def _overlaps(path: str, parts: tuple[str, ...]) -> bool:

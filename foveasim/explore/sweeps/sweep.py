@@ -16,7 +16,7 @@ from foveasim.errors import SimulationError
 from foveasim.explore._metrics import Metric
 from foveasim.explore._records import WORKER_LOST, Journal, Record, check_same_plan, journal_path
 from foveasim.explore.executor import KILLED, WORKERS, executor
-from foveasim.explore.sweeps.plan import Plan, plan_sweep
+from foveasim.explore.sweeps.plan import Plan, Seed, plan_sweep
 from foveasim.explore.sweeps.results import (
     check_store,
     import_xarray,
@@ -42,7 +42,7 @@ def sweep(
     *,
     mode: Literal["product", "zip"] = "product",
     repeats: int = 1,
-    seed: int = 0,
+    seed: Seed = 0,
     metrics: Iterable[str | Metric] | Mapping[str, Metric] | None = None,
     changes: Mapping[str, Any] | None = None,
     out: str | Path | None = None,
