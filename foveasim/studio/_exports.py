@@ -37,7 +37,7 @@ def text_of(what: str, settings: Mapping[str, Any], start: Mapping[str, Any], na
     name of the shot. ``files``: files that the settings contain, which must be next to the text. Raises ParameterError when
     the format is unknown.
     """
-    note = f"# Uploaded files, next to this file: {', '.join(files)}\n" if files else ""
+    note = note_of_files(files)
     match what:
         case "yaml":
             return note + format_yaml(settings)
@@ -52,6 +52,11 @@ def text_of(what: str, settings: Mapping[str, Any], start: Mapping[str, Any], na
             return "".join(difflib.unified_diff(old, new, f"{name}.yaml", "studio"))
         case _:
             raise ParameterError("what", "must be yaml, python, notebook, link or diff", printable(what)[:40])
+
+
+def note_of_files(files: Sequence[str]) -> str:
+    """Return a comment about the uploaded files that a file requires."""
+    return f"# Uploaded files, next to this file: {', '.join(files)}\n" if files else ""
 
 
 def log_of(states: Sequence[Mapping[str, Any]]) -> str:

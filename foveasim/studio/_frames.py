@@ -222,3 +222,9 @@ class Frames:
         if not file.exists():
             write_picture(file, pixels)
         return {key: file}
+
+    def with_file(self, settings: dict[str, Any]) -> dict[str, Any]:
+        """Return settings whose scene is a stored file of the current frame, or the same object."""
+        for file in self.export(settings).values():
+            settings = {**settings, "scene": {**settings["scene"], "picture": str(file)}}
+        return settings

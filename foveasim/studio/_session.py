@@ -10,16 +10,17 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from foveasim._core.work_arrays import release_memory
 from foveasim._io.atomic import atomic_write
 from foveasim._io.yaml_files import format_yaml
-from foveasim.config import RESULTS, Requirement, check_settings, get_setting, put_setting, validate
+from foveasim.config import RESULTS, Requirement, check_settings, put_setting, validate
 from foveasim.errors import FoveasimError, ParameterError, SimulationError, printable
 from foveasim.explore import measure
 from foveasim.explore.solving import search_value
@@ -45,7 +46,6 @@ from foveasim.studio._settings.changes import (
     ONCE,
     changed_keys,
     check_depth,
-    choose_preset,
     chooses_filters,
     is_change,
     is_draft,
@@ -56,7 +56,7 @@ from foveasim.studio._settings.changes import (
     string_of,
     with_file,
 )
-from foveasim.studio._settings.controls import chosen_value, controls_of, structure_of
+from foveasim.studio._settings.controls import controls_of, structure_of
 from foveasim.studio._settings.unknowns import (
     PARAMETERS,
     balanced,
@@ -65,6 +65,8 @@ from foveasim.studio._settings.unknowns import (
     with_n_sites,
     with_unknown,
 )
+from foveasim.studio._settings.values import number_control, present_number, values_of, with_values
+from foveasim.studio._sweeps import Sweep, Sweeps, axes_of, results_of
 from foveasim.studio._variants import DIRECTORY, Variants
 from foveasim.studio._views import Views
 
@@ -72,8 +74,8 @@ from foveasim.studio._views import Views
 MAX_SESSION_BYTES = 512 << 20
 #: Largest number of photosites that charts compare, and of variants that are compared with the current state.
 MAX_PINNED, MAX_COMPARED = 6, 5
-#: Kinds of controls whose values goal seek can change, and its range of automatic exposures.
-NUMBERS, EXPOSURES_S = ("number", "integer"), (1e-5, 1.0)
+#: Range of goal seek for automatic exposures.
+EXPOSURES_S = (1e-5, 1.0)
 #: Largest number of messages that wait.
 MAX_WAITING = 1000
 #: Newer changes stop simulations for at most this time in succession, so that some are shown.
@@ -132,6 +134,7 @@ class Session:
         self.frames = Frames(self.uploads, self._new_path)
         self._costs = Costs()
         self._views = Views(self._send, self._line, self._costs)
+        self._sweeps = Sweeps(self._send, self._line)
         self._version = 0
         self._last_id: Any = None
         self._structure: Any = None
@@ -291,9 +294,14 @@ class Session:
                     return
                 messages = list(self._waiting)
                 self._waiting.clear()
-                self._is_working = True
+                is_sweeping = self._sweeps.is_running and not self._wants_rest
+                # Points are interrupted by messages, not cancelled.
+                self._is_working = bool(messages) or not is_sweeping
             try:
-                if messages or self._wants_rest:
+                if is_sweeping and not messages:
+                    self._has_unused_memory = True
+                    self._sweeps.compute_next(self.engine.simulate)
+                elif messages or self._wants_rest:
                     self._has_unused_memory = True
                     self._handle(messages) if messages else self._complete()
                 elif self._has_unused_memory:
@@ -312,6 +320,8 @@ class Session:
         """Time without messages after which the thread has something to do; None for any time."""
         if self._wants_rest:
             return REST_S
+        if self._sweeps.is_running:
+            return 0.0
         if self._has_unused_memory:
             return RELEASE_S
         return FORGET_S if self.is_idle and self.result is not None else None
@@ -358,6 +368,10 @@ class Session:
         """
         if self._is_closed:
             raise SupersededError
+        if self._sweeps.is_computing:
+            if self._sweeps.is_interrupted(list(self._waiting)):
+                raise SupersededError
+            return
         if self._is_cancelled:
             raise CancelledError("cancelled; the settings are those before")
         if not self._is_dragging:
@@ -372,14 +386,17 @@ class Session:
 
     def _generated(self, settings: Mapping[str, Any]) -> Layout | None:
         """Return the layout of the generator of settings, without edits; None without one."""
-        if self.result is None:
-            return generated_layout(settings, None)
-        shown, section = self.result.capture.layout, settings.get("layout")
-        is_shown = self.result.settings.get("layout") == section
-        changes = ("edits", "inset_um", "move_um", "snap_um")
-        if isinstance(section, dict) and is_shown and not any(section.get(name) for name in changes):
-            return shown
-        return generated_layout(settings, shown)
+        return self._layout_source()(settings)
+
+    def _layout_source(self) -> Callable[[Mapping[str, Any]], Layout | None]:
+        """Return a function as :meth:`_generated`, which later results do not affect."""
+        shown = None if self.result is None else self.result.capture.layout
+        section = None if self.result is None else self.result.settings.get("layout")
+        return lambda settings: generated_layout(settings, shown, section)
+
+    def _setter(self) -> Callable[[dict[str, Any], Sequence[tuple[str, Any]]], dict[str, Any]]:
+        """Return a function that sets values as the page does now."""
+        return partial(with_values, controls=self._controls, start=self.start.settings, layout_of=self._layout_source())
 
     @property
     def is_preview(self) -> bool:
@@ -458,17 +475,10 @@ class Session:
                     raise SimulationError("there is no step to redo")
                 return
             case "set":
-                settings = copy.deepcopy(settings)
                 value = from_json(check_depth(message.get("value")))
-                key = key_of(message)
-                if key == "layout" and isinstance(value, str):
-                    settings = apply_preset(f"layout:{value}", settings)
-                else:
-                    value = chosen_value(key, value, self._controls, settings, self.start.settings)
-                    put_setting(None, settings, key, value)
-                settings = balanced(settings, key, before, self._generated)
-                if key == "sensor.preset":
-                    choose_preset(settings)
+                settings = self._setter()(settings, [(key_of(message), value)])
+            case "assign":
+                settings = self._setter()(settings, values_of(message))
             case "reset":
                 key = key_of(message)
                 settings = balanced(reset(settings, self.start.settings, key), key, before, self._generated)
@@ -535,20 +545,13 @@ class Session:
         One number is changed; the curve of its results is sent to the page.
         """
         key, wanted = key_of(message), from_json(check_depth(message.get("requirement")))
-        is_exposure = key == "exposure_s"  # also a text, such as "auto"
-        control = next(
-            (each for each in self._controls if each["key"] == key and (each["kind"] in NUMBERS or is_exposure)), None
-        )
-        if control is None or self.result is None:
-            raise ParameterError("key", "must be the key of a number", printable(key)[:40])
+        control = number_control(self._controls, key)
+        if self.result is None:
+            raise SimulationError("there is no result to start from")
         if not isinstance(wanted, dict):
             raise ParameterError("requirement", "must be a mapping")
         requirement: Requirement = validate(None, Requirement, wanted)
-        present = get_setting(settings, key)
-        if is_exposure and not isinstance(present, int | float):
-            present = self.result.shot.exposure_s
-        if present is None:
-            present = solved_of(settings, self.result.capture.layout).get(key, control["default"])
+        present = present_number(settings, control, self.result)
         low, high = control.get("suggested") or EXPOSURES_S
         if isinstance(present, int | float):
             low, high = min(low, present), max(high, present if key != f"{PARAMETERS}.n_sites" else 4 * present)
@@ -596,6 +599,21 @@ class Session:
         })  # fmt: skip
         return changed(solution.value)
 
+    def _planned_sweep(self, message: dict[str, Any]) -> Sweep:
+        """Return the sweep of a message, of the settings as they are now."""
+        result, base, set_values = self.result, self.frames.with_file(self.history.settings), self._setter()
+        if result is None:
+            raise SimulationError("there is no result to start from")
+        axes = axes_of(message, self._controls)
+        present = [present_number(base, axis.control, result) for axis in axes]
+
+        def change(settings: dict[str, Any], values: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+            found: dict[str, Any] = self.files.resolve(set_values(settings, values))
+            check_settings(None, found)
+            return found
+
+        return Sweep(message.get("id"), base, axes, results_of(message), present, change)
+
     def _reduced(self, path: str) -> str:
         """Return the path of a picture, or of a reduced one if it is large."""
         if self.result is None:
@@ -638,6 +656,7 @@ class Session:
         match message.get("do"):
             case "refresh":
                 self._views.forget()
+                self._sweeps.send()
                 self._structure = None
                 if self.result is None:
                     self._send({"kind": "busy"})
@@ -665,6 +684,13 @@ class Session:
                 self._change_variant(message)
             case "compare":
                 self._compare(message.get("variants"))
+            case "sweep":
+                self._sweeps.start(self._planned_sweep(message))
+            case "stop_sweep":
+                self._sweeps.stop()
+            case "sweep_file":
+                text, files = self._sweeps.file(self.uploads)
+                self._send({"kind": "text", "id": message.get("id"), "what": "sweep", "text": text, "files": files})
             case "text":
                 what, exported = string_of(message, "what"), self.exported()
                 self._send({

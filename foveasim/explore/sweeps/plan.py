@@ -145,7 +145,7 @@ class Plan:
         return self._settings_with(chosen) | {"seed": self.seed_of(point)}
 
     def seed_of(self, point: int) -> int:
-        """Return the noise seed of a point: derived from the sweep seed and the point number, or that of the shot."""
+        """Return the noise seed of a point: that of the shot, or derived from seed and number."""
         return self.seed if self.is_seed_common else derive_seed(self.seed, point)
 
     @property

@@ -13,6 +13,7 @@ from foveasim.studio._parts.registry import page_part
 page_part("histogram", "Histogram", order=20, is_first=True)
 page_part("site", "Photosite", order=30, is_wide=True)
 page_part("goal", "Goal seek", order=97)
+page_part("sweep", "Sweep", order=98)
 page_part("steps", "Steps", order=100)
 page_part("summary", "Summary", order=110, is_first=True)
 page_part("variants", "Variants", order=125)

@@ -11,6 +11,9 @@ from foveasim.explore import CheckedRequirement, measure
 from foveasim.studio._engine import Simulated
 from foveasim.studio._parts.registry import PartData, part
 
+#: Results of which smaller values are better.
+COSTS = ("n_sites", "saturated_fraction", "data_rate_gbit_per_s", "violations", "exposure_s")
+
 
 @part("Requirements", lambda result: (result.capture, result.shot.requirements), order=95)
 def requirements(result: Simulated) -> PartData:
@@ -31,6 +34,7 @@ def requirements(result: Simulated) -> PartData:
             "label": f"{label} / {unit}" if unit else label,
             "unit": unit,
             "has_region": name not in WITHOUT_REGION,
+            "is_cost": name in COSTS,
         }
         for name, (label, unit) in RESULTS.items()
     ]

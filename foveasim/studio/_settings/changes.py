@@ -17,6 +17,7 @@ from foveasim.studio._settings.templates import WITHOUT_MOSAIC
 #: Messages that change the settings.
 CHANGES = (
     "set",
+    "assign",
     "reset",
     "delete",
     "undo",

@@ -24,6 +24,8 @@ COLUMNS = "columns"
 EXCLUDED = {"pitch_um": "size_um", "size_um": "pitch_um"}
 #: Parameters for which a generator solves only without another one.
 INSTEAD_OF = {"n_fovea": "pitch_um"}
+#: Settings of a layout that change what its generator returns.
+AFTER_GENERATOR = ("edits", "inset_um", "move_um", "snap_um")
 #: Largest difference of the number of sites, in percent, where generators have no nearer possible number.
 MAX_PERCENT = 8
 #: Margins of the field of a raster, relative to its pitch, that are tried so that the number of sites remains.
@@ -73,15 +75,18 @@ def solved_of(settings: Mapping[str, Any], layout: Layout) -> dict[str, Any]:
     return {f"{PARAMETERS}.{name}": value for name, value in {**found, "n_sites": layout.n_sites}.items()}
 
 
-def generated_layout(settings: Mapping[str, Any], shown: Layout | None) -> Layout | None:
+def generated_layout(settings: Mapping[str, Any], shown: Layout | None, section: Any = None) -> Layout | None:
     """
     Return the layout of a generator without edits.
 
-    ``shown``: layout with edits, which replaces it for generators that read a picture. Returns None if there is none.
+    ``shown``: layout with edits, which replaces it for generators that read a picture. ``section``: settings of this layout,
+    which is returned if it has no edits. Returns None if there is none.
     """
     if not is_generated(settings):
         return shown
     layout = settings["layout"]
+    if layout == section and not any(layout.get(name) for name in AFTER_GENERATOR):
+        return shown
     if LAYOUTS[layout["generator"]].picture is not None:  # type: ignore[attr-defined]
         return shown
     with suppress(FoveasimError, TypeError, ValueError):

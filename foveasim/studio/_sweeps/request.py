@@ -1,0 +1,114 @@
+"""Sweeps that a page requests: the values of their settings, and their results."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from foveasim._core.short_repr import short_repr
+from foveasim.config import RESULTS, RegionResult, validate
+from foveasim.errors import ParameterError
+from foveasim.explore.sweeps.plan import SEED, ValueRange
+from foveasim.studio._messages import from_json
+from foveasim.studio._settings.changes import check_depth, key_of
+from foveasim.studio._settings.values import number_control
+
+#: Largest number of points: a page shows the results of each, and a table of all.
+MAX_POINTS = 1000
+#: Largest number of settings, and of results.
+MAX_AXES, MAX_RESULTS = 2, 2
+#: Significant digits of values between the ends.
+DIGITS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """A setting with its values."""
+
+    control: Mapping[str, Any]
+    values: Sequence[Any]
+    is_log: bool
+
+    __repr__ = short_repr
+
+    @property
+    def key(self) -> str:
+        """Path of the setting."""
+        return str(self.control["key"])
+
+    def about(self) -> dict[str, Any]:
+        """Return the axis as plain data."""
+        return {
+            "key": self.key,
+            "label": self.control["label"],
+            "unit": self.control["unit"],
+            "values": list(self.values),
+            "is_log": self.is_log,
+        }
+
+
+def axes_of(message: Mapping[str, Any], controls: Sequence[Mapping[str, Any]]) -> list[Axis]:
+    """
+    Return the settings of a sweep with their values.
+
+    Raises ParameterError or ConfigError when a setting is not a number, its range is invalid, or there are too many points.
+    """
+    ranges = _mappings(message, "settings", MAX_AXES)
+    keys = [key_of(each) for each in ranges]
+    if len(set(keys)) < len(keys):
+        raise ParameterError("settings", "must differ", keys[0])
+    if SEED in keys:
+        raise ParameterError("settings", "must not contain the seed: all points of a sweep have the same one")
+    found = [
+        (number_control(controls, key), _range_of({name: item for name, item in each.items() if name != "key"}))
+        for key, each in zip(keys, ranges, strict=True)
+    ]
+    n_points = math.prod(value_range.n for _, value_range in found)
+    if n_points > MAX_POINTS:
+        raise ParameterError("n", f"must give at most {MAX_POINTS:,} points, got {n_points:,}; use fewer values")
+    return [Axis(control, _values(control, each), each.spacing == "geometric") for control, each in found]
+
+
+def results_of(message: Mapping[str, Any]) -> list[RegionResult]:
+    """Return the results of a sweep; raise an error when one is invalid."""
+    found = [validate(None, RegionResult, each) for each in _mappings(message, "results", MAX_RESULTS)]
+    if found.count(found[0]) > 1:
+        raise ParameterError("results", "must differ", found[0].subject)
+    return found
+
+
+def about_result(result: RegionResult) -> dict[str, Any]:
+    """Return a result as plain data."""
+    return {
+        "measure": result.measure,
+        "label": RESULTS[result.measure][0],
+        "subject": result.subject,
+        "unit": result.unit,
+    }
+
+
+def _mappings(message: Mapping[str, Any], name: str, n_most: int) -> list[dict[str, Any]]:
+    found = from_json(check_depth(message.get(name)))
+    if not isinstance(found, list) or not 0 < len(found) <= n_most or not all(isinstance(each, dict) for each in found):
+        raise ParameterError(name, f"must be a list of 1 to {n_most} mappings")
+    return found
+
+
+def _range_of(data: Mapping[str, Any]) -> ValueRange:
+    found: ValueRange = validate(None, ValueRange, data)
+    if not found.low < found.high:
+        raise ParameterError("to", "must be above the first value", found.high)
+    if found.n < 2:
+        raise ParameterError("n", "must be at least 2", found.n)
+    return found
+
+
+def _values(control: Mapping[str, Any], value_range: ValueRange) -> list[Any]:
+    """Return the values of a range: distinct integers, or numbers with few digits."""
+    values = value_range.values()
+    if control["kind"] == "integer":
+        return sorted({round(value) for value in values})
+    inner = [float(f"{value:.{DIGITS}g}") for value in values[1:-1]]
+    return [value_range.low, *inner, value_range.high]

@@ -1,0 +1,199 @@
+"""Sweep of a session: its points are computed one by one while no message waits."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from foveasim.config import RegionResult
+from foveasim.errors import SimulationError
+from foveasim.explore import measure
+from foveasim.studio._costs import SupersededError
+from foveasim.studio._engine import Simulated
+from foveasim.studio._settings.changes import is_frame
+from foveasim.studio._sweeps.files import sweep_file
+from foveasim.studio._sweeps.request import Axis, about_result
+
+#: Shortest time between two messages with partial results.
+SEND_S = 0.1
+#: Messages interrupt a point for at most this time in succession, so that sweeps advance while a slider is dragged.
+MAX_STOPPED_S = 3.0
+#: Messages that replace or end a sweep: they interrupt a point at any time.
+CONTROLS = ("sweep", "stop_sweep")
+
+
+class Sweep:
+    """
+    Points of a sweep with their results; the first one has the settings at the start.
+
+    ``number``: that of the message. ``base``: settings at the start. ``present``: values of the axes in these. ``change``:
+    returns settings with values, as the page sets them.
+    """
+
+    def __init__(
+        self,
+        number: Any,
+        base: dict[str, Any],
+        axes: Sequence[Axis],
+        results: Sequence[RegionResult],
+        present: Sequence[Any],
+        change: Callable[[dict[str, Any], Sequence[tuple[str, Any]]], dict[str, Any]],
+    ) -> None:
+        self.number, self.base, self.axes, self.results = number, base, axes, results
+        self._present, self._change = present, change
+        self._points = list(itertools.product(*(axis.values for axis in axes)))
+        self._settings: list[dict[str, Any] | None] = [None] * len(self._points)
+        #: Values of the results: of the settings at the start, and of the points so far.
+        self._values: list[list[float]] = []
+        self._problem = ""
+        self.is_stopped = False
+        self.started_s: float | None = None
+
+    @property
+    def is_running(self) -> bool:
+        """Whether points are still to be computed."""
+        return not self.is_stopped and len(self._values) <= len(self._points)
+
+    def settings_of(self, point: int) -> dict[str, Any]:
+        """Return the settings of a point, which share equal sections with those at the start."""
+        known = self._settings[point]
+        if known is not None:
+            return known
+        pairs = [(axis.key, value) for axis, value in zip(self.axes, self._points[point], strict=True)]
+        changed = self._change(self.base, pairs)
+        found = {name: self.base[name] if self.base.get(name) == each else each for name, each in changed.items()}
+        self._settings[point] = found
+        return found
+
+    def compute_next(
+        self, simulate: Callable[[dict[str, Any]], Simulated], line: Callable[[BaseException], str]
+    ) -> None:
+        """
+        Compute the next point; its error is stored.
+
+        Raises SupersededError when the simulation was interrupted: the point is then still the next one.
+        """
+        self.started_s = time.monotonic() if self.started_s is None else self.started_s
+        values = [math.nan] * len(self.results)
+        try:
+            done = len(self._values)
+            simulated = simulate(self.base if done == 0 else self.settings_of(done - 1))
+        except SupersededError:
+            raise
+        except Exception as error:  # noqa: BLE001 -- settings may cause any exception of the package or a library
+            self._explain(line(error))
+        else:
+            values = [self._measured(result, simulated, line) for result in self.results]
+        self.started_s = None
+        self._values.append(values)
+
+    def _measured(self, result: RegionResult, simulated: Simulated, line: Callable[[BaseException], str]) -> float:
+        """Return a result; NaN after an error, which is stored."""
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # those of the simulation are in the state
+                found = measure(result, simulated.shot, simulated.capture)
+        except Exception as error:  # noqa: BLE001 -- as above
+            self._explain(line(error))
+            return math.nan
+        if math.isnan(found):
+            self._explain(f"{result.subject}: no value, for example because all photosites are saturated")
+        return found
+
+    def _explain(self, text: str) -> None:
+        """Store the first problem of a point, which is not that of the settings at the start."""
+        if self._values:
+            self._problem = self._problem or text
+
+    def about(self) -> dict[str, Any]:
+        """Return the sweep with its results so far as a message."""
+        points = self._values[1:]
+        return {
+            "kind": "sweep",
+            "id": self.number,
+            "state": "running" if self.is_running else "stopped" if self.is_stopped else "done",
+            "axes": [axis.about() for axis in self.axes],
+            "results": [about_result(result) for result in self.results],
+            "n_points": len(self._points),
+            "start": {"settings": list(self._present), "results": self._values[0] if self._values else None},
+            "points": points,
+            "problem": self._problem,
+            "n_failed": sum(any(math.isnan(value) for value in point) for point in points),
+        }
+
+    def file(self, uploads: Path) -> tuple[str, list[str]]:
+        """Return the file for ``foveasim sweep``, and the uploaded files that it requires."""
+        settings = [self.settings_of(point) for point in range(len(self._points))]
+        return sweep_file(self.base, settings, self.axes, self.results, uploads)
+
+
+class Sweeps:
+    """
+    The sweep of a session.
+
+    ``send``: sends a message to the page. ``line``: returns an error in one line.
+    """
+
+    def __init__(self, send: Callable[[dict[str, Any]], None], line: Callable[[BaseException], str]) -> None:
+        self._send, self._line = send, line
+        self._sweep: Sweep | None = None
+        self._sent_s = -math.inf
+        self.is_computing = False
+
+    @property
+    def is_running(self) -> bool:
+        """Whether points are still to be computed."""
+        return self._sweep is not None and self._sweep.is_running
+
+    def start(self, sweep: Sweep) -> None:
+        """Replace the sweep."""
+        self._sweep = sweep
+        self.send()
+
+    def stop(self) -> None:
+        """End the sweep; the results so far remain."""
+        if self._sweep is not None and self._sweep.is_running:
+            self._sweep.is_stopped = True
+            self.send()
+
+    def send(self) -> None:
+        """Send the sweep with its results so far, if there is one."""
+        if self._sweep is not None:
+            self._sent_s = time.monotonic()
+            self._send(self._sweep.about())
+
+    def compute_next(self, simulate: Callable[[dict[str, Any]], Simulated]) -> None:
+        """Compute a point and send the results so far, not more often than the page can show them."""
+        assert self._sweep is not None
+        self.is_computing = True
+        try:
+            self._sweep.compute_next(simulate, self._line)
+        except SupersededError:
+            return
+        finally:
+            self.is_computing = False
+        if not self.is_running or time.monotonic() - self._sent_s >= SEND_S:
+            self.send()
+
+    def is_interrupted(self, waiting: Iterable[Any]) -> bool:
+        """Return whether messages that wait interrupt the present point; frames of a video do not."""
+        others = [message for message in waiting if not is_frame(message)]
+        if any(isinstance(message, Mapping) and message.get("do") in CONTROLS for message in others):
+            return True
+        started_s = None if self._sweep is None else self._sweep.started_s
+        return bool(others) and (started_s is None or time.monotonic() - started_s < MAX_STOPPED_S)
+
+    def file(self, uploads: Path) -> tuple[str, list[str]]:
+        """
+        Return the file of the sweep, and the names of uploaded files that it requires.
+
+        Raises SimulationError when there was no sweep.
+        """
+        if self._sweep is None:
+            raise SimulationError("there is no sweep; run one first")
+        return self._sweep.file(uploads)
