@@ -95,9 +95,15 @@ interface Sought {
   result_unit: string;
   limits: (number | null)[]; curve: (number | null)[][];
 }
+interface SweepAxis { key: string; label: string; unit: string; values: number[]; is_log: boolean }
+interface SweepMessage {
+  kind: "sweep"; id: number; state: "running" | "stopped" | "done"; axes: SweepAxis[];
+  results: { measure: string; label: string; subject: string; unit: string }[]; n_points: number; points: (number | string | null)[][];
+  start: { settings: (number | null)[]; results: (number | string | null)[] | null }; problem: string; n_failed: number;
+}
 interface Exists { kind: "exists"; id: number; name: string; file: string }
 interface Saved { kind: "saved"; id: number; path: string }
-type ServerMessage = Busy | ControlsMessage | State | Done | Failure | TextMessage | Saved | Note | Progress | Exists | Sought;
+type ServerMessage = Busy | ControlsMessage | State | Done | Failure | TextMessage | Saved | Note | Progress | Exists | Sought | SweepMessage;
 
 // Binary messages: a header and arrays; as readPart returns them.
 interface PartHeader {
@@ -116,6 +122,9 @@ type Boundary = (context: CanvasRenderingContext2D, toX: (x: number) => number, 
 type Change =
   | { do: "undo" | "redo" | "match" | "fit" }
   | { do: "set"; key: string; value: unknown; final: boolean }
+  | { do: "assign"; values: { key: string; value: unknown }[] }
+  | { do: "sweep"; settings: unknown[] | undefined; results: unknown[] | undefined }
+  | { do: "stop_sweep" | "sweep_file" }
   | { do: "reset" | "delete"; key: string }
   | { do: "preset" | "solve"; name: string }
   | { do: "pin"; sites: number[] }

@@ -9,7 +9,7 @@ import { sizeOf } from "./frames.js";
 import { fitted } from "./site_pane.js";
 
 const SVG = "http://www.w3.org/2000/svg";
-const FONT = "11px system-ui, sans-serif";
+export const FONT = "11px system-ui, sans-serif";
 // Names of curves with a colour of their own; other curves have the next of the list, by theme.
 const NAMED = { R: ["#c62828", "#ff7b72"], G: ["#1b7f3b", "#5fd37f"], B: ["#1f5fbf", "#7db3ff"], W: ["#566073", "#c3cad6"] };
 const INKS = [["#1f5fbf", "#7db3ff"], ["#c2571a", "#ffa657"], ["#1b7f3b", "#5fd37f"], ["#8338a8", "#d2a8ff"], ["#a02c5a", "#ff8cc0"],
@@ -22,7 +22,7 @@ const DASHES = [[], [7, 3], [2, 2.5], [9, 3, 2, 3], [4, 3], [1, 4]];
 
 const theme = () => (document.documentElement.dataset.theme === "dark" ? 1 : 0);
 const inkOfCurve = (curve, k) => (NAMED[curve.name] || INKS[k % INKS.length])[theme()];
-const axisTitle = (name, unit) => (unit ? name + " / " + unit : name);
+export const axisTitle = (name, unit) => (unit ? name + " / " + unit : name);
 
 function ticksOf(low, high, most) {
   const step = roundStep((high - low) / most), ticks = [];
@@ -30,7 +30,7 @@ function ticksOf(low, high, most) {
   return ticks;
 }
 
-function limitsOf(arrays) {
+export function limitsOf(arrays) {
   let low = Infinity, high = -Infinity;
   for (const values of arrays) for (const v of values) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); }
   return low === Infinity ? [0, 1] : [low, high > low ? high : low + 1];
@@ -65,7 +65,7 @@ function decadesOf(low, high, most) {
 const decadeText = (value) => (value >= 1e-3 && value < 1e4 ? String(value) : value.toExponential(0).replace("e+", "e"));
 
 // Conversion of numbers to fractions of an axis, and its ticks.
-function axisOf(low, high, isLog) {
+export function axisOf(low, high, isLog) {
   if (!isLog) return { low, high, at: (v) => (v - low) / (high - low), value: (t) => low + t * (high - low),
     ticks: (most) => ticksOf(low, high, most), text: brief };
   const span = Math.log(high / low);
@@ -80,12 +80,15 @@ function decadeLimits(arrays) {
   return low === Infinity ? [1, 10] : [low, Math.max(high, 1.01 * low)];
 }
 
-// Curves y of x with their legend; those with isDashed are of variant A. Axes in "log" (such as "xy") are logarithmic.
+// Curves y of x with their legend; those with isDashed are of variant A. Axes in "log" (such as "xy") are logarithmic; with
+// hasZero, others begin at zero.
 export class CurveChart {
-  root; nameX; nameY; label; log; marks = []; lines = [];
+  root; nameX; nameY; label; log; hasZero; marks = []; lines = [];
+  // Conversion of numbers to CSS pixels, of the last drawing on the page.
+  /** @type {((x: number, y: number) => Point) | null} */ place = null;
 
-  constructor(root, { nameX, nameY, label, log = "" }) {
-    Object.assign(this, { root, nameX, nameY, label, log });
+  constructor(root, { nameX, nameY, label, log = "", hasZero = true }) {
+    Object.assign(this, { root, nameX, nameY, label, log, hasZero });
     this.canvas = make("canvas");
     this.canvas.setAttribute("role", "img");
     this.legend = make("ul", undefined, "chart-legend");
@@ -102,8 +105,8 @@ export class CurveChart {
     this.canvas.addEventListener("pointerleave", () => { this.at = null; this.draw(); });
   }
 
-  // Curves: [{ label, name, unit_x, unit_y, x, y, isDashed }]; marks on them: [{ x, y, name, kind }], "end" for a bar, else
-  // a dot; vertical lines: [{ x, label, of }].
+  // Curves: [{ label, name, unit_x, unit_y, x, y, isDashed }]; marks on them: [{ x, y, name, kind }], "end" for a bar,
+  // "point" for a small dot, else a dot; vertical lines: [{ x, label, of }].
   use(curves, { marks = [], lines = [], note = "" } = {}) {
     Object.assign(this, { curves, marks, lines });
     this.note.textContent = note;
@@ -152,9 +155,11 @@ export class CurveChart {
       return;
     }
     const allY = curves.map((curve) => curve.y), [low, high] = limitsOf(allY), [lowest, highest] = decadeLimits(allY);
-    const axisY = isLogY ? axisOf(0.9 * lowest, 1.3 * highest, true) : axisOf(Math.min(0, low), high * 1.04, false);
+    const edge = 0.04 * (high - low), linear = this.hasZero ? [Math.min(0, low), high * 1.04] : [low - edge, high + edge];
+    const axisY = isLogY ? axisOf(0.9 * lowest, 1.3 * highest, true) : axisOf(linear[0], linear[1], false);
     const w = width - left - right, h = height - top - bottom;
     const toX = (v) => left + axisX.at(v) * w, toY = (v) => top + h - axisY.at(v) * h;
+    if (!target) this.place = (x, y) => [toX(x), toY(y)];
     context.strokeStyle = inkOf("--line");
     context.fillStyle = inkOf("--quiet");
     context.lineWidth = 1;
@@ -257,7 +262,7 @@ export class CurveChart {
     context.lineWidth = 1.5;
     context.beginPath();
     if (mark.kind === "end") context.rect(x - 1.25, y - 6, 2.5, 12);
-    else context.arc(x, y, 4.5, 0, 7);
+    else context.arc(x, y, mark.kind === "point" ? 3 : 4.5, 0, 7);
     context.stroke();
     context.fill();
   }
@@ -275,6 +280,21 @@ export class CurveChart {
     if (here !== null) items.unshift(make("li", brief(Number(here.toPrecision(4))) + " " + own[0].unit_x));
     this.legend.replaceChildren(...items);
   }
+}
+
+// Calls choose() with the nearest point of a click, of curves that have the indices of their points.
+/** @param {CurveChart} chart @param {(k: number) => void} choose */
+export function listenToPoints(chart, choose) {
+  chart.canvas.addEventListener("click", ({ clientX, clientY }) => {
+    const box = chart.canvas.getBoundingClientRect(), found = { distance: Infinity, point: -1 };
+    for (const { x, y, points } of chart.curves) {
+      points.forEach((point, i) => {
+        const [px, py] = chart.place?.(x[i], y[i]) ?? [NaN, NaN], distance = Math.hypot(px + box.left - clientX, py + box.top - clientY);
+        if (distance < found.distance) Object.assign(found, { distance, point });
+      });
+    }
+    if (found.point >= 0) choose(found.point);
+  });
 }
 
 // A short line as in the chart.

@@ -1,4 +1,4 @@
-// Form of a requirement: a result, the photosites it is of, and a limit.
+// Forms of a result with the photosites it is of, and of a requirement, which limits one.
 
 import { make } from "/web/page_parts.js";
 import { numberOf } from "./numbers.js";
@@ -8,7 +8,7 @@ const REGIONS = [["all", "all photosites"], ["site", "pinned photosite"], ["rect
 const LIMITS = [["at_least", "at least"], ["at_most", "at most"], ["equal", "equals"]];
 
 /** @type {(choices: string[][], label: string) => HTMLSelectElement} */
-function selectOf(choices, label) {
+export function selectOf(choices, label) {
   const select = make("select");
   select.setAttribute("aria-label", label);
   for (const [value, text] of choices) select.append(new Option(text, value));
@@ -16,30 +16,39 @@ function selectOf(choices, label) {
 }
 
 /** @type {(label: string, placeholder: string) => HTMLInputElement} */
-function fieldOf(label, placeholder) {
+export function fieldOf(label, placeholder) {
   const field = make("input");
   Object.assign(field, { type: "text", placeholder, autocomplete: "off", spellcheck: false });
   field.setAttribute("aria-label", label);
   return field;
 }
 
-export class ConditionForm {
-  // page: the pinned photosite and the selected rectangle; hasEqual: whether a result may have to equal a value.
-  constructor(page, { hasEqual = true } = {}) {
+// The number in a field; an error explains what is missing.
+/** @type {(field: HTMLInputElement, what: string, unit: string) => number} */
+export function readNumber(field, what, unit) {
+  const found = numberOf(field.value, unit);
+  if (!Number.isFinite(found)) throw new Error("Enter " + what + " as a number");
+  return found;
+}
+
+export class ResultForm {
+  // page: the pinned photosite and the selected rectangle; none: text of the choice of no result.
+  /** @param {any} page @param {{ none?: string }} [options] */
+  constructor(page, { none } = {}) {
     this.page = page;
     this.measures = [];
-    this.measure = selectOf([], "Result");
+    this.measure = selectOf(none === undefined ? [] : [["", none]], "Result");
     this.region = selectOf(REGIONS, "Photosites");
     this.inner = fieldOf("Inner radius, µm", "from / µm");
     this.outer = fieldOf("Outer radius, µm", "to / µm");
     this.frequency = fieldOf("Spatial frequency, per mm", "1/mm");
-    this.limit = selectOf(hasEqual ? LIMITS : LIMITS.slice(0, 2), "Condition");
-    this.value = fieldOf("Value", "value");
     this.root = make("div", undefined, "condition");
-    this.root.append(this.measure, this.frequency, this.region, this.inner, this.outer, this.limit, this.value);
+    this.root.append(this.measure, this.frequency, this.region, this.inner, this.outer);
     for (const select of [this.measure, this.region]) select.addEventListener("change", () => this._show());
     this._show();
   }
+
+  get about() { return this.measures.find(({ name }) => name === this.measure.value); }
 
   // Takes over the results of the server.
   use(measures) {
@@ -50,45 +59,56 @@ export class ConditionForm {
   }
 
   _show() {
-    const about = this.measures.find(({ name }) => name === this.measure.value), hasRegion = !about || about.has_region;
+    const { about } = this, hasRegion = this.measures.length ? Boolean(about?.has_region) : true;
     this.frequency.hidden = this.measure.value !== "mtf";
     this.region.hidden = !hasRegion;
     this.inner.hidden = this.outer.hidden = !hasRegion || this.region.value !== "annulus";
   }
 
-  // Returns { requirement } as in settings, or { problem }.
-  read() {
-    const name = this.measure.value, about = this.measures.find((each) => each.name === name);
+  // Returns the result as in settings; null where none is chosen. Throws an error that explains what is missing.
+  readResult() {
+    const { about } = this;
+    if (!about) return null;
     /** @type {{ [key: string]: unknown }} */
-    const requirement = { measure: name };
-    const number = (field, what, unit = "µm") => {
-      const found = numberOf(field.value, unit);
-      if (!Number.isFinite(found)) throw new Error("Enter " + what + " as a number");
-      return found;
-    };
-    try {
-      const value = number(this.value, "the value", about?.unit ?? "");
-      if (this.limit.value !== "at_most") requirement.at_least = value;
-      if (this.limit.value !== "at_least") requirement.at_most = value;
-      if (name === "mtf") requirement.frequency_per_mm = number(this.frequency, "the spatial frequency", "");
-      if (about?.has_region) this._readRegion(requirement, number);
-    } catch (error) {
-      return { problem: error instanceof Error ? error.message : String(error) };
-    }
-    return { requirement };
+    const result = { measure: about.name };
+    if (about.name === "mtf") result.frequency_per_mm = readNumber(this.frequency, "the spatial frequency", "");
+    if (about.has_region) this._readRegion(result);
+    return result;
   }
 
-  _readRegion(requirement, number) {
+  _readRegion(result) {
     const { pinned, rectangle } = this.page, kind = this.region.value;
-    if (kind === "annulus") requirement.annulus_um = [number(this.inner, "the inner radius"), number(this.outer, "the outer radius")];
-    else if (kind === "site") {
+    if (kind === "annulus") {
+      result.annulus_um = [readNumber(this.inner, "the inner radius", "µm"), readNumber(this.outer, "the outer radius", "µm")];
+    } else if (kind === "site") {
       if (pinned < 0) throw new Error("Click a photosite to pin it first");
-      requirement.site = pinned;
+      result.site = pinned;
     } else if (kind === "rectangle") {
       if (!rectangle) throw new Error("Select photosites first (key S)");
       const [[ax, ay], [bx, by]] = rectangle;
       const corners = [Math.min(ax, bx), Math.min(ay, by), Math.max(ax, bx), Math.max(ay, by)];
-      requirement.rectangle_um = corners.map((v) => Number(v.toPrecision(6)));
+      result.rectangle_um = corners.map((v) => Number(v.toPrecision(6)));
+    }
+  }
+}
+
+export class ConditionForm extends ResultForm {
+  constructor(page) {
+    super(page);
+    this.limit = selectOf(LIMITS, "Condition");
+    this.value = fieldOf("Value", "value");
+    this.root.append(this.limit, this.value);
+  }
+
+  // Returns { requirement } as in settings, or { problem }.
+  read() {
+    try {
+      const value = readNumber(this.value, "the value", this.about?.unit ?? ""), requirement = { ...this.readResult() };
+      if (this.limit.value !== "at_most") requirement.at_least = value;
+      if (this.limit.value !== "at_least") requirement.at_most = value;
+      return { requirement };
+    } catch (error) {
+      return { problem: error instanceof Error ? error.message : String(error) };
     }
   }
 }

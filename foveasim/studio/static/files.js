@@ -1,6 +1,6 @@
 // Files and links: dropped and chosen files, the menu, texts of the state, and links that restore it.
 
-import { $, download, notice } from "/web/page_parts.js";
+import { $, download, downloadText, notice } from "/web/page_parts.js";
 import { fragmentOf, settingsOf, stateOf } from "./links.js";
 import { confirmed, copyText, listenToMenu, showText } from "./menus.js";
 import { isVideo } from "./sources.js";
@@ -103,7 +103,10 @@ export class Files {
       if (files.length) notice("The link contains only the names of uploaded files: " + files.join(", "));
     } else if (what === "diff") showText("Differences", text || "The settings are those at the start.");
     else if (what === "log") showText("Changes of this session", text || "Nothing was changed.");
-    else copyText(text, what === "yaml" ? "YAML" : "Python");
+    else if (what === "sweep") {
+      downloadText(text, document.title.split(" – ")[0] + "_sweep", "yaml", "application/yaml");
+      if (files.length) notice("The sweep requires these uploaded files next to it: " + files.join(", "));
+    } else copyText(text, what === "yaml" ? "YAML" : "Python");
   }
 
   // Restores the settings of a link, which is then removed from the address; the server checks them. Returns whether it is one.

@@ -176,10 +176,11 @@ function receive(message, { isFailed }) {
     if (isFailed && requests.waiting.some((one) => one.id === message.id)) notice(Object.values(message.errors)[0]);
   } else if (kind === "controls") controls.describe(message.controls);
   else if (kind === "done") finish(message);
-  else if (kind === "error") notice(message.text);
+  else if (kind === "error") { notice(message.text); views.made.sweep?.fail(message); }
   else if (kind === "text") files.receiveText(message);
   else if (kind === "saved") notice("Saved as " + message.path);
   else if (kind === "sought") views.show("goal", true).then(() => views.made.goal?.show(message));
+  else if (kind === "sweep") views.show("sweep", true).then(() => views.made.sweep?.show(message));
   else if (kind === "exists") files.askToReplace(message);
   else if (kind === "note") notice(message.text);
   else if (kind === "progress") { showStage(message.text); return; }

@@ -4,42 +4,31 @@ import { make, notice } from "/web/page_parts.js";
 import { addFiles } from "../chart_files.js";
 import { CurveChart } from "../charts.js";
 import { ConditionForm } from "../condition_form.js";
+import { SettingSelect, isWide } from "../number_settings.js";
 import { figure } from "./requirements.js";
 
 export function create(root, studio) {
-  const form = new ConditionForm(studio.page), setting = make("select"), solve = make("button", "Solve");
+  const form = new ConditionForm(studio.page), setting = new SettingSelect("Setting to change"), solve = make("button", "Solve");
   const text = make("p", "", "quiet"), frame = make("div", undefined, "chart");
-  setting.setAttribute("aria-label", "Setting to change");
   solve.type = "button";
   text.id = "goal-text";
   text.setAttribute("role", "status");
   text.textContent = "Choose a setting and the result that it must give.";
   frame.id = "goal";
-  form.root.prepend(setting);
+  form.root.prepend(setting.root);
   form.root.append(solve);
   root.append(form.root, text, frame);
   addFiles(root, "Goal seek", () => chart);
   /** @type {CurveChart | null} */
   let chart = null;
-  let names = "";
   // Number of the last message, until it is answered.
   /** @type {number | null} */
   let asked = null;
-  // The settings that are numbers.
-  const list = () => {
-    const rows = [...studio.controls.rows.values()].filter(({ control: { kind } }) => kind === "number" || kind === "integer");
-    const found = JSON.stringify(rows.map(({ control: { key } }) => key));
-    if (found === names) return;
-    names = found;
-    const chosen = setting.value || "exposure_s";
-    setting.replaceChildren(...rows.map(({ name, control: { key } }) => new Option(name, key)));
-    setting.value = rows.some(({ control: { key } }) => key === chosen) ? chosen : rows[0]?.control.key ?? "";
-  };
   solve.addEventListener("click", () => {
     const { requirement, problem } = form.read();
     if (problem) { notice(problem); return; }
     text.textContent = "seeking…";
-    asked = studio.connection.send({ do: "seek", key: setting.value, requirement });
+    asked = studio.connection.send({ do: "seek", key: setting.root.value, requirement });
   });
   form.value.addEventListener("keydown", (event) => { if (event.key === "Enter") solve.click(); });
   // The measures are those of the requirements.
@@ -48,7 +37,7 @@ export function create(root, studio) {
     form,
     draw: () => chart?.draw(),
     onState() {
-      list();
+      setting.follow(studio.controls);
       const about = studio.views.parts.requirements?.about;
       if (about) form.use(about.measures);
       if (asked === null || (studio.state.id ?? 0) < asked) return;
@@ -62,7 +51,7 @@ export function create(root, studio) {
         + figure(found.result, found.result_unit);
       const points = found.curve.filter((point) => Number.isFinite(point[1])), xs = points.map((point) => point[0]);
       frame.replaceChildren();
-      const isLog = xs[0] > 0 && xs[xs.length - 1] / xs[0] >= 50;
+      const isLog = isWide(xs[0], xs[xs.length - 1]);
       chart = new CurveChart(frame, { nameX: found.label, nameY: found.measure, label: "Goal seek", log: isLog ? "x" : "" });
       const curve = { label: found.subject, name: "", unit_x: found.unit, unit_y: found.result_unit, x: xs,
         y: points.map((point) => point[1]) };
