@@ -202,7 +202,11 @@ def test_page_is_usable_during_a_sweep(visit):
     until(page, "() => studio.views.made.sweep.points?.values.length > 1")
     assert "do not affect this sweep" in page.inner_text("#sweep-text")
     set_value(page, "exposure_s", 0.03)
-    assert not page.is_hidden("#tile-sweep button[aria-label='Cancel the sweep']")
+    page.click("[data-tile=sweep]")
+    n_done = page.evaluate("studio.page.sweep.points.length")
+    until(page, "n => studio.page.sweep.points.length > n", n_done)
+    assert page.is_hidden("#tile-sweep")  # further points do not open it again
+    page.click("[data-tile=sweep]")
     page.click("#tile-sweep button[aria-label='Cancel the sweep']")
     until(page, "() => document.getElementById('sweep-text').textContent.startsWith('Cancelled after ')")
     n_done = page.evaluate("studio.views.made.sweep.points.values.length")

@@ -45,6 +45,8 @@ class StudioPage {
   /** @type {Set<PaneName> | null} */ asked = null;
   // Messages that are shown together.
   /** @type {{ states: State[], parts: Part[] }} */ held = { states: [], parts: [] };
+  // The sweep of the session with its results so far.
+  /** @type {SweepMessage | null} */ sweep = null;
   // Position of the layout at the start of a drag.
   /** @type {Point | null} */ gazeAt = null;
   /** @type {Boundary | null} */ boundary = null;
@@ -180,7 +182,7 @@ function receive(message, { isFailed }) {
   else if (kind === "text") files.receiveText(message);
   else if (kind === "saved") notice("Saved as " + message.path);
   else if (kind === "sought") views.show("goal", true).then(() => views.made.goal?.show(message));
-  else if (kind === "sweep") views.show("sweep", true).then(() => views.made.sweep?.show(message));
+  else if (kind === "sweep") { page.sweep = message; views.made.sweep?.show(message); }
   else if (kind === "exists") files.askToReplace(message);
   else if (kind === "note") notice(message.text);
   else if (kind === "progress") { showStage(message.text); return; }

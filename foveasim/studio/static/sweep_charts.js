@@ -14,7 +14,7 @@ import { paretoFront } from "./sweep_points.js";
 
 // Points within this distance of the mouse are chosen, CSS pixels.
 const REACH = 24;
-const HINT = "Click a point to apply its settings.";
+export const HINT = "Click a point to apply its settings.";
 // Colours of a bar, and pixels between two labels of an axis.
 const BAR_STEPS = 48, WIDE_STEP = 54, TALL_STEP = 17;
 

@@ -26,12 +26,12 @@ export class SweepTable {
 
   _create({ titles }) {
     const table = make("table"), head = make("thead"), row = make("tr");
+    row.append(make("td"));
     for (const title of titles) {
       const cell = make("th", title);
       cell.scope = "col";
       row.append(cell);
     }
-    row.append(make("td"));
     head.append(row);
     this.body = make("tbody");
     this.n = 0;
@@ -45,7 +45,7 @@ export class SweepTable {
     button.setAttribute("aria-label", "Apply " + points.settingsText(k));
     button.addEventListener("click", () => this.choose(k));
     cell.append(button);
-    row.append(...[...points.settings(k), ...points.values[k]].map((value) => make("td", cellText(value))), cell);
+    row.append(cell, ...[...points.settings(k), ...points.values[k]].map((value) => make("td", cellText(value))));
     return row;
   }
 }

@@ -6,7 +6,7 @@ import { addFiles } from "../chart_files.js";
 import { CurveChart, listenToPoints } from "../charts.js";
 import { selectOf } from "../condition_form.js";
 import { presentOf } from "../number_settings.js";
-import { HeatMap, ParetoChart } from "../sweep_charts.js";
+import { HINT, HeatMap, ParetoChart } from "../sweep_charts.js";
 import { SweepForm } from "../sweep_form.js";
 import { SweepPoints } from "../sweep_points.js";
 import { SweepTable } from "../sweep_table.js";
@@ -55,8 +55,7 @@ export function create(root, studio) {
   /** @type {SweepPoints | null} */
   let points = null;
   // What is shown, and of which sweep.
-  /** @type {{ what: string, id: number | null }} */
-  const current = { what: "", id: null };
+  const current = { what: "", sweep: "" };
   /** @type {number | null} */
   let asked = null;
 
@@ -82,7 +81,7 @@ export function create(root, studio) {
       /** @type {any} */
       const lines = [{ x: present()[0], label: "", of: "" }];
       found.use(curves, { marks: marks.filter((mark) => Number.isFinite(mark.y)), lines,
-        note: n > curves.length ? curves.length + " of " + n + " values." : "" });
+        note: (n > curves.length ? curves.length + " of " + n + " values. " : "") + HINT });
     };
     use();
     return { use, draw: () => found.draw(), rows: () => points?.rows() ?? [], paint: (target) => found.paint(target) };
@@ -125,6 +124,17 @@ export function create(root, studio) {
     } else chart.use();
   }
 
+  // Shows the sweep of the server with its results so far.
+  /** @param {SweepMessage} message */
+  function receive(message) {
+    const { id, axes, results: wanted } = message, sweep = JSON.stringify([id, axes, wanted]), isNew = sweep !== current.sweep;
+    current.sweep = sweep;
+    points = new SweepPoints(message);
+    if (isNew) list();
+    show(isNew);
+    tell(message);
+  }
+
   /** @param {SweepMessage} message */
   function tell({ state, n_points: n, points: done, problem, n_failed: nFailed }) {
     const missing = nFailed ? " " + nFailed + " without a result: " + problem : "";
@@ -155,18 +165,10 @@ export function create(root, studio) {
     draw: () => chart?.draw(),
     onState() {
       form.follow(studio.controls, studio.state, studio.views.parts.requirements?.about.measures);
-      chart?.use();
+      if (!points && studio.page.sweep) receive(studio.page.sweep);
+      else chart?.use();
     },
-    // Shows the sweep of the server with its results so far.
-    /** @param {SweepMessage} message */
-    show(message) {
-      const isNew = message.id !== current.id;
-      current.id = message.id;
-      points = new SweepPoints(message);
-      if (isNew) list();
-      show(isNew);
-      tell(message);
-    },
+    show: receive,
     // Explains why the sweep was not accepted.
     fail(message) { if (message.id === asked && asked !== null) text.textContent = message.text; },
   };
