@@ -52,7 +52,8 @@ class Sweep:
         self._values: list[list[float]] = []
         self._problem = ""
         self.is_stopped = False
-        self.started_s: float | None = None
+        #: Time of the first interruption of the present point.
+        self.stopped_s: float | None = None
 
     @property
     def is_running(self) -> bool:
@@ -78,18 +79,18 @@ class Sweep:
 
         Raises SupersededError when the simulation was interrupted: the point is then still the next one.
         """
-        self.started_s = time.monotonic() if self.started_s is None else self.started_s
         values = [math.nan] * len(self.results)
         try:
             done = len(self._values)
             simulated = simulate(self.base if done == 0 else self.settings_of(done - 1))
         except SupersededError:
+            self.stopped_s = time.monotonic() if self.stopped_s is None else self.stopped_s
             raise
         except Exception as error:  # noqa: BLE001 -- settings may cause any exception of the package or a library
             self._explain(line(error))
         else:
             values = [self._measured(result, simulated, line) for result in self.results]
-        self.started_s = None
+        self.stopped_s = None
         self._values.append(values)
 
     def _measured(self, result: RegionResult, simulated: Simulated, line: Callable[[BaseException], str]) -> float:
@@ -185,8 +186,8 @@ class Sweeps:
         others = [message for message in waiting if not is_frame(message)]
         if any(isinstance(message, Mapping) and message.get("do") in CONTROLS for message in others):
             return True
-        started_s = None if self._sweep is None else self._sweep.started_s
-        return bool(others) and (started_s is None or time.monotonic() - started_s < MAX_STOPPED_S)
+        stopped_s = None if self._sweep is None else self._sweep.stopped_s
+        return bool(others) and (stopped_s is None or time.monotonic() - stopped_s < MAX_STOPPED_S)
 
     def file(self, uploads: Path) -> tuple[str, list[str]]:
         """
