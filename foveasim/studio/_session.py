@@ -689,7 +689,7 @@ class Session:
             case "stop_sweep":
                 self._sweeps.stop()
             case "sweep_file":
-                text, files = self._sweeps.file(self.uploads)
+                text, files = self._sweeps.file(self._file_directories)
                 self._send({"kind": "text", "id": message.get("id"), "what": "sweep", "text": text, "files": files})
             case "text":
                 what, exported = string_of(message, "what"), self.exported()
@@ -811,8 +811,12 @@ class Session:
         ``name_of``: returns the name of a file. Returns ``files``: uploaded files by name, and the current frame of a source.
         """
         settings = self.history.settings
-        directories = self.uploads, self.variants.directory
-        return without_directories(settings, directories, self.frames.export(settings), name_of)
+        return without_directories(settings, self._file_directories, self.frames.export(settings), name_of)
+
+    @property
+    def _file_directories(self) -> tuple[Path, ...]:
+        """Directories whose files are copied with settings."""
+        return self.uploads, self.variants.directory
 
     def _saved_path(self, name: str) -> Path:
         """Return the path of saved settings with a name."""

@@ -21,15 +21,15 @@ def sweep_file(
     points: Sequence[dict[str, Any]],
     axes: Sequence[Axis],
     results: Sequence[RegionResult],
-    uploads: Path,
+    directories: Sequence[Path],
 ) -> tuple[str, list[str]]:
     """
     Return a file whose points have the given settings, and the uploaded files of these.
 
-    ``base``: settings that the points change. ``points``: settings in the order of all combinations of the values. The files
-    are names; they must be next to the file.
+    ``base``: settings that the points change. ``points``: settings in the order of all combinations of the values.
+    ``directories``: those of uploaded files. The files are names; they must be next to the file.
     """
-    named, files = without_directories({"shot": base, "points": list(points)}, uploads, {}, lambda file: file.name)
+    named, files = without_directories({"shot": base, "points": list(points)}, directories, {}, lambda file: file.name)
     base, points = named["shot"], named["points"]
     content = {
         **_varied(base, points, axes),

@@ -127,10 +127,10 @@ class Sweep:
             "n_failed": sum(any(math.isnan(value) for value in point) for point in points),
         }
 
-    def file(self, uploads: Path) -> tuple[str, list[str]]:
+    def file(self, directories: Sequence[Path]) -> tuple[str, list[str]]:
         """Return the file for ``foveasim sweep``, and the uploaded files that it requires."""
         settings = [self.settings_of(point) for point in range(len(self._points))]
-        return sweep_file(self.base, settings, self.axes, self.results, uploads)
+        return sweep_file(self.base, settings, self.axes, self.results, directories)
 
 
 class Sweeps:
@@ -189,7 +189,7 @@ class Sweeps:
         stopped_s = None if self._sweep is None else self._sweep.stopped_s
         return bool(others) and (stopped_s is None or time.monotonic() - stopped_s < MAX_STOPPED_S)
 
-    def file(self, uploads: Path) -> tuple[str, list[str]]:
+    def file(self, directories: Sequence[Path]) -> tuple[str, list[str]]:
         """
         Return the file of the sweep, and the names of uploaded files that it requires.
 
@@ -197,4 +197,4 @@ class Sweeps:
         """
         if self._sweep is None:
             raise SimulationError("there is no sweep; run one first")
-        return self._sweep.file(uploads)
+        return self._sweep.file(directories)
