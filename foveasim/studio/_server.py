@@ -36,7 +36,7 @@ from foveasim.studio._exports import archive
 from foveasim.studio._files import file_name, presets
 from foveasim.studio._frames import camera_frame
 from foveasim.studio._messages import is_answer_to_freeze, one_line
-from foveasim.studio._session import MAX_SESSION_BYTES, Session, Start
+from foveasim.studio._session import MAX_SESSION_BYTES, Listener, Session, Start
 
 #: Largest uploaded file.
 MAX_FILE_BYTES = 64 << 20
@@ -101,6 +101,7 @@ class Studio:
         self.start, self.hosts = start, hosts
         self.token = token or secrets.token_urlsafe(24)
         self.sessions: dict[str, Session] = {}
+        self._opening = threading.Lock()  # in threads, because files are copied
         self.unauthenticated = _Unauthenticated()
         routes = [
             Route("/", self._index),
@@ -119,15 +120,23 @@ class Studio:
             session.close()
         self.sessions.clear()
 
-    def session(self, name: object, page: object = None) -> tuple[Session | None, bool]:
+    def session(
+        self, name: object, page: object = None, listener: Listener | None = None
+    ) -> tuple[Session | None, bool]:
         """
         Return the session of a name or a new one, and whether it has the initial state.
 
         ``page``: identifier of the page. If another page uses the session, such as the one that a tab was duplicated from, the
-        new session has a copy of its state.
+        new session has a copy of its state. ``listener``: receives the messages of the session.
         """
+        with self._opening:
+            session, is_new = self._session(name, page if isinstance(page, str) else None)
+            if session is not None and listener is not None:
+                session.attach(listener)  # at once: a session without a page may be closed
+        return session, is_new
+
+    def _session(self, name: object, page: str | None) -> tuple[Session | None, bool]:
         origin = self.sessions.get(name) if isinstance(name, str) else None
-        page = page if isinstance(page, str) else None
         if origin is not None and (origin.is_idle or origin.page == page):
             origin.page = page
             return origin, False
@@ -186,12 +195,13 @@ class Studio:
                 await socket.close(WRONG_TOKEN, "wrong token")
                 return
             self.unauthenticated.remove(socket.client)
-            session, is_new = self.session(first.get("session"), first.get("page"))
+            outgoing = _Outbox(asyncio.get_running_loop())
+            session, is_new = await asyncio.to_thread(
+                self.session, first.get("session"), first.get("page"), outgoing.put
+            )
             if session is None:
                 await socket.close(TOO_MANY, "too many sessions")
                 return
-            outgoing = _Outbox(asyncio.get_running_loop())
-            session.attach(outgoing.put)  # at once: a session without a page may be closed
             hello = {
                 "kind": "hello",
                 "session": session.name,

@@ -160,6 +160,23 @@ def test_number_of_photosites_is_entered(visit):
 # -- connections ---------------------------------------------------------------------------------------------------------------
 
 
+def test_reloaded_page_keeps_its_session(visit, server):
+    """Also while the server has not noticed that the earlier connection is closed."""
+    page = visit()
+    set_value(page, "exposure_s", 0.004)
+    name = "() => sessionStorage.getItem('foveasim-studio-session')"
+    before = page.evaluate(name)
+    session = server.studio.sessions[before]
+    session.attach(print)
+    try:
+        page.reload()
+        settle(page)
+        assert page.evaluate(name) == before
+        assert setting(page, "exposure_s") == 0.004
+    finally:
+        session.detach(print)
+
+
 def test_duplicated_tab_is_a_copy(visit):
     page = visit()
     set_value(page, "exposure_s", 0.004)

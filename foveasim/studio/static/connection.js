@@ -13,9 +13,6 @@ const PATIENCE_MS = 4000;
 // Without any message for this time after a change, the server does not answer.
 const SILENT_MS = 1500;
 
-// Identifies this page: a duplicated tab remembers the same session, and receives a copy of it.
-const PAGE = Array.from(crypto.getRandomValues(new Uint32Array(4)), (part) => part.toString(36)).join("");
-
 // What the page remembers in this tab, such as its session.
 export const memory = {
   /** @param {string} name */
@@ -23,6 +20,16 @@ export const memory = {
   /** @param {string} name @param {string} text */
   set(name, text) { try { sessionStorage.setItem("foveasim-studio-" + name, text); } catch { /* not kept */ } },
 };
+
+// Identifies this page: a duplicated tab remembers the same session, and receives a copy of it; a reloaded one keeps the session.
+const PAGE = (isReloaded() && memory.get("page"))
+  || Array.from(crypto.getRandomValues(new Uint32Array(4)), (part) => part.toString(36)).join("");
+memory.set("page", PAGE);
+
+function isReloaded() {
+  const [entry] = performance.getEntriesByType("navigation");
+  return entry instanceof PerformanceNavigationTiming && entry.type === "reload";
+}
 
 // Returns the header and the arrays of a part; arrays are views of its buffer.
 /** @type {(buffer: ArrayBuffer) => Part} */
