@@ -560,7 +560,10 @@ def video(
     stop: Annotated[int | None, typer.Option("--stop", help="Maximum number of frames.")] = None,
     gaze: Annotated[
         Path | None,
-        typer.Option("--gaze", help="CSV file of a gaze path with the columns t_s, x_um and y_um, instead of gaze_um."),
+        typer.Option(
+            "--gaze",
+            help="CSV file of a gaze path with the columns t_s, x_um and y_um, instead of gaze_path or gaze_um.",
+        ),
     ] = None,
     threads: Threads = None,
 ) -> None:

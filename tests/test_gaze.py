@@ -468,8 +468,8 @@ def test_paths_are_read_as_written(tmp_path_factory, n, seed):
         ("t_s,x_um\n0,1\n", "must have the columns"),
         ("t_s,x_um,y_um\n0,1,left\n", "must have numbers in line 2, got 0, 1, left"),
         ("t_s,x_um,y_um\n1,0,0\n0,0,0\n", "ascending"),
-        ("t_s,x_um,y_um\n0,nan,0\n", "must be finite"),
-        ("t_s,x_um,y_um\n", "one or more times"),
+        ("t_s,x_um,y_um\n0,nan,0\n", "three finite numbers, t_s, x_um and y_um, in line 2"),
+        ("t_s,x_um,y_um\n", "one or more rows"),
     ],
 )
 def test_invalid_path_file_is_one_line(tmp_path, text, message):

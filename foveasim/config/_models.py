@@ -40,6 +40,7 @@ from foveasim.sensor import (
 from foveasim.sensor.effects import EFFECTS
 from foveasim.sensor.limits import EXPOSURE
 from foveasim.sensor.spectral import CURVES
+from foveasim.video import GazePath
 
 __all__ = ["FILE_OPTIONS", "LayerSection", "Models", "PerArea", "Section", "call_of", "models"]
 
@@ -185,6 +186,18 @@ def _check_exposure(value: float | str) -> float | str:
     return value
 
 
+def _check_gaze_path(rows: list[list[float]]) -> list[list[float]]:
+    """Check the rows of a gaze path."""
+    try:
+        GazePath.from_rows(rows)
+    except ParameterError as error:
+        raise ValueError(error.detail) from None
+    return rows
+
+
+#: Rows of a gaze path, whose message names the row.
+_GazeRow: Any = Annotated[list[float], Field(json_schema_extra={"minItems": 3, "maxItems": 3})]
+_GazeRows: Any = Annotated[list[_GazeRow], AfterValidator(_check_gaze_path)]
 #: Seconds, or a text that cameras accept.
 _ExposureTime: Any = Annotated[float | str, AfterValidator(_check_exposure)]
 
@@ -255,6 +268,16 @@ def _models(_versions: tuple[int, ...]) -> Models:
         "gaze_um": (
             tuple[float, float],
             Field((0.0, 0.0), description="point of the image, in µm, at which the centre of the sensor is"),
+        ),
+        "gaze_path": (
+            _GazeRows | str | None,
+            Field(
+                None,
+                description=(
+                    "gaze of the frames of a video (foveasim video): rows [t_s, x_um, y_um], with straight lines between "
+                    "them, or a CSV file with these columns; a single capture has the gaze gaze_um"
+                ),
+            ),
         ),
         "axis": (
             GazeAxis,

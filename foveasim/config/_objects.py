@@ -34,13 +34,14 @@ from foveasim.optics import Optics
 from foveasim.scene import Scene
 from foveasim.scene._scene import FRAMINGS
 from foveasim.sensor import Sensor
+from foveasim.video import GazePath
 
 #: Prefix of the names of pictures that scikit-image contains.
 BUNDLED_PICTURE = "skimage:"
 #: Extensions of settings files; the format of other layout files follows from their content.
 YAML_EXTENSIONS = (".yaml", ".yml")
 #: Settings whose value may be a file.
-FILE_SETTINGS = ("density", "file", "importance", "layers", "layout", "path", "picture")
+FILE_SETTINGS = ("density", "file", "gaze_path", "importance", "layers", "layout", "path", "picture")
 #: Option of the command line that replaces settings.
 CHANGE = "--set"
 #: Keys of a layout that do not change its photosites before the edits.
@@ -89,6 +90,8 @@ class Shot:
     seed : int
     requirements : tuple of Requirement
         Conditions on results, which :func:`foveasim.explore.check_requirements` checks.
+    gaze_source : GazePath, Path or None
+        Gaze path of videos, or its CSV file.
     """
 
     name: str
@@ -98,8 +101,14 @@ class Shot:
     requested_s: float | Literal["auto"]
     seed: int
     requirements: tuple[Requirement, ...] = ()
+    gaze_source: GazePath | Path | None = None
 
     __repr__ = short_repr
+
+    @cached_property
+    def gaze_path(self) -> GazePath | None:
+        """Gaze path of videos, which single captures do not have; a CSV file is read when it is first required."""
+        return GazePath.read(self.gaze_source) if isinstance(self.gaze_source, Path) else self.gaze_source
 
     @cached_property
     def exposure_s(self) -> float:
@@ -304,7 +313,15 @@ def build_shot(
         requested_s=exposure_s,
         seed=streams.seed,
         requirements=tuple(_build(source, "requirements", settings.requirements or [])),
+        gaze_source=_gaze_source(source, settings.gaze_path),
     )
+
+
+def _gaze_source(source: Source, gaze_path: list[list[float]] | str | None) -> GazePath | Path | None:
+    """Return the gaze path of checked settings, or its file."""
+    if isinstance(gaze_path, str):
+        return source.directory / gaze_path
+    return None if gaze_path is None else GazePath.from_rows(gaze_path)
 
 
 def read_layout_file(path: str | Path) -> LayoutFile:

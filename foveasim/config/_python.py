@@ -53,7 +53,8 @@ def to_python(settings: Mapping[str, Any], *, source: Source | str | Path | None
     Returns
     -------
     text : str
-        Source that defines ``camera``, ``scene`` and ``capture``.
+        Source that defines ``camera``, ``scene`` and ``capture``; with a gaze path also ``gaze_path``, and ``video``, which
+        yields a capture for each of its rows.
 
     Raises
     ------
@@ -84,6 +85,8 @@ def to_python(settings: Mapping[str, Any], *, source: Source | str | Path | None
             "camera, scene = shot.camera, shot.scene",
             "capture = camera.capture(scene, exposure_s=shot.requested_s, seed=shot.seed)",
         ]
+        if shot.gaze_path is not None:
+            lines += ["gaze_path = shot.gaze_path", _video_line(writer, _Name("shot.requested_s"), _Name("shot.seed"))]
     imports = ["import foveasim as fs", *sorted(writer.imports)]
     return "\n".join([HEADER, *imports, "", *lines, ""])
 
@@ -111,7 +114,25 @@ def _shot_lines(writer: _Writer, shot: Any) -> list[str]:
         f"camera = {writer.call('fs.Camera', camera)}",
         writer.assignment("scene", shot.scene),
         f"capture = {writer.call('camera.capture', capture, positional=('scene',))}",
+        *_gaze_lines(writer, shot),
     ]
+
+
+def _gaze_lines(writer: _Writer, shot: Any) -> list[str]:
+    """Return the lines that define the gaze path of a shot, and its captures."""
+    if shot.gaze_path is None:
+        return []
+    call = "fs.video.GazePath." + ("read" if isinstance(shot.gaze_path, str) else "from_rows")
+    return [
+        f"gaze_path = {writer.call(call, {'value': shot.gaze_path}, positional=('value',))}",
+        _video_line(writer, shot.exposure_s, shot.seed),
+    ]
+
+
+def _video_line(writer: _Writer, exposure_s: Any, seed: Any) -> str:
+    """Return the line that defines the captures along a gaze path."""
+    frames = {"frames": _Name("fs.video.shift_sensor(scene, gaze_path)"), "exposure_s": exposure_s, "seed": seed}
+    return f"video = {writer.call('camera.video', frames, positional=('frames',))}"
 
 
 def _layout_lines(writer: _Writer, section: Any, variable: str = "layout") -> list[str]:

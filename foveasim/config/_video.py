@@ -53,8 +53,8 @@ def run_video(
     stop : int, optional
         Maximum number of frames.
     gaze : path, optional
-        CSV file of a gaze path (:meth:`foveasim.video.GazePath.read`), with times from the first frame; by default the gaze of
-        the shot.
+        CSV file of a gaze path (:meth:`foveasim.video.GazePath.read`), with times from the first frame, instead of the path of
+        the shot (``gaze_path``); without both, each frame has the gaze of the shot.
     n_threads : int, optional
         Number of frames that are computed at a time; one per core by default.
     progress : bool
@@ -87,7 +87,7 @@ def run_video(
         raise ParameterError(
             "frame_s", "must be given for a rolling shutter: pictures in a directory have no frame rate"
         )
-    path = None if gaze is None else GazePath.read(gaze)
+    path = shot.gaze_path if gaze is None else GazePath.read(gaze)
     frame_period_s = source.frame_s or DEFAULT_FRAME_S
     is_store = Path(out).suffix.lower() == ".zarr"
     n_before = count_recorded_frames(out) if is_store else 0

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim._core.calls import NOT_NEGATIVE, POSITIVE
+from foveasim._core.calls import NOT_NEGATIVE, POSITIVE, OwnCheck
 from foveasim._core.random_streams import Streams
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, check_number, check_shape, finite_array, read_only
@@ -19,7 +19,7 @@ from foveasim._io.atomic import atomic_write
 from foveasim._io.text_files import read_columns
 from foveasim.camera import Camera
 from foveasim.camera._frames import PathPosition, path_digests, path_positions
-from foveasim.errors import FileError, ParameterError
+from foveasim.errors import FileError, ParameterError, format_value
 from foveasim.fields import PowerMap
 from foveasim.optics import Optics
 from foveasim.scene import Scene
@@ -94,17 +94,54 @@ class GazePath:
             When the file cannot be read, or is not such a table.
         """
         path = Path(path)
-        rows = read_columns(path, "a table of gazes", COLUMNS, MAX_FILE_BYTES)
-        values = np.empty((len(rows), len(COLUMNS)))
-        for k, (number, cells) in enumerate(rows):
+        lines = read_columns(path, "a table of gazes", COLUMNS, MAX_FILE_BYTES)
+        rows = []
+        for number, cells in lines:
             try:
-                values[k] = [float(cell) for cell in cells]
+                rows.append([float(cell) for cell in cells])
             except ValueError:
                 raise FileError(path, f"must have numbers in line {number}, got {', '.join(cells)[:60]}") from None
-        try:
-            return cls(values[:, 0], values[:, 1:])
-        except ParameterError as error:
-            raise FileError(path, str(error)) from None
+        problem = _problem_of_rows(rows, [f"line {number}" for number, _ in lines])
+        if problem is not None:
+            raise FileError(path, problem)
+        return cls._of(rows)
+
+    @classmethod
+    def from_rows(cls, rows: OwnCheck[Sequence[Sequence[float]] | Floats]) -> GazePath:
+        """
+        Return the path of rows, as settings files contain them (``gaze_path``).
+
+        Parameters
+        ----------
+        rows : sequence of (t_s, x_um, y_um)
+            Times in s, strictly ascending, and positions in µm.
+
+        Raises
+        ------
+        ParameterError
+            When a row is not three finite numbers, or not later than the one before.
+
+        Examples
+        --------
+        >>> path = GazePath.from_rows([[0.0, 0.0, 0.0], [1.0, 100.0, 50.0]])
+        >>> path.at(0.25).tolist()
+        [25.0, 12.5]
+        """
+        problem = _problem_of_rows(rows, [f"row {k}" for k in range(1, len(rows) + 1)])
+        if problem is not None:
+            raise ParameterError("rows", problem)
+        return cls._of(rows)
+
+    @classmethod
+    def _of(cls, rows: Sequence[Sequence[float]] | Floats) -> GazePath:
+        """Return the path of valid rows."""
+        values = np.array(rows, dtype=float)
+        return cls(values[:, 0], values[:, 1:])
+
+    @property
+    def rows(self) -> Floats:
+        """Times and positions, (n, 3): see :meth:`from_rows`."""
+        return np.column_stack((self.t_s, self.xy_um))
 
     def write(self, path: str | Path) -> None:
         """
@@ -116,8 +153,7 @@ class GazePath:
             When the file cannot be written.
         """
         with atomic_write(path) as temporary:
-            values = np.column_stack((self.t_s, self.xy_um))
-            np.savetxt(temporary, values, fmt="%.17g", delimiter=",", header=",".join(COLUMNS), comments="")
+            np.savetxt(temporary, self.rows, fmt="%.17g", delimiter=",", header=",".join(COLUMNS), comments="")
 
     def at(self, t_s: ArrayLike) -> Floats:
         """
@@ -127,6 +163,32 @@ class GazePath:
         """
         times_s = finite_array("t_s", t_s)
         return np.stack([np.interp(times_s, self.t_s, self.xy_um[:, axis]) for axis in (0, 1)], axis=-1)
+
+
+def _problem_of_rows(rows: Sequence[Sequence[float]] | Floats, names: Sequence[str]) -> str | None:
+    """Return the first problem of rows with names such as "row 1"; None if they are a path."""
+    if len(rows) == 0:
+        return "must have one or more rows [t_s, x_um, y_um]"
+    before_s = -math.inf
+    for k, (row, name) in enumerate(zip(rows, names, strict=True)):
+        if not _is_row(row):
+            return f"must have three finite numbers, t_s, x_um and y_um, in {name}, got {format_value(row)}"
+        if row[0] <= before_s:
+            return (
+                f"must have times in strictly ascending order, got {row[0]:g} s in {name} after {before_s:g} s in "
+                f"{names[k - 1]}"
+            )
+        before_s = row[0]
+    return None
+
+
+def _is_row(row: Any) -> bool:
+    """Return whether an object is a time and a position."""
+    return (
+        isinstance(row, list | tuple | np.ndarray)
+        and len(row) == len(COLUMNS)
+        and all(isinstance(x, int | float | np.number) and not isinstance(x, bool) and math.isfinite(x) for x in row)
+    )
 
 
 def saccades(
