@@ -12,6 +12,7 @@ type RasterMap = import("./foveasim/studio/static/raster_map.js").RasterMap;
 type SitePane = import("./foveasim/studio/static/site_pane.js").SitePane;
 type ImagePane = import("./foveasim/studio/static/image_pane.js").ImagePane;
 type Film = import("./foveasim/studio/static/film.js").Film;
+type Connection = import("./foveasim/studio/static/connection.js").Connection;
 type Rate = import("./foveasim/studio/static/film.js").Rate;
 
 // -- geometry and values ------------------------------------------------------------------------------------------------
@@ -103,7 +104,9 @@ interface SweepMessage {
 }
 interface Exists { kind: "exists"; id: number; name: string; file: string }
 interface Saved { kind: "saved"; id: number; path: string }
-type ServerMessage = Busy | ControlsMessage | State | Done | Failure | TextMessage | Saved | Note | Progress | Exists | Sought | SweepMessage;
+interface GazePathMessage { kind: "gaze_path"; rows: [number, number, number][]; problem: string; step_s: number }
+type ServerMessage = Busy | ControlsMessage | State | Done | Failure | TextMessage | Saved | Note | Progress | Exists | Sought | SweepMessage
+  | GazePathMessage;
 
 // Binary messages: a header and arrays; as readPart returns them.
 interface PartHeader {
@@ -133,7 +136,10 @@ type Change =
   | { do: "restore"; settings: Settings | undefined }
   | { do: "file"; path: string | undefined; as: string }
   | { do: "video"; path: string | undefined }
-  | { do: "frame"; n: number }
+  | { do: "frame"; n: number; follows?: boolean; final?: boolean }
+  | { do: "follow"; t_s: number; final: boolean }
+  | { do: "gaze_file"; path: string | undefined }
+  | { do: "saccades" }  // with the parameters of the path
   | { do: "views"; names: string[]; pixels: number }
   | { do: "freeze"; variant?: string }
   | { do: "unfreeze" }

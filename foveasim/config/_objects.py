@@ -107,7 +107,7 @@ class Shot:
 
     @cached_property
     def gaze_path(self) -> GazePath | None:
-        """Gaze path of videos, which single captures do not have; a CSV file is read when it is first required."""
+        """Gaze path of videos; a CSV file is read when the path is first required."""
         return GazePath.read(self.gaze_source) if isinstance(self.gaze_source, Path) else self.gaze_source
 
     @cached_property
@@ -317,11 +317,11 @@ def build_shot(
     )
 
 
-def _gaze_source(source: Source, gaze_path: list[list[float]] | str | None) -> GazePath | Path | None:
+def _gaze_source(source: Source, rows: list[list[float]] | str | None) -> GazePath | Path | None:
     """Return the gaze path of checked settings, or its file."""
-    if isinstance(gaze_path, str):
-        return source.directory / gaze_path
-    return None if gaze_path is None else GazePath.from_rows(gaze_path)
+    if isinstance(rows, str):
+        return source.directory / rows
+    return None if rows is None else GazePath.from_rows(rows)
 
 
 def read_layout_file(path: str | Path) -> LayoutFile:

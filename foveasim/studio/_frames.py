@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from foveasim._io.images import write_picture
 from foveasim._io.videos import SandboxedVideo
+from foveasim.config._video import DEFAULT_FRAME_S
 from foveasim.errors import FileError, ParameterError
 
 #: Largest size of the decoded frames that are stored for steps back.
@@ -178,16 +179,25 @@ class Frames:
         if self._pixels is None or not self._is_used(settings):
             return None
         height, width = self._pixels.shape[:2]
-        frame_s = None if self._video is None else self._video.frame_s
         return {
             "kind": "camera" if self._video is None else "video",
             "name": self._name,
             "n": self._number,
             "n_frames": self._n_frames if self._video is not None else None,
-            "frame_s": frame_s,
+            "frame_s": self.frame_s or None,
             "width": width,
             "height": height,
         }
+
+    @property
+    def time_s(self) -> float:
+        """Time of the current frame of a video, as in :func:`foveasim.config.run_video`."""
+        return self._number * self.frame_s
+
+    @property
+    def frame_s(self) -> float:
+        """Frame period of a video; 0 for a camera, whose frames have no fixed times."""
+        return 0.0 if self._video is None else self._video.frame_s or DEFAULT_FRAME_S
 
     def _is_used(self, settings: Mapping[str, Any]) -> bool:
         scene = settings.get("scene")

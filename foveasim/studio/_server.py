@@ -440,8 +440,8 @@ def _exported(session: Session, what: str) -> tuple[bytes, str]:
         exported, result = session.exported(), session.result
         texts = {f"{stem}.{extension}": session.text(text, exported) for text, extension in TEXTS.items()}
         return archive(stem, texts, exported[1], None if result is None else result.capture.layout), f"{stem}.zip"
-    if what not in ("gds", "oas", "geojson", "npz", "svg", "png"):
-        names = f"{', '.join(TEXTS)}, zip, gds, oas, geojson, npz, svg or png"
+    if what not in ("gds", "oas", "geojson", "npz", "svg", "png", "csv"):
+        names = f"{', '.join(TEXTS)}, zip, gds, oas, geojson, npz, svg, png or csv"
         raise ParameterError("what", f"must be {names}", printable(what)[:40])
     if session.result is None:
         raise SimulationError("there is no result")
@@ -450,6 +450,8 @@ def _exported(session: Session, what: str) -> tuple[bytes, str]:
         path = Path(directory) / f"{stem}.{what}"
         if what == "png":
             capture.picture(max_pixels=1024).save(path, capture.white_dn)
+        elif what == "csv":
+            session.gaze.required_path(session.history.settings).write(path)
         else:
             write_layout(capture.layout, path)
         return path.read_bytes(), path.name

@@ -50,13 +50,16 @@ from foveasim.studio._settings.changes import (
     is_change,
     is_draft,
     is_frame,
+    is_temporary,
     key_of,
     match_filters,
     reset,
+    setting_of,
     string_of,
     with_file,
 )
 from foveasim.studio._settings.controls import controls_of, structure_of
+from foveasim.studio._settings.gaze import SessionGaze, random_rows, rows_of_file
 from foveasim.studio._settings.unknowns import (
     PARAMETERS,
     balanced,
@@ -132,6 +135,7 @@ class Session:
         self.page: str | None = None
         self._uploading = threading.Lock()  # in threads of the server
         self.frames = Frames(self.uploads, self._new_path)
+        self.gaze = SessionGaze(self._line)
         self._costs = Costs()
         self._views = Views(self._send, self._line, self._costs)
         self._sweeps = Sweeps(self._send, self._line)
@@ -427,7 +431,7 @@ class Session:
             for message, following in zip(messages, [*messages[1:], None], strict=True)
             if following is None
             or not (
-                (is_draft(message) and is_draft(following, message.get("key")))
+                (is_draft(message) and is_draft(following, setting_of(message)))
                 or (is_frame(message) and is_frame(following) and not message.get("is_first"))
             )
         ]
@@ -436,7 +440,8 @@ class Session:
         try:
             for message in kept:
                 self._apply(message)
-            self._key = kept[-1]["key"] if len(kept) == 1 and isinstance(kept[0].get("key"), str) else None
+            key = setting_of(kept[0])
+            self._key = key if len(kept) == 1 and isinstance(key, str) else None
             self._is_dragging = is_draft(kept[-1])
             can_stop = can_stop and not any(message["do"] in ONCE for message in kept)
             self._simulate(self.history.settings, can_stop=can_stop)
@@ -522,21 +527,42 @@ class Session:
                 shown = self.frames.path if self.frames.open_video(path) else path
                 settings = with_file(settings, self.start.settings, self.files, str(shown), "scene")
             case "frame":
-                if "pixels" not in message:
-                    self.frames.show(message.get("n"))
+                found = self._with_frame(settings, message)
+                if found is None:
                     return
-                is_first = bool(message.get("is_first"))
-                if not self.frames.receive(message["pixels"], is_first=is_first) or not is_first:
-                    return
-                settings = with_file(settings, self.start.settings, self.files, str(self.frames.path), "scene")
+                settings = found
+            case "follow":
+                settings = self.gaze.at(settings, message.get("t_s"))
+            case "gaze_file":
+                rows = rows_of_file(self.files.available(string_of(message, "path")))
+                settings = {**settings, "gaze_path": rows}
+            case "saccades":
+                shot = None if self.result is None else self.result.shot
+                film = self.frames.about(settings)
+                rows = random_rows(message, shot, None if film is None else film["frame_s"])
+                settings = {**settings, "gaze_path": rows}
         settings = self.files.resolve(settings)
         if chooses_filters(message):
             match_filters(settings, before)
         check_settings(None, settings)
-        if message["do"] == "set" and message.get("final", True) is False:
+        if is_temporary(message):
             self.history.preview(settings)
         else:
             self.history.commit(settings)
+
+    def _with_frame(self, settings: dict[str, Any], message: dict[str, Any]) -> dict[str, Any] | None:
+        """Use a frame, and return the settings that follow from it; None if they are the same."""
+        if "pixels" in message:
+            is_first = bool(message.get("is_first"))
+            if not self.frames.receive(message["pixels"], is_first=is_first) or not is_first:
+                return None
+            return with_file(settings, self.start.settings, self.files, str(self.frames.path), "scene")
+        if message.get("follows") is not True:
+            self.frames.show(message.get("n"))
+            return None
+        self.gaze.required_path(settings)  # an error leaves the frame
+        self.frames.show(message.get("n"))
+        return self.gaze.at(settings, self.frames.time_s)
 
     def _sought(self, settings: dict[str, Any], message: dict[str, Any]) -> dict[str, Any]:
         """
@@ -658,6 +684,7 @@ class Session:
                 self._views.forget()
                 self._sweeps.send()
                 self._structure = None
+                self.gaze.forget()
                 if self.result is None:
                     self._send({"kind": "busy"})
                     try:
@@ -858,6 +885,9 @@ class Session:
         if structure != self._structure:
             self._structure, self._controls = structure, controls_of(settings, self.start.settings)
             self._send({"kind": "controls", "controls": self._controls})
+        gaze_path = self.gaze.message(settings, None if result is None else result.shot)
+        if gaze_path is not None:
+            self._send(gaze_path)
         self._send({
             "kind": "state",
             "id": self._last_id,

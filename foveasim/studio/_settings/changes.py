@@ -32,7 +32,12 @@ CHANGES = (
     "solve",
     "fit",
     "seek",
+    "follow",
+    "gaze_file",
+    "saccades",
 )
+#: Changes that are drafts while they are not final.
+DRAFTS = ("set", "follow")
 #: Changes that advance a source of frames: newer ones do not stop their simulations.
 ONCE = ("video", "frame", "seek")
 #: Longest path of a setting.
@@ -51,13 +56,23 @@ def is_change(message: Any) -> bool:
     return isinstance(message, dict) and message.get("do") in CHANGES
 
 
+def setting_of(message: dict[str, Any]) -> Any:
+    """Return the path of the setting that a message changes, if there is one."""
+    return "gaze_um" if message.get("do") == "follow" else message.get("key")
+
+
 def is_draft(message: dict[str, Any], key: Any = None) -> bool:
-    """Return whether a message sets a value during a drag, of a given key."""
-    return message.get("do") == "set" and message.get("final") is False and (key is None or message.get("key") == key)
+    """Return whether a message sets a value during a drag or a replay, of a given key."""
+    return message.get("do") in DRAFTS and message.get("final") is False and (key is None or setting_of(message) == key)
+
+
+def is_temporary(message: dict[str, Any]) -> bool:
+    """Return whether a message changes the settings without an undo step."""
+    return is_draft(message) or (is_frame(message) and message.get("final") is False)
 
 
 def is_frame(message: Any) -> bool:
-    """Return whether a message changes only the frame of a video or camera."""
+    """Return whether a message changes the frame of a video or camera."""
     return isinstance(message, dict) and message.get("do") == "frame"
 
 

@@ -8,6 +8,7 @@ import { isVideo } from "./sources.js";
 // How the server uses a file: by its name.
 function useOf(name) {
   if (isVideo(name)) return "video";
+  if (/\.csv$/i.test(name)) return "gaze";
   if (/\.ya?ml$/i.test(name)) return "settings";
   return /\.(gds|gds2|gdsii|oas|oasis|geojson|json|npz|svg)(\.gz)?$/i.test(name) ? "layout" : "scene";
 }
@@ -86,8 +87,9 @@ export class Files {
       notice(file.name + ": " + answer.error);
       return;
     }
-    const use = useOf(file.name);
-    this.connection.send(use === "video" ? { do: "video", path: answer.path } : { do: "file", path: answer.path, as: use });
+    const use = useOf(file.name), { path } = answer;
+    if (use === "video") this.connection.send({ do: "video", path });
+    else this.connection.send(use === "gaze" ? { do: "gaze_file", path } : { do: "file", path, as: use });
   }
 
   // Asks before saved settings are replaced.

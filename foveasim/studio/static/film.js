@@ -5,17 +5,21 @@ const PICTURE_S = 0.5;
 
 export class Film {
   /** @type {[number, boolean] | null} */ wanted = null;
+  // Number of the frame that is computed.
+  next = 0;
 
-  // show(n, isFinal) shows a frame, and resolves to false when it failed; changed() is called when the state changes.
+  // show(n, isFinal) shows a frame, and resolves to false when it failed; changed() is called when the state changes. settles:
+  // whether a pause shows its frame again as the final one.
   /**
-   * @param {{ count: number, frameS?: number | null, isSkipping: boolean, n?: number,
+   * @param {{ count: number, frameS?: number | null, isSkipping: boolean, n?: number, settles?: boolean,
    *   show: (n: number, isFinal: boolean) => Promise<boolean>, changed: () => void }} options
    */
-  constructor({ count, frameS, isSkipping, show, changed, n = 0 }) {
+  constructor({ count, frameS, isSkipping, show, changed, n = 0, settles = false }) {
     this.count = count;
     this.n = n;
     this.frameS = frameS || PICTURE_S;
     this.isSkipping = isSkipping;
+    this.settles = settles;
     this.show = show;
     this.changed = changed;
     this.isPlaying = false;
@@ -32,6 +36,7 @@ export class Film {
       return true;
     }
     this.isBusy = true;
+    this.next = to;
     const isShown = await this.show(to, isFinal).catch(() => false);
     this.isBusy = false;
     if (isShown) {
@@ -77,8 +82,10 @@ export class Film {
   }
 
   pause() {
+    const wasPlaying = this.isPlaying;
     this.isPlaying = false;
     this.changed();
+    if (wasPlaying && this.settles) this.go(this.isBusy ? this.next : this.n, true);
   }
 }
 

@@ -35,26 +35,38 @@ export class ImagePane {
     // Drag of the outline: its position on the picture at the start, from the lower left corner, and its displacement.
     /** @type {{ from: Point, offset: Point } | null} */
     this.drag = null;
+    // Path of the gaze, whose points can be dragged.
+    /** @type {import("./gaze_marks.js").GazeMarks | null} */
+    this.path = null;
     this._listen();
   }
 
   _listen() {
     const { marks, on } = this;
+    // In CSS pixels.
+    /** @type {(event: MouseEvent) => Point} */
+    const onMarks = (event) => {
+      const box = marks.getBoundingClientRect();
+      return [event.clientX - box.left, event.clientY - box.top];
+    };
     // Point of the layout.
     /** @type {(event: MouseEvent) => Point} */
     const at = (event) => {
-      const box = marks.getBoundingClientRect(), view = this.view(), [px, py] = this.place;
-      return [view.fromX(event.clientX - box.left) - px, view.fromY(event.clientY - box.top) - py];
+      const [x, y] = onMarks(event), view = this.view(), [px, py] = this.place;
+      return [view.fromX(x) - px, view.fromY(y) - py];
     };
-    /** @type {{ clientX: number, clientY: number, isOnLayout: boolean } | null} */
+    /** @typedef {ReturnType<import("./gaze_marks.js").GazeMarks["grip"]>} Grip */
+    /** @type {{ clientX: number, clientY: number, isOnLayout: boolean, grip: Grip } | null} */
     let start = null;
     marks.addEventListener("pointerdown", (event) => {
       if (!this.bounds || event.button !== 0) return;
-      start = { clientX: event.clientX, clientY: event.clientY, isOnLayout: this._isInFrame(at(event)) };
+      const grip = this.path?.grip(this.view(), ...onMarks(event)) ?? null;
+      start = { grip,  clientX: event.clientX, clientY: event.clientY, isOnLayout: this._isInFrame(at(event)) };
       marks.setPointerCapture(event.pointerId);
     });
     marks.addEventListener("pointermove", (event) => {
       if (!this.bounds) return;
+      if (start?.grip) { start.grip.move(...onMarks(event)); return; }
       if (!start || !start.isOnLayout || !this.canMove()) {
         on.hover(...at(event), this);
         return;
@@ -71,7 +83,8 @@ export class ImagePane {
     });
     const end = (event) => {
       const { drag } = this;
-      if (drag) {
+      if (start?.grip) start.grip.end(event.type === "pointerup");
+      else if (drag) {
         if (event.type === "pointerup") on.gaze(...drag.offset, true);
         else on.gaze(0, 0, true);
       } else if (start && event.type === "pointerup") on.click(...at(event));
@@ -155,7 +168,7 @@ export class ImagePane {
     if (!this.isShown) return;
     const view = this.view(), isAt = cursor && cursor.from !== this, [px, py] = this.place;
     const state = JSON.stringify([view.width, view.height, view.toX(0), view.toY(0), view.perUm, this.frame, px, py,
-      isAt && [cursor.x, cursor.y], map && !this.follows && [map.x, map.y, map.scale, map.width, map.height]]);
+      this.path?.version, isAt && [cursor.x, cursor.y], map && !this.follows && [map.x, map.y, map.scale, map.width, map.height]]);
     // Drawn again only when the marks change: each layer costs time to compose the page.
     if (state === this.shown && boundary === this.shownBoundary) return;
     this.shown = state;
@@ -165,6 +178,7 @@ export class ImagePane {
     if (boundary && this.frame) {
       outline(context, () => boundary(context, onLayout.toX, onLayout.toY), [3.5, 1.5], ["rgb(0 0 0 / 60%)", "#ffd34d"]);
     }
+    this.path?.draw(context, view);
     if (map && !this.follows) drawView(context, onLayout, map, width, height);
     if (isAt) drawCross(context, onLayout.toX(cursor.x), onLayout.toY(cursor.y), true);
   }

@@ -3,6 +3,7 @@
 import { $, make, notice } from "/web/page_parts.js";
 import { Camera, FIRST_SIZE, SIZES } from "./camera.js";
 import { Film, Rate } from "./film.js";
+import { FilmRow, rowButton } from "./film_row.js";
 import { listenToMenu } from "./menus.js";
 
 const VIDEO = /\.(mp4|m4v|mov|avi|mkv|webm|mpe?g|ogv|wmv|gif)$/i;
@@ -10,6 +11,7 @@ const PICTURE = /\.(bmp|exr|hdr|jp2|jpe?g|png|ppm|tga|tiff?|webp)$/i;
 // Pictures that browsers can show.
 const SHOWN = /\.(bmp|jpe?g|png|webp)$/i;
 const MAX_PICTURES = 500;
+const NAMES = { back: "One frame back", play: "Play", pause: "Pause", forward: "One frame forward", slider: "Frame" };
 
 export const isVideo = (name) => VIDEO.test(name);
 
@@ -27,11 +29,11 @@ export class Sources {
   /** @type {HTMLInputElement} */ directory;
   /** @type {HTMLElement} */ row;
   /** @type {HTMLElement} */ strip;
-  /** @type {HTMLInputElement} */ slider;
+  /** @type {FilmRow} */ controls;
   /** @type {HTMLSelectElement} */ size;
   /** @type {HTMLElement} */ label;
 
-  // Callbacks: connection(), state(), charts() (choices of the scene), choose() (a file).
+  // Callbacks: connection(), state(), charts() (choices of the scene), choose() (a file), playing() before a film plays.
   constructor(pane, on) {
     this.pane = pane;
     this.on = on;
@@ -67,35 +69,19 @@ export class Sources {
     this.strip.setAttribute("role", "group");
     this.strip.setAttribute("aria-label", "Pictures of the folder");
     bar.after(this.row, this.strip);
-    const item = (name, title, act) => {
-      const found = make("button", name);
-      found.type = "button";
-      if (title) found.title = title;
-      found.setAttribute("aria-label", title || name);
-      found.addEventListener("click", act);
-      return found;
-    };
+    this.controls = new FilmRow(NAMES, () => this.film, () => this.on.playing());
     this.buttons = {
-      back: item("◂", "One frame back", () => this.film?.step(-1)),
-      play: item("▶", "Play", () => this._play()),
-      forward: item("▸", "One frame forward", () => this.film?.step(1)),
-      close: item("✕", "Close", () => this._close()),
-      camera: item("Stop", "Stop the camera; its last frame stays the scene",
+      close: rowButton("✕", "Close", () => this._close()),
+      camera: rowButton("Stop", "Stop the camera; its last frame stays the scene",
         () => (this.camera.isOn ? this.stopCamera() : this.startCamera())),
     };
-    this.slider = make("input");
-    Object.assign(this.slider, { type: "range", min: 0, step: 1, value: 0 });
-    this.slider.setAttribute("aria-label", "Frame");
-    this.slider.addEventListener("input", () => { this.film?.go(Number(this.slider.value), false); this.film?.pause(); });
-    this.slider.addEventListener("change", () => this.film?.go(Number(this.slider.value), true));
     this.size = make("select");
     this.size.setAttribute("aria-label", "Longer side of camera frames");
     this.size.append(...SIZES.map((size) => { return new Option(size + " px", String(size)); }));
     this.size.value = String(FIRST_SIZE);
     this.size.addEventListener("change", () => { this.camera.size = Number(this.size.value); });
     this.label = make("span", undefined, "quiet");
-    const { back, play, forward, camera, close } = this.buttons;
-    this.row.append(back, play, forward, this.slider, camera, this.size, this.label, close);
+    this.row.append(...this.controls.elements, this.buttons.camera, this.size, this.label, this.buttons.close);
     button.addEventListener("click", () => this._fillMenu());
     listenToMenu(button, this.menu);
     this.menu.addEventListener("click", (event) => {
@@ -176,11 +162,11 @@ export class Sources {
   _show() {
     const { film, kind, camera } = this, isCamera = kind === "camera" || camera.isOn;
     const rate = (isCamera ? this.rate : film?.rate)?.perS ?? NaN;
-    const { back, play, forward, camera: stop } = this.buttons;
+    const { camera: stop } = this.buttons;
     this.row.hidden = !film && !isCamera;
     this.strip.hidden = !(this.folder && (kind === "folder"));
     if (this.row.hidden) return;
-    for (const each of [back, play, forward, this.slider]) each.hidden = isCamera;
+    for (const each of this.controls.elements) each.hidden = isCamera;
     for (const each of [stop, this.size]) each.hidden = !isCamera;
     this.row.classList.toggle("live", camera.isOn);
     const perS = Number.isFinite(rate) && (film?.isPlaying || camera.isOn) ? rate.toFixed(rate < 10 ? 1 : 0) + " frames/s" : "";
@@ -194,15 +180,7 @@ export class Sources {
     }
     if (!film) return;
     const total = String(film.count);
-    this.slider.max = String(film.count - 1);
-    if (film.isPlaying || !film.isBusy) this.slider.value = String(film.n);
-    this.slider.setAttribute("aria-valuetext", "Frame " + (film.n + 1) + " of " + total);
-    play.textContent = film.isPlaying ? "❚❚" : "▶";
-    play.title = film.isPlaying ? "Pause" : "Play";
-    play.setAttribute("aria-label", play.title);
-    play.disabled = film.count < 2;
-    back.disabled = film.n <= 0;
-    forward.disabled = film.n >= film.count - 1;
+    this.controls.show(film, "Frame " + (film.n + 1) + " of " + total);
     const name = kind === "folder" ? this.folder?.[film.n]?.file.name : this.about?.name;
     this.label.textContent = String(film.n + 1).padStart(total.length, "\u2007") + " / " + total + (perS ? " · " + perS : "");
     this.label.title = name || "";
@@ -211,12 +189,6 @@ export class Sources {
       if (isCurrent && cell.getAttribute("aria-current") !== "true") cell.scrollIntoView({ block: "nearest", inline: "nearest" });
       cell.setAttribute("aria-current", String(isCurrent));
     });
-  }
-
-  _play() {
-    if (!this.film) return;
-    if (this.film.isPlaying) this.film.pause();
-    else this.film.play();
   }
 
   // Closes the row; the current frame stays the scene.

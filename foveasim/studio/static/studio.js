@@ -11,6 +11,7 @@ import { Connection, memory } from "./connection.js";
 import { Controls, valueAt } from "./controls.js";
 import { Files } from "./files.js";
 import { inNextFrame } from "./frames.js";
+import { GazePanel } from "./gaze_panel.js";
 import { ImagePane } from "./image_pane.js";
 import { listenToDialogs } from "./menus.js";
 import { Problems } from "./problems.js";
@@ -65,6 +66,8 @@ let panes;
 let editor;
 /** @type {Sources} */
 let sources;
+/** @type {GazePanel} */
+let gazePanel;
 /** @type {Files} */
 let files;
 /** @type {Views} */
@@ -180,6 +183,7 @@ function receive(message, { isFailed }) {
   else if (kind === "done") finish(message);
   else if (kind === "error") { notice(message.text); views.made.sweep?.fail(message); }
   else if (kind === "text") files.receiveText(message);
+  else if (kind === "gaze_path") gazePanel.usePath(message);
   else if (kind === "saved") notice("Saved as " + message.path);
   else if (kind === "sought") views.show("goal", true).then(() => views.made.goal?.show(message));
   else if (kind === "sweep") { page.sweep = message; views.made.sweep?.show(message); }
@@ -260,6 +264,7 @@ function showState(message) {
   if (!state.frozen && frozen?.isAnswered) unfreeze();
   if (state.frozen && frozen) frozen.isAnswered = true;
   sources.use(message);
+  gazePanel.use(message);
 }
 
 /** @param {Hello} message @param {{ isSame: boolean }} about */
@@ -300,7 +305,7 @@ function fillPresets(presets) {
 /** @param {"open" | "lost" | "denied"} status */
 function showConnection(status) {
   const isOpen = status === "open";
-  if (!isOpen) sources.lost();
+  if (!isOpen) { sources.lost(); gazePanel.lost(); }
   document.body.classList.toggle("offline", !isOpen);
   if (isOpen) {
     if (!connection.requests.isBusy) showStatus("ready");
@@ -438,10 +443,13 @@ function showSelection() { views.tell("onSelection"); }
 function gaze(dx, dy, isFinal) {
   const key = "gaze_um", { map } = panes.b;
   /** @type {Point} */
-  const from = page.gazeAt || valueAt(page.state?.settings, key) || [0, 0];
+  const from = page.gazeAt || gazePanel.recordedAt || valueAt(page.state?.settings, key) || [0, 0];
   page.gazeAt = from;
   const digits = clamp(Math.ceil(Math.log10(map ? map.scale : 1)) + 1, 1, 4), [x, y] = from;
-  connection.set(key, [x + dx, y + dy].map((v) => Number(v.toFixed(digits))), isFinal);
+  const rounded = (/** @type {number} */ v) => Number(v.toFixed(digits));
+  /** @type {Point} */
+  const to = [rounded(x + dx), rounded(y + dy)];
+  connection.set(key, to, !gazePanel.moved(to) && isFinal);
   if (isFinal) page.gazeAt = null;
   ask("marks");
 }
@@ -684,6 +692,7 @@ const studio = {
   get connection() { return connection; },
   get editor() { return editor; },
   get sources() { return sources; },
+  get gazePanel() { return gazePanel; },
   get views() { return views; },
   get state() { return page.state; },
   // Of the views that are loaded.
@@ -711,7 +720,10 @@ function start() {
   const scene = () => [...controls.rows.values()].find(({ control: { key, kind } }) => key === "scene" && kind === "choice");
   sources = new Sources($("pane-scene"), {
     connection: () => connection, state: () => page.state, choose: () => $("chosen-file").click(),
-    charts: () => scene()?.control.choices || [],
+    charts: () => scene()?.control.choices || [], playing: () => gazePanel.film?.pause(),
+  });
+  gazePanel = new GazePanel($("pane-scene"), panes.scene, {
+    connection: () => connection, state: () => page.state, playing: () => sources.film?.pause(), redraw: () => ask("marks"),
   });
   views = new Views(studio, () => { sendViews(); resize(); });
   // Its violations are reported with the other problems.

@@ -1,0 +1,347 @@
+// Gaze path: a row under the bar of the optical image to record, replay and edit it, and its files.
+
+import { clamp } from "/web/colours.js";
+import { change, download, find, make, notice, speak } from "/web/page_parts.js";
+import { Film } from "./film.js";
+import { FilmRow, rowButton } from "./film_row.js";
+import { GazeMarks } from "./gaze_marks.js";
+import { Recording, withChanged, withRow } from "./gaze_rows.js";
+import { GazeTable } from "./gaze_table.js";
+import { listenToMenu } from "./menus.js";
+import { numberOf } from "./numbers.js";
+
+/** @typedef {import("./gaze_rows.js").GazeRow} GazeRow */
+
+const KEY = "gaze_path";
+const NAMES = { back: "One step back on the gaze path", play: "Play the gaze path", pause: "Pause the gaze path",
+  forward: "One step forward on the gaze path", slider: "Time on the gaze path" };
+// Interval in which the time of a recording is shown, in ms.
+const TICK_MS = 100;
+// Parameters of random paths: name, label, unit, value at first (for a video its duration).
+const SACCADES = [["duration_s", "Duration", "s", "5"], ["fixation_s", "Mean fixation", "s", "0.3"],
+  ["drift_um_per_root_s", "Drift after 1 s", "µm", "0"], ["seed", "Seed", "", "1"]];
+
+export class GazePanel {
+  /** @type {GazeRow[]} */ rows = [];
+  /** @type {Film | null} */ film = null;
+  /** @type {Recording | null} */ recording = null;
+  /** @type {FilmAbout | null} */ video = null;
+  /** @type {HTMLInputElement[]} */ fields = [];
+  /** @type {{ of: Recording, n: number, rows: GazeRow[] } | null} */ recorded = null;
+  // Elements.
+  /** @type {HTMLElement} */ row;
+  /** @type {HTMLElement} */ label;
+  /** @type {{ [name: string]: HTMLButtonElement }} */ buttons;
+  /** @type {FilmRow} */ controls;
+  /** @type {HTMLInputElement} */ chosen;
+  /** @type {HTMLDialogElement} */ dialog;
+  pictureStep = 1; problem = ""; error = ""; filmKey = ""; isKnown = false; timer = 0;
+
+  // Callbacks: connection(), state(), playing() before the path plays, redraw() of the marks.
+  /**
+   * @param {HTMLElement} root @param {ImagePane} pane
+   * @param {{ connection: () => Connection, state: () => State | null, playing: () => void, redraw: () => void }} on
+   */
+  constructor(root, pane, on) {
+    this.root = root;
+    this.pane = pane;
+    this.on = on;
+    this.marks = new GazeMarks(pane, {
+      moved: (index, row) => this._commit(withChanged(this.rows, index, row)),
+      chosen: (index) => this._goTo(this.rows[index][0]),
+      redraw: () => on.redraw(),
+    });
+    pane.path = this.marks;
+    this.table = new GazeTable({
+      changed: (index, row) => this._commit(withChanged(this.rows, index, row)),
+      removed: (index) => this._commit(this.rows.filter((_, k) => k !== index)),
+      inserted: () => this._commit(withRow(this.rows, [this.time, ...this.position], this.step)),
+    });
+    this.buttons = {};
+    this._build();
+    this._buildDialog();
+  }
+
+  // -- elements -------------------------------------------------------------------------------------------------------------
+
+  _build() {
+    const toggle = rowButton("Gaze path", "", () => this.open(Boolean(this.row.hidden))), { on } = this;
+    toggle.id = "gaze-path";
+    toggle.title = "Record, replay and edit movements of the gaze";
+    find(this.root, "#follow-scene").before(toggle);
+    this.row = make("div", undefined, "film gaze");
+    this.row.id = "gaze";
+    this.row.setAttribute("role", "group");
+    this.row.setAttribute("aria-label", "Gaze path");
+    const record = rowButton("Record", "", () => (this.recording ? this.finish() : this.start()));
+    record.classList.add("record");
+    record.title = "Record movements of the gaze: drag the outline, or use the arrow keys on the optical image";
+    this.controls = new FilmRow(NAMES, () => this.film, () => on.playing());
+    this.label = make("span", undefined, "quiet");
+    const table = rowButton("Rows", "Show the rows of the gaze path", () => {
+      this.table.root.hidden = !this.table.root.hidden;
+      this._show();
+    });
+    Object.assign(this.buttons, { toggle, record, table });
+    const end = make("div", undefined, "end");
+    end.append(this.label, table, this._menu());
+    this.row.append(record, ...this.controls.elements, end);
+    this.table.root.hidden = this.row.hidden = true;
+    find(this.root, ".stage").before(this.row);
+    find(this.root, ".stage").append(this.table.root);
+  }
+
+  _menu() {
+    const frame = make("div", undefined, "menu-frame"), button = make("button", "Path "), menu = make("div", undefined, "menu right");
+    const arrow = make("span", "▾"), entry = (text, act) => {
+      const item = make("button", text);
+      item.type = "button";
+      item.addEventListener("click", act);
+      menu.append(item);
+      return item;
+    };
+    arrow.setAttribute("aria-hidden", "true");
+    button.type = "button";
+    button.id = "gaze-menu";
+    button.append(arrow);
+    menu.hidden = true;
+    this.chosen = make("input");
+    Object.assign(this.chosen, { type: "file", accept: ".csv,text/csv", className: "unseen", tabIndex: -1, id: "chosen-gaze" });
+    this.chosen.setAttribute("aria-label", "CSV file of a gaze path");
+    this.chosen.addEventListener("change", () => {
+      const file = this.chosen.files?.[0];
+      if (file) this._openFile(file);
+      this.chosen.value = "";
+    });
+    entry("Saccades…", () => this._ask());
+    entry("Open CSV…", () => this.chosen.click());
+    this.buttons.save = entry("Save CSV", () => this._saveFile());
+    this.buttons.clear = entry("Clear", () => this._commit([]));
+    frame.append(button, menu, this.chosen);
+    listenToMenu(button, menu);
+    return frame;
+  }
+
+  _buildDialog() {
+    const form = make("form"), title = make("h2", "Random gaze path of saccades");
+    const create = make("button", "Create"), cancel = make("button", "Cancel");
+    this.dialog = make("dialog");
+    this.dialog.id = "saccades-dialog";
+    title.id = "saccades-title";
+    this.dialog.setAttribute("aria-labelledby", title.id);
+    form.method = "dialog";
+    create.value = "create";
+    const lines = SACCADES.map(([name, label, unit, value]) => {
+      const line = make("label", label + (unit ? " / " + unit : "")), field = make("input");
+      Object.assign(field, { type: "text", name, value, autocomplete: "off", spellcheck: false });
+      this.fields.push(field);
+      line.append(field);
+      return line;
+    });
+    const buttons = make("div", undefined, "buttons");
+    buttons.append(create, " ", cancel);
+    form.append(...lines, make("p", "Targets lie where the image covers all photosites.", "quiet"), buttons);
+    form.addEventListener("submit", (event) => {
+      if (event.submitter === create && !this._create()) event.preventDefault();
+    });
+    this.dialog.append(title, form);
+    document.body.append(this.dialog);
+  }
+
+  // -- state ----------------------------------------------------------------------------------------------------------------
+
+  get isVideo() { return this.video !== null; }
+  // Time step in s: of the frames of a video, or of a replay over a picture.
+  get step() { return this.video?.frame_s || this.pictureStep; }
+  // Time of the first step of a replay; frames of a video begin at 0.
+  get begin() { return this.isVideo ? 0 : Math.min(0, this.rows[0]?.[0] ?? 0); }
+  // The present time of the path.
+  get time() { return this.isVideo ? (this.video?.n ?? 0) * this.step : this._timeOf(this.film?.n ?? 0); }
+  /** @returns {Point} */
+  get position() { return this.on.state()?.settings.gaze_um || [0, 0]; }
+  // Where the gaze is during a recording, before the server has answered.
+  get recordedAt() { return this.recording?.position; }
+
+  /** @param {number} n */
+  _timeOf(n) { return this.begin + n * this.step; }
+
+  open(isOpen = true) {
+    if (!isOpen) {
+      this.finish();
+      this.film?.pause();
+    }
+    this.row.hidden = !isOpen;
+    if (!isOpen) this.table.root.hidden = true;
+    this._show();
+  }
+
+  /** @param {GazePathMessage} message */
+  usePath({ rows, problem, step_s: step }) {
+    const isNew = this.isKnown && !this.rows.length && rows.length > 0;
+    Object.assign(this, { rows, problem, pictureStep: step, isKnown: true });
+    this._useFilm();
+    if (isNew) this.open();
+    else this._show();
+  }
+
+  /** @param {State} state */
+  use(state) {
+    const before = this.video, video = state.film?.kind === "video" ? state.film : null;
+    if (this.recording && Boolean(before) !== Boolean(video)) this.finish();
+    this.video = video;
+    // While the outline is held, each new frame has its position.
+    if (this.recording && video && video.n !== before?.n && this.pane.drag) this.recording.move(this.recording.position, video.n);
+    this._useFilm();
+    this.error = state.errors[KEY] || "";
+    if (this.error) this.table.restore();
+    this._show();
+  }
+
+  // The film of a replay: frames of the video, or steps of time over a picture.
+  _useFilm() {
+    const { rows, video, step, begin } = this, last = rows[rows.length - 1]?.[0] ?? 0;
+    const count = !rows.length ? 0 : video ? video.n_frames ?? 1 : Math.ceil((last - begin) / step - 1e-6) + 1;
+    const key = JSON.stringify([Boolean(video), count, step, begin]), before = this.film;
+    if (key !== this.filmKey) {
+      const n = video ? video.n : clamp(before?.n ?? 0, 0, Math.max(0, count - 1));
+      before?.pause();
+      this.filmKey = key;
+      this.film = count ? new Film({ count, n, frameS: step, isSkipping: true, settles: true, changed: () => this._show(),
+        show: (k, isFinal) => this._follow(k, isFinal) }) : null;
+    } else if (before && video && !before.isBusy) before.n = video.n;
+  }
+
+  // Shows a step of the path: drafts while it plays, at its end an undo step.
+  /** @param {number} n @param {boolean} isFinal */
+  _follow(n, isFinal) {
+    const connection = this.on.connection();
+    return connection.requests.answered(connection.send(this.isVideo ? { do: "frame", n, follows: true, final: isFinal }
+      : { do: "follow", t_s: this._timeOf(n), final: isFinal }));
+  }
+
+  /** @param {number} t */
+  _goTo(t) {
+    this.film?.pause();
+    this.film?.go(Math.round((t - this.begin) / this.step), true);
+  }
+
+  // Sets the rows: one undo step.
+  /** @param {GazeRow[]} rows */
+  _commit(rows) {
+    this.film?.pause();
+    if (rows.length) this.on.connection().set(KEY, rows, true);
+    else this.on.connection().remove(KEY);
+  }
+
+  // -- recording --------------------------------------------------------------------------------------------------------------
+
+  start() {
+    this.film?.pause();
+    this.recording = new Recording({ step: this.step, isVideo: this.isVideo, position: this.position });
+    this.timer = setInterval(() => this._show(), TICK_MS);
+    speak(() => "recording the gaze");
+    this._show();
+  }
+
+  // The gaze has moved; returns whether this is recorded: the end of the recording is then the undo step.
+  /** @param {Point} position */
+  moved(position) {
+    if (!this.recording) {
+      if (this.film?.isPlaying) this.film.pause();
+      return false;
+    }
+    this.recording.move(position, this.video?.n ?? 0);
+    this._show();
+    return true;
+  }
+
+  // Ends the recording: the path and the last position are one undo step.
+  finish() {
+    const { recording } = this, connection = this.on.connection();
+    if (!recording) return;
+    this.recording = null;
+    clearInterval(this.timer);
+    if (recording.nMoved) {
+      const rows = recording.rows(this.rows);
+      connection.send({ do: "set", key: "gaze_um", value: recording.position, final: false });
+      connection.set(KEY, rows, true);
+      speak(() => rows.length + " rows recorded");
+    } else notice("No movement of the gaze was recorded");
+    this._show();
+  }
+
+  // The connection is lost.
+  lost() {
+    this.film?.pause();
+    this.finish();
+  }
+
+  // -- files and random paths ---------------------------------------------------------------------------------------------------
+
+  /** @param {File} file */
+  async _openFile(file) {
+    const connection = this.on.connection(), { path, error } = await connection.upload(file);
+    if (error) notice(file.name + ": " + error);
+    else connection.send({ do: "gaze_file", path });
+  }
+
+  async _saveFile() {
+    const { blob, error } = await this.on.connection().fetchFile("csv");
+    if (blob) download(blob, document.title.split(" – ")[0] + "_gaze", "csv");
+    else notice(error || "The file is not available");
+  }
+
+  _ask() {
+    const duration = this.fields.find(({ name }) => name === "duration_s");
+    if (duration && this.video?.n_frames) duration.value = String(Number((this.video.n_frames * this.step).toPrecision(6)));
+    this.dialog.showModal();
+  }
+
+  // Asks the server for a random path; returns whether all fields are numbers.
+  _create() {
+    const values = this.fields.map((field, k) => {
+      const value = numberOf(field.value, SACCADES[k][2]);
+      if (Number.isFinite(value)) field.removeAttribute("aria-invalid");
+      else field.setAttribute("aria-invalid", "true");
+      return [field.name, value];
+    });
+    if (!values.every(([, value]) => Number.isFinite(value))) return false;
+    this.on.connection().send({ do: "saccades", ...Object.fromEntries(values) });
+    return true;
+  }
+
+  // -- display --------------------------------------------------------------------------------------------------------------------
+
+  _show() {
+    const { recording, row, rows, film, buttons, label } = this, isOpen = !row.hidden, state = this.on.state();
+    const isRecording = Boolean(recording), shown = recording ? this._recorded(recording) : rows;
+    buttons.toggle.setAttribute("aria-pressed", String(isOpen));
+    this.marks.use(shown, recording?.position ?? this.position, { isShown: isOpen && shown.length > 0, isRecording });
+    if (!isOpen || !state) return;
+    const problem = isRecording ? "" : this.error || this.problem, words = problem || this._words(), isTableShown = !this.table.root.hidden;
+    buttons.record.setAttribute("aria-pressed", String(isRecording));
+    change(buttons.record, { textContent: isRecording ? "Stop" : "Record",
+      ariaLabel: isRecording ? "Stop recording the gaze" : "Record the gaze" });
+    this.controls.show(isRecording ? null : film, words);
+    change(label, { textContent: words, title: problem, className: problem ? "quiet wrong" : "quiet" });
+    buttons.table.setAttribute("aria-pressed", String(isTableShown));
+    for (const each of [buttons.save, buttons.clear]) each.disabled = !rows.length;
+    this.table.insert.disabled = isRecording;
+    if (isTableShown) this.table.use(shown, this.time, this.step);
+  }
+
+  // Rows of a recording in progress, the same object until it changes.
+  /** @param {Recording} recording */
+  _recorded(recording) {
+    if (this.recorded?.of !== recording || this.recorded.n !== recording.nMoved) {
+      this.recorded = { of: recording, n: recording.nMoved, rows: recording.rows(this.rows) };
+    }
+    return this.recorded.rows;
+  }
+
+  _words() {
+    const { recording } = this, [x, y] = recording?.position ?? this.position;
+    const t = recording && !this.isVideo ? recording.elapsed : this.time, digits = this.step < 0.01 ? 3 : 2;
+    return t.toFixed(digits) + " s · " + x.toFixed(1) + ", " + y.toFixed(1) + " µm";
+  }
+}

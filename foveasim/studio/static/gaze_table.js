@@ -1,0 +1,135 @@
+// Table of the rows of a gaze path: fields, deletion, and the row of the present time.
+
+import { make } from "/web/page_parts.js";
+import { rowButton } from "./film_row.js";
+import { rowAt } from "./gaze_rows.js";
+import { numberOf } from "./numbers.js";
+
+/** @typedef {import("./gaze_rows.js").GazeRow} GazeRow */
+
+// Name, unit, and decimals that fields show.
+/** @type {[string, string, number][]} */
+const COLUMNS = [["time", "s", 4], ["x", "µm", 2], ["y", "µm", 2]];
+// Rows that are shown at a time.
+const MOST_ROWS = 50;
+
+export class GazeTable {
+  /** @type {GazeRow[]} */ rows = [];
+  first = 0; current = -1; label = "";
+
+  // Callbacks: changed(index, row), removed(index), inserted() for a row at the present time.
+  /** @param {{ changed: (index: number, row: GazeRow) => void, removed: (index: number) => void, inserted: () => void }} on */
+  constructor(on) {
+    this.on = on;
+    this.root = make("div", undefined, "gaze-table");
+    this.root.id = "gaze-table";
+    this.root.setAttribute("role", "group");
+    this.root.setAttribute("aria-label", "Rows of the gaze path");
+    this.insert = rowButton("Insert", "Insert the present gaze at the present time", () => this.on.inserted());
+    this.earlier = rowButton("◂", "Earlier rows", () => this._turn(-MOST_ROWS));
+    this.later = rowButton("▸", "Later rows", () => this._turn(MOST_ROWS));
+    this.note = make("span", undefined, "quiet");
+    const head = make("div", undefined, "gaze-head"), scroller = make("div", undefined, "gaze-rows");
+    const table = make("table"), titles = make("tr");
+    head.append(this.insert, this.note, this.earlier, this.later);
+    for (const [name, unit] of COLUMNS) {
+      const title = make("th", name + "\u00a0/\u00a0" + unit);
+      title.scope = "col";
+      titles.append(title);
+    }
+    titles.append(make("td"));
+    this.body = make("tbody");
+    const heading = make("thead");
+    heading.append(titles);
+    table.append(heading, this.body);
+    scroller.append(table);
+    this.root.append(head, scroller);
+  }
+
+  // Shows rows; those at the present time are marked, and shown first if the time has changed.
+  /** @param {GazeRow[]} rows @param {number} t @param {number} step */
+  use(rows, t, step) {
+    const current = rowAt(rows, t, step), isMoved = current !== this.current;
+    this.current = current;
+    if (isMoved && !this.root.contains(document.activeElement)) this.first = this._pageOf(Math.max(0, current));
+    if (rows !== this.rows) {
+      this.rows = rows;
+      this.first = Math.min(this.first, this._pageOf(Math.max(0, rows.length - 1)));
+    }
+    this._show();
+    if (isMoved) this.body.querySelector("[aria-current]")?.scrollIntoView({ block: "nearest" });
+  }
+
+  /** @param {number} index */
+  _pageOf(index) { return MOST_ROWS * Math.floor(index / MOST_ROWS); }
+
+  /** @param {number} by */
+  _turn(by) {
+    this.first = Math.max(0, Math.min(this._pageOf(this.rows.length - 1), this.first + by));
+    this._show();
+  }
+
+  _show() {
+    const { rows, first, body } = this, shown = rows.slice(first, first + MOST_ROWS), last = first + shown.length;
+    while (body.rows.length > shown.length) body.deleteRow(-1);
+    while (body.rows.length < shown.length) body.append(this._newRow(body.rows.length));
+    shown.forEach((row, i) => this._fill(body.rows[i], first + i, row));
+    const all = rows.length + (rows.length === 1 ? " row" : " rows");
+    this.note.textContent = rows.length > MOST_ROWS ? (first + 1) + "–" + last + " of " + all : all;
+    this.earlier.hidden = this.later.hidden = rows.length <= MOST_ROWS;
+    this.earlier.disabled = first === 0;
+    this.later.disabled = last >= rows.length;
+  }
+
+  // A line of the table, for the row at this distance from the first one.
+  /** @param {number} i */
+  _newRow(i) {
+    const line = make("tr");
+    COLUMNS.forEach((_, column) => {
+      const field = make("input"), cell = make("td");
+      Object.assign(field, { type: "text", inputMode: "decimal", autocomplete: "off", spellcheck: false });
+      field.addEventListener("change", () => this._change(this.first + i, column, field));
+      cell.append(field);
+      line.append(cell);
+    });
+    const cell = make("td");
+    cell.append(rowButton("✕", "Delete", () => { this.on.removed(this.first + i); }));
+    line.append(cell);
+    return line;
+  }
+
+  /** @param {HTMLTableRowElement} line @param {number} index @param {GazeRow} row */
+  _fill(line, index, row) {
+    line.querySelectorAll("input").forEach((field, column) => {
+      const [name, unit, decimals] = COLUMNS[column], text = String(Number(row[column].toFixed(decimals)));
+      field.setAttribute("aria-label", name + " of row " + (index + 1) + ", " + unit);
+      // A text that is being typed stays.
+      if (field !== document.activeElement || field.dataset.text !== text) field.value = text;
+      field.dataset.text = text;
+      field.removeAttribute("aria-invalid");
+    });
+    const button = line.querySelector("button");
+    if (button) {
+      button.title = "Delete row " + (index + 1);
+      button.setAttribute("aria-label", button.title);
+    }
+    if (index === this.current) line.setAttribute("aria-current", "true");
+    else line.removeAttribute("aria-current");
+  }
+
+  /** @param {number} index @param {number} column @param {HTMLInputElement} field */
+  _change(index, column, field) {
+    const value = numberOf(field.value, COLUMNS[column][1]), row = /** @type {GazeRow} */ ([...this.rows[index]]);
+    if (!Number.isFinite(value)) {
+      field.setAttribute("aria-invalid", "true");
+      return;
+    }
+    row[column] = value;
+    this.on.changed(index, row);
+  }
+
+  // Shows the values of the rows again, after a change that the server has rejected.
+  restore() {
+    for (const field of this.body.querySelectorAll("input")) field.value = field.dataset.text ?? "";
+  }
+}
