@@ -12,6 +12,7 @@ import pytest
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
+from reference.accessibility import violations
 from studio.page_tools import change, codes, drop, set_value, setting, settle, until
 from studio.test_sources_page import film, ready, video
 
@@ -435,3 +436,36 @@ def test_path_works_by_keyboard(visit):
     page.keyboard.press("Enter")
     at_rest(page)
     assert path_of(page) is None
+
+
+@pytest.mark.slow(keep=1)
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [390, 1280, 1920])
+def test_row_has_no_serious_violations(visit, scheme, width):
+    page = visit(width=width, height=844, color_scheme=scheme)
+    with_rows(page)
+    page.click(TABLE)
+    assert violations(page) == []
+    page.click(RECORD)
+    assert violations(page) == []
+    page.click(RECORD)
+    page.click("#gaze-menu")
+    page.evaluate("() => { document.getElementById('notice').hidden = true; }")
+    assert violations(page) == []
+    page.click("#gaze .menu >> text=Saccades…")
+    assert violations(page) == []
+    row, pane = (page.locator(each).bounding_box() for each in ("#gaze", "#pane-scene"))
+    assert row["x"] + row["width"] <= pane["x"] + pane["width"] + 0.5
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+def test_slider_shows_times_of_the_path(visit):
+    page = visit()
+    with_rows(page)
+    before = steps(page)
+    page.locator("#gaze input[type=range]").fill("3")
+    at_rest(page)
+
+    assert gaze(page) == pytest.approx(interpolated(ROWS, 0.1))
+    assert page.locator("#gaze input[type=range]").get_attribute("aria-valuetext").startswith("0.10 s")
+    assert steps(page) == before + 1

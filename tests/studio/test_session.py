@@ -47,7 +47,7 @@ def test_first_connection_receives_all_parts(recorder):
     assert set(recorder.part_names) == first
     assert not first & {"solid", "comparison"}
     kinds = [message["kind"] for message in recorder.messages if message["kind"] != "progress"]
-    assert kinds == ["busy", "controls", "state", "done"]
+    assert kinds == ["busy", "controls", "gaze_path", "state", "done"]
     assert {header["version"] for header, _ in recorder.parts} == {1}
 
 

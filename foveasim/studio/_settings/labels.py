@@ -88,6 +88,10 @@ WORDS: dict[str, Words] = {
     "fwhm_nm": Words("full width at half maximum", "Full width of the curve at half of its maximum."),
     "gain_fpn_fraction": Words("gain FPN", synonyms="fixed pattern"),
     "gaussian_above_e": Words("exact shot noise up to", synonyms="poisson"),
+    "gaze_path": Words(
+        help="Gaze of the frames of a video, recorded and edited on the optical image. A single capture has the gaze.",
+        synonyms="fixation saccade eye movement record replay",
+    ),
     "gaze_range_um": Words(synonyms="fixation saccade eye"),
     "gaze_um": Words(
         "gaze",

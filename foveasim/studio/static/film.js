@@ -85,7 +85,7 @@ export class Film {
     const wasPlaying = this.isPlaying;
     this.isPlaying = false;
     this.changed();
-    if (wasPlaying && this.settles) this.go(this.isBusy ? this.next : this.n, true);
+    if (wasPlaying && this.settles && !this.wanted) this.go(this.isBusy ? this.next : this.n, true);
   }
 }
 

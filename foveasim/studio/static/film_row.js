@@ -26,7 +26,7 @@ export class FilmRow {
     this.slider = make("input");
     Object.assign(this.slider, { type: "range", min: 0, step: 1, value: 0 });
     this.slider.setAttribute("aria-label", names.slider);
-    this.slider.addEventListener("input", () => { this.film()?.pause(); this.film()?.go(Number(this.slider.value), false); });
+    this.slider.addEventListener("input", () => { this.film()?.go(Number(this.slider.value), false); this.film()?.pause(); });
     this.slider.addEventListener("change", () => this.film()?.go(Number(this.slider.value), true));
   }
 

@@ -117,7 +117,8 @@ export class GazePanel {
     entry("Open CSV…", () => this.chosen.click());
     this.buttons.save = entry("Save CSV", () => this._saveFile());
     this.buttons.clear = entry("Clear", () => this._commit([]));
-    frame.append(button, menu, this.chosen);
+    find(this.root, ".bar").append(this.chosen);
+    frame.append(button, menu);
     listenToMenu(button, menu);
     return frame;
   }
