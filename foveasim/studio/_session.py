@@ -331,7 +331,11 @@ class Session:
         return FORGET_S if self.is_idle and self.result is not None else None
 
     def _forget_result(self) -> None:
-        """Release the memory of a session without a page, which simulates its settings again for the next one."""
+        """
+        Release the memory of a session without a page.
+
+        Its settings are simulated again for the next one.
+        """
         self.result = None
         self.engine.clear()
         release_memory()
