@@ -21,6 +21,7 @@ from PIL import Image, ImageOps
 import foveasim.view
 from foveasim._core.quantities import format_quantity
 from foveasim._core.registry import Registry
+from foveasim._io.yaml_files import first_comment
 from foveasim.config import bundled_layouts, read_layout_file
 from foveasim.layout import LAYOUTS
 from foveasim.scene import SCENES
@@ -240,13 +241,12 @@ def write_layouts(_app: Sphinx, _config: Config) -> None:
         if not picture.exists() or picture.stat().st_mtime < path.stat().st_mtime:
             with with_dark_variants():
                 foveasim.view.save_figure(figure_of(layout), picture, dpi=140)
-        comment, _, rest = path.read_text().partition("\n")
-        source = " ".join(rest.partition("source: >")[2].split())
+        source = " ".join(path.read_text().partition("source: >")[2].split())
         found = layout.describe()
         x0, y0, x1, y1 = found.bounds_um
         sizes = format_quantity([float(found.size_um[0]), float(found.size_um[-1])], "µm", digits=3)
         figures = f"{found.n_sites:,} photosites of {sizes} in a field of {x1 - x0:,.5g} × {y1 - y0:,.5g} µm."
-        title = comment.removeprefix("# ")
+        title = first_comment(path)
         sections.append(f"## {name}\n\n{title} {figures}\n\n![{title}]({name}.png)\n\nSource: {source}")
     about = (
         "Each name stands for a layout in every command, and in `fs.read_layout`: `foveasim view giotto_2`. The files are in "

@@ -20,6 +20,7 @@ from foveasim.errors import FileError, FoveasimError, FoveasimWarning, printable
 
 if TYPE_CHECKING:
     from rich.status import Status
+    from rich.table import Table
 
     from foveasim.config import Result
 
@@ -179,27 +180,39 @@ def layouts() -> None:
     from rich.table import Table
 
     from foveasim._core.quantities import format_quantity
+    from foveasim._io.yaml_files import first_comment
     from foveasim.config import bundled_layouts, read_layout_file
     from foveasim.layout import LAYOUTS
+    from foveasim.layout.families import summary_of
 
     table = Table(box=None)
     for heading in ("name", "photosites", "field / µm", "site size / µm", "generator"):
         table.add_column(heading, justify="left" if heading in {"name", "generator"} else "right")
+    descriptions = _described("name")
     with _status("reading layouts"):
         for name, path in bundled_layouts().items():
+            descriptions.add_row(name, first_comment(path))
             found = read_layout_file(path).layout.describe()
             x0, y0, x1, y1 = found.bounds_um
             sizes = format_quantity([float(found.size_um[0]), float(found.size_um[-1])], "", digits=3)
             table.add_row(name, f"{found.n_sites:,}", f"{x1 - x0:.5g} x {y1 - y0:.5g}", sizes, found.origin)
-    console.print(table)
-    families = Table(box=None)
-    families.add_column("generator")
-    families.add_column("description")
+    families = _described("generator")
     for name, generator in sorted(LAYOUTS.items()):
-        summary = (generator.__doc__ or "").strip().split("\n\n")[0].split(". ")[0]
-        families.add_row(name, " ".join(summary.replace("``", "").split()).rstrip("."))
-    console.print()
-    console.print(families)
+        families.add_row(name, summary_of(generator))
+    console.print(table)
+    for each in (descriptions, families):
+        console.print()
+        console.print(each)
+
+
+def _described(heading: str) -> Table:
+    """Return an empty table of names and descriptions."""
+    from rich.table import Table
+
+    found = Table(box=None)
+    found.add_column(heading, no_wrap=True)
+    found.add_column("description")
+    return found
 
 
 @app.command()
@@ -215,13 +228,16 @@ def describe(
     lanes: Annotated[int, typer.Option("--lanes", help="Number of output lanes.")] = 1,
 ) -> None:
     """Print counts, areas, site sizes, channels and, with --fps, the data rate of a layout."""
-    from foveasim.config import read_any_layout
+    from foveasim._io.yaml_files import first_comment
+    from foveasim.config import bundled_layouts, read_any_layout
     from foveasim.layout import Readout
 
     readout = None
     if frames_per_s is not None:
         readout = Readout(frames_per_s=frames_per_s, bits=bits, blanking=blanking, n_lanes=lanes)
     found = read_any_layout(layout, **_reading_options(layer, channels, cell, centre))
+    if str(layout) in bundled_layouts() and not layout.exists():
+        console.print(first_comment(bundled_layouts()[str(layout)]))
     console.print(found.layout.describe(readout))
 
 

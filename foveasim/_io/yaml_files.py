@@ -123,6 +123,16 @@ def position_of(path: Path, keys: Sequence[str], *, is_exact: bool = False) -> t
     return None if mark is None else _position(mark)
 
 
+def first_comment(path: Path) -> str:
+    """
+    Return the comment in the first line of a YAML file, which describes it.
+
+    Without one, the string is empty. Raises ConfigError when the file cannot be read.
+    """
+    line = read_text(path).partition("\n")[0]
+    return line.lstrip("#").strip() if line.startswith("#") else ""
+
+
 def read_text(path: Path) -> str:
     """
     Read a small UTF-8 text file.

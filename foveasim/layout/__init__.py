@@ -52,6 +52,7 @@ from foveasim.layout.generators.tiling import fill, tiling
 from foveasim.layout.generators.voronoi import voronoi
 from foveasim.layout.generators.zones import zones
 from foveasim.layout.model import Layout
+from foveasim.layout.optical_formats import OPTICAL_FORMATS, OpticalFormat
 from foveasim.layout.readout import nearest_bus, readout_by, readout_order
 from foveasim.layout.site_counts import SolveFor
 from foveasim.layout.summary import Summary, describe
@@ -62,6 +63,7 @@ __all__ = [
     "FORMATS",
     "LAYOUTS",
     "MOSAICS",
+    "OPTICAL_FORMATS",
     "PRESETS",
     "RULES",
     "Change",
@@ -69,6 +71,7 @@ __all__ = [
     "FileFormat",
     "Layout",
     "LayoutLayer",
+    "OpticalFormat",
     "Preset",
     "Readout",
     "Report",

@@ -97,6 +97,12 @@ def layout_family(
     return decorate
 
 
+def summary_of(generator: Callable[..., Layout]) -> str:
+    """Return the first sentence of the docstring of a generator, without markup and full stop."""
+    summary = (generator.__doc__ or "").strip().split("\n\n")[0].split(". ")[0]
+    return " ".join(summary.replace("``", "").split()).rstrip(".")
+
+
 def _to_plain(value: Any) -> Any:
     """Convert a parameter to the plain data of a settings file."""
     if isinstance(value, shapely.Geometry):

@@ -250,6 +250,10 @@ def test_layouts_lists_bundled_layouts(foveasim, tmp_path):
     assert result.returncode == 0, result.stderr
     assert all(name in result.stdout for name in bundled_layouts())
     assert "243,712" in result.stdout
+    printed = " ".join(result.stdout.split())
+    for path in bundled_layouts().values():
+        first_line = path.read_text(encoding="utf-8").splitlines()[0]
+        assert " ".join(first_line.removeprefix("# ").split()[:4]) in printed
 
 
 def test_describe_prints_counts_and_data_rate(foveasim, tmp_path):
@@ -260,6 +264,7 @@ def test_describe_prints_counts_and_data_rate(foveasim, tmp_path):
     assert by_file.returncode == by_name.returncode == 0
     assert all(text in by_file.stdout for text in ("7,168", "100 %", "4,096", "3,072", "zones"))
     assert all(text in by_name.stdout for text in ("13,312", "100 % of the convex hull", "4.792 Mbit/s", "4 to 32 µm"))
+    assert by_name.stdout.startswith("Four nested square zones whose pitch doubles outwards")
 
 
 def test_describe_rejects_invalid_options(foveasim, tmp_path):
