@@ -74,7 +74,16 @@ interface FilmAbout {
 type Summary = { [name: string]: number };
 interface Hello {
   kind: "hello"; session: string; version: string; is_new: boolean; presets: Preset[]; name: string; can_save: boolean;
-  settings: Settings; controls: Control[]; views: ViewAbout[];
+  settings: Settings; controls: Control[]; views: ViewAbout[]; shows_start_page: boolean;
+}
+interface StartPreset extends Preset { text: string; picture: string }
+interface RecentFile { name: string; path: string; directory: string; time_s: number }
+// Of the start page, which requests it.
+interface StartContents {
+  presets: StartPreset[]; generators: { name: string; label: string; text: string; fills_format: boolean; has_mosaic: boolean }[];
+  formats: { name: string; label: string; size_um: number[]; source: string }[]; mosaics: { name: string; label: string }[];
+  electronics: { name: string; label: string; source: string }[]; max_sites: number; recent: RecentFile[] | null;
+  initial: { generator: string; format: string; n_sites: number; filters: string; electronics: string };
 }
 interface Busy { kind: "busy" }
 interface ControlsMessage { kind: "controls"; controls: Control[] }
@@ -130,6 +139,7 @@ type Change =
   | { do: "stop_sweep" | "sweep_file" }
   | { do: "reset" | "delete"; key: string }
   | { do: "preset" | "solve"; name: string }
+  | { do: "new_sensor"; generator: string; size_um: number[]; n_sites: number; filters: string | null; electronics: string }
   | { do: "pin"; sites: number[] }
   | { do: "seek"; key: string; requirement: { [name: string]: unknown } | undefined }
   | { do: "save"; name: string; may_replace?: boolean }

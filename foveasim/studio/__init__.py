@@ -51,7 +51,7 @@ def run_studio(
     Parameters
     ----------
     shot : path, optional
-        Settings file to start from; by default that of the demo.
+        Settings file to start from; by default that of the demo, below a start page if there are no changes.
     changes : sequence of "key=value"
         Settings to replace, as for :func:`foveasim.config.read_shot`.
     out : path, optional
@@ -104,7 +104,13 @@ def run_studio(
     directory = None if out is None else _writable(out)
     settings, name = start_settings(shot, changes)
     check_settings(None if shot is None else Path(shot), settings)
-    start = Start(settings, name, None if shot is None else Path(shot).absolute().parent, directory)
+    start = Start(
+        settings,
+        name,
+        None if shot is None else Path(shot).absolute().parent,
+        directory,
+        shows_start_page=shot is None and not changes,
+    )
     if not _is_loopback(host):
         warn(
             f"the studio is accessible from other computers at {host}: everyone with the address and its token can use it; "

@@ -54,15 +54,21 @@ def with_preset(settings: dict[str, Any]) -> dict[str, Any]:
     return {**settings, "sensor": expand_preset(settings["sensor"])} if "sensor" in settings else settings
 
 
+def preset_paths() -> dict[str, Path]:
+    """Return the files of the bundled shots and layouts, by name."""
+    shots = {f"shot:{path.stem}": path for path in demo_settings()}
+    return {**shots, **{f"layout:{name}": path for name, path in bundled_layouts().items()}}
+
+
 def presets() -> list[dict[str, str]]:
-    """Return the bundled shots and layouts by name."""
-    shots = [
-        {"name": f"shot:{path.stem}", "label": path.stem.replace("_", " "), "kind": "shot"} for path in demo_settings()
-    ]
-    layouts = [
-        {"name": f"layout:{name}", "label": name.replace("_", " "), "kind": "layout"} for name in bundled_layouts()
-    ]
-    return [*shots, *layouts]
+    """Return the names, labels and kinds of the bundled shots and layouts."""
+    split = [(name, *name.split(":")) for name in preset_paths()]
+    return [{"name": name, "label": stem.replace("_", " "), "kind": kind} for name, kind, stem in split]
+
+
+def thumbnail_name(name: str) -> str:
+    """Return the name of the picture of a preset."""
+    return f"{name.replace(':', '_')}.webp"
 
 
 def apply_preset(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -71,13 +77,12 @@ def apply_preset(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 
     Raises ParameterError when the preset does not exist.
     """
-    kind, _, stem = name.partition(":")
-    shots = {path.stem: path for path in demo_settings()}
-    if kind == "shot" and stem in shots:
-        return start_settings(shots[stem])[0]
-    if kind == "layout" and stem in bundled_layouts():
-        return with_layout(settings, resolve_files(bundled_layouts()[stem].parent, read_yaml(bundled_layouts()[stem])))
-    raise ParameterError("name", "must be the name of a preset", printable(name))
+    path = preset_paths().get(name)
+    if path is None:
+        raise ParameterError("name", "must be the name of a preset", printable(name))
+    if name.startswith("shot:"):
+        return start_settings(path)[0]
+    return with_layout(settings, resolve_files(path.parent, read_yaml(path)))
 
 
 def with_layout(settings: Mapping[str, Any], layout: Any) -> dict[str, Any]:
@@ -138,15 +143,19 @@ class Files:
 
     These are pictures of scikit-image, uploaded files, files of the initial settings, and files in some directories.
 
-    ``start``: the initial settings, with absolute paths. ``uploads``: directory of the uploaded files. ``directories``: those
-    of the settings file and of variants.
+    ``start``: the initial settings, with absolute paths. ``kept``: directories of the settings file and of saved files, or
+    None. ``uploads``, ``variants``: directories of the uploaded files and of variants.
     """
 
-    def __init__(self, start: Mapping[str, Any], uploads: Path, *directories: Path) -> None:
+    def __init__(
+        self, start: Mapping[str, Any], kept: Sequence[Path | None], uploads: Path, variants: Path
+    ) -> None:
         named: list[Path] = []
         resolve_files(Path(), dict(start), found=named)
         self._named = {path.resolve() for path in named}
-        self._directories = [path.resolve() for path in (uploads, *directories)]
+        #: Directories whose files remain after the session.
+        self.kept_directories = list(dict.fromkeys(path.resolve() for path in kept if path is not None))
+        self._directories = [uploads.resolve(), variants.resolve(), *self.kept_directories]
         self._uploads = uploads
 
     def allows(self, path: str | Path) -> bool:

@@ -37,6 +37,7 @@ from foveasim.studio._files import file_name, presets
 from foveasim.studio._frames import camera_frame
 from foveasim.studio._messages import is_answer_to_freeze, one_line
 from foveasim.studio._session import MAX_SESSION_BYTES, Listener, Session, Start
+from foveasim.studio._start import contents_of
 
 #: Largest uploaded file.
 MAX_FILE_BYTES = 64 << 20
@@ -68,6 +69,7 @@ TYPES = {
     ".css": "text/css; charset=utf-8",
     ".svg": "image/svg+xml",
     ".png": "image/png",
+    ".webp": "image/webp",
 }
 HEADERS = {
     "Cache-Control": "no-store",
@@ -107,9 +109,11 @@ class Studio:
             Route("/", self._index),
             Route("/static/{name}", self._static),
             Route("/static/views/{name}", self._view),
+            Route("/static/presets/{name}", self._thumbnail),
             Route("/web/{name}", self._web),
             Route("/file", self._file, methods=["POST"]),
             Route("/download", self._download),
+            Route("/start", self._start_page),
             WebSocketRoute("/socket", self._socket),
         ]
         self.app: ASGIApp = _Guard(Starlette(routes=routes), hosts, has_all_addresses=has_all_addresses)
@@ -176,6 +180,9 @@ class Studio:
 
     async def _view(self, request: Request) -> Response:
         return _package_file("foveasim.studio", "static/views", request.path_params["name"])
+
+    async def _thumbnail(self, request: Request) -> Response:
+        return _package_file("foveasim.studio", "static/presets", request.path_params["name"])
 
     async def _web(self, request: Request) -> Response:
         name = request.path_params["name"]
@@ -265,6 +272,12 @@ class Studio:
         if path is None:
             return _error(message, 413)
         return JSONResponse({"path": str(path), "name": path.name})
+
+    async def _start_page(self, request: Request) -> Response:
+        session = self._authorised(request)
+        if isinstance(session, Response):
+            return session
+        return JSONResponse(await asyncio.to_thread(contents_of, session.files))
 
     async def _download(self, request: Request) -> Response:
         session = self._authorised(request)

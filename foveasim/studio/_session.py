@@ -69,6 +69,7 @@ from foveasim.studio._settings.unknowns import (
     with_unknown,
 )
 from foveasim.studio._settings.values import number_control, present_number, values_of, with_values
+from foveasim.studio._start import new_sensor
 from foveasim.studio._sweeps import Sweep, Sweeps, axes_of, results_of
 from foveasim.studio._variants import DIRECTORY, Variants
 from foveasim.studio._views import Views
@@ -100,12 +101,21 @@ class Start:
         Directory of the settings file.
     out : Path, optional
         Directory for saved files.
+    shows_start_page : bool
+        Whether new pages begin with the start page.
     """
 
     def __init__(
-        self, settings: dict[str, Any], name: str = "shot", directory: Path | None = None, out: Path | None = None
+        self,
+        settings: dict[str, Any],
+        name: str = "shot",
+        directory: Path | None = None,
+        out: Path | None = None,
+        *,
+        shows_start_page: bool = False,
     ) -> None:
         self.settings, self.name, self.directory, self.out = settings, name, directory, out
+        self.shows_start_page = shows_start_page
 
 
 class Session:
@@ -121,9 +131,7 @@ class Session:
         self.uploads = Path(tempfile.mkdtemp(prefix="foveasim-studio-"))
         directory = (self.uploads if start.out is None else start.out.absolute()) / DIRECTORY
         self.variants = Variants(directory, self._save)
-        self.files = Files(
-            start.settings, self.uploads, *(() if start.directory is None else (start.directory,)), directory
-        )
+        self.files = Files(start.settings, (start.directory, start.out), self.uploads, directory)
         self.engine = Engine(n_threads=n_threads, check=self._check)
         self.history = History(start.settings)
         self.result: Simulated | None = None
@@ -180,6 +188,7 @@ class Session:
             "can_save": self.start.out is not None,
             "settings": to_json(settings),
             "name": self.start.name,
+            "shows_start_page": self.start.shows_start_page,
         }
 
     def _copy_state(self, origin: Session) -> None:
@@ -509,6 +518,9 @@ class Session:
                 settings = self.variants.settings_of(message.get("variant"))
             case "preset":
                 settings = apply_preset(string_of(message, "name"), settings)
+            case "new_sensor":
+                self._check("solving for the number of photosites")
+                settings = new_sensor(settings, message)
             case "restore":
                 restored = from_json(check_depth(message.get("settings")))
                 if not isinstance(restored, dict):

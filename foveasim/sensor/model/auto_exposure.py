@@ -47,7 +47,7 @@ def exposure_for(
 
     @cache
     def excess(log_s: float) -> float:
-        exposure_s = math.exp(log_s)
+        exposure_s = min(math.exp(log_s), EXPOSURE.high)  # rounding
         expected_e = sensor.expected_electrons(photo_e_per_s, exposure_s, n_threads=n_threads)
         # The range depends on the time for collections that depend on it, such as counters.
         black_dn, span_dn = range_dn(exposure_s if sensor.collection.needs_exposure else 1.0)

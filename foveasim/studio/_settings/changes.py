@@ -24,6 +24,7 @@ CHANGES = (
     "redo",
     "apply",
     "preset",
+    "new_sensor",
     "restore",
     "file",
     "video",

@@ -13,6 +13,7 @@ import { Files } from "./files.js";
 import { inNextFrame } from "./frames.js";
 import { GazePanel } from "./gaze_panel.js";
 import { ImagePane } from "./image_pane.js";
+import { stateOf } from "./links.js";
 import { listenToDialogs } from "./menus.js";
 import { Problems } from "./problems.js";
 import { SitePane, useSoftware } from "./site_pane.js";
@@ -285,7 +286,17 @@ function hello(message, { isSame }) {
     page.offered = JSON.parse(stored);
     $("offer").hidden = false;
   }
+  if (message.shows_start_page && message.is_new && !stored && stateOf(location.hash) === null) openStart({ isAtStart: true });
   files.openLink(location.hash);
+}
+
+/** @type {Promise<import("./start_page.js").StartPage> | null} */
+let startPage = null;
+
+// Shows the start page, whose module is loaded when it is first shown.
+async function openStart(options = {}) {
+  startPage ||= import("./start_page.js").then(({ StartPage }) => new StartPage(connection, () => page.held.states.at(-1) || page.state));
+  await (await startPage).open(options);
 }
 
 /** @param {Preset[]} presets */
@@ -541,6 +552,7 @@ function listenToButtons() {
     });
   }
   press("help", () => $("keys").showModal());
+  press("start-open", () => openStart());
 }
 
 /** @param {KeyboardEvent} event */
@@ -583,6 +595,7 @@ function listenToKeys() {
     } else if (zoomByKey(map, key)) ask("map");
     else if (key === "0") fit();
     else if (key === "s" || key === "S") useSelection(!page.isSelecting);
+    else if (key === "h" || key === "H") openStart();
     else if (key === "Escape") clearAll();
     if (!onMap) return;
     if (panByKey(map, key)) ask("map");

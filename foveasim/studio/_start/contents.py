@@ -1,0 +1,77 @@
+"""Contents of the start page, as plain data."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from foveasim._io.yaml_files import first_comment
+from foveasim.layout import LAYOUTS, MOSAICS, OPTICAL_FORMATS
+from foveasim.layout.families import summary_of
+from foveasim.sensor import PRESETS
+from foveasim.studio._engine import MAX_SITES
+from foveasim.studio._files import Files, preset_paths, presets, thumbnail_name
+from foveasim.studio._settings.templates import WITHOUT_MOSAIC
+from foveasim.studio._start.new_sensor import BAYER, RECTANGULAR, electronics, generators, mosaics
+from foveasim.studio._start.recent import recent_files
+
+#: Initial choices of a new sensor.
+INITIAL = {
+    "generator": "log_polar",
+    "format": "1/3",
+    "n_sites": 12_000,
+    "filters": BAYER,
+    "electronics": "machine_vision",
+}
+
+
+def contents_of(files: Files) -> dict[str, Any]:
+    """
+    Return presets with sentences and thumbnails, the choices of a new sensor, and recent files.
+
+    ``files``: those that settings may contain. Without directories that are kept, ``recent`` is None.
+    """
+    directories = files.kept_directories
+    return {
+        "presets": [_with_sentence(each) for each in presets()],
+        "generators": [_generator(name) for name in generators()],
+        "formats": [
+            {
+                "name": name,
+                "label": f"{each.title}, {each.description}",
+                "size_um": list(each.size_um),
+                "source": each.source,
+            }
+            for name, each in OPTICAL_FORMATS.items()
+        ],
+        "mosaics": [{"name": name, "label": _mosaic_label(name)} for name in mosaics()],
+        "electronics": [
+            {"name": name, "label": PRESETS[name].title, "source": PRESETS[name].source} for name in electronics()
+        ],
+        "initial": INITIAL,
+        "max_sites": MAX_SITES,
+        "recent": recent_files(files, directories) if directories else None,
+    }
+
+
+def _with_sentence(preset: dict[str, str]) -> dict[str, str]:
+    name = preset["name"]
+    return {**preset, "text": first_comment(preset_paths()[name]), "picture": thumbnail_name(name)}
+
+
+def _generator(name: str) -> dict[str, Any]:
+    text = summary_of(LAYOUTS[name]).removeprefix("Generate ")
+    return {
+        "name": name,
+        "label": name.replace("_", " "),
+        "text": f"{text[:1].upper()}{text[1:]}.",
+        "fills_format": name in RECTANGULAR,
+        "has_mosaic": name not in WITHOUT_MOSAIC,
+    }
+
+
+def _mosaic_label(name: str) -> str:
+    """Return the name and the size of a mosaic."""
+    if name == BAYER:
+        return f"Bayer, {name}"
+    block = MOSAICS[name]
+    return f"{name.replace('_', ' ')}, {len(block[0])} × {len(block)}"

@@ -1,0 +1,201 @@
+"""New sensors: a generator that fills a format with a number of photosites, filters, and named electronics."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from foveasim._core.validation import check_choice, check_count, check_length_um
+from foveasim.config import build_shot
+from foveasim.errors import ParameterError
+from foveasim.layout import LAYOUTS, MOSAICS, Layout
+from foveasim.sensor import PRESETS
+from foveasim.studio._engine import MAX_SITES
+from foveasim.studio._files import with_covering_scene, with_layout
+from foveasim.studio._settings.changes import choose_preset, match_filters
+from foveasim.studio._settings.templates import templates
+from foveasim.studio._settings.unknowns import INSTEAD_OF, generated_layout, with_n_sites
+
+#: Generators that fill a rectangle, with the parameters that its sides and the number of photosites replace.
+RECTANGULAR: dict[str, tuple[str, ...]] = {
+    "grid": ("n_x", "n_y", "pitch_um"),
+    "hexagonal": ("n_columns", "n_rows", "pitch_um"),
+    "octagonal": ("n_x", "n_y", "pitch_um"),
+    "tiling": ("pitch_um", "radius_um"),
+    "voronoi": (),
+}
+#: Parameters that follow the size of a photosite relative to the field: numbers of photosites along a line, and lengths.
+LINE_COUNTS = {"foveal_cartesian": ("n_fovea",), "giotto": ("n_rho", "n_fovea", "n_across")}
+SITE_LENGTHS = {"giotto": ("unit_um",), "log_polar": ("min_size_um",)}
+#: Ratios of neighbouring photosites, whose product over a line remains.
+RATIOS = {"foveal_cartesian": ("ring_ratio",)}
+#: Significant digits of lengths, and of the design rule for the smallest photosite.
+LENGTH_DIGITS, RULE_DIGITS = 7, 3
+#: Suffix of lengths.
+LENGTH = "_um"
+#: Parameters of the range of the ADC.
+RANGE = {"capacitance_f", "v_sat_v"}
+#: Filters of mosaics that sensors have by name, their letters, and the mosaic with red at the top left.
+FILTERS, LETTERS, BAYER = "rgb", set("RGB"), "RGGB"
+
+
+def generators() -> list[str]:
+    """Return the generators that templates can have: those with initial values that solve for a number of photosites."""
+    initial = {name: templates(f"{name} parameters") for name in sorted(LAYOUTS)}
+    return [name for name, given in initial.items() if given and ("n_sites" in given or _unknown(name) is not None)]
+
+
+def mosaics() -> list[str]:
+    """Return the mosaics whose filters sensors have by name: Bayer's by its letters, others by their names."""
+    larger = [
+        name for name, block in MOSAICS.items() if len(block) ** 2 > len(BAYER) and set("".join(block)) <= LETTERS
+    ]
+    return [BAYER, *larger]
+
+
+def electronics() -> list[str]:
+    """Return the named electronics with a range of the ADC; the others only replace parts of a sensor."""
+    return [name for name, preset in PRESETS.items() if set(preset.settings()) >= RANGE]
+
+
+def new_sensor(settings: Mapping[str, Any], template: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Return settings with a new sensor, which the scene covers; its exposure is automatic.
+
+    Optics, scene and seed remain. The centre of the sensor is at that of the image.
+
+    Parameters
+    ----------
+    settings : mapping
+    template : mapping
+        ``generator``; ``size_um`` (width, height) of the format, which rasters fill, and in whose shorter side other layouts
+        are inscribed; ``n_sites``, approximately; ``filters``, a name of :func:`mosaics` or None; ``electronics``, a name of
+        :func:`electronics`.
+
+    Raises
+    ------
+    ParameterError
+        When a value is invalid, or the generator cannot have this number of photosites.
+    SimulationError
+        When the scene has a size that cannot change.
+    """
+    generator = check_choice("generator", template.get("generator"), generators())
+    mosaic = template.get("filters")
+    if mosaic is not None:
+        check_choice("filters", mosaic, mosaics())
+    found = with_layout(settings, _layout(generator, _size_um(template), _n_sites(template), settings))
+    found.pop("gaze_um", None)
+    found["scene"].pop("gaze_range_um", None)
+    found["sensor"] = {
+        **(found.get("sensor") or {}),
+        "preset": check_choice("electronics", template.get("electronics"), electronics()),
+    }
+    choose_preset(found)
+    found["sensor"].pop("filters", None)
+    if mosaic is not None:
+        found["sensor"]["filters"], found["layout"]["mosaic"] = FILTERS, mosaic
+    match_filters(found, settings)
+    found["exposure_s"] = "auto"
+    if found["scene"].get("kind") != "picture":
+        return with_covering_scene(found, build_shot(None, found))
+    return found
+
+
+def _size_um(template: Mapping[str, Any]) -> tuple[float, float]:
+    size_um = template.get("size_um")
+    if not isinstance(size_um, Sequence) or isinstance(size_um, str) or len(size_um) != 2:
+        raise ParameterError("size_um", "must be the width and the height of the sensor")
+    width_um, height_um = (check_length_um("size_um", length_um) for length_um in size_um)
+    return width_um, height_um
+
+
+def _n_sites(template: Mapping[str, Any]) -> int:
+    return check_count("n_sites", template.get("n_sites"), at_most=MAX_SITES)
+
+
+def _layout(generator: str, size_um: tuple[float, float], n_sites: int, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the section of a layout in a format, with the design rules that it satisfies."""
+    if generator in RECTANGULAR:
+        given = templates(f"{generator} parameters")
+        parameters = {name: value for name, value in given.items() if name not in RECTANGULAR[generator]}
+        section = _solved(generator, {**parameters, "size_um": list(size_um)}, n_sites, is_resized=False)
+    else:
+        section = _solved(generator, _refined(generator, n_sites), n_sites)
+        factor = 0.5 * min(size_um) / float(np.abs(_built(section, settings).bounds_um).max())
+        section["parameters"] = {
+            name: _scaled(value, factor) if name.endswith(LENGTH) else value
+            for name, value in section["parameters"].items()
+        }
+    min_size_um = float(_built(section, settings).size_um.min())
+    return {**section, "rules": {"min_size_um": _rounded_down(min_size_um, RULE_DIGITS), "max_overlap_um2": 0.0}}
+
+
+def _initial(generator: str) -> Layout | None:
+    """Return the layout of the initial values of a generator; None if it requires a picture."""
+    return generated_layout(
+        {"layout": {"generator": generator, "parameters": templates(f"{generator} parameters")}}, None
+    )
+
+
+def _refined(generator: str, n_sites: int) -> dict[str, Any]:
+    """Return initial values for another number of photosites, before one of the parameters is solved for."""
+    found, initial = copy.deepcopy(templates(f"{generator} parameters")), _initial(generator)
+    if initial is None:
+        return found
+    factor = math.sqrt(n_sites / initial.n_sites)
+    for name in LINE_COUNTS.get(generator, ()):
+        found[name] = max(1, round(found[name] * factor))
+    for name in SITE_LENGTHS.get(generator, ()):
+        found[name] = found[name] / factor
+    for name in RATIOS.get(generator, ()):
+        found[name] = found[name] ** (1.0 / factor)
+    return found
+
+
+def _solved(generator: str, parameters: Mapping[str, Any], n_sites: int, *, is_resized: bool = True) -> dict[str, Any]:
+    """Return the section of a generator that solves for a number of photosites."""
+    unknown, initial = _unknown(generator), _initial(generator)
+    given = {name: value for name, value in parameters.items() if name != INSTEAD_OF.get(unknown or "")}
+    if initial is None:
+        return {"generator": generator, "parameters": {**given, "n_sites": n_sites}}
+    section = {"generator": generator, "parameters": given}
+    found: dict[str, Any] = with_n_sites({"layout": section}, n_sites, initial, unknown, is_resized=is_resized)[
+        "layout"
+    ]
+    return found
+
+
+def _built(section: Mapping[str, Any], settings: Mapping[str, Any]) -> Layout:
+    """
+    Return the layout of a section; those that can have pictures are built with their shot, without filters.
+
+    Raises ParameterError or ConfigError when the generator rejects the parameters.
+    """
+    found = generated_layout({"layout": section}, None)
+    if found is not None:
+        return found
+    shot = {name: value for name, value in settings.items() if name not in ("sensor", "requirements")}
+    return build_shot(None, {**shot, "layout": section}).camera.layout
+
+
+def _unknown(generator: str) -> str | None:
+    """Return the parameter that is solved for; None if the number of photosites is itself one."""
+    solvable = LAYOUTS[generator].solve_for  # type: ignore[attr-defined]
+    return str(solvable[0].name) if solvable else None
+
+
+def _scaled(value: Any, factor: float) -> Any:
+    """Return a length or lengths multiplied by a factor."""
+    if isinstance(value, list):
+        return [_scaled(item, factor) for item in value]
+    return _rounded_down(value * factor, LENGTH_DIGITS) if isinstance(value, int | float) else value
+
+
+def _rounded_down(value: float, n_digits: int) -> float:
+    """Return a positive number with a number of significant digits, not above it."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - n_digits + 1)
+    return float(f"{math.floor(value / unit) * unit:.{n_digits}g}")
