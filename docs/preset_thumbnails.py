@@ -31,7 +31,6 @@ SAME_SIZE = 1e-6
 BOUNDARY = (40, 46, 58)
 #: Samples along each side of a pixel; lines between sites have the width of one.
 N_SAMPLES = 2
-QUALITY = 80
 
 
 def frame_um(bounds_um: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -89,7 +88,7 @@ def main() -> None:
     for path in THUMBNAILS.glob("*.webp"):
         path.unlink()
     for name in preset_paths():
-        thumbnail(name).save(THUMBNAILS / thumbnail_name(name), quality=QUALITY, method=6)
+        thumbnail(name).save(THUMBNAILS / thumbnail_name(name), lossless=True, method=6)
 
 
 if __name__ == "__main__":

@@ -59,7 +59,8 @@ export class StartPage {
       if (preset) this._choose({ do: "preset", name: preset });
       else if (path) this._choose({ do: "file", path, as: "settings" });
     });
-    $("start-form").addEventListener("change", () => this._showHints());
+    // While typing, not when a field is left: the page must not move below a click.
+    $("start-form").addEventListener("input", () => this._showHints());
     $("start-form").addEventListener("submit", (event) => {
       event.preventDefault();
       this._create();
