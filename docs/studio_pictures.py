@@ -20,6 +20,10 @@ from playwright.sync_api import Page, sync_playwright
 PICTURES = Path(__file__).parent / "pictures"
 WIDTH, HEIGHT, TIMEOUT_MS = 1440, 900, 120_000
 SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+LOADED = (
+    "document.querySelector('#start img') && [...document.querySelectorAll('#start img')].every((one) => one.complete)"
+)
+SKIP_START = "localStorage.setItem('foveasim-studio-start', 'never')"
 READY = "studio.isReady && !(studio.connection.requests.doneId < studio.connection.requests.lastId)"
 
 
@@ -67,6 +71,13 @@ def download(page: Page, what: str, path: Path) -> Path:
         page.click(f"#file-menu [data-file={what}]")
     found.value.save_as(path)
     return path
+
+
+def start(page: Page) -> None:
+    """Open the start page, when its thumbnails are loaded."""
+    page.click("#start-open")
+    page.wait_for_function(LOADED, timeout=TIMEOUT_MS)
+    page.uncheck("#start-never")
 
 
 def photograph(page: Page, picture: Path) -> None:
@@ -150,6 +161,7 @@ def main() -> None:
             temporary = Path(directory)
             tasks = {
                 "light": ("light", wait_for_views),
+                "start": ("light", start),
                 "photograph": ("light", lambda page: photograph(page, Path(str(files("skimage.data") / "coffee.png")))),
                 "square": ("dark", foveal_against_square),
                 "chip": ("light", lambda page: chip(page, temporary)),
@@ -164,6 +176,7 @@ def main() -> None:
                     bypass_csp=True,
                     accept_downloads=True,
                 )
+                context.add_init_script(SKIP_START)
                 page = context.new_page()
                 page.goto(address)
                 wait_for_views(page)

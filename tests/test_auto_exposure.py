@@ -165,6 +165,13 @@ def test_impossible_exposures_give_one_line(call, message):
         call(camera_of())
 
 
+def test_unreachable_target_is_named():
+    """A full well of 7,000 e- is less than one of 256 codes for 1.87 million electrons."""
+    sensor = fs.Sensor.from_preset(LAYOUT, "paper_read_noise")
+    with pytest.raises(ParameterError, match="'target' must be a level that the sites reach"):
+        sensor.exposure_for(np.full(LAYOUT.n_sites, 1e6))
+
+
 @pytest.mark.parametrize(
     ("exposure_s", "message"),
     [

@@ -79,7 +79,7 @@ def test_skipping_can_be_remembered(open_start, start_server):
     until(third, HAS_CARDS)
 
 
-def test_pages_of_files_and_links_begin_with_the_table(visit, open_start, start_server):
+def test_files_and_links_skip_start_page(visit, open_start, start_server):
     assert visit().evaluate(OPEN) is False
 
     page = open_start()

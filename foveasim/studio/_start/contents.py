@@ -26,13 +26,13 @@ INITIAL = {
 
 def contents_of(files: Files) -> dict[str, Any]:
     """
-    Return presets with sentences and thumbnails, the choices of a new sensor, and recent files.
+    Return presets with thumbnails, the choices of a new sensor, and recent files.
 
     ``files``: those that settings may contain. Without directories that are kept, ``recent`` is None.
     """
     directories = files.kept_directories
     return {
-        "presets": [_with_sentence(each) for each in presets()],
+        "presets": [_with_description(each) for each in presets()],
         "generators": [_generator(name) for name in generators()],
         "formats": [
             {
@@ -53,7 +53,7 @@ def contents_of(files: Files) -> dict[str, Any]:
     }
 
 
-def _with_sentence(preset: dict[str, str]) -> dict[str, str]:
+def _with_description(preset: dict[str, str]) -> dict[str, str]:
     name = preset["name"]
     return {**preset, "text": first_comment(preset_paths()[name]), "picture": thumbnail_name(name)}
 

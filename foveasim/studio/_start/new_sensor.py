@@ -1,4 +1,4 @@
-"""New sensors: a generator that fills a format with a number of photosites, filters, and named electronics."""
+"""New sensors from a generator, a format, a number of photosites, filters and electronics."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ FILTERS, LETTERS, BAYER = "rgb", set("RGB"), "RGGB"
 
 
 def generators() -> list[str]:
-    """Return the generators that templates can have: those with initial values that solve for a number of photosites."""
+    """Return the generators with initial values that solve for a number of photosites."""
     initial = {name: templates(f"{name} parameters") for name in sorted(LAYOUTS)}
     return [name for name, given in initial.items() if given and ("n_sites" in given or _unknown(name) is not None)]
 
 
 def mosaics() -> list[str]:
-    """Return the mosaics whose filters sensors have by name: Bayer's by its letters, others by their names."""
+    """Return the mosaics of red, green and blue: Bayer's by its letters, others by name."""
     larger = [
         name for name, block in MOSAICS.items() if len(block) ** 2 > len(BAYER) and set("".join(block)) <= LETTERS
     ]
@@ -58,7 +58,7 @@ def mosaics() -> list[str]:
 
 
 def electronics() -> list[str]:
-    """Return the named electronics with a range of the ADC; the others only replace parts of a sensor."""
+    """Return the named electronics that specify the range of the ADC."""
     return [name for name, preset in PRESETS.items() if set(preset.settings()) >= RANGE]
 
 
@@ -142,7 +142,7 @@ def _initial(generator: str) -> Layout | None:
 
 
 def _refined(generator: str, n_sites: int) -> dict[str, Any]:
-    """Return initial values for another number of photosites, before one of the parameters is solved for."""
+    """Return initial values for another number of photosites, before one is solved for."""
     found, initial = copy.deepcopy(templates(f"{generator} parameters")), _initial(generator)
     if initial is None:
         return found
@@ -171,9 +171,10 @@ def _solved(generator: str, parameters: Mapping[str, Any], n_sites: int, *, is_r
 
 def _built(section: Mapping[str, Any], settings: Mapping[str, Any]) -> Layout:
     """
-    Return the layout of a section; those that can have pictures are built with their shot, without filters.
+    Return the layout of a section.
 
-    Raises ParameterError or ConfigError when the generator rejects the parameters.
+    Generators that can read pictures are called with a shot, without filters. Raises ParameterError or ConfigError when the
+    generator rejects the parameters.
     """
     found = generated_layout({"layout": section}, None)
     if found is not None:

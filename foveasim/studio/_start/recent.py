@@ -44,7 +44,7 @@ def _yaml_files(directory: Path) -> Iterator[Path]:
 
 
 def _is_shot(path: Path) -> bool:
-    """Return whether a file contains settings of a shot: also sweeps, layouts and design rules are YAML."""
+    """Return whether a file contains settings of a shot, unlike those of sweeps or layouts."""
     try:
         settings = read_yaml(path)
     except ConfigError:
