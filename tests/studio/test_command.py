@@ -67,6 +67,15 @@ def test_address_is_printed_without_browser(started, monkeypatch):
     assert second == "no browser found; open the address in one"
 
 
+@pytest.mark.parametrize(
+    ("arguments", "is_shown"), [((), True), ((str(demo_settings()[1]),), False), (("--set", "sensor.bits=10"), False)]
+)
+def test_start_page_is_shown_without_settings(started, arguments, is_shown):
+    CliRunner().invoke(app, ["studio", "--no-browser", *arguments])
+
+    assert started[0].start.shows_start_page is is_shown
+
+
 def test_browser_opens_address(started, monkeypatch):
     opened = queue.Queue()
     monkeypatch.setattr("webbrowser.get", lambda: Browser("firefox", opened))
