@@ -147,9 +147,7 @@ class Files:
     None. ``uploads``, ``variants``: directories of the uploaded files and of variants.
     """
 
-    def __init__(
-        self, start: Mapping[str, Any], kept: Sequence[Path | None], uploads: Path, variants: Path
-    ) -> None:
+    def __init__(self, start: Mapping[str, Any], kept: Sequence[Path | None], uploads: Path, variants: Path) -> None:
         named: list[Path] = []
         resolve_files(Path(), dict(start), found=named)
         self._named = {path.resolve() for path in named}
