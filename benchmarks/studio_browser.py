@@ -124,6 +124,7 @@ class Studio:
         self.playwright = sync_playwright().start()
         browser = self.playwright.chromium.launch(executable_path=shutil.which("chromium"), args=list(arguments))
         context = browser.new_context(viewport={"width": 1440, "height": 900}, bypass_csp=True)
+        context.add_init_script("localStorage.setItem('foveasim-studio-start', 'never')")  # the table at once
         self.page: Page = context.new_page()
         self.messages: list[str] = []
         self.page.on("console", lambda message: self._log(message.text))
