@@ -37,7 +37,7 @@ interface Fitted { context: CanvasRenderingContext2D; width: number; height: num
 interface Column {
   key: string; label: string; unit: string; kind: "linear" | "grey" | "lit" | "kinds";
   array?: string; of?: "area" | "size"; names?: string[]; colours?: string[]; note?: string;
-  is_integer?: boolean; is_repeat?: boolean;
+  is_integer?: boolean; is_repeat?: boolean; is_signal?: boolean;
   values: Numbers;  // from arrays, when they are decoded
 }
 interface Palette { kinds: string[]; no_data: string; gamma: number }
@@ -56,7 +56,7 @@ type Arrays = { [name: string]: any };
 
 interface Preset { name: string; label: string; kind: string }
 interface ViewAbout {
-  name: string; label: string; is_tile: boolean; is_first: boolean; is_wide: boolean; is_costly: boolean; has_data: boolean;
+  name: string; label: string; is_tile: boolean; is_first: boolean; is_wide: boolean; is_lazy: boolean; has_data: boolean;
 }
 interface Choice { label: string; value: any }
 interface Control {
@@ -119,13 +119,13 @@ type ServerMessage = Busy | ControlsMessage | State | Done | Failure | TextMessa
 
 // Binary messages: a header and arrays; as readPart returns them.
 interface PartHeader {
-  part: string; version: number; about: any; is_preview?: boolean; has_more?: boolean;
+  part: string; version: number; about: any; is_preview?: boolean; has_more?: boolean; is_awaited?: boolean;
   arrays: { name: string; type: ArrayType; size: number; offset: number }[];
 }
 type ArrayType = "uint8" | "int8" | "uint16" | "int16" | "uint32" | "int32" | "float32" | "float64";
 interface Part {
-  part: string; version: number; is_preview: boolean; hasMore: boolean; about: any; arrays: Arrays;
-  sites?: Sites; boundary?: Boundary;  // of views, prepared while the server computes
+  part: string; version: number; is_preview: boolean; hasMore: boolean; isAwaited: boolean; about: any; arrays: Arrays;
+  sites?: Sites; boundary?: Boundary; columns?: Column[] | null;  // of views, prepared while the server computes
 }
 type Boundary = (context: CanvasRenderingContext2D, toX: (x: number) => number, toY: (y: number) => number) => void;
 

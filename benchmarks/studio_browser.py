@@ -44,23 +44,29 @@ LEAK_MIB = 200.0
 #: Time after which the soak test restarts the server, and the numbers of steps after which it duplicates the tab, refreshes the
 #: views, and compares the codes with those of the settings.
 RESTART_S, DUPLICATED, REFRESHED, COMPARED = 300.0, 15, 10, 20
-#: Sends a change, and resolves to the times until the photosites are drawn and until the frame with all views is painted. The
-#: page tells when it is done: timers or frames that poll would take time from it.
+#: Sends a change, and resolves to the times until the new values of the photosites are drawn, and until the frame with all
+#: views is painted. The page tells when it is done: timers or frames that poll would take time from it.
 CHANGE = """([key, value]) => new Promise((resolve) => {
-  const { page, connection } = studio, { requests } = connection, start = performance.now();
-  const property = { configurable: true, enumerable: true };
-  let { doneId } = requests, id = Infinity;
+  const { page, connection, views } = studio, { requests } = connection, start = performance.now();
+  const property = { configurable: true, enumerable: true }, before = views.parts.columns;
+  let { doneId } = requests, id = Infinity, drawn = NaN, { drawnAt } = page;
   const finish = () => {
-    if (page.asked === null) resolve([page.drawnAt > start ? page.drawnAt - start : NaN, performance.now() - start]);
+    if (page.asked === null) resolve([drawn, performance.now() - start]);
     else setTimeout(finish, 2);
   };
   const set = (value) => {
     doneId = value;
     if (doneId < id) return;
     Object.defineProperty(requests, "doneId", { ...property, value, writable: true });
+    Object.defineProperty(page, "drawnAt", { ...property, value: drawnAt, writable: true });
     setTimeout(finish);  // set at the beginning of a frame: after it
   };
+  const setDrawn = (value) => {
+    drawnAt = value;
+    if (Number.isNaN(drawn) && views.parts.columns !== before) drawn = value - start;
+  };
   Object.defineProperty(requests, "doneId", { ...property, get: () => doneId, set });
+  Object.defineProperty(page, "drawnAt", { ...property, get: () => drawnAt, set: setDrawn });
   id = connection.set(key, value, true);
 })"""
 #: Sends messages, and resolves to null when the last one is done and drawn, and with a second argument also all previews

@@ -19,6 +19,7 @@ from foveasim.capture import Capture
 from foveasim.config import Shot
 from foveasim.errors import GeometryError
 from foveasim.explore.worker_cache import ShotRunner
+from foveasim.layout import Layout
 from foveasim.scene import Scene
 
 #: Longer side of pictures where the page gives none.
@@ -81,10 +82,17 @@ class Engine:
     Layout, scene, optics, distortion, compiled outlines, optical images and power on sites are cached by their settings.
 
     ``n_threads``: number of threads; one per core by default. ``check``: called with the name of each stage before it; it may
-    raise an exception to stop the simulation.
+    raise an exception to stop the simulation. ``on_layout``: called with the layout before it is simulated.
     """
 
-    def __init__(self, *, n_threads: int | None = None, check: Callable[[str], None] | None = None) -> None:
+    def __init__(
+        self,
+        *,
+        n_threads: int | None = None,
+        check: Callable[[str], None] | None = None,
+        on_layout: Callable[[Layout], None] = lambda _: None,
+    ) -> None:
+        self._on_layout = on_layout
         self._runner = ShotRunner(None, {}, n_threads=n_threads, max_bytes=MAX_BYTES, check=check)
 
     @property
@@ -113,6 +121,7 @@ class Engine:
             warnings.simplefilter("always")
             try:
                 shot, used, is_reduced = self._shot(settings, is_preview)
+                self._on_layout(shot.camera.layout)
                 capture = self._runner.capture(shot, used)
                 if not 0 < capture.layout.n_sites <= MAX_SITES:
                     raise GeometryError(

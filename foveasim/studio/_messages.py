@@ -30,13 +30,15 @@ def encode_part(
     *,
     is_preview: bool = False,
     has_more: bool = False,
+    is_awaited: bool = False,
 ) -> bytes:
     """
     Encode a part: the length of the header as little-endian uint32, the header, the arrays.
 
     ``version``: number of the state that the part belongs to. ``about``: plain data. ``arrays``: of the types in
     :data:`TYPES`, any shape; each begins at a multiple of 8 bytes. ``is_preview``: whether the data are those of a preview.
-    ``has_more``: whether the page waits for the next part, and shows both in one frame.
+    ``has_more``: whether the page waits for the next part, and shows both in one frame. ``is_awaited``: whether the page
+    answers when it is drawn.
     """
     described, pieces, offset = [], [], 0
     for key, array in arrays.items():
@@ -55,6 +57,7 @@ def encode_part(
             "arrays": described,
             **({"is_preview": True} if is_preview else {}),
             **({"has_more": True} if has_more else {}),
+            **({"is_awaited": True} if is_awaited else {}),
         },
         allow_nan=False,
         separators=(",", ":"),

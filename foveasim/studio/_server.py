@@ -36,7 +36,7 @@ from foveasim.studio._exports import archive
 from foveasim.studio._files import file_name, presets
 from foveasim.studio._frames import camera_frame
 from foveasim.studio._messages import is_answer_to_freeze, one_line
-from foveasim.studio._session import MAX_SESSION_BYTES, Listener, Session, Start
+from foveasim.studio._session import MAX_SESSION_BYTES, Session, Start
 from foveasim.studio._start import contents_of
 
 #: Largest uploaded file.
@@ -125,18 +125,18 @@ class Studio:
         self.sessions.clear()
 
     def session(
-        self, name: object, page: object = None, listener: Listener | None = None
+        self, name: object, page: object = None, outgoing: _Outbox | None = None
     ) -> tuple[Session | None, bool]:
         """
         Return the session of a name or a new one, and whether it has the initial state.
 
         ``page``: identifier of the page. If another page uses the session, such as the one that a tab was duplicated from, the
-        new session has a copy of its state. ``listener``: receives the messages of the session.
+        new session has a copy of its state. ``outgoing``: receives the messages of the session.
         """
         with self._opening:
             session, is_new = self._session(name, page if isinstance(page, str) else None)
-            if session is not None and listener is not None:
-                session.attach(listener)  # at once: a session without a page may be closed
+            if session is not None and outgoing is not None:
+                session.attach(outgoing.put, answers=True)  # at once: a session without a page may be closed
         return session, is_new
 
     def _session(self, name: object, page: str | None) -> tuple[Session | None, bool]:
@@ -203,9 +203,7 @@ class Studio:
                 return
             self.unauthenticated.remove(socket.client)
             outgoing = _Outbox(asyncio.get_running_loop())
-            session, is_new = await asyncio.to_thread(
-                self.session, first.get("session"), first.get("page"), outgoing.put
-            )
+            session, is_new = await asyncio.to_thread(self.session, first.get("session"), first.get("page"), outgoing)
             if session is None:
                 await socket.close(TOO_MANY, "too many sessions")
                 return
@@ -553,6 +551,8 @@ def serve(
         server_header=False,
         date_header=False,
     )
+    # Connections inherit it: otherwise a short message after a large one waits for an acknowledgement, about 40 ms.
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     share_heap()
     interval_s = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL_S)

@@ -84,6 +84,10 @@ EXPOSURES_S = (1e-5, 1.0)
 MAX_WAITING = 1000
 #: Newer changes stop simulations for at most this time in succession, so that some are shown.
 MAX_STOPPED_S = 3.0
+#: Longest time for which views wait until a page has drawn the photosites.
+DRAWN_S = 0.5
+#: Stages are not reported in the first time of a change: short ones are not shown.
+PROGRESS_S = 0.3
 #: Receives messages for a page: strings of JSON, and bytes of parts.
 Listener = Callable[[str | bytes], None]
 
@@ -132,7 +136,9 @@ class Session:
         directory = (self.uploads if start.out is None else start.out.absolute()) / DIRECTORY
         self.variants = Variants(directory, self._save)
         self.files = Files(start.settings, (start.directory, start.out), self.uploads, directory)
-        self.engine = Engine(n_threads=n_threads, check=self._check)
+        self._costs = Costs()
+        self._views = Views(self._send, self._wait_for_page, self._line, self._costs)
+        self.engine = Engine(n_threads=n_threads, check=self._check, on_layout=self._views.work_ahead)
         self.history = History(start.settings)
         self.result: Simulated | None = None
         self.last_used_s = time.monotonic()
@@ -144,8 +150,6 @@ class Session:
         self._uploading = threading.Lock()  # in threads of the server
         self.frames = Frames(self.uploads, self._new_path)
         self.gaze = SessionGaze(self._line)
-        self._costs = Costs()
-        self._views = Views(self._send, self._line, self._costs)
         self._sweeps = Sweeps(self._send, self._line)
         self._version = 0
         self._last_id: Any = None
@@ -169,8 +173,10 @@ class Session:
         self._has_unused_memory = False
         self._is_cancelled = self._is_working = False
         self._can_stop = False
-        self._stopped_s = -math.inf
-        self._listeners: set[Listener] = set()
+        self._stopped_s = self._started_s = -math.inf
+        # Connections, and whether they answer when the photosites are drawn.
+        self._listeners: dict[Listener, bool] = {}
+        self._drawn_version = 0
         self._waiting: deque[dict[str, Any]] = deque()
         self._wake = threading.Condition()
         self._is_closed = False
@@ -216,17 +222,21 @@ class Session:
         old, new = f"{origin.uploads}/", f"{self.uploads}/"
         self.history = origin.history.mapped(moved)
 
-    def attach(self, listener: Listener) -> None:
-        """Add a connection, which receives all parts."""
+    def attach(self, listener: Listener, *, answers: bool = False) -> None:
+        """
+        Add a connection, which receives all parts.
+
+        ``answers``: whether it posts ``drawn`` when it has drawn photosites that the session waits for.
+        """
         with self._wake:
-            self._listeners.add(listener)
+            self._listeners[listener] = answers
             self.last_used_s = time.monotonic()
         self.post({"do": "refresh", "id": None})
 
     def detach(self, listener: Listener) -> None:
         """Remove a connection."""
         with self._wake:
-            self._listeners.discard(listener)
+            self._listeners.pop(listener, None)
             self.last_used_s = time.monotonic()
             self._wake.notify()
 
@@ -239,8 +249,14 @@ class Session:
         """
         Add a message of the page.
 
-        It is handled in the thread of the session, but ``cancel`` at once: it stops the work in progress and what waits.
+        It is handled in the thread of the session, but two at once: ``cancel`` stops the work in progress and what waits,
+        ``drawn`` starts work that would delay the page.
         """
+        if isinstance(message, dict) and message.get("do") == "drawn":
+            with self._wake:
+                self._drawn_version = message["version"] if type(message.get("version")) is int else 0
+                self._wake.notify()
+            return
         if isinstance(message, dict) and message.get("do") == "cancel":
             with self._wake:
                 self._is_cancelled = self._is_working or bool(self._waiting)
@@ -354,6 +370,7 @@ class Session:
         changes: list[dict[str, Any]] = []
         done = 0
         self._is_working = True
+        self._started_s = time.monotonic()
         try:
             for k, message in enumerate(messages):
                 if is_change(message):
@@ -391,7 +408,7 @@ class Session:
             return
         if self._is_cancelled:
             raise CancelledError("cancelled; the settings are those before")
-        if not self._is_dragging:
+        if not self._is_dragging and time.monotonic() - self._started_s > PROGRESS_S:
             self._send({"kind": "progress", "text": stage})
         if not self._can_stop or not any(is_change(m) and m["do"] not in ONCE for m in list(self._waiting)):
             return
@@ -682,7 +699,7 @@ class Session:
             self.result = self.engine.simulate(settings, is_preview=is_preview)
         finally:
             self._can_stop = False
-        self._stopped_s = -math.inf
+        self._stopped_s = self._started_s = -math.inf
         if not self.result.is_preview:
             self._costs.add_simulation(self._key, self.result.seconds_s)
         self._version += 1
@@ -963,6 +980,16 @@ class Session:
 
     def _send_error(self, number: Any, error: BaseException) -> None:
         self._send({"kind": "error", "id": number, "text": self._line(error)})
+
+    def _wait_for_page(self) -> None:
+        """Wait until a page has drawn the photosites, so that later work does not delay it."""
+
+        def is_over() -> bool:
+            return self._drawn_version >= self._version or bool(self._waiting) or self._is_closed
+
+        with self._wake:
+            if any(self._listeners.values()):
+                self._wake.wait_for(is_over, DRAWN_S)
 
     def _send(self, message: dict[str, Any] | bytes) -> None:
         sent = message if isinstance(message, bytes) else json.dumps(to_json(message), allow_nan=False)

@@ -10,38 +10,46 @@ from typing import Any
 from weakref import ref
 
 from foveasim.errors import ParameterError
+from foveasim.layout import Layout
 from foveasim.studio._costs import Costs
 from foveasim.studio._engine import PICTURE_PIXELS, Simulated
 from foveasim.studio._messages import encode_part
 from foveasim.studio._parts import PARTS, Part, PartData
 from foveasim.studio._parts.registry import FIRST_TILE
+from foveasim.studio._parts.sites import compute_ahead
 
 #: Parts that are sent first and together: sites, and their values.
-FIRST = ("sites", "columns")
+FIRST = ("sites", "columns", "signals")
 #: Limit of the longer side of pictures.
 MAX_PIXELS = 2048
 #: The page draws the parts of a change in one frame if those after the photosites are expected within the first time, and
 #: otherwise those of the second: each frame takes a browser tens of milliseconds.
 SOON_S, TOGETHER_S = 0.04, 0.1
+#: Views that are expected to take longer wait until the page has drawn the photosites: both need the processor.
+AWAITED_S = 0.2
+#: Number of photosites whose outlines take so long that they are computed while the photosites are simulated.
+MANY_SITES = 50_000
 
 
 class Views:
     """
     Selected views, and what was sent of them.
 
-    ``send``: receives parts as bytes, and errors as dicts. ``line``: returns its message in one line. ``costs``: receives the
-    times of views; slow ones are left out during drags.
+    ``send``: receives parts as bytes, and errors as dicts. ``wait_for_page``: waits until the page has
+    drawn the photosites. ``line``: returns its message in one line. ``costs``: receives the times of views;
+    slow ones are left out during drags.
     """
 
     def __init__(
         self,
         send: Callable[[dict[str, Any] | bytes], None],
+        wait_for_page: Callable[[], None],
         line: Callable[[BaseException], str],
         costs: Costs,
     ) -> None:
-        self._send, self._line, self._costs = send, line, costs
+        self._send, self._wait_for_page, self._line, self._costs = send, wait_for_page, line, costs
         self.left_out: list[str] = []
-        self._names = [name for name, part in PARTS.items() if part.has_data and not part.is_costly]
+        self._names = [name for name, part in PARTS.items() if part.has_data and not (part.is_lazy or part.is_costly)]
         self._pixels = PICTURE_PIXELS
         # Weak references to what each view was computed from: a view that is not shown retains no earlier result.
         self._sent: dict[str, list[Any]] = {}
@@ -60,6 +68,12 @@ class Views:
             raise ParameterError("names", f"must be a list of names of views: {', '.join(PARTS)}")
         self._names = [name for name in PARTS if name in names]
         self._pixels = self._pixels if pixels is None else pixels
+
+    def work_ahead(self, layout: Layout) -> None:
+        """Compute the outlines of many photosites while they are simulated."""
+        is_sent = "sites" in self._sent and _is_same(self._sent["sites"], (layout,))
+        if "sites" in self._names and layout.n_sites >= MANY_SITES and not is_sent:
+            compute_ahead(layout)
 
     def forget(self, name: str | None = None) -> None:
         """Send a view again, or all."""
@@ -115,15 +129,20 @@ class Views:
                 time_s = time.perf_counter() - start_s
                 times_ms[name] = 1e3 * time_s
                 self._costs.add_part(key, name, time_s)
-                is_stopped = k >= len(FIRST) and is_interrupted()
+                is_stopped = k >= len(first) and is_interrupted()
                 is_late = k + 1 >= len(first) and time.perf_counter() - drawn_s > TOGETHER_S
-                has_slow = k + 1 == len(first) and self._costs.parts_s(key, names[k + 1 :]) > SOON_S
+                is_last = k + 1 == len(first)
+                rest_s = self._costs.parts_s(key, names[k + 1 :])
+                has_slow = is_last and rest_s > SOON_S
                 is_drawn = is_stopped or is_late or has_slow
+                is_awaited = is_last and rest_s > AWAITED_S and not is_stopped
                 if data is not None:
-                    options = {"is_preview": result.is_preview, "has_more": not is_drawn}
+                    options = {"is_preview": result.is_preview, "has_more": not is_drawn, "is_awaited": is_awaited}
                     message = self._attempt(part, number, encode_part, name, version, *data, **options)
                     if message is not None:
                         self._send(message)
+                if is_awaited:
+                    self._wait_for_page()
                 if is_drawn:
                     drawn_s = time.perf_counter()
                 if is_stopped:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from foveasim.studio import _session
 from foveasim.studio._messages import decode_part
 from foveasim.studio._session import Session, Start
 
@@ -32,7 +33,7 @@ class Recorder:
     def __init__(self, session):
         self.session = session
         self.messages, self.parts = [], []
-        session._listeners.add(self._receive)
+        session._listeners[self._receive] = False
         self.do(do="refresh")
 
     def _receive(self, message):
@@ -67,7 +68,8 @@ def settings():
 
 
 @pytest.fixture
-def make_session(settings):
+def make_session(settings, monkeypatch):
+    monkeypatch.setattr(_session, "PROGRESS_S", -1.0)  # all stages
     made = []
 
     def make(out=None, directory=None, start=None):

@@ -79,15 +79,21 @@ def test_pages_have_no_serious_violations(browser, tmp_path, make, scheme):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("width", [390, 1280, 1920])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_studio_has_no_serious_violations(visit, scheme):
-    page = visit(width=1800, height=1000, color_scheme=scheme)
+def test_studio_has_no_serious_violations(visit, scheme, width):
+    page = visit(width=width, height=1000, color_scheme=scheme)
     check(page)
+    page.evaluate(
+        "() => studio.connection.send({ do: 'variant', action: 'keep', name: 'first', note: 'as at the start' })"
+    )
     page.evaluate(OPEN_ALL)
     page.evaluate("() => { for (const each of document.querySelectorAll('details')) each.open = true; }")
     settle(page)
     page.click("#freeze")
     until(page, "() => studio.isReady && studio.views.parts.comparison")
+    page.evaluate("() => studio.compare([studio.state.variants[0].id])")
+    until(page, "() => studio.isReady && studio.state.variants[0].is_compared")
     page.click("#edit")
     settle(page)
     check(page)

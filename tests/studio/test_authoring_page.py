@@ -335,7 +335,7 @@ def test_moved_selection_stays_selected(edit):
 
 def test_layer_is_placed_in_the_view(edit):
     page = edit("layer")
-    page.get_by_label("Generator").select_option(label="hexagonal")
+    page.locator(".tool-options").get_by_label("Generator").select_option(label="hexagonal")
     page.click(".apply")
     wait(page)
     (added,) = edits(page)
@@ -581,7 +581,7 @@ def test_drawn_settings_match_command(edit, tmp_path):
 
 def test_layer_in_rectangle_keeps_the_rest(edit):
     page = edit("layer")
-    page.get_by_label("Generator").select_option(label="grid")
+    page.locator(".tool-options").get_by_label("Generator").select_option(label="grid")
     drag(page, (10.0, 10.0), (50.0, 30.0))
     wait(page)
     (added,) = edits(page)

@@ -84,6 +84,7 @@ def test_columns_are_values_of_capture(engine, settings):
     result = engine.simulate(settings)
     about, arrays = PARTS["columns"].make(result)
     columns = {column["key"]: arrays[column["array"]] for column in about["columns"] if "array" in column}
+    columns |= PARTS["signals"].make(result)[1]
     page, _, _ = describe_sites(result.capture.layout)
 
     assert np.array_equal(columns["code"], result.capture.code)

@@ -91,7 +91,7 @@ def test_cancelled_goal_seek_changes_nothing(recorder):
         if not isinstance(message, bytes) and "goal seek, step 3" in message:
             recorder.session.post({"do": "cancel"})
 
-    recorder.session._listeners = {cancel}
+    recorder.session._listeners = {cancel: False}
     state = recorder.do(
         do="seek", key="exposure_s", requirement={"measure": "snr", "at_least": 20, "at_most": 20}, id=1
     )

@@ -88,7 +88,7 @@ def test_stages_are_reported_and_cancelled(recorder):
             if seen[-1] == "optical image":
                 recorder.session.post({"do": "cancel"})
 
-    recorder.session._listeners = {cancel}
+    recorder.session._listeners = {cancel: False}
     state = recorder.do(do="set", key="optics.f_number", value=4.0, final=True, id=3)
 
     assert seen[-1] == "optical image"
@@ -96,7 +96,7 @@ def test_stages_are_reported_and_cancelled(recorder):
     assert [message["text"] for message in recorder.messages if message["kind"] == "note"] == [
         "cancelled; the settings are those before"
     ]
-    recorder.session._listeners = {receive}
+    recorder.session._listeners = {receive: False}
     state = recorder.do(do="set", key="optics.f_number", value=4.0, final=True, id=4)
     assert state["settings"]["optics"]["f_number"] == 4.0
     assert recorder.session.result.shot.camera.optics.f_number == 4.0
@@ -114,10 +114,10 @@ def test_cancelled_start_is_repeated(make_session, settings):
         if not isinstance(message, bytes) and '"progress"' in message:
             recorder.session.post({"do": "cancel"})
 
-    recorder.session._listeners = {cancel}
+    recorder.session._listeners = {cancel: False}
     state = recorder.do(do="refresh", id=1)
     assert list(state["errors"].values()) == ["cancelled; the settings are those before"]
-    recorder.session._listeners = {receive}
+    recorder.session._listeners = {receive: False}
     assert recorder.do(do="refresh", id=2)["summary"]["n_sites"] == 224
     recorder.session.post({"do": "cancel"})  # nothing is in progress
     assert recorder.do(do="set", key="seed", value=7, id=3)["settings"]["seed"] == 7

@@ -293,6 +293,18 @@ def test_tabs_have_separate_sessions(served, settings):
     assert np.array_equal(two.code, codes_of({**settings, "seed": 8}))
 
 
+def test_short_messages_do_not_wait(served):
+    """Nagle's algorithm would hold a short message after a large one until that is acknowledged."""
+    with socket.create_connection(("127.0.0.1", served.port)):
+        end_s = time.monotonic() + TIMEOUT_S
+        while not (found := list(served.studio.unauthenticated._transports.values())):
+            assert time.monotonic() < end_s
+            time.sleep(0.01)
+        connection = found[0].get_extra_info("socket")
+
+        assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) != 0
+
+
 def test_duplicated_tab_has_a_copy(served, settings, tmp_path):
     """Both pages have the same state at first, files included, and change separately."""
     write_picture(tmp_path / "photo.png", np.random.default_rng(0).integers(0, 256, (40, 50, 3), dtype=np.uint8))

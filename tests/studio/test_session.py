@@ -24,6 +24,7 @@ from foveasim.config import build_shot, read_settings
 from foveasim.sensor import PRESETS
 from foveasim.studio import _session, _views
 from foveasim.studio._files import start_settings
+from foveasim.studio._messages import decode_part
 from foveasim.studio._session import Session, Start
 
 LINE = 600
@@ -43,7 +44,9 @@ def code_part(recorder):
 def test_first_connection_receives_all_parts(recorder):
     assert recorder.part_names[:2] == ["sites", "columns"]
     parts = _session.PARTS.values()
-    first = {part.name for part in parts if part.has_data and not (part.is_costly or part.is_of_variants)}
+    first = {
+        part.name for part in parts if part.has_data and not (part.is_lazy or part.is_costly or part.is_of_variants)
+    }
     assert set(recorder.part_names) == first
     assert not first & {"solid", "comparison"}
     kinds = [message["kind"] for message in recorder.messages if message["kind"] != "progress"]
@@ -687,11 +690,84 @@ def test_session_without_page_releases_its_results(settings, monkeypatch):
         session.close()
 
 
+def test_signals_are_sent_when_requested(recorder):
+    capture = recorder.session.result.capture
+    names = ["sites", "columns"]
+    recorder.do(do="views", names=names)
+    recorder.do(do="set", key="exposure_s", value=0.02, final=True)
+    about = next(header["about"] for header, _ in recorder.parts if header["part"] == "columns")
+    keys = {column["key"] for column in about["columns"] if column.get("is_signal")}
+    assert keys == {"electrons", "expected_e", "snr"}
+    assert not any(column.get("array") for column in about["columns"] if column["key"] in keys)
+
+    recorder.do(do="views", names=[*names, "signals"])
+    capture = recorder.session.result.capture
+    assert recorder.part_names == ["signals"]
+    found = recorder.parts[0][1]
+    assert np.array_equal(found["electrons"], capture.electrons)
+    assert np.array_equal(found["expected_e"], capture.expected_e)
+    assert found["snr"] == pytest.approx(capture.signal_to_noise(sensor=recorder.session.result.shot.camera.sensor))
+
+
+def test_outlines_are_computed_ahead(recorder, monkeypatch):
+    state = recorder.do(do="set", key="layout.parameters.n_x", value=20, final=True)
+    expected = next(arrays for header, arrays in recorder.parts if header["part"] == "sites")
+    recorder.do(do="undo")
+    monkeypatch.setattr(_views, "MANY_SITES", 1)
+    recorder.do(do="redo")
+    found = next(arrays for header, arrays in recorder.parts if header["part"] == "sites")
+
+    assert state["errors"] == {}
+    assert expected.keys() == found.keys()
+    assert all(np.array_equal(expected[name], found[name]) for name in expected)
+
+
+def test_slow_views_wait_for_the_page(settings, monkeypatch):
+    """Until the page has drawn the photosites, or a newer message waits."""
+    monkeypatch.setattr(_views, "AWAITED_S", -1.0)
+    monkeypatch.setattr(_session, "DRAWN_S", 20.0)
+    session, parts = Session("threaded", Start(settings), n_threads=1), []
+
+    def listen(message):
+        if isinstance(message, bytes):
+            parts.append(decode_part(message)[0])
+
+    def names():
+        return [header["part"] for header in parts]
+
+    try:
+        session.attach(listen, answers=True)
+        wait_until(lambda: "columns" in names())
+        time.sleep(0.1)
+        assert names() == ["sites", "columns"]
+        assert [header.get("is_awaited", False) for header in parts] == [False, True]
+        session.post({"do": "drawn", "version": parts[-1]["version"]})
+        wait_until(lambda: "picture" in names())
+        parts.clear()
+        session.post({"do": "set", "key": "exposure_s", "value": 0.02, "final": True})
+        wait_until(lambda: "columns" in names())
+        assert "picture" not in names()
+        session.post({"do": "set", "key": "exposure_s", "value": 0.03, "final": True})
+        wait_until(lambda: names().count("columns") == 2)
+    finally:
+        session.close()
+
+
+def test_stages_of_short_changes_are_not_reported(recorder, monkeypatch):
+    monkeypatch.setattr(_session, "PROGRESS_S", 60.0)
+    recorder.do(do="set", key="exposure_s", value=0.02, final=True)
+    assert "progress" not in [message["kind"] for message in recorder.messages]
+    monkeypatch.setattr(_session, "PROGRESS_S", -1.0)
+    recorder.do(do="set", key="exposure_s", value=0.03, final=True)
+
+    assert "progress" in [message["kind"] for message in recorder.messages]
+
+
 def test_failing_listener_leaves_others(recorder):
     def fail(_message):
         raise OSError
 
-    recorder.session._listeners.add(fail)
+    recorder.session.attach(fail)
     assert recorder.do(do="set", key="seed", value=2, final=True)["errors"] == {}
 
 

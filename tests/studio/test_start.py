@@ -260,4 +260,4 @@ def test_other_files_are_not_opened(make_session, settings, tmp_path, path):
     state = recorder.do(do="file", path=str(out / path), **{"as": "settings"})
 
     assert "is not available here" in state["errors"]["file"]
-    assert not Files(settings, (None, out), tmp_path / "uploads").allows(out / path)
+    assert not Files(settings, (None, out), tmp_path / "uploads", out / "variants").allows(out / path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from foveasim._core.validation import Floats
 from foveasim.sensor import noise_budget
 from foveasim.studio._engine import Simulated
 from foveasim.studio._parts.registry import PartData, capture_of, part
@@ -17,6 +18,11 @@ def noise(result: Simulated) -> PartData:
     sources = [
         {"name": name, "label": name.replace("_", " "), "is_temporal": name in budget.temporal, "values": found}
         for name, values in budget.items()
-        if (found := float(np.median(values))) > 0.0
+        if (found := _median(values)) > 0.0
     ]
     return {"sources": sources, "unit": "e-", "median_electrons": float(np.median(capture.electrons))}, {}
+
+
+def _median(values: Floats) -> float:
+    """Return the median; without sorting of equal values, as of uniform electronics."""
+    return float(values[0] if values.min() == values.max() else np.median(values))

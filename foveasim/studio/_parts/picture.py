@@ -16,7 +16,7 @@ from foveasim.view.site_colours import encode_light
 N_LEVELS = 1 << 14
 
 
-@part("Picture", lambda result: (result.capture, (result.picture_pixels,)), order=2)
+@part("Picture", lambda result: (result.capture, (result.picture_pixels,)), order=3)
 def picture(result: Simulated) -> PartData:
     """Return the picture that is reconstructed from the codes."""
     capture = result.capture

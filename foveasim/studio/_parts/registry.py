@@ -53,8 +53,10 @@ class Part:
         Whether the tile is shown at first.
     is_wide : bool
         Whether the tile is shown at first on wide pages.
+    is_lazy : bool
+        Whether the part is computed only when a page asks for it.
     is_costly : bool
-        Whether the part is computed only when a page asks for it, and not for previews.
+        Whether the part is not computed for previews either.
     is_of_variants : bool
         Whether the part is computed only when there are variants to compare with.
     """
@@ -66,6 +68,7 @@ class Part:
     order: int = 1000
     is_first: bool = False
     is_wide: bool = False
+    is_lazy: bool = False
     is_costly: bool = False
     is_of_variants: bool = False
 
@@ -84,7 +87,7 @@ class Part:
             "is_tile": self.order >= FIRST_TILE,
             "is_first": self.is_first,
             "is_wide": self.is_first or self.is_wide,
-            "is_costly": self.is_costly,
+            "is_lazy": self.is_lazy or self.is_costly,
             "has_data": self.has_data,
         }
 

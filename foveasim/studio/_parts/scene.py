@@ -34,7 +34,7 @@ def _light_of(result: Simulated) -> tuple[Any, ...]:
     return (*result.images.values(), tuple(result.images), numbers)
 
 
-@part("Optical image", _light_of, order=3)
+@part("Optical image", _light_of, order=4)
 def scene(result: Simulated) -> PartData:
     """Return the optical image through each colour filter."""
     camera, source = result.shot.camera, result.shot.scene

@@ -1,5 +1,7 @@
 // Connection to the server: one WebSocket that reconnects, messages with numbers, and parts with arrays.
 
+import { WorkerSocket } from "./worker_socket.js";
+
 const TYPES = {
   uint8: Uint8Array, int8: Int8Array, uint16: Uint16Array, int16: Int16Array,
   uint32: Uint32Array, int32: Int32Array, float32: Float32Array, float64: Float64Array,
@@ -41,7 +43,7 @@ export function readPart(buffer) {
   const arrays = {};
   for (const { name, type, size, offset } of header.arrays) arrays[name] = new TYPES[type](buffer, 4 + length + offset, size);
   return { part: header.part, version: header.version, is_preview: Boolean(header.is_preview), hasMore: Boolean(header.has_more),
-    about: header.about, arrays };
+    isAwaited: Boolean(header.is_awaited), about: header.about, arrays };
 }
 
 // Messages of one connection: their numbers, which of them wait for an answer, and the views that the page asked for.
@@ -84,7 +86,7 @@ export class Requests {
 }
 
 export class Connection {
-  /** @type {WebSocket | null} */ socket = null;
+  /** @type {WorkerSocket | null} */ socket = null;
   // Final values that were set without a connection.
   /** @type {Map<string, unknown>} */ unsent = new Map();
   // Values whose messages are not answered, with their numbers: they are sent again after the connection was lost.
@@ -116,19 +118,20 @@ export class Connection {
 
   open() {
     clearTimeout(this.retry);
-    const socket = new WebSocket((location.protocol === "https:" ? "wss://" : "ws://") + location.host + "/socket");
-    this.socket = socket;
-    socket.binaryType = "arraybuffer";
-    socket.addEventListener("open", () => socket.send(JSON.stringify({ token: this.token, session: memory.get("session"), page: PAGE })));
-    socket.addEventListener("message", ({ data }) => {
-      this._hear();
-      if (typeof data === "string") this._receive(JSON.parse(data));
-      else this.on.part(readPart(data));
+    const address = (location.protocol === "https:" ? "wss://" : "ws://") + location.host + "/socket";
+    const socket = new WorkerSocket(address, {
+      open: () => socket.send(JSON.stringify({ token: this.token, session: memory.get("session"), page: PAGE })),
+      message: (data) => {
+        this._hear();
+        if (typeof data === "string") this._receive(JSON.parse(data));
+        else this.on.part(readPart(data));
+      },
+      close: (code) => this._close(socket, code),
     });
-    socket.addEventListener("close", ({ code }) => this._close(socket, code));
+    this.socket = socket;
   }
 
-  /** @param {WebSocket} socket @param {number} code */
+  /** @param {WorkerSocket} socket @param {number} code */
   _close(socket, code) {
     if (socket !== this.socket) return;
     this.socket = null;
@@ -204,6 +207,10 @@ export class Connection {
     this.isSilent = false;
     this.on.silent(false);
   }
+
+  // The photosites of a version are drawn: the server goes on with what takes time.
+  /** @param {number} version */
+  drawn(version) { this.socket?.send(JSON.stringify({ do: "drawn", version })); }
 
   // Cancels the present change; this has no answer of its own.
   cancel() { this.socket?.send(JSON.stringify({ do: "cancel" })); }

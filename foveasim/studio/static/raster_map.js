@@ -1,7 +1,7 @@
 // The map without WebGL2: the sites at all sample points, found again when the view changes, and their colours from a table.
 
 import { MapView } from "/web/map.js";
-import { pixelRatio } from "/web/gl.js";
+import { pixelRatio, textureSize } from "/web/gl.js";
 
 // Sites of at least this many pixels need one sample per pixel; smaller ones, and those below one pixel, more per side.
 const LARGE_PIXELS = 3;
@@ -16,12 +16,54 @@ const ENCODED = Uint8Array.from({ length: LEVELS }, (_, i) => {
   return Math.round(255 * (light <= 0.0031308 ? 12.92 * light : 1.055 * light ** (1 / 2.4) - 0.055));
 });
 
-export class RasterMap extends MapView {
-  // Sides of the smallest site in µm; given by use().
-  /** @type {number} */ smallest;
-  // Numbers of the sites at all samples, and colours by these numbers.
-  /** @type {Uint16Array<ArrayBuffer> | Uint32Array<ArrayBuffer>} */ owner;
+// The sites at the samples of a view, and its pixels.
+class Raster {
+  isRendered = false;
   table = new Uint32Array(0);
+  /** @type {Sites} */ sites;
+  // Number of samples per side of a pixel, and pixels per row.
+  /** @type {number} */ n;
+  /** @type {number} */ width;
+  /** @type {string} */ view;
+  // Numbers of the sites at all samples.
+  /** @type {Uint16Array<ArrayBuffer> | Uint32Array<ArrayBuffer>} */ owner;
+  /** @type {ReturnType<typeof mixedPixels> | null} */ mixed;
+  /** @type {ImageData} */ picture;
+  /** @type {ImageData} */ nextPicture;
+
+  // spare: a raster that is no longer in use, whose arrays are used again.
+  /** @param {RasterMap} map @param {Raster | null} spare */
+  constructor(map, spare) {
+    const { sites, canvas: { width, height }, samples: n } = map, Numbers = sites.n < 2 ** 16 ? Uint16Array : Uint32Array;
+    const size = n * n * width * height, isSame = spare?.owner.constructor === Numbers && spare.owner.length === size;
+    Object.assign(this, { sites, width, n, view: map.viewKey });
+    this.owner = spare && isSame ? spare.owner : new Numbers(size);
+    findOwners(map, n * width, n * height, this.owner);
+    this.mixed = n === 1 ? null : mixedPixels(this.owner, width, height, n);
+    const fits = spare && spare.picture.width === width && spare.picture.height === height;
+    this.picture = fits ? spare.picture : map.context.createImageData(width, height);
+    this.nextPicture = fits ? spare.nextPicture : map.context.createImageData(width, height);
+  }
+
+  // Sets pixels from the colours of the sites.
+  /** @param {ImageData} picture @param {Uint32Array} colours @param {number[]} ground */
+  render(picture, colours, ground) {
+    const { owner, mixed, sites, width, n } = this, pixels = new Uint32Array(picture.data.buffer);
+    if (this.table.length !== sites.n + 1) this.table = new Uint32Array(sites.n + 1);
+    const { table } = this;
+    table[0] = (255 << 24 | ground[2] << 16 | ground[1] << 8 | ground[0]) >>> 0;
+    table.set(colours.subarray(0, sites.n), 1);
+    const first = mixed ? mixed.first : owner;
+    for (let p = 0; p < pixels.length; p++) pixels[p] = table[first[p]];
+    if (mixed) averageSamples(pixels, mixed.pixels, owner, width, n, lightOf(table));
+  }
+}
+
+export class RasterMap extends MapView {
+  /** @type {Raster | null} */ raster = null;
+  // The raster of sites that are shown next, and one whose arrays can be used again.
+  /** @type {Raster | null} */ next = null;
+  /** @type {Raster | null} */ spare = null;
 
   constructor(canvas, sites) {
     super(canvas);
@@ -29,42 +71,69 @@ export class RasterMap extends MapView {
     this.use(sites);
   }
 
-  use(sites) {
-    super.use(sites);
-    this.drawn = null;
-    this.smallest = Infinity;
-    for (let i = 0; i < sites.box.length; i += 4) this.smallest = Math.min(this.smallest,
-      Math.max(sites.box[i + 2] - sites.box[i], sites.box[i + 3] - sites.box[i + 1]));
+  // Works ahead for sites that are shown next, completely or in the present view.
+  /** @param {Sites} sites @param {boolean} isWhole */
+  prepare(sites, isWhole) {
+    /** @type {RasterMap} */
+    const map = Object.create(this);
+    map.use(sites);
+    const [x, y] = map.middle;
+    if (isWhole) map.set(x, y, map.fitScale());
+    else map.set(map.x, map.y, map.scale);
+    this.next = new Raster(map, this.next ?? this.spare);
+    this.spare = null;
+  }
+
+  // Works ahead for colours of sites: paint(colours) sets them. Returns what adopt() takes, or null if the view is another one.
+  /** @param {Sites} sites @param {number[]} ground @param {(colours: Uint32Array<ArrayBuffer>) => void} paint */
+  prepareColours(sites, ground, paint) {
+    const raster = this.next?.sites === sites ? this.next : this.raster;
+    if (raster?.sites !== sites || (raster === this.raster && raster.view !== this.viewKey)) return null;
+    const colours = new Uint32Array(textureSize(sites.n));
+    paint(colours);
+    raster.render(raster.nextPicture, colours, ground);
+    return { raster, colours };
+  }
+
+  // Shows prepared colours in the next drawing, if the view is still the same.
+  adopt({ raster, colours }) {
+    if (this._current() !== raster) return false;
+    this.colours = colours;
+    [raster.picture, raster.nextPicture] = [raster.nextPicture, raster.picture];
+    raster.isRendered = true;
+    return true;
   }
 
   // Colours are read when the map is drawn.
-  sendColours() {}
+  sendColours() { if (this.raster) this.raster.isRendered = false; }
 
   get samples() {
-    const { width, height } = this.canvas, pixels = this.smallest * this.scale * pixelRatio();
+    const { width, height } = this.canvas, pixels = this.sites.smallest * this.scale * pixelRatio();
     const wanted = pixels >= LARGE_PIXELS ? 1 : pixels >= 1 ? FEW_SAMPLES : MANY_SAMPLES;
     return Math.max(1, Math.min(wanted, Math.floor(Math.sqrt(MOST_SAMPLES / (width * height)))));
   }
 
-  draw(ground) {
-    const { canvas } = this, { width, height } = canvas, n = this.samples, view = [this.x, this.y, this.scale, width, height, n].join();
-    if (this.drawn !== view) {
-      const Numbers = this.sites.n < 2 ** 16 ? Uint16Array : Uint32Array, size = n * n * width * height;
-      if (this.owner?.constructor !== Numbers || this.owner.length !== size) this.owner = new Numbers(size);
-      findOwners(this, n * width, n * height, this.owner);
-      this.mixed = n === 1 ? null : mixedPixels(this.owner, width, height, n);
-      if (!this.picture || this.picture.width !== width
-        || this.picture.height !== height) this.picture = this.context.createImageData(width, height);
-      if (this.table.length !== this.sites.n + 1) this.table = new Uint32Array(this.sites.n + 1);
-      this.drawn = view;
+  get viewKey() { return [this.x, this.y, this.scale, this.canvas.width, this.canvas.height, this.samples].join(); }
+
+  // The raster of the present view.
+  _current() {
+    const { raster, next, viewKey: view, sites } = this;
+    if (raster?.sites === sites && raster.view === view) return raster;
+    if (next?.sites === sites && next.view === view) {
+      this.spare = raster;
+      this.next = null;
+      this.raster = next;
+      return next;
     }
-    const pixels = new Uint32Array(this.picture.data.buffer), { table, owner, mixed } = this;
-    table[0] = (255 << 24 | ground[2] << 16 | ground[1] << 8 | ground[0]) >>> 0;
-    table.set(this.colours.subarray(0, this.sites.n), 1);
-    const first = mixed ? mixed.first : owner;
-    for (let p = 0; p < pixels.length; p++) pixels[p] = table[first[p]];
-    if (mixed) averageSamples(pixels, mixed.pixels, owner, width, n, lightOf(table));
-    this.context.putImageData(this.picture, 0, 0);
+    this.raster = new Raster(this, raster);
+    return this.raster;
+  }
+
+  draw(ground) {
+    const raster = this._current();
+    if (!raster.isRendered) raster.render(raster.picture, this.colours, ground);
+    raster.isRendered = true;
+    this.context.putImageData(raster.picture, 0, 0);
   }
 }
 

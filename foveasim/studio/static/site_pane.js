@@ -38,6 +38,12 @@ export class SitePane {
   /** @type {Palette} */ palette;
   /** @type {Scale | null} */ scale = null;
   /** @type {Overview | null} */ overview = null;
+  // Values that are shown next: their scale, and what the map has prepared.
+  /**
+   * @type {{ scale: Scale, column: Column, wantsLog: boolean | undefined, range: Interval | null, ground: number[],
+   *   ready: NonNullable<ReturnType<RasterMap["prepareColours"]>> } | null}
+   */
+  next = null;
   // Whether the sites are edited; violations of a view: their version, their markers, and the chosen one.
   isEdited = false; violations = () => null; drawViolations = (_context, _map) => {}; trace = () => null;
 
@@ -149,16 +155,37 @@ export class SitePane {
   colourBy(key, options) {
     if (!this.columns.length || !this.map) return;
     this.column = this.columnOf(key);
-    this.scale = new Scale(this.column, this.column.values, this.column.kind === "lit" ? this.filterOf : null, this.palette, options);
+    const { next, column } = this, isReady = next?.column === column && next.wantsLog === options.wantsLog && !options.alsoValues;
+    const filterOf = column.kind === "lit" ? this.filterOf : null;
+    this.scale = isReady ? next.scale : new Scale(column, column.values, filterOf, this.palette, options);
   }
 
   paint(range) {
     const { map, scale } = this;
     if (!map || !scale) return;
     this.range = range;
-    scale.paint(map.colours, range, groundColour());
-    map.sendColours();
+    const { next } = this, ground = groundColour();
+    this.next = null;
+    const isReady = next !== null && next.scale === scale && next.range === range && next.ground.join() === ground.join();
+    if (!isReady || !(map instanceof RasterMap) || !map.adopt(next.ready)) {
+      scale.paint(map.colours, range, ground);
+      map.sendColours();
+    }
     this._drawLegend(scale);
+  }
+
+  // Works ahead for sites that are shown next.
+  prepareSites(sites) {
+    if (this.map instanceof RasterMap && this.isShown) this.map.prepare(sites, this.isWhole && !this.isEdited);
+  }
+
+  // Works ahead for values of sites that are shown next.
+  prepareColours(sites, column, filterOf, { wantsLog, range }) {
+    const { map } = this;
+    if (!(map instanceof RasterMap) || !this.isShown) return;
+    const scale = new Scale(column, column.values, column.kind === "lit" ? filterOf : null, this.palette, { wantsLog });
+    const ground = groundColour(), ready = map.prepareColours(sites, ground, (colours) => scale.paint(colours, range, ground));
+    this.next = ready && { scale, column, wantsLog, range, ground, ready };
   }
 
   _drawLegend(scale) {

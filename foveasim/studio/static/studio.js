@@ -23,6 +23,8 @@ import { Views } from "./views.js";
 const BUSY_DELAY_MS = 150, LONG_MS = 1000;
 const SIZE_DELAY_MS = 250;
 const HOLD_MS = 100;
+// Time after which values that are no longer shown are not requested.
+const SIGNALS_MS = 2000;
 const MOST_KEPT = 6;
 const PICTURE_SIZES = [256, 320, 384, 512, 768, 1024], SMALLER = 0.85;
 
@@ -53,7 +55,7 @@ class StudioPage {
   /** @type {Point | null} */ gazeAt = null;
   /** @type {Boundary | null} */ boundary = null;
   key = ""; stage = ""; longTimer = 0; hovered = -1; pinned = -1; isSelecting = false;
-  sizeTimer = 0; holdTimer = 0; busyTimer = 0; drawnAt = 0;
+  sizeTimer = 0; signalsTimer = 0; holdTimer = 0; busyTimer = 0; drawnAt = 0;
 }
 
 const page = new StudioPage();
@@ -136,9 +138,11 @@ function resize() {
 function recolour() {
   const { a, b } = panes, { wantsLog } = page;
   if (!b.columns.length || !b.map) return;
-  const other = page.frozen && a.columns.find((column) => column.key === page.key);
+  // Values that follow.
+  if (!b.columnOf(page.key).values) return;
+  const other = page.frozen && a.columns.find((column) => column.key === page.key && column.values);
   b.colourBy(page.key, { wantsLog, alsoValues: other?.values });
-  if (page.frozen) a.colourBy(page.key, { wantsLog, alsoValues: b.column.values });
+  if (page.frozen) a.colourBy(other ? page.key : "", { wantsLog, alsoValues: other ? b.column.values : null });
   paint();
   $("log-label").hidden = !b.scale?.canLog;
   $("log").checked = Boolean(b.scale?.isLog);
@@ -169,7 +173,10 @@ function showHeld() {
   const { states, parts } = page.held;
   page.held = { states: [], parts: [] };
   for (const state of states) showState(state);
-  for (const part of parts) views.use(part);
+  for (const part of parts) {
+    views.use(part);
+    if (part.isAwaited) connection.drawn(part.version);
+  }
   if (page.state) problems.update(page.state, views.parts);
 }
 
@@ -276,6 +283,7 @@ function hello(message, { isSame }) {
   fillPresets(message.presets);
   $("save").hidden = !message.can_save;
   views.describe(message.views);
+  followSignals();
   const stored = message.is_new ? memory.get("settings") : null;
   sendViews();
   if (page.kept.length) connection.send({ do: "pin", sites: page.kept });
@@ -352,6 +360,19 @@ function followSize() {
 
 function sendViews() { connection.askFor(views.wanted, pictureSize()); }
 
+// Asks for the signals of the photosites while they are shown, and for some time after that.
+function followSignals() {
+  const { needed } = views, isShown = page.hovered >= 0 || page.pinned >= 0 || page.selected.length > 0 || page.frozen !== null
+    || views.shown.has("site") || Boolean(panes.b.columns.find(({ key }) => key === page.key)?.is_signal);
+  if (isShown) {
+    clearTimeout(page.signalsTimer);
+    page.signalsTimer = 0;
+    if (!needed.has("signals")) views.need("signals", true);
+  } else if (needed.has("signals") && !page.signalsTimer) {
+    page.signalsTimer = setTimeout(() => { page.signalsTimer = 0; views.need("signals", false); }, SIGNALS_MS);
+  }
+}
+
 // -- the photosite ------------------------------------------------------------------------------------------------------
 
 function hover(x, y, from, site = panes.b.pick(x, y)) {
@@ -373,6 +394,7 @@ function leave() {
 
 function tellSite() {
   const { sites, columns } = panes.b, site = page.hovered >= 0 ? page.hovered : page.pinned;
+  followSignals();
   views.tell("onSite");
   speak(site < 0 || !sites ? null : () => spokenSite(columns, site, sites.area));
 }
@@ -441,6 +463,7 @@ function select(rectangle, sites = rectangle ? panes.b.sitesIn(rectangle) : []) 
   page.selected = sites;
   if (rectangle) views.show("selection", true);
   editor.follow(page.selected);
+  followSignals();
   showSelection();
   ask("marks");
 }
@@ -473,6 +496,7 @@ function freeze(variant) {
   if (!panes.b.sites || !page.state) return;
   page.frozen = { isAnswered: false, isKept: false };
   keepVariant(page.frozen);
+  followSignals();
   page.frozen.id = connection.send({ do: "freeze", variant });
   views.show("comparison", true);
   showVariants();
@@ -497,6 +521,7 @@ function compare(variants) {
 
 function unfreeze() {
   page.frozen = null;
+  followSignals();
   showVariants();
 }
 
@@ -536,6 +561,7 @@ function listenToButtons() {
   press("dismiss", () => { $("offer").hidden = true; });
   $("colouring").addEventListener("change", () => {
     Object.assign(page, { key: $("colouring").value, range: null, wantsLog: undefined });
+    followSignals();
     recolour();
     ask("map");
   });
@@ -699,7 +725,8 @@ function createPanes() {
 
 // What the modules of views, tests and scripts use.
 const studio = {
-  page, ask, drawAsked, recolour, showSelection, setRange, select, hover, leave, pin, keep, fly, flyToStep, sendViews, freeze, compare,
+  page, ask, drawAsked, recolour, showSelection, tellSite,
+  setRange, select, hover, leave, pin, keep, fly, flyToStep, sendViews, freeze, compare,
   get panes() { return panes; },
   get controls() { return controls; },
   get connection() { return connection; },
@@ -738,7 +765,7 @@ function start() {
   gazePanel = new GazePanel($("pane-scene"), panes.scene, {
     connection: () => connection, state: () => page.state, playing: () => sources.film?.pause(), redraw: () => ask("marks"),
   });
-  views = new Views(studio, () => { sendViews(); resize(); });
+  views = new Views(studio, () => { followSignals(); sendViews(); resize(); });
   // Its violations are reported with the other problems.
   views.needed.add("rules").add("requirements");
   problems = new Problems({ show: (view) => views.show(view, true), fit: () => connection.send({ do: "fit" }) });

@@ -10,6 +10,8 @@ const WIDE = 1800;
 // draw() after a change of size or theme, onShown(isShown), and, only while the tile is shown, onState() after new settings,
 // onValues() after the colours of the map, onSite() after the photosite under the mouse, onSelection(), onMap() when the map is
 // drawn, onMarks(marks). Data are requested unless wantsData is false.
+// Views of the map of the photosites.
+const OF_MAP = ["sites", "columns", "signals"];
 const FOLLOWED = ["onState", "onValues", "onSite", "onSelection", "onMap", "draw"];
 
 export class Views {
@@ -55,7 +57,7 @@ export class Views {
       if (Array.isArray(chosen) ? chosen.includes(view.name) : isFirst(view)) this.shown.add(view.name);
       this._mark(view.name);
     }
-    for (const view of list.filter((each) => !each.is_tile)) this.needed.add(view.name);
+    for (const view of list.filter((each) => !each.is_tile && !each.is_lazy)) this.needed.add(view.name);
     this._load();
   }
 
@@ -89,7 +91,7 @@ export class Views {
     if (isNeeded) this.needed.add(name);
     else this.needed.delete(name);
     this._load();
-    this.changed();
+    this.studio.sendViews();
   }
 
   /** @param {string} name */
@@ -145,7 +147,7 @@ export class Views {
   }
 
   // Shows all again, after variant A came or went.
-  refresh() { for (const { name } of this.list) if (name !== "sites" && name !== "columns") this._refresh(name); }
+  refresh() { for (const { name } of this.list) if (!OF_MAP.includes(name)) this._refresh(name); }
 
   /** @param {Part} part */
   prepare(part) { this._call(part.part, "prepare", part); }

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from io import BytesIO
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.quantities import format_quantity
 from foveasim._core.rings import same_rings
-from foveasim._core.validation import UNIT_SUFFIXES, Floats
+from foveasim._core.validation import UNIT_SUFFIXES
 from foveasim.capture import Capture
 from foveasim.errors import GeometryError, ParameterError, SimulationError, type_name
 from foveasim.fields import PowerMap
@@ -44,6 +44,14 @@ MAX_LISTED = 2000
 MAX_EXACT = 2**53
 #: Channel names of a layout without filters.
 CHANNEL_NAMES = "RGBW"
+
+
+def _hex(colour: Rgb) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*colour)
+
+
+#: Colours of categories and of photosites without value, and the exponent of grey levels.
+PALETTE = {"kinds": [_hex(colour) for colour in CATEGORY_COLOURS], "no_data": _hex(NO_DATA), "gamma": DISPLAY_GAMMA}
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,14 +119,15 @@ def content_of(
 
 
 def describe_sites(
-    data: Layout | Capture, *, name: str = "", sensor: Sensor | None = None
+    data: Layout | Capture, *, name: str = "", sensor: Sensor | None = None, has_signals: bool = True
 ) -> tuple[dict[str, Any], dict[str, NDArray[Any]], Layout]:
     """
     Return the data of photosites for all kinds of pages.
 
     ``name``: heading; by default the generator of the layout. ``sensor``: the sensor of the capture, as for
-    :meth:`foveasim.Capture.signal_to_noise`. Returns ``about``: heading, notes, number of sites, bounds, columns, palette.
-    ``arrays``: arrays of the columns. Raises ParameterError, GeometryError as for :func:`content_of`.
+    :meth:`foveasim.Capture.signal_to_noise`. ``has_signals``: whether the arrays contain those of :func:`signals_of`. Returns
+    ``about``: heading, notes, number of sites, bounds, columns, palette. ``arrays``: arrays of the columns. Raises
+    ParameterError, GeometryError as for :func:`content_of`.
     """
     if not isinstance(data, Layout | Capture):
         raise ParameterError("data", f"must be a Layout or a Capture, got {type_name(data)}")
@@ -127,7 +136,7 @@ def describe_sites(
     if layout.n_sites == 0:
         raise GeometryError("the layout has no sites; a page needs at least one")
     arrays: dict[str, NDArray[Any]] = {}
-    columns = _columns(layout, capture, arrays, sensor)
+    columns = _columns(layout, capture, arrays, sensor, has_signals=has_signals)
     provenance = layout.provenance
     origin = str(provenance.get("generator", provenance.get("made_by", "polygons"))).replace("_", " ")
     about = {
@@ -138,11 +147,7 @@ def describe_sites(
         "bounds_um": layout.bounds_um,
         "columns": columns,
         "filter": next((column["array"] for column in columns if column["key"] == "channel"), None),
-        "palette": {
-            "kinds": [_hex(colour) for colour in CATEGORY_COLOURS],
-            "no_data": _hex(NO_DATA),
-            "gamma": DISPLAY_GAMMA,
-        },
+        "palette": PALETTE,
     }
     return about, arrays, layout
 
@@ -169,8 +174,38 @@ def outlines_of(shapes: Shapes) -> dict[str, NDArray[Any]]:
 # -- columns ------------------------------------------------------------------------------------------------------------
 
 
+class _Signal(NamedTuple):
+    """Column of a capture: heading, and a function that returns its values if they exist."""
+
+    key: str
+    label: str
+    unit: str
+    values: Callable[[], NDArray[Any] | None]
+    note: str = ""
+
+
+def _signals(capture: Capture, sensor: Sensor | None) -> list[_Signal]:
+    note = "expected photoelectrons over temporal noise, quantisation included"
+    return [
+        _Signal("electrons", "electrons", "e-", lambda: capture.electrons),
+        _Signal("expected_e", "expected electrons", "e-", lambda: capture.expected_e),
+        _Signal("snr", "signal to noise", "", lambda: _signal_to_noise(capture, sensor), note),
+    ]
+
+
+def signals_of(capture: Capture, sensor: Sensor | None) -> dict[str, NDArray[Any]]:
+    """Return the columns of a capture that take time to compute and to send, by key."""
+    found = {signal.key: signal.values() for signal in _signals(capture, sensor)}
+    return {key: to_smallest_type(values) for key, values in found.items() if values is not None}
+
+
 def _columns(
-    layout: Layout, capture: Capture | None, arrays: dict[str, NDArray[Any]], sensor: Sensor | None = None
+    layout: Layout,
+    capture: Capture | None,
+    arrays: dict[str, NDArray[Any]],
+    sensor: Sensor | None = None,
+    *,
+    has_signals: bool = True,
 ) -> list[dict[str, Any]]:
     """Return the columns of a page in list order: label, unit, and type of colour scale."""
     columns: list[dict[str, Any]] = []
@@ -190,17 +225,12 @@ def _columns(
         if len(colours) > 1:
             lit = {**columns[0], "key": "picture", "label": "colour mosaic", "kind": "lit", "colours": colours}
             columns.insert(0, {**lit, "array": code, "is_repeat": True})
-        add("electrons", "electrons", "e-", capture.electrons)
-        add("expected_e", "expected electrons", "e-", capture.expected_e)
-        ratio = _signal_to_noise(capture, sensor)
-        if ratio is not None:
-            add(
-                "snr",
-                "signal to noise",
-                "",
-                ratio.astype(np.float32),
-                note="expected photoelectrons over temporal noise, quantisation included",
-            )
+        for key, label, unit, values_of, note in _signals(capture, sensor):
+            more = {"note": note} if note else {}
+            if not has_signals:
+                columns.append({"key": key, "label": label, "unit": unit, "kind": "linear", "is_signal": True, **more})
+            elif (values := values_of()) is not None:
+                add(key, label, unit, values, **more)
         if len(colours) > 1:
             names = list(capture.filter_names)
             add("channel", "filter", "", capture.filter_of_site, "kinds", names=names, colours=colours)
@@ -243,10 +273,10 @@ def _second_columns(layout: Layout, second: Capture, arrays: dict[str, NDArray[A
     ]
 
 
-def _signal_to_noise(capture: Capture, sensor: Sensor | None) -> Floats | None:
+def _signal_to_noise(capture: Capture, sensor: Sensor | None) -> NDArray[np.float32] | None:
     """Return the ratio of every site, (n_site,); None if settings lack the electronics."""
     try:
-        return capture.signal_to_noise(sensor=sensor)
+        return capture.signal_to_noise(sensor=sensor).astype(np.float32)
     except (ParameterError, SimulationError):
         return None
 
@@ -287,10 +317,6 @@ def _label(key: str) -> tuple[str, str]:
 
 def _filter_colour(position: int, name: str) -> str:
     return _hex(FILTER_COLOURS.get(name, CATEGORY_COLOURS[position % len(CATEGORY_COLOURS)]))
-
-
-def _hex(colour: Rgb) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*colour)
 
 
 # -- picture, rules, notes ----------------------------------------------------------------------------------------------

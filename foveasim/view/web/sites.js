@@ -7,6 +7,8 @@ export class Sites {
   // Boxes in µm, and areas in µm².
   /** @type {Float64Array} */ box;
   /** @type {Float64Array} */ area;
+  // Longer side of the smallest box in µm.
+  smallest = Infinity;
   // Bins: columns, rows, both per µm, and the sites of all bins.
   nx = 1; ny = 1; perX = 1; perY = 1;
   /** @type {Uint32Array} */ binOffsets;
@@ -36,11 +38,12 @@ export class Sites {
   /** @param {number} site */
   firstVertex(site) { return this.ringOffsets[this.firstRing(site)]; }
 
-  // Boxes and areas of all sites; holes have the opposite winding, so that their areas subtract.
+  // Boxes and areas of all sites, and the longer side of the smallest box; holes have the opposite winding, so that their areas subtract.
   _measure() {
     const { n, xy, position, ringOffsets } = this;
     this.box = new Float64Array(4 * n);
     this.area = new Float64Array(n);
+    let smallest = Infinity;
     for (let site = 0; site < n; site++) {
       let x0 = Infinity, y0 = Infinity, x1 = -Infinity, y1 = -Infinity, twice = 0;
       const ax = xy[2 * position[this.firstVertex(site)]], ay = xy[2 * position[this.firstVertex(site)] + 1];
@@ -63,7 +66,10 @@ export class Sites {
       this.box[4 * site + 2] = x1;
       this.box[4 * site + 3] = y1;
       this.area[site] = twice / 2;
+      const side = x1 - x0 > y1 - y0 ? x1 - x0 : y1 - y0;
+      if (side < smallest) smallest = side;
     }
+    this.smallest = smallest;
   }
 
   // A grid of bins, each with the sites whose boxes intersect it; coarser where boxes are large or many overlap.

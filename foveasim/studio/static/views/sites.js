@@ -9,6 +9,7 @@ export function create(root, { page, panes, editor, ask }) {
   const prepare = (part) => {
     part.sites = new Sites(part.arrays, part.about);
     part.boundary = boundaryOf(part.sites, part.arrays.boundary);
+    if (!page.frozen) b.prepareSites(part.sites);
   };
   return {
     prepare,
