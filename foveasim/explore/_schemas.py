@@ -33,7 +33,7 @@ def schema_of(kind: str) -> dict[str, Any]:
     --------
     >>> import foveasim as fs
     >>> list(fs.explore.schema_of("sweep")["properties"])
-    ['shot', 'set', 'vary', 'points', 'mode', 'repeats', 'seed', 'metrics']
+    ['shot', 'set', 'vary', 'points', 'mode', 'repeats', 'seed', 'metrics', 'results']
     """
     check_choice("kind", kind, FILES)
     return schema(FILES[kind], f"foveasim {kind}")
