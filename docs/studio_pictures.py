@@ -115,7 +115,7 @@ def chip(page: Page, directory: Path) -> Path:
     page.click("#fit")
     page.click("#edit")
     page.click("[data-tool=layer]")
-    page.get_by_label("Generator").select_option(label="log polar")
+    page.locator(".tool-options").get_by_label("Generator").select_option(label="log polar")
     page.get_by_label("Margin in µm").fill("0.5")
     page.mouse.click(*at(page, 0.5, 0.5))
     wait_for_views(page)
