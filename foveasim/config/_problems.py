@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -19,6 +20,9 @@ from foveasim.errors import ConfigError, ParameterError, format_value
 
 #: Maximum number of problems in one message.
 MAX_PROBLEMS = 3
+#: Problems of pydantic: names that a section or a dataclass does not have, and wrong types with the words for the right one.
+UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
+TYPES = {"int_type": "an integer", "float_type": "a number"}
 
 
 def plain_settings(source: Source | str | Path | None, value: Any, key_path: tuple[str, ...] = ()) -> Any:
@@ -115,7 +119,7 @@ def _problems(kind: Any, data: dict[str, Any], error: ValidationError) -> list[t
     # For a union, pydantic reports a problem for every type: only those of the deepest key matter.
     problems: list[tuple[tuple[str, ...], str]] = []
     # Unknown keys first: a misspelt key is also missing.
-    for key_path, item in sorted(found, key=lambda each: each[1]["type"] != "extra_forbidden"):
+    for key_path, item in sorted(found, key=lambda each: each[1]["type"] not in UNKNOWN_KEY):
         is_shadowed = _is_of_type(item) and any(
             other[: len(key_path)] == key_path and (len(other) > len(key_path) or not _is_of_type(o))
             for other, o in found
@@ -123,7 +127,8 @@ def _problems(kind: Any, data: dict[str, Any], error: ValidationError) -> list[t
         if not is_shadowed:
             # The value of the key that selects the kind of a section.
             tag = [item["ctx"]["discriminator"].strip("'")] if item["type"] == "union_tag_invalid" else []
-            problems.append(((*key_path, *tag), _describe(kind, item, is_first=not problems)))
+            types = [TYPES[o["type"]] for other, o in found if other == key_path and o["type"] in TYPES]
+            problems.append(((*key_path, *tag), _describe(kind, item, types, is_first=not problems)))
     return list(dict.fromkeys(problems))
 
 
@@ -156,17 +161,23 @@ def _tags(data: Any) -> tuple[Any, ...]:
     return (data.get("kind"), data.get("generator")) if isinstance(data, dict) else ()
 
 
-def _describe(kind: Any, error: Any, *, is_first: bool) -> str:
-    """Return the rule and the value of a problem; for the first unknown name the list."""
+def _describe(kind: Any, error: Any, types: list[str], *, is_first: bool) -> str:
+    """
+    Return the rule and the value of a problem; for the first unknown name the list.
+
+    ``types``: types that are valid instead of a name.
+    """
     match error["type"]:
-        case "extra_forbidden":
+        case "extra_forbidden" | "unexpected_keyword_argument":
             name = error["loc"][-1]
             section = _section_at(kind, error["loc"][:-1])
             if section is None:
                 return "unknown key"
-            call = call_of(section)
+            if not issubclass(section, BaseModel):
+                call, keys = None, [field.name for field in fields(section)]
+            else:
+                call, keys = call_of(section), [field.alias or key for key, field in section.model_fields.items()]
             what = "unknown key" if call is None else f"unknown parameter of {call.__name__}"
-            keys = [field.alias or key for key, field in section.model_fields.items()]
             hint = possible_names(name, keys) if is_first else did_you_mean(name, keys)
             return f"{what}; {hint}" if hint else what
         case "missing":
@@ -183,7 +194,7 @@ def _describe(kind: Any, error: Any, *, is_first: bool) -> str:
             return _not_one_of(_quoted(error["ctx"]["expected_tags"]), tag, shown)
         case "literal_error":
             value = error["input"]
-            return _not_one_of(_quoted(error["ctx"]["expected"]), value, json.dumps(value))
+            return _not_one_of(_quoted(error["ctx"]["expected"]), value, json.dumps(value), types)
         case _:
             got = "" if isinstance(error["input"], dict | list) else f", got {json.dumps(error['input'])}"
             rule = re.sub(r"^\w+ should", "must", error["msg"].removeprefix("Value error, ")).replace(
@@ -197,20 +208,24 @@ def _quoted(names: str) -> list[str]:
     return re.findall(r"'([^']*)'", names) or re.findall(r"[^\s,]+(?<!\bor)", names)
 
 
-def _not_one_of(known: list[str], value: Any, shown: str) -> str:
+def _not_one_of(known: list[str], value: Any, shown: str, types: Sequence[str] = ()) -> str:
     hint = did_you_mean(value, known) if isinstance(value, str) else ""
-    return f"must be one of {list_names(known, value)}, got {shown}{'; ' if hint else ''}{hint}"
+    also = "".join(f"{each}, or " for each in dict.fromkeys(types))
+    return f"must be {also}one of {list_names(known, value)}, got {shown}{'; ' if hint else ''}{hint}"
 
 
-def _section_at(kind: Any, loc: tuple[Any, ...]) -> type[BaseModel] | None:
-    """Return the model of a section, by its location in the notation of pydantic."""
+def _section_at(kind: Any, loc: tuple[Any, ...]) -> type[Any] | None:
+    """Return the model or dataclass of a section, by its location in the notation of pydantic."""
     candidates = list(_alternatives(kind))
     for part in loc:
         tagged = [each for each in candidates if part in _literals(each)]
         candidates = tagged or [
             below for each in candidates for inner in _below(each, part) for below in _alternatives(inner)
         ] or candidates  # fmt: skip
-    return next((each for each in candidates if isinstance(each, type) and issubclass(each, BaseModel)), None)
+    return next(
+        (each for each in candidates if isinstance(each, type) and (issubclass(each, BaseModel) or is_dataclass(each))),
+        None,
+    )
 
 
 def _alternatives(kind: Any) -> Iterator[Any]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-from fractions import Fraction
 
 import numpy as np
 import pytest
 import yaml
+from films import random_pictures, write_film
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -182,16 +182,7 @@ def test_gaze_option_replaces_the_path(files):
 
 @pytest.mark.slow
 def test_video_file_has_its_frame_times(files):
-    av = pytest.importorskip("av")
-    with av.open(str(files / "clip.avi"), "w") as container:
-        stream = container.add_stream("ffv1", rate=Fraction(50))
-        stream.width, stream.height, stream.pix_fmt = 40, 24, "bgr0"
-        for k in range(3):
-            pixels = np.random.default_rng(k).integers(0, 255, (24, 40, 3), dtype=np.uint8)
-            for packet in stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")):
-                container.mux(packet)
-        for packet in stream.encode():
-            container.mux(packet)
+    write_film(files / "clip.avi", random_pictures(3, 40, 24), rate=50)
     colour = {**SETTINGS["scene"], "wavelength_nm": [620.0, 550.0, 450.0], "band_width_nm": 80.0}
     shot = read_shot(write_shot(files, "film", gaze_path=ROWS, scene=colour))
     fs.config.run_video(shot, files / "clip.avi", files / "film.zarr")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from typing import get_args
 
 import numpy as np
@@ -370,3 +371,20 @@ def test_results_just_below_saturation_are_found():
 def test_regions_are_finite(region):
     with pytest.raises(ParameterError, match="must be finite"):
         Requirement(measure="snr", at_least=1.0, **region)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"results": {"a": {"measure": "snr", "at_least": 3}}}, "results.a.at_least: unknown key; possible: 'measure'"),
+        ({"results": {"a": {"measure": "sharpness"}}}, "results.a.measure: must be one of 'snr'"),
+        ({"seed": "random"}, "seed: must be an integer, or one of 'shot', got \"random\""),
+    ],
+)
+def test_wrong_results_of_sweeps_are_one_line(tmp_path, keys, message):
+    path = tmp_path / "sweep.yaml"
+    path.write_text(yaml.safe_dump({"shot": SHOT, "vary": {"sensor.bits": [8, 10]}, **keys}))
+    with pytest.raises(ConfigError, match=re.escape(message)) as caught:
+        fs.explore.read_sweep(path)
+
+    assert "\n" not in str(caught.value)

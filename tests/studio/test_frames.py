@@ -7,11 +7,11 @@ import json
 import subprocess
 import sys
 import zipfile
-from fractions import Fraction
 
 import numpy as np
 import pytest
 import yaml
+from films import write_film
 from PIL import Image
 
 from foveasim.capture import Capture
@@ -44,17 +44,7 @@ def png(array):
 @pytest.fixture
 def clip(tmp_path):
     """Write a video of 10 frames without losses."""
-    av = pytest.importorskip("av")
-    path = tmp_path / "clip.avi"
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("ffv1", rate=Fraction(25))
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "bgr0"
-        for k in range(10):
-            for packet in stream.encode(av.VideoFrame.from_ndarray(pixels(k), format="rgb24")):
-                container.mux(packet)
-        for packet in stream.encode():
-            container.mux(packet)
-    return path
+    return write_film(tmp_path / "clip.avi", [pixels(k) for k in range(10)])
 
 
 def opened(recorder, clip):

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from fractions import Fraction
-
 import numpy as np
 import pytest
 import yaml
+from films import random_pictures, write_film
 
 from foveasim.config import build_shot, read_shot, run_video
 from foveasim.studio._server import _exported
@@ -29,18 +28,7 @@ def gaze_of(t_s, rows=ROWS):
 @pytest.fixture
 def clip(tmp_path):
     """Write a video of 10 frames without losses."""
-    av = pytest.importorskip("av")
-    path = tmp_path / "clip.avi"
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("ffv1", rate=Fraction(25))
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "bgr0"
-        for k in range(N_FRAMES):
-            pixels = np.random.default_rng(k).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
-            for packet in stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")):
-                container.mux(packet)
-        for packet in stream.encode():
-            container.mux(packet)
-    return path
+    return write_film(tmp_path / "clip.avi", random_pictures(N_FRAMES, WIDTH, HEIGHT))
 
 
 def opened(recorder, clip):

@@ -6,10 +6,10 @@ import io
 import json
 import shutil
 import zipfile
-from fractions import Fraction
 
 import numpy as np
 import pytest
+from films import write_film
 
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
@@ -50,20 +50,11 @@ def png(k):
 
 def video(tmp_path, name="clip.mp4", n_frames=12):
     """Return a video whose frames differ in their brightness."""
-    av = pytest.importorskip("av")
-    path = tmp_path / name
     codec, pixels = {"mp4": ("mpeg4", "yuv420p"), "avi": ("mpeg4", "yuv420p"), "gif": ("gif", "rgb8")}[name[-3:]]
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=Fraction(10))
-        stream.width, stream.height, stream.pix_fmt = *SIZE, pixels
-        for k in range(n_frames):
-            frame = np.full((SIZE[1], SIZE[0], 3), 40 + 15 * k, np.uint8)
-            frame[: SIZE[1] // 2] //= 2
-            for packet in stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")):
-                container.mux(packet)
-        for packet in stream.encode():
-            container.mux(packet)
-    return path.read_bytes()
+    frames = [np.full((SIZE[1], SIZE[0], 3), 40 + 15 * k, np.uint8) for k in range(n_frames)]
+    for frame in frames:
+        frame[: SIZE[1] // 2] //= 2
+    return write_film(tmp_path / name, frames, rate=10, codec=codec, pixels=pixels).read_bytes()
 
 
 def ready(page):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import itertools
 import os
 import re
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from PIL import Image
+from scripts import load_script
 
 import foveasim as fs
 from foveasim.config import bundled_layouts, demo_settings
@@ -20,7 +20,6 @@ from foveasim.studio._files import Files, apply_preset
 from foveasim.studio._start import contents_of
 from foveasim.studio._start.new_sensor import electronics, generators, mosaics
 
-SCRIPT = Path(fs.__file__).parents[1] / "docs" / "preset_thumbnails.py"
 THUMBNAILS = Path(fs.__file__).parent / "studio" / "static" / "presets"
 MAX_BYTES = 400_000
 #: Generators whose outlines end at the sides of a rectangle; the others are circles or squares.
@@ -42,10 +41,7 @@ def contents(recorder):
 
 @pytest.fixture(scope="module")
 def script():
-    specification = importlib.util.spec_from_file_location("preset_thumbnails", SCRIPT)
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return module
+    return load_script("docs/preset_thumbnails.py")
 
 
 # -- new sensors --------------------------------------------------------------------------------------------------------

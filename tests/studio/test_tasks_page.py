@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import zipfile
 from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scripts import load_script
 
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
@@ -19,15 +19,10 @@ import foveasim as fs
 
 pytestmark = pytest.mark.needs("chromium")
 
-SCRIPT = Path(fs.__file__).parents[1] / "docs" / "studio_pictures.py"
-
 
 @pytest.fixture(scope="module")
 def tasks():
-    specification = importlib.util.spec_from_file_location("studio_pictures", SCRIPT)
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return module
+    return load_script("docs/studio_pictures.py")
 
 
 @pytest.fixture

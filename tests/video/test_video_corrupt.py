@@ -3,28 +3,19 @@
 from __future__ import annotations
 
 import random
-from fractions import Fraction
 
 import numpy as np
 import pytest
+from films import random_pictures, write_film
 
 from foveasim.errors import FileError
 from foveasim.video import FrameSource
 
-av = pytest.importorskip("av")
 SCENE = {"pitch_um": 1.0, "distance_m": 1.0, "peak_radiance_w_m2_sr_nm": 1.0}
 
 
-def write_film(path, codec):
-    with av.open(str(path), mode="w") as container:
-        container.metadata["title"] = "a title"
-        stream = container.add_stream(codec, rate=Fraction(25))
-        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
-        for k in range(3):
-            picture = np.random.default_rng(k).integers(0, 255, (32, 48, 3), np.uint8)
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
-        container.mux(stream.encode())
-    return path.read_bytes()
+def film(path, codec):
+    return write_film(path, random_pictures(3, 48, 32), codec=codec, pixels="yuv420p", title="a title").read_bytes()
 
 
 def flipped(content, seed):
@@ -39,7 +30,7 @@ def flipped(content, seed):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "codec"), [("a.mp4", "libx264"), ("a.mkv", "ffv1")])
 def test_flipped_bits_give_frames_or_file_errors(tmp_path, name, codec):
-    content = write_film(tmp_path / name, codec)
+    content = film(tmp_path / name, codec)
     bad = tmp_path / f"bad{name}"
     n_read, messages = 0, set()
     for seed in range(200):
@@ -57,7 +48,7 @@ def test_flipped_bits_give_frames_or_file_errors(tmp_path, name, codec):
 
 
 def test_non_utf8_metadata_are_ignored(tmp_path):
-    content = write_film(tmp_path / "a.mp4", "libx264")
+    content = film(tmp_path / "a.mp4", "libx264")
     bad = content.replace(b"a title", b"\xe1 t\xff\xfeit")
     assert bad != content
     (tmp_path / "bad.mp4").write_bytes(bad)

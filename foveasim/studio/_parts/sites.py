@@ -33,7 +33,8 @@ def sites(result: Simulated) -> PartData:
 
 def compute_ahead(layout: Layout) -> None:
     """Start to compute the arrays of a layout in another thread, until its outlines are sent."""
-    _ahead[layout] = _executor.submit(_arrays_of, layout)
+    if layout not in _ahead:
+        _ahead[layout] = _executor.submit(_arrays_of, layout)
 
 
 _executor = ThreadPoolExecutor(1, "studio outlines")
