@@ -793,7 +793,7 @@ class Session:
             self._version += 1
         self._frozen_result = self.result
         self._frozen = {"summary": summary_of(self.result), "settings": settings}
-        self._send_parts(is_freeze=True)
+        self._send_parts(is_freeze=True, is_followed=variant is not None)
         if variant is not None:
             self.result = current
             self._version += 1
@@ -943,11 +943,11 @@ class Session:
             "is_preview": result is not None and result.is_preview,
         })  # fmt: skip
 
-    def _send_parts(self, *, is_freeze: bool = False) -> None:
+    def _send_parts(self, *, is_freeze: bool = False, is_followed: bool = False) -> None:
         """
         Compute and send the parts that changed, until newer messages interrupt.
 
-        Those of a variant are complete.
+        Those of a variant are complete; those of the current state follow them.
         """
         if self.result is None:
             return
@@ -972,6 +972,7 @@ class Session:
                 "ms": times_ms,
                 "is_preview": self.is_preview,
                 "is_freeze": is_freeze,
+                "is_followed": is_followed,
             })  # fmt: skip
 
     def _line(self, error: BaseException) -> str:

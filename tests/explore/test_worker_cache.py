@@ -140,6 +140,7 @@ OTHERS = {
     "layout.mosaic": ["RB"],
     "layout.move_um": [2.0, 3.0],
     "gaze_um": [4.0, -3.0],
+    "gaze_path": [[0.0, 4.0, -3.0], [0.01, 8.0, 2.0]],
     "layout.edits": [{"kind": "rotate", "angle_deg": 10.0}, {"kind": "scale", "factor": 1.2}],
     "layout.rules": {"min_size_um": 0.2},
     "layout.source": "a paper",

@@ -180,9 +180,9 @@ def test_variant_is_shown_as_a(make_session):
     sent = [
         (header["part"], header["version"], arrays) for header, arrays in recorder.parts if header["part"] == "columns"
     ]
-    kinds = [(each["kind"], each.get("is_freeze")) for each in recorder.messages if each["kind"] == "done"]
+    kinds = [(each["is_freeze"], each["is_followed"]) for each in recorder.messages if each["kind"] == "done"]
 
-    assert kinds == [("done", True), ("done", False)]
+    assert kinds == [(True, True), (False, False)]
     # The page keeps the first ones as A, and shows the second ones.
     assert [np.array_equal(next(iter(arrays.values())), first) for _, _, arrays in sent] == [True, False]
     assert sent[0][1] < sent[1][1]

@@ -167,7 +167,7 @@ export class Connection {
     const isFailed = (message.kind === "error" && !message.part) || (message.kind === "state" && Object.keys(message.errors).length > 0);
     const isDone = message.kind === "done";
     if (message.kind === "busy") requests.isBusy = true;
-    else if (isDone || message.kind === "error" || isFailed) requests.isBusy = false;
+    else if (isDone || message.kind === "error" || isFailed) requests.isBusy = isDone && Boolean(message.is_followed);
     if (message.kind === "done") {
       requests.nDone++;
       requests.isPreview = Boolean(message.is_preview);
