@@ -94,7 +94,8 @@ interface State {
   film: FilmAbout | null; is_preview: boolean;
 }
 interface Done {
-  kind: "done"; id: number | null; version: number; ms: { [view: string]: number }; is_preview: boolean; is_freeze: boolean; is_followed: boolean;
+  kind: "done"; id: number | null; version: number; ms: { [view: string]: number }; is_preview: boolean; is_freeze: boolean;
+  is_followed: boolean;
 }
 interface Failure { kind: "error"; id: number | null; text: string; part?: string }
 interface TextMessage { kind: "text"; id: number; what: string; text: string; files: string[] }
