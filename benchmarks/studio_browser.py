@@ -40,6 +40,8 @@ TIMEOUT_MS = 120_000
 REST_S = 7.0
 #: Interval at which the memory of the server is printed.
 PRINT_S = 120.0
+#: Changes that take longer are printed.
+SLOW_S = 10.0
 LEAK_MIB = 200.0
 #: Time after which the soak test restarts the server, and the numbers of steps after which it duplicates the tab, refreshes the
 #: views, and compares the codes with those of the settings.
@@ -306,8 +308,12 @@ class Soak:
 
     def step(self, page: Page) -> None:
         """Make some changes."""
-        self.n_late += self.studio.send(random_messages(self.rng, self.studio, page), page=page)
+        messages, start_s = random_messages(self.rng, self.studio, page), time.monotonic()
+        self.n_late += self.studio.send(messages, page=page)
         self.n_steps += 1
+        if (time_s := time.monotonic() - start_s) > SLOW_S:
+            changed = ", ".join(f"{m['do']} {m.get('key', m.get('name', ''))} {m.get('value', '')}" for m in messages)
+            console.print(f"step {self.n_steps}: {time_s:.0f} s for {changed}")
 
     def refresh(self, page: Page) -> None:
         """Compare the views with those that the server sends again."""

@@ -16,6 +16,10 @@ from foveasim.studio._session import Start
 SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 TOKEN = "the-token-of-these-tests-0123456"
 TIMEOUT_MS = 60_000
+HAS_FOCUS = """(selector) => {
+  const element = document.activeElement, label = element?.labels?.[0]?.textContent ?? "";
+  return selector.startsWith("label=") ? label.startsWith(selector.slice(6)) : Boolean(element?.matches(selector));
+}"""
 #: A foveal colour sensor of 1,152 photosites with design rules.
 SHOT = yaml.safe_load("""
 scene:
@@ -137,3 +141,89 @@ def drop(page, name, content):
         for (const type of ["dragenter", "dragover", "drop"]) document.body.dispatchEvent(new DragEvent(type, { dataTransfer: data, bubbles: true, cancelable: true })); }""",
         [name, list(content)],
     )
+
+
+class Keys:
+    """A user without a mouse: reaches elements by Tab, and uses them by keys."""
+
+    def __init__(self, page):
+        self.page = page
+        page.on("filechooser", lambda chooser: None)  # otherwise the interception may start after the key
+        page.evaluate("() => { window.nPointed = 0; addEventListener('pointerdown', () => { nPointed++; }, true); }")
+
+    def press(self, *keys):
+        for key in keys:
+            self.page.keyboard.press(key)
+
+    def to(self, selector, *, n_most=400):
+        """Move the focus to an element, or to the field of a label: ``"label=..."``."""
+        for _ in range(n_most):
+            if self.page.evaluate(HAS_FOCUS, selector):
+                return
+            self.press("Tab")
+        raise AssertionError(f"Tab does not reach {selector}")
+
+    def use(self, selector):
+        """Press Enter on a button."""
+        self.to(selector)
+        self.press("Enter")
+        self.wait()
+
+    def type_in(self, selector, text):
+        """Replace the text of a field."""
+        self.to(selector)
+        self.press("Control+a")
+        self.page.keyboard.type(text)
+
+    def enter(self, selector, text):
+        """Replace the text of a field, and press Enter."""
+        self.type_in(selector, text)
+        self.press("Enter")
+        self.wait()
+
+    def choose(self, selector, label):
+        """Select an option by the first letters of its label."""
+        self.to(selector)
+        self.page.keyboard.type(label, delay=10)
+        self.wait()
+        chosen = self.page.evaluate("() => document.activeElement.selectedOptions[0].label")
+        assert chosen.startswith(label), f"{selector}: {chosen} instead of {label}"
+
+    def set(self, key, text):
+        """Enter the value of a control."""
+        self.enter(f".control[data-key='{key}'] input[type=text]", text)
+
+    def show(self, *names):
+        """Show exactly these tiles."""
+        for name in self.page.evaluate("() => [...document.querySelectorAll('#tabs button')].map((b) => b.dataset.tile)"):
+            button = f"#tabs button[data-tile={name}]"
+            if (name in names) != (self.page.get_attribute(button, "aria-pressed") == "true"):
+                self.use(button)
+
+    def menu(self, selector):
+        """Move to an entry of the menu of files."""
+        self.use("#file")
+        for _ in range(20):
+            if self.page.evaluate(HAS_FOCUS, selector):
+                return
+            self.press("ArrowDown")
+        raise AssertionError(f"the menu has no {selector}")
+
+    def download(self, selector, path):
+        """Store a file of the menu."""
+        self.menu(selector)
+        with self.page.expect_download() as found:
+            self.press("Enter")
+        found.value.save_as(path)
+        return path
+
+    def wait(self):
+        """Wait until the page shows the answer, and no key waits for a rest."""
+        until(
+            self.page,
+            "() => studio.isReady && studio.connection.requests.doneId >= studio.connection.requests.lastId",
+        )
+
+    @property
+    def n_pointed(self):
+        return self.page.evaluate("nPointed")

@@ -548,6 +548,9 @@ def test_restarted_server_restores_state(browser, tmp_path, visit):
         before = codes(page)
         own.stop()
         until(page, "() => document.body.classList.contains('offline')")
+        # Several attempts fail; a view that is not loaded yet is shown later.
+        page.click("#tabs button[data-tile=snr]")
+        until(page, "() => studio.connection.delay > 1000")
         control(page, "optics.f_number").fill("4")
         control(page, "optics.f_number").press("Enter")
         own.start()
@@ -561,6 +564,7 @@ def test_restarted_server_restores_state(browser, tmp_path, visit):
         )
         change(page, "() => { studio.connection.set('optics.f_number', 2.8, true); }")
         assert np.array_equal(codes(page), before)
+        until(page, "() => document.querySelector('#tile-snr canvas')")
         page.reload()
         settle(page)
         assert setting(page, "exposure_s") == 0.007

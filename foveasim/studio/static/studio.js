@@ -304,7 +304,10 @@ let startPage = null;
 // Shows the start page, whose module is loaded when it is first shown.
 async function openStart(options = {}) {
   startPage ||= import("./start_page.js").then(({ StartPage }) => new StartPage(connection, () => page.held.states.at(-1) || page.state));
-  await (await startPage).open(options);
+  try { await (await startPage).open(options); } catch (error) {
+    startPage = null;  // without a server
+    notice("The start page cannot be shown: " + (error instanceof Error ? error.message : error));
+  }
 }
 
 /** @param {Preset[]} presets */

@@ -35,7 +35,10 @@ export class Views {
   describe(list) {
     // A server that was started again counts from the beginning.
     for (const part of Object.values(this.parts)) part.version = -1;
-    if (this.list.length) return;
+    if (this.list.length) {
+      this._load();  // what could not be loaded without a server
+      return;
+    }
     this.list = list;
     /** @type {unknown} */
     let chosen;
@@ -110,7 +113,10 @@ export class Views {
     names.forEach((name, i) => {
       const result = modules[i], root = document.getElementById("tile-" + name);
       try {
-        if (result.status === "rejected") throw result.reason;
+        if (result.status === "rejected") {
+          delete this.made[name];  // until the next connection
+          throw result.reason;
+        }
         this.made[name] = result.value.create(root, this.studio);
       } catch (error) {
         this._explain(name, error);
