@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -312,7 +313,9 @@ class Soak:
         self.n_late += self.studio.send(messages, page=page)
         self.n_steps += 1
         if (time_s := time.monotonic() - start_s) > SLOW_S:
-            changed = ", ".join(f"{m['do']} {m.get('key', m.get('name', ''))} {m.get('value', '')}" for m in messages)
+            changed = ", ".join(
+                f"{m['do']} {m.get('key', m.get('name', ''))} {m.get('value', '')}"[:60] for m in messages
+            )
             console.print(f"step {self.n_steps}: {time_s:.0f} s for {changed}")
 
     def refresh(self, page: Page) -> None:
@@ -374,6 +377,7 @@ class Soak:
 
 def soak(studio: Studio, report: Report, minutes: float, seed: int, out: Path) -> None:
     """Make random changes, and add memory, console messages, stale views and differences of codes to the report."""
+    warnings.simplefilter("ignore")  # of random settings
     run = Soak(studio, seed)
     console.print(
         f"after every view, preset and choice: server {run.first_mib[0]:.0f} MiB, page {run.first_mib[1]:.0f} MiB; seed {seed}"

@@ -16,9 +16,14 @@ from foveasim.studio._session import Start
 SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 TOKEN = "the-token-of-these-tests-0123456"
 TIMEOUT_MS = 60_000
-HAS_FOCUS = """(selector) => {
-  const element = document.activeElement, label = element?.labels?.[0]?.textContent ?? "";
-  return selector.startsWith("label=") ? label.startsWith(selector.slice(6)) : Boolean(element?.matches(selector));
+#: Whether an element, or the field of a label, has the focus (0), or follows what has it (1) or not (-1).
+DIRECTION = """(selector) => {
+  const text = selector.startsWith("label=") ? selector.slice(6) : null, { activeElement } = document;
+  const all = text === null ? [...document.querySelectorAll(selector)]
+    : [...document.querySelectorAll("label")].filter((label) => label.textContent.startsWith(text)).map((label) => label.control);
+  if (all.includes(activeElement)) return 0;
+  const target = all.find((element) => element.checkVisibility()) || document.body;
+  return activeElement.compareDocumentPosition(target) & Node.DOCUMENT_POSITION_PRECEDING ? -1 : 1;
 }"""
 #: A foveal colour sensor of 1,152 photosites with design rules.
 SHOT = yaml.safe_load("""
@@ -155,12 +160,13 @@ class Keys:
         for key in keys:
             self.page.keyboard.press(key)
 
-    def to(self, selector, *, n_most=400):
+    def to(self, selector):
         """Move the focus to an element, or to the field of a label: ``"label=..."``."""
-        for _ in range(n_most):
-            if self.page.evaluate(HAS_FOCUS, selector):
+        for _ in range(400):
+            direction = self.page.evaluate(DIRECTION, selector)
+            if direction == 0:
                 return
-            self.press("Tab")
+            self.press("Tab" if direction > 0 else "Shift+Tab")
         raise AssertionError(f"Tab does not reach {selector}")
 
     def use(self, selector):
@@ -195,7 +201,9 @@ class Keys:
 
     def show(self, *names):
         """Show exactly these tiles."""
-        for name in self.page.evaluate("() => [...document.querySelectorAll('#tabs button')].map((b) => b.dataset.tile)"):
+        for name in self.page.evaluate(
+            "() => [...document.querySelectorAll('#tabs button')].map((b) => b.dataset.tile)"
+        ):
             button = f"#tabs button[data-tile={name}]"
             if (name in names) != (self.page.get_attribute(button, "aria-pressed") == "true"):
                 self.use(button)
@@ -204,7 +212,7 @@ class Keys:
         """Move to an entry of the menu of files."""
         self.use("#file")
         for _ in range(20):
-            if self.page.evaluate(HAS_FOCUS, selector):
+            if self.page.evaluate(DIRECTION, selector) == 0:
                 return
             self.press("ArrowDown")
         raise AssertionError(f"the menu has no {selector}")

@@ -13,7 +13,7 @@ pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
 from reference.accessibility import violations
-from studio.page_tools import change, codes, drop, set_value, setting, settle, until
+from studio.page_tools import Keys, change, codes, drop, set_value, setting, settle, until
 from studio.test_sources_page import film, ready, video
 
 from foveasim.config import read_shot
@@ -391,51 +391,31 @@ def test_path_survives_reload_and_restart(visit, server):
 
 def test_path_works_by_keyboard(visit):
     page = visit()
-    start = gaze(page)
-
-    def focus_by_tab(selector):
-        for _ in range(200):
-            if page.evaluate("selector => document.activeElement.matches(selector)", selector):
-                return
-            page.keyboard.press("Tab")
-        raise AssertionError(f"no focus on {selector}")
-
-    page.evaluate("() => document.getElementById('help').focus()")
-    focus_by_tab("#gaze-path")
-    page.keyboard.press("Enter")
-    focus_by_tab("#gaze .record")
-    page.keyboard.press("Enter")
-    focus_by_tab("#scene .marks")
+    keys, start = Keys(page), gaze(page)
+    keys.use("#gaze-path")
+    keys.use("#gaze .record")
+    keys.to("#scene .marks")
     for key in ("ArrowRight", "ArrowRight", "ArrowUp"):
         page.wait_for_timeout(150)
-        page.keyboard.press(key)
-    for _ in range(4):
-        page.keyboard.press("Shift+Tab")
-        if page.evaluate("document.activeElement.matches('#gaze .record')"):
-            break
-    page.evaluate("() => document.querySelector('#gaze .record').focus()")
-    page.keyboard.press("Enter")
+        keys.press(key)
+    keys.use("#gaze .record")
     at_rest(page)
     rows = np.array(path_of(page))
     moved = rows[-1, 1:] - start
     assert moved[0] > 0
     assert moved[0] == pytest.approx(2 * moved[1], rel=0.01)
-    focus_by_tab("#gaze [aria-label='Play the gaze path']")
-    page.keyboard.press("Enter")
+    keys.use("#gaze [aria-label='Play the gaze path']")
     until(page, "() => !studio.gazePanel.film.isPlaying && studio.gazePanel.film.n > 0")
     at_rest(page)
-    focus_by_tab("#gaze [aria-label='Show the rows of the gaze path']")
-    page.keyboard.press("Enter")
-    focus_by_tab("[aria-label='Delete row 1']")
-    page.keyboard.press("Enter")
+    keys.use("#gaze [aria-label='Show the rows of the gaze path']")
+    keys.use("[aria-label='Delete row 1']")
     at_rest(page)
     assert len(path_of(page)) == len(rows) - 1
-    page.evaluate("() => document.getElementById('gaze-menu').focus()")
-    page.keyboard.press("Enter")
-    page.keyboard.press("End")
-    page.keyboard.press("Enter")
+    keys.use("#gaze-menu")
+    keys.press("End", "Enter")
     at_rest(page)
     assert path_of(page) is None
+    assert keys.n_pointed == 0
 
 
 @pytest.mark.slow(keep=1)

@@ -69,7 +69,10 @@ export class Files {
       this.wantsToken = action === "link";
       connection.send({ do: "text", what: "link" });
     }
-    else if (action === "save") $("save-dialog").showModal();
+    else if (action === "save") {
+      $("save-dialog").showModal();
+      $("save-name").select();
+    }
     else if (action === "diff" || action === "log") connection.send({ do: "text", what: action });
     else if (copy) connection.send({ do: "text", what: copy });
     else if (file) {

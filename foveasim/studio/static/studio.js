@@ -475,12 +475,12 @@ function showSelection() { views.tell("onSelection"); }
 
 // -- gaze -------------------------------------------------------------------------------------------------------------------
 
-// Moves the gaze by a distance from that at the start of the drag.
+// Moves the gaze by a distance from that at the start of the drag, or from the newest one, which may not be answered yet.
 /** @param {number} dx @param {number} dy @param {boolean} isFinal */
 function gaze(dx, dy, isFinal) {
   const key = "gaze_um", { map } = panes.b;
   /** @type {Point} */
-  const from = page.gazeAt || gazePanel.recordedAt || valueAt(page.state?.settings, key) || [0, 0];
+  const from = page.gazeAt || gazePanel.recordedAt || connection.unanswered.get(key)?.value || valueAt(page.state?.settings, key) || [0, 0];
   page.gazeAt = from;
   const digits = clamp(Math.ceil(Math.log10(map ? map.scale : 1)) + 1, 1, 4), [x, y] = from;
   const rounded = (/** @type {number} */ v) => Number(v.toFixed(digits));
