@@ -31,14 +31,15 @@ from rich.console import Console
 from studio import CHANGES, N_CHANGES, N_QUICK, SENSORS, SETTINGS, SHOWN_MS, start_server
 
 from foveasim.config import build_shot
+from foveasim.studio._costs import FORGET_S, RELEASE_S
 
 #: Arguments of Chromium: as installed for the latency; with WebGL by the processor for the soak test, which opens 3D views.
 #: Without its own sandbox, because containers have no user namespaces.
 INSTALLED = ("--no-sandbox",)
 WEBGL = (*INSTALLED, "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu-rasterization")
 TIMEOUT_MS = 120_000
-#: The server returns unused memory after a rest that is a little shorter.
-REST_S = 7.0
+#: The server releases the results of sessions without a page, and returns unused memory, after a rest that is a little shorter.
+REST_S = FORGET_S + RELEASE_S + 2.0
 #: Interval at which the memory of the server is printed.
 PRINT_S = 120.0
 #: Changes that take longer are printed.

@@ -357,11 +357,13 @@ class Session:
 
     def _forget_result(self) -> None:
         """
-        Release the memory of a session without a page.
+        Release the memory of a session without a page, also that of variants and of what was sent.
 
-        Its settings are simulated again for the next one.
+        Its settings are simulated again for the next one, which chooses the variants to compare.
         """
-        self.result = None
+        self.result = self._frozen = self._frozen_result = None
+        self._compared = {}
+        self._views.forget()
         self.engine.clear()
         release_memory()
 

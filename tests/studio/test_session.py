@@ -678,10 +678,19 @@ def test_session_without_page_releases_its_results(settings, monkeypatch):
         session.attach(messages.append)
         wait_until(is_done)
         code = session.result.capture.code
+        session.post({"do": "freeze"})
+        wait_until(lambda: session._frozen_result is not None)
+        session.post({"do": "variant", "action": "keep", "name": "one"})
+        wait_until(lambda: list(session.variants))
+        session.post({"do": "compare", "variants": [each.id for each in session.variants]})
+        wait_until(lambda: session._compared)
+        results = [session.result, session._frozen_result, *(found for _, found in session._compared.values())]
+        captures = [weakref.ref(each.capture) for each in results]
+        del results
         time.sleep(0.3)
         assert session.result is not None
         session.detach(messages.append)
-        wait_until(lambda: session.result is None)
+        wait_until(lambda: session.result is None and all(each() is None for each in captures))
         messages.clear()
         session.attach(messages.append)
         wait_until(is_done)
