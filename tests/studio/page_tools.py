@@ -190,10 +190,14 @@ class Keys:
     def choose(self, selector, label):
         """Select an option by the first letters of its label."""
         self.to(selector)
-        self.page.keyboard.type(label, delay=10)
-        self.wait()
-        chosen = self.page.evaluate("() => document.activeElement.selectedOptions[0].label")
-        assert chosen.startswith(label), f"{selector}: {chosen} instead of {label}"
+        for _ in range(5):
+            self.page.keyboard.type(label)
+            self.wait()
+            chosen = self.page.evaluate("() => document.activeElement.selectedOptions[0].label")
+            if chosen.startswith(label):
+                return
+            self.page.wait_for_timeout(1500)  # the browser took letters that came late for those of another label
+        raise AssertionError(f"{selector}: {chosen} instead of {label}")
 
     def set(self, key, text):
         """Enter the value of a control."""
