@@ -357,9 +357,10 @@ class Session:
 
     def _forget_result(self) -> None:
         """
-        Release the memory of a session without a page, also that of variants and of what was sent.
+        Release the memory of a session without a page.
 
-        Its settings are simulated again for the next one, which chooses the variants to compare.
+        Also that of variants and of what was sent. Its settings are simulated again for the next page, which chooses the
+        variants to compare.
         """
         self.result = self._frozen = self._frozen_result = None
         self._compared = {}
