@@ -359,10 +359,10 @@ class Session:
         """
         Release the memory of a session without a page.
 
-        Also that of variants and of what was sent. Its settings are simulated again for the next page, which chooses the
-        variants to compare.
+        Also that of variants and of what was sent. The settings and those of A are simulated again for the next page, which
+        chooses the other variants to compare.
         """
-        self.result = self._frozen = self._frozen_result = None
+        self.result = self._frozen_result = None
         self._compared = {}
         self._views.forget()
         self.engine.clear()
@@ -723,6 +723,7 @@ class Session:
                 self.gaze.forget()
                 if self.result is None:
                     self._send({"kind": "busy"})
+                    self._simulate_frozen()
                     try:
                         self._simulate(self.history.settings, can_stop=False)
                     except Exception as error:  # noqa: BLE001 -- shown at the settings
@@ -800,6 +801,15 @@ class Session:
         if variant is not None:
             self.result = current
             self._version += 1
+
+    def _simulate_frozen(self) -> None:
+        """Simulate A again, whose result was released; without its files it is removed."""
+        if self._frozen is None or self._frozen_result is not None:
+            return
+        try:
+            self._frozen_result = self.engine.simulate(self._frozen["settings"])
+        except FoveasimError:
+            self._frozen = None
 
     def _change_variant(self, message: dict[str, Any]) -> None:
         variant = message.get("variant")

@@ -106,10 +106,15 @@ def settle(page):
     )
 
 
+def answered(page):
+    """Wait until the page shows the answer to its last message."""
+    until(page, "() => studio.isReady && studio.connection.requests.doneId >= studio.connection.requests.lastId")
+
+
 def change(page, script, argument=None):
     """Run a script that sends messages, and wait for the answer to the last one."""
     page.evaluate(script, argument)
-    until(page, "() => studio.isReady && studio.connection.requests.doneId >= studio.connection.requests.lastId")
+    answered(page)
 
 
 def set_value(page, key, value):
@@ -221,6 +226,13 @@ class Keys:
             self.press("ArrowDown")
         raise AssertionError(f"the menu has no {selector}")
 
+    def open_file(self, path):
+        """Open a file by the menu."""
+        self.menu("[data-do=open]")
+        with self.page.expect_file_chooser() as chooser:
+            self.press("Enter")
+        chooser.value.set_files(path)
+
     def download(self, selector, path):
         """Store a file of the menu."""
         self.menu(selector)
@@ -230,11 +242,8 @@ class Keys:
         return path
 
     def wait(self):
-        """Wait until the page shows the answer, and no key waits for a rest."""
-        until(
-            self.page,
-            "() => studio.isReady && studio.connection.requests.doneId >= studio.connection.requests.lastId",
-        )
+        """Wait until the page shows the answer to the last key."""
+        answered(self.page)
 
     @property
     def n_pointed(self):

@@ -13,7 +13,7 @@ from PIL import Image
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
-from studio.page_tools import TOKEN, Server, change, codes, control, set_value, setting, settle, until
+from studio.page_tools import TOKEN, Server, answered, change, codes, control, set_value, setting, settle, until
 
 from foveasim.studio._session import Session
 
@@ -28,7 +28,7 @@ def field(page, key, value):
     box = control(page, key)
     box.fill(value)
     box.press("Enter")
-    until(page, "() => studio.isReady && studio.connection.requests.doneId >= studio.connection.requests.lastId")
+    answered(page)
 
 
 # -- problems -----------------------------------------------------------------------------------------------------------

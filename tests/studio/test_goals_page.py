@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
-from studio.page_tools import Server, change, setting, settle, until
+from studio.page_tools import Server, answered, change, setting, settle, until
 from studio.test_daily_page import field
 
 from foveasim.cli import app
@@ -32,7 +32,7 @@ def fill(page, tile, *, measure, value, limit="at least", region=None, annulus=N
     form.locator("select[aria-label=Condition]").select_option(label=limit)
     form.locator("input[aria-label=Value]").fill(str(value))
     form.locator("input[aria-label=Value]").press("Enter")
-    until(page, "() => studio.isReady && studio.connection.requests.doneId >= studio.connection.requests.lastId")
+    answered(page)
 
 
 def test_exposure_for_a_ratio_in_the_periphery(visit):

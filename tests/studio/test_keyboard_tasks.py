@@ -19,8 +19,6 @@ import foveasim as fs
 
 pytestmark = pytest.mark.needs("chromium")
 
-SNR = "signal-to-noise"
-
 
 @pytest.fixture
 def keys(visit):
@@ -45,10 +43,7 @@ def requirement(keys, tile, *, measure, value, limit, annulus=None, frequency=No
 def test_photograph_is_captured(keys):
     page = keys.page
     keys.show("histogram")
-    keys.menu("[data-do=open]")
-    with page.expect_file_chooser() as chooser:
-        keys.press("Enter")
-    chooser.value.set_files(Path(str(files("skimage.data") / "coffee.png")))
+    keys.open_file(Path(str(files("skimage.data") / "coffee.png")))
     until(page, "() => studio.state.settings.scene.picture.endsWith('coffee.png')")
     keys.wait()
     keys.press("Escape", "/")
@@ -171,7 +166,7 @@ def test_exposure_for_a_ratio_is_found(keys):
     keys.show("goal")
     page.wait_for_selector("#tile-goal select[aria-label=Result] option[value=snr]", state="attached")
     keys.choose("#tile-goal select[aria-label='Setting to change']", "exposure")
-    requirement(keys, "goal", measure=SNR, value=10, limit="equals", annulus=(500, 690))
+    requirement(keys, "goal", measure="signal-to-noise", value=10, limit="equals", annulus=(500, 690))
     until(page, "() => document.querySelector('#goal canvas')")
 
     assert "signal-to-noise ratio from 500 to 690 µm 10" in page.inner_text("#goal-text")
@@ -206,10 +201,7 @@ def test_hexagons_against_squares(keys):
 def test_gaze_is_recorded_over_video(keys, tmp_path):
     page = keys.page
     (tmp_path / "clip.mp4").write_bytes(video(tmp_path))
-    keys.menu("[data-do=open]")
-    with page.expect_file_chooser() as chooser:
-        keys.press("Enter")
-    chooser.value.set_files(tmp_path / "clip.mp4")
+    keys.open_file(tmp_path / "clip.mp4")
     until(page, "() => studio.state.film && !document.getElementById('film').hidden")
     keys.wait()
     keys.use("#gaze-path")

@@ -677,9 +677,11 @@ def test_session_without_page_releases_its_results(settings, monkeypatch):
     try:
         session.attach(messages.append)
         wait_until(is_done)
-        code = session.result.capture.code
         session.post({"do": "freeze"})
-        wait_until(lambda: session._frozen_result is not None)
+        session.post({"do": "set", "key": "exposure_s", "value": 0.002, "final": True})
+        wait_until(lambda: session.history.settings["exposure_s"] == 0.002 and session.result.shot.exposure_s == 0.002)
+        code, frozen_code = session.result.capture.code, session._frozen_result.capture.code
+        assert not np.array_equal(code, frozen_code)
         session.post({"do": "variant", "action": "keep", "name": "one"})
         wait_until(lambda: list(session.variants))
         session.post({"do": "compare", "variants": [each.id for each in session.variants]})
@@ -695,6 +697,7 @@ def test_session_without_page_releases_its_results(settings, monkeypatch):
         session.attach(messages.append)
         wait_until(is_done)
         assert np.array_equal(session.result.capture.code, code)
+        assert np.array_equal(session._frozen_result.capture.code, frozen_code)
     finally:
         session.close()
 

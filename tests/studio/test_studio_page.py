@@ -16,6 +16,7 @@ pytest.importorskip("uvicorn")
 from studio.page_tools import (
     TIMEOUT_MS,
     Server,
+    answered,
     change,
     codes,
     control,
@@ -160,7 +161,7 @@ def test_violations_of_earlier_layout_vanish(visit):
     assert page.evaluate("nDrawn") == 1
     assert page.evaluate("studio.rules.traceOn(studio.panes.b.sites)") is None
     page.click("[data-tile=rules]")
-    until(page, "() => studio.isReady && studio.connection.requests.doneId >= studio.connection.requests.lastId")
+    answered(page)
     assert page.evaluate("studio.rules.sites === studio.panes.b.sites")
 
 
@@ -298,7 +299,7 @@ def test_slider_back_at_start_is_released(visit):
     page.evaluate("""() => { const slider = document.querySelector(".control[data-key='optics.f_number'] input[type=range]"), start = slider.value;
       for (const value of [Number(start) + 50, start]) { slider.value = value; slider.dispatchEvent(new Event("input", { bubbles: true })); }
       slider.dispatchEvent(new PointerEvent("pointerup", { bubbles: true })); }""")
-    until(page, "() => studio.isReady && studio.connection.requests.doneId >= studio.connection.requests.lastId")
+    answered(page)
     assert setting(page, "optics.f_number") == 2.8
     assert page.is_disabled("#undo")
     change(page, "() => { studio.connection.set('optics.f_number', 5.6, true); }")
@@ -545,12 +546,16 @@ def test_restarted_server_restores_state(browser, tmp_path, visit):
         page = visit(is_checked=False, address=own.address)
         settle(page)
         set_value(page, "exposure_s", 0.007)
-        before = codes(page)
+        before, gaze_um = codes(page), setting(page, "gaze_um")
         own.stop()
         until(page, "() => document.body.classList.contains('offline')")
         # Several attempts fail; a view that is not loaded yet is shown later.
         page.click("#tabs button[data-tile=snr]")
+        page.click("#start-open")
+        page.locator("#scene .marks").press("ArrowUp")
+        page.locator("#scene .marks").press("ArrowUp")
         until(page, "() => studio.connection.delay > 1000")
+        assert "the server does not answer" in page.inner_text("#notice")
         control(page, "optics.f_number").fill("4")
         control(page, "optics.f_number").press("Enter")
         own.start()
@@ -562,9 +567,18 @@ def test_restarted_server_restores_state(browser, tmp_path, visit):
             page,
             "() => !document.body.classList.contains('offline') && studio.connection.requests.doneId >= studio.connection.requests.lastId",
         )
+        # Each arrow key counted, also without a server.
+        assert setting(page, "gaze_um")[1] > gaze_um[1]
+        page.locator("#scene .marks").press("ArrowDown")
+        page.locator("#scene .marks").press("ArrowDown")
+        answered(page)
+        assert setting(page, "gaze_um") == pytest.approx(gaze_um, abs=0.2)
+        set_value(page, "gaze_um", gaze_um)
         change(page, "() => { studio.connection.set('optics.f_number', 2.8, true); }")
         assert np.array_equal(codes(page), before)
         until(page, "() => document.querySelector('#tile-snr canvas')")
+        page.click("#start-open")
+        until(page, "() => document.querySelectorAll('#start .card').length > 0")
         page.reload()
         settle(page)
         assert setting(page, "exposure_s") == 0.007

@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
-from studio.page_tools import Server, change, set_value, setting, until
+from studio.page_tools import Server, answered, change, set_value, setting, until
 
 pytestmark = pytest.mark.needs("chromium")
 
@@ -22,7 +22,6 @@ FINE = {
     "parameters": {"n_columns": 60, "n_rows": 68, "pitch_um": 15.0},
     "mosaic": ["RG", "GB"],
 }
-DONE = "() => studio.isReady && studio.connection.requests.doneId >= studio.connection.requests.lastId"
 
 
 def keep(page, name):
@@ -32,7 +31,7 @@ def keep(page, name):
 
 
 def cells(page):
-    until(page, DONE)
+    answered(page)
     found = page.locator("#comparison tr[data-name]").evaluate_all(
         "all => all.map((row) => [row.dataset.name, [...row.querySelectorAll('td')].map((cell) => cell.textContent)])"
     )

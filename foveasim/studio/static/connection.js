@@ -259,6 +259,10 @@ export class Connection {
     return id;
   }
 
+  // The newest final value of a setting that is not answered; undefined without one.
+  /** @type {(key: string) => any} */
+  pending(key) { return this.unsent.get(key) ?? this.unanswered.get(key)?.value; }
+
   // Removes a value, with its default after that.
   /** @param {string} key */
   remove(key) {

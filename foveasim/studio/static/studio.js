@@ -304,9 +304,11 @@ let startPage = null;
 // Shows the start page, whose module is loaded when it is first shown.
 async function openStart(options = {}) {
   startPage ||= import("./start_page.js").then(({ StartPage }) => new StartPage(connection, () => page.held.states.at(-1) || page.state));
-  try { await (await startPage).open(options); } catch (error) {
-    startPage = null;  // without a server
-    notice("The start page cannot be shown: " + (error instanceof Error ? error.message : error));
+  const shown = await startPage.catch(() => null);
+  if (shown) await shown.open(options);
+  else {
+    startPage = null;
+    notice("The start page cannot be shown: the server does not answer");
   }
 }
 
@@ -480,7 +482,7 @@ function showSelection() { views.tell("onSelection"); }
 function gaze(dx, dy, isFinal) {
   const key = "gaze_um", { map } = panes.b;
   /** @type {Point} */
-  const from = page.gazeAt || gazePanel.recordedAt || connection.unanswered.get(key)?.value || valueAt(page.state?.settings, key) || [0, 0];
+  const from = page.gazeAt || gazePanel.recordedAt || connection.pending(key) || valueAt(page.state?.settings, key) || [0, 0];
   page.gazeAt = from;
   const digits = clamp(Math.ceil(Math.log10(map ? map.scale : 1)) + 1, 1, 4), [x, y] = from;
   const rounded = (/** @type {number} */ v) => Number(v.toFixed(digits));
