@@ -1,5 +1,5 @@
 """
-Counter-based random numbers, and positions of points in outlines.
+Counter-based random numbers, moments of outlines, and positions of points in them.
 
 A Philox generator maps a counter and a key to random words: J. K. Salmon, M. A. Moraes, R. O. Dror and D. E. Shaw, Parallel
 random numbers: as easy as 1, 2, 3 (SC11), section 3.3. All generators use ten rounds. Words of 32 bits are stored in 64-bit
@@ -178,6 +178,30 @@ def add_normals(values, deviation, key):
             sigma = deviation[first : first + BATCH]
             for j in range(part.size):
                 part[j] += sigma[j] * np.float64(normals[j])
+
+
+@njit(types.void(_points, _ints, types.float64[::1], types.float64[:, ::1]))
+def ring_moments(xy, ring_offsets, area, moment):
+    """
+    Store the signed area and the first moments of every ring, (n_ring,) and (n_ring, 2).
+
+    Computed relative to the first vertex of each ring.
+    """
+    for ring in range(area.size):
+        first, last = ring_offsets[ring], ring_offsets[ring + 1]
+        x0, y0 = xy[first, 0], xy[first, 1]
+        x, y = 0.0, 0.0
+        twice, moment_x, moment_y = 0.0, 0.0, 0.0
+        for k in range(first + 1, last):
+            next_x, next_y = xy[k, 0] - x0, xy[k, 1] - y0
+            cross = x * next_y - y * next_x
+            twice += cross
+            moment_x += (x + next_x) * cross
+            moment_y += (y + next_y) * cross
+            x, y = next_x, next_y
+        area[ring] = 0.5 * twice
+        moment[ring, 0] = moment_x / 6.0 + x0 * area[ring]
+        moment[ring, 1] = moment_y / 6.0 + y0 * area[ring]
 
 
 @njit(types.int64[::1](_points, _ints, _ints, _points, _points))

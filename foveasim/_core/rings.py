@@ -35,6 +35,8 @@ TIE_FRACTION = 1e-6
 
 #: Turning angles (rad) below this may be rounding errors.
 MIN_TURN_RAD = 1e-12
+#: Moments of this number of vertices are computed by a kernel: the import of numba takes longer than those of fewer.
+KERNEL_VERTICES = 1 << 14
 
 
 def next_vertex(ring_offsets: Ints) -> Ints:
@@ -124,6 +126,12 @@ def ring_moments(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Floats]:
     if ring_offsets.size == 1:
         return np.zeros(0), np.zeros((0, 2))
     starts = ring_offsets[:-1]
+    if xy_um.shape[0] >= KERNEL_VERTICES:
+        from foveasim._core import _kernels
+
+        area_um2, moment_um3 = np.empty(starts.size), np.empty((starts.size, 2))
+        _kernels.ring_moments(np.ascontiguousarray(xy_um), np.ascontiguousarray(ring_offsets), area_um2, moment_um3)
+        return area_um2, moment_um3
     x, y, x_after, y_after = _local_edges(xy_um, ring_offsets)
     cross = x * y_after - y * x_after
     area_um2 = 0.5 * np.add.reduceat(cross, starts)
@@ -190,8 +198,10 @@ def site_moments(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> tuple
     if site_offsets.size == 1:
         return np.zeros(0), np.zeros((0, 2))
     area_um2, moment_um3 = ring_moments(xy_um, ring_offsets)
-    site_area = np.add.reduceat(area_um2, site_offsets[:-1])
-    return site_area, np.add.reduceat(moment_um3, site_offsets[:-1], axis=0) / site_area[:, np.newaxis]
+    if ring_offsets.size > site_offsets.size:  # sites with several rings
+        area_um2 = np.add.reduceat(area_um2, site_offsets[:-1])
+        moment_um3 = np.add.reduceat(moment_um3, site_offsets[:-1], axis=0)
+    return area_um2, moment_um3 / area_um2[:, np.newaxis]
 
 
 def site_area_um2(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> Floats:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import shapely
 
 from foveasim._core.calls import NOT_NEGATIVE
 from foveasim._core.rings import next_vertex
+from foveasim._core.validation import Floats, Ints
 from foveasim.layout.model import Layout
 
 if TYPE_CHECKING:
@@ -58,12 +58,7 @@ def adjacency(layout: Layout, *, max_gap_um: Annotated[float, NOT_NEGATIVE] = TO
 
     from foveasim.layout import _kernels
 
-    box = layout.site_bounds_um
-    reach = box + max(max_gap_um, TOUCHING_UM) * np.array([-0.5, -0.5, 0.5, 0.5])
-    boxes = shapely.box(*reach.T)
-    a, b = shapely.STRtree(boxes).query(boxes)
-    is_first = a < b
-    a, b = a[is_first], b[is_first]
+    a, b = near_boxes(layout.site_bounds_um, max(max_gap_um, TOUCHING_UM))
     length_um = _kernels.shared_lengths(
         layout.xy_um,
         next_vertex(layout.ring_offsets),
@@ -77,3 +72,19 @@ def adjacency(layout: Layout, *, max_gap_um: Annotated[float, NOT_NEGATIVE] = TO
     n = layout.n_sites
     both = (np.concatenate((length_um, length_um)), (np.concatenate((a, b)), np.concatenate((b, a))))
     return coo_array(both, shape=(n, n)).tocsr()
+
+
+def near_boxes(box_um: Floats, reach_um: float | Floats) -> tuple[Ints, Ints]:
+    """
+    Return the pairs of boxes (n, 4) that are at most ``reach_um`` apart.
+
+    ``reach_um``: of all, or (n,) of each; then pairs are at most the mean of both apart. The first of a pair is the lower one;
+    pairs are ordered by the first, then the second.
+    """
+    from foveasim.layout import _kernels
+
+    half_um = np.broadcast_to(0.5 * np.asarray(reach_um), box_um.shape[:1])[:, np.newaxis]
+    grown_um = np.concatenate((box_um[:, :2] - half_um, box_um[:, 2:] + half_um), axis=1)
+    pairs = _kernels.intersecting_boxes(grown_um, np.argsort(grown_um[:, 0]))
+    first, second = np.divmod(np.sort(pairs), max(box_um.shape[0], 1))
+    return first, second

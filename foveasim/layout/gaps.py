@@ -10,7 +10,7 @@ import shapely
 from foveasim._core.rings import next_vertex, positions_in_runs, site_area_um2, site_bounds_um
 from foveasim._core.validation import Bools, Floats, Ints, freeze
 from foveasim.fields import PackedRings
-from foveasim.layout.adjacency import TOUCHING_UM
+from foveasim.layout.adjacency import TOUCHING_UM, near_boxes
 from foveasim.layout.lattice import RectangleLattice
 from foveasim.layout.model import Layout
 
@@ -47,17 +47,14 @@ def edge_gaps_um(layout: PackedRings, sites: Ints | None = None) -> Floats:
     xy_um, ring_offsets, site_offsets = layout.xy_um, layout.ring_offsets, layout.site_offsets
     sites = np.arange(site_offsets.size - 1) if sites is None else sites
     limit_um = MAX_GAP_FRACTION * np.sqrt(site_area_um2(xy_um, ring_offsets, site_offsets)) + TOUCHING_UM
-    reach_um = 0.5 * limit_um[sites, np.newaxis] * np.array([-1.0, -1.0, 1.0, 1.0])
-    boxes = shapely.box(*(site_bounds_um(xy_um, ring_offsets, site_offsets)[sites] + reach_um).T)
-    first, second = shapely.STRtree(boxes).query(boxes)
-    is_other = first != second
+    first, second = near_boxes(site_bounds_um(xy_um, ring_offsets, site_offsets)[sites], limit_um[sites])
     gap_um = np.full(xy_um.shape[0], np.inf)
     _kernels.edge_gaps(
         xy_um,
         next_vertex(ring_offsets),
         ring_offsets[site_offsets],
-        sites[first[is_other]],
-        sites[second[is_other]],
+        sites[np.concatenate((first, second))],
+        sites[np.concatenate((second, first))],
         limit_um,
         TOUCHING_UM,
         gap_um,

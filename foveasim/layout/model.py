@@ -17,6 +17,7 @@ from foveasim._core.names import possible_names
 from foveasim._core.provenance import copy_plain_data
 from foveasim._core.rings import (
     are_convex,
+    from_frame,
     next_vertex,
     positions_in_runs,
     ring_area_um2,
@@ -535,7 +536,9 @@ class Layout:
         step = f"translated by ({dx_um:g}, {dy_um:g}) µm"
         if self.lattice is not None:
             return derived(self, step, self.lattice.scaled(1.0, shift_um))
-        return derived(self, step, (self.xy_um + shift_um, self.ring_offsets, self.site_offsets))
+        return derived(
+            self, step, (freeze(from_frame(self.xy_um, shift_um, 1.0)), self.ring_offsets, self.site_offsets)
+        )
 
     def centre(self) -> Layout:
         """Translate the layout so that the centre of its bounding box is at the origin."""
@@ -615,7 +618,7 @@ def layout_of(
     provenance: Mapping[str, Any] | None = None,
 ) -> Layout:
     """Return a layout of valid sites, by default of one ring each, without checks of holes."""
-    site_offsets = np.arange(ring_offsets.size) if site_offsets is None else site_offsets
+    site_offsets = freeze(np.arange(ring_offsets.size)) if site_offsets is None else site_offsets
     layout = object.__new__(Layout)
     fields = (xy_um, ring_offsets, site_offsets, columns or {}, provenance or {})
     for name, value in zip((*RINGS, "columns", "provenance"), fields, strict=True):

@@ -13,10 +13,16 @@ _points = types.Array(types.float64, 2, "C", readonly=True)
 _ids = types.Array(types.int32, 2, "C", readonly=True)
 _colours = types.Array(types.float32, 2, "C", readonly=True)
 _encoded = types.Array(types.uint8, 1, "C", readonly=True)
+_light = types.Array(types.float32, 3, "C", readonly=True)
 _bits = types.Array(types.uint64, 2, "C", readonly=True)
 #: Odd multipliers of hashes: 2⁶⁴ divided by the golden ratio, and a prime of xxHash64.
 _MIX, _PRIME = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F)
 _HALF_WORD = np.uint64(32)
+_ZERO, _HALF, _ONE, _BYTES = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(255.0)
+#: Places of a hash table that are read at once.
+LOOKAHEAD = 64
+#: More edges of one position are sorted.
+MANY_EDGES = 16
 #: Samples over a shorter length than this are at one position.
 MIN_LENGTH = 1e-200
 
@@ -142,6 +148,27 @@ def blend(ids, colours, encoded, n_samples, has_boundaries, first_row, band):
             band[row, column, 3] = (255 * n + n_samples * n_samples // 2) // (n_samples * n_samples)
 
 
+@njit(types.void(_light, types.Array(types.float32, 2, "C", readonly=True), _encoded, types.uint8[:, :, ::1]))
+def encode_pixels(light, coverage, encoded, pixels):
+    """
+    Store linear light and coverage as bytes (n_y, n_x, 4), top row first.
+
+    ``light``: (1 or 3, n_y, n_x). Light and coverage are limited to 0 to 1, NaN is 0. ``encoded`` is the byte of each of
+    evenly spaced levels from 0 to 1.
+    """
+    n_y, n_x = coverage.shape
+    n_levels = np.float32(encoded.size - 1)
+    for row in range(n_y):
+        for channel in range(3):
+            part = light[min(channel, light.shape[0] - 1), n_y - 1 - row]
+            for column in range(n_x):
+                level = part[column] * n_levels
+                pixels[row, column, channel] = encoded[int(min(level, n_levels)) if level > _ZERO else 0]
+        for column in range(n_x):
+            covered = min(max(coverage[n_y - 1 - row, column], _ZERO), _ONE)
+            pixels[row, column, 3] = int(_BYTES * covered + _HALF)
+
+
 @njit(types.float64[::1](_points, _ints, _ints))
 def smallest_fan_triangles(xy, first, end):
     """
@@ -187,19 +214,29 @@ def number_points(bits, position, first):
     first point of each number to ``first``.
     """
     table = np.full(_table_size(bits.shape[0]), -1, np.int32)
+    places, entries = np.empty(LOOKAHEAD, np.int64), np.empty(LOOKAHEAD, np.int32)
     n_found = 0
-    for i in range(bits.shape[0]):
-        at = _slot(bits[i, 0], bits[i, 1], table.size - 1)
-        while table[at] >= 0:
-            known = first[table[at]]
-            if bits[known, 0] == bits[i, 0] and bits[known, 1] == bits[i, 1]:
-                break
-            at = (at + 1) & (table.size - 1)
-        if table[at] < 0:
-            table[at] = n_found
-            first[n_found] = i
-            n_found += 1
-        position[i] = table[at]
+    for begin in range(0, bits.shape[0], LOOKAHEAD):
+        n = min(LOOKAHEAD, bits.shape[0] - begin)
+        for k in range(n):
+            places[k] = _slot(bits[begin + k, 0], bits[begin + k, 1], table.size - 1)
+        for k in range(n):  # without branches: the processor waits for all of them at once
+            entries[k] = table[places[k]]
+        for k in range(n):
+            i, at, entry = begin + k, places[k], entries[k]
+            if entry < 0:  # unless one of the points before is there now
+                entry = table[at]
+            while entry >= 0:
+                known = first[entry]
+                if bits[known, 0] == bits[i, 0] and bits[known, 1] == bits[i, 1]:
+                    break
+                at = (at + 1) & (table.size - 1)
+                entry = table[at]
+            if entry < 0:
+                table[at] = entry = n_found
+                first[n_found] = i
+                n_found += 1
+            position[i] = entry
     return n_found
 
 
@@ -210,29 +247,41 @@ def outer_edges(position, ring_offsets):
 
     ``position``: number of each vertex of the rings, equal where the vertices are.
     """
-    table = np.full(_table_size(position.size), -1, np.int32)
-    ends = np.empty((position.size, 2), np.int64)
-    counts = np.zeros(position.size, np.int32)
-    n_found = 0
-    for ring in range(ring_offsets.size - 1):
-        for v in range(ring_offsets[ring], ring_offsets[ring + 1]):
-            following = v + 1 if v + 1 < ring_offsets[ring + 1] else ring_offsets[ring]
-            a, b = position[v], position[following]
-            low, high = min(a, b), max(a, b)
-            at = _slot(np.uint64(low), np.uint64(high), table.size - 1)
-            while table[at] >= 0:
-                known = table[at]
-                if min(ends[known, 0], ends[known, 1]) == low and max(ends[known, 0], ends[known, 1]) == high:
-                    break
-                at = (at + 1) & (table.size - 1)
-            if table[at] < 0:
-                table[at] = n_found
-                ends[n_found, 0], ends[n_found, 1] = a, b
-                n_found += 1
-            counts[table[at]] += 1
-    n_outer = 0
-    for k in range(n_found):
-        if counts[k] == 1:
-            ends[n_outer, 0], ends[n_outer, 1] = ends[k, 0], ends[k, 1]
-            n_outer += 1
-    return ends[:n_outer].copy()
+    n_edges, n_positions = position.size, 0
+    for v in range(n_edges):
+        n_positions = max(n_positions, position[v] + 1)
+    # The edges by their lower position: twice the higher one, and 1 if it is the first one. The numbers of edges of each
+    # lower position, then their ends.
+    end, edges = np.zeros(n_positions + 1, np.int64), np.empty(n_edges, np.int64)
+    for is_filling in range(2):
+        for ring in range(ring_offsets.size - 1):
+            a = position[ring_offsets[ring + 1] - 1]
+            for v in range(ring_offsets[ring], ring_offsets[ring + 1]):
+                b = position[v]
+                low = min(a, b)
+                if is_filling:
+                    edges[end[low]] = 2 * max(a, b) + (a > b)
+                    end[low] += 1
+                else:
+                    end[low + 1] += 1
+                a = b
+        if not is_filling:
+            for low in range(n_positions):
+                end[low + 1] += end[low]
+    outer, n_outer, begin = np.empty((n_edges, 2), np.int64), 0, 0
+    for low in range(n_positions):
+        is_sorted = end[low] - begin > MANY_EDGES  # such as those at the centre of sectors
+        if is_sorted:
+            edges[begin : end[low]].sort()
+        for k in range(begin, end[low]):
+            high, n_equal = edges[k] >> 1, 0
+            for other in range(
+                max(begin, k - 1) if is_sorted else begin, min(k + 2, end[low]) if is_sorted else end[low]
+            ):
+                n_equal += edges[other] >> 1 == high
+            if n_equal == 1:
+                outer[n_outer, 0] = high if edges[k] & 1 else low
+                outer[n_outer, 1] = low if edges[k] & 1 else high
+                n_outer += 1
+        begin = end[low]
+    return outer[:n_outer].copy()

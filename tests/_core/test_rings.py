@@ -12,7 +12,9 @@ from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from foveasim._core import _kernels
 from foveasim._core.rings import (
+    KERNEL_VERTICES,
     are_convex,
     collapse_short_edges,
     next_vertex,
@@ -75,6 +77,33 @@ def test_ring_moments_match_exact_arithmetic(nested):
 
     np.testing.assert_allclose(area_um2, [float(a) for a, _ in expected], rtol=1e-13, atol=1e-11)
     np.testing.assert_allclose(moment_um3, [[float(m) for m in ms] for _, ms in expected], rtol=1e-12, atol=1e-9)
+
+
+@given(sites)
+@relaxed
+def test_kernel_of_moments_matches_exact_arithmetic(nested):
+    xy_um, ring_offsets, _ = packed(nested)
+    n_rings = ring_offsets.size - 1
+    area_um2, moment_um3 = np.empty(n_rings), np.empty((n_rings, 2))
+    _kernels.ring_moments(xy_um, ring_offsets, area_um2, moment_um3)
+    expected = [exact_area_and_moment(ring) for site in nested for ring in site]
+
+    np.testing.assert_allclose(area_um2, [float(a) for a, _ in expected], rtol=1e-13, atol=1e-11)
+    np.testing.assert_allclose(moment_um3, [[float(m) for m in ms] for _, ms in expected], rtol=1e-12, atol=1e-9)
+
+
+def test_many_sites_have_moments_of_few():
+    ring_um = np.array([(0.0, 0.0), (4.0, 0.0), (4.0, 2.0), (0.0, 3.0)])
+    shift_um = np.random.default_rng(3).integers(-500, 500, (KERNEL_VERTICES, 2)).astype(float)
+    many_um = (ring_um + shift_um[:, np.newaxis]).reshape(-1, 2)
+    few_um, _ = ring_moments(ring_um, np.array([0, 4]))
+    area_um2, centroid_um = site_moments(
+        many_um, 4 * np.arange(shift_um.shape[0] + 1), np.arange(shift_um.shape[0] + 1)
+    )
+    _, (at_origin_um,) = site_moments(ring_um, np.array([0, 4]), np.array([0, 1]))
+
+    assert (area_um2 == few_um).all()
+    np.testing.assert_allclose(centroid_um - shift_um, np.broadcast_to(at_origin_um, shift_um.shape), rtol=1e-12)
 
 
 @given(rings)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import foveasim as fs
 from foveasim.errors import ParameterError
+from foveasim.layout.adjacency import near_boxes
 from foveasim.layout.model import layout_of
 
 TILINGS = {
@@ -123,3 +124,25 @@ def test_rotated_voronoi_cells_share_same_edges():
 
     assert abs(layout.rotate(30.0).adjacency() - layout.adjacency()).max() < 1e-9
     assert layout.check(fs.DesignRules(min_width_um=0.4)).ok
+
+
+@given(
+    st.lists(st.tuples(*[st.integers(-20, 20)] * 2, *[st.integers(0, 9)] * 2, st.integers(0, 6)), max_size=40),
+    st.booleans(),
+)
+@settings(max_examples=examples(60))
+def test_near_boxes_match_plain_loop(described, has_own_reach):
+    low = np.array([box[:2] for box in described], float).reshape(-1, 2)
+    side = np.array([box[2:4] for box in described], float).reshape(-1, 2)
+    boxes, reach = np.concatenate((low, low + side), axis=1), np.array([box[4] for box in described], float)
+    reach = reach if has_own_reach else np.full(len(described), 3.0)
+
+    first, second = near_boxes(boxes, reach if has_own_reach else 3.0)
+
+    expected = []
+    for i in range(len(described)):
+        for j in range(i + 1, len(described)):
+            gap = np.maximum(boxes[i, :2] - boxes[j, 2:], boxes[j, :2] - boxes[i, 2:]).max()
+            if gap <= 0.5 * (reach[i] + reach[j]):
+                expected.append((i, j))
+    assert list(zip(first.tolist(), second.tolist(), strict=True)) == expected

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import foveasim as fs
 from foveasim.studio._parts.sites import _boundary_of
-from foveasim.view._kernels import number_points, outer_edges, smallest_fan_triangles
+from foveasim.view._kernels import encode_pixels, number_points, outer_edges, smallest_fan_triangles
 from foveasim.view.web._shapes import shapes_of
 
 
@@ -38,7 +38,33 @@ def test_outer_edges_occur_once(rings):
 
     found = outer_edges(position, offsets)
 
-    assert [tuple(edge) for edge in found] == [edge for edge in edges if counts[frozenset(edge)] == 1]
+    assert sorted(map(tuple, found)) == sorted(edge for edge in edges if counts[frozenset(edge)] == 1)
+
+
+@pytest.mark.parametrize("n_sectors", [3, 16, 17, 40])
+def test_sectors_have_edges_at_their_circle(n_sectors):
+    # Sectors from a common centre, 0: only the chords from one corner to the next belong to a single sector.
+    corners = 1 + np.arange(n_sectors)
+    sectors = np.stack((np.zeros(n_sectors, np.int64), corners, np.roll(corners, -1)), axis=1)
+
+    found = outer_edges(sectors.ravel(), 3 * np.arange(n_sectors + 1))
+
+    assert sorted(map(tuple, found)) == sorted(map(tuple, sectors[:, 1:]))
+
+
+def test_pixels_are_bytes_of_light():
+    light = np.array([[[0.0, 0.25, 1.0], [np.nan, -3.0, 7.0]]], np.float32)
+    coverage = np.array([[0.0, 0.5, 1.0], [1.0, -1.0, 2.0]], np.float32)
+    pixels = np.empty((2, 3, 4), np.uint8)
+    encode_pixels(light, coverage, np.arange(5, dtype=np.uint8), pixels)
+    colours = np.concatenate((light, 2.0 * light, 0.5 * light))
+    coloured = np.empty((2, 3, 4), np.uint8)
+    encode_pixels(colours, coverage, np.arange(5, dtype=np.uint8), coloured)
+
+    assert pixels[::-1, :, 0].tolist() == [[0, 1, 4], [0, 0, 4]]  # levels of the table, top row first
+    assert (pixels[..., :3] == pixels[..., :1]).all()
+    assert pixels[::-1, :, 3].tolist() == [[0, 128, 255], [255, 0, 255]]
+    assert coloured[1].tolist() == [[0, 0, 0, 0], [1, 2, 0, 128], [4, 4, 2, 255]]
 
 
 @given(st.lists(st.tuples(st.floats(-9, 9), st.floats(-9, 9)), min_size=3, max_size=8))

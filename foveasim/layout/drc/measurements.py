@@ -17,7 +17,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property, parallel_map, thread_count
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.layout._noding import intersections, node_edges
-from foveasim.layout.adjacency import TOUCHING_UM
+from foveasim.layout.adjacency import TOUCHING_UM, near_boxes
 from foveasim.layout.drc.routing import Readout, Routing, track_demand
 from foveasim.layout.model import Layout
 
@@ -88,7 +88,7 @@ class Case:
         The boxes have the shape (n, 4). The pairs are ordered by site.
         """
         n = self.layout.n_sites
-        site, box = _near_pairs(np.concatenate((self.layout.site_bounds_um, box_um)), reach_um)
+        site, box = near_boxes(np.concatenate((self.layout.site_bounds_um, box_um)), reach_um)
         is_mixed = (site < n) & (box >= n)
         return box[is_mixed] - n, site[is_mixed]
 
@@ -121,7 +121,7 @@ class Case:
 
         layout = self.layout
         reach_um = max(float(self.rules.min_space_um or 0.0), 2.0 * TOUCHING_UM)
-        first, second = _near_pairs(layout.site_bounds_um, reach_um)
+        first, second = near_boxes(layout.site_bounds_um, reach_um)
         box = layout.site_bounds_um
         depth_um = AREA_ROUNDING * layout.area_um2 / np.hypot(box[:, 2] - box[:, 0], box[:, 3] - box[:, 1])
         overhang_um = _kernels.overhangs(layout.xy_um, self.after, self.first_vertex)
@@ -169,16 +169,6 @@ class Case:
 def _task_slices(n: int) -> list[slice]:
     """Return slices of pairs for several threads."""
     return [slice(start, start + PAIRS_PER_TASK) for start in range(0, max(n, 1), PAIRS_PER_TASK)]
-
-
-def _near_pairs(box_um: Floats, reach_um: float) -> tuple[Ints, Ints]:
-    """Return pairs of boxes at most ``reach_um`` apart, ordered by the first, then the second."""
-    from foveasim.layout import _kernels
-
-    grown_um = box_um + 0.5 * reach_um * np.array([-1.0, -1.0, 1.0, 1.0])
-    pairs = _kernels.intersecting_boxes(grown_um, np.argsort(grown_um[:, 0]))
-    first, second = np.divmod(np.sort(pairs), max(box_um.shape[0], 1))
-    return first, second
 
 
 @dataclass(frozen=True, slots=True)

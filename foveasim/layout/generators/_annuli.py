@@ -10,14 +10,14 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from foveasim._core.calls import Limits
-from foveasim._core.validation import Floats, Ints, read_only
+from foveasim._core.validation import Floats, Ints, freeze, read_only
 
 #: Chords per arc.
 CHORDS = Limits(at_least=1, at_most=1000)
 #: Minimum number of sites of a ring of the fovea, per unit of its radius.
 MIN_SITES_PER_RHO = 3
-#: Number of circles that are cached: those between rings of equal sectors are of at most two kinds, in alternation.
-MAX_CIRCLES = 4
+#: Number of circles and rings that are cached: those of equal sectors are of at most two kinds, in alternation.
+MAX_CACHED = 4
 #: Filling of the centre: none, rings with sites in proportion to the radius, linear-polar rings of the same sectors, hexagons.
 Fovea: TypeAlias = Literal["none", "rings", "linear", "hexagons"]
 
@@ -40,9 +40,9 @@ class Annuli(NamedTuple):
 
 
 class _Circle(NamedTuple):
-    """Points of a circle, counter-clockwise, and their angles in steps of 360° / ``n_steps``."""
+    """Points of a unit circle, and their angles in steps of 360° / ``n_steps``."""
 
-    xy_um: Floats
+    xy: Floats
     step: Ints
     n_steps: int
 
@@ -57,24 +57,24 @@ def annuli(radii_um: Floats, rings: Sequence[Ring]) -> Annuli:
     """
     outlines, n_vertices = [], []
     has_disc = rings[0].n_sites == 1
-    inner = _circle(float(radii_um[0]), rings[:1])
+    inner = _adjacent(float(radii_um[0]), rings[:1])
+    inner_um = radii_um[0] * _circle(inner).xy
     for i, ring in enumerate(rings):
-        outer = _circle(float(radii_um[i + 1]), rings[i : i + 2])
+        outer = _adjacent(float(radii_um[i + 1]), rings[i : i + 2])
+        outer_um = radii_um[i + 1] * _circle(outer).xy
         if i == 0 and has_disc:
-            outlines.append(outer.xy_um)
-            n_vertices.append(np.array([len(outer.xy_um)]))
+            outlines.append(outer_um)
+            n_vertices.append(np.array([len(outer_um)]))
         else:
-            xy_um, counts = ring_outlines(
-                outer.xy_um, *_corner_positions(outer, ring), inner.xy_um, *_corner_positions(inner, ring)
-            )
-            outlines.append(xy_um)
+            points, counts = _points_of_ring(outer, ring, inner)
+            outlines.append(np.concatenate((outer_um, inner_um)).take(points, axis=0))
             n_vertices.append(counts)
-        inner = outer
+        inner, inner_um = outer, outer_um
     n_sites = np.array([ring.n_sites for ring in rings])
     ring_of = np.repeat(np.arange(len(rings)), n_sites)
     sector = np.arange(ring_of.size) - (np.cumsum(n_sites) - n_sites)[ring_of]
     offsets = np.concatenate(([0], np.cumsum(np.concatenate(n_vertices))))
-    return Annuli(np.concatenate(outlines), offsets, ring_of, sector)
+    return Annuli(freeze(np.concatenate(outlines)), freeze(offsets), freeze(ring_of), freeze(sector))
 
 
 def fovea_rings(
@@ -105,43 +105,42 @@ def fovea_rings(
     return radii, [Ring(int(n), 0, n_chords) for n in counts]
 
 
-def ring_outlines(
-    outer_um: Floats, outer_first: Ints, outer_last: Ints, inner_um: Floats, inner_first: Ints, inner_last: Ints
-) -> tuple[Floats, Ints]:
+def points_of_outlines(
+    n_outer: int, outer_first: Ints, outer_last: Ints, n_inner: int, inner_first: Ints, inner_last: Ints
+) -> tuple[Ints, Ints]:
     """
-    Return the outlines of the sites of a ring between two closed loops of points.
+    Return the points of the sites of a ring between two closed loops of points.
 
-    ``outer_um``, ``inner_um`` (n_point, 2) float64, µm: the loops, counter-clockwise, shared with the adjacent rings.
+    ``n_outer``, ``n_inner``: numbers of points of the loops, counter-clockwise, shared with the adjacent rings.
     ``outer_first``, ``outer_last``, ``inner_first``, ``inner_last`` (n_site,) int64: positions of the corners of each site on
     the loops, unwrapped beyond the end of a loop. A site includes the points between its corners, and therefore the corners of
-    its neighbours. Returns ``xy_um`` (n_vertex, 2) float64, µm: site after site: its part of the outer loop, then its part of
-    the inner loop in reverse. ``n_vertices`` (n_site,) int64: number of vertices of each site.
+    its neighbours. Returns ``points`` (n_vertex,) int64: site after site, its points of the outer loop, then its points of the
+    inner loop in reverse, which are numbered after those of the outer one. ``n_vertices`` (n_site,) int64: number of vertices
+    of each site.
     """
-    n_outer = outer_last - outer_first + 1
-    n_vertices = n_outer + inner_last - inner_first + 1
+    n_of_outer = outer_last - outer_first + 1
+    n_vertices = n_of_outer + inner_last - inner_first + 1
     site = np.repeat(np.arange(n_vertices.size), n_vertices)
     position = np.arange(site.size) - (np.cumsum(n_vertices) - n_vertices)[site]
-    is_inner = position >= n_outer[site]
-    point = np.where(
+    is_inner = position >= n_of_outer[site]
+    points = np.where(
         is_inner,
-        len(outer_um) + (inner_last[site] - position + n_outer[site]) % len(inner_um),
-        (outer_first[site] + position) % len(outer_um),
+        n_outer + (inner_last[site] - position + n_of_outer[site]) % n_inner,
+        (outer_first[site] + position) % n_outer,
     )
-    return np.concatenate((outer_um, inner_um))[point], n_vertices
+    return points, n_vertices
 
 
-def _circle(radius_um: float, rings: Sequence[Ring]) -> _Circle:
-    """Return a circle with the distinct corners and chord ends of the rings on both sides."""
-    adjacent = [ring for ring in rings if ring.n_sites > 1]
-    if radius_um <= 0.0 or not adjacent:
-        return _Circle(np.zeros((1, 2)), np.zeros(1, np.int64), 1)
-    unit, step, n_steps = _unit_circle(tuple(adjacent))
-    return _Circle(radius_um * unit, step, n_steps)
+def _adjacent(radius_um: float, rings: Sequence[Ring]) -> tuple[Ring, ...]:
+    """Return the rings with corners on a circle; none on the axis."""
+    return tuple(ring for ring in rings if ring.n_sites > 1) if radius_um > 0.0 else ()
 
 
-@lru_cache(maxsize=MAX_CIRCLES)
-def _unit_circle(adjacent: tuple[Ring, ...]) -> _Circle:
-    """Return the points of a circle of radius 1, the same for many circles of a layout."""
+@lru_cache(maxsize=MAX_CACHED)
+def _circle(adjacent: tuple[Ring, ...]) -> _Circle:
+    """Return the distinct corners and chord ends of rings on a unit circle, or the axis."""
+    if not adjacent:
+        return _Circle(read_only(np.zeros((1, 2))), read_only(np.zeros(1, np.int64)), 1)
     n_steps = math.lcm(*(2 * ring.n_sites * ring.n_chords for ring in adjacent))
     steps = []
     for n_sites, rotation, n_chords in adjacent:
@@ -149,7 +148,16 @@ def _unit_circle(adjacent: tuple[Ring, ...]) -> _Circle:
         steps.append(half_chords * (n_steps // (2 * n_sites * n_chords)) % n_steps)
     step = np.unique(np.concatenate(steps))
     angle_rad = (2.0 * math.pi) * (step / n_steps)
-    return _Circle(np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1), read_only(step), n_steps)
+    return _Circle(read_only(np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1)), read_only(step), n_steps)
+
+
+@lru_cache(maxsize=MAX_CACHED)
+def _points_of_ring(outer: tuple[Ring, ...], ring: Ring, inner: tuple[Ring, ...]) -> tuple[Ints, Ints]:
+    """Return the points of a ring between two circles, as :func:`points_of_outlines`."""
+    circles = _circle(outer), _circle(inner)
+    loops = [(circle.step.size, *_corner_positions(circle, ring)) for circle in circles]
+    points, n_vertices = points_of_outlines(*loops[0], *loops[1])
+    return read_only(points), read_only(n_vertices)
 
 
 def _corner_positions(circle: _Circle, ring: Ring) -> tuple[Ints, Ints]:

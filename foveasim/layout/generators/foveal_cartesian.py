@@ -11,7 +11,7 @@ from foveasim._core.calls import LENGTH, Limits
 from foveasim._core.validation import MAX_LENGTH_UM, MAX_SITES, Floats, Ints, check_count, check_sites
 from foveasim.errors import ParameterError
 from foveasim.layout.families import layout_family
-from foveasim.layout.generators._annuli import ring_outlines
+from foveasim.layout.generators._annuli import points_of_outlines
 from foveasim.layout.model import Layout, layout_of
 from foveasim.layout.site_counts import SolveFor
 
@@ -150,8 +150,10 @@ def _outlines(n_rings: int, ring_ratio: float, pitch_um: float, n_fovea: int) ->
             # A corner site has a single point on the inner square.
             at = np.searchsorted(inner_side_um, inner_cuts_um)
             inner_first, inner_last = _corners(np.concatenate((at[:1], at, at[-1:])), inner_side_um.size - 1)
-            xy_um, counts = ring_outlines(outer_um, outer_first, outer_last, inner_um, inner_first, inner_last)
-            outlines.append(xy_um)
+            points, counts = points_of_outlines(
+                len(outer_um), outer_first, outer_last, len(inner_um), inner_first, inner_last
+            )
+            outlines.append(np.concatenate((outer_um, inner_um))[points])
             n_vertices.append(counts)
         inner_um, inner_side_um, inner_cuts_um = outer_um, side_um, next_cuts_um
     return np.concatenate(outlines), np.concatenate(n_vertices)

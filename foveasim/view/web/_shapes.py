@@ -56,18 +56,21 @@ def shapes_of(layout: Layout) -> Shapes:
     """
     xy_um, ring_offsets = layout.xy_um, layout.ring_offsets
     first_ring = layout.site_offsets[:-1]
-    is_filled = np.diff(layout.site_offsets) == 1
-    is_filled[is_filled] = _is_filled(layout, first_ring[is_filled])
-    order = np.arange(xy_um.shape[0])
-    left = np.flatnonzero(~is_filled & (np.diff(layout.site_offsets) == 1))
-    part = layout[left]
-    fans, smallest = triangle_fans(part.xy_um, part.ring_offsets)
-    is_filled[left] = smallest >= -ROUNDING
-    counts, starts = np.diff(part.ring_offsets), part.ring_offsets[:-1]
-    shift = fans[starts - 2 * np.arange(left.size), 0] - starts
-    begin, within = np.repeat(ring_offsets[first_ring[left]], counts), positions_in_runs(counts)
-    order[begin + within] = begin + (within + np.repeat(shift, counts)) % np.repeat(counts, counts)
-    xy_um, position = _unique_positions(xy_um[order])
+    has_one_ring = np.diff(layout.site_offsets) == 1
+    is_filled = has_one_ring.copy()
+    is_filled[is_filled] = _is_filled(layout, np.flatnonzero(is_filled))
+    left = np.flatnonzero(~is_filled & has_one_ring)
+    if left.size:
+        order = np.arange(xy_um.shape[0])
+        part = layout[left]
+        fans, smallest = triangle_fans(part.xy_um, part.ring_offsets)
+        is_filled[left] = smallest >= -ROUNDING
+        counts, starts = np.diff(part.ring_offsets), part.ring_offsets[:-1]
+        shift = fans[starts - 2 * np.arange(left.size), 0] - starts
+        begin, within = np.repeat(ring_offsets[first_ring[left]], counts), positions_in_runs(counts)
+        order[begin + within] = begin + (within + np.repeat(shift, counts)) % np.repeat(counts, counts)
+        xy_um = xy_um[order]
+    xy_um, position = _unique_positions(xy_um)
     cut_sites = np.flatnonzero(~is_filled)
     # Self-intersecting outlines, which only the plain constructor accepts, are drawn as their enclosed area.
     cuts, owner, *_ = delaunay(layout, cut_sites, is_repaired=True)
@@ -82,13 +85,17 @@ def _unique_positions(xy_um: Floats) -> tuple[Floats, Ints]:
     xy_um = np.ascontiguousarray(xy_um) + 0.0  # replaces -0 by 0
     position, first = np.empty((2, xy_um.shape[0]), np.int64)
     n_distinct = number_points(xy_um.view(np.uint64), position, first)
-    return xy_um[first[:n_distinct]], position
+    return xy_um.take(first[:n_distinct], axis=0), position
 
 
-def _is_filled(layout: Layout, rings: Ints) -> Bools:
-    """Return whether the fan from the first vertex of each ring has no reversed triangle."""
+def _is_filled(layout: Layout, sites: Ints) -> Bools:
+    """
+    Return whether the fan from the first vertex of a site has no reversed triangle.
+
+    ``sites``: with one ring each.
+    """
     from foveasim.view._kernels import smallest_fan_triangles
 
+    rings = layout.site_offsets[sites]
     smallest_um2 = smallest_fan_triangles(layout.xy_um, layout.ring_offsets[rings], layout.ring_offsets[rings + 1])
-    tolerance_um2 = ROUNDING * np.abs(layout.area_um2[np.searchsorted(layout.site_offsets, rings)])
-    return np.asarray(smallest_um2 >= -tolerance_um2)
+    return np.asarray(smallest_um2 >= -ROUNDING * np.abs(layout.area_um2[sites]))
