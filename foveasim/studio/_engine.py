@@ -19,7 +19,6 @@ from foveasim.capture import Capture
 from foveasim.config import Shot
 from foveasim.errors import GeometryError
 from foveasim.explore.worker_cache import ShotRunner
-from foveasim.layout import Layout
 from foveasim.scene import Scene
 
 #: Longer side of pictures where the page gives none.
@@ -82,7 +81,7 @@ class Engine:
     Layout, scene, optics, distortion, compiled outlines, optical images and power on sites are cached by their settings.
 
     ``n_threads``: number of threads; one per core by default. ``check``: called with the name of each stage before it; it may
-    raise an exception to stop the simulation. ``on_layout``: called with the layout before it is simulated.
+    raise an exception to stop the simulation. ``on_shot``: called with the shot before it is simulated.
     """
 
     def __init__(
@@ -90,9 +89,9 @@ class Engine:
         *,
         n_threads: int | None = None,
         check: Callable[[str], None] | None = None,
-        on_layout: Callable[[Layout], None] = lambda _: None,
+        on_shot: Callable[[Shot], None] = lambda _: None,
     ) -> None:
-        self._on_layout = on_layout
+        self._on_shot = on_shot
         self._runner = ShotRunner(None, {}, n_threads=n_threads, max_bytes=MAX_BYTES, check=check)
 
     @property
@@ -121,7 +120,7 @@ class Engine:
             warnings.simplefilter("always")
             try:
                 shot, used, is_reduced = self._shot(settings, is_preview)
-                self._on_layout(shot.camera.layout)
+                self._on_shot(shot)
                 capture = self._runner.capture(shot, used)
                 if not 0 < capture.layout.n_sites <= MAX_SITES:
                     raise GeometryError(

@@ -138,7 +138,7 @@ class Session:
         self.files = Files(start.settings, (start.directory, start.out), self.uploads, directory)
         self._costs = Costs()
         self._views = Views(self._send, self._wait_for_page, self._line, self._costs)
-        self.engine = Engine(n_threads=n_threads, check=self._check, on_layout=self._views.work_ahead)
+        self.engine = Engine(n_threads=n_threads, check=self._check, on_shot=self._views.work_ahead)
         self.history = History(start.settings)
         self.result: Simulated | None = None
         self.last_used_s = time.monotonic()

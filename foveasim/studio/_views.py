@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any
 from weakref import ref
 
+from foveasim.config import Shot
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
 from foveasim.studio._costs import Costs
@@ -16,7 +17,6 @@ from foveasim.studio._engine import PICTURE_PIXELS, Simulated
 from foveasim.studio._messages import encode_part
 from foveasim.studio._parts import PARTS, Part, PartData
 from foveasim.studio._parts.registry import FIRST_TILE
-from foveasim.studio._parts.sites import compute_ahead
 
 #: Parts that are sent first and together: sites, and their values.
 FIRST = ("sites", "columns", "signals")
@@ -27,8 +27,6 @@ MAX_PIXELS = 2048
 SOON_S, TOGETHER_S = 0.04, 0.1
 #: Views that are expected to take longer wait until the page has drawn the photosites: both need the processor.
 AWAITED_S = 0.2
-#: Number of photosites whose outlines take so long that they are computed while the photosites are simulated.
-MANY_SITES = 50_000
 
 
 class Views:
@@ -54,6 +52,7 @@ class Views:
         # Weak references to what each view was computed from: a view that is not shown retains no earlier result.
         self._sent: dict[str, list[Any]] = {}
         self._version: dict[str, int] = {}
+        self._layout: ref[Layout] | None = None
 
     def select(self, names: Any, pixels: Any = None) -> None:
         """
@@ -69,11 +68,15 @@ class Views:
         self._names = [name for name in PARTS if name in names]
         self._pixels = self._pixels if pixels is None else pixels
 
-    def work_ahead(self, layout: Layout) -> None:
-        """Compute the outlines of many photosites while they are simulated."""
-        is_sent = "sites" in self._sent and _is_same(self._sent["sites"], (layout,))
-        if "sites" in self._names and layout.n_sites >= MANY_SITES and not is_sent:
-            compute_ahead(layout)
+    def work_ahead(self, shot: Shot) -> None:
+        """Start what views require of a new layout while it is simulated."""
+        layout = shot.camera.layout
+        if self._layout is not None and self._layout() is layout:
+            return
+        self._layout = ref(layout)
+        for name in self._names:
+            if (start := PARTS[name].work_ahead) is not None:
+                start(shot, self._pixels)
 
     def forget(self, name: str | None = None) -> None:
         """Send a view again, or all."""

@@ -6,16 +6,33 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from foveasim.config import Shot
+from foveasim.layout import Layout
 from foveasim.studio._engine import Simulated
+from foveasim.studio._parts.ahead import MANY_SITES, Ahead
 from foveasim.studio._parts.registry import PartData, part
 from foveasim.view.web._content import rules_of
 
 
-@part("Design rules", lambda result: (result.capture.layout, result.shot.rules), order=90, is_wide=True)
+def _start(shot: Shot, _pixels: int) -> None:
+    if shot.rules is not None and shot.camera.layout.n_sites < MANY_SITES:
+        _check.start(shot.camera.layout, shot.rules)
+
+
+@part(
+    "Design rules",
+    lambda result: (result.capture.layout, result.shot.rules),
+    order=90,
+    is_wide=True,
+    work_ahead=_start,
+)
 def rules(result: Simulated) -> PartData:
     """Return the results of the design-rule check."""
     if result.shot.rules is None:
         return {"rules": []}, {}
     arrays: dict[str, NDArray[Any]] = {}
-    report = result.capture.layout.check(result.shot.rules)
+    report = _check(result.capture.layout, result.shot.rules)
     return {"rules": rules_of(report, arrays), "is_satisfied": bool(report.ok)}, arrays
+
+
+_check = Ahead(Layout.check)

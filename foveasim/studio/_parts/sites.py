@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim.config import Shot
 from foveasim.layout import Layout
 from foveasim.studio._engine import Simulated
+from foveasim.studio._parts.ahead import MANY_SITES, Ahead
 from foveasim.studio._parts.registry import PartData, layout_of, part
 from foveasim.view.web._content import PALETTE, outlines_of
 from foveasim.view.web._shapes import Shapes, shapes_of
@@ -22,25 +22,20 @@ MAX_EDGES = 20_000
 EDGES_PER_SIDE, MORE_EDGES = 24, 64
 
 
-@part("Photosites", layout_of, order=0)
+def _start(shot: Shot, _pixels: int) -> None:
+    if shot.camera.layout.n_sites >= MANY_SITES:
+        _arrays_of.start(shot.camera.layout)
+
+
+@part("Photosites", layout_of, order=0, work_ahead=_start)
 def sites(result: Simulated) -> PartData:
     """Return the outlines of the photosites, and the boundary of the layout."""
     layout = result.capture.layout
     about = {"n_sites": layout.n_sites, "bounds_um": layout.bounds_um, "palette": PALETTE}
-    ahead = _ahead.pop(layout, None)
-    return about, _arrays_of(layout) if ahead is None else ahead.result()
+    return about, _arrays_of(layout)
 
 
-def compute_ahead(layout: Layout) -> None:
-    """Start to compute the arrays of a layout in another thread, until its outlines are sent."""
-    if layout not in _ahead:
-        _ahead[layout] = _executor.submit(_arrays_of, layout)
-
-
-_executor = ThreadPoolExecutor(1, "studio outlines")
-_ahead: WeakKeyDictionary[Layout, Future[dict[str, NDArray[Any]]]] = WeakKeyDictionary()
-
-
+@Ahead
 def _arrays_of(layout: Layout) -> dict[str, NDArray[Any]]:
     shapes = shapes_of(layout)
     return outlines_of(shapes) | _boundary_of(shapes)

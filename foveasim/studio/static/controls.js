@@ -347,7 +347,7 @@ class Row {
       const other = field.querySelector("option[value='-1']");
       if (chosen < 0 && !other) field.prepend(new Option("–", "-1"));
       else if (chosen >= 0) other?.remove();
-      field.value = String(chosen);
+      change(field, { value: String(chosen) });  // browsers examine all forms again when a choice is set
     } else if (control.kind === "boolean") Object.assign(field, { checked: Boolean(value ?? control.default) });
     else if (field.value !== fieldText(value)) field.value = fieldText(value);
     if (slider) this._place(slider, typeof value === "number" ? value : typeof this.solved === "number" ? this.solved : NaN);

@@ -3,8 +3,8 @@
 import { MapView } from "/web/map.js";
 import { pixelRatio, textureSize } from "/web/gl.js";
 
-// Sites of at least this many pixels need one sample per pixel; smaller ones, and those below one pixel, more per side.
-const LARGE_PIXELS = 3;
+// Sites of at least this many pixels need one sample per pixel; smaller ones, and those below half a pixel, more per side.
+const LARGE_PIXELS = 3, SMALL_PIXELS = 0.5;
 const FEW_SAMPLES = 2, MANY_SAMPLES = 3;
 const MOST_SAMPLES = 1.2e7;
 // Levels of linear light in the table of bytes.
@@ -109,7 +109,7 @@ export class RasterMap extends MapView {
 
   get samples() {
     const { width, height } = this.canvas, pixels = this.sites.smallest * this.scale * pixelRatio();
-    const wanted = pixels >= LARGE_PIXELS ? 1 : pixels >= 1 ? FEW_SAMPLES : MANY_SAMPLES;
+    const wanted = pixels >= LARGE_PIXELS ? 1 : pixels >= SMALL_PIXELS ? FEW_SAMPLES : MANY_SAMPLES;
     return Math.max(1, Math.min(wanted, Math.floor(Math.sqrt(MOST_SAMPLES / (width * height)))));
   }
 
@@ -146,10 +146,10 @@ function mixedPixels(owner, width, height, n) {
     for (let x = 0, at = y * n * row; x < width; x++, p++, at += n) {
       const one = owner[at];
       first[p] = one;
-      // Opposite corners differ in most of them.
+      // Opposite corners differ in most of them. MANY_SAMPLES of a row are compared without a loop.
       let isOne = owner[at + corner] === one;
       for (let start = at; isOne && start <= at + corner; start += row) {
-        for (let k = start; k < start + n; k++) if (owner[k] !== one) { isOne = false; break; }
+        isOne = owner[start] === one && owner[start + 1] === one && owner[start + n - 1] === one;
       }
       if (!isOne) pixels[nMixed++] = p;
     }
@@ -189,43 +189,46 @@ function averageSamples(pixels, mixed, owner, width, n, { redGreen, blue }) {
 function findOwners(view, width, height, owner) {
   const { sites } = view, { xy, position, ringOffsets, box } = sites, step = (view.scale * width) / view.width;
   const left = view.fromX(0), top = view.fromY(0), right = view.fromX(view.width), bottom = view.fromY(view.height);
-  // Crossings of outlines and rows of pixel centres: in each row up to one per vertex.
+  // Positions in columns and rows of pixel centres: sites of a common edge have equal numbers.
+  const places = new Float64Array(xy.length);
+  for (let at = 0; at < xy.length; at += 2) {
+    places[at] = (xy[at] - left) * step - 0.5;
+    places[at + 1] = (top - xy[at + 1]) * step - 0.5;
+  }
+  // First columns after the crossings of outlines and rows: in each row up to one per vertex.
   const counts = new Uint32Array(height);
-  let crossings = new Float64Array(4096);
+  let crossings = new Int32Array(4096);
   owner.fill(0);
   for (let site = 0; site < sites.n; site++) {
     const at = 4 * site;
     if (box[at] > right || box[at + 2] < left || box[at + 1] > top || box[at + 3] < bottom) continue;
+    const firstRing = sites.firstRing(site), endRing = sites.firstRing(site + 1), most = ringOffsets[endRing] - ringOffsets[firstRing];
     const first = Math.max(0, Math.ceil((top - box[at + 3]) * step - 0.5));
     const last = Math.min(height - 1, Math.floor((top - box[at + 1]) * step - 0.5));
     if (last < first) continue;
-    const firstRing = sites.firstRing(site), endRing = sites.firstRing(site + 1), most = ringOffsets[endRing] - ringOffsets[firstRing];
-    if ((last - first + 1) * most > crossings.length) crossings = new Float64Array(2 * (last - first + 1) * most);
+    if ((last - first + 1) * most > crossings.length) crossings = new Int32Array(2 * (last - first + 1) * most);
     for (let ring = firstRing; ring < endRing; ring++) {
       const to = ringOffsets[ring + 1];
       let p = 2 * position[to - 1];
       for (let v = ringOffsets[ring]; v < to; v++) {
-        const q = 2 * position[v], ay = xy[p + 1], by = xy[q + 1];
-        // One row more at both ends: the comparison below decides, which both sites of an edge make with equal numbers.
-        const from = Math.max(first, Math.floor((top - Math.max(ay, by)) * step - 0.5));
-        const end = Math.min(last, Math.ceil((top - Math.min(ay, by)) * step - 0.5));
-        for (let row = from; row <= end; row++) {
-          const y = top - (row + 0.5) / step;
-          if (ay > y !== by > y) crossings[(row - first) * most + counts[row]++] = (xy[p]
-            + ((y - ay) / (by - ay)) * (xy[q] - xy[p]) - left) * step;
-        }
+        const q = 2 * position[v], low = places[p + 1] < places[q + 1] ? p : q, high = p + q - low;
+        // The upper end belongs to the edge, the lower one does not.
+        const begin = places[low + 1], from = Math.max(first, Math.ceil(begin)), end = Math.min(last + 1, Math.ceil(places[high + 1]));
         p = q;
+        if (end <= from) continue;
+        const slope = (places[high] - places[low]) / (places[high + 1] - begin);
+        for (let row = from; row < end; row++) {
+          crossings[(row - first) * most + counts[row]++] = Math.min(width, Math.max(0, Math.ceil(places[low] + (row - begin) * slope)));
+        }
       }
     }
     for (let row = first; row <= last; row++) {
-      const start = (row - first) * most, n = counts[row];
+      const start = (row - first) * most, n = counts[row], base = row * width;
       counts[row] = 0;
       if (n > 2) crossings.subarray(start, start + n).sort();
-      else if (n === 2 && crossings[start] > crossings[start + 1]) [crossings[start], crossings[start + 1]] = [crossings[start + 1],
-        crossings[start]];
       for (let k = start; k + 1 < start + n; k += 2) {
-        const from = Math.max(0, Math.ceil(crossings[k] - 0.5)), to = Math.min(width, Math.ceil(crossings[k + 1] - 0.5));
-        for (let x = from, base = row * width; x < to; x++) owner[base + x] = site + 1;
+        const a = crossings[k], b = crossings[k + 1];
+        for (let x = base + Math.min(a, b), to = base + Math.max(a, b); x < to; x++) owner[x] = site + 1;
       }
     }
   }

@@ -1,6 +1,6 @@
 // The tools of the editor next to the map, and the options of the chosen one above it.
 
-import { make, notice } from "/web/page_parts.js";
+import { make, notice, setChoices } from "/web/page_parts.js";
 
 // Name, key, heading, icon (lines in a square of 16), and hint.
 export const TOOLS = [
@@ -53,17 +53,9 @@ function iconButton(title, path) {
 function select(label, choices, values) {
   const field = make("select");
   field.setAttribute("aria-label", label);
-  fill(field, choices);
+  setChoices(field, choices);
   if (values) field.value = values;
   return field;
-}
-
-function fill(field, choices) {
-  const text = JSON.stringify(choices), { value } = field;
-  if (field.dataset.choices === text) return;
-  field.dataset.choices = text;
-  field.replaceChildren(...choices.map(([name, label]) => { const option = make("option", label); option.value = name; return option; }));
-  if (choices.some(([name]) => name === value)) field.value = value;
 }
 
 function textField(label, { size, value = "", mode = "decimal", placeholder = "" }) {
@@ -190,7 +182,7 @@ export class ToolBar {
   value(name) { return this.fields[name].value.trim(); }
   number(name) { const text = this.value(name); return text !== "" && Number.isFinite(Number(text)) ? Number(text) : null; }
 
-  fill(name, choices) { fill(this.fields[name], choices); }
+  fill(name, choices) { setChoices(/** @type {HTMLSelectElement} */ (this.fields[name]), choices); }
 
   // What is typed next replaces the position.
   _showPosition(position) {

@@ -38,6 +38,17 @@ export function change(element, properties) {
   for (const [name, value] of Object.entries(properties)) if (element[name] !== value) element[name] = value;
 }
 
+// Sets the choices of a select, pairs of a value and its label, if they are others; the value stays if it is among them. Browsers
+// examine all forms of a page again when choices or values are set.
+/** @type {(select: HTMLSelectElement, choices: [string, string][]) => void} */
+export function setChoices(select, choices) {
+  const text = JSON.stringify(choices), { value } = select;
+  if (select.dataset.choices === text) return;
+  select.dataset.choices = text;
+  select.replaceChildren(...choices.map(([each, label]) => new Option(label, each)));
+  if (choices.some(([each]) => each === value)) select.value = value;
+}
+
 const inks = new Map();
 
 // Colour of the theme by the name of its variable.

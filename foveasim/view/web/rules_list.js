@@ -1,7 +1,7 @@
 // List of violations of design rules.
 
 import { shown } from "./colours.js";
-import { make } from "./page_parts.js";
+import { change, make, setChoices } from "./page_parts.js";
 import { Violations } from "./violations.js";
 
 const AT_A_TIME = 200;
@@ -37,10 +37,8 @@ export class RulesList {
     this.chosen = null;
     const total = rules.reduce((sum, rule) => sum + rule.count, 0);
     const textOf = ({ name, count, waiver }) => name + " (" + shown(count) + (waiver ? ", waived)" : ")");
-    this.select.replaceChildren(new Option("all (" + shown(total) + ")", "-1"),
-      ...rules.map((rule, k) => new Option(textOf(rule), String(k))));
-    this.select.value = String(Math.max(-1, rules.findIndex((rule) => rule.name === before)));
-    this.select.hidden = !rules.length;
+    setChoices(this.select, [["-1", "all (" + shown(total) + ")"], ...rules.map((rule, k) => [String(k), textOf(rule)])]);
+    change(this.select, { value: String(Math.max(-1, rules.findIndex((rule) => rule.name === before))), hidden: !rules.length });
     this._list(true);
   }
 

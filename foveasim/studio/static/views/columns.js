@@ -1,17 +1,14 @@
 // Values of the photosites: colours of the map.
 
 import { titleOf } from "/web/legend.js";
-import { $ } from "/web/page_parts.js";
+import { $, change, setChoices } from "/web/page_parts.js";
 
 export function create(root, { page, panes, editor, recolour, showSelection, ask, drawAsked }) {
   function fillColumns(columns) {
-    const select = $("colouring"), text = columns.map((column) => column.key + titleOf(column)).join();
-    if (select.dataset.columns !== text) {
-      select.dataset.columns = text;
-      select.replaceChildren(...columns.map((column) => new Option(titleOf(column), column.key)));
-    }
+    const select = $("colouring");
+    setChoices(select, columns.map((column) => [column.key, titleOf(column)]));
     if (!columns.some((column) => column.key === page.key)) page.key = columns[0].key;
-    select.value = page.key;
+    change(select, { value: page.key });
   }
   // Columns with the values of sites; null if they are those of others.
   function columnsOf({ about, arrays }, sites) {
