@@ -721,19 +721,6 @@ def test_signals_are_sent_when_requested(recorder):
     assert found["snr"] == pytest.approx(capture.signal_to_noise(sensor=recorder.session.result.shot.camera.sensor))
 
 
-def test_outlines_are_computed_ahead(recorder, monkeypatch):
-    state = recorder.do(do="set", key="layout.parameters.n_x", value=20, final=True)
-    expected = next(arrays for header, arrays in recorder.parts if header["part"] == "sites")
-    recorder.do(do="undo")
-    monkeypatch.setattr(_views, "MANY_SITES", 1)
-    recorder.do(do="redo")
-    found = next(arrays for header, arrays in recorder.parts if header["part"] == "sites")
-
-    assert state["errors"] == {}
-    assert expected.keys() == found.keys()
-    assert all(np.array_equal(expected[name], found[name]) for name in expected)
-
-
 def test_slow_views_wait_for_the_page(settings, monkeypatch):
     """Until the page has drawn the photosites, or a newer message waits."""
     monkeypatch.setattr(_views, "AWAITED_S", -1.0)
