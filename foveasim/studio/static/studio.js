@@ -15,6 +15,7 @@ import { GazePanel } from "./gaze_panel.js";
 import { ImagePane } from "./image_pane.js";
 import { stateOf } from "./links.js";
 import { listenToDialogs } from "./menus.js";
+import { load } from "./modules.js";
 import { Problems } from "./problems.js";
 import { SitePane, useSoftware } from "./site_pane.js";
 import { Sources } from "./sources.js";
@@ -303,7 +304,7 @@ let startPage = null;
 
 // Shows the start page, whose module is loaded when it is first shown.
 async function openStart(options = {}) {
-  startPage ||= import("./start_page.js").then(({ StartPage }) => new StartPage(connection, () => page.held.states.at(-1) || page.state));
+  startPage ||= load("./start_page.js").then(({ StartPage }) => new StartPage(connection, () => page.held.states.at(-1) || page.state));
   const shown = await startPage.catch(() => null);
   if (shown) await shown.open(options);
   else {

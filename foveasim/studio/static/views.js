@@ -1,6 +1,7 @@
 // Views: the server lists them; each is a module in views/, which is imported when its view is first needed.
 
 import { $, find, make, notice } from "/web/page_parts.js";
+import { load } from "./modules.js";
 
 // From this width, more tiles are shown at first.
 const WIDE = 1800;
@@ -108,7 +109,7 @@ export class Views {
     const names = this.list.map(({ name }) => name).filter((name) => this._isNeeded(name) && this.made[name] === undefined);
     for (const name of names) this.made[name] = null;
     this.nLoading++;
-    const modules = await Promise.allSettled(names.map((name) => import("./views/" + name + ".js")));
+    const modules = await Promise.allSettled(names.map((name) => load("./views/" + name + ".js")));
     this.nLoading--;
     names.forEach((name, i) => {
       const result = modules[i], root = document.getElementById("tile-" + name);
