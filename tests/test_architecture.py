@@ -31,7 +31,7 @@ LAYERS = [
     {"_core"},
     {"units"},
     {"_io"},
-    {"fields"},
+    {"fields", "incidence"},
     {"distortion", "integrate", "layout", "maps", "optics", "scene", "sensor"},
     {"modes", "reconstruct"},
     {"capture"},
