@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -165,13 +165,12 @@ class PixelOptics(ABC):
 
     Subclasses are frozen dataclasses, registered with ``@PIXEL_OPTICS.register("name")`` for settings files.
 
-    Attributes
-    ----------
-    has_mixing : bool
-        Whether sites collect light of others. Such a sensor cannot be divided into tiles.
     """
 
-    has_mixing: ClassVar[bool] = False
+    @property
+    def has_mixing(self) -> bool:
+        """Whether sites collect light of others; such a sensor cannot be divided into tiles."""
+        return False
 
     @abstractmethod
     def footprints(self, sites: Photosites, incidence: Incidence) -> Footprints:

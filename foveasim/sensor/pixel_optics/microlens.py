@@ -15,7 +15,7 @@ from foveasim._core.validation import Floats, Ints, check_choice, check_number
 from foveasim.incidence import ChiefRayTable, Incidence
 from foveasim.sensor.effects.contract import Photosites
 from foveasim.sensor.pixel_optics._layers import Layers, as_layers
-from foveasim.sensor.pixel_optics._shapes import Shapes
+from foveasim.sensor.pixel_optics._shapes import Shapes, inset
 from foveasim.sensor.pixel_optics.aperture_stack import INSET
 from foveasim.sensor.pixel_optics.contract import PIXEL_OPTICS, Footprints, Outlines, PixelOptics
 
@@ -107,7 +107,7 @@ class Microlens(PixelOptics):
             object.__setattr__(self, "photodiode", Outlines.of("photodiode", self.photodiode))
 
     @property
-    def has_mixing(self) -> bool:  # type: ignore[override]
+    def has_mixing(self) -> bool:
         """Whether sites collect light of others."""
         return self.crosstalk
 
@@ -173,10 +173,10 @@ class Microlens(PixelOptics):
         import shapely
         from scipy.sparse import coo_array
 
-        every = Outlines(sites.xy_um, sites.ring_offsets, sites.site_offsets)
-        from foveasim.sensor.pixel_optics._shapes import inset
-
-        photodiode = inset("photodiode", every, self.photodiode_inset_um) if self.photodiode is None else self.photodiode
+        photodiode = self.photodiode
+        if photodiode is None:
+            every = Outlines(sites.xy_um, sites.ring_offsets, sites.site_offsets)
+            photodiode = inset("photodiode", every, self.photodiode_inset_um)
         starts = photodiode.ring_offsets[photodiode.site_offsets[:-1]]
         low_um, high_um = (
             find.reduceat(photodiode.xy_um, starts, axis=0) for find in (np.minimum, np.maximum)
