@@ -1,8 +1,8 @@
 """
 Cones of light at photosites: chief rays, exit pupils and tables of chief ray angles.
 
-Directions are tangents: ``(t_x, t_y)`` is the lateral displacement of a ray per unit of depth, in its direction of propagation, in
-the frame of the sensor. A chief ray of an ordinary lens points away from the optical axis.
+Directions are tangents: ``(t_x, t_y)`` is the lateral displacement of a ray per unit of depth, in its direction of propagation
+and the frame of the sensor. A chief ray of an ordinary lens points away from the optical axis.
 """
 
 from __future__ import annotations
@@ -102,7 +102,10 @@ class ChiefRayTable:
         last_um, highest_um = self.image_height_um[-1], float(height_um.max(initial=0.0))
         if highest_um > last_um * (1.0 + HEIGHT_ROUNDING):
             raise ParameterError(
-                "image_height_um", f"must extend to {highest_um:.6g} µm, the largest distance of a site from the axis", last_um, "µm"
+                "image_height_um",
+                f"must extend to {highest_um:.6g} µm, the largest distance of a site",
+                last_um,
+                "µm",
             )
         tangent = _interpolant(self)(np.minimum(height_um, last_um))
         per_um = np.divide(tangent, height_um, out=np.zeros(height_um.size), where=height_um > 0.0)

@@ -163,8 +163,9 @@ def _tiles(
         clock = Clock()
         with clock.stage("compile layout"):
             sensor = camera.sensor.part(slice(first, last))
-            footprints = find_footprints(camera, sensor.layout, sensor.pixel_optics, light, camera.position_um)
-            part = placed(sensor.layout, footprints, camera.position_um)
+            part = layout[first:last]
+            footprints = find_footprints(camera, part, sensor.pixel_optics, light, camera.position_um)
+            part = placed(part, footprints, camera.position_um)
             bounds_um = outline_bounds_um(part, camera.distortion)
             strips = [_rows_under(image.grid, bounds_um) for image in images]
             integrators = [

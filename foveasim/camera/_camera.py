@@ -425,8 +425,8 @@ class Camera:
         compiled : bool
             As for :class:`Integrator`. Both sum in different orders, and are cached separately.
         footprints : Footprints, optional
-            Light that the sites collect: :meth:`footprints`. Its outlines, in the frame of the sensor, are used instead of those
-            of the layout.
+            Light that the sites collect: :meth:`footprints`. Its outlines, in the frame of the sensor, replace those of the
+            layout.
 
         Returns
         -------
@@ -434,7 +434,13 @@ class Camera:
             From the cache, when the same one was used recently.
         """
         position_um = self.position_um if position_um is None else position_um
-        key = grid, order, position_um, compiled, None if footprints is None or footprints.outlines is None else footprints
+        key = (
+            grid,
+            order,
+            position_um,
+            compiled,
+            None if footprints is None or footprints.outlines is None else footprints,
+        )
         integrator = self._integrators.get(key)
         if integrator is None:
             integrator = Integrator(

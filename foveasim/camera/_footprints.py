@@ -19,7 +19,8 @@ from foveasim.scene import Scene
 from foveasim.sensor.pixel_optics.contract import Footprints, PixelOptics, check_footprints
 
 if TYPE_CHECKING:
-    from foveasim.camera._camera import Camera, Position
+    from foveasim.camera._camera import Camera
+    from foveasim.camera._frames import Position
 
 #: Number of cached footprints: one per lens, distance and gaze.
 MAX_FOOTPRINTS = 4
@@ -32,7 +33,9 @@ class FootprintCache:
         #: Footprints with the objects that their keys identify.
         self._found: dict[Hashable, tuple[Footprints, PixelOptics, Any]] = {}
 
-    def get(self, pixel_optics: PixelOptics, layout: Layout, optics: Optics, incidence: Incidence, axis_um: Any) -> Footprints:
+    def get(
+        self, pixel_optics: PixelOptics, layout: Layout, optics: Optics, incidence: Incidence, axis_um: Any
+    ) -> Footprints:
         """Return the footprints of a layout for the cones of a lens."""
         cone = incidence.radius, incidence.exit_pupil_um, incidence.table, incidence.displacement_um, tuple(axis_um)
         key = id(pixel_optics), id(optics.pupil), cone

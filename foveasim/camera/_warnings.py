@@ -238,7 +238,7 @@ def warn_of_small_openings(pixel_optics: PixelOptics, layout: Layout, light: Sce
     if opening_um < MIN_OPENING_WAVELENGTHS * wavelength_um:
         warn(
             f"the narrowest opening of the pixel optics measures {opening_um / wavelength_um:.2g} wavelengths in its layer, "
-            f"fewer than {MIN_OPENING_WAVELENGTHS:g}: the geometric rays of the response neglect diffraction; use larger sites, "
+            f"fewer than {MIN_OPENING_WAVELENGTHS:g}: geometric rays neglect diffraction; use larger sites, "
             "or a measured 'sensitivity'",
             FoveasimWarning,
         )

@@ -27,7 +27,6 @@ from foveasim.layout import EDITS, LAYOUTS, PRESETS, RULES, DesignRules, Readout
 from foveasim.maps import read_power_map
 from foveasim.optics import PUPILS, ChiefRayTable, LateralColour, Optics, Seidel, Zernike
 from foveasim.scene import SCENES
-from foveasim.sensor import PRESETS as SENSOR_PRESETS
 from foveasim.sensor import (
     PIXEL_OPTICS,
     Diffusion,
@@ -38,6 +37,7 @@ from foveasim.sensor import (
     Sensor,
     read_filters,
 )
+from foveasim.sensor import PRESETS as SENSOR_PRESETS
 from foveasim.sensor.effects import EFFECTS
 from foveasim.sensor.limits import EXPOSURE
 from foveasim.sensor.spectral import CURVES

@@ -34,7 +34,9 @@ if TYPE_CHECKING:
 
 FOCAL_LENGTH = Limits(above=0.0, at_least=0.01, at_most=1e6, hint="check the unit: focal lengths are in mm")
 F_NUMBER = Limits(above=0.0, at_least=0.5, at_most=1e4, hint="f/0.5 is the limit for a lens in air")
-EXIT_PUPIL = Limits(above=0.0, at_least=0.01, at_most=1e6, hint="distances of exit pupils are in mm, inf if telecentric")
+EXIT_PUPIL = Limits(
+    above=0.0, at_least=0.01, at_most=1e6, hint="distances of exit pupils are in mm, inf if telecentric"
+)
 #: Wavelength of the transmittance of pupils for rays.
 CONE_NM = 550.0
 #: Fraction of the PSF energy outside the default padding radius.
@@ -210,7 +212,7 @@ class Optics(PointImages):
                 distance_mm = EXIT_PUPIL.check("exit_pupil_mm", distance_mm)
             object.__setattr__(self, "exit_pupil_mm", distance_mm)
             if self.chief_ray is not None:
-                raise ParameterError("exit_pupil_mm", "must not be given with 'chief_ray'; remove one of them", distance_mm, "mm")
+                raise ParameterError("exit_pupil_mm", "must not be given with 'chief_ray'", distance_mm, "mm")
         if self._is_varying() and self.padding == "periodic":
             raise ParameterError(
                 "padding",

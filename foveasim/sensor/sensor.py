@@ -132,8 +132,8 @@ class Sensor:
     dead_fraction : float
         Fraction of dead sites, which have no photo response.
     pixel_optics : PixelOptics, optional
-        Openings, layers and microlenses above the photodiodes: :class:`ApertureStack`, :class:`Microlens`. A camera computes the
-        light that each site collects from the cone of its optics, at the site's position in the image.
+        Openings, layers and microlenses above the photodiodes: :class:`ApertureStack`, :class:`Microlens`. A camera computes
+        the light that each site collects from the cone of its optics, at the site's position in the image.
     crosstalk : Diffusion or KernelCrosstalk, optional
         Charge exchange between neighbours before collection.
     shot_noise : {"auto", "exact", "off"}

@@ -68,8 +68,13 @@ def _add_below(x_a, x_b, y_a, y_b, sign, sums):
     sums[0] += 0.5 * h * (y_a + y_b)
     sums[1] += h / 6.0 * (x_a * (2.0 * y_a + y_b) + x_b * (y_a + 2.0 * y_b))
     sums[2] += h / 6.0 * (square_a + product + square_b)
-    sums[3] += h / 12.0 * (
-        y_a * (3.0 * x_a * x_a + 2.0 * x_a * x_b + x_b * x_b) + y_b * (x_a * x_a + 2.0 * x_a * x_b + 3.0 * x_b * x_b)
+    sums[3] += (
+        h
+        / 12.0
+        * (
+            y_a * (3.0 * x_a * x_a + 2.0 * x_a * x_b + x_b * x_b)
+            + y_b * (x_a * x_a + 2.0 * x_a * x_b + 3.0 * x_b * x_b)
+        )
     )
     sums[4] += h / 24.0 * (square_a * (3.0 * x_a + x_b) + 2.0 * product * (x_a + x_b) + square_b * (x_a + 3.0 * x_b))
     sums[5] += h / 12.0 * (y_a + y_b) * (square_a + square_b)
@@ -319,10 +324,10 @@ def ray_fractions(
 
 @njit(types.void(_points, _number, _number, _number, types.Array(types.float64, 3, "C", readonly=True), _out2))
 def interpolate(field, step, first_column, first_row, nodes, out):
-    """Interpolate values at nodes (n_row, n_column, n_value) bilinearly at positions (n, 2); nodes are multiples of the step."""
+    """Interpolate values at nodes (n_row, n_column, n_value), at multiples of a step, bilinearly at positions (n, 2)."""
     for k in range(out.shape[0]):
         x, y = field[k, 0] / step - first_column, field[k, 1] / step - first_row
-        j, i = min(max(int(math.floor(x)), 0), nodes.shape[1] - 2), min(max(int(math.floor(y)), 0), nodes.shape[0] - 2)
+        j, i = min(max(math.floor(x), 0), nodes.shape[1] - 2), min(max(math.floor(y), 0), nodes.shape[0] - 2)
         x, y = x - j, y - i
         for v in range(out.shape[1]):
             low = (1.0 - x) * nodes[i, j, v] + x * nodes[i, j + 1, v]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,7 +32,9 @@ class Layers(NamedTuple):
         heights_um = np.atleast_1d(HEIGHT.check_array("height_um", height_um))
         index = np.atleast_1d(INDEX.check_array("refractive_index", refractive_index))
         if heights_um.ndim > 1 or index.ndim > 1 or not heights_um.size:
-            raise ParameterError("height_um", "and 'refractive_index' must be numbers, or lists of one number per layer")
+            raise ParameterError(
+                "height_um", "and 'refractive_index' must be numbers, or lists of one number per layer"
+            )
         if heights_um.size != index.size:
             rule = f"must have one value for each of the {heights_um.size} heights, got {index.size}"
             raise ParameterError("refractive_index", rule)
@@ -55,10 +57,10 @@ class Layers(NamedTuple):
         return np.asarray(tangents * per_tangent.sum(axis=-1, keepdims=True))
 
 
-def as_layers(instance: object) -> Layers:
+def as_layers(instance: Any) -> Layers:
     """Return the layers of pixel optics, and store their heights and indices as numbers or tuples."""
-    height_um, index = getattr(instance, "height_um"), getattr(instance, "refractive_index")  # noqa: B009 -- of any class
-    layers = Layers.of(height_um, index)
-    for name, value, array in (("height_um", height_um, layers.height_um), ("refractive_index", index, layers.refractive_index)):
-        object.__setattr__(instance, name, tuple(array.tolist()) if np.ndim(value) else float(array[0]))
+    layers = Layers.of(instance.height_um, instance.refractive_index)
+    for name, array in layers._asdict().items():
+        value = tuple(array.tolist()) if np.ndim(getattr(instance, name)) else float(array[0])
+        object.__setattr__(instance, name, value)
     return layers

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from foveasim._core.rings import ring_area_um2, site_moments
 from foveasim._core.threads import parallel_map, thread_count
@@ -51,11 +52,11 @@ class Shapes(NamedTuple):
             if isinstance(given, Outlines) and given.n_sites != sites.n_sites:
                 raise ParameterError(name, f"must have the {sites.n_sites} sites of the layout, got {given.n_sites}")
         own = _one_of_lattice(sites)
-        given = [each for each in (opening, photodiode) if isinstance(each, Outlines)]
-        if own is None or given:
+        others = [each for each in (opening, photodiode) if isinstance(each, Outlines)]
+        if own is None or others:
             own = Outlines(sites.xy_um, sites.ring_offsets, sites.site_offsets)
             centre_um = site_moments(own.xy_um, own.ring_offsets, own.site_offsets)[1]
-            is_congruent = sites.n_sites > 1 and all(_are_congruent(each, centre_um) for each in (own, *given))
+            is_congruent = sites.n_sites > 1 and all(_are_congruent(each, centre_um) for each in (own, *others))
             if is_congruent:
                 first = slice(0, 1)
                 own, centre_um = own.part(first), centre_um[first]
@@ -157,7 +158,9 @@ def _are_congruent(outlines: Outlines, centre_um: Floats) -> bool:
     """Return whether sites are translated copies of each other, with the same positions relative to their centres."""
     n_sites, n_vertices = outlines.n_sites, np.diff(outlines.ring_offsets)
     n_rings = outlines.site_offsets[1]
-    if (np.diff(outlines.site_offsets) != n_rings).any() or (n_vertices.reshape(n_sites, -1) != n_vertices[:n_rings]).any():
+    if (np.diff(outlines.site_offsets) != n_rings).any() or (
+        n_vertices.reshape(n_sites, -1) != n_vertices[:n_rings]
+    ).any():
         return False
     local_um = outlines.xy_um.reshape(n_sites, -1, 2) - centre_um[:, np.newaxis]
     width_um = np.ptp(local_um[0], axis=0).max()
@@ -191,7 +194,7 @@ def inset(name: str, outlines: Outlines, margin_um: float) -> Outlines:
     return _packed(shrunk)
 
 
-def _packed(polygons: object) -> Outlines:
+def _packed(polygons: NDArray[Any]) -> Outlines:
     """Return the rings of shapely polygons, outlines counter-clockwise and holes clockwise."""
     import shapely
 
@@ -204,5 +207,5 @@ def _packed(polygons: object) -> Outlines:
     is_reversed = (ring_area_um2(xy_um, offsets) > 0.0) == is_hole
     index = np.arange(xy_um.shape[0])
     flipped = offsets[ring_of] + offsets[ring_of + 1] - 1 - index
-    sites = np.concatenate(([0], np.cumsum(np.bincount(site_of, minlength=np.size(polygons)))))
+    sites = np.concatenate(([0], np.cumsum(np.bincount(site_of, minlength=polygons.size))))
     return Outlines(xy_um[np.where(is_reversed[ring_of], flipped, index)], offsets, sites)

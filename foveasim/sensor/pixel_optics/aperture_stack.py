@@ -19,7 +19,7 @@ from foveasim.sensor.pixel_optics._layers import as_layers
 from foveasim.sensor.pixel_optics._shapes import Shapes
 from foveasim.sensor.pixel_optics.contract import PIXEL_OPTICS, Footprints, Outlines, PixelOptics
 
-__all__ = ["ApertureStack", "INSET"]
+__all__ = ["INSET", "ApertureStack"]
 
 INSET = Limits(at_least=0.0, at_most=1e4, hint="insets are in µm")
 #: Directions and rings of the fine rays of the control variate, at least, and per direction and ring of the rays.

@@ -190,11 +190,11 @@ class PixelOptics(ABC):
             Each site must have the footprint that it has in any selection of sites, unless ``has_mixing``.
         """
 
-    def part(self, selection: slice | Ints) -> PixelOptics:
+    def part(self, selection: slice | Ints) -> PixelOptics:  # noqa: ARG002 -- for subclasses
         """Return the pixel optics of some of the sites, for those with data per site."""
         return self
 
-    def optical_opening_um(self, sites: Photosites) -> float:
+    def optical_opening_um(self, sites: Photosites) -> float:  # noqa: ARG002 -- for subclasses
         """
         Return the smallest width of an opening times its refractive index, µm.
 

@@ -61,10 +61,10 @@ class Microlens(PixelOptics):
 
     Notes
     -----
-    The microlens covers its site, and images the exit pupil onto the plane of the photodiode: a ray of tangent t above the stack
-    meets it at ``Σ h t / sqrt(n² (1 + t²) - t²) - s`` from the centroid of the site. The response is the fraction of the power
-    in this image that is on the photodiode. The optimal shift is ``s = Σ h tan asin(sin CRA / n)``. On the axis, all light is
-    collected while ``h / (2 n N)`` is at most the radius of the inscribed circle.
+    The microlens covers its site, and images the exit pupil onto the plane of the photodiode: a ray of tangent t meets it at
+    ``Σ h t / sqrt(n² (1 + t²) - t²) - s`` from the centroid of the site. The response is the fraction of the power in this image
+    that is on the photodiode. The optimal shift is ``s = Σ h tan asin(sin CRA / n)``. On the axis, all light is collected while
+    ``h / (2 n N)`` is at most the radius of the inscribed circle.
 
     Images of clear circular pupils are polygons of 96 vertices, whose power per area is linear in the squared displacement: the
     fraction is within 1e-3. Images of other pupils are counted ray by ray, with ``n_rings`` rings of rays.
@@ -101,7 +101,9 @@ class Microlens(PixelOptics):
         as_layers(self)
         shift = self.shift
         object.__setattr__(
-            self, "shift", check_choice("shift", shift, SHIFTS) if isinstance(shift, str) else check_number("shift", shift)
+            self,
+            "shift",
+            check_choice("shift", shift, SHIFTS) if isinstance(shift, str) else check_number("shift", shift),
         )
         if self.photodiode is not None:
             object.__setattr__(self, "photodiode", Outlines.of("photodiode", self.photodiode))
@@ -166,9 +168,7 @@ class Microlens(PixelOptics):
             _kernels.ray_fractions(*stack, *cones.rays(), *target)
         return found
 
-    def _mixing(
-        self, sites: Photosites, incidence: Incidence, layers: Layers, response: Floats
-    ) -> csr_array[Any]:
+    def _mixing(self, sites: Photosites, incidence: Incidence, layers: Layers, response: Floats) -> csr_array[Any]:
         """Return the fractions of the light of sites on the photodiodes of others."""
         import shapely
         from scipy.sparse import coo_array
@@ -178,9 +178,7 @@ class Microlens(PixelOptics):
             every = Outlines(sites.xy_um, sites.ring_offsets, sites.site_offsets)
             photodiode = inset("photodiode", every, self.photodiode_inset_um)
         starts = photodiode.ring_offsets[photodiode.site_offsets[:-1]]
-        low_um, high_um = (
-            find.reduceat(photodiode.xy_um, starts, axis=0) for find in (np.minimum, np.maximum)
-        )
+        low_um, high_um = (find.reduceat(photodiode.xy_um, starts, axis=0) for find in (np.minimum, np.maximum))
         tree = shapely.STRtree(shapely.box(*low_um.T, *high_um.T))
         lost = np.flatnonzero(response < 1.0)
         cones = incidence.at(incidence.field_um[lost])
