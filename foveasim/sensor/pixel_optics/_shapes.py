@@ -19,8 +19,10 @@ from foveasim.sensor.pixel_optics.contract import Outlines
 
 #: Sites are congruent if their vertices, relative to their centroids, differ by at most this fraction of their width.
 CONGRUENT = 1e-9
-#: Step of the nodes of congruent sites in the tangent of the chief ray: bilinear interpolation of responses is within 1e-5.
+#: Step of the nodes of congruent sites in the tangent of the chief ray: bilinear interpolation of responses is within 1e-4.
 NODE_STEP = 1.0 / 128.0
+#: Largest number of nodes; there are 10^5 up to tangents of 1.
+MAX_NODES = 1 << 22
 #: Rows per call of a kernel, fixed so that results do not depend on the number of threads.
 ROWS = 4096
 #: Ratio of the length of a sharp corner to its inset.
@@ -87,8 +89,10 @@ class Shapes(NamedTuple):
             first = incidence.at(incidence.field_um[:1])
             return np.repeat(compute(first, np.zeros(1, np.int64)), incidence.n_sites, axis=0)
         field_um = incidence.field_um
-        low = np.floor(field_um.min(axis=0) / step_um)
-        n_x, n_y = (np.floor(field_um.max(axis=0) / step_um) - low).astype(np.int64) + 2
+        low, high = (np.floor(find(axis=0) / step_um) for find in (field_um.min, field_um.max))
+        if np.prod(high - low + 2.0) > MAX_NODES:  # of a table with a step in its angles
+            return _in_blocks(incidence, np.zeros(incidence.n_sites, np.int64), n_values, compute)
+        n_x, n_y = (high - low).astype(np.int64) + 2
         columns, rows = low[0] + np.arange(n_x), low[1] + np.arange(n_y)
         nodes_um = np.stack(np.meshgrid(columns * step_um, rows * step_um), axis=-1).reshape(-1, 2)
         values = np.zeros((nodes_um.shape[0], n_values))

@@ -62,9 +62,9 @@ class Microlens(PixelOptics):
     Notes
     -----
     The microlens covers its site, and images the exit pupil onto the plane of the photodiode: a ray of tangent t meets it at
-    ``Σ h t / sqrt(n² (1 + t²) - t²) - s`` from the centroid of the site. The response is the fraction of the power in this image
-    that is on the photodiode. The optimal shift is ``s = Σ h tan asin(sin CRA / n)``. On the axis, all light is collected while
-    ``h / (2 n N)`` is at most the radius of the inscribed circle.
+    ``Σ h t / sqrt(n² (1 + t²) - t²) - s`` from the centroid of the site. The response is the fraction of the power in this
+    image that is on the photodiode. The optimal shift is ``s = Σ h tan asin(sin CRA / n)``. On the axis, all light is collected
+    while ``h / (2 n N)`` is at most the radius of the inscribed circle.
 
     Images of clear circular pupils are polygons of 96 vertices, whose power per area is linear in the squared displacement: the
     fraction is within 1e-3. Images of other pupils are counted ray by ray, with ``n_rings`` rings of rays.
