@@ -221,7 +221,7 @@ class Incidence:
 
     @property
     def um_per_tangent(self) -> float:
-        """Smallest displacement in the image that changes the tangent of a chief ray by 1; infinity if it is constant."""
+        """Smallest displacement in the image per change of a chief ray tangent, inf if constant."""
         if self.table is None:
             return self.exit_pupil_um
         slope_per_um = self.table._slope_per_um  # noqa: SLF001 -- of this module
@@ -235,7 +235,7 @@ class Incidence:
 
     @property
     def weights(self) -> Floats:
-        """Weights of the rays, (n_site, n_ray): proportional to (1 + t²)⁻², with a sum of 1 per site."""
+        """Weights of the rays, (n_site, n_ray): (1 + t²)⁻² over its sum."""
         weights = self.rays()[1] / (1.0 + np.square(self.tangents).sum(axis=2)) ** 2
         return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
@@ -275,9 +275,9 @@ class Incidence:
 @lru_cache(maxsize=16)
 def disc_cubature(n_rings: int, n_directions: int) -> tuple[Floats, Floats]:
     """
-    Return points (n, 2) and weights (n,) of a cubature of the unit disc, exact for polynomials.
+    Return points (n, 2) and weights (n,) of a cubature of the unit disc.
 
-    Radii are nodes of Gauss and Legendre in the squared radius. Rings are rotated against each other by half a step, and by an
+    It is exact for polynomials. Radii are nodes of Gauss and Legendre in the squared radius. Rings are rotated against each other by half a step, and by an
     eighth of a step against the axes, at which the overlap of rectangles has kinks.
     """
     node, weight = np.polynomial.legendre.leggauss(n_rings)

@@ -56,7 +56,7 @@ def test_displacement_moves_field_but_not_design():
     lens = fs.Optics(focal_length_mm=8.0, f_number=2.0, exit_pupil_mm=10.0)
     cone = lens.incidence(FIELD_UM, displacement_um=(50.0, -20.0))
 
-    np.testing.assert_allclose(cone.chief_ray, (FIELD_UM + [50.0, -20.0]) / 10_000.0, rtol=1e-13)
+    np.testing.assert_allclose(cone.chief_ray, (FIELD_UM + np.array([50.0, -20.0])) / 10_000.0, rtol=1e-13)
     np.testing.assert_allclose(cone.design(), FIELD_UM / 10_000.0, rtol=1e-13)
 
 

@@ -57,9 +57,9 @@ def find_footprints(
     cache: FootprintCache | None = None,
 ) -> Footprints | None:
     """
-    Return the light that the sites of a layout collect, at a position in the image; None without pixel optics.
+    Return the light that the sites of a layout collect; None without pixel optics.
 
-    ``layout``: photosites in the frame of the sensor. ``light``: a scene with its pitch, or a power map.
+    ``position_um``: that of the layout in the image. ``layout``: photosites in the frame of the sensor. ``light``: a scene with its pitch, or a power map.
     """
     if pixel_optics is None:
         return None
@@ -83,7 +83,7 @@ def site_centres_um(layout: Layout) -> Floats:
 
 
 def placed(layout: Layout, footprints: Footprints | None, position_um: Position) -> Layout:
-    """Return the outlines over which the light of sites is integrated, at a position in the image."""
+    """Return the outlines for integration, at a position in the image."""
     outlines: PackedRings | None = None if footprints is None else footprints.outlines
     if outlines is not None:
         xy_um = outlines.xy_um + np.array(position_um) if any(position_um) else outlines.xy_um

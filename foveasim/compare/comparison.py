@@ -455,7 +455,7 @@ def cameras(
 
 
 def _with_angular_response(camera: Camera, light: Scene | PowerMap) -> Sensor:
-    """Return the sensor of a camera with its known response to cones of light, for corrections."""
+    """Return the sensor with its known response to cones of light, for corrections."""
     if camera.sensor.pixel_optics is None:
         return camera.sensor
     return camera.sensor.with_angular_response(camera.angular_response(light))

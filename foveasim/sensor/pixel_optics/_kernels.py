@@ -1,5 +1,5 @@
 """
-Numba kernels of pixel optics: moments of overlaps of polygons, averaged over cones of rays.
+Numba kernels of pixel optics: moments of overlaps, averaged over cones of rays.
 
 The indicator of a polygon is the signed sum over its edges of the regions below them, s the sign of the direction along x. The
 product of two indicators is the sum over pairs of edges of the regions below both, so that
@@ -31,7 +31,7 @@ _rings = (_points, _ints, _ints)
 
 @njit()
 def _fill_edges(xy, ring_offsets, first_ring, last_ring, x_0, y_0, edges):
-    """Write the edges of rings as x_low, x_high, y at x_low, slope, sign, relative to a point; return their number."""
+    """Write edges as x_low, x_high, y at x_low, slope, sign; return their number."""
     n = 0
     for ring in range(first_ring, last_ring):
         start, stop = ring_offsets[ring], ring_offsets[ring + 1]
@@ -107,7 +107,7 @@ def _add_overlap(edges_a, n_a, edges_b, n_b, d_x, d_y, sums):
 
 @njit()
 def _displacement_per_tangent(squared_tangent, height_um, squared_index):
-    """Return the lateral displacement in a stack of layers over the tangent of the incident ray."""
+    """Return the displacement in a stack of layers over the tangent of the ray."""
     total = 0.0
     for k in range(height_um.size):
         total += height_um[k] / math.sqrt(squared_index[k] * (1.0 + squared_tangent) - squared_tangent)
@@ -116,7 +116,7 @@ def _displacement_per_tangent(squared_tangent, height_um, squared_index):
 
 @njit(types.void(*_rings, *_rings, _points, _out2))
 def overlap_moments(a_xy, a_rings, a_sites, b_xy, b_rings, b_sites, displacement, out):
-    """Write the moments of A ∩ (B - d) of each site, (n, 6), about the origin, for displacements (n, 2)."""
+    """Write the moments of A ∩ (B - d) of sites, (n, 6), for displacements (n, 2)."""
     edges_a, edges_b = np.empty((a_xy.shape[0], 5)), np.empty((b_xy.shape[0], 5))
     for s in range(out.shape[0]):
         n_a = _fill_edges(a_xy, a_rings, a_sites[s], a_sites[s + 1], 0.0, 0.0, edges_a)
@@ -172,7 +172,7 @@ def cone_moments(
     a_xy, a_rings, a_sites, b_xy, b_rings, b_sites, site_of, is_same, centre, out,
 ):  # fmt: skip
     """
-    Write the mean area, and the mean moments, of the overlaps A ∩ (B - d) over the rays of cones.
+    Write mean areas and moments of the overlaps A ∩ (B - d) over the rays of cones.
 
     Row k, (7,), is for the chief ray ``chief_rays[k]`` and the outlines of the site ``site_of[k]``: the mean area, then the
     moments of the sum over the rays about the centre of the site. If A and B are the same, the overlap for small displacements
@@ -245,7 +245,7 @@ def _squared_distance(xy, ring_offsets, first_ring, last_ring, x, y):
 
 @njit()
 def _density(squared_tangent, height_um, squared_index):
-    """Return the power per area of the image of the pupil, and the squared displacement, for a ray."""
+    """Return the power per area of the image of the pupil, and the squared displacement."""
     per_tangent, slope = 0.0, 0.0
     for k in range(height_um.size):
         inverse2 = 1.0 / (squared_index[k] * (1.0 + squared_tangent) - squared_tangent)
@@ -259,9 +259,9 @@ def _density(squared_tangent, height_um, squared_index):
 @njit(types.void(_points, _number, _floats, _floats, _points, *_rings, _ints, _points, _out1))
 def pupil_fractions(chief_rays, radius, height_um, squared_index, shift, xy, rings, sites, site_of, centre, out):
     """
-    Write the fraction of the power in images of clear circular pupils that falls on photodiodes.
+    Write the fractions of images of clear circular pupils on photodiodes.
 
-    Image k is that of the chief ray ``chief_rays[k]``, shifted by ``-shift[k]``, relative to ``centre[k]``, and falls on the
+    The fractions are of power. Image k is that of the chief ray ``chief_rays[k]``, shifted by ``-shift[k]``, relative to ``centre[k]``, and falls on the
     outline of the site ``site_of[k]``. Its power per area is a function of the squared displacement p, linear over the range of
     the image.
     """
@@ -309,7 +309,7 @@ def pupil_fractions(chief_rays, radius, height_um, squared_index, shift, xy, rin
 def ray_fractions(
     chief_rays, radius, height_um, squared_index, points, weights, shift, xy, rings, sites, site_of, centre, out
 ):
-    """Write the fraction of the weight of rays that meet photodiodes, for images as in :func:`pupil_fractions`."""
+    """Write the fractions of rays on photodiodes, as for :func:`pupil_fractions`."""
     rays = np.empty((3, points.shape[0]))
     for k in range(out.size):
         first_ring, last_ring = sites[site_of[k]], sites[site_of[k] + 1]
@@ -324,7 +324,7 @@ def ray_fractions(
 
 @njit(types.void(_points, _number, _number, _number, types.Array(types.float64, 3, "C", readonly=True), _out2))
 def interpolate(field, step, first_column, first_row, nodes, out):
-    """Interpolate values at nodes (n_row, n_column, n_value), at multiples of a step, bilinearly at positions (n, 2)."""
+    """Interpolate values (n_row, n_column, n_value) at multiples of a step bilinearly."""
     for k in range(out.shape[0]):
         x, y = field[k, 0] / step - first_column, field[k, 1] / step - first_row
         j, i = min(max(math.floor(x), 0), nodes.shape[1] - 2), min(max(math.floor(y), 0), nodes.shape[0] - 2)

@@ -58,7 +58,7 @@ class Layers(NamedTuple):
 
 
 def as_layers(instance: Any) -> Layers:
-    """Return the layers of pixel optics, and store their heights and indices as numbers or tuples."""
+    """Return the layers of pixel optics, and store valid heights and indices."""
     layers = Layers.of(instance.height_um, instance.refractive_index)
     for name, array in layers._asdict().items():
         value = tuple(array.tolist()) if np.ndim(getattr(instance, name)) else float(array[0])

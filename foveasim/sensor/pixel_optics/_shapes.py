@@ -31,7 +31,7 @@ MITRE_LIMIT = 100.0
 
 class Shapes(NamedTuple):
     """
-    Outlines of the shapes of sites, each with its index of the site, or those of one of several congruent sites.
+    Openings and photodiodes of sites, or those of one of several congruent sites.
 
     ``sites``, ``opening``, ``photodiode``: outlines. ``centre_um`` (n, 2): centroids of the sites. ``is_congruent``: whether
     the outlines are those of one site, of which the others are translated copies.
@@ -46,7 +46,7 @@ class Shapes(NamedTuple):
     @classmethod
     def of(cls, sites: Photosites, opening: Outlines | float, photodiode: Outlines | float) -> Shapes:
         """
-        Return the shapes of sites: given outlines, or insets in µm of the outlines of the sites.
+        Return the shapes of sites: given outlines, or insets in µm.
 
         Raises ParameterError when given outlines have another number of sites, and GeometryError for insets that are too large.
         """
@@ -119,7 +119,7 @@ class Shapes(NamedTuple):
 
 
 def _clip_to_table(incidence: Incidence, nodes_um: Floats) -> Incidence:
-    """Return cones at nodes; those beyond a table of chief rays, which only outermost sites use, at its last height."""
+    """Return cones at nodes; those of outermost sites beyond a table at its last height."""
     if incidence.table is None:
         return incidence.at(nodes_um)
     last_um = incidence.table.image_height_um[-1]
@@ -159,7 +159,7 @@ def _one_of_lattice(sites: Photosites) -> Outlines | None:
 
 
 def _are_congruent(outlines: Outlines, centre_um: Floats) -> bool:
-    """Return whether sites are translated copies of each other, with the same positions relative to their centres."""
+    """Return whether sites are translated copies of each other, as are their centres."""
     n_sites, n_vertices = outlines.n_sites, np.diff(outlines.ring_offsets)
     n_rings = outlines.site_offsets[1]
     if (np.diff(outlines.site_offsets) != n_rings).any() or (

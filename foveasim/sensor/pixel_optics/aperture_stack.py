@@ -103,7 +103,7 @@ class ApertureStack(PixelOptics):
         )
 
     def optical_opening_um(self, sites: Photosites) -> float:
-        """Return the square root of the smallest area of an opening, times the refractive index of the top layer."""
+        """Return the smallest opening times the index of the top layer, µm."""
         opening, index = self._shapes(sites).opening, np.atleast_1d(self.refractive_index)[0]
         area_um2 = site_area_um2(opening.xy_um, opening.ring_offsets, opening.site_offsets)
         return float(index * np.sqrt(area_um2.min(initial=np.inf)))

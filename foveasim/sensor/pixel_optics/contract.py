@@ -1,5 +1,5 @@
 """
-Base class of pixel optics: what light meets between the surface of the sensor and the photodiodes.
+Base class of pixel optics: openings, layers and microlenses above photodiodes.
 
 Pixel optics convert the light that is incident on the outlines of photosites to the light that their photodiodes collect. A
 camera integrates the image over the outlines of :class:`Footprints`, and multiplies by their factors.

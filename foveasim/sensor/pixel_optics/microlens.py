@@ -118,7 +118,7 @@ class Microlens(PixelOptics):
         return self if self.photodiode is None else replace(self, photodiode=self.photodiode.part(selection))
 
     def optical_opening_um(self, sites: Photosites) -> float:
-        """Return the square root of the smallest area of a site, times the refractive index of the top layer."""
+        """Return the size of the smallest site times the index of the top layer, µm."""
         return float(np.atleast_1d(self.refractive_index)[0] * np.sqrt(sites.area_um2.min(initial=np.inf)))
 
     def shift_um(self, incidence: Incidence) -> Floats:

@@ -94,7 +94,7 @@ def median_site(values: Floats) -> int:
 
 
 def copies_of(sensor: Sensor, site: int, n: int) -> Sensor:
-    """Return a sensor of n copies of a photosite, without exchange of charge, for expected charges."""
+    """Return a sensor of n copies of a photosite, without exchange of charge or light."""
     sensor = replace(sensor, pixel_optics=None)
     connecting = [effect.name for effect in sensor.chain if effect.reach == "all"]
     return (sensor.without(*connecting) if connecting else sensor).part(np.full(n, site))
