@@ -277,8 +277,8 @@ def disc_cubature(n_rings: int, n_directions: int) -> tuple[Floats, Floats]:
     """
     Return points (n, 2) and weights (n,) of a cubature of the unit disc.
 
-    It is exact for polynomials. Radii are nodes of Gauss and Legendre in the squared radius. Rings are rotated against each other by half a step, and by an
-    eighth of a step against the axes, at which the overlap of rectangles has kinks.
+    It is exact for polynomials. Radii are nodes of Gauss and Legendre in the squared radius. Rings are rotated against each
+    other by half a step, and by an eighth of a step against the axes, at which the overlap of rectangles has kinks.
     """
     node, weight = np.polynomial.legendre.leggauss(n_rings)
     radius = np.sqrt(0.5 * (1.0 + node))

@@ -59,7 +59,8 @@ def find_footprints(
     """
     Return the light that the sites of a layout collect; None without pixel optics.
 
-    ``position_um``: that of the layout in the image. ``layout``: photosites in the frame of the sensor. ``light``: a scene with its pitch, or a power map.
+    ``position_um``: that of the layout in the image. ``layout``: photosites in the frame of the sensor. ``light``: a scene with
+    its pitch, or a power map.
     """
     if pixel_optics is None:
         return None

@@ -261,9 +261,9 @@ def pupil_fractions(chief_rays, radius, height_um, squared_index, shift, xy, rin
     """
     Write the fractions of images of clear circular pupils on photodiodes.
 
-    The fractions are of power. Image k is that of the chief ray ``chief_rays[k]``, shifted by ``-shift[k]``, relative to ``centre[k]``, and falls on the
-    outline of the site ``site_of[k]``. Its power per area is a function of the squared displacement p, linear over the range of
-    the image.
+    The fractions are of power. Image k is that of the chief ray ``chief_rays[k]``, shifted by ``-shift[k]``, relative to
+    ``centre[k]``, and falls on the outline of the site ``site_of[k]``. Its power per area is a function of the squared
+    displacement p, linear over the range of the image.
     """
     image, edges_p = np.empty((N_PUPIL, 2)), np.empty((N_PUPIL, 5))
     edges = np.empty((_largest_size(rings, sites, site_of), 5))
