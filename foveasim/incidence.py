@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.calls import Limits, OwnCheck, check_declared, publish
+from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, finite_array, read_only
 from foveasim.errors import ParameterError
 
@@ -66,6 +67,8 @@ class ChiefRayTable:
 
     image_height_um: Annotated[Sequence[float], HEIGHT]
     angle_deg: Annotated[Sequence[float], ANGLE]
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         check_declared(self)

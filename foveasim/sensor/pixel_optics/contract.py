@@ -221,4 +221,4 @@ def check_footprints(optics: PixelOptics, sites: Photosites, incidence: Incidenc
 
 #: Pixel optics by their names in settings files. Classes are registered with ``@PIXEL_OPTICS.register("name")``, or by entry
 #: points of the group ``foveasim.pixel_optics`` in installed packages.
-PIXEL_OPTICS: Registry[type[PixelOptics]] = Registry("kind of pixel optics", "foveasim.pixel_optics")
+PIXEL_OPTICS: Registry[type[PixelOptics]] = Registry("pixel optics", "foveasim.pixel_optics")
