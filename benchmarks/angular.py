@@ -28,9 +28,7 @@ def _bench_rings(report: Report, shape: tuple[int, int]) -> None:
     optics = fs.Optics(focal_length_mm=8.0, f_number=2.8, oversample=1)
     grid = fs.Grid.centred(shape, 0.5)
     r_max_um = 0.495 * shape[0] * 0.5
-    layout = fs.layout.log_polar(
-        n_sectors=N_SECTORS, n_rings=N_RINGS, r_min_um=0.1 * r_max_um, r_max_um=r_max_um
-    )
+    layout = fs.layout.log_polar(n_sectors=N_SECTORS, n_rings=N_RINGS, r_min_um=0.1 * r_max_um, r_max_um=r_max_um)
     cones = optics.incidence(layout.centroid_um)
     times = best_s(
         {

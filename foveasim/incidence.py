@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.calls import Limits, OwnCheck, check_declared, publish
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, finite_array, read_only
+from foveasim._core.validation import Floats, as_numbers, finite_array, own, read_only
 from foveasim.errors import ParameterError
 
 __all__ = ["ChiefRayTable", "Incidence"]
@@ -170,10 +170,12 @@ class Incidence:
 
     def __post_init__(self) -> None:
         check_declared(self)
-        field_um = finite_array("field_um", self.field_um)
+        field_um = np.ascontiguousarray(as_numbers("field_um", self.field_um), np.float64)
         if field_um.ndim != 2 or field_um.shape[1] != 2:
             raise ParameterError("field_um", f"must have the shape (n_site, 2), got {field_um.shape}")
-        object.__setattr__(self, "field_um", read_only(np.array(field_um, np.float64, order="C")))
+        if not math.isfinite(field_um.sum()):
+            finite_array("field_um", field_um)  # raises an error with the position
+        object.__setattr__(self, "field_um", own(field_um))
         if not self.exit_pupil_um > 0.0:
             raise ParameterError("exit_pupil_um", "must be > 0", self.exit_pupil_um, "µm")
 

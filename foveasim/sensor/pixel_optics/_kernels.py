@@ -20,6 +20,7 @@ from foveasim._core.jit import njit
 N_MOMENTS = 6
 #: Vertices of the polygon in an image of the pupil: its area is that of the disc to 7e-4.
 N_PUPIL = 96
+SIXTH, TWELFTH = 1.0 / 6.0, 1.0 / 12.0
 
 _floats = types.Array(types.float64, 1, "C", readonly=True)
 _points = types.Array(types.float64, 2, "C", readonly=True)
@@ -61,34 +62,32 @@ def _largest_size(ring_offsets, site_offsets, site_of):
 
 
 @njit()
-def _add_below(x_a, x_b, y_a, y_b, sign, sums):
-    """Add the moments of the region below a line from (x_a, y_a) to (x_b, y_b), down to y = 0."""
+def _moments_below(x_a, x_b, y_a, y_b, sign):
+    """Return the moments of the region below a line from (x_a, y_a) to (x_b, y_b), down to y = 0."""
     h = sign * (x_b - x_a)
-    square_a, square_b, product = y_a * y_a, y_b * y_b, y_a * y_b
-    sums[0] += 0.5 * h * (y_a + y_b)
-    sums[1] += h / 6.0 * (x_a * (2.0 * y_a + y_b) + x_b * (y_a + 2.0 * y_b))
-    sums[2] += h / 6.0 * (square_a + product + square_b)
-    sums[3] += (
-        h
-        / 12.0
-        * (
-            y_a * (3.0 * x_a * x_a + 2.0 * x_a * x_b + x_b * x_b)
-            + y_b * (x_a * x_a + 2.0 * x_a * x_b + 3.0 * x_b * x_b)
-        )
+    total, square_a, square_b, product = y_a + y_b, y_a * y_a, y_b * y_b, y_a * y_b
+    x_ab, xx_a, xx_b = x_a + x_b, x_a * x_a, x_b * x_b
+    xx = (x_ab * x_ab + 2.0 * xx_a, x_ab * x_ab + 2.0 * xx_b)
+    return (
+        0.5 * h * total,
+        SIXTH * h * (x_a * (total + y_a) + x_b * (total + y_b)),
+        SIXTH * h * (square_a + product + square_b),
+        TWELFTH * h * (y_a * xx[0] + y_b * xx[1]),
+        0.5 * TWELFTH * h * (square_a * (x_ab + 2.0 * x_a) + 2.0 * product * x_ab + square_b * (x_ab + 2.0 * x_b)),
+        TWELFTH * h * total * (square_a + square_b),
     )
-    sums[4] += h / 24.0 * (square_a * (3.0 * x_a + x_b) + 2.0 * product * (x_a + x_b) + square_b * (x_a + 3.0 * x_b))
-    sums[5] += h / 12.0 * (y_a + y_b) * (square_a + square_b)
 
 
 @njit()
 def _add_overlap(edges_a, n_a, edges_b, n_b, d_x, d_y, sums):
     """Add the moments of A ∩ (B - d) to six sums."""
+    m_0, m_x, m_y, m_xx, m_xy, m_yy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for e in range(n_a):
         e_low, e_high, e_y, e_slope = edges_a[e, 0], edges_a[e, 1], edges_a[e, 2], edges_a[e, 3]
         for f in range(n_b):
-            f_low = edges_b[f, 0] - d_x
-            low = max(e_low, f_low)
-            high = min(e_high, edges_b[f, 1] - d_x)
+            f_low, f_high = edges_b[f, 0] - d_x, edges_b[f, 1] - d_x
+            low = max(f_low, e_low)
+            high = min(f_high, e_high)
             if not low < high:
                 continue
             sign = edges_a[e, 4] * edges_b[f, 4]
@@ -96,13 +95,24 @@ def _add_overlap(edges_a, n_a, edges_b, n_b, d_x, d_y, sums):
             e_at_low, e_at_high = e_y + e_slope * (low - e_low), e_y + e_slope * (high - e_low)
             f_at_low, f_at_high = f_y + f_slope * (low - f_low), f_y + f_slope * (high - f_low)
             before, after = e_at_low - f_at_low, e_at_high - f_at_high
+            at_low = f_at_low if before > 0.0 else e_at_low
+            at_high = f_at_high if after > 0.0 else e_at_high
             if before * after < 0.0:  # the edges cross
                 x = low + (high - low) * (before / (before - after))
                 y = e_y + e_slope * (x - e_low)
-                _add_below(low, x, min(e_at_low, f_at_low), y, sign, sums)
-                _add_below(x, high, y, min(e_at_high, f_at_high), sign, sums)
-            else:
-                _add_below(low, high, min(e_at_low, f_at_low), min(e_at_high, f_at_high), sign, sums)
+                part = _moments_below(low, x, at_low, y, sign)
+                m_0, m_x, m_y = m_0 + part[0], m_x + part[1], m_y + part[2]
+                m_xx, m_xy, m_yy = m_xx + part[3], m_xy + part[4], m_yy + part[5]
+                low, at_low = x, y
+            part = _moments_below(low, high, at_low, at_high, sign)
+            m_0, m_x, m_y = m_0 + part[0], m_x + part[1], m_y + part[2]
+            m_xx, m_xy, m_yy = m_xx + part[3], m_xy + part[4], m_yy + part[5]
+    sums[0] += m_0
+    sums[1] += m_x
+    sums[2] += m_y
+    sums[3] += m_xx
+    sums[4] += m_xy
+    sums[5] += m_yy
 
 
 @njit()

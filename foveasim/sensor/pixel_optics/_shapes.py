@@ -89,14 +89,19 @@ class Shapes(NamedTuple):
             first = incidence.at(incidence.field_um[:1])
             return np.repeat(compute(first, np.zeros(1, np.int64)), incidence.n_sites, axis=0)
         field_um = incidence.field_um
-        low, high = (np.floor(find(axis=0) / step_um) for find in (field_um.min, field_um.max))
+        # Column by column: many times faster than a reduction along axis 0.
+        low, high = (
+            np.floor(np.array([find(field_um[:, axis]) for axis in (0, 1)]) / step_um) for find in (np.min, np.max)
+        )
         if np.prod(high - low + 2.0) > MAX_NODES:  # of a table with a step in its angles
             return _in_blocks(incidence, np.zeros(incidence.n_sites, np.int64), n_values, compute)
         n_x, n_y = (high - low).astype(np.int64) + 2
         columns, rows = low[0] + np.arange(n_x), low[1] + np.arange(n_y)
         nodes_um = np.stack(np.meshgrid(columns * step_um, rows * step_um), axis=-1).reshape(-1, 2)
         values = np.zeros((nodes_um.shape[0], n_values))
-        used = self._nodes_near(field_um / step_um - low, n_x, n_y)
+        used = np.arange(n_x * n_y)
+        if used.size > 4 * field_um.shape[0]:
+            used = _nodes_near(field_um / step_um - low, n_x)
         at = _clip_to_table(incidence, nodes_um[used])
         values[used] = _in_blocks(at, np.zeros(at.n_sites, np.int64), n_values, compute)
         found = np.empty((incidence.n_sites, n_values))
@@ -108,14 +113,12 @@ class Shapes(NamedTuple):
         parallel_map(block, _blocks(incidence.n_sites), thread_count())
         return found
 
-    @staticmethod
-    def _nodes_near(position: Floats, n_x: int, n_y: int) -> Ints:
-        """Return the indices of the nodes around positions, or of all nodes if there are few."""
-        if n_x * n_y <= 4 * position.shape[0]:
-            return np.arange(n_x * n_y)
-        column, row = np.floor(position).astype(np.int64).T
-        corner = row * n_x + column
-        return np.unique(np.concatenate([corner, corner + 1, corner + n_x, corner + n_x + 1]))
+
+def _nodes_near(position: Floats, n_x: int) -> Ints:
+    """Return the indices of the nodes around positions."""
+    column, row = np.floor(position).astype(np.int64).T
+    corner = row * n_x + column
+    return np.unique(np.concatenate([corner, corner + 1, corner + n_x, corner + n_x + 1]))
 
 
 def _clip_to_table(incidence: Incidence, nodes_um: Floats) -> Incidence:
