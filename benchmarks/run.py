@@ -25,6 +25,7 @@ from typing import ClassVar
 import numpy as np
 import scipy.fft
 import shapely
+from angular import bench_angular
 from dense import bench_dense
 from exploring import bench_exploring
 from gradients import bench_gradients
@@ -444,6 +445,8 @@ def main() -> int:
             bench(report, shape)
     with console.status("bench dense"):
         bench_dense(report, 512 if is_quick else 2048)
+    with console.status("bench angular"):
+        bench_angular(report, shape, 512 if is_quick else 2048)
     with console.status("bench kernels"):
         bench_kernels(report, 512 if is_quick else 2048)
     with console.status("bench sensor"):

@@ -39,6 +39,7 @@ from foveasim._io.resumable import LOCK, disk_errors, finish, partial_path, resu
 from foveasim._io.zarr_stores import ZARR, open_group, store_format
 from foveasim.camera import Camera
 from foveasim.camera._clock import Clock
+from foveasim.camera._footprints import find_footprints, placed
 from foveasim.camera._steps import WeightedMap, capture_settings, expose, integrate_maps, white_dn
 from foveasim.camera._warnings import Covered, warn_of_coarse_cells, warn_of_coverage, warn_of_focal_length
 from foveasim.capture import Capture
@@ -162,7 +163,9 @@ def _tiles(
         clock = Clock()
         with clock.stage("compile layout"):
             sensor = camera.sensor.part(slice(first, last))
-            part = layout[first:last].translate(*camera.position_um)
+            part = layout[first:last]
+            footprints = find_footprints(camera, part, sensor.pixel_optics, light, camera.position_um)
+            part = placed(part, footprints, camera.position_um)
             bounds_um = outline_bounds_um(part, camera.distortion)
             strips = [_rows_under(image.grid, bounds_um) for image in images]
             integrators = [
@@ -178,7 +181,8 @@ def _tiles(
             ]
         smallest = min(integrators, key=lambda integrator: integrator.grid.cell_area_um2)
         coverages.append(Covered.by(smallest))
-        rate_e_per_s = integrate_maps(sensor, light, _maps(sensor, light, images, strips, clock), integrators, clock)
+        maps = _maps(sensor, light, images, strips, clock)
+        rate_e_per_s = integrate_maps(sensor, light, maps, integrators, clock, footprints)
         # Arrays per site are those of all sites, as in a stored capture.
         about = {"first_site": first, "n_sites": layout.n_sites}
         part_streams = Streams(streams.seed, streams.frame, first // BLOCK_SITES)

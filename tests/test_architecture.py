@@ -31,7 +31,7 @@ LAYERS = [
     {"_core"},
     {"units"},
     {"_io"},
-    {"fields"},
+    {"fields", "incidence"},
     {"distortion", "integrate", "layout", "maps", "optics", "scene", "sensor"},
     {"modes", "reconstruct"},
     {"capture"},
@@ -52,17 +52,17 @@ HEAVY = {
 }  # fmt: skip
 #: Names of dimensionless numbers, or of numbers in the unit of other arguments.
 DIMENSIONLESS = {
-    "a", "above", "amplitude", "at_least", "at_most", "blanking", "coefficients", "colour_matrix", "companding_table", "contrast", "contrast_off", "contrast_on", "count", "custom", "data_range", "delta_e", "delta_e_raw", "deviation", "dpi", "esf", "f_number", "factor", "figure_inches", "fill_factor", "gain", "gamma", "half_step", "high", "hot_sigmas", "illuminant", "k", "k1", "k2", "k3", "k4", "k5", "k6", "kernel",
+    "a", "above", "amplitude", "area_ratio", "at_least", "at_most", "blanking", "coefficients", "colour_matrix", "companding_table", "contrast", "contrast_off", "contrast_on", "count", "custom", "data_range", "delta_e", "delta_e_raw", "deviation", "dpi", "esf", "f_number", "factor", "figure_inches", "fill_factor", "gain", "gamma", "half_step", "high", "hot_sigmas", "illuminant", "k", "k1", "k2", "k3", "k4", "k5", "k6", "kernel",
     "limit", "limits", "log_strength", "low", "magnification", "matrix", "median", "min_coverage", "misfit", "missing", "mtf", "mtf_sigma", "mu", "max_aspect_ratio", "obscuration", "offset",
-    "max_density", "max_growth", "max_neighbour_ratio", "max_track_utilisation", "min_density", "min_growth", "neighbour_fraction", "noisy_ratio", "out", "p1", "p2", "peak", "per_vertex", "percentile", "power", "psnr_db", "psnr_db_by_eccentricity", "qe", "ratio", "reflectance", "rounding",
+    "max_density", "max_growth", "max_neighbour_ratio", "max_track_utilisation", "min_density", "min_growth", "neighbour_fraction", "noisy_ratio", "out", "p1", "p2", "peak", "per_vertex", "percentile", "power", "psnr_db", "psnr_db_by_eccentricity", "qe", "ratio", "reflectance", "refractive_index", "response", "rounding",
     "result", "result_at", "results", "ring_ratio", "sensitivity", "site_weights", "snr", "spectrum", "ssim", "ssim_by_eccentricity", "stretch", "target", "tolerance", "transmission", "value", "values", "variance", "wavelength", "weight", "weights", "white", "worst_area_error", "zoom",
 }  # fmt: skip
 #: Names in private functions, in cells, pitches, steps or aperture radii as their docstrings specify.
 INTERNAL = {
-    "at", "axes", "blur_cells", "blur_lambda_n", "bound", "bounds", "corners", "curve", "cycles", "diagonal", "edge", "extent", "fraction", "fractions", "from_step", "function", "gradient", "height", "inl", "mean", "measure",
+    "after", "at", "axes", "before", "blur_cells", "blur_lambda_n", "bound", "bounds", "corners", "curve", "cycles", "diagonal", "edge", "extent", "fraction", "fractions", "from_step", "function", "gradient", "height", "inl", "mean", "measure",
     "n_across", "n_source_cells", "moments", "new_radius", "node", "norm", "off_diagonal", "one", "other", "per_step", "pixel", "plane", "points", "quantiles", "r2", "radius", "right", "row", "rows", "s_x", "s_y", "scale", "screen", "side", "sigma", "slope", "spread", "start", "tables_at",
     "tangent2_x", "tangent2_y", "threshold", "to_step", "u", "upper", "v", "x", "x2", "xy", "y", "y2", "sampling", "step", "t", "weigh", "window",
-    "bounds_db", "difference_db", "illumination", "spectra", "srgb", "white_xyz", "xyz", "centre", "centres", "circles", "column_x", "discs", "half", "lines_x", "lines_y", "ordered", "phase", "radians", "radians_x", "rho", "row_y", "segments", "shift", "tangents",
+    "bounds_db", "difference_db", "illumination", "spectra", "srgb", "white_xyz", "xyz", "centre", "centres", "circles", "column_x", "compute", "discs", "inner", "maps", "opening", "outer", "photodiode", "position", "sums", "half", "lines_x", "lines_y", "ordered", "phase", "radians", "radians_x", "rho", "row_y", "segments", "shift", "tangents",
 }  # fmt: skip
 FLOATING = re.compile(r"\b(float|Floats|PerSite)\b")
 
@@ -281,7 +281,7 @@ def test_names_imported_by_benchmarks_exist():
 ELECTRONIC = {
     *(field.name for field in fields(Sensor)),
     "dark_rate_e_per_s", "nominal_dark_e_per_s", "v_per_e", "well_e", "dark_current_ratio",
-} - {"layout", "filters", "qe", "bits", "effects", "disabled", "device_seed", "temperature_k", "crosstalk", "coupling"}  # fmt: skip
+} - {"layout", "filters", "qe", "bits", "effects", "disabled", "device_seed", "temperature_k", "pixel_optics", "crosstalk", "coupling"}  # fmt: skip
 #: Modules that show or transfer parameters, or limit charges at the full well, with those that they read.
 READS_PARAMETERS = {
     "view/notebook/_objects.py": None,  # table of parameters

@@ -24,7 +24,10 @@ layout:
   generator: daisy
   parameters: {n_petals: 12, petal_um: 3.0}
   rules: {custom: {min_roundness: 0.9}}
-sensor: {read_noise_e: 2.0, effects: [{kind: supply_ripple, sigma_v: 0.002}]}
+sensor:
+  read_noise_e: 2.0
+  effects: [{kind: supply_ripple, sigma_v: 0.002}]
+  pixel_optics: {kind: baffle, max_tangent: 0.1}
 exposure_s: 0.01
 """
 PROGRAM = """
@@ -45,7 +48,7 @@ capture.save("capture.npz")
 again = fs.Capture.load("capture.npz")
 open("two.lines", "w").write("LINES\\n1 2\\n3 4\\n")
 cube = fs.Scene.from_cube("two.lines", distance_m=1.0)
-names = {"daisy", "stretch_x", "min_roundness", "boxes", "pad", "powers", "lines", "supply_ripple", "binary_gates", "comb", "half_plane",
+names = {"daisy", "stretch_x", "min_roundness", "boxes", "pad", "powers", "lines", "supply_ripple", "binary_gates", "baffle", "comb", "half_plane",
          "half_moon", "magnifier", "darkest_code_dn"}
 own = [found for found in extensions() if found[1] in names]
 for kind, name in own:
@@ -61,7 +64,8 @@ print(json.dumps({
     "metric": METRICS["darkest_code_dn"](shot, shot.camera, capture) == int(capture.code.min()),
     "chart": type(fs.scene.charts.half_plane(shape=(4, 4), pitch_um=1.0, distance_m=1.0)).__name__,
     "cube": (cube.basis[0, ::-1] * cube.spectrum_w_m2_sr_nm).tolist(),
-    "schema": all(name in json.dumps(schema()) for name in ("daisy", "supply_ripple", "half_moon", "magnifier", "half_plane")),
+    "schema": all(name in json.dumps(schema()) for name in ("daisy", "supply_ripple", "half_moon", "magnifier", "half_plane", "baffle")),
+    "response": bool((abs(shot.camera.angular_response(shot.scene) - 0.607) < 0.02).all()),
     "snr": bool(np.allclose(again.signal_to_noise(), capture.signal_to_noise(sensor=shot.camera.sensor), rtol=1e-9)),
 }))
 """
@@ -95,6 +99,7 @@ def test_installed_package_extends_every_kind(extended):
         "chart": "Scene",
         "cube": [[1.0, 2.0], [3.0, 4.0]],
         "schema": True,
+        "response": True,
         "snr": True,
     }
 

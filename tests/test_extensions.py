@@ -17,12 +17,14 @@ from foveasim.layout import DERIVED_LAYERS, EDITS, FORMATS, LAYOUTS, RULES, File
 from foveasim.maps import MAP_FORMATS, Found
 from foveasim.optics import PUPILS, PupilEdges
 from foveasim.scene import CUBE_FORMATS, SCENES
+from foveasim.sensor import PIXEL_OPTICS, Footprints, PixelOptics
 from foveasim.sensor.effects import EFFECTS, AdditiveNoise, Effect, FixedFactor, FixedOffset
 from foveasim.sensor.spectral import CURVES
 from foveasim.testing import check_all, check_extension, extensions
 
 REGISTRIES = (
-    LAYOUTS, EDITS, RULES, FORMATS, DERIVED_LAYERS, MAP_FORMATS, CUBE_FORMATS, EFFECTS, CURVES, SCENES, PUPILS, LENSES, METRICS,
+    LAYOUTS, EDITS, RULES, FORMATS, DERIVED_LAYERS, MAP_FORMATS, CUBE_FORMATS, EFFECTS, PIXEL_OPTICS, CURVES, SCENES, PUPILS, LENSES,
+    METRICS,
 )  # fmt: skip
 NUMBERS = count()
 
@@ -176,6 +178,27 @@ class Pattern(FixedFactor):
 
     def pattern_moments(self, sites):
         return 1.0, self.sigma**2
+
+
+@dataclass(frozen=True)
+class Absorber(PixelOptics):
+    response: float = 0.8
+
+    def footprints(self, sites, incidence):
+        return Footprints(np.full(sites.n_sites, self.response))
+
+
+@dataclass(frozen=True)
+class OfIndex(PixelOptics):
+    def footprints(self, sites, incidence):
+        return Footprints(1.0 / (1.0 + np.arange(sites.n_sites)))
+
+
+@dataclass(frozen=True)
+class Shrunk(PixelOptics):
+    def footprints(self, sites, incidence):
+        outlines = fs.layout.inset(sites, 0.1)
+        return Footprints(outlines.area_um2 / sites.area_um2, outlines)
 
 
 @dataclass(frozen=True)
@@ -409,6 +432,10 @@ WRONG = [
     (EFFECTS, WrongVariance, {}, None, r"has draws whose variance differs by 2\d.\d+% from that of moments\(\) over devices"),
     (EFFECTS, Position, {}, None, "has another effect in a part of the sensor, such as a tile"),
     (EFFECTS, lambda: 3, {}, None, "must return an Effect, got int"),
+    (PIXEL_OPTICS, Absorber, {}, 0.7, "has the response 0.8000 of a square of 10 µm on the axis, expected 0.7000"),
+    (PIXEL_OPTICS, OfIndex, {}, None, "must give each site the response that it has in any part of a sensor"),
+    (PIXEL_OPTICS, Shrunk, {}, None, "must return the areas of its outlines over those of the sites as 'area_ratio'"),
+    (PIXEL_OPTICS, lambda: 3, {}, None, "must return PixelOptics, got int"),
     (CURVES, lambda: percent, {}, None, "must be from 0 to 1, got 50 at 300 nm"),
     (CURVES, lambda: mean_of_all, {}, None, "must act on each wavelength separately"),
     (CURVES, lambda: micrometres, {}, {550.0: 0.8}, "is 0.1 at 550 nm, expected 0.8"),
@@ -482,6 +509,7 @@ def test_every_kind_has_wrong_extensions():
         (CUBE_FORMATS, text_format(read_radiance), write_radiance, None),
         (EFFECTS, Ripple, {"sigma_v": 1e-3}, None),
         (EFFECTS, Pattern, {}, None),
+        (PIXEL_OPTICS, Absorber, {"response": 0.4}, 0.4),
         (SCENES, corner, PICTURE, CORNER),
         (LENSES, Magnifier, {}, {(1.0, 2.0): (1.1, 2.2)}),
     ],

@@ -27,6 +27,7 @@ from foveasim._core.validation import Bools, Floats, check_per_site, check_point
 from foveasim.camera._clock import Clock
 from foveasim.camera._colour import colour_correction
 from foveasim.camera._exposure import AUTO_SETTINGS, ExposureTime, exposure_time
+from foveasim.camera._footprints import FootprintCache, find_footprints, placed
 from foveasim.camera._frames import Frame, ImageCache, Position, Task, check_frames, position_settings, tasks
 from foveasim.camera._steps import SensorFrame, WeightedMap, expose, integrate_maps, white_dn
 from foveasim.camera._warnings import (
@@ -50,7 +51,7 @@ from foveasim.optics import Optics
 from foveasim.reconstruct import Picture, reference
 from foveasim.reconstruct.rasters import sum_of_images
 from foveasim.scene import Scene
-from foveasim.sensor import NoiseBudget, Sensor, noise_budget
+from foveasim.sensor import Footprints, NoiseBudget, Sensor, noise_budget
 from foveasim.sensor.limits import EXPOSURE
 from foveasim.sensor.model.auto_exposure import AUTO_PERCENTILE, AUTO_TARGET
 from foveasim.units import um_from_nm, w_from_w_m2_um2
@@ -144,7 +145,9 @@ class Camera:
         self._gaze_um = check_point("gaze_um", gaze_um)
         self._axis: GazeAxis = axis
         self._n_threads = thread_count(n_threads)
-        self._integrators: dict[tuple[Grid, int, Position, bool], Integrator] = {}
+        #: By grid, order, position, whether the overlaps are stored, and footprints.
+        self._integrators: dict[tuple[Grid, int, Position, bool, Footprints | None], Integrator] = {}
+        self._footprints = FootprintCache()
         self._bounds_um: list[tuple[float, float, float, float]] = []
         #: The most recent scene with ``fit``, and the framed scene.
         self._framed: tuple[Scene, Scene] | None = None
@@ -152,7 +155,12 @@ class Camera:
         self._warned: set[str] = set()
 
     def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"_integrators": {}, "_bounds_um": [], "_framed": None}  # without caches
+        return vars(self) | {
+            "_integrators": {},
+            "_footprints": FootprintCache(),
+            "_bounds_um": [],
+            "_framed": None,
+        }  # without caches
 
     def __repr__(self) -> str:
         return f"Camera({self._optics!r}, {self._sensor!r})"
@@ -400,6 +408,7 @@ class Camera:
         n_grids: int = 1,
         position_um: Position | None = None,
         compiled: bool = True,
+        footprints: Footprints | None = None,
     ) -> Integrator:
         """
         Return the sensor's layout compiled for a grid.
@@ -415,6 +424,9 @@ class Camera:
             Position of the layout's origin in the image, by default :attr:`position_um`.
         compiled : bool
             As for :class:`Integrator`. Both sum in different orders, and are cached separately.
+        footprints : Footprints, optional
+            Light that the sites collect: :meth:`footprints`. Its outlines, in the frame of the sensor, replace those of the
+            layout.
 
         Returns
         -------
@@ -422,12 +434,17 @@ class Camera:
             From the cache, when the same one was used recently.
         """
         position_um = self.position_um if position_um is None else position_um
-        key = grid, order, position_um, compiled
+        key = (
+            grid,
+            order,
+            position_um,
+            compiled,
+            None if footprints is None or footprints.outlines is None else footprints,
+        )
         integrator = self._integrators.get(key)
         if integrator is None:
-            layout = self._layout.translate(*position_um) if any(position_um) else self._layout
             integrator = Integrator(
-                layout,
+                placed(self._layout, footprints, position_um),
                 grid,
                 distortion=self._distortion,
                 order=order,
@@ -466,7 +483,7 @@ class Camera:
             n_threads=self._n_threads if n_threads is None else n_threads,
         )
         if other._layout is self._layout:
-            other._bounds_um = self._bounds_um
+            other._bounds_um, other._footprints = self._bounds_um, self._footprints
             if other._n_threads == self._n_threads:
                 other._integrators = self._integrators
         return other
@@ -1008,7 +1025,7 @@ class Camera:
                 [frame.image(grid) for grid, _ in images],
             )
         with clock.stage("compile layout"):
-            order = self.order(light)
+            order, footprints = self.order(light), self._find_footprints(light, position_um)
             integrators = [
                 self.integrator(
                     grid,
@@ -1017,13 +1034,97 @@ class Camera:
                     position_um=position_um,
                     # Most gazes of a video occur once, and so do the images of a camera that turns.
                     compiled=moving_um is None or gaze_um == self._gaze_um,
+                    footprints=footprints,
                 )
                 for grid in grids
             ]
-        smallest = min(integrators, key=lambda integrator: integrator.grid.cell_area_um2)
+            smallest = min(integrators, key=lambda integrator: integrator.grid.cell_area_um2)
+            covered = Covered.by(smallest)
+            if footprints is not None and footprints.outlines is not None:
+                covered = self._covered(smallest.grid, position_um)
         named_um = None if moving_um is None and not any(gaze_um) else gaze_um
-        warn_of_coverage(source, Covered.by(smallest), self._layout.n_sites, named_um, warned)
-        return integrate_maps(self._sensor, light, maps, integrators, clock)
+        warn_of_coverage(source, covered, self._layout.n_sites, named_um, warned)
+        return integrate_maps(self._sensor, light, maps, integrators, clock, footprints)
+
+    def _find_footprints(self, light: Scene | PowerMap, position_um: Position) -> Footprints | None:
+        return find_footprints(self, self._layout, self._sensor.pixel_optics, light, position_um, self._footprints)
+
+    def _covered(self, grid: Grid, position_um: Position) -> Covered:
+        """Return the coverage of the layout, whose outlines are not those of the integrators."""
+        if self._distortion is None and self._layout.n_sites:
+            x0_um, y0_um, x1_um, y1_um = (self._layout_bounds_um() + np.tile(position_um, 2)).tolist()
+            low_x_um, low_y_um, high_x_um, high_y_um = grid.bounds_um
+            if low_x_um <= x0_um and low_y_um <= y0_um and x1_um <= high_x_um and y1_um <= high_y_um:
+                return Covered(grid.bounds_um, (x0_um, y0_um, x1_um, y1_um), 0, 0)
+        layout = placed(self._layout, None, position_um)
+        return Covered.by(
+            Integrator(layout, grid, distortion=self._distortion, compiled=False, n_threads=self._n_threads)
+        )
+
+    def footprints(
+        self, light: Scene | PowerMap, *, gaze_um: tuple[float, float] | None = None, axis: GazeAxis | None = None
+    ) -> Footprints | None:
+        """
+        Return the light that the photosites collect through the pixel optics of the sensor.
+
+        Parameters
+        ----------
+        light : Scene or PowerMap
+        gaze_um, axis : optional
+            As for :meth:`capture`.
+
+        Returns
+        -------
+        Footprints or None
+            None for a sensor without ``pixel_optics``.
+
+        Raises
+        ------
+        ParameterError
+            When a site is beyond the table of chief rays.
+        GeometryError
+            When an inset of the pixel optics is too large for a site.
+        """
+        if gaze_um is not None or axis is not None:
+            return self.at(gaze_um, axis).footprints(light)
+        return self._find_footprints(self.seen(light), self.position_um)
+
+    def angular_response(
+        self, light: Scene | PowerMap, *, gaze_um: tuple[float, float] | None = None, axis: GazeAxis | None = None
+    ) -> Floats:
+        """
+        Return the response of each site to uniform light through the pixel optics.
+
+        Parameters
+        ----------
+        light : Scene or PowerMap
+            The distance of a scene determines the cone of light.
+        gaze_um, axis : optional
+            As for :meth:`capture`.
+
+        Returns
+        -------
+        response : (n_site,) float64
+            Fraction of the power incident on its outline that a site collects, with the light of other sites; 1 without pixel
+            optics. Charges divided by it are corrected for the angular response, as by a flat field.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> stack = fs.sensor.ApertureStack(height_um=4.0, refractive_index=1.5)
+        >>> sensor = fs.Sensor(fs.layout.grid(n_x=3, n_y=1, pitch_um=4.0), pixel_optics=stack)
+        >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+        >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=50.0, distance_m=1.0, illuminance_lux=500.0)
+        >>> camera.angular_response(scene).round(2).tolist()
+        [0.9, 0.9, 0.9]
+        """
+        found = self.footprints(light, gaze_um=gaze_um, axis=axis)
+        if found is None:
+            return np.ones(self._layout.n_sites)
+        if found.mixing is None:
+            return np.array(found.response)
+        area_um2 = self._layout.area_um2
+        return np.asarray(found.response + found.mixing @ area_um2 / area_um2)
 
     def _bands(self, power_map: PowerMap, e_per_j: Floats) -> Iterator[WeightedMap]:
         """Yield each band of a power map, with every site's photoelectrons per joule in it."""

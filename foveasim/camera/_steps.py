@@ -22,7 +22,7 @@ from foveasim.fields import Grid, PowerMap
 from foveasim.integrate import Integrator
 from foveasim.layout import Layout
 from foveasim.scene import Scene
-from foveasim.sensor import Sensor
+from foveasim.sensor import Footprints, Sensor
 from foveasim.units import w_from_w_m2_um2
 
 if TYPE_CHECKING:
@@ -77,8 +77,13 @@ def integrate_maps(
     maps: Iterable[WeightedMap],
     integrators: Sequence[Integrator],
     clock: Clock,
+    footprints: Footprints | None = None,
 ) -> Floats:
-    """Return the sums of weighted maps over every site, photoelectrons per second."""
+    """
+    Return the sums of weighted maps over every site, photoelectrons per second.
+
+    ``footprints``: the light that sites collect within the outlines of the integrators; None for all of it.
+    """
     rate_e_per_s = np.zeros(sensor.layout.n_sites)
     for image, cells, where, weight in maps:
         with clock.stage("integration"):
@@ -91,7 +96,8 @@ def integrate_maps(
     with clock.stage("integration"):
         rate_e_per_s *= w_from_w_m2_um2(1.0)
         _check_rates(light, rate_e_per_s, integrators[0].order)
-        return np.maximum(rate_e_per_s, 0.0, out=rate_e_per_s)
+        np.maximum(rate_e_per_s, 0.0, out=rate_e_per_s)
+        return rate_e_per_s if footprints is None else footprints.apply(rate_e_per_s)
 
 
 def _check_rates(light: Scene | PowerMap, rate_e_per_s: Floats, order: int) -> None:

@@ -18,7 +18,7 @@ from foveasim.integrate import Integrator
 from foveasim.layout import Layout
 from foveasim.optics import Optics
 from foveasim.scene import Scene
-from foveasim.sensor import Sensor
+from foveasim.sensor import PixelOptics, Sensor
 from foveasim.units import um_from_m, um_from_nm
 
 #: Cameras warn when the layout measures less than this fraction of the width of a photograph.
@@ -27,6 +27,8 @@ MIN_PICTURE_FRACTION = 0.25
 MAX_FOCAL_DIFFERENCE = 0.02
 #: Cameras warn when a larger fraction of the sites is saturated, or smaller than the pixels of a photograph.
 MAX_SATURATED, MAX_BELOW_PIXELS = 0.2, 0.1
+#: Cameras warn of openings of pixel optics that measure fewer wavelengths in their layer.
+MIN_OPENING_WAVELENGTHS = 2.0
 #: Error of photosites above which a limited automatic oversampling causes a warning.
 MAX_AUTO_ERROR = 1e-3
 
@@ -227,6 +229,19 @@ def warn_of_coarse_cells(optics: Optics, scene: Scene, layout: Layout) -> None:
         "or Optics(oversample=1) to accept them",
         SamplingWarning,
     )
+
+
+def warn_of_small_openings(pixel_optics: PixelOptics, layout: Layout, light: Scene | PowerMap) -> None:
+    """Warn of openings of pixel optics in which rays are diffracted."""
+    wavelength_um = float(um_from_nm(light.wavelength_nm.max()))
+    opening_um = pixel_optics.optical_opening_um(layout)
+    if opening_um < MIN_OPENING_WAVELENGTHS * wavelength_um:
+        warn(
+            f"the narrowest opening of the pixel optics measures {opening_um / wavelength_um:.2g} wavelengths in its layer, "
+            f"fewer than {MIN_OPENING_WAVELENGTHS:g}: geometric rays neglect diffraction; use larger sites, "
+            "or a measured 'sensitivity'",
+            FoveasimWarning,
+        )
 
 
 def warn_of_negative(rate_e_per_s: Floats, is_negative: Bools) -> None:

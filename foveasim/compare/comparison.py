@@ -369,6 +369,7 @@ def cameras(
     annuli, grid, covariance_grid = _field(all_layouts, fixation, n_annuli, max_pixels)
     shots: dict[str, list[_Shot]] = {name: [] for name in named}
     irradiance = []
+    known_response: dict[str, Floats] = {}
     for light in scenes.values():
         power_map = first.power_map(light) if isinstance(light, Scene) else light
         # Means over the colour filters of the first camera.
@@ -376,10 +377,12 @@ def cameras(
         irradiance.append(seen.reference(power_map, covariance_grid, exposure_s=exposure_s).data.mean(axis=0))
         for name, camera in named.items():
             capture = camera.capture(light, exposure_s=exposure_s, seed=seed)
-            picture = capture.picture(method, of="light_e", per="um2", grid=grid, sensor=camera.sensor)
+            known = _with_angular_response(camera, light)
+            picture = capture.picture(method, of="light_e", per="um2", grid=grid, sensor=known)
             seen = _behind_image(camera)
             ideal = seen.reference(power_map, grid, exposure_s=exposure_s)
             shots[name].append(_Shot(picture, ideal, *scene_measures(seen, capture, power_map, annuli)))
+            known_response[name] = known.light_response()
             advance()
     covered = [one[0].picture.coverage >= MIN_COVERAGE for one in shots.values()]
     is_common, is_field = (combine(covered, axis=0) for combine in (np.all, np.any))
@@ -400,7 +403,7 @@ def cameras(
             quality_by_eccentricity(one.picture, one.ideal, **annuli._asdict(), is_compared=is_common) for one in own
         ]
         channel_e_per_um2 = np.nanmean([one.ideal.data for one in own], axis=(0, 2, 3))
-        response = channel_e_per_um2[camera.sensor.filter_of_site] / mean_e_per_um2 * camera.sensor.light_response()
+        response = channel_e_per_um2[camera.sensor.filter_of_site] / mean_e_per_um2 * known_response[name]
         measures = [quality._asdict() | one.measures for quality, one in zip(qualities, own, strict=True)]
         found = (
             {key: [one[key] for one in measures] for key in measures[0]}
@@ -449,6 +452,13 @@ def cameras(
             "versions": versions(),
         },
     )
+
+
+def _with_angular_response(camera: Camera, light: Scene | PowerMap) -> Sensor:
+    """Return the sensor with its known response to cones of light, for corrections."""
+    if camera.sensor.pixel_optics is None:
+        return camera.sensor
+    return camera.sensor.with_angular_response(camera.angular_response(light))
 
 
 def _behind_image(camera: Camera) -> Camera:

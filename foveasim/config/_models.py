@@ -25,10 +25,10 @@ from foveasim.distortion import LENSES
 from foveasim.errors import ParameterError
 from foveasim.layout import EDITS, LAYOUTS, PRESETS, RULES, DesignRules, Readout, Routing, read_layout
 from foveasim.maps import read_power_map
-from foveasim.optics import PUPILS, LateralColour, Optics, Seidel, Zernike
+from foveasim.optics import PUPILS, ChiefRayTable, LateralColour, Optics, Seidel, Zernike
 from foveasim.scene import SCENES
-from foveasim.sensor import PRESETS as SENSOR_PRESETS
 from foveasim.sensor import (
+    PIXEL_OPTICS,
     Diffusion,
     FilterSet,
     InterPixelCapacitance,
@@ -37,6 +37,7 @@ from foveasim.sensor import (
     Sensor,
     read_filters,
 )
+from foveasim.sensor import PRESETS as SENSOR_PRESETS
 from foveasim.sensor.effects import EFFECTS
 from foveasim.sensor.limits import EXPOSURE
 from foveasim.sensor.spectral import CURVES
@@ -47,7 +48,7 @@ __all__ = ["FILE_OPTIONS", "LayerSection", "Models", "PerArea", "Section", "call
 #: The function or class of each section.
 _CALLS: dict[type[BaseModel], Callable[..., Any]] = {}
 #: Registries whose members are sections: the models are rebuilt when one of these changes.
-_REGISTRIES: tuple[Registry[Any], ...] = (LAYOUTS, EDITS, RULES, SCENES, LENSES, PUPILS, CURVES, EFFECTS)
+_REGISTRIES: tuple[Registry[Any], ...] = (LAYOUTS, EDITS, RULES, SCENES, LENSES, PUPILS, CURVES, EFFECTS, PIXEL_OPTICS)
 
 _log = logging.getLogger("foveasim")
 
@@ -242,6 +243,8 @@ def _models(_versions: tuple[int, ...]) -> Models:
         zernike=_model("zernike", Zernike) | None,
         seidel=_model("seidel", Seidel) | None,
         lateral_colour=_model("lateral colour", LateralColour) | None,
+        exit_pupil_mm=float | None,
+        chief_ray=_model("chief ray table", ChiefRayTable) | None,
     )
     sensor = _sensor()
     rules = _rules()
@@ -332,12 +335,16 @@ def _sensor() -> type[Section]:
         ),
     ]
     effects = _registered_sections(EFFECTS)
+    pixel_optics = _registered_sections(
+        PIXEL_OPTICS, skip=("opening", "photodiode"), design_chief_ray=_model("design chief ray", ChiefRayTable) | None
+    )
     sensor = _model(
         "sensor",
         Sensor,
         skip=("layout",) if effects else ("layout", "effects"),
         qe=float | curve | list[float | curve],  # type: ignore[valid-type]
         filters=Literal["rgb"] | filters | None,
+        pixel_optics=_union_of("kind", pixel_optics) | None,
         crosstalk=_union_of("kind", {name: _model(name, model) for name, model in _CROSSTALK.items()}) | None,
         coupling=_model("coupling", InterPixelCapacitance) | None,
         sensitivity=_PerSite,

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from foveasim._core.provenance import to_plain_data
 from foveasim._core.threads import thread_count
 from foveasim._core.validation import Floats
 from foveasim.capture import Capture
@@ -290,10 +291,15 @@ def rate_settings(shot: Shot, settings: Mapping[str, Any]) -> list[Any]:
     Return all that determines the photoelectron rates of a shot's sites, as plain data.
 
     Sections of the settings that do not are excluded by name, so that any other section, also a new one, is contained. Of the
-    sensor, only spectral responsivity and the filter of each site matter.
+    sensor, only spectral responsivity, the filter of each site and pixel optics matter.
     """
     filters = hashlib.sha256(shot.camera.sensor.filter_of_site.tobytes()).hexdigest()
-    return [_without(settings, AFTER_LIGHT), _responsivity_digest(shot), filters]
+    return [_without(settings, AFTER_LIGHT), _responsivity_digest(shot), filters, pixel_optics_settings(shot)]
+
+
+def pixel_optics_settings(shot: Shot) -> Any:
+    """Return the pixel optics of a shot as plain data, None without."""
+    return to_plain_data(shot.camera.sensor.pixel_optics)
 
 
 def _image_settings(shot: Shot, settings: Mapping[str, Any]) -> list[Any]:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from foveasim.camera import Camera
+from foveasim.camera._footprints import placed
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid
 from foveasim.integrate import UndistortedOutlines
@@ -52,6 +53,7 @@ class Model(nn.Module):
     Attributes
     ----------
     mesh : Mesh
+        Of the layout; with pixel optics of the outlines in which sites collect light, which are constants.
     imaging : Imaging
     readout : Readout
     distortion : Parameter (n_coefficient,)
@@ -64,7 +66,7 @@ class Model(nn.Module):
     Raises
     ------
     ParameterError
-        When a variable is unknown or absent from the camera.
+        When a variable is unknown or absent from the camera, or is ``"vertices"`` for a sensor with pixel optics.
 
     Examples
     --------
@@ -104,7 +106,14 @@ class Model(nn.Module):
         self.grid: Grid = camera.sensor_frame(self._scene).image(self.imaging.grid)
         self.register_buffer("_position_um", constant(camera.position_um))
         self.order = camera.order(self._scene)
-        layout: Any = sensor.layout
+        self._footprints = camera.footprints(scene)
+        if self._footprints is not None and "vertices" in self.wrt:
+            raise ParameterError(
+                "wrt",
+                "must not contain 'vertices' for a sensor with pixel optics, whose response and outlines are constants; remove "
+                "'pixel_optics' from the sensor",
+            )
+        layout: Any = placed(camera.layout, self._footprints, (0.0, 0.0))
         self.mesh = Mesh(layout, boundary).requires_grad_("vertices" in self.wrt)
         self.readout: Readout = Readout(sensor)
         wave_nm = self._scene.wavelength_nm
@@ -181,7 +190,19 @@ class Model(nn.Module):
         for k, (_, sites) in enumerate(self._parts):
             power = site_power(points, maps[..., k, :, :], self._outlines_of[k], self.grid, order=self.order)
             rates = rates.index_add(-1, sites, power)
-        return rates * float(w_from_w_m2_um2(1.0))
+        return self._collect(rates * float(w_from_w_m2_um2(1.0)))
+
+    def _collect(self, rates: Tensor) -> Tensor:
+        """Return the rates that the sites collect through pixel optics, (..., n_site)."""
+        if self._footprints is None:
+            return rates
+        collected = rates * constant(self._footprints.factor)
+        mixing = self._footprints.mixing
+        if mixing is None:
+            return collected
+        rows, columns = mixing.nonzero()
+        exchanged = rates[..., torch.from_numpy(columns)] * constant(mixing.data)
+        return collected.index_add(-1, torch.from_numpy(rows), exchanged)
 
     def forward(self, basis: Tensor | None = None) -> Tensor:
         """

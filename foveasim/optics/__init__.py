@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from foveasim._core.calls import publish
 from foveasim._core.registry import import_all
+from foveasim.incidence import ChiefRayTable, Incidence
 from foveasim.optics._optics import Optics
 from foveasim.optics._point_images import PointSpread
 from foveasim.optics._quadrature import PupilEdges
@@ -15,6 +16,8 @@ __all__ = [
     "PUPILS",
     "Annulus",
     "Blades",
+    "ChiefRayTable",
+    "Incidence",
     "LateralColour",
     "Optics",
     "PointSpread",

@@ -20,6 +20,7 @@ from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, check_number, check_point, finite_array, read_only, wavelengths_nm
 from foveasim.errors import ParameterError, SamplingWarning
 from foveasim.fields import Grid, PowerMap, SceneLike
+from foveasim.incidence import N_RINGS, N_RINGS_OF_PUPILS, ChiefRayTable, Incidence
 from foveasim.optics._aperture import Aperture, Wavefront, overlaps
 from foveasim.optics._point_images import Point, PointImages
 from foveasim.optics.aberrations import LateralColour, Seidel, Zernike
@@ -33,6 +34,11 @@ if TYPE_CHECKING:
 
 FOCAL_LENGTH = Limits(above=0.0, at_least=0.01, at_most=1e6, hint="check the unit: focal lengths are in mm")
 F_NUMBER = Limits(above=0.0, at_least=0.5, at_most=1e4, hint="f/0.5 is the limit for a lens in air")
+EXIT_PUPIL = Limits(
+    above=0.0, at_least=0.01, at_most=1e6, hint="distances of exit pupils are in mm, inf if telecentric"
+)
+#: Wavelength of the transmittance of pupils for rays.
+CONE_NM = 550.0
 #: Fraction of the PSF energy outside the default padding radius.
 LOST_FRACTION = 0.01
 #: Fraction of the PSF energy that an isoplanatic patch may displace.
@@ -125,6 +131,11 @@ class Optics(PointImages):
         Width of the padding; by default approximately the radius of 99 % encircled energy.
     precision : {"single", "double"}
         Precision of the Fourier transforms and the maps.
+    exit_pupil_mm : float, optional, mm
+        Distance of the exit pupil from the sensor, infinity for a telecentric lens; by default that of the thin lens, its image
+        distance. It determines the chief ray angles at the sites of a sensor with ``pixel_optics``: see :meth:`incidence`.
+    chief_ray : ChiefRayTable, optional
+        Chief ray angles at image heights, instead of an exit pupil.
 
     Notes
     -----
@@ -176,6 +187,8 @@ class Optics(PointImages):
     padding: Literal["reflect", "edge", "zero", "periodic"] = "reflect"
     padding_cells: Annotated[int | None, Limits(at_least=0, at_most=2**20)] = None
     precision: Literal["single", "double"] = "single"
+    exit_pupil_mm: Annotated[float | None, Usual(1.0, 200.0)] = None
+    chief_ray: ChiefRayTable | None = None
     _cache: TableCache = field(default_factory=TableCache, init=False, repr=False, compare=False)
 
     __repr__ = short_repr
@@ -193,6 +206,13 @@ class Optics(PointImages):
             raise ParameterError(
                 "pupil", "must be a pupil of foveasim.optics, or a callable T(x, y, wavelength_nm)", self.pupil
             )
+        if self.exit_pupil_mm is not None:
+            distance_mm = self.exit_pupil_mm
+            if distance_mm != math.inf:
+                distance_mm = EXIT_PUPIL.check("exit_pupil_mm", distance_mm)
+            object.__setattr__(self, "exit_pupil_mm", distance_mm)
+            if self.chief_ray is not None:
+                raise ParameterError("exit_pupil_mm", "must not be given with 'chief_ray'", distance_mm, "mm")
         if self._is_varying() and self.padding == "periodic":
             raise ParameterError(
                 "padding",
@@ -263,6 +283,59 @@ class Optics(PointImages):
             return 0.0
         radius_m = 0.5 * float(m_from_mm(self.focal_length_mm)) / self.f_number
         return float(um_from_m(0.5 * radius_m**2 * (1.0 / distance_m - 1.0 / self.focus_distance_m)))
+
+    def incidence(
+        self, field_um: Floats, distance_m: float | None = None, *, displacement_um: tuple[float, float] = (0.0, 0.0)
+    ) -> Incidence:
+        """
+        Return the cones of light at positions of the image.
+
+        Parameters
+        ----------
+        field_um : (n, 2) float64, µm
+            Positions relative to the optical axis, for a sensor that is not displaced.
+        distance_m : float, optional, m
+            Distance of the scene; by default that at which the lens is focused, or infinity.
+        displacement_um : (x, y), µm
+            Displacement of the sensor behind the lens.
+
+        Returns
+        -------
+        Incidence
+            Cones of tangent radius ``1 / 2N`` of the image-side f-number N around chief rays from the centre of the exit pupil,
+            ``t = r / D``, or from the table. Rays are weighted with the transmittance of the pupil at 550 nm.
+
+        Raises
+        ------
+        ParameterError
+            When the scene is not farther away than the focal length, or a position is beyond the table of chief rays.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> lens = fs.Optics(focal_length_mm=8.0, f_number=2.0, exit_pupil_mm=10.0)
+        >>> cone = lens.incidence([[0.0, 0.0], [0.0, 2000.0]])
+        >>> cone.radius, cone.chief_ray.tolist()
+        (0.25, [[0.0, 0.0], [0.0, 0.2]])
+        """
+        if distance_m is None:
+            distance_m = math.inf if self.focus_distance_m is None else self.focus_distance_m
+        distance_m = self._check_distance("distance_m", distance_m)
+        distance_mm = self._image_distance_mm(distance_m) if self.exit_pupil_mm is None else self.exit_pupil_mm
+        pupils = self._pupils()
+
+        def transmission(x: Floats, y: Floats) -> Floats:
+            return np.prod([np.square(np.abs(pupil(x, y, CONE_NM))) for pupil in pupils], axis=0)
+
+        return Incidence(
+            field_um,
+            radius=0.5 / self.working_f_number(distance_m),
+            exit_pupil_um=float(um_from_m(m_from_mm(distance_mm))),
+            table=self.chief_ray,
+            displacement_um=displacement_um,
+            transmission=transmission if pupils else None,
+            n_rings=N_RINGS_OF_PUPILS if pupils else N_RINGS,
+        )
 
     def grid(self, scene: SceneLike) -> Grid:
         """Return the upright sensor-plane grid of the scene pixels, centred as the scene."""

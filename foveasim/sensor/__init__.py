@@ -13,6 +13,14 @@ from foveasim.sensor.effects.shot import draw_shot_noise
 from foveasim.sensor.exposures import Ramp, Rates, fit_ramp, merge_exposures, non_destructive_reads
 from foveasim.sensor.model.inversion import Inverse
 from foveasim.sensor.model.linearisation import Linearisation
+from foveasim.sensor.pixel_optics import (
+    PIXEL_OPTICS,
+    ApertureStack,
+    Footprints,
+    Microlens,
+    Outlines,
+    PixelOptics,
+)
 from foveasim.sensor.presets import PRESETS, Preset
 from foveasim.sensor.sensor import Sensor
 from foveasim.sensor.signal_to_noise import SiteSignals, signal_to_noise
@@ -33,8 +41,10 @@ from foveasim.sensor.spectral.tables import PolynomialCurve, SplineCurve, StepCu
 __all__ = [
     "FIXED",
     "LIMITS",
+    "PIXEL_OPTICS",
     "PRESETS",
     "TEMPORAL",
+    "ApertureStack",
     "BandMean",
     "Calibration",
     "ConstantCurve",
@@ -42,14 +52,18 @@ __all__ = [
     "Curve",
     "Diffusion",
     "FilterSet",
+    "Footprints",
     "GaussianCurve",
     "InterPixelCapacitance",
     "Inverse",
     "KernelCrosstalk",
     "Limits",
     "Linearisation",
+    "Microlens",
     "NoiseBudget",
+    "Outlines",
     "PassBand",
+    "PixelOptics",
     "PolynomialCurve",
     "Preset",
     "ProductCurve",

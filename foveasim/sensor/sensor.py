@@ -18,6 +18,7 @@ from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_per_site, finite_array, read_only, unmasked
 from foveasim.errors import ParameterError, SimulationError, type_name
+from foveasim.incidence import ChiefRayTable
 from foveasim.sensor.adc import ADC, BITS, DNL, INL, LOG_STRENGTH, Companding, ConversionTables
 from foveasim.sensor.blocks import for_each_block
 from foveasim.sensor.chain import (
@@ -67,6 +68,7 @@ from foveasim.sensor.model.prediction import (
     clipped_gaussian_moments,
 )
 from foveasim.sensor.model.records import Record, light_records, map_light, readout_model
+from foveasim.sensor.pixel_optics import PIXEL_OPTICS, Outlines, PixelOptics
 from foveasim.sensor.presets import find_preset
 from foveasim.sensor.spectral.curves import ConstantCurve, Curve, CurveError
 from foveasim.sensor.spectral.response import FilterSet, rgb_filters
@@ -129,6 +131,9 @@ class Sensor:
         Fraction of hot sites, and their additional dark current (e-/s, at ``dark_reference_k``).
     dead_fraction : float
         Fraction of dead sites, which have no photo response.
+    pixel_optics : PixelOptics, optional
+        Openings, layers and microlenses above the photodiodes: :class:`ApertureStack`, :class:`Microlens`. A camera computes
+        the light that each site collects from the cone of its optics, at the site's position in the image.
     crosstalk : Diffusion or KernelCrosstalk, optional
         Charge exchange between neighbours before collection.
     shot_noise : {"auto", "exact", "off"}
@@ -204,6 +209,7 @@ class Sensor:
     hot_fraction: Annotated[float, SHARE, Usual(0.0, 0.1)] = 0.0
     hot_e_per_s: Annotated[float, RATE] = 0.0
     dead_fraction: Annotated[float, SHARE, Usual(0.0, 0.1)] = 0.0
+    pixel_optics: PixelOptics | None = None
     crosstalk: Diffusion | KernelCrosstalk | None = None
     shot_noise: ShotChoice = "auto"
     gaussian_above_e: Annotated[float, GAUSSIAN_ABOVE] = 100.0
@@ -331,8 +337,8 @@ class Sensor:
         layout : Layout
             Layout of the capture.
         settings : mapping
-            ``capture.settings["sensor"]``. Effects are identified by class among those of the package and
-            :data:`foveasim.sensor.effects.EFFECTS`.
+            ``capture.settings["sensor"]``. Effects and pixel optics are identified by class among those of the package,
+            :data:`foveasim.sensor.effects.EFFECTS` and :data:`foveasim.sensor.PIXEL_OPTICS`.
         arrays : mapping, optional
             ``capture.sensor_arrays``: arrays with more than 64 values, by their SHA-256 in the settings.
 
@@ -342,7 +348,10 @@ class Sensor:
             If a parameter whose default is not 0 or None is missing, an array is missing in ``arrays``, or an effect is not
             registered.
         """
-        kinds: tuple[Any, ...] = (Diffusion, KernelCrosstalk, InterPixelCapacitance, ShotNoise, *EFFECTS.values())
+        kinds: tuple[Any, ...] = (
+            Diffusion, KernelCrosstalk, InterPixelCapacitance, ShotNoise, *EFFECTS.values(), *PIXEL_OPTICS.values(), Outlines,
+            ChiefRayTable,
+        )  # fmt: skip
         classes = {kind.__name__: kind for kind in kinds}
         values: dict[str, Any] = {}
         for parameter in fields(cls):
@@ -516,6 +525,26 @@ class Sensor:
         """
         return replace(self, disabled=tuple(dict.fromkeys((*self.disabled, *names))))
 
+    def with_angular_response(self, response: ArrayLike) -> Sensor:
+        """
+        Return the sensor with a known angular response as sensitivity, instead of pixel optics.
+
+        Estimates of the light with it are corrected for the angular response: ``capture.picture(of="light_e", per="um2",
+        sensor=camera.sensor.with_angular_response(camera.angular_response(scene)))``.
+
+        Parameters
+        ----------
+        response : (n_site,) float64
+            Result of :meth:`foveasim.Camera.angular_response`. Above 1, which light of other sites can cause, it is 1.
+
+        Raises
+        ------
+        ParameterError
+            When the response is not one number from 0 per site.
+        """
+        known = check_per_site("response", finite_array("response", response, at_least=0.0), self.layout.n_sites)
+        return replace(self, sensitivity=np.minimum(known * self.sensitivity, 1.0), pixel_optics=None)
+
     def part(self, selection: OwnCheck[slice | Ints]) -> Sensor:
         """
         Return the sensor of some of the sites, with their fixed patterns and effects.
@@ -543,6 +572,8 @@ class Sensor:
         values: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(Sensor)}
         per_site = (name for name, declared in declarations_of(Sensor).items() if declared.is_per_site)
         values |= {name: values[name][chosen] for name in per_site if np.ndim(values[name])}
+        if self.pixel_optics is not None:
+            values["pixel_optics"] = self.pixel_optics.part(chosen)
         return SensorPart(**values | {"layout": self.layout[chosen]}, _complete=self, _selection=chosen)
 
     def _check_local(self) -> None:
@@ -552,6 +583,11 @@ class Sensor:
                 "sensor",
                 f"must have no effects between sites to be divided, got {connecting}",
                 hint=f"switch them off: sensor.without({connecting})",
+            )
+        if self.pixel_optics is not None and self.pixel_optics.has_mixing:
+            raise ParameterError(
+                "pixel_optics",
+                "must not mix the light of sites in a sensor to be divided; use pixel optics without crosstalk",
             )
 
     @property

@@ -19,6 +19,8 @@ power map format  as layout formats, for power maps
 cube format       as layout formats; returns the radiance (n_band, n_y, n_x) of
                   the scene, bottom row first, W/(m² sr nm)
 effect            parameters
+pixel optics      parameters                                                     response of a square of 10 µm on the
+                                                                                 axis at f/2.8
 curve             parameters                                                     mapping of wavelengths, nm, to values
 scene             parameters                                                     picture of cells, top row first: ``#``
                                                                                  for bright, ``.`` for dark, else a space
@@ -52,6 +54,7 @@ from foveasim.testing._files import check_cube_format, check_layout_format, chec
 from foveasim.testing._layouts import check_derived_layer, check_edit, check_family, check_rule
 from foveasim.testing._lenses import check_curve, check_lens, check_pupil
 from foveasim.testing._metrics import check_metric
+from foveasim.testing._pixel_optics import check_pixel_optics
 from foveasim.testing._scenes import check_scene
 
 __all__ = ["check_all", "check_extension", "check_sensor_effect", "extensions"]
@@ -63,6 +66,7 @@ CHECKS: dict[str, Check] = {
     check.registry.kind: check
     for check in (
         check_family, check_edit, check_rule, check_layout_format, check_derived_layer, check_map_format, check_effect,
+        check_pixel_optics,
         check_curve, check_cube_format, check_scene, check_pupil, check_lens, check_metric,
     )
 }  # fmt: skip

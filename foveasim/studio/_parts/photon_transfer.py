@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from foveasim._core.validation import Floats
@@ -92,7 +94,8 @@ def median_site(values: Floats) -> int:
 
 
 def copies_of(sensor: Sensor, site: int, n: int) -> Sensor:
-    """Return a sensor of n copies of a photosite, without exchange of charge."""
+    """Return a sensor of n copies of a photosite, without exchange of charge or light."""
+    sensor = replace(sensor, pixel_optics=None)
     connecting = [effect.name for effect in sensor.chain if effect.reach == "all"]
     return (sensor.without(*connecting) if connecting else sensor).part(np.full(n, site))
 

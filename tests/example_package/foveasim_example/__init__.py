@@ -16,6 +16,7 @@ from foveasim.layout import DERIVED_LAYERS, FORMATS, RULES, FileFormat, Rule, Wr
 from foveasim.maps import MAP_FORMATS, Found
 from foveasim.optics import PUPILS
 from foveasim.scene import CUBE_FORMATS, SCENES
+from foveasim.sensor import PIXEL_OPTICS, Footprints, PixelOptics
 from foveasim.sensor.effects import EFFECTS, AdditiveNoise, Collection
 from foveasim.sensor.spectral import CURVES
 
@@ -81,6 +82,20 @@ class BinaryGates(Collection):
         """Return mean and variance of the number of fired gates."""
         dark = np.exp(-mean / self.n_gates)  # probability that a gate does not fire
         return self.n_gates * (1.0 - dark), variance * dark**2 + self.n_gates * dark * (1.0 - dark)
+
+
+@PIXEL_OPTICS.register("baffle", example={"max_tangent": 0.1}, expected=0.3204)
+@dataclass(frozen=True)
+class Baffle(PixelOptics):
+    """A baffle that absorbs rays beyond an angle."""
+
+    max_tangent: float
+
+    def footprints(self, sites, incidence):
+        """Return the fraction of the rays of each site that the baffle transmits."""
+        cones = incidence.with_rings(24)
+        is_open = np.hypot(*np.moveaxis(cones.tangents, -1, 0)) <= self.max_tangent
+        return Footprints(np.minimum((cones.weights * is_open).sum(axis=1), 1.0))
 
 
 min_roundness = Rule(

@@ -1,0 +1,93 @@
+"""Light that photosites collect through pixel optics, shared by the camera and its tiles."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from foveasim._core.validation import Floats, read_only
+from foveasim.camera._steps import SensorFrame
+from foveasim.camera._warnings import warn_of_small_openings
+from foveasim.fields import PackedRings, PowerMap
+from foveasim.incidence import Incidence
+from foveasim.layout import Layout
+from foveasim.layout.model import layout_of
+from foveasim.optics import Optics
+from foveasim.scene import Scene
+from foveasim.sensor.pixel_optics.contract import Footprints, PixelOptics, check_footprints
+
+if TYPE_CHECKING:
+    from foveasim.camera._camera import Camera
+    from foveasim.camera._frames import Position
+
+#: Number of cached footprints: one per lens, distance and gaze.
+MAX_FOOTPRINTS = 4
+
+
+class FootprintCache:
+    """Recent footprints of a layout, shared by cameras with this layout."""
+
+    def __init__(self) -> None:
+        #: Footprints with the objects that their keys identify.
+        self._found: dict[Hashable, tuple[Footprints, PixelOptics, Any]] = {}
+
+    def get(
+        self, pixel_optics: PixelOptics, layout: Layout, optics: Optics, incidence: Incidence, axis_um: Any
+    ) -> Footprints:
+        """Return the footprints of a layout for the cones of a lens."""
+        cone = incidence.radius, incidence.exit_pupil_um, incidence.table, incidence.displacement_um, tuple(axis_um)
+        key = id(pixel_optics), id(optics.pupil), cone
+        known = self._found.get(key)
+        if known is None:
+            known = check_footprints(pixel_optics, layout, incidence), pixel_optics, optics.pupil
+            self._found[key] = known
+            while len(self._found) > MAX_FOOTPRINTS:
+                self._found.pop(next(iter(self._found)), None)
+        return known[0]
+
+
+def find_footprints(
+    camera: Camera,
+    layout: Layout,
+    pixel_optics: PixelOptics | None,
+    light: Scene | PowerMap,
+    position_um: Position,
+    cache: FootprintCache | None = None,
+) -> Footprints | None:
+    """
+    Return the light that the sites of a layout collect; None without pixel optics.
+
+    ``position_um``: that of the layout in the image. ``layout``: photosites in the frame of the sensor. ``light``: a scene with
+    its pitch, or a power map.
+    """
+    if pixel_optics is None:
+        return None
+    frame = camera.sensor_frame(light) if isinstance(light, Scene) else SensorFrame.of(camera.distortion)
+    distance_m = light.distance_m if isinstance(light, Scene) else None
+    field_um = read_only(site_centres_um(layout, frame.axis_um))
+    incidence = camera.optics.incidence(field_um, distance_m, displacement_um=position_um)
+    warn_of_small_openings(pixel_optics, layout, light)
+    cache = FootprintCache() if cache is None else cache
+    return cache.get(pixel_optics, layout, camera.optics, incidence, frame.axis_um)
+
+
+def site_centres_um(layout: Layout, origin_um: Position) -> Floats:
+    """Return the centroid of each site relative to an origin, (n_site, 2) µm."""
+    if layout.lattice is None:
+        return layout.centroid_um - np.array(origin_um)
+    axes = zip((layout.lattice.x_um, layout.lattice.y_um), origin_um, strict=True)
+    x_um, y_um = (0.5 * axis.sum(axis=1) - origin for axis, origin in axes)
+    centres_um = np.empty((y_um.size, x_um.size, 2))
+    centres_um[..., 0], centres_um[..., 1] = x_um, y_um[:, np.newaxis]
+    return centres_um.reshape(-1, 2)
+
+
+def placed(layout: Layout, footprints: Footprints | None, position_um: Position) -> Layout:
+    """Return the outlines for integration, at a position in the image."""
+    outlines: PackedRings | None = None if footprints is None else footprints.outlines
+    if outlines is not None:
+        xy_um = outlines.xy_um + np.array(position_um) if any(position_um) else outlines.xy_um
+        return layout_of(xy_um, outlines.ring_offsets, outlines.site_offsets)
+    return layout.translate(*position_um) if any(position_um) else layout

@@ -1,0 +1,297 @@
+"""
+Cones of light at photosites: chief rays, exit pupils and tables of chief ray angles.
+
+Directions are tangents: ``(t_x, t_y)`` is the lateral displacement of a ray per unit of depth, in its direction of propagation
+and the frame of the sensor. A chief ray of an ordinary lens points away from the optical axis.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from foveasim._core.calls import Limits, OwnCheck, check_declared, publish
+from foveasim._core.short_repr import short_repr
+from foveasim._core.validation import Floats, as_numbers, finite_array, own, read_only
+from foveasim.errors import ParameterError
+
+__all__ = ["ChiefRayTable", "Incidence"]
+
+#: Image heights and angles of tables.
+HEIGHT = Limits(at_least=0.0, at_most=1e7, hint="image heights are in µm")
+ANGLE = Limits(at_least=-80.0, at_most=80.0, hint="chief ray angles are in degrees")
+#: Largest tangent radius of a cone: that of f/0.5.
+RADIUS = Limits(above=0.0, at_most=1.0)
+#: Default number of rings of rays, for clear circular pupils and for others.
+N_RINGS, N_RINGS_OF_PUPILS = 2, 8
+#: Largest number of rings: 32,512 rays.
+MAX_RINGS = 64
+#: Image heights beyond a table by this fraction are rounding errors.
+HEIGHT_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class ChiefRayTable:
+    """
+    Chief ray angles at image heights, as in data sheets of lenses and sensors.
+
+    Parameters
+    ----------
+    image_height_um : sequence of float, µm
+        Distances from the optical axis, ascending from 0.
+    angle_deg : sequence of float, degrees
+        Angle between chief ray and normal at each height, positive for rays that point away from the axis, 0 on the axis.
+
+    Raises
+    ------
+    ParameterError
+        When there are fewer than two heights, they do not ascend from 0, or the numbers of heights and angles differ.
+
+    Notes
+    -----
+    The tangent of the angle is interpolated monotonically in the image height (F. N. Fritsch and J. Butland, A method for
+    constructing local monotone piecewise cubic interpolants, SIAM J. Sci. Stat. Comput. 5, 300, 1984).
+
+    Examples
+    --------
+    >>> table = ChiefRayTable(image_height_um=(0.0, 1000.0, 2000.0), angle_deg=(0.0, 15.0, 25.0))
+    >>> table.tangents([[0.0, 1000.0]]).round(4).tolist()  # 15 degrees upwards
+    [[0.0, 0.2679]]
+    """
+
+    image_height_um: Annotated[Sequence[float], HEIGHT]
+    angle_deg: Annotated[Sequence[float], ANGLE]
+
+    __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        check_declared(self)
+        heights_um = np.asarray(self.image_height_um)
+        if heights_um.size < 2 or heights_um[0] != 0.0 or not (np.diff(heights_um) > 0.0).all():
+            raise ParameterError(
+                "image_height_um", "must have at least two values that ascend from 0", list(self.image_height_um), "µm"
+            )
+        if len(self.angle_deg) != heights_um.size:
+            rule = f"must have one angle for each of the {heights_um.size} heights, got {len(self.angle_deg)}"
+            raise ParameterError("angle_deg", rule)
+        if self.angle_deg[0] != 0.0:
+            raise ParameterError("angle_deg", "must be 0 on the axis", self.angle_deg[0], "degrees")
+
+    def tangents(self, field_um: ArrayLike) -> Floats:
+        """
+        Interpolate the chief rays at positions relative to the optical axis.
+
+        Parameters
+        ----------
+        field_um : (n, 2) float64, µm
+
+        Returns
+        -------
+        tangents : (n, 2) float64
+
+        Raises
+        ------
+        ParameterError
+            When a position is beyond the last height of the table.
+        """
+        field_um = finite_array("field_um", field_um, ndim=2)
+        height_um = np.hypot(field_um[:, 0], field_um[:, 1])
+        last_um, highest_um = self.image_height_um[-1], float(height_um.max(initial=0.0))
+        if highest_um > last_um * (1.0 + HEIGHT_ROUNDING):
+            raise ParameterError(
+                "image_height_um",
+                f"must extend to {highest_um:.6g} µm, the largest distance of a site",
+                last_um,
+                "µm",
+            )
+        tangent = _interpolant(self)(np.minimum(height_um, last_um))
+        per_um = np.divide(tangent, height_um, out=np.zeros(height_um.size), where=height_um > 0.0)
+        return np.asarray(field_um * per_um[:, np.newaxis])
+
+    @property
+    def _slope_per_um(self) -> float:
+        """Largest increase of the tangent per µm between two heights."""
+        tangent = np.tan(np.radians(self.angle_deg))
+        return float(np.abs(np.diff(tangent) / np.diff(self.image_height_um)).max())
+
+
+@lru_cache(maxsize=16)
+def _interpolant(table: ChiefRayTable) -> Callable[[Floats], Floats]:
+    from scipy.interpolate import PchipInterpolator
+
+    found: Callable[[Floats], Floats] = PchipInterpolator(table.image_height_um, np.tan(np.radians(table.angle_deg)))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Incidence:
+    """
+    Cones of light at photosites, each around a chief ray.
+
+    Created by :meth:`foveasim.Optics.incidence`.
+
+    Parameters
+    ----------
+    field_um : (n_site, 2) float64, µm
+        Positions of the sites relative to the optical axis, for a sensor that is not displaced.
+    radius : float
+        Tangent radius of the cone, ``1 / 2N``.
+    exit_pupil_um : float, µm
+        Distance of the exit pupil from the sensor; infinity for a telecentric lens.
+    table : ChiefRayTable, optional
+        Chief ray angles instead of an exit pupil.
+    displacement_um : (x, y), µm
+        Displacement of the sensor behind the lens, as by a gaze.
+    transmission : callable, optional
+        Power transmittance ``T(x, y)`` at points of the pupil, in units of its radius; by default a clear circle.
+    n_rings : int
+        Number of rings of rays; ring cubature with ``4 n_rings - 2`` rays per ring, at least 6.
+
+    Examples
+    --------
+    >>> cone = Incidence(np.array([[0.0, 0.0], [1000.0, 0.0]]), radius=0.125, exit_pupil_um=8000.0)
+    >>> cone.chief_ray.tolist(), cone.tangents.shape
+    ([[0.0, 0.0], [0.125, 0.0]], (2, 12, 2))
+    """
+
+    field_um: Floats
+    radius: Annotated[float, RADIUS]
+    exit_pupil_um: OwnCheck[float] = math.inf
+    table: ChiefRayTable | None = None
+    displacement_um: tuple[float, float] = (0.0, 0.0)
+    transmission: OwnCheck[Callable[[Floats, Floats], Any] | None] = None
+    n_rings: Annotated[int, Limits(at_least=1, at_most=MAX_RINGS)] = N_RINGS
+
+    def __post_init__(self) -> None:
+        check_declared(self)
+        field_um = np.ascontiguousarray(as_numbers("field_um", self.field_um), np.float64)
+        if field_um.ndim != 2 or field_um.shape[1] != 2:
+            raise ParameterError("field_um", f"must have the shape (n_site, 2), got {field_um.shape}")
+        if not math.isfinite(field_um.sum()):
+            finite_array("field_um", field_um)  # raises an error with the position
+        object.__setattr__(self, "field_um", own(field_um))
+        if not self.exit_pupil_um > 0.0:
+            raise ParameterError("exit_pupil_um", "must be > 0", self.exit_pupil_um, "µm")
+
+    def __repr__(self) -> str:
+        return f"Incidence({self.n_sites} sites, cones of f/{0.5 / self.radius:.3g}, {self.n_rings} rings)"
+
+    @property
+    def n_sites(self) -> int:
+        """Number of sites."""
+        return self.field_um.shape[0]
+
+    def with_rings(self, n_rings: int) -> Incidence:
+        """Return the same cones with another number of rings of rays."""
+        return replace(self, n_rings=n_rings)
+
+    def at(self, field_um: Floats) -> Incidence:
+        """Return the cones of the same lens at other positions, (n, 2) µm."""
+        return replace(self, field_um=field_um)
+
+    @property
+    def chief_ray(self) -> Floats:
+        """Tangents of the chief rays at the sites, (n_site, 2)."""
+        return self._chief_rays_at(self.field_um + np.array(self.displacement_um))
+
+    def design(self, table: ChiefRayTable | None = None) -> Floats:
+        """
+        Return the chief rays for which microlenses of the sensor are designed.
+
+        Parameters
+        ----------
+        table : ChiefRayTable, optional
+            By default the chief rays of the lens.
+
+        Returns
+        -------
+        tangents : (n_site, 2) float64
+            At the positions of the sites without displacement.
+
+        Raises
+        ------
+        ParameterError
+            When a site is beyond the table.
+        """
+        return self._chief_rays_at(self.field_um) if table is None else table.tangents(self.field_um)
+
+    def _chief_rays_at(self, field_um: Floats) -> Floats:
+        return np.asarray(field_um / self.exit_pupil_um) if self.table is None else self.table.tangents(field_um)
+
+    @property
+    def um_per_tangent(self) -> float:
+        """Smallest displacement in the image per change of a chief ray tangent, inf if constant."""
+        if self.table is None:
+            return self.exit_pupil_um
+        slope_per_um = self.table._slope_per_um  # noqa: SLF001 -- of this module
+        return 1.0 / slope_per_um if slope_per_um > 0.0 else math.inf
+
+    @property
+    def tangents(self) -> Floats:
+        """Tangents of the rays, (n_site, n_ray, 2)."""
+        points, _ = self.rays()
+        return np.asarray(self.chief_ray[:, np.newaxis] + self.radius * points)
+
+    @property
+    def weights(self) -> Floats:
+        """Weights of the rays, (n_site, n_ray): (1 + t²)⁻² over its sum."""
+        weights = self.rays()[1] / (1.0 + np.square(self.tangents).sum(axis=2)) ** 2
+        return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+    def rays(self, n_rings: int | None = None, n_directions: int | None = None) -> tuple[Floats, Floats]:
+        """
+        Return a cubature of the cone that all sites share.
+
+        Parameters
+        ----------
+        n_rings, n_directions : int, optional
+            Numbers of rings, and of rays in each; by default those of the rays.
+
+        Returns
+        -------
+        points : (n_ray, 2) float64
+            Points of the unit disc: the tangent of a ray is that of the chief ray plus :attr:`radius` times its point.
+        weights : (n_ray,) float64
+            Areas times transmittance, without the factor (1 + t²)⁻².
+
+        Raises
+        ------
+        ParameterError
+            When the pupil transmits none of the rays.
+        """
+        n_rings = self.n_rings if n_rings is None else n_rings
+        points, weights = disc_cubature(n_rings, max(4 * n_rings - 2, 6) if n_directions is None else n_directions)
+        if self.transmission is None:
+            return points, weights
+        # A ray from the point x of the pupil propagates towards -x.
+        transmitted = np.asarray(self.transmission(-points[:, 0], -points[:, 1]), np.float64)
+        weights = weights * np.broadcast_to(transmitted, weights.shape)
+        if not weights.sum() > 0.0:
+            raise ParameterError("n_rings", "must be larger: the pupil transmits none of the rays", n_rings)
+        return points, read_only(weights / weights.sum())
+
+
+@lru_cache(maxsize=16)
+def disc_cubature(n_rings: int, n_directions: int) -> tuple[Floats, Floats]:
+    """
+    Return points (n, 2) and weights (n,) of a cubature of the unit disc.
+
+    It is exact for polynomials. Radii are nodes of Gauss and Legendre in the squared radius. Rings are rotated against each
+    other by half a step, and by an eighth of a step against the axes, at which the overlap of rectangles has kinks.
+    """
+    node, weight = np.polynomial.legendre.leggauss(n_rings)
+    radius = np.sqrt(0.5 * (1.0 + node))
+    step = 2.0 * np.pi / n_directions
+    angle = step * (np.arange(n_directions) + 0.125 + 0.5 * (np.arange(n_rings)[:, np.newaxis] % 2))
+    points = np.stack((radius[:, np.newaxis] * np.cos(angle), radius[:, np.newaxis] * np.sin(angle)), axis=-1)
+    weights = np.repeat(0.5 * weight / n_directions, n_directions)
+    return read_only(points.reshape(-1, 2)), read_only(weights)
+
+
+publish(__name__)

@@ -1,0 +1,188 @@
+"""Openings above photodiodes, without microlenses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+
+from foveasim._core.calls import Limits, OwnCheck, check_declared
+from foveasim._core.rings import site_area_um2
+from foveasim._core.short_repr import short_repr
+from foveasim._core.validation import Floats, Ints
+from foveasim.incidence import Incidence
+from foveasim.sensor.effects.contract import Photosites
+from foveasim.sensor.pixel_optics._affine import affine_maps, determinant
+from foveasim.sensor.pixel_optics._layers import as_layers
+from foveasim.sensor.pixel_optics._shapes import Shapes
+from foveasim.sensor.pixel_optics.contract import PIXEL_OPTICS, Footprints, Outlines, PixelOptics
+
+__all__ = ["INSET", "ApertureStack"]
+
+INSET = Limits(at_least=0.0, at_most=1e4, hint="insets are in µm")
+#: Directions and rings of the fine rays of the control variate, at least, and per direction and ring of the rays.
+N_DIRECTIONS, DIRECTIONS_PER_RAY, N_FINE_RINGS = 64, 4, 2
+
+
+@PIXEL_OPTICS.register("aperture_stack", example={"height_um": 2.0, "refractive_index": 1.5})
+@dataclass(frozen=True, kw_only=True)
+class ApertureStack(PixelOptics):
+    """
+    Photodiodes at the bottom of a stack of layers, under openings without microlenses.
+
+    Parameters
+    ----------
+    height_um : float or sequence of float, µm
+        Distance between opening and photodiode, or the heights of several layers from top to bottom.
+    refractive_index : float or sequence of float
+        Refractive index of each layer, at least 1.
+    opening_inset_um, photodiode_inset_um : float, µm
+        Distance of the edges of openings and photodiodes from the outline of the site, inwards.
+    opening, photodiode : Layout, optional
+        Openings and photodiodes of all sites, instead of an inset: such as a layer of a chip file, with the same sites in the
+        same order and frame.
+
+    Raises
+    ------
+    ParameterError
+        When a value is out of range, or the numbers of heights and indices differ.
+    GeometryError
+        In captures, when an inset leaves nothing of a site.
+
+    Notes
+    -----
+    A ray of tangent t above the stack is displaced by ``d = Σ h t / sqrt(n² (1 + t²) - t²)`` on its way from the opening A to
+    the photodiode B, and is collected from ``A ∩ (B - d)``. The response is the mean of this area over the cone, over the area
+    of the site. The light is collected from one affine image of A, which has the centroid and the second moments of the mean
+    overlap: on photographs blurred by 1.5 µm, within 0.05 % (rms) of sixteen clipped outlines per site.
+
+    Rays are geometric: diffraction inside the stack is neglected, which is wrong for openings of a few wavelengths. Light that
+    misses its photodiode is absorbed. Sites of equal shape are interpolated between nodes of 1/128 in the tangent of the
+    chief ray.
+
+    Source: P. B. Catrysse and B. A. Wandell, Optical efficiency of image sensor pixels, J. Opt. Soc. Am. A 19, 1610 (2002).
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.Layout.from_rectangles([[0.0, 0.0]], 4.0)
+    >>> lens = fs.Optics(focal_length_mm=8.0, f_number=2.0)
+    >>> stack = ApertureStack(height_um=2.0, refractive_index=1.5)
+    >>> stack.footprints(layout, lens.incidence(layout.centroid_um)).response.round(3).tolist()
+    [0.933]
+    """
+
+    height_um: OwnCheck[float | Sequence[float]]
+    refractive_index: OwnCheck[float | Sequence[float]]
+    opening_inset_um: Annotated[float, INSET] = 0.0
+    photodiode_inset_um: Annotated[float, INSET] = 0.0
+    opening: OwnCheck[Outlines | None] = None
+    photodiode: OwnCheck[Outlines | None] = None
+
+    __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        check_declared(self)
+        as_layers(self)
+        for name in ("opening", "photodiode"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, Outlines.of(name, getattr(self, name)))
+
+    def part(self, selection: slice | Ints) -> ApertureStack:
+        """Return the stack of some of the sites."""
+        parts = {name: getattr(self, name) for name in ("opening", "photodiode") if getattr(self, name) is not None}
+        return replace(self, **{name: each.part(selection) for name, each in parts.items()}) if parts else self
+
+    def _shapes(self, sites: Photosites) -> Shapes:
+        return Shapes.of(
+            sites,
+            self.opening_inset_um if self.opening is None else self.opening,
+            self.photodiode_inset_um if self.photodiode is None else self.photodiode,
+        )
+
+    def optical_opening_um(self, sites: Photosites) -> float:
+        """Return the smallest opening times the index of the top layer, µm."""
+        opening, index = self._shapes(sites).opening, np.atleast_1d(self.refractive_index)[0]
+        area_um2 = site_area_um2(opening.xy_um, opening.ring_offsets, opening.site_offsets)
+        return float(index * np.sqrt(area_um2.min(initial=np.inf)))
+
+    def footprints(self, sites: Photosites, incidence: Incidence) -> Footprints:
+        """Compute the mean overlap of openings and displaced photodiodes, and its affine outlines."""
+        from foveasim.sensor.pixel_optics import _kernels
+
+        if not sites.n_sites:
+            return Footprints(np.zeros(0))
+        shapes, layers = self._shapes(sites), as_layers(self)
+        sites_um2, opening_um2 = (
+            site_area_um2(each.xy_um, each.ring_offsets, each.site_offsets) for each in (shapes.sites, shapes.opening)
+        )
+        before = _own_moments(shapes.opening, shapes.centre_um)
+        is_same = _is_same(shapes.opening, shapes.photodiode)
+        points, weights = incidence.rays()
+        n_directions = max(N_DIRECTIONS, DIRECTIONS_PER_RAY * points.shape[0] // incidence.n_rings)
+        fine_points, fine_weights = incidence.rays(incidence.n_rings + N_FINE_RINGS, n_directions)
+
+        def values(cones: Incidence, site_of: Ints) -> Floats:
+            """Return response, three elements of the matrix and two of the shift of each cone."""
+            sums = np.empty((cones.n_sites, 1 + _kernels.N_MOMENTS))
+            _kernels.cone_moments(
+                np.ascontiguousarray(cones.chief_ray), cones.radius, layers.height_um, layers.squared_index,
+                points, weights, fine_points, fine_weights, *_arrays(shapes.opening), *_arrays(shapes.photodiode),
+                site_of, is_same, shapes.centre_um, sums,
+            )  # fmt: skip
+            matrix, shift_um, has_map = affine_maps(before[site_of], sums[:, 1:])
+            response = np.where(has_map, sums[:, 0] / sites_um2[site_of], 0.0)
+            return np.column_stack((response, matrix, shift_um))
+
+        found = shapes.evaluate(incidence, 6, values)
+        own = np.zeros(sites.n_sites, np.int64) if shapes.is_congruent else np.arange(sites.n_sites)
+        ratio = determinant(found[:, 1:4]) * (opening_um2 / sites_um2)[own]
+        outlines = _affine_outlines(shapes, _centres_um(sites, shapes), before, found[:, 1:])
+        return Footprints(np.clip(found[:, 0], 0.0, 1.0), outlines, ratio)
+
+
+def _arrays(outlines: Outlines) -> tuple[Floats, Ints, Ints]:
+    return outlines.xy_um, outlines.ring_offsets, outlines.site_offsets
+
+
+def _is_same(one: Outlines, other: Outlines) -> bool:
+    """Return whether two outlines have the same arrays."""
+    return one is other or all(np.array_equal(a, b) for a, b in zip(_arrays(one), _arrays(other), strict=True))
+
+
+def _own_moments(outlines: Outlines, centre_um: Floats) -> Floats:
+    """Return the moments of outlines about centres, (n, 6)."""
+    from foveasim.sensor.pixel_optics import _kernels
+
+    vertices = np.repeat(np.arange(outlines.n_sites), np.diff(outlines.ring_offsets[outlines.site_offsets]))
+    local_um = np.ascontiguousarray(outlines.xy_um - centre_um[vertices])
+    sums = np.empty((outlines.n_sites, _kernels.N_MOMENTS))
+    rings = local_um, outlines.ring_offsets, outlines.site_offsets
+    _kernels.overlap_moments(*rings, *rings, np.zeros((outlines.n_sites, 2)), sums)
+    return sums
+
+
+def _centres_um(sites: Photosites, shapes: Shapes) -> Floats:
+    """Return the centroid of each site, (n_site, 2)."""
+    return sites.centroid_um if shapes.is_congruent else shapes.centre_um
+
+
+def _affine_outlines(shapes: Shapes, centre_um: Floats, before: Floats, maps: Floats) -> Outlines:
+    """Return the image of each opening: ``M (x - x̄) + x̄ + shift``."""
+    opening, n_sites = shapes.opening, centre_um.shape[0]
+    n_vertices = np.diff(opening.ring_offsets[opening.site_offsets])
+    rings, site_offsets = opening.ring_offsets, opening.site_offsets
+    local_um = opening.xy_um - np.repeat(shapes.centre_um, n_vertices, axis=0)
+    if shapes.is_congruent:
+        n_rings, before = rings.size - 1, np.repeat(before, n_sites, axis=0)
+        local_um = np.tile(local_um, (n_sites, 1))
+        steps = rings[-1] * np.arange(n_sites)[:, np.newaxis]
+        rings = np.append((rings[:-1] + steps).ravel(), rings[-1] * n_sites)
+        site_offsets, n_vertices = n_rings * np.arange(n_sites + 1), np.full(n_sites, n_vertices[0])
+    mean_um = before[:, 1:3] / before[:, :1]
+    a, b, c = (np.repeat(element, n_vertices) for element in maps[:, :3].T)
+    x, y = (local_um - np.repeat(mean_um, n_vertices, axis=0)).T
+    origin_um = np.repeat(centre_um + mean_um + maps[:, 3:5], n_vertices, axis=0)
+    return Outlines(origin_um + np.column_stack((a * x + b * y, b * x + c * y)), rings, site_offsets)
