@@ -197,12 +197,12 @@ class Model(nn.Module):
         if self._footprints is None:
             return rates
         collected = rates * constant(self._footprints.factor)
-        mixing = self._footprints.mixing
-        if mixing is None:
+        if self._footprints.mixing is None:
             return collected
-        rows, columns = mixing.nonzero()
-        exchanged = rates[..., torch.from_numpy(columns)] * constant(mixing.data)
-        return collected.index_add(-1, torch.from_numpy(rows), exchanged)
+        mixing = self._footprints.mixing.tocoo()
+        rows, columns = (torch.from_numpy(each.astype(np.int64)) for each in (mixing.row, mixing.col))
+        incident = rates / constant(self._footprints.area_ratio)
+        return collected.index_add(-1, rows, incident[..., columns] * constant(mixing.data))
 
     def forward(self, basis: Tensor | None = None) -> Tensor:
         """

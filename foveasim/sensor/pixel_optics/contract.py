@@ -153,10 +153,11 @@ class Footprints:
         """
         Return the rates of photoelectrons, given those within the outlines, (n_site,) e-/s.
 
+        The rate within the outline of a site is that within the outlines, over the ratio of their areas.
         Light that meets the photodiode of another site has passed the filter of its own site.
         """
         collected = rate_e_per_s * self.factor
-        return collected if self.mixing is None else collected + self.mixing @ rate_e_per_s
+        return collected if self.mixing is None else collected + self.mixing @ (rate_e_per_s / self.area_ratio)
 
 
 class PixelOptics(ABC):
