@@ -10,7 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import Limits, OwnCheck, Usual, check_declared
 from foveasim._core.short_repr import short_repr
