@@ -196,6 +196,11 @@ class Incidence:
         return replace(self, field_um=field_um)
 
     @property
+    def image_height_um(self) -> Floats:
+        """Distance of each site from the optical axis, (n_site,) µm."""
+        return np.hypot(*(self.field_um + np.array(self.displacement_um)).T)
+
+    @property
     def chief_ray(self) -> Floats:
         """Tangents of the chief rays at the sites, (n_site, 2)."""
         return self._chief_rays_at(self.field_um + np.array(self.displacement_um))

@@ -27,7 +27,7 @@ from foveasim._core.validation import Bools, Floats, check_per_site, check_point
 from foveasim.camera._clock import Clock
 from foveasim.camera._colour import colour_correction
 from foveasim.camera._exposure import AUTO_SETTINGS, ExposureTime, exposure_time
-from foveasim.camera._footprints import FootprintCache, find_footprints, placed
+from foveasim.camera._footprints import FootprintCache, find_footprints, find_incidence, placed
 from foveasim.camera._frames import Frame, ImageCache, Position, Task, check_frames, position_settings, tasks
 from foveasim.camera._steps import SensorFrame, WeightedMap, expose, integrate_maps, white_dn
 from foveasim.camera._warnings import (
@@ -44,6 +44,7 @@ from foveasim.capture import Capture
 from foveasim.distortion import Lens
 from foveasim.errors import FoveasimWarning, ParameterError, type_name
 from foveasim.fields import Grid, PowerMap
+from foveasim.incidence import Incidence
 from foveasim.integrate import Integrator, outline_bounds_um
 from foveasim.layout import Layout
 from foveasim.modes import Between, Exposure, Shutter
@@ -1060,6 +1061,38 @@ class Camera:
         return Covered.by(
             Integrator(layout, grid, distortion=self._distortion, compiled=False, n_threads=self._n_threads)
         )
+
+    def incidence(
+        self, light: Scene | PowerMap, *, gaze_um: tuple[float, float] | None = None, axis: GazeAxis | None = None
+    ) -> Incidence:
+        """
+        Return the cones of light at the photosites.
+
+        Parameters
+        ----------
+        light : Scene or PowerMap
+            The distance of a scene determines the cones; those of a power map are of a lens in focus.
+        gaze_um, axis : optional
+            As for :meth:`capture`.
+
+        Returns
+        -------
+        Incidence
+            With the chief ray and the image height of each site.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> lens = fs.Optics(focal_length_mm=8.0, f_number=2.8, exit_pupil_mm=10.0)
+        >>> camera = fs.Camera(optics=lens, sensor=fs.Sensor(fs.layout.grid(n_x=2, n_y=1, pitch_um=200.0)))
+        >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
+        >>> cones = camera.incidence(scene)
+        >>> cones.image_height_um.tolist(), cones.chief_ray.tolist()
+        ([100.0, 100.0], [[-0.01, 0.0], [0.01, 0.0]])
+        """
+        if gaze_um is not None or axis is not None:
+            return self.at(gaze_um, axis).incidence(light)
+        return find_incidence(self, self._layout, self.seen(light), self.position_um)[0]
 
     def footprints(
         self, light: Scene | PowerMap, *, gaze_um: tuple[float, float] | None = None, axis: GazeAxis | None = None

@@ -64,13 +64,20 @@ def find_footprints(
     """
     if pixel_optics is None:
         return None
+    incidence, axis_um = find_incidence(camera, layout, light, position_um)
+    warn_of_small_openings(pixel_optics, layout, light)
+    cache = FootprintCache() if cache is None else cache
+    return cache.get(pixel_optics, layout, camera.optics, incidence, axis_um)
+
+
+def find_incidence(
+    camera: Camera, layout: Layout, light: Scene | PowerMap, position_um: Position
+) -> tuple[Incidence, tuple[float, float]]:
+    """Return the cones of light at the sites of a layout, and where the optical axis meets it, µm."""
     frame = camera.sensor_frame(light) if isinstance(light, Scene) else SensorFrame.of(camera.distortion)
     distance_m = light.distance_m if isinstance(light, Scene) else None
     field_um = read_only(site_centres_um(layout, frame.axis_um))
-    incidence = camera.optics.incidence(field_um, distance_m, displacement_um=position_um)
-    warn_of_small_openings(pixel_optics, layout, light)
-    cache = FootprintCache() if cache is None else cache
-    return cache.get(pixel_optics, layout, camera.optics, incidence, frame.axis_um)
+    return camera.optics.incidence(field_um, distance_m, displacement_um=position_um), frame.axis_um
 
 
 def site_centres_um(layout: Layout, origin_um: Position) -> Floats:

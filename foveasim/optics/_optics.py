@@ -10,7 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import Limits, OwnCheck, Usual, check_declared
 from foveasim._core.short_repr import short_repr
@@ -285,7 +285,7 @@ class Optics(PointImages):
         return float(um_from_m(0.5 * radius_m**2 * (1.0 / distance_m - 1.0 / self.focus_distance_m)))
 
     def incidence(
-        self, field_um: Floats, distance_m: float | None = None, *, displacement_um: tuple[float, float] = (0.0, 0.0)
+        self, field_um: ArrayLike, distance_m: float | None = None, *, displacement_um: tuple[float, float] = (0.0, 0.0)
     ) -> Incidence:
         """
         Return the cones of light at positions of the image.
@@ -328,7 +328,7 @@ class Optics(PointImages):
             return np.prod([np.square(np.abs(pupil(x, y, CONE_NM))) for pupil in pupils], axis=0)
 
         return Incidence(
-            field_um,
+            np.asarray(field_um),
             radius=0.5 / self.working_f_number(distance_m),
             exit_pupil_um=float(um_from_m(m_from_mm(distance_mm))),
             table=self.chief_ray,

@@ -47,7 +47,7 @@ def check_pixel_optics(extension: Extension) -> None:
         )
     if extension.expected is not None:
         square = Layout.from_rectangles([[0.0, 0.0]], 10.0)
-        on_axis = float(optics.footprints(square, lens.incidence(np.zeros((1, 2)))).response[0])
+        on_axis = float(optics.footprints(square, lens.incidence([[0.0, 0.0]])).response[0])
         require(
             abs(on_axis - extension.expected) <= EXPECTED_TOLERANCE,
             f"has the response {on_axis:.4f} of a square of 10 µm on the axis, expected {extension.expected:.4f}",

@@ -12,6 +12,7 @@ from foveasim.view.meshes import Mesh, polydata, prisms
 from foveasim.view.notebook import to_html, to_png, widget
 from foveasim.view.plots import (
     hidden_figures,
+    plot_angular_response,
     plot_capture,
     plot_cortical,
     plot_curves,
@@ -47,6 +48,7 @@ __all__ = [
     "hidden_figures",
     "id_map",
     "picture_colours",
+    "plot_angular_response",
     "plot_capture",
     "plot_cortical",
     "plot_curves",

@@ -675,6 +675,7 @@ CALLS = {
     "view.hidden_figures": lambda o: view.hidden_figures().__enter__(),
     "view.id_map": lambda o: view.id_map(o.layout, (20, 20)),
     "view.picture_colours": lambda o: view.picture_colours(o.layout, PICTURE),
+    "view.plot_angular_response": lambda o: view.plot_angular_response(o.camera, o.scene),
     "view.plot_capture": lambda o: view.plot_capture(o.capture),
     "view.plot_cortical": lambda o: view.plot_cortical(o.cortical),
     "view.plot_curves": lambda o: view.plot_curves({"a": (LENGTH, LENGTH)}, "x", "y"),

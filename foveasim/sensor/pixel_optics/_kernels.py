@@ -63,7 +63,7 @@ def _largest_size(ring_offsets, site_offsets, site_of):
 
 @njit()
 def _moments_below(x_a, x_b, y_a, y_b, sign):
-    """Return the moments of the region between y = 0 and a line from (x_a, y_a) to (x_b, y_b)."""
+    """Return the moments between a line from (x_a, y_a) to (x_b, y_b) and y = 0."""
     h = sign * (x_b - x_a)
     total, square_a, square_b, product = y_a + y_b, y_a * y_a, y_b * y_b, y_a * y_b
     x_ab, xx_a, xx_b = x_a + x_b, x_a * x_a, x_b * x_b

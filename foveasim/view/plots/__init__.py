@@ -8,6 +8,7 @@ from foveasim.view.plots.rasters import plot_cortical, plot_image, plot_picture,
 from foveasim.view.plots.results import plot_results
 from foveasim.view.plots.rules import plot_report
 from foveasim.view.plots.sites import (
+    plot_angular_response,
     plot_capture,
     plot_curves,
     plot_layout,
@@ -18,6 +19,7 @@ from foveasim.view.plots.sites import (
 
 __all__ = [
     "hidden_figures",
+    "plot_angular_response",
     "plot_capture",
     "plot_cortical",
     "plot_curves",

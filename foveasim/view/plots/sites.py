@@ -25,7 +25,19 @@ if TYPE_CHECKING:
     from matplotlib.collections import Collection
     from matplotlib.figure import Figure
 
-__all__ = ["plot_capture", "plot_curves", "plot_layout", "plot_noise_budget", "save_drawing", "save_figure"]
+    from foveasim.camera import Camera
+    from foveasim.fields import PowerMap
+    from foveasim.scene import Scene
+
+__all__ = [
+    "plot_angular_response",
+    "plot_capture",
+    "plot_curves",
+    "plot_layout",
+    "plot_noise_budget",
+    "save_drawing",
+    "save_figure",
+]
 
 #: Layouts of more sites are drawn as an image, which is faster than outlines.
 MAX_OUTLINES = 4000
@@ -33,6 +45,8 @@ MAX_OUTLINES = 4000
 MAX_ADJACENCY_SITES = 50_000
 #: Drawings of more sites open slowly in all viewers.
 MAX_DRAWING_SITES = 20_000
+#: Sizes that differ by a smaller fraction are equal.
+SAME_SIZE = 1e-6
 #: Brightness of readout lines relative to the category colours of their sites.
 LINE_BRIGHTNESS = 0.55
 
@@ -143,6 +157,46 @@ def plot_capture(
     if isinstance(by, str) and by == "snr" and by not in capture.layout.columns:
         by, label = capture.signal_to_noise(), label or "signal-to-noise ratio"
     return _plot(capture.layout, colours_of(capture, by, label=label), overlay, scale_bar, legend, ax, figure_inches)
+
+
+def plot_angular_response(camera: Camera, light: Scene | PowerMap, *, ax: Axes | None = None) -> Axes:
+    """
+    Draw the response of photosites to uniform light against their image height.
+
+    Parameters
+    ----------
+    camera : Camera
+        Sensor with ``pixel_optics``; without, all responses are 1.
+    light : Scene or PowerMap
+        As for :meth:`foveasim.Camera.angular_response`.
+    ax : matplotlib axes, optional
+        New axes by default.
+
+    Returns
+    -------
+    matplotlib axes
+        A point per site, whose colour is the size of the site where sizes differ.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> stack = fs.sensor.ApertureStack(height_um=4.0, refractive_index=1.5)
+    >>> layout = fs.layout.log_polar(n_sectors=24, r_min_um=20.0, r_max_um=200.0)
+    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=fs.Sensor(layout, pixel_optics=stack))
+    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> axes = fs.view.plot_angular_response(camera, scene)
+    >>> axes.get_xlabel(), axes.get_ylabel()
+    ('image height / µm', 'response to uniform light')
+    """
+    ax = new_axes(7.0, 0.64) if ax is None else ax
+    height_um, size_um = camera.incidence(light).image_height_um, camera.layout.size_um
+    has_sizes = np.ptp(size_um) > SAME_SIZE * size_um.max()
+    points = ax.scatter(height_um, camera.angular_response(light), s=6.0, c=size_um if has_sizes else None)
+    if has_sizes:
+        ax.figure.colorbar(points, ax=ax, label="site size / µm")
+    ax.set(xlabel="image height / µm", ylabel="response to uniform light")
+    ax.grid(visible=True, alpha=0.3)
+    return ax
 
 
 def plot_noise_budget(
