@@ -73,7 +73,7 @@ def find_footprints(
 def find_incidence(
     camera: Camera, layout: Layout, light: Scene | PowerMap, position_um: Position
 ) -> tuple[Incidence, tuple[float, float]]:
-    """Return the cones of light at the sites of a layout, and where the optical axis meets it, µm."""
+    """Return the cones of light at the sites, and the position of the optical axis, µm."""
     frame = camera.sensor_frame(light) if isinstance(light, Scene) else SensorFrame.of(camera.distortion)
     distance_m = light.distance_m if isinstance(light, Scene) else None
     field_um = read_only(site_centres_um(layout, frame.axis_um))

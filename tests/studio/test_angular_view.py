@@ -52,7 +52,7 @@ def test_telecentric_response_is_one_curve(simulate):
 
     assert list(curves) == ["mean"]
     assert curves["mean"][1] == pytest.approx(expected, abs=1e-3)
-    assert f"smallest site {expected:.2f}" in about["note"]
+    assert [float(text.split()[-1]) for text in about["note"].split(";")] == pytest.approx([expected] * 2, abs=1.6e-3)
 
 
 def test_curves_are_means_and_extremes_of_annuli(simulate):
